@@ -1,10 +1,10 @@
-//! What the embedded bus costs under a whole skin: 253 clients, each with one exact filter, hear a broadcast
-//! at 62.5 Hz and each answers it to one client.
+//! Measures the cost of the embedded bus under a whole skin: 253 clients, each with one exact filter, receive a
+//! broadcast at 62.5 Hz, and each answers it to one client.
 //!
 //! `cargo run --release -p vcan-setup --example skin_pattern [CELLS] [SECONDS] [CELLS_PER_CLIENT]`
 //!
-//! Almost all of the cost is the system's, which wakes one reader per delivery; cells that share a client are
-//! woken together and cost a fraction.
+//! Almost all of the cost is the system's, which wakes one reader per delivery. Cells that share a client are woken
+//! together and cost a fraction.
 #![allow(clippy::print_stdout, reason = "an example that prints")]
 
 use std::error::Error;
@@ -39,7 +39,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let ids: Vec<_> = (1..=cells).map(|cell| 0x200 + cell).collect();
     for ids in ids.chunks(share.max(1)) {
         let (bus, ids) = (open(exact(0x001))?, ids.to_vec());
-        // They end with the process.
+        // The threads end with the process.
         Builder::new().stack_size(128 << 10).spawn(move || answer(&bus, &ids))?;
     }
     let gateway = open(vec![Filter { id: 0x200, mask: 0x700 }])?;
@@ -94,7 +94,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Some cells: answer every broadcast with its first bytes, until the bus is closed.
+/// Answers every broadcast with its first bytes for some cells, until the bus is closed.
 fn answer(bus: &Bus, ids: &[u32]) {
     let mut inbox = Inbox::new();
     let mut replies = Vec::new();

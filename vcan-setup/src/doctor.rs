@@ -1,4 +1,4 @@
-//! Whether a bench would run on this machine.
+//! Assesses whether a bench would run on this machine.
 //!
 //! ```text
 //!   skin or names --+
@@ -21,25 +21,25 @@ mod interface;
 
 pub use facts::{Bus, Facts, Heard, Program, User};
 
-/// What one frame takes in a receive buffer, as the kernel counts it.
+/// The space of one frame in a receive buffer as the kernel accounts for it, in bytes.
 const FRAME: usize = 1_024;
-/// How many times an answer of every cell should fit into a receive buffer.
+/// The number of answers of every cell that should fit into a receive buffer.
 const TIMES: usize = 4;
 
-/// How much a finding matters.
+/// The severity of a finding.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Level {
-    /// As it should be.
+    /// Everything is in order.
     Ok,
-    /// A bench runs, and this is worth knowing.
+    /// A bench runs, but the user should know this.
     Note,
-    /// No bench runs, or none whose figures mean anything.
+    /// A bench does not run, or its figures would be meaningless.
     Fault,
 }
 
 impl Level {
-    /// The level's name, as it is printed.
+    /// Returns the printed name of the level.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -50,14 +50,14 @@ impl Level {
     }
 }
 
-/// One thing that was found.
+/// One finding.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Finding {
-    /// How much it matters.
+    /// The severity.
     pub level: Level,
-    /// What it is.
+    /// The description.
     pub text: String,
-    /// How to fix it: one command each, any of them is enough.
+    /// Ways to fix it, one command each; any one is enough.
     pub hints: Vec<String>,
 }
 
@@ -74,7 +74,7 @@ impl Finding {
         Self { level: Level::Fault, text: text.into(), hints: Vec::new() }
     }
 
-    /// With one more hint.
+    /// Adds a hint.
     fn hint(mut self, hint: impl Into<String>) -> Self {
         self.hints.push(hint.into());
         self
@@ -86,7 +86,7 @@ impl Finding {
     }
 }
 
-/// Whether a bench would run: nothing that was found is a fault.
+/// Returns true if a bench would run: the findings contain no fault.
 #[must_use]
 pub fn would_run(findings: &[Finding]) -> bool {
     findings.iter().all(|finding| finding.level != Level::Fault)
@@ -117,7 +117,7 @@ pub fn assess(facts: &Facts) -> Vec<Finding> {
 }
 
 impl Facts {
-    /// The kind of bus that a bench would use.
+    /// Returns the kind of bus that a bench would use.
     #[must_use]
     pub fn bus_kind(&self) -> BusKind {
         match self.choice {
@@ -127,12 +127,12 @@ impl Facts {
         }
     }
 
-    /// Returns whether a named bus is an interface, or none was named.
+    /// Returns true if a named bus is an interface, or if no bus is named.
     fn has_interface(&self) -> bool {
         self.buses.is_empty() || self.buses.iter().any(|bus| bus.interface.is_some())
     }
 
-    /// A command of this program, as root.
+    /// Returns a command line of this program, to be run as root.
     fn own(&self, command: &str) -> String {
         self.sudo(&format!("{} {command}", self.program))
     }
@@ -141,7 +141,7 @@ impl Facts {
         if self.user.admin || self.user.root { command.to_owned() } else { format!("sudo {command}") }
     }
 
-    /// The argument of `vcan-setup up` for a bus: its skin, or its name.
+    /// Returns the `vcan-setup up` command for a bus, with its skin or its name.
     fn up(&self, target: &Target) -> String {
         let what = target.skin.as_ref().map_or(&target.name, |skin| &skin.file);
         self.own(&format!("up {what}"))
@@ -170,7 +170,7 @@ impl Facts {
         }
     }
 
-    /// The nodes on a bus already.
+    /// Reports the nodes that are already on a bus.
     fn traffic(&self, bus: &Bus, on: &str) -> Vec<Finding> {
         let name = &bus.target.name;
         let heard = match &bus.heard {
@@ -196,24 +196,23 @@ impl Facts {
                 ))
             }
             (true, 0) => Some(
-                Finding::fault(format!(
-                    "no cell is heard on {on}, and with --no-spawn they have to be there"
-                ))
-                .hint(format!(
-                    "cell-node --bus {name} --nodes 1-... --skin SKIN.toml &  # or leave out --no-spawn"
-                )),
+                Finding::fault(format!("no cell sends on {on}, and --no-spawn needs cells that run already"))
+                    .hint(format!(
+                        "cell-node --bus {name} --nodes 1-... --skin SKIN.toml &  # or leave out --no-spawn"
+                    )),
             ),
             (true, 1..) if absent().is_empty() => Some(Finding::ok(format!("{count} cells are on {on}"))),
             (true, 1..) => {
                 let absent = nodes(&absent());
-                let text = format!("{count} cells are on {on}; of the skin's these were not heard: {absent}");
+                let text =
+                    format!("{count} cells are on {on}; these cells of the skin sent nothing: {absent}");
                 Some(Finding::note(text))
             }
         };
         gateway.into_iter().chain(cells).collect()
     }
 
-    /// Whether a burst of answers fits into a socket.
+    /// Checks that a burst of answers fits into the receive buffer of a socket.
     fn receive_buffer(&self) -> Option<Finding> {
         let granted = self.receive_buffer?;
         let all = usize::from(CellId::MAX.get());
@@ -241,7 +240,7 @@ impl Facts {
         })
     }
 
-    /// Whether one answer of every cell fits into the kernel's queue between sender and receiver.
+    /// Checks that one answer of every cell fits into the kernel's queue between sender and receiver.
     fn backlog(&self) -> Option<Finding> {
         let frames = |bus: &Bus| bus.cells.as_ref().map_or(0, BTreeSet::len) * frames_of(&bus.target);
         let frames: usize = self.buses.iter().map(frames).sum();
@@ -256,7 +255,7 @@ impl Facts {
             )),
             Some(backlog) => Finding::fault(format!(
                 "the kernel's backlog of {backlog} does not hold an answer of all cells, {frames} frames: some would \
-                 be lost without a word"
+                 be lost silently"
             ))
             .hint(self.sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))),
         })
@@ -285,7 +284,7 @@ impl Facts {
     }
 }
 
-/// Frames that a packet takes.
+/// Returns the number of frames per packet.
 const fn frames_of(target: &Target) -> usize {
     match target.format {
         Format::Fd => 1,
@@ -293,7 +292,7 @@ const fn frames_of(target: &Target) -> usize {
     }
 }
 
-/// Some nodes, for people: `1, 2, 5`.
+/// Lists node ids for people: `1, 2, 5`.
 fn nodes(cells: &BTreeSet<CellId>) -> String {
     let first: Vec<_> = cells.iter().take(12).map(ToString::to_string).collect();
     let more = if cells.len() > first.len() {

@@ -1,13 +1,13 @@
-//! The embedded bus: `CAN_RAW`'s rules over a Unix socket, for machines whose kernel has no SocketCAN.
+//! The embedded bus: the rules of `CAN_RAW` over a Unix socket, for machines whose kernel has no SocketCAN.
 //!
 //! ```text
 //!   client --datagram--> [ Parcel::accept ] -> [ Router ] -> [ Queue ] per client --datagram--> client
 //!                          16 or 72 bytes       filters       bounded, counts drops
 //! ```
 //!
-//! Routing and queues are pure; [`Server`] is the shell around them: one thread, one `epoll`. Frames are
-//! passed on in the order in which they are read, so all clients see the same order. It is private to the
-//! user and it is not `AF_CAN`: `candump` cannot attach to it.
+//! Routing and queues are pure; [`Server`] is the shell around them: one thread, one `epoll`. Frames are forwarded in
+//! the order in which they are read, so all clients see the same order. The bus is private to the user, and it is not
+//! `AF_CAN`: `candump` cannot attach to it.
 
 mod client;
 pub mod parcel;

@@ -1,11 +1,12 @@
-//! One bus on several hosts: its frames in numbered batches, and what has become of each.
+//! One bus on several hosts: numbers the frames of each host, sends them in batches, and accounts for each frame.
 //!
 //! ```text
-//!   bus ──> outgoing ──> message ──> transport ──> incoming ──> bus of another host
+//! bus ──> outgoing ──> message ──> transport ──> incoming ──> bus of another host
 //! ```
 //!
-//! No input or output: a shell with a transport, the program `vcan-link`, moves the bytes ([`program`]). A source numbers every frame that it takes from its bus,
-//! those that it then drops too, so that whoever hears it knows how many are missing and where they were lost.
+//! This module has no input or output. The program `vcan-link`, a shell with a transport, moves the bytes
+//! ([`program`]). A source numbers every frame that it receives from its bus, including those that it drops afterwards.
+//! The receiver therefore knows how many frames are missing and where they were lost.
 
 pub mod incoming;
 pub mod message;

@@ -1,50 +1,50 @@
-//! What this machine's kernel can do about CAN, and where what is missing can be had.
+//! CAN support of this machine's kernel, and ways to install missing modules.
 
 use std::fs;
 use std::path::Path;
 
 use protocol::bus::has_socketcan;
 
-/// Where a module of the kernel is.
+/// The availability of a kernel module.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Module {
-    /// In the kernel: built in, or loaded.
+    /// The module is built in or loaded.
     There,
-    /// On the disk: it can be loaded.
+    /// The module is on the disk and can be loaded.
     Loadable,
-    /// Not among the modules of this kernel.
+    /// The module does not belong to this kernel's modules.
     Missing,
-    /// Unknown: the modules of this kernel are not on this disk.
+    /// The state is unknown, because this kernel's modules are not on this disk.
     Unknown,
 }
 
-/// What a kernel is, as far as CAN is concerned.
+/// The properties of a kernel that concern CAN.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Kernel {
-    /// Its release, as in `uname -r`.
+    /// The release, as in `uname -r`.
     pub release: String,
     /// The machine, as in `uname -m`.
     pub machine: String,
-    /// The distribution's names, from os-release: `ID` and `ID_LIKE`.
+    /// The names of the distribution from os-release: `ID` and `ID_LIKE`.
     pub distribution: String,
-    /// Whether `CAN_RAW` sockets can be opened.
+    /// True if `CAN_RAW` sockets can be opened.
     pub has_can: bool,
-    /// `CAN_RAW` sockets.
+    /// The module for `CAN_RAW` sockets.
     pub can_raw: Module,
-    /// Virtual buses.
+    /// The module for virtual buses.
     pub vcan: Module,
-    /// Pairs.
+    /// The module for pairs of virtual interfaces.
     pub vxcan: Module,
 }
 
 impl Kernel {
-    /// Looks at the kernel that runs.
+    /// Examines the running kernel.
     #[must_use]
     pub fn look() -> Self {
         let uname = rustix::system::uname();
         let release = uname.release().to_string_lossy().into_owned();
         let lists = Lists::read(&release);
-        // Asking for such a socket makes the kernel load the module if it has it.
+        // A request for such a socket makes the kernel load the module if it is available.
         let has_can = has_socketcan();
         let loaded = |name: &str| Path::new("/sys/module").join(name).exists();
         let os_release = fs::read_to_string("/etc/os-release").unwrap_or_default();
@@ -59,14 +59,13 @@ impl Kernel {
         }
     }
 
-    /// Where one of the virtual kinds, `vcan` or `vxcan`, is.
+    /// Returns the state of the module for a virtual kind, `vcan` or `vxcan`.
     #[must_use]
     pub fn module(&self, kind: &str) -> Module {
         if kind == "vxcan" { self.vxcan } else { self.vcan }
     }
 
-    /// How to fix that there is no CAN, or no `vcan`: one command each, with a comment as in a shell, the
-    /// nearest first.
+    /// Returns ways to get CAN or `vcan`: one shell command with a comment each, the simplest first.
     #[must_use]
     pub fn hints(&self, module: Module) -> Vec<String> {
         let modprobe = "sudo modprobe -a can_raw vcan vxcan";
@@ -90,7 +89,7 @@ impl Kernel {
             other => other,
         };
         let release = &self.release;
-        // Elsewhere than on the distribution's own kernel its packages do not help.
+        // The distribution's packages do not help on other kernels.
         if is("ubuntu")
             && ["-generic", "-virtual", "-kvm", "-aws", "-azure", "-gcp"]
                 .iter()
@@ -113,7 +112,7 @@ impl Kernel {
 struct Lists {
     built_in: Option<String>,
     on_disk: Option<String>,
-    /// Whether the kernel can load modules at all.
+    /// True if the kernel can load modules at all.
     takes_modules: bool,
 }
 
@@ -139,7 +138,7 @@ impl Lists {
     }
 }
 
-/// Whether a list of paths has this module: `kernel/net/can/can-raw.ko.xz: kernel/net/can/can.ko.xz`.
+/// Returns true if a list of paths contains the module: `kernel/net/can/can-raw.ko.xz: kernel/net/can/can.ko.xz`.
 fn names(list: &str, module: &str) -> bool {
     list.lines().any(|line| {
         let path = line.split(':').next().unwrap_or_default();
@@ -148,7 +147,7 @@ fn names(list: &str, module: &str) -> bool {
     })
 }
 
-/// The names that a distribution gives itself.
+/// Returns the names that a distribution gives itself.
 fn distribution(os_release: &str) -> String {
     let values = os_release.lines().filter_map(|line| {
         let (key, value) = line.split_once('=')?;

@@ -1,50 +1,50 @@
-//! What an interface of the kernel is, as far as a CAN bus is concerned.
+//! Interfaces of the kernel, with their properties as CAN buses.
 
 use core::fmt;
 
 use serde::Serialize;
 
-/// The alias (`ip link show` prints it) that marks what this program has made, and nothing else.
+/// The alias that marks interfaces made by this program; `ip link show` prints it.
 pub const MARK: &str = "skinbus";
-/// The largest frame of an interface that carries classic CAN only.
+/// The MTU of an interface that carries classic CAN only.
 pub const CLASSIC_MTU: u32 = 16;
-/// The same of one that carries CAN FD too.
+/// The MTU of an interface that carries CAN FD too.
 pub const FD_MTU: u32 = 72;
 
 /// An interface.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Interface {
-    /// Its number.
+    /// The index of the interface.
     pub index: u32,
-    /// Its name.
+    /// The name of the interface.
     pub name: String,
-    /// What it is.
+    /// The kind of the interface.
     pub kind: Kind,
-    /// Whether this program has made it: it bears the [`MARK`].
+    /// True if this program made the interface: it has the alias [`MARK`].
     pub ours: bool,
-    /// Whether it is up.
+    /// True if the interface is up.
     pub up: bool,
-    /// The largest frame in bytes: 16 for classic CAN, 72 for CAN FD, more for CAN XL.
+    /// The MTU in bytes: 16 for classic CAN, 72 for CAN FD, more for CAN XL.
     pub mtu: u32,
-    /// What went through it.
+    /// The traffic counters.
     pub counters: Counters,
 }
 
-/// What an interface is.
+/// The kind of an interface.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum Kind {
-    /// A bus in the kernel.
+    /// A virtual bus in the kernel.
     Vcan,
     /// One end of a pair, which may lead into another network namespace.
     Vxcan(Option<Peer>),
     /// A CAN controller, or an adapter that looks like one.
     Hardware(Hardware),
-    /// No CAN at all: in words, what it is.
+    /// An interface without CAN, with a description.
     Other(String),
 }
 
 impl Kind {
-    /// In one word.
+    /// Returns the kind in one word.
     #[must_use]
     pub const fn name(&self) -> &'static str {
         match self {
@@ -59,44 +59,44 @@ impl Kind {
 /// The other end of a pair.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Peer {
-    /// Its number, in its own namespace.
+    /// The index in its own namespace.
     pub index: u32,
-    /// Its name, if it may be known.
+    /// The name, if this user may read it.
     pub name: Option<String>,
     /// The name of its network namespace under /run/netns, if that is another one and has a name.
     pub namespace: Option<String>,
-    /// The number that its network namespace has in this one; `None` when it is this one.
+    /// The id of its network namespace in this one; `None` if it is in this one.
     pub namespace_id: Option<i32>,
 }
 
 /// A CAN controller.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Hardware {
-    /// Its driver.
+    /// The driver.
     pub driver: Option<String>,
-    /// What its error counters have come to.
+    /// The error state.
     pub state: Option<State>,
-    /// Bits in a second; `None` while none are set.
+    /// The bit rate in bit/s; `None` if it is not set.
     pub bitrate: Option<u32>,
-    /// Bits in a second of CAN FD data; `None` while none are set.
+    /// The bit rate of CAN FD data in bit/s; `None` if it is not set.
     pub data_bitrate: Option<u32>,
-    /// Whether it is switched to CAN FD.
+    /// True if the controller is switched to CAN FD.
     pub fd: bool,
-    /// Whether it only listens: it cannot send, nor acknowledge.
+    /// True if the controller only listens: it can neither send nor acknowledge.
     pub listen_only: bool,
 }
 
 /// Bit rates of CAN hardware.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Rates {
-    /// Bits in a second; `None`: none are set.
+    /// The bit rate in bit/s; `None` if it is not set.
     pub bitrate: Option<u32>,
-    /// Bits in a second of CAN FD data; `None`: classic CAN.
+    /// The bit rate of CAN FD data in bit/s; `None` for classic CAN.
     pub data_bitrate: Option<u32>,
 }
 
 impl Hardware {
-    /// The bit rates that it has; in classic mode it has none for data.
+    /// Returns the bit rates in use; a controller in classic mode has no data bit rate.
     #[must_use]
     pub fn rates(&self) -> Rates {
         Rates { bitrate: self.bitrate, data_bitrate: self.data_bitrate.filter(|_| self.fd) }
@@ -104,10 +104,11 @@ impl Hardware {
 }
 
 impl Rates {
-    /// Whether these are the target's, within half a percent; a rate that the target leaves open may be anything.
+    /// Returns true if the rates are within half a percent of the target's. A rate that the target does not give may
+    /// have any value.
     #[must_use]
     pub fn meet(self, target: Self) -> bool {
-        // A controller's clock is divided by whole numbers: it may miss what was requested, by less than the
+        // A controller divides its clock by whole numbers. It may therefore miss the requested rate, by less than the
         // nodes of a bus may differ.
         let near = |target: Option<u32>, has: Option<u32>| {
             let near = |target: u32, has: u32| u64::from(target.abs_diff(has)) * 200 <= target.into();
@@ -117,7 +118,7 @@ impl Rates {
     }
 }
 
-/// For people: `500 kbit/s, data 83333 bit/s`.
+/// Formats rates as `500 kbit/s, data 83333 bit/s`.
 impl fmt::Display for Rates {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let words = |rate: u32| {
@@ -135,26 +136,26 @@ impl fmt::Display for Rates {
     }
 }
 
-/// How far a controller's error counters have brought it.
+/// The error state of a controller.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "SCREAMING-KEBAB-CASE")]
 pub enum State {
-    /// All is well.
+    /// Normal operation.
     ErrorActive,
     /// More than 96 errors.
     ErrorWarning,
-    /// More than 127: it must not destroy others' frames any more.
+    /// More than 127 errors: the controller no longer destroys others' frames.
     ErrorPassive,
-    /// More than 255: it takes no part any more.
+    /// More than 255 errors: the controller no longer takes part in the bus.
     BusOff,
-    /// Down.
+    /// The interface is down.
     Stopped,
-    /// Asleep.
+    /// The controller sleeps.
     Sleeping,
 }
 
 impl State {
-    /// The state by the number that the kernel gives it.
+    /// Returns the state for the kernel's number.
     #[must_use]
     pub const fn from_number(number: u32) -> Option<Self> {
         Some(match number {
@@ -168,7 +169,7 @@ impl State {
         })
     }
 
-    /// The state's name, as `ip -details link` prints it.
+    /// Returns the name of the state, as `ip -details link` prints it.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -182,45 +183,45 @@ impl State {
     }
 }
 
-/// What went through an interface since it was made.
+/// The traffic of an interface since it was made.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Counters {
     /// Frames received.
     pub received: u64,
     /// Frames sent.
     pub sent: u64,
-    /// Frames that the interface dropped, either way.
+    /// Frames dropped by the interface in either direction.
     pub dropped: u64,
-    /// Frames that were damaged, either way.
+    /// Damaged frames in either direction.
     pub errors: u64,
 }
 
 impl Interface {
-    /// Whether it is made of software alone, so that it may be made and removed.
+    /// Returns true if the interface is software only, so that it may be made and removed.
     #[must_use]
     pub const fn is_virtual(&self) -> bool {
         matches!(self.kind, Kind::Vcan | Kind::Vxcan(_))
     }
 
-    /// The other end, of a pair.
+    /// Returns the other end if the interface belongs to a pair.
     #[must_use]
     pub const fn peer(&self) -> Option<&Peer> {
         if let Kind::Vxcan(Some(peer)) = &self.kind { Some(peer) } else { None }
     }
 
-    /// The controller, of hardware.
+    /// Returns the controller if the interface is hardware.
     #[must_use]
     pub const fn hardware(&self) -> Option<&Hardware> {
         if let Kind::Hardware(hardware) = &self.kind { Some(hardware) } else { None }
     }
 
-    /// Whether it carries CAN frames.
+    /// Returns true if the interface carries CAN frames.
     #[must_use]
     pub const fn is_can(&self) -> bool {
         !matches!(self.kind, Kind::Other(_))
     }
 
-    /// What it is, in words: `a vcan`, `CAN hardware (kvaser_pci)`, `an ethernet interface`.
+    /// Describes the interface: `a vcan`, `CAN hardware (kvaser_pci)`, `an ethernet interface`.
     #[must_use]
     pub fn what(&self) -> String {
         match &self.kind {

@@ -1,4 +1,4 @@
-//! Looks at this machine for the [`doctor`](crate::doctor), and changes nothing.
+//! Collects the facts about this machine for the [`doctor`](crate::doctor), and changes nothing.
 
 use std::fs;
 use std::io;
@@ -21,11 +21,11 @@ use crate::kernel::Kernel;
 use crate::link::Interface;
 use crate::plan::Target;
 
-/// How long a bus is listened to: a gateway sends joints much more often, a cell sends a heartbeat at
-/// least every half second.
+/// The time for which a bus is observed. A gateway sends joints much more often, and a cell sends a heartbeat at least
+/// every half second.
 const LISTEN: Duration = Duration::from_millis(600);
 
-/// Looks at everything that a bench on these buses would meet.
+/// Collects all facts that affect a bench on these buses.
 #[must_use]
 pub fn facts(mut buses: Vec<Bus>, choice: Choice, no_spawn: bool, present: &[Interface]) -> Facts {
     for bus in &mut buses {
@@ -58,7 +58,7 @@ fn usable(target: &Target, interface: &Interface) -> bool {
     interface.is_can() && interface.up && target.carried_by(interface.mtu)
 }
 
-/// Listens on all buses at once that can be opened.
+/// Observes at the same time all buses that can be opened.
 fn listen_to_all(buses: &[Bus], choice: Choice) -> Vec<Option<Result<Option<Heard>, String>>> {
     let kind_of = |bus: &Bus| match (choice, &bus.interface) {
         (Choice::Only(kind), _) => kind,
@@ -83,7 +83,7 @@ fn listen_to_all(buses: &[Bus], choice: Choice) -> Vec<Option<Result<Option<Hear
     })
 }
 
-/// Listens for other gateways and for cells; nothing when the bus is not served.
+/// Observes a bus for other gateways and cells. Returns `None` if the bus is not served.
 fn listen(target: &Target, kind: BusKind) -> Result<Option<Heard>, String> {
     let options = Options { fd: target.format == Format::Fd, ..Options::default() };
     let until = Instant::now() + LISTEN;
@@ -109,11 +109,11 @@ fn listen(target: &Target, kind: BusKind) -> Result<Option<Heard>, String> {
 }
 
 impl Heard {
-    /// Takes note of who sends a frame with this identifier.
+    /// Records the sender of a frame with this identifier.
     pub fn take(&mut self, id: Id) {
         let node = Node::from_byte(id.node);
         match id.kind {
-            // The rest of the gateway's side may come from a user at a shell.
+            // The gateway's other commands may come from a user at a shell.
             Kind::Command => self.gateway |= Command::from_byte(id.node) == Some(Command::Joints),
             Kind::Network if node == Node::Gateway => self.gateway = true,
             Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured => {
@@ -124,14 +124,16 @@ impl Heard {
     }
 }
 
-/// What the kernel grants to a request like the gateway's; it is the same for every sort of socket.
+/// Returns the receive buffer size that the kernel grants to a request like the gateway's. It is the same for all kinds
+/// of sockets.
 fn receive_buffer() -> io::Result<usize> {
     let socket =
         rustix::net::socket_with(AddressFamily::UNIX, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
     bus::set_receive_buffer(&socket, GATEWAY_RECEIVE_BUFFER as usize)
 }
 
-/// How this program is called so that `sudo`, which looks in the system's own directories only, finds it.
+/// Returns a name of this program under which `sudo` finds it, because `sudo` searches only the system's own
+/// directories.
 #[must_use]
 pub fn program() -> String {
     let own = std::env::current_exe().unwrap_or_default();
@@ -144,13 +146,13 @@ pub fn program() -> String {
     quoted_os(&called.unwrap_or_else(|| own.into_os_string()))
 }
 
-/// Whether this process may change interfaces.
+/// Returns true if this process may change interfaces.
 #[must_use]
 pub fn is_admin() -> bool {
     capabilities(None).is_ok_and(|sets| sets.effective.contains(CapabilitySet::NET_ADMIN))
 }
 
-/// The cells' program, which should be beside this one where `SKINBUS_CELL_NODE` does not name it.
+/// Returns the cell program: `SKINBUS_CELL_NODE`, or the file `cell-node` beside this program.
 fn cell_node() -> Program {
     if let Some(path) = std::env::var_os("SKINBUS_CELL_NODE").filter(|path| !path.is_empty()) {
         let path = PathBuf::from(path);
@@ -161,13 +163,13 @@ fn cell_node() -> Program {
     Program { there: path.is_file(), path }
 }
 
-/// Where embedded buses can be served, or why not.
+/// Returns the directory for embedded buses, or the reason why none can be served.
 fn embedded() -> Result<PathBuf, String> {
     let directory = usual_directory();
     address(&directory, "a23456789012345").map_err(|error| error.to_string())?;
     match open_directory(&directory) {
         Ok(_) => {}
-        // It is made when a bus is served.
+        // The directory is created when a bus is served.
         Err(error) if error.is_absent() => {
             let parent = directory.parent().unwrap_or_else(|| Path::new("/"));
             rustix::fs::access(parent, Access::WRITE_OK | Access::EXEC_OK).map_err(|errno| {
@@ -183,15 +185,15 @@ fn embedded() -> Result<PathBuf, String> {
 /// An embedded bus of this user.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Embedded {
-    /// Its name.
+    /// The name of the bus.
     pub name: String,
-    /// Its socket.
+    /// The path of its socket.
     pub path: String,
-    /// Whether it is served: a killed server leaves its socket behind.
+    /// True if the bus is served; a killed server leaves its socket behind.
     pub served: bool,
 }
 
-/// The embedded buses of this user.
+/// Returns the embedded buses of this user.
 #[must_use]
 pub fn embedded_buses() -> Vec<Embedded> {
     let directory = usual_directory();
@@ -213,7 +215,7 @@ pub fn embedded_buses() -> Vec<Embedded> {
     buses
 }
 
-/// Only a socket without a listener refuses.
+/// Returns true if the bus is served. Only a socket without a listener refuses connections.
 fn is_served(directory: &Path, name: &str) -> bool {
     let socket = seqpacket(SocketFlags::NONBLOCK);
     let (Ok(socket), Ok(address)) = (socket, address(directory, name)) else { return false };

@@ -1,4 +1,4 @@
-//! `vcan-setup`: gives you a bus.
+//! The program `vcan-setup`, which sets up CAN buses.
 
 mod cli;
 

@@ -1,4 +1,4 @@
-//! Network namespaces, as people name them.
+//! Network namespaces, named by users.
 
 use core::fmt;
 use std::ffi::OsStr;
@@ -8,25 +8,25 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// Where `ip netns` keeps the namespaces that have names.
+/// The directory in which `ip netns` keeps named namespaces.
 pub const NAMED: &str = "/run/netns";
 
-/// A network namespace as it was named.
+/// A network namespace as named by the user.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum Namespace {
     /// A name that `ip netns` lists.
     Name(String),
-    /// That of a process.
+    /// The namespace of a process.
     Process(u32),
-    /// A file that stands for it.
+    /// The path of a namespace file.
     Path(PathBuf),
 }
 
-/// A namespace that is not there or cannot be used.
+/// The error of a namespace that does not exist or cannot be opened.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum NamespaceError {
-    /// No such name.
+    /// The name does not exist.
     #[error(
         "there is no network namespace {name} in {NAMED}: `sudo ip netns add {name}` makes it, `ip netns` lists them; a process' number or a path is taken too"
     )]
@@ -34,26 +34,27 @@ pub enum NamespaceError {
         /// The name.
         name: String,
     },
-    /// No such process.
+    /// The process does not exist.
     #[error(
         "there is no network namespace {pid} in {NAMED}, and no process {pid}: is it still running? `ip netns` lists names"
     )]
     Process {
-        /// Its number.
+        /// The process id.
         pid: u32,
     },
-    /// Any other error of the system.
+    /// Another system error.
     #[error("cannot open the network namespace {}: {source}", path.display())]
     Io {
-        /// Its file.
+        /// The path of the namespace file.
         path: PathBuf,
-        /// The system's error.
+        /// The system error.
         source: io::Error,
     },
 }
 
 impl Namespace {
-    /// What a word names: a path holds a `/`, a name comes before a process of the same number.
+    /// Parses a namespace. An argument with a `/` is a path, and a name takes precedence over a process of the same
+    /// number.
     #[must_use]
     pub fn named(word: &OsStr) -> Self {
         let Some(word) = word.to_str().filter(|word| !word.contains('/')) else {
@@ -66,7 +67,7 @@ impl Namespace {
         }
     }
 
-    /// The file that stands for it.
+    /// Returns the path of the namespace file.
     #[must_use]
     pub fn path(&self) -> PathBuf {
         match self {
@@ -76,10 +77,10 @@ impl Namespace {
         }
     }
 
-    /// Opens it.
+    /// Opens the namespace file.
     ///
     /// # Errors
-    /// When it is not there, or may not be opened.
+    /// Returns [`NamespaceError`] if the namespace does not exist or may not be opened.
     pub fn open(&self) -> Result<File, NamespaceError> {
         let path = self.path();
         File::open(&path).map_err(|source| match (self, source.kind()) {
@@ -89,7 +90,7 @@ impl Namespace {
         })
     }
 
-    /// The beginning of a command that runs `ip` in it.
+    /// Returns the beginning of a command that runs `ip` in the namespace.
     #[must_use]
     pub fn ip(&self) -> String {
         match self {
@@ -100,7 +101,7 @@ impl Namespace {
     }
 }
 
-/// As `ip link add ... netns` takes it.
+/// Formats the namespace as `ip link add ... netns` expects it.
 impl fmt::Display for Namespace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {

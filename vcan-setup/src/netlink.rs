@@ -1,7 +1,7 @@
-//! The kernel's interfaces, listed and changed by rtnetlink.
+//! Lists and changes the kernel's interfaces by rtnetlink.
 //!
-//! Decides nothing: [`plan`](crate::plan) does. A link that is made is given its number here, so that what
-//! follows is done to that one and to no other of the same name.
+//! All decisions are made in [`plan`](crate::plan). This module chooses the index of a new link itself, so that the
+//! following operations affect that link and no other one of the same name.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -28,30 +28,31 @@ mod reading;
 
 use reading::{driver, interface};
 
-/// Bytes of the header before a namespace's attributes begin.
+/// The length of the header before a namespace's attributes, in bytes.
 const NSID_HEADER: usize = 4;
-/// How many numbers are tried for a new link while others make theirs; a pair takes two.
+/// The maximum number of indices that are tried for a new link while other programs create theirs; a pair takes two.
 const TRIES: u32 = 64;
 
-/// Speaks to the kernel about the interfaces of one network namespace.
+/// A netlink socket for the interfaces of one network namespace.
 #[derive(Debug)]
 pub struct Netlink {
     exchange: Exchange,
 }
 
 impl Netlink {
-    /// For the namespace of the calling thread.
+    /// Opens a socket in the namespace of the calling thread.
     ///
     /// # Errors
-    /// When the system gives no such socket.
+    /// Returns an error if the system provides no such socket.
     pub fn open() -> io::Result<Self> {
         Exchange::open().map(|exchange| Self { exchange })
     }
 
-    /// For another namespace. A socket stays in the namespace where it was opened, and a thread opens it.
+    /// Opens a socket in another namespace. A socket stays in the namespace where it was opened, so a separate thread
+    /// enters the namespace and opens it.
     ///
     /// # Errors
-    /// When the namespace may not be entered, or is none.
+    /// Returns an error if the namespace may not be entered, or if the file is not a namespace.
     pub fn open_in(namespace: &File) -> io::Result<Self> {
         let enter = || {
             move_into_link_name_space(namespace.as_fd(), Some(LinkNameSpaceType::Network))?;
@@ -61,10 +62,10 @@ impl Netlink {
             .unwrap_or_else(|_| Err(io::Error::other("the thread that entered it panicked")))
     }
 
-    /// All interfaces, by number.
+    /// Returns all interfaces, by index.
     ///
     /// # Errors
-    /// When the kernel does not answer.
+    /// Returns an error if the kernel does not answer.
     pub fn interfaces(&mut self) -> io::Result<Vec<Interface>> {
         let mut interfaces: Vec<_> = self.all()?.iter().filter_map(|link| interface(link)).collect();
         interfaces.sort_by_key(|interface| interface.index);
@@ -89,15 +90,15 @@ impl Netlink {
         Ok(interfaces)
     }
 
-    /// Each interface as the kernel reports it.
+    /// Returns each interface as the kernel reports it.
     fn all(&mut self) -> io::Result<Vec<Vec<u8>>> {
         self.exchange.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)
     }
 
-    /// The number that another namespace has in this one, if it has one.
+    /// Returns the id that another namespace has in this one, if any.
     ///
     /// # Errors
-    /// When the kernel refuses.
+    /// Returns an error if the kernel refuses.
     pub fn namespace_id(&mut self, namespace: &File) -> io::Result<Option<i32>> {
         let fd = u32::try_from(namespace.as_raw_fd()).map_err(io::Error::other)?;
         let mut message = NsidMessage::default();
@@ -111,7 +112,7 @@ impl Netlink {
             .filter(|&id| id >= 0))
     }
 
-    /// The namespaces that have both a number here and a name.
+    /// Returns the namespaces that have both an id here and a name.
     fn named_namespaces(&mut self) -> HashMap<i32, String> {
         let mut names = HashMap::new();
         for entry in std::fs::read_dir(NAMED).into_iter().flatten().flatten() {
@@ -128,26 +129,26 @@ impl Netlink {
         Ok(self.query(queried)?.map(|interface| interface.name))
     }
 
-    /// The interface that a message is about.
+    /// Returns the interface that a message is about.
     fn query(&mut self, about: LinkMessage) -> io::Result<Option<Interface>> {
         let answers = self.exchange.request(RouteNetlinkMessage::GetLink(about), 0)?;
         Ok(answers.iter().find_map(|answer| interface(answer)))
     }
 
-    /// Makes a vcan of this name, marks it and brings it up; its number.
+    /// Makes a vcan, marks it and brings it up. Returns its index.
     ///
     /// # Errors
-    /// The kernel's error; then nothing was made, or it was removed again.
+    /// Returns the kernel's error; the vcan was then not made, or was removed again.
     pub fn make_vcan(&mut self, name: &str) -> io::Result<u32> {
         let index = self.add(name, |_| Ok(vec![LinkInfo::Kind(InfoKind::Vcan)]))?;
         let marked = self.mark(index);
         self.or_undo(marked, Undo::Remove { index }).map(|_| index)
     }
 
-    /// Makes a pair, marks both ends and brings them up; the number of the end that is here.
+    /// Makes a pair, marks both ends and brings them up. Returns the index of the end in this namespace.
     ///
     /// # Errors
-    /// The kernel's error; then nothing was made, or it was removed again.
+    /// Returns the kernel's error; the pair was then not made, or was removed again.
     pub fn make_pair(
         &mut self,
         name: &str,
@@ -174,15 +175,15 @@ impl Netlink {
         self.or_undo(marked, Undo::Remove { index }).map(|_| index)
     }
 
-    /// A number that no interface has, one above all.
+    /// Returns an index above those of all interfaces.
     fn free_index(&mut self) -> io::Result<u32> {
         let links = self.all()?;
         let indices = links.iter().filter_map(|link| LinkHeader::parse(link).ok()).map(|header| header.index);
         Ok(indices.max().unwrap_or(0) + 1)
     }
 
-    /// Makes a link, which is down and has MTU 72; its number. It is chosen here: the kernel does not report
-    /// which one it would have taken, and a name can have changed hands before it is looked up.
+    /// Makes a link, which is down and has MTU 72. Returns its index, which is chosen here: the kernel would not report
+    /// its own choice, and the name may belong to another link before it is looked up.
     fn add(
         &mut self,
         name: &str,
@@ -198,9 +199,9 @@ impl Netlink {
             let flags = NLM_F_CREATE | NLM_F_EXCL;
             match self.exchange.request(RouteNetlinkMessage::NewLink(message), flags) {
                 Ok(_) => return Ok(index),
-                // Somebody else took the number of the other end meanwhile,
+                // Another program took the index of the other end meanwhile,
                 Err(error) if is(&error, Errno::BUSY) && number < TRIES => number += 2,
-                // or this one: the kernel returns the same error for a name that is taken.
+                // or that of this end: the kernel returns the same error for a name that is taken.
                 Err(error) if is(&error, Errno::EXIST) && number < TRIES && self.free_index()? > index => {
                     number += 2;
                 }
@@ -210,7 +211,7 @@ impl Netlink {
     }
 
     fn mark(&mut self, index: u32) -> io::Result<()> {
-        // First the mark: a link that has it can be removed by the next command.
+        // The mark comes first, so that the next command can remove the link if a later step fails.
         self.change(link(index, [LinkAttribute::IfAlias(MARK.to_owned())]))?;
         self.set_up(index, true)
     }
@@ -222,7 +223,7 @@ impl Netlink {
     /// Brings an interface up or down.
     ///
     /// # Errors
-    /// The kernel's error.
+    /// Returns the kernel's error.
     pub fn set_up(&mut self, index: u32, up: bool) -> io::Result<()> {
         let mut message = link(index, []);
         message.header.change_mask = LinkFlags::Up;
@@ -230,18 +231,18 @@ impl Netlink {
         self.change(message)
     }
 
-    /// Sets the MTU of an interface, which has to be down.
+    /// Sets the MTU of an interface, which must be down.
     ///
     /// # Errors
-    /// The kernel's error.
+    /// Returns the kernel's error.
     pub fn set_mtu(&mut self, index: u32, mtu: u32) -> io::Result<()> {
         self.change(link(index, [LinkAttribute::Mtu(mtu)]))
     }
 
-    /// Sets the bit rates of CAN hardware, which has to be down. Without a rate for data it is classic.
+    /// Sets the bit rates of CAN hardware, which must be down. Without a data rate it is switched to classic CAN.
     ///
     /// # Errors
-    /// The driver's error.
+    /// Returns the driver's error.
     pub fn set_rates(&mut self, index: u32, rates: Rates) -> io::Result<()> {
         let fd = if rates.data_bitrate.is_some() { CanCtrlModeFlags::Fd } else { CanCtrlModeFlags::empty() };
         let mut data = vec![InfoCan::CtrlMode(CanCtrlMode { mask: CanCtrlModeFlags::Fd, flags: fd })];
@@ -251,7 +252,7 @@ impl Netlink {
         self.change(link(index, [LinkAttribute::LinkInfo(info)]))
     }
 
-    /// Sees that a clock comes near enough to what was requested: a driver takes what is five percent away.
+    /// Checks that the clock comes close enough to the requested rates, because drivers accept a rate up to 5 % off.
     fn see_rates(&mut self, index: u32, target: Rates) -> io::Result<()> {
         let nearest = self.query(link(index, []))?.and_then(|it| it.hardware().map(Hardware::rates));
         match nearest.filter(|nearest| !nearest.meet(target)) {
@@ -263,15 +264,15 @@ impl Netlink {
     /// Removes an interface, and the other end of its pair with it.
     ///
     /// # Errors
-    /// The kernel's error.
+    /// Returns the kernel's error.
     pub fn remove(&mut self, index: u32) -> io::Result<()> {
         self.exchange.request(RouteNetlinkMessage::DelLink(link(index, [])), 0).map(|_| ())
     }
 
-    /// Does one step; what undoes it, if there is anything to be undone.
+    /// Executes a step. Returns the action that undoes it, if there is one.
     ///
     /// # Errors
-    /// The kernel's error; then what the step has done so far was undone.
+    /// Returns the kernel's error; the completed part of the step was then undone.
     pub fn carry_out(&mut self, step: &Step, there: Option<(&File, &mut Self)>) -> io::Result<Option<Undo>> {
         let restore = |index, mtu, up| Undo::Restore { index, mtu, rates: None, up };
         let Step { name, action } = step;
@@ -307,10 +308,10 @@ impl Netlink {
         done.map(|()| undo)
     }
 
-    /// Takes back what a step has done.
+    /// Undoes a step.
     ///
     /// # Errors
-    /// The kernel's error.
+    /// Returns the kernel's error.
     pub fn undo(&mut self, undo: &Undo) -> io::Result<()> {
         match *undo {
             Undo::Remove { index } => self.remove(index),
@@ -319,7 +320,7 @@ impl Netlink {
                 if let Some(mtu) = mtu {
                     self.set_mtu(index, mtu)?;
                 }
-                // No kernel takes back that a rate was set at all.
+                // The kernel cannot unset a rate once it was set.
                 if let Some(rates @ Rates { bitrate: Some(_), .. }) = rates {
                     self.set_rates(index, rates)?;
                 }
@@ -329,28 +330,28 @@ impl Netlink {
     }
 }
 
-/// What takes a step back.
+/// The action that undoes a step.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum Undo {
-    /// Removes what was made.
+    /// Removes the interface that was made.
     Remove {
-        /// Its number.
+        /// The index of the interface.
         index: u32,
     },
-    /// Gives an interface back what it had.
+    /// Restores the former settings of an interface.
     Restore {
-        /// Its number.
+        /// The index of the interface.
         index: u32,
-        /// Its MTU, if that was changed.
+        /// The former MTU, if it was changed.
         mtu: Option<u32>,
-        /// Its bit rates, if those were.
+        /// The former bit rates, if they were changed.
         rates: Option<Rates>,
-        /// Whether it was up.
+        /// True if the interface was up.
         up: bool,
     },
 }
 
-/// One try at making a link.
+/// One attempt to make a link.
 #[derive(Clone, Copy)]
 struct Attempt {
     index: u32,
@@ -361,7 +362,7 @@ fn is(error: &io::Error, errno: Errno) -> bool {
     error.raw_os_error() == Some(errno.raw_os_error())
 }
 
-/// A message about the interface of this number.
+/// Returns a message about the interface of this index.
 fn link(index: u32, attributes: impl IntoIterator<Item = LinkAttribute>) -> LinkMessage {
     let mut message = LinkMessage::default();
     message.header.index = index;

@@ -1,14 +1,14 @@
-//! What is to be done, before anything is done: target interfaces and present ones are turned into
-//! steps, or into a refusal.
+//! Plans the changes to interfaces before any change is made: compares target interfaces with present ones, and returns
+//! steps or a refusal.
 //!
 //! ```text
 //!   target  --+
-//!             +--> up, down --> steps, each of which can be printed in words and as an `ip` command
-//!   present --+            \--> or why nothing is done at all
+//!             +--> up, down --> steps, each of which can be printed as text and as an `ip` command
+//!   present --+            \--> or the reason why nothing is done
 //! ```
 //!
-//! A step makes an interface, or changes or removes one that this program has made. The one exception is
-//! [`Action::SetRates`], which is planned only when it was requested, and only for CAN hardware.
+//! A step makes an interface, or changes or removes one that this program made. The only exception is
+//! [`Action::SetRates`], which is planned only on request, and only for CAN hardware.
 
 use std::ffi::OsStr;
 
@@ -29,31 +29,31 @@ pub use step::{Action, Step};
 /// A requested interface.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Target {
-    /// Its name.
+    /// The name.
     pub name: String,
-    /// Which frames it has to carry.
+    /// The format of the frames that it must carry.
     pub format: Format,
-    /// The skin that it is a bus of; `None` when it was named on the command line.
+    /// The skin that the bus belongs to; `None` if it was named on the command line.
     pub skin: Option<SkinBus>,
 }
 
 /// A skin's values for a bus that may be hardware.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct SkinBus {
-    /// The skin's file, as a shell takes it.
+    /// The skin's file, quoted for a shell.
     pub file: String,
-    /// Its bit rates, those that the skin gives.
+    /// The bit rates that the skin gives.
     pub rates: Rates,
 }
 
 impl Target {
-    /// An interface that was named, for all frames.
+    /// Returns the target for an interface that was named, for frames of both formats.
     #[must_use]
     pub fn named(name: &str) -> Self {
         Self { name: name.to_owned(), format: Format::Fd, skin: None }
     }
 
-    /// The buses of a skin.
+    /// Returns the targets for the buses of a skin.
     #[must_use]
     pub fn of_skin(file: &OsStr, skin: &Skin) -> Vec<Self> {
         let target = |bus: &protocol::skin::Bus| Self {
@@ -67,7 +67,7 @@ impl Target {
         skin.buses.iter().map(target).collect()
     }
 
-    /// For hardware that was named without a skin, the format is the one that it carries.
+    /// Takes over the format of hardware that was named without a skin.
     pub fn take_format_of_hardware(&mut self, present: &[Interface]) {
         let there = find(present, &self.name).filter(|it| it.hardware().is_some());
         if self.skin.is_none() && there.is_some_and(|it| it.mtu < FD_MTU) {
@@ -75,13 +75,13 @@ impl Target {
         }
     }
 
-    /// The skin that gives it a bit rate, so that it can only be hardware.
+    /// Returns the skin if it gives the bus a bit rate, which makes the bus hardware.
     #[must_use]
     pub fn hardware(&self) -> Option<&SkinBus> {
         self.skin.as_ref().filter(|skin| skin.rates.bitrate.is_some())
     }
 
-    /// Why it cannot be had together with others, if it cannot: two skins give one bus two bit rates.
+    /// Returns a refusal if another skin gives the bus different bit rates.
     fn at_odds(&self, others: &[Self]) -> Option<Refusal> {
         let own = self.hardware()?;
         let mut skins = others.iter().filter(|other| other.name == self.name).filter_map(Self::hardware);
@@ -90,7 +90,7 @@ impl Target {
         Some(Refusal::AtOdds { name: self.name.clone(), one: says(other), other: says(own) })
     }
 
-    /// Whether an interface's MTU carries the required frames.
+    /// Returns true if an interface of this MTU carries the required frames.
     #[must_use]
     pub const fn carried_by(&self, mtu: u32) -> bool {
         matches!(self.format, Format::Classic) || mtu >= FD_MTU
@@ -104,26 +104,26 @@ pub struct TargetPair<'a> {
     pub name: &'a str,
     /// The other end.
     pub peer: &'a str,
-    /// Where the other end is to be; `None`: in this namespace too.
+    /// The namespace of the other end; `None` for this namespace.
     pub there: Option<&'a There>,
 }
 
 /// Another network namespace.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct There {
-    /// As it was named.
+    /// The namespace as named by the user.
     pub name: Namespace,
-    /// Its number in this one, if it has one.
+    /// Its id in this namespace, if it has one.
     pub id: Option<i32>,
     /// Its interfaces.
     pub present: Vec<Interface>,
 }
-/// What is done, and what is not and why.
+/// The planned changes.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct Plan {
-    /// In this order.
+    /// The steps in their order.
     pub steps: Vec<Step>,
-    /// One line on each interface that is left as it is.
+    /// One line for each interface that is left unchanged.
     pub unchanged: Vec<String>,
 }
 
@@ -131,10 +131,10 @@ fn find<'a>(present: &'a [Interface], name: &str) -> Option<&'a Interface> {
     present.iter().find(|interface| interface.name == name)
 }
 
-/// The steps after which every target interface is there, is up and carries the required frames.
+/// Plans the steps after which every target interface exists, is up and carries the required frames.
 ///
 /// # Errors
-/// When that cannot be had without touching something that is not ours. Then nothing is to be done.
+/// Returns [`Refusal`] if that requires a change to an interface that this program did not make.
 pub fn up(target: &[Target], present: &[Interface], set_bit_rates: bool) -> Result<Plan, Refusal> {
     let mut plan = Plan::default();
     if let Some(refusal) = target.iter().enumerate().find_map(|(at, it)| it.at_odds(target.get(..at)?)) {
@@ -162,10 +162,10 @@ pub fn up(target: &[Target], present: &[Interface], set_bit_rates: bool) -> Resu
     Ok(plan)
 }
 
-/// What has to be done so that both ends of a pair are there and up.
+/// Plans the steps after which both ends of a pair exist and are up.
 ///
 /// # Errors
-/// When that cannot be had without touching something that is not ours. Then nothing is to be done.
+/// Returns [`Refusal`] if that requires a change to an interface that this program did not make.
 pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, Refusal> {
     let TargetPair { name, peer, there } = *target;
     if there.is_none() && name == peer {
@@ -190,7 +190,7 @@ pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, R
         plan.fit(&Target::named(peer), other)?;
         return Ok(plan);
     };
-    // Steps do not reach into the other namespace, but for making what is not there.
+    // Steps do not change interfaces in the other namespace, except for making a missing pair.
     let ip = there.name.ip();
     let (what, command) = match (other.up, other.mtu >= FD_MTU) {
         (true, true) => return Ok(plan),
@@ -228,26 +228,26 @@ fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&There>) -> Refu
 }
 
 impl Plan {
-    /// Whether a step is about an interface of this name already.
+    /// Returns true if a step already affects an interface of this name.
     fn changes(&self, name: &str) -> bool {
         self.steps.iter().any(|step| step.name == name)
     }
 
-    /// Says of an interface, once, that it is left as it is.
+    /// Adds a line for an interface that is left unchanged, once.
     fn leave(&mut self, line: String) {
         if !self.unchanged.contains(&line) {
             self.unchanged.push(line);
         }
     }
 
-    /// Brings a virtual interface that is there into the target state, if it is ours.
+    /// Brings an existing virtual interface into the target state, if this program made it.
     fn fit(&mut self, target: &Target, interface: &Interface) -> Result<(), Refusal> {
         let Interface { index, mtu, .. } = *interface;
         let name = interface.name.clone();
         let wide = target.carried_by(mtu);
         let action = match (wide, interface.up, interface.ours) {
             (true, true, ours) => {
-                let whose = if ours { "" } else { ", made by somebody else" };
+                let whose = if ours { "" } else { ", made by another program" };
                 self.leave(format!("{name} is there already, and fits ({}{whose})", interface.what()));
                 return Ok(());
             }
@@ -260,7 +260,7 @@ impl Plan {
         Ok(())
     }
 
-    /// Compares hardware with the skin, and sets it when that was requested.
+    /// Compares hardware with the skin, and sets its rates on request.
     fn hardware(
         &mut self,
         target: &Target,
@@ -299,7 +299,7 @@ impl Plan {
             return Err(Refusal::HardwareNarrow { name, what, mtu: interface.mtu, file });
         }
         match missing {
-            // Its rates are set, and the skin has none.
+            // The hardware has bit rates, but the skin gives none.
             Some(_) if before.bitrate.is_some() => Err(Refusal::Down(name)),
             Some((key, example)) => Err(Refusal::NoRate { name, key, example, file }),
             None => Err(Refusal::HardwareDown { name, what, file }),
@@ -307,10 +307,11 @@ impl Plan {
     }
 }
 
-/// The steps that remove those of the target interfaces that this program has made.
+/// Plans the steps that remove those target interfaces that this program made.
 ///
 /// # Errors
-/// When an interface was named that is not ours. Buses of a skin are left alone instead.
+/// Returns [`Refusal`] if an interface was named that this program did not make. Buses of a skin are left alone
+/// instead.
 pub fn down(target: &[Target], present: &[Interface]) -> Result<Plan, Refusal> {
     let mut plan = Plan::default();
     for target in target {
@@ -342,7 +343,7 @@ pub fn down(target: &[Target], present: &[Interface]) -> Result<Plan, Refusal> {
     Ok(plan)
 }
 
-/// Whether the other end of its pair, which takes this end with it, is removed already.
+/// Returns true if the other end of its pair, which takes this end with it, is already to be removed.
 fn removed_with(plan: &Plan, interface: &Interface, present: &[Interface]) -> bool {
     let peer = interface.peer().filter(|peer| peer.namespace_id.is_none());
     let peer = peer.and_then(|peer| present.iter().find(|other| other.index == peer.index));

@@ -1,4 +1,4 @@
-//! Serial lines that speak slcan, each as a participant of a bus.
+//! Serial lines with the slcan protocol, each of which takes part in a bus.
 //!
 //! ```text
 //!              one client for each line, with its filters
@@ -6,9 +6,9 @@
 //!        <──── [Incoming: decoder, queue] <────
 //! ```
 //!
-//! [`Outgoing`](outgoing::Outgoing), [`Incoming`](incoming::Incoming) and the account take bytes, frames and times, and
-//! touch nothing. A [`Bridge`] is one thread around all lines of a bus. It never waits for a line or for the bus: what
-//! does not fit a queue is dropped, and counted by reason.
+//! [`Outgoing`](outgoing::Outgoing), [`Incoming`](incoming::Incoming) and the account process bytes, frames and times
+//! without input or output. A [`Bridge`] is one thread around all lines of a bus. It never blocks on a line or on the
+//! bus: frames that do not fit into a queue are dropped, and counted by reason.
 
 pub mod account;
 mod bridge;

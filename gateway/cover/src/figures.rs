@@ -1,17 +1,17 @@
-//! How well a link is covered.
+//! Measures how well a link is covered.
 
 use crate::grid::Grid;
 use crate::place::{Spot, spacing};
 use crate::surface::{Sample, Surface, real};
 use crate::{Figures, Link};
 
-/// A link's figures.
+/// Computes the figures of a link.
 pub(crate) fn figures(link: &Link, surface: &Surface<'_>, spots: &[Spot], pitch: f64) -> Figures {
     let grid = Grid::of(pitch, spots.iter().map(|spot| &spot.point));
     let covered = |sample: &&Sample| {
         let mut near = grid.around(grid.cube(&sample.point)).filter_map(|index| spots.get(index));
         near.any(|spot| {
-            // Not through a thin wall.
+            // A cell does not cover the other side of a thin wall.
             spot.normal.dot(&sample.face) > -0.5 && (spot.point - sample.point).norm() <= pitch
         })
     };

@@ -1,9 +1,8 @@
-//! Covers robot links with hexagonal skin cells: where they lie on the visual meshes, how they are wired, and on
-//! which bus each is.
+//! Covers robot links with hexagonal skin cells: places cells on the visual meshes, wires them, and assigns them to
+//! buses.
 //!
-//! Only the outer surface wears cells: a point belongs to it when rays from just above it escape. Meshes may have
-//! inner parts, double walls and triangles that are wound the wrong way. The same input and seed give the same
-//! cells.
+//! Only the outer surface gets cells: a point belongs to it if rays from just above it escape. Meshes may have inner
+//! parts, double walls and triangles with the wrong winding. The result is the same for the same input and seed.
 //!
 //! ```
 //! use cover::mesh::Mesh;
@@ -43,18 +42,18 @@ pub const MIN_PITCH: f64 = 1e-3;
 /// The largest pitch, in m.
 pub const MAX_PITCH: f64 = 1.0;
 
-/// The most links, covered ones and obstacles together.
+/// The maximum number of links, covered ones and obstacles together.
 pub const MAX_LINKS: usize = 1000;
 
 /// A rigid body of a robot.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Link {
-    /// What errors call it.
+    /// The name, for errors.
     pub name: String,
-    /// What it is made of; inner parts wear no cells.
+    /// The meshes; inner parts get no cells.
     pub parts: Vec<Part>,
-    /// Where its frame is at the joint configuration at which it is covered, in a frame that all links share, in m.
-    /// Where links hide each other then, they wear no cells.
+    /// The pose of its frame in a frame that all links share, in m, for the joint configuration at which it is covered.
+    /// Surfaces that links hide from each other in this configuration get no cells.
     pub pose: Isometry3<f64>,
 }
 
@@ -63,20 +62,20 @@ pub struct Link {
 pub struct Part {
     /// The mesh.
     pub mesh: Mesh,
-    /// Where the mesh's frame is in the link's frame, in m.
+    /// The pose of the mesh's frame in the link's frame, in m.
     pub pose: Isometry3<f64>,
-    /// By which factors its coordinates are multiplied first; negative ones mirror it.
+    /// The factors by which the mesh's coordinates are multiplied first; negative ones mirror it.
     pub scale: [f64; 3],
 }
 
 impl Part {
-    /// A mesh at the origin of the link's frame, as large as it is.
+    /// Creates an unscaled part at the origin of the link's frame.
     #[must_use]
     pub fn new(mesh: Mesh) -> Self {
         Self { mesh, pose: Isometry3::identity(), scale: [1.0; 3] }
     }
 
-    /// Its triangles where `frame` is the link's frame.
+    /// Returns the triangles of the part if `frame` is the link's frame.
     #[must_use]
     pub fn triangles(&self, frame: &Isometry3<f64>) -> Vec<Triangle> {
         let (pose, [x, y, z]) = (frame * self.pose, self.scale);
@@ -85,29 +84,29 @@ impl Part {
     }
 }
 
-/// A box that holds no cell.
+/// A box that must not contain cells.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KeepOut {
-    /// In which of the covered links' frames, from 0.
+    /// The index of the covered link in whose frame the box is given.
     pub link: usize,
-    /// Its smallest coordinates, in m.
+    /// The smallest coordinates, in m.
     pub min: [f64; 3],
-    /// Its largest coordinates, in m.
+    /// The largest coordinates, in m.
     pub max: [f64; 3],
 }
 
-/// How to cover.
+/// Options of the cover.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
-    /// From one cell's middle to the next one's, in m.
+    /// The distance between the centers of neighbouring cells, in m.
     pub pitch: f64,
-    /// Where chance begins.
+    /// The seed of the random numbers.
     pub seed: u64,
-    /// Boxes that hold no cell.
+    /// Boxes that must not contain cells.
     pub keep_out: Vec<KeepOut>,
-    /// The most cells of one bus, 1 to [`MAX_NODES`].
+    /// The maximum number of cells per bus, 1 to [`MAX_NODES`].
     pub nodes_per_bus: usize,
-    /// How far each cell's middle is at least from other links, in m.
+    /// The minimum distance of each cell's center from other links, in m.
     pub clearance: f64,
 }
 
@@ -120,98 +119,97 @@ impl Default for Options {
 /// A cell of the skin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cell {
-    /// On which of the covered links it is, from 0.
+    /// The index of the covered link.
     pub link: usize,
-    /// Its middle, on the mesh, in the link's frame, in m.
+    /// The center on the mesh, in the link's frame, in m.
     pub position: [f64; 3],
-    /// Which way it faces, away from the link: a unit vector in the link's frame. It is the mean of the mesh's
-    /// normals below the cell, and at most 9 degrees off the mesh's normal at `position`.
+    /// The outward unit normal in the link's frame. It is the mean of the mesh's normals below the cell, and at most 9
+    /// degrees off the mesh's normal at `position`.
     pub normal: [f64; 3],
-    /// On which bus it is, from 0.
+    /// The index of the bus.
     pub bus: usize,
-    /// Its number on the bus, from 1.
+    /// The node id on the bus, from 1.
     pub node: u8,
-    /// By port, the node that it is wired to, on the same bus and link. Ports are a quarter of a turn from each
-    /// other, counterclockwise when seen from outside; each wire has the port nearest to its direction.
+    /// By port: the node id of the wired cell, on the same bus and link. Ports are a quarter of a turn apart,
+    /// counterclockwise as seen from outside. Each wire uses the port nearest to its direction.
     pub neighbors: [Option<u8>; PORTS],
-    /// Whether it is wired to the gateway: one cell of all that wires join.
+    /// True for one cell of each wired group, which is wired to the gateway.
     pub root: bool,
 }
 
-/// How well a link is covered.
+/// The figures of a covered link.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Figures {
-    /// The link's name.
+    /// The name of the link.
     pub name: String,
-    /// How many cells it wears.
+    /// The number of cells.
     pub cells: usize,
-    /// Its outer surface, without what other links hide, in m².
+    /// The area of the outer surface, without parts that other links hide, in m².
     pub outer_area: f64,
-    /// How much of the outer surface is in keep-out boxes, 0 to 1; 0 when there is no outer surface.
+    /// The share of the outer surface in keep-out boxes, 0 to 1; 0 without an outer surface.
     pub kept_out: f64,
-    /// How much of the outer surface, keep-out boxes included, is within one pitch of a cell on the same side, 0 to
-    /// 1; 0 when there is no outer surface.
+    /// The share of the outer surface, including keep-out boxes, within one pitch of a cell on the same side, 0 to 1; 0
+    /// without an outer surface.
     pub covered: f64,
-    /// The median, over its cells, of the distance to the nearest cell on the same side, in m; `None` with fewer
-    /// than two cells.
+    /// The median distance from a cell to the nearest one on the same side, in m; `None` for fewer than two cells.
     pub spacing: Option<f64>,
-    /// The largest angle between a cell's normal and the mesh's normal there, in rad.
+    /// The largest angle between a cell's normal and the mesh's normal at its center, in rad.
     pub tilt: f64,
 }
 
 /// A skin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Skin {
-    /// Sorted by bus and node, which is also by link.
+    /// The cells, ordered by bus and node id, and therefore by link.
     pub cells: Vec<Cell>,
-    /// How many buses there are.
+    /// The number of buses.
     pub buses: usize,
-    /// By covered link.
+    /// The figures of each covered link.
     pub links: Vec<Figures>,
 }
 
-/// Why links cannot be covered.
+/// The error of links that cannot be covered.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum CoverError {
-    /// The pitch cannot be that of cells.
+    /// The pitch is out of range.
     #[error("pitch {0} m: it is {MIN_PITCH} to {MAX_PITCH} m; correct it")]
     Pitch(f64),
-    /// The clearance is no distance.
+    /// The clearance is out of range.
     #[error("clearance {0} m: it is 0 to {MAX_PITCH} m; correct it")]
     Clearance(f64),
-    /// A bus cannot have so many nodes.
+    /// The number of nodes per bus is out of range.
     #[error("{0} nodes per bus: it is 1 to {MAX_NODES}; correct it")]
     Nodes(usize),
     /// There are too many links.
     #[error("{0} links, at most {MAX_LINKS}: add those far from the skin to --leave-out")]
     Links(usize),
-    /// A box is of no link, or inside out.
+    /// A box belongs to no link, or its sides are invalid.
     #[error("keep-out box {index}: {reason}; correct it")]
     KeepOut {
-        /// Its place in the options, from 0.
+        /// The index of the box in the options.
         index: usize,
-        /// What is wrong.
+        /// The problem.
         reason: String,
     },
-    /// A scale or a pose is not a number, or so large that a coordinate becomes infinite.
+    /// Scale and pose make a coordinate infinite or NaN.
     #[error(
         "link {link}, part {part}: coordinates are not finite after scale {scale:?} and its pose; correct them"
     )]
     NotFinite {
-        /// The link's name.
+        /// The name of the link.
         link: String,
-        /// The part's place in the link, from 0.
+        /// The index of the part in the link.
         part: usize,
-        /// Its scale.
+        /// The scale of the part.
         scale: [f64; 3],
     },
     /// The parts of a link together have more triangles than a mesh may have.
     #[error("link {link}: its parts have {count} triangles, at most {}; decimate them", mesh::MAX_TRIANGLES)]
     Triangles {
-        /// The link's name.
+        /// The name of the link.
         link: String,
-        /// How many there are.
+        /// The number of triangles.
         count: usize,
     },
     /// The surface is too large for the pitch.
@@ -221,23 +219,23 @@ pub enum CoverError {
         raised(*.pitch, *.cells, *.most)
     )]
     TooLarge {
-        /// The link's name.
+        /// The name of the link.
         link: String,
-        /// Area of all triangles, inner ones too, in m².
+        /// The area of all triangles, including inner ones, in m².
         area: f64,
-        /// Cells that this would take.
+        /// The number of cells for this area.
         cells: f64,
         /// The pitch, in m.
         pitch: f64,
-        /// The most cells.
+        /// The maximum number of cells.
         most: usize,
     },
 }
 
-/// Covers `links` with cells, where neither they nor `others` hide them.
+/// Covers `links` with cells, except where they or `others` hide the surface.
 ///
 /// # Errors
-/// When an option is out of its range, or a link is too large for the pitch or not finite.
+/// Returns [`CoverError`] if an option is out of range, or if a link is too large for the pitch or not finite.
 pub fn cover(links: &[Link], others: &[Link], options: &Options) -> Result<Skin, CoverError> {
     check(links, others, options)?;
     let mut placed = Vec::with_capacity(links.len());
@@ -252,10 +250,10 @@ pub fn cover(links: &[Link], others: &[Link], options: &Options) -> Result<Skin,
     Ok(Skin { cells, buses, links: figures })
 }
 
-/// Formats the pitch in m that is large enough; nothing where none is.
+/// Formats the smallest sufficient pitch in m; empty if there is none in the allowed range.
 fn raised(pitch: f64, cells: f64, most: usize) -> String {
     let most = u32::try_from(most).map_or(f64::INFINITY, f64::from);
-    // In whole mm, upwards.
+    // The pitch is rounded up to whole mm.
     let needed = (pitch * (cells / most).sqrt() * 1e3).ceil() / 1e3;
     if needed <= MAX_PITCH { format!(", or raise the pitch to {needed} m") } else { String::new() }
 }

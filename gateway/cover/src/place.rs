@@ -1,4 +1,4 @@
-//! Where cells lie on a surface.
+//! Places cells on a surface.
 
 use core::f64::consts::FRAC_PI_3;
 
@@ -12,39 +12,39 @@ use crate::grid::Grid;
 use crate::relax::{Field, Site};
 use crate::surface::{Sample, Surface, cell_area, real};
 
-/// How far a cell's normal is from the mesh's at most, in rad: 9 degrees.
+/// The maximum angle between a cell's normal and the mesh's, in rad: 9 degrees.
 const MAX_TILT: f64 = 0.157;
 
-/// How far apart the first sites are, in pitches: relaxed, they make room for those that fit in between.
+/// The initial distance between sites, in pitches: relaxation makes room for further ones between them.
 const START: f64 = 1.15;
 
-/// How often other distances are tried, until the spacing is the pitch.
+/// The maximum number of attempts with other distances, until the spacing is the pitch.
 const TRIES: usize = 4;
 
-/// How near to the pitch the median spacing has to be, as a share of it, for no other try.
+/// The relative difference between the median spacing and the pitch that ends the attempts.
 const NEAR: f64 = 0.015;
 
-/// What a tilted sample costs when a cell's place is chosen, per squared pitch and 1 minus the cosine: 9 degrees are
-/// worth a fifth of a pitch.
+/// The cost of tilt in the choice of a cell's position, per squared pitch and 1 minus the cosine: 9 degrees cost as
+/// much as a fifth of a pitch.
 const TILT_COST: f64 = 3.0;
 
-/// The nearest that two cells on the same side lie to each other, in pitches. Relaxation leaves a few nearer ones where a
-/// surface is folded or narrow.
+/// The minimum distance of two cells on the same side, in pitches. Relaxation leaves a few closer ones where a surface
+/// is folded or narrow.
 const CLOSEST: f64 = 0.6;
 
-/// The smallest cosine of the angle between the normals of two cells on the same side.
+/// The minimum cosine of the angle between the normals of two cells on the same side.
 const SAME_SIDE: f64 = 0.5;
 
-/// A place for a cell, in the link's frame.
+/// The position of a cell in the link's frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Spot {
     pub(crate) point: Point3<f64>,
     pub(crate) normal: Vector3<f64>,
-    /// Of the normal, off the mesh's, in rad.
+    /// The angle between the normal and the mesh's, in rad.
     pub(crate) tilt: f64,
 }
 
-/// The places of a link's cells.
+/// Returns the positions of a link's cells.
 pub(crate) fn place(surface: &Surface<'_>, options: &Options, link: usize) -> Vec<Spot> {
     let pitch = options.pitch;
     let field = Field::new(surface.samples.iter().filter(|sample| sample.free).collect(), 1.2 * pitch);
@@ -76,7 +76,7 @@ pub(crate) fn place(surface: &Surface<'_>, options: &Options, link: usize) -> Ve
     best.map_or_else(Vec::new, |(_, spots)| spots)
 }
 
-/// The places without those that lie nearer than [`CLOSEST`] to an earlier one on the same side.
+/// Removes positions that are closer than [`CLOSEST`] to an earlier one on the same side.
 fn thinned(spots: Vec<Spot>, pitch: f64) -> Vec<Spot> {
     let apart = CLOSEST * pitch;
     let mut grid = Grid::new(apart);
@@ -94,18 +94,18 @@ fn thinned(spots: Vec<Spot>, pitch: f64) -> Vec<Spot> {
     kept
 }
 
-/// The median distance from a place to the nearest one that faces about the same way, in m.
+/// Returns the median distance from a position to the nearest one that faces about the same way, in m.
 pub(crate) fn spacing(spots: &[Spot], pitch: f64) -> Option<f64> {
     let nearest = |spot: &Spot| {
         let same = spots.iter().filter(|other| *other != spot && other.normal.dot(&spot.normal) > 0.0);
         same.map(|other| (other.point - spot.point).norm()).min_by(f64::total_cmp)
     };
-    // A cell that is alone on its side says nothing of the spacing.
+    // A cell that is alone on its side has no neighbours, and does not count.
     let nearest = spots.iter().filter_map(nearest).filter(|&distance| distance < 3.0 * pitch);
     median(&mut nearest.collect::<Vec<_>>())
 }
 
-/// The middle one of some numbers; of two the larger.
+/// Returns the median; the larger one of two middle values.
 fn median(values: &mut [f64]) -> Option<f64> {
     let middle = values.len() / 2;
     if values.is_empty() {
@@ -115,7 +115,7 @@ fn median(values: &mut [f64]) -> Option<f64> {
     Some(*median)
 }
 
-/// The places on the mesh for relaxed sites.
+/// Returns the positions on the mesh for relaxed sites.
 fn spots(surface: &Surface<'_>, field: &Field<'_>, sites: &[Site], pitch: f64) -> Vec<Spot> {
     let mut best: Vec<Option<(f64, &Sample)>> = vec![None; sites.len()];
     for (owner, sample) in field.owners(sites).into_iter().zip(&field.samples) {
@@ -140,7 +140,7 @@ fn spots(surface: &Surface<'_>, field: &Field<'_>, sites: &[Site], pitch: f64) -
     sites.iter().zip(best).filter_map(spot).collect()
 }
 
-/// A unit vector towards `requested`, but at most [`MAX_TILT`] off `face`.
+/// Returns a unit vector towards `requested`, but at most [`MAX_TILT`] off `face`.
 fn limited(face: &Vector3<f64>, requested: &Vector3<f64>) -> Vector3<f64> {
     let angle = face.angle(requested);
     if angle <= MAX_TILT {

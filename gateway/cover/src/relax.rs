@@ -1,5 +1,5 @@
-//! Lloyd's relaxation on a surface's samples: every site goes to the middle of the samples nearest to it, until they
-//! lie like the cells of a honeycomb.
+//! Lloyd's relaxation on the samples of a surface: every site moves to the mean of the samples nearest to it, until the
+//! sites form a honeycomb.
 
 use core::f64::consts::FRAC_PI_3;
 use std::collections::VecDeque;
@@ -9,20 +9,20 @@ use nalgebra::{Point3, Rotation3, Unit, Vector3};
 use crate::grid::Grid;
 use crate::surface::{Sample, tangents};
 
-/// How much two normals agree at least, as their cosine, for a sample to belong to a site. The two sides of a thin
-/// wall and the faces at a sharp edge do not.
+/// The minimum cosine between two normals for a sample to belong to a site. It separates the two sides of a thin wall
+/// and the faces at a sharp edge.
 const AGREE: f64 = 0.3;
 
-/// How near to each other sites are at least when they grow, in steps: where a honeycomb meets itself behind a tube.
+/// The minimum distance of sites while they grow, in steps. It applies where a honeycomb meets itself behind a tube.
 const CLOSEST: f64 = 0.75;
 
-/// How often sites are moved.
+/// The number of rounds in which sites are moved.
 const ROUNDS: usize = 60;
 
-/// In these rounds, samples that are far from every site get new ones.
+/// The interval of rounds after which samples far from every site get new sites.
 const ADDING: usize = 15;
 
-/// A middle of samples.
+/// The center of a group of samples.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Site {
     pub(crate) point: Point3<f64>,
@@ -30,13 +30,13 @@ pub(crate) struct Site {
 }
 
 impl Site {
-    /// The squared distance to a sample, in m², if they face about the same way.
+    /// Returns the squared distance to a sample, in m², if they face about the same way.
     pub(crate) fn distance(&self, sample: &Sample) -> Option<f64> {
         (self.normal.dot(&sample.smooth) > AGREE).then(|| (self.point - sample.point).norm_squared())
     }
 }
 
-/// The samples that cells may be at, and how far a site serves.
+/// The samples where cells may be, and the maximum distance that a site serves.
 #[derive(Debug)]
 pub(crate) struct Field<'a> {
     pub(crate) samples: Vec<&'a Sample>,
@@ -50,7 +50,7 @@ impl<'a> Field<'a> {
         Self { samples, grid, reach }
     }
 
-    /// Sites among the samples, in this order of numbers, that are `apart` from each other.
+    /// Adds sites at samples, in the given order, that are `apart` from each other.
     pub(crate) fn apart(&self, order: &[usize], apart: f64, sites: &mut Vec<Site>) {
         let mut grid = Grid::of(apart, sites.iter().map(|site| &site.point));
         for sample in order.iter().filter_map(|&index| self.samples.get(index)) {
@@ -64,8 +64,8 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// Grows sites that are a `step` from each other like the cells of a honeycomb, from samples in this order, where
-    /// no other site is near. `turn` is the direction of the first row, in rad.
+    /// Grows sites that are a `step` from each other like the cells of a honeycomb. Growth begins at samples in the
+    /// given order that have no site nearby. `turn` is the direction of the first row, in rad.
     pub(crate) fn grow(&self, order: &[usize], step: f64, turn: f64) -> Vec<Site> {
         let mut sites: Vec<Site> = Vec::new();
         let mut grid = Grid::new(step);
@@ -104,7 +104,7 @@ impl<'a> Field<'a> {
         sites
     }
 
-    /// A site brought to the surface at the nearest sample, if one is near.
+    /// Projects a site to the surface at the nearest sample, if one is near.
     fn snapped(&self, site: &Site, within: f64) -> Option<Site> {
         let near = self.grid.around(self.grid.cube(&site.point)).filter_map(|index| self.samples.get(index));
         let near = near.filter_map(|sample| Some((site.distance(sample)?, sample)));
@@ -114,7 +114,7 @@ impl<'a> Field<'a> {
         (distance <= within * within).then_some(Site { point, normal: sample.smooth })
     }
 
-    /// By sample, the site nearest to it, if one is within reach.
+    /// Returns the nearest site of each sample, if one is within reach.
     pub(crate) fn owners(&self, sites: &[Site]) -> Vec<Option<usize>> {
         let mut owners = vec![None; self.samples.len()];
         let grid = Grid::of(self.reach, sites.iter().map(|site| &site.point));
@@ -139,7 +139,7 @@ impl<'a> Field<'a> {
         owners
     }
 
-    /// Moves sites until they are spread evenly; those that no sample is nearest to are lost.
+    /// Moves sites until they are distributed evenly. Sites that are nearest to no sample are removed.
     pub(crate) fn relax(&self, sites: &mut Vec<Site>, apart: f64) {
         for round in 1..=ROUNDS {
             let owners = self.owners(sites);

@@ -1,4 +1,4 @@
-//! The outer surface of a link, as samples.
+//! The outer surface of a link, represented by samples.
 
 use core::f64::consts::{PI, TAU};
 
@@ -9,56 +9,56 @@ use crate::mesh::{Affine, MAX_TRIANGLES, Triangle};
 use crate::tree::{Ray, Tree};
 use crate::{CoverError, KeepOut, Link, Options};
 
-/// Samples for the area of one cell.
+/// The number of samples per cell area.
 const PER_CELL: f64 = 64.0;
 
-/// The most cells that the triangles of a link may have room for.
+/// The maximum number of cells for the triangles of a link.
 const MAX_CELLS: usize = 6000;
 
-/// Fewer samples than these are never taken, so that the figures of a small link mean something.
+/// The minimum number of samples, so that the figures of a small link are meaningful.
 const MIN_SAMPLES: f64 = 2000.0;
 
-/// Rays from a side of a sample; if the first [`FEW`] agree, no others are cast.
+/// The number of rays from a side of a sample. If the first [`FEW`] agree, no others are cast.
 const RAYS: u32 = 32;
 const FEW: u32 = 8;
 
-/// Which share of the rays from a side of the outer surface escapes at the minimum: more than through a screw's hole, less
+/// The minimum share of rays that escape from a side of the outer surface: more than through a screw hole, and less
 /// than from between the arms of a fork.
 const ESCAPING: f64 = 0.3;
 
-/// Which share of the rays from inside another link may leave it through gaps of its mesh.
+/// The maximum share of rays from inside another link that leave it through gaps of its mesh.
 const LEAKING: f64 = 0.1;
 
-/// Which share of the rays from a side has to leave the robot at the minimum, whatever link is in the way: less comes
-/// in through the gap between two links only, where nothing can touch a cell.
+/// The minimum share of rays from a side that leave the robot, past all links. A smaller share comes only through the
+/// gap between two links, where nothing can touch a cell.
 const REACHED: f64 = 0.05;
 
-/// Rays for that share; if half of the first [`FEW`] leave, no others are cast.
+/// The number of rays for that share. If half of the first [`FEW`] leave, no others are cast.
 const REACHING: u32 = 128;
 
-/// How far above the surface rays start, in pitches.
+/// The height above the surface at which rays start, in pitches.
 const ABOVE: f64 = 1e-3;
 
-/// How far other links hide a surface, in pitches.
+/// The distance up to which other links hide a surface, in pitches.
 const HIDING: f64 = 2.0;
 
-/// Which share of the disc below a cell has to be surface that faces about the same way: at a straight edge it is
-/// half, on the rim of a sheet next to nothing.
+/// The minimum share of the disc below a cell that is surface facing about the same way. It is about half at a straight
+/// edge, and near zero on the rim of a sheet.
 const SUPPORT: f64 = 0.4;
 
-/// A point of the outer surface. Each stands for the same area.
+/// A point of the outer surface. Each sample represents the same area.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sample {
     pub(crate) point: Point3<f64>,
-    /// Of the triangle, outward.
+    /// The outward normal of the triangle.
     pub(crate) face: Vector3<f64>,
-    /// Mean of the outer surface below a cell there, outward.
+    /// The outward mean normal of the surface below a cell at the point.
     pub(crate) smooth: Vector3<f64>,
-    /// Whether a cell may be there.
+    /// True if a cell may be at the point.
     pub(crate) free: bool,
 }
 
-/// A link's outer surface in its own frame.
+/// The outer surface of a link in its own frame.
 #[derive(Debug)]
 pub(crate) struct Surface<'a> {
     own: Tree,
@@ -67,17 +67,17 @@ pub(crate) struct Surface<'a> {
     clearance: f64,
     pitch: f64,
     pub(crate) samples: Vec<Sample>,
-    /// The area that each sample stands for, in m².
+    /// The area that each sample represents, in m².
     pub(crate) share: f64,
 }
 
-/// The area of a hexagonal cell, in m².
+/// Returns the area of a hexagonal cell, in m².
 pub(crate) fn cell_area(pitch: f64) -> f64 {
     pitch * pitch * 0.75_f64.sqrt()
 }
 
 impl<'a> Surface<'a> {
-    /// The outer surface of one of the links.
+    /// Samples the outer surface of one of the links.
     pub(crate) fn new(
         index: usize,
         links: &[Link],
@@ -118,10 +118,10 @@ impl<'a> Surface<'a> {
         Ok(surface)
     }
 
-    /// Takes samples of all triangles, evenly by area, and keeps the outer ones.
+    /// Samples all triangles evenly by area, and keeps the outer samples.
     fn sample(&mut self, area: f64, count: f64) {
         self.share = area / count;
-        // Half of the first share is skipped, so that rounding does not decide whether there is one more.
+        // Half of the first share is skipped, so that rounding errors do not add a sample.
         let mut due = -0.5;
         let mut taken = 0;
         for &triangle in self.own.triangles() {
@@ -144,10 +144,11 @@ impl<'a> Surface<'a> {
         }
     }
 
-    /// The outward normal of a point on a triangle with this normal; `None` if it is not on the outer surface.
+    /// Returns the outward normal of a point on a triangle with this normal; `None` if the point is not on the outer
+    /// surface.
     fn outward(&self, point: &Point3<f64>, face: &Vector3<f64>) -> Option<Vector3<f64>> {
         let front = self.escaping(point, face);
-        // A sheet has two outer sides: the one that faces more of the world, and of two equal ones the front.
+        // Both sides of a sheet are outer sides. The more open one is chosen, and the front if they are equal.
         let back = if front < 0.95 { self.escaping(point, &-face) } else { 0.0 };
         let (side, share) = if back > front { (-face, back) } else { (*face, front) };
         let is_outer = share >= ESCAPING
@@ -156,13 +157,13 @@ impl<'a> Surface<'a> {
         is_outer.then_some(side)
     }
 
-    /// The share of rays from just above a point that escapes, weighted by how directly they leave.
+    /// Returns the share of rays from just above a point that escape, weighted by the cosine to the normal.
     fn escaping(&self, point: &Point3<f64>, side: &Vector3<f64>) -> f64 {
         let rays = self.rays(point, side);
         share(|ray| self.escapes(&rays(*ray), HIDING * self.pitch))
     }
 
-    /// Checks that something can touch a point from a side: enough rays leave the robot.
+    /// Returns true if something can touch the point from this side: enough rays leave the robot.
     fn is_reached(&self, point: &Point3<f64>, side: &Vector3<f64>) -> bool {
         let rays = self.rays(point, side);
         let leaves = |ray: &u32| self.escapes(&rays(*ray), f64::INFINITY);
@@ -178,7 +179,8 @@ impl<'a> Surface<'a> {
         needed <= 0.0 || left.is_some()
     }
 
-    /// Rays by number, from just above a point to a side, the denser the more directly they leave.
+    /// Returns rays by number, from just above a point to a side, with a density proportional to the cosine to the
+    /// normal.
     fn rays(&self, point: &Point3<f64>, side: &Vector3<f64>) -> impl Fn(u32) -> Ray {
         let origin = point + side * (ABOVE * self.pitch);
         let ((s, t), side) = (tangents(side), *side);
@@ -189,7 +191,7 @@ impl<'a> Surface<'a> {
         }
     }
 
-    /// Checks that a ray meets nothing of its own link, and no other link before it is `until` long.
+    /// Returns true if a ray meets neither its own link, nor another link within `until`.
     fn escapes(&self, ray: &Ray, until: f64) -> bool {
         !self.own.blocks(ray, f64::INFINITY) && !self.others.blocks(ray, until)
     }
@@ -211,12 +213,12 @@ impl<'a> Surface<'a> {
         true
     }
 
-    /// Whether neither a box nor another link keeps cells from a point.
+    /// Returns true if neither a box nor another link excludes cells at a point.
     fn allowed(&self, point: &Point3<f64>) -> bool {
         !self.keeps_out(point) && !self.others.near(point, self.clearance)
     }
 
-    /// Whether a point is in a box that holds no cell.
+    /// Returns true if a point is in a keep-out box.
     pub(crate) fn keeps_out(&self, point: &Point3<f64>) -> bool {
         let inside = |keep_out: &&KeepOut| {
             let sides = keep_out.min.iter().zip(&keep_out.max);
@@ -225,7 +227,7 @@ impl<'a> Surface<'a> {
         self.keep_out.iter().any(inside)
     }
 
-    /// Means of normals below each sample, and whether there is enough surface below a cell.
+    /// Computes the mean normal around each sample, and checks that there is enough surface below a cell.
     fn smooth(&mut self) {
         let radius = self.pitch / 2.0;
         let grid = Grid::of(radius, self.samples.iter().map(|sample| &sample.point));
@@ -255,8 +257,8 @@ impl<'a> Surface<'a> {
         }
     }
 
-    /// The point of the mesh above or below `point`, near a sample, with the mesh's outward normal there; `None` if
-    /// a cell may not be there.
+    /// Returns the point of the mesh above or below `point`, near a sample, with the mesh's outward normal there;
+    /// `None` if a cell may not be there.
     pub(crate) fn project(
         &self,
         point: &Point3<f64>,
@@ -272,7 +274,7 @@ impl<'a> Surface<'a> {
     }
 }
 
-/// The share of rays that pass, from few of them when those agree.
+/// Returns the share of rays that pass, from the first few if those agree.
 fn share(escapes: impl Fn(&u32) -> bool) -> f64 {
     let few = count((0..FEW).filter(&escapes));
     if few == 0 || few == FEW {
@@ -286,13 +288,13 @@ fn count(rays: impl Iterator<Item = u32>) -> u32 {
     rays.fold(0, |count, _| count + 1)
 }
 
-/// Points of the unit square that are spread evenly however many are taken (a sequence of Roberts).
+/// Returns points of the unit square that are distributed evenly for any number of points (a sequence of Roberts).
 fn scattered(index: u32) -> (f64, f64) {
     let at = f64::from(index);
     ((0.5 + at * 0.754_877_666_246_692_8).fract(), (0.5 + at * 0.569_840_290_998_053_3).fract())
 }
 
-/// Two unit vectors that are at right angles to a unit vector and to each other.
+/// Returns two unit vectors that are perpendicular to a unit vector and to each other.
 pub(crate) fn tangents(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
     let mut axis = Vector3::zeros();
     if let Some(smallest) = axis.get_mut(normal.iamin()) {
@@ -302,17 +304,17 @@ pub(crate) fn tangents(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
     (s, normal.cross(&s))
 }
 
-/// A triangle's area, in m².
+/// Returns the area of a triangle, in m².
 pub(crate) fn area([a, b, c]: &Triangle) -> f64 {
     (b - a).cross(&(c - a)).norm() / 2.0
 }
 
-/// A triangle's normal, if it has an area.
+/// Returns the normal of a triangle, if it has an area.
 pub(crate) fn normal([a, b, c]: &Triangle) -> Option<Vector3<f64>> {
     Unit::try_new((b - a).cross(&(c - a)), 0.0).map(Unit::into_inner)
 }
 
-/// The triangles of a link, in a frame in which its own is at `pose`.
+/// Collects the triangles of a link, in a frame in which its own is at `pose`.
 fn collect(link: &Link, pose: &Isometry3<f64>, triangles: &mut Vec<Triangle>) -> Result<(), CoverError> {
     let count = link.parts.iter().map(|part| part.mesh.triangles().len()).sum();
     if count > MAX_TRIANGLES {
@@ -335,11 +337,11 @@ fn collect(link: &Link, pose: &Isometry3<f64>, triangles: &mut Vec<Triangle>) ->
     Ok(())
 }
 
-/// Leaves out triangles that are there twice, in whatever order their corners are.
+/// Removes duplicate triangles, whatever the order of their corners.
 fn once(triangles: &mut Vec<Triangle>) {
     let mut seen = std::collections::HashSet::with_capacity(triangles.len());
     triangles.retain(|triangle| {
-        // The sum makes -0 to 0.
+        // Adding zero converts -0 to 0.
         let mut corners =
             triangle.map(|corner| [corner.x, corner.y, corner.z].map(|value| (value + 0.0).to_bits()));
         corners.sort_unstable();

@@ -26,7 +26,7 @@ fn cube(edge: f64) -> Mesh {
     Mesh::cuboid([edge; 3]).unwrap()
 }
 
-/// A skin of one link, whose wiring is sound.
+/// Covers one link, and checks the wiring.
 fn covered(link: Link, options: &Options) -> Skin {
     let skin = cover(&[link], &[], options).unwrap();
     sound(&skin, options);
@@ -37,7 +37,7 @@ fn vectors(cell: &Cell) -> (Vector3<f64>, Vector3<f64>) {
     (Vector3::from(cell.position), Vector3::from(cell.normal))
 }
 
-/// What holds for the cells of every skin.
+/// Checks the properties of every skin's cells.
 fn sound(skin: &Skin, options: &Options) {
     let mut buses: BTreeMap<usize, Vec<&Cell>> = BTreeMap::new();
     for cell in &skin.cells {
@@ -89,13 +89,13 @@ fn sound(skin: &Skin, options: &Options) {
     }
 }
 
-/// What a well covered link's figures are.
+/// Checks the figures of a well covered link.
 fn well(figures: &Figures) {
     let spacing = figures.spacing.unwrap() / PITCH;
     assert!(figures.covered > 0.98, "{figures:?}");
     assert!((0.9..1.1).contains(&spacing), "{figures:?}");
     assert!(figures.tilt.to_degrees() < 9.01, "{figures:?}");
-    // A honeycomb has one cell on each cell's area; here edges and bends take some.
+    // A honeycomb has one cell per cell area; edges and bends reduce that here.
     let room = figures.outer_area / (PITCH * PITCH * 0.866);
     let density = f64::from(u32::try_from(figures.cells).unwrap()) / room;
     assert!((0.65..1.05).contains(&density), "{density} of {room}");
@@ -149,7 +149,7 @@ fn the_sides_of_a_thin_plate_are_covered_each_for_itself() {
 fn a_sheet_without_thickness_is_covered_on_the_side_of_its_winding() {
     let corner = |x: f64, y: f64| Point3::new(x, y, 0.0);
     let (a, b, c, d) = (corner(0.0, 0.0), corner(0.2, 0.0), corner(0.2, 0.2), corner(0.0, 0.2));
-    // Each triangle is there twice.
+    // Each triangle occurs twice.
     let sheet = Mesh::new("sheet", vec![[a, b, c], [a, c, d], [b, c, a], [d, a, c]]).unwrap();
     let skin = covered(single(sheet), &options());
     assert!((skin.links[0].outer_area - 0.04).abs() < 1e-4, "{:?}", skin.links);
@@ -160,7 +160,7 @@ fn a_sheet_without_thickness_is_covered_on_the_side_of_its_winding() {
 #[test]
 fn inner_parts_wear_nothing() {
     let inner = Part { scale: [0.5; 3], ..Part::new(cube(0.2)) };
-    // A second wall, just below the outer one.
+    // The third part is a second wall, just below the outer one.
     let wall = Part { scale: [0.99; 3], ..Part::new(cube(0.2)) };
     let skin = covered(link("boxes", vec![inner, Part::new(cube(0.2)), wall]), &options());
     well(&skin.links[0]);
@@ -191,7 +191,7 @@ fn winding_and_mirrors_do_not_turn_cells_inward() {
 
 #[test]
 fn other_links_hide_and_keep_cells_away() {
-    // The other cube holds the right half of this one, and the gap to a plate below is too narrow for cells.
+    // The other cube contains the right half of this one, and the gap to a plate below is too narrow for cells.
     let at = |x, y, z| Isometry3::from_parts(Translation3::new(x, y, z), UnitQuaternion::identity());
     let pose = Isometry3::from_parts(
         Translation3::new(0.3, -0.2, 1.0),
@@ -203,13 +203,13 @@ fn other_links_hide_and_keep_cells_away() {
     let plate = Link { pose: pose * at(0.0, 0.0, -0.115), ..plate };
     let skin = cover(core::slice::from_ref(&clad), &[holding, plate], &options()).unwrap();
     sound(&skin, &options());
-    // Left: one whole side, and half of three others.
+    // One whole side and half of three others remain.
     assert!((skin.links[0].outer_area / 0.1 - 1.0).abs() < 0.1, "{:?}", skin.links);
     assert!(skin.links[0].covered > 0.95);
     for cell in &skin.cells {
         assert!(cell.position[0] <= -0.005 && cell.position[2] > -0.0999, "{cell:?}");
     }
-    // Two links hide each other, and one that is inside another wears nothing.
+    // Two links hide each other, and a link inside another gets no cells.
     let shell = Link { pose, ..single(cube(0.3)) };
     let skin = cover(&[clad, shell], &[], &options()).unwrap();
     sound(&skin, &options());
@@ -219,7 +219,7 @@ fn other_links_hide_and_keep_cells_away() {
     assert!(skin.cells.iter().all(|cell| cell.link == 1));
 }
 
-/// The 642 corners of an icosahedron whose edges were halved three times.
+/// Returns the 642 corners of an icosahedron whose edges were halved three times.
 fn directions() -> Vec<Vector3<f64>> {
     let long = (1.0 + 5.0_f64.sqrt()) / 2.0;
     let turned = |x: f64, y: f64| [[0.0, x, y], [x, y, 0.0], [y, 0.0, x]];
@@ -238,7 +238,7 @@ fn directions() -> Vec<Vector3<f64>> {
     all
 }
 
-/// How many cells of the first link nothing can touch: no direction leads from them past all links.
+/// Returns the number of the first link's cells that nothing can touch: every direction from them meets a link.
 fn enclosed(links: &[Link], skin: &Skin) -> usize {
     let directions = directions();
     let parts = links.iter().flat_map(|link| link.parts.iter().map(|part| part.triangles(&link.pose)));
@@ -255,7 +255,7 @@ fn enclosed(links: &[Link], skin: &Skin) -> usize {
 fn no_cell_is_where_links_together_enclose_it() {
     let at = |z: f64| Isometry3::translation(0.0, 0.0, z);
     let plate = single(Mesh::cuboid([0.4, 0.4, 0.02]).unwrap());
-    // A tube without a bottom, 2 mm above the plate; no ray from the plate alone, or from the tube alone, is blocked by much.
+    // A tube without a bottom is 2 mm above the plate. The plate alone, or the tube alone, blocks only a few rays.
     let closed = Mesh::cylinder(0.1, 0.2).unwrap();
     let tube = |wall: f64, lift: f64| {
         let is_open = |triangle: &&Triangle| triangle.iter().any(|corner| corner.z > -0.1 + 1e-9);
@@ -278,13 +278,13 @@ fn no_cell_is_where_links_together_enclose_it() {
         assert_eq!(enclosed(&links, &skin), 0);
         let outside = skin.cells.iter().filter(|cell| cell.normal[2] > 0.9).count();
         assert!(outside > 60, "{outside}");
-        // As the second of two covered links too, and inside the tube as little as on the plate.
+        // The same holds if the links are covered in the other order, and inside the tube as on the plate.
         let links = [links[1].clone(), links[0].clone()];
         let skin = cover(&links, &[], &options()).unwrap();
         assert_eq!(enclosed(&links, &skin), 0);
         assert!(skin.cells.iter().filter(|cell| cell.link == 1).filter(below).count() == 0);
     }
-    // High above the plate it hides nothing.
+    // High above the plate, the tube hides nothing.
     let links = [plate, tube(0.0, 0.3)];
     let skin = cover(&links[..1], &links[1..], &options()).unwrap();
     let alone = cover(&links[..1], &[], &options()).unwrap();
@@ -322,7 +322,7 @@ fn buses_are_patches_along_a_link_and_nodes_follow_it() {
     let skin = covered(single(Mesh::cylinder(0.04, 0.6).unwrap()), &options);
     assert!(skin.buses > 3);
     for pair in skin.cells.windows(2) {
-        // The axis may point either way.
+        // The axis may have either direction.
         let step = (pair[1].position[2] - pair[0].position[2]).abs();
         assert!(step < 2.2 * PITCH || pair[0].bus == pair[1].bus);
     }
@@ -372,17 +372,17 @@ fn links_without_room_for_a_cell_wear_none() {
     let line = [point, point * 2.0, point * 3.0];
     let degenerate = covered(single(Mesh::new("d", vec![[point; 3], line]).unwrap()), &options());
     assert_eq!(degenerate.cells.len(), 0);
-    // A kilometre long and a micrometre wide.
+    // The triangle is a kilometre long and a micrometre wide.
     let sliver = [Point3::origin(), Point3::new(1e3, 0.0, 0.0), Point3::new(1e3, 1e-6, 0.0)];
     let sliver = covered(single(Mesh::new("s", vec![sliver]).unwrap()), &options());
     assert_eq!(sliver.cells.len(), 0);
     assert!((sliver.links[0].outer_area - 5e-4).abs() < 1e-5);
-    // Smaller than a cell, and yet with sides that could hold one.
+    // The cube is smaller than a cell, but its sides could hold one.
     let small = covered(single(cube(0.03)), &options());
     assert!(small.cells.len() <= 6 && small.links[0].outer_area > 0.005, "{:?}", small.links);
 }
 
-/// Triangles of all sizes, thin ones too.
+/// Generates triangles of all sizes, including thin ones.
 fn soup() -> impl Strategy<Value = Vec<Triangle>> {
     let coordinate = prop_oneof![16 => -0.1..0.1_f64, 2 => Just(0.0), 1 => -0.4..0.4_f64];
     let point = proptest::array::uniform3(coordinate).prop_map(Point3::from);

@@ -1,16 +1,16 @@
-//! A tree of boxes around triangles, for rays and for the nearest triangle.
+//! A tree of bounding boxes around triangles, for rays and for the nearest triangle.
 //!
-//! The crates that have one need a newer compiler than this workspace (`bvh`), or bring another crate for
-//! vectors and twenty more (`parry3d`); all that is needed here is below.
+//! Existing crates either need a newer compiler than this workspace (`bvh`), or depend on another vector crate and
+//! twenty more (`parry3d`). This module is all that is needed here.
 
 use nalgebra::{Point3, Vector3};
 
 use crate::mesh::Triangle;
 
-/// Triangles in a leaf.
+/// The maximum number of triangles in a leaf.
 const LEAF: usize = 4;
 
-/// A box.
+/// A bounding box.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Bounds {
     pub(crate) min: Point3<f64>,
@@ -26,12 +26,12 @@ impl Bounds {
         points.fold(empty, |bounds, point| Self { min: bounds.min.inf(point), max: bounds.max.sup(point) })
     }
 
-    /// How far a point is from the box, in m; 0 inside.
+    /// Returns the distance of a point from the box, in m; 0 inside.
     fn distance(&self, point: &Point3<f64>) -> f64 {
         (point.sup(&self.min).inf(&self.max) - point).norm()
     }
 
-    /// Where a ray enters the box, if it does before `until`.
+    /// Returns the position at which a ray enters the box, if it is before `until`.
     fn entered(&self, ray: &Ray, until: f64) -> Option<f64> {
         let near = (self.min - ray.origin).component_mul(&ray.inverse);
         let far = (self.max - ray.origin).component_mul(&ray.inverse);
@@ -45,7 +45,7 @@ impl Bounds {
     }
 }
 
-/// A half line. Lengths along it are in m if its direction is a unit vector.
+/// A ray. Lengths along it are in m if its direction is a unit vector.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Ray {
     origin: Point3<f64>,
@@ -58,9 +58,9 @@ impl Ray {
         Self { origin, direction, inverse: direction.map(f64::recip) }
     }
 
-    /// Where the ray meets a triangle, from either side (Möller and Trumbore).
+    /// Returns the position at which the ray meets a triangle, from either side (Möller and Trumbore).
     fn meets(&self, [a, b, c]: &Triangle) -> Option<f64> {
-        // Rays through an edge between two triangles hit at least one of them.
+        // Rays through an edge between two triangles must hit at least one of them.
         const MARGIN: f64 = 1e-9;
         let (ab, ac) = (b - a, c - a);
         let p = self.direction.cross(&ac);
@@ -76,18 +76,18 @@ impl Ray {
 
 #[derive(Clone, Copy, Debug)]
 enum Kind {
-    /// From and to which triangle.
+    /// The range of triangles.
     Leaf(usize, usize),
-    /// The two nodes below.
+    /// The two child nodes.
     Fork(usize, usize),
 }
 
-/// Triangles that can be asked for the first one that a ray meets and for the one nearest to a point.
+/// Triangles with queries for the first one that a ray meets, and for those near a point.
 #[derive(Clone, Debug)]
 pub(crate) struct Tree {
-    /// The root comes first.
+    /// The nodes; the root comes first.
     nodes: Vec<(Bounds, Kind)>,
-    /// In the order of the leaves.
+    /// The triangles in the order of the leaves.
     triangles: Vec<Triangle>,
 }
 
@@ -95,14 +95,14 @@ impl Tree {
     pub(crate) fn new(mut triangles: Vec<Triangle>) -> Self {
         let count = triangles.len();
         let mut nodes = Vec::new();
-        // Each split takes half, so that the tree is as deep as the logarithm of the count.
+        // Each split halves the triangles, so the depth of the tree is the logarithm of their number.
         let mut open = vec![(0, count, None)];
         while let Some((from, to, place)) = open.pop() {
             let Some(part) = triangles.get_mut(from..to).filter(|part| !part.is_empty()) else { continue };
             let bounds = Bounds::of(part.iter().flatten());
             let node = nodes.len();
             nodes.push((bounds, Kind::Leaf(from, to)));
-            // The parent learns where its second child is; the first one follows it directly.
+            // The parent stores the index of its second child; the first one follows the parent directly.
             if let Some((_, Kind::Fork(_, second))) = place.and_then(|parent: usize| nodes.get_mut(parent)) {
                 *second = node;
             }
@@ -136,17 +136,17 @@ impl Tree {
         (from..to).zip(self.triangles.get(from..to).unwrap_or_default())
     }
 
-    /// Whether a ray meets a triangle before it is `until` long.
+    /// Returns true if a ray meets a triangle within `until`.
     pub(crate) fn blocks(&self, ray: &Ray, until: f64) -> bool {
         self.meets(ray, until, true).is_some()
     }
 
-    /// Where a ray first meets a triangle before it is `until` long, and which.
+    /// Returns the position at which a ray first meets a triangle within `until`, and the index of the triangle.
     pub(crate) fn first(&self, ray: &Ray, until: f64) -> Option<(f64, usize)> {
         self.meets(ray, until, false)
     }
 
-    /// The first triangle that a ray meets before it is `until` long, or the `any` that is found soonest.
+    /// Returns the first triangle that a ray meets within `until`; with `any`, the first one found.
     fn meets(&self, ray: &Ray, until: f64, any: bool) -> Option<(f64, usize)> {
         let mut best = None;
         let mut until = until;
@@ -174,7 +174,7 @@ impl Tree {
         best
     }
 
-    /// Whether a triangle is nearer to a point than `within`, in m.
+    /// Returns true if a triangle is closer to a point than `within`, in m.
     pub(crate) fn near(&self, point: &Point3<f64>, within: f64) -> bool {
         let mut open = vec![0];
         while let Some(node) = open.pop() {
@@ -195,12 +195,12 @@ impl Tree {
     }
 }
 
-/// How far a point is from a triangle, in m.
+/// Returns the distance of a point from a triangle, in m.
 pub(crate) fn distance(point: &Point3<f64>, &[a, b, c]: &Triangle) -> f64 {
     let edge = |from: Point3<f64>, to: Point3<f64>| {
         let along = to - from;
         let share = (point - from).dot(&along) / along.norm_squared();
-        // Of an edge without a length, one end.
+        // An edge without a length is treated as a point.
         let share = if share.is_finite() { share.clamp(0.0, 1.0) } else { 0.0 };
         (point - (from + along * share)).norm()
     };
@@ -223,7 +223,7 @@ mod tests {
 
     fn triangles() -> impl Strategy<Value = Vec<Triangle>> {
         let triangle = (point(), point(), point()).prop_map(|(a, b, c)| {
-            // Small ones, so that some rays miss.
+            // The triangles are small, so that some rays miss.
             [a, a + (b - Point3::origin()) * 0.3, a + (c - Point3::origin()) * 0.3]
         });
         proptest::collection::vec(triangle, 0..60)

@@ -1,4 +1,4 @@
-//! The cells' arithmetic: the sine's error over the whole circle, and what one Jacobian costs.
+//! The cells' arithmetic: the error of the sine over the whole circle, and the operations of one Jacobian.
 
 use cell_node::kernel::oracle::{Counted, Projection};
 use cell_node::kernel::{Kernel, Operations, Wrench};
@@ -13,26 +13,26 @@ use super::ticks::POSE;
 use analysis::paper;
 use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table};
 
-/// One in so many angles is drawn.
+/// The interval of drawn angles.
 const DRAWN: usize = 16;
-/// Angles of which the maximum error is drawn.
+/// The number of angles per drawn maximum error.
 const PART: usize = 256;
 
-/// The error of a sine over all angles there are.
+/// The error of a sine function over all angles.
 #[derive(Clone, Debug)]
 pub struct SineError {
-    /// Mean absolute error.
+    /// The mean absolute error.
     pub mean: f64,
-    /// Maximum absolute error.
+    /// The maximum absolute error.
     pub max: f64,
-    /// Angle in quarter turns, signed error.
+    /// Angles in quarter turns, with signed errors.
     pub points: Vec<(f64, f64)>,
-    /// The middle of each part of the circle in quarter turns, the maximum absolute error there.
+    /// The middle of each part of the circle in quarter turns, with the maximum absolute error in it.
     pub parts: Vec<(f64, f64)>,
 }
 
 impl SineError {
-    /// Over all 65 536 words.
+    /// Computes the error over all 65 536 words.
     #[must_use]
     pub fn of(function: impl Fn(Q1_14) -> Q1_14) -> Self {
         let (mut sum, mut max) = (0.0, 0.0_f64);
@@ -54,7 +54,7 @@ impl SineError {
     }
 }
 
-/// The sine's error over the whole circle.
+/// Writes the section on the error of the sine over the whole circle.
 #[must_use]
 pub fn sine_section() -> Section {
     let [fifth, seventh, rounded] = [
@@ -96,17 +96,17 @@ pub fn sine_section() -> Section {
         ])
 }
 
-/// What the Jacobian of a cell on each link of a robot costs.
+/// The operations of a cell's Jacobian on each link of a robot.
 #[derive(Clone, Debug)]
 pub struct Costs {
-    /// By the wrench, for a cell on link 1, 2, ...
+    /// By the wrench kernel, for a cell on link 1, 2, ...
     pub wrench: Vec<Operations>,
     /// By the paper's projections.
     pub projection: Vec<Operations>,
 }
 
 impl Costs {
-    /// Of a skin's robot, counted by running the kernels on numbers that count.
+    /// Counts the operations for a skin's robot by running the kernels on counting numbers.
     #[must_use]
     pub fn of(skin: &Skin) -> Self {
         let joints = u8::try_from(skin.robot.joints.len()).unwrap_or(u8::MAX);
@@ -125,22 +125,22 @@ impl Costs {
     }
 }
 
-/// What one Jacobian takes.
+/// Counts the operations of one Jacobian.
 fn jacobian<K: Kernel<Counted>>(cell: &Parameters, words: &[Q1_14; MAX_JOINTS]) -> Operations {
     let kernel = K::new(cell);
     Operations::count(|| kernel.jacobian(words)).1
 }
 
-/// Operations by name, in the paper's order.
+/// Returns operations by name, in the paper's order.
 fn named(done: &Operations) -> [(&'static str, u32); 4] {
     let Operations { multiplications, additions, sines, cosines, .. } = *done;
     [("multiplications", multiplications), ("additions", additions), ("sines", sines), ("cosines", cosines)]
 }
 
-/// What the wrench kernel is to need at most.
+/// The maximum number of operations of the wrench kernel.
 const WRENCH: [u32; 4] = [40, 24, 5, 5];
 
-/// Operations of both kernels.
+/// Writes the section on the operations of both kernels.
 #[must_use]
 pub fn kernels_section(robot: &str, costs: &Costs) -> Section {
     let links = |costs: &[Operations]| (1_u8..).zip(costs.to_vec()).collect::<Vec<_>>();

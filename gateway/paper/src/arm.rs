@@ -7,7 +7,7 @@ use model::generate::{Target, generate};
 
 pub use model::generate::Reply;
 
-/// The name of files of a run with these answers.
+/// Returns the name of the files of a run with this kind of replies.
 #[must_use]
 pub const fn name(reply: Reply) -> &'static str {
     match reply {
@@ -16,13 +16,13 @@ pub const fn name(reply: Reply) -> &'static str {
     }
 }
 
-/// Cells of the paper's arm.
+/// The number of cells of the paper's arm.
 const CELLS: usize = 253;
-/// Cells of a quick one.
+/// The number of cells of a quick run.
 const FEW: usize = 24;
-/// Strokes, palms, a grip and a poke; the central computation is off from 5.7 s on.
+/// A scenario with strokes, palms, a grip and a poke; the central computation is off from 5.7 s on.
 const TOUCHES: &str = include_str!("../../examples/demo.toml");
-/// A touch of all cells at once; the central computation is off from 1.2 s on.
+/// A scenario with a touch of all cells at once; the central computation is off from 1.2 s on.
 const TOUCH: &str = "# A hand closes around the arm and opens again.
 version = 1
 duration_s = 2.4
@@ -48,10 +48,10 @@ force_n = 2.0
 profile = \"half-sine\"
 ";
 
-/// The arm's `skin.toml`.
+/// Returns the arm's `skin.toml`.
 ///
 /// # Panics
-/// Never: so many cells fit.
+/// Never: this number of cells fits.
 #[must_use]
 pub fn skin(reply: Reply, effort: Effort) -> String {
     let cells = match effort {
@@ -61,16 +61,16 @@ pub fn skin(reply: Reply, effort: Effort) -> String {
     generate(&Target { cells, reply, ..Target::default() }).expect("so many cells fit on the arm")
 }
 
-/// The paper's arm, whose cells answer with torques.
+/// Returns the paper's arm, whose cells reply with torques.
 ///
 /// # Panics
-/// Never: what is generated can be read.
+/// Never: a generated skin can be parsed.
 #[must_use]
 pub fn paper() -> Skin {
     Skin::parse("skin.toml", &skin(Reply::Torque, Effort::Full)).expect("it has been generated")
 }
 
-/// Its `scenario.toml`.
+/// Returns the arm's `scenario.toml`.
 #[must_use]
 pub const fn scenario(effort: Effort) -> &'static str {
     match effort {

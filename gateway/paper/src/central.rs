@@ -1,8 +1,8 @@
-//! Fig. 9 and 10: what the central computation costs, over cells and over active cells.
+//! Fig. 9 and 10: the cost of the central computation, over cells and over active cells.
 //!
-//! What is timed is [`Central::frames`] and [`Central::total`], which a comparing tick runs for each bus, here over one
-//! list of cells. Every measurement is of several computations in a row, so reading the clock does not count, and
-//! code and data lie in the caches as well as they can.
+//! Timed are [`Central::frames`] and [`Central::total`], which a comparing tick runs for each bus, here over one list
+//! of cells. Every measurement covers several computations in a row, so that reading the clock does not count, and code
+//! and data are in the caches as far as possible.
 
 use std::hint::black_box;
 
@@ -19,43 +19,43 @@ use analysis::paper;
 use analysis::report::figure::{Axis, Figure, Finding, Quantity, Section, Shape, Table, number};
 use model::central::Central;
 
-/// Computations between two readings of the clock.
+/// The number of computations between two readings of the clock.
 const IN_A_ROW: u32 = 16;
-/// Measurements of one touch; the minimum counts.
+/// The number of measurements of one touch, of which the minimum counts.
 const LOOKS: usize = 5;
 
-/// How much is measured.
+/// The extent of the measurements.
 #[derive(Clone, Copy, Debug)]
 pub struct Extent {
-    /// From one number of cells to the next.
+    /// The step between two numbers of cells.
     pub step: usize,
-    /// How often each number of cells is measured.
+    /// The number of measurements of each number of cells.
     pub rounds: usize,
-    /// Touches of the skin, each of a number of cells drawn at random.
+    /// The number of touches, each of a random number of cells.
     pub touches: usize,
 }
 
-/// T_skin over cells none of which is active.
+/// T_skin over the number of cells, all of them inactive.
 #[derive(Clone, Debug)]
 pub struct OverCells {
-    /// Cells, median, 25th and 75th percentile in ns.
+    /// The number of cells, and the median, 25th and 75th percentile in ns.
     pub points: Vec<[f64; 4]>,
-    /// T_skin in ns over cells.
+    /// The fit of T_skin in ns over the number of cells.
     pub line: Line,
 }
 
-/// T_skin over active cells of a skin.
+/// T_skin over the number of active cells of a skin.
 #[derive(Clone, Debug)]
 pub struct OverActive {
-    /// Cells of the skin.
+    /// The number of cells of the skin.
     pub cells: usize,
-    /// Active cells, T_skin in ns, and of how many touches that is the median.
+    /// The number of active cells, the median of T_skin in ns, and the number of touches as the weight.
     pub points: Vec<Weighted>,
-    /// T_skin in ns over active cells, by the number of touches.
+    /// The fit of T_skin in ns over active cells, weighted by the number of touches.
     pub line: Line,
 }
 
-/// One computation of so many in a row, in ns.
+/// Returns the time of one computation, averaged over several in a row, in ns.
 fn timed(central: &Central, reference_torque: &[SkinSensors], now: &impl Fn() -> u64) -> f64 {
     let joints = POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default());
     let began = now();
@@ -66,7 +66,8 @@ fn timed(central: &Central, reference_torque: &[SkinSensors], now: &impl Fn() ->
     nanos(now().saturating_sub(began)) / f64::from(IN_A_ROW)
 }
 
-/// Measures T_skin over 0 to all cells of a skin, none of them active. `None` for fewer than three numbers of cells.
+/// Measures T_skin over 0 to all cells of a skin, all inactive. Returns `None` for fewer than three numbers of
+/// cells.
 #[must_use]
 pub fn over_cells(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option<OverCells> {
     let central = Central::new(skin);
@@ -86,8 +87,8 @@ pub fn over_cells(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option<
     Some(OverCells { points, line })
 }
 
-/// Measures T_skin over active cells of a skin. A touch is a patch: cells that follow each other in the skin's order,
-/// as neighbours do, from a cell drawn at random, as many as are drawn at random.
+/// Measures T_skin over the number of active cells of a skin. A touch is a patch of consecutive cells in the skin's
+/// order, which are neighbours. Its first cell and its size are random.
 #[must_use]
 pub fn over_active(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option<OverActive> {
     let central = Central::new(skin);
@@ -109,7 +110,7 @@ pub fn over_active(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option
     Some(OverActive { cells, line: Line::through(&points)?, points })
 }
 
-/// The quality of a law that the bar asks for.
+/// The minimum R² of a law.
 const QUALITY: f64 = 0.99;
 
 fn quality(line: &Line, paper: f64) -> Finding {
@@ -117,7 +118,7 @@ fn quality(line: &Line, paper: f64) -> Finding {
     finding.must(format!("at least {QUALITY}"), line.quality >= QUALITY)
 }
 
-/// A slope or a start in ns beside the paper's in s, as it is and as a ratio.
+/// Compares a slope or an intercept in ns with the paper's in s, as a value and as a ratio.
 fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
     let ours = ours.into();
     let ratio = ours.value / (paper_s * 1e9);
@@ -127,19 +128,19 @@ fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
     ]
 }
 
-/// How many cells fit into a cycle, so many of them active.
+/// Compares the maximum number of cells in a cycle with the paper's.
 fn limit(active: &str, paper: f64, ours: f64) -> Finding {
     let what = format!("most cells at 500 Hz, {active} active, with 0.2 ms for the rest of a cycle");
     Finding::more_is_better(what, paper, (ours, "cells"))
 }
 
-/// T_skin over something.
+/// Returns a figure of T_skin.
 fn figure(name: &str, title: impl Into<String>, x: &str) -> Figure {
     Figure::new(name, title, Axis::new(x, ""), Axis::new("T_skin", "µs"))
 }
 
-/// A figure again up to the largest x, on a logarithmic axis, with the paper's law in s as a polyline that is smooth
-/// there too.
+/// Returns the figure up to the largest x with a logarithmic axis, together with the paper's law in s. The law is a
+/// polyline that is smooth on this axis too.
 fn beside(
     figure: &Figure,
     equation: &str,
@@ -155,12 +156,12 @@ fn beside(
         .draw("the paper's law", Shape::Dashed, law.collect())
 }
 
-/// A law in ns as a line from 0 on, in µs.
+/// Returns a law in ns as a line from 0 on, in µs.
 fn law(line: &Line, most: f64) -> Vec<(f64, f64)> {
     [0.0, most].map(|x| (x, line.at(x) * 1e-3)).into()
 }
 
-/// Fig. 9 with Eq. 29.
+/// Writes the section on Fig. 9 with Eq. 29.
 #[must_use]
 pub fn fig9(over: &OverCells) -> Section {
     let OverCells { points, line } = over;
@@ -200,7 +201,7 @@ pub fn fig9(over: &OverCells) -> Section {
         .findings([quality(line, paper::CELLS_QUALITY), limit("none", paper::LIMIT, cells)])
 }
 
-/// Fig. 10 with Eq. 30 and 31, and the limits of both laws.
+/// Writes the section on Fig. 10 with Eq. 30 and 31, and the limits of both laws.
 #[must_use]
 pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
     let OverActive { points, line, cells: of } = over;
@@ -262,7 +263,7 @@ mod tests {
         Line { slope, intercept, quality: 0.999, slope_half: 0.1 }
     }
 
-    /// What is found where the law is the paper's own, in ns.
+    /// The findings for the paper's own law, in ns.
     #[test]
     fn the_papers_own_laws_lead_to_its_limits_and_to_no_verdict_but_the_same() {
         let law = line(paper::CELL_S * 1e9, paper::FIXED_S * 1e9);
@@ -290,7 +291,7 @@ mod tests {
         assert_eq!(worse, 3, "slope, quality and limit");
     }
 
-    /// On a clock that goes on by 16 ns at each look every computation takes 1 ns, however many cells it is of.
+    /// On a clock that advances by 16 ns per reading, every computation takes 1 ns, whatever the number of cells.
     #[test]
     fn every_number_of_cells_and_of_active_cells_is_measured() {
         let skin = ticks::skin(40, 1).unwrap();

@@ -1,9 +1,9 @@
-//! What the distributed way costs: the loop's ticks over cells and over active cells, the central computation in the
-//! same ticks, and what no paper counts: receiving.
+//! The cost of the distributed computation: the loop's ticks over cells and over active cells, the central computation
+//! in the same ticks, and the cost of receiving, which no paper counts.
 //!
-//! The skin lies on a fixed number of buses, so that only its cells become more. A tick of the distributed way is the
-//! whole tick, not only its part that has to do with the skin: taking the receivers' sums, controller, robot, encoding
-//! and handing on the joints.
+//! The skin is on a fixed number of buses, so that only the number of cells grows. The time of the distributed
+//! computation is that of the whole tick, not only of its part for the skin: reading the receivers' sums, controller,
+//! robot, encoding and sending the joints.
 
 use std::hint::black_box;
 
@@ -20,55 +20,55 @@ use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, number};
 use model::scenario::Mode;
 use model::table::Table;
 
-/// How much is measured.
+/// The extent of the measurements.
 #[derive(Clone, Copy, Debug)]
 pub struct Extent {
-    /// Numbers of cells beside one on each bus, and of active cells beside 0.
+    /// The number of steps of the number of cells after one per bus, and of active cells after 0.
     pub steps: usize,
-    /// How often each is measured.
+    /// The number of measurements of each.
     pub rounds: usize,
 }
 
-/// Times of ticks over something, and their laws; all in ns.
+/// Times of ticks over a number of cells, and their fits; all in ns.
 #[derive(Clone, Debug)]
 pub struct Over {
-    /// How many, a tick of the distributed way, the central computation in a comparing one.
+    /// The number, the time of a distributed tick, and that of the central computation in a comparing tick.
     pub points: Vec<[f64; 3]>,
-    /// Of distributed ticks.
+    /// The fit of distributed ticks.
     pub distributed: Line,
-    /// Of central computations.
+    /// The fit of central computations.
     pub central: Line,
 }
 
 impl Over {
-    /// The upper end of the distributed slope's 95 % interval, by the central slope.
+    /// Returns the upper end of the distributed slope's 95 % interval, relative to the central slope.
     #[must_use]
     pub fn share(&self) -> f64 {
         self.distributed.slope_at_most() / self.central.slope
     }
 }
 
-/// All that is measured.
+/// All measurements.
 #[derive(Clone, Debug)]
 pub struct Distributed {
-    /// Over cells, none active.
+    /// Times over cells, all of them inactive.
     pub cells: Over,
-    /// Over active cells of the whole skin.
+    /// Times over active cells of the whole skin.
     pub active: Over,
-    /// Distributed ticks over the number of buses, in ns.
+    /// The fit of distributed ticks over the number of buses, in ns.
     pub buses: Line,
-    /// Cells of the whole skin.
+    /// The number of cells of the whole skin.
     pub of: usize,
-    /// What the receiver's thread needs for a torque, from the frame to the sum, in ns.
+    /// The time of the receiver's thread for a torque, from the frame to the sum, in ns.
     pub receiving: f64,
 }
 
-/// Measures everything on parts of a skin. `None` for fewer than two steps.
+/// Measures everything on parts of a skin. Returns `None` for fewer than two steps.
 #[must_use]
 pub fn measure(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Option<Distributed> {
     let most = skin.cells.len();
     let step = |step| most * step / extent.steps.max(1);
-    // A bus without cells has no robot to compute, so that there is one cell at least on each.
+    // A bus without cells has no robot to compute, so each bus has at least one cell.
     let min = skin.buses.len().min(most);
     let cells: Vec<usize> = (0..=extent.steps).map(|place| step(place).max(min)).collect();
     let active: Vec<usize> = (0..=extent.steps).map(step).collect();
@@ -86,7 +86,8 @@ pub fn measure(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Opt
     })
 }
 
-/// Ticks of both ways over some numbers; `ticks` makes the loop of one of them, by its place, and of a way.
+/// Measures ticks of both computations over some numbers. `ticks` returns the loop for the index of a number and a
+/// mode.
 pub(super) fn over(
     numbers: &[usize],
     rounds: usize,
@@ -99,7 +100,7 @@ pub(super) fn over(
     let mut loops: Vec<_> = things.map(|(place, mode)| (ticks(place, mode), mode)).collect();
     let measured = samples::interleaved(loops.len(), rounds, seed, |thing| {
         let Some((ticks, mode)) = loops.get_mut(thing) else { return f64::NAN };
-        // Once to find code and data in the caches, as after the loop before it.
+        // The first epoch fills the caches with code and data, as after the loop before it.
         ticks.epoch(now);
         let took = ticks.epoch(now);
         if *mode == distributed { took.tick } else { took.central }
@@ -113,7 +114,7 @@ pub(super) fn over(
     Some(Over { distributed: line(|point| point[1])?, central: line(|point| point[2])?, points })
 }
 
-/// Distributed ticks over the first buses of a skin without cells.
+/// Measures distributed ticks over the first buses of a skin without cells.
 fn over_buses(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Option<Line> {
     let bare = |buses: usize| Skin {
         buses: skin.buses.iter().take(buses).cloned().collect(),
@@ -132,8 +133,8 @@ fn over_buses(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Opti
     Line::through_equals(&numbers.iter().map(|&buses| count(buses)).zip(medians).collect::<Vec<_>>())
 }
 
-/// What handling a torque costs, in ns: its packet is checked and read, and its torque takes the place of the cell's
-/// one before in the sum. Every cell of a bus answers in every epoch, each time with another torque.
+/// Returns the time for handling a torque, in ns: its packet is checked and decoded, and its torque replaces the cell's
+/// previous one in the sum. Every cell of a bus replies in every epoch, each time with another torque.
 fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
     let mut table = Table::new(skin, 0);
     let mut epoch = Epoch(0);
@@ -164,7 +165,7 @@ fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
     super::line::quantile(&mut took, 0.5)
 }
 
-/// The bar: the distributed slope at most so much of the central one.
+/// The maximum distributed slope relative to the central one.
 const SHARE: f64 = 0.01;
 
 pub(super) fn of_share(what: &str, over: &Over) -> [Finding; 3] {
@@ -180,7 +181,7 @@ pub(super) fn of_share(what: &str, over: &Over) -> [Finding; 3] {
     ]
 }
 
-/// Times over cells and over active cells.
+/// Writes the section on times over cells and over active cells.
 #[must_use]
 pub fn section(measured: &Distributed) -> Section {
     let Distributed { cells, active, buses, of, receiving } = measured;
@@ -236,7 +237,7 @@ mod tests {
     use super::*;
     use crate::ticks;
 
-    /// A clock that goes on by 1 ns at each reading: a tick of the distributed way looks twice, whatever the cells.
+    /// On a clock that advances by 1 ns per reading, a distributed tick reads it twice, whatever the number of cells.
     #[test]
     fn both_ways_are_measured_over_both_numbers() {
         let skin = ticks::skin(48, BUSES).unwrap();

@@ -1,4 +1,4 @@
-//! Files of experiments beside their page: each figure's data as CSV, all findings as JSON.
+//! Files of experiments beside their page: each figure's data as CSV, and all findings as JSON.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -7,8 +7,8 @@ use serde_json::{Value, json};
 
 use analysis::report::figure::{Axis, Figure, Page, Series, Shape};
 
-/// A figure's data: x, and y of each series, with units in the head; blank where a series has nothing. A band is two
-/// columns. Several values of a series at one x are several rows.
+/// Returns a figure's data: x, and y of each series, with units in the header. A value is blank where a series has no
+/// point. A band has two columns. Several values of a series at the same x are in several rows.
 #[must_use]
 pub fn csv(figure: &Figure) -> String {
     let columns: Vec<(String, &[(f64, f64)])> = figure.series.iter().flat_map(columns).collect();
@@ -45,7 +45,7 @@ pub fn csv(figure: &Figure) -> String {
     text
 }
 
-/// A series' columns: there and, of a band, back.
+/// Returns the columns of a series: one, or the lower and upper edge of a band.
 fn columns(series: &Series) -> Vec<(String, &[(f64, f64)])> {
     if series.shape != Shape::Band {
         return vec![(series.caption.clone(), &series.points)];
@@ -54,7 +54,7 @@ fn columns(series: &Series) -> Vec<(String, &[(f64, f64)])> {
     vec![(format!("{}, lower", series.caption), lower), (format!("{}, upper", series.caption), upper)]
 }
 
-/// A number as one that is ordered as it is.
+/// Maps a number to an integer with the same order.
 fn ordered(x: f64) -> u64 {
     let bits = x.to_bits();
     if bits >> 63 == 0 { bits | 1 << 63 } else { !bits }
@@ -72,7 +72,7 @@ fn quoted(text: &str) -> String {
     }
 }
 
-/// All findings of a page, by experiment, with how it came about.
+/// Returns all findings of a page, by experiment, with the facts about the run.
 #[must_use]
 pub fn results(page: &Page) -> Value {
     let facts: BTreeMap<_, _> = page.facts.iter().map(|(name, value)| (name, value)).collect();

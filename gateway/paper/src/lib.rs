@@ -1,4 +1,4 @@
-//! The paper's experiments, and some beyond it: measured, drawn and rated.
+//! The paper's experiments, and some beyond them: measured, drawn and rated.
 //!
 //! ```text
 //!   Lab (a clock, whole benches) ─┐
@@ -6,11 +6,11 @@
 //!   Effort (how much) ────────────┘                          └─> report::page, report::svg, files::csv, files::results
 //! ```
 //!
-//! What is computed here is pure but for the clock; benches of processes are run by the implementation of [`Lab`].
-//! Verdicts are computed from the measurements, never stored.
+//! Computations here are pure except for the clock. The implementation of [`Lab`] runs benches of processes. Verdicts
+//! are computed from the measurements, never stored.
 //!
-//! This module alone, of all the gateway, calls the cells' code: to count its operations and to sum without a bus. The
-//! gateway meets cells on the bus only, and `tests/cells.rs` holds it to that.
+//! Of all crates of the gateway, only this one calls the cells' code: to count its operations, and to sum without a
+//! bus. The gateway itself communicates with cells only over the bus, which `tests/cells.rs` enforces.
 
 pub mod arithmetic;
 pub mod arm;
@@ -37,7 +37,7 @@ use analysis::report::figure::Section;
 use arm::Reply;
 use moving::Run;
 
-/// One experiment.
+/// An experiment.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
 pub enum Experiment {
     /// Torques of the moving arm.
@@ -46,11 +46,11 @@ pub enum Experiment {
     Fig7,
     /// Its cycle times.
     Fig8,
-    /// Central computation over cells.
+    /// The central computation over cells.
     Fig9,
-    /// Central computation over active cells.
+    /// The central computation over active cells.
     Fig10,
-    /// The distributed way over both.
+    /// The distributed computation over both.
     Distributed,
     /// Errors of sums.
     Sums,
@@ -65,7 +65,7 @@ pub enum Experiment {
 }
 
 impl Experiment {
-    /// All of them, in the order of a page.
+    /// All experiments, in the order of a page.
     pub const ALL: [Self; 11] = [
         Self::Fig6,
         Self::Fig7,
@@ -80,7 +80,7 @@ impl Experiment {
         Self::Scale,
     ];
 
-    /// Its name, what it does, and how long it takes about, in s: quick and in full.
+    /// Returns the name, the description, and the approximate duration in s, for a quick and a full measurement.
     const fn about_it(self) -> (&'static str, &'static str, [u64; 2]) {
         match self {
             Self::Fig6 => (
@@ -119,19 +119,19 @@ impl Experiment {
         }
     }
 
-    /// Its name on the command line and in files.
+    /// Returns the name on the command line and in files.
     #[must_use]
     pub const fn name(self) -> &'static str {
         self.about_it().0
     }
 
-    /// What it does, in a line.
+    /// Returns the description, in one line.
     #[must_use]
     pub const fn about(self) -> &'static str {
         self.about_it().1
     }
 
-    /// About how long it takes, in s, beside what those before it have done already.
+    /// Returns the approximate duration in s, in addition to measurements that earlier experiments share.
     #[must_use]
     pub const fn seconds(self, effort: Effort) -> u64 {
         let [quick, full] = self.about_it().2;
@@ -160,43 +160,43 @@ impl FromStr for Experiment {
     }
 }
 
-/// How much is measured.
+/// The extent of the measurements.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Effort {
-    /// Enough to see that everything works; laws and errors are those of less.
+    /// Enough to check that everything works; laws and errors are less precise.
     Quick,
-    /// What the paper did.
+    /// The extent of the paper.
     Full,
 }
 
-/// What experiments need of the world.
+/// The environment of experiments.
 pub trait Lab {
-    /// Why a bench did not come to its end.
+    /// The error of a bench that failed.
     type Error;
 
-    /// A monotonic clock in ns.
+    /// Returns the time of a monotonic clock, in ns.
     fn now(&self) -> u64;
 
-    /// Runs a whole bench and reads what it recorded.
+    /// Runs a whole bench, and reads its recording.
     ///
     /// # Errors
-    /// When it did not come to its end, or was not recorded whole.
+    /// Returns an error if the bench failed, or if its recording is incomplete.
     fn bench(&mut self, reply: Reply, effort: Effort) -> Result<Run, Self::Error>;
 
-    /// Runs a bench of so many cells; its summary as JSON, whatever came of it.
+    /// Runs a bench of this size. Returns its summary as JSON, whatever its outcome.
     ///
     /// # Errors
-    /// When it did not begin.
+    /// Returns an error if the bench did not begin.
     fn scaled(&mut self, bench: &scale::Bench) -> Result<Value, Self::Error>;
 
-    /// Whether to go on; asked between two measurements.
+    /// Checks between two measurements that the experiments should continue.
     ///
     /// # Errors
-    /// When it has to end.
+    /// Returns an error if they should end.
     fn go_on(&mut self) -> Result<(), Self::Error>;
 }
 
-/// Some experiments, one after the other; what several of them need is measured once.
+/// A sequence of experiments; measurements that several of them need are made once.
 #[derive(Debug)]
 pub struct Session {
     effort: Effort,
@@ -206,19 +206,19 @@ pub struct Session {
 }
 
 impl Session {
-    /// Nothing measured yet.
+    /// Creates a session without measurements.
     #[must_use]
     pub const fn new(effort: Effort) -> Self {
         Self { effort, single: None, over_cells: None, large: None }
     }
 
-    /// Does one experiment.
+    /// Performs one experiment.
     ///
     /// # Errors
-    /// Those of the lab.
+    /// Returns the error of the lab.
     ///
     /// # Panics
-    /// Never: skins that are generated here fit, and laws have points enough.
+    /// Never: the skins generated here fit, and fits have enough points.
     pub fn perform<L: Lab>(&mut self, experiment: Experiment, lab: &mut L) -> Result<Section, L::Error> {
         lab.go_on()?;
         Ok(match experiment {
@@ -278,12 +278,12 @@ impl Session {
         )
     }
 
-    /// The arm of the paper, or a small one.
+    /// Returns the paper's arm, or a small one for a quick measurement.
     fn arm(&self) -> Skin {
         ticks::skin(self.pick(24, 253), 1).expect("so many cells fit on the arm")
     }
 
-    /// As many cells as in Fig. 9, or fewer.
+    /// Returns a skin with as many cells as in Fig. 9, or fewer for a quick measurement.
     fn large(&mut self) -> &Skin {
         let cells = self.pick(240, ticks::MOST_CELLS);
         self.large.get_or_insert_with(|| {

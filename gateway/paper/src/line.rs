@@ -1,42 +1,42 @@
-//! Linear regression: a line through points, with its quality and the interval of its slope.
+//! Linear regression: a line through points, with its quality and the confidence interval of its slope.
 
 use analysis::report::figure::Quantity;
 
-/// A point, and how much it counts.
+/// A point with a weight.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Weighted {
-    /// To the right.
+    /// The independent variable.
     pub x: f64,
-    /// Upwards.
+    /// The dependent variable.
     pub y: f64,
-    /// How many measurements it stands for; above 0.
+    /// The number of measurements that the point represents; above 0.
     pub weight: f64,
 }
 
 impl Weighted {
-    /// The median of what was measured at x.
+    /// Returns the median of the measurements at x.
     #[must_use]
     pub fn median(x: f64, measured: &mut [f64]) -> Self {
         Self { x, y: quantile(measured, 0.5), weight: count(measured.len()) }
     }
 }
 
-/// `y = slope x + intercept`.
+/// A line `y = slope x + intercept`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Line {
-    /// In units of y for one of x.
+    /// The slope, in units of y per unit of x.
     pub slope: f64,
-    /// In units of y.
+    /// The intercept, in units of y.
     pub intercept: f64,
-    /// R²: the part of y's variance that the line explains, in [0, 1].
+    /// R²: the share of y's variance that the line explains, in [0, 1].
     pub quality: f64,
-    /// Half the width of the slope's 95 % interval, in its unit.
+    /// Half the width of the slope's 95 % confidence interval, in its unit.
     pub slope_half: f64,
 }
 
 impl Line {
-    /// The line with the minimum of the weighted squared distances along y. `None` for fewer than three points, or when
-    /// all have the same x: then there is no line, or no interval.
+    /// Returns the line with the smallest weighted sum of squared distances along y. Returns `None` for fewer than
+    /// three points, or if all have the same x: the line or its interval is then undefined.
     ///
     /// With weights w, means over w, and n points:
     ///
@@ -68,54 +68,54 @@ impl Line {
         let intercept = y_mean - slope * x_mean;
         let left = |point: &Weighted| point.weight * (point.y - slope * point.x - intercept).powi(2);
         let residual: f64 = points.iter().map(left).sum();
-        // A level line explains nothing, and has nothing to explain.
+        // A horizontal line explains no variance, because there is none.
         let quality = if syy > 0.0 { (1.0 - residual / syy).max(0.0) } else { 0.0 };
         let freedom = count(points.len() - 2);
         let slope_half = student(freedom) * (residual / freedom / sxx).sqrt();
         Some(Self { slope, intercept, quality, slope_half })
     }
 
-    /// The line through points that all count the same.
+    /// Returns the line through points of equal weight.
     #[must_use]
     pub fn through_equals(points: &[(f64, f64)]) -> Option<Self> {
         let points: Vec<_> = points.iter().map(|&(x, y)| Weighted { x, y, weight: 1.0 }).collect();
         Self::through(&points)
     }
 
-    /// The value of the line at `x`.
+    /// Returns the value of the line at `x`.
     #[must_use]
     pub fn at(&self, x: f64) -> f64 {
         self.slope * x + self.intercept
     }
 
-    /// The slope with its 95 % interval, which is in this unit.
+    /// Returns the slope with its 95 % confidence interval, in this unit.
     #[must_use]
     pub fn slope_in(&self, unit: &str) -> Quantity {
         Quantity::new(self.slope, unit).plus_minus(self.slope_half)
     }
 
-    /// The upper end of the slope's 95 % interval.
+    /// Returns the upper end of the slope's 95 % confidence interval.
     #[must_use]
     pub fn slope_at_most(&self) -> f64 {
         self.slope + self.slope_half
     }
 
-    /// The largest x at which the line is not above `y`; not a number for a line that does not rise.
+    /// Returns the largest x at which the line is not above `y`; NaN for a line that does not rise.
     #[must_use]
     pub fn reaches(&self, y: f64) -> f64 {
         if self.slope > 0.0 { (y - self.intercept) / self.slope } else { f64::NAN }
     }
 }
 
-/// A count as a real number.
+/// Converts a count to a real number.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "counts of what is in memory, below 2^53")]
 pub fn count(count: usize) -> f64 {
     count as f64
 }
 
-/// Student's t, at 97.5 %, by its expansion about the normal distribution (Abramowitz and Stegun 26.7.5):
-/// below 10 degrees of freedom it is up to 5 % too small.
+/// Returns Student's t at 97.5 %, by its expansion about the normal distribution (Abramowitz and Stegun 26.7.5). Below
+/// 10 degrees of freedom it is up to 5 % too small.
 fn student(freedom: f64) -> f64 {
     const Z: f64 = 1.959_963_984_540_054;
     let z = |power: i32| Z.powi(power);
@@ -128,7 +128,7 @@ fn student(freedom: f64) -> f64 {
     terms.into_iter().zip(1..).fold(Z, |sum, (term, power)| sum + term / freedom.powi(power))
 }
 
-/// The value below which a part of some values lies; not a number of none. `part` in [0, 1].
+/// Returns the value below which the share `part` of the values lies, with `part` in [0, 1]; NaN without values.
 #[must_use]
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a place within the values")]
 pub fn quantile(values: &mut [f64], part: f64) -> f64 {
@@ -151,8 +151,8 @@ mod tests {
         assert!((line.reaches(25.0) - 9.0).abs() < 1e-12 && (line.at(9.0) - 25.0).abs() < 1e-12);
     }
 
-    /// x 1 to 5, y 2, 4, 5, 4, 5: slope 0.6, intercept 2.2, R² 0.6, standard error of the slope 0.2828 (any
-    /// textbook's example), t(0.975, 3) = 3.182.
+    /// x 1 to 5, y 2, 4, 5, 4, 5: slope 0.6, intercept 2.2, R² 0.6, standard error of the slope 0.2828 (a common
+    /// textbook example), t(0.975, 3) = 3.182.
     #[test]
     fn quality_and_interval_are_those_of_a_textbook() {
         let points = [(1.0, 2.0), (2.0, 4.0), (3.0, 5.0), (4.0, 4.0), (5.0, 5.0)];

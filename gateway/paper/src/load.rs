@@ -1,4 +1,5 @@
-//! How much of a real bus the paper's arm needs, over the number of cells and by bit rate: the worst case of [`analysis::fit`].
+//! The load that the paper's arm causes on a real bus, over the number of cells and by bit rate: the worst case of
+//! [`analysis::fit`].
 
 use super::arm;
 use super::line::count;
@@ -7,10 +8,10 @@ use analysis::fit::verdict::Answer;
 use analysis::fit::{self, COMPUTATION_NS, Row};
 use analysis::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table};
 
-/// Cells in the figure.
+/// The maximum number of cells in the figure.
 const MOST: u32 = 300;
 
-/// Loads over cells.
+/// Writes the section on loads over cells.
 #[must_use]
 pub fn section() -> Section {
     let skin = arm::paper();
@@ -22,7 +23,7 @@ pub fn section() -> Section {
         let points = (0..=MOST).step_by(10).map(load).collect();
         Series::new(Answer::worst_case(rated).rates, Shape::Line, points)
     };
-    // These rates are defaults that were not chosen, so none is rated.
+    // These rates are defaults and not a choice of the user, so they get no verdict.
     let finding = |row: &Row| {
         let Answer { load, rates, cells, verdict } = Answer::worst_case(&row.fullest.rated);
         let what = format!("worst case of one bus at {rates}: {verdict} ({cells})");

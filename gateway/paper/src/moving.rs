@@ -1,4 +1,4 @@
-//! Fig. 6, 7 and 8: the moving arm, of recorded runs of a whole bench.
+//! Fig. 6, 7 and 8: the moving arm, from recorded runs of a whole bench.
 
 use serde_json::Value;
 
@@ -9,19 +9,19 @@ use analysis::report::figure::{
     Axis, Figure, Finding, Mark, Quantity, Section, Series, Shape, Table, number,
 };
 
-/// A run: its ticks, and the figures of its end (`bench::summary::Summary` as JSON).
+/// A run: its ticks, and its summary (`bench::summary::Summary` as JSON).
 #[derive(Clone, Debug)]
 pub struct Run {
-    /// Its ticks, in the order of time.
+    /// The ticks, in the order of time.
     pub rows: Vec<Row>,
-    /// Its summary.
+    /// The summary.
     pub summary: Value,
-    /// Joints of the robot.
+    /// The number of joints of the robot.
     pub joints: usize,
 }
 
 impl Run {
-    /// A figure of the summary by its keys; not a number where there is none.
+    /// Returns a figure of the summary by its keys; NaN if it does not exist.
     #[must_use]
     pub fn figure(&self, keys: &[&str]) -> f64 {
         let value = keys.iter().try_fold(&self.summary, |value, key| match key.parse::<usize>() {
@@ -31,13 +31,14 @@ impl Run {
         value.and_then(Value::as_f64).unwrap_or(f64::NAN)
     }
 
-    /// How many cells there were.
+    /// Returns the number of cells.
     fn cells(&self) -> f64 {
         let cells = self.summary.get("cells").and_then(Value::as_array);
         cells.and_then(|cells| u32::try_from(cells.len()).ok()).map_or(f64::NAN, f64::from)
     }
 
-    /// When the central computation was switched off, in s; `None` in a run that compared to its end.
+    /// Returns the time at which the central computation was switched off, in s; `None` for a run that compared to its
+    /// end.
     fn switched_s(&self) -> Option<f64> {
         let last = self.rows.iter().rposition(|row| row.central.is_some())?;
         self.rows.get(last + 1).map(|row| row.time_s)
@@ -47,7 +48,7 @@ impl Run {
         self.rows.iter().map(|row| (row.time_s, value(row))).collect()
     }
 
-    /// A figure over the time of this run.
+    /// Returns a figure over the time of this run.
     fn drawn(&self, name: impl Into<String>, title: impl Into<String>, y: Axis) -> Figure {
         Figure::new(name, title, Axis::new("time", "s"), y).marks(self.switched())
     }
@@ -63,8 +64,8 @@ impl Run {
     }
 }
 
-/// Fig. 6: central against distributed torques of a run in which each cell answers itself, and the errors of that one
-/// and of one in which they answer with sums.
+/// Writes the section on Fig. 6: central against distributed torques of a run in which each cell replies itself, and
+/// the errors of this run and of one in which cells reply with sums.
 #[must_use]
 pub fn fig6(single: &Run, summed: &Run) -> Section {
     let joint = |joint: usize| {
@@ -129,7 +130,7 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
         )])
 }
 
-/// Which joints have no torque.
+/// Names the joints without a torque.
 fn bare(run: &Run) -> String {
     let bears = |joint: usize| run.rows.iter().any(|row| at(&row.distributed, joint).abs() > 0.0);
     let bare: Vec<_> =
@@ -145,7 +146,7 @@ fn at(values: &[f64], joint: usize) -> f64 {
     values.get(joint).copied().unwrap_or(f64::NAN)
 }
 
-/// Fig. 7: joint velocities and active cells.
+/// Writes the section on Fig. 7: joint velocities and active cells.
 #[must_use]
 pub fn fig7(run: &Run) -> Section {
     let velocity = |joint: usize| {
@@ -169,15 +170,15 @@ pub fn fig7(run: &Run) -> Section {
         ])
 }
 
-/// Cycles of which the median is drawn.
+/// The number of cycles per drawn median.
 const TOGETHER: usize = 25;
 
-/// The median of some ticks' times in µs.
+/// Returns the median of some ticks' times in µs.
 fn median<'a>(rows: impl Iterator<Item = &'a Row>, time: impl Fn(&Row) -> f64) -> f64 {
     quantile(&mut rows.map(time).collect::<Vec<_>>(), 0.5)
 }
 
-/// Fig. 8: cycle times, and the central computation in them until it is switched off.
+/// Writes the section on Fig. 8: cycle times, and the central computation in them until it is switched off.
 #[must_use]
 pub fn fig8(run: &Run) -> Section {
     let cells = run.cells();
@@ -256,7 +257,7 @@ pub fn fig8(run: &Run) -> Section {
         ])
 }
 
-/// Median times of ticks over active cells, by the number of ticks.
+/// Fits the median times of ticks over active cells, weighted by the number of ticks.
 fn over_active<'a>(rows: impl Iterator<Item = &'a Row>) -> Option<Line> {
     let mut by_active = std::collections::BTreeMap::<u32, Vec<f64>>::new();
     for row in rows {
@@ -273,7 +274,7 @@ mod tests {
     use protocol::packet::padded;
     use serde_json::json;
 
-    /// A second of ticks: the central computation takes 3 µs and is off from 0.5 s on.
+    /// Returns a second of ticks: the central computation takes 3 µs and is off from 0.5 s on.
     fn run() -> Run {
         let row = |tick: u16| {
             let central = (tick < 250).then_some([1.0; 6]);

@@ -1,4 +1,4 @@
-//! The ticks of a recorded run, for experiments.
+//! Reads the ticks of a recorded run.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -16,32 +16,32 @@ use trace::ros2::standard::JointState;
 /// A tick.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Row {
-    /// When it should have begun, in s since the first one.
+    /// The scheduled start, in s since the first tick.
     pub time_s: f64,
     /// Joint velocities in rad/s.
     pub velocity: [f64; MAX_ROBOT_JOINTS],
-    /// The sum of the cells' torques, in Nm.
+    /// The sum of the cells' joint torques, in Nm.
     pub distributed: [f64; MAX_ROBOT_JOINTS],
-    /// The central torque in Nm, in ticks that compared.
+    /// The central joint torques in Nm, in ticks that compared.
     pub central: Option<[f64; MAX_ROBOT_JOINTS]>,
-    /// Cells in the cells' torque.
+    /// The number of cells in the cells' torque.
     pub contributing: u32,
-    /// How long the tick took, in µs.
+    /// The duration of the tick, in µs.
     pub took_us: f64,
-    /// How long the central computation took of that, in µs.
+    /// The part of the duration used by the central computation, in µs.
     pub central_us: f64,
 }
 
 /// Reads the ticks of a recording, in the order of time.
 ///
 /// # Errors
-/// When it cannot be read, is damaged, or has no ticks.
+/// Returns [`CaptureError`] if the recording cannot be read or is damaged.
 pub fn read(path: &Path) -> Result<Vec<Row>, CaptureError> {
     let mut items = Reader::open_with_others(&[path.to_path_buf()])?;
     let mut rows: BTreeMap<u64, Row> = BTreeMap::new();
     while let Some(item) = items.next_item()? {
         if let Item::Other(other) = item {
-            // A message that is not as expected was written by another program.
+            // Another program may have written an unexpected message, so errors are ignored.
             let _ = take(&mut rows, other.topic, other.schema, other.nanos, other.message);
         }
     }
@@ -54,7 +54,7 @@ fn seconds(nanos: u64) -> f64 {
     nanos as f64 * 1e-9
 }
 
-/// Takes a message of a tick into its row; others are left alone.
+/// Stores a message of a tick in its row; other messages are ignored.
 fn take(
     rows: &mut BTreeMap<u64, Row>,
     topic: &str,
@@ -80,7 +80,7 @@ fn take(
     Ok(())
 }
 
-/// A number for each joint; 0 for those that the robot has not.
+/// Returns a number for each joint; 0 for joints that the robot does not have.
 fn by_joint(numbers: &[f64]) -> [f64; MAX_ROBOT_JOINTS] {
     padded(numbers)
 }

@@ -1,7 +1,7 @@
-//! Measuring many things on a machine that does something else too.
+//! Measures many things on a machine that also does other work.
 //!
-//! Every round measures each thing once, in another random order: a stall hits one thing in one round, and a slow while
-//! hits all alike. Of a thing's measurements the median counts.
+//! Every round measures each thing once, in a new random order. A stall affects one thing in one round, and a slow
+//! period affects all alike. The median of a thing's measurements counts.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -9,8 +9,8 @@ use rand_pcg::Pcg64Mcg;
 
 use super::line::quantile;
 
-/// Measures each of `things` things in every one of `rounds` rounds; `once` measures the thing of a number. Returns
-/// what was measured of each thing, sorted.
+/// Measures each of `things` things in each of `rounds` rounds; `once` measures the thing with this index. Returns the
+/// sorted measurements of each thing.
 pub fn interleaved(
     things: usize,
     rounds: usize,
@@ -35,7 +35,7 @@ pub fn interleaved(
     measured
 }
 
-/// The median of each thing's measurements.
+/// Returns the median of each thing's measurements.
 #[must_use]
 pub fn medians(measured: &[Vec<f64>]) -> Vec<f64> {
     measured.iter().map(|values| quantile(&mut values.clone(), 0.5)).collect()

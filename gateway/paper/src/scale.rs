@@ -1,8 +1,9 @@
-//! A bench over its cells, up to ten thousand: how long it takes to start, what it costs, how late its loop is, and which
-//! replies come in time at the highest rate that holds.
+//! Benches of up to ten thousand cells: the time to start, the cost, the lateness of the loop, and the replies in time
+//! at the highest rate that holds.
 //!
-//! Each number of cells lies on as few buses as have node ids for it, and each bus' cells are one process. A rate holds
-//! when [`HOLDS`] of the replies of [`ACTIVE`] of the cells come in time and nothing is lost without a reason.
+//! Each number of cells is on the fewest buses with enough node ids, and the cells of each bus are one process. A rate
+//! holds if a share of [`HOLDS`] of the replies arrives in time while a share of [`ACTIVE`] of the cells is touched,
+//! and all losses have a known reason.
 
 mod section;
 
@@ -22,40 +23,40 @@ pub use section::section;
 
 /// The share of cells that are touched.
 pub const ACTIVE: f64 = 0.05;
-/// The share of replies that has to be in time.
+/// The share of replies that must be in time.
 pub const HOLDS: f64 = 0.99;
 /// The force on a touched cell, in N.
 const TOUCH_N: f64 = 0.5;
-/// Cells of the smallest bench of a full measurement: those of the paper's arm.
+/// The number of cells of the smallest bench in a full measurement: that of the paper's arm.
 const PAPER: usize = 253;
 
-/// One bench.
+/// A bench.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bench {
-    /// Its cells.
+    /// The number of cells.
     pub cells: usize,
-    /// Its buses.
+    /// The number of buses.
     pub buses: usize,
-    /// Joint broadcasts in a second.
+    /// Joint broadcasts per second.
     pub hz: f64,
-    /// Whether [`ACTIVE`] of its cells are touched.
+    /// True if [`ACTIVE`] of its cells are touched.
     pub active: bool,
-    /// How long it runs.
+    /// The duration of the run, in s.
     pub seconds: f64,
 }
 
 impl Bench {
-    /// What its files are called.
+    /// Returns the name of its files.
     #[must_use]
     pub fn name(&self) -> String {
         let Self { cells, buses, hz, active, seconds: _ } = self;
         format!("scale-{cells}-on-{buses}-{hz}-hz-{}", if *active { "active" } else { "quiet" })
     }
 
-    /// Its `skin.toml`.
+    /// Returns its `skin.toml`.
     ///
     /// # Panics
-    /// Never: so many cells fit.
+    /// Never: this number of cells fits.
     #[must_use]
     pub fn skin(&self) -> String {
         let Self { cells, buses, hz, .. } = *self;
@@ -63,7 +64,8 @@ impl Bench {
         generate(&target).expect("so many cells fit on the arm")
     }
 
-    /// Its `scenario.toml`: the touched cells are the first ones of each bus, the same number on all (to one).
+    /// Returns its `scenario.toml`. The touched cells are the first ones of each bus; their numbers differ by at most
+    /// one between buses.
     #[must_use]
     pub fn scenario(&self) -> String {
         let mut text = format!(
@@ -86,31 +88,31 @@ impl Bench {
     }
 }
 
-/// How many of so many cells are touched.
+/// Returns the number of touched cells.
 const fn share(cells: usize) -> usize {
     cells.div_ceil(20)
 }
 
-/// What a bench's summary says.
+/// The figures of a bench's summary.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Figures {
-    /// From its start to the first joints, in s.
+    /// The time from its start to the first joints, in s.
     pub start_s: f64,
-    /// Processor of the gateway, the buses and the cells, in cores.
+    /// Processor use of the gateway, the buses and the cells, in cores.
     pub cores: [f64; 3],
-    /// Memory of the gateway, of all that serves buses, and of the largest process of cells, in MB.
+    /// Memory of the gateway, of all bus servers, and of the largest cell process, in MB.
     pub memory_mb: [f64; 3],
-    /// The median of a tick that computes nothing centrally, in µs.
+    /// The median duration of a tick without a central computation, in µs.
     pub tick_us: f64,
-    /// How late 99 % of the ticks begin at most, in µs, and an idle thread's.
+    /// The 99th percentile of the lateness of ticks, and that of an idle thread, in µs.
     pub late_us: [f64; 2],
     /// Replies that were due.
     pub due: f64,
-    /// Those that came before the next joints.
+    /// Replies that arrived before the next joints.
     pub in_time: f64,
-    /// Replies and packets that are missing for no known reason.
+    /// Replies and packets missing for no known reason.
     pub unknown: f64,
-    /// Whether the run came to its end with the robot moving.
+    /// True if the run was completed with the robot moving.
     pub done: bool,
 }
 
@@ -141,61 +143,62 @@ impl Figures {
         }
     }
 
-    /// The share of due replies that came in time.
+    /// Returns the share of due replies that arrived in time.
     #[must_use]
     pub fn share(&self) -> f64 {
         if self.due > 0.0 { self.in_time / self.due } else { f64::NAN }
     }
 
-    /// Whether its rate holds.
+    /// Returns true if the rate holds.
     fn holds(&self) -> bool {
         self.done && self.share() >= HOLDS && self.unknown <= 0.0
     }
 }
 
-/// One number of cells, at the highest rate that holds, or else at the lowest.
+/// The measurements of one number of cells, at the highest rate that holds, or else at the lowest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Size {
-    /// Cells.
+    /// The number of cells.
     pub cells: usize,
-    /// Buses.
+    /// The number of buses.
     pub buses: usize,
-    /// Joint broadcasts in a second.
+    /// Joint broadcasts per second.
     pub hz: f64,
-    /// Whether that rate holds.
+    /// True if that rate holds.
     pub holds: bool,
-    /// With no cell touched.
+    /// The figures without touched cells.
     pub quiet: Figures,
-    /// With [`ACTIVE`] of them touched.
+    /// The figures with [`ACTIVE`] of the cells touched.
     pub active: Figures,
 }
 
-/// Ticks without threads, in ns: of the fewest cells, of them on as many buses as the most, and of the most.
+/// Times of ticks without threads, in ns: of the fewest cells, of the fewest cells on as many buses as the most, and of
+/// the most.
 pub type Beside = [f64; 3];
 
-/// All that is measured.
+/// All measurements.
 #[derive(Clone, Debug)]
 pub struct Scale {
-    /// By number of cells.
+    /// Ticks over cells, all of them active, on as many buses as the largest number needs.
     pub sizes: Vec<Size>,
     /// Ticks over cells, all active, on as many buses as the most of them need.
     pub ticks: Over,
-    /// Ticks beside each other, all cells active.
+    /// Times of the compared ticks, with all cells active.
     pub beside: Beside,
 }
 
-/// How much is measured.
+/// The extent of the measurements.
 #[derive(Clone, Copy, Debug)]
 struct Extent {
-    /// Numbers of cells, from the fewest to the most.
+    /// Numbers of cells, in ascending order.
     cells: &'static [usize],
-    /// Rates, the highest first.
+    /// Rates, in descending order.
     rates: &'static [f64],
-    /// How long a bench runs, in s.
+    /// The duration of a bench, in s.
     seconds: f64,
-    /// Numbers of cells in ticks without threads, beside one on each bus.
+    /// The number of steps of the number of cells in ticks without threads, after one per bus.
     steps: usize,
-    /// How often their ticks are measured.
+    /// The number of measurements of these ticks.
     rounds: usize,
 }
 
@@ -212,10 +215,10 @@ const QUICK: Extent = Extent { cells: &[24, 300], rates: &[62.5], seconds: 1.0, 
 /// Measures everything.
 ///
 /// # Errors
-/// Those of the lab.
+/// Returns the error of the lab.
 ///
 /// # Panics
-/// Never: skins that are generated here fit, and laws have points enough.
+/// Never: the skins generated here fit, and fits have enough points.
 pub fn measure<L: Lab>(lab: &mut L, effort: Effort) -> Result<Scale, L::Error> {
     let extent = match effort {
         Effort::Quick => QUICK,
@@ -231,7 +234,7 @@ pub fn measure<L: Lab>(lab: &mut L, effort: Effort) -> Result<Scale, L::Error> {
     Ok(Scale { sizes, ticks, beside })
 }
 
-/// Finds the highest rate at which so many cells hold, and measures them at it.
+/// Finds the highest rate that this number of cells holds, and measures at it.
 fn size<L: Lab>(lab: &mut L, cells: usize, extent: Extent) -> Result<Size, L::Error> {
     let buses = cells.div_ceil(CellId::COUNT);
     let of = |hz, active| Bench { cells, buses, hz, active, seconds: extent.seconds };
@@ -249,12 +252,12 @@ fn size<L: Lab>(lab: &mut L, cells: usize, extent: Extent) -> Result<Size, L::Er
     Ok(Size { cells, buses, hz, holds: active.holds(), quiet, active })
 }
 
-/// Ticks without threads: over cells, and three of them beside each other.
+/// Measures ticks without threads: over cells, and three of them for comparison.
 fn loops(fewest: usize, most: usize, extent: Extent, now: impl Fn() -> u64 + Copy) -> (Over, Beside) {
     let skin = |cells, buses| ticks::skin(cells, buses).expect("so many cells fit on the arm");
     let buses = most.div_ceil(CellId::COUNT);
     let large = skin(most, buses);
-    // A bus without cells has no robot to compute, so that there is one cell at least on each.
+    // A bus without cells has no robot to compute, so each bus has at least one cell.
     let numbers: Vec<usize> =
         (0..=extent.steps).map(|step| (most * step / extent.steps).max(buses)).collect();
     let parts: Vec<_> = numbers.iter().map(|&cells| spread(&large, cells)).collect();
@@ -275,7 +278,7 @@ fn loops(fewest: usize, most: usize, extent: Extent, now: impl Fn() -> u64 + Cop
     (over, std::array::from_fn(|place| medians.get(place).copied().unwrap_or(f64::NAN)))
 }
 
-/// A count of cells on an axis.
+/// Returns the number of cells for an axis.
 fn cells_of(size: &Size) -> f64 {
     count(size.cells)
 }

@@ -1,5 +1,5 @@
-//! How far sums of torques along a tree are from the central computation, over the number of active cells: when each
-//! cell cuts off, when it rounds, and when it carries what rounding took away into its next value.
+//! The error of torque sums along a tree relative to the central computation, over the number of active cells: if each
+//! cell truncates, if it rounds, and if it carries the rounding error into its next value.
 
 use protocol::fixed::Q5_10;
 use protocol::message::SkinSensors;
@@ -16,40 +16,40 @@ use analysis::report::figure::{Axis, Figure, Finding, Section, Series, Shape, Ta
 
 /// Numbers of active cells; the paper's arm had about twenty.
 const ACTIVE: [usize; 10] = [1, 2, 5, 10, 20, 40, 80, 120, 180, 253];
-/// The number that the findings are of.
+/// The number of active cells for the findings.
 const FOUND_AT: usize = 20;
-/// Epochs over which a constant touch is averaged.
+/// The number of epochs over which a constant touch is averaged.
 const AVERAGED: u32 = 32;
-/// Torques outside Q7.8 are left out.
+/// The maximum torque; larger ones are outside Q7.8 and left out.
 const MOST_NM: f64 = 127.0;
 
-/// How much is measured.
+/// The extent of the measurements.
 #[derive(Clone, Copy, Debug)]
 pub struct Extent {
-    /// Touches for each number of active cells.
+    /// The number of touches for each number of active cells.
     pub touches: usize,
-    /// Epochs of each while the arm moves.
+    /// The number of epochs of each touch while the arm moves.
     pub epochs: u32,
 }
 
 /// Mean absolute errors over loaded joints, in Nm.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Errors {
-    /// Active cells.
+    /// The number of active cells.
     pub active: usize,
-    /// Every cell's torque cut off.
+    /// Every cell's torque is truncated.
     pub truncated: f64,
-    /// Rounded to the nearest.
+    /// Torques are rounded to the nearest value.
     pub rounded: f64,
-    /// Rounded, what that took away carried on.
+    /// Torques are rounded, and the rounding error is carried on.
     pub carried: f64,
-    /// Rounded, the average over 32 epochs of a constant touch.
+    /// Torques are rounded and averaged over 32 epochs of a constant touch.
     pub rounded_average: f64,
-    /// Carried, the average over 32 epochs of a constant touch.
+    /// Torques are carried and averaged over 32 epochs of a constant touch.
     pub carried_average: f64,
 }
 
-/// So many cells of a skin, drawn at random, each with a force of 0.6 to 6 N.
+/// Returns random cells of a skin, each with a force of 0.6 to 6 N.
 fn touched(dice: &mut Pcg64Mcg, cells: usize, active: usize) -> Vec<(usize, SkinSensors)> {
     let mut places: Vec<usize> = (0..cells).collect();
     places.shuffle(dice);
@@ -60,7 +60,7 @@ fn touched(dice: &mut Pcg64Mcg, cells: usize, active: usize) -> Vec<(usize, Skin
     places.into_iter().take(active).map(reference_torque).collect()
 }
 
-/// The mean of absolute errors.
+/// A mean of absolute errors.
 #[derive(Clone, Copy, Debug, Default)]
 struct Mean {
     sum: f64,
@@ -82,13 +82,13 @@ impl Mean {
     }
 }
 
-/// The numbers of active cells that a skin has cells for.
+/// Returns the numbers of active cells that a skin has enough cells for.
 pub fn numbers(skin: &Skin) -> impl Iterator<Item = usize> + use<> {
     let cells = skin.cells.len();
     ACTIVE.into_iter().filter(move |&active| active <= cells)
 }
 
-/// Measures the errors for a number of active cells; the same for the same skin and extent.
+/// Measures the errors for a number of active cells. The result is deterministic.
 #[must_use]
 pub fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
     let mut dice = Pcg64Mcg::seed_from_u64(active as u64);
@@ -106,7 +106,7 @@ pub fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
             carried.add(carry.loaded, &carry.sum, &carry.central);
         }
         let q = phase.map(|phase| 1.5 * phase.sin());
-        // A sum with carry begins with nothing to carry.
+        // A sum with carry begins without a carried error.
         let mut fresh = Tree::new(skin, true);
         for (tree, average) in [(&mut rounding, &mut rounded_average), (&mut fresh, &mut carried_average)] {
             let (mean, last) = averaged(tree, &q, &touch);
@@ -123,7 +123,7 @@ pub fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
     }
 }
 
-/// The average of the sums of a constant touch on an arm that stands.
+/// Returns the average of the sums of a constant touch on an arm at rest.
 fn averaged(
     tree: &mut Tree,
     q: &[f64; MAX_JOINTS],
@@ -142,7 +142,7 @@ fn averaged(
 /// A column of [`Errors`]: its heading, the text of its finding, and its value.
 type Way = (&'static str, &'static str, fn(&Errors) -> f64);
 
-/// Each way to sum.
+/// All methods of summing.
 const WAYS: [Way; 5] = [
     ("truncated", "each cut off, mean error", |at| at.truncated),
     ("rounded", "rounded, mean error", |at| at.rounded),
@@ -151,7 +151,7 @@ const WAYS: [Way; 5] = [
     ("carried, average of 32", "carried, mean error of the average over 32 epochs", |at| at.carried_average),
 ];
 
-/// Errors over the number of active cells.
+/// Writes the section on errors over the number of active cells.
 #[must_use]
 pub fn section(skin: &Skin, errors: &[Errors]) -> Section {
     let of = skin.cells.len();
@@ -208,11 +208,11 @@ mod tests {
         let errors = measure();
         assert_eq!(errors.iter().map(|at| at.active).collect::<Vec<_>>(), [1, 2, 5, 10, 20, 40]);
         let (one, forty) = (errors[0], errors[5]);
-        // Half a step of 1/256 Nm for each cell that loads a joint; those near the base load fewer.
+        // Each cell that loads a joint contributes half a step of 1/256 Nm; cells near the base load fewer joints.
         let drift = |at: &Errors| at.truncated / (count(at.active) / 512.0);
         assert!((0.6..1.1).contains(&drift(&one)) && (0.6..1.0).contains(&drift(&forty)), "{errors:?}");
         assert!((25.0..45.0).contains(&(forty.truncated / one.truncated)), "{errors:?}");
-        // A quarter of a step for one; grows with the root.
+        // One cell contributes a quarter of a step; the error grows with the square root.
         assert!(forty.rounded < 0.012 && forty.truncated > 4.0 * forty.rounded, "{errors:?}");
         assert!(forty.carried_average < forty.rounded_average / 2.0, "{errors:?}");
         let section = section(&skin, &errors);

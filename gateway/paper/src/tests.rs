@@ -1,4 +1,4 @@
-//! Every experiment that needs no bench, in its quick form.
+//! Runs every experiment that needs no bench, in its quick form.
 
 use super::*;
 use analysis::report::figure::{Figure, Shape, Verdict};
@@ -7,7 +7,7 @@ use std::time::Instant;
 
 static BEGAN: LazyLock<Instant> = LazyLock::new(Instant::now);
 
-/// A clock and no benches.
+/// A lab with a clock and without benches.
 struct Bare;
 
 impl Lab for Bare {
@@ -50,7 +50,7 @@ fn is_drawable(figure: &Figure) {
     }
 }
 
-/// No verdict of a time is looked at: a debug build on a busy machine may take as long as it likes.
+/// Verdicts on times are not checked: a debug build on a busy machine may take any time.
 #[test]
 fn every_experiment_without_a_bench_has_figures_and_findings_of_its_own() {
     let mut session = Session::new(Effort::Quick);
@@ -82,7 +82,8 @@ fn every_experiment_without_a_bench_has_figures_and_findings_of_its_own() {
     assert_eq!(names.len(), all, "figures have names of their own");
 }
 
-/// Whether a finding without a limit is for information only: by its verdict, which another comparison comes to as well.
+/// Returns true if a finding without a limit is for information only. The verdict is decisive, because another
+/// comparison may yield one as well.
 fn is_stated(finding: &analysis::report::figure::Finding) -> bool {
     finding.paper.is_none() || finding.verdict == Verdict::Stated
 }

@@ -1,5 +1,5 @@
-//! A skin of any number of cells, and the control loop's ticks over it, without threads, sockets or waiting: what times
-//! are measured on.
+//! Skins with any number of cells, and the control loop's ticks over them without threads, sockets or waiting, for
+//! measuring times.
 
 use std::sync::Arc;
 
@@ -18,29 +18,30 @@ use model::generate::{GenerateError, Target, generate};
 use model::scenario::{Mode, ModeChange, Scenario, contact_words};
 use model::table::{Snapshot, Table};
 
-/// Most cells of the paper's Fig. 9.
+/// The maximum number of cells in the paper's Fig. 9.
 pub const MOST_CELLS: usize = 3_000;
-/// Buses that so many cells need.
+/// The number of buses for that many cells.
 pub const BUSES: usize = 12;
-/// Where the arm stands while times are measured, in rad.
+/// The position of the arm while times are measured, in rad.
 pub const POSE: [f64; WORDS] = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
 /// The force on an active cell, in N.
 const TOUCH_N: f64 = 1.5;
-/// Ticks in an epoch, at 500 Hz and 62.5 Hz.
+/// The number of ticks in an epoch, at 500 Hz and 62.5 Hz.
 const TICKS: u64 = 8;
-/// Records and broadcasts that wait between two epochs: far more than there are.
+/// The capacity for records and broadcasts between two epochs, far more than occur.
 const QUEUE: usize = 64;
 
-/// A UR5 with a skin of so many cells on so many buses.
+/// Returns a UR5 with a skin of this many cells on this many buses.
 ///
 /// # Errors
-/// When they do not fit on the buses.
+/// Returns [`GenerateError`] if the cells do not fit on the buses.
 pub fn skin(cells: usize, buses: usize) -> Result<Skin, GenerateError> {
     let text = generate(&Target { cells, buses, ..Target::default() })?;
     Ok(Skin::parse("generated skin", &text)?)
 }
 
-/// The first cells of each bus, the same number on all (to one): the skin's parts that do not grow stay as they are.
+/// Reduces a skin to the first cells of each bus; their numbers differ by at most one between buses. All other parts of
+/// the skin stay the same.
 #[must_use]
 pub fn spread(skin: &Skin, cells: usize) -> Skin {
     let buses = skin.buses.len().max(1);
@@ -49,19 +50,19 @@ pub fn spread(skin: &Skin, cells: usize) -> Skin {
     Skin { cells: (0..buses).flat_map(of_bus).collect(), ..skin.clone() }
 }
 
-/// The contact state of a touched cell.
+/// Returns the sensor values of a touched cell.
 #[must_use]
 pub fn touch() -> SkinSensors {
     SkinSensors { contact: contact_words(TOUCH_N), ..SkinSensors::default() }
 }
 
-/// The contact state of each cell of a skin when the first `active` of them in the order of `spread` are touched.
+/// Returns the sensor values of each cell of a skin if the first `active` of them in the order of `spread` are touched.
 fn sensors(cells: usize, active: usize) -> Vec<SkinSensors> {
     (0..cells).map(|cell| if cell < active { touch() } else { SkinSensors::default() }).collect()
 }
 
-/// What the receiver of a bus hands to the loop when the first `active` cells of `cells` have answered an epoch: by
-/// the real table, of real frames.
+/// Returns the snapshot that the receiver of a bus passes to the loop after the first `active` cells have replied in an
+/// epoch. A real table computes it from real frames.
 fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
     let mut table = Table::new(skin, bus);
     let cells: Vec<&Cell> = skin.cells_of(bus).collect();
@@ -73,14 +74,14 @@ fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
     };
     hear(true, Message::Joints { epoch, joints: Joints { in_use: 6, ..Joints::default() } });
     for cell in cells.iter().take(active) {
-        // Some torque: what it is costs the same.
+        // The value of the torque does not affect the time.
         hear(false, Message::Torque { from: cell.node, epoch, torque: [409; WORDS].into() });
     }
     Snapshot { sums: table.snapshot().sums, sensors: sensors(cells.len(), active) }
 }
 
-/// Holds the arm, and computes all that the kinesthetic controller computes: a robot that moved to its limits would make
-/// ticks of few cells other than those of many.
+/// A controller that computes everything that the kinesthetic controller computes, but holds the arm. If the robot
+/// moved to its limits, ticks of few cells would differ from those of many.
 struct Held(Kinesthetic);
 
 impl Controller for Held {
@@ -92,7 +93,7 @@ impl Controller for Held {
     }
 }
 
-/// A control loop over buses whose receivers have handed over sums.
+/// A control loop over buses whose receivers have passed on sums.
 #[derive(Debug)]
 pub struct Ticks {
     turn: Turn,
@@ -102,7 +103,7 @@ pub struct Ticks {
     number: u64,
 }
 
-/// What a receiver has of the loop.
+/// The receiver's ends of the channels to the loop.
 #[derive(Debug)]
 struct Inlet {
     snapshot: Snapshot,
@@ -110,20 +111,20 @@ struct Inlet {
     positions: rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
 }
 
-/// What the ticks of an epoch took, on average, in ns.
+/// The average times of an epoch's ticks, in ns.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Took {
-    /// A whole tick, without the central computation.
+    /// The time of a whole tick, without the central computation.
     pub tick: f64,
-    /// The central computation in it; 0 without one.
+    /// The time of the central computation in it; 0 without one.
     pub central: f64,
 }
 
 impl Ticks {
-    /// A loop over a skin of which the first `active` cells, evenly over the buses, are touched.
+    /// Creates a loop over a skin of which the first `active` cells, distributed evenly over the buses, are touched.
     ///
     /// # Panics
-    /// When the skin has an external controller: a generated one has none.
+    /// If the skin has an external controller, which a generated one does not have.
     #[must_use]
     pub fn new(skin: &Skin, active: usize, mode: Mode) -> Self {
         let buses = skin.buses.len();
@@ -151,11 +152,11 @@ impl Ticks {
         Self { turn, buses: inlets, records, mode, number: 0 }
     }
 
-    /// The ticks of one epoch, each on a snapshot that has just come.
+    /// Runs the ticks of one epoch, each on a new snapshot.
     pub fn epoch(&mut self, now: impl Fn() -> u64 + Copy) -> Took {
         for _ in 0..TICKS {
             for Inlet { snapshot, to_loop, positions } in &mut self.buses {
-                // The epoch of the broadcast before, as a bus that works brings it back.
+                // The read-back epoch is that of the previous broadcast, as on a working bus.
                 let sent = self.number.checked_sub(1).map(|number| number / TICKS);
                 snapshot.sums.read_back = sent.map(|sent| Epoch(sent.to_le_bytes()[0]));
                 to_loop.input_buffer_mut().take(snapshot, self.mode == Mode::Compare);
@@ -176,8 +177,8 @@ impl Ticks {
         took
     }
 
-    /// What the last epoch's ticks knew: cells in the torque, active cells of the central computation (none without
-    /// one), and whether the robot was halted.
+    /// Returns the state after one more epoch: the number of cells in the torque, the number of active cells of the
+    /// central computation (`None` without one), and true if the robot is halted.
     pub fn known(&mut self, now: impl Fn() -> u64 + Copy) -> (u32, Option<u32>, bool) {
         self.epoch(now);
         let tick = Tick { number: self.number, time: Micros(self.number * 2_000) };
@@ -213,7 +214,7 @@ mod tests {
             assert!(counts.iter().max().unwrap() - counts.iter().min().unwrap() <= 1, "{counts:?}");
             let target = u32::try_from(active).unwrap();
             let mut compared = Ticks::new(&part, active, Mode::Compare);
-            // More than a hundred ticks: the robot is not halted for missing read-back.
+            // The loop runs for more than a hundred ticks, so a missing read-back would halt the robot.
             for _ in 0..20 {
                 compared.epoch(|| 0);
             }
@@ -223,7 +224,7 @@ mod tests {
         }
     }
 
-    /// A clock that goes on by 1 ns each time it is looked at: begin, before and after the central computation, end.
+    /// On a clock that advances by 1 ns per reading: the start, before and after the central computation, and the end.
     #[test]
     fn a_tick_is_told_without_its_central_computation() {
         let part = spread(&skin(BUSES, BUSES).unwrap(), BUSES);

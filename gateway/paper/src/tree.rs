@@ -1,5 +1,5 @@
-//! The cells' own arithmetic along a tree, without a bus: what arrives at the root, beside the central computation of the
-//! same touch.
+//! Runs the cells' own arithmetic along a tree without a bus, and compares the sums at the roots with the central
+//! computation of the same touch.
 
 use std::collections::VecDeque;
 
@@ -17,9 +17,9 @@ use protocol::time::{Micros, Span};
 
 use model::central::Central;
 
-/// Fraction bits between a cell's exact torque and Q7.8.
+/// The number of fraction bits between a cell's exact torque and Q7.8.
 const SHORTENED: u32 = 30 - 8;
-/// From joints to joints, in µs.
+/// The interval between joint broadcasts, in µs.
 const PERIOD: u64 = 16_000;
 
 /// A cell, its depth, and its children with their ports.
@@ -30,35 +30,36 @@ struct Branch {
     children: Vec<(usize, usize)>,
 }
 
-/// A skin on one bus whose cells add up along the shortest routes to the nearest root.
+/// A skin on one bus whose cells sum along the shortest routes to the nearest root.
 #[derive(Clone, Debug)]
 pub struct Tree {
     skin: Skin,
     central: Central,
     sums: Vec<Sum>,
-    /// From the leaves to the roots.
+    /// The cells in the order from the leaves to the roots.
     order: Vec<Branch>,
     kernels: Vec<Wrench>,
     epoch: Epoch,
 }
 
-/// What came out of one epoch, in Nm.
+/// The result of one epoch, in Nm.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Came {
-    /// Computed centrally in double precision.
+    /// The torque computed centrally in double precision.
     pub central: [f64; MAX_JOINTS],
-    /// Summed along the tree, Q7.8.
+    /// The sum along the tree in Q7.8.
     pub sum: [f64; MAX_JOINTS],
-    /// Each active cell's torque cut off to Q7.8, then summed.
+    /// The sum of each active cell's torque, truncated to Q7.8.
     pub truncated: [f64; MAX_JOINTS],
-    /// Joints that some active cell loads.
+    /// The number of joints that active cells load.
     pub loaded: usize,
-    /// Cells in the sum.
+    /// The number of cells in the sum.
     pub count: usize,
 }
 
 impl Tree {
-    /// A tree in which rounding is carried into a cell's next value, or not. Unreachable cells have no part.
+    /// Creates a tree. `carry` is true to carry rounding errors into a cell's next value. Unreachable cells take no
+    /// part.
     #[must_use]
     pub fn new(skin: &Skin, carry: bool) -> Self {
         let place = |node: CellId| skin.cells.iter().position(|cell| cell.node == node);
@@ -93,13 +94,13 @@ impl Tree {
         Self { central: Central::new(skin), skin: skin.clone(), sums, order, kernels, epoch: Epoch(0) }
     }
 
-    /// Cells with a route to a root.
+    /// Returns the number of cells with a route to a root.
     #[must_use]
     pub fn cells(&self) -> usize {
         self.order.len()
     }
 
-    /// One epoch in which cells, by their places in the skin, are in contact while the joints are at `q` (rad).
+    /// Runs one epoch in which the cells with these indices are in contact while the joints are at `q` (rad).
     pub fn turn(&mut self, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> Came {
         let words = q.map(|q| Q1_14::from_radians(q).unwrap_or_default());
         let frames = self.central.frames(&words);
@@ -163,7 +164,7 @@ fn add(sum: &mut [f64; MAX_JOINTS], more: [f64; MAX_JOINTS]) {
     }
 }
 
-/// The value of a cell that cuts off the bits below Q7.8, in Nm.
+/// Returns the value of a cell that drops the bits below Q7.8, in Nm.
 #[expect(clippy::cast_precision_loss, reason = "a torque has far fewer than 2^53 steps")]
 fn truncated(exact: Acc<30>) -> f64 {
     (exact.steps() >> SHORTENED) as f64 / 256.0

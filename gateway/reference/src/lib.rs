@@ -1,5 +1,5 @@
-//! What a cell would answer, by the cell's own code: for comparison, and for the test vectors of people who write cells
-//! elsewhere.
+//! Computes the replies of a cell with the cell's own code, for comparison, and for the test vectors for cells that are
+//! written elsewhere.
 
 use cell_node::contact::{Force, Torque};
 use cell_node::kernel::{Kernel, Wrench};
@@ -7,7 +7,7 @@ use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::message::SkinSensors;
 use protocol::parameters::{Contact, MAX_JOINTS, Parameters};
 
-/// A cell with a configuration, and nothing else of it.
+/// A cell with a configuration, reduced to its arithmetic.
 #[derive(Clone, Debug)]
 pub struct Reference {
     kernel: Wrench,
@@ -16,7 +16,7 @@ pub struct Reference {
 }
 
 impl Reference {
-    /// A cell with these parameters.
+    /// Creates a cell with these parameters.
     #[must_use]
     pub fn new(parameters: &Parameters) -> Self {
         Self {
@@ -26,26 +26,28 @@ impl Reference {
         }
     }
 
-    /// The torque about each joint of one newton on the cell, in m, at joint positions in quarter turns; of
-    /// prismatic joints a number, at positions in m.
+    /// Returns the torque about each joint for a force of 1 N on the cell, in m, at joint positions in quarter turns.
+    /// For prismatic joints it is dimensionless, at positions in m.
     #[must_use]
     pub fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [Q1_14; MAX_JOINTS] {
         self.kernel.jacobian(joints)
     }
 
-    /// In which format it sends torques.
+    /// Returns the format in which the cell sends torques.
     #[must_use]
     pub const fn format(&self) -> TorqueFormat {
         self.format
     }
 
-    /// The words of the torques that it would send with these sensors, at joint positions in quarter turns or m.
+    /// Returns the words of the torques that the cell would send with these sensor values, at joint positions in
+    /// quarter turns or m.
     #[must_use]
     pub fn torque(&self, joints: &[Q1_14; MAX_JOINTS], sensors: &SkinSensors) -> [i16; MAX_JOINTS] {
         self.under(joints, Force::fuse(sensors.contact, sensors.proximity, &self.contact))
     }
 
-    /// The words of the torques that so many newtons on the cell make, whatever it measures: to the nearest 2^-16 N.
+    /// Returns the words of the torques of a force on the cell in N, whatever its sensors measure. The force is rounded
+    /// to 2^-16 N.
     #[must_use]
     pub fn torque_of(&self, joints: &[Q1_14; MAX_JOINTS], newtons: f64) -> [i16; MAX_JOINTS] {
         #[expect(clippy::cast_possible_truncation, reason = "held within what a force can be")]

@@ -1,8 +1,8 @@
-//! The text of a `skin.toml` for chains of a robot and the cells on their links.
+//! Writes the text of a `skin.toml` for chains of a robot and the cells on their links.
 //!
 //! ```text
 //!   Chain, .. ──┐
-//!               ├─> Import ──> toml ──> text that Skin::parse takes
+//!               ├─> Import ──> toml ──> text that Skin::parse accepts
 //!   CellOnLink ─┘
 //! ```
 
@@ -18,80 +18,80 @@ use thiserror::Error;
 use crate::chain::{Chain, Joint};
 use crate::error::RobotError;
 
-/// Cells on a bus, where no other number is asked for: node ids 1 to 250, which leaves some for cells that are added.
+/// The default number of cells per bus: node ids 1 to 250, which leaves some for cells that are added later.
 pub const CELLS_OF_A_BUS: usize = 250;
 
-/// The fastest that a joint is allowed where the URDF says nothing, in rad/s or m/s.
+/// The maximum speed of a joint if the URDF gives none, in rad/s or m/s.
 const MAX_SPEED: f64 = 2.0;
 
-/// A cell where somebody says that it is.
+/// A cell with its position on a link.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CellOnLink {
     /// The link of the URDF.
     pub link: String,
-    /// Where it sits in the link's frame, in m.
+    /// The position in the link's frame, in m.
     pub position: [f64; 3],
-    /// Its outward normal in the same frame, of any length above zero.
+    /// The outward normal in the link's frame, of any length above zero.
     pub normal: [f64; 3],
-    /// Its bus, if that is said.
+    /// The bus, if it is given.
     pub bus: Option<String>,
-    /// Its node id there, if that is said.
+    /// The node id, if it is given.
     pub node: Option<u8>,
     /// The node ids that are wired to its ports, on its bus.
     pub neighbors: [Option<u8>; 4],
-    /// Whether it is wired to the gateway's side.
+    /// True if the cell is wired to the gateway's side.
     pub root: bool,
-    /// The line of the file that says it, for errors.
+    /// The line of the file that defines the cell, for errors.
     pub line: usize,
 }
 
-/// What a skin is made of.
+/// The input for a skin.
 #[derive(Debug)]
 pub struct Import<'a> {
-    /// The robot's name.
+    /// The name of the robot.
     pub name: &'a str,
-    /// What made it, for the first line.
+    /// The command that made the skin, for the first line.
     pub command: &'a str,
-    /// The path of its URDF from where the skin's file will be, if that is known.
+    /// The path of the URDF relative to the skin's file, if it is known.
     pub urdf: Option<&'a str>,
-    /// Its chains; those after the first have their own tip, and may share joints with those before.
+    /// The chains. Those after the first have their own tip, and may share joints with earlier ones.
     pub chains: &'a [Chain],
-    /// The cells, in their order. Without any, there is one on each tip.
+    /// The cells in their order. If there are none, each tip gets one.
     pub cells: &'a [CellOnLink],
 }
 
-/// Why there is no skin.
+/// The error of an import that yields no skin.
 #[derive(Debug, Error)]
 pub enum ImportError {
-    /// The chains have too many joints together.
+    /// The chains together have too many joints.
     #[error(
         "{count} joints move between the root and the tips; a robot has 1 to {MAX_ROBOT_JOINTS}: give fewer --tip"
     )]
     Joints {
-        /// How many.
+        /// The number of joints.
         count: usize,
     },
-    /// A link that carries a cell.
+    /// The link of a cell cannot carry it.
     #[error("{}{error}", at(*line))]
     Link {
         /// The line of the file of cells.
         line: usize,
-        /// What is wrong with it.
+        /// The error of the link.
         error: RobotError,
     },
-    /// A normal without a direction.
+    /// A normal has no direction.
     #[error("{}the normal nx,ny,nz = {x},{y},{z} has no direction: it must be longer than 0", at(*line))]
     Normal {
         /// The line of the file of cells.
         line: usize,
-        /// Its x.
+        /// The x component.
         x: f64,
-        /// Its y.
+        /// The y component.
         y: f64,
-        /// Its z.
+        /// The z component.
         z: f64,
     },
-    /// One bus for cells of two chains.
+    /// Cells of two chains are on one bus.
     #[error(
         "{}bus {bus:?} carries chain {first:?} already, and this cell sits on chain {second:?}: name another bus",
         at(*line)
@@ -106,7 +106,7 @@ pub enum ImportError {
         /// The chain of this cell.
         second: String,
     },
-    /// A bus has no number left.
+    /// A bus has no free node id.
     #[error("{}bus {bus:?} has no node id left: it has 254", at(*line))]
     Full {
         /// The line of the file of cells.
@@ -114,19 +114,19 @@ pub enum ImportError {
         /// The bus.
         bus: String,
     },
-    /// Two cells with the same node.
+    /// Two cells have the same node id.
     #[error("{}node {node} of bus {bus:?} is that of line {first} already: give it another one, or none", at(*line))]
     Taken {
         /// The line of the file of cells.
         line: usize,
         /// The bus.
         bus: String,
-        /// The node.
+        /// The node id.
         node: u8,
         /// The line of the cell that has it.
         first: usize,
     },
-    /// No interface can have the name.
+    /// The name of the bus is not possible for an interface.
     #[error("{}bus {bus:?}: its name has 1 to 15 letters, digits, `-`, `_` or `.`, and does not begin with `.`", at(*line))]
     BusName {
         /// The line of the file of cells.
@@ -134,7 +134,7 @@ pub enum ImportError {
         /// The bus.
         bus: String,
     },
-    /// A cell that is too far away.
+    /// A cell is too far away.
     #[error(
         "{}position px,py,pz = {x},{y},{z} of link {link:?} can come {reach:.3} m from a frame of the rows below \
          it, if all joints turn freely; less than {REACH} m is possible: correct it, or choose a root nearer to the link",
@@ -145,39 +145,40 @@ pub enum ImportError {
         line: usize,
         /// The link.
         link: String,
-        /// Its x in the link's frame, in m.
+        /// The x coordinate in the link's frame, in m.
         x: f64,
-        /// Its y.
+        /// The y coordinate.
         y: f64,
-        /// Its z.
+        /// The z coordinate.
         z: f64,
-        /// In m.
+        /// The distance that the cell can reach, in m.
         reach: f64,
     },
-    /// The skin's check refuses cells or buses.
+    /// The check of the skin refuses cells or buses.
     #[error("{}{what}", at(*line))]
     Cells {
-        /// The line of the file of cells, 0 for all of it.
+        /// The line of the file of cells; 0 for the whole file.
         line: usize,
-        /// What it says.
+        /// The message of the check.
         what: String,
     },
-    /// The skin's check refuses the robot.
+    /// The check of the skin refuses the robot.
     #[error("{what}")]
     Robot {
-        /// What it says.
+        /// The message of the check.
         what: String,
     },
 }
 
 impl ImportError {
-    /// Whether the cells are wrong, and not the robot.
+    /// Returns true if the cells are wrong, rather than the robot.
     #[must_use]
     pub const fn is_of_cells(&self) -> bool {
         !matches!(self, Self::Joints { .. } | Self::Robot { .. })
     }
 
-    /// What the check of the skin's text says, by the lines of the cells: nobody sees that text.
+    /// Converts an error of the skin's check, and refers it to the lines of the cells, because the user does not see
+    /// the text of the skin.
     fn of_check(error: DocumentError, cells: &[CellOnLink], buses: &[Bus]) -> Self {
         let DocumentError::Wrong { what, .. } = error else { return Self::Robot { what: error.to_string() } };
         let lines_of_buses = || buses.iter().map(|bus| bus.line);
@@ -193,18 +194,18 @@ impl ImportError {
     }
 }
 
-/// Number and key of `cell[3].node = 7: ...`.
+/// Splits `cell[3].node = 7: ...` into the number and the rest.
 fn numbered<'a>(what: &'a str, table: &str) -> Option<(usize, &'a str)> {
     let (number, rest) = what.strip_prefix(table)?.strip_prefix('[')?.split_once(']')?;
     Some((number.parse().ok()?, rest.trim_start_matches('.')))
 }
 
-/// The line of a cell in an error; cells that no file names have none.
+/// Formats the line of a cell in an error; empty for cells without a file.
 fn at(line: usize) -> String {
     if line == 0 { String::new() } else { format!("line {line}: ") }
 }
 
-/// A cell with its place on a chain.
+/// A cell with its position on a chain.
 struct Placed<'a> {
     cell: &'a CellOnLink,
     bus: usize,
@@ -216,24 +217,24 @@ struct Placed<'a> {
     normal: [f64; 3],
 }
 
-/// A bus as it fills.
+/// A bus while cells are assigned to it.
 struct Bus {
     name: String,
     chain: usize,
     /// The line of its first cell.
     line: usize,
-    /// Nodes, and the lines of their cells.
+    /// The used node ids, with the lines of their cells.
     taken: Vec<(u8, usize)>,
-    /// Whether it was named, or comes from the count of cells.
+    /// True if a cell names the bus, false if the number of cells requires it.
     named: bool,
 }
 
 impl Import<'_> {
-    /// The text of the skin; the same for the same chains and cells.
+    /// Returns the text of the skin. The result is deterministic.
     ///
     /// # Errors
-    /// When a cell sits on a link that no chain moves, or has no direction, or there is no room on its bus, or what comes
-    /// out is no skin.
+    /// Returns [`ImportError`] if a cell is on a link that no chain moves, if its normal has no direction, if its bus
+    /// is full, or if the result is not a valid skin.
     pub fn toml(&self) -> Result<String, ImportError> {
         let count = self.joints().len();
         if count > MAX_ROBOT_JOINTS {
@@ -250,7 +251,7 @@ impl Import<'_> {
         }
     }
 
-    /// The first chain whose link it is, and its bus.
+    /// Assigns a cell to the first chain that moves its link, and to a bus.
     fn place<'a>(&self, cell: &'a CellOnLink, buses: &mut Vec<Bus>) -> Result<Placed<'a>, ImportError> {
         let line = cell.line;
         let mut found = None;
@@ -300,7 +301,7 @@ impl Import<'_> {
         Ok(Placed { cell, bus, node, chain, joint, row, position: position.into(), normal: normal.into() })
     }
 
-    /// The bus of a cell: the one that it names, or the last of its chain that is not full.
+    /// Returns the bus of a cell: the one that it names, or the last one of its chain that has room.
     fn bus(&self, cell: &CellOnLink, chain: usize, buses: &mut Vec<Bus>) -> Result<usize, ImportError> {
         let name = |chain: usize| self.chains.get(chain).map_or_else(String::new, |chain| chain.tip.clone());
         if let Some(named) = &cell.bus {
@@ -333,7 +334,7 @@ impl Import<'_> {
         Ok(buses.len() - 1)
     }
 
-    /// The joints of all chains, each once.
+    /// Returns the joints of all chains, each once.
     fn joints(&self) -> Vec<&Joint> {
         let mut joints: Vec<&Joint> = Vec::new();
         for joint in self.chains.iter().flat_map(|chain| &chain.joints) {
@@ -409,7 +410,7 @@ impl Import<'_> {
     }
 }
 
-/// Adds a chain: where it begins, and its rows.
+/// Adds a chain: its base and its rows.
 fn add_chain(draft: &mut Draft, chain: &Chain) {
     draft.table("[[robot.chain]]", Some("standard Denavit-Hartenberg, base to tip; m, rad"));
     draft.set("name", Value::Text(&chain.tip));
@@ -428,18 +429,18 @@ fn add_chain(draft: &mut Draft, chain: &Chain) {
     draft.set_rows("rows", None, rows);
 }
 
-/// The row of a joint, both from 1.
+/// Returns the row of a joint, both from 1.
 fn row_of(chain: &Chain, joint: usize) -> Option<usize> {
     let moving = chain.rows.iter().enumerate().filter(|(_, row)| row.kind != RowKind::Fixed);
     moving.map(|(index, _)| index + 1).nth(joint.checked_sub(1)?)
 }
 
-/// A cell at the origin of a chain's tip, which faces along z.
+/// Returns a cell at the origin of a chain's tip, which faces along z.
 fn on_tip(chain: &Chain) -> CellOnLink {
     CellOnLink { link: chain.tip.clone(), normal: [0.0, 0.0, 1.0], ..CellOnLink::default() }
 }
 
-/// What is left of rounding is nothing; never minus zero.
+/// Removes rounding residues and negative zeros.
 fn tidy(value: f64) -> f64 {
     if value.abs() < 1e-12 { 0.0 } else { value }
 }

@@ -1,4 +1,4 @@
-//! What is wrong with a robot's file, or with the chain that was asked for.
+//! Errors in a robot's file, or in a requested chain.
 
 use thiserror::Error;
 
@@ -7,39 +7,39 @@ use protocol::skin::REACH;
 
 use crate::rows::{MAX_LENGTH_M, MAX_RESIDUAL};
 
-/// What is wrong, and in which file: one line.
+/// An error in a file, in one line.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[error("{file}{}: {problem}", line.map_or_else(String::new, |line| format!(":{line}")))]
 pub struct RobotError {
-    /// The file's name, as it was given.
+    /// The name of the file, as it was given.
     pub file: String,
-    /// The line, from 1, where the file has it.
+    /// The line, from 1, if it is known.
     pub line: Option<u32>,
-    /// What is wrong.
+    /// The problem.
     pub problem: Box<Problem>,
 }
 
 impl RobotError {
-    /// An error in a file.
+    /// Creates an error in a file.
     pub(crate) fn new(file: &str, line: Option<u32>, problem: Problem) -> Self {
         Self { file: file.to_owned(), line, problem: Box::new(problem) }
     }
 }
 
-/// What is wrong with a robot's file, or with a chain of it.
+/// A problem in a robot's file, or in a chain of it.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum Problem {
-    /// There is nothing in the file.
+    /// The file is empty.
     #[error("the file is empty; a URDF has a robot element with links and joints")]
     Empty,
-    /// It does not begin as XML does.
+    /// The file does not begin as XML does.
     #[error("not XML: a URDF begins with <?xml or <robot, and this does not; name the robot's URDF")]
     NotXml,
-    /// It is not XML that can be read: what there is, and what to do.
+    /// The file is not readable XML, with the fault and the action to take.
     #[error("{0}")]
     Xml(String),
-    /// It is a template of a URDF.
+    /// The file is a template of a URDF.
     #[error(
         "{what} is left: this is a xacro file, a template of a URDF. Make one with `xacrodoc {file} -o NEW.urdf` (pip install xacrodoc), and name that"
     )]
@@ -49,13 +49,13 @@ pub enum Problem {
         /// The file.
         file: String,
     },
-    /// It is XML of another kind.
+    /// The file is XML of another kind.
     #[error("the outermost element is {0}; a URDF has `robot`: name the robot's URDF")]
     NotARobot(String),
-    /// It says which of a robot's joints belong together.
+    /// The file is an SRDF, which defines groups of a robot's joints.
     #[error("an SRDF file, of MoveIt, which has no links: name the robot's URDF")]
     Srdf,
-    /// There are no links.
+    /// The robot has no links.
     #[error("the robot has no links; a URDF has at least one")]
     NoLinks,
     /// An element or attribute is missing.
@@ -63,22 +63,22 @@ pub enum Problem {
     Missing {
         /// The element.
         thing: String,
-        /// What it lacks.
+        /// The missing part.
         missing: &'static str,
     },
-    /// A value is not what is allowed.
+    /// A value is not allowed.
     #[error("{thing}: {attribute} = {value:?}: {allowed}")]
     Value {
         /// The element.
         thing: String,
         /// The attribute.
         attribute: &'static str,
-        /// What it says.
+        /// The value.
         value: String,
-        /// What is allowed.
+        /// The allowed values.
         allowed: String,
     },
-    /// A name is there twice.
+    /// A name occurs twice.
     #[error("two {what}s are named {name:?}; each needs a name of its own: rename one")]
     Duplicate {
         /// `link` or `joint`.
@@ -93,9 +93,9 @@ pub enum Problem {
         joint: String,
         /// `parent` or `child`.
         role: &'static str,
-        /// The name.
+        /// The name of the link.
         link: String,
-        /// Names like it.
+        /// Similar names.
         nearest: String,
     },
     /// Two joints move the same link.
@@ -105,41 +105,41 @@ pub enum Problem {
     TwoParents {
         /// The link.
         link: String,
-        /// A joint.
+        /// The first joint.
         first: String,
-        /// Another.
+        /// The second joint.
         second: String,
     },
-    /// Links are each other's parents.
+    /// A link is its own ancestor.
     #[error("link {0:?} is above itself; links must be a tree: remove a joint of the cycle")]
     Cycle(String),
-    /// There are two trees.
+    /// The links form two trees.
     #[error(
         "the links {first:?} and {second:?} have no parent; one root is allowed: connect them with a fixed joint"
     )]
     TwoRoots {
-        /// A root.
+        /// The first root.
         first: String,
-        /// Another.
+        /// The second root.
         second: String,
     },
-    /// A link is asked for that does not exist.
+    /// A requested link does not exist.
     #[error("there is no link {link:?}; the nearest are {nearest}")]
     NoSuchLink {
-        /// What was asked for.
+        /// The requested name.
         link: String,
-        /// Names like it.
+        /// Similar names.
         nearest: String,
     },
-    /// A joint is asked for that does not exist, or does not move by itself.
+    /// A requested joint does not exist, or does not move by itself.
     #[error("no joint {joint:?} moves; the nearest are {nearest}")]
     NoSuchJoint {
-        /// What was asked for.
+        /// The requested name.
         joint: String,
-        /// Names like it.
+        /// Similar names.
         nearest: String,
     },
-    /// A chain of a skin is another one than that of the file.
+    /// A chain of a skin differs from that of the file.
     #[error(
         "behind joint {joint:?} it is not where chain {chain:?} of the skin has it: import the skin from this file again, or correct the rows"
     )]
@@ -149,14 +149,14 @@ pub enum Problem {
         /// The chain.
         chain: String,
     },
-    /// The chain's end is not below its start.
+    /// The tip of the chain is not below its root.
     #[error("link {tip:?} is not below {root:?}; the path to it is {path}: choose a root on it")]
     NotBelow {
-        /// The chain's end.
+        /// The tip.
         tip: String,
-        /// The chain's start.
+        /// The root.
         root: String,
-        /// The links above the end, from the root.
+        /// The links above the tip, from the root.
         path: String,
     },
     /// No joint of the chain moves.
@@ -164,9 +164,9 @@ pub enum Problem {
         "no joint moves between {root:?} and {tip:?}; 1 to {MAX_JOINTS} are needed: choose a tip farther out, or a root nearer to the base"
     )]
     NoMovingJoint {
-        /// The chain's start.
+        /// The root of the chain.
         root: String,
-        /// The chain's end.
+        /// The tip of the chain.
         tip: String,
     },
     /// The chain has too many joints.
@@ -174,11 +174,11 @@ pub enum Problem {
         "{count} joints move between {root:?} and {tip:?}; {MAX_JOINTS} are possible: choose a root or a tip nearer to the other"
     )]
     TooManyJoints {
-        /// How many.
+        /// The number of joints.
         count: usize,
-        /// The chain's start.
+        /// The root of the chain.
         root: String,
-        /// The chain's end.
+        /// The tip of the chain.
         tip: String,
     },
     /// The chain needs too many rows.
@@ -186,9 +186,9 @@ pub enum Problem {
         "the chain to {tip:?} needs {count} rows; {MAX_ROWS} are possible: choose a root or a tip nearer to the other"
     )]
     TooManyRows {
-        /// How many.
+        /// The number of rows.
         count: usize,
-        /// The chain's end.
+        /// The tip of the chain.
         tip: String,
     },
     /// A joint of the chain has several degrees of freedom.
@@ -208,10 +208,10 @@ pub enum Problem {
     Mimic {
         /// The joint.
         joint: String,
-        /// The one that it follows.
+        /// The joint that it follows.
         of: String,
     },
-    /// A joint says nothing of its limits.
+    /// A joint has no limits.
     #[error(
         "joint {joint:?} has no limits: add <limit lower=\"..\" upper=\"..\"/>, or make the joint continuous or fixed"
     )]
@@ -226,25 +226,25 @@ pub enum Problem {
     Limits {
         /// The joint.
         joint: String,
-        /// In rad or m.
+        /// The lower limit, in rad or m.
         lower: f64,
-        /// In rad or m.
+        /// The upper limit, in rad or m.
         upper: f64,
     },
-    /// A length does not fit a cell's words.
+    /// A length exceeds the range of a cell's parameters.
     #[error(
         "row {row}, to {to}: {what} = {value:.3} m; [-{MAX_LENGTH_M}, {MAX_LENGTH_M}) m is possible: {hint}"
     )]
     Length {
         /// The row, from 1.
         row: usize,
-        /// The joint that comes next, or the tip.
+        /// The next joint, or the tip.
         to: String,
         /// `a` or `d`, or `d` with the joint at a limit.
         what: &'static str,
-        /// In m.
+        /// The length in m.
         value: f64,
-        /// The hint, as an order.
+        /// The action to take.
         hint: &'static str,
     },
     /// The chain is longer than a cell can compute.
@@ -254,17 +254,17 @@ pub enum Problem {
     Reach {
         /// The link.
         link: String,
-        /// In m.
+        /// The reach in m.
         reach: f64,
     },
-    /// Rows and URDF do not agree.
+    /// Rows and URDF differ.
     #[error(
         "the rows differ by {residual:.1e} m or rad from the URDF at link {link:?}; {MAX_RESIDUAL:.0e} is allowed: please report this robot"
     )]
     Residual {
         /// The link.
         link: String,
-        /// In m or rad.
+        /// The difference in m or rad.
         residual: f64,
     },
     /// A link does not move.
@@ -274,7 +274,7 @@ pub enum Problem {
     BeforeFirstJoint {
         /// The link.
         link: String,
-        /// The chain's first joint.
+        /// The first joint of the chain.
         joint: String,
     },
     /// A link moves, but not with the chain.
@@ -286,17 +286,17 @@ pub enum Problem {
         link: String,
         /// The joint.
         joint: String,
-        /// The chain's start.
+        /// The root of the chain.
         root: String,
-        /// The chain's end.
+        /// The tip of the chain.
         tip: String,
     },
-    /// A link that is not above nor below anything of the chain.
+    /// A link is not below the root of the chain.
     #[error("link {link:?} is not below the chain's root {root:?}: choose a root above it")]
     AboveChain {
         /// The link.
         link: String,
-        /// The chain's start.
+        /// The root of the chain.
         root: String,
     },
 }

@@ -1,5 +1,5 @@
-//! Robots as others describe them: a URDF file is read, and a chain of its joints is turned into standard
-//! Denavit-Hartenberg rows. Nothing here opens a file.
+//! Reads robots from URDF text, and converts a chain of joints into standard Denavit-Hartenberg rows. This crate opens
+//! no files.
 //!
 //! ```
 //! # fn main() -> Result<(), robots::RobotError> {
@@ -21,11 +21,11 @@
 //!
 //! | module | what |
 //! |---|---|
-//! | `urdf` | the file: links, joints, shapes, and its own kinematics |
-//! | `describe` | the text of a skin for chains and cells |
-//! | `links` | each link on its parent, for the positions of joints |
-//! | `taken` | names that have to be unique where they are written |
-//! | `written` | the text of a URDF for the chains of a skin |
+//! | `urdf` | a parsed file: links, joints, shapes, and its own kinematics |
+//! | `describe` | writing a skin for chains and cells |
+//! | `links` | the pose of each link on its parent, for given positions of joints |
+//! | `taken` | unique names for output |
+//! | `written` | writing a URDF for the chains of a skin |
 //! | `chain` | the joints between two links, with rows and the frame of each link |
 //! | `rows` | rows, and how one axis leads to the next |
 

@@ -1,4 +1,4 @@
-//! A robot's links on their parents, for the positions of some of its joints.
+//! The poses of a robot's links on their parents, for given positions of some joints.
 
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
@@ -9,19 +9,19 @@ use crate::urdf::{Kind, Urdf, UrdfJoint};
 /// A link on its parent.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LinkPose {
-    /// The link that it is on.
+    /// The parent link.
     pub parent: String,
     /// The link.
     pub child: String,
-    /// From the parent to the child, with the joint at zero.
+    /// The transform from the parent to the link, with the joint at zero.
     origin: Isometry3<f64>,
     motion: Option<Motion>,
 }
 
-/// How a link moves on its parent.
+/// The motion of a link on its parent.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Motion {
-    /// Which of the joints moves it.
+    /// The index of the joint that moves the link.
     joint: usize,
     slides: bool,
     axis: Unit<Vector3<f64>>,
@@ -30,13 +30,13 @@ struct Motion {
 }
 
 impl LinkPose {
-    /// Whether one of the joints moves it.
+    /// Returns true if one of the joints moves the link.
     #[must_use]
     pub const fn moves(&self) -> bool {
         self.motion.is_some()
     }
 
-    /// From the parent to the child, with the joints at these positions in rad or m.
+    /// Returns the transform from the parent to the link, with the joints at these positions in rad or m.
     #[must_use]
     pub fn at(&self, positions: &[f64]) -> Isometry3<f64> {
         let Some(Motion { joint, slides, axis, multiplier, offset }) = self.motion else {
@@ -52,10 +52,11 @@ impl LinkPose {
 }
 
 impl Urdf {
-    /// All links but the root, each on its parent. These joints move, and those that mimic them; all others are at rest.
+    /// Returns the poses of all links except the root on their parents. The given joints and those that mimic them
+    /// move; all others are at rest.
     ///
     /// # Errors
-    /// When one of the joints does not exist, or does not move by itself.
+    /// Returns [`RobotError`] if one of the joints does not exist, or does not move by itself.
     pub fn link_poses(&self, joints: &[&str]) -> Result<Vec<LinkPose>, RobotError> {
         for name in joints {
             self.moving(name)?;
@@ -80,10 +81,10 @@ impl Urdf {
         Ok(self.joints().iter().map(pose).collect())
     }
 
-    /// The link that a joint moves.
+    /// Returns the link that a joint moves.
     ///
     /// # Errors
-    /// When there is no such joint, or it does not move by itself.
+    /// Returns [`RobotError`] if the joint does not exist, or does not move by itself.
     pub fn link_of(&self, joint: &str) -> Result<&str, RobotError> {
         Ok(self.link_name(self.moving(joint)?.child))
     }

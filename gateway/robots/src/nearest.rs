@@ -1,9 +1,9 @@
-//! Names that a mistyped one may have meant.
+//! Suggestions for mistyped names.
 
-/// How many names are proposed.
+/// The maximum number of suggested names.
 const PROPOSED: usize = 3;
 
-/// The names that are nearest to one that does not exist, nearest first, at most three; as a list in words.
+/// Lists the names that are most similar to a mistyped one, nearest first, at most three.
 pub(crate) fn nearest<'a>(target: &str, names: impl IntoIterator<Item = &'a str>) -> String {
     let target = target.to_lowercase();
     let mut found: Vec<_> =
@@ -17,7 +17,7 @@ pub(crate) fn nearest<'a>(target: &str, names: impl IntoIterator<Item = &'a str>
     }
 }
 
-/// The fewest characters to insert, delete or replace that turn one word into the other.
+/// Returns the smallest number of characters to insert, delete or replace that turns one word into the other.
 fn edits(from: &str, to: &str) -> usize {
     let to: Vec<_> = to.chars().collect();
     let mut row: Vec<_> = (0..=to.len()).collect();

@@ -1,4 +1,4 @@
-//! Rows compared with the URDF's own kinematics.
+//! Compares rows with the URDF's own kinematics.
 
 use core::f64::consts::TAU;
 
@@ -9,13 +9,13 @@ use crate::chain::{Hanging, behind};
 use crate::urdf::UrdfJoint;
 use protocol::skin::JointKind;
 
-/// Positions of the joints at which they are compared, besides zero and the limits.
+/// The number of random joint positions for the comparison, besides zero and the limits.
 const RANDOM_POSITIONS: usize = 64;
 
-/// The largest difference, and where.
+/// The largest difference, and the link where it occurs.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Residual {
-    /// In m or rad.
+    /// The difference in m or rad.
     pub(crate) residual: f64,
     /// The link.
     pub(crate) link: String,
@@ -31,7 +31,7 @@ pub(crate) fn residual(chain: &Chain, path: &[&UrdfJoint], hanging: &[Hanging]) 
             let urdf = joint.checked_sub(1).and_then(|index| behind.get(index)).map(|pose| pose * fixed);
             let rows = frames.get(found.row).map(|frame| frame * found.frame);
             let residual = urdf.zip(rows).map_or(f64::INFINITY, |(urdf, rows)| difference(&urdf, &rows));
-            // Not a number is the worst.
+            // NaN counts as the largest difference.
             if residual.is_nan() || residual > worst.residual {
                 worst = Residual { residual, link: link.clone() };
             }
@@ -40,15 +40,15 @@ pub(crate) fn residual(chain: &Chain, path: &[&UrdfJoint], hanging: &[Hanging]) 
     worst
 }
 
-/// The greater of the distance in m and the angle in rad between two frames.
+/// Returns the greater of the distance in m and the angle in rad between two frames.
 pub(crate) fn difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
     let turn = one.rotation.rotation_to(&other.rotation);
-    // Not by the cosine: that of a small angle has lost it.
+    // The cosine of a small angle would lose its digits.
     let angle = 2.0 * turn.imag().norm().atan2(turn.scalar().abs());
     (one.translation.vector - other.translation.vector).norm().max(angle)
 }
 
-/// Zero, the limits, and positions within them, always the same.
+/// Returns zero, the limits, and reproducible positions between them.
 fn positions(chain: &Chain) -> Vec<Vec<f64>> {
     let limits = chain.joints.iter().map(|joint| match joint.kind {
         JointKind::Revolute => joint.limits.map(|limit| limit.clamp(-TAU, TAU)),
@@ -62,7 +62,7 @@ fn positions(chain: &Chain) -> Vec<Vec<f64>> {
     ];
     let mut state = 1_u64;
     let mut uniform = |[lower, upper]: &[f64; 2]| {
-        // Knuth's linear congruential generator; its upper 32 bits.
+        // Knuth's linear congruential generator; the upper 32 bits are used.
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         let high = u32::try_from(state >> 32).unwrap_or_default();
         lower + (upper - lower) * f64::from(high) / f64::from(u32::MAX)

@@ -1,22 +1,23 @@
-//! Names that have to be unique where they are written.
+//! Unique names for output.
 
 use std::collections::BTreeSet;
 
 use protocol::skin::Skin;
 
-/// Names that are taken.
+/// A set of used names.
 #[derive(Clone, Debug, Default)]
 pub struct Taken(BTreeSet<String>);
 
 impl Taken {
-    /// Gives out these names, in their order. A name that is taken, also by one before it, gets a number: `name_2`.
+    /// Returns unique names for the requested ones, in their order. A name that is already used, also by an earlier one
+    /// in the list, gets a number: `name_2`.
     pub fn give(&mut self, requested: Vec<String>) -> Vec<String> {
         let is_free: Vec<_> = requested.iter().map(|name| self.0.insert(name.clone())).collect();
         let numbered = requested.into_iter().zip(is_free);
         numbered.map(|(name, is_free)| if is_free { name } else { self.numbered(&name) }).collect()
     }
 
-    /// Gives out a name.
+    /// Returns a unique name for the requested one.
     pub fn give_one(&mut self, name: String) -> String {
         if self.0.insert(name.clone()) { name } else { self.numbered(&name) }
     }
@@ -33,13 +34,13 @@ impl Taken {
     }
 }
 
-/// A name as a frame or a topic may have it.
+/// Replaces characters of a name that frames and topics do not allow.
 #[must_use]
 pub fn word(name: &str) -> String {
     name.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '_' }).collect()
 }
 
-/// The words that stand for the chains of a skin in names of links, each another one; empty for an only chain.
+/// Returns unique words for the chains of a skin in the names of links; empty if there is only one chain.
 #[must_use]
 pub fn chain_words(skin: &Skin) -> Vec<String> {
     let chains = &skin.robot.chains;

@@ -1,8 +1,9 @@
-//! A URDF for the chains of a skin, of which no other is known.
+//! Writes a URDF for the chains of a skin that has none.
 //!
-//! Each row is one joint: its origin is what does not move of the row before it, `Rz(theta_offset) Tz(d) Tx(a) Rx(alpha)`, and its
-//! axis is z. Behind the last row there is a link `tip`. Chains that begin with the same joints and rows share their links; a
-//! joint that is on two chains in different places is one of the second that mimics it.
+//! Each row is one joint: its origin is the constant part of the row before it, `Rz(theta_offset) Tz(d) Tx(a)
+//! Rx(alpha)`, and its axis is z. After the last row there is a link `tip`. Chains that begin with the same joints and
+//! rows share their links. A joint that two chains have in different places is written for the second chain as one that
+//! mimics it.
 
 use core::fmt::Write;
 
@@ -16,23 +17,23 @@ use crate::taken::chain_words;
 
 /// The link that all chains are on.
 const BASE: &str = "base";
-/// The radius of what is drawn of a link, in m.
+/// The radius of the drawn shapes, in m.
 const RADIUS_M: f64 = 0.04;
-/// What is shorter is not drawn, in m.
+/// Shorter segments are not drawn, in m.
 const SHORTEST_M: f64 = 1e-3;
-/// The effort that URDF requires a limit for, in Nm or N: none is known.
+/// The effort limit in Nm or N. URDF requires one, and a skin has none.
 const EFFORT: f64 = 1000.0;
 
-/// A URDF and what its links are called.
+/// A URDF and the names of its links.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Written {
-    /// Its text.
+    /// The text.
     pub xml: String,
-    /// By chain, the link that each of its joints moves.
+    /// By chain: the link that each of its joints moves.
     pub links: Vec<Vec<String>>,
 }
 
-/// From a link to a joint on it, as URDF has it: lengths in m; roll, pitch and yaw in rad.
+/// The transform from a link to a joint on it, as URDF has it: lengths in m; roll, pitch and yaw in rad.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Origin {
     xyz: [f64; 3],
@@ -40,7 +41,7 @@ struct Origin {
 }
 
 impl Origin {
-    /// What does not move of a row.
+    /// Returns the constant part of a row.
     fn of_row(row: &Row) -> Self {
         let (sine, cosine) = row.theta_offset.sin_cos();
         Self { xyz: [row.a * cosine, row.a * sine, row.d], rpy: [row.alpha, 0.0, row.theta_offset] }
@@ -57,7 +58,7 @@ impl Origin {
 }
 
 fn three(numbers: [f64; 3]) -> String {
-    // Adding zero takes the sign from a negative zero.
+    // Adding zero removes the sign of a negative zero.
     numbers.map(|number| format!("{}", number + 0.0)).join(" ")
 }
 
@@ -65,16 +66,16 @@ fn three(numbers: [f64; 3]) -> String {
 struct Joint {
     parent: String,
     origin: Origin,
-    /// Which joint of the robot it is, unless it is fixed.
+    /// The index of the robot's joint, unless it is fixed.
     moved: Option<usize>,
     link: String,
-    /// Its element, without its origin and links.
+    /// The attributes and contents of its element, without its origin and links.
     name: String,
     kind: &'static str,
     inner: String,
 }
 
-/// Describes the chains of a skin.
+/// Writes a URDF for the chains of a skin.
 #[must_use]
 pub fn written(skin: &Skin) -> Written {
     let robot = &skin.robot;
@@ -109,7 +110,7 @@ pub fn written(skin: &Skin) -> Written {
     Written { xml: xml(&robot.name, &joints), links }
 }
 
-/// A joint between a link and a new one.
+/// Returns a joint between a link and a new one.
 fn joint(
     skin: &Skin,
     before: &[Joint],
@@ -172,7 +173,7 @@ fn xml(name: &str, joints: &[Joint]) -> String {
     out
 }
 
-/// What is drawn between a link's origin and the next joint.
+/// Draws the segment between a link's origin and the next joint.
 fn segment(out: &mut String, to: [f64; 3]) {
     let way = Vector3::from(to);
     let length = way.norm();

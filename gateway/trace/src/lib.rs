@@ -1,13 +1,13 @@
-//! Files: captures in every format, recordings, and how files appear whole.
+//! Files of the bench: captures in both formats, recordings of runs, and files that are replaced atomically.
 //!
 //! | module | what |
 //! |---|---|
-//! | [`capture`] | captures read and written: candump text and MCAP, in one piece or in parts |
+//! | [`capture`] | reading and writing captures: candump text and MCAP, whole or in parts |
 //! | [`container`] | the checked reader of MCAP records |
 //! | [`recording`] | recordings of a run: their files, parts, names, and recovery |
 //! | [`ros2`] | the ROS 2 messages in them, in CDR |
-//! | [`files`] | files that appear whole, and logs that grow |
-//! | [`order`] | frames in the order of their times |
+//! | [`files`] | files that are replaced atomically, and logs that grow |
+//! | [`order`] | merging of buses by the times of their frames |
 
 pub mod capture;
 pub mod container;

@@ -1,39 +1,40 @@
-//! What stands between frames: comments, frames that are missing, lines that are no frame.
+//! Notes between the frames of a capture: comments, lost frames, lines that are not frames.
 
-/// What stands between frames.
+/// An entry between the frames of a capture.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Note<'a> {
-    /// What it is.
+    /// The kind of the note.
     pub kind: NoteKind,
-    /// When, in ns since 1970; in a log, the time of the frame before it, 0 before the first one.
+    /// The time, in ns since 1970. In a log, the time of the frame before it, or 0 before the first frame.
     pub nanos: u64,
-    /// The bus, when it is about one; else empty.
+    /// The bus that the note is about, or empty.
     pub interface: &'a str,
-    /// Its line in a log, from 1; 0 when it comes from none.
+    /// The line number in a log, from 1; 0 if the note does not come from a log.
     pub line: u64,
-    /// The line as it stands in the log, without its end; or words of whoever recorded it.
+    /// The line as it stands in the log, without its end; or a text of the recorder.
     pub text: &'a [u8],
 }
 
-/// What a note is.
+/// The kind of a note.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum NoteKind {
-    /// A comment, an empty line, anything that can-utils skip too.
+    /// A comment, an empty line, or anything else that can-utils skip too.
     Text,
-    /// So many frames are missing here: whoever took the capture lost them.
+    /// The number of frames that the recorder of the capture lost here.
     Dropped(u64),
-    /// A CAN XL frame, which is not read.
+    /// A CAN XL frame, which is not decoded.
     CanXl,
-    /// A line that begins like a frame and is none, and why.
+    /// A line that begins like a frame but cannot be parsed, with the reason.
     Unreadable(String),
 }
 
-/// What a recorder notes of a bus, as a text: its frames are missing from then to when it works again.
+/// A recorder's note on the state of a bus. Frames of the bus are missing between [`BusNote::Lost`] and
+/// [`BusNote::Back`].
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum BusNote {
-    /// It was lost.
+    /// The bus was lost.
     Lost,
-    /// It works again.
+    /// The bus works again.
     Back,
 }
 
@@ -47,17 +48,17 @@ impl BusNote {
         }
     }
 
-    /// The text.
+    /// Returns the text of the note.
     #[must_use]
     pub fn text(self, bus: &str) -> String {
         format!("{START}{bus}{}", self.end())
     }
 
-    /// The bus that a note says this of.
+    /// Parses a note. Returns the bus and its new state, or `None` if the note is another one.
     #[must_use]
     pub fn of<'a>(note: &Note<'a>) -> Option<(&'a str, Self)> {
         let text = core::str::from_utf8(note.text).ok().filter(|_| note.kind == NoteKind::Text)?;
-        // In a log it is a comment.
+        // In a log the note is a comment.
         let text = text.strip_prefix("# ").unwrap_or(text);
         let of = |it: Self| Some((text.strip_prefix(START)?.strip_suffix(it.end())?, it));
         Self::ALL.into_iter().find_map(of)

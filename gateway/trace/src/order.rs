@@ -1,45 +1,45 @@
-//! Frames in the order of their times, with bounded memory.
+//! Merges the frames of several buses by time, in bounded memory.
 //!
 //! ```text
-//!   frames in the capture's order ──> push ──> [ window ] ──> pop ──> frames in the order in which they are sent
+//! frames in the capture's order ──> push ──> [ window ] ──> pop ──> frames in the order in which they are sent
 //! ```
 //!
-//! A recorder of several buses reads them in turn, so in a capture the frames of one bus are in the bus' order, and
-//! those of two may not be in the order of their times. So the buses are merged by time, and no bus' own order is
-//! changed: frames that a cell received before the joints must come before the joints again, whatever their time
-//! stamps are. Frames of the same time keep the capture's order.
+//! A recorder of several buses reads them in turn. In a capture the frames of one bus are therefore in the order of the
+//! bus, but those of two buses may not be in the order of their times. The merge is by time, and it never changes the
+//! order of one bus: frames that a cell received before the joints must come before the joints again, whatever their
+//! time stamps are. Frames of the same time keep the capture's order.
 
 use std::collections::BTreeMap;
 
-/// A frame waits until one has been read that is so much newer, in ns.
+/// The age at which a frame is released, in ns: a frame waits until one that is newer by this much has been read.
 pub const WINDOW_NS: u64 = 1_000_000_000;
-/// At most so many frames wait.
+/// The maximum number of waiting frames.
 pub const WINDOW_FRAMES: usize = 8_192;
 
-/// The next one to be sent.
+/// The next frame to be sent.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Ordered<T> {
-    /// When, by the capture's clock; never before the one before it.
+    /// The time to send it, by the capture's clock; never before that of the frame before it.
     pub at: u64,
-    /// Its own time.
+    /// The frame's own time.
     pub nanos: u64,
-    /// Whether one that is newer came before it: then it is sent at once.
+    /// True if a newer frame was released before it; the frame is then sent at once.
     pub is_late: bool,
-    /// What it is.
+    /// The frame.
     pub item: T,
 }
 
 /// Merges buses by time.
 #[derive(Clone, Debug)]
 pub struct Order<T> {
-    /// Those that wait, by their time, or that of a frame before them on their bus when that was later, and by where
-    /// they stood in the capture: their own time, and what they are.
+    /// Waiting frames with their own times. The key is the time, or the latest time before it on the same bus, and the
+    /// position in the capture.
     waiting: BTreeMap<(u64, u64), (u64, T)>,
     /// The latest time so far on each bus.
     buses: Vec<u64>,
     places: u64,
     newest: u64,
-    /// The time of the last one that came out.
+    /// The time of the last released frame.
     released: u64,
 }
 
@@ -50,7 +50,7 @@ impl<T> Default for Order<T> {
 }
 
 impl<T> Order<T> {
-    /// Takes the capture's next frame.
+    /// Adds the capture's next frame.
     pub fn push(&mut self, bus: usize, nanos: u64, item: T) {
         if self.buses.len() <= bus {
             self.buses.resize(bus + 1, 0);
@@ -64,20 +64,20 @@ impl<T> Order<T> {
         self.newest = self.newest.max(nanos);
     }
 
-    /// The next one, if it need not wait any longer.
+    /// Returns the next frame, if it need not wait longer.
     pub fn pop(&mut self) -> Option<Ordered<T>> {
         let (&(key, _), _) = self.waiting.first_key_value()?;
         let waits = self.newest.saturating_sub(key) <= WINDOW_NS && self.waiting.len() <= WINDOW_FRAMES;
         if waits { None } else { self.pop_last() }
     }
 
-    /// Whether none waits.
+    /// Returns true if no frame waits.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.waiting.is_empty()
     }
 
-    /// The next one, when the capture has no more.
+    /// Returns the next frame without waiting, at the end of the capture.
     pub fn pop_last(&mut self) -> Option<Ordered<T>> {
         let ((key, _), (nanos, item)) = self.waiting.pop_first()?;
         let is_late = nanos < self.released;
@@ -91,7 +91,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// All that comes out: bus, place and what the order says of it.
+    /// Returns all released frames with their bus and position.
     fn merged(frames: &[(usize, u64)]) -> Vec<Ordered<(usize, usize)>> {
         let mut order = Order::default();
         let mut out = Vec::new();
@@ -162,7 +162,7 @@ mod tests {
         fn disorder_within_the_window_is_repaired(
             steps in proptest::collection::vec((0_usize..3, 1_u64..50, 0_u64..900), 1..200),
         ) {
-            // Each bus by itself is in order; it is read up to 0.9 s late.
+            // Each bus by itself is in order, and is read up to 0.9 s late.
             let mut buses = [Vec::new(), Vec::new(), Vec::new()];
             let mut now = 0;
             for (bus, step, late) in steps {

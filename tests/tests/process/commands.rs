@@ -302,8 +302,8 @@ fn the_doctor_hears_gateways_and_cells() {
     let said = doctor_hears(&folder, "--no-spawn", &cells);
     assert_eq!(findings(&said, "fault"), Vec::<String>::new());
     assert!(findings(&said, "note")[0].starts_with(
-        "2 cells are on the embedded bus nosuchcan1; of the skin's these were not heard: 1, 2, 4, 5"
+        "2 cells are on the embedded bus nosuchcan1; these cells of the skin sent nothing: 1, 2, 4, 5"
     ));
     let said = doctor_hears(&folder, "--no-spawn", &[]);
-    assert!(findings(&said, "fault")[0].starts_with("no cell is heard on the embedded bus nosuchcan1"));
+    assert!(findings(&said, "fault")[0].starts_with("no cell sends on the embedded bus nosuchcan1"));
 }

@@ -194,14 +194,14 @@ fn files_that_are_not_the_parts_of_one_recording_are_named() {
     let said = "skinbus: run-1.mcap and again.mcap are both part 1 of the recording: name one of them";
     assert_eq!(refused("run.mcap run-1.mcap again.mcap run-2.mcap"), said);
     let line = refused("run.mcap run-1.mcap run.log");
-    assert_eq!(line, "skinbus: run.mcap is a part of a recording, and run.log is none: name the parts alone");
+    assert_eq!(line, "skinbus: run.mcap is a part of a recording, but run.log is not: name only the parts");
     let line = refused("run.mcap nothing.mcap");
     assert!(line.starts_with("skinbus: there is no file nothing.mcap, and run.mcap is one: "), "{line}");
     fs::rename(place.path("run.mcap"), place.path("run-recovered.mcap")).unwrap();
     place.bench(0.1, "--record other.mcap").end().well();
     let line = refused("other.mcap run-1.mcap");
     assert!(
-        line.starts_with("skinbus: other.mcap and run-1.mcap are of different recordings, begun at "),
+        line.starts_with("skinbus: other.mcap and run-1.mcap belong to different recordings, begun at "),
         "{line}"
     );
     // The file name does not matter, and neither do missing parts at an end.

@@ -180,7 +180,7 @@ fn what_is_not_ours_is_never_touched() {
          vcan20` removes it"
     );
     assert!(fails("up vcan21 lo", 2).starts_with("lo is real, the loopback interface, and is left alone"));
-    assert_eq!(done("up vcan0"), "vcan0 is there already, and fits (a vcan, made by somebody else)\n");
+    assert_eq!(done("up vcan0"), "vcan0 is there already, and fits (a vcan, made by another program)\n");
     let same = |links: Vec<Value>| -> Vec<_> {
         links
             .into_iter()
@@ -199,7 +199,7 @@ fn what_is_not_ours_is_never_touched() {
 
     // The hint works.
     assert!(Command::new("sh").args(["-c", &repairs["sudo ".len()..]]).status().unwrap().success());
-    assert_eq!(done("up vcan20"), "vcan20 is there already, and fits (a vcan, made by somebody else)\n");
+    assert_eq!(done("up vcan20"), "vcan20 is there already, and fits (a vcan, made by another program)\n");
 }
 
 #[test]
@@ -217,7 +217,7 @@ fn a_skins_buses_are_made_and_removed_and_what_others_made_stays() {
     let said = done(&format!("up {path}"));
     assert_eq!(
         said,
-        "vcan0 is there already, and fits (a vcan, made by somebody else)\nvcan20 is made, a vcan with MTU 72, and up\n"
+        "vcan0 is there already, and fits (a vcan, made by another program)\nvcan20 is made, a vcan with MTU 72, and up\n"
     );
     let doctor = run_as(0, &format!("doctor {path} --json"));
     let json: Value = serde_json::from_str(&doctor.out).unwrap();
@@ -467,7 +467,7 @@ fn the_doctor_finds_what_is_wrong_and_its_hints_repair_it() {
         other_gateway.0 == 1 && other_gateway.1[0].starts_with("another gateway sends joints on vcan20"),
         "{other_gateway:?}"
     );
-    assert!(doctor("vcan20").1[0].starts_with("no cell is heard on vcan20"));
+    assert!(doctor("vcan20").1[0].starts_with("no cell sends on vcan20"));
 
     for (narrow, alias, hint) in [
         (false, "skinbus", format!(" | {program} up vcan20")),

@@ -1,5 +1,5 @@
-//! What `vcan-setup link` adds to a round trip, and what it takes of a processor for a frame, with two embedded buses of
-//! this machine as the two hosts.
+//! Measures the round-trip time that `vcan-setup link` adds, and its processor time per frame. Two embedded buses of
+//! this machine stand for the two hosts.
 //!
 //! `cd vcan-setup/link && cargo build --locked --release --bins --examples && target/release/examples/link_cost`
 #![allow(clippy::print_stdout, reason = "an example that prints")]
@@ -22,7 +22,7 @@ type Outcome<T> = Result<T, Box<dyn Error>>;
 const BUS: &str = "vcan0";
 const PINGS: usize = 1_000;
 const PAUSE: Duration = Duration::from_millis(1);
-/// Frames that are sent at once, as the cells of a bus answer, and how often.
+/// The number of frames that are sent at once, as the cells of a bus answer, and how often.
 const CELLS: usize = 100;
 const EPOCHS: usize = 625;
 const EPOCH: Duration = Duration::from_millis(16);
@@ -42,7 +42,7 @@ fn main() -> Outcome<()> {
     let near = open(&here)?;
     let mut pings = 0..;
     let mut rounds = [Vec::new(), Vec::new()];
-    // Some rounds on one bus, some over the link, and again: a busy moment of the machine meets both.
+    // Rounds on one bus and over the link alternate, so that a busy moment of the machine affects both.
     for turn in 0..10 {
         for (far, rounds) in [&here, &there].into_iter().zip(&mut rounds) {
             let answers = Answers::start(open(far)?)?;
@@ -99,12 +99,12 @@ fn open(folder: &Path) -> Outcome<Bus> {
     Ok(Bus::open(BUS, Choice::Only(BusKind::Embedded), &options)?)
 }
 
-/// The links of both hosts, which end with this.
+/// The links of both hosts, which are stopped on drop.
 struct Links(Vec<Child>);
 
 impl Links {
     fn start(&mut self, folder: &Path, host: &str, how: &str) -> Outcome<()> {
-        // Beside the folder of the examples.
+        // The program is beside the folder of the examples.
         let program: PathBuf =
             std::env::current_exe()?.parent().and_then(Path::parent).ok_or("no folder")?.join("vcan-link");
         let mut command = Command::new(program);
@@ -113,7 +113,7 @@ impl Links {
         Ok(())
     }
 
-    /// Their processor time so far, in s, as the scheduler counts it: of all their threads.
+    /// Returns the processor time of all their threads so far, in s, as the scheduler counts it.
     fn processor(&self) -> f64 {
         let nanos = |path: PathBuf| {
             let text = std::fs::read_to_string(path).unwrap_or_default();
@@ -154,7 +154,7 @@ impl Answers {
                     return;
                 }
                 for ping in inbox.frames().filter(|received| received.frame.raw_id() == PING) {
-                    // Two answers with the same data would be a circle for the link.
+                    // Two answers with the same data would look like a circle to the link.
                     let _ = Frame::fd(PONG, 1, ping.frame.data()).map(|pong| bus.send(&[pong]));
                 }
             }
@@ -168,7 +168,7 @@ impl Answers {
     }
 }
 
-/// Waits until who answers has opened the bus, and the links have joined.
+/// Waits until the responder has opened the bus and the links have joined.
 fn until_answered(near: &Bus, pings: &mut impl Iterator<Item = u32>) -> Outcome<()> {
     let began = Instant::now();
     while began.elapsed() < SOON {
@@ -176,7 +176,7 @@ fn until_answered(near: &Bus, pings: &mut impl Iterator<Item = u32>) -> Outcome<
             return Ok(());
         }
     }
-    Err("nobody answers: is vcan-link built beside the folder of the examples?".into())
+    Err("no ping was answered: is vcan-link built beside the folder of the examples?".into())
 }
 
 fn round_trip(near: &Bus, pings: &mut impl Iterator<Item = u32>) -> Outcome<Option<Duration>> {

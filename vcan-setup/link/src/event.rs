@@ -1,31 +1,31 @@
-//! What a link tells people while it runs.
+//! Events that a link reports while it runs.
 
 use std::fmt;
 
-/// What happened.
+/// An event of a link.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub(crate) enum Event {
     /// Another host has linked the bus.
     Joined(String),
-    /// A host is gone, or not reached any more.
+    /// A host has left, or can no longer be reached.
     Gone(String),
-    /// A connection failed, or was refused.
+    /// A connection failed or was refused.
     Transport(String),
-    /// The bus here is away, and why; it is tried again.
+    /// The local bus is unavailable, with the reason. It is reopened as soon as possible.
     BusAway(String),
-    /// It is back.
+    /// The local bus is available again.
     BusBack,
-    /// A message of a host was none.
+    /// A host sent an invalid message: its name, and the error.
     Garbage(String, String),
-    /// Frames of other hosts came back from the bus here: something makes a circle.
+    /// Frames of other hosts came back from the local bus: the buses are joined in a circle.
     Circle,
     /// Two hosts have this name.
     SameName(String),
-    /// Frames were lost since the last report: dropped here on the way out, and of other hosts.
+    /// Frames were lost since the last report.
     Lost {
-        /// From this bus.
+        /// Frames of the local bus.
         from_here: u64,
-        /// From other hosts.
+        /// Frames of other hosts.
         from_others: u64,
     },
 }

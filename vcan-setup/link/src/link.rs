@@ -1,4 +1,4 @@
-//! The shell around the core: a bus, a session of Zenoh, and one thread between them.
+//! The link program around the pure core in `hosts`: a bus, a session of Zenoh, and one thread between them.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -29,23 +29,23 @@ use crate::log;
 use crate::session::{FRAMES, HEARD, LinkError, Settings, config, host_of, key, life};
 use crate::watchers::Watchers;
 
-/// Frames that may wait unread in the socket of the bus.
+/// The requested receive buffer of the bus socket, in bytes.
 const RECEIVE_BUFFER: usize = 8 << 20;
-/// How soon a bus that is full is tried again.
+/// The interval between two attempts to send to a full bus.
 const RETRY: Duration = Duration::from_millis(1);
-/// From one attempt to open a bus that is away to the next.
+/// The interval between two attempts to open an unavailable bus.
 const AGAIN: Duration = Duration::from_millis(100);
-/// Between two reports of losses on standard error.
+/// The minimum interval between two loss reports on standard error.
 const SAY: Duration = Duration::from_secs(1);
-/// Between two reports to other hosts, and to programs here.
+/// The interval between two reports to other hosts and to local programs.
 const TELL: Duration = Duration::from_millis(200);
-/// Batches taken from the bus before anything else has its turn.
+/// The maximum number of batches read from the bus before other work is done.
 const TURNS: usize = 4;
 
-/// What threads of Zenoh hand to the link's.
+/// The state that Zenoh's threads share with the link's thread.
 struct Shared {
     incoming: Mutex<Incoming>,
-    /// What each other host says has become of this host's frames.
+    /// The account of this host's frames that each other host has published.
     ours: Mutex<BTreeMap<String, Heard>>,
     wake: OwnedFd,
 }
@@ -60,22 +60,22 @@ impl Shared {
     }
 
     fn wake(&self) {
-        // It can only be full, and then it can be read.
+        // The write fails only if the counter is full, and then it is readable.
         let _ = rustix::io::write(&self.wake, &1_u64.to_ne_bytes());
     }
 }
 
-/// A bus that is linked.
+/// A linked bus.
 pub(crate) struct Link {
     settings: Settings,
     kind: BusKind,
     session: Session,
     publisher: Publisher<'static>,
-    /// For what was heard of the other hosts.
+    /// The publisher of the accounts of the other hosts' frames.
     accounts: Publisher<'static>,
     shared: Arc<Shared>,
     events: Receiver<Event>,
-    /// Dropped at the end.
+    /// Subscriptions and tokens, which end when they are dropped.
     declared: Vec<Box<dyn Send>>,
     bus: Option<Bus>,
     outgoing: Outgoing,
@@ -83,7 +83,7 @@ pub(crate) struct Link {
     began: Instant,
     missed_before: u64,
     there: BTreeSet<String>,
-    /// As long as it listens, no other link of this bus here can.
+    /// The local programs that receive reports. While it listens, no other process of this machine can link the bus.
     watchers: Watchers,
     tell_at: Instant,
 }
@@ -95,10 +95,11 @@ impl fmt::Debug for Link {
 }
 
 impl Link {
-    /// Opens the bus and a session. Others may be away.
+    /// Opens the bus and a session. Other hosts may be unreachable.
     ///
     /// # Errors
-    /// When the bus cannot be opened, the configuration is wrong, or another link has the same name.
+    /// Returns [`LinkError`] if the bus cannot be opened, if the configuration is wrong, or if another process links
+    /// the bus.
     pub(crate) fn open(settings: Settings) -> Result<Self, LinkError> {
         let own = key(FRAMES, &settings.bus, &settings.host)?;
         let config = config(&settings)?;
@@ -151,7 +152,7 @@ impl Link {
         Ok(link)
     }
 
-    /// Listens to the other hosts: their frames, what they heard of this one, and who is there.
+    /// Subscribes to the other hosts: their frames, their accounts of this host's frames, and their presence.
     fn declare(&mut self, tell: &Sender<Event>) -> Result<(), LinkError> {
         let Settings { bus, host, .. } = self.settings.clone();
         let shared = Arc::clone(&self.shared);
@@ -161,7 +162,7 @@ impl Link {
         let (shared, this) = (Arc::clone(&self.shared), host.clone());
         self.subscribe(HEARD, tell.clone(), move |from, bytes| {
             let heard: BTreeMap<String, Heard> = serde_json::from_slice(bytes)
-                .map_err(|error| format!("no account of what it heard: {error}"))?;
+                .map_err(|error| format!("an invalid account of received frames: {error}"))?;
             let mut ours = shared.ours();
             if let Some(heard) = heard.get(&this).filter(|_| ours.len() < SOURCES || ours.contains_key(from))
             {
@@ -186,7 +187,7 @@ impl Link {
         Ok(())
     }
 
-    /// Hands what other hosts publish to `take`, and says what was wrong with it.
+    /// Passes data of other hosts to `take`, and reports its errors.
     fn subscribe(
         &mut self,
         what: &str,
@@ -212,16 +213,16 @@ impl Link {
         Ok(())
     }
 
-    /// What carries the bus here.
+    /// Returns the kind of the local bus.
     #[must_use]
     pub(crate) const fn kind(&self) -> BusKind {
         self.kind
     }
 
-    /// Passes frames until `stop` can be read or is hung up; what has become of them.
+    /// Forwards frames until `stop` is readable or hung up. Returns the accounts of all frames.
     ///
     /// # Errors
-    /// When the system cannot wait.
+    /// Returns [`LinkError::Wait`] if the system cannot wait.
     pub(crate) fn run(mut self, stop: impl AsFd, mut report: impl FnMut(Event)) -> Result<Report, LinkError> {
         let (mut inbox, mut bytes) = (Inbox::new(), Vec::new());
         let (mut said, mut say_at, mut open_at) = ((0, 0), Instant::now(), Instant::now());
@@ -274,7 +275,7 @@ impl Link {
         Ok(report)
     }
 
-    /// Takes note of who is there, and says so.
+    /// Tracks the present hosts, and reports events.
     fn note_events(&mut self, report: &mut impl FnMut(Event)) {
         for event in self.events.try_iter() {
             if let Event::Joined(host) = &event
@@ -284,13 +285,13 @@ impl Link {
             } else if let Event::Gone(host) = &event {
                 self.there.remove(host);
             }
-            // Programs here learn it at once.
+            // Local programs receive the change at once.
             self.tell_at = self.began;
             report(event);
         }
     }
 
-    /// Tells the other hosts what was heard of them, and programs here everything.
+    /// Publishes the accounts of the other hosts' frames, and sends the report to local programs.
     fn tell(&mut self) {
         self.tell_at = Instant::now() + TELL;
         let report = self.report();
@@ -298,13 +299,13 @@ impl Link {
         if let Ok(bytes) = serde_json::to_vec(&heard)
             && !heard.is_empty()
         {
-            // Five times a second the newest; one that is lost is not missed.
+            // Accounts are published five times a second, so a lost one does no harm.
             let _ = self.accounts.put(bytes).wait();
         }
         self.watchers.tell(&report);
     }
 
-    /// Takes what the bus has.
+    /// Reads frames from the bus.
     fn read(&mut self, inbox: &mut Inbox) -> Result<(), BusError> {
         let Some(bus) = &self.bus else { return Ok(()) };
         let now = nanos(self.began.elapsed());
@@ -325,7 +326,7 @@ impl Link {
         Ok(())
     }
 
-    /// Hands what waits to the bus.
+    /// Sends waiting frames to the bus.
     fn write(&mut self) -> Result<(), BusError> {
         let Some(bus) = &self.bus else { return Ok(()) };
         let now = nanos(self.began.elapsed());
@@ -356,7 +357,8 @@ impl Link {
         Ok(())
     }
 
-    /// Hands what waits to Zenoh, which never waits: what it has no room for it drops, and others count it as lost.
+    /// Passes waiting frames to Zenoh, which never blocks. It drops frames that it has no room for, and the other hosts
+    /// count them as lost.
     fn publish(&mut self, bytes: &mut Vec<u8>) {
         loop {
             let count = self.outgoing.message(bytes);
@@ -370,7 +372,7 @@ impl Link {
         }
     }
 
-    /// Waits until there is something to do; whether it goes on.
+    /// Waits until there is something to do. Returns false if the link should stop.
     fn wait(&self, stop: &impl AsFd) -> io::Result<bool> {
         let mut polled =
             vec![PollFd::new(stop, PollFlags::IN), PollFd::new(&self.shared.wake, PollFlags::IN)];
@@ -386,19 +388,19 @@ impl Link {
         };
         match poll(&mut polled, Timespec::try_from(timeout).ok().as_ref()) {
             Ok(_) | Err(Errno::INTR) => {}
-            // No memory for a moment: everything is looked at.
+            // The kernel lacks memory for a moment: treat all sources as ready.
             Err(Errno::NOMEM | Errno::AGAIN) => std::thread::sleep(RETRY),
             Err(errno) => return Err(errno.into()),
         }
         let came = |at: usize| polled.get(at).is_some_and(|polled| !polled.revents().is_empty());
         if came(1) {
-            // Whatever stood there: everything is looked at.
+            // The value is irrelevant: all sources are treated as ready.
             let _ = rustix::io::read(&self.shared.wake, &mut [0; 8]);
         }
         Ok(!came(0))
     }
 
-    /// Frames lost: from here, and of others.
+    /// Returns the numbers of lost frames of the local bus and of other hosts.
     fn losses(&self) -> (u64, u64) {
         let Sent { dropped, missed, .. } = self.outgoing.account();
         let incoming = self.shared.incoming();

@@ -1,4 +1,4 @@
-//! What Zenoh says of its connections, which it only logs.
+//! Collects errors of connections from Zenoh's log, because Zenoh reports them only there.
 
 use std::collections::BTreeMap;
 use std::fmt::{Debug, Write};
@@ -15,26 +15,26 @@ use tracing::{Event as Entry, Level, Metadata, Subscriber};
 use crate::event::Event;
 use crate::session::plain;
 
-/// Where failed connections are logged, at level debug because they are tried again.
+/// The log target of failed connections. Their level is debug, because they are retried.
 const CONNECTIONS: &str = "zenoh::net::runtime::orchestrator";
 const FAILED: &str = "Unable to connect to configured peer ";
-/// Warnings about what is as it should be: nobody is searched for, and a host may be alone at the start.
+/// Warnings about intended behaviour: scouting is off, and a host may be alone at the start.
 const EXPECTED: [&str; 2] = ["Gossip is disabled", "Scouting delay elapsed"];
-/// For so long the same is said once.
+/// The time for which a repeated text is reported only once.
 const ONCE: Duration = Duration::from_secs(60);
-/// Texts that are told apart.
+/// The maximum number of texts that are remembered.
 const TEXTS: usize = 64;
 
-/// Takes what it logs.
+/// A subscriber that forwards log entries as events.
 struct Log {
     tell: Mutex<Sender<Event>>,
     said: Mutex<BTreeMap<String, Instant>>,
 }
 
-/// Hands warnings, errors and failed connections to `tell`; once in a process.
+/// Forwards warnings, errors and failed connections to `tell`. Only the first call in a process has an effect.
 pub(crate) fn listen(tell: Sender<Event>) {
     let log = Log { tell: Mutex::new(tell), said: Mutex::default() };
-    // A program that has a log of its own has these there.
+    // If the process already has a subscriber, that one gets the entries.
     let _ = tracing::subscriber::set_global_default(log);
 }
 
@@ -49,7 +49,7 @@ impl Visit for Text {
     }
 }
 
-/// What is said of an entry; nothing of attempts that have not failed.
+/// Returns the text of an entry; `None` for expected warnings and for attempts that have not failed.
 fn said(is_warning: bool, text: &str) -> Option<String> {
     if let Some(failed) = text.strip_prefix(FAILED) {
         let failed = failed.split(". Retry in").next().unwrap_or(failed);

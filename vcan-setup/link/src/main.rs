@@ -1,4 +1,4 @@
-//! `vcan-link`: joins a bus with those of the same name on other hosts. `vcan-setup link` runs it.
+//! The program `vcan-link`, which joins a bus with those of the same name on other hosts. `vcan-setup link` runs it.
 
 mod event;
 mod link;
@@ -30,7 +30,7 @@ struct Arguments {
 fn main() -> ExitCode {
     let done = program::check_caller().map_err(Failure::run).and_then(|()| match Arguments::try_parse() {
         Ok(arguments) => run(arguments.options),
-        // Help and version, which are asked for, are printed as they are.
+        // The user requested help or the version; clap prints them.
         Err(queried) if !queried.use_stderr() => queried.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => Err(Failure::usage(one_line(&wrong.render().to_string()))),

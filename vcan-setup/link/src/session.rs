@@ -1,4 +1,4 @@
-//! How a bus is linked: what is said on the command line, as Zenoh has it.
+//! Converts the settings of a link into a configuration of Zenoh.
 
 use std::fmt;
 use std::io;
@@ -10,31 +10,31 @@ use thiserror::Error;
 use zenoh::Config;
 use zenoh::key_expr::KeyExpr;
 
-/// What a host takes from its bus: `skinbus/frames/BUS/HOST`. The liveliness tokens have these keys too.
+/// The key of a host's frames: `skinbus/frames/BUS/HOST`. Its liveliness token has the same key.
 pub(crate) const FRAMES: &str = "frames";
-/// What a host has heard of each other: `skinbus/heard/BUS/HOST`.
+/// The key of a host's accounts of the other hosts' frames: `skinbus/heard/BUS/HOST`.
 pub(crate) const HEARD: &str = "heard";
 
-/// How a bus is linked.
+/// The settings of a link.
 #[derive(Clone, Debug)]
 pub(crate) struct Settings {
-    /// The bus here, and elsewhere.
+    /// The name of the bus, here and on the other hosts.
     pub(crate) bus: String,
-    /// Its kind here.
+    /// The kind of the local bus.
     pub(crate) choice: Choice,
-    /// Where embedded buses live; `None` is the usual directory.
+    /// The directory of embedded buses; `None` for the usual one.
     pub(crate) directory: Option<PathBuf>,
-    /// This host's name.
+    /// The name of this host.
     pub(crate) host: String,
-    /// A configuration of Zenoh.
+    /// A configuration file of Zenoh.
     pub(crate) config: Option<PathBuf>,
-    /// Where to connect to, as `tcp/192.168.1.7:7447`.
+    /// Endpoints to connect to, such as `tcp/192.168.1.7:7447`.
     pub(crate) connect: Vec<String>,
-    /// Where to wait for others.
+    /// Endpoints to listen at.
     pub(crate) listen: Vec<String>,
 }
 
-/// Why a bus cannot be linked.
+/// The error of a bus that cannot be linked.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub(crate) enum LinkError {
@@ -50,21 +50,21 @@ pub(crate) enum LinkError {
          file for --config"
     )]
     Alone,
-    /// An endpoint of an unsupported form, and the option or file that names it.
+    /// An endpoint of an unsupported form: the option or file that contains it, and the endpoint.
     #[error("{0} {1}: an endpoint is tcp/HOST:PORT or tls/HOST:PORT")]
     Endpoint(String, String),
-    /// An endpoint without TLS beside one with TLS.
-    #[error("{plain} would be open to everybody beside {secure}: make all endpoints tls/, or none of them")]
+    /// An endpoint without TLS is used beside one with TLS.
+    #[error("{plain} would be open to everyone beside {secure}: make all endpoints tls/, or none of them")]
     PlainBesideTls {
         /// The endpoint without TLS.
         plain: String,
         /// The endpoint with TLS.
         secure: String,
     },
-    /// The bus or the host has a name that no key can have.
+    /// The name of the bus or the host cannot be part of a key.
     #[error("'{0}' cannot be a part of a key of Zenoh: {1}")]
     Name(String, String),
-    /// Another process here links the bus.
+    /// Another process of this machine links the bus.
     #[error("the bus '{0}' is linked already by another process here: one link carries it to all hosts")]
     Twice(String),
     /// The system cannot wait.
@@ -73,7 +73,7 @@ pub(crate) enum LinkError {
 }
 
 impl Settings {
-    /// An error of Zenoh, and the configuration that it may be about.
+    /// Converts an error of Zenoh, and adds the name of the configuration file.
     pub(crate) fn blame(&self, error: &str) -> LinkError {
         let of = self.config.as_ref().map_or_else(String::new, |path| format!("{}: ", path.display()));
         LinkError::Zenoh(format!("{of}{}", plain(error)))
@@ -81,7 +81,7 @@ impl Settings {
 }
 
 impl LinkError {
-    /// Whether the user has asked for what cannot be.
+    /// Returns true if the user requested something impossible.
     #[must_use]
     pub(crate) const fn is_usage(&self) -> bool {
         matches!(
@@ -95,21 +95,22 @@ impl LinkError {
     }
 }
 
-/// What an error of Zenoh says, without the places in its source.
+/// Returns the message of a Zenoh error without locations in its source.
 pub(crate) fn plain(error: &str) -> String {
     let message = error.split_once("msg: \"").and_then(|(_, rest)| rest.split_once("\", location"));
     let text = message.map_or(error, |(message, _)| message);
     text.split(" at /").next().unwrap_or(text).trim_end_matches('.').to_owned()
 }
 
-/// Zenoh's configuration: that of the file, with the endpoints of the command line in place of the file's.
+/// Builds the configuration of Zenoh: that of the file, with its endpoints replaced by those of the command line.
 ///
-/// Zenoh's defaults open a listener without TLS, look for other hosts by multicast and tell hosts of each other. Each
-/// default on which it depends who can reach the bus is set here.
+/// By default Zenoh opens a listener without TLS, searches for other hosts by multicast, and introduces hosts to each
+/// other. All settings that decide who can reach the bus are set here.
 ///
 /// # Errors
 ///
-/// The file cannot be read, an endpoint has an unsupported form or no TLS beside others with TLS, or there is none.
+/// Returns [`LinkError`] if the file cannot be read, if an endpoint has an unsupported form or lacks TLS beside others
+/// with TLS, or if no endpoint is given.
 pub(crate) fn config(settings: &Settings) -> Result<Config, LinkError> {
     let mut config = match &settings.config {
         Some(path) => Config::from_file(path).map_err(|error| settings.blame(&error.to_string()))?,
@@ -137,11 +138,11 @@ pub(crate) fn config(settings: &Settings) -> Result<Config, LinkError> {
         set("connect/exit_on_failure", "false")?;
         set("connect/retry", "{ period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2 }")?;
     }
-    // Batches of 64 KiB that wait for the network, of at most 16: what finds no room in them within 1 ms is lost.
+    // Up to 16 batches of 64 KiB wait for the network. Data that finds no room within 1 ms is dropped.
     set("transport/link/tx/queue/size/real_time", "16")?;
-    // A link that says nothing for so long is lost.
+    // A silent connection is closed after this time.
     set("transport/link/tx/lease", "1000")?;
-    // Who connects by TLS proves who it is, unless the file says otherwise.
+    // A client that connects by TLS must authenticate itself, unless the file disables that.
     if endpoints.secure && !endpoints.listen.is_empty() {
         set_unless_given(&mut config, "transport/link/tls/enable_mtls")?;
     }
@@ -152,7 +153,7 @@ pub(crate) fn config(settings: &Settings) -> Result<Config, LinkError> {
 /// The endpoints of a link.
 struct Endpoints {
     listen: Vec<String>,
-    /// All of them use TLS; otherwise none does.
+    /// True if all endpoints use TLS, false if none does.
     secure: bool,
 }
 
@@ -188,7 +189,7 @@ impl Endpoints {
     }
 }
 
-/// Returns the endpoints that the file gives for this mode; none where they are Zenoh's defaults.
+/// Returns the endpoints that the file gives for this mode; empty if they are Zenoh's defaults.
 fn configured(config: &Config, key: &str, mode: &str) -> Result<Vec<String>, LinkError> {
     let given = value(config, key)?;
     if given == value(&Config::default(), key)? {
@@ -218,7 +219,7 @@ fn list(endpoints: &[String]) -> String {
     serde_json::to_string(endpoints).unwrap_or_default()
 }
 
-/// Sets an option that the file does not give.
+/// Sets an option to true unless the file gives it.
 fn set_unless_given(config: &mut Config, key: &str) -> Result<(), LinkError> {
     if value(config, key)?.is_null() {
         config.insert_json5(key, "true").map_err(LinkError::zenoh)?;
@@ -241,10 +242,10 @@ pub(crate) fn host_of(key: &str) -> &str {
     key.rsplit('/').next().unwrap_or(key)
 }
 
-/// A number that no other start has.
+/// Returns a random number that identifies this start of the link.
 pub(crate) fn life() -> u64 {
     let mut bytes = [0; 8];
-    // Early at boot there may be nothing random.
+    // Early at boot the system may have no entropy.
     match rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty()) {
         Ok(8) => u64::from_ne_bytes(bytes),
         _ => u64::from(std::process::id()) << 32 ^ u64::from(std::process::id()),
@@ -257,7 +258,7 @@ mod tests {
 
     use super::*;
 
-    /// The configuration of a file's text and options, or its refusal.
+    /// Returns the configuration of a file's text and options, or its error.
     fn configured_by(text: &str, connect: &[&str], listen: &[&str]) -> Result<Config, LinkError> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("link.json5");

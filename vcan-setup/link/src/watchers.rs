@@ -1,4 +1,4 @@
-//! Programs of this machine that want to know what a link knows.
+//! Sends the report of a link to local programs.
 
 use std::io::{ErrorKind, Write};
 use std::os::fd::{AsFd, BorrowedFd};
@@ -6,17 +6,17 @@ use std::os::unix::net::{UnixListener, UnixStream};
 
 use vcan_setup::hosts::report::Report;
 
-/// Programs at most; further ones are hung up on.
+/// The maximum number of connected programs; further ones are disconnected.
 const WATCHERS: usize = 64;
 
-/// Those that are connected, and where others connect.
+/// The connected programs, and the listener for further ones.
 #[derive(Debug)]
 pub(crate) struct Watchers {
     listener: UnixListener,
     streams: Vec<UnixStream>,
     /// The newest report that all of them have, as a line.
     line: Vec<u8>,
-    /// Nobody can be taken now, whoever waits: there is no file.
+    /// True while no connection can be accepted, because the process has no file descriptors left.
     is_full: bool,
 }
 
@@ -25,12 +25,12 @@ impl Watchers {
         Self { listener, streams: Vec::new(), line: Vec::new(), is_full: false }
     }
 
-    /// Readable when somebody connects; nothing to wait for while nobody can be taken.
+    /// Returns the listener to poll; `None` while no connection can be accepted.
     pub(crate) fn listener(&self) -> Option<BorrowedFd<'_>> {
         (!self.is_full).then(|| self.listener.as_fd())
     }
 
-    /// Takes those that connect, and gives them the newest report.
+    /// Accepts connections, and sends them the newest report.
     pub(crate) fn accept(&mut self) {
         loop {
             let mut stream = match self.listener.accept() {
@@ -50,7 +50,8 @@ impl Watchers {
         }
     }
 
-    /// Tells all of them, if it is new. Whoever does not read is hung up on, for half a line would be worse than none.
+    /// Sends a changed report to all programs. A program that does not read is disconnected, because a partial line
+    /// would be worse.
     pub(crate) fn tell(&mut self, report: &Report) {
         let Ok(mut line) = serde_json::to_vec(report) else { return };
         line.push(b'\n');

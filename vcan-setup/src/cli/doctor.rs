@@ -13,7 +13,7 @@ use super::{json, named, query};
 
 /// Check whether a bench would run on this machine, with a hint for each fault
 ///
-/// Looks at the kernel, the interfaces, permissions, buffers and nodes on the buses already (it listens for
+/// Checks the kernel, interfaces, permissions, buffers, and the nodes that are already on the buses (it listens for
 /// 600 ms, and sends nothing), and reports what would stop `skinbus run`. Changes nothing. Run it as the user
 /// who runs the gateway. Exit code 0: a bench would run; 1: it would not; 2: wrong use.
 #[derive(Args, Debug)]
@@ -23,13 +23,13 @@ use super::{json, named, query};
   vcan-setup doctor skin.toml --no-spawn           its cells are on the bus already
   vcan-setup doctor can0 --bus-kind socketcan")]
 pub(crate) struct Doctor {
-    /// Names of buses, or skins: what ends in .toml or holds a '/'
+    /// Names of buses, or skin files, which end in .toml or contain a '/'
     #[arg(value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
     /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
     #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
     bus_kind: Choice,
-    /// The cells are on the bus already, or are real: as with `skinbus run --no-spawn`
+    /// Expect cells that run already, or real ones, as `skinbus run --no-spawn` does
     #[arg(long)]
     no_spawn: bool,
     /// Print JSON
@@ -42,7 +42,7 @@ impl Doctor {
         let mut buses = named(&self.what, Bus::of_skin, Bus::named)?;
         let present = match (query(), self.bus_kind) {
             (Ok((_, present)), _) => present,
-            // Which needs none of them.
+            // The embedded bus needs no interface.
             (Err(_), Choice::Only(BusKind::Embedded)) => Vec::new(),
             (Err(_), Choice::Auto) if !has_socketcan() => Vec::new(),
             (Err(failure), _) => return Err(failure),

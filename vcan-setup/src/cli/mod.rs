@@ -1,5 +1,5 @@
-//! The commands. Each is a thin layer over the library; errors are one line, exit codes are 0 (done),
-//! 1 (it failed, or this machine does not allow it) and 2 (wrong use or configuration).
+//! The commands of `vcan-setup`. Each is a thin layer over the library. Errors are one line. Exit codes are 0 (done), 1
+//! (failed, or not possible on this machine) and 2 (wrong use or configuration).
 
 mod doctor;
 mod serve;
@@ -24,7 +24,7 @@ use vcan_setup::link::Interface;
 use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::Target;
 
-/// Gives you a bus: makes vcan interfaces, checks what a bench still needs, serves embedded buses
+/// Sets up CAN buses: makes vcan interfaces, checks what a bench still needs, serves embedded buses
 #[derive(Debug, Parser)]
 #[command(
     version,
@@ -62,17 +62,17 @@ impl Command {
             Self::Doctor(command) => command.run(),
             Self::Serve(command) => command.run(),
             Self::Slcan(command) => command.run(),
-            // After the names of this program and of the command.
+            // The first two arguments are the names of this program and of the command.
             Self::Link(_) => Err(Failure::run(program::run(std::env::args_os().skip(2)))),
         }
     }
 }
 
-/// Reads the command line and does it.
+/// Parses the command line and runs the command.
 pub(crate) fn main() -> ExitCode {
     let done = match Arguments::try_parse() {
         Ok(arguments) => arguments.command.run(),
-        // Help and version, which are asked for, are printed as they are.
+        // The user requested help or the version; clap prints them.
         Err(queried) if !queried.use_stderr() => queried.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => Err(Failure::usage(one_line(&wrong.render().to_string()))),
@@ -80,17 +80,17 @@ pub(crate) fn main() -> ExitCode {
     end("vcan-setup", done)
 }
 
-/// What `--json` prints.
+/// Formats the output of `--json`.
 fn json(report: &impl Serialize) -> Result<String, Failure> {
     serde_json::to_string_pretty(report).map(|text| text + "\n").map_err(Failure::run)
 }
 
-/// A bus' name, as the command line gives it.
+/// Parses the name of a bus.
 fn bus_name(word: &str) -> Result<String, BusError> {
     check_name(word).map(|()| word.to_owned())
 }
 
-/// What a word on the command line names: a skin's file ends in `.toml` or holds a `/`.
+/// A positional argument: the file of a skin, which ends in `.toml` or contains a `/`, or a name.
 enum Word {
     File(Box<Skin>),
     Name(String),
@@ -108,7 +108,7 @@ fn word(word: &OsStr) -> Result<Word, Failure> {
     bus_name(name).map(Word::Name).map_err(Failure::usage)
 }
 
-/// What words on the command line name.
+/// Converts positional arguments into the buses that they name.
 fn named<T>(
     words: &[OsString],
     of_skin: impl Fn(&OsStr, &Skin) -> Vec<T>,
@@ -124,12 +124,12 @@ fn named<T>(
     Ok(all)
 }
 
-/// The interfaces that words on the command line name.
+/// Returns the interfaces that positional arguments name.
 fn target(words: &[OsString]) -> Result<Vec<Target>, Failure> {
     named(words, Target::of_skin, Target::named)
 }
 
-/// The present interfaces, and the socket that listed them.
+/// Returns the present interfaces, and the socket that listed them.
 fn query() -> Result<(Netlink, Vec<Interface>), Failure> {
     let mut netlink = Netlink::open().map_err(unreadable)?;
     let present = netlink.interfaces().map_err(unreadable)?;

@@ -12,13 +12,13 @@ use vcan_setup::embedded::{Server, Totals};
 
 use super::bus_name;
 
-/// Before all other processes, as far as niceness goes.
+/// The highest priority that niceness allows.
 const URGENT: i32 = -20;
 
 /// Serve an embedded bus, for machines whose kernel has no SocketCAN, until SIGINT or SIGTERM
 ///
 /// Prints one line, "serving NAME at PATH", when clients can connect. The bus is private to the user; its
-/// socket lies in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
+/// socket is in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
 #[derive(Args, Debug)]
 #[command(
     after_help = "Examples:\n  vcan-setup serve vcan0\n  sleep 10 | vcan-setup serve vcan0 --until-eof"
@@ -38,7 +38,7 @@ impl Serve {
     }
 }
 
-/// Returns an error with its causes, each once: some name their cause themselves.
+/// Formats an error with its causes, each once, because some contain their cause already.
 fn with_causes(error: &anyhow::Error) -> String {
     error.chain().skip(1).fold(error.to_string(), |text, cause| match cause.to_string() {
         cause if text.contains(&cause) => text,
@@ -53,7 +53,7 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
         signal_hook::low_level::pipe::register(signal, stop).context("cannot catch signals")?;
     }
     if until_eof {
-        // The system counts the thread that started this process as its parent.
+        // The system regards the thread that started this process as its parent.
         rustix::process::set_parent_process_death_signal(Some(Signal::TERM))
             .context("cannot follow the parent process")?;
         let follow = move || {
@@ -64,8 +64,8 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
             .spawn(follow)
             .context("cannot start a thread to follow standard input")?;
     }
-    // A kernel passes frames on at once; a process that waits its turn among hundreds of cells does not. Whoever may
-    // not do this has a slower bus.
+    // The kernel forwards frames at once, but a process may wait behind hundreds of cells for its turn. Without the
+    // permission to raise its priority the bus is only slower.
     let _ = rustix::process::setpriority_process(None, URGENT);
     protocol::bus::never_interrupt();
     allow_files();
@@ -74,7 +74,7 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
         .and_then(|()| std::io::stdout().flush())
         .context("cannot write to standard output")?;
     let Totals { garbage, refused, turned_away, failed, failure, .. } = server.run(stopped)?;
-    // Only the server can report it: a client gets no error for what it sends.
+    // Only the server can report these: a client gets no error for an invalid datagram.
     if garbage > 0 || refused > 0 {
         say(&format!(
             "{name}: ignored {garbage} datagrams that were neither frames nor filters, and refused {refused} clients: \
@@ -95,14 +95,14 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Lets as many files be open as the system allows: each client is one.
+/// Raises the limit of open files to the maximum that the system allows: each client needs one.
 fn allow_files() {
     let Rlimit { maximum, .. } = getrlimit(Resource::Nofile);
-    // With fewer there is room for fewer clients, which are turned away.
+    // If this fails, fewer clients are accepted.
     let _ = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum });
 }
 
-/// Without standard error there is no reader.
+/// Prints to standard error. A failure is ignored, because nothing could report it.
 fn say(text: &str) {
     let _ = writeln!(std::io::stderr(), "vcan-setup: {text}");
 }

@@ -15,13 +15,13 @@ use vcan_setup::slcan::{Account, Bridge, BridgeError, LineOptions, Settings};
 
 use super::{bus_name, json};
 
-/// Make serial lines that speak slcan participants of a bus, until SIGINT or SIGTERM
+/// Connect serial lines with the slcan protocol to a bus, until SIGINT or SIGTERM
 ///
-/// A LINE is a terminal (/dev/ttyACM0), unix:PATH or tcp:HOST:PORT, and after commas what holds for it alone:
-/// cell=12 or cell=1-8 (only what these cells receive goes to the line), filter=100:700 (identifier and mask, as
-/// candump has them), rates=1M/5M, baud=115200, classic, settle=2. Each line has a client of the bus of its own. A line
-/// that goes away is opened again when it is back. Nothing waits for a line: what it cannot carry is dropped, and
-/// counted by reason. Prints one line when all is open, and at the end what has become of every frame.
+/// A LINE is a terminal (/dev/ttyACM0), unix:PATH or tcp:HOST:PORT, followed by its own options after commas:
+/// cell=12 or cell=1-8 (the line gets only frames that these cells receive), filter=100:700 (identifier and mask, as
+/// in candump), rates=1M/5M, baud=115200, classic, settle=2. Each line has its own client of the bus. A lost line is
+/// reopened when it returns. The bus never waits for a line: frames that a line cannot carry are dropped, and counted
+/// by reason. Prints one line when all lines are open, and the counts of all frames at the end.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vcan-setup slcan vcan0 /dev/ttyACM0 --cell 12 --bit-rates 1M/5M
@@ -33,31 +33,31 @@ pub(crate) struct Slcan {
     /// The bus
     #[arg(value_parser = bus_name)]
     bus: String,
-    /// The lines: PATH, unix:PATH or tcp:HOST:PORT, then options after commas
+    /// The lines: PATH, unix:PATH or tcp:HOST:PORT, followed by options after commas
     #[arg(value_name = "LINE", required = true)]
     lines: Vec<LineOptions>,
     /// The cell behind a line: one for each LINE, in their order
     #[arg(long, value_name = "N", value_parser = cell)]
     cell: Vec<CellId>,
-    /// Bit rates to set in adapters, as 500k or 1M/5M; else they keep theirs
+    /// Bit rates to set in adapters, as 500k or 1M/5M; by default they keep theirs
     #[arg(long, value_name = "RATES")]
     bit_rates: Option<BitRates>,
-    /// Speed of terminals in bit/s; else they keep theirs
+    /// Speed of terminals in bit/s; by default they keep theirs
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     baud: Option<u32>,
     /// The adapters have no CAN FD: drop FD frames
     #[arg(long)]
     classic: bool,
-    /// Seconds from opening a line to setting its adapter: for boards that opening resets (Arduino, ESP32)
+    /// Seconds from opening a line to setting its adapter, for boards that are reset by opening (Arduino, ESP32)
     #[arg(long, value_name = "SECONDS", value_parser = settle)]
     settle: Option<Duration>,
-    /// Begin without lines that are away
+    /// Begin without unavailable lines, and open them later
     #[arg(long)]
     wait: bool,
     /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
     #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
     bus_kind: Choice,
-    /// Print what has become of the frames as JSON
+    /// Print the counts of all frames as JSON
     #[arg(long)]
     json: bool,
 }
@@ -98,7 +98,7 @@ impl Slcan {
         if !away.is_empty() {
             ready += &format!(", still away: {}", away.join(", "));
         }
-        // With JSON, standard output is that alone.
+        // With `--json`, standard output contains only the JSON.
         if self.json {
             say(&ready)
         } else {
@@ -112,7 +112,7 @@ impl Slcan {
         print(&accounts.iter().map(|account| format!("{account}\n")).collect::<String>())
     }
 
-    /// The lines, each with what holds for all.
+    /// Returns the lines, each with the options that apply to all.
     fn lines(&self) -> Result<Vec<LineOptions>, Failure> {
         let mut lines = self.lines.clone();
         if !self.cell.is_empty() && self.cell.len() != lines.len() {

@@ -15,18 +15,18 @@ use vcan_setup::look::{Embedded, embedded_buses};
 
 use super::{json, query, target};
 
-/// How long a link may take to answer.
+/// The time for which a link may take to answer.
 const ANSWER: Duration = Duration::from_millis(500);
 
 /// Show the CAN interfaces of this machine, and the embedded buses of this user
 ///
-/// Of hardware also the bit rates and the error state. Exit code 1 when one that was named is not there.
+/// Shows the bit rates and the error state of hardware too. Exit code 1 if a named one does not exist.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vcan-setup status
   vcan-setup status skin.toml --json")]
 pub(crate) struct Status {
-    /// Only these: names, or skins, which end in .toml or hold a '/'
+    /// Show only these: names, or skin files, which end in .toml or contain a '/'
     #[arg(value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
     /// Print JSON
@@ -54,7 +54,7 @@ impl Status {
             }
             (false, false) => table(&interfaces, &embedded) + &joined(&links),
             (false, true) if target.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
-            // What was named and is not there is reported below.
+            // Named buses that are missing are reported below.
             (false, true) => String::new(),
         };
         print(&text)?;
@@ -75,7 +75,7 @@ impl Status {
     }
 }
 
-/// What the links of these buses report; a link that is stopped does not answer.
+/// Returns the reports of the links of these buses. A stopped link does not answer, and is left out.
 fn links<'a>(buses: impl Iterator<Item = (&'a str, BusKind)>) -> BTreeMap<&'a str, hosts::Report> {
     let report = |(bus, kind)| {
         let report = hosts::Reports::connect(bus, kind, None).and_then(|mut it| it.wait(ANSWER));
@@ -92,7 +92,7 @@ fn joined(links: &BTreeMap<&str, hosts::Report>) -> String {
     };
     let line = |(bus, report): (&&str, &hosts::Report)| {
         let hosts: Vec<_> = report.hosts.iter().map(host).collect();
-        let with = if hosts.is_empty() { "nobody yet".to_owned() } else { hosts.join(", ") };
+        let with = if hosts.is_empty() { "no host yet".to_owned() } else { hosts.join(", ") };
         format!("{bus} is linked as '{}' with {with}\n", report.host)
     };
     links.iter().map(line).collect()
@@ -183,7 +183,7 @@ fn rates(interface: &Interface) -> String {
 struct Report<'a> {
     interfaces: Vec<InterfaceReport<'a>>,
     embedded: &'a [Embedded],
-    /// Of buses that are joined with those of other hosts.
+    /// Reports of buses that are joined with those of other hosts.
     links: &'a BTreeMap<&'a str, hosts::Report>,
 }
 

@@ -19,10 +19,10 @@ use super::{Word, query, target, unreadable, word};
 
 /// Make virtual CAN interfaces, and bring them up
 ///
-/// Makes what is missing, with MTU 72 for CAN FD, and marks it with the alias "skinbus". What is there
-/// already and fits stays as it is, so it may be called again and again. Nothing is touched that it has not
-/// made: of a real interface in a skin it only checks the bit rates, unless told to set them. Needs
-/// root, unless there is nothing to do.
+/// Makes missing interfaces with MTU 72 for CAN FD, and marks them with the alias "skinbus". Interfaces that exist
+/// and fit stay as they are, so the command may be repeated. It changes only interfaces that it has made: of a real
+/// interface in a skin it only checks the bit rates, unless --set-bit-rates is given. Needs root, unless all
+/// interfaces are in place.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vcan-setup up --dry-run skin.toml                           print what would be done
@@ -31,7 +31,7 @@ use super::{Word, query, target, unreadable, word};
   sudo vcan-setup up vcan0 --peer vcan0 --namespace blue      a pair that leads into a namespace
   sudo vcan-setup up skin.toml --set-bit-rates                and set those of real interfaces")]
 pub(crate) struct Up {
-    /// Names of interfaces, or skins: what ends in .toml or holds a '/'
+    /// Names of interfaces, or skin files, which end in .toml or contain a '/'
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
     /// Print what would be done, and do nothing
@@ -40,24 +40,24 @@ pub(crate) struct Up {
     /// Make a vxcan pair: NAME is one end, PEER the other
     #[arg(long, value_name = "PEER")]
     peer: Option<String>,
-    /// The network namespace of the other end: a name, a path, or the number of a process
+    /// The network namespace of the other end: a name, a path, or a process id
     #[arg(long, value_name = "NAME|PATH|PID", requires = "peer")]
     namespace: Option<OsString>,
-    /// Set the bit rates of CAN hardware to those of the skin, for which it is taken down for a moment
+    /// Set the bit rates of CAN hardware to those of the skin; takes the interface down for a moment
     #[arg(long, conflicts_with = "peer")]
     set_bit_rates: bool,
 }
 
 /// Remove the virtual CAN interfaces that `up` has made
 ///
-/// Removes only what bears the mark "skinbus". Of a skin's buses it leaves alone what it has not made; a
-/// name of such an interface is an error.
+/// Removes only interfaces with the alias "skinbus". Other buses of a skin are left alone, but naming such an
+/// interface is an error.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   sudo vcan-setup down skin.toml
   vcan-setup down --dry-run vcan0")]
 pub(crate) struct Down {
-    /// Names of interfaces, or skins: what ends in .toml or holds a '/'
+    /// Names of interfaces, or skin files, which end in .toml or contain a '/'
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
     /// Print what would be done, and do nothing
@@ -116,7 +116,7 @@ impl Down {
     }
 }
 
-/// Names that the kernel takes as they are, and a shell too.
+/// Checks that a name is valid for the kernel and needs no quotes in a shell.
 fn plain(name: &str) -> Result<(), Failure> {
     super::bus_name(name).map_err(Failure::usage)?;
     if !is_plain(name) || name.starts_with(['-', '.']) {
@@ -127,7 +127,7 @@ fn plain(name: &str) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Opens a namespace; `None` when it is the one where we are.
+/// Opens a namespace; returns `None` for the current one.
 fn enter(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
     let namespace = Namespace::named(word);
     let not_allowed = || not_allowed(&format!("look into the network namespace {namespace}"));
@@ -170,14 +170,14 @@ fn not_allowed(what: &str) -> Failure {
     Failure::run(format!("not allowed to {what}, which needs root: `sudo {again}`"))
 }
 
-/// Carries out plans.
+/// Executes plans.
 struct Worker<'a> {
     netlink: &'a mut Netlink,
     there: Option<(&'a File, &'a mut Netlink)>,
 }
 
 impl Worker<'_> {
-    /// Prints what is left alone, and does the rest or prints what it would do.
+    /// Prints the unchanged interfaces, and executes the plan or prints its steps.
     fn finish(mut self, plan: &Plan, dry_run: bool) -> Result<(), Failure> {
         let mut text = String::new();
         for line in &plan.unchanged {
@@ -209,12 +209,12 @@ impl Worker<'_> {
                 }
             }
         }
-        // Printed when all is done: a failure undoes the steps before it.
+        // The steps are printed at the end, because a failure undoes the earlier ones.
         print(&plan.steps.iter().map(|step| format!("{}\n", step.done())).collect::<String>())
     }
 }
 
-/// Why a step fails, and how to fix it.
+/// Explains why a step failed, and how to fix it.
 fn explain(step: &Step, error: &io::Error) -> Failure {
     let kind = match step.action {
         Action::MakeVcan => Some("vcan"),
@@ -227,7 +227,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
     let unknown = |kind: &str, kernel: &Kernel| {
         let hints = kernel.hints(kernel.module(kind));
         let nearest = hints.first().map_or("", String::as_str);
-        // A command and its comment.
+        // A hint consists of a command and a comment.
         let (command, why) = nearest.split_once("# ").unwrap_or((nearest, ""));
         let command = if command.is_empty() { String::new() } else { format!("`{}`", command.trim()) };
         let why = match (command.is_empty(), why) {
@@ -248,7 +248,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
         )),
         (Some(Errno::OPNOTSUPP), Some(kind)) => unknown(kind, &Kernel::look()),
         (Some(Errno::PERM | Errno::ACCESS), kind) => {
-            // Root would only get this error.
+            // Even root would get this error.
             let kernel = Kernel::look();
             let missing = kind.filter(|kind| kernel.module(kind) == Module::Missing);
             missing.map_or_else(|| not_allowed(&doing), |kind| unknown(kind, &kernel))

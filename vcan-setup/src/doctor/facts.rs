@@ -1,4 +1,4 @@
-//! What the judgement rests on.
+//! The facts that the doctor assesses.
 
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
@@ -12,68 +12,68 @@ use crate::kernel::Kernel;
 use crate::link::Interface;
 use crate::plan::Target;
 
-/// All that the judgement rests on.
+/// The facts that the doctor assesses.
 #[derive(Clone, Debug)]
 pub struct Facts {
-    /// Which kind of bus is requested.
+    /// The requested kind of bus.
     pub choice: Choice,
-    /// Whether the cells are there already, as `skinbus run --no-spawn` has it.
+    /// True if the cells are already present, as with `skinbus run --no-spawn`.
     pub no_spawn: bool,
-    /// How this program is called so that `sudo` finds it.
+    /// The name of this program under which `sudo` finds it.
     pub program: String,
     /// The kernel.
     pub kernel: Kernel,
     /// The user who runs the doctor.
     pub user: User,
-    /// Bytes of a receive buffer that the kernel grants to a request like the gateway's.
+    /// The size of a receive buffer that the kernel grants to a request like the gateway's, in bytes.
     pub receive_buffer: Option<usize>,
-    /// Frames that may wait in the kernel until they are handed on; `None` when it is unknown.
+    /// The maximum number of frames that wait in the kernel's backlog; `None` if it is unknown.
     pub backlog: Option<usize>,
-    /// The program of the cells.
+    /// The cell program.
     pub cell_node: Program,
-    /// Where the embedded buses of this user are, or why none can be used.
+    /// The directory of this user's embedded buses, or the reason why it cannot be used.
     pub embedded: Result<PathBuf, String>,
-    /// The buses that were named.
+    /// The named buses.
     pub buses: Vec<Bus>,
-    /// The CAN interfaces that there are.
+    /// The present CAN interfaces.
     pub present: Vec<Interface>,
 }
 
 /// The user who runs the doctor.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct User {
-    /// Whether it is root.
+    /// True if the user is root.
     pub root: bool,
-    /// Whether it may make interfaces (`CAP_NET_ADMIN`).
+    /// True if the user may create interfaces (`CAP_NET_ADMIN`).
     pub admin: bool,
 }
 
 /// A program that a bench needs.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Program {
-    /// Where it should be.
+    /// The expected path.
     pub path: PathBuf,
-    /// Whether it is there.
+    /// True if the file exists.
     pub there: bool,
 }
 
-/// A bus that was named.
+/// A named bus.
 #[derive(Clone, Debug)]
 pub struct Bus {
-    /// What is required of it.
+    /// The requirements.
     pub target: Target,
-    /// Its cells; `None` without a skin.
+    /// The expected cells; `None` without a skin.
     pub cells: Option<BTreeSet<CellId>>,
-    /// Whether its cells are to answer with sums.
+    /// True if its cells answer with tree sums.
     pub sums: bool,
-    /// The interface of its name.
+    /// The interface of this name.
     pub interface: Option<Interface>,
-    /// What was received on it; `None` when it was not opened, or why it could not be.
+    /// The observed traffic; `None` if the bus was not opened, or the reason why it could not be.
     pub heard: Result<Option<Heard>, String>,
 }
 
 impl Bus {
-    /// The buses of a skin.
+    /// Returns the buses of a skin.
     #[must_use]
     pub fn of_skin(file: &OsStr, skin: &Skin) -> Vec<Self> {
         let of = |(index, target): (usize, Target)| Self {
@@ -84,23 +84,23 @@ impl Bus {
         Target::of_skin(file, skin).into_iter().enumerate().map(of).collect()
     }
 
-    /// A bus that was named.
+    /// Returns the bus of this name.
     #[must_use]
     pub fn named(name: &str) -> Self {
         Self::of(Target::named(name))
     }
 
-    /// One that has not been looked at yet.
+    /// Returns a bus that has not been examined yet.
     const fn of(target: Target) -> Self {
         Self { target, cells: None, sums: false, interface: None, heard: Ok(None) }
     }
 }
 
-/// What was received on a bus.
+/// The traffic observed on a bus.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct Heard {
-    /// Whether another gateway sends on it.
+    /// True if another gateway sends on the bus.
     pub gateway: bool,
-    /// Which cells do.
+    /// The cells that send on the bus.
     pub cells: BTreeSet<CellId>,
 }

@@ -1,4 +1,4 @@
-//! What is wrong with interfaces, and how to fix it.
+//! Assesses interfaces, and suggests how to fix them.
 
 use protocol::bus::Choice;
 use protocol::can::Format;
@@ -9,7 +9,7 @@ use crate::link::{FD_MTU, Hardware, Interface, Kind, State};
 use crate::plan::widen;
 
 impl Facts {
-    /// Whether interfaces that are missing can be made.
+    /// Reports whether missing interfaces can be created.
     pub(super) fn making(&self) -> Vec<Finding> {
         let missing = |bus: &&Bus| bus.interface.is_none() && bus.target.hardware().is_none();
         let mut findings = Vec::new();
@@ -20,7 +20,7 @@ impl Facts {
         findings.extend(match self.kernel.vcan {
             Module::There => None,
             Module::Unknown => {
-                let text = "whether the kernel has vcan is not to be seen; should it have none:";
+                let text = "cannot see whether the kernel has vcan; if it has none:";
                 Some(Finding::note(text).hints(hints))
             }
             Module::Loadable => {
@@ -47,7 +47,7 @@ impl Facts {
         findings
     }
 
-    /// Without buses that were named: whether there is any that could be used.
+    /// Reports whether a usable interface exists, if no buses are named.
     pub(super) fn any_interface(&self) -> Option<Finding> {
         if !self.buses.is_empty() {
             return None;
@@ -61,7 +61,7 @@ impl Facts {
         })
     }
 
-    /// What a bus without an interface comes to where either kind of bus would do.
+    /// Reports the effect of a missing interface if either kind of bus is acceptable.
     pub(super) fn absent(&self, bus: &Bus) -> Option<Finding> {
         if self.choice != Choice::Auto || !self.kernel.has_can {
             return None;
@@ -144,7 +144,7 @@ impl Facts {
         let Interface { name, mtu, up, .. } = interface;
         let what = interface.what();
         let skin = bus.target.skin.as_ref();
-        // What sets the bit rates, or would if they were known.
+        // Returns the command that sets the bit rates, or would if they were known.
         let set = || match bus.target.hardware() {
             Some(skin) => self.own(&format!("up {} --set-bit-rates", skin.file)),
             None => {
@@ -186,14 +186,14 @@ impl Facts {
         findings.extend(match hardware.state.filter(|_| *up) {
             Some(State::BusOff) => Some(
                 Finding::fault(format!(
-                    "{name} is BUS-OFF: after too many errors it takes no part any more; wiring, termination or bit \
+                    "{name} is BUS-OFF: it no longer takes part after too many errors; wiring, termination or bit \
                      rates are wrong"
                 ))
                 .hint(self.sudo(&format!("ip link set {name} type can restart"))),
             ),
             Some(state @ (State::ErrorPassive | State::ErrorWarning)) => Some(
                 Finding::note(format!(
-                    "{name} is {}: it sees errors; is anybody else on the bus, terminated, at the same bit rates?",
+                    "{name} is {}: it sees errors; is another node on the bus, terminated, at the same bit rates?",
                     state.name()
                 ))
                 .hint(format!("ip -details -statistics link show {name}")),
@@ -216,7 +216,7 @@ impl Facts {
     }
 }
 
-/// What an interface of this MTU carries.
+/// Returns the name of the CAN format that an interface of this MTU carries.
 const fn carries(mtu: u32) -> &'static str {
     if mtu >= FD_MTU { "CAN FD" } else { "classic CAN" }
 }

@@ -12,7 +12,7 @@ fn cell(node: i64) -> CellId {
     CellId::new(node).unwrap()
 }
 
-/// A bus of a skin, with 100 cells.
+/// Returns a bus of a skin with 100 cells.
 fn bus(interface: Option<Interface>) -> Bus {
     let name = interface.as_ref().map_or("vcan0", |it| it.name.as_str()).to_owned();
     let skin = Some(SkinBus { file: "skin.toml".into(), rates: Rates::default() });
@@ -25,7 +25,7 @@ fn bus(interface: Option<Interface>) -> Bus {
     }
 }
 
-/// A machine on which all is well.
+/// Returns the facts of a machine without faults.
 fn good() -> Facts {
     Facts {
         choice: Choice::Auto,
@@ -58,7 +58,7 @@ fn no_can(choice: Choice) -> Facts {
     facts
 }
 
-/// All findings as they are printed, but for those that are ok.
+/// Returns all findings as printed, except those that are ok.
 fn complaints(facts: &Facts) -> Vec<String> {
     let bad = |finding: Finding| {
         let hints = finding.hints.iter().map(|hint| format!(" | {hint}")).collect::<String>();
@@ -67,7 +67,7 @@ fn complaints(facts: &Facts) -> Vec<String> {
     assess(facts).into_iter().filter_map(bad).collect()
 }
 
-/// The findings when the bus, its interface or the machine is changed.
+/// Returns the findings after a change of the facts.
 fn about(change: impl FnOnce(&mut Facts)) -> Vec<String> {
     let mut facts = good();
     change(&mut facts);
@@ -182,7 +182,7 @@ fn a_bus_of_either_kind_that_is_absent_is_made_by_a_run_that_starts_its_cells() 
             "fault: {text}, and no embedded bus of this name is served | sudo vcan-setup up skin.toml | vcan-setup serve vcan0 &"
         )]
     );
-    assert_eq!(absent(true, Some(Heard::default())).len(), 1, "no cell is heard there");
+    assert_eq!(absent(true, Some(Heard::default())).len(), 1, "no cell sends there");
 }
 
 #[test]
@@ -214,9 +214,7 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     assert!(
         missing(admin, Module::Missing)[0].starts_with("fault: the kernel (6.1.0) has CAN and no vcan | ")
     );
-    assert!(
-        missing(admin, Module::Unknown)[0].starts_with("note: whether the kernel has vcan is not to be seen")
-    );
+    assert!(missing(admin, Module::Unknown)[0].starts_with("note: cannot see whether the kernel has vcan"));
     let contained = missing(User { root: true, admin: false }, Module::There);
     assert!(contained[0].starts_with("fault: root may not make interfaces here: it has no CAP_NET_ADMIN"));
     let named = about(|facts| {
@@ -314,9 +312,9 @@ fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
     assert_eq!(listens(cells(1..=100), true), Vec::<String>::new());
     assert_eq!(
         listens(cells(2..=100), true),
-        ["note: 99 cells are on vcan0; of the skin's these were not heard: 1"]
+        ["note: 99 cells are on vcan0; these cells of the skin sent nothing: 1"]
     );
-    assert!(listens(cells([]), true)[0].starts_with("fault: no cell is heard on vcan0"));
+    assert!(listens(cells([]), true)[0].starts_with("fault: no cell sends on vcan0"));
     let embedded = |heard| {
         let mut facts = no_can(Choice::Auto);
         facts.buses[0].heard = Ok(heard);
@@ -374,7 +372,7 @@ fn the_backlog_holds_an_answer_of_every_cell_of_every_bus() {
         backlog(Some(99)),
         [
             "fault: the kernel's backlog of 99 does not hold an answer of all cells, 100 frames: some would be lost \
-          without a word | sudo sysctl -w net.core.netdev_max_backlog=200"
+          silently | sudo sysctl -w net.core.netdev_max_backlog=200"
         ]
     );
     assert!(backlog(None)[0].starts_with("note: the kernel's backlog cannot be seen"));

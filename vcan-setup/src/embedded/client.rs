@@ -1,4 +1,4 @@
-//! One client of a bus: its socket, and what waits for it.
+//! One client of a bus: its socket, and its queue.
 
 use std::os::fd::OwnedFd;
 
@@ -14,10 +14,10 @@ use super::parcel::Parcel;
 use super::queue::{Entry, Queue};
 use super::routing::ClientId;
 
-/// Frames that wait for a client beyond what its socket holds.
+/// The maximum number of frames that wait for a client beyond those in its socket.
 const QUEUE: usize = 256;
 
-/// What sending to any client takes.
+/// The resources for sending to any client.
 #[derive(Debug)]
 pub(super) struct Post {
     pub(super) epoll: OwnedFd,
@@ -25,16 +25,16 @@ pub(super) struct Post {
     pub(super) totals: Totals,
 }
 
-/// Outcome of sending what waits for a client.
+/// The outcome of sending a client's queue.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Sent {
-    /// It was sent, or waits until its socket has room, which `epoll` reports.
+    /// The queue is sent, or waits until the socket has room, which `epoll` reports.
     Done,
-    /// The system lacks memory: to be tried again soon.
+    /// The system lacks memory; sending is retried soon.
     Shortage,
-    /// It does not read any more.
+    /// The client no longer reads.
     Gone,
-    /// Its socket fails for a reason that does not pass.
+    /// The socket fails permanently.
     Failed(Errno),
 }
 
@@ -47,16 +47,16 @@ pub(super) struct Client {
     /// The other client of that process, if there are two.
     pub(super) sibling: Option<ClientId>,
     queue: Queue,
-    /// Its hello; nothing is routed before.
+    /// True once its hello was received; frames are routed only afterwards.
     pub(super) greeted: bool,
     pub(super) fd: bool,
-    /// Filters of which some parts have arrived.
+    /// New filters of which some parts have arrived.
     pub(super) filters: Option<Vec<Filter>>,
-    /// Its socket is full; `epoll` reports when it is not.
+    /// True while its socket is full; `epoll` reports when it has room.
     blocked: bool,
-    /// It is in the list of clients with something to send.
+    /// True while it is in the list of clients with something to send.
     dirty: bool,
-    /// Receptions in succession that failed.
+    /// The number of failed receptions in a row.
     pub(super) failures: u32,
 }
 
@@ -78,41 +78,41 @@ impl Client {
         }
     }
 
-    /// Takes a frame that is to be sent to it; whether it has to be flushed from now on, and had not before.
+    /// Queues a frame. Returns true if the client needs to be flushed and did not before.
     pub(super) fn take(&mut self, parcel: Parcel, post: &mut Post) -> bool {
         post.totals.routed += 1;
         if !self.queue.push(parcel) {
             post.totals.dropped += 1;
             return false;
         }
-        // A client that does not read any more is found again, and muted, at the end of the round.
+        // A client that no longer reads is detected again, and muted, at the end of the round.
         if !self.blocked && self.queue.frames() >= BATCH {
             let _ = self.send(post);
         }
         !self.blocked && !std::mem::replace(&mut self.dirty, true)
     }
 
-    /// Sends what waits for it before its process gets a newer frame by another socket. Errors are found again at the end
-    /// of the round.
+    /// Sends the queue before the client's process gets a newer frame by another socket. Errors are detected again at
+    /// the end of the round.
     pub(super) fn send_early(&mut self, post: &mut Post) {
         if self.dirty && !self.blocked {
             let _ = self.send(post);
         }
     }
 
-    /// Sends what waits for it, unless there is no room.
+    /// Sends the queue, unless the socket is full.
     pub(super) fn flush(&mut self, post: &mut Post) -> Sent {
         self.dirty = false;
         if self.blocked { Sent::Done } else { self.send(post) }
     }
 
-    /// Takes its socket out of `epoll`, and sends nothing to it, until it is resumed.
+    /// Removes the socket from `epoll`, and sends nothing to it until it is resumed.
     pub(super) fn pause(&mut self, post: &Post) {
         self.blocked = true;
         let _ = epoll::delete(&post.epoll, &self.socket);
     }
 
-    /// Ends a pause; whether the system allowed it.
+    /// Ends a pause. Returns true on success.
     pub(super) fn resume(&mut self, post: &Post) -> bool {
         let data = EventData::new_u64(self.id.0 as u64);
         let resumed = epoll::add(&post.epoll, &self.socket, data, EventFlags::IN).is_ok();
@@ -120,20 +120,20 @@ impl Client {
         resumed
     }
 
-    /// Whether it can be sent to again and could not before.
+    /// Returns true if the client was blocked and can be sent to again.
     pub(super) fn unblock(&mut self, post: &Post) -> bool {
         let free = self.blocked && self.watch(post, EventFlags::IN);
         self.blocked &= !free;
         free
     }
 
-    /// Counts what waits for it as abandoned.
+    /// Drops the queue, and counts its frames as abandoned.
     pub(super) fn abandon(&mut self, post: &mut Post) {
         post.totals.abandoned += self.queue.frames() as u64;
         self.queue = Queue::new(QUEUE);
     }
 
-    /// Sends what waits for it until it is all sent or its socket is full.
+    /// Sends the queue until it is empty or the socket is full.
     fn send(&mut self, post: &mut Post) -> Sent {
         loop {
             self.queue.report_dropped();
@@ -156,7 +156,7 @@ impl Client {
             }
             match post.outgoing.send(&self.socket) {
                 Ok(count) => post.totals.delivered += self.queue.sent(count) as u64,
-                // Its socket may have room: that would be reported at once, again and again.
+                // The socket may have room, which `epoll` would report at once, again and again.
                 Err(error) if is_shortage(&error) => return Sent::Shortage,
                 Err(error) => match Errno::from_io_error(&error) {
                     Some(Errno::INTR) => {}

@@ -1,12 +1,12 @@
-//! A frame's datagram on its way through the bus.
+//! The datagram of a frame on its way through the bus.
 
 use protocol::bus::embedded::OWN_BYTE;
 use protocol::can::{FD_BYTES, FD_FORMAT, Format, Frame};
 
-/// Which byte holds the FD flags.
+/// The index of the byte that holds the FD flags.
 const FLAGS_BYTE: usize = 5;
 
-/// `struct can_frame` or `struct canfd_frame`, as the bus passes it on.
+/// A `struct can_frame` or `struct canfd_frame`, as the bus forwards it.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Parcel {
     bytes: [u8; FD_BYTES],
@@ -15,11 +15,11 @@ pub struct Parcel {
 }
 
 impl Parcel {
-    /// Takes a client's datagram; `None` when it is no frame that `CAN_RAW` would send.
+    /// Checks a client's datagram; returns `None` if it is not a frame that `CAN_RAW` would send.
     ///
-    /// The size must be that of one of the structs, the length at most what it carries, and CAN FD must be
-    /// what the client opened (`fd`). As kernels do from 6.1 on, an FD frame gets its flag FDF. The bytes are
-    /// passed on as they came otherwise, except the one that marks own frames. Never panics.
+    /// The size must be that of one of the structs, and the length at most the data that it holds. CAN FD requires that
+    /// the client enabled it (`fd`). As in kernels from 6.1 on, an FD frame gets its flag FDF. Otherwise the bytes are
+    /// forwarded unchanged, except the one that marks own frames. Never panics.
     #[must_use]
     pub fn accept(datagram: &[u8], fd: bool) -> Option<Self> {
         let frame = Frame::from_bytes(datagram).ok()?;
@@ -35,7 +35,7 @@ impl Parcel {
         Some(Self { bytes, id: frame.raw_id(), format: frame.format() })
     }
 
-    /// The same frame, marked as the receiver's own or not.
+    /// Returns the frame, marked as the receiver's own or not.
     #[must_use]
     pub fn marked(mut self, own: bool) -> Self {
         if let Some(byte) = self.bytes.get_mut(OWN_BYTE) {
@@ -44,25 +44,25 @@ impl Parcel {
         self
     }
 
-    /// Identifier and flags.
+    /// Returns the identifier with its flags.
     #[must_use]
     pub const fn raw_id(&self) -> u32 {
         self.id
     }
 
-    /// Classic or FD.
+    /// Returns the format: classic or FD.
     #[must_use]
     pub const fn format(&self) -> Format {
         self.format
     }
 
-    /// The datagram is the first [`Parcel::byte_len`] of these.
+    /// Returns the bytes; the datagram is the first [`Parcel::byte_len`] of them.
     #[must_use]
     pub const fn bytes(&self) -> &[u8; FD_BYTES] {
         &self.bytes
     }
 
-    /// 16 or 72.
+    /// Returns the length of the datagram: 16 or 72.
     #[must_use]
     pub const fn byte_len(&self) -> usize {
         self.format.byte_len()

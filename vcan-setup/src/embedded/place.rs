@@ -1,7 +1,8 @@
-//! Where a bus's socket lies, and who may put it there.
+//! The socket of a bus in its directory, and the rules for creating and removing it.
 //!
-//! Whoever makes or removes a socket or the directory holds a lock on the directory meanwhile, so a socket
-//! that a killed server left behind is told apart from one that is served, and only one wins.
+//! A process that creates or removes a socket or the directory holds a lock on the directory meanwhile. A socket that a
+//! killed server left behind is therefore distinguished from one that is served, and only one server can take its
+//! place.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -16,52 +17,52 @@ use rustix::io::Errno;
 use rustix::net::SocketFlags;
 use thiserror::Error;
 
-/// Why a bus cannot be served under a name.
+/// The error of a bus that cannot be served under a name.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum PlaceError {
-    /// No bus can have this name.
+    /// The name is not allowed.
     #[error(transparent)]
     Name(BusError),
     /// The directory cannot be used.
     #[error(transparent)]
     Directory(#[from] DirectoryError),
-    /// Another server is there.
+    /// Another server serves the bus.
     #[error("the embedded bus {name} is already served at {}: use it, or stop its server first", path.display())]
     Served {
-        /// The bus.
+        /// The name of the bus.
         name: String,
-        /// Its socket.
+        /// The path of its socket.
         path: PathBuf,
     },
-    /// A file that is no socket.
+    /// A file that is not a socket has the path.
     #[error("{} is in the way and is no socket: move it away", .0.display())]
     InTheWay(PathBuf),
-    /// Any other error of the system.
+    /// Another system error.
     #[error("cannot {doing} {}: {source}", path.display())]
     Io {
-        /// The socket or the directory.
+        /// The path of the socket or the directory.
         path: PathBuf,
-        /// What was tried.
+        /// The failed operation.
         doing: &'static str,
-        /// The system's error.
+        /// The system error.
         source: io::Error,
     },
 }
 
-/// A listening socket in its directory; dropping it removes both, the directory only when it is
-/// empty and a server made it.
+/// A listening socket in its directory. Dropping it removes the socket, and the directory if a server created it and it
+/// is empty.
 #[derive(Debug)]
 pub(super) struct Place {
     pub(super) listener: OwnedFd,
     pub(super) path: PathBuf,
     directory: PathBuf,
     file: String,
-    /// Device and inode of the socket's file, to remove no one else's.
+    /// The device and inode of the socket file, so that only this server's file is removed.
     inode: (u64, u64),
 }
 
-/// How many clients may be waiting to be let in; the kernel's own limit is often lower.
+/// The maximum number of clients waiting to be accepted; the kernel's own limit is often lower.
 const BACKLOG: i32 = 4096;
 
 impl Place {
@@ -81,7 +82,7 @@ impl Place {
             }
             Ok(_) => {
                 let probe = seqpacket(SocketFlags::NONBLOCK).map_err(failed("ask for"))?;
-                // Only a socket without a listener refuses; a full list of waiting clients does not.
+                // Only a socket without a listener refuses; a full backlog does not.
                 if rustix::net::connect(&probe, &address) != Err(Errno::CONNREFUSED) {
                     return Err(PlaceError::Served { name: name.to_owned(), path });
                 }
@@ -112,24 +113,24 @@ impl Place {
 
 impl Drop for Place {
     fn drop(&mut self) {
-        // Nothing more can be done: another program removed it, or the directory has other buses or is
-        // the user's.
+        // Nothing more can be done if another program removed the socket, or if the directory holds other buses or
+        // belongs to the user.
         let _ = self.remove();
     }
 }
 
-/// The most attempts at a directory that is gone again when it has been made.
+/// The maximum number of attempts if the directory disappears again after it was created.
 const MOST_ABSENT: u32 = 1_000;
 
-/// Makes the directory unless it is there, and locks it.
+/// Creates the directory if necessary, and locks it.
 fn lock(path: &Path) -> Result<OwnedFd, PlaceError> {
     let failed = |errno: Errno| PlaceError::Io { path: path.to_owned(), doing: "lock", source: errno.into() };
     let mut absent = 0;
     loop {
         let directory = match make_directory(path) {
             Ok(directory) => directory,
-            // A server that ended removed it between the two looks; but a missing parent stays missing, and where a file
-            // system has no directories to make, as in /proc, it stays absent.
+            // A server that ended may have removed the directory in between. But a missing parent stays missing, and on
+            // file systems without creatable directories, such as /proc, the directory stays absent.
             Err(error)
                 if error.is_absent() && absent < MOST_ABSENT && path.parent().is_some_and(Path::exists) =>
             {
@@ -141,7 +142,7 @@ fn lock(path: &Path) -> Result<OwnedFd, PlaceError> {
         rustix::io::retry_on_intr(|| rustix::fs::flock(&directory, FlockOperation::LockExclusive))
             .map_err(failed)?;
         let locked = rustix::fs::fstat(&directory).map_err(failed)?;
-        // Whoever held the lock before may have removed the directory: then this lock is on nothing.
+        // The previous holder of the lock may have removed the directory; this lock would then be useless.
         if let Ok(present) = rustix::fs::lstat(path)
             && (present.st_dev, present.st_ino) == (locked.st_dev, locked.st_ino)
         {

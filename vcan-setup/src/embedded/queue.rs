@@ -1,4 +1,4 @@
-//! What waits for one client, and what was dropped because it did not read.
+//! The queue of one client, and the count of frames that were dropped because it did not read.
 
 use std::collections::VecDeque;
 
@@ -9,12 +9,12 @@ use super::parcel::Parcel;
 pub enum Entry {
     /// A frame.
     Frame(Parcel),
-    /// How many frames were dropped so far.
+    /// The number of frames dropped so far.
     Dropped(u32),
 }
 
-/// A bounded queue. When it is full the newest frame is dropped, as a socket's receive buffer does it, and
-/// the client gets the total before the next frame that it gets.
+/// A bounded queue. When it is full the newest frame is dropped, as in a socket's receive buffer, and the client gets
+/// the total before its next frame.
 #[derive(Debug)]
 pub struct Queue {
     entries: VecDeque<Entry>,
@@ -25,13 +25,13 @@ pub struct Queue {
 }
 
 impl Queue {
-    /// An empty queue for at most `limit` frames.
+    /// Creates an empty queue for at most `limit` frames.
     #[must_use]
     pub const fn new(limit: usize) -> Self {
         Self { entries: VecDeque::new(), frames: 0, limit, dropped: 0, reported: 0 }
     }
 
-    /// Appends a frame; `false` when there was no room and it was dropped and counted.
+    /// Appends a frame. Returns false if there was no room; the frame is then dropped and counted.
     pub fn push(&mut self, parcel: Parcel) -> bool {
         if self.frames >= self.limit {
             self.dropped = self.dropped.wrapping_add(1);
@@ -43,8 +43,8 @@ impl Queue {
         true
     }
 
-    /// Appends the total of dropped frames, unless it was reported already. To be called also when the queue has
-    /// run empty, so that the report comes at the right place in the sequence.
+    /// Appends the total of dropped frames, unless it was already reported. Must also be called when the queue has run
+    /// empty, so that the report has the correct position in the sequence.
     pub fn report_dropped(&mut self) {
         if self.reported != self.dropped {
             self.entries.push_back(Entry::Dropped(self.dropped));
@@ -52,12 +52,12 @@ impl Queue {
         }
     }
 
-    /// What comes next, oldest first.
+    /// Returns the entries, oldest first.
     pub fn iter(&self) -> impl Iterator<Item = &Entry> {
         self.entries.iter()
     }
 
-    /// Removes the oldest `count` entries, which were sent; how many of them were frames.
+    /// Removes the oldest `count` entries, which were sent. Returns the number of frames among them.
     pub fn sent(&mut self, count: usize) -> usize {
         let sent = self.entries.drain(..count.min(self.entries.len()));
         let frames = sent.filter(|entry| matches!(entry, Entry::Frame(_))).count();
@@ -65,13 +65,13 @@ impl Queue {
         frames
     }
 
-    /// How many frames wait.
+    /// Returns the number of waiting frames.
     #[must_use]
     pub const fn frames(&self) -> usize {
         self.frames
     }
 
-    /// Whether nothing waits, not even a notice.
+    /// Returns true if the queue holds neither frames nor a report.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.entries.is_empty()

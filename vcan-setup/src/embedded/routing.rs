@@ -1,7 +1,7 @@
-//! Which clients get a frame: the rules of the kernel's `CAN_RAW`.
+//! Selects the clients that get a frame, by the rules of the kernel's `CAN_RAW`.
 //!
-//! As the kernel does (`net/can/af_can.c`), filters are sorted once into classes, so that a frame looks only
-//! where it can match: an exact identifier is found in a table, whatever the number of clients.
+//! As in the kernel (`net/can/af_can.c`), filters are sorted into classes once, so that a frame is compared only where
+//! it can match. An exact identifier is found in a table, whatever the number of clients.
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -10,11 +10,11 @@ use protocol::bus::Filter;
 use protocol::bus::embedded::Hello;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, REMOTE, STANDARD_MASK};
 
-/// A client's place in the server's table.
+/// The index of a client in the server's table.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct ClientId(pub usize);
 
-/// Where a filter is looked up.
+/// The class of a filter, which decides where it is looked up.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Class {
     /// Error frames of the classes in this mask.
@@ -26,7 +26,7 @@ enum Class {
 }
 
 impl Class {
-    /// The kernel's `can_rcv_list_find`.
+    /// Classifies a filter as the kernel's `can_rcv_list_find` does.
     fn of(filter: Filter) -> Self {
         let Filter { id, mut mask } = filter;
         if mask & ERROR != 0 {
@@ -43,7 +43,7 @@ impl Class {
         }
     }
 
-    /// Whether a frame with this identifier and these flags passes.
+    /// Returns true if a frame with this identifier and these flags passes.
     const fn passes(self, frame: u32) -> bool {
         let error = frame & ERROR != 0;
         match self {
@@ -56,12 +56,12 @@ impl Class {
 
 #[derive(Clone, Debug)]
 struct Wants {
-    /// What it is listed for, and no more.
+    /// The filters for which it is listed.
     filters: Vec<Filter>,
     own_frames: bool,
     fd: bool,
     error_mask: u32,
-    /// The last frame that was delivered, so that a second match does not deliver it again.
+    /// The number of the last delivered frame, so that a second match does not deliver it again.
     last: u64,
 }
 
@@ -72,25 +72,25 @@ impl Wants {
     }
 }
 
-/// All subscriptions.
+/// The subscriptions of all clients.
 #[derive(Debug, Default)]
 pub struct Router {
     clients: Vec<Option<Wants>>,
-    /// The clients that subscribe to exactly a data frame with this identifier.
+    /// The clients that subscribe to exactly one data frame identifier.
     exact: HashMap<u32, Vec<ClientId>>,
-    /// What every frame is held against.
+    /// The filters that are compared with every frame.
     walked: Vec<(Class, ClientId)>,
     frames: u64,
 }
 
 impl Router {
-    /// Nobody wants anything.
+    /// Creates a router without subscriptions.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Replaces a client's subscriptions.
+    /// Replaces a client's subscription.
     pub fn insert(&mut self, client: ClientId, hello: &Hello) {
         self.remove(client);
         if self.clients.len() <= client.0 {
@@ -104,7 +104,7 @@ impl Router {
         }
     }
 
-    /// Replaces the filters of a present client; the rest of its subscriptions stays.
+    /// Replaces the filters of a present client; the rest of its subscription stays.
     pub fn set_filters(&mut self, client: ClientId, filters: Vec<Filter>) {
         let Some(mut wants) = self.clients.get_mut(client.0).and_then(Option::take) else { return };
         self.unlist(client, &wants);
@@ -124,14 +124,15 @@ impl Router {
         }
     }
 
-    /// Forgets a client; nothing happens if there is none.
+    /// Removes a client, if it is present.
     pub fn remove(&mut self, client: ClientId) {
         if let Some(wants) = self.clients.get_mut(client.0).and_then(Option::take) {
             self.unlist(client, &wants);
         }
     }
 
-    /// Looks only where the client is listed: hundreds of them change their filters while frames are waiting.
+    /// Searches only the lists that contain the client: hundreds of clients change their filters while frames are
+    /// waiting.
     fn unlist(&mut self, client: ClientId, wants: &Wants) {
         for class in wants.classes() {
             match class {
@@ -148,7 +149,7 @@ impl Router {
         }
     }
 
-    /// Names each client that gets a frame, once, and whether the frame is its own.
+    /// Calls `deliver` once for each client that gets a frame, with true if the frame is its own.
     pub fn route(
         &mut self,
         from: ClientId,
@@ -185,7 +186,7 @@ mod tests {
         Hello { filters: filters.to_vec(), own_frames: false, fd: true, error_mask: 0, buffer: 0 }
     }
 
-    /// Its receivers, in order of their numbers.
+    /// Returns the receivers of a frame, in order of their numbers.
     fn receivers(router: &mut Router, from: usize, id: u32, format: Format) -> Vec<(usize, bool)> {
         let mut receivers = Vec::new();
         router.route(ClientId(from), id, format, |client, own| receivers.push((client.0, own)));
@@ -239,7 +240,7 @@ mod tests {
         assert_eq!(receivers(&mut router, 300, 0x8000_0007, Format::Fd), [(7, false)]);
     }
 
-    /// The rule as the kernel's documentation states it, without any classes.
+    /// The rule as the kernel's documentation states it, without classes.
     fn passes(filters: &[Filter], error_mask: u32, id: u32) -> bool {
         let errors = |filter: &&Filter| filter.mask & ERROR != 0;
         if id & ERROR != 0 {
@@ -267,7 +268,7 @@ mod tests {
         (word(), mask).prop_map(|(id, mask)| Filter { id, mask })
     }
 
-    /// A frame's identifier as drivers make it: 11 bits unless the flag for 29 is set.
+    /// Returns an identifier as drivers make it: 11 bits unless the flag for 29 is set.
     fn sound(id: u32) -> u32 {
         if id & (EXTENDED | ERROR) == 0 { id & (STANDARD_MASK | REMOTE) } else { id }
     }

@@ -1,4 +1,4 @@
-//! A bus in a thread of this process.
+//! Serves a bus in a thread of this process.
 
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
@@ -8,7 +8,7 @@ use protocol::bus::embedded::usual_directory;
 
 use super::{ServeError, Server, Totals};
 
-/// A bus that is served by a thread of this process until this is dropped.
+/// A bus that a thread of this process serves until this is dropped.
 #[derive(Debug)]
 pub struct Served {
     path: PathBuf,
@@ -20,7 +20,7 @@ impl Served {
     /// Serves a bus in the usual directory.
     ///
     /// # Errors
-    /// As [`Server::bind`].
+    /// Returns [`ServeError`] as [`Server::bind`] does.
     pub fn start(name: &str) -> Result<Self, ServeError> {
         Self::start_in(&usual_directory(), name)
     }
@@ -28,7 +28,7 @@ impl Served {
     /// Serves a bus in another directory.
     ///
     /// # Errors
-    /// As [`Server::bind`].
+    /// Returns [`ServeError`] as [`Server::bind`] does.
     pub fn start_in(directory: &Path, name: &str) -> Result<Self, ServeError> {
         let failed = |doing| move |source| ServeError::Io { name: name.to_owned(), doing, source };
         let server = Server::bind_in(directory, name)?;
@@ -41,19 +41,19 @@ impl Served {
         Ok(Self { path, stop: Some(stop), thread: Some(thread) })
     }
 
-    /// The socket's path.
+    /// Returns the path of the socket.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Stops serving; what the bus has done.
+    /// Stops serving, and returns the counts of the bus.
     ///
     /// # Errors
-    /// When it had failed before.
+    /// Returns [`ServeError`] if the server had failed before.
     ///
     /// # Panics
-    /// When its thread did.
+    /// If the thread of the server panicked.
     pub fn stop(mut self) -> Result<Totals, ServeError> {
         drop(self.stop.take());
         let thread = self.thread.take().expect("stopped once");

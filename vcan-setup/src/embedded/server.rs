@@ -1,4 +1,4 @@
-//! The process around routing and queues: one thread, one `epoll`, many datagrams per system call.
+//! The server around routing and queues: one thread, one `epoll`, many datagrams per system call.
 
 use std::collections::VecDeque;
 use std::io;
@@ -27,30 +27,30 @@ mod admission;
 #[cfg(test)]
 mod tests;
 
-/// Batches taken from one client before the next one's turn: what its send buffer holds, and more.
+/// The maximum number of batches read from one client before the next one's turn: more than its send buffer holds.
 const DRAIN: usize = 16;
-/// Time for which a socket is left alone after an error that may last, such as a lack of memory or of files.
+/// The time for which a socket is left alone after an error that may last, such as a lack of memory or files.
 const PAUSE: Duration = Duration::from_millis(1);
-/// Receptions in succession that may fail before a client is given up: a second of them.
+/// The number of failed receptions in a row after which a client is given up; this takes a second.
 const FAILURES: u32 = 1_000;
 const LISTENER: u64 = u64::MAX;
 const STOP: u64 = u64::MAX - 1;
 
-/// Why a bus stopped being served.
+/// The error that ends the serving of a bus.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ServeError {
-    /// It could not begin.
+    /// The server could not begin.
     #[error(transparent)]
     Place(#[from] PlaceError),
     /// A system call failed.
     #[error("cannot {doing} while serving {name}: {source}")]
     Io {
-        /// The bus.
+        /// The name of the bus.
         name: String,
-        /// What was tried.
+        /// The failed operation.
         doing: &'static str,
-        /// The system's error.
+        /// The system error.
         source: io::Error,
     },
 }
@@ -60,7 +60,7 @@ pub enum ServeError {
 pub struct Server {
     name: String,
     place: Place,
-    /// Given up for a moment to turn a client away when there are no file descriptors left.
+    /// A reserved file descriptor, which is released for a moment to turn a client away when no others are left.
     spare: Option<OwnedFd>,
     /// A client that is turned away and has not sent its hello.
     parting: Option<OwnedFd>,
@@ -69,16 +69,16 @@ pub struct Server {
     dirty: VecDeque<ClientId>,
     router: Router,
     post: Post,
-    /// Tokens of sockets that are left alone until a time.
+    /// Tokens of sockets that are left alone until `resume_at`.
     paused: Vec<u64>,
     resume_at: Option<Instant>,
 }
 
-/// Where the server receives datagrams.
+/// The source of received datagrams.
 trait Receive {
-    /// As [`Batch::receive`].
+    /// Receives datagrams as [`Batch::receive`] does.
     fn receive(&mut self, socket: &OwnedFd) -> io::Result<usize>;
-    /// As [`Batch::datagrams`].
+    /// Returns the datagrams as [`Batch::datagrams`] does.
     fn datagrams(&self) -> impl ExactSizeIterator<Item = Datagram<'_>>;
 }
 
@@ -93,19 +93,18 @@ impl Receive for Batch {
 }
 
 impl Server {
-    /// Takes a name in the usual directory; clients can connect from now on, and are let in by
-    /// [`Server::run`].
+    /// Binds a name in the usual directory. Clients can connect from now on; [`Server::run`] accepts them.
     ///
     /// # Errors
-    /// When the name is served already, or the directory is not ours alone.
+    /// Returns [`ServeError`] if the name is already served, or if the directory is accessible to other users.
     pub fn bind(name: &str) -> Result<Self, ServeError> {
         Self::bind_in(&usual_directory(), name)
     }
 
-    /// The same in another directory.
+    /// Binds a name in another directory.
     ///
     /// # Errors
-    /// As [`Server::bind`].
+    /// Returns [`ServeError`] as [`Server::bind`] does.
     pub fn bind_in(directory: &Path, name: &str) -> Result<Self, ServeError> {
         let failed =
             |doing| move |errno: Errno| ServeError::Io { name: name.to_owned(), doing, source: errno.into() };
@@ -127,22 +126,22 @@ impl Server {
         })
     }
 
-    /// The socket's path.
+    /// Returns the path of the socket.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.place.path
     }
 
-    /// The bus's name.
+    /// Returns the name of the bus.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Serves until `stop` can be read or is hung up; what the bus has done. Clients then find it closed.
+    /// Serves until `stop` is readable or hung up. Returns the counts of the bus. Clients then see a closed bus.
     ///
     /// # Errors
-    /// When a system call fails; no client can cause that.
+    /// Returns [`ServeError`] if a system call fails, which no client can cause.
     pub fn run(self, stop: impl AsFd) -> Result<Totals, ServeError> {
         self.run_with(stop, Batch::new())
     }
@@ -182,7 +181,7 @@ impl Server {
         }
     }
 
-    /// Leaves a socket alone for a while: what is wrong is a state, and would be reported again at once.
+    /// Leaves a socket alone for a while: the error is a state that `epoll` would report again at once.
     fn pause(&mut self, token: u64) {
         let Self { post, place, .. } = self;
         if token == LISTENER {
@@ -249,15 +248,15 @@ impl Server {
         client(&mut self.clients, id.0)
     }
 
-    /// Routes what a client has sent. As much as a client can have under way is taken at once, so that what
-    /// it sent before another began comes first; more than that waits, so that no client holds up the rest.
+    /// Routes the datagrams of a client. All data that a client can have in flight is read at once, so that it comes
+    /// before data that another client sent later. More data waits, so that no client delays the others.
     fn drain(&mut self, id: ClientId, batch: &mut impl Receive) {
         for _ in 0..DRAIN {
             let Some(client) = self.client(id) else { return };
             let fd = client.fd;
             match batch.receive(&client.socket) {
                 Ok(_) => client.failures = 0,
-                // It went away with frames unread; what it had sent can still be read.
+                // The client disconnected with unread frames; the data that it sent can still be read.
                 Err(error) if error.raw_os_error() == Some(Errno::CONNRESET.raw_os_error()) => continue,
                 Err(error)
                     if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) =>
@@ -271,7 +270,7 @@ impl Server {
             let mut failure = None;
             for datagram in batch.datagrams() {
                 let bytes = datagram.bytes();
-                // A closed socket reads as empty datagrams without end.
+                // A closed socket returns empty datagrams without end.
                 if bytes.is_some_and(<[u8]>::is_empty) {
                     match self.is_hung_up(id) {
                         Ok(true) => return self.forget(id),
@@ -294,7 +293,7 @@ impl Server {
         }
     }
 
-    /// Takes a part of a client's new filters, and whether it is one.
+    /// Adds a part of a client's new filters. Returns false if the datagram is not one.
     fn refilter(&mut self, id: ClientId, bytes: &[u8]) -> bool {
         let Some(mut part) = FilterPart::decode(bytes) else { return false };
         let Some(client) = self.client(id) else { return false };
@@ -319,7 +318,7 @@ impl Server {
         Ok(ready > 0)
     }
 
-    /// Tries later to receive from a client, until that has failed for too long.
+    /// Pauses a client whose reception failed, and gives it up after too many failures.
     fn fails(&mut self, id: ClientId, errno: Errno) {
         let Some(client) = self.client(id) else { return };
         client.failures += 1;
@@ -342,7 +341,8 @@ impl Server {
         let Self { router, clients, dirty, post, .. } = self;
         post.totals.frames += 1;
         router.route(from, parcel.raw_id(), parcel.format(), |to, own| {
-            // The kernel's time stamps, set when a frame is sent, then order the frames of both sockets of a process.
+            // The kernel stamps frames when they are sent; sending the other socket's queue first keeps the time stamps
+            // of a process with two sockets in order.
             let sibling = client(clients, to.0).and_then(|client| client.sibling);
             if let Some(sibling) = sibling.and_then(|sibling| client(clients, sibling.0)) {
                 sibling.send_early(post);
@@ -368,7 +368,7 @@ impl Server {
         }
     }
 
-    /// Ends sending to a client: it sees that and may connect again, and what it has sent is received until it hangs up.
+    /// Ends sending to a client: the client detects that and may reconnect. Its frames are received until it hangs up.
     fn release(&mut self, id: ClientId) {
         if let Some(client) = self.client(id) {
             let _ = shutdown(&client.socket, Shutdown::Write);
@@ -384,7 +384,7 @@ impl Server {
         }
     }
 
-    /// Sends nothing more to a client that does not read; what it still sends is received.
+    /// Stops sending to a client that does not read. Its frames are still received.
     fn silence(&mut self, id: ClientId) {
         self.router.remove(id);
         let Self { clients, post, .. } = self;

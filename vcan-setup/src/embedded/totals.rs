@@ -2,30 +2,30 @@
 
 use rustix::io::Errno;
 
-/// What a bus has done. `routed` is always `delivered + dropped + abandoned` when nothing waits.
+/// The counts of a bus. `routed` equals `delivered + dropped + abandoned` when no frames wait.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 #[non_exhaustive]
 pub struct Totals {
-    /// Clients that were let in.
+    /// Accepted clients.
     pub clients: u64,
-    /// Connections that were refused: no hello, or one of another version.
+    /// Refused connections: no hello, or one of another version.
     pub refused: u64,
-    /// Connections that were turned away because there was no file or memory for them.
+    /// Connections turned away for lack of files or memory.
     pub turned_away: u64,
-    /// Clients that were given up because their socket failed, and the last reason.
+    /// Clients given up because their socket failed.
     pub failed: u64,
-    /// See above.
+    /// The last reason why a client was given up.
     pub failure: Option<Errno>,
-    /// Frames taken from clients.
+    /// Frames received from clients.
     pub frames: u64,
     /// Datagrams of clients that were neither a frame nor filters.
     pub garbage: u64,
-    /// Frames times the clients that were to get them.
+    /// Deliveries to be made: frames times their receivers.
     pub routed: u64,
-    /// Frames handed to clients' sockets.
+    /// Frames written to clients' sockets.
     pub delivered: u64,
-    /// Frames dropped because a client did not read; reported to it.
+    /// Frames dropped because a client did not read; the client gets a report.
     pub dropped: u64,
-    /// Frames that waited for a client that went away.
+    /// Frames that waited for a client that disconnected.
     pub abandoned: u64,
 }

@@ -1,4 +1,4 @@
-//! From other hosts to a bus: what is missing of each source, and frames that wait for the bus.
+//! Frames from other hosts to the local bus: the account of each source, and the frames that wait for the bus.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -8,48 +8,48 @@ use serde::{Deserialize, Serialize};
 
 use super::message::{Head, MessageError, Stamped, decode};
 
-/// Frames that wait for the bus at most.
+/// The maximum number of frames that wait for the bus.
 pub const QUEUE: usize = 8_192;
-/// Sources that are told apart; a host with another name each time would fill the memory.
+/// The maximum number of sources. Without a limit, a host that changes its name each time would fill the memory.
 pub const SOURCES: usize = 256;
 
-/// What has become of the frames of one source. `numbered` is always `before`, `dropped_there`, `lost` and `taken`; `taken`
-/// is always `sent`, `copies`, `dropped_here`, `refused` and those that wait.
+/// The account of the frames of one source. `numbered` equals `before + dropped_there + lost + taken`; `taken` equals
+/// `sent + copies + dropped_here + refused` plus the frames that wait.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
 pub struct Heard {
-    /// Numbers that the source has given, of all its lives.
+    /// Numbers that the source has assigned, over all its starts.
     pub numbered: u64,
-    /// Of these, from before this link heard the source first, or after it restarted.
+    /// Numbers from before this link first received from the source, or before a restart of the source.
     pub before: u64,
-    /// Dropped by the source: its queue was full.
+    /// Frames dropped by the source because its queue was full.
     pub dropped_there: u64,
-    /// Lost between the hosts.
+    /// Frames lost between the hosts.
     pub lost: u64,
-    /// Taken here.
+    /// Frames received here.
     pub taken: u64,
-    /// Handed to the bus.
+    /// Frames sent to the local bus.
     pub sent: u64,
-    /// Not handed to the bus: copies of frames that went around a circle.
+    /// Frames not sent to the bus, because they are copies that went around a circle.
     #[serde(default)]
     pub copies: u64,
-    /// Dropped here: the queue to the bus was full.
+    /// Frames dropped here because the queue to the bus was full.
     pub dropped_here: u64,
-    /// Refused by the bus.
+    /// Frames refused by the bus.
     pub refused: u64,
-    /// Came again; not taken again.
+    /// Frames received again, and ignored.
     pub repeated: u64,
-    /// Dropped by the source's bus before the source took them; they have no numbers.
+    /// Frames that the source's bus dropped before the source read them; they have no numbers.
     pub missed_there: u64,
-    /// Messages that were none.
+    /// Invalid messages.
     pub garbage: u64,
     /// Starts of the source.
     pub lives: u64,
-    /// Of these, returns of the life before: two hosts have the same name.
+    /// Returns of the previous start among these, which mean that two hosts have the same name.
     pub shared: u64,
 }
 
 impl Heard {
-    /// Frames that did not get through, wherever they were lost.
+    /// Returns the number of frames that did not get through, wherever they were lost.
     #[must_use]
     pub fn missing(&self) -> u64 {
         [self.dropped_there, self.lost, self.missed_there, self.dropped_here, self.refused]
@@ -58,7 +58,7 @@ impl Heard {
     }
 }
 
-/// The node ids under which cells of a host have sent.
+/// The node ids of the cells whose frames came from a host.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Nodes([u64; 4]);
 
@@ -72,7 +72,7 @@ impl Nodes {
         }
     }
 
-    /// In order.
+    /// Returns the node ids in ascending order.
     pub fn iter(&self) -> impl Iterator<Item = CellId> {
         let is_in = |cell: &CellId| {
             self.0.get(usize::from(cell.get() / 64)).is_some_and(|word| word >> (cell.get() % 64) & 1 == 1)
@@ -81,7 +81,7 @@ impl Nodes {
     }
 }
 
-/// Counts what a host says, which may be anything.
+/// Adds a number that a host sent, which may have any value, without overflow.
 const fn add(counter: &mut u64, more: u64) {
     *counter = counter.saturating_add(more);
 }
@@ -91,14 +91,14 @@ struct Source {
     head: Head,
     /// The number of its next frame.
     next: u64,
-    /// The life before this one.
+    /// The random number of its previous start.
     before: Option<u64>,
     account: Heard,
     nodes: Nodes,
 }
 
 impl Source {
-    /// Takes what a message says of the numbers; how many of its frames were heard before.
+    /// Accounts for the numbers of a message. Returns the number of its frames that were received before.
     fn take(&mut self, head: &Head, count: u64) -> u64 {
         let account = &mut self.account;
         if account.lives == 0 || self.head.life != head.life {
@@ -130,10 +130,10 @@ impl Source {
 /// The frames of all other hosts.
 #[derive(Debug, Default)]
 pub struct Incoming {
-    /// By host.
+    /// The sources by host.
     sources: BTreeMap<String, Source>,
     waiting: VecDeque<Frame>,
-    /// Whose they are, in runs.
+    /// The hosts of the waiting frames, in runs.
     of: VecDeque<(String, usize)>,
     /// Messages of hosts beyond [`SOURCES`].
     unknown_hosts: u64,
@@ -141,10 +141,10 @@ pub struct Incoming {
 }
 
 impl Incoming {
-    /// Takes a message of a host.
+    /// Processes a message of a host.
     ///
     /// # Errors
-    /// When it is none; it is counted.
+    /// Returns [`MessageError`] if the message is invalid; it is counted.
     pub fn take(&mut self, host: &str, bytes: &[u8]) -> Result<(), MessageError> {
         if !self.sources.contains_key(host) {
             if self.sources.len() >= SOURCES {
@@ -172,23 +172,23 @@ impl Incoming {
         Ok(())
     }
 
-    /// Frames for the bus, the oldest first; not all of them where the buffer wraps.
+    /// Returns frames for the bus, the oldest first; only a part of them if the buffer wraps.
     #[must_use]
     pub fn waiting(&self) -> &[Frame] {
         self.waiting.as_slices().0
     }
 
-    /// The bus has taken so many of the first ones.
+    /// Removes the first `count` frames, which were sent to the bus.
     pub fn sent(&mut self, count: usize) {
         self.gone(count, |account, count| account.sent += count);
     }
 
-    /// So many of the first ones are copies, and not for the bus.
+    /// Removes the first `count` frames, which are copies and not sent to the bus.
     pub fn copies(&mut self, count: usize) {
         self.gone(count, |account, count| account.copies += count);
     }
 
-    /// The bus has refused so many of the first ones.
+    /// Removes the first `count` frames, which the bus refused.
     pub fn refused(&mut self, count: usize) {
         self.gone(count, |account, count| account.refused += count);
     }
@@ -209,17 +209,17 @@ impl Incoming {
         }
     }
 
-    /// What has become of the frames of each host, and the cells that sent them.
+    /// Returns the account of each host's frames, and the cells that sent them.
     pub fn accounts(&self) -> impl Iterator<Item = (&str, Heard, Nodes)> {
         self.sources.iter().map(|(host, source)| (host.as_str(), source.account, source.nodes))
     }
 
-    /// The names that more than one host has.
+    /// Returns the names that more than one host has.
     pub fn shared(&self) -> impl Iterator<Item = &str> {
         self.sources.iter().filter(|(_, source)| source.account.shared > 0).map(|(host, _)| host.as_str())
     }
 
-    /// Messages of hosts that were too many.
+    /// Returns the number of messages of hosts beyond the limit.
     #[must_use]
     pub const fn unknown_hosts(&self) -> u64 {
         self.unknown_hosts

@@ -1,6 +1,6 @@
-//! The messages between hosts.
+//! The format of the messages between hosts.
 //!
-//! Little-endian; a message is one batch of frames of one source:
+//! Numbers are little-endian. A message is one batch of frames of one source:
 //!
 //! | bytes | what |
 //! |---|---|
@@ -8,8 +8,8 @@
 //! | 1 to 7 | 0 |
 //! | 8 to 15 | life: a random number of this start of the source |
 //! | 16 to 23 | number of the first frame; the next ones follow without a gap |
-//! | 24 to 31 | frames that the source took from its bus and dropped before that, since it started; they have numbers too |
-//! | 32 to 39 | frames that the source's bus dropped before the source took them; they have no numbers |
+//! | 24 to 31 | frames that the source received from its bus and dropped before that, since it started; they have numbers too |
+//! | 32 to 39 | frames that the source's bus dropped before the source received them; they have no numbers |
 //! | 40 to 41 | frames in this message |
 //! | then each | time in ns since 1970 by the source's clock (8), identifier and flags as in the kernel's struct (4), 1 for FD (1), FD flags (1), DLC of 9 to 15 of a classic frame, else 0 (1), length (1), data |
 
@@ -18,66 +18,66 @@ use thiserror::Error;
 
 /// The only version.
 pub const VERSION: u8 = 1;
-/// Frames in a message at most.
+/// The maximum number of frames in a message.
 pub const FRAMES: usize = 256;
-/// Bytes before the frames.
+/// The length of the header in bytes.
 const HEAD: usize = 42;
-/// Bytes of a frame before its data.
+/// The length of a frame before its data, in bytes.
 const FRAME_HEAD: usize = 16;
 
-/// A frame, and when it was on its bus, in ns since 1970 by its host's clock.
+/// A frame with its time on the bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Stamped {
-    /// When.
+    /// The time in ns since 1970, by its host's clock.
     pub at_nanos: u64,
-    /// What.
+    /// The frame.
     pub frame: Frame,
 }
 
-/// What a message says beside its frames.
+/// The header of a message.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Head {
-    /// A random number of this start of the source.
+    /// A random number that identifies this start of the source.
     pub life: u64,
     /// The number of the first frame.
     pub first: u64,
-    /// Of the numbers before that, those of frames that the source dropped.
+    /// The number of frames before that which the source dropped.
     pub dropped: u64,
-    /// Frames that the source's bus dropped before the source took them.
+    /// Frames that the source's bus dropped before the source received them.
     pub missed: u64,
 }
 
-/// Why bytes are no message.
+/// The error of an invalid message.
 #[derive(Clone, Copy, Debug, Error, Eq, PartialEq)]
 #[non_exhaustive]
 pub enum MessageError {
-    /// It is of another version.
+    /// The message has another version.
     #[error(
         "a message of version {0}, and {VERSION} is understood: use the same release of skinbus on all hosts"
     )]
     Version(u8),
-    /// It is cut off, or has more bytes than frames.
+    /// The message is truncated, or longer than its frames.
     #[error("a message of {0} bytes does not hold the frames that it names")]
     Length(usize),
-    /// A frame is none.
+    /// A frame is invalid.
     #[error("frame {index} of a message: {error}")]
     Frame {
-        /// Its place in the message.
+        /// Its index in the message.
         index: usize,
-        /// What is wrong.
+        /// The error of the frame.
         error: FrameError,
     },
-    /// The numbers of its frames would pass 2^64, or more were dropped than have numbers.
+    /// The numbers of its frames would exceed 2^64, or more frames were dropped than have numbers.
     #[error("a message with the numbers {first} and {dropped}, which no source has")]
     Numbers {
-        /// Of the first frame.
+        /// The number of the first frame.
         first: u64,
-        /// Of those that were dropped.
+        /// The number of dropped frames.
         dropped: u64,
     },
 }
 
-/// Writes a message of at most [`FRAMES`] frames; more are left out.
+/// Encodes a message of at most [`FRAMES`] frames; further ones are left out.
 pub fn encode<'a>(head: &Head, frames: impl IntoIterator<Item = &'a Stamped>, bytes: &mut Vec<u8>) {
     bytes.clear();
     bytes.extend([VERSION, 0, 0, 0, 0, 0, 0, 0]);
@@ -100,10 +100,10 @@ pub fn encode<'a>(head: &Head, frames: impl IntoIterator<Item = &'a Stamped>, by
     }
 }
 
-/// Reads a message; its frames are appended. Never panics, and takes nothing of a message that is wrong.
+/// Decodes a message, and appends its frames. Appends nothing if the message is invalid. Never panics.
 ///
 /// # Errors
-/// When it is of another version, or not whole, or a frame is none.
+/// Returns [`MessageError`] if the message has another version, is incomplete, or contains an invalid frame.
 pub fn decode(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<Head, MessageError> {
     let before = frames.len();
     let read = read(bytes, frames);

@@ -1,4 +1,4 @@
-//! The command line of `vcan-setup link`: read by `vcan-setup`, which then runs the program `vcan-link`, and by that.
+//! The command line of `vcan-setup link`. Both `vcan-setup` and `vcan-link`, which it runs, parse it.
 
 use std::path::PathBuf;
 
@@ -7,9 +7,10 @@ use protocol::bus::{BusError, Choice, check_name};
 
 /// Join a bus here with those of the same name on other hosts, until SIGINT or SIGTERM
 ///
-/// Carries every frame over Zenoh (TCP or TLS), or counts it as lost with where and why. Nothing waits for a link: what
-/// it cannot carry is dropped, and counted. Nobody is looked for in the network: say where the others are with --connect,
-/// where they find this host with --listen, or both in a file of Zenoh's. A connection that was lost is made again.
+/// Carries every frame over Zenoh (TCP or TLS), or counts where and why it was lost. The bus never waits for a link:
+/// frames that it cannot carry are dropped, and counted. The network is not searched: name the other hosts with
+/// --connect, the address of this host with --listen, or both in a configuration file of Zenoh. A lost connection is
+/// made again.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vcan-setup link vcan0 --listen tcp/192.168.1.7:7447      on the host of the robot
@@ -25,24 +26,24 @@ pub struct LinkOptions {
     /// A configuration of Zenoh: certificates, access control, endpoints
     #[arg(long, value_name = "FILE.json5")]
     pub config: Option<PathBuf>,
-    /// Connect to this host, as often as there are hosts: tcp/HOST:PORT or tls/HOST:PORT
+    /// Connect to this host: tcp/HOST:PORT or tls/HOST:PORT; may be repeated for further hosts
     #[arg(long, value_name = "ENDPOINT")]
     pub connect: Vec<String>,
-    /// Wait for other hosts here
+    /// Wait for other hosts at this address
     #[arg(long, value_name = "ENDPOINT")]
     pub listen: Vec<String>,
-    /// This host's name among the others; else the machine's
+    /// This host's name among the others; by default the machine's name
     #[arg(long, value_name = "NAME")]
     pub host: Option<String>,
     /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
     #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
     pub bus_kind: Choice,
-    /// Print what has become of the frames as JSON
+    /// Print the counts of all frames as JSON
     #[arg(long)]
     pub json: bool,
 }
 
-/// Returns a bus' name, as the command line gives it.
+/// Parses the name of a bus.
 fn bus_name(word: &str) -> Result<String, BusError> {
     check_name(word).map(|()| word.to_owned())
 }

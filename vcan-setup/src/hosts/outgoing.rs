@@ -1,4 +1,4 @@
-//! From a bus to the other hosts: frames that wait, numbered, and dropped where there is no room.
+//! Frames from the local bus to the other hosts: numbers them, and drops those that find no room.
 
 use std::collections::VecDeque;
 
@@ -6,21 +6,21 @@ use serde::{Deserialize, Serialize};
 
 use super::message::{FRAMES, Head, Stamped, encode};
 
-/// Frames that wait at most: 100 ms of a full bus.
+/// The maximum number of waiting frames: 100 ms of a full bus.
 pub const QUEUE: usize = 4_096;
 
-/// What has become of the frames of a bus. `taken` is always `sent`, `dropped` and those that wait.
+/// The account of the frames of a bus. `taken` equals `sent + dropped` plus the frames that wait.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
 pub struct Sent {
-    /// Frames that the bus gave this link.
+    /// Frames received from the bus.
     pub taken: u64,
-    /// Frames that were handed to the transport.
+    /// Frames passed to the transport.
     pub sent: u64,
-    /// Messages in which they were.
+    /// Messages that contained them.
     pub messages: u64,
-    /// Frames that found no room in the queue here, or that the transport refused.
+    /// Frames dropped because the queue was full or the transport refused them.
     pub dropped: u64,
-    /// Frames that the bus dropped, because this process did not read in time; not in `taken`.
+    /// Frames that the bus dropped because this process did not read in time; not in `taken`.
     pub missed: u64,
 }
 
@@ -28,7 +28,7 @@ pub struct Sent {
 #[derive(Debug)]
 pub struct Outgoing {
     life: u64,
-    /// Frames that wait, in runs without a gap in their numbers.
+    /// Waiting frames with their numbers. A gap in the numbers ends a message.
     waiting: VecDeque<(u64, Stamped)>,
     /// The number of the next frame.
     next: u64,
@@ -36,13 +36,13 @@ pub struct Outgoing {
 }
 
 impl Outgoing {
-    /// None so far; `life` is a random number.
+    /// Creates an empty queue; `life` is a random number that identifies this start.
     #[must_use]
     pub fn new(life: u64) -> Self {
         Self { life, waiting: VecDeque::with_capacity(QUEUE), next: 0, account: Sent::default() }
     }
 
-    /// Takes a frame of the bus; drops it when there is no room.
+    /// Queues a frame of the bus, or drops it if the queue is full.
     pub fn take(&mut self, stamped: Stamped) {
         let number = self.next;
         self.next += 1;
@@ -54,42 +54,43 @@ impl Outgoing {
         }
     }
 
-    /// Frames that the bus has dropped so far.
+    /// Sets the number of frames that the bus has dropped so far.
     pub const fn miss(&mut self, so_far: u64) {
         self.account.missed = so_far;
     }
 
-    /// Writes the next message; how many frames are in it. They wait until [`Outgoing::sent`] or [`Outgoing::refused`].
+    /// Encodes the next message, and returns the number of its frames. They stay in the queue until [`Outgoing::sent`]
+    /// or [`Outgoing::refused`].
     pub fn message(&self, bytes: &mut Vec<u8>) -> usize {
         let Some(&(first, _)) = self.waiting.front() else { return 0 };
         let run = self.waiting.iter().zip(first..).take(FRAMES);
         let count = run.take_while(|((number, _), expected)| number == expected).count();
-        // All before it were sent or dropped.
+        // All earlier frames were sent or dropped.
         let dropped = first - self.account.sent;
         let head = Head { life: self.life, first, dropped, missed: self.account.missed };
         encode(&head, self.waiting.iter().take(count).map(|(_, stamped)| stamped), bytes);
         count
     }
 
-    /// The transport has taken a message of so many frames.
+    /// Removes the frames of a message that was passed to the transport.
     pub fn sent(&mut self, count: usize) {
         let gone = self.waiting.drain(..count.min(self.waiting.len())).count() as u64;
         self.account.sent += gone;
         self.account.messages += 1;
     }
 
-    /// The transport has refused it.
+    /// Removes the frames of a message that the transport refused.
     pub fn refused(&mut self, count: usize) {
         self.account.dropped += self.waiting.drain(..count.min(self.waiting.len())).count() as u64;
     }
 
-    /// What has become of the frames so far.
+    /// Returns the account of the frames so far.
     #[must_use]
     pub const fn account(&self) -> Sent {
         self.account
     }
 
-    /// Frames that wait.
+    /// Returns the number of waiting frames.
     #[must_use]
     pub fn waiting(&self) -> usize {
         self.waiting.len()
@@ -106,7 +107,7 @@ mod tests {
         Stamped { at_nanos, frame: Frame::classic(0x201, &at_nanos.to_le_bytes()).unwrap() }
     }
 
-    /// The next message: its first number, what was dropped before, and the times of its frames.
+    /// Returns the next message: its first number, the number of frames dropped before, and the times of its frames.
     fn next(outgoing: &mut Outgoing) -> Option<(u64, u64, Vec<u64>)> {
         let (mut bytes, mut frames) = (Vec::new(), Vec::new());
         let count = outgoing.message(&mut bytes);

@@ -1,7 +1,8 @@
-//! The program `vcan-link`, which joins a bus with those of other hosts: where it is, and how it takes the place of
+//! Finds and runs the program `vcan-link`, which joins a bus with those of other hosts and replaces the process of
 //! `vcan-setup link`.
 //!
-//! It is a workspace of its own because of Zenoh, and is installed by itself. Both programs have to be of one version.
+//! It is a workspace of its own because of its dependency Zenoh, and is installed separately. Both programs must have
+//! the same version.
 
 use std::env;
 use std::ffi::{OsStr, OsString};
@@ -14,42 +15,42 @@ use protocol::usage::{path_in, quoted_os};
 use rustix::fs::{Access, access};
 use thiserror::Error;
 
-/// The program's name.
+/// The name of the program.
 pub const PROGRAM: &str = "vcan-link";
-/// The environment variable that has the program's path, where it is neither beside `vcan-setup` nor on `PATH`.
+/// The environment variable for the program's path, if it is neither beside `vcan-setup` nor on `PATH`.
 pub const VARIABLE: &str = "SKINBUS_VCAN_LINK";
 /// The environment variable in which `vcan-setup` passes its version to the program.
 const CALLER: &str = "VCAN_SETUP_VERSION";
 /// The version of this crate, which both programs are built with.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// The reason why the program does not run.
+/// The error of a program that cannot be run.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ProgramError {
-    /// There is no such file.
+    /// The program was not found.
     #[error(
         "vcan-link was found neither beside vcan-setup nor on PATH; to install it, in the project's folder: \
          `cargo install --locked --path vcan-setup/link`"
     )]
     Missing,
-    /// The system does not run the file that [`VARIABLE`] names.
+    /// The system cannot run the file that [`VARIABLE`] names.
     #[error("cannot run {}: {source}; {VARIABLE} names it", quoted_os(path.as_os_str()))]
     Named {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system error.
         source: io::Error,
     },
-    /// The system does not run the file that was found.
+    /// The system cannot run the file that was found.
     #[error("cannot run {}: {source}", quoted_os(path.as_os_str()))]
     Found {
         /// The file.
         path: PathBuf,
-        /// What the system says.
+        /// The system error.
         source: io::Error,
     },
-    /// The program and the `vcan-setup` that runs it are of different versions.
+    /// The program and the `vcan-setup` that runs it have different versions.
     #[error(
         "vcan-link {VERSION} was run by vcan-setup {0}: both have to be of one version; in the project's folder: \
          `cargo install --locked --path vcan-setup/link`"
@@ -57,8 +58,8 @@ pub enum ProgramError {
     Version(String),
 }
 
-/// Runs the program in the place of this process, which keeps its id: exit code and signals are the program's. Returns only
-/// when that fails.
+/// Replaces this process by the program, which keeps the process id, so that exit code and signals are the program's.
+/// Returns only on failure.
 pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ProgramError {
     let start = |path: &Path| Command::new(path).args(arguments).env(CALLER, VERSION).exec();
     if let Some(path) = path_in(VARIABLE) {
@@ -75,23 +76,24 @@ pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ProgramError {
     }
 }
 
-/// Finds the program beside `vcan-setup`, else in the folders of `PATH`: the first file that may be executed, else the first
-/// one, so that the error can name it.
+/// Finds the program beside `vcan-setup`, or in the folders of `PATH`. Returns the first file that is executable, or
+/// else the first file, so that the error can name it.
 fn find(beside: Option<&Path>, path: Option<&OsStr>) -> Option<PathBuf> {
     let folders = beside.map(Path::to_owned).into_iter();
     let folders = folders.chain(path.into_iter().flat_map(env::split_paths));
-    // An empty folder of PATH would be the current one.
+    // An empty folder in PATH would be the current one.
     let folders = folders.filter(|folder| !folder.as_os_str().is_empty());
     let files: Vec<_> = folders.map(|folder| folder.join(PROGRAM)).filter(|file| file.is_file()).collect();
     let executable = files.iter().find(|file| access(file.as_path(), Access::EXEC_OK).is_ok());
     executable.or_else(|| files.first()).cloned()
 }
 
-/// Compares the version of the `vcan-setup` that ran this program with its own; nothing to compare where none did.
+/// Compares the version of the `vcan-setup` that ran this program with its own. Accepts a program that was run
+/// directly.
 ///
 /// # Errors
 ///
-/// [`ProgramError::Version`].
+/// Returns [`ProgramError::Version`] if the versions differ.
 pub fn check_caller() -> Result<(), ProgramError> {
     fits(env::var_os(CALLER).as_deref())
 }

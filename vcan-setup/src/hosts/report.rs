@@ -1,7 +1,7 @@
-//! What a link tells of itself to programs of its machine, and where they find it.
+//! Reports of a link to local programs, and the address of the link.
 //!
-//! A link listens at an abstract address, of which there is one for each bus in a network namespace. Whoever connects receives
-//! a [`Report`] at once and after each change, as a line of JSON, and sends nothing.
+//! A link listens at an abstract address, one for each bus in a network namespace. A program that connects receives a
+//! [`Report`] at once and after each change, as a line of JSON, and sends nothing.
 
 use std::collections::BTreeMap;
 use std::io::{self, ErrorKind, Read};
@@ -17,40 +17,40 @@ use serde::{Deserialize, Serialize};
 use super::incoming::Heard;
 use super::outgoing::Sent;
 
-/// The longest line in bytes: 256 hosts are shorter.
+/// The maximum length of a line in bytes. A report of 256 hosts is shorter.
 const LONGEST: usize = 1 << 20;
-/// Bytes of an abstract address.
+/// The maximum length of an abstract address, in bytes.
 const NAME: usize = 107;
 
-/// What a link knows.
+/// The state of a link.
 #[derive(Clone, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
 pub struct Report {
-    /// This host's name.
+    /// The name of this host.
     pub host: String,
-    /// From this bus to the other hosts.
+    /// The account of frames from this bus to the other hosts.
     pub sent: Sent,
-    /// Each other host.
+    /// The other hosts by name.
     pub hosts: BTreeMap<String, Host>,
-    /// Frames of other hosts that came back from this bus, or in a circle came again, and were not sent once more.
+    /// Frames that came back from this bus or repeated in a circle, and were not sent again.
     pub returned: u64,
-    /// Messages of hosts that were too many.
+    /// Messages of hosts beyond the limit.
     pub unknown_hosts: u64,
 }
 
-/// What a link knows of another host.
+/// The state of another host.
 #[derive(Clone, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
 pub struct Host {
-    /// It is reached.
+    /// True if the host is reachable.
     pub is_there: bool,
-    /// The cells whose frames came from there, by node id.
+    /// The node ids of the cells whose frames came from the host.
     pub nodes: Vec<u8>,
-    /// What has become of its frames.
+    /// The account of the host's frames here.
     pub heard: Heard,
-    /// What it says has become of this host's frames; null until it says so.
+    /// The host's account of this host's frames; null until it has sent one.
     pub ours: Option<Heard>,
 }
 
-/// Where the link of a bus is found; `directory` is where embedded buses live, `None` the usual one.
+/// Returns the address of the link of a bus. `directory` is that of embedded buses, `None` the usual one.
 fn address(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<SocketAddr> {
     let place = match kind {
         BusKind::Embedded => directory.map_or_else(usual_directory, Path::to_owned),
@@ -63,10 +63,10 @@ fn address(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<Soc
     SocketAddr::from_abstract_name(name)
 }
 
-/// Claims the place of the link of a bus.
+/// Binds the address of the link of a bus.
 ///
 /// # Errors
-/// [`ErrorKind::AddrInUse`] when there is one.
+/// Returns an error of the kind [`ErrorKind::AddrInUse`] if another process links the bus.
 pub fn listen(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<UnixListener> {
     let listener = UnixListener::bind_addr(&address(bus, kind, directory)?)?;
     listener.set_nonblocking(true)?;
@@ -84,7 +84,7 @@ impl Reports {
     /// Connects to the link of a bus.
     ///
     /// # Errors
-    /// [`ErrorKind::ConnectionRefused`] when nothing links it.
+    /// Returns an error of the kind [`ErrorKind::ConnectionRefused`] if the bus is not linked.
     pub fn connect(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<Self> {
         let stream = UnixStream::connect_addr(&address(bus, kind, directory)?)?;
         stream.set_nonblocking(true)?;
@@ -94,7 +94,7 @@ impl Reports {
     /// Waits for a report.
     ///
     /// # Errors
-    /// When none comes in that time, or the link has ended.
+    /// Returns an error if none arrives in time, or if the link has ended.
     pub fn wait(&mut self, timeout: Duration) -> io::Result<Report> {
         let until = Instant::now() + timeout;
         loop {
@@ -108,10 +108,10 @@ impl Reports {
         }
     }
 
-    /// The reports that have come, in order. Does not wait.
+    /// Returns the reports that have arrived, in order. Does not block.
     ///
     /// # Errors
-    /// When the link has ended, or sends no reports.
+    /// Returns an error if the link has ended, or if it sends anything but reports.
     pub fn take(&mut self) -> io::Result<Vec<Report>> {
         let mut piece = [0; 4_096];
         loop {

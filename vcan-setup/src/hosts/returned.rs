@@ -1,49 +1,51 @@
-//! Frames of other hosts that come back: from a second link of the bus, an adapter or a bridge that makes a circle.
+//! Detects frames of other hosts that come back: from a second link of the bus, or from an adapter or a bridge that
+//! makes a circle.
 //!
-//! A bus gives a sender's own frames to all others. So a frame that this link has put on the bus, and that it then
-//! receives from there, was sent once more by somebody else: there is a circle. A link of the other side would never see a
-//! frame of its own in it. So after that, for a second, a frame passes this link in either direction only once in 100 ms.
+//! A bus delivers a sender's frames to all others. If this link receives a frame from the bus that it has put there
+//! itself, another program sent it again: there is a circle. The link of the other side would never see a frame of its
+//! own in it. For a second after that, a frame therefore passes this link in either direction only once in 100 ms.
 
 use std::collections::{HashMap, VecDeque};
 use std::hash::{BuildHasher, RandomState};
 
 use protocol::can::Frame;
 
-/// How long after a frame has passed the same one counts as returned, in ns.
+/// The time after a frame has passed during which the same frame counts as returned, in ns.
 pub const WITHIN_NS: u64 = 100_000_000;
-/// How long after a frame of this link has returned a circle is expected, in ns.
+/// The time after a frame of this link has returned during which a circle is assumed, in ns.
 const CIRCLE_NS: u64 = 1_000_000_000;
-/// Frames that are remembered at most in each direction.
+/// The maximum number of frames that are remembered in each direction.
 const REMEMBERED: usize = 16_384;
 
-/// The frames that passed of late.
+/// The frames that passed recently.
 #[derive(Debug, Default)]
 pub struct Returned {
     hasher: RandomState,
     put: Recent,
-    /// Only while there is a circle.
+    /// Frames received from the bus. Recorded only while a circle is assumed.
     taken: Recent,
-    /// When the last one that was put on the bus came from there.
+    /// The time at which a frame of this link last returned.
     noticed: Option<u64>,
     count: u64,
 }
 
 impl Returned {
-    /// A frame was put on the bus, at a time of a clock that only goes forward.
+    /// Records a frame that was put on the bus, at a time of a monotonic clock.
     pub fn put(&mut self, now: u64, frame: &Frame) {
         let hash = self.hash(frame);
         self.put.insert(now, hash);
     }
 
-    /// Whether a frame that is to be put on the bus is a copy that went around a circle.
+    /// Returns true if a frame that is to be put on the bus is a copy that went around a circle.
     pub fn is_copy(&mut self, now: u64, frame: &Frame) -> bool {
         self.is_circle(now) && self.put.contains(now, self.hash(frame))
     }
 
-    /// Whether a frame that came from the bus is one that was put there, or in a circle one that came before.
+    /// Returns true if a frame from the bus is one that this link put there, or in a circle one that was received
+    /// before.
     pub fn is_returned(&mut self, now: u64, frame: &Frame) -> bool {
         let is_circle = self.is_circle(now);
-        // Most of the time nothing is remembered of a bus that only sends.
+        // Usually no frames are remembered, if the bus only sends.
         if self.put.is_empty(now) && !is_circle {
             return false;
         }
@@ -60,7 +62,7 @@ impl Returned {
         is_returned
     }
 
-    /// How many of those that came from the bus were returned.
+    /// Returns the number of frames from the bus that had returned.
     #[must_use]
     pub const fn count(&self) -> u64 {
         self.count
@@ -78,9 +80,9 @@ impl Returned {
 /// Frames of the last 100 ms, by their hashes.
 #[derive(Debug, Default)]
 struct Recent {
-    /// In order, and when.
+    /// Times and hashes in order.
     order: VecDeque<(u64, u64)>,
-    /// How often each of them is in it.
+    /// The number of occurrences of each hash.
     times: HashMap<u64, u32>,
 }
 
@@ -158,8 +160,8 @@ mod tests {
         assert_eq!(sum as usize, REMEMBERED);
     }
 
-    /// A bridge that sends on the first bus what comes on the second: of the first one's frames it makes a circle in which
-    /// no link sees what it has put on its bus, until one of the second's goes around.
+    /// A bridge sends on the first bus what arrives on the second. Frames of the first bus go around a circle in which
+    /// no link sees a frame that it has put on its bus, until a frame of the second bus goes around.
     #[test]
     fn in_a_circle_that_was_noticed_a_frame_passes_once_in_100_ms() {
         let (it, other) = (frame(0x201, &[1]), frame(0x202, &[2]));

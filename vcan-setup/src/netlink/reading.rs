@@ -1,4 +1,4 @@
-//! Reads the kernel's description of an interface.
+//! Parses the kernel's description of an interface.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use protocol::bus::netlink::attributes;
 
 use crate::link::{Counters, Hardware, Interface, Kind, MARK, Peer, State};
 
-/// Reads the kernel's description of one interface.
+/// Parses the kernel's description of one interface.
 pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
     let header = LinkHeader::parse(bytes).ok()?;
     let is_can = header.link_layer_type == LinkLayerType::Can;
@@ -83,7 +83,7 @@ fn hardware(data: &[InfoCan]) -> Hardware {
     hardware
 }
 
-/// What an interface is that is no CAN.
+/// Describes an interface without CAN.
 fn words(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
     if layer == LinkLayerType::Loopback {
         return "the loopback interface".to_owned();
@@ -94,7 +94,7 @@ fn words(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
     }
 }
 
-/// The driver of hardware, by sysfs.
+/// Returns the driver of hardware according to sysfs.
 pub(super) fn driver(name: &str) -> Option<String> {
     let link = std::fs::read_link(Path::new("/sys/class/net").join(name).join("device/driver")).ok()?;
     Some(link.file_name()?.to_string_lossy().into_owned())

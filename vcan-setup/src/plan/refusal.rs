@@ -1,4 +1,4 @@
-//! Why nothing is done.
+//! Reasons why a plan is refused.
 
 use protocol::usage::Failure;
 use thiserror::Error;
@@ -6,165 +6,165 @@ use thiserror::Error;
 use super::widen;
 use crate::link::{FD_MTU, Interface, Rates};
 
-/// Why nothing is done: one line, with the command that fixes it.
+/// The reason why a plan is refused: one line, with the command that fixes it.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum Refusal {
-    /// An interface that carries something else.
+    /// The interface does not carry CAN.
     #[error("{name} is real, {what}, and is left alone: choose another name, as `vcan-setup up vcan0` does")]
     NotCan {
-        /// Its name.
+        /// The name.
         name: String,
-        /// What it is.
+        /// A description of the interface.
         what: String,
     },
-    /// CAN hardware that was named where something virtual is made.
+    /// CAN hardware was named where a virtual interface is made.
     #[error(
         "{name} is real, {what}, and is left alone: to check its bit rates put it into a skin and run `vcan-setup up SKIN.toml`, to see it `vcan-setup status {name}`"
     )]
     Hardware {
-        /// Its name.
+        /// The name.
         name: String,
-        /// What it is.
+        /// A description of the interface.
         what: String,
     },
-    /// Somebody else's, with too small an MTU.
+    /// An interface of another program has too small an MTU.
     #[error(
         "{name} has MTU {mtu} and CAN FD needs {FD_MTU}; vcan-setup has not made it and leaves it alone: `sudo sh -c '{}'` fixes it",
         widen("ip", name)
     )]
     Narrow {
-        /// Its name.
+        /// The name.
         name: String,
-        /// Its MTU.
+        /// The MTU.
         mtu: u32,
     },
-    /// Somebody else's, and down.
+    /// An interface of another program is down.
     #[error(
         "{0} is down; vcan-setup has not made it and leaves it alone: `sudo ip link set {0} up` fixes it"
     )]
     Down(String),
-    /// A pair is requested where there is something else.
+    /// An interface that is not an end of the requested pair has its name.
     #[error("{name} is there already and is {what}, not one end of a pair with {peer}: {hint}")]
     OtherPair {
-        /// Its name.
+        /// The name.
         name: String,
-        /// What it is.
+        /// A description of the interface.
         what: String,
-        /// The other end that was requested.
+        /// The requested other end.
         peer: String,
-        /// What to do.
+        /// The action to take.
         hint: String,
     },
-    /// A pair that is there, and whose other end does not work.
+    /// The other end of an existing pair does not work.
     #[error(
         "the other end of {name}, {end}, and vcan-setup changes nothing there: `sudo {command}` fixes it"
     )]
     OtherEnd {
-        /// Its name.
+        /// The name.
         name: String,
-        /// The other end, and what is wrong with it.
+        /// The other end and its fault.
         end: String,
-        /// What to do.
+        /// The command to run.
         command: String,
     },
-    /// A pair of one name in one namespace.
+    /// Both ends of a pair in one namespace have the same name.
     #[error(
         "{0} cannot be both ends of a pair in one network namespace: give --peer another name, or --namespace"
     )]
     OneName(String),
-    /// A bus that has a bit rate and is not there.
+    /// Hardware is missing: the skin gives the bus a bit rate.
     #[error(
         "there is no interface {name}, and {file} gives it a bitrate, so it is hardware: plug it in and load its driver, or leave out bitrate and it will be a vcan"
     )]
     Absent {
-        /// Its name.
+        /// The name.
         name: String,
         /// The skin's file.
         file: String,
     },
-    /// Two skins that give one bus different bit rates.
+    /// Two skins give one bus different bit rates.
     #[error("of {name} {one} and {other}: run `vcan-setup up` with one of them, or make them agree")]
     AtOdds {
-        /// Its name.
+        /// The name.
         name: String,
-        /// The value of the one.
+        /// The first skin and its rates.
         one: String,
-        /// The value of the other.
+        /// The second skin and its rates.
         other: String,
     },
-    /// Hardware with other bit rates.
+    /// The hardware has other bit rates.
     #[error(
         "{name} is at {has} and {file} says {wants}: `sudo vcan-setup up {file} --set-bit-rates` sets them, or change {file}"
     )]
     Rates {
-        /// Its name.
+        /// The name.
         name: String,
-        /// What is set.
+        /// The present rates.
         has: Rates,
-        /// What the skin wants.
+        /// The rates of the skin.
         wants: Rates,
         /// The skin's file.
         file: String,
     },
-    /// Hardware that is down.
+    /// The hardware is down.
     #[error(
         "{name} is {what}, and down: `sudo vcan-setup up {file} --set-bit-rates` sets its bit rates and brings it up"
     )]
     HardwareDown {
-        /// Its name.
+        /// The name.
         name: String,
-        /// What it is.
+        /// A description of the interface.
         what: String,
         /// The skin's file.
         file: String,
     },
-    /// Hardware in classic mode on a bus that the skin calls FD.
+    /// The hardware is in classic mode, but the skin requires CAN FD.
     #[error(
         "{name} is {what} with MTU {mtu}, and {file} says format = \"fd\", which needs {FD_MTU}: `sudo vcan-setup up {file} --set-bit-rates` switches it to CAN FD if it can, or use \"classic\""
     )]
     HardwareNarrow {
-        /// Its name.
+        /// The name.
         name: String,
-        /// What it is.
+        /// A description of the interface.
         what: String,
-        /// Its MTU.
+        /// The MTU.
         mtu: u32,
         /// The skin's file.
         file: String,
     },
-    /// Bit rates are to be set and the skin has none.
+    /// Bit rates are to be set, but the skin gives none.
     #[error("{file} has no {key} for {name}: put `{key} = {example}` under its [[bus]], then try again")]
     NoRate {
-        /// Its name.
+        /// The name.
         name: String,
-        /// The key that is missing.
+        /// The missing key.
         key: &'static str,
-        /// A usual value.
+        /// A common value.
         example: u32,
         /// The skin's file.
         file: String,
     },
-    /// Interfaces that were to be removed and that this program has not made.
+    /// The interface to be removed was not made by this program.
     #[error("{name} is {what} that vcan-setup has not made, and is left alone{hint}")]
     NotOurs {
-        /// Its name.
+        /// The name.
         name: String,
-        /// What it is.
+        /// A description of the interface.
         what: String,
-        /// What to do.
+        /// The action to take.
         hint: String,
     },
 }
 
 impl Refusal {
-    /// Of what is not virtual, and is left alone.
+    /// Returns the refusal for an interface that is not virtual.
     pub(super) fn real(interface: &Interface) -> Self {
         let (name, what) = (interface.name.clone(), interface.what());
         if interface.is_can() { Self::Hardware { name, what } } else { Self::NotCan { name, what } }
     }
 
-    /// Whether the command line or the skin is wrong, and not the state of the machine.
+    /// Returns true if the command line or the skin is wrong, rather than the state of the machine.
     #[must_use]
     pub const fn is_usage(&self) -> bool {
         match self {

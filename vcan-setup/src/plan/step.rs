@@ -1,65 +1,65 @@
-//! What is done, one thing at a time: in words, and as an `ip` command.
+//! Steps of a plan, printed as text and as `ip` commands.
 
 use core::fmt;
 
 use crate::link::{FD_MTU, MARK, Rates};
 use crate::namespace::Namespace;
 
-/// One thing that is to be done.
+/// One step.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Step {
-    /// The interface that it is about.
+    /// The name of the interface.
     pub name: String,
-    /// What is done with it.
+    /// The action.
     pub action: Action,
 }
 
-/// What is done with an interface.
+/// An action on an interface.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum Action {
     /// Makes a vcan with MTU 72, marks it, and brings it up.
     MakeVcan,
     /// Makes a pair with MTU 72, marks both ends, and brings them up.
     MakePair {
-        /// The other end.
+        /// The name of the other end.
         peer: String,
-        /// The other end's network namespace.
+        /// The network namespace of the other end.
         namespace: Option<Namespace>,
     },
-    /// Brings an interface of ours up.
+    /// Brings up an interface that this program made.
     BringUp {
-        /// Its number.
+        /// The index of the interface.
         index: u32,
     },
-    /// Gives an interface of ours MTU 72, for which it has to be down, and brings it up.
+    /// Takes down an interface that this program made, gives it MTU 72, and brings it up.
     Widen {
-        /// Its number.
+        /// The index of the interface.
         index: u32,
-        /// What it has had, in bytes.
+        /// The former MTU in bytes.
         from: u32,
-        /// Whether it was up.
+        /// True if the interface was up.
         was_up: bool,
     },
-    /// Sets the bit rates of CAN hardware, for which it has to be down, and brings it up.
+    /// Takes CAN hardware down, sets its bit rates, and brings it up.
     SetRates {
-        /// Its number.
+        /// The index of the interface.
         index: u32,
-        /// What is to be set.
+        /// The rates to be set.
         rates: Rates,
-        /// What was set.
+        /// The former rates.
         before: Rates,
-        /// Whether it was up.
+        /// True if the interface was up.
         was_up: bool,
     },
-    /// Removes an interface of ours, and the other end of its pair with it.
+    /// Removes an interface that this program made, and the other end of its pair with it.
     Remove {
-        /// Its number.
+        /// The index of the interface.
         index: u32,
     },
 }
 
 impl Step {
-    /// What it does, in few words: `make vcan0`.
+    /// Returns a short form such as `make vcan0`.
     #[must_use]
     pub fn doing(&self) -> String {
         let name = &self.name;
@@ -73,7 +73,7 @@ impl Step {
         }
     }
 
-    /// What is printed once it is done.
+    /// Returns the text that is printed after the step.
     #[must_use]
     pub fn done(&self) -> String {
         let name = &self.name;
@@ -92,7 +92,7 @@ impl Step {
         }
     }
 
-    /// The `ip` command that does the same.
+    /// Returns the equivalent `ip` command.
     #[must_use]
     pub fn command(&self) -> String {
         let name = &self.name;
@@ -126,7 +126,7 @@ impl Step {
     }
 }
 
-/// What gives an interface MTU 72; `ip` is how that program is called.
+/// Returns the command that gives an interface MTU 72; `ip` is the beginning of the command.
 pub(crate) fn widen(ip: &str, name: &str) -> String {
     format!("{ip} link set {name} down && {ip} link set {name} mtu {FD_MTU} up")
 }

@@ -41,7 +41,7 @@ fn what_is_missing_is_made_and_a_second_run_has_nothing_to_do() {
     let world = World::of(vec![interface("vcan0", 2, Kind::Vcan)]);
     let plan = up(&target, &world.here, false).unwrap();
     assert_eq!(plan.steps, [Step { name: "vcan1".into(), action: Action::MakeVcan }]);
-    assert_eq!(plan.unchanged, ["vcan0 is there already, and fits (a vcan, made by somebody else)"]);
+    assert_eq!(plan.unchanged, ["vcan0 is there already, and fits (a vcan, made by another program)"]);
     let again = up(&target, &world.carry_out_all(&plan).here, false).unwrap();
     assert_eq!(again.steps, []);
 }

@@ -1,4 +1,4 @@
-//! What has become of every frame of a line.
+//! Counts of the frames of a line.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -6,25 +6,25 @@ use std::fmt;
 use protocol::slcan::Refused;
 use serde::Serialize;
 
-/// Frames from the bus to the line. `received` is always `sent` and all of `dropped`, when nothing waits.
+/// Counts of frames from the bus to the line. `received` equals `sent` plus the sum of `dropped` if no frames wait.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct ToLine {
-    /// Frames that the bus gave this line.
+    /// Frames received from the bus.
     pub received: u64,
-    /// Frames that were handed to the line as a whole.
+    /// Frames written to the line completely.
     pub sent: u64,
-    /// Frames that were not, by reason.
+    /// Frames that were not sent, by reason.
     pub dropped: ToLineDropped,
-    /// Frames that the bus itself dropped, because this process did not read in time; not in `received`.
+    /// Frames that the bus dropped because this process did not read in time; not in `received`.
     pub dropped_by_bus: u64,
 }
 
-/// Why frames of the bus did not get to the line.
+/// Counts of frames that were not sent to the line, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct ToLineDropped {
-    /// The queue was full: the line, or the adapter's bus at its bit rates, carries less.
+    /// The queue was full: the line, or the adapter's bus at its bit rates, is too slow.
     pub queue_full: u64,
-    /// The line was away, or went away before the frame was handed to it as a whole.
+    /// The line was unavailable, or became unavailable before the frame was written completely.
     pub line_away: u64,
     /// An FD frame for a line with `classic`.
     pub not_classic: u64,
@@ -32,52 +32,52 @@ pub struct ToLineDropped {
     pub error_frame: u64,
     /// The adapter refused the frame (BEL).
     pub refused: u64,
-    /// The end came before its turn.
+    /// The program ended before the frame was sent.
     pub ended: u64,
 }
 
-/// Frames from the line to the bus. `received` is always `sent` and all of `dropped`, when nothing waits.
+/// Counts of frames from the line to the bus. `received` equals `sent` plus the sum of `dropped` if no frames wait.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct ToBus {
-    /// Lines that were frames, and error frames of the adapter's faults.
+    /// Frames received from the line, and error frames made of the adapter's faults.
     pub received: u64,
-    /// Frames that the bus took.
+    /// Frames sent to the bus.
     pub sent: u64,
-    /// Frames that it did not take, by reason.
+    /// Frames that were not sent, by reason.
     pub dropped: ToBusDropped,
-    /// Lines that could not be used, by reason; not in `received`.
+    /// Invalid lines, by reason; not in `received`.
     pub refused: RefusedLines,
     /// BEL: lines that the adapter refused.
     pub bells: u64,
-    /// Lines that were neither frames nor acknowledgements, such as a version.
+    /// Lines that are neither frames nor acknowledgements, such as a version.
     pub other_lines: u64,
 }
 
-/// Why frames of the line did not get to the bus.
+/// Counts of frames that were not sent to the bus, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct ToBusDropped {
-    /// The queue was full: the bus takes less.
+    /// The queue was full: the bus is too slow.
     pub queue_full: u64,
-    /// The bus was down or away.
+    /// The bus was down or unavailable.
     pub bus_away: u64,
     /// An FD frame for a bus that carries classic frames only.
     pub not_classic: u64,
-    /// The end came before its turn.
+    /// The program ended before the frame was sent.
     pub ended: u64,
 }
 
-/// Lines that cannot be used.
+/// Counts of invalid lines.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct RefusedLines {
-    /// Bytes that no line has.
+    /// Lines with bytes that slcan does not use.
     pub garbage: u32,
-    /// Longer than their DLC says, or than any line.
+    /// Lines longer than their DLC requires, or longer than any line.
     pub long: u32,
-    /// Shorter than their DLC says.
+    /// Lines shorter than their DLC requires.
     pub short: u32,
-    /// A DLC that the format does not have.
+    /// Lines with a DLC that the format does not have.
     pub dlc: u32,
-    /// An identifier beyond 11 or 29 bits.
+    /// Lines with an identifier beyond 11 or 29 bits.
     pub identifier: u32,
 }
 
@@ -88,29 +88,29 @@ impl From<Refused> for RefusedLines {
     }
 }
 
-/// What has become of every frame of a line.
+/// The account of a line.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Account {
-    /// The line's address.
+    /// The address of the line.
     pub line: String,
-    /// How often the line was opened.
+    /// The number of times the line was opened.
     pub opened: u64,
-    /// How often it went away.
+    /// The number of times the line was lost.
     pub lost: u64,
-    /// Number of times its adapter was opened again, because it refused frames.
+    /// The number of times the adapter was reopened because it refused frames.
     pub reopened: u64,
-    /// From the bus to the line.
+    /// Frames from the bus to the line.
     pub to_line: ToLine,
-    /// From the line to the bus.
+    /// Frames from the line to the bus.
     pub to_bus: ToBus,
     /// Faults and states that the adapter reported, by name.
     pub faults: Faults,
 }
 
-/// Faults and changes of state that an adapter reported, by name.
+/// Counts of the faults and changes of state that an adapter reported, by name.
 pub type Faults = BTreeMap<&'static str, u64>;
 
-/// Faults since `before` in words; nothing when there are none.
+/// Lists the faults since `before`; empty if there are none.
 pub(super) fn faults_since(before: &Faults, now: &Faults) -> String {
     let more = now.iter().map(|(name, count)| (name, count - before.get(name).copied().unwrap_or(0)));
     let words = more.filter(|(_, count)| *count > 0).map(|(name, count)| match count {
@@ -121,7 +121,7 @@ pub(super) fn faults_since(before: &Faults, now: &Faults) -> String {
 }
 
 impl ToLineDropped {
-    /// All of them.
+    /// Returns the total.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.named().into_iter().map(|(count, _)| count).sum()
@@ -140,7 +140,7 @@ impl ToLineDropped {
 }
 
 impl ToBusDropped {
-    /// All of them.
+    /// Returns the total.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.named().into_iter().map(|(count, _)| count).sum()
@@ -157,7 +157,7 @@ impl ToBusDropped {
 }
 
 impl RefusedLines {
-    /// All of them.
+    /// Returns the total.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.named().into_iter().map(|(count, _)| count).sum()
@@ -175,7 +175,7 @@ impl RefusedLines {
 }
 
 impl ToLine {
-    /// `, 3 dropped (2 line too slow, 1 line away)`; nothing when nothing was lost.
+    /// Formats losses as `, 3 dropped (2 line too slow, 1 line away)`; empty if there are none.
     pub(super) fn losses(&self) -> String {
         losses("dropped", &self.dropped.named())
             + &losses("not received", &[(self.dropped_by_bus, "dropped by the bus")])
@@ -183,7 +183,7 @@ impl ToLine {
 }
 
 impl ToBus {
-    /// The same of the other way.
+    /// Formats the losses on the way to the bus.
     pub(super) fn losses(&self) -> String {
         losses("dropped", &self.dropped.named()) + &losses("lines refused", &self.refused.named())
     }
@@ -208,7 +208,7 @@ fn times(count: u64) -> String {
 }
 
 impl fmt::Display for Account {
-    /// Three lines, or four when the adapter reported faults, without an end.
+    /// Writes three lines, or four if the adapter reported faults, without a line feed at the end.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { line, opened, lost, reopened, to_line, to_bus, faults } = self;
         write!(f, "{line}: opened {}, lost {}", times(*opened), times(*lost))?;

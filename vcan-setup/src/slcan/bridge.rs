@@ -1,4 +1,4 @@
-//! One thread, one `poll` around all lines of a bus.
+//! The bridge between a bus and its lines: one thread and one `poll` for all of them.
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
@@ -15,16 +15,16 @@ use super::options::LineOptions;
 use super::participant::{Participant, Ready};
 use super::settings::{Settings, open};
 
-/// How long a line may take at the end for what it has begun and for closing its adapter.
+/// The time at the end for finishing a line that was begun and for closing its adapter.
 const CLOSING: Duration = Duration::from_millis(500);
-/// Between two attempts at the start.
+/// The interval between two attempts at the start.
 const AGAIN: Duration = Duration::from_millis(20);
 
-/// Why lines cannot be joined to a bus.
+/// The error of lines that cannot be joined to a bus.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum BridgeError {
-    /// Two lines have one address.
+    /// Two lines have the same address.
     #[error("{0} is named twice: each line is one participant")]
     Twice(String),
     /// The bus cannot be opened.
@@ -33,11 +33,11 @@ pub enum BridgeError {
     /// A line cannot be opened.
     #[error("cannot open {line}: {source}{hint}")]
     Line {
-        /// Its address.
+        /// The address.
         line: String,
-        /// What is wrong.
+        /// The cause.
         source: io::Error,
-        /// What to do, if that does not say it.
+        /// The action to take, unless the cause contains it.
         hint: &'static str,
     },
     /// The system cannot wait.
@@ -45,7 +45,7 @@ pub enum BridgeError {
     Wait(#[source] io::Error),
 }
 
-/// Lines that are participants of a bus.
+/// The lines of a bus.
 #[derive(Debug)]
 pub struct Bridge {
     settings: Settings,
@@ -54,10 +54,10 @@ pub struct Bridge {
 }
 
 impl Bridge {
-    /// Opens the bus once for each line, and the lines. With [`Settings::wait`] lines may be away.
+    /// Opens the bus once for each line, and the lines. With [`Settings::wait`] lines may be unavailable.
     ///
     /// # Errors
-    /// When the bus or a line cannot be opened.
+    /// Returns [`BridgeError`] if the bus or a line cannot be opened.
     pub fn open(settings: Settings, lines: Vec<LineOptions>) -> Result<Self, BridgeError> {
         let kind = settings.choice.resolve(&settings.bus);
         let mut participants: Vec<Participant> = Vec::new();
@@ -80,20 +80,20 @@ impl Bridge {
                 if let Some(error) = participant.take_reason() {
                     return Err(refused(participant.name(), error));
                 }
-                // TCP, which says in time whether it is connected.
+                // A TCP connection reports in time whether it is established.
                 std::thread::sleep(AGAIN);
             }
         }
         Ok(bridge)
     }
 
-    /// What carries the bus.
+    /// Returns the kind of the bus.
     #[must_use]
     pub const fn kind(&self) -> BusKind {
         self.kind
     }
 
-    /// The lines that are away, each with the reason where that is known.
+    /// Returns the unavailable lines, each with the reason if it is known.
     #[must_use]
     pub fn away(&self) -> Vec<String> {
         let away = self.participants.iter().filter(|it| !it.is_up());
@@ -103,11 +103,12 @@ impl Bridge {
         away.map(words).collect()
     }
 
-    /// Passes frames until `stop` can be read or is hung up, then closes the adapters; the accounts, in the order of the
-    /// lines. `report` hears of lines and of buses that go and come, and of losses, at most once a second for each line.
+    /// Forwards frames until `stop` is readable or hung up, and then closes the adapters. Returns the accounts in the
+    /// order of the lines. `report` is called when a line or a bus is lost or returns, and for losses at most once a
+    /// second for each line.
     ///
     /// # Errors
-    /// When the system cannot wait.
+    /// Returns [`BridgeError::Wait`] if the system cannot wait.
     pub fn run(
         mut self,
         stop: impl AsFd,
@@ -127,7 +128,7 @@ impl Bridge {
         let until = Instant::now() + CLOSING;
         self.participants.iter_mut().for_each(Participant::end);
         loop {
-            // All of them, not only up to the first one that is not done.
+            // All participants must be polled, not only those before the first unfinished one.
             let left = self.participants.iter_mut().filter_map(|it| (!it.finish()).then_some(())).count();
             if left == 0 || Instant::now() >= until {
                 break;
@@ -142,7 +143,8 @@ impl Bridge {
         Ok(self.participants.iter().map(Participant::account).collect())
     }
 
-    /// Waits until there is something to do: for each line what can be read; nothing when it is time to stop.
+    /// Waits until there is something to do. Returns the readable ends of each line, or `None` if the bridge should
+    /// stop.
     fn wait(
         &mut self,
         stop: Option<BorrowedFd<'_>>,
@@ -167,7 +169,7 @@ impl Bridge {
         let timeout = next.and_then(|next| Timespec::try_from(next.saturating_duration_since(now)).ok());
         match poll(&mut polled, timeout.as_ref()) {
             Ok(_) | Err(Errno::INTR) => {}
-            // No memory for a moment: everything is looked at.
+            // The kernel lacks memory for a moment: treat all ends as ready.
             Err(Errno::NOMEM | Errno::AGAIN) => std::thread::sleep(AGAIN),
             Err(errno) => return Err(errno.into()),
         }
@@ -185,7 +187,7 @@ impl Bridge {
 }
 
 fn refused(line: String, source: io::Error) -> BridgeError {
-    // What is of the wrong kind, or used by others, says so itself.
+    // Errors about the kind of the file or about its use by others contain the action.
     let says_it = matches!(source.kind(), io::ErrorKind::InvalidInput | io::ErrorKind::ResourceBusy);
     let hint = if says_it {
         ""

@@ -1,36 +1,36 @@
-//! Events of a line, as they are reported while it runs.
+//! Events that a line reports while it runs.
 
 use std::fmt;
 
 use super::account::Account;
 
-/// Event of a line.
+/// An event of a line.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum Event {
     /// The line is open.
     LineUp,
-    /// The line is away, or cannot be opened, and why; it is tried again.
+    /// The line was lost or cannot be opened, with the reason; it is retried.
     LineAway(String),
     /// The bus is open again.
     BusUp,
-    /// The bus is away, and why; it is tried again.
+    /// The bus was lost, with the reason; it is retried.
     BusAway(String),
     /// Frames were lost since the last report.
     Lost {
         /// Frames from the bus.
         to_line: u64,
-        /// Frames from the line, and lines that could not be used.
+        /// Frames from the line, and invalid lines.
         to_bus: u64,
-        /// All so far.
+        /// The account so far.
         account: Box<Account>,
     },
-    /// The adapter refused some of these commands that set it.
+    /// The adapter refused some of these commands during its setup.
     SettingRefused(String),
-    /// The adapter refused lines, and is opened again.
+    /// The adapter refused lines, and is reopened.
     Reopened,
     /// The adapter reported these faults and states since the last report.
     Reported(String),
-    /// At the end the line took nothing for so long that its adapter was not closed.
+    /// The adapter was not closed, because the line was blocked at the end.
     NotClosed,
 }
 

@@ -1,4 +1,4 @@
-//! From a line to the bus: bytes become frames, which wait until the bus takes them.
+//! Frames from a line to the bus: decodes bytes into frames, which wait until the bus accepts them.
 
 use std::collections::VecDeque;
 
@@ -7,17 +7,17 @@ use protocol::slcan::{BusState, Decoder, Fault, Line, Report};
 
 use super::account::{Faults, ToBus};
 
-/// Frames that wait for the bus at most.
+/// The maximum number of frames that wait for the bus.
 pub const QUEUE: usize = 1_024;
 
-/// The way of frames from a line to the bus.
+/// The path of frames from a line to the bus.
 #[derive(Debug, Default)]
 pub struct Incoming {
     decoder: Decoder,
-    /// The bus carries classic frames only.
+    /// True if the bus carries classic frames only.
     classic: bool,
     is_up: bool,
-    /// Real hardware would send an error frame as a data frame.
+    /// True if the bus is virtual. Hardware would send an error frame as a data frame.
     is_virtual: bool,
     frames: VecDeque<Frame>,
     account: ToBus,
@@ -30,9 +30,9 @@ pub struct Incoming {
 /// Replies of an adapter since it was opened.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Replies {
-    /// It acknowledged a line, or sent a frame.
+    /// True if the adapter acknowledged a line or sent a frame.
     pub accepted: bool,
-    /// Number of refusals in succession.
+    /// The number of refusals in a row.
     pub refusals: u64,
 }
 
@@ -41,29 +41,29 @@ impl Replies {
 }
 
 impl Incoming {
-    /// To a bus that is not there yet.
+    /// Creates the path to a bus that is not open yet.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// The bus is there; `classic` drops FD frames, and only a bus that `is_virtual` gets error frames.
+    /// Records that the bus is open. `classic` drops FD frames, and only a bus that `is_virtual` gets error frames.
     pub const fn up(&mut self, classic: bool, is_virtual: bool) {
         (self.is_up, self.classic, self.is_virtual) = (true, classic, is_virtual);
     }
 
-    /// The adapter was opened: its replies are those to what follows, and its bus has no error.
+    /// Records that the adapter was opened: replies belong to later lines, and its bus has no error.
     pub fn opened(&mut self) {
         (self.replies, self.state) = (Replies::default(), BusState::Active);
     }
 
-    /// The bus is gone, and takes nothing of what waits.
+    /// Records that the bus was lost, and drops the waiting frames.
     pub fn down(&mut self) {
         self.is_up = false;
         self.account.dropped.bus_away += self.clear();
     }
 
-    /// Takes bytes of the line.
+    /// Decodes bytes of the line.
     pub fn take(&mut self, bytes: &[u8]) {
         for &byte in bytes {
             match self.decoder.push(byte) {
@@ -89,13 +89,13 @@ impl Incoming {
         self.replies
     }
 
-    /// Faults that the adapter reported.
+    /// Returns the faults that the adapter reported.
     #[must_use]
     pub const fn faults(&self) -> &Faults {
         &self.faults
     }
 
-    /// Counts the faults of a report, and passes them on as an error frame.
+    /// Counts the faults of a report, and forwards them as an error frame.
     fn report(&mut self, report: Report) {
         let before = self.state;
         self.state = report.state().unwrap_or(before);
@@ -111,28 +111,28 @@ impl Incoming {
         self.account.other_lines += u64::from(is_empty);
     }
 
-    /// The line is gone, with what it had begun.
+    /// Records that the line was lost, and drops an incomplete line.
     pub fn line_lost(&mut self) {
         self.decoder.restart();
     }
 
-    /// The frames that wait for the bus, from the first one on.
+    /// Returns the frames that wait for the bus, oldest first.
     pub fn waiting(&mut self) -> &[Frame] {
         self.frames.make_contiguous()
     }
 
-    /// The bus took so many of them.
+    /// Removes the first `count` frames, which were sent.
     pub fn sent(&mut self, count: usize) {
         let count = self.frames.drain(..count.min(self.frames.len())).count();
         self.account.sent += count as u64;
     }
 
-    /// The end: what waits is dropped.
+    /// Drops the waiting frames at the end of the program.
     pub fn end(&mut self) {
         self.account.dropped.ended += self.clear();
     }
 
-    /// What became of the frames.
+    /// Returns the counts of the frames.
     #[must_use]
     pub fn account(&self) -> ToBus {
         ToBus { refused: self.decoder.refused().into(), ..self.account }

@@ -1,4 +1,4 @@
-//! Opening a line: terminals in raw mode, Unix sockets, TCP sockets. Nothing here waits.
+//! Opens lines without blocking: terminals in raw mode, Unix sockets and TCP sockets.
 
 use std::io;
 use std::net::{SocketAddr, ToSocketAddrs};
@@ -14,11 +14,11 @@ use rustix::termios::{self, ControlModes, InputModes, OptionalActions, QueueSele
 
 use super::options::{Address, LineOptions};
 
-/// How long a TCP connection may take.
+/// The time for which a TCP connection may take.
 const CONNECT: Duration = Duration::from_secs(3);
-/// Bytes that a socket may hold on the way: more would only make frames old, and hide that the peer is too slow.
+/// The send buffer of a socket in bytes. A larger one would only delay frames, and hide that the peer is too slow.
 const SEND_BUFFER: usize = 16 << 10;
-/// A TCP peer that is silent so long is asked whether it is there, every second, three times.
+/// The time after which a silent TCP peer is probed, three times a second apart.
 const SILENT: Duration = Duration::from_secs(5);
 
 /// An open line.
@@ -26,7 +26,7 @@ const SILENT: Duration = Duration::from_secs(5);
 pub(super) struct Port {
     fd: OwnedFd,
     is_tty: bool,
-    /// The connection is not there yet, and given up then.
+    /// The time at which a pending connection is given up.
     connecting: Option<Instant>,
 }
 
@@ -36,11 +36,11 @@ impl AsFd for Port {
     }
 }
 
-/// Opens a line, again and again.
+/// Opens a line repeatedly.
 #[derive(Debug)]
 pub(super) struct Opener {
     options: LineOptions,
-    /// Of a TCP line: where its host is, found once, because to find out may take long.
+    /// The addresses of a TCP line's host, resolved once, because resolving may take long.
     hosts: Vec<SocketAddr>,
     next: usize,
 }
@@ -86,12 +86,12 @@ impl Opener {
 }
 
 impl Port {
-    /// Whether it is still to be connected.
+    /// Returns true if the connection is pending.
     pub(super) const fn is_connecting(&self) -> bool {
         self.connecting.is_some()
     }
 
-    /// Whether it is connected by now.
+    /// Returns true if the connection is established.
     pub(super) fn connected(&mut self) -> io::Result<bool> {
         let Some(until) = self.connecting else { return Ok(true) };
         let mut polled = [PollFd::new(&self.fd, PollFlags::OUT)];
@@ -99,8 +99,8 @@ impl Port {
             return if Instant::now() < until { Ok(false) } else { Err(Errno::TIMEDOUT.into()) };
         }
         sockopt::socket_error(&self.fd)??;
-        // Where nobody listens on a port that the system also gives to those who connect, it connects sooner or later a
-        // socket to itself, and every frame would come back.
+        // If no program listens on a port of the ephemeral range, a socket sooner or later connects to itself, and
+        // every frame would come back.
         if Some(rustix::net::getsockname(&self.fd)?) == rustix::net::getpeername(&self.fd)? {
             return Err(Errno::CONNREFUSED.into());
         }
@@ -108,7 +108,7 @@ impl Port {
         Ok(true)
     }
 
-    /// How many bytes came; 0 when none are there yet.
+    /// Reads bytes, and returns their number; 0 if none are available yet.
     pub(super) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match rustix::io::read(&self.fd, buffer) {
             Ok(0) => Err(io::Error::new(io::ErrorKind::UnexpectedEof, "it was closed")),
@@ -118,7 +118,7 @@ impl Port {
         }
     }
 
-    /// How many bytes it took.
+    /// Writes bytes, and returns the number accepted.
     pub(super) fn write(&self, bytes: &[u8]) -> io::Result<usize> {
         let done = if self.is_tty {
             rustix::io::write(&self.fd, bytes)
@@ -132,7 +132,7 @@ impl Port {
         }
     }
 
-    /// Takes back what a terminal has not sent, so that closing it does not wait for an adapter that takes nothing.
+    /// Discards unsent output of a terminal, so that closing it does not wait for an adapter that accepts nothing.
     pub(super) fn discard(&self) {
         if self.is_tty {
             let _ = termios::tcflush(&self.fd, QueueSelector::OFlush);
@@ -155,8 +155,7 @@ fn connect(
     Ok(Port { fd, is_tty: false, connecting })
 }
 
-/// A terminal that passes every byte on as it is, in both directions, and belongs to this process as far as others heed
-/// the lock.
+/// Opens a terminal in raw mode in both directions, and locks it against programs that respect the lock.
 fn open_tty(path: &Path, baud: Option<u32>) -> io::Result<OwnedFd> {
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
     let other = |hint: String| Err(io::Error::new(io::ErrorKind::InvalidInput, hint));
@@ -167,7 +166,7 @@ fn open_tty(path: &Path, baud: Option<u32>) -> io::Result<OwnedFd> {
         }
         Err(errno) => return Err(errno.into()),
     };
-    // A lock, and not TIOCEXCL: that one holds back no root, and outlives a process that is killed.
+    // A lock is used instead of TIOCEXCL, which does not exclude root and outlives a process that is killed.
     match flock(&fd, FlockOperation::NonBlockingLockExclusive) {
         Ok(()) => {}
         Err(Errno::WOULDBLOCK) => {

@@ -1,4 +1,4 @@
-//! A line as the command line names it: its address, and how it is used.
+//! The options of a line on the command line: its address, and its use.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -12,47 +12,47 @@ use protocol::slcan::Command;
 use protocol::wire_time::BitRates;
 use thiserror::Error;
 
-/// Where a line is.
+/// The address of a line.
 #[derive(Clone, Debug, Eq, Hash, PartialEq)]
 pub enum Address {
-    /// A terminal: an adapter's device, or a pseudoterminal.
+    /// A terminal: the device of an adapter, or a pseudoterminal.
     Tty(PathBuf),
-    /// A Unix socket that a program listens on.
+    /// A Unix socket on which a program listens.
     Unix(PathBuf),
-    /// A TCP socket that a program listens on.
+    /// A TCP socket on which a program listens.
     Tcp {
-        /// A name or an address.
+        /// The name or address of the host.
         host: String,
         /// The port.
         port: u16,
     },
 }
 
-/// How a line is used.
+/// The options of a line.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct LineOptions {
-    /// Where it is.
+    /// The address.
     pub address: Address,
-    /// Which frames of the bus go to the line: what passes any of these; all when there are none.
+    /// Filters for frames from the bus to the line. A frame passes if any filter matches, or if there are none.
     pub filters: Vec<Filter>,
-    /// The bit rates that the adapter is set to; else it keeps its own.
+    /// The bit rates to be set in the adapter; `None` keeps its own.
     pub bit_rates: Option<BitRates>,
-    /// The speed of a terminal in bit/s; else it keeps its own.
+    /// The speed of a terminal in bit/s; `None` keeps its own.
     pub baud: Option<u32>,
-    /// The adapter has no CAN FD: FD frames are dropped.
+    /// True if the adapter has no CAN FD: FD frames are dropped.
     pub classic: bool,
-    /// Time that the adapter needs after its line was opened, before it takes commands: boards that opening resets.
+    /// The time from opening the line until the adapter accepts commands, for boards that are reset by opening.
     pub settle: Duration,
 }
 
-/// A word that is no line.
+/// The error of an invalid line argument.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum LineError {
-    /// It has no form of an address.
+    /// The address has no known form.
     #[error("{0:?} is no line: /dev/ttyACM0, unix:/path/to/socket and tcp:localhost:3333 are")]
     Address(String),
-    /// An option that no line has.
+    /// The option is unknown.
     #[error(
         "{line}: {got:?} is no option of a line: cell=12, cell=1-8, filter=100:700, rates=1M/5M, baud=115200, settle=2 and classic are"
     )]
@@ -62,58 +62,60 @@ pub enum LineError {
         /// The option.
         got: String,
     },
-    /// An option with a wrong value.
+    /// The value of an option is invalid.
     #[error("{line}: {got:?}: {expected}")]
     Value {
         /// The address.
         line: String,
         /// The option.
         got: String,
-        /// What would be right.
+        /// The allowed values.
         expected: String,
     },
 }
 
-/// The longest time that a board may need to start.
+/// The maximum time for which a board may start, in s.
 const MAX_SETTLE: f64 = 60.0;
-/// From a command of the opening to the next: adapters handle one in a USB packet, and answer within this time.
+/// The time between two commands of the opening. Adapters process one command per USB packet, and answer within this
+/// time.
 const COMMAND_GAP: Duration = Duration::from_millis(10);
-/// Gap after closing the adapter: its answer, a refusal when it was closed already, comes before any other command.
+/// The time after closing the adapter. Its answer, a refusal if it was already closed, must arrive before any other
+/// command.
 const CLOSE_GAP: Duration = Duration::from_millis(30);
 
 /// A command of the opening.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct OpeningStep {
-    /// Its line.
+    /// The bytes of the command.
     pub bytes: Vec<u8>,
-    /// From it to the next line.
+    /// The time until the next command.
     pub gap: Duration,
-    /// Stage of the adapter from there on.
+    /// The stage of the adapter after the command.
     pub stage: Stage,
 }
 
-/// Stage of opening an adapter.
+/// The stage of opening an adapter.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Stage {
-    /// Nothing was sent to it.
+    /// No command was sent yet.
     #[default]
     Away,
-    /// It was closed, which it refuses if it was closed before.
+    /// The adapter was closed, which it refuses if it was already closed.
     Closed,
-    /// Its bit rates are being set.
+    /// The bit rates are being set.
     Setting,
-    /// It takes part in its bus.
+    /// The adapter takes part in its bus.
     Open,
 }
 
-/// What a line's bit rates may be, in an error.
+/// The allowed bit rates of a line, for an error.
 const RATES: &str = "slcan has the bit rates 10k, 20k, 50k, 83.3k, 100k, 125k, 250k, 500k, 750k or 800k, and 1M; \
                      for data 500k and whole Mbit/s up to 8M";
 
-/// Values of [`LineOptions::settle`], for an error.
+/// The allowed values of [`LineOptions::settle`], for an error.
 pub const SETTLE: &str = "seconds from 0 to 60, such as 2 or 0.5";
 
-/// Reads [`LineOptions::settle`].
+/// Parses [`LineOptions::settle`].
 #[must_use]
 pub fn settle_time(word: &str) -> Option<Duration> {
     let seconds = word.parse().ok().filter(|seconds| (0.0..=MAX_SETTLE).contains(seconds))?;
@@ -121,7 +123,7 @@ pub fn settle_time(word: &str) -> Option<Duration> {
 }
 
 impl LineOptions {
-    /// A line to which all frames go, that keeps its own speed and bit rates.
+    /// Returns the options of a line that gets all frames, and keeps its own speed and bit rates.
     #[must_use]
     pub const fn new(address: Address) -> Self {
         Self {
@@ -134,7 +136,8 @@ impl LineOptions {
         }
     }
 
-    /// Only what a cell with this node id receives goes to the line, beside what its other filters let pass.
+    /// Adds the filters for the frames that a cell receives. The line gets only these frames, besides those that match
+    /// its other filters.
     pub fn add_cell(&mut self, cell: CellId) {
         for filter in Id::of_cell(cell).map(Filter::exact) {
             if !self.filters.contains(&filter) {
@@ -146,7 +149,7 @@ impl LineOptions {
     /// Sets the adapter's bit rates.
     ///
     /// # Errors
-    /// When slcan has no command for one.
+    /// Returns an error text if slcan has no command for one of the rates.
     pub fn set_bit_rates(&mut self, rates: BitRates) -> Result<(), String> {
         let data = rates.data();
         if Command::nominal(rates.nominal()).is_none()
@@ -158,8 +161,8 @@ impl LineOptions {
         Ok(())
     }
 
-    /// The commands that open the adapter: they end whatever it has of a line, leave the bus, set the bit rates, join the
-    /// bus. The data bit rate is stated even when it equals the nominal one, since adapters have another default.
+    /// Returns the commands that open the adapter: they end an incomplete line, leave the bus, set the bit rates, and
+    /// join the bus. The data bit rate is set even if it equals the nominal one, because adapters have another default.
     #[must_use]
     pub fn opening(&self) -> Vec<OpeningStep> {
         let rates = self.bit_rates;
@@ -179,8 +182,8 @@ impl LineOptions {
         .collect()
     }
 
-    /// Returns whether frames may switch to the data bit rate. Where it equals the nominal one they gain nothing by it, and would
-    /// lose by an adapter that does not have the command for it.
+    /// Returns true if frames may switch to the data bit rate. If it equals the nominal one, switching gains nothing,
+    /// and would fail on an adapter without the command for it.
     #[must_use]
     pub fn switches_bit_rate(&self) -> bool {
         self.bit_rates.is_none_or(|rates| rates.data() != rates.nominal())
@@ -242,7 +245,7 @@ impl LineOptions {
     }
 }
 
-/// Identifier and mask, 3 digits for data frames of 11 bits, 8 for those of 29.
+/// Parses identifier and mask: 3 digits for data frames of 11 bits, 8 for those of 29.
 fn filter(text: &str) -> Option<Filter> {
     let (id, mask) = text.split_once(':')?;
     let (max, flag) = match id.len() {
@@ -341,7 +344,7 @@ mod tests {
             assert!(!passes(&one, id), "{id:X}");
         }
         assert_eq!(one.filters.len(), 10);
-        // What all receive is there once.
+        // The filters that all cells share are added once.
         let three = line("/dev/ttyACM0,cell=12-13,cell=40");
         assert_eq!(three.filters.len(), 7 + 3 * 3);
         assert!(passes(&three, 0x50D) && passes(&three, 0x728));

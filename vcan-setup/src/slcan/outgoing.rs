@@ -1,4 +1,5 @@
-//! From the bus to a line: frames become text, wait in a queue, and leave no faster than the line carries them.
+//! Frames from the bus to a line: encodes them as text, queues them, and releases them no faster than the line carries
+//! them.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -10,22 +11,22 @@ use protocol::wire_time::{BitRates, Bits};
 use super::account::ToLine;
 use super::options::{LineOptions, OpeningStep, Stage};
 
-/// Frames that wait at most: a tenth of a second of a line at 1 Mbaud.
+/// The maximum number of waiting frames: a tenth of a second of a line at 1 Mbaud.
 pub const QUEUE: usize = 256;
-/// How far the line may be ahead of what its bus or its wire carries: what an adapter buffers.
+/// The time by which the line may be ahead of its bus or its wire, which is what an adapter buffers.
 pub const AHEAD: Duration = Duration::from_millis(2);
 
-/// How long a frame keeps the line busy.
+/// The rates from which the duration of a frame on the line is computed.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Pace {
-    /// The adapter's bus.
+    /// The bit rates of the adapter's bus.
     pub bit_rates: Option<BitRates>,
-    /// The wire between the host and the adapter; ten bits a byte.
+    /// The speed of the wire between the host and the adapter in bit/s; a byte has ten bits.
     pub baud: Option<u32>,
 }
 
 impl Pace {
-    /// The pace of a line and of the bus behind it.
+    /// Returns the pace of a line and of the bus behind it.
     #[must_use]
     pub const fn of(options: &LineOptions) -> Self {
         Self { bit_rates: options.bit_rates, baud: options.baud }
@@ -38,7 +39,7 @@ impl Pace {
     }
 }
 
-/// Text that waits or is being written.
+/// A text that waits or is being written.
 #[derive(Debug)]
 struct Entry {
     bytes: usize,
@@ -46,11 +47,11 @@ struct Entry {
     kind: Kind,
 }
 
-/// Kind of a text.
+/// The kind of a text.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Kind {
     Frame,
-    /// A command, which is not counted; once it is written the adapter is in this stage.
+    /// A command, which is not counted. Once it is written the adapter is in this stage.
     Command(Stage),
 }
 
@@ -60,52 +61,52 @@ impl Entry {
     }
 }
 
-/// The way of frames from the bus to a line.
+/// The path of frames from the bus to a line.
 #[derive(Debug, Default)]
 pub struct Outgoing {
     classic: bool,
-    /// Frames that switch their bit rate are sent without.
+    /// True if frames are sent without their bit rate switch.
     one_rate: bool,
     pace: Pace,
     /// The text of all entries, from the first byte that is not written.
     text: VecDeque<u8>,
     entries: VecDeque<Entry>,
-    /// Bytes of the first entry that are written.
+    /// The number of bytes of the first entry that are written.
     written: usize,
-    /// Entries that may be written by now, and their bytes, without what is written of the first.
+    /// The number of entries that may be written by now, and that of their unwritten bytes.
     released: usize,
     released_bytes: usize,
     busy_until: Duration,
     is_up: bool,
     stage: Stage,
-    /// Frames that were sent since the adapter was opened, without those that it refused.
+    /// Frames sent since the adapter was opened, without those that it refused.
     since_open: u64,
-    /// What became of the frames.
+    /// The counts of the frames.
     pub account: ToLine,
 }
 
 impl Outgoing {
-    /// To a line that is not there yet; `classic` drops FD frames.
+    /// Creates the path to a line that is not open yet; `classic` drops FD frames.
     #[must_use]
     pub fn new(classic: bool, pace: Pace) -> Self {
         Self { classic, pace, ..Self::default() }
     }
 
-    /// Builds the way to a line with these options.
+    /// Creates the path to a line with these options.
     #[must_use]
     pub fn of(options: &LineOptions) -> Self {
         let one_rate = !options.switches_bit_rate();
         Self { one_rate, ..Self::new(options.classic, Pace::of(options)) }
     }
 
-    /// The line is there; `opening` is written first.
+    /// Records that the line is open. `opening` is written first.
     pub fn up(&mut self, opening: &[OpeningStep]) {
         self.down();
         self.is_up = true;
         opening.iter().for_each(|step| self.push_step(step));
     }
 
-    /// Opens the adapter again, before what waits and after what was begun.
+    /// Reopens the adapter, after a line that was begun and before the frames that wait.
     pub fn reopen(&mut self, opening: &[OpeningStep]) {
         let begun = usize::from(self.written > 0);
         let rest = self.entries.front().filter(|_| begun > 0).map_or(0, |entry| entry.bytes - self.written);
@@ -124,7 +125,7 @@ impl Outgoing {
         self.stage
     }
 
-    /// The adapter refused so many lines; those that were frames were not sent.
+    /// Records that the adapter refused lines. Those that were frames count as refused instead of sent.
     pub fn refused(&mut self, lines: u64) {
         let frames = lines.min(self.since_open);
         self.since_open -= frames;
@@ -132,14 +133,14 @@ impl Outgoing {
         self.account.dropped.refused += frames;
     }
 
-    /// The line is gone, with all that waited for it.
+    /// Records that the line was lost, and drops the waiting frames.
     pub fn down(&mut self) {
         let waiting = self.clear();
         self.account.dropped.line_away += waiting;
         self.is_up = false;
     }
 
-    /// Takes a frame of the bus.
+    /// Queues a frame of the bus, or drops it.
     pub fn take(&mut self, frame: &Frame) {
         self.account.received += 1;
         let dropped = &mut self.account.dropped;
@@ -163,7 +164,7 @@ impl Outgoing {
         *reason += 1;
     }
 
-    /// What may be written now; and when there may be more, if something waits that may not yet.
+    /// Returns the bytes that may be written now, and the time at which more may be written if entries wait.
     pub fn ready(&mut self, now: Duration) -> (&[u8], Option<Duration>) {
         while let Some(entry) = self.entries.get(self.released) {
             if self.busy_until > now + AHEAD {
@@ -178,7 +179,7 @@ impl Outgoing {
         (text.get(..self.released_bytes.min(text.len())).unwrap_or_default(), again)
     }
 
-    /// The line took so many bytes of what was ready.
+    /// Removes `bytes` bytes, which were written to the line.
     pub fn wrote(&mut self, bytes: usize) {
         let bytes = bytes.min(self.released_bytes);
         self.text.drain(..bytes);
@@ -203,7 +204,7 @@ impl Outgoing {
         }
     }
 
-    /// The end: what was not begun is dropped, and `closing` follows what was.
+    /// Drops the frames that were not begun, and appends `closing` after one that was.
     pub fn end(&mut self, closing: &[u8]) {
         let begun = usize::from(self.written > 0);
         let dropped = self.entries.iter().skip(begun).filter(|entry| entry.is_frame()).count();
@@ -219,20 +220,20 @@ impl Outgoing {
         }
     }
 
-    /// The end of the end: what was begun was not taken as a whole.
+    /// Drops a frame that was begun and not written completely.
     pub fn give_up(&mut self) {
         self.account.dropped.ended += self.clear();
         self.is_up = false;
     }
 
-    /// Whether nothing waits.
+    /// Returns true if no entries wait.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.entries.is_empty()
     }
 
     fn push_step(&mut self, step: &OpeningStep) {
-        // What is written ahead of its time shortens no gap.
+        // Writing ahead of time must not shorten a gap.
         self.push(&step.bytes, step.gap + AHEAD, Kind::Command(step.stage));
     }
 
@@ -241,7 +242,7 @@ impl Outgoing {
         self.entries.push_back(Entry { bytes: text.len(), cost, kind });
     }
 
-    /// Forgets what waits; how many frames that were.
+    /// Clears the queue. Returns the number of frames in it.
     fn clear(&mut self) -> u64 {
         let frames = self.entries.iter().filter(|entry| entry.is_frame()).count();
         let Self { classic, one_rate, pace, account, .. } = *self;
@@ -256,7 +257,7 @@ fn unswitched(frame: &Frame) -> Option<Frame> {
     Frame::with_data(frame.raw_id(), frame.format(), flags, frame.data()).ok()
 }
 
-/// What closes an adapter.
+/// Returns the command that closes an adapter.
 #[must_use]
 pub fn closing() -> Vec<u8> {
     let close = protocol::slcan::Command::Close.encode();
@@ -276,12 +277,12 @@ mod tests {
         Frame::classic(0x123, &[number]).unwrap()
     }
 
-    /// An opening that is written at once.
+    /// Returns an opening that may be written at once.
     fn opening(text: &[u8]) -> Vec<OpeningStep> {
         vec![OpeningStep { bytes: text.to_vec(), gap: Duration::ZERO, stage: Stage::Open }]
     }
 
-    /// Writes until nothing is left, or no more at once.
+    /// Writes until the queue is empty or has to wait.
     fn drain(outgoing: &mut Outgoing, now: Duration) -> Vec<u8> {
         let mut all = Vec::new();
         loop {
@@ -363,7 +364,7 @@ mod tests {
         drain(&mut outgoing, NOW);
         outgoing.refused(2);
         assert_eq!((outgoing.account.sent, outgoing.account.dropped.refused), (3, 2));
-        // What was begun is finished before the adapter is opened again, and what waits comes behind that.
+        // A line that was begun is finished before the adapter is reopened, and waiting frames follow.
         (5..7).for_each(|number| outgoing.take(&frame(number)));
         outgoing.ready(NOW);
         outgoing.wrote(3);
@@ -371,7 +372,7 @@ mod tests {
         assert_eq!(outgoing.stage(), Stage::Away);
         assert_eq!(drain(&mut outgoing, NOW + AHEAD), b"3105\rC\rO\rt123106\r");
         assert_eq!(outgoing.stage(), Stage::Open);
-        // More refusals than frames since then are of commands.
+        // Refusals beyond the frames since then are of commands.
         outgoing.refused(9);
         let ToLine { received, sent, dropped, .. } = outgoing.account;
         assert_eq!((received, sent, dropped.refused, dropped.total()), (7, 4, 3, 3));
@@ -415,7 +416,7 @@ mod tests {
         outgoing.end(&closing());
         assert_eq!(drain(&mut outgoing, NOW), b"3101\rC\r");
         assert_eq!((outgoing.account.sent, outgoing.account.dropped.ended), (1, 1));
-        // What is never taken as a whole is not sent.
+        // A frame that was never written completely is not sent.
         let mut stuck = Outgoing::new(false, Pace::default());
         stuck.up(&[]);
         stuck.take(&frame(1));
@@ -424,7 +425,7 @@ mod tests {
         stuck.end(&closing());
         stuck.give_up();
         assert_eq!((stuck.account.sent, stuck.account.dropped.ended, stuck.is_empty()), (0, 1, true));
-        // Nothing is there that could be closed.
+        // A line that is not open is not closed.
         let mut away = Outgoing::new(false, Pace::default());
         away.end(&closing());
         assert!(away.is_empty());
@@ -435,7 +436,7 @@ mod tests {
         let pace = Pace { bit_rates: Some("125k".parse().unwrap()), baud: None };
         let mut outgoing = Outgoing::new(true, pace);
         outgoing.up(&[]);
-        // 34 + 8 + 13 bits, and stuff bits.
+        // The frame has 34 + 8 + 13 bits, and stuff bits.
         let cost = Duration::from_nanos(Bits::of(&frame(0xAA)).unwrap().nanoseconds("125k".parse().unwrap()));
         let (mut now, mut sent) = (NOW, 0);
         while now < NOW + Duration::from_secs(1) {

@@ -1,4 +1,4 @@
-//! One line, and its client of the bus.
+//! One line and its client of the bus.
 
 use std::io;
 use std::time::{Duration, Instant};
@@ -15,23 +15,23 @@ use super::outgoing::{Outgoing, closing};
 use super::refusals::{Action, Refusals};
 use super::settings::{Settings, open};
 
-/// From one attempt to open what is away to the next.
+/// The interval between two attempts to open an unavailable line or bus.
 const AGAIN: Duration = Duration::from_millis(100);
-/// How soon a bus that is full is tried again.
+/// The interval between two attempts to send to a full bus.
 const RETRY: Duration = Duration::from_millis(1);
-/// Between two reports of losses of a line.
+/// The minimum interval between two loss reports of a line.
 const REPORT: Duration = Duration::from_secs(1);
-/// Batches taken from a bus, and from a line, before the next line's turn.
+/// The maximum number of batches read from a bus or from a line before the next line's turn.
 const TURNS: usize = 4;
 
-/// What can be read.
+/// The readable ends.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Ready {
     pub(super) line: bool,
     pub(super) bus: bool,
 }
 
-/// What to wait for at an open line; of the client only that it can be read.
+/// The events to poll for at an open line; the client is polled for reading only.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Interest {
     pub(super) line: Option<PollFlags>,
@@ -51,7 +51,7 @@ enum Client {
     Open(Box<Bus>),
 }
 
-/// One line, and its client of the bus.
+/// One line and its client of the bus.
 #[derive(Debug)]
 pub(super) struct Participant {
     opener: Opener,
@@ -67,9 +67,9 @@ pub(super) struct Participant {
     reported_faults: Faults,
     report_at: Instant,
     refusals: Refusals,
-    /// The adapter is set then: opening its line resets it.
+    /// The time at which the adapter is set up, if opening its line resets it.
     settled_at: Option<Instant>,
-    /// Why the line was away when that was last reported.
+    /// The last reported reason why the line is unavailable.
     reason: Option<io::Error>,
     began: Instant,
 }
@@ -123,7 +123,7 @@ impl Participant {
         }
     }
 
-    /// What to wait for at the line.
+    /// Returns the events to poll for at the line.
     pub(super) fn interest(&mut self) -> Interest {
         let now = self.began.elapsed();
         let line = match &self.line {
@@ -135,7 +135,7 @@ impl Participant {
         Interest { line }
     }
 
-    /// The line, and the client, to wait for.
+    /// Returns the line and the client to poll.
     pub(super) const fn ends(&self) -> (Option<&Port>, Option<&Bus>) {
         let port = match &self.line {
             Line::Open(port) => Some(port),
@@ -147,7 +147,7 @@ impl Participant {
         }
     }
 
-    /// When there is something to do, whatever comes.
+    /// Returns the time at which there is something to do, whatever arrives.
     pub(super) fn timeout(&mut self, now: Instant) -> Option<Instant> {
         let elapsed = now - self.began;
         let line = match &self.line {
@@ -164,7 +164,7 @@ impl Participant {
         [line, client, report, self.settled_at].into_iter().flatten().min()
     }
 
-    /// Moves what can be moved.
+    /// Forwards all available data.
     pub(super) fn work(&mut self, settings: &Settings, ready: Ready, report: &mut impl FnMut(Event)) {
         let now = Instant::now();
         self.open_line(now, report);
@@ -193,7 +193,7 @@ impl Participant {
         self.losses() != self.reported || *self.incoming.faults() != self.reported_faults
     }
 
-    /// Returns whether there is a fault that was never reported before: it does not wait.
+    /// Returns true if there is a fault that was never reported before. It is reported at once.
     fn has_new_fault(&self) -> bool {
         self.incoming.faults().len() > self.reported_faults.len()
     }
@@ -213,7 +213,7 @@ impl Participant {
         }
     }
 
-    /// Opens the line, if it is time; why it could not be opened.
+    /// Opens the line if it is time, and reports the reason if it cannot be opened.
     pub(super) fn open_line(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
         let opened = match &mut self.line {
             Line::Away(at) if *at <= now => self.opener.open(),
@@ -242,12 +242,12 @@ impl Participant {
         }
     }
 
-    /// Why the line is away; `None` as long as that is not known.
+    /// Returns the reason why the line is unavailable; `None` if it is not known yet.
     pub(super) const fn reason(&self) -> Option<&io::Error> {
         self.reason.as_ref()
     }
 
-    /// The same, once.
+    /// Returns and clears the reason.
     pub(super) const fn take_reason(&mut self) -> Option<io::Error> {
         self.reason.take()
     }
@@ -270,7 +270,7 @@ impl Participant {
         self.outgoing.up(&self.opener.options().opening());
     }
 
-    /// Does what an adapter's refusals call for.
+    /// Reacts to an adapter's refusals.
     fn heed_refusals(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
         let (bells, replies) = (self.incoming.account().bells, self.incoming.replies());
         match self.refusals.take(now - self.began, self.outgoing.stage(), bells, replies) {
@@ -384,7 +384,7 @@ impl Participant {
         }
     }
 
-    /// An interface that is down, or a bus that has ended: what waits for it is lost.
+    /// Handles an interface that went down or a bus that ended: frames waiting for it are lost.
     fn bus_failed(&mut self, error: &BusError, now: Instant, report: &mut impl FnMut(Event)) {
         self.incoming.down();
         self.dropped_before += u64::from(self.inbox.dropped());
@@ -411,7 +411,7 @@ impl Participant {
         (to_line.dropped.total() + by_bus, to_bus.dropped.total() + to_bus.refused.total())
     }
 
-    /// Takes what has come, and closes the adapter after what has begun; nothing comes from the bus any more.
+    /// Reads the remaining input, and closes the adapter after a line that was begun. The bus is not read afterwards.
     pub(super) fn end(&mut self) {
         let now = Instant::now();
         self.read_line(now, &mut |_| {});
@@ -422,13 +422,13 @@ impl Participant {
         self.outgoing.end(&closing());
     }
 
-    /// Writes what is left; whether that is done.
+    /// Writes the remaining output. Returns true when it is done.
     pub(super) fn finish(&mut self) -> bool {
         self.write_line(Instant::now(), &mut |_| {});
         !self.is_up() || self.outgoing.is_empty()
     }
 
-    /// There is no more time: whether the adapter was closed.
+    /// Gives up at the timeout. Returns true if the adapter was closed.
     pub(super) fn give_up(&mut self) -> bool {
         let closed = self.finish();
         if let Line::Open(port) = &self.line

@@ -1,31 +1,32 @@
-//! When an adapter that refuses lines is opened again.
+//! Decides when an adapter that refuses lines is reopened.
 
 use std::time::Duration;
 
 use super::incoming::Replies;
 use super::options::Stage;
 
-/// From one opening after a refusal to the next: it takes the adapter off its bus for a moment.
+/// The minimum time between two reopenings, which take the adapter off its bus for a moment.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Longest pause, when opening it again does not help.
+/// The maximum time between two reopenings that do not help.
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-/// Refusals in succession of an adapter that has accepted lines before: its queue may be full for a moment.
+/// The number of refusals in a row after which an adapter that accepted lines before is reopened: its queue may be full
+/// for a moment.
 const MANY: u64 = 8;
 
-/// Action that refused lines call for.
+/// The reaction to refused lines.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Action {
-    /// Nothing: there are none, or they are expected.
+    /// Ignore them: there are none, or they are expected.
     Nothing,
-    /// The adapter does not have a setting.
+    /// Report that the adapter does not support a setting.
     ReportSettings,
-    /// Count these refused lines of an adapter that was opened.
+    /// Count these refused lines of an open adapter.
     Count(u64),
-    /// Count them, and open the adapter again, which is closed or was reset.
+    /// Count them, and reopen the adapter, which is closed or was reset.
     Reopen(u64),
 }
 
-/// Memory of an adapter's refusals. Takes counts and times, and touches nothing.
+/// The history of an adapter's refusals. It processes counts and times without input or output.
 #[derive(Debug)]
 pub struct Refusals {
     seen: u64,
@@ -35,19 +36,19 @@ pub struct Refusals {
 }
 
 impl Refusals {
-    /// Starts with an adapter that has refused nothing.
+    /// Creates an empty history.
     #[must_use]
     pub const fn new() -> Self {
         Self { seen: 0, next: Duration::ZERO, pause: FIRST_PAUSE, reopened: 0 }
     }
 
-    /// Returns the number of times it was opened again.
+    /// Returns the number of reopenings.
     #[must_use]
     pub const fn reopened(&self) -> u64 {
         self.reopened
     }
 
-    /// Takes the refusals so far, of an adapter in this stage with these replies since it was opened.
+    /// Evaluates the refusals so far, for an adapter in this stage with these replies since it was opened.
     pub fn take(&mut self, now: Duration, stage: Stage, bells: u64, replies: Replies) -> Action {
         let more = bells - std::mem::replace(&mut self.seen, bells);
         if replies.accepted && replies.refusals == 0 {
@@ -55,7 +56,7 @@ impl Refusals {
         }
         match stage {
             _ if more == 0 => Action::Nothing,
-            // Of frames before it was opened again, or of the end of a line and of closing what is closed.
+            // These refusals are of frames before a reopening, or of an incomplete line or of closing a closed adapter.
             Stage::Away | Stage::Closed => Action::Count(more),
             Stage::Setting => Action::ReportSettings,
             Stage::Open if now < self.next || (replies.accepted && replies.refusals < MANY) => {
@@ -97,7 +98,7 @@ mod tests {
         }
         assert_eq!(times, [1, 1_001, 3_001, 7_001, 15_001, 31_001, 61_001, 91_001]);
         assert_eq!(refusals.reopened(), 8);
-        // Once it has accepted something it is as new.
+        // Once the adapter has accepted a line, the history starts anew.
         refusals.take(at(200_000), Stage::Open, 100_000, Replies { accepted: true, refusals: 0 });
         for (now, expected) in [(200_001, true), (200_900, false), (201_001, true)] {
             let action = refusals.take(at(now), Stage::Open, 100_000 + now, replies(1));

@@ -1,4 +1,4 @@
-//! The bus of some lines, and how the client of each line is opened.
+//! The bus of the lines, and the opening of each line's client.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -7,16 +7,16 @@ use protocol::bus::{Bus, BusError, Choice, Filter, Options};
 
 use super::options::LineOptions;
 
-/// The bus of some lines.
+/// The bus of the lines.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Settings {
-    /// Its name.
+    /// The name of the bus.
     pub bus: String,
-    /// Its kind.
+    /// The kind of the bus.
     pub choice: Choice,
-    /// Where embedded buses live; `None` is the usual directory.
+    /// The directory of embedded buses; `None` for the usual one.
     pub directory: Option<PathBuf>,
-    /// Begin without lines that are away, and open them when they are there.
+    /// True to begin without unavailable lines, and to open them later.
     pub wait: bool,
 }
 

@@ -97,7 +97,7 @@ fn what_was_killed_before_it_recorded_anything_is_taken_away() {
     assert!(claimed.is_ok());
     assert_eq!(
         said,
-        ["run.mcap.part was left by a run that was killed; nothing was recorded in it, it is gone"]
+        ["run.mcap.part was left by a run that was killed; it held no messages and was removed"]
     );
 }
 
@@ -162,10 +162,10 @@ fn what_is_not_ours_is_named_and_stays_as_it_is() {
         why.split(';').next().unwrap().to_owned()
     };
     for name in ["again", "copy", "download", "empty", "text"] {
-        assert_eq!(reason(name), "no run of this program has begun it here");
+        assert_eq!(reason(name), "no run of this program created it here");
     }
     for name in ["folder", "pipe", "socket"] {
-        assert_eq!(reason(name), "it is no regular file");
+        assert_eq!(reason(name), "it is not a regular file");
     }
     assert_eq!(["link", "lost"].map(reason), ["it is a symlink", "it is a symlink"]);
     assert_eq!(reason("two"), "it has 2 names (hard links)");
@@ -175,10 +175,7 @@ fn what_is_not_ours_is_named_and_stays_as_it_is() {
     // Under the name of one of them nothing is recorded.
     let (claimed, _) = claims(folder.path(), "download.mcap");
     let why = claimed.unwrap_err();
-    assert!(
-        why.ends_with("no run that was killed has left it: move it away, or record to another name"),
-        "{why}"
-    );
+    assert!(why.ends_with("was not left by a killed run: move it away, or record to another name"), "{why}");
     assert_eq!(all(), before);
 }
 

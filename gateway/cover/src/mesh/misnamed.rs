@@ -1,11 +1,11 @@
-//! Files that have another format than their name says.
+//! Recognises files whose format is not that of their extension.
 
 use protocol::xml::kind_of_root;
 use roxmltree::Document;
 
 use super::MeshError;
 
-/// The hint for a format that is not read.
+/// The hint for an unsupported format.
 const CONVERT: &str = "convert it to stl, dae or obj, and name that in the URDF";
 
 /// Formats by their first bytes.
@@ -18,7 +18,7 @@ const MAGIC: &[(&[u8], &str, &str)] = &[
     (b"Kaydara FBX", "an FBX file", CONVERT),
 ];
 
-/// The error for a file that another format explains better than its own; `extension` is in small letters.
+/// Returns a better error for a file whose contents are of another format; `extension` is in lower case.
 pub(super) fn error(file: &str, extension: &str, bytes: &[u8]) -> Option<MeshError> {
     let (what, hint) = kind(extension, bytes)?;
     Some(MeshError::Foreign { file: file.to_owned(), line: None, what, hint })
@@ -41,7 +41,7 @@ fn kind(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
     (extension != "obj" && is_obj).then(|| ("an OBJ mesh".to_owned(), "rename it to .obj, in the URDF too"))
 }
 
-/// Names XML that is no COLLADA, or that is COLLADA and has another name.
+/// Names XML that is not COLLADA, or COLLADA with another extension.
 fn xml(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
     let text = protocol::xml::text(bytes).ok()?;
     let prepared = protocol::xml::prepare(&text).ok()?;
@@ -86,7 +86,7 @@ mod tests {
             (b"ISO-10303-21;\n", "a STEP file"),
         ] {
             for extension in ["stl", "dae", "obj"] {
-                // Also where a header of an STL would be.
+                // Enough bytes for the header of an STL follow.
                 let error = refused(&format!("a.{extension}"), &[bytes, &[0; 100]].concat());
                 assert!(
                     error.ends_with(&format!(

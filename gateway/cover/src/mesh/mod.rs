@@ -21,34 +21,33 @@ use thiserror::Error;
 
 pub use simplify::simplify;
 
-/// The most triangles of one mesh.
+/// The maximum number of triangles of one mesh.
 pub const MAX_TRIANGLES: usize = 1_000_000;
 
-/// The largest mesh file, in bytes: that of an ASCII STL of [`MAX_TRIANGLES`].
+/// The maximum size of a mesh file in bytes: that of an ASCII STL with [`MAX_TRIANGLES`].
 const MAX_BYTES: u64 = 300_000_000;
 
-/// Three corners, in m, counterclockwise when seen from outside if the file is well made. Nothing in this
-/// crate relies on that.
+/// Three corners in m. In a well-made file they are counterclockwise as seen from outside, but this crate does not rely
+/// on that.
 pub type Triangle = [Point3<f64>; 3];
 
-/// Which axis of a COLLADA file points up. STL and OBJ files do not say, and are taken as they are.
+/// The treatment of the up axis of a COLLADA file. STL and OBJ files have none, and are read unchanged.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub enum UpAxis {
-    /// As the file is written: its `up_axis` is ignored, as RViz and Pinocchio do, with which most URDF files
-    /// were made.
+    /// Ignores the file's `up_axis`, as RViz and Pinocchio do, with which most URDF files were made.
     #[default]
     Ignore,
-    /// As the COLLADA specification says: the file's `up_axis`, `Y_UP` when it has none, is turned to z.
+    /// Rotates the file's `up_axis`, by default `Y_UP`, to z, as the COLLADA specification requires.
     Follow,
 }
 
-/// Triangles without any order, in m. It has at least one, all coordinates are finite.
+/// An unordered, non-empty set of triangles with finite coordinates, in m.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mesh {
     triangles: Vec<Triangle>,
 }
 
-/// Why there is no mesh.
+/// The error of a mesh that cannot be read or built.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum MeshError {
@@ -57,10 +56,10 @@ pub enum MeshError {
     Read {
         /// The file.
         file: String,
-        /// What the system says.
+        /// The system error.
         source: io::Error,
     },
-    /// The file's name has an extension that is not known.
+    /// The extension of the file is unknown.
     #[error(
         "mesh {file}: extension {extension:?} is none of stl, dae and obj; {}",
         if extension.is_empty() { "add the one that it is" } else { "convert the file" }
@@ -68,18 +67,18 @@ pub enum MeshError {
     Extension {
         /// The file.
         file: String,
-        /// What is behind the last dot.
+        /// The text after the last dot.
         extension: String,
     },
-    /// The file is not what its extension says.
+    /// The file is not valid for its extension.
     #[error("mesh {file}: {reason}; export it again")]
     Syntax {
         /// The file.
         file: String,
-        /// What the parser says, in one line.
+        /// The message of the parser, in one line.
         reason: String,
     },
-    /// The file is no XML that is read: what there is, and what to do.
+    /// The XML cannot be read.
     #[error("mesh {file}: {fault}")]
     Xml {
         /// The file.
@@ -87,16 +86,16 @@ pub enum MeshError {
         /// The fault, with its hint.
         fault: Fault,
     },
-    /// The file is another one, or stands for another one.
+    /// The file has another format, or is a placeholder for another file.
     #[error("mesh {file}{}: {what}: {hint}", line.map_or_else(String::new, |line| format!(":{line}")))]
     Foreign {
         /// The file.
         file: String,
-        /// The line, from 1, where it has one.
+        /// The line, from 1, if it is known.
         line: Option<usize>,
-        /// The kind of file, after "it is".
+        /// The kind of file, as it follows "it is".
         what: String,
-        /// The hint, as an order.
+        /// The action to take.
         hint: &'static str,
     },
     /// A part of the file is missing.
@@ -104,45 +103,45 @@ pub enum MeshError {
     Damaged {
         /// The file.
         file: String,
-        /// What does not fit, in one line.
+        /// The inconsistency, in one line.
         reason: String,
     },
-    /// The file has no triangle.
+    /// The file has no triangles.
     #[error("mesh {file}: it has no triangle; export it again, with its surface")]
     Empty {
         /// The file.
         file: String,
     },
-    /// A coordinate is not a number, or infinite.
+    /// A coordinate is infinite or NaN.
     #[error(
         "mesh {file}: triangle {triangle} has the coordinate {value}, which is not finite; export it again"
     )]
     NotFinite {
         /// The file.
         file: String,
-        /// Its number, from 0.
+        /// The index of the triangle.
         triangle: usize,
         /// The coordinate.
         value: f64,
     },
-    /// There is more of it than is read.
+    /// The file exceeds a limit.
     #[error("mesh {file}: {count} {what}, at most {most}; decimate the mesh")]
     TooLarge {
         /// The file.
         file: String,
-        /// How many there are; of triangles maybe only how many were counted.
+        /// The number; for triangles possibly only those counted so far.
         count: u64,
-        /// What is counted.
+        /// The counted unit.
         what: &'static str,
-        /// How many there may be.
+        /// The limit.
         most: u64,
     },
-    /// A primitive's size is not above zero, or not finite.
+    /// A size of a primitive is not above zero, or not finite.
     #[error("{shape} with {what} {value} m: a size is above 0 and finite; correct it")]
     Size {
         /// The primitive.
         shape: &'static str,
-        /// Which size.
+        /// The name of the size.
         what: &'static str,
         /// The size, in m.
         value: f64,
@@ -150,10 +149,11 @@ pub enum MeshError {
 }
 
 impl Mesh {
-    /// A mesh of these triangles, in m; `name` is for errors.
+    /// Creates a mesh of these triangles, in m; `name` is used in errors.
     ///
     /// # Errors
-    /// When there is no triangle or more than [`MAX_TRIANGLES`], or a coordinate is not finite.
+    /// Returns [`MeshError`] if there are no triangles or more than [`MAX_TRIANGLES`], or if a coordinate is not
+    /// finite.
     pub fn new(name: &str, triangles: Vec<Triangle>) -> Result<Self, MeshError> {
         let file = || name.to_owned();
         if triangles.is_empty() {
@@ -171,11 +171,11 @@ impl Mesh {
         Ok(Self { triangles })
     }
 
-    /// Reads a file; its extension says what it is: `.stl` (binary and ASCII), `.dae` or `.obj`, in small or
-    /// capital letters. STL and OBJ have no unit: their numbers are taken as m.
+    /// Reads a file. The extension determines the format: `.stl` (binary and ASCII), `.dae` or `.obj`, in lower or
+    /// upper case. STL and OBJ have no unit: their numbers are read as m.
     ///
     /// # Errors
-    /// When the file cannot be read, is of another kind, or is no mesh.
+    /// Returns [`MeshError`] if the file cannot be read, has another format, or is not a mesh.
     pub fn load(path: &Path, up: UpAxis) -> Result<Self, MeshError> {
         let name = path.display().to_string();
         let read = |source| MeshError::Read { file: name.clone(), source };
@@ -194,10 +194,10 @@ impl Mesh {
         Self::parse(&name, &fs::read(path).map_err(read)?, up)
     }
 
-    /// The mesh of a file with this name and these bytes; as [`Mesh::load`].
+    /// Parses the bytes of a file with this name, as [`Mesh::load`] does.
     ///
     /// # Errors
-    /// As those of [`Mesh::load`].
+    /// Returns [`MeshError`] as [`Mesh::load`] does.
     pub fn parse(name: &str, bytes: &[u8], up: UpAxis) -> Result<Self, MeshError> {
         if let Some(Foreign { line, what, hint }) = foreign(bytes) {
             return Err(MeshError::Foreign { file: name.to_owned(), line, what: what.to_owned(), hint });
@@ -220,7 +220,7 @@ impl Mesh {
         })
     }
 
-    /// The triangles, in m.
+    /// Returns the triangles, in m.
     #[must_use]
     pub fn triangles(&self) -> &[Triangle] {
         &self.triangles
@@ -244,7 +244,7 @@ fn syntax(file: &str, reason: &str) -> MeshError {
     MeshError::Syntax { file: file.to_owned(), reason: reason.lines().collect::<Vec<_>>().join(" ") }
 }
 
-/// A linear map and a shift, of corners.
+/// A linear map followed by a translation.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Affine {
     pub(crate) linear: Matrix3<f64>,
@@ -256,12 +256,12 @@ impl Affine {
         Self { linear: Matrix3::identity(), shift: Vector3::zeros() }
     }
 
-    /// First `inner`, then this.
+    /// Returns the composition of this map after `inner`.
     pub(crate) fn after(&self, inner: &Self) -> Self {
         Self { linear: self.linear * inner.linear, shift: self.linear * inner.shift + self.shift }
     }
 
-    /// A triangle's corners mapped; a map that mirrors exchanges two, so that its winding stays.
+    /// Maps a triangle. A mirroring map exchanges two corners, so that the winding is preserved.
     pub(crate) fn map(&self, triangle: &Triangle) -> Triangle {
         let [a, b, c] = triangle.map(|corner| Point3::from(self.linear * corner.coords + self.shift));
         if self.linear.determinant() < 0.0 { [a, c, b] } else { [a, b, c] }

@@ -1,15 +1,15 @@
-//! Wavefront OBJ files: vertices and faces. Normals, textures, materials, groups and lines are ignored.
+//! Reads Wavefront OBJ files: vertices and faces. Normals, textures, materials, groups and lines are ignored.
 
 use nalgebra::Point3;
 
 use super::polygon::Filled;
 use super::{MAX_TRIANGLES, MeshError, Triangle, syntax, too_many};
 
-/// The triangles of a file.
+/// Returns the triangles of a file.
 pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
     let mut vertices: Vec<Point3<f64>> = Vec::new();
     let mut filled = Filled::default();
-    // Names may be in any encoding; numbers are ASCII.
+    // Names may have any encoding; numbers are ASCII.
     let text = String::from_utf8_lossy(bytes);
     for (line, words) in lines(&text) {
         let wrong = |why: String| syntax(name, &format!("line {line}: {why}"));
@@ -30,7 +30,8 @@ pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshE
     filled.finish().map_err(|why| syntax(name, &why))
 }
 
-/// Lines without their comments, each with its number from 1; one that ends with `\` goes on in the next.
+/// Returns lines without their comments, each with its number from 1. A line that ends with `\` continues in the next
+/// one.
 fn lines(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
     let text = text.trim_start_matches('\u{feff}');
     let mut lines = text.lines().enumerate();
@@ -49,7 +50,7 @@ fn lines(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
     })
 }
 
-/// A vertex: x, y, z, then maybe a weight, or a colour.
+/// Parses a vertex: x, y, z, and optionally a weight or a colour.
 fn vertex<'a>(words: impl Iterator<Item = &'a str>) -> Result<Point3<f64>, String> {
     let number = |word: &str| word.parse::<f32>().map_err(|_| format!("{word:?} is not a number"));
     let number = |word| number(word).map(f64::from);
@@ -62,7 +63,7 @@ fn vertex<'a>(words: impl Iterator<Item = &'a str>) -> Result<Point3<f64>, Strin
     }
 }
 
-/// The vertex of a face's corner, `5`, `5/1`, `5//1` or `5/1/1`; negative numbers count from the last one.
+/// Returns the vertex of a face's corner, `5`, `5/1`, `5//1` or `5/1/1`. Negative numbers count from the last vertex.
 fn corner(word: &str, vertices: &[Point3<f64>]) -> Result<Point3<f64>, String> {
     let number = word.split('/').next().unwrap_or_default();
     let index = number.parse::<i64>().map_err(|_| format!("{word:?} is not a corner of a face"))?;

@@ -1,4 +1,4 @@
-//! Polygons with any number of corners as triangles whose area is the polygon's.
+//! Divides polygons with any number of corners into triangles with the same total area.
 
 use earcut::Earcut;
 use nalgebra::{Point3, Unit, Vector3};
@@ -6,32 +6,33 @@ use nalgebra::{Point3, Unit, Vector3};
 use super::Triangle;
 use crate::surface::{self, tangents};
 
-/// By which share of a polygon's area that of its triangles may differ.
+/// The tolerated difference between a polygon's area and that of its triangles, as a share.
 const AREA_TOLERANCE: f64 = 1e-6;
 
-/// How many times a polygon's area that of its triangles may be, if it is not flat: as if all were tilted by 60 degrees.
+/// The maximum area of a nonplanar polygon's triangles relative to the polygon's area: that of triangles tilted by 60
+/// degrees.
 const BENT: f64 = 2.0;
 
-/// Which share of a mesh's area polygons may differ by that cross themselves or are bent. Meshes of real robots have
-/// some that do, a square millimetre each.
+/// The tolerated share of a mesh's area in polygons that intersect themselves or are bent. Meshes of real robots have
+/// some, of a square millimetre each.
 const FAULTY: f64 = 1e-3;
 
-/// The width of a polygon without an area, as a share of its length.
+/// The width of a polygon without an area, relative to its length.
 const THIN: f64 = 1e-6;
 
-/// Triangles of polygons.
+/// The triangles of polygons.
 #[derive(Debug, Default)]
 pub(super) struct Filled {
     pub(super) triangles: Vec<Triangle>,
-    /// By how much areas differ where polygons cross themselves or are bent.
+    /// The total difference in area of polygons that intersect themselves or are bent.
     off: f64,
-    /// The polygon of the largest such difference, in words.
+    /// The largest of these differences, with a description of its polygon.
     worst: Option<(f64, String)>,
 }
 
 impl Filled {
-    /// Adds the triangles of a polygon with holes. The polygon is looked at along the mean of its normals (Newell's),
-    /// so it need not be flat. One without an area has no triangles.
+    /// Adds the triangles of a polygon with holes. The polygon is projected along the mean of its normals (Newell's
+    /// method), so it need not be planar. A polygon without an area adds no triangles.
     pub(super) fn add(&mut self, outline: &[Point3<f64>], holes: &[Vec<Point3<f64>>]) {
         if let (&[a, b, c], []) = (outline, holes) {
             self.triangles.push([a, b, c]);
@@ -75,7 +76,7 @@ impl Filled {
         }
     }
 
-    /// Adds a polygon's ears; gives the polygon's area in its plane and that of its ears.
+    /// Adds a polygon's ears. Returns the polygon's area in its plane and that of its ears.
     fn ears(
         &mut self,
         plane: &Plane,
@@ -115,7 +116,8 @@ impl Filled {
         }
     }
 
-    /// The triangles; in words why not, if polygons that cross themselves or are bent are much of the surface.
+    /// Returns the triangles, or a description of the worst polygon if too much of the surface is in polygons that
+    /// intersect themselves or are bent.
     pub(super) fn finish(self) -> Result<Vec<Triangle>, String> {
         let whole: f64 = self.triangles.iter().map(surface::area).sum();
         match self.worst {
@@ -127,7 +129,7 @@ impl Filled {
     }
 }
 
-/// The triangles between the first corner and each edge.
+/// Adds the triangles between the first corner and each edge.
 pub(super) fn fan(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
     if let [first, rest @ ..] = corners {
         triangles.extend(rest.windows(2).filter_map(|edge| match *edge {
@@ -137,18 +139,18 @@ pub(super) fn fan(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
     }
 }
 
-/// A polygon as seen along the mean of its normals.
+/// A polygon projected along the mean of its normals.
 enum Outline {
     Flat(Plane),
-    /// It has no area.
+    /// The polygon has no area.
     Thin,
-    /// Its parts have opposite areas, together at most about this.
+    /// The parts of the polygon have opposite areas, together at most about this.
     Opposite {
         area: f64,
     },
 }
 
-/// The plane on which a polygon is largest. Lengths in it are shares of the polygon's extent.
+/// The plane in which a polygon is largest. Lengths in it are relative to the polygon's extent.
 struct Plane {
     origin: Point3<f64>,
     axes: (Vector3<f64>, Vector3<f64>),
@@ -175,7 +177,7 @@ impl Plane {
         }
     }
 
-    /// Points in the plane's coordinates; the polygon runs counterclockwise.
+    /// Converts points to coordinates in the plane, in which the polygon is counterclockwise.
     fn points(&self, corners: &[Point3<f64>]) -> Vec<[f64; 2]> {
         let Self { origin, axes: (x, y), extent } = self;
         let flat = |corner: &Point3<f64>| {
@@ -186,19 +188,19 @@ impl Plane {
     }
 }
 
-/// Half the cross product of the vectors from one point to two others.
+/// Returns half the cross product of the vectors from one point to two others.
 fn between([x, y]: [f64; 2], [ax, ay]: [f64; 2], [bx, by]: [f64; 2]) -> f64 {
     ((ax - x) * (by - y) - (bx - x) * (ay - y)) / 2.0
 }
 
-/// A polygon's area, above zero if it runs counterclockwise.
+/// Returns a polygon's area, which is positive if the polygon is counterclockwise.
 fn area(polygon: &[[f64; 2]]) -> f64 {
     let [first, rest @ ..] = polygon else { return 0.0 };
     rest.windows(2).map(|edge| if let &[a, b] = edge { between(*first, a, b) } else { 0.0 }).sum()
 }
 
-/// Checks that the triangles of a fan from the first corner are the polygon: each runs the polygon's way, and they go
-/// around less than half a turn.
+/// Returns true if the fan from the first corner covers exactly the polygon: each triangle has the polygon's direction,
+/// and together they span less than half a turn.
 fn is_fan(polygon: &[[f64; 2]]) -> bool {
     let ([first, second, .., last], [_, rest @ ..]) = (polygon, polygon) else { return false };
     let runs_on = rest.windows(2).all(|edge| match *edge {
@@ -210,7 +212,7 @@ fn is_fan(polygon: &[[f64; 2]]) -> bool {
     runs_on && between(*first, *second, *last) >= 0.0 && turns < core::f64::consts::PI
 }
 
-/// The angle between the directions from a point to two others, in rad; 0 to a point itself.
+/// Returns the angle between the directions from a point to two others, in rad; 0 if a direction has no length.
 fn angle([x, y]: [f64; 2], [ax, ay]: [f64; 2], [bx, by]: [f64; 2]) -> f64 {
     let ([ax, ay], [bx, by]) = ([ax - x, ay - y], [bx - x, by - y]);
     (ax * by - ay * bx).atan2(ax * bx + ay * by).abs()
@@ -226,7 +228,7 @@ mod tests {
     use super::*;
 
     fn filled(outline: &[[f64; 2]], holes: &[Vec<[f64; 2]>]) -> Result<Vec<Triangle>, String> {
-        // Somewhere in space, far from the origin compared with its size.
+        // The polygon is in a general position, and far from the origin compared with its size.
         let pose = Translation3::new(3.0, -2.0, 1.0) * Rotation3::from_euler_angles(0.4, 1.1, -2.0);
         let points = |ring: &[[f64; 2]]| -> Vec<Point3<f64>> {
             ring.iter().map(|&[x, y]| pose * Point3::new(x, y, 0.0)).collect()
@@ -264,7 +266,7 @@ mod tests {
                 let triangles = filled(&outline, &[]).unwrap();
                 assert_eq!(triangles.len(), 3);
                 assert!((total(&triangles) - 0.045).abs() < 1e-12, "{start}: {triangles:?}");
-                // Wound as the polygon is.
+                // The triangles have the winding of the polygon.
                 let up: Vector3<f64> = triangles.iter().map(|[a, b, c]| (b - a).cross(&(c - a))).sum();
                 assert_eq!(up.z < 0.0, mirrored);
             }
@@ -281,7 +283,7 @@ mod tests {
         let holes = [square(0.2, [-0.5, 0.0]), turned];
         let triangles = filled(&square(1.0, [0.0; 2]), &holes).unwrap();
         assert!((total(&triangles) - (4.0 - 0.16 - 0.04)).abs() < 1e-12, "{}", total(&triangles));
-        // A hole that is not inside.
+        // The hole is outside the polygon.
         let outside = filled(&square(1.0, [0.0; 2]), &[square(0.5, [3.0, 0.0])]).unwrap_err();
         assert!(outside.starts_with("a polygon with 8 corners crosses itself, as triangles"), "{outside}");
     }
@@ -326,7 +328,7 @@ mod tests {
     }
 
     proptest! {
-        /// Stars with arms of any length: seen from their middle, each corner is in another direction.
+        /// Star-shaped polygons: seen from their center, each corner is in another direction.
         #[test]
         fn triangles_of_any_star_have_its_area_and_are_inside(
             arms in proptest::collection::vec(0.05..1.0_f64, 3..40), start in any::<prop::sample::Index>(),

@@ -1,4 +1,4 @@
-//! Boxes, cylinders and spheres as triangles, where URDF puts them: around the origin, a cylinder along z.
+//! Boxes, cylinders and spheres as triangles, in the position of URDF: centered on the origin, a cylinder along z.
 
 use core::f64::consts::{PI, TAU};
 
@@ -6,24 +6,24 @@ use nalgebra::Point3;
 
 use super::{Mesh, MeshError, Triangle};
 
-/// Corners around a cylinder or a sphere: 5 degrees each, so that a face's normal is within 2.5 degrees of the
-/// surface's.
+/// The number of corners around a cylinder or a sphere: 5 degrees each, so that a face's normal is within 2.5 degrees
+/// of the surface's.
 const AROUND: u32 = 72;
 
 fn checked(shape: &'static str, what: &'static str, value: f64) -> Result<f64, MeshError> {
     if value.is_finite() && value > 0.0 { Ok(value) } else { Err(MeshError::Size { shape, what, value }) }
 }
 
-/// The two triangles of four corners in order; those without an area are left out.
+/// Returns the two triangles of four corners in order; those without an area are left out.
 fn quad([a, b, c, d]: [Point3<f64>; 4]) -> impl Iterator<Item = Triangle> {
     [[a, b, c], [a, c, d]].into_iter().filter(|[a, b, c]| a != b && b != c && c != a)
 }
 
 impl Mesh {
-    /// A box of these edge lengths, in m.
+    /// Creates a box with these edge lengths, in m.
     ///
     /// # Errors
-    /// When a length is not above 0.
+    /// Returns [`MeshError::Size`] if a length is not above 0.
     pub fn cuboid(size: [f64; 3]) -> Result<Self, MeshError> {
         let [x, y, z] = size;
         let x = checked("box", "x", x)? / 2.0;
@@ -41,22 +41,22 @@ impl Mesh {
         Self::new("box", sides.into_iter().flat_map(|side| quad(side.map(point))).collect())
     }
 
-    /// A cylinder of this radius and length, in m, closed at both ends.
+    /// Creates a cylinder with this radius and length, in m, closed at both ends.
     ///
     /// # Errors
-    /// When a size is not above 0.
+    /// Returns [`MeshError::Size`] if a size is not above 0.
     pub fn cylinder(radius: f64, length: f64) -> Result<Self, MeshError> {
         let radius = checked("cylinder", "radius", radius)?;
         let top = checked("cylinder", "length", length)? / 2.0;
-        // From the middle of one end over the wall to the middle of the other.
+        // The profile runs from the center of one end along the wall to the center of the other.
         let profile = [(0.0, -top), (radius, -top), (radius, top), (0.0, top)];
         Self::new("cylinder", turned(&profile))
     }
 
-    /// A sphere of this radius, in m.
+    /// Creates a sphere with this radius, in m.
     ///
     /// # Errors
-    /// When the radius is not above 0.
+    /// Returns [`MeshError::Size`] if the radius is not above 0.
     pub fn sphere(radius: f64) -> Result<Self, MeshError> {
         let radius = checked("sphere", "radius", radius)?;
         let half = AROUND / 2;
@@ -71,7 +71,7 @@ impl Mesh {
     }
 }
 
-/// A profile of radius and height, turned about z.
+/// Rotates a profile of radii and heights about z.
 fn turned(profile: &[(f64, f64)]) -> Vec<Triangle> {
     let point = |(radius, z): (f64, f64), step: u32| {
         let angle = TAU * f64::from(step % AROUND) / f64::from(AROUND);

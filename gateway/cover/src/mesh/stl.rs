@@ -1,4 +1,4 @@
-//! STL files, binary and ASCII. Normals are ignored.
+//! Reads STL files, binary and ASCII. Normals are ignored.
 //!
 //! ```text
 //!              0        80      84     96                        132    134
@@ -16,7 +16,8 @@ const START: usize = TITLE + 4;
 const TRIANGLE: usize = 50;
 const NORMAL: usize = 12;
 
-/// The triangles of a file. It is binary when it is as long as its count of triangles says, whatever its title.
+/// Returns the triangles of a file. A file is binary if its length is that of its count of triangles, whatever its
+/// title.
 pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
     let binary = binary(bytes);
     if let Some(Binary { announced, body }) = binary {
@@ -45,7 +46,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshE
     }
 }
 
-/// A binary file's count of triangles, and what follows it.
+/// The count of triangles in a binary file, and the bytes after it.
 #[derive(Clone, Copy)]
 struct Binary<'a> {
     announced: u32,
@@ -64,19 +65,21 @@ fn triangle(bytes: &[u8; TRIANGLE]) -> Triangle {
     core::array::from_fn(|_| Point3::new(next(), next(), next()))
 }
 
-/// Without a byte order mark.
+/// Returns the bytes without a byte order mark.
 fn unmarked(bytes: &[u8]) -> &[u8] {
     bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)
 }
 
-/// Text that begins with `solid`. Binary files may do so too, but have zeros in their titles or first triangles.
+/// Returns true for text that begins with `solid`. Binary files may also begin so, but have zeros in their titles or
+/// first triangles.
 fn is_ascii(bytes: &[u8]) -> bool {
     let text = unmarked(bytes).trim_ascii_start();
     let head = bytes.get(..bytes.len().min(START + TRIANGLE)).unwrap_or_default();
     text.get(..5).is_some_and(|word| word.eq_ignore_ascii_case(b"solid")) && !head.contains(&0)
 }
 
-/// The triangles of a text, whose numbers have the precision of the binary ones. Names of solids may be in any encoding.
+/// Returns the triangles of a text, whose numbers have the precision of binary files. Names of solids may have any
+/// encoding.
 fn ascii(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
     let text = String::from_utf8_lossy(unmarked(bytes));
     let mut triangles = Vec::new();
@@ -88,7 +91,7 @@ fn ascii(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
         while let Some(word) = words.next() {
             last = word.to_ascii_lowercase();
             match last.as_str() {
-                // The rest is a name.
+                // The rest of the line is a name.
                 "solid" | "endsolid" => break,
                 "normal" => _ = words.nth(2),
                 "vertex" => {
@@ -122,7 +125,7 @@ fn ascii(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
 mod tests {
     use super::*;
 
-    /// Twelve triangles.
+    /// Returns a file with twelve triangles.
     fn binary(announced: u32) -> Vec<u8> {
         let mut bytes = vec![b' '; TITLE];
         bytes.extend(announced.to_le_bytes());

@@ -5,7 +5,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// The smallest and largest corner of a mesh.
+/// Returns the smallest and largest corner of a mesh.
 fn extent(mesh: &Mesh) -> ([f64; 3], [f64; 3]) {
     let mut corners = mesh.triangles().iter().flatten();
     let first = *corners.next().unwrap();
@@ -17,7 +17,7 @@ fn close(a: [f64; 3], b: [f64; 3]) -> bool {
     a.iter().zip(&b).all(|(a, b)| (a - b).abs() < 1e-6)
 }
 
-/// The volume that the triangles enclose: above 0 when all are wound outward.
+/// Returns the volume that the triangles enclose, which is positive if all are wound outward.
 fn volume(mesh: &Mesh) -> f64 {
     mesh.triangles().iter().map(|[a, b, c]| a.coords.cross(&b.coords).dot(&c.coords) / 6.0).sum()
 }
@@ -68,7 +68,7 @@ fn obj() -> String {
     text
 }
 
-/// The tetrahedron in a file with this asset and these nodes.
+/// Returns a file with the tetrahedron, this asset and these nodes.
 fn dae(asset: &str, nodes: &str) -> String {
     format!(
         r##"<?xml version="1.0"?>
@@ -147,17 +147,18 @@ fn a_file_is_read_from_its_path() {
 
 #[test]
 fn unit_axis_and_nested_nodes_of_collada_are_applied() {
-    // Of the tetrahedron's 1, 2, 3: moved by 10 along x, the inner node turned about z by a quarter.
+    // The tetrahedron with edges 1, 2, 3 is moved by 10 along x, and the inner node is rotated by a quarter turn about
+    // z.
     let nodes = r##"<node>
         <matrix>1 0 0 10  0 1 0 0  0 0 1 0  0 0 0 1</matrix>
         <node><rotate>0 0 1 90</rotate><translate>100 0 0</translate><instance_geometry url="#shape"/></node>
     </node>"##;
     let asset = r#"<unit name="millimeter" meter="0.001"/><up_axis>Y_UP</up_axis>"#;
-    // In the file x: 10 - 2..10, y: 100..101, z: 0..3.
+    // In the file x is 10 - 2 to 10, y is 100 to 101, z is 0 to 3.
     let as_written = parsed(&dae(asset, nodes), UpAxis::Ignore);
     assert!(close(extent(&as_written).0, [0.008, 0.1, 0.0]), "{:?}", extent(&as_written));
     assert!(close(extent(&as_written).1, [0.01, 0.101, 0.003]));
-    // y to z, z to -y.
+    // y becomes z, and z becomes -y.
     let turned = parsed(&dae(asset, nodes), UpAxis::Follow);
     assert!(close(extent(&turned).0, [0.008, -0.003, 0.1]), "{:?}", extent(&turned));
     assert!(close(extent(&turned).1, [0.01, 0.0, 0.101]));
@@ -291,7 +292,7 @@ fn primitives_are_closed_and_as_large_as_said() {
 }
 
 proptest! {
-    /// Whatever is in a file, it is a mesh or an error.
+    /// Any file is either a mesh or an error.
     #[test]
     fn no_bytes_stop_the_program(
         name in prop::sample::select(vec!["a.stl", "a.obj", "a.dae"]),
@@ -313,7 +314,7 @@ proptest! {
         }
     }
 
-    /// Numbers of vertices that are not there, in any sign.
+    /// The faces have indices of missing vertices, with either sign.
     #[test]
     fn no_obj_face_stops_the_program(numbers in proptest::collection::vec(-6..7_i64, 0..9)) {
         let face: Vec<_> = numbers.iter().map(|number| format!("{number}/{number}/{number}")).collect();

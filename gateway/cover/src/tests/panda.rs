@@ -1,5 +1,5 @@
-//! Links of a real robot, measured by means of their own: random points of the mesh, and every triangle asked for
-//! every ray.
+//! Links of a real robot, measured independently: with random points of the mesh, and rays that are tested against
+//! every triangle.
 
 #![allow(
     clippy::unwrap_used,
@@ -21,7 +21,7 @@ const PITCH: f64 = 0.028;
 const NAMES: [&str; 9] = ["link0", "link1", "link2", "link3", "link4", "link5", "link6", "link7", "hand"];
 const COVERED: core::ops::Range<usize> = 3..7;
 
-/// The robot with bent elbow and wrist: each joint's origin and roll as in `panda.urdf`, and an angle.
+/// Returns the robot with bent elbow and wrist: each joint's origin and roll as in `panda.urdf`, and an angle.
 fn robot() -> Vec<Link> {
     let folder =
         env::var("SKINBUS_ROBOTS").expect("SKINBUS_ROBOTS is the folder of example-robot-data's robots");
@@ -61,7 +61,7 @@ fn normal([a, b, c]: &Triangle) -> Vector3<f64> {
     (b - a).cross(&(c - a))
 }
 
-/// Whether a ray meets a triangle before it is `until` long: by the volumes of the tetrahedra between them.
+/// Returns true if a ray meets a triangle within `until`, by the volumes of the tetrahedra between them.
 fn meets(from: &Point3<f64>, direction: &Vector3<f64>, until: f64, triangle: &Triangle) -> bool {
     let [a, b, c] = triangle.map(|corner| corner - from);
     let volumes = [a.cross(&b).dot(direction), b.cross(&c).dot(direction), c.cross(&a).dot(direction)];
@@ -81,8 +81,8 @@ fn direction(dice: &mut Pcg64Mcg) -> Vector3<f64> {
     }
 }
 
-/// The share of rays into the half space above `up` that meet nothing: own triangles at any distance, others within
-/// two pitches.
+/// Returns the share of rays into the half space above `up` that are free: own triangles block at any distance, others
+/// within two pitches.
 fn open(
     from: &Point3<f64>,
     up: &Vector3<f64>,
@@ -93,7 +93,7 @@ fn open(
     let rays = 16;
     let mut free = 0;
     for _ in 0..rays {
-        // Weighted by the cosine.
+        // The rays are weighted by the cosine.
         let ray = (direction(dice) + up * 1.001).normalize();
         let blocked = own.iter().any(|triangle| meets(from, &ray, f64::INFINITY, triangle))
             || others.iter().any(|triangle| meets(from, &ray, 2.0 * PITCH, triangle));
@@ -102,7 +102,7 @@ fn open(
     f64::from(free) / f64::from(rays)
 }
 
-/// Whether a point is inside another link: next to no ray leaves it.
+/// Returns true if a point is inside another link: hardly any ray leaves it.
 fn inside(from: &Point3<f64>, others: &[Vec<Triangle>], dice: &mut Pcg64Mcg) -> bool {
     others.iter().any(|other| {
         let mut corners = other.iter().flatten();
@@ -116,13 +116,14 @@ fn inside(from: &Point3<f64>, others: &[Vec<Triangle>], dice: &mut Pcg64Mcg) -> 
     })
 }
 
-/// The triangles with a corner within three pitches of a point; the robot's are much smaller than a pitch.
+/// Returns the triangles with a corner within three pitches of a point; the robot's triangles are much smaller than a
+/// pitch.
 fn near(point: &Point3<f64>, others: &[Vec<Triangle>]) -> Vec<Triangle> {
     let near = |triangle: &&Triangle| triangle.iter().any(|corner| (corner - point).norm() < 3.0 * PITCH);
     others.iter().flatten().filter(near).copied().collect()
 }
 
-/// How far a point is from a triangle's plane, when it is above the triangle.
+/// Returns the distance of a point from a triangle's plane, if it is above the triangle.
 fn height(point: &Point3<f64>, triangle: &Triangle) -> Option<f64> {
     let [a, b, c] = triangle;
     let up = normal(triangle);
@@ -164,7 +165,7 @@ fn measure(skin: &Skin, all: &[Link], index: usize) {
     for (point, up) in &cells {
         let same = cells.iter().filter(|(other, facing)| other != point && facing.dot(up) > 0.0);
         spacing.extend(same.map(|(other, _)| (other - point).norm()).min_by(f64::total_cmp));
-        // Of the triangles at the cell, the one that agrees best: at an edge there are two.
+        // At an edge two triangles touch the cell; the one with the better angle counts.
         let at = own.iter().filter(|triangle| height(point, triangle).is_some_and(|height| height < 1e-6));
         let angle = |triangle: &Triangle| {
             let angle = normal(triangle).angle(up);

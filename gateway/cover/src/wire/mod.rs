@@ -1,8 +1,8 @@
-//! Which bus and node each cell is, and which cells wires join.
+//! Assigns cells to buses and node ids, and wires them.
 //!
-//! Cells are numbered by link, along the link in rings of one row each, and around it; a bus gets those that follow
-//! each other, so that it is one patch of each link. Wires join neighbours of one bus and link: first as few and
-//! short ones as reach all cells, then more of them, the shortest first, while both cells have a free port.
+//! Cells are numbered by link, along the link in rings of one row each, and around it. A bus gets consecutive cells, so
+//! that it is one patch of each link. Wires join neighbours on the same bus and link: first the fewest and shortest
+//! wires that reach all cells, then further ones, shortest first, while both cells have a free port.
 
 mod ports;
 
@@ -14,23 +14,23 @@ use crate::place::Spot;
 use crate::surface::{real, tangents};
 use crate::{Cell, Options};
 
-/// Ports of a cell.
+/// The number of ports of a cell.
 pub const PORTS: usize = 4;
 
-/// The most cells of one bus.
+/// The maximum number of cells per bus.
 pub const MAX_NODES: usize = 250;
 
-/// The longest wire, in pitches.
+/// The maximum length of a wire, in pitches.
 const LONGEST: f64 = 1.5;
 
-/// How much the normals of two wired cells agree at least, as their cosine: cells are wired around a sharp edge, and
-/// not through a wall.
+/// The minimum cosine between the normals of two wired cells. Cells are wired around a sharp edge, but not through a
+/// wall.
 const AGREE: f64 = -0.2;
 
-/// How far from its even share a bus may end for the sake of ending with a link, in nodes of its budget.
+/// The maximum deviation from a bus' even share that lets the bus end with a link, relative to its budget of nodes.
 const SLACK: f64 = 0.1;
 
-/// The cells of all links with their wires, and how many buses they are on.
+/// Returns the cells of all links with their wires, and the number of buses.
 pub(crate) fn wire(placed: &[Vec<Spot>], options: &Options) -> (Vec<Cell>, usize) {
     let sizes: Vec<_> = placed.iter().map(Vec::len).collect();
     let buses = shares(&sizes, options.nodes_per_bus);
@@ -47,7 +47,7 @@ pub(crate) fn wire(placed: &[Vec<Spot>], options: &Options) -> (Vec<Cell>, usize
     (cells, buses.len())
 }
 
-/// How many cells each bus gets, of links with so many cells.
+/// Returns the number of cells of each bus, for links with these numbers of cells.
 fn shares(links: &[usize], budget: usize) -> Vec<usize> {
     let mut ends = Vec::with_capacity(links.len());
     let mut total = 0;
@@ -57,7 +57,7 @@ fn shares(links: &[usize], budget: usize) -> Vec<usize> {
     }
     let mut shares = Vec::new();
     let mut from = 0;
-    // Before each bus, the rest fits on those that are left, and not on one less.
+    // Before each bus, the rest of the cells fits on the remaining buses, but not on one fewer.
     for buses in (1..=total.div_ceil(budget)).rev() {
         let rest = total - from;
         let even = rest.div_ceil(buses);
@@ -81,7 +81,7 @@ struct Place {
     axis: Vector3<f64>,
 }
 
-/// A link as its cells lie: along an axis.
+/// A link reduced to the axis along which its cells lie.
 #[derive(Clone, Copy, Debug)]
 struct Limb {
     middle: Point3<f64>,
@@ -89,7 +89,7 @@ struct Limb {
 }
 
 impl Limb {
-    /// The axis is the one along which cells are farthest from each other, away from the link's origin.
+    /// Computes the axis: the direction in which the cells spread farthest, away from the link's origin.
     fn of(spots: &[Spot]) -> Self {
         let count = real(spots.len().max(1));
         let middle = Point3::from(spots.iter().map(|spot| spot.point.coords).sum::<Vector3<f64>>() / count);
@@ -106,7 +106,7 @@ impl Limb {
         Self { middle, axis }
     }
 
-    /// Cells by ring along the axis, and around it.
+    /// Orders cells by ring along the axis, and around it within a ring.
     fn order(&self, spots: &[Spot], pitch: f64) -> Vec<Spot> {
         let along = |spot: &Spot| (spot.point - self.middle).dot(&self.axis);
         let first = spots.iter().map(along).min_by(f64::total_cmp).unwrap_or_default();
@@ -125,7 +125,7 @@ impl Limb {
     }
 }
 
-/// The cells of one bus.
+/// Wires the cells of one bus.
 fn wired(bus: usize, places: &[Place], pitch: f64) -> Vec<Cell> {
     let wires = joined(places.len(), &near(places, pitch));
     let roots = roots(&wires);
@@ -149,13 +149,13 @@ fn wired(bus: usize, places: &[Place], pitch: f64) -> Vec<Cell> {
     places.iter().enumerate().map(cell).collect()
 }
 
-/// The node id of a place in a bus.
+/// Returns the node id for an index on a bus.
 fn node(index: usize) -> u8 {
-    // No bus has more than MAX_NODES.
+    // A bus has at most MAX_NODES cells.
     u8::try_from(index + 1).unwrap_or(u8::MAX)
 }
 
-/// Pairs of cells that a wire may join, the nearest ones first.
+/// Returns pairs of cells that a wire may join, the nearest ones first.
 fn near(places: &[Place], pitch: f64) -> Vec<[usize; 2]> {
     let longest = LONGEST * pitch;
     let mut found = Vec::new();
@@ -173,7 +173,7 @@ fn near(places: &[Place], pitch: f64) -> Vec<[usize; 2]> {
     found.into_iter().map(|(_, pair)| pair).collect()
 }
 
-/// By cell, those that it is wired to.
+/// Returns the cells that each cell is wired to.
 fn joined(count: usize, pairs: &[[usize; 2]]) -> Vec<Vec<usize>> {
     let mut wires: Vec<Vec<usize>> = vec![Vec::new(); count];
     let mut groups: Vec<_> = (0..count).collect();
@@ -190,7 +190,7 @@ fn joined(count: usize, pairs: &[[usize; 2]]) -> Vec<Vec<usize>> {
         }
         true
     };
-    // One port of each cell is left at first, for cells that have no other neighbour.
+    // At first one port of each cell stays free, for cells without other neighbours.
     for (most, &[a, b]) in
         [PORTS - 1, PORTS].into_iter().flat_map(|most| pairs.iter().map(move |pair| (most, pair)))
     {
@@ -206,7 +206,7 @@ fn joined(count: usize, pairs: &[[usize; 2]]) -> Vec<Vec<usize>> {
     wires
 }
 
-/// One cell of all that wires join: the first of those from which the farthest one is nearest.
+/// Returns one cell of each wired group: the first one with the smallest distance to its farthest cell.
 fn roots(wires: &[Vec<usize>]) -> Vec<usize> {
     let mut seen = vec![false; wires.len()];
     let mut roots = Vec::new();
@@ -227,7 +227,7 @@ fn roots(wires: &[Vec<usize>]) -> Vec<usize> {
     roots
 }
 
-/// The cells that wires join with one, and how many wires away they are, the nearest first.
+/// Returns the cells that are connected to a cell, with the number of wires between them, the nearest first.
 fn reached(wires: &[Vec<usize>], from: usize) -> Vec<(usize, usize)> {
     let mut seen = vec![false; wires.len()];
     let mut found = Vec::new();

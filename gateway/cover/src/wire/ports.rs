@@ -1,4 +1,4 @@
-//! Which port of a cell each of its wires has.
+//! Assigns the wires of a cell to its ports.
 
 use core::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -7,8 +7,8 @@ use nalgebra::{Unit, Vector3};
 use super::PORTS;
 use crate::surface::tangents;
 
-/// By port, what is wired to it, given where each is from the cell's middle. Port 0 points along `axis`, as far as
-/// it lies in the cell's plane, and the others follow counterclockwise when seen from outside.
+/// Returns the wired cell of each port, for the directions of all wired cells from the cell's center. Port 0 points
+/// along `axis`, projected to the cell's plane, and the others follow counterclockwise as seen from outside.
 pub(super) fn assigned(
     normal: &Vector3<f64>,
     axis: &Vector3<f64>,
@@ -22,8 +22,8 @@ pub(super) fn assigned(
     wires.map(|wire| others.get(wire?).map(|&(other, _)| other))
 }
 
-/// The smallest sum of squared angles between wires and their ports, and which wire each port has: of this wire and
-/// those after it, when some ports are taken.
+/// Returns the smallest sum of squared angles between wires and their ports, and the assignment that has it, for this
+/// wire and those after it, if some ports are taken.
 fn best(turns: &[f64], taken: [Option<usize>; PORTS], wire: usize) -> (f64, [Option<usize>; PORTS]) {
     let Some(&turn) = turns.get(wire) else { return (0.0, taken) };
     let mut min = (f64::INFINITY, taken);

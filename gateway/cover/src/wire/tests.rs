@@ -27,7 +27,7 @@ proptest! {
 
 #[test]
 fn ports_are_at_the_side_of_their_wires() {
-    // Seen from above, forward is x: port 0 to x, 1 to y, 2 to -x, 3 to -y.
+    // Seen from above, forward is x: port 0 is at x, 1 at y, 2 at -x, 3 at -y.
     let (up, forward) = (Vector3::z(), Vector3::new(1.0, 0.0, 5.0));
     let at = |degrees: f64| Vector3::new(degrees.to_radians().cos(), degrees.to_radians().sin(), 0.1);
     let ports = |turns: &[f64]| {
@@ -36,23 +36,23 @@ fn ports_are_at_the_side_of_their_wires() {
     };
     assert_eq!(ports(&[180.0, 0.0, 90.0, -90.0]), [Some(1), Some(2), Some(0), Some(3)]);
     assert_eq!(ports(&[100.0]), [None, Some(0), None, None]);
-    // Three wires of a honeycomb, turned: none is displaced by more than needed.
+    // Three wires of a honeycomb are rotated: none is displaced more than necessary.
     assert_eq!(ports(&[350.0, 50.0, 110.0]), [Some(0), Some(1), Some(2), None]);
     assert_eq!(ports(&[]), [None; PORTS]);
-    // A cell that faces along the axis has no forward, but four ports.
+    // A cell that faces along the axis has no forward direction, but four ports.
     assert_eq!(ports::assigned(&up, &up, &[(8, at(0.0)), (9, at(90.0))]).iter().flatten().count(), 2);
 }
 
 #[test]
 fn a_root_is_in_the_middle_and_one_of_each_group() {
-    // A row of five, and one alone.
+    // The cells are a row of five, and a single one.
     let row = vec![vec![1], vec![0, 2], vec![1, 3], vec![2, 4], vec![3], vec![]];
     assert_eq!(roots(&row), [2, 5]);
 }
 
 #[test]
 fn a_full_cell_leaves_wires_to_others() {
-    // A star of six around 0, which are neighbours in a ring too; the spokes are shorter.
+    // Six cells are around cell 0, and are neighbours in a ring too; the spokes are shorter.
     let spokes = (1..7).map(|at| [0, at]);
     let ring = (1..7).map(|at| [at.min(at % 6 + 1), at.max(at % 6 + 1)]);
     let wires = joined(7, &spokes.chain(ring).collect::<Vec<_>>());
@@ -64,7 +64,7 @@ fn a_full_cell_leaves_wires_to_others() {
 
 #[test]
 fn cells_are_reached_before_others_get_more_wires() {
-    // Five cells that are all near each other, and one that is near to only one of them, and farther.
+    // Five cells are all near each other; a sixth is near to only one of them, and farther away.
     let all = (0..5).flat_map(|a| (a + 1..5).map(move |b| [a, b]));
     let wires = joined(6, &all.chain([[0, 5]]).collect::<Vec<_>>());
     assert_eq!(wires[5], [0]);

@@ -1,17 +1,17 @@
-//! The section of a page about benches over their cells.
+//! Writes the section on benches over their cells.
 
 use super::{ACTIVE, Figures, HOLDS, Scale, Size, cells_of};
 use crate::distributed::{self, Over};
 use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table, number};
 
-/// The bars: of the start in s, of the gateway's memory in MB, and of the distributed tick beside that of the fewest
-/// cells, on their own buses and on as many as the most have.
+/// The limits: of the start in s, of the gateway's memory in MB, and of the distributed tick relative to that of the
+/// fewest cells, on their own buses and on as many as the most have.
 const START_S: f64 = 10.0;
 const MEMORY_MB: f64 = 200.0;
 const TICK: f64 = 4.0;
 const TICK_ON_AS_MANY: f64 = 1.2;
 
-/// What was measured, drawn and rated.
+/// Writes the section with figures, findings and a table.
 #[must_use]
 pub fn section(measured: &Scale) -> Section {
     let Scale { sizes, ticks, beside } = measured;
@@ -37,10 +37,10 @@ pub fn section(measured: &Scale) -> Section {
         .tables([table(sizes)])
 }
 
-/// The name of a line of a picture, and its height.
+/// The caption of a curve, and its value.
 type Series<'a> = (&'a str, fn(&Size) -> f64);
 
-/// A figure of benches over their cells, in a series for each pair of a caption and a value.
+/// Returns a figure of benches over their cells, with a series for each pair of a caption and a value.
 fn drawn<const N: usize>(
     (name, title): (&str, &str),
     y: Axis,
@@ -125,7 +125,7 @@ fn over_cells(over: &Over) -> Figure {
         .draw("distributed: the whole tick", Shape::Points, micros(|point| point[1]))
 }
 
-/// What is asked of the bench with the most cells.
+/// Returns the findings on the bench with the most cells.
 fn of_most(size: &Size) -> Vec<Finding> {
     let Size { cells, hz, holds, quiet, active, .. } = size;
     let of = |what: &str| format!("{what}, {cells} cells");
@@ -146,7 +146,7 @@ fn of_most(size: &Size) -> Vec<Finding> {
     ]
 }
 
-/// The tick of the most cells beside that of the fewest.
+/// Compares the tick of the most cells with that of the fewest.
 fn of_ticks(sizes: &[Size], [few, few_on_as_many, most]: &[f64; 3]) -> Vec<Finding> {
     let (Some(fewest), Some(largest)) = (sizes.first(), sizes.last()) else { return Vec::new() };
     let (cells, buses, fewest_cells) = (largest.cells, largest.buses, fewest.cells);

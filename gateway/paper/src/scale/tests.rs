@@ -1,4 +1,4 @@
-//! Which benches are run, and what is made of their summaries.
+//! Tests of the choice of benches and of the evaluation of their summaries.
 
 use std::cell::Cell;
 
@@ -10,7 +10,7 @@ use model::scenario::Scenario;
 use protocol::skin::Skin;
 use serde_json::json;
 
-/// A lab whose benches answer in time up to so many replies a second; it notes what was run.
+/// A lab whose benches reply in time up to a number of replies per second. It records the benches.
 struct Made {
     most: f64,
     ran: Vec<Bench>,
@@ -39,7 +39,7 @@ impl Lab for Made {
     }
 }
 
-/// A summary; of a bench that is too large half of the replies are late.
+/// Returns a summary; half of the replies of a bench that is too large are late.
 pub(crate) fn summary(bench: &Bench, in_time: bool) -> Value {
     let due = if bench.active { count(share(bench.cells)) * bench.hz } else { 0.0 };
     let bus = json!({

@@ -1,4 +1,5 @@
-//! The cell's integers against `protocol/tests/golden/arithmetic.json`, which another program wrote from the document.
+//! Compares the cell's integers with `protocol/tests/golden/arithmetic.json`, which another program wrote from the
+//! document.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use cell_node::contact::{Force, Torque};
@@ -24,7 +25,7 @@ fn words<const N: usize>(value: &Value) -> [i16; N] {
     words.try_into().unwrap()
 }
 
-/// J, and the force on it.
+/// Returns the Jacobian and the force.
 fn pressed(of: &Value) -> ([Q1_14; WORDS], Force) {
     (words(&of["jacobian"]).map(Q1_14::from_bits), Force::from_steps(of["force"].as_i64().unwrap()))
 }

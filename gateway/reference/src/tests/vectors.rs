@@ -1,9 +1,9 @@
-//! `protocol/vectors.json`, for people who write cells elsewhere: packets and what they mean, frames that are refused,
-//! segments and what they come to, exchanges of one cell with its bus, messages over wires, and rows of arithmetic.
+//! Checks `protocol/vectors.json`, which is for cells that are written elsewhere: packets and their contents, refused
+//! frames, segments and their outcome, exchanges of one cell with its bus, messages over wires, and rows of arithmetic.
 //!
-//! All but the torques are those of `protocol/tests/golden`, which another program wrote from the documents. The torques
-//! are the cell's own, compared here with Eq. 8 in double precision. With `SKINBUS_TAKE_OVER=yes` this test writes the file
-//! instead of comparing.
+//! All vectors except the torques are those of `protocol/tests/golden`, which another program wrote from the documents.
+//! The torques are the cell's own, compared here with Eq. 8 in double precision. With `SKINBUS_TAKE_OVER=yes` this test
+//! writes the file instead of comparing it.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -33,7 +33,7 @@ const EXCHANGE: &str = include_str!("../../../../protocol/tests/golden/exchange.
 const WIRE: &str = include_str!("../../../../protocol/tests/golden/wire.log");
 const ARITHMETIC: &str = include_str!("../../../../protocol/tests/golden/arithmetic.json");
 
-/// Each frame of a log and what it says.
+/// Converts each frame of a log and its description.
 fn said<T>(log: &str, tell: impl Fn(&Record<'_>, Map<String, Value>) -> T) -> Vec<T> {
     let mut all = Vec::new();
     for line in log.lines() {
@@ -67,7 +67,7 @@ fn session(record: &Record<'_>, says: Map<String, Value>) -> Value {
     json!({ "from": from, "fd": record.frame.to_string(), "kind": says["kind"] })
 }
 
-/// The frames of a log with the comment above each, and the title above that.
+/// Returns the frames of a log with the comment above each, and the title above that.
 fn commented(log: &str) -> impl Iterator<Item = (&str, &str, Record<'_>)> {
     let (mut title, mut comment) = ("", "");
     log.lines().filter_map(move |line| {
@@ -81,7 +81,7 @@ fn commented(log: &str) -> impl Iterator<Item = (&str, &str, Record<'_>)> {
     })
 }
 
-/// Segments in the order and at the times in which they arrive, and what becomes of each.
+/// Returns segments in the order and at the times of their arrival, and the outcome of each.
 fn reassembly() -> Vec<Value> {
     let rows = commented(REASSEMBLY).map(|(title, comment, record)| {
         let outcome = match comment.split_once(' ') {
@@ -95,7 +95,7 @@ fn reassembly() -> Vec<Value> {
     rows.collect()
 }
 
-/// What one cell receives and sends from its start on: a row for each start, and one for each frame.
+/// Returns the frames that one cell receives and sends from its start on: a row for each start, and one for each frame.
 fn exchanges() -> Vec<Value> {
     let mut rows = Vec::new();
     let mut title = "";
@@ -118,7 +118,7 @@ fn exchanges() -> Vec<Value> {
     rows
 }
 
-/// Messages over wires, and what they mean; what is refused has an error.
+/// Returns messages over wires with their contents; refused ones have an error.
 fn wires() -> Vec<Value> {
     let row = |(_, meaning, record): (&str, &str, Record<'_>)| json!({ "frame": record.frame.to_string(), "meaning": meaning });
     commented(WIRE).map(row).collect()
@@ -148,7 +148,7 @@ fn torques() -> Vec<Value> {
     arm::cases().map(row).collect()
 }
 
-/// The file: an array's elements are a line each.
+/// Returns the text of the file, with each element of an array on its own line.
 fn file() -> String {
     let about = "Frames as candump and cansend write them; docs/reference/protocol.md says what they mean, and cell.md what a cell \
                  does. packets: frames and what they say. refused: frames that are none. reassembly: segments in their order, and \

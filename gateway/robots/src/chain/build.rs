@@ -1,4 +1,4 @@
-//! From a URDF to a chain.
+//! Builds a chain from a URDF.
 
 use core::f64::consts::PI;
 use std::collections::BTreeMap;
@@ -14,7 +14,7 @@ use crate::residual::{self, Residual};
 use crate::rows::{self, Axis, MAX_LENGTH_M, MAX_RESIDUAL, Row, frames};
 use crate::urdf::{Kind, Urdf, UrdfJoint};
 
-/// Builds a chain, or says why it cannot.
+/// Builds a chain, or returns the reason why it cannot be built.
 pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<Chain, RobotError> {
     let root = urdf.index(root.unwrap_or_else(|| urdf.root()))?;
     let path = path(urdf, root, urdf.index(tip)?)?;
@@ -27,7 +27,7 @@ pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<Chain,
     })
 }
 
-/// Builds a chain whose fixed rows save this length, in m.
+/// Builds a chain in which each fixed row must save at least `row_cost`, in m.
 fn with_rows(
     urdf: &Urdf,
     root: usize,
@@ -60,7 +60,7 @@ fn with_rows(
     let rows = chain.chain_rows();
     for (link, LinkFrame { row, frame, .. }) in &chain.carried {
         let reach = reach(rows.get(..*row).unwrap_or_default(), frame.translation.vector.into());
-        // Whatever hangs beside the path may carry no cell: only the path has to be in reach.
+        // Links beside the path may have no cells, so only the path must be within reach.
         if reach >= REACH && path.iter().any(|joint| urdf.link_name(joint.child) == link) {
             return Err(urdf.error(Problem::Reach { link: link.clone(), reach }));
         }
@@ -73,7 +73,7 @@ fn with_rows(
     Ok(chain)
 }
 
-/// The path's joints that move.
+/// Returns the moving joints of the path.
 fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec<Joint>, RobotError> {
     let mut joints = Vec::new();
     for joint in path {
@@ -105,7 +105,7 @@ fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec
     }
 }
 
-/// Frame 0 and the rows.
+/// Returns frame 0 and the rows.
 fn table(
     urdf: &Urdf,
     path: &[&UrdfJoint],
@@ -152,9 +152,9 @@ fn table(
     Ok((base, rows))
 }
 
-/// The links that move with the chain, the path's first, and why the others do not.
+/// Returns the links that move with the chain, those of the path first, and the reasons why the others do not.
 fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<Hanging>, Vec<(String, Apart)>) {
-    // Of each link of the path: moving joints before it, and how it is fixed behind them.
+    // The values are the number of moving joints before the link, and its fixed transform after them.
     let (mut count, mut fixed) = (0, Isometry3::identity());
     let mut order = vec![root];
     let mut on_path = BTreeMap::from([(root, (count, fixed))]);
@@ -193,7 +193,7 @@ fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<Hanging>, Vec<
     (hanging, apart)
 }
 
-/// Where a link is on the chain.
+/// Returns the position of a link on the chain.
 fn carrier(
     rows: &[Row],
     at_zero: &[Isometry3<f64>],

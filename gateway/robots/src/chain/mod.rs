@@ -1,4 +1,4 @@
-//! The joints between two links, with rows and the frame of each link.
+//! Chains: the joints between two links, with rows and the frame of each link.
 
 mod build;
 mod path;
@@ -17,69 +17,69 @@ pub(crate) use path::{Hanging, behind};
 /// The joints between two links.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Chain {
-    /// The link that is held still.
+    /// The fixed link at the start.
     pub root: String,
     /// The link at the end.
     pub tip: String,
-    /// The joints that move, from root to tip; 1 to [`protocol::parameters::MAX_JOINTS`].
+    /// The moving joints from root to tip; 1 to [`protocol::parameters::MAX_JOINTS`].
     pub joints: Vec<Joint>,
-    /// Rows, from root to tip; at most [`protocol::parameters::MAX_ROWS`]. Those that move are in the order of `joints`.
+    /// The rows from root to tip; at most [`protocol::parameters::MAX_ROWS`]. Moving rows are in the order of `joints`.
     pub rows: Vec<Row>,
-    /// From the root link's frame to frame 0, whose z axis is the first joint's.
+    /// The transform from the root link's frame to frame 0, whose z axis is that of the first joint.
     pub base: Isometry3<f64>,
-    /// From the URDF's root to the root link, with joints between at rest.
+    /// The transform from the URDF's root to the root link, with the joints between at rest.
     pub below: Isometry3<f64>,
-    /// The largest difference between rows and URDF that was found, in m or rad.
+    /// The largest difference found between rows and URDF, in m or rad.
     pub residual: f64,
-    /// The links that move with the chain, the path's first.
+    /// The links that move with the chain, those of the path first.
     carried: Vec<(String, LinkFrame)>,
-    /// Links below the root that do not: the ones before the first joint, and the others.
+    /// The links that do not move with the chain, each with the reason.
     apart: Vec<(String, Apart)>,
-    /// The file's name.
+    /// The name of the file.
     file: String,
 }
 
-/// A joint that moves.
+/// A moving joint.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Joint {
-    /// Its name.
+    /// The name.
     pub name: String,
-    /// How it moves.
+    /// The kind of motion.
     pub kind: JointKind,
-    /// Minimum and maximum position in rad or m; of a continuous joint -pi and pi.
+    /// The minimum and maximum position in rad or m; -pi and pi for a continuous joint.
     pub limits: [f64; 2],
-    /// The maximum speed in rad/s or m/s, where the URDF has one above zero.
+    /// The maximum speed in rad/s or m/s; `None` unless the URDF has one above zero.
     pub max_speed: Option<f64>,
 }
 
-/// Where a link is on a chain.
+/// The position of a link on a chain.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LinkFrame {
     /// The last joint before the link, from 1.
     pub joint: usize,
-    /// The row whose frame the link is fixed to, from 1: of those from the joint's own on that move with the link, the one whose origin is
-    /// nearest.
+    /// The row whose frame the link is fixed to, from 1. Of the rows that move with the link, it is the one whose
+    /// origin is nearest.
     pub row: usize,
-    /// From that row's frame to the link's.
+    /// The transform from that row's frame to the link's.
     pub frame: Isometry3<f64>,
 }
 
-/// Why a link cannot carry a cell.
+/// The reason why a link cannot carry a cell.
 #[derive(Clone, Debug, PartialEq)]
 enum Apart {
-    /// It is before the first joint.
+    /// The link is before the first joint.
     Still,
-    /// This joint moves it, which is not in the chain.
+    /// This joint, which is not in the chain, moves the link.
     MovedBy(String),
-    /// It is not below the root.
+    /// The link is not below the root.
     Elsewhere,
 }
 
 impl Chain {
-    /// Where a link is: one behind the first joint, on the path or fixed to it.
+    /// Returns the position of a link after the first joint, on the path or fixed to it.
     ///
     /// # Errors
-    /// When there is no such link, or when it does not move with the chain.
+    /// Returns [`RobotError`] if the link does not exist, or does not move with the chain.
     pub fn link(&self, link: &str) -> Result<LinkFrame, RobotError> {
         if let Some((_, found)) = self.carried.iter().find(|(name, _)| name == link) {
             return Ok(*found);
@@ -102,18 +102,18 @@ impl Chain {
         Err(RobotError::new(&self.file, None, problem))
     }
 
-    /// The links that can carry a cell: those of the path first, then those that are fixed to it.
+    /// Returns the links that can carry a cell: those of the path first, then those fixed to it.
     pub fn links(&self) -> impl Iterator<Item = (&str, LinkFrame)> {
         self.carried.iter().map(|(name, frame)| (name.as_str(), *frame))
     }
 
-    /// The frames 0 to `rows.len()` in the root link's coordinates, with the joints at `positions` in rad or m.
+    /// Returns the frames 0 to `rows.len()` in the root link's coordinates, with the joints at `positions` in rad or m.
     #[must_use]
     pub fn frames(&self, positions: &[f64]) -> Vec<Isometry3<f64>> {
         frames(&self.base, &self.rows, positions)
     }
 
-    /// The rows as those of a skin's chain, with their joints' limits.
+    /// Returns the rows in the form of a skin's chain, with their joints' limits.
     #[must_use]
     pub fn chain_rows(&self) -> Vec<ChainRow> {
         let mut joints = self.joints.iter();
@@ -124,7 +124,7 @@ impl Chain {
         self.rows.iter().map(row).collect()
     }
 
-    /// The joints' limits, in their order, in rad or m.
+    /// Returns the limits of the joints, in their order, in rad or m.
     #[must_use]
     pub fn limits(&self) -> Vec<[f64; 2]> {
         self.joints.iter().map(|joint| joint.limits).collect()
@@ -132,12 +132,12 @@ impl Chain {
 }
 
 impl Urdf {
-    /// The chain from a link, or the robot's root, to another link below it.
+    /// Builds the chain from a link, or from the robot's root, to another link below it.
     ///
     /// # Errors
-    /// When one of the links does not exist or the tip is not below the root, when a joint between them is not revolute, continuous,
-    /// prismatic or fixed, mimics another one or cannot move within its limits, when there is none that moves or there are too many,
-    /// when the chain is too long, or when rows and URDF differ.
+    /// Returns [`RobotError`] if one of the links does not exist or the tip is not below the root; if a joint between
+    /// them is not revolute, continuous, prismatic or fixed, mimics another one, or cannot move within its limits; if
+    /// no joint moves or too many do; if the chain is too long; or if rows and URDF differ.
     pub fn chain(&self, root: Option<&str>, tip: &str) -> Result<Chain, RobotError> {
         build::build(self, root, tip)
     }

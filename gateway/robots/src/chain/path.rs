@@ -1,4 +1,4 @@
-//! The path of a chain in its URDF, and what hangs on it.
+//! The path of a chain in its URDF, and the links fixed to it.
 
 use nalgebra::Isometry3;
 use protocol::skin::JointKind;
@@ -6,17 +6,17 @@ use protocol::skin::JointKind;
 use crate::error::{Problem, RobotError};
 use crate::urdf::{Kind, Urdf, UrdfJoint};
 
-/// A link and how it hangs on the chain.
+/// A link that moves with a chain.
 pub(crate) struct Hanging {
-    /// Its name.
+    /// The name of the link.
     pub(crate) link: String,
-    /// Moving joints of the chain before it.
+    /// The number of moving joints of the chain before it.
     pub(crate) joint: usize,
-    /// From the link behind that joint (or the root) to this one; it does not move.
+    /// The constant transform from the link after that joint (or the root) to this one.
     pub(crate) fixed: Isometry3<f64>,
 }
 
-/// The joints from the root to the tip.
+/// Returns the joints from the root to the tip.
 pub(super) fn path(urdf: &Urdf, root: usize, tip: usize) -> Result<Vec<&UrdfJoint>, RobotError> {
     let mut path = Vec::new();
     if root == tip {
@@ -35,7 +35,7 @@ pub(super) fn path(urdf: &Urdf, root: usize, tip: usize) -> Result<Vec<&UrdfJoin
     Err(urdf.error(Problem::NotBelow { tip, root, path: names.join(" > ") }))
 }
 
-/// How a joint of a path moves; none if it is fixed.
+/// Returns the motion of a joint on a path; `None` if it is fixed.
 pub(super) fn moves(joint: &UrdfJoint) -> Option<JointKind> {
     match joint.kind {
         Kind::Revolute | Kind::Continuous => Some(JointKind::Revolute),
@@ -44,7 +44,8 @@ pub(super) fn moves(joint: &UrdfJoint) -> Option<JointKind> {
     }
 }
 
-/// The frames of the links right behind the path's moving joints, in the root's coordinates; joints without a position are at zero.
+/// Returns the frames of the links directly after the moving joints of the path, in the root's coordinates. Joints
+/// without a position are at zero.
 pub(crate) fn behind(path: &[&UrdfJoint], positions: &[f64]) -> Vec<Isometry3<f64>> {
     let mut positions = positions.iter();
     let mut pose = Isometry3::identity();

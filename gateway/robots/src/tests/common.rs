@@ -1,4 +1,4 @@
-//! What the tests share: torques and differences, computed without the crate's own code where that matters.
+//! Helpers of the tests. Torques and differences are computed without the crate's own code where that matters.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -6,14 +6,14 @@ use std::path::PathBuf;
 use crate::{Chain, RowKind};
 use nalgebra::{Isometry3, Point3, Vector3};
 
-/// The folder of example-robot-data, from the environment.
+/// Returns the folder of example-robot-data, from the environment.
 pub(crate) fn folder() -> PathBuf {
     let folder = std::env::var_os("SKINBUS_ROBOTS");
     PathBuf::from(folder.expect("SKINBUS_ROBOTS is the folder `robots` of example-robot-data"))
 }
 
-/// The torque of each joint in Nm, or the force in N, of a contact with `force` newtons against `normal` at `point`, both in a link's
-/// frame: the transposed Jacobian, from rows.
+/// Returns the torque of each joint in Nm, or its force in N, for a contact with `force` newtons against `normal` at
+/// `point`, both in a link's frame: the transposed Jacobian, from rows.
 pub(crate) fn torques(
     chain: &Chain,
     link: &str,
@@ -42,13 +42,13 @@ pub(crate) fn torques(
     all
 }
 
-/// The greater of the distance in m and the difference of the rotations' matrices.
+/// Returns the greater of the distance in m and the difference of the rotation matrices.
 pub(crate) fn difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
     let turn = one.rotation.to_rotation_matrix().matrix() - other.rotation.to_rotation_matrix().matrix();
     (one.translation.vector - other.translation.vector).norm().max(turn.norm())
 }
 
-/// Positions by the joints' names.
+/// Returns a function from the name of a joint to its position.
 pub(crate) fn named<'a>(chain: &'a Chain, positions: &[f64]) -> impl Fn(&str) -> f64 + use<'a> {
     let names = chain.joints.iter().map(|joint| joint.name.as_str());
     let all: BTreeMap<_, _> = names.zip(positions.to_vec()).collect();

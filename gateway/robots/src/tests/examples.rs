@@ -31,13 +31,13 @@ fn chain(xml: &str, tip: &str) -> Chain {
     chain
 }
 
-/// How far the tip comes from an axis.
+/// Returns the maximum distance of the tip from an axis.
 fn far(chain: &Chain) -> f64 {
     let place = chain.link(&chain.tip).unwrap();
     reach(&chain.chain_rows()[..place.row], place.frame.translation.vector.into())
 }
 
-/// The tip at these positions.
+/// Returns the position of the tip.
 fn at(chain: &Chain, positions: &[f64]) -> Point3<f64> {
     let place = chain.link(&chain.tip).unwrap();
     chain.frames(positions)[place.row] * place.frame * Point3::origin()
@@ -53,7 +53,7 @@ fn assert_at(chain: &Chain, positions: &[f64], expected: [f64; 3]) {
 fn panda_is_as_its_table_says() {
     let chain = chain(PANDA, "hand");
     assert_eq!(chain.joints.len(), 7);
-    // Stretched upward, but for the elbow's 82.5 mm, which come back, and the flange's 88 mm.
+    // The arm is stretched upward, except for the elbow's 82.5 mm, which cancel, and the flange's 88 mm.
     assert_at(&chain, &[0.0; 7], [0.088, 0.0, 0.333 + 0.316 + 0.384 - 0.107]);
     let expected = 0.316_f64.hypot(0.0825) + 0.384_f64.hypot(0.0825) + 0.088_f64.hypot(0.107);
     assert!(far(&chain) > 0.8 && far(&chain) < expected + 0.08, "{} {expected}", far(&chain));
@@ -80,7 +80,7 @@ fn two_arms_are_two_chains_on_one_torso() {
     }
     let names = left.joints.iter().chain(&right.joints).map(|joint| joint.name.as_str());
     assert_eq!(names.collect::<std::collections::BTreeSet<_>>().len(), 12);
-    // Mirror images.
+    // The arms are mirror images.
     let [mut left_at, right_at] = [(&left, 1.0), (&right, -1.0)]
         .map(|(arm, side)| at(arm, &[0.0, 0.3, -0.5, side * 0.4, side * 0.2, -1.0, 0.0]));
     left_at.y = -left_at.y;
@@ -98,7 +98,7 @@ fn the_lift_lifts() {
     assert!(far(&chain) < 1.0, "{}", far(&chain));
 }
 
-/// Beside the files that others made of the same robots.
+/// Compares the examples with other descriptions of the same robots.
 #[test]
 #[ignore = "needs example-robot-data"]
 fn examples_agree_with_the_files_of_others() {
@@ -112,7 +112,7 @@ fn examples_agree_with_the_files_of_others() {
         let [chain, other] = [ours.chain(None, tip).unwrap(), theirs.chain(None, other_tip).unwrap()];
         let names: Vec<_> = other.joints.iter().map(|joint| joint.name.clone()).collect();
         for round in 0_u32..50 {
-            // Anywhere within the limits, by multiples of the golden ratio.
+            // Positions are spread within the limits by multiples of the golden ratio.
             let part = |joint: usize| (f64::from(round) * 0.618_034 + joint as f64 * 0.414_214).fract();
             let limits = chain.joints.iter().map(|joint| joint.limits).enumerate();
             let q: Vec<_> = limits.map(|(at, [lower, upper])| lower + (upper - lower) * part(at)).collect();

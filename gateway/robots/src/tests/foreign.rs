@@ -1,4 +1,4 @@
-//! Other people's robots. `pip install example-robot-data==6.0.0`, and `SKINBUS_ROBOTS` is its folder
+//! Robots of other authors. Needs `pip install example-robot-data==6.0.0`; `SKINBUS_ROBOTS` is its folder
 //! `cmeel.prefix/share/example-robot-data/robots`.
 
 use std::collections::BTreeMap;
@@ -11,7 +11,7 @@ use protocol::skin::reach;
 
 use super::common::{folder, torques};
 
-/// URDF files in a folder and below, in order.
+/// Returns the URDF files in a folder and below, in order.
 fn files(folder: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).unwrap() {
@@ -30,7 +30,7 @@ fn read(path: &Path) -> Result<Urdf, RobotError> {
     Urdf::parse(&path.display().to_string(), &fs::read_to_string(path).unwrap())
 }
 
-/// One word for a refusal.
+/// Returns one word for a refusal.
 fn word(problem: &Problem) -> &'static str {
     let words = [
         (matches!(problem, Problem::Mimic { .. }), "mimic"),
@@ -99,7 +99,7 @@ fn every_chain_is_imported_or_refused_for_a_reason() {
     assert_eq!(unread, ["ur_description/urdf/ur3.urdf"], "it has no links");
 }
 
-/// `tests/data/robots.csv`: torques by Pinocchio.
+/// Compares torques with those of Pinocchio in `tests/data/robots.csv`.
 #[test]
 #[ignore = "needs example-robot-data"]
 fn torques_from_rows_are_those_of_pinocchio() {

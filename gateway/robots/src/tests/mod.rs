@@ -1,4 +1,4 @@
-//! Chains of URDF files: those written here, those made by chance, and those of others.
+//! Tests of chains: hand-written URDF files, random ones, and those of other authors.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 

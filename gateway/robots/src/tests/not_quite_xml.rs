@@ -1,4 +1,4 @@
-//! Files that are not quite XML, or not quite URDF: those that are read, and the words for those that are not.
+//! Files that are not quite XML, or not quite URDF: those that are accepted, and the errors for those that are not.
 
 use crate::{Urdf, text};
 
@@ -89,9 +89,9 @@ fn other_faults_have_their_line_and_what_to_do() {
     ] {
         assert_eq!(refused(&good.replacen(from, to, 1)), expected);
     }
-    // Blank lines before the first tag are lines.
+    // Blank lines before the first tag count.
     assert!(refused("\n\n<robot>\n&</robot>").starts_with("t.urdf:4: a & "));
-    // An element with many attributes is refused before the parser compares each with all others.
+    // An element with many attributes is refused before the parser compares each of them with all others.
     let many: String = (0..50_000).map(|number| format!(" a{number}=''")).collect();
     let expected = "t.urdf:3: element link has 50001 attributes, and at most 256 are read: delete some";
     assert_eq!(refused(&wrap(&format!("<link name=\"a\"{many}/>"))), expected);
@@ -161,7 +161,7 @@ fn utf_16_is_refused_as_by_ros_with_a_command_that_repairs_it() {
             )
         );
     }
-    // The command leaves the declaration as it is.
+    // The command leaves the declaration unchanged.
     assert_eq!(text("t.urdf", declared.as_bytes()).unwrap(), declared);
     read(&declared);
 }
@@ -220,7 +220,7 @@ fn a_faulty_shape_is_an_error_when_it_is_used() {
 
 #[test]
 fn a_control_character_that_the_parser_quotes_leaves_one_line() {
-    // `refused` sees that it is one.
+    // `refused` checks that the message is one line.
     let message = refused("<robot name=\"r\"><link name=\"a\" /\n></robot>");
     assert!(message.contains("\\u{a}"), "{message}");
 }

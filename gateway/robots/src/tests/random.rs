@@ -1,4 +1,4 @@
-//! Chains made by chance: rows against kinematics that is computed here, with matrices.
+//! Compares the rows of random chains with kinematics that is computed here with matrices.
 
 use core::f64::consts::{FRAC_PI_2, PI};
 
@@ -10,7 +10,7 @@ use protocol::skin::reach;
 use super::common::torques;
 use super::written::{FIVE_DIGITS, TWELVE_DIGITS, Written, robot};
 
-/// What rows may differ by, in m, or rad, or Nm with a newton.
+/// The maximum difference of rows, in m or rad, or in Nm for a force of 1 N.
 const ERROR: f64 = 5e-11;
 
 fn angle() -> impl Strategy<Value = f64> {
@@ -18,7 +18,7 @@ fn angle() -> impl Strategy<Value = f64> {
         3 => Just(0.0),
         2 => proptest::sample::select(vec![FRAC_PI_2, -FRAC_PI_2, PI, TWELVE_DIGITS, FIVE_DIGITS]),
         2 => -PI..PI,
-        // Nearly straight.
+        // Nearly straight angles.
         1 => (2..=13_i32, -1.0..1.0_f64).prop_map(|(exponent, factor)| factor * 10_f64.powi(-exponent)),
     ]
 }
@@ -37,7 +37,7 @@ fn length() -> impl Strategy<Value = f64> {
     prop_oneof![1 => Just(0.0), 1 => -0.25..0.25]
 }
 
-/// Also what q to take, as parts of the way between the limits.
+/// Generates joints, each with two positions as fractions of the range between its limits.
 fn written() -> impl Strategy<Value = (Written, [f64; 2])> {
     let kind = proptest::sample::select(vec!["revolute", "revolute", "continuous", "prismatic", "fixed"]);
     let place = ([length(), length(), length()], [angle(), angle(), angle()], axis());
@@ -57,7 +57,7 @@ fn chains() -> impl Strategy<Value = Vec<(Written, [f64; 2])>> {
     proptest::collection::vec(written(), 1..=14)
 }
 
-/// From a joint's parent to its child.
+/// Returns the transform from a joint's parent to its child.
 fn step(joint: &Written, position: f64) -> Matrix4<f64> {
     let [roll, pitch, yaw] = joint.rpy;
     let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), yaw)
@@ -108,7 +108,7 @@ proptest! {
                 let rows = (frames[place.row] * place.frame).to_homogeneous();
                 prop_assert!((rows - pose).norm() < ERROR, "link {}: {}", index + 1, (rows - pose).norm());
             }
-            // Torques at the tip, and how far it is from what it turns about.
+            // Torques at the tip, and its distance from the axes.
             let point = Point3::from(cell);
             let normal = Vector3::new(0.6, 0.0, 0.8);
             let got = torques(&chain, &tip, &point, &normal, 1.0, &q);
@@ -133,7 +133,7 @@ proptest! {
         }
     }
 
-    /// Whatever the text is, it is read or refused in one line.
+    /// Any text is accepted, or refused in one line.
     #[test]
     fn any_text_is_refused_in_one_line(text in "[ -~]{0,40}", cut in 0_usize..600, put in "[ -~]{0,6}") {
         let whole = robot(&[Written::hinge([0.1, 0.0, 0.0], [0.0; 3]), Written::slide([0.1, 0.0, 0.0], [0.0; 3])]);

@@ -1,4 +1,4 @@
-//! Files as people write them: what must not be misread.
+//! Files with unusual but valid contents, which must be read correctly.
 
 use core::f64::consts::PI;
 
@@ -46,11 +46,11 @@ fn a_file_is_read_as_its_format_says() {
     assert_eq!(urdf.links().collect::<Vec<_>>(), ["base", "arm", "hand", "tool"]);
     assert_eq!(urdf.leaves().collect::<Vec<_>>(), ["tool"]);
     let chain = urdf.chain(None, "tool").unwrap();
-    // A continuous joint turns freely, whatever limits it carries.
+    // A continuous joint has no limits, even if the file gives some.
     assert_eq!(chain.limits(), [[-PI, PI], [0.0, 0.5]]);
     assert_eq!(chain.joints[0].max_speed, Some(2.5));
     assert_eq!(chain.joints[1].max_speed, None);
-    // No axis is x; angles are about fixed axes, x first; an axis is as long as 1.
+    // The default axis is x. Angles are about fixed axes, x first. An axis is normalized.
     let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), 0.7);
     let origin = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), 0.3)
         * UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 0.2)
@@ -104,7 +104,7 @@ fn a_joint_that_mimics_follows() {
     assert_eq!(found.map(f64::to_bits), [0.125_f64, 0.5, -0.75].map(f64::to_bits));
 }
 
-/// A namespace of the whole file changes nothing; elements of another namespace are not the robot's.
+/// A default namespace changes nothing; elements of another namespace do not belong to the robot.
 #[test]
 fn namespaces_are_kept_apart() {
     let inner = r#"<link name="a"/><s:link name="ghost"/>"#;

@@ -1,4 +1,4 @@
-//! What is refused, and in which words.
+//! Refused files and chains, and their error messages.
 
 use crate::{CellOnLink, Chain, Import, Urdf};
 
@@ -8,7 +8,7 @@ fn parse(xml: &str) -> String {
     Urdf::parse("t.urdf", xml).unwrap_err().to_string()
 }
 
-/// What the chain from the root to this tip is refused for.
+/// Returns the error of the chain from the root to this tip.
 fn chain(xml: &str, tip: &str) -> String {
     Urdf::parse("t.urdf", xml).unwrap().chain(None, tip).unwrap_err().to_string()
 }
@@ -17,7 +17,7 @@ fn good(xml: &str, tip: &str) -> Chain {
     Urdf::parse("t.urdf", xml).unwrap().chain(None, tip).unwrap()
 }
 
-/// Links `a` and `b`, and this joint between them.
+/// Returns links `a` and `b`, and a joint between them.
 fn joined(kind: &str, inner: &str) -> String {
     wrap(&format!(
         "<link name=\"a\"/>\n<link name=\"b\"/>\n<joint name=\"j\" type=\"{kind}\"><parent link=\"a\"/><child link=\"b\"/>{inner}</joint>\n"
@@ -40,7 +40,7 @@ fn files_that_are_no_urdf() {
         "t.urdf:1: the outermost element is \"sdf\" (an SDF file, of Gazebo); a URDF has `robot`: name the robot's URDF"
     );
     assert_eq!(parse("<robot/>"), "t.urdf:1: the robot has no links; a URDF has at least one");
-    // The lines of the file, whatever stands before the first tag.
+    // Lines are those of the file, whatever stands before the first tag.
     assert_eq!(parse("\n\n<robot>\n</robot>"), "t.urdf:3: the robot has no links; a URDF has at least one");
 }
 
@@ -56,7 +56,7 @@ fn xacro_is_refused_where_it_was_not_run() {
     );
     let expression = joined("revolute", "<origin xyz=\"${length} 0 0\"/>");
     assert_eq!(parse(&expression), format!("t.urdf:5: expression ${{length}} {why}"));
-    // What xacro wrote still names it.
+    // The output of xacro still declares its namespace.
     let run = bound.replace("<xacro:arm/>", "<!-- <xacro:arm/> ${x} -->");
     assert_eq!(Urdf::parse("t.urdf", &run).unwrap().root(), "a");
 }

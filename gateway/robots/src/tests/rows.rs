@@ -1,4 +1,4 @@
-//! Rows of chains that are written by hand.
+//! Rows of hand-written chains.
 
 use core::f64::consts::{FRAC_PI_2, PI};
 
@@ -25,7 +25,7 @@ fn assert_row(row: &Row, [a, alpha, d, theta_offset]: [f64; 4]) {
     for (got, expected) in [(row.a, a), (row.d, d)] {
         assert!((got - expected).abs() < 1e-11, "{row:?}");
     }
-    // Exactly, so that no twist of nearly a quarter turn is left.
+    // The comparison is exact, so that no twist of nearly a quarter turn remains.
     assert_eq!(
         [row.alpha, row.theta_offset].map(f64::to_bits),
         [alpha, theta_offset].map(f64::to_bits),
@@ -33,7 +33,7 @@ fn assert_row(row: &Row, [a, alpha, d, theta_offset]: [f64; 4]) {
     );
 }
 
-/// The arm of the skin examples, written as a URDF: its table comes back.
+/// The arm of the skin examples, written as a URDF, yields its known table.
 #[test]
 fn a_known_table_comes_back() {
     let chain = chain(&[
@@ -71,10 +71,10 @@ fn opposite_and_equal_axes_need_one_row() {
     assert_row(&beside.rows[0], [0.4, 0.0, 0.0, FRAC_PI_2]);
 }
 
-/// The common normal of nearly parallel axes is far away: a fixed row goes another way.
+/// The common normal of nearly parallel axes is far away: a fixed row takes another path.
 #[test]
 fn a_tilt_of_any_size_keeps_rows_short() {
-    // Not 1e-11 itself: there either is right.
+    // 1e-11 itself is left out, because either result is correct.
     for exponent in (1..=10).chain(12..=13) {
         let tilt = 10_f64.powi(-exponent);
         for turn in [0.0, PI] {
@@ -96,7 +96,7 @@ fn a_tilt_of_any_size_keeps_rows_short() {
     }
 }
 
-/// A small angle between axes that meet nearby: digits would be lost, though no row is long.
+/// Axes that meet nearby at a small angle would lose digits, although no row is long.
 #[test]
 fn axes_that_meet_at_a_small_angle_lose_no_digits() {
     for exponent in 2..=9 {
@@ -108,7 +108,7 @@ fn axes_that_meet_at_a_small_angle_lose_no_digits() {
     }
 }
 
-/// A common normal that is far away although the angle is large: axes in one plane that meet 1.5 m farther.
+/// A common normal may be far away although the angle is large: here two axes in one plane meet 1.5 m farther out.
 #[test]
 fn a_far_foot_is_avoided() {
     let meets = Written::hinge([0.4, 0.0, 0.0], [0.0, -(0.4_f64 / 1.5).atan(), 0.0]);
@@ -118,8 +118,8 @@ fn a_far_foot_is_avoided() {
     assert!(chain.rows.iter().all(|row| row.a.abs() <= 0.5 && row.d.abs() <= 0.5), "{:?}", chain.rows);
 }
 
-/// The waist and the left arm of a humanoid whose shoulder axis is tilted against the waist's by 16 degrees: their common normal is
-/// 0.9 m beside the robot. The tip is this far from the elbow.
+/// Returns the waist and the left arm of a humanoid whose shoulder axis is tilted against the waist's by 16 degrees, so
+/// that their common normal is 0.9 m beside the robot. `forearm` is the distance of the tip from the elbow.
 fn tilted_shoulder(forearm: f64) -> Vec<Written> {
     let [x, y, z] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
     vec![
@@ -134,7 +134,7 @@ fn tilted_shoulder(forearm: f64) -> Vec<Written> {
     ]
 }
 
-/// The farthest that the tip comes from any joint before it, of many positions, in m.
+/// Returns the greatest distance of the tip from any joint before it, over many positions, in m.
 fn farthest(urdf: &Urdf, chain: &Chain) -> f64 {
     let (mut most, mut state) = (0.0_f64, 1_u32);
     for _ in 0..1000 {
@@ -171,7 +171,7 @@ fn rows_do_not_fold_back_beside_the_robot() {
     assert!(long.to_string().contains("can come 2."), "{long}");
 }
 
-/// The way from joint to joint, with a fixed row for each, bounds all others.
+/// The path from joint to joint, with a fixed row for each, is an upper bound.
 #[test]
 fn rows_are_no_longer_than_the_way_from_joint_to_joint() {
     let mut state = 7_u32;
@@ -236,7 +236,7 @@ fn joints_say_what_the_file_says() {
     assert_eq!(chain.joints[1].name, "j2");
 }
 
-/// Fixed joints before, between and behind, and a branch: each link's frame is the URDF's.
+/// With fixed joints before, between and after, and with a branch, each link's frame is that of the URDF.
 #[test]
 fn links_are_where_the_file_has_them() {
     let joints = [
@@ -288,7 +288,7 @@ fn links_are_where_the_file_has_them() {
     assert!(difference(&pose, &expected) < 1e-13);
 }
 
-/// Behind a fixed row's helper axis, the row whose origin is nearest carries the link.
+/// After a fixed row's helper axis, the row whose origin is nearest carries the link.
 #[test]
 fn the_nearest_row_carries_a_link() {
     let joints = [

@@ -1,12 +1,12 @@
-//! URDF files as the tests write them.
+//! URDF files written by the tests.
 
 use core::f64::consts::FRAC_PI_2;
 use core::fmt::Write;
 
-/// Pi / 2 as many files have it, 1.57079632679.
+/// Pi / 2 as in many files, 1.57079632679.
 pub(crate) const TWELVE_DIGITS: f64 = FRAC_PI_2 - 4.9e-12;
 
-/// Pi / 2 as others have it, 1.5708.
+/// Pi / 2 as in other files, 1.5708.
 pub(crate) const FIVE_DIGITS: f64 = FRAC_PI_2 + 3.673_205e-6;
 
 /// A joint of a chain.
@@ -20,12 +20,12 @@ pub(crate) struct Written {
 }
 
 impl Written {
-    /// About z, within a radian.
+    /// Returns a revolute joint about z, with limits of 1 rad.
     pub(crate) fn hinge(xyz: [f64; 3], rpy: [f64; 3]) -> Self {
         Self { kind: "revolute", xyz, rpy, axis: [0.0, 0.0, 1.0], limits: [-1.0, 1.0] }
     }
 
-    /// Along z, by 0.2 m.
+    /// Returns a prismatic joint along z, with a range of 0.2 m.
     pub(crate) fn slide(xyz: [f64; 3], rpy: [f64; 3]) -> Self {
         Self { kind: "prismatic", limits: [-0.1, 0.1], ..Self::hinge(xyz, rpy) }
     }
@@ -34,13 +34,13 @@ impl Written {
         Self { kind: "fixed", axis: [0.0; 3], ..Self::hinge(xyz, rpy) }
     }
 
-    /// About or along this axis instead.
+    /// Returns the joint with another axis.
     pub(crate) fn axis(self, axis: [f64; 3]) -> Self {
         Self { axis, ..self }
     }
 }
 
-/// A robot with these joints in a row: joint `j1` moves link `l1`, and so on, from link `l0`.
+/// Returns a robot with these joints in a row: joint `j1` moves link `l1`, and so on, from link `l0`.
 pub(crate) fn robot(joints: &[Written]) -> String {
     let mut inner = "<link name=\"l0\"/>\n".to_owned();
     for (index, joint) in joints.iter().enumerate() {
@@ -60,7 +60,7 @@ pub(crate) fn robot(joints: &[Written]) -> String {
     wrap(&inner)
 }
 
-/// Links and joints, made a robot.
+/// Returns a robot with these links and joints.
 pub(crate) fn wrap(inner: &str) -> String {
     format!("<?xml version=\"1.0\"?>\n<robot name=\"test\">\n{inner}</robot>\n")
 }

@@ -1,4 +1,4 @@
-//! The URDF that is written for a skin's rows says the same as the rows.
+//! The URDF that is written for a skin's rows has the kinematics of the rows.
 
 use crate::{Import, Isometry3, Row, Urdf, frames, pose_of, written};
 use protocol::skin::Skin;
@@ -13,12 +13,12 @@ fn imported(file: &str, tips: &[&str]) -> Skin {
     Skin::parse("skin.toml", &import.toml().unwrap()).unwrap()
 }
 
-/// The difference of two poses, in m and rad.
+/// Returns the difference of two poses, in m plus rad.
 fn apart(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
     (one.translation.vector - other.translation.vector).norm() + one.rotation.angle_to(&other.rotation)
 }
 
-/// Compares the poses behind all chains, with the joints spread over their limits in some ways.
+/// Compares the poses of all chains, with the joints at several positions within their limits.
 fn check(skin: &Skin) -> Urdf {
     let text = written(skin);
     let urdf = Urdf::parse("robot.urdf", &text.xml).unwrap_or_else(|error| panic!("{error}\n{}", text.xml));
@@ -29,7 +29,7 @@ fn check(skin: &Skin) -> Urdf {
             .map(|(at, joint)| joint.limits[0] + part(at) * (joint.limits[1] - joint.limits[0]))
             .collect();
         let position = |name: &str| {
-            // Fixed ones are asked for too.
+            // Fixed joints are requested too.
             skin.robot.joints.iter().position(|joint| joint.name == name).map_or(0.0, |found| q[found])
         };
         for (chain, links) in skin.robot.chains.iter().zip(&text.links) {
@@ -110,7 +110,7 @@ normal = [0.0, 1.0, 0.0]
     assert_eq!(urdf.link_of("<b & c>"), Ok("one_link2"));
     let poses = urdf.link_poses(&["a", "<b & c>"]).unwrap();
     assert_eq!(poses.iter().filter(|pose| pose.moves()).count(), 3);
-    // Two names that become one word.
+    // Two names map to the same word.
     let mut skin = skin;
     for (chain, name) in skin.robot.chains.iter_mut().zip(["le ft", "le_ft"]) {
         name.clone_into(&mut chain.name);

@@ -13,22 +13,22 @@ use crate::nearest::nearest;
 pub use shape::{Geometry, Shape};
 pub use xml::text;
 
-/// A checked file: its links are one tree, and each joint moves one of them.
+/// A checked URDF: its links form one tree, and each joint moves one of them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Urdf {
-    /// The file's name, as it was given.
+    /// The name of the file, as it was given.
     pub file: String,
-    /// The robot's name; empty if it has none.
+    /// The name of the robot; empty if it has none.
     pub name: String,
-    /// In the file's order.
+    /// The links in the file's order.
     links: Vec<Link>,
-    /// In the file's order.
+    /// The joints in the file's order.
     joints: Vec<UrdfJoint>,
-    /// Index of the link without a parent.
+    /// The index of the link without a parent.
     root: usize,
 }
 
-/// The shapes of a link; the error of a faulty one is kept until somebody asks for them.
+/// The shapes of a link. The error of a faulty shape is kept until the shapes are used.
 type Shapes = Result<Vec<Shape>, RobotError>;
 
 /// A link.
@@ -37,7 +37,7 @@ struct Link {
     name: String,
     visuals: Shapes,
     collisions: Shapes,
-    /// Index of the joint that moves it.
+    /// The index of the joint that moves it.
     parent: Option<usize>,
 }
 
@@ -46,26 +46,26 @@ struct Link {
 pub(crate) struct UrdfJoint {
     pub(crate) name: String,
     pub(crate) kind: Kind,
-    /// Index of the link that it is on.
+    /// The index of its parent link.
     pub(crate) parent: usize,
-    /// Index of the link that it moves.
+    /// The index of the link that it moves.
     pub(crate) child: usize,
-    /// From the parent to the child at position zero.
+    /// The transform from the parent to the child at position zero.
     pub(crate) origin: Isometry3<f64>,
-    /// In the child's coordinates; z for a joint without one.
+    /// The axis in the child's coordinates; z for a joint without one.
     pub(crate) axis: Unit<Vector3<f64>>,
-    /// Lower and upper, in rad or m, as written; zero where the file says nothing.
+    /// The lower and upper limit in rad or m, as written; zero if the file gives none.
     pub(crate) limits: [f64; 2],
-    /// The file has a `limit` element with at least one of them.
+    /// True if the file has a `limit` element with at least one of them.
     pub(crate) has_limit: bool,
-    /// In rad/s or m/s, as written.
+    /// The maximum speed in rad/s or m/s, as written.
     pub(crate) velocity: Option<f64>,
     pub(crate) mimic: Option<Mimic>,
-    /// The file's line.
+    /// The line in the file.
     pub(crate) line: u32,
 }
 
-/// A joint's type.
+/// The type of a joint.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(crate) enum Kind {
     Revolute,
@@ -76,7 +76,7 @@ pub(crate) enum Kind {
     Planar,
 }
 
-/// Which joint another one follows.
+/// The joint that another one follows.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Mimic {
     pub(crate) joint: String,
@@ -85,7 +85,8 @@ pub(crate) struct Mimic {
 }
 
 impl UrdfJoint {
-    /// From the parent to the child with the joint at this position in rad or m. Floating and planar joints stay at their origin.
+    /// Returns the transform from the parent to the child with the joint at this position in rad or m. Floating and
+    /// planar joints stay at their origin.
     pub(crate) fn transform(&self, position: f64) -> Isometry3<f64> {
         match self.kind {
             Kind::Revolute | Kind::Continuous => {
@@ -96,64 +97,65 @@ impl UrdfJoint {
         }
     }
 
-    /// Its name, unless it is fixed.
+    /// Returns the name of the joint; `None` if it is fixed.
     pub(crate) fn moving_name(&self) -> Option<String> {
         (self.kind != Kind::Fixed).then(|| self.name.clone())
     }
 }
 
 impl Urdf {
-    /// Reads a file's text; `file` is its name in errors. [`text`] makes it of bytes.
+    /// Parses the text of a file; `file` is its name in errors. [`text`] decodes bytes.
     ///
     /// # Errors
-    /// When it is not XML or not a URDF, when a value is not what is allowed, or when its links are not one tree.
+    /// Returns [`RobotError`] if the text is not XML or not a URDF, if a value is not allowed, or if the links do not
+    /// form one tree.
     pub fn parse(file: &str, xml: &str) -> Result<Self, RobotError> {
         read::read(file, xml)
     }
 
-    /// The link that has no parent.
+    /// Returns the link that has no parent.
     #[must_use]
     pub fn root(&self) -> &str {
         self.link_name(self.root)
     }
 
-    /// The links' names, in the file's order.
+    /// Returns the names of the links, in the file's order.
     pub fn links(&self) -> impl Iterator<Item = &str> {
         self.links.iter().map(|link| link.name.as_str())
     }
 
-    /// The links that no joint is on: the ends of the tree, in the file's order.
+    /// Returns the links without joints on them, which are the ends of the tree, in the file's order.
     pub fn leaves(&self) -> impl Iterator<Item = &str> {
         let is_leaf = |index: &usize| self.joints.iter().all(|joint| joint.parent != *index);
         let indices = (0..self.links.len()).filter(is_leaf);
         indices.filter_map(|index| self.links.get(index)).map(|link| link.name.as_str())
     }
 
-    /// What a link looks like.
+    /// Returns the visual shapes of a link.
     ///
     /// # Errors
-    /// When there is no such link, or one of its shapes is faulty.
+    /// Returns [`RobotError`] if the link does not exist, or if one of its shapes is faulty.
     pub fn visuals(&self, link: &str) -> Result<&[Shape], RobotError> {
         self.link(link)?.1.visuals.as_deref().map_err(Clone::clone)
     }
 
-    /// What of a link hits things.
+    /// Returns the collision shapes of a link.
     ///
     /// # Errors
-    /// When there is no such link, or one of its shapes is faulty.
+    /// Returns [`RobotError`] if the link does not exist, or if one of its shapes is faulty.
     pub fn collisions(&self, link: &str) -> Result<&[Shape], RobotError> {
         self.link(link)?.1.collisions.as_deref().map_err(Clone::clone)
     }
 
-    /// The link that a link hangs on; none of the root, or of a link that does not exist.
+    /// Returns the parent of a link; `None` for the root and for a link that does not exist.
     #[must_use]
     pub fn parent(&self, link: &str) -> Option<&str> {
         let (index, _) = self.link(link).ok()?;
         self.above(index).next().map(|joint| self.link_name(joint.parent))
     }
 
-    /// Where a joint stands that nobody moves, in rad or m: at zero, or in the middle of its limits if zero is not between them. Zero
-    /// for a joint that does not exist.
+    /// Returns the rest position of a joint in rad or m: zero, or the middle of its limits if zero is not between them.
+    /// Returns zero for a joint that does not exist.
     #[must_use]
     pub fn rest(&self, joint: &str) -> f64 {
         let Some(joint) = self.joints.iter().find(|it| it.name == joint) else { return 0.0 };
@@ -163,11 +165,12 @@ impl Urdf {
         if limited && !(lower <= 0.0 && 0.0 <= upper) && middle.is_finite() { middle } else { 0.0 }
     }
 
-    /// A link's frame in the root's coordinates, by the file's own kinematics. `position` gives each joint's position in rad or m by
-    /// its name; it is not asked for joints that mimic others. Floating and planar joints stay at their origin.
+    /// Returns a link's frame in the root's coordinates, by the file's own kinematics. `position` returns each joint's
+    /// position in rad or m by its name; it is not called for joints that mimic others. Floating and planar joints stay
+    /// at their origin.
     ///
     /// # Errors
-    /// When there is no such link.
+    /// Returns [`RobotError`] if the link does not exist.
     pub fn pose(&self, link: &str, position: &dyn Fn(&str) -> f64) -> Result<Isometry3<f64>, RobotError> {
         let (index, _) = self.link(link)?;
         let transform = |joint: &UrdfJoint| match &joint.mimic {
@@ -179,7 +182,7 @@ impl Urdf {
         Ok(self.above(index).map(transform).fold(Isometry3::identity(), |pose, joint| joint * pose))
     }
 
-    /// A link and its index.
+    /// Returns a link and its index.
     fn link(&self, name: &str) -> Result<(usize, &Link), RobotError> {
         let found = self.links.iter().enumerate().find(|(_, link)| link.name == name);
         found.ok_or_else(|| {
@@ -187,33 +190,33 @@ impl Urdf {
         })
     }
 
-    /// The joints, in the file's order.
+    /// Returns the joints, in the file's order.
     pub(crate) fn joints(&self) -> &[UrdfJoint] {
         &self.joints
     }
 
-    /// A link's index.
+    /// Returns the index of a link.
     pub(crate) fn index(&self, link: &str) -> Result<usize, RobotError> {
         Ok(self.link(link)?.0)
     }
 
-    /// A link's name.
+    /// Returns the name of a link.
     pub(crate) fn link_name(&self, index: usize) -> &str {
         self.links.get(index).map_or("", |link| &link.name)
     }
 
-    /// The joints from a link up to the root.
+    /// Returns the joints from a link up to the root.
     pub(crate) fn above(&self, link: usize) -> impl Iterator<Item = &UrdfJoint> {
         let up = move |link: usize| self.joints.get(self.links.get(link)?.parent?);
         core::iter::successors(up(link), move |joint| up(joint.parent))
     }
 
-    /// An error without a line.
+    /// Creates an error without a line.
     pub(crate) fn error(&self, problem: Problem) -> RobotError {
         RobotError::new(&self.file, None, problem)
     }
 
-    /// An error at a joint.
+    /// Creates an error at a joint.
     pub(crate) fn error_at(&self, joint: &UrdfJoint, problem: Problem) -> RobotError {
         RobotError::new(&self.file, Some(joint.line), problem)
     }

@@ -1,4 +1,4 @@
-//! The file's text.
+//! Parses the text of a URDF.
 
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 use roxmltree::{Document, Node};
@@ -8,10 +8,10 @@ use super::tree::{self, Loose, Placed};
 use super::{Kind, Link, Mimic, Shapes, Urdf, UrdfJoint, xml};
 use crate::error::{Problem, RobotError};
 
-/// An axis that is shorter has no direction.
+/// The minimum length of an axis that has a direction.
 const SHORTEST_AXIS: f64 = 1e-6;
 
-/// Reads a file.
+/// Parses a file.
 pub(super) fn read(file: &str, xml: &str) -> Result<Urdf, RobotError> {
     let prepared = xml::prepared(file, xml)?;
     let document = xml::parsed(file, &prepared)?;
@@ -19,13 +19,13 @@ pub(super) fn read(file: &str, xml: &str) -> Result<Urdf, RobotError> {
     Reader { file, document: &document, lines_before: prepared.lines_before, breaks }.robot()
 }
 
-/// A file that is being read.
+/// The state of parsing a file.
 struct Reader<'a> {
     file: &'a str,
     document: &'a Document<'a>,
-    /// Lines before the document.
+    /// The number of lines before the document.
     lines_before: usize,
-    /// Where the document's lines end.
+    /// The offsets of the document's line ends.
     breaks: Vec<usize>,
 }
 
@@ -52,9 +52,9 @@ impl<'a> Reader<'a> {
         tree::grow(self.file, name, links, joints)
     }
 
-    /// Refuses what xacro would have replaced. Definitions that nothing uses are no reason.
+    /// Refuses elements and expressions that xacro would have replaced. Unused definitions are accepted.
     fn refuse_xacro(&self, robot: Node<'a, 'a>) -> Result<(), RobotError> {
-        // Only the name before the colon tells: files bind it to anything, and many bind it and do not use it.
+        // Only the prefix is decisive: files bind it to arbitrary namespaces, and many bind it without using it.
         let is_xacro = |node: &Node<'a, 'a>| self.source(node).starts_with("<xacro:");
         let defines =
             |node: &Node<'a, 'a>| is_xacro(node) && matches!(node.tag_name().name(), "property" | "arg");
@@ -95,7 +95,7 @@ impl<'a> Reader<'a> {
         Ok((Link { name, visuals, collisions, parent: None }, self.line(node)))
     }
 
-    /// A shape; none where there is no geometry.
+    /// Parses a shape; returns `None` if it has no geometry.
     fn shape(&self, node: Node<'a, 'a>, thing: &str) -> Result<Option<Shape>, RobotError> {
         let origin = self.origin(node, thing)?;
         let geometry = self.child(node, "geometry").and_then(|node| node.first_element_child());
@@ -173,7 +173,7 @@ impl<'a> Reader<'a> {
     fn axis(&self, node: Node<'a, 'a>, thing: &str, kind: Kind) -> Result<Unit<Vector3<f64>>, RobotError> {
         match kind {
             Kind::Revolute | Kind::Continuous | Kind::Prismatic => {}
-            // Often 0 0 0, and never used.
+            // The axis of these joints is often 0 0 0, and is never used.
             Kind::Fixed | Kind::Floating | Kind::Planar => return Ok(Vector3::z_axis()),
         }
         let Some(node) = self.child(node, "axis") else { return Ok(Vector3::x_axis()) };
@@ -203,7 +203,7 @@ impl<'a> Reader<'a> {
         Ok(Isometry3::from_parts(Translation3::new(x, y, z), turn))
     }
 
-    /// Direct children of the robot's namespace.
+    /// Returns direct children in the robot's namespace.
     fn children(&self, node: Node<'a, 'a>, name: &'static str) -> impl Iterator<Item = Node<'a, 'a>> {
         let namespace = self.document.root_element().tag_name().namespace();
         node.children().filter(move |child| {
@@ -211,19 +211,19 @@ impl<'a> Reader<'a> {
         })
     }
 
-    /// The first child of a name.
+    /// Returns the first child of this name.
     fn child(&self, node: Node<'a, 'a>, name: &'static str) -> Option<Node<'a, 'a>> {
         self.children(node, name).next()
     }
 
-    /// A word that has to be there.
+    /// Returns a required attribute.
     fn text(&self, node: Node<'a, 'a>, thing: &str, attribute: &'static str) -> Result<String, RobotError> {
         let text = node.attribute(attribute).map(str::trim).filter(|text| !text.is_empty());
         let missing = || Problem::Missing { thing: thing.to_owned(), missing: attribute };
         text.map(str::to_owned).ok_or_else(|| self.error(node, missing()))
     }
 
-    /// Finite numbers, if they are there: as many as the type has.
+    /// Parses an optional attribute of `N` finite numbers.
     fn numbers<const N: usize>(
         &self,
         node: Node<'a, 'a>,
@@ -237,7 +237,7 @@ impl<'a> Reader<'a> {
         numbers.map(Some).ok_or_else(|| self.value(node, thing, attribute, text, allowed))
     }
 
-    /// A number that may be infinite, if it is there.
+    /// Parses an optional attribute of one number, which may be infinite.
     fn any_number(
         &self,
         node: Node<'a, 'a>,
@@ -250,7 +250,8 @@ impl<'a> Reader<'a> {
         number.map(Some).ok_or_else(|| self.value(node, thing, attribute, text, allowed))
     }
 
-    /// A value that is not allowed; where a xacro expression was left, that is what is wrong.
+    /// Creates the error for a value that is not allowed. If the value contains a xacro expression, the error names
+    /// that.
     fn value(
         &self,
         node: Node<'a, 'a>,
@@ -286,7 +287,7 @@ impl<'a> Reader<'a> {
     }
 }
 
-/// The first expression of xacro in a value, as it is written.
+/// Returns the first xacro expression in a value, as it is written.
 fn expression(value: &str) -> Option<&str> {
     let begin = [value.find("${"), value.find("$(")].into_iter().flatten().min()?;
     let rest = value.get(begin..)?;

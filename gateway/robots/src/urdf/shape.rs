@@ -1,47 +1,47 @@
-//! What a link looks like.
+//! The shapes of a link.
 
 use nalgebra::Isometry3;
 
 /// A shape on a link.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Shape {
-    /// From the link's frame to the shape's.
+    /// The transform from the link's frame to the shape's.
     pub origin: Isometry3<f64>,
-    /// What it is.
+    /// The geometry.
     pub geometry: Geometry,
 }
 
-/// What a shape is. Lengths are in m; boxes, cylinders and spheres are centered on the shape's frame.
+/// The geometry of a shape. Lengths are in m; boxes, cylinders and spheres are centered on the shape's frame.
 #[derive(Clone, Debug, PartialEq)]
 #[non_exhaustive]
 pub enum Geometry {
     /// A file with triangles.
     Mesh {
-        /// As written: a path, `package://`, `file://`.
+        /// The reference as written: a path, `package://` or `file://`.
         path: String,
-        /// Factor along x, y and z; may be negative.
+        /// The factors along x, y and z; they may be negative.
         scale: [f64; 3],
     },
     /// A box.
     Box {
-        /// Along x, y and z.
+        /// The lengths along x, y and z.
         size: [f64; 3],
     },
     /// A cylinder along z.
     Cylinder {
-        /// Its radius.
+        /// The radius.
         radius: f64,
-        /// Its length.
+        /// The length.
         length: f64,
     },
     /// A sphere.
     Sphere {
-        /// Its radius.
+        /// The radius.
         radius: f64,
     },
-    /// Something that URDF does not have.
+    /// An element that URDF does not define.
     Other {
-        /// The element's name.
+        /// The name of the element.
         element: String,
     },
 }

@@ -1,4 +1,4 @@
-//! Links and joints, made a tree.
+//! Connects links and joints to a tree.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -6,13 +6,13 @@ use super::{Link, Urdf, UrdfJoint};
 use crate::error::{Problem, RobotError};
 use crate::nearest::nearest;
 
-/// A joint whose links are names still.
+/// A joint whose links are still names.
 pub(super) struct Loose {
     /// The joint; its parent and child are not yet set.
     pub(super) joint: UrdfJoint,
-    /// The link that it is on.
+    /// The name of the parent link.
     pub(super) parent: String,
-    /// The link that it moves.
+    /// The name of the link that it moves.
     pub(super) child: String,
 }
 
@@ -71,9 +71,9 @@ pub(super) fn grow(
     }
 }
 
-/// A link that is above itself.
+/// Returns a link that is its own ancestor.
 fn cycle(urdf: &Urdf) -> Option<&Link> {
-    // Links that have been met on the path to the root, and from which link.
+    // For each link met on a path to the root: the link from which that path began.
     let mut walked = vec![None; urdf.links.len()];
     for start in 0..urdf.links.len() {
         let mut at = Some(start);

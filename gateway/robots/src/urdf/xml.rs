@@ -1,4 +1,4 @@
-//! A file's bytes as XML, and the words for what is none.
+//! Reads a file's bytes as XML, and describes errors.
 
 use std::borrow::Cow;
 
@@ -8,11 +8,12 @@ use roxmltree::{Document, Error};
 
 use crate::error::{Problem, RobotError};
 
-/// The text of a file's bytes: UTF-8, or Latin-1 or Windows-1252 where it declares it. UTF-16 is refused, as by ROS's parser
-/// (urdfdom): a robot that is imported here loads there.
+/// Decodes the bytes of a file: UTF-8, or Latin-1 or Windows-1252 if the file declares it. UTF-16 is refused, as by the
+/// parser of ROS (urdfdom), so that a robot that is imported here also loads there.
 ///
 /// # Errors
-/// A file in another encoding, or one that stands for another file (a Git LFS pointer, a saved web page).
+/// Returns [`RobotError`] if the file has another encoding, or is a placeholder for another file (a Git LFS pointer, a
+/// saved web page).
 pub fn text<'a>(file: &str, bytes: &'a [u8]) -> Result<Cow<'a, str>, RobotError> {
     refuse_foreign(file, bytes)?;
     if let Some(name) = utf16(bytes) {
@@ -58,7 +59,7 @@ fn error(file: &str, Fault { line, what }: Fault) -> RobotError {
     RobotError::new(file, line, Problem::Xml(what))
 }
 
-/// Describes an error of the parser, and what to do.
+/// Describes an error of the parser, and the action to take.
 #[expect(clippy::wildcard_enum_match_arm, reason = "the parser's own words do for all others")]
 fn words(reason: &Error) -> String {
     let plain = |what: &str| what.to_owned();

@@ -1,4 +1,4 @@
-//! A capture of one format into the other, entry by entry.
+//! Conversion of a capture from one format into the other, entry by entry.
 
 use std::io::{self, Write};
 
@@ -8,7 +8,7 @@ pub use super::mcap::Origin;
 use super::{CaptureError, Entry, Format, Note, NoteKind, Reader};
 use thiserror::Error;
 
-/// Where entries go.
+/// A capture that is being written, in either format.
 #[derive(Debug)]
 pub struct Output<W: Write>(Form<W>);
 
@@ -19,10 +19,10 @@ enum Form<W: Write> {
 }
 
 impl<W: Write> Output<W> {
-    /// A capture of a format, made of a log; `style` is for a log.
+    /// Begins a capture that is converted from a log; `style` applies to candump text only.
     ///
     /// # Errors
-    /// When its beginning cannot be written.
+    /// Returns an error if the head of the file cannot be written.
     pub fn new(out: W, format: Format, style: Style) -> io::Result<Self> {
         Ok(match format {
             Format::Candump => Self(Form::Log(Box::new(LogWriter::new(out, style)))),
@@ -30,10 +30,10 @@ impl<W: Write> Output<W> {
         })
     }
 
-    /// A recording.
+    /// Begins an MCAP recording.
     ///
     /// # Errors
-    /// When its beginning cannot be written.
+    /// Returns an error if the head of the file cannot be written.
     pub fn recording(out: W, origin: Origin<'_>) -> io::Result<Self> {
         Ok(Self(Form::Mcap(Box::new(McapWriter::new(out, origin)?))))
     }
@@ -41,7 +41,7 @@ impl<W: Write> Output<W> {
     /// Writes an entry.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns an error if the output cannot be written.
     pub fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote> {
         match &mut self.0 {
             Form::Log(log) => log.write(entry),
@@ -49,10 +49,10 @@ impl<W: Write> Output<W> {
         }
     }
 
-    /// Hands lines on that wait for more; a recording is written in its own pieces.
+    /// Flushes buffered lines of a log. A recording is left alone: it is written in chunks.
     ///
     /// # Errors
-    /// When they cannot be written.
+    /// Returns an error if the output cannot be written.
     pub fn pass_on(&mut self) -> io::Result<()> {
         match &mut self.0 {
             Form::Log(log) => log.pass_on(),
@@ -60,10 +60,10 @@ impl<W: Write> Output<W> {
         }
     }
 
-    /// Hands everything on: what was written can be read from the output, whatever happens afterwards.
+    /// Flushes everything written so far, so that it can be read from the output whatever happens afterwards.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns an error if the output cannot be written.
     pub fn keep(&mut self) -> io::Result<()> {
         match &mut self.0 {
             Form::Log(log) => log.pass_on(),
@@ -71,10 +71,10 @@ impl<W: Write> Output<W> {
         }
     }
 
-    /// Writes what is left, and the end.
+    /// Writes what is buffered, and the end of the file.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns an error if the output cannot be written.
     pub fn finish(&mut self) -> io::Result<()> {
         match &mut self.0 {
             Form::Log(log) => log.flush(),
@@ -83,18 +83,18 @@ impl<W: Write> Output<W> {
     }
 }
 
-/// Where [`convert`] writes.
+/// The destination of [`convert`].
 pub trait Target {
     /// Writes an entry.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns an error if the output cannot be written.
     fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote>;
 
-    /// Hands lines on that wait for more.
+    /// Flushes buffered lines.
     ///
     /// # Errors
-    /// When they cannot be written.
+    /// Returns an error if the output cannot be written.
     fn pass_on(&mut self) -> io::Result<()>;
 }
 
@@ -108,41 +108,41 @@ impl<W: Write> Target for Output<W> {
     }
 }
 
-/// Frames whose line says less than the capture, by what it does not say.
+/// Counts of frames that lost information in candump text, by the kind of information.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Shortened {
-    /// Digits of their times.
+    /// Frames whose time lost digits.
     pub digits: u64,
-    /// Their direction.
+    /// Frames that lost their direction.
     pub direction: u64,
-    /// Their raw DLC.
+    /// Frames that lost their raw DLC.
     pub raw_dlc: u64,
-    /// The name of their bus.
+    /// Frames that lost the name of their bus.
     pub name: u64,
 }
 
-/// What a conversion came to.
+/// The counts of a conversion.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Converted {
-    /// Frames that were written.
+    /// Frames written.
     pub frames: u64,
-    /// Other lines and words that were written.
+    /// Other lines and texts written.
     pub notes: u64,
-    /// Lines that begin like a frame and are none.
+    /// Lines that begin like a frame but cannot be parsed.
     pub unreadable: u64,
-    /// Messages that are none of their type.
+    /// Messages that do not match their type.
     pub unreadable_messages: u64,
     /// CAN XL frames, kept as text.
     pub can_xl: u64,
-    /// Frames that whoever took the capture lost.
+    /// Frames that the recorder of the capture lost.
     pub dropped: u64,
-    /// Frames whose line says less than the capture.
+    /// Frames whose line holds less than the capture.
     pub shortened: Shortened,
-    /// Notes that are not in the output.
+    /// Notes that the output cannot hold.
     pub omitted: u64,
 }
 
-/// Why a conversion ended before its time.
+/// The error of a conversion that ended early.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ConvertError {
@@ -152,16 +152,16 @@ pub enum ConvertError {
     /// The output cannot be written.
     #[error(transparent)]
     Write(io::Error),
-    /// Something is unreadable, and nothing of that kind is let through.
+    /// An entry is unreadable, and the caller allows none.
     #[error("{0}")]
     Strict(String),
 }
 
-/// Copies all entries in their order. `unreadable` is told of each line that is no frame; what it returns
-/// says whether to go on.
+/// Copies all entries in their order. `unreadable` is called for each line or message that is not a frame; an error
+/// from it stops the conversion.
 ///
 /// # Errors
-/// When one side fails, or `unreadable` says so.
+/// Returns [`ConvertError`] if either side fails, or if `unreadable` returns an error.
 pub fn convert(
     from: &mut Reader,
     to: &mut impl Target,
@@ -173,7 +173,7 @@ pub fn convert(
             Ok(Some(entry)) => entry,
             Ok(None) => return Ok(done),
             Err(error) => {
-                // Who reads along has what came before.
+                // A reader that follows the output gets everything before the error.
                 to.pass_on().map_err(ConvertError::Write)?;
                 return Err(error.into());
             }
@@ -196,7 +196,7 @@ pub fn convert(
             }
         }
         if from.is_drained() {
-            // Somebody may be reading along.
+            // A reader may be following the output.
             to.pass_on().map_err(ConvertError::Write)?;
         }
     }

@@ -8,48 +8,48 @@ use super::mcap::Fault;
 use super::parts::PartsError;
 use crate::container::Damage;
 
-/// Why a capture cannot be read, or not further.
+/// An error of opening or reading a capture.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum CaptureError {
-    /// It cannot be opened or read.
+    /// The file cannot be opened or read.
     #[error("{name}: {source}")]
     Io {
-        /// Its name.
+        /// The name of the capture.
         name: String,
-        /// Why.
+        /// The cause.
         source: io::Error,
     },
     /// Several files are not the parts of one recording.
     #[error(transparent)]
     Parts(#[from] PartsError),
-    /// Its first bytes say that it is something else.
+    /// The first bytes belong to another format.
     #[error("{name} is {what}, and no candump log or MCAP recording: {hint}")]
     Other {
-        /// Its name.
+        /// The name of the capture.
         name: String,
-        /// What it is.
+        /// The format, such as `a gzip file`.
         what: &'static str,
-        /// What to do.
+        /// The action to take.
         hint: &'static str,
     },
-    /// From here on it is not what it was.
+    /// The rest of the file is damaged.
     #[error(
-        "{name} is damaged: {what}; {entries} frames and notes before that were read; `skinbus recover` makes a new \
-         file of what is whole"
+        "{name} is damaged: {what}; {entries} frames and notes before that were read; `skinbus recover` copies the \
+         intact part to a new file"
     )]
     Damaged {
-        /// Its name.
+        /// The name of the capture.
         name: String,
-        /// What is wrong.
+        /// The damage.
         what: Damage,
-        /// How many entries came before.
+        /// The number of entries before the damage.
         entries: u64,
     },
 }
 
 impl Fault {
-    /// As an error of a file of which so many entries have been read.
+    /// Converts the fault into an error of the file `name`, of which `entries` have been read.
     pub(super) fn of(self, name: &str, entries: u64) -> CaptureError {
         let name = name.to_owned();
         match self {

@@ -1,4 +1,4 @@
-//! The contents of a recording beside frames and notes.
+//! The contents of a recording other than frames and notes.
 
 use std::collections::BTreeMap;
 
@@ -7,44 +7,44 @@ use protocol::document::DocumentError;
 use protocol::skin::Skin;
 use serde::Serialize;
 
-/// The contents of an MCAP recording beside frames and notes, as far as it has been read.
+/// The contents of an MCAP recording other than frames and notes, as far as it has been read.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Extras {
-    /// Topics that are no frames and no notes, in the order in which they came.
+    /// Topics that hold neither frames nor notes, in the order of their first messages.
     pub topics: Vec<Topic>,
     /// Earlier frames that are latched when the recording begins.
     pub latched: Vec<Latched>,
-    /// Attachments by name; the largest without their bytes.
+    /// Attachments by name. The largest are listed without their bytes.
     pub attachments: Vec<(String, Vec<u8>)>,
-    /// Metadata by name.
+    /// Metadata records by name.
     pub metadata: Vec<(String, Vec<(String, String)>)>,
-    /// What is missing at its end, when it was never finished.
+    /// A description of the missing end, if the recording was never finished.
     pub unfinished: Option<String>,
 }
 
-/// The metadata that says when the loop of a run began.
+/// The name of the metadata record that holds the start of a run's loop.
 pub const RUN: &str = "run";
-/// Its key: the first tick, in ns since 1970.
+/// The key of the first tick's time in [`RUN`], in ns since 1970.
 const BEGAN: &str = "began_ns";
 
-/// Makes the facts of the metadata [`RUN`]: the time of the first tick, in ns since 1970.
+/// Returns the contents of the metadata record [`RUN`] for a first tick at `nanos` ns since 1970.
 #[must_use]
 pub fn facts_of_run(nanos: u64) -> BTreeMap<String, String> {
     [(BEGAN.to_owned(), nanos.to_string())].into()
 }
 
-/// Returns the seconds from a time to another, both in ns since 1970; negative before it.
+/// Returns the seconds from `zero` to `nanos`, both in ns since 1970; negative if `nanos` is earlier.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "to a nanosecond within three months")]
 pub const fn seconds_since(zero: u64, nanos: u64) -> f64 {
     if nanos < zero { (zero - nanos) as f64 / -1e9 } else { (nanos - zero) as f64 / 1e9 }
 }
 
-/// What the skin in a recording of a run is called.
+/// The name of the attachment that holds the skin of a recorded run.
 pub const SKIN: &str = "skin.toml";
 
 impl Extras {
-    /// Nothing.
+    /// The empty contents.
     pub(super) const NONE: &Self = &Self {
         topics: Vec::new(),
         latched: Vec::new(),
@@ -53,24 +53,25 @@ impl Extras {
         unfinished: None,
     };
 
-    /// A value of the metadata.
+    /// Returns the value of `key` in the metadata record `record`.
     #[must_use]
     pub fn fact(&self, record: &str, key: &str) -> Option<&str> {
         let (_, facts) = self.metadata.iter().find(|(name, _)| name == record)?;
         facts.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
     }
 
-    /// The time of the run's first tick, in ns since 1970, from which seconds count; where it is not known they count from the
-    /// capture's first frame. Of what is read only once it is not known before the first frame.
+    /// Returns the time of the run's first tick, in ns since 1970. Seconds of the run count from it, or from the
+    /// capture's first frame if it is unknown. An input that is read only once has it after the first frame at the
+    /// earliest.
     #[must_use]
     pub fn run_began(&self) -> Option<u64> {
         self.fact(RUN, BEGAN)?.parse().ok()
     }
 
-    /// The skin that is attached; `None` when none is.
+    /// Returns the attached skin; `None` if the recording has none.
     ///
     /// # Errors
-    /// Of the skin, when it is none that this version knows.
+    /// Returns [`DocumentError`] if this version cannot read the skin.
     #[must_use]
     pub fn skin(&self) -> Option<Result<Skin, DocumentError>> {
         let (_, text) = self.attachments.iter().find(|(name, _)| name == SKIN)?;
@@ -78,27 +79,27 @@ impl Extras {
     }
 }
 
-/// A frame that was on a bus before a recording began, and is still latched.
+/// A frame that was sent before a recording began and is still latched.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Latched {
-    /// Its bus.
+    /// The bus of the frame.
     pub bus: String,
-    /// Whether the recorder had sent it.
+    /// True if the recorder had sent it.
     pub own: bool,
-    /// What it is.
+    /// The frame.
     pub frame: Frame,
-    /// When it was on the bus, in ns since 1970.
+    /// The time of the frame on the bus, in ns since 1970.
     pub nanos: u64,
 }
 
-/// A topic that is neither frames nor notes.
+/// A topic that holds neither frames nor notes.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Topic {
-    /// Its name.
+    /// The name of the topic.
     #[serde(rename = "topic")]
     pub name: String,
     /// The type of its messages.
     pub schema: String,
-    /// How many.
+    /// The number of its messages.
     pub messages: u64,
 }

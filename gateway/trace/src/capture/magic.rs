@@ -1,4 +1,4 @@
-//! What a file is, by its first bytes.
+//! Recognition of a file's format by its first bytes.
 
 use std::fs::File;
 use std::io::{self, Read, Seek};
@@ -9,12 +9,12 @@ use ::mcap::records::op;
 use super::text_kinds::ASC;
 use crate::container::{self, read_some};
 
-/// Bytes among which a recording's first record is.
+/// The length in bytes of a file's beginning that must contain the header record of a recording.
 const BEGINNING: usize = 4 << 10;
 const UNPACK: &str = "unpack it first";
 const EXPORT: &str = "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can)";
 
-/// Files that are told by their first bytes. Anything else is text.
+/// First bytes of known formats. Everything else is text.
 const MAGIC: &[(&[u8], Kind)] = &[
     (b"\x89MCAP", Kind::Mcap),
     (b"PK\x03\x04", Kind::Other("a zip archive", UNPACK)),
@@ -78,17 +78,17 @@ const PCAP: Kind = Kind::Other(
 const UTF_16: Kind =
     Kind::Other("text in UTF-16", "save it as UTF-8, as with `iconv -f utf-16 -t utf-8 FILE > NEW.log`");
 
-/// What is read as a capture.
+/// The format of an input.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Kind {
     Text,
     Mcap,
-    /// What it is, and what to do.
+    /// The name of the other format, and the action to take.
     Other(&'static str, &'static str),
 }
 
-/// Reads the beginning of an input, no more of it than is needed to tell what it is, so that a pipe whose
-/// first line is slow to come is not waited for longer than that.
+/// Recognises the format of an input and returns the bytes that were read. Reads as few bytes as necessary, so that a
+/// pipe whose first line is slow does not block longer than needed.
 pub(super) fn look(input: &mut impl Read) -> io::Result<(Kind, Vec<u8>)> {
     let mut head = Vec::new();
     let longest = MAGIC.iter().map(|(magic, _)| magic.len()).max().unwrap_or(0);
@@ -110,7 +110,7 @@ pub(super) fn look(input: &mut impl Read) -> io::Result<(Kind, Vec<u8>)> {
     }
 }
 
-/// Returns true for an MCAP recording, by its first bytes or by its last, and leaves the file at its beginning.
+/// Returns true if the first or the last bytes are those of an MCAP recording, and rewinds the file.
 pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
     let (kind, _) = look(file)?;
     if kind == Kind::Mcap {
@@ -125,14 +125,14 @@ pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
         file.read_exact_at(&mut last, size - container::MAGIC.len() as u64)?;
     }
     file.rewind()?;
-    // A place in one of them, or all of one, may be damaged.
+    // Some bytes of one magic, or all bytes of the other, may be damaged.
     let alike = first.iter().zip(container::MAGIC).filter(|(one, other)| one == other).count();
     Ok(last == *container::MAGIC
         || alike > container::MAGIC.len() / 2
         || is_header(first.get(container::MAGIC.len()..).unwrap_or_default()))
 }
 
-/// Returns true for bytes that begin with a whole header record.
+/// Returns true if the bytes begin with a complete header record.
 fn is_header(bytes: &[u8]) -> bool {
     let Some((&[code, ref length @ ..], body)) = bytes.split_first_chunk::<{ container::HEAD }>() else {
         return false;
@@ -167,7 +167,7 @@ mod tests {
             Kind::Other(_, hint) => hint,
             kind @ (Kind::Text | Kind::Mcap) => panic!("{kind:?}"),
         };
-        // can_logconvert makes an empty log of a header that other programs wrote.
+        // can_logconvert writes an empty log for an ASC header of other programs.
         assert!(hint(b"date Mon Dec 6 11:21:13 am 2021\n").contains("asc2log"));
         assert!(hint(b"MDF     4.11").contains("python-can[mf4]"));
         assert!(hint(b"LOGG").contains("can_logconvert FILE NEW.log"));
@@ -176,7 +176,7 @@ mod tests {
 
     #[test]
     fn of_a_pipe_no_more_is_taken_than_tells_what_it_is() {
-        /// Gives its bytes one by one, and fails a test that wants more.
+        /// Returns its bytes one by one, and panics if the reader asks for more.
         struct Slow(&'static [u8]);
         impl Read for Slow {
             fn read(&mut self, room: &mut [u8]) -> io::Result<usize> {
@@ -186,7 +186,7 @@ mod tests {
                 Ok(1)
             }
         }
-        // A zstd file begins with a parenthesis too.
+        // The magic of skippable zstd frames begins with a parenthesis too.
         assert_eq!(look(&mut Slow(b"(1")).unwrap(), (Kind::Text, b"(1".to_vec()));
         assert_eq!(look(&mut Slow(b"PK\x03\x04")).unwrap().0, Kind::Other("a zip archive", UNPACK));
     }

@@ -6,8 +6,8 @@
 //!   MCAP ─────────┘                      └── dump, replay, explain
 //! ```
 //!
-//! An [`Entry`] keeps everything that either format says of a frame, so that a capture comes back from the other
-//! one as it was. Entries stand in the order of the file, which is not always that of their times.
+//! An [`Entry`] keeps all information that either format holds of a frame, so that a capture survives the round trip
+//! through the other format. Entries are in the order of the file, which is not always the order of their times.
 
 pub mod convert;
 mod error;
@@ -39,13 +39,13 @@ use std::io::Read;
 
 use protocol::candump::Record;
 
-/// What a file is read through.
+/// A wrapper around each opened file, such as a progress meter.
 pub type Through = Box<dyn Fn(File) -> Box<dyn Read + Send> + Send>;
 
-/// What a capture is written in.
+/// The format of a capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Format {
-    /// Text of `candump -L`.
+    /// Text in the format of `candump -L`.
     Candump,
     /// An MCAP recording.
     Mcap,
@@ -56,14 +56,14 @@ pub enum Format {
 pub enum Entry<'a> {
     /// A frame.
     Frame(Record<'a>),
-    /// Something that is no frame, and has its place between them.
+    /// Anything else that has a position between frames.
     Note(Note<'a>),
 }
 
-/// One thing of a recording that is read with all its topics.
+/// One item of a recording that is read with all its topics.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Item<'a> {
-    /// A frame, or what stands between frames.
+    /// A frame or a note.
     Entry(Entry<'a>),
     /// A message of another topic.
     Other(Other<'a>),
@@ -72,12 +72,12 @@ pub enum Item<'a> {
 /// A message that is neither a frame nor a note.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Other<'a> {
-    /// Its topic.
+    /// The topic.
     pub topic: &'a str,
-    /// Its type.
+    /// The type of the message.
     pub schema: &'a str,
-    /// When, in ns since 1970.
+    /// The time, in ns since 1970.
     pub nanos: u64,
-    /// The message as the recording has it.
+    /// The encoded message.
     pub message: &'a [u8],
 }

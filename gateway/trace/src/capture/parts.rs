@@ -1,11 +1,12 @@
-//! The parts of a split recording, as one.
+//! Joins the parts of a split recording into one capture.
 //!
 //! ```text
-//!   run-10.mcap run-2.mcap run.mcap ...  ── order ──>  run.mcap run-1.mcap run-2.mcap ...
+//! run-10.mcap run-2.mcap run.mcap ...  ── order ──>  run.mcap run-1.mcap run-2.mcap ...
 //! ```
 //!
-//! Each part says which one it is and of which recording. What a shell makes of `run*.mcap` is put in order by that,
-//! whatever the files are called. Logs, and recordings that other programs split, are put in order by their first frames.
+//! Each part stores its number and the identity of its recording. The order of `run*.mcap`, as a shell expands it, is
+//! corrected by these, whatever the names of the files. Logs, and recordings that other programs split, are ordered by
+//! their first frames.
 
 use std::collections::HashSet;
 use std::fs;
@@ -15,91 +16,91 @@ use thiserror::Error;
 
 use super::{Extras, Format};
 
-/// Why several files are not the parts of one recording.
+/// The error for files that are not the parts of one recording.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum PartsError {
-    /// Not even one.
+    /// The list of files is empty.
     #[error("no file is named: name a capture")]
     None,
-    /// One is a part of a recording, and another is not.
-    #[error("{} is a part of a recording, and {} is none: name the parts alone", .part.display(), .other.display())]
+    /// One file is a part of a recording, and another is not.
+    #[error("{} is a part of a recording, but {} is not: name only the parts", .part.display(), .other.display())]
     Mixed {
         /// The part.
         part: PathBuf,
-        /// The other one.
+        /// The other file.
         other: PathBuf,
     },
-    /// Logs and recordings are not one capture.
-    #[error("{} is a candump log, and {} an MCAP recording: make a log of it first with `skinbus convert`", .log.display(), .mcap.display())]
+    /// The files are of both formats.
+    #[error("{} is a candump log, and {} an MCAP recording: convert it to a log first with `skinbus convert`", .log.display(), .mcap.display())]
     Formats {
-        /// The log.
+        /// A log.
         log: PathBuf,
-        /// The recording.
+        /// A recording.
         mcap: PathBuf,
     },
-    /// A text among captures.
-    #[error("{} has no frame in it: name captures alone", .0.display())]
+    /// One file is text without frames.
+    #[error("{} contains no frames: name only captures", .0.display())]
     NoFrame(PathBuf),
-    /// One is named twice.
+    /// One file is listed twice.
     #[error("{} is named twice: name it once", .0.display())]
     Same(PathBuf),
-    /// One has no name.
-    #[error("- is standard input, which cannot be one of several files: name files alone")]
+    /// Standard input cannot be one of several files.
+    #[error("- is standard input, which cannot be one of several files: name only files")]
     StandardInput,
-    /// Two belong to different recordings.
+    /// Two parts belong to different recordings.
     #[error(
-        "{} and {} are of different recordings, begun at {} and {} ns: name the parts of one",
+        "{} and {} belong to different recordings, begun at {} and {} ns: name the parts of one",
         .one.path.display(), .other.path.display(), .one.began, .other.began
     )]
     Different {
-        /// One of them.
+        /// One part.
         one: Part,
-        /// The other one.
+        /// The other part.
         other: Part,
     },
-    /// Two are the same part.
+    /// Two files are the same part.
     #[error(
         "{} and {} are both part {} of the recording: name one of them",
         .one.path.display(), .other.path.display(), .one.number
     )]
     Twice {
-        /// One of them.
+        /// One file.
         one: Part,
-        /// The other one.
+        /// The other file.
         other: Part,
     },
-    /// One is missing between two others.
+    /// One part is missing between two others.
     #[error(
         "part {} of the recording is missing between {} and {}: name all parts from the first to the last, or one alone",
         .one.number + 1, .one.path.display(), .next.path.display()
     )]
     Missing {
-        /// The one before.
+        /// The part before the gap.
         one: Part,
-        /// The next one that is there.
+        /// The part after the gap.
         next: Part,
     },
 }
 
-/// Which part of which recording a file is.
+/// The number of a part, and the recording that it belongs to.
 #[derive(Clone, Debug)]
 pub struct Part {
     path: PathBuf,
-    /// When the recording began, in ns since 1970.
+    /// The start of the recording, in ns since 1970. It identifies the recording.
     began: String,
     number: u32,
 }
 
 impl Part {
-    /// By what the file has beside its frames; `None` when it is no part of anything.
+    /// Reads the identity from the metadata of the file; `None` if the file is not a part.
     fn of(path: &Path, extras: &Extras) -> Option<Self> {
         let (began, number) = extras.fact("program", "began_ns").zip(extras.fact("part", "number"))?;
         Some(Self { path: path.to_owned(), began: began.to_owned(), number: number.parse().ok()? })
     }
 }
 
-/// One of several files.
+/// One of several files, with the facts that decide its position.
 #[derive(Debug)]
 pub(super) struct Named {
     pub(super) path: PathBuf,
@@ -107,23 +108,23 @@ pub(super) struct Named {
     part: Option<Part>,
     /// The time of its first frame, in ns since 1970.
     first: Option<u64>,
-    /// Set if it has lines and no frame.
+    /// True if it has lines and no frame.
     is_text: bool,
 }
 
 impl Named {
-    /// A file whose lines up to the first frame have been counted; a recording has none.
+    /// Describes a file. `lines` counts its lines up to the first frame; it is 0 for a recording.
     pub(super) fn new(path: &Path, extras: &Extras, format: Format, first: Option<u64>, lines: u64) -> Self {
         let (part, is_text) = (Part::of(path, extras), first.is_none() && lines > 0);
         Self { path: path.to_owned(), format, part, first, is_text }
     }
 }
 
-/// The files in the order in which they are read: parts of one recording by their numbers, and others by the times of
-/// their first frames.
+/// Returns the files in the order in which they are read: parts of one recording by their numbers, others by the times
+/// of their first frames.
 ///
 /// # Errors
-/// When they are not one capture.
+/// Returns [`PartsError`] if the files are not one capture.
 pub(super) fn together(mut files: Vec<Named>) -> Result<Vec<PathBuf>, PartsError> {
     if let Some(text) = files.iter().find(|file| file.is_text) {
         return Err(PartsError::NoFrame(text.path.clone()));
@@ -150,10 +151,11 @@ pub(super) fn together(mut files: Vec<Named>) -> Result<Vec<PathBuf>, PartsError
     Ok(files.into_iter().map(|file| file.path).collect())
 }
 
-/// The files of parts, in their order.
+/// Returns the files of the parts, by part number.
 ///
 /// # Errors
-/// When they are not all parts of one recording, one is missing between two others, or is there twice.
+/// Returns [`PartsError`] if the parts belong to different recordings, if one is missing between two others, or if one
+/// occurs twice.
 fn ordered(mut parts: Vec<Part>) -> Result<Vec<PathBuf>, PartsError> {
     parts.sort_by_key(|part| part.number);
     for pair in parts.windows(2) {
@@ -171,7 +173,7 @@ fn ordered(mut parts: Vec<Part>) -> Result<Vec<PathBuf>, PartsError> {
     Ok(parts.into_iter().map(|part| part.path).collect())
 }
 
-/// What several files are called together.
+/// Returns a common name for several files.
 pub(super) fn title(paths: &[PathBuf]) -> String {
     match paths {
         [] => String::new(),

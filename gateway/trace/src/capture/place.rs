@@ -1,50 +1,51 @@
-//! Places in a capture at which a reader can go on.
+//! Positions in a capture at which a reader can continue.
 
 use std::path::{Path, PathBuf};
 
 use super::log::Clock;
 use super::mcap::{Fault, State};
 
-/// Where in a capture an entry is.
+/// The position of an entry in a capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Place {
-    /// Which part, from 0.
+    /// The index of the part.
     pub(super) part: usize,
-    /// Bytes of the part before the record or the line.
+    /// The byte offset of the record or line in its part.
     pub(super) offset: u64,
-    /// Lines before it, where they were counted.
+    /// The number of lines before it, if they were counted.
     pub(super) line: u64,
-    /// Entries of the record before it.
+    /// The number of entries before it in the same record.
     pub(super) skip: u32,
-    /// The times of a log up to there.
+    /// The clock of a log at this position.
     pub(super) clock: Clock,
 }
 
-/// Some places of a capture, by time.
+/// An index of positions in a capture, by time.
 #[derive(Debug)]
 pub struct Places {
     pub(super) parts: Vec<Part>,
-    /// In their order, each with the latest time of all that stands before the next one, in ns since 1970.
+    /// The positions in their order, each with the latest time of all entries before the next position, in ns since
+    /// 1970.
     pub(super) marks: Vec<(u64, Place)>,
-    /// Bytes of a file from one place to the next.
+    /// The minimum distance between two positions of a file, in bytes.
     pub(super) piece: u64,
 }
 
 #[derive(Debug)]
 pub(super) struct Part {
     pub(super) path: PathBuf,
-    /// Records of the summary that say what the messages are: operation codes and contents.
+    /// Records of the summary that describe the messages: operation codes and contents.
     pub(super) descriptions: Vec<(u8, Vec<u8>)>,
 }
 
 impl Places {
-    /// The latest time in the capture, in ns since 1970, as its places say; 0 of an empty one.
+    /// Returns the latest time in the capture, in ns since 1970, as far as the index knows; 0 for an empty capture.
     #[must_use]
     pub fn latest(&self) -> u64 {
         self.marks.last().map_or(0, |(latest, _)| *latest)
     }
 
-    /// The last place that has nothing of this time or later before it.
+    /// Returns the last position that has only entries earlier than `nanos` before it.
     #[must_use]
     pub fn before(&self, nanos: u64) -> Place {
         let at = self.marks.partition_point(|(latest, _)| *latest < nanos);
@@ -55,12 +56,12 @@ impl Places {
         self.parts.get(part).map(|part| part.path.as_path())
     }
 
-    /// The parts behind one.
+    /// Returns the files of the parts after `part`.
     pub(super) fn behind(&self, part: usize) -> impl Iterator<Item = &PathBuf> {
         self.parts.iter().skip(part + 1).map(|part| &part.path)
     }
 
-    /// Says to the state of a reader what the messages of a part are.
+    /// Passes the message descriptions of a part to the state of a reader.
     pub(super) fn describe(&self, part: usize, state: &mut State) -> Result<(), Fault> {
         for (opcode, body) in self.parts.get(part).into_iter().flat_map(|part| &part.descriptions) {
             state.take(*opcode, body, false)?;

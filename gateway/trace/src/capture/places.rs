@@ -1,9 +1,10 @@
-//! The search for places at which a reader can go on, so that a moment is found without reading all that is before it.
+//! Builds the index of positions at which a reader can continue, so that a time is found without reading everything
+//! before it.
 //!
 //! ```text
-//!   MCAP:  heads of chunks ─────────────────┐
-//!                                           ├──> Places ── before(time) ──> Place ──> Reader::go_to
-//!   log:   a line of each piece of the file ┘
+//! MCAP:  heads of chunks ─────────────────┐
+//!                                         ├──> Places ── before(time) ──> Place ──> Reader::go_to
+//! log:   a line of each piece of the file ┘
 //! ```
 
 use std::fs::File;
@@ -20,23 +21,24 @@ use super::{CaptureError, Entry, Reader};
 use crate::container::{LONGEST_DESCRIPTION, MAGIC, find};
 use crate::order::WINDOW_NS;
 
-/// Bytes from one place of a file to the next.
+/// The minimum distance between two positions of a file, in bytes.
 const PIECE: u64 = 64 << 10;
-/// Bytes of descriptions that are kept of a part.
+/// The maximum size of the descriptions that are kept for a part, in bytes.
 const DESCRIPTIONS: usize = 16 << 20;
-/// Bytes of a log's end among which its last frame is looked for.
+/// The length of a log's end in which its last frame is searched, in bytes.
 const END: u64 = 4 * LONGEST_LINE as u64;
 
 impl Places {
-    /// Those of one file, or of the parts of one recording in any order. Reads of each only what says when it was written.
+    /// Indexes one file, or the parts of one recording in any order. Reads only the times in each file.
     ///
     /// # Errors
-    /// When a file cannot be read or gone back in, or they are not parts of one recording.
+    /// Returns [`CaptureError`] if a file cannot be read or is not seekable, or if the files are not parts of one
+    /// recording.
     pub fn of(paths: &[PathBuf]) -> Result<Self, CaptureError> {
         Self::apart(paths, PIECE)
     }
 
-    /// The same with a place for each so many bytes.
+    /// Indexes the files with a position every `piece` bytes.
     fn apart(paths: &[PathBuf], piece: u64) -> Result<Self, CaptureError> {
         let mut places = Self { parts: Vec::new(), marks: Vec::new(), piece };
         for path in Reader::ordered(paths)? {
@@ -49,15 +51,15 @@ impl Places {
     fn add(&mut self, path: &Path) -> io::Result<()> {
         let mut file = input::open(path)?;
         if !file.metadata()?.is_file() {
-            let why = "it is no regular file, and cannot be gone back in: write it to a file first";
+            let why = "it is not a regular file, and not seekable: write it to a file first";
             return Err(io::Error::new(io::ErrorKind::NotSeekable, why));
         }
         self.parts.push(Part { path: path.to_owned(), descriptions: Vec::new() });
         if is_mcap(&mut file)? { self.add_mcap(file) } else { self.add_log(file) }
     }
 
-    /// A place in the last part, if the one before it is far enough away; everything before the next one is at `latest`
-    /// or earlier.
+    /// Adds a position in the last part if it is far enough from the one before. All entries before the next position
+    /// have times up to `latest`.
     fn mark(&mut self, place: Place, latest: u64) {
         let place = Place { part: self.parts.len() - 1, ..place };
         let latest = latest.max(self.latest());
@@ -71,7 +73,7 @@ impl Places {
 
     fn add_mcap(&mut self, file: File) -> io::Result<()> {
         const TARGET: &[u8] = &[op::CHUNK, op::MESSAGE, op::SCHEMA, op::CHANNEL, op::FOOTER];
-        // Most of what is passed over is longer than this.
+        // Most of the skipped data is longer than this.
         let mut from = BufReader::with_capacity(4 << 10, file);
         from.seek(SeekFrom::Start(MAGIC.len() as u64))?;
         let mut described = 0;
@@ -107,7 +109,8 @@ impl Places {
         Ok(())
     }
 
-    /// A line of every piece. Its neighbours of other buses may be older and newer by the window of the order.
+    /// Indexes one line of every piece of a log. Neighbouring lines of other buses may differ in time by the window of
+    /// the merge.
     fn add_log(&mut self, mut file: File) -> io::Result<()> {
         let length = file.metadata()?.len();
         let mut last = Place::default();
@@ -131,7 +134,7 @@ impl Places {
         Ok(())
     }
 
-    /// The same of a log whose times depend on all lines before them.
+    /// Indexes a log whose times depend on all lines before them, by reading it whole.
     fn add_by_reading(&mut self, mut file: File) -> io::Result<()> {
         file.rewind()?;
         let part = self.parts.len() - 1;
@@ -155,13 +158,13 @@ const fn is_line_end(byte: u8) -> bool {
     matches!(byte, b'\n' | b'\r')
 }
 
-/// The first frame of a log at this place or behind it: where its line begins, and its time if it says that itself.
+/// Returns the first frame of a log at or after `at`: the offset of its line, and its time if the line holds one.
 fn line_at(file: &mut File, at: u64) -> io::Result<Option<(u64, Option<u64>)>> {
     file.seek(SeekFrom::Start(at))?;
     let mut piece = Vec::new();
     file.take(2 * LONGEST_LINE as u64).read_to_end(&mut piece)?;
     let mut from = at;
-    // Within a line, unless it is the first one.
+    // The first line of a piece is incomplete, unless the piece begins the file.
     for (number, line) in piece.split_inclusive(|&byte| is_line_end(byte)).enumerate() {
         let text = line.trim_ascii_end();
         if let Some(nanos) = known_time(text).filter(|_| number > 0 || at == 0) {

@@ -1,4 +1,4 @@
-//! Reading a capture of either format.
+//! The reader of captures in either format.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -17,27 +17,27 @@ use super::text_kinds::kind_of;
 use super::times::Times;
 use super::{CaptureError, Entry, Extras, Format, Item, Through};
 
-/// Reads a capture from its beginning to its end, in bounded memory. The parts of a split recording are one capture.
+/// Reads a capture from its beginning to its end in bounded memory. The parts of a split recording are one capture.
 pub struct Reader {
-    /// What all of it is called.
+    /// The name of the whole capture.
     name: String,
-    /// The file that is being read.
+    /// The name of the file that is being read.
     file: String,
     source: Source,
-    /// Whether messages of all topics are requested.
+    /// True if messages of all topics are requested.
     others: bool,
     entries: u64,
-    /// Which of the parts it is, from 0.
+    /// The index of the current part.
     part: usize,
-    /// Parts that follow.
+    /// The parts that follow.
     rest: VecDeque<PathBuf>,
     through: Through,
-    /// Whether a part before this one has no end.
+    /// True if a part before this one has no end.
     is_unfinished: bool,
-    /// The buses of other people's frames, as far as they are known before they are read.
+    /// The buses of other programs' frames, if they are known before the frames are read.
     buses: Buses,
     times: Times,
-    /// The file before this one, until the first frame of this one is read.
+    /// The name of the file before this one, until the first frame of this one is read.
     before: Option<String>,
     /// Remarks on the logs before this one.
     remarks: Vec<Remark>,
@@ -49,7 +49,7 @@ enum Source {
 }
 
 impl Source {
-    /// Of a recording that is a regular file, attachments and metadata are known from the beginning.
+    /// Opens a file. The attachments and metadata of a recording are known from the beginning if it is a regular file.
     fn open(path: &Path, through: &Through, mut state: State) -> Result<(String, Self), CaptureError> {
         let name = path.display().to_string();
         let failed = |source| CaptureError::Io { name: name.clone(), source };
@@ -72,7 +72,7 @@ impl Source {
     ) -> Result<Self, CaptureError> {
         let (name, mut input) = (name.to_owned(), Box::new(input));
         match magic::look(&mut input) {
-            // A recording whose first bytes are damaged; the reader reports them.
+            // The first bytes of the recording are damaged; the reader reports them.
             Ok((Kind::Text, head)) if file.is_some() => Ok(Self::mcap(&head, input, state, file)),
             Ok((Kind::Text, head)) => Ok(Self::Log(LogReader::new(&head, input))),
             Ok((Kind::Mcap, head)) => Ok(Self::mcap(&head, input, state, file)),
@@ -85,7 +85,7 @@ impl Source {
         Self::Mcap(Box::new(McapReader::new(head, input, state, file)))
     }
 
-    /// Returns true behind its last entry.
+    /// Returns true after the last entry.
     fn is_at_its_end(&mut self, name: &str, entries: u64) -> Result<bool, CaptureError> {
         let at_its_end = match self {
             Self::Log(log) => log.is_at_its_end().map_err(Fault::from),
@@ -105,19 +105,18 @@ impl fmt::Debug for Reader {
 }
 
 impl Reader {
-    /// Opens a file, or standard input by the name `-`.
+    /// Opens a file, or standard input for the name `-`.
     ///
     /// # Errors
-    /// When it cannot be opened or is no capture.
+    /// Returns [`CaptureError`] if it cannot be opened or is not a capture.
     pub fn open(path: &Path) -> Result<Self, CaptureError> {
         Self::open_all(&[path.to_owned()])
     }
 
-    /// Reads from anything; the name is for errors. What it is, is told by its first bytes, which are waited
-    /// for here.
+    /// Reads from any input; `name` is used in errors. Blocks until the first bytes show the format.
     ///
     /// # Errors
-    /// When it cannot be read or is no capture.
+    /// Returns [`CaptureError`] if the input cannot be read or is not a capture.
     pub fn from_read(
         name: impl Into<String>,
         input: impl Read + Send + 'static,
@@ -127,27 +126,27 @@ impl Reader {
         Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), plain(), false))
     }
 
-    /// Opens one file, or several as one capture: the parts of one recording in any order, or other files, which are read
-    /// in the order of their first frames.
+    /// Opens one file, or several as one capture: the parts of one recording in any order, or other files, which are
+    /// read in the order of their first frames.
     ///
     /// # Errors
-    /// As [`Reader::open`]; when several files are not one capture.
+    /// Returns [`CaptureError`] as [`Reader::open`] does, and if several files are not one capture.
     pub fn open_all(paths: &[PathBuf]) -> Result<Self, CaptureError> {
         Self::open_parts(paths, plain(), false)
     }
 
-    /// The same, read through something.
+    /// Opens a capture whose files are read through the wrapper `through`.
     ///
     /// # Errors
-    /// As [`Reader::open_all`].
+    /// Returns [`CaptureError`] as [`Reader::open_all`] does.
     pub fn open_through(paths: &[PathBuf], through: Through) -> Result<Self, CaptureError> {
         Self::open_parts(paths, through, false)
     }
 
-    /// The same, with the messages of all topics, which [`Reader::next_item`] gives out.
+    /// Opens a capture with the messages of all topics, which [`Reader::next_item`] returns.
     ///
     /// # Errors
-    /// As [`Reader::open_all`].
+    /// Returns [`CaptureError`] as [`Reader::open_all`] does.
     pub fn open_with_others(paths: &[PathBuf]) -> Result<Self, CaptureError> {
         Self::open_parts(paths, plain(), true)
     }
@@ -170,8 +169,8 @@ impl Reader {
         Ok(Self { buses, ..Self::begin(name, opened, rest, through, others) })
     }
 
-    /// The buses of other people's frames in all of the files; none where they need not be known before. Files that
-    /// cannot be read report that when they are.
+    /// Returns the buses of other programs' frames in all files; empty if they need not be known in advance. Unreadable
+    /// files are skipped here, because reading reports them.
     fn survey<'a>(paths: impl Iterator<Item = &'a PathBuf> + Clone) -> Buses {
         let recording = |path: &&PathBuf| {
             let mut file = input::can_be_read_again(path).then(|| File::open(path).ok()).flatten()?;
@@ -188,7 +187,7 @@ impl Reader {
         files.fold(Buses::default(), |known, file| survey.buses_of(Box::new(file), known)).settled()
     }
 
-    /// The parts of a recording in their order.
+    /// Returns the parts of a recording in their order.
     pub(super) fn ordered(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CaptureError> {
         if let [] | [_] = paths {
             return Ok(paths.to_vec());
@@ -197,7 +196,7 @@ impl Reader {
             true => Err(CaptureError::from(PartsError::StandardInput)),
             false => {
                 let mut reader = Self::open(path)?;
-                // What is a part says so before its frames.
+                // A part holds its number before its frames.
                 let first = reader.first_time();
                 Ok(Named::new(path, reader.extras(), reader.format(), first, reader.lines()))
             }
@@ -205,7 +204,7 @@ impl Reader {
         Ok(parts::together(paths.iter().map(named).collect::<Result<_, CaptureError>>()?)?)
     }
 
-    /// The time of the first frame; none where it cannot be read up to there.
+    /// Returns the time of the first frame; `None` if the capture has no readable frame.
     fn first_time(&mut self) -> Option<u64> {
         loop {
             match self.next() {
@@ -216,10 +215,10 @@ impl Reader {
         }
     }
 
-    /// Reads on up to the first frame; whether there is one.
+    /// Reads up to the first frame. Returns true if the capture has one.
     ///
     /// # Errors
-    /// As of [`Reader::next`].
+    /// Returns [`CaptureError`] as [`Reader::next`] does.
     pub fn has_frame(&mut self) -> Result<bool, CaptureError> {
         loop {
             match self.next()? {
@@ -254,13 +253,13 @@ impl Reader {
         }
     }
 
-    /// What it is called: its name, or those of its first and last part.
+    /// Returns the name of the capture: that of its file, or those of its first and last part.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Goes on with the part that follows; whether there is one.
+    /// Opens the next part. Returns false after the last one.
     fn go_on(&mut self) -> Result<bool, CaptureError> {
         let Some(path) = self.rest.pop_front() else { return Ok(false) };
         self.part += 1;
@@ -282,7 +281,7 @@ impl Reader {
         Ok(true)
     }
 
-    /// Where its next entry is. Of an input that cannot be gone back in it is of no use.
+    /// Returns the position of the next entry. It is useful only for seekable inputs.
     #[must_use]
     pub const fn place(&self) -> Place {
         let (offset, skip) = match &self.source {
@@ -295,10 +294,10 @@ impl Reader {
         Place { part: self.part, offset, line: 0, skip, clock: Clock::NEW }
     }
 
-    /// Goes to a place of the same capture; what comes next is the entry there.
+    /// Seeks to a position of the same capture; the entry there is read next.
     ///
     /// # Errors
-    /// When it cannot be read, or is damaged: then nothing more comes.
+    /// Returns [`CaptureError`] if the capture cannot be read or is damaged; reading ends then.
     pub fn go_to(&mut self, places: &Places, place: Place) -> Result<(), CaptureError> {
         let Some(path) = places.path(place.part) else { return Ok(()) };
         if self.part != place.part || place.offset == 0 {
@@ -332,7 +331,7 @@ impl Reader {
         Ok(())
     }
 
-    /// What it is written in.
+    /// Returns the format of the current file.
     #[must_use]
     pub const fn format(&self) -> Format {
         match self.source {
@@ -341,27 +340,27 @@ impl Reader {
         }
     }
 
-    /// The next entry, in the order of the file; `None` after the last one. Never panics.
+    /// Returns the next entry in the order of the file; `None` after the last one. Never panics.
     ///
     /// # Errors
-    /// When it cannot be read, or is damaged: then nothing more comes.
+    /// Returns [`CaptureError`] if the capture cannot be read or is damaged; reading ends then.
     #[expect(
         clippy::should_implement_trait,
         reason = "an entry borrows from the reader; an iterator's cannot"
     )]
     pub fn next(&mut self) -> Result<Option<Entry<'_>>, CaptureError> {
-        // Only what was opened with others has them.
+        // Only a reader that was opened with all topics returns other messages.
         Ok(match self.next_item()? {
             Some(Item::Entry(entry)) => Some(entry),
             Some(Item::Other(_)) | None => None,
         })
     }
 
-    /// The next entry, or message of another topic where these are requested, in the order of the file; `None` after the
-    /// last one. Never panics.
+    /// Returns the next entry, or the next message of another topic if these were requested, in the order of the file;
+    /// `None` after the last one. Never panics.
     ///
     /// # Errors
-    /// When it cannot be read, or is damaged: then nothing more comes.
+    /// Returns [`CaptureError`] if the capture cannot be read or is damaged; reading ends then.
     pub fn next_item(&mut self) -> Result<Option<Item<'_>>, CaptureError> {
         while !self.rest.is_empty() && self.source.is_at_its_end(&self.file, self.entries)? {
             self.go_on()?;
@@ -382,15 +381,16 @@ impl Reader {
         Ok(next)
     }
 
-    /// Whether its entries are lines of a log, now or before it was converted. Else what was left to whoever
-    /// took the capture is in it too, as each frame's direction.
+    /// Returns true if the entries are lines of a log, or were before a conversion. Other recordings also hold
+    /// information that a log leaves out, such as the direction of each frame.
     #[must_use]
     pub fn is_of_a_log(&self) -> bool {
         let (key, value) = SOURCE;
         self.format() == Format::Candump || self.extras().fact(ORIGIN, key) == Some(value)
     }
 
-    /// Lines of a log so far: the number of the last entry's; 0 in an MCAP recording.
+    /// Returns the number of log lines read so far, which is the line number of the last entry; 0 for an MCAP
+    /// recording.
     #[must_use]
     pub const fn lines(&self) -> u64 {
         match &self.source {
@@ -399,13 +399,13 @@ impl Reader {
         }
     }
 
-    /// Remarks on times, flags and buses of the frames so far, a line each.
+    /// Returns remarks on the times, flags and buses of the frames so far, one per line.
     #[must_use]
     pub fn remarks(&self) -> Vec<String> {
         self.times.backwards().into_iter().chain(self.remarks_beside_order()).collect()
     }
 
-    /// Remarks without the one on the order of times.
+    /// Returns the remarks without the one on the order of times.
     #[must_use]
     pub fn remarks_beside_order(&self) -> Vec<String> {
         let shared = match &self.source {
@@ -427,13 +427,13 @@ impl Reader {
         remarks
     }
 
-    /// Returns false when lines without a time were read.
+    /// Returns false if lines without a time were read.
     #[must_use]
     pub fn has_times(&self) -> bool {
         !self.log_remarks().contains(&Remark::NoTimes)
     }
 
-    /// Names the kind of a text without frames, and what to do with it, by its first lines.
+    /// Recognises the kind of a text without frames by its first lines. Returns its name and the action to take.
     #[must_use]
     pub fn text_kind(&self) -> Option<(&'static str, &'static str)> {
         match &self.source {
@@ -442,7 +442,7 @@ impl Reader {
         }
     }
 
-    /// Returns true when a channel so far has frames of another program's type.
+    /// Returns true if a channel so far has frames of another program's message type.
     #[must_use]
     pub fn has_foreign_frames(&self) -> bool {
         match &self.source {
@@ -451,8 +451,8 @@ impl Reader {
         }
     }
 
-    /// Whether all that has been taken from the input is used up, so that the next entry may take a while: the
-    /// time to flush what is shown of a live pipe.
+    /// Returns true if all data taken from the input is used up, so that the next entry may take a while. Output that
+    /// follows a live pipe is flushed then.
     #[must_use]
     pub fn is_drained(&self) -> bool {
         match &self.source {
@@ -461,8 +461,8 @@ impl Reader {
         }
     }
 
-    /// What it has beside frames and notes, as far as it has been read; what stands before the first of them, from
-    /// the beginning. A log has nothing.
+    /// Returns the contents other than frames and notes, as far as they have been read. Those before the first frame
+    /// are there from the beginning. A log has none.
     #[must_use]
     pub fn extras(&self) -> &Extras {
         match &self.source {
@@ -472,7 +472,7 @@ impl Reader {
     }
 }
 
-/// Files as they are.
+/// Returns the wrapper that leaves files unchanged.
 fn plain() -> Through {
     Box::new(|file| Box::new(file))
 }

@@ -1,17 +1,17 @@
-//! Kinds of texts without frames, by their first lines.
+//! Recognition of texts without frames, by their first lines.
 
 const EXPORT: &str =
     "no converter of it is known here: export it as a candump log from the program that wrote it";
 pub(super) const ASC: (&str, &str) =
     ("a Vector ASC log", "write a candump log with can-utils' `asc2log -I FILE -O NEW.log`");
 
-/// The kind of a skin or a scenario.
+/// The kind of a skin or scenario file.
 pub const DESCRIPTION: &str = "a skin or a scenario";
-/// Tables that skins and scenarios have, and other files hardly.
+/// Headings of tables that occur in skins and scenarios and hardly in other files.
 const TABLES: [&str; 7] =
     ["[robot]", "[[chain]]", "[[bus]]", "[[cell]]", "[motion]", "[[touch]]", "[[fault]]"];
 
-/// Names the kind of a text, and what to do with it; `None` for an unknown one.
+/// Returns the kind of a text and the action to take; `None` for an unknown kind.
 pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
     let text = String::from_utf8_lossy(text);
     let lines: Vec<_> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
@@ -82,19 +82,19 @@ fn is_hex(word: &str) -> bool {
     !word.is_empty() && word.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
-/// `1)  1841  0001  8  00 ...`, with or without `Rx` before the identifier.
+/// Matches `1)  1841  0001  8  00 ...`, with or without `Rx` before the identifier.
 fn is_trc(words: &[String]) -> bool {
     let number = words.first().and_then(|word| word.strip_suffix(')'));
     let is_number = number.is_some_and(|word| word.parse::<u64>().is_ok());
     is_number && words.get(1).is_some_and(|word| word.parse::<f64>().is_ok()) && words.len() > 3
 }
 
-/// `Chn Identifier Flg DLC ...` or `... logging started`.
+/// Matches `Chn Identifier Flg DLC ...` or a line with `Kvaser`.
 fn is_kvaser(line: &str) -> bool {
     line.starts_with("Chn Identifier") || line.contains("Kvaser")
 }
 
-/// `1320745424.002 1R11 402 FA 01`, and headers with `CXX`.
+/// Matches `1320745424.002 1R11 402 FA 01`, and headers with `CXX`.
 fn is_crtd(words: &[String]) -> bool {
     let [time, kind, ..] = words else { return false };
     let kind = kind.trim_start_matches(|digit: char| digit.is_ascii_digit());
@@ -102,7 +102,7 @@ fn is_crtd(words: &[String]) -> bool {
     is_of_crtd && time.parse::<f64>().is_ok()
 }
 
-/// `2016-02-28T19:57:02.364Z,6,129285,204,255,8,...`.
+/// Matches `2016-02-28T19:57:02.364Z,6,129285,204,255,8,...`.
 fn is_canboat(line: &str) -> bool {
     let fields: Vec<_> = line.split(',').collect();
     let [time, rest @ ..] = fields.as_slice() else { return false };
@@ -114,16 +114,16 @@ fn is_canboat(line: &str) -> bool {
         && data.iter().all(|it| is_hex(it))
 }
 
-/// `123#00`, `can0 123#00` or `cansend can0 123#00`.
+/// Matches `123#00`, `can0 123#00` and `cansend can0 123#00`.
 fn is_frame_of_cansend(line: &str) -> bool {
     let words: Vec<_> = line.split_whitespace().collect();
     let ([frame] | [_, frame] | ["cansend", _, frame]) = words.as_slice() else { return false };
     protocol::candump::parse_frame(frame).is_ok()
 }
 
-/// Lines with as many separators each, three at least; a few may be of another kind.
+/// Returns true if at least three quarters of the lines have the same number of separators, three or more.
 fn is_table(lines: &[&str]) -> bool {
-    // The last one may be cut off.
+    // The last line may be cut off.
     let lines = lines.get(..lines.len().saturating_sub(1)).filter(|lines| !lines.is_empty()).unwrap_or(lines);
     [',', ';', '\t'].iter().any(|separator| {
         let counts: Vec<_> = lines.iter().map(|line| line.matches(*separator).count()).collect();

@@ -2,22 +2,23 @@
 
 use std::fmt;
 
-/// Buses whose times are compared.
+/// The maximum number of buses whose times are checked.
 const BUSES: usize = 64;
-/// Frames of one time that are no accident.
+/// The number of frames with one time that is not a coincidence.
 const ENOUGH: u64 = 3;
 
-/// Looks at the times of frames, each bus by itself: only frames of one bus have an order.
+/// Checks the times of frames, each bus by itself, because only frames of one bus have an order.
 #[derive(Debug, Default)]
 pub(super) struct Times {
     buses: Vec<Bus>,
-    /// The bus of the last frame.
+    /// The index of the last frame's bus.
     current: usize,
     frames: u64,
     latest: u64,
-    /// Count of frames that are older than the one before them on their bus, and the first of them, counted from 1.
+    /// The number of frames that are older than the one before them on their bus, and the first of these frames,
+    /// counted from 1.
     backwards: Option<(u64, u64)>,
-    /// Names of a file that begins before the end of the one before it, and of that one.
+    /// The names of a file that begins before the file before it ends, and of the file before it.
     overlap: Option<(String, String)>,
 }
 
@@ -27,12 +28,12 @@ struct Bus {
     first: u64,
     last: u64,
     frames: u64,
-    /// Set once two of its frames have different times.
+    /// True once two of its frames have different times.
     has_several: bool,
 }
 
 impl Times {
-    /// A frame of a bus has this time.
+    /// Checks the time of a bus' next frame.
     #[inline]
     pub(super) fn take(&mut self, bus: &str, nanos: u64) {
         self.frames += 1;
@@ -61,23 +62,23 @@ impl Times {
         })
     }
 
-    /// The latest time so far, in ns since 1970.
+    /// Returns the latest time so far, in ns since 1970.
     pub(super) const fn latest(&self) -> u64 {
         self.latest
     }
 
-    /// A file begins before the end of the one before it.
+    /// Records that a file begins before the file before it ends.
     pub(super) fn overlaps(&mut self, file: &str, before: &str) {
         self.overlap.get_or_insert_with(|| (file.to_owned(), before.to_owned()));
     }
 
-    /// Remark on times that run backwards.
+    /// Returns the remark on times that run backwards.
     pub(super) fn backwards(&self) -> Option<String> {
         let (times, first) = self.backwards?;
         Some(format!("times run backwards {times} times, first at frame {first}; the order is kept"))
     }
 
-    /// Other remarks, a line each.
+    /// Returns the other remarks, one per line.
     pub(super) fn remarks(&self) -> impl Iterator<Item = String> {
         let overlap = self.overlap.as_ref().map(|(file, before)| {
             format!(
@@ -95,7 +96,7 @@ impl Times {
     }
 }
 
-/// A time in s, as a log has it.
+/// A time that is formatted in seconds, as in a log.
 struct Seconds(u64);
 
 impl fmt::Display for Seconds {

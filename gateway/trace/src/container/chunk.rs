@@ -1,4 +1,4 @@
-//! A chunk: unpacked, checked, and then its records.
+//! Chunks of records: decompressed, checked, and read record by record.
 
 use std::fmt;
 use std::io::{self, Read};
@@ -9,27 +9,27 @@ use zstd::zstd_safe::{self, DCtx, ErrorCode, get_error_name};
 use super::field::Fields;
 use super::{Damage, LONGEST};
 
-/// What may come out of a file's chunks in all, whatever its length.
+/// The number of bytes that a file's chunks may always decompress to in total, whatever the length of the file.
 const FREE_BYTES: u64 = 256 << 20;
-/// What may come out of a byte of the file, besides.
+/// The number of decompressed bytes allowed in addition per byte of the file.
 const BYTES_A_BYTE: u64 = 1_000;
-/// Records that may come out of a file's chunks in all, whatever its length.
+/// The number of records that a file's chunks may always hold in total, whatever the length of the file.
 const FREE_RECORDS: u64 = 1 << 17;
-/// Records that may come out of a byte of the file, besides; each should cost its entry in an index, 16 bytes.
+/// The number of records allowed in addition per byte of the file. Each record should cost an index entry of 16 bytes.
 const RECORDS_A_BYTE: u64 = 1;
-/// Bytes of a record in a chunk beside its own.
+/// The length of a record's header in bytes: operation code and length.
 const HEAD: usize = 9;
 
-/// The chunk that was unpacked last. Nothing of it is handed out before all of it was checked: its length, its
-/// checksum, and that its records end where it does.
+/// The chunk that was decompressed last. It is checked as a whole before any record is returned: its length, its
+/// checksum, and that its last record ends where it does.
 #[derive(Default)]
 pub struct Chunk {
     bytes: Vec<u8>,
-    /// Where its next record begins.
+    /// The offset of the next record.
     at: usize,
-    /// How long the one before it is.
+    /// The length of the record before it.
     body: usize,
-    /// Of all chunks so far.
+    /// Totals of all chunks so far.
     total_bytes: u64,
     total_records: u64,
     is_checked: bool,
@@ -46,10 +46,10 @@ impl fmt::Debug for Chunk {
 }
 
 impl Chunk {
-    /// Unpacks a chunk record; `read` is how many bytes of its file were read so far.
+    /// Decompresses a chunk record; `read` is the number of bytes of the file that were read so far.
     ///
     /// # Errors
-    /// When anything is wrong with it: then it has no records.
+    /// Returns [`Damage`] if anything is wrong with the chunk; it then has no records.
     pub fn unpack(&mut self, record: &[u8], read: u64) -> Result<(), Damage> {
         self.rewind();
         let unpacked = self.open(record, read);
@@ -59,7 +59,7 @@ impl Chunk {
         unpacked
     }
 
-    /// The next record: its operation code, and its bytes.
+    /// Returns the operation code and the contents of the next record.
     #[expect(
         clippy::should_implement_trait,
         reason = "a record borrows from the chunk; an iterator's cannot"
@@ -70,13 +70,13 @@ impl Chunk {
         Some((opcode, body))
     }
 
-    /// The bytes of the record that was the last one.
+    /// Returns the contents of the record that was returned last.
     #[must_use]
     pub fn body(&self) -> &[u8] {
         self.bytes.get(self.at - self.body..self.at).unwrap_or_default()
     }
 
-    /// Whether the chunk that was unpacked last has a checksum, which then is right.
+    /// Returns true if the current chunk has a checksum. It was correct then.
     #[must_use]
     pub const fn is_checked(&self) -> bool {
         self.is_checked
@@ -135,7 +135,7 @@ impl Chunk {
         Ok(())
     }
 
-    /// Frame by frame into one buffer, so that no window of a frame's own choice is needed.
+    /// Decompresses frame by frame into one buffer, so that a frame cannot choose a window size.
     fn unpack_zstd(&mut self, mut packed: &[u8], claimed: u64) -> Result<(), Damage> {
         let wrong = |code: ErrorCode| Damage::Unpack(get_error_name(code).to_owned());
         let context = self.zstd.get_or_insert_with(DCtx::create);
@@ -144,7 +144,7 @@ impl Chunk {
             let (frame, rest) = packed.split_at_checked(frame).unwrap_or((packed, &[]));
             packed = rest;
             let room = usize::try_from(claimed).unwrap_or(0) - self.bytes.len();
-            // Memory that is not written to is none: what a small chunk claims costs nothing.
+            // Reserved, untouched memory is not resident: a small chunk that claims a large size costs nothing.
             if self.bytes.is_empty() {
                 self.bytes.reserve_exact(room);
                 context.decompress(&mut self.bytes, frame).map_err(wrong)?;
@@ -173,10 +173,10 @@ impl Chunk {
     }
 }
 
-/// A record's operation code, its bytes, and how many are left behind it.
+/// A record's operation code, its contents, and the number of bytes after it.
 type First<'a> = (u8, &'a [u8], usize);
 
-/// The first of some records.
+/// Splits off the first record.
 fn split(records: &[u8]) -> Option<Result<First<'_>, Damage>> {
     if records.is_empty() {
         return None;
@@ -195,7 +195,7 @@ fn split(records: &[u8]) -> Option<Result<First<'_>, Damage>> {
 mod tests {
     use super::*;
 
-    /// A chunk's record, with what it claims to unpack to.
+    /// Builds a chunk record that claims to decompress to `claimed` bytes.
     fn chunk(claimed: u64, checksum: u32, compression: &str, packed: &[u8]) -> Vec<u8> {
         let name = u32::try_from(compression.len()).unwrap().to_le_bytes();
         let packed = [&(packed.len() as u64).to_le_bytes()[..], packed].concat();
@@ -225,7 +225,7 @@ mod tests {
         let length = two.len() as u64;
         let checksum = crc32fast::hash(&two);
         let zstd = zstd::bulk::compress(&two, 1).unwrap();
-        // In two frames, and with something behind them.
+        // The data is split into two frames, with trailing bytes in one case.
         let (first, second) = two.split_at(7);
         let frames = [first, second].map(|part| zstd::bulk::compress(part, 1).unwrap()).concat();
         let lz4 = [first, second].map(lz4).concat();
@@ -252,7 +252,7 @@ mod tests {
         assert!(matches!(unpacked(&chunk(12, 0, "zstd", &one)), Err(Damage::Unpack(_))));
         assert!(matches!(unpacked(&chunk(12, 0, "lz4", &one)), Err(Damage::Unpack(_))));
         assert_eq!(unpacked(&chunk(12, 0, "br", &one)), Err(Damage::Compression("br".to_owned())));
-        // Behind the last byte of an LZ4 block come four that end its frame, and that no chunk needs.
+        // An LZ4 frame ends with four bytes after its last block, which no chunk needs.
         for (compression, packed, spare) in
             [("zstd", zstd::bulk::compress(&one, 1).unwrap(), 0), ("lz4", lz4(&one), 4)]
         {
@@ -261,7 +261,7 @@ mod tests {
             for end in 0..whole.len() - spare {
                 let mut cut = whole[..end].to_vec();
                 assert!(unpacked(&cut).is_err(), "{compression} {end}");
-                // The same, with the length of what is left.
+                // The truncated chunk fails too if its length field fits.
                 if let Some((bytes, left)) = cut.split_at_mut_checked(length + 8) {
                     bytes[length..].copy_from_slice(&(left.len() as u64).to_le_bytes());
                 }

@@ -1,4 +1,4 @@
-//! What a record says.
+//! Decodes the fields of records.
 
 use std::collections::BTreeMap;
 
@@ -6,99 +6,99 @@ use mcap::records::op;
 
 use super::{Damage, LONGEST_DESCRIPTION};
 
-/// A record, as far as readers of recordings want to know it.
+/// A record with the fields that readers of recordings need.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Record<'a> {
-    /// How a file begins.
+    /// The beginning of a file.
     Header {
-        /// What conventions it follows.
+        /// The conventions that the file follows.
         profile: &'a str,
-        /// Who wrote it.
+        /// The program that wrote it.
         library: &'a str,
     },
     /// A type of messages.
     Schema {
-        /// Its number.
+        /// The number of the schema.
         id: u16,
-        /// Its name.
+        /// The name of the type.
         name: &'a str,
         /// The language of its definition.
         encoding: &'a str,
-        /// Its definition.
+        /// The definition.
         data: &'a [u8],
     },
-    /// A topic.
+    /// A channel: a topic with a type of messages.
     Channel {
-        /// Its number.
+        /// The number of the channel.
         id: u16,
-        /// The number of its messages' type; 0 when they have none.
+        /// The number of its schema; 0 if it has none.
         schema: u16,
-        /// Its name.
+        /// The name of the topic.
         topic: &'a str,
-        /// How its messages are encoded.
+        /// The encoding of its messages.
         encoding: &'a str,
-        /// What else is said of it.
+        /// Further properties.
         facts: Facts<'a>,
     },
     /// A message.
     Message {
         /// The number of its channel.
         channel: u16,
-        /// Its number there.
+        /// Its sequence number in the channel.
         sequence: u32,
-        /// When it was recorded, in ns.
+        /// The time at which it was recorded, in ns.
         log_time: u64,
-        /// When it was sent, in ns.
+        /// The time at which it was sent, in ns.
         publish_time: u64,
-        /// What it says.
+        /// The encoded contents.
         data: &'a [u8],
     },
-    /// A file in the file.
+    /// An attached file.
     Attachment {
-        /// When it was recorded, in ns.
+        /// The time at which it was recorded, in ns.
         log_time: u64,
-        /// When it was made, in ns.
+        /// The time at which it was created, in ns.
         create_time: u64,
         /// Its name.
         name: &'a str,
         /// Its media type.
         media_type: &'a str,
-        /// Its bytes.
+        /// Its contents.
         data: &'a [u8],
     },
-    /// Facts under a name.
+    /// A named set of keys and values.
     Metadata {
         /// The name.
         name: &'a str,
-        /// The facts.
+        /// The keys and values.
         facts: Facts<'a>,
     },
     /// The end of the file.
     Footer {
-        /// The checksum of the summary and of what is before this; 0 when there is none.
+        /// The checksum of the summary and of the footer before this field; 0 if there is none.
         crc: u32,
     },
-    /// The end of what was recorded.
+    /// The end of the data section.
     DataEnd {
-        /// The checksum of everything before it; 0 when there is none.
+        /// The checksum of everything before it; 0 if there is none.
         crc: u32,
     },
-    /// Anything else: indexes, statistics, chunks, what is not known.
+    /// Any other record: an index, statistics, a chunk, or an unknown one.
     Other,
 }
 
-/// Keys and values, as they stand in the file: whole, and UTF-8.
+/// Keys and values as they stand in the file. They are complete and valid UTF-8.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Facts<'a>(&'a [u8]);
 
 impl<'a> Facts<'a> {
-    /// One after the other.
+    /// Iterates over the pairs of key and value.
     pub fn iter(&self) -> impl Iterator<Item = (&'a str, &'a str)> + use<'a> {
         let mut rest = Fields { record: "", bytes: 0, rest: self.0 };
         std::iter::from_fn(move || Some((rest.text("").ok()?, rest.text("").ok()?)))
     }
 
-    /// The value of a key.
+    /// Returns the value of a key.
     #[must_use]
     pub fn get(&self, key: &str) -> Option<&'a str> {
         self.iter().find(|(name, _)| *name == key).map(|(_, value)| value)
@@ -111,27 +111,27 @@ impl From<Facts<'_>> for BTreeMap<String, String> {
     }
 }
 
-/// What is kept of the names in a file, which whoever wrote it may have made as long and as many as they liked.
+/// A limit on the memory for names in a file, whose number and length an untrusted writer chose.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Names(usize);
 
 impl Names {
-    /// What keeping a name costs beside its bytes.
+    /// The memory overhead of a name, in bytes.
     pub const ENTRY: usize = 128;
-    /// All of them together.
+    /// The maximum size of all names together, in bytes.
     const LIMIT: usize = 32 << 20;
 
-    /// Makes sure that there is room for another one, of so many bytes.
+    /// Reserves room for another name of `bytes` bytes.
     ///
     /// # Errors
-    /// When there is not.
+    /// Returns [`Damage::Names`] if the limit is exceeded.
     pub fn add(&mut self, bytes: usize) -> Result<(), Damage> {
         self.0 = self.0.saturating_add(bytes).saturating_add(Self::ENTRY);
         if self.0 > Self::LIMIT { Err(Damage::Names { limit: Self::LIMIT }) } else { Ok(()) }
     }
 }
 
-/// A record's fields, one after the other.
+/// A cursor over a record's fields.
 #[derive(Clone, Copy)]
 pub(super) struct Fields<'a> {
     record: &'static str,
@@ -166,7 +166,10 @@ impl<'a> Fields<'a> {
         self.array(field).map(u64::from_le_bytes)
     }
 
-    /// So many bytes, which it must have.
+    /// Returns the next `count` bytes.
+    ///
+    /// # Errors
+    /// Returns [`Damage::Short`] if the record has fewer.
     pub(super) fn bytes(&mut self, count: u64, field: &'static str) -> Result<&'a [u8], Damage> {
         let split = usize::try_from(count).ok().and_then(|count| self.rest.split_at_checked(count));
         let (bytes, rest) = split.ok_or_else(|| self.short(field))?;
@@ -192,10 +195,11 @@ impl<'a> Fields<'a> {
     }
 }
 
-/// What a record says. Of a chunk, an index and the like nothing: [`Record::Other`].
+/// Decodes a record. Returns [`Record::Other`] for chunks, indexes and the like.
 ///
 /// # Errors
-/// When it is shorter than it says, longer than a description may be, or a name in it is not UTF-8.
+/// Returns [`Damage`] if the record is shorter than its fields, if a description is too long, if a name is not UTF-8,
+/// or if an attachment's checksum is wrong.
 pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, Damage> {
     let description = |record| match body.len() as u64 {
         bytes if body.len() > LONGEST_DESCRIPTION => {
@@ -257,7 +261,7 @@ fn attachment(body: &[u8]) -> Result<Record<'_>, Damage> {
     Ok(Record::Attachment { log_time, create_time, name, media_type, data })
 }
 
-/// The name of an attachment of which only the beginning is there; empty when not even that is.
+/// Returns the name of an attachment of which only the beginning is available; empty if not even the name is complete.
 #[must_use]
 pub(super) fn attachment_name(beginning: &[u8]) -> &str {
     let mut from = Fields::new("attachment", beginning);

@@ -1,12 +1,12 @@
-//! The MCAP container as it is read: every byte of a file that somebody else may have written goes through here.
+//! The checked reader of MCAP containers. Every byte of an untrusted recording goes through here.
 //!
 //! ```text
-//!   input ─> Source: records, framed ─┬─> parse: what a record says
+//!   input ─> Source: records, framed ─┬─> parse: fields of a record
 //!                                     └─> Chunk: unpacked, checked ─> records, framed ─> parse
 //! ```
 //!
-//! A length that a file claims is compared with what is there before anything is done with it, and nothing is allocated
-//! by a claim alone. The crate `mcap` writes files; it reads none here.
+//! A length field is compared with the available bytes before it is used, and never causes an allocation by itself. The
+//! crate `mcap` is used only to write files.
 
 mod chunk;
 mod field;
@@ -26,13 +26,13 @@ use crate::ros2::MessageError;
 
 /// The first and the last bytes of a file.
 pub const MAGIC: &[u8] = mcap::MAGIC;
-/// The longest record that is taken into memory, and the most that a chunk may unpack to; ours have 256 KiB, and those
-/// of other writers a few MiB.
+/// The longest record that is read into memory, and the maximum decompressed size of a chunk, in bytes. Chunks of
+/// skinbus have 256 KiB, those of other writers a few MiB.
 pub const LONGEST: u64 = 128 << 20;
-/// The longest record that describes something: a schema, a channel, metadata.
+/// The longest descriptive record in bytes: a schema, a channel, metadata.
 pub const LONGEST_DESCRIPTION: usize = 4 << 20;
 
-/// Reads what there is, whatever signals come.
+/// Reads the available bytes and retries if a signal interrupts the call.
 pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<usize> {
     loop {
         match input.read(room) {
@@ -42,16 +42,16 @@ pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<us
     }
 }
 
-/// What is wrong with a record or a chunk.
+/// An error in a record or a chunk.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum Damage {
-    /// A length in it leads beyond its end.
+    /// A length field leads beyond the end of its record.
     #[error("a {record} record of {bytes} bytes ends within its {field}")]
     Short {
         /// The kind of record.
         record: &'static str,
-        /// Its length.
+        /// The length of the record.
         bytes: usize,
         /// The field.
         field: &'static str,
@@ -64,117 +64,119 @@ pub enum Damage {
         /// The field.
         field: &'static str,
     },
-    /// It is longer than anything that is read.
+    /// A record or chunk is too long to be read.
     #[error("a {what} of {bytes} bytes is too long: at most {limit} are read")]
     Long {
-        /// What it is.
+        /// The kind of record.
         what: &'static str,
-        /// Its length.
+        /// Its length in bytes.
         bytes: u64,
-        /// The limit.
+        /// The limit in bytes.
         limit: u64,
     },
     /// A checksum is wrong.
     #[error("the checksum of {what} is {saved:08x} in the file, and {found:08x} by its bytes")]
     Checksum {
-        /// What was checked.
+        /// The checked section.
         what: &'static str,
-        /// As the file has it.
+        /// The checksum in the file.
         saved: u32,
-        /// As it should be.
+        /// The checksum of the bytes.
         found: u32,
     },
-    /// A compression that nobody here knows.
+    /// The compression of a chunk is not supported.
     #[error("a chunk is compressed by {0:?}: zstd, lz4 and none are read")]
     Compression(String),
-    /// The compressed bytes make no sense.
+    /// A chunk cannot be decompressed.
     #[error("a chunk cannot be unpacked: {0}")]
     Unpack(String),
-    /// A chunk unpacks to another length than it says.
+    /// A chunk decompresses to another length than its header states.
     #[error("a chunk unpacks to {found} bytes, not to the {claimed} that it claims")]
     Unpacked {
-        /// By its header.
+        /// The length in the header.
         claimed: u64,
-        /// In truth.
+        /// The actual length.
         found: u64,
     },
     /// A record reaches beyond its chunk.
-    #[error("a record of {bytes} bytes in a chunk has {leftover} bytes left there")]
+    #[error("a record of {bytes} bytes does not fit into the {leftover} bytes left in its chunk")]
     Overrun {
-        /// Its length.
+        /// The length of the record.
         bytes: u64,
-        /// What is left of the chunk.
+        /// The number of bytes left in the chunk.
         leftover: u64,
     },
-    /// Names of topics and types.
+    /// The names of topics and types take too much memory.
     #[error("the names of its topics and types are too long: at most {limit} bytes are read")]
     Names {
-        /// The limit.
+        /// The limit in bytes.
         limit: usize,
     },
-    /// It is no file of this kind, or another one is behind it.
+    /// The file does not begin or end with the magic bytes.
     #[error("it does not begin and end with the magic bytes of an MCAP file")]
     Magic,
-    /// A message of nothing.
-    #[error("a message belongs to channel {0}, which it has not")]
+    /// A message is on an undefined channel.
+    #[error("a message is on channel {0}, which the file does not define")]
     Channel(u16),
-    /// A message that says something else than its channel.
+    /// A message does not match the type of its channel.
     #[error("a message of {topic}: {source}")]
     Message {
-        /// Its topic.
+        /// The topic.
         topic: String,
-        /// Why.
+        /// The cause.
         source: MessageError,
     },
-    /// An operation code that the format does not have.
+    /// The operation code is not defined by the format.
     #[error("no record has the operation code {0:02x}")]
     Unknown(u8),
-    /// An operation code that no record has at this place, or with this content.
-    #[error("a record has the operation code {0:02x}, and is none of that kind")]
+    /// The operation code does not fit the position or the contents of the record.
+    #[error("a record has the operation code {0:02x}, but is not of that kind")]
     Code(u8),
-    /// A record's length is not that of its content.
+    /// The length of a record is not that of its contents.
     #[error(
         "a record of operation code {code:02x} has {own} bytes by its content, and {bytes} by its length"
     )]
     Length {
-        /// Its operation code.
+        /// The operation code.
         code: u8,
-        /// By its length.
+        /// The length in the record's header.
         bytes: u64,
-        /// By its content.
+        /// The length of the contents.
         own: u64,
     },
-    /// A message's length leads over the records behind it.
+    /// The length of a message spans the records after it.
     #[error("a message of {0} bytes contains the records behind it")]
     Swallowed(u64),
-    /// A record that leads beyond the end of a file that is not cut off in it.
-    #[error("a record of {bytes} bytes leads beyond the file's end, and others follow where it begins")]
+    /// A record reaches beyond the end of the file, but other records follow its beginning.
+    #[error(
+        "a record of {bytes} bytes reaches beyond the file's end, but other records follow its beginning"
+    )]
     Beyond {
-        /// By its length.
+        /// The length in the record's header.
         bytes: u64,
     },
-    /// The magic bytes of the end, and no footer before them.
+    /// The magic bytes at the end have no footer before them.
     #[error("it ends with the magic bytes of an MCAP file, and without the footer before them")]
     Footer,
-    /// The file has something behind its end.
-    #[error("something follows behind its end")]
+    /// The file continues after its end.
+    #[error("the file continues after its end")]
     Behind,
-    /// Another number of messages than the file says at its end.
-    #[error("it has {found} messages, and {stated} by its statistics")]
+    /// The number of messages is not that of the statistics.
+    #[error("it has {found} messages, but its statistics say {stated}")]
     Messages {
-        /// That came.
+        /// The number of messages read.
         found: u64,
-        /// By its statistics.
+        /// The number in the statistics.
         stated: u64,
     },
-    /// Far more comes out than went in.
+    /// The chunks decompress to far more than the file holds.
     #[error("{read} bytes unpack to more than {limit} {what}")]
     Bomb {
-        /// Bytes that were read.
+        /// The number of bytes read.
         read: u64,
         /// The limit.
         limit: u64,
-        /// Bytes or records.
+        /// The unit of the limit: bytes or records.
         what: &'static str,
     },
 }

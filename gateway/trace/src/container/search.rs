@@ -1,7 +1,7 @@
-//! Where records go on behind damage.
+//! Finds the next intact record after damage.
 //!
-//! A length that is wrong leads anywhere. What is certain again is a chunk or an attachment, whose lengths agree with each
-//! other, or a series of records each of which ends where the next one begins.
+//! A wrong length leads to an arbitrary offset. Certain again is a chunk or an attachment, whose length fields agree
+//! with each other, or a row of records each of which ends where the next one begins.
 
 use std::io::{self, Read, Seek, SeekFrom};
 
@@ -10,24 +10,24 @@ use mcap::records::op;
 use super::field::Fields;
 use super::{LONGEST, MAGIC, read_some};
 
-/// Bytes of an operation code and a length.
+/// The length of a record's header in bytes: operation code and length.
 pub const HEAD: usize = 9;
-/// Bytes that are looked through at once.
+/// The number of bytes that are searched at once.
 const WINDOW: usize = 1 << 20;
-/// The most bytes of a record that say what it is.
+/// The maximum number of bytes that identify a record.
 const BEGINNING: usize = 512;
-/// Records in a row that are no accident.
+/// The number of records in a row that is not a coincidence.
 const ROW: usize = 4;
-/// Bytes of a message's record before its content.
+/// The length of a message record before its contents, in bytes.
 const MESSAGE_HEAD: u64 = 22;
 
-/// Whether the format knows records of this operation code; those of 80 and more are an application's own.
+/// Returns true if the format defines the operation code. Codes from 0x80 on belong to applications.
 #[must_use]
 pub(super) const fn is_known(opcode: u8) -> bool {
     matches!(opcode, 0x01..=0x0F | 0x80..)
 }
 
-/// The fewest bytes that such a record has.
+/// Returns the minimum length of such a record, in bytes.
 const fn min_length(opcode: u8) -> Option<u64> {
     Some(match opcode {
         op::HEADER | op::METADATA => 8,
@@ -48,18 +48,19 @@ const fn min_length(opcode: u8) -> Option<u64> {
     })
 }
 
-/// Whether a record can begin here: its operation code is known, and it ends within the file.
+/// Returns true if a record can begin at `at`: its operation code is known, and it ends within the file.
 ///
 /// # Errors
-/// When the input fails.
+/// Returns an error if the input fails.
 pub fn is_record(input: &mut (impl Read + Seek), at: u64, size: u64) -> io::Result<bool> {
     Ok(at == size || next(input, at, size)?.is_some())
 }
 
-/// Where the first record begins, at `from` or behind it and before `until`; of chunks and attachments only, unless `any`.
+/// Returns the offset of the first record from `from` on and before `until`. Only chunks and attachments are found
+/// unless `any` is true.
 ///
 /// # Errors
-/// When the input fails, or cannot be gone back in.
+/// Returns an error if the input fails or is not seekable.
 pub fn first_record(
     input: &mut (impl Read + Seek),
     mut from: u64,
@@ -87,7 +88,8 @@ pub fn first_record(
     Ok(None)
 }
 
-/// The operation code and the length of a record that begins with these bytes, if it can be one and is within `leftover`.
+/// Returns the operation code and the length of the record that begins with these bytes, if they are possible and the
+/// record fits in `leftover` bytes.
 fn head(bytes: &[u8], leftover: u64) -> Option<(u8, u64)> {
     let &[opcode, ref length @ ..] = bytes.first_chunk::<HEAD>()?;
     let length = u64::from_le_bytes(*length);
@@ -95,7 +97,7 @@ fn head(bytes: &[u8], leftover: u64) -> Option<(u8, u64)> {
         .then_some((opcode, length))
 }
 
-/// Whether a chunk or an attachment begins with these bytes: each of its lengths is in it twice.
+/// Returns true if a chunk or an attachment begins with these bytes. Each of its lengths is stored twice.
 fn is_certain(bytes: &[u8], leftover: u64) -> bool {
     let Some((opcode, length)) = head(bytes, leftover) else { return false };
     let body = bytes.get(HEAD..).unwrap_or_default();
@@ -103,7 +105,8 @@ fn is_certain(bytes: &[u8], leftover: u64) -> bool {
     is_of_two && own_length(opcode, body) == Some(length)
 }
 
-/// The length of a record by the fields in it; `None` when its kind does not say, or the bytes end before they do.
+/// Returns the length of a record according to its fields; `None` if its kind has no such fields, or if the bytes end
+/// too early.
 #[must_use]
 pub fn own_length(opcode: u8, body: &[u8]) -> Option<u64> {
     match opcode {
@@ -124,10 +127,10 @@ pub fn own_length(opcode: u8, body: &[u8]) -> Option<u64> {
     }
 }
 
-/// Bytes of an entry in a message index.
+/// The length of an entry in a message index, in bytes.
 const INDEX_ENTRY: u64 = 16;
 
-/// The length of so many bytes and, behind them, strings, each behind its length in 32 bits.
+/// Returns the length of `fixed` bytes followed by strings, each with its length in 32 bits before it.
 fn lengths(body: &[u8], fixed: u64, strings: &str) -> Option<u64> {
     strings.bytes().try_fold(fixed, |at, _| {
         let from = usize::try_from(at).ok()?;
@@ -136,7 +139,7 @@ fn lengths(body: &[u8], fixed: u64, strings: &str) -> Option<u64> {
     })
 }
 
-/// The length of a chunk's record by the fields in it.
+/// Returns the length of a chunk record according to its fields.
 fn chunk(body: &[u8]) -> Option<u64> {
     let mut from = Fields::new("chunk", body);
     let (start, end, unpacked) = (from.u64("").ok()?, from.u64("").ok()?, from.u64("").ok()?);
@@ -148,13 +151,13 @@ fn chunk(body: &[u8]) -> Option<u64> {
         .then(|| packed.checked_add(fields))?
 }
 
-/// Whether a chunk's records stand in it as they are.
+/// Returns true if a chunk's records are not compressed.
 #[must_use]
 pub(super) fn is_plain(chunk: &[u8]) -> bool {
     chunk.get(28..32).is_some_and(|length| length == [0; 4])
 }
 
-/// The length of an attachment's record by the fields in it.
+/// Returns the length of an attachment record according to its fields.
 fn attachment(body: &[u8]) -> Option<u64> {
     let mut from = Fields::new("attachment", body);
     from.u64("").and_then(|_| from.u64("")).ok()?;
@@ -163,7 +166,7 @@ fn attachment(body: &[u8]) -> Option<u64> {
     data.checked_add(36 + name.len() as u64 + media_type.len() as u64)
 }
 
-/// Whether the content of a record of an application's own kind is that of a chunk, an attachment or metadata: a bit of
+/// Returns true if a record of an application's kind has the contents of a chunk, an attachment or metadata: a bit of
 /// its operation code is wrong.
 #[must_use]
 pub(super) fn is_disguised(body: &[u8], length: u64) -> bool {
@@ -171,7 +174,7 @@ pub(super) fn is_disguised(body: &[u8], length: u64) -> bool {
     length > 8 && kinds.iter().any(|&code| own_length(code, body) == Some(length))
 }
 
-/// Whether records stand behind each other in the content of a message, up to its end: its length leads over others.
+/// Returns true if the contents of a message end with a row of records: its length is wrong and spans them.
 #[must_use]
 pub(super) fn has_records(message: &[u8]) -> bool {
     let first = usize::try_from(MESSAGE_HEAD).unwrap_or(usize::MAX);
@@ -187,7 +190,7 @@ pub(super) fn has_records(message: &[u8]) -> bool {
     })
 }
 
-/// Whether records follow each other from here on, or up to where the file ends.
+/// Returns true if records follow each other from `at` on, or up to the end of the file.
 fn is_row(input: &mut (impl Read + Seek), mut at: u64, size: u64) -> io::Result<bool> {
     for before in 0..ROW {
         if before > 0 && at == size {
@@ -202,7 +205,7 @@ fn is_row(input: &mut (impl Read + Seek), mut at: u64, size: u64) -> io::Result<
     Ok(true)
 }
 
-/// The operation code of the record that begins here, and where it ends.
+/// Returns the operation code of the record that begins at `at`, and the offset of its end.
 fn next(input: &mut (impl Read + Seek), at: u64, size: u64) -> io::Result<Option<(u8, u64)>> {
     let mut bytes = [0; HEAD];
     input.seek(SeekFrom::Start(at))?;

@@ -1,4 +1,4 @@
-//! Records of a file, one after the other.
+//! Reads the records of a file, one after the other.
 
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
@@ -8,61 +8,61 @@ use super::field::{Record, attachment_name, parse};
 use super::search::{HEAD, has_records, is_disguised, is_known, is_plain, own_length};
 use super::{Damage, LONGEST, MAGIC, read_some};
 
-/// Bytes that are kept of a record that is longer than anything that is taken into memory, or that nobody reads.
+/// The number of bytes kept of a record that is too long for memory, or that no reader needs.
 const BEGINNING: u64 = 64 << 10;
-/// Bytes that are kept of an index, which nobody reads.
+/// The number of bytes kept of a message index, which no reader needs.
 const INDEX: u64 = 64;
 
-/// Bytes of a footer that its checksum is of; that stands behind them.
+/// The number of bytes of a footer before its checksum, which covers them.
 const FOOTER_CHECKED: usize = 16;
 
-/// What comes next in a file.
+/// The next item of a file.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Framed {
-    /// A record of this operation code, in [`Source::body`].
+    /// A record with this operation code, whose contents are in [`Source::body`].
     Record(u8),
-    /// A record of this operation code and length that was passed over: an index, statistics, an application's own. Its
+    /// A skipped record with this operation code and length: an index, statistics, or a record of an application. Its
     /// beginning is in [`Source::body`].
     Passed(u8, u64),
-    /// A record of this operation code and length that is too long for memory; its beginning is in [`Source::body`].
+    /// A record with this operation code and length that is too long for memory. Its beginning is in [`Source::body`].
     Long(u8, u64),
-    /// A record of an operation code that the format does not know, and its length.
+    /// A record with an operation code that the format does not define, and its length.
     Unknown(u8, u64),
-    /// A record of this operation code and length that ends behind the input; as much of its beginning as is kept is in
+    /// A record with this operation code and length that ends beyond the input. The kept part of its beginning is in
     /// [`Source::body`].
     Cut(u8, u64),
-    /// So many bytes that are no operation code and length, and nothing behind them. 0 when the file ends between two
-    /// records.
+    /// The end of the input after this number of bytes, too few for an operation code and a length. 0 if the file ends
+    /// between two records.
     End(u64),
 }
 
-/// The records of an input, framed. Only what is looked at by anybody is taken into memory: of indexes, statistics and
-/// records that are not known only the beginning is.
+/// Frames the records of an input. Records that no reader needs are skipped: only the beginning of indexes, statistics
+/// and unknown records is kept.
 #[derive(Debug)]
 pub struct Source<R> {
     input: R,
     body: Vec<u8>,
-    /// Bytes that came.
+    /// The number of bytes read.
     read: u64,
-    /// Where the record that was read last begins, and its operation code.
+    /// The offset and the operation code of the last record.
     began: u64,
     code: u8,
-    /// Where the one before it begins, if that is a message: no checksum says that its length is right.
+    /// The offset of the record before it, if that is a message: no checksum confirms its length.
     message_before: Option<u64>,
-    /// The longest attachment that is taken into memory.
+    /// The longest attachment that is read into memory, in bytes.
     attachments: u64,
-    /// Of everything before the end of the data section.
+    /// The checksum of everything before the end of the data section.
     checksum: Option<crc32fast::Hasher>,
-    /// Whether a chunk came.
+    /// True once a chunk was read.
     has_chunks: bool,
-    /// Whether the data section is over.
+    /// True after the end of the data section.
     in_summary: bool,
-    /// The last bytes that came.
+    /// The last bytes read.
     last: [u8; MAGIC.len()],
 }
 
 impl<R: Read> Source<R> {
-    /// Reads from an input, attachments of so many bytes at most.
+    /// Creates a reader that keeps attachments of at most `attachments` bytes.
     pub fn new(input: R, attachments: u64) -> Self {
         let checksum = Some(crc32fast::Hasher::new());
         let (body, last) = (Vec::new(), [0; MAGIC.len()]);
@@ -81,15 +81,15 @@ impl<R: Read> Source<R> {
         }
     }
 
-    /// The same in the middle of a file, behind so many bytes.
+    /// Creates a reader that continues at the offset `read` of a file.
     pub fn at(read: u64, input: R, attachments: u64) -> Self {
         Self { read, checksum: None, ..Self::new(input, attachments) }
     }
 
-    /// Takes the magic bytes of the beginning or the end into [`Source::body`]; whether they are there.
+    /// Reads the magic bytes of the beginning or the end into [`Source::body`]. Returns true if they are correct.
     ///
     /// # Errors
-    /// When the input fails.
+    /// Returns an error if the input fails.
     pub fn magic(&mut self) -> io::Result<bool> {
         self.body.clear();
         self.take(MAGIC.len() as u64)?;
@@ -97,47 +97,47 @@ impl<R: Read> Source<R> {
         Ok(self.body == MAGIC)
     }
 
-    /// The record that was read last, without its operation code and length.
+    /// Returns the contents of the last record, without its operation code and length.
     #[must_use]
     pub fn body(&self) -> &[u8] {
         &self.body
     }
 
-    /// Bytes so far.
+    /// Returns the number of bytes read so far.
     #[must_use]
     pub const fn read(&self) -> u64 {
         self.read
     }
 
-    /// Where the record that was read last begins.
+    /// Returns the offset of the last record.
     #[must_use]
     pub const fn began(&self) -> u64 {
         self.began
     }
 
-    /// Where the record before the one that was read last begins, if that is a message.
+    /// Returns the offset of the record before the last one, if that is a message.
     #[must_use]
     pub const fn message_before(&self) -> Option<u64> {
         self.message_before
     }
 
-    /// Whether what was read last are the magic bytes of the end.
+    /// Returns true if the last bytes read are the magic bytes.
     #[must_use]
     pub fn ends_with_magic(&self) -> bool {
         self.last == *MAGIC
     }
 
-    /// The length by its content of the record that was read last, if that is a chunk, as far as it is there, and not
-    /// compressed: records in it are its own.
+    /// Returns the length of the last record by its fields if it is an uncompressed chunk, as far as it is available:
+    /// records in it are its own.
     #[must_use]
     pub fn plain_chunk(&self) -> Option<u64> {
         own_length(op::CHUNK, &self.body).filter(|_| self.code == op::CHUNK && is_plain(&self.body))
     }
 
-    /// Compares what was framed last with what it says of itself, and with its place in the file.
+    /// Compares the last item with its own fields, and with its position in the file.
     ///
     /// # Errors
-    /// When its operation code or its length is wrong.
+    /// Returns [`Damage`] if its operation code or its length is wrong.
     pub fn check(&self, framed: Framed) -> Result<(), Damage> {
         let (code, bytes) = match framed {
             Framed::Unknown(code, _) => return Err(Damage::Unknown(code)),
@@ -153,7 +153,7 @@ impl<R: Read> Source<R> {
         );
         let is_elsewhere =
             (is_index && !self.in_summary) || (code == op::HEADER && self.began > MAGIC.len() as u64);
-        // Messages stand in chunks or between descriptions; behind a chunk its indexes do.
+        // Messages stand in chunks or between descriptions. Message indexes follow chunks.
         let is_of = |kind| own_length(kind, &self.body) == Some(bytes);
         let is_other = code == op::MESSAGE
             && (is_of(op::SCHEMA) || is_of(op::CHANNEL) || (self.has_chunks && is_of(op::MESSAGE_INDEX)));
@@ -167,17 +167,17 @@ impl<R: Read> Source<R> {
         }
     }
 
-    /// The name of an attachment that is too long.
+    /// Returns the name of an attachment that is too long.
     #[must_use]
     pub fn attachment_name(&self) -> &str {
         attachment_name(&self.body)
     }
 
-    /// Compares a section with the checksum in the record that was read last: the data section when its end has come, or
-    /// the summary when the footer has. Nothing is wrong where the file has none, or where something was left out.
+    /// Compares a section with the checksum in the last record: the data section at its end, or the summary at the
+    /// footer. Accepts a file without checksums, and one of which a part was skipped.
     ///
     /// # Errors
-    /// When the record or the checksum is wrong.
+    /// Returns [`Damage`] if the record or the checksum is wrong.
     pub fn check_section(&mut self, code: u8) -> Result<(), Damage> {
         let found = self.checksum.take().map(crc32fast::Hasher::finalize);
         let (Record::DataEnd { crc: saved } | Record::Footer { crc: saved }) = parse(code, &self.body)?
@@ -191,21 +191,21 @@ impl<R: Read> Source<R> {
         }
     }
 
-    /// The summary section begins here: what is compared next is that, and the footer before its checksum.
+    /// Begins the summary section: its checksum covers everything from here to the checksum in the footer.
     pub fn begin_summary(&mut self) {
         self.checksum = Some(crc32fast::Hasher::new());
         self.in_summary = true;
     }
 
-    /// It was none: the data section goes on.
+    /// Returns to the data section, because the summary was not one.
     pub const fn end_summary(&mut self) {
         self.in_summary = false;
     }
 
-    /// The next record.
+    /// Returns the next item.
     ///
     /// # Errors
-    /// When the input fails.
+    /// Returns an error if the input fails.
     #[expect(
         clippy::should_implement_trait,
         reason = "a record borrows from the source; an iterator's cannot"
@@ -258,8 +258,7 @@ impl<R: Read> Source<R> {
         })
     }
 
-    /// Reads so many bytes behind those that are there, or what there is; it grows with that, not with what was asked
-    /// for.
+    /// Appends up to `bytes` bytes to the body. The body grows with the bytes read, not with those requested.
     fn take(&mut self, bytes: u64) -> io::Result<u64> {
         let came = (&mut self.input).take(bytes).read_to_end(&mut self.body)?;
         self.read += came as u64;
@@ -278,7 +277,7 @@ impl<R: Read> Source<R> {
         }
     }
 
-    /// Reads so many bytes without keeping them; whether they were there.
+    /// Skips `bytes` bytes. Returns true if the input had them all.
     fn pass_over(&mut self, bytes: u64) -> io::Result<bool> {
         let mut leftover = bytes;
         let mut piece = [0; 8 << 10];
@@ -299,25 +298,25 @@ impl<R: Read> Source<R> {
 }
 
 impl<R: Read + Seek> Source<R> {
-    /// What it reads from.
+    /// Returns the input.
     pub const fn input(&mut self) -> &mut R {
         &mut self.input
     }
 
-    /// All bytes that there are.
+    /// Returns the length of the input, in bytes.
     ///
     /// # Errors
-    /// When the input fails, or is none that can be gone back in.
+    /// Returns an error if the input fails or is not seekable.
     pub fn size(&mut self) -> io::Result<u64> {
         let size = self.input.seek(SeekFrom::End(0))?;
         self.input.seek(SeekFrom::Start(self.read))?;
         Ok(size)
     }
 
-    /// Goes on at another place. No checksum of all is known any more, unless it is the same place.
+    /// Seeks to `place`. The checksum is dropped, unless the position stays the same.
     ///
     /// # Errors
-    /// When the input fails.
+    /// Returns an error if the input fails.
     pub fn move_to(&mut self, place: u64) -> io::Result<()> {
         self.input.seek(SeekFrom::Start(place))?;
         if place != self.read {
@@ -326,11 +325,11 @@ impl<R: Read + Seek> Source<R> {
         Ok(())
     }
 
-    /// Takes the content of a record that begins at a place into [`Source::body`], with another length than it says;
-    /// whether all of it is there.
+    /// Reads the contents of the record at `began` into [`Source::body`], with `length` in place of its own length.
+    /// Returns true if all bytes are available.
     ///
     /// # Errors
-    /// When the input fails.
+    /// Returns an error if the input fails.
     pub fn read_as(&mut self, began: u64, length: u64) -> io::Result<bool> {
         self.move_to(began + HEAD as u64)?;
         self.began = began;
@@ -339,7 +338,7 @@ impl<R: Read + Seek> Source<R> {
     }
 }
 
-/// Keeps the last bytes of all that came.
+/// Keeps the last bytes of the input.
 fn remember(last: &mut [u8; MAGIC.len()], came: &[u8]) {
     let came = came.get(came.len().saturating_sub(last.len())..).unwrap_or_default();
     last.rotate_left(came.len());
@@ -349,10 +348,11 @@ fn remember(last: &mut [u8; MAGIC.len()], came: &[u8]) {
     }
 }
 
-/// Goes to the next record of one of these kinds, without reading what is before it; its operation code and length.
+/// Seeks to the next record of one of the kinds in `target`, without reading those before it. Returns its operation
+/// code and length.
 ///
 /// # Errors
-/// When the input fails.
+/// Returns an error if the input fails.
 pub fn find<R: Read + Seek>(input: &mut BufReader<R>, target: &[u8]) -> io::Result<Option<(u8, u64)>> {
     loop {
         let mut head = [0; 9];
@@ -365,7 +365,7 @@ pub fn find<R: Read + Seek>(input: &mut BufReader<R>, target: &[u8]) -> io::Resu
         if target.contains(&opcode) {
             return Ok(Some((opcode, length)));
         }
-        // A length that leads beyond everything.
+        // The length leads beyond any file.
         let Ok(length) = i64::try_from(length) else { return Ok(None) };
         if input.seek_relative(length).is_err() {
             return Ok(None);

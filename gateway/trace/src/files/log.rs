@@ -1,4 +1,4 @@
-//! Logs: files that are there, and can be followed, while they grow.
+//! Log files, which have their names while they grow and can be followed.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Write};
@@ -14,47 +14,47 @@ use super::target::{
     sync_folder, with_hint, write_all_patiently,
 };
 
-/// A log. It has its name from the start, is locked against other writers, and holds whole lines only. One that
-/// takes another file's place does so with its first line.
+/// A log file. It has its name from the start, is locked against other writers, and holds only complete lines. It
+/// replaces an existing file with its first line.
 #[derive(Debug)]
 pub struct LogFile {
     path: PathBuf,
     state: State,
-    /// Bytes in it that are ours.
+    /// The number of bytes written.
     bytes: u64,
     ended: bool,
 }
 
 #[derive(Debug)]
 enum State {
-    /// A regular file of ours.
+    /// A regular file of this log.
     Ours(File),
-    /// Another file, which is overwritten with the first line; held until then, and afterwards.
+    /// An existing file, which the first line replaces. It is locked until then.
     Old(File),
-    /// What is no regular file has no length and no lock.
+    /// A stream such as a terminal, which has no length and no lock.
     Stream(Stoppable<File>),
 }
 
 impl LogFile {
-    /// Begins a log. A FIFO is waited for until somebody reads it, or until `stopped`.
+    /// Begins a log. Waits for a reader of a FIFO until `stopped` is set.
     ///
     /// # Errors
-    /// When it cannot be written, and what to do.
+    /// Returns an error that includes what to do if the file cannot be written.
     pub fn create(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
         let state = match Target::of(path, force) {
             Ok(Target::Stream) => State::Stream(Stoppable::new(open_stream(path, stopped)?)),
             Ok(Target::New) => State::Ours(begin(path)?),
             Ok(Target::Old) => {
-                // A link that took its place meanwhile is not followed.
+                // A link that replaced the file meanwhile is not followed.
                 let old = open_unfollowed(path).map_err(with_hint)?;
                 hold_log(&old)?;
-                // That nothing can take its place is known before the first line.
+                // A folder that allows no replacement is reported before the first line.
                 let writes = access(folder_of(path), Access::WRITE_OK | Access::EXEC_OK);
                 writes.map_err(|errno| with_hint(errno.into()))?;
                 State::Old(old)
             }
             Err(error) => {
-                // That somebody writes it says more than that it is there.
+                // The error that another run writes the file is more useful than that it exists.
                 let about = fs::symlink_metadata(path);
                 if about.is_ok_and(|about| about.is_file()) {
                     File::open(path).map_or(Ok(()), |old| hold_log(&old))?;
@@ -65,10 +65,10 @@ impl LogFile {
         Ok(Self { path: path.to_owned(), state, bytes: 0, ended: false })
     }
 
-    /// Begins a log under the first of the names `run.log`, `run-1.log`, `run-2.log`, ... that is free.
+    /// Begins a log under the first free name of `run.log`, `run-1.log`, `run-2.log`, ...
     ///
     /// # Errors
-    /// When none can be written, and what to do.
+    /// Returns an error that includes what to do if none can be written.
     pub fn create_numbered(path: &Path, stopped: &AtomicBool) -> io::Result<Self> {
         let mut number = 0;
         let mut name = path.to_owned();
@@ -83,30 +83,30 @@ impl LogFile {
         }
     }
 
-    /// Its name.
+    /// Returns the name of the file.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Bytes written.
+    /// Returns the number of bytes written.
     #[must_use]
     pub const fn bytes(&self) -> u64 {
         self.bytes
     }
 
-    /// Appends whole lines, all of them or none.
+    /// Appends complete lines, all of them or none.
     ///
     /// # Errors
-    /// When the file does not take them; then it ends with the lines before.
+    /// Returns an error if the file cannot be written; it then ends with the lines before.
     pub fn append(&mut self, lines: &str) -> io::Result<()> {
         self.append_bytes(lines.as_bytes())
     }
 
-    /// Appends whole lines that need not be text.
+    /// Appends complete lines that need not be UTF-8.
     ///
     /// # Errors
-    /// As of [`LogFile::append`].
+    /// Returns an error as [`LogFile::append`] does.
     pub fn append_bytes(&mut self, lines: &[u8]) -> io::Result<()> {
         if lines.is_empty() {
             return Ok(());
@@ -120,9 +120,9 @@ impl LogFile {
         };
         match &self.state {
             _ if written.is_ok() => self.bytes += lines.len() as u64,
-            // A part of a line would be no line. If that fails too, nothing more can be done.
+            // The file must not end within a line. If truncating fails too, nothing more can be done.
             State::Ours(file) => {
-                // It is only ever made shorter: somebody else may have done so.
+                // Only make the file shorter: another program may have truncated it.
                 if file.metadata().is_ok_and(|about| about.len() > self.bytes) {
                     let _ = file.set_len(self.bytes);
                 }
@@ -132,13 +132,13 @@ impl LogFile {
         written
     }
 
-    /// Sees that the file still has its name and holds what was written.
+    /// Checks that the file still has its name and its contents.
     ///
     /// # Errors
-    /// When another program has renamed, removed or truncated it, or written to it.
+    /// Returns an error if another program has renamed, removed, truncated or written it.
     pub fn look(&self) -> io::Result<()> {
         let State::Ours(file) = &self.state else { return Ok(()) };
-        // Where it cannot be looked at, nothing is known against it.
+        // A failure to query the file is not evidence of a change.
         let Ok(about) = file.metadata() else { return Ok(()) };
         let (bytes, written) = (about.len(), self.bytes);
         let why = if is_still(&self.path, identity(&about)) == Some(false) {
@@ -155,10 +155,10 @@ impl LogFile {
         Err(io::Error::other(why))
     }
 
-    /// The lines that stand in the file of its name and begin in a way; none where that is not the file that is written.
+    /// Counts the lines of the file that begin with `begin`; `None` if the name belongs to another file now.
     ///
     /// # Errors
-    /// When it cannot be read.
+    /// Returns an error if the file cannot be read.
     pub fn lines(&self, begin: &str) -> io::Result<Option<u64>> {
         let State::Ours(file) = &self.state else { return Ok(None) };
         let there = open_unfollowed(&self.path);
@@ -170,7 +170,7 @@ impl LogFile {
         Ok(Some(lines))
     }
 
-    /// A new file takes the place of the old one, whose other names, and readers, keep it.
+    /// Replaces the old file with a new one. Other hard links and readers keep the old one.
     fn take_place(&self) -> io::Result<File> {
         let part = part_of(&self.path);
         let file = begin(&part)?;
@@ -180,13 +180,13 @@ impl LogFile {
         Ok(file)
     }
 
-    /// Ends the log: what it holds outlives a loss of power from now on.
+    /// Ends the log: its contents survive a loss of power from now on.
     ///
     /// # Errors
-    /// When the disk does not take it.
+    /// Returns an error if the disk cannot store them.
     pub fn finish(mut self) -> io::Result<()> {
         if let State::Old(_) = &self.state {
-            // Nothing was said, and that is what stands in it.
+            // An empty log also replaces the old file.
             self.state = State::Ours(self.take_place()?);
         }
         self.ended = true;
@@ -198,7 +198,7 @@ impl LogFile {
 }
 
 impl Drop for LogFile {
-    /// A log that was never ended, and in which nothing stands, is taken away.
+    /// Removes a log that was never ended and is empty.
     fn drop(&mut self) {
         let State::Ours(file) = &self.state else { return };
         let is_there =
@@ -215,7 +215,7 @@ fn is_same(one: &File, other: &File) -> bool {
     of(one).is_some_and(|is| Some(is) == of(other))
 }
 
-/// Makes a file that nobody else has, and holds it.
+/// Creates and locks a new file.
 fn begin(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new().append(true).create_new(true).open(path);
     let file = file.map_err(|error| or_exists(with_hint(error)))?;
@@ -223,7 +223,7 @@ fn begin(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
-/// Holds a log against other writers; where the file system has no locks it is not held.
+/// Locks a log against other writers. File systems without locks are accepted.
 fn hold_log(file: &File) -> io::Result<()> {
     if hold(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock) {
         let why = "another run is writing it: name another file, or wait for that run's end";

@@ -1,7 +1,7 @@
-//! Files that commands write. Nothing is overwritten unless that is asked for, and no symlink is followed to a file.
+//! Output files of commands. A file is overwritten only on request, and a symlink to a file is never followed.
 //!
-//! - [`WholeFile`]: a result; under its name it is whole or not there.
-//! - [`LogFile`]: a log; it is there from its first line on, and grows.
+//! - [`WholeFile`]: a result file, which appears under its name only when it is complete.
+//! - [`LogFile`]: a log file, which exists from its first line on and grows.
 
 pub mod log;
 mod target;
@@ -17,35 +17,36 @@ pub use target::{STANDARD_OUTPUT, check, check_regular, rename, suffixed, sync_f
 use target::{Target, open_stream, or_exists, part_of};
 pub(crate) use target::{hold, identity, is_still, link, nameless, open_unfollowed, write_patiently};
 
-/// A file that has a name only when it is whole. Until then it has none at all, and so is gone with a
-/// program that is killed; where the file system has no such files it is called `.NAME.PID.part`, and a run
-/// that does not come to its end takes it away. Once it has its name, it outlives a loss of power.
+/// A file that gets its name only when it is complete. Until then it is unnamed, and so disappears if the program is
+/// killed. On a file system without unnamed files it is called `.NAME.PID.part`, and a run that fails removes it. Once
+/// it has its name, it survives a loss of power.
 ///
-/// What is there and is no regular file (a FIFO, a terminal, `/dev/stdout`), and `-`, standard output, are written to as they are.
+/// Existing targets that are not regular files (a FIFO, a terminal, `/dev/stdout`), and `-`, standard output, are
+/// written directly.
 #[derive(Debug)]
 pub struct WholeFile {
     path: PathBuf,
     force: bool,
-    /// Until it has its name; of what is written to as it is, never.
+    /// The file until it has its name; `None` if the target is written directly.
     file: Option<File>,
-    /// Whether it has another name until then.
+    /// True if it has a temporary name until then.
     is_part: bool,
 }
 
 impl WholeFile {
-    /// Opens a file, so that what makes that impossible is known before there is anything to write. One that exists
-    /// is overwritten with `force`, and otherwise refused.
+    /// Opens a file early, so that errors are reported before there is anything to write. An existing file is
+    /// overwritten if `force` is true, and refused otherwise.
     ///
     /// # Errors
-    /// When it cannot be written, and what to do.
+    /// Returns an error that includes what to do if the file cannot be written.
     pub fn create(path: &Path, force: bool) -> io::Result<(Self, File)> {
         Self::create_unless(path, force, &AtomicBool::new(false))
     }
 
-    /// The same; a FIFO that nobody reads is waited for only until `stopped`.
+    /// Opens a file. Waits for a reader of a FIFO only until `stopped` is set.
     ///
     /// # Errors
-    /// When it cannot be written, and what to do.
+    /// Returns an error that includes what to do if the file cannot be written.
     pub fn create_unless(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<(Self, File)> {
         let begun = |file, is_part| Self { path: path.to_owned(), force, file, is_part };
         if Target::of(path, force)? == Target::Stream {
@@ -60,27 +61,27 @@ impl WholeFile {
         Ok((begun(Some(file.try_clone()?), true), file))
     }
 
-    /// Its name, once it is whole.
+    /// Returns the final name of the file.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Returns true for what is written to as it is.
+    /// Returns true if the target is written directly.
     #[must_use]
     pub const fn is_stream(&self) -> bool {
         self.file.is_none()
     }
 
-    /// Gives it its name; everything has been written.
+    /// Gives the complete file its name.
     ///
     /// # Errors
-    /// When the file system refuses, or another program has made a file of this name meanwhile.
+    /// Returns an error if the file system refuses, or if another program has created a file of this name meanwhile.
     pub fn finish(mut self) -> io::Result<()> {
         let Some(file) = &self.file else { return Ok(()) };
         file.sync_all()?;
         if !self.is_part {
-            // A link never takes another file's place, so that one gets a name of its own first.
+            // A hard link never replaces another file, so the file gets a temporary name first.
             let name = if self.force { part_of(&self.path) } else { self.path.clone() };
             link(file, &name).map_err(or_exists)?;
             self.is_part = self.force;
@@ -103,10 +104,10 @@ impl Drop for WholeFile {
     }
 }
 
-/// Writes a whole file; as [`WholeFile`].
+/// Writes a text to a file, as [`WholeFile`] does.
 ///
 /// # Errors
-/// When it cannot be written, and what to do.
+/// Returns an error that includes what to do if the file cannot be written.
 pub fn write_whole(path: &Path, text: &str, force: bool) -> io::Result<()> {
     let (whole, mut file) = WholeFile::create(path, force)?;
     file.write_all(text.as_bytes())?;

@@ -1,4 +1,4 @@
-//! What stands under the name of a file that is to be written, and whether it may be.
+//! Checks of output files: the kind of the existing target, and permission to write it.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, FileType, OpenOptions};
@@ -16,26 +16,26 @@ use rustix::fs::{
 };
 use rustix::io::Errno;
 
-/// Between two looks whether somebody reads a FIFO.
+/// The interval between two attempts to open a FIFO that has no reader.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// The name of standard output; a file of this name is `./-`.
+/// The name of standard output. A file of this name is written as `./-`.
 pub const STANDARD_OUTPUT: &str = "-";
 
-/// What stands under a name.
+/// The kind of target under a name.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Target {
-    /// Nothing.
+    /// The name is free.
     New,
     /// A regular file, which is to be overwritten.
     Old,
-    /// A FIFO, a terminal, `/dev/stdout`, `-`: written to as it is.
+    /// A FIFO, a terminal, `/dev/stdout` or `-`, which is written directly.
     Stream,
 }
 
 impl Target {
-    /// Looks at a name. A regular file is overwritten only with `force`; a symlink to one, or to nothing, is never
-    /// followed.
+    /// Determines the target under a name. A regular file is accepted only with `force`; a symlink to one, or to
+    /// nothing, is never followed.
     pub(super) fn of(path: &Path, force: bool) -> io::Result<Self> {
         if path == Path::new(STANDARD_OUTPUT) {
             return Ok(Self::Stream);
@@ -69,18 +69,18 @@ impl Target {
     }
 }
 
-/// Whether a file may be written under a name, before there is anything to write.
+/// Checks early that a file may be written.
 ///
 /// # Errors
-/// Why not, and what to do.
+/// Returns an error that includes what to do if it may not.
 pub fn check(path: &Path, force: bool) -> io::Result<()> {
     Target::of(path, force).map(|_| ())
 }
 
-/// The same of a file that has to be a regular one.
+/// Checks early that a regular file may be written.
 ///
 /// # Errors
-/// Why not, and what to do.
+/// Returns an error that includes what to do if it may not.
 pub fn check_regular(path: &Path, force: bool) -> io::Result<()> {
     match Target::of(path, force)? {
         Target::New | Target::Old => Ok(()),
@@ -89,16 +89,16 @@ pub fn check_regular(path: &Path, force: bool) -> io::Result<()> {
 }
 
 fn no_regular_file() -> io::Error {
-    io::Error::new(io::ErrorKind::AlreadyExists, "it is no regular file: name another one")
+    io::Error::new(io::ErrorKind::AlreadyExists, "it is not a regular file: name another one")
 }
 
-/// The refusal of a name that is taken.
+/// Returns the error for a name that is taken.
 pub(super) fn exists() -> io::Error {
     let why = "it exists: name another file, or overwrite it with --overwrite";
     io::Error::new(io::ErrorKind::AlreadyExists, why)
 }
 
-/// The same in place of an error that says no more.
+/// Replaces an error of the kind `AlreadyExists` by [`exists`], which includes what to do.
 pub(super) fn or_exists(error: io::Error) -> io::Error {
     if error.kind() == io::ErrorKind::AlreadyExists { exists() } else { error }
 }
@@ -107,7 +107,7 @@ fn is_stream(kind: FileType) -> bool {
     kind.is_fifo() || kind.is_char_device()
 }
 
-/// Opens what is written to as it is. A FIFO is waited for until somebody reads it, or until `stopped`.
+/// Opens a target that is written directly. Waits for a reader of a FIFO until `stopped` is set.
 pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File> {
     let descriptor = if path == Path::new(STANDARD_OUTPUT) { Some(1) } else { own_descriptor(path) };
     let own: Option<OwnedFd> = match descriptor {
@@ -123,7 +123,10 @@ pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File>
         match OpenOptions::new().append(true).custom_flags(nonblocking).open(path) {
             Err(error) if Errno::from_io_error(&error) == Some(Errno::NXIO) => {
                 if stopped.load(Ordering::Relaxed) {
-                    return Err(io::Error::new(io::ErrorKind::Interrupted, "interrupted: nobody read it"));
+                    return Err(io::Error::new(
+                        io::ErrorKind::Interrupted,
+                        "interrupted: no program read it",
+                    ));
                 }
                 std::thread::sleep(LOOK);
             }
@@ -137,7 +140,7 @@ pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File>
     Ok(file)
 }
 
-/// A file's name with something between its stem and its end.
+/// Returns a file's name with a suffix between its stem and its extension.
 #[must_use]
 pub fn suffixed(path: &Path, suffix: impl AsRef<OsStr>, end: &OsStr) -> PathBuf {
     let mut name = path.file_stem().unwrap_or_default().to_owned();
@@ -149,47 +152,48 @@ pub fn suffixed(path: &Path, suffix: impl AsRef<OsStr>, end: &OsStr) -> PathBuf 
     path.with_file_name(name)
 }
 
-/// A file without a name in a folder, for writing and reading.
+/// Creates an unnamed file in a folder, for writing and reading.
 ///
 /// # Errors
-/// When it cannot be written there, or the file system has no such files.
+/// Returns an error if the folder cannot be written, or if the file system does not support unnamed files.
 pub(crate) fn nameless(folder: &Path, mode: u32) -> io::Result<File> {
     let flags = OFlags::TMPFILE | OFlags::RDWR | OFlags::CLOEXEC;
     Ok(open(folder, flags, Mode::from_raw_mode(mode))?.into())
 }
 
-/// Gives a file without a name one; never another file's.
+/// Gives an unnamed file a name. Never replaces another file.
 ///
 /// # Errors
-/// When it cannot have it.
+/// Returns an error if the name cannot be given.
 pub(crate) fn link(file: &File, path: &Path) -> io::Result<()> {
     let nameless = format!("/proc/self/fd/{}", file.as_raw_fd());
     Ok(linkat(CWD, nameless, CWD, path, AtFlags::SYMLINK_FOLLOW)?)
 }
 
-/// Opens what may be anybody's: a link is not followed, and a pipe without a writer is not waited for.
+/// Opens a file that another user may have created: a link is not followed, and a pipe without a writer does not block.
 ///
 /// # Errors
-/// When it cannot be read.
+/// Returns an error if the file cannot be opened.
 pub(crate) fn open_unfollowed(path: &Path) -> io::Result<File> {
     let flags = (OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::NOCTTY).bits().cast_signed();
     OpenOptions::new().read(true).custom_flags(flags).open(path)
 }
 
-/// Holds a file against everybody else, as long as it is open.
+/// Locks a file exclusively for as long as it is open.
 ///
 /// # Errors
-/// Of the kind [`io::ErrorKind::WouldBlock`], when somebody else does; when the file system has no locks.
+/// Returns an error of the kind [`io::ErrorKind::WouldBlock`] if another process holds the lock, or another error if
+/// the file system has no locks.
 pub(crate) fn hold(file: &File) -> io::Result<()> {
     Ok(flock(file, FlockOperation::NonBlockingLockExclusive)?)
 }
 
-/// Which file it is, whatever has its name: device and inode.
+/// Returns the device and inode, which identify a file whatever its name.
 pub(crate) fn identity(about: &fs::Metadata) -> (u64, u64) {
     (about.dev(), about.ino())
 }
 
-/// Whether a name is that of a file, and not of a link to it; `None` when it cannot be looked at.
+/// Returns true if the name is that of the file `is`, and not of a link to it; `None` if the name cannot be queried.
 pub(crate) fn is_still(path: &Path, is: (u64, u64)) -> Option<bool> {
     match fs::symlink_metadata(path) {
         Ok(about) => Some(identity(&about) == is),
@@ -200,16 +204,16 @@ pub(crate) fn is_still(path: &Path, is: (u64, u64)) -> Option<bool> {
     }
 }
 
-/// How long a file that takes nothing is tried again.
+/// The time for which a blocked write is retried.
 const RETRY_TIMEOUT: Duration = Duration::from_secs(1);
-/// Between two attempts.
+/// The interval between two attempts.
 const PAUSE: Duration = Duration::from_millis(2);
 
-/// Writes what a file takes of some bytes. An interruption is none, one that takes nothing now is tried again for a second,
-/// and any other error once.
+/// Writes as many bytes as the file accepts. An interrupted call is retried, a blocked one for up to a second, and one
+/// with any other error once.
 ///
 /// # Errors
-/// When it stays so.
+/// Returns the error if it persists.
 pub(crate) fn write_patiently(file: &mut impl Write, bytes: &[u8]) -> io::Result<usize> {
     let mut since = None;
     let mut is_second = false;
@@ -229,10 +233,10 @@ pub(crate) fn write_patiently(file: &mut impl Write, bytes: &[u8]) -> io::Result
     }
 }
 
-/// The same of all bytes.
+/// Writes all bytes, with the retries of [`write_patiently`].
 ///
 /// # Errors
-/// See above; also when the file takes nothing.
+/// Returns the error if it persists, and an error if the file accepts no bytes.
 pub(crate) fn write_all_patiently(file: &mut impl Write, mut bytes: &[u8]) -> io::Result<()> {
     while !bytes.is_empty() {
         match write_patiently(file, bytes)? {
@@ -243,7 +247,7 @@ pub(crate) fn write_all_patiently(file: &mut impl Write, mut bytes: &[u8]) -> io
     Ok(())
 }
 
-/// Beside a file, a name that no other program gives.
+/// Returns a temporary name beside a file that no other program uses.
 pub(super) fn part_of(path: &Path) -> PathBuf {
     let mut name = OsString::from(".");
     name.push(path.file_name().unwrap_or_default());
@@ -251,28 +255,28 @@ pub(super) fn part_of(path: &Path) -> PathBuf {
     path.with_file_name(name)
 }
 
-/// Gives a file another name; takes another file's place only with `force`.
+/// Renames a file. Replaces another file only with `force`.
 ///
 /// # Errors
-/// When it cannot have it.
+/// Returns an error if the file cannot be renamed.
 pub fn rename(from: &Path, to: &Path, force: bool) -> io::Result<()> {
     if force {
         return fs::rename(from, to);
     }
     match renameat_with(CWD, from, CWD, to, RenameFlags::NOREPLACE) {
-        // A file system that cannot promise it.
+        // The file system does not support this atomically.
         Err(Errno::INVAL | Errno::NOSYS) if fs::symlink_metadata(to).is_err() => fs::rename(from, to),
         Err(Errno::EXIST | Errno::INVAL | Errno::NOSYS) => Err(exists()),
         renamed => Ok(renamed?),
     }
 }
 
-/// Makes the names in a file's folder durable. A file system that cannot does what it can.
+/// Makes the names in a file's folder durable, as far as the file system supports it.
 pub fn sync_folder(path: &Path) {
     let _ = File::open(folder_of(path)).and_then(|folder| folder.sync_all());
 }
 
-/// Why a file cannot be begun, and what to do when it is because of where it is to be.
+/// Adds what to do to an error of creating a file, if the cause is its location.
 #[must_use]
 pub fn with_hint(error: io::Error) -> io::Error {
     if matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) {

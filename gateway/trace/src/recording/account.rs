@@ -1,4 +1,4 @@
-//! What a recording came to.
+//! Counts of what a recording wrote and lost.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -8,19 +8,19 @@ use serde::Serialize;
 /// One file of a recording.
 #[derive(Clone, Debug, Serialize)]
 pub struct Written {
-    /// Its name.
+    /// The name of the file.
     pub path: String,
-    /// candump or mcap.
+    /// The format: `candump` or `mcap`.
     pub format: &'static str,
-    /// Frames in it.
+    /// The number of frames in it.
     pub frames: u64,
-    /// Messages in it, frames among them.
+    /// The number of messages in it, including frames.
     pub messages: u64,
-    /// Its size.
+    /// Its size in bytes.
     pub bytes: u64,
 }
 
-/// How many.
+/// Counts of messages.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Count {
     /// Frames.
@@ -30,10 +30,10 @@ pub struct Count {
 }
 
 impl Count {
-    /// A frame of a bus.
+    /// One frame of a bus.
     pub const FRAME: Self = Self { frames: 1, others: 0 };
 
-    /// So many other messages.
+    /// Counts `others` other messages.
     #[must_use]
     pub const fn others(others: u64) -> Self {
         Self { frames: 0, others }
@@ -44,32 +44,32 @@ impl Count {
         self.others += other.others;
     }
 
-    /// What a file came to in which it is.
+    /// Returns the account of a file that holds these messages.
     pub(super) fn in_file(self, path: &Path, bytes: u64) -> Written {
         let Self { frames, others } = self;
         Written { path: path.display().to_string(), format: "mcap", frames, messages: frames + others, bytes }
     }
 }
 
-/// What a run's recording came to.
+/// The account of a run's recording.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Recording {
-    /// Its files, in the order in which they were finished.
+    /// The files, in the order in which they were finished.
     pub files: Vec<Written>,
-    /// Frames that are in every format that was asked for.
+    /// Frames that are in every requested format.
     pub frames: u64,
-    /// Frames that are not: the sum of the two below.
+    /// Lost frames: the sum of the two below.
     pub lost: u64,
-    /// Frames that did not fit into the queue to the recorder.
+    /// Frames that did not fit into the recorder's queue.
     pub lost_queue: u64,
     /// Frames that could not be written.
     pub lost_write: u64,
-    /// Other messages that are missing, by topic's kind: ticks and epochs, and those that could not be written.
+    /// Other messages that are missing, by kind of topic: ticks and epochs, and those that could not be written.
     pub messages_lost: BTreeMap<&'static str, u64>,
-    /// Messages that came too late for their place in the order of times, and stand behind it.
+    /// Messages that arrived too late for their position in the order of times, and stand after it.
     pub messages_late: u64,
-    /// Processor time of the recorder's thread, in s.
+    /// The processor time of the recorder's thread, in s.
     pub processor_s: f64,
-    /// What went wrong, in words, each once.
+    /// Error messages, each once.
     pub errors: Vec<String>,
 }

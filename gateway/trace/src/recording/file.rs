@@ -1,10 +1,10 @@
-//! One MCAP file as it is written: what it is made of, its channels, its messages.
+//! Writes one MCAP file: its settings, channels and messages.
 //!
-//! The only place that knows the crate `mcap` and the settings that a recording needs.
+//! This is the only module that uses the writer of the crate `mcap`.
 //!
-//! Types and topics are described where the crate does it, in the chunk of their first message; outside of chunks, behind
-//! that chunk and again every [`DESCRIBED_EVERY`] chunks; and in the summary. So no damaged place of a file takes what all
-//! others need.
+//! Schemas and channels are written by the crate in the chunk of their first message. This module repeats them outside
+//! of chunks, after that chunk and then every [`DESCRIBED_EVERY`] chunks; the crate also writes them in the summary. No
+//! single damaged place in a file therefore destroys what all messages need.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -22,18 +22,19 @@ use super::output::Output;
 use crate::container::{Framed, Record, Source, parse};
 use crate::ros2::Message;
 
-/// Bytes that are compressed together; larger ones take a writer's time in pieces that queues feel.
+/// The number of bytes that are compressed together. Larger chunks block the writer for so long that its queues fill
+/// up.
 pub const CHUNK: u64 = 256 << 10;
 
-/// Chunks between two descriptions of all types and topics.
+/// The number of chunks between two descriptions of all schemas and channels.
 pub const DESCRIBED_EVERY: u32 = 64;
 
-/// Bytes of a message's record beside its own.
+/// The overhead of a message record in bytes.
 const HEAD: u64 = 31;
 
-/// The settings of every file that is written: no seeking, so that what has been flushed stays readable
-/// whatever happens afterwards; no threads, which cost more than they save. Chunks are ended by the [`FileWriter`], and the
-/// checksum of the data section is that of the [`Output`].
+/// Returns the settings of every written file. The crate does not seek, so that flushed data stays readable whatever
+/// happens afterwards, and uses no threads, which cost more than they save. The [`FileWriter`] ends chunks, and the
+/// [`Output`] computes the checksum of the data section.
 fn options() -> WriteOptions {
     WriteOptions::new()
         .profile(PROFILE)
@@ -45,38 +46,39 @@ fn options() -> WriteOptions {
         .disable_seeking(true)
 }
 
-/// The metadata that says which file a recording was begun in.
+/// The name of the metadata record that identifies the file in which a recording was begun.
 const MARK: &str = "recorder";
-/// The fact that says it.
+/// The key of the inode in [`MARK`].
 const INODE: &str = "inode";
 const BORN: &str = "born_ns";
 /// The conventions that a recording follows.
 const PROFILE: &str = "ros2";
-/// Who writes.
+/// The name of the writing program.
 const PROGRAM: &str = "skinbus ";
 
-/// What tells a file from a copy of it: its inode, and since inodes are used again, when it was made, where the file
-/// system knows that.
+/// Returns the identity that distinguishes a file from a copy: its inode, and its creation time if the file system
+/// stores it, because inodes are reused.
 fn identity(about: &fs::Metadata) -> BTreeMap<String, String> {
     let born = about.created().ok().and_then(|at| at.duration_since(UNIX_EPOCH).ok());
     let born = born.map(|born| (BORN.to_owned(), born.as_nanos().to_string()));
     [(INODE.to_owned(), about.ino().to_string())].into_iter().chain(born).collect()
 }
 
-/// What a recording's file begins with: that it is ours, and not a copy of ours.
+/// Returns the beginning of a recording: magic bytes, header, and the identity of the file `about`.
 ///
 /// # Errors
-/// Never, into memory.
+/// Never returns one, because it writes to memory.
 pub fn mark(about: &fs::Metadata) -> io::Result<Vec<u8>> {
     let mut writer = FileWriter::in_file(Vec::new(), about)?;
     writer.flush()?;
     Ok(writer.into_inner())
 }
 
-/// Whether a file begins with its mark, of whatever version; its place is moved.
+/// Returns true if a file begins with its own identity, written by any version of this program. Moves the position in
+/// the file.
 ///
 /// # Errors
-/// When it cannot be read.
+/// Returns an error if the file cannot be read.
 pub fn is_marked(file: &mut File) -> io::Result<bool> {
     let target = identity(&file.metadata()?);
     file.rewind()?;
@@ -93,13 +95,13 @@ pub fn is_marked(file: &mut File) -> io::Result<bool> {
     Ok(name == MARK && target.iter().all(|(key, value)| facts.get(key) == Some(value)))
 }
 
-/// What was written cannot go on.
+/// Converts an error of the crate `mcap` into an I/O error.
 #[must_use]
 pub fn io_error(error: McapError) -> io::Error {
     if let McapError::Io(error) = error { error } else { io::Error::other(error.to_string()) }
 }
 
-/// A topic of a file.
+/// A channel of a file.
 #[derive(Clone, Copy, Debug)]
 pub struct Channel {
     id: u16,
@@ -108,12 +110,13 @@ pub struct Channel {
 }
 
 impl Channel {
-    /// Its number in the file.
+    /// Returns the number of the channel.
     pub(super) const fn id(&self) -> u16 {
         self.id
     }
 
-    /// Its number, that of its next message, and whether that is a frame of a bus.
+    /// Returns the number of the channel, the sequence number of its next message, and true if it holds frames of a
+    /// bus.
     pub(super) const fn next(&mut self) -> (u16, u32, bool) {
         let sequence = self.sequence;
         self.sequence = sequence.wrapping_add(1);
@@ -121,26 +124,26 @@ impl Channel {
     }
 }
 
-/// Whether a topic of messages of a type is frames of a bus.
+/// Returns true if a channel holds frames of a bus.
 #[must_use]
 pub(super) fn is_frames(topic: &str, schema: &str) -> bool {
     schema == Frame::TYPE && topic.starts_with(TOPIC_OF_BUS)
 }
 
-/// A file that is being written. After an error it takes nothing more.
+/// A file that is being written. It is unusable after an error.
 pub struct FileWriter<W: Write> {
     writer: Writer<Output<W>>,
     output: Output<W>,
     buffer: Vec<u8>,
-    /// Chunks that were ended.
+    /// The number of complete chunks.
     chunks: u64,
-    /// Uncompressed bytes in the chunk that is open.
+    /// The number of uncompressed bytes in the open chunk.
     open: u64,
-    /// The records of all types and topics.
+    /// The records of all schemas and channels.
     descriptions: Vec<u8>,
-    /// Which of them are in it.
+    /// The numbers of the schemas and channels in `descriptions`.
     described: (BTreeSet<u16>, BTreeSet<u16>),
-    /// Chunks since they were written; `None` when some were never.
+    /// The number of chunks since the descriptions were written; `None` if some have not been written yet.
     since: Option<u32>,
 }
 
@@ -154,7 +157,7 @@ impl<W: Write> FileWriter<W> {
     /// Begins a file.
     ///
     /// # Errors
-    /// When it cannot be written, as of everything below.
+    /// Returns an error if the file cannot be written, as all methods below do.
     pub fn new(out: W) -> io::Result<Self> {
         Self::with_profile(out, PROFILE)
     }
@@ -162,7 +165,7 @@ impl<W: Write> FileWriter<W> {
     /// Begins a file that follows other conventions.
     ///
     /// # Errors
-    /// See above.
+    /// Returns an error if the file cannot be written.
     pub(super) fn with_profile(out: W, profile: &str) -> io::Result<Self> {
         let output = Output::new(out);
         let writer = options().profile(profile).create(output.clone()).map_err(io_error)?;
@@ -178,35 +181,35 @@ impl<W: Write> FileWriter<W> {
         })
     }
 
-    /// Begins the file of a run's recording, with its mark.
+    /// Begins the file of a run's recording, with its identity.
     ///
     /// # Errors
-    /// See above.
+    /// Returns an error if the file cannot be written.
     pub fn in_file(out: W, about: &fs::Metadata) -> io::Result<Self> {
         let mut writer = Self::new(out)?;
         writer.metadata(MARK, &identity(about))?;
         Ok(writer)
     }
 
-    /// Facts by name.
+    /// Writes a metadata record.
     ///
     /// # Errors
-    /// See above.
+    /// Returns an error if the file cannot be written.
     pub fn metadata(&mut self, name: &str, facts: &BTreeMap<String, String>) -> io::Result<()> {
         self.end_chunk()?;
         let record = Metadata { name: name.to_owned(), metadata: facts.clone() };
         self.writer.write_metadata(&record).map_err(io_error)
     }
 
-    /// A file in the file, as it is.
+    /// Attaches a file.
     ///
     /// # Errors
-    /// See above.
+    /// Returns an error if the file cannot be written.
     pub fn attach(&mut self, name: &str, media_type: &str, nanos: u64, bytes: &[u8]) -> io::Result<()> {
         self.attach_at(name, media_type, (nanos, nanos), bytes)
     }
 
-    /// The same with both of its times: when it was recorded, and when it was made.
+    /// Attaches a file with separate times of recording and creation.
     pub(super) fn attach_at(
         &mut self,
         name: &str,
@@ -220,12 +223,12 @@ impl<W: Write> FileWriter<W> {
         self.writer.attach(&attachment).map_err(io_error)
     }
 
-    /// A topic for messages of a type; `facts` is what else the file says of it.
+    /// Adds a channel for messages of a type, with metadata.
     ///
     /// # Errors
-    /// See above.
+    /// Returns an error if the file cannot be written.
     pub fn channel<M: Message>(&mut self, topic: &str, facts: &[(&str, &str)]) -> io::Result<Channel> {
-        // Bag tools want to find it, and take it empty.
+        // Bag tools require the key, and accept an empty value.
         let qos = ("offered_qos_profiles", "");
         let facts = [&qos].into_iter().chain(facts).map(|&(key, value)| (key.to_owned(), value.to_owned()));
         let (facts, definition) = (facts.collect(), M::DEFINITION.as_bytes());
@@ -236,7 +239,7 @@ impl<W: Write> FileWriter<W> {
         Ok(Channel { id, sequence: 0, is_frames: is_frames(topic, M::TYPE) })
     }
 
-    /// A type with a number of its own.
+    /// Adds a schema with a given number.
     pub(super) fn schema_as(
         &mut self,
         id: u16,
@@ -248,7 +251,7 @@ impl<W: Write> FileWriter<W> {
         Ok(())
     }
 
-    /// A topic with a number of its own, and that of its messages' type.
+    /// Adds a channel with given numbers of its own and of its schema.
     pub(super) fn channel_as(
         &mut self,
         (id, schema): (u16, u16),
@@ -285,7 +288,7 @@ impl<W: Write> FileWriter<W> {
     }
 
     fn describe(&mut self, opcode: u8, body: &[u8]) {
-        // The crate puts it into the chunk too.
+        // The crate also writes the description into the chunk.
         self.open += (HEAD_OF_RECORD + body.len()) as u64;
         self.descriptions.push(opcode);
         self.descriptions.extend((body.len() as u64).to_le_bytes());
@@ -293,10 +296,10 @@ impl<W: Write> FileWriter<W> {
         self.since = None;
     }
 
-    /// A message. Nothing is allocated for it but the chunk's growth.
+    /// Writes a message. Allocates only when the chunk grows.
     ///
     /// # Errors
-    /// See above.
+    /// Returns an error if the file cannot be written.
     pub fn write<M: Message>(&mut self, channel: &mut Channel, nanos: u64, message: &M) -> io::Result<()> {
         let mut buffer = std::mem::take(&mut self.buffer);
         message.encode_into(&mut buffer);
@@ -306,7 +309,7 @@ impl<W: Write> FileWriter<W> {
         put
     }
 
-    /// The bytes of a channel's message: its numbers, when it is logged and when it was published.
+    /// Writes an encoded message with its channel and sequence numbers, and its times of logging and publishing.
     pub(super) fn put(
         &mut self,
         (channel_id, sequence): (u16, u32),
@@ -322,7 +325,7 @@ impl<W: Write> FileWriter<W> {
         Ok(())
     }
 
-    /// Ends the chunk, and describes types and topics behind it when it is time.
+    /// Ends the chunk, and writes the descriptions after it if they are due.
     fn end_chunk(&mut self) -> io::Result<()> {
         if self.open == 0 {
             return Ok(());
@@ -340,25 +343,25 @@ impl<W: Write> FileWriter<W> {
         Ok(())
     }
 
-    /// At least as many chunks as there are so far.
+    /// Returns an upper bound of the number of chunks so far.
     #[must_use]
     pub const fn chunks(&self) -> u64 {
         self.chunks + 1
     }
 
-    /// Ends the chunk and hands everything on: what is in the file from here on can be read.
+    /// Ends the chunk and flushes the output: the file can be read up to here from now on.
     ///
     /// # Errors
-    /// See above.
+    /// Returns an error if the file cannot be written.
     pub fn flush(&mut self) -> io::Result<()> {
         self.end_chunk()?;
         self.output.hand_on()
     }
 
-    /// Writes the end: indexes and figures, by which readers find their way.
+    /// Writes the end of the file: indexes and statistics for seeking.
     ///
     /// # Errors
-    /// See above.
+    /// Returns an error if the file cannot be written.
     pub fn finish(&mut self) -> io::Result<()> {
         self.end_chunk()?;
         self.output.begin_end();
@@ -366,10 +369,10 @@ impl<W: Write> FileWriter<W> {
         self.output.hand_on()
     }
 
-    /// The output, without an end if none was written.
+    /// Returns the output. The file has no end unless [`FileWriter::finish`] wrote it.
     ///
     /// # Panics
-    /// Never: nobody else has the output.
+    /// Never: the other handle of the output is dropped here.
     #[must_use]
     pub fn into_inner(self) -> W {
         drop(self.writer.into_inner());
@@ -377,10 +380,10 @@ impl<W: Write> FileWriter<W> {
     }
 }
 
-/// Bytes of an operation code and a length.
+/// The length of a record's header in bytes: operation code and length.
 const HEAD_OF_RECORD: usize = 9;
 
-/// Bytes behind their length, as the format has strings.
+/// Encodes bytes after their length, as the format stores strings.
 fn text(bytes: &[u8]) -> Vec<u8> {
     [&u32::try_from(bytes.len()).unwrap_or(u32::MAX).to_le_bytes()[..], bytes].concat()
 }

@@ -1,4 +1,4 @@
-//! The topics of a recording, by the skin: what each is called and what is in it.
+//! The topics of a recording and their contents, derived from the skin.
 
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
@@ -9,53 +9,53 @@ use robots::{Taken, chain_words, word};
 use super::robot::Robot;
 use super::{TOPIC_OF_BUS, TOPIC_OF_STATE};
 
-/// What positions are relative to, where no robot says it.
+/// The reference frame of positions if no robot description names one.
 const BASE: &str = "base";
-/// The points of a patch are recorded at most so often.
+/// The maximum rate at which the points of a patch are recorded.
 const POINTS_HZ: f64 = 30.0;
 
-/// Cells of one bus on one link.
+/// The cells of one bus on one link.
 #[derive(Clone, Debug)]
 pub struct Patch {
-    /// Its topic.
+    /// The topic of the patch.
     pub topic: String,
-    /// The link: a frame of the robot.
+    /// The link, which is a frame of the robot.
     pub link: String,
-    /// The bus, by its place in the skin.
+    /// The index of the bus in the skin.
     pub bus: usize,
-    /// The chain that it is on, and the joint of that which moves it, from 1.
+    /// The index of the chain, and the joint of that chain that moves the patch, from 1.
     pub joint: (usize, usize),
-    /// The cells: place among the bus' cells, and number there.
+    /// The cells: index among the cells of the bus, and node id.
     pub cells: Vec<(usize, u16)>,
 }
 
-/// What a skin's recording is made of.
+/// The layout of a skin's recording.
 #[derive(Debug)]
 pub struct Layout {
-    /// The buses' names.
+    /// The names of the buses.
     pub buses: Vec<String>,
-    /// The robot's name, as topics have it.
+    /// The name of the robot, as topics contain it.
     pub arm: String,
-    /// The joints' names.
+    /// The names of the joints.
     pub joints: Vec<String>,
     /// The patches.
     pub patches: Vec<Patch>,
-    /// By bus: each joint of its chain by its place among those of the robot.
+    /// By bus: the index in the robot of each joint of its chain.
     chains: Vec<Vec<usize>>,
-    /// By bus: what its cells make of their sensors, and where they are.
+    /// By bus: the computation of forces from sensor values, and the positions of its cells.
     pub central: Vec<Central>,
-    /// From one of a patch's clouds of points to the next, in epochs.
+    /// The interval between two point clouds of a patch, in epochs.
     pub epochs_per_cloud: u64,
-    /// From one tick to the next, in ns.
+    /// The duration of a tick, in ns.
     pub tick_ns: u64,
-    /// From one of the poses of links to the next, in ticks.
+    /// The interval between two recordings of link poses, in ticks.
     pub ticks_per_poses: u64,
-    /// What is known of the robot's links.
+    /// The robot's links, if they are known.
     pub robot: Option<Robot>,
 }
 
 impl Layout {
-    /// A skin's.
+    /// Derives the layout from a skin.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
         let buses: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
@@ -103,7 +103,7 @@ impl Layout {
         }
     }
 
-    /// With the robot's links.
+    /// Adds the robot's links, whose names the patches get.
     #[must_use]
     pub fn with_robot(mut self, robot: Robot) -> Self {
         for patch in &mut self.patches {
@@ -114,8 +114,8 @@ impl Layout {
         Self { robot: Some(robot), ..self }
     }
 
-    /// The topics of the buses' frames, and of those latched before a file. They give way to the patches' topics and `others`:
-    /// readers know a bus by its messages.
+    /// Returns the topics of the buses' frames, and of the frames that were latched before a file. They avoid the
+    /// topics of the patches and `others`: readers identify a bus by its messages, not by its topic.
     #[must_use]
     pub fn bus_topics(&self, others: impl Iterator<Item = String>) -> [Vec<String>; 2] {
         let mut taken = Taken::default();
@@ -125,19 +125,19 @@ impl Layout {
             .map(|before| taken.give(self.buses.iter().map(|bus| format!("{before}{bus}")).collect()))
     }
 
-    /// Whether the poses of links are recorded at a tick.
+    /// Returns true if the poses of links are recorded at this tick.
     #[must_use]
     pub const fn poses_at(&self, tick: u64) -> bool {
         self.robot.is_some() && tick.is_multiple_of(self.ticks_per_poses)
     }
 
-    /// The frame that positions of cells are in: the robot's base.
+    /// Returns the frame of the cells' positions: the robot's base.
     #[must_use]
     pub fn base(&self) -> &str {
         self.robot.as_ref().map_or(BASE, Robot::base)
     }
 
-    /// Of positions of the robot those of a bus' chain.
+    /// Selects the positions of a bus' chain from those of the robot.
     #[must_use]
     pub fn chain_positions(&self, bus: usize, q: &[f64; MAX_ROBOT_JOINTS]) -> [f64; MAX_JOINTS] {
         let mut positions = [0.0; MAX_JOINTS];
@@ -165,7 +165,7 @@ mod tests {
         let cells: usize = layout.patches.iter().map(|patch| patch.cells.len()).sum();
         assert_eq!(cells, skin.cells.len(), "each in one patch");
         assert_eq!(layout.epochs_per_cloud, 3, "62.5 Hz are 20.8 clouds a second");
-        // A second bus with the same cells: now the bus tells patches of one link apart.
+        // A second bus has the same cells: its name distinguishes the patches on one link.
         let mut other = skin.buses[0].clone();
         other.name = "vcan-1".to_owned();
         skin.buses.push(other);
@@ -176,7 +176,7 @@ mod tests {
         let first = layout.patches[0].link.clone();
         assert_eq!(topics[0], format!("/skin/{first}_{}", word(&skin.buses[0].name)));
         assert_eq!(topics[1], format!("/skin/{first}_vcan_1"));
-        // Names that become one word stay apart, and topics of buses give way to all others.
+        // Names that map to the same topic word stay distinct, and topics of buses avoid all others.
         skin.buses[0].name = "notes".to_owned();
         skin.buses[1].name = "vcan_1".to_owned();
         skin.buses.push(protocol::skin::Bus { name: "vcan-1".to_owned(), ..skin.buses[0].clone() });

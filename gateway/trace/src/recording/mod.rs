@@ -1,4 +1,4 @@
-//! Recordings: MCAP files that are written in parts, named, found again and repaired.
+//! Recordings: MCAP files that are written in parts, named, found and repaired.
 
 pub mod account;
 pub mod file;
@@ -13,9 +13,9 @@ pub mod series;
 pub mod sink;
 pub mod window;
 
-/// What topics of frames begin with; the bus' name follows.
+/// The prefix of topics of frames; the name of the bus follows.
 pub const TOPIC_OF_BUS: &str = "/can/";
-/// What topics of frames begin with that were latched before the file began.
+/// The prefix of topics of frames that were latched before the file began.
 pub const TOPIC_OF_STATE: &str = "/state/";
-/// What stands between frames.
+/// The topic of notes between frames.
 pub const NOTES: &str = "/can/notes";

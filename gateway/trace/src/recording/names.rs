@@ -1,12 +1,13 @@
-//! What a recording's files are called, and who may write them.
+//! Names and ownership of a recording's files.
 //!
 //! ```text
 //!   run.mcap.part  ── finish ──>  run.mcap         then run-1.mcap.part, run-2.mcap.part, ...
 //!        └─ writer killed ──────>  run-recovered.mcap     and run.mcap.damaged, if more is lost than its end
 //! ```
 //!
-//! Who writes a file holds a lock on it, which goes with the process, and has put its own mark into it before it had a
-//! name: a `.part` that nobody holds and that bears this mark is orphaned. Any other is somebody else's.
+//! The writer of a file holds a lock on it, which ends with the process. It stores the identity of the file in it
+//! before the file gets a name. A `.part` file that is not locked and holds its own identity is therefore orphaned. All
+//! others belong to other programs.
 
 use std::ffi::OsStr;
 use std::fs::{self, File, OpenOptions};
@@ -21,35 +22,35 @@ use crate::files::{
     folder_of, hold, identity, is_still, link, nameless, open_unfollowed, rename, suffixed, with_hint,
 };
 
-/// What a file is called in addition until it is whole.
+/// The extension of a file until it is complete.
 const PART: &str = "part";
-/// How a recording's name ends.
+/// The extension of a recording.
 const MCAP: &str = "mcap";
 
-/// A file that is being written, held against others.
+/// A file that is being written and locked.
 #[derive(Debug)]
 pub struct Part {
-    /// Its name for now.
+    /// The temporary name.
     pub path: PathBuf,
-    /// Its name when it is whole.
+    /// The final name.
     pub goal: PathBuf,
-    /// Which file it is, whatever has its name: device and inode.
+    /// The device and inode, which identify the file whatever its name.
     is: (u64, u64),
 }
 
-/// The file that a part becomes: its name without the end.
+/// Returns the final name of a part file: its name without the extension `part`.
 #[must_use]
 pub fn goal_of(part: &Path) -> PathBuf {
     if part.extension() == Some(OsStr::new(PART)) { part.with_extension("") } else { part.to_owned() }
 }
 
-/// The name of a recording's file: the one that was asked for, then with a number.
+/// Returns the name of a recording's file with this number: the requested name for 0, then the name with the number.
 #[must_use]
 pub fn numbered(path: &Path, number: u32) -> PathBuf {
     if number == 0 { path.to_owned() } else { suffixed(path, format!("-{number}"), MCAP.as_ref()) }
 }
 
-/// What a recovered file is called; never the name of one that is there.
+/// Returns an unused name for a recovered file.
 #[must_use]
 pub fn recovered(goal: &Path) -> PathBuf {
     let first = suffixed(goal, "-recovered", MCAP.as_ref());
@@ -60,13 +61,13 @@ fn exists(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }
 
-/// What a file is called in addition that is damaged, and kept beside what was recovered from it.
+/// The extension of a damaged file that is kept beside the recovered one.
 const DAMAGED: &str = "damaged";
 
-/// Keeps a `.part` under another name, at which no run looks for what it could repair: `run.mcap.damaged`. That name.
+/// Renames a part file to `run.mcap.damaged`, so that later runs do not try to repair it. Returns the new name.
 ///
 /// # Errors
-/// When it is another file now, or cannot have another name.
+/// Returns an error if the name belongs to another file now, or if the file cannot be renamed.
 pub fn keep_damaged(part: &Path, from: &File) -> io::Result<PathBuf> {
     is_its_own(part, from)?;
     let goal = goal_of(part);
@@ -87,22 +88,22 @@ pub fn keep_damaged(part: &Path, from: &File) -> io::Result<PathBuf> {
     Err(io::Error::other("it has no name left"))
 }
 
-/// The files of an earlier recording of this name that are there: it, and those with a number.
+/// Returns the existing files of an earlier recording of this name: the first one and those with numbers.
 #[must_use]
 pub fn series(path: &Path) -> Vec<PathBuf> {
     let from = |first: u32| -> Vec<_> {
         (first..).map(|number| numbered(path, number)).take_while(|path| exists(path)).collect()
     };
     let all = from(0);
-    // The first one may have been taken away.
+    // The first file may have been removed.
     if all.is_empty() { from(1) } else { all }
 }
 
 impl Part {
-    /// Begins a file that nobody else is writing.
+    /// Creates and locks a part file.
     ///
     /// # Errors
-    /// When somebody is, or it cannot be written.
+    /// Returns an error if another program is writing it, or if it cannot be written.
     pub fn create(goal: PathBuf) -> io::Result<(Self, File)> {
         let mut name = goal.file_name().unwrap_or_default().to_owned();
         name.push(".");
@@ -119,10 +120,10 @@ impl Part {
         Ok((Self { path, goal, is }, file))
     }
 
-    /// Gives the file its name; takes another file's place only when `force` says so.
+    /// Gives the file its final name. Replaces another file only with `force`.
     ///
     /// # Errors
-    /// When it cannot have it.
+    /// Returns an error if the file cannot be renamed.
     pub fn finish(&self, force: bool) -> io::Result<()> {
         if !self.is_there() {
             return Err(io::Error::other(format!("{} is another file now", self.path.display())));
@@ -130,24 +131,24 @@ impl Part {
         rename(&self.path, &self.goal, force)
     }
 
-    /// Whether it still has its name for now, or that cannot be looked at.
+    /// Returns true if the file still has its temporary name, or if the name cannot be queried.
     #[must_use]
     pub fn is_there(&self) -> bool {
         is_still(&self.path, self.is) != Some(false)
     }
 
-    /// Takes the file away, if it is still there.
+    /// Removes the file, if it still has its temporary name.
     pub fn remove(&self) {
         if is_still(&self.path, self.is) == Some(true) {
-            // Else the next run takes it away.
+            // If this fails, the next run removes the file.
             let _ = fs::remove_file(&self.path);
         }
     }
 
-    /// The file, to be read.
+    /// Opens the file for reading.
     ///
     /// # Errors
-    /// When it cannot be opened, or its name is that of another file now.
+    /// Returns an error if the file cannot be opened, or if its name belongs to another file now.
     pub fn open(&self) -> io::Result<File> {
         let file = open_unfollowed(&self.path)?;
         if identity(&file.metadata()?) != self.is {
@@ -157,27 +158,28 @@ impl Part {
     }
 }
 
-/// The error for a name that another program has given to a file while a recording was written.
+/// Returns the message that another program took the name while a recording was written.
 pub(super) fn taken_meanwhile(goal: &Path) -> String {
     format!("{}: another program made a file of this name meanwhile", goal.display())
 }
 
-/// Why a recording cannot begin under a name.
+/// Returns the reason why a recording cannot begin under a name.
 fn why_taken(path: &Path) -> String {
     let name = path.display();
-    // A pipe is not opened: whoever waits at its other end would take that for a reader.
+    // A pipe is not opened: a program that waits at its other end would take that for a reader.
     if fs::symlink_metadata(path).is_ok_and(|about| !about.is_file()) {
-        return format!("{name} is there and is no regular file: move it away, or record to another name");
+        return format!("{name} exists and is not a regular file: move it away, or record to another name");
     }
     match open_unfollowed(path) {
         Ok(file) if !is_held(&file) => format!(
-            "{name} is there, and no run that was killed has left it: move it away, or record to another name"
+            "{name} exists, but was not left by a killed run: move it away, or record to another name"
         ),
-        _ => format!("{name} is there: another run records to this name now: record to another name"),
+        _ => format!("{name} exists: another run is recording to this name: record to another name"),
     }
 }
 
-/// A file that gets its name when it is held and bears its mark; nothing where the file system has none like it.
+/// Creates a file that gets its name only when it is locked and holds its identity; `None` if the file system does not
+/// support that.
 fn unnamed(path: &Path) -> Option<io::Result<File>> {
     let mut file = nameless(folder_of(path), 0o666).ok()?;
     claim(&mut file).ok()?;
@@ -190,75 +192,75 @@ fn unnamed(path: &Path) -> Option<io::Result<File>> {
 fn named(path: &Path) -> io::Result<File> {
     let mut file = OpenOptions::new().write(true).create_new(true).open(path)?;
     claim(&mut file).inspect_err(|_| {
-        // It is ours, and nobody's without its mark.
+        // The file was just created here, and is useless without its identity.
         let _ = fs::remove_file(path);
     })?;
     Ok(file)
 }
 
-/// Holds a file, and makes it ours for whoever finds it later.
+/// Locks a file, and writes its identity, by which later runs recognise it.
 fn claim(file: &mut File) -> io::Result<()> {
     hold(file)?;
     let about = file.metadata()?;
     file.write_all(&file::mark(&about)?)
 }
 
-/// Whether somebody writes this file now.
+/// Returns true if another process holds the lock on the file.
 #[must_use]
 pub fn is_held(file: &File) -> bool {
     hold(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
 }
 
-/// Why a `.part` in a recording's folder is not ours to touch.
+/// The reason why a `.part` file is not repaired or removed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum Leftover {
-    /// A link to something.
+    /// It is a symlink.
     #[error("it is a symlink")]
     Symlink,
-    /// A folder, a pipe, a device.
-    #[error("it is no regular file")]
+    /// It is a folder, a pipe or a device.
+    #[error("it is not a regular file")]
     Irregular,
-    /// It cannot be looked at.
+    /// It cannot be queried.
     #[error(transparent)]
     Io(#[from] io::Error),
     /// It cannot be read.
     #[error("it cannot be read: {0}")]
     Unreadable(#[source] io::Error),
-    /// Somebody else's.
+    /// It belongs to another user.
     #[error("it belongs to user {owner}, and this is user {me}")]
     Owner {
-        /// Whose it is.
+        /// The user id of the owner.
         owner: u32,
-        /// Who asks.
+        /// The user id of this process.
         me: u32,
     },
-    /// It has other names.
+    /// It has several hard links.
     #[error("it has {0} names (hard links)")]
     Linked(u64),
-    /// Its writer is there.
+    /// Another process holds the lock.
     #[error("another program is writing it")]
     Held,
-    /// It has no mark, or that of another file.
-    #[error("no run of this program has begun it here")]
+    /// It holds no identity, or that of another file.
+    #[error("no run of this program created it here")]
     Unmarked,
 }
 
 impl Leftover {
-    /// Whether it may be a recording.
+    /// Returns true if it may be a recording.
     #[must_use]
     pub const fn may_be_recording(&self) -> bool {
         matches!(self, Self::Owner { .. } | Self::Linked(_) | Self::Unmarked)
     }
 }
 
-/// A file that a run left which was killed, held against others from now on; or why it is not.
+/// A file that a killed run left, which is locked from now on; or the reason why it is not touched.
 pub type Orphan = Result<File, Leftover>;
 
-/// What of unfinished recordings is in a recording's folder.
+/// Returns the part files in a recording's folder.
 ///
 /// # Errors
-/// When the folder cannot be read.
+/// Returns an error if the folder cannot be read.
 pub fn parts(path: &Path) -> io::Result<Vec<(PathBuf, Orphan)>> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder_of(path))? {
@@ -274,9 +276,9 @@ pub fn parts(path: &Path) -> io::Result<Vec<(PathBuf, Orphan)>> {
     Ok(found)
 }
 
-/// Whose a file is.
+/// Locks a part file if it is an orphan.
 fn look(path: &Path) -> Orphan {
-    // Of what is no file not even an opening is harmless.
+    // Opening anything but a regular file may have side effects.
     let kind = fs::symlink_metadata(path)?.file_type();
     if kind.is_symlink() {
         return Err(Leftover::Symlink);
@@ -302,16 +304,16 @@ fn look(path: &Path) -> Orphan {
     if file::is_marked(&mut file).map_err(Leftover::Unreadable)? { Ok(file) } else { Err(Leftover::Unmarked) }
 }
 
-/// Takes an orphan away, if its name is still its own.
+/// Removes an orphan, if its name still belongs to it.
 ///
 /// # Errors
-/// When it is not, or cannot be taken away.
+/// Returns an error if the name belongs to another file now, or if the file cannot be removed.
 pub fn remove(path: &Path, file: &File) -> io::Result<()> {
     is_its_own(path, file)?;
     fs::remove_file(path)
 }
 
-/// Makes sure that a name is still that of a file.
+/// Checks that a name still belongs to a file.
 fn is_its_own(path: &Path, file: &File) -> io::Result<()> {
     if is_still(path, identity(&file.metadata()?)) == Some(true) {
         return Ok(());
@@ -344,7 +346,7 @@ mod tests {
         assert_eq!(orphans(&goal).len(), 0, "somebody writes it");
         let error = Part::create(goal.clone()).unwrap_err().to_string();
         assert!(
-            error.ends_with("part is there: another run records to this name now: record to another name"),
+            error.ends_with("part exists: another run is recording to this name: record to another name"),
             "{error}"
         );
         drop(file);

@@ -1,9 +1,9 @@
-//! The output below the crate's writer, into which records can be written that the crate cannot: descriptions outside of
-//! chunks.
+//! The output below the writer of the crate `mcap`. It allows records to be inserted that the crate cannot write:
+//! descriptions outside of chunks.
 //!
 //! ```text
 //!   crate's writer ── bytes ──┐
-//!                             ├──> Output: place and checksum of all bytes ──> file
+//!                             ├──> Output: offset and checksum of all bytes ──> file
 //!   descriptions ── records ──┘
 //! ```
 
@@ -12,16 +12,16 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use mcap::records::op;
 
-/// Bytes of the record that ends the data section: its head, and a checksum of the section.
+/// The length of the record that ends the data section, in bytes: its header, and a checksum of the section.
 const DATA_END: usize = 13;
 
-/// What all handles write to.
+/// The state that all handles share.
 struct Inner<W> {
     out: W,
     place: u64,
-    /// Of all bytes of the data section.
+    /// The checksum of all bytes of the data section.
     checksum: crc32fast::Hasher,
-    /// The record that ends the data section, as the crate writes it, once that is to come.
+    /// The bytes so far of the record that ends the data section, while the crate writes it.
     end: Option<Vec<u8>>,
 }
 
@@ -33,8 +33,8 @@ impl<W: Write> Inner<W> {
         Ok(())
     }
 
-    /// Takes the record that ends the data section, and writes it with the checksum of all bytes; how many bytes belonged
-    /// to it.
+    /// Takes the bytes of the record that ends the data section, and writes that record with the checksum of all bytes.
+    /// Returns the number of bytes that belonged to it.
     fn put_end(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let Some(end) = &mut self.end else { return Ok(0) };
         let taken = bytes.get(..bytes.len().min(DATA_END - end.len())).unwrap_or_default();
@@ -49,7 +49,7 @@ impl<W: Write> Inner<W> {
     }
 }
 
-/// A handle of the output. What the crate flushes is not handed on: it does so with each chunk.
+/// A handle of the output. Flushes by the crate are ignored, because it flushes after each chunk.
 pub(super) struct Output<W>(Arc<Mutex<Inner<W>>>);
 
 impl<W> Clone for Output<W> {
@@ -68,22 +68,22 @@ impl<W: Write> Output<W> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Writes whole records, while the crate's writer is between two.
+    /// Writes complete records while the crate's writer is between two records.
     pub(super) fn records(&self, records: &[u8]) -> io::Result<()> {
         self.inner().put(records)
     }
 
-    /// The crate ends the data section next.
+    /// Expects the record that ends the data section next.
     pub(super) fn begin_end(&self) {
         self.inner().end = Some(Vec::new());
     }
 
-    /// Hands on what was written.
+    /// Flushes the output.
     pub(super) fn hand_on(&self) -> io::Result<()> {
         self.inner().out.flush()
     }
 
-    /// What was written to, when this is the last handle.
+    /// Returns the inner writer if this is the last handle.
     pub(super) fn into_inner(self) -> Option<W> {
         let inner = Arc::into_inner(self.0)?;
         Some(inner.into_inner().unwrap_or_else(PoisonError::into_inner).out)
@@ -105,7 +105,7 @@ impl<W: Write> Write for Output<W> {
 }
 
 impl<W: Write> Seek for Output<W> {
-    /// Tells the place; there is no other to go to.
+    /// Returns the current offset. No other seek is supported.
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         match to {
             SeekFrom::Current(0) => Ok(self.inner().place),

@@ -1,5 +1,5 @@
-//! Gives files their names when the disk has them. Syncing takes as long as the disk takes, which a recorder cannot
-//! wait for: a thread does it, one file after the other.
+//! Gives files their final names once they are on the disk. Syncing may block for longer than a recorder can wait, so a
+//! thread does it, one file after the other.
 
 use std::fs::File;
 use std::io;
@@ -10,26 +10,26 @@ use std::thread::{self, JoinHandle};
 use super::names::{self, Part};
 use crate::files::sync_folder;
 
-/// A file that has ended, and what is told of it once it has its name.
+/// A complete file, and the information that is returned with its final name.
 #[derive(Debug)]
 pub(super) struct Ended<T> {
-    /// The file, which is held until then.
+    /// The file, which stays locked until it is renamed.
     pub(super) file: File,
     pub(super) part: Part,
     pub(super) about: T,
 }
 
-/// A file with the name that it keeps.
+/// A file with its final name.
 #[derive(Debug)]
 pub(super) struct Published<T> {
-    /// None if another program renamed or removed it.
+    /// The name; `None` if another program renamed or removed the file.
     pub(super) path: Option<PathBuf>,
     pub(super) about: T,
-    /// Why it is not the name that it was to have.
+    /// The reason why the name is not the requested one.
     pub(super) error: Option<String>,
 }
 
-/// The thread, and what it has done.
+/// The thread, and the files that it has finished.
 #[derive(Debug)]
 pub(super) struct Publisher<T> {
     force: bool,
@@ -39,13 +39,13 @@ pub(super) struct Publisher<T> {
 }
 
 impl<T: Send + 'static> Publisher<T> {
-    /// Takes the place of other files only with `force`.
+    /// Creates a publisher that replaces other files only if `force` is true.
     pub(super) fn new(force: bool) -> Self {
         let (sender, published) = mpsc::channel();
         Self { force, running: None, sender, published }
     }
 
-    /// Syncs a file and gives it its name, in its turn.
+    /// Queues a file for syncing and renaming.
     pub(super) fn publish(&mut self, ended: Ended<T>) {
         if self.running.is_none() {
             self.running = self.start().ok();
@@ -55,7 +55,7 @@ impl<T: Send + 'static> Publisher<T> {
             None => Some(ended),
         };
         if let Some(ended) = unsent {
-            // Without a thread the recorder waits; what comes meanwhile waits in its queue.
+            // If the thread cannot be started, the recorder waits; messages meanwhile wait in its queue.
             let _ = self.sender.send(publish(ended, self.force));
         }
     }
@@ -71,22 +71,22 @@ impl<T: Send + 'static> Publisher<T> {
         Ok((sender, thread::Builder::new().name("sync".into()).spawn(work)?))
     }
 
-    /// Those that have their names by now.
+    /// Returns the files that have been published since the last call.
     pub(super) fn done(&self) -> impl Iterator<Item = Published<T>> {
         self.published.try_iter()
     }
 
-    /// Waits until all have.
+    /// Waits until all files are published.
     pub(super) fn finish(&mut self) {
         if let Some((sender, thread)) = self.running.take() {
             drop(sender);
-            // Its panics are reported where they happen.
+            // The panic hook has already reported a panic of the thread.
             let _ = thread.join();
         }
     }
 }
 
-/// Only what a loss of power leaves whole has the name of a whole file.
+/// Syncs a file before it renames it: a file under its final name is complete even after a loss of power.
 fn publish<T>(Ended { file, part, about }: Ended<T>, force: bool) -> Published<T> {
     let named = file.sync_all().and_then(|()| part.finish(force));
     match named {

@@ -1,4 +1,4 @@
-//! Makes a whole file of one whose writer ended in the middle.
+//! Recovers a complete file from one whose writer was killed.
 //!
 //! ```text
 //!   magic │ head │ chunk │ index │ chunk │ index │ chu        a file whose writer was killed
@@ -6,8 +6,8 @@
 //!            kept, message by message            └ reported: bytes of an incomplete record
 //! ```
 //!
-//! A chunk is kept when it is whole and its checksum is right. One that is damaged is left out and reported, and so are
-//! bytes that are no record; what follows is kept, and looked for where a length leads nowhere.
+//! A chunk is kept if it is complete and its checksum is correct. Damaged chunks, and bytes that are not a record, are
+//! left out and reported. Intact records after them are kept; where a length is wrong they are searched for.
 
 mod described;
 mod survey;
@@ -23,47 +23,47 @@ use self::survey::{Piece, Survey};
 use super::file::FileWriter;
 use crate::container::{Chunk, Damage, Framed, Record, Source, parse};
 
-/// The longest attachment that is copied.
+/// The longest attachment that is copied, in bytes.
 const LONGEST_ATTACHMENT: u64 = 1 << 30;
 
-/// What a recovery came to.
+/// The result of a recovery.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct Recovered {
-    /// Messages that were kept.
+    /// Messages kept.
     pub messages: u64,
-    /// Of these, frames of buses.
+    /// Frames of buses among them.
     pub frames: u64,
-    /// The latest time of a message, in ns since 1970; 0 of none.
+    /// The latest time of a message, in ns since 1970; 0 without messages.
     pub last_nanos: u64,
-    /// Bytes at the end that are no whole record.
+    /// Bytes at the end that are not a complete record.
     pub unfinished: u64,
-    /// Damaged places, and their bytes.
+    /// The number of damaged places, and the bytes lost there.
     pub damaged: (u64, u64),
-    /// Messages whose topic was described only in something that is lost.
+    /// Messages whose channel was described only in a lost part.
     pub homeless: u64,
-    /// Messages that there were, if the file says how many.
+    /// The number of messages according to the statistics of the file, if it has any.
     pub stated: Option<u64>,
-    /// Whether the file had its end.
+    /// True if the file had its end.
     pub whole: bool,
-    /// Whether a checksum of all its data, or of its summary, is wrong.
+    /// True if the checksum of all data or of the summary is wrong.
     pub checksum: bool,
 }
 
 impl Recovered {
-    /// Whether nothing is lost but what a killed writer had not finished.
+    /// Returns true if only the data that a killed writer had not finished is lost.
     #[must_use]
     pub const fn is_undamaged(&self) -> bool {
         self.damaged.0 == 0 && self.homeless == 0
     }
 
-    /// Whether nothing was wrong with the file.
+    /// Returns true if the file was complete and correct.
     #[must_use]
     pub fn is_sound(&self) -> bool {
         let is_all = self.stated.is_none_or(|stated| stated == self.messages);
         self.whole && self.unfinished == 0 && self.is_undamaged() && !self.checksum && is_all
     }
 
-    /// Whether more messages were lost than kept, as far as it is known how many there were.
+    /// Returns true if more messages were lost than kept, as far as their number is known.
     #[must_use]
     pub fn is_little(&self) -> bool {
         let missing = self.stated.map_or(0, |stated| stated.saturating_sub(self.messages));
@@ -100,26 +100,26 @@ impl fmt::Display for Recovered {
     }
 }
 
-/// Why nothing can be recovered.
+/// The error of a recovery that finds nothing.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RecoverError {
-    /// Something else.
+    /// The input is not an MCAP file.
     #[error(
         "it is no MCAP file: it begins with {}, an MCAP file with 89 4d 43 41 50: name a recording",
         hex(got)
     )]
     NoMcap {
-        /// Its first bytes.
+        /// The first bytes of the input.
         got: Vec<u8>,
     },
-    /// An MCAP file that breaks off before its first message could be.
+    /// The MCAP file ends before its first message.
     #[error("it ends within its first {0} bytes: there is nothing in it")]
     Empty(u64),
-    /// It cannot be read.
+    /// The input cannot be read.
     #[error("reading: {0}")]
     Read(io::Error),
-    /// The new one cannot be written.
+    /// The new file cannot be written.
     #[error("writing: {0}")]
     Write(io::Error),
 }
@@ -129,11 +129,11 @@ fn hex(bytes: &[u8]) -> String {
     if digits.is_empty() { "nothing".to_owned() } else { digits.join(" ") }
 }
 
-/// Copies everything whole into a new file, and ends it. Behind damage it goes on with the next record that is certain.
-/// What types and topics are is known from wherever the file says it.
+/// Copies all intact records into a new file, and finishes it. After damage it continues with the next record that is
+/// certain. Schemas and channels are collected from the whole file in advance.
 ///
 /// # Errors
-/// When there is nothing to keep, a file fails, or the input cannot be gone back in.
+/// Returns [`RecoverError`] if there is nothing to keep, if a file fails, or if the input is not seekable.
 pub fn recover(mut from: impl Read + Seek, out: impl Write) -> Result<Recovered, RecoverError> {
     let Survey { profile, pieces, described, recovered } = Survey::of(&mut from)?;
     let begin = || -> io::Result<_> {
@@ -170,21 +170,20 @@ pub fn recover(mut from: impl Read + Seek, out: impl Write) -> Result<Recovered,
 
 struct Copy<W: Write> {
     writer: FileWriter<W>,
-    /// Topics, and whether their messages are frames.
+    /// Channel numbers, each with true if its messages are frames.
     topics: BTreeMap<u16, bool>,
     recovered: Recovered,
 }
 
 impl<W: Write> Copy<W> {
-    /// Copies a record, which was right when the file was gone through; `read` is how many bytes of the file were read
-    /// so far.
+    /// Copies a record that the survey found intact; `read` is the number of bytes of the file read so far.
     fn take(&mut self, chunk: &mut Chunk, code: u8, body: &[u8], read: u64) -> Result<(), RecoverError> {
         if code != op::CHUNK {
             return self.record(code, body).map_err(RecoverError::Write);
         }
         chunk.unpack(body, read).map_err(changed)?;
         while let Some((code, body)) = chunk.next() {
-            // Types and topics are written, and nothing else belongs into a chunk.
+            // Schemas and channels are already written, and chunks hold no other records.
             if code == op::MESSAGE {
                 self.record(code, body).map_err(RecoverError::Write)?;
             }
@@ -210,7 +209,7 @@ impl<W: Write> Copy<W> {
                 self.writer.attach_at(name, media_type, (log_time, create_time), data)
             }
             Record::Metadata { name, facts } => self.writer.metadata(name, &facts.into()),
-            // Written before, generated again, or of no file of ours.
+            // These records are already written, are generated anew, or are not written by skinbus.
             Record::Schema { .. }
             | Record::Channel { .. }
             | Record::Header { .. }
@@ -221,7 +220,7 @@ impl<W: Write> Copy<W> {
     }
 }
 
-/// The file is another one than a moment ago.
+/// The input changed between the survey and the copy.
 fn changed(damage: Damage) -> RecoverError {
     RecoverError::Read(io::Error::other(format!("it was changed meanwhile: {damage}")))
 }

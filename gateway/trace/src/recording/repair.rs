@@ -1,4 +1,4 @@
-//! Files whose writers are gone: finds, repairs and reports them.
+//! Finds, repairs and reports files whose writers were killed.
 
 use std::fs::{File, Permissions};
 use std::io::{self, BufReader, BufWriter, Seek};
@@ -12,25 +12,25 @@ use super::recover::{RecoverError, Recovered, recover};
 use super::sink::is_full;
 use crate::files::{WholeFile, folder_of, nameless};
 
-/// Names that are tried for a new file, when somebody else takes one after the other.
+/// The maximum number of names that are tried for a new file while other programs take them.
 const NAMES: u32 = 100;
 
-/// A recording that was made whole.
+/// A repaired recording.
 #[derive(Clone, Debug)]
 pub struct Repaired {
-    /// What it came to.
+    /// The result of the recovery.
     pub recovered: Recovered,
-    /// The new file and its bytes; none when nothing was recorded.
+    /// The new file and its length in bytes; `None` if nothing was recorded.
     pub new: Option<(PathBuf, u64)>,
-    /// What the original is called now, when more of it is lost than its writer had not finished; else it is gone.
+    /// The new name of the original, if it is damaged before its end; otherwise the original is removed.
     pub original: Option<PathBuf>,
 }
 
-/// Makes a complete file of one that broke off, and removes the latter, or keeps it under another name if it is damaged
-/// before its end. `goal` gives a name for the new one at each attempt; it replaces another file only with `force`.
+/// Makes a complete file from one that broke off. Removes the latter, or keeps it under another name if it is damaged
+/// before its end. `goal` returns a name for the new file at each attempt; another file is replaced only with `force`.
 ///
 /// # Errors
-/// When nothing can be recovered or written; the file stays as it is.
+/// Returns [`RecoverError`] if nothing can be recovered or written; the file stays as it is.
 pub fn repair(
     part: &Path,
     from: &File,
@@ -62,7 +62,7 @@ pub fn repair(
     Ok(Repaired { original, ..repaired })
 }
 
-/// The line for a file that broke off and could not be repaired either.
+/// Returns the message for a file that broke off and could not be repaired.
 pub(super) fn unrepaired(Part { path, goal, .. }: &Part, error: &RecoverError) -> String {
     let path = path.display();
     let is = |kind: fn(&io::Error) -> bool| matches!(error, RecoverError::Write(error) if kind(error));
@@ -75,11 +75,11 @@ pub(super) fn unrepaired(Part { path, goal, .. }: &Part, error: &RecoverError) -
     format!("{why}; what was recorded is in {path}: repair it with `skinbus recover {path}{more}")
 }
 
-/// Makes a whole file of another one, unless that is whole itself or no message comes of it. What it came to, and the new
-/// one's bytes if there is a new one. It takes another file's place only when `force` says so.
+/// Recovers a file, unless it is sound or holds no messages. Returns the result, and the length of the new file in
+/// bytes if one was made. Replaces another file only with `force`.
 ///
 /// # Errors
-/// When nothing can be recovered or written.
+/// Returns [`RecoverError`] if nothing can be recovered or written.
 pub fn copy_unless_sound(
     from: &File,
     to: &Path,
@@ -98,7 +98,7 @@ fn copy(
     as_private(from, &file).map_err(RecoverError::Write)?;
     let mut out = BufWriter::new(file);
     let mut from = from;
-    // A pipe is read once, and a recording twice.
+    // A recording is read twice, but a pipe can be read only once.
     let kept = if from.rewind().is_err() {
         Some(kept(from, folder_of(to)).map_err(RecoverError::Read)?)
     } else {
@@ -116,7 +116,7 @@ fn copy(
     Ok((recovered, Some(finish().map_err(RecoverError::Write)?)))
 }
 
-/// All that comes of a pipe, in a file without a name.
+/// Copies a pipe to its end into an unnamed file.
 fn kept(mut from: &File, folder: &Path) -> io::Result<File> {
     let mut file = nameless(folder, 0o600)?;
     io::copy(&mut from, &mut file)?;
@@ -124,7 +124,7 @@ fn kept(mut from: &File, folder: &Path) -> io::Result<File> {
     Ok(file)
 }
 
-/// Lets nobody read a copy who could not read the original.
+/// Gives a copy no more permissions than the original has.
 fn as_private(from: &File, copy: &File) -> io::Result<()> {
     let (original, about) = (from.metadata()?, copy.metadata()?);
     if !original.is_file() || !about.is_file() {
@@ -132,15 +132,16 @@ fn as_private(from: &File, copy: &File) -> io::Result<()> {
     }
     let mut mode = original.mode() & about.mode() & 0o777;
     if original.gid() != about.gid() && fchown(copy, None, Some(Gid::from_raw(original.gid()))).is_err() {
-        // Its group is another one.
+        // The copy belongs to another group.
         mode &= 0o707;
     }
     copy.set_permissions(Permissions::from_mode(mode))
 }
 
-/// Repairs the files of killed runs in a recording's folder, and reports each in a line; also files of others.
+/// Repairs the files of killed runs in a recording's folder, and reports each in a line. Also reports files of other
+/// programs.
 pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
-    // A folder that cannot be read says so when the recording itself is begun.
+    // An unreadable folder is reported when the recording is begun.
     for (part, found) in names::parts(path).unwrap_or_default() {
         let name = part.display();
         let held = match found {
@@ -163,7 +164,7 @@ pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
                 say(&format!("{name} {leftover}; repaired, it is {}: {recovered}{kept}", path.display()));
             }
             Ok(Repaired { new: None, .. }) => {
-                say(&format!("{name} {leftover}; nothing was recorded in it, it is gone"));
+                say(&format!("{name} {leftover}; it held no messages and was removed"));
             }
             Err(error) => say(&format!("{name} {leftover} and cannot be repaired: {error}")),
         }

@@ -1,4 +1,4 @@
-//! What a recording says of the robot: its description, where its links are, and where cells are on them.
+//! The robot in a recording: its description, the poses of its links, and the positions of cells on them.
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use protocol::skin::{Cell, Chain, Skin};
@@ -6,25 +6,25 @@ use robots::{LinkPose, Problem, RobotError, Row, Urdf, frames, pose_of, written}
 
 use crate::ros2::robot::Transform;
 
-/// How much the rows of a skin and the links of a description may differ, in m.
+/// The maximum difference between the rows of a skin and the links of a description, in m.
 const TOLERANCE_M: f64 = 1e-6;
-/// How far joints are moved to compare them, in rad or m.
+/// The distance by which joints are moved for the comparison, in rad or m.
 const STEP: f64 = 0.3;
 
-/// A robot.
+/// The robot in a recording.
 #[derive(Clone, Debug)]
 pub struct Robot {
-    /// Its URDF.
+    /// The URDF text.
     pub description: String,
     base: String,
     poses: Vec<LinkPose>,
-    /// By chain, the link that each of its joints moves.
+    /// By chain: the link that each of its joints moves.
     links: Vec<Vec<String>>,
-    /// Each cell on its link: the link, its own frame, where it is.
+    /// The cells: link, own frame, and pose on the link.
     cells: Vec<(String, String, Isometry3<f64>)>,
 }
 
-/// A URDF and the names of its links.
+/// A URDF with its link poses and link names.
 struct Described {
     urdf: Urdf,
     poses: Vec<LinkPose>,
@@ -32,20 +32,21 @@ struct Described {
 }
 
 impl Robot {
-    /// The robot of a skin by its rows.
+    /// Describes the robot of a skin by its Denavit-Hartenberg rows.
     ///
     /// # Errors
-    /// When rows cannot be described, as when chains share a joint that is in different places.
+    /// Returns [`RobotError`] if the rows cannot be described, for example if chains share a joint that has different
+    /// poses.
     pub fn of_rows(skin: &Skin) -> Result<Self, RobotError> {
         let written = written(skin);
         let urdf = Urdf::parse("the skin's robot", &written.xml)?;
         Self::new(skin, urdf, written.xml, written.links)
     }
 
-    /// The robot of a skin by its URDF.
+    /// Describes the robot of a skin by its URDF.
     ///
     /// # Errors
-    /// When that is of another robot than the skin's rows.
+    /// Returns [`RobotError`] if the URDF does not match the skin's rows.
     pub fn of_urdf(skin: &Skin, urdf: Urdf, text: String) -> Result<Self, RobotError> {
         let link = |joint: &usize| {
             let name = skin.robot.joints.get(*joint).map_or("", |joint| &joint.name);
@@ -71,26 +72,26 @@ impl Robot {
         Ok(Self { description, base, poses, links, cells })
     }
 
-    /// The link that all others are on.
+    /// Returns the root link.
     #[must_use]
     pub fn base(&self) -> &str {
         &self.base
     }
 
-    /// The link that a joint of a chain, from 1, moves.
+    /// Returns the link that a joint of a chain, from 1, moves.
     #[must_use]
     pub fn link(&self, (chain, joint): (usize, usize)) -> Option<&str> {
         self.links.get(chain)?.get(joint.checked_sub(1)?).map(String::as_str)
     }
 
-    /// Links that move, with the joints at these positions in rad or m.
+    /// Returns the poses of links that move, for joints at `q` in rad or m.
     #[must_use]
     pub fn moving(&self, q: &[f64]) -> Vec<Transform<'_>> {
         let moving = self.poses.iter().filter(|pose| pose.moves());
         moving.map(|pose| transform(&pose.parent, &pose.child, &pose.at(q))).collect()
     }
 
-    /// Links that do not move, and cells.
+    /// Returns the poses of fixed links and of cells.
     #[must_use]
     pub fn still(&self) -> Vec<Transform<'_>> {
         let links = self.poses.iter().filter(|pose| !pose.moves());
@@ -100,7 +101,7 @@ impl Robot {
 }
 
 impl Described {
-    /// A cell on the link that its joint moves.
+    /// Returns the link that a cell's joint moves, the cell's own frame, and its pose on the link.
     fn cell(&self, skin: &Skin, cell: &Cell) -> Result<(String, String, Isometry3<f64>), RobotError> {
         let bus = skin.buses.get(cell.bus);
         let index = bus.map_or(0, |bus| bus.chain);
@@ -122,7 +123,7 @@ impl Described {
             return Err(RobotError { file: self.urdf.file.clone(), line: None, problem });
         }
         let normal = Vector3::from(cell.normal);
-        // Where it is turned about its normal nobody knows.
+        // The skin does not define the rotation of a cell about its normal.
         let turn = UnitQuaternion::rotation_between(&Vector3::z(), &normal)
             .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), core::f64::consts::PI));
         let place = Isometry3::from_parts(Point3::from(cell.position).into(), turn);
@@ -130,7 +131,7 @@ impl Described {
         Ok((link.to_owned(), name, one * place))
     }
 
-    /// From a link to the frame of a row.
+    /// Returns the pose of a row's frame relative to a link.
     fn row_on(&self, link: &str, chain: &Chain, row: usize, q: &[f64]) -> Isometry3<f64> {
         let of_chain: Vec<_> =
             chain.joints.iter().map(|joint| q.get(*joint).copied().unwrap_or_default()).collect();

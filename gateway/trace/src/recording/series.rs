@@ -1,8 +1,8 @@
-//! A recording's MCAP files, one after the other: each is begun with what makes it readable by itself, flushed,
-//! ended when it is large or old enough, and given its name when it is whole.
+//! Writes a recording as a series of MCAP files. Each file begins with all that makes it readable by itself, is flushed
+//! regularly, ends when it is large or old enough, and gets its final name when it is complete.
 //!
-//! After an error the file takes nothing more. It is kept, repaired at the end, and another one is tried at once, then every
-//! few seconds; what comes meanwhile is counted.
+//! After an error the file is closed, and repaired at the end. Another file is begun at once, then every few seconds;
+//! messages that arrive meanwhile are counted as lost.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -23,55 +23,55 @@ use super::sink::{Gauge, Sink};
 use super::window::Window;
 use crate::files::folder_of;
 
-/// Bytes that go to the file together; a chunk is larger and goes by itself.
+/// The size of the write buffer in bytes. A chunk is larger and bypasses it.
 const BUFFER: usize = 64 << 10;
-/// Between two attempts behind an error.
+/// The interval between two attempts after an error.
 const RETRY: Duration = Duration::from_secs(5);
-/// A file that is to end waits so long at most for what holds it: any traffic may look like a segment.
+/// The maximum time for which an open segment delays the end of a file, because any traffic may look like a segment.
 const HOLD: Duration = Duration::from_millis(500);
-/// Between two looks whether a file still has its name.
+/// The interval between two checks that a file still has its name.
 const LOOK: Duration = Duration::from_secs(1);
-/// Room on a disk that was full before it is tried again.
+/// The free space that a full disk must have before recording is tried again, in bytes.
 const ROOM: u64 = 64 << 20;
 
 /// The writer of a file.
 pub type Writer = FileWriter<BufWriter<Sink>>;
 
-/// When another file is begun.
+/// The limits at which another file is begun.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Split {
-    /// When this one has so many bytes beside what each file begins with.
+    /// The size of a file in bytes, without what each file begins with.
     pub bytes: u64,
-    /// When it is so old.
+    /// The age of a file.
     pub age: Duration,
 }
 
 impl Default for Split {
-    /// 1 GiB, or 10 minutes.
+    /// Returns 1 GiB and 10 minutes.
     fn default() -> Self {
         Self { bytes: 1 << 30, age: Duration::from_secs(600) }
     }
 }
 
-/// A file in the file.
+/// An attachment.
 #[derive(Clone, Debug)]
 pub struct Attached {
-    /// Its name there.
+    /// The name of the attachment.
     pub name: String,
-    /// What it is.
+    /// Its media type.
     pub media_type: &'static str,
-    /// Its bytes.
+    /// Its contents.
     pub bytes: Vec<u8>,
 }
 
-/// What each file begins with.
+/// The contents at the beginning of each file.
 #[derive(Clone, Debug, Default)]
 pub struct Head {
-    /// When the recording began, in ns since 1970.
+    /// The start of the recording, in ns since 1970.
     pub nanos: u64,
-    /// Facts by name.
+    /// Metadata records by name.
     pub metadata: Vec<(&'static str, BTreeMap<String, String>)>,
-    /// Files.
+    /// Attachments.
     pub attachments: Vec<Attached>,
 }
 
@@ -92,14 +92,14 @@ impl Head {
 /// An event to be reported.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum Said {
-    /// A file takes nothing more; the run goes on.
+    /// A file failed; the run goes on.
     BrokeOff(String),
-    /// Anything else.
+    /// Any other event.
     Else(String),
 }
 
 impl Said {
-    /// What happened, for the end of the run.
+    /// Returns the description of the event, for the end of the run.
     #[must_use]
     pub fn what(&self) -> &str {
         match self {
@@ -127,21 +127,21 @@ struct Open<T> {
     topics: T,
     part: Part,
     gauge: Arc<Gauge>,
-    /// Bytes before the first message.
+    /// The number of bytes before the first message.
     head: u64,
     began: Instant,
-    /// When it was looked at whether it still has its name.
+    /// The time of the last check that the file still has its name.
     looked: Instant,
-    /// Since when it is large or old enough.
+    /// The time since when it is large or old enough.
     enough: Option<Instant>,
-    /// In the file, flushed.
+    /// Messages that are flushed to the file.
     kept: Count,
-    /// Written since.
+    /// Messages written since the last flush.
     written: Count,
 }
 
 impl<T> Open<T> {
-    /// Writes what has waited long enough, or all that waits.
+    /// Writes messages that have waited long enough, or all that wait.
     fn release(&mut self, window: &mut Window, all: bool) -> io::Result<()> {
         let Self { writer, written, .. } = self;
         written.add(if all { window.release_all(writer) } else { window.release(writer) }?);
@@ -149,7 +149,7 @@ impl<T> Open<T> {
     }
 }
 
-/// A file that broke off, held until it is repaired.
+/// A file that broke off and is locked until it is repaired.
 #[derive(Debug)]
 struct Broken {
     part: Part,
@@ -157,7 +157,7 @@ struct Broken {
     kept: Count,
 }
 
-/// The files of a recording; `T` is what a file's channels are kept in.
+/// The files of a recording. `T` holds the channels of a file.
 #[derive(Debug)]
 pub struct Series<T> {
     path: PathBuf,
@@ -166,33 +166,33 @@ pub struct Series<T> {
     head: Head,
     /// The recorder's time.
     now: u64,
-    /// The number of the file that is open, or was last.
+    /// The number of the open file, or of the last one.
     number: u32,
-    /// Claimed, and not begun.
+    /// The first file, claimed but not begun.
     claimed: Option<(Part, File)>,
-    /// Files of an earlier recording whose places this one takes.
+    /// Files of an earlier recording that this one replaces.
     stale: Vec<PathBuf>,
     open: Option<Open<T>>,
-    /// What waits for the file that is open: one for all of them, whose buffers stay.
+    /// Messages that wait for the open file. All files share the window, so that its buffers stay allocated.
     window: Window,
-    /// When the last error was.
+    /// The time of the last error.
     failed: Option<Instant>,
-    /// When a file was begun at once behind an error, which is to be done next.
+    /// The time at which a file was last begun at once after an error, and true if this is to be done next.
     prompt: (Option<Instant>, bool),
     broken: Vec<Broken>,
-    /// Ends files that are whole, each with what is in it and its bytes.
+    /// Publishes complete files, each with its message counts and its length.
     publisher: Publisher<(Count, u64)>,
     written: Vec<Written>,
     lost: Count,
-    /// What people should know.
+    /// Events that have not been reported yet.
     said: Vec<Said>,
 }
 
 impl<T> Series<T> {
-    /// Claims the first file, so that what makes that impossible is known before there is anything to write.
+    /// Claims the first file early, so that errors are reported before there is anything to write.
     ///
     /// # Errors
-    /// When somebody else has it, or it cannot be written.
+    /// Returns an error if another program is writing it, or if it cannot be written.
     pub fn claim(path: &Path, force: bool, split: Split) -> io::Result<Self> {
         let stale = names::series(path);
         if let Some(there) = stale.first().filter(|_| !force) {
@@ -231,7 +231,7 @@ impl<T> Series<T> {
         }
     }
 
-    /// Adds facts that are known only now, to the file that is open and to each that follows.
+    /// Adds a metadata record to the open file and to all that follow.
     pub fn add(&mut self, name: &'static str, facts: BTreeMap<String, String>) {
         let written = self.open.as_mut().map_or(Ok(()), |open| open.writer.metadata(name, &facts));
         self.head.metadata.push((name, facts));
@@ -258,7 +258,7 @@ impl<T> Series<T> {
             }
             Ok((writer, topics, gauge))
         };
-        // There is nothing in it.
+        // The file is still empty.
         let (writer, topics, gauge) = begin().inspect_err(|_: &io::Error| part.remove())?;
         self.window.begin(self.now);
         let (head, began) = (gauge.bytes(), Instant::now());
@@ -266,7 +266,7 @@ impl<T> Series<T> {
         Ok(Open { writer, topics, part, gauge, head, began, looked: began, enough: None, kept, written })
     }
 
-    /// Tells the recorder's time, in ns since 1970, by which messages are put in order.
+    /// Sets the recorder's time, in ns since 1970, by which messages are ordered.
     pub fn look(&mut self, now: u64) {
         self.now = now;
         let Some(Open { writer, written, .. }) = &mut self.open else { return };
@@ -276,7 +276,7 @@ impl<T> Series<T> {
         }
     }
 
-    /// Takes messages for the file that is open; without one they are counted.
+    /// Adds messages to the open file. They count as lost if no file is open.
     pub fn put(&mut self, count: Count, write: impl FnOnce(&mut Window, &mut T)) {
         let Some(open) = &mut self.open else { return self.lost.add(count) };
         write(&mut self.window, &mut open.topics);
@@ -285,7 +285,7 @@ impl<T> Series<T> {
         }
     }
 
-    /// Writes what waits in the file that is open: what comes then stands behind it.
+    /// Writes all waiting messages to the open file. Messages added later stand after them.
     pub fn settle(&mut self) {
         self.release(true);
     }
@@ -296,8 +296,8 @@ impl<T> Series<T> {
         }
     }
 
-    /// Hands on what has waited long enough; ends a file that is large or old enough, as soon as nothing `holds` it, or
-    /// whose disk is full. Whether another file should be begun with [`Series::next`].
+    /// Flushes messages that have waited long enough. Ends a file that is large or old enough once `holds` is false,
+    /// and one whose disk is full. Returns true if another file should be begun with [`Series::next`].
     pub fn flush(&mut self, holds: bool) -> bool {
         self.take_published();
         let Some(open) = &mut self.open else {
@@ -333,7 +333,7 @@ impl<T> Series<T> {
         enough
     }
 
-    /// Begins another file; whether that was possible.
+    /// Begins another file. Returns true on success.
     pub fn next(&mut self, topics: impl FnOnce(&mut Writer) -> io::Result<T>) -> bool {
         let number = self.number + 1;
         let goal = names::numbered(&self.path, number);
@@ -356,36 +356,36 @@ impl<T> Series<T> {
         }
     }
 
-    /// Whether something is being written.
+    /// Returns true if a file is open.
     #[must_use]
     pub const fn is_open(&self) -> bool {
         self.open.is_some()
     }
 
-    /// Frames and others that were not written.
+    /// Returns the messages that were not written.
     #[must_use]
     pub const fn lost(&self) -> Count {
         self.lost
     }
 
-    /// Messages that came when their file was past their time.
+    /// Returns the number of messages that arrived after later ones were written.
     #[must_use]
     pub const fn late(&self) -> u64 {
         self.window.late()
     }
 
-    /// Bytes of the file that is open.
+    /// Returns the size of the open file in bytes.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.open.as_ref().map_or(0, |open| open.gauge.bytes())
     }
 
-    /// What people should know since they were told last.
+    /// Returns the events since the last call.
     pub fn said(&mut self) -> std::vec::Drain<'_, Said> {
         self.said.drain(..)
     }
 
-    /// Ends the file and gives it its name.
+    /// Ends the file and publishes it.
     fn end(&mut self) {
         let Some(mut open) = self.open.take() else { return };
         if let Err(error) = open.release(&mut self.window, true).and_then(|()| open.writer.finish()) {
@@ -398,30 +398,30 @@ impl<T> Series<T> {
         self.publisher.publish(Ended { file: sink.into_file(), part: open.part, about });
     }
 
-    /// Notes the files that have their names by now.
+    /// Collects the files that have their final names by now.
     fn take_published(&mut self) {
         for Published { path, about: (kept, bytes), error } in self.publisher.done() {
             self.said.extend(error.map(Said::Else));
             match path {
                 Some(path) => self.written.push(kept.in_file(&path, bytes)),
-                // Wherever it is, it is whole; but nobody is told where.
+                // The file is complete, but its name is unknown.
                 None => self.lost.add(kept),
             }
         }
     }
 
-    /// The file takes nothing more.
+    /// Closes the open file after an error.
     fn break_off(&mut self, error: &io::Error) {
         let Some(open) = self.open.take() else { return };
         self.lost.add(open.written);
         self.lost.add(self.window.count());
-        // What is buffered is a part of something; the file stays held until it is repaired.
+        // The buffer holds an incomplete record and is dropped. The file stays locked until it is repaired.
         let (sink, _) = open.writer.into_inner().into_parts();
         self.broken.push(Broken { part: open.part, file: sink.into_file(), kept: open.kept });
         self.fail(error);
     }
 
-    /// Another file is begun at once, unless that was done just now: then it is not a single error.
+    /// Requests another file at once, unless that was tried a moment ago: then the error is not a single one.
     fn fail(&mut self, error: &io::Error) {
         let (last, prompt) = &mut self.prompt;
         if last.is_none_or(|at| at.elapsed() >= RETRY) {
@@ -433,15 +433,15 @@ impl<T> Series<T> {
         }
     }
 
-    /// Takes the file that is open away.
+    /// Removes the open file.
     pub fn discard(&mut self) {
         if let Some(open) = self.open.take() {
-            // What remains is an orphan, which the next run repairs.
+            // If this fails, the next run repairs the file.
             open.part.remove();
         }
     }
 
-    /// Ends the recording: its files, and what was lost.
+    /// Ends the recording. Returns its files and the lost messages.
     pub fn finish(&mut self) -> (Vec<Written>, Count) {
         self.end();
         self.publisher.finish();
@@ -451,7 +451,7 @@ impl<T> Series<T> {
             let goal = || part.goal.clone();
             match from.and_then(|from| repair::repair(&part.path, &from, goal, self.force)) {
                 Ok(Repaired { recovered, new: Some((goal, bytes)), .. }) => {
-                    // More may have come to the disk than is known of, or less.
+                    // More or fewer messages may have reached the disk than were counted.
                     self.lost.frames = (self.lost.frames + kept.frames).saturating_sub(recovered.frames);
                     let others = recovered.messages - recovered.frames;
                     self.lost.others = (self.lost.others + kept.others).saturating_sub(others);
@@ -465,10 +465,10 @@ impl<T> Series<T> {
                 }
             }
         }
-        // One that is longer than this one would seem to go on with the other's files.
+        // An earlier recording with more files would seem to continue this one.
         for stale in std::mem::take(&mut self.stale) {
             if !self.written.iter().any(|written| Path::new(&written.path) == stale) {
-                // It was to be overwritten; that it is still there harms nobody.
+                // The file was to be overwritten; it does no harm if it stays.
                 let _ = std::fs::remove_file(stale);
             }
         }
@@ -479,7 +479,7 @@ impl<T> Series<T> {
 impl<T> Drop for Series<T> {
     fn drop(&mut self) {
         if let Some((part, _)) = &self.claimed {
-            // There is nothing in it.
+            // The file is still empty.
             part.remove();
         }
     }

@@ -1,5 +1,5 @@
-//! The file below a recording: counted, and with room in reserve, so that a disk that becomes full leaves a file
-//! with its end.
+//! The file below a recording. It counts bytes and holds space in reserve, so that a file can be finished although its
+//! disk becomes full.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -11,12 +11,12 @@ use rustix::fs::{FallocateFlags, fallocate};
 
 use crate::files::{nameless, write_patiently};
 
-/// What a file without a single chunk may need for its end, a chunk on the way included.
+/// The space in bytes that a file without chunks may need for its end, including one pending chunk.
 const RESERVE: u64 = 512 << 10;
-/// What the end grows by with each chunk: its entry in the index.
+/// The space in bytes that the end grows by with each chunk, for its index entry.
 const RESERVE_FOR_CHUNK: u64 = 400;
 
-/// What is known of a file from outside of its writer.
+/// The state of a file that is visible outside of its writer.
 #[derive(Debug, Default)]
 pub struct Gauge {
     bytes: AtomicU64,
@@ -24,7 +24,7 @@ pub struct Gauge {
     reserve: Mutex<Option<Reserve>>,
 }
 
-/// Room on a disk, held by a file without a name.
+/// Disk space held by an unnamed file.
 #[derive(Debug)]
 struct Reserve {
     file: File,
@@ -32,77 +32,77 @@ struct Reserve {
 }
 
 impl Gauge {
-    /// Bytes in the file.
+    /// Returns the size of the file in bytes.
     #[must_use]
     pub fn bytes(&self) -> u64 {
         self.bytes.load(Ordering::Relaxed)
     }
 
-    /// Whether the disk is full: the file lives on what was in reserve and has to be ended now.
+    /// Returns true if the disk is full: the file uses the reserve and must be finished now.
     #[must_use]
     pub fn is_full(&self) -> bool {
         self.full.load(Ordering::Relaxed)
     }
 
-    /// Makes sure of the room that the end of a file of so many chunks needs.
+    /// Extends the reserve for the end of a file with `chunks` chunks.
     pub fn reserve_for(&self, chunks: u64) {
         let mut held = self.reserve.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(reserve) = held.as_mut() else { return };
-        // Half of it is for the chunk on the way.
+        // Half of the reserve is for the pending chunk.
         let target = RESERVE / 2 + chunks * RESERVE_FOR_CHUNK;
         if target <= reserve.bytes {
             return;
         }
         let more = target.next_multiple_of(RESERVE);
-        // Without more of it, what there is helps as far as it goes; it is tried again.
+        // If the extension fails, the present reserve still helps; the extension is retried.
         if fallocate(&reserve.file, FallocateFlags::empty(), 0, more).is_ok() {
             reserve.bytes = more;
         }
     }
 
-    /// Releases the reserved room; whether there was any.
+    /// Releases the reserved space. Returns true if there was any.
     fn use_reserve(&self) -> bool {
         self.full.store(true, Ordering::Relaxed);
         self.reserve.lock().unwrap_or_else(PoisonError::into_inner).take().is_some()
     }
 }
 
-/// A file that is written to its end also when its disk becomes full meanwhile.
+/// A file that can be finished although its disk becomes full.
 #[derive(Debug)]
 pub struct Sink {
     file: File,
-    /// Bytes that it begins with, and that are written again.
+    /// The number of bytes that the file already holds; the writer writes them again, and they are skipped.
     there: u64,
     gauge: Arc<Gauge>,
 }
 
 impl Sink {
-    /// Takes a file of a folder over, and room beside it. What is in the file already is what it begins with; whoever
-    /// writes begins with the same. Where the file system gives no room, a full disk is like any other error.
+    /// Wraps a file, and reserves space in its folder. The writer must begin with the bytes that are already in the
+    /// file. If the file system reserves no space, a full disk is an ordinary error.
     ///
     /// # Errors
-    /// When the file cannot be looked at.
+    /// Returns an error if the file cannot be queried.
     pub fn new(file: File, folder: &Path) -> io::Result<(Self, Arc<Gauge>)> {
         let (reserve, there) = (reserve(folder), file.metadata()?.len());
         let gauge = Arc::new(Gauge { reserve: Mutex::new(reserve), ..Gauge::default() });
         Ok((Self { file, there, gauge: Arc::clone(&gauge) }, gauge))
     }
 
-    /// The file.
+    /// Returns the file.
     #[must_use]
     pub fn into_file(self) -> File {
         self.file
     }
 }
 
-/// Room for an end; none where the file system has no files without a name, or gives no room.
+/// Reserves space; `None` if the file system does not support unnamed files or preallocation.
 fn reserve(folder: &Path) -> Option<Reserve> {
     let file = nameless(folder, 0o600).ok()?;
     fallocate(&file, FallocateFlags::empty(), 0, RESERVE).ok()?;
     Some(Reserve { file, bytes: RESERVE })
 }
 
-/// Whether an error says that there is no room.
+/// Returns true for errors that report a full disk or an exceeded quota.
 #[must_use]
 pub fn is_full(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)

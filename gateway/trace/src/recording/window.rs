@@ -1,12 +1,12 @@
-//! Messages in the order of their times: each waits a little before it is written.
+//! Orders messages by time: each waits briefly before it is written.
 //!
 //! ```text
-//!   topics ──> write ──> [ waiting ] ──> release ──> file, in order of log_time
+//! topics ──> write ──> [ waiting ] ──> release ──> file, in order of log_time
 //! ```
 //!
-//! Receivers and the loop hand over in turn, so only messages of one topic come in order. A message's `log_time` is its own
-//! time; it is later where the file is past that already, so that the file's order is always that of `log_time`. The
-//! message's own time is its `publish_time`. The order of one topic is never changed.
+//! Receivers and the loop deliver messages in turn, so only the messages of one topic arrive in order. The `log_time`
+//! of a message is its own time, or later if the file has already passed that, so that a file is always ordered by
+//! `log_time`. The message's own time is its `publish_time`. The order of one topic is never changed.
 
 use std::io::{self, Write};
 
@@ -14,23 +14,23 @@ use super::account::Count;
 use super::file::{Channel, FileWriter};
 use crate::ros2::Message;
 
-/// How long a message waits for others that are older, in ns.
+/// The time for which a message waits for older ones, in ns.
 pub const WINDOW_NS: u64 = 40_000_000;
-/// Messages that wait at most: more than a second of three full buses.
+/// The maximum number of waiting messages: more than a second of three full buses.
 const MESSAGES: usize = 65_536;
-/// Their bytes at most.
+/// The maximum size of waiting messages, in bytes.
 const BYTES: usize = 16 << 20;
-/// The bytes of each buffer from the beginning on; what it grew by while a file stood still is given back.
+/// The initial size of each buffer, in bytes. Growth while a file was blocked is given back.
 const KEPT: usize = 1 << 20;
 
-/// A message that waits.
+/// A waiting message.
 #[derive(Clone, Copy, Debug)]
 struct Waiting {
-    /// Where it belongs in the file, in ns since 1970.
+    /// The position in the order of the file, in ns since 1970.
     at: u64,
-    /// Its own time.
+    /// The message's own time.
     nanos: u64,
-    /// Where its bytes are.
+    /// The range of its bytes in the buffer.
     begin: usize,
     end: usize,
     channel: u16,
@@ -38,25 +38,25 @@ struct Waiting {
     is_frame: bool,
 }
 
-/// The messages that wait to be written, of one file after the other.
+/// Messages that wait to be written, for one file after the other.
 #[derive(Debug)]
 pub struct Window {
     waiting: Vec<Waiting>,
     bytes: Vec<u8>,
-    /// The latest place of each channel.
+    /// The latest position of each channel.
     latest: Vec<u64>,
     /// The recorder's time.
     now: u64,
-    /// The place of the last message that was written.
+    /// The position of the last written message.
     released: u64,
-    /// Messages that came when the file was past their time.
+    /// The number of messages that arrived after later ones were written.
     late: u64,
     buffers: (Vec<u8>, Vec<u8>),
 }
 
 impl Default for Window {
-    /// Without a message. Its memory is used once, so that a recorder takes all of it from its start on, and not when
-    /// it is late for the first time.
+    /// Returns an empty window. Its memory is written to once, so that a recorder occupies it from its start on, and
+    /// not when it is late for the first time.
     fn default() -> Self {
         let bytes = || {
             let mut bytes = vec![1; KEPT];
@@ -79,7 +79,8 @@ impl Default for Window {
 }
 
 impl Window {
-    /// Begins the order of another file, at a time in ns since 1970; what waits is forgotten, the buffers stay.
+    /// Begins the order of another file at `now`, in ns since 1970. Waiting messages are dropped; the buffers stay
+    /// allocated.
     pub fn begin(&mut self, now: u64) {
         self.waiting.clear();
         self.bytes.clear();
@@ -87,18 +88,18 @@ impl Window {
         (self.now, self.released) = (now, 0);
     }
 
-    /// Takes a message with its own time, in ns since 1970.
+    /// Adds a message with its own time, in ns since 1970.
     pub fn write<M: Message>(&mut self, channel: &mut Channel, nanos: u64, message: &M) {
         self.write_at(channel, nanos, nanos, message);
     }
 
-    /// Takes a message that belongs elsewhere in the file than its own time says.
+    /// Adds a message whose position in the file, `at`, differs from its own time.
     pub fn write_at<M: Message>(&mut self, channel: &mut Channel, at: u64, nanos: u64, message: &M) {
         let id = usize::from(channel.id());
         if self.latest.len() <= id {
             self.latest.resize(id + 1, 0);
         }
-        // A time in the future would have everything else wait for it.
+        // Without this limit, a time in the future would delay all other messages.
         let mut at = at.min(self.now.saturating_add(WINDOW_NS));
         if let Some(latest) = self.latest.get_mut(id) {
             at = at.max(*latest);
@@ -112,28 +113,28 @@ impl Window {
         self.waiting.push(Waiting { at, nanos, begin, end, channel, sequence, is_frame });
     }
 
-    /// The latest place of a channel's messages; 0 when there was none.
+    /// Returns the latest position of a channel's messages; 0 without messages.
     #[must_use]
     pub fn latest(&self, channel: &Channel) -> u64 {
         self.latest.get(usize::from(channel.id())).copied().unwrap_or_default()
     }
 
-    /// Messages that wait.
+    /// Returns the number of waiting messages.
     #[must_use]
     pub fn count(&self) -> Count {
         count(&self.waiting)
     }
 
-    /// Messages that came when the file was past their time.
+    /// Returns the number of messages that arrived after later ones were written.
     #[must_use]
     pub const fn late(&self) -> u64 {
         self.late
     }
 
-    /// Tells the time. When the clock was set back, everything that waits is written first, and what comes then begins a new order.
+    /// Sets the time. If the clock was set back, all waiting messages are written first, and a new order begins.
     ///
     /// # Errors
-    /// When the file cannot be written, as of everything below.
+    /// Returns an error if the file cannot be written, as all methods below do.
     pub fn look<W: Write>(&mut self, now: u64, file: &mut FileWriter<W>) -> io::Result<Count> {
         let written = if now < self.now {
             let written = self.release_all(file)?;
@@ -147,10 +148,10 @@ impl Window {
         Ok(written)
     }
 
-    /// Writes what has waited long enough, and the older half of what waits if that is too much; how many.
+    /// Writes the messages that have waited long enough, and the older half if too many wait. Returns their number.
     ///
     /// # Errors
-    /// See above.
+    /// Returns an error if the file cannot be written.
     pub fn release<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<Count> {
         self.sort();
         let until = self.now.saturating_sub(WINDOW_NS);
@@ -159,27 +160,27 @@ impl Window {
         self.write_out(due, file)
     }
 
-    /// Whether more waits than may.
+    /// Returns true if a limit is reached.
     #[must_use]
     pub const fn is_full(&self) -> bool {
         self.waiting.len() >= MESSAGES || self.bytes.len() >= BYTES
     }
 
-    /// Writes everything that waits; how many.
+    /// Writes all waiting messages. Returns their number.
     ///
     /// # Errors
-    /// See above.
+    /// Returns an error if the file cannot be written.
     pub fn release_all<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<Count> {
         self.sort();
         self.write_out(self.waiting.len(), file)
     }
 
-    /// Messages of the same place stay in the order in which they came.
+    /// Sorts the messages. Those of the same position keep their order of arrival.
     fn sort(&mut self) {
         self.waiting.sort_by_key(|it| it.at);
     }
 
-    /// Writes the first ones.
+    /// Writes the first `due` messages.
     fn write_out<W: Write>(&mut self, due: usize, file: &mut FileWriter<W>) -> io::Result<Count> {
         let Self { waiting, bytes, released, late, buffers: (_, kept), .. } = self;
         let written = waiting.get(..due).unwrap_or_default();

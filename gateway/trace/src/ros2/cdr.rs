@@ -1,31 +1,31 @@
-//! CDR, the encoding of ROS 2's messages: little endian, each number at a multiple of its size.
+//! CDR, the encoding of ROS 2 messages: little endian, each number aligned to its size.
 //!
 //! ```text
 //!   byte  0    1    2    3    4 ...
-//!         00   01   00   00   fields; a number's place is counted from byte 4
+//!         00   01   00   00   fields; alignment is counted from byte 4
 //!         text: u32 length with the NUL, bytes, NUL        sequence: u32 count, elements
 //! ```
 
 use protocol::can::IdentifierError;
 use thiserror::Error;
 
-/// "Plain CDR, little endian", and two bytes of options.
+/// "Plain CDR, little endian", and two option bytes.
 const HEAD: [u8; 4] = [0, 1, 0, 0];
-/// Sequences longer than this are none of ours.
+/// The maximum number of elements in a decoded sequence.
 const LONGEST: u32 = 64;
 
-/// What a message is made of, as it is written.
+/// A part of a message that can be encoded.
 pub trait Encode {
-    /// Writes it behind what is there.
+    /// Appends it to the message.
     fn encode(&self, out: &mut Writer<'_>);
 }
 
-/// What a message is made of, as it is read; texts are borrowed from the message.
+/// A part of a message that can be decoded. Texts are borrowed from the message.
 pub trait Decode<'a>: Sized {
-    /// Reads it where the reader is. Never panics.
+    /// Decodes it at the reader's position. Never panics.
     ///
     /// # Errors
-    /// When the message ends before it, or holds a value that it does not have.
+    /// Returns [`CdrError`] if the message ends too early or holds an invalid value.
     fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError>;
 }
 
@@ -80,7 +80,7 @@ impl<'a> Decode<'a> for &'a str {
         let wrong = CdrError::Text { at: from.at - bytes.len() };
         let text = match bytes {
             _ if from.form == Form::Ros1 => bytes,
-            // Some writers leave the NUL of an empty text away.
+            // Some writers omit the NUL of an empty text.
             [] => bytes,
             [text @ .., 0] => text,
             _ => return Err(wrong),
@@ -89,7 +89,7 @@ impl<'a> Decode<'a> for &'a str {
     }
 }
 
-/// At most `LONGEST` elements.
+/// Decodes at most `LONGEST` elements.
 impl<'a, T: Decode<'a>> Decode<'a> for Vec<T> {
     fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
         let count = from.get::<u32>()?;
@@ -100,7 +100,7 @@ impl<'a, T: Decode<'a>> Decode<'a> for Vec<T> {
     }
 }
 
-/// One after the other, without a count.
+/// Decodes the elements without a count.
 impl<'a, T: Decode<'a> + Copy + Default, const N: usize> Decode<'a> for [T; N] {
     fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
         let mut all = [T::default(); N];
@@ -124,46 +124,46 @@ impl<T: Encode + ?Sized> Encode for &T {
     }
 }
 
-/// Writes a message into a buffer that can be used again.
+/// Writes a message into a buffer that can be reused.
 #[derive(Debug)]
 pub struct Writer<'a> {
     out: &'a mut Vec<u8>,
 }
 
 impl<'a> Writer<'a> {
-    /// Begins a message; what was in the buffer is gone.
+    /// Begins a message and clears the buffer.
     pub fn new(out: &'a mut Vec<u8>) -> Self {
         out.clear();
         out.extend_from_slice(&HEAD);
         Self { out }
     }
 
-    /// A number, a text, or what else a message is made of.
+    /// Appends a number, a text, or another part of a message.
     pub fn put(&mut self, value: impl Encode) {
         value.encode(self);
     }
 
-    /// How many elements follow.
+    /// Appends the number of elements that follow.
     ///
     /// # Panics
-    /// When they are more than 2^32 - 1: no message of ours comes near.
+    /// If there are more than 2^32 - 1 elements, which no message of skinbus has.
     pub fn count(&mut self, count: usize) {
         self.put(u32::try_from(count).expect("a message has fewer than 2^32 elements"));
     }
 
-    /// A sequence of bytes.
+    /// Appends a sequence of bytes.
     pub fn bytes(&mut self, bytes: &[u8]) {
         self.count(bytes.len());
         self.out.extend_from_slice(bytes);
     }
 
-    /// A sequence of anything.
+    /// Appends a sequence of elements.
     pub fn sequence(&mut self, elements: impl ExactSizeIterator<Item = impl Encode>) {
         self.count(elements.len());
         elements.for_each(|element| self.put(element));
     }
 
-    /// A number at a multiple of its size.
+    /// Appends an aligned number.
     fn number<const N: usize>(&mut self, bytes: [u8; N]) {
         let over = (self.out.len() - HEAD.len()) % N;
         if over != 0 {
@@ -173,44 +173,44 @@ impl<'a> Writer<'a> {
     }
 }
 
-/// Bytes that are not the message they should be.
+/// An error in an encoded message.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum CdrError {
-    /// Another encoding.
+    /// The encoding is not supported.
     #[error("a message begins with {got:02x?}, not with 00 01: only little-endian CDR is read")]
     Encoding {
         /// The first two bytes, or 0.
         got: [u8; 2],
     },
-    /// Fewer bytes than its fields need.
+    /// The message ends too early.
     #[error("a message ends at byte {at} in the middle of {what}")]
     Short {
-        /// Where, from 0.
+        /// The offset of its end.
         at: usize,
-        /// Of what.
+        /// The incomplete part.
         what: &'static str,
     },
-    /// A text that is none.
+    /// A text is invalid.
     #[error("the text at byte {at} of a message is not UTF-8 with a NUL at its end")]
     Text {
-        /// Where, from 0.
+        /// The offset of the text.
         at: usize,
     },
-    /// A value that the type does not have.
+    /// A value is not allowed.
     #[error("{what} of a message is {got}: allowed is {allowed}")]
     Value {
-        /// Of what.
+        /// The name of the value.
         what: &'static str,
         /// The value.
         got: u64,
-        /// What would be right.
+        /// The allowed values.
         allowed: &'static str,
     },
-    /// An identifier that has more bits than its frame's kind.
+    /// An identifier has more bits than its kind of frame allows.
     #[error("id of a message: {0}")]
     Identifier(#[from] IdentifierError),
-    /// A time that no recording has.
+    /// A time is out of range.
     #[error(
         "the time of a message is {sec} s and {nanosec} ns: allowed are 0 s or more, and less than 1000000000 ns"
     )]
@@ -225,13 +225,13 @@ pub enum CdrError {
 /// The encoding of a message.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Form {
-    /// That of ROS 2.
+    /// The encoding of ROS 2.
     Cdr,
-    /// That of ROS 1: without a head, without padding, texts without a NUL.
+    /// The encoding of ROS 1: without a header and padding, and texts without a NUL.
     Ros1,
 }
 
-/// Reads a message; texts and bytes are borrowed from it. Never panics.
+/// Decodes a message. Texts and bytes are borrowed from it. Never panics.
 #[derive(Clone, Debug)]
 pub struct Reader<'a> {
     bytes: &'a [u8],
@@ -240,10 +240,10 @@ pub struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    /// Begins at a message's first field.
+    /// Begins at the first field of a message.
     ///
     /// # Errors
-    /// When it is no little-endian CDR.
+    /// Returns [`CdrError::Encoding`] if the message is not little-endian CDR.
     pub fn new(bytes: &'a [u8]) -> Result<Self, CdrError> {
         match bytes {
             [0, 1, _, _, ..] => Ok(Self { bytes, at: HEAD.len(), form: Form::Cdr }),
@@ -252,24 +252,24 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Begins at the first field of a message of ROS 1.
+    /// Begins at the first field of a ROS 1 message.
     #[must_use]
     pub const fn ros1(bytes: &'a [u8]) -> Self {
         Self { bytes, at: 0, form: Form::Ros1 }
     }
 
-    /// A number, a text, or what else a message is made of.
+    /// Decodes a number, a text, or another part of a message.
     ///
     /// # Errors
-    /// When the message ends before it, or holds a value that it does not have.
+    /// Returns [`CdrError`] if the message ends too early or holds an invalid value.
     pub fn get<T: Decode<'a>>(&mut self) -> Result<T, CdrError> {
         T::decode(self)
     }
 
-    /// A sequence of bytes.
+    /// Decodes a sequence of bytes.
     ///
     /// # Errors
-    /// When the message ends before its end.
+    /// Returns [`CdrError::Short`] if the message ends too early.
     pub fn bytes(&mut self) -> Result<&'a [u8], CdrError> {
         let count = self.get::<u32>()?;
         self.take(usize::try_from(count).unwrap_or(usize::MAX), "a sequence of bytes")
@@ -303,7 +303,7 @@ mod tests {
     use proptest::prelude::*;
     use serde::{Deserialize, Serialize};
 
-    /// Every kind of field, in an order that a case chooses.
+    /// One field of every kind, encoded in this order.
     #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
     struct Everything {
         byte: u8,

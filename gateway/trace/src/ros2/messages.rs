@@ -1,7 +1,7 @@
-//! Our own types: a CAN frame, and what stands between frames.
+//! Message types of skinbus: CAN frames, and notes between frames.
 //!
-//! There is no convention for CAN in recordings that would bring a candump line back as it was: `can_msgs/Frame`
-//! holds 8 bytes, `ros2_socketcan_msgs/FdFrame` has no flags. These do, and any viewer reads them.
+//! No existing message type for CAN holds all information of a candump line: `can_msgs/Frame` has 8 bytes of data, and
+//! `ros2_socketcan_msgs/FdFrame` has no flags. These types do, and any viewer can read them.
 
 use protocol::can::{ERROR, EXTENDED, Format, Frame, REMOTE, identifier};
 use protocol::candump::{Direction, Record, Timestamp};
@@ -37,19 +37,19 @@ impl Encode for Record<'_> {
     }
 }
 
-/// When the frame was on its bus, by its header, in ns since 1970: of a frame of before, that is long before the
-/// recording has it.
+/// Returns the time of a frame on its bus according to its header, in ns since 1970. For a frame that was latched
+/// before the recording, this is earlier than the time of the record.
 ///
 /// # Errors
-/// When it is no such message.
+/// Returns [`CdrError`] if the bytes are not such a message.
 pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
     Ok(Reader::new(message)?.get::<Header<'_>>()?.nanos)
 }
 
-/// Reads a frame that the recording holds at a time. Never panics.
+/// Decodes a frame, with the time of its record. Never panics.
 ///
 /// # Errors
-/// When it is no such message.
+/// Returns [`CdrError`] if the bytes are not such a message.
 pub fn frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrError> {
     let mut from = Reader::new(message)?;
     let (Header { frame_id: interface, .. }, number) = (from.get()?, from.get::<u32>()?);
@@ -97,7 +97,7 @@ fn value(what: &'static str, got: u8, allowed: &'static str) -> CdrError {
     CdrError::Value { what, got: got.into(), allowed }
 }
 
-/// Something between frames: a comment, frames that were lost, a line that is no frame.
+/// A note between frames: a comment, lost frames, or a line that is not a frame.
 impl Message for Note<'_> {
     const TYPE: &'static str = "skinbus_msgs/msg/CaptureNote";
     const DEFINITION: &'static str =
@@ -106,7 +106,7 @@ impl Message for Note<'_> {
 
 impl Encode for Note<'_> {
     fn encode(&self, out: &mut Writer<'_>) {
-        // A text of CDR ends at its NUL for some readers.
+        // Some readers end a CDR text at its first NUL.
         let same = || str::from_utf8(self.text).ok().filter(|text| !text.contains('\0'));
         let (kind, frames, same) = match self.kind {
             NoteKind::Text => (0_u8, 0, same()),
@@ -126,10 +126,10 @@ impl Encode for Note<'_> {
     }
 }
 
-/// Reads a note that the recording holds at a time. Never panics.
+/// Decodes a note, with the time of its record. Never panics.
 ///
 /// # Errors
-/// When it is no such message.
+/// Returns [`CdrError`] if the bytes are not such a message.
 pub fn note(message: &[u8], nanos: u64) -> Result<Note<'_>, CdrError> {
     let mut from = Reader::new(message)?;
     let (Header { frame_id: interface, .. }, kind) = (from.get()?, from.get::<u8>()?);
@@ -191,7 +191,7 @@ mod tests {
             bytes[at] = value;
             frame(&bytes, time).map(|_| ()).unwrap_err().to_string()
         };
-        // The empty name takes 5 bytes, and 3 fill.
+        // The empty name takes 5 bytes, followed by 3 bytes of padding.
         let id = "id of a message: FF000000 does not fit an identifier of 11 bits: at most 7FF";
         assert_eq!(with(23, 0xFF), id);
         assert!(with(21, 8).ends_with("800 does not fit an identifier of 11 bits: at most 7FF"));

@@ -1,7 +1,7 @@
-//! Messages as ROS 2 writes them: the encoding (CDR) and the types that recordings carry, with their definitions.
+//! Messages of ROS 2: the encoding (CDR) and the types in recordings, with their definitions.
 //!
-//! Viewers and bag tools interpret these bytes by the definition that stands in the file beside them; neither ROS
-//! nor a generated type is needed on either side. The definitions are the files in `gateway/trace/msg`.
+//! Viewers and bag tools decode the messages by the definitions in the same file. Neither ROS nor a generated type is
+//! needed on either side. The definitions are the files in `gateway/trace/msg`.
 
 pub mod cdr;
 pub mod messages;
@@ -13,37 +13,37 @@ pub mod standard;
 use cdr::{CdrError, Decode, Encode, Reader, Writer};
 use thiserror::Error;
 
-/// A type of message: what a recording says of it, and how its bytes come about.
+/// A message type with its definition and its encoding.
 pub trait Message: Encode {
-    /// Its full name, `package/msg/Type`.
+    /// The full name of the type, `package/msg/Type`.
     const TYPE: &'static str;
-    /// Its fields and those of every type in it (encoding `ros2msg`).
+    /// The fields of the type and of every type in it (encoding `ros2msg`).
     const DEFINITION: &'static str;
 
-    /// Writes it into a buffer, in the place of what is there; allocates only while the buffer grows.
+    /// Encodes the message into a buffer and replaces its contents. Allocates only if the buffer grows.
     fn encode_into(&self, buffer: &mut Vec<u8>) {
         self.encode(&mut Writer::new(buffer));
     }
 }
 
-/// What is wrong with a message.
+/// An error in a message of a recording.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum MessageError {
-    /// Longer than anything of its type.
-    #[error("it has {bytes} bytes, and may have {limit}")]
+    /// The message is too long for its type.
+    #[error("it has {bytes} bytes, but at most {limit} are allowed")]
     Long {
-        /// Its length.
+        /// Its length in bytes.
         bytes: usize,
-        /// The limit.
+        /// The limit in bytes.
         limit: usize,
     },
-    /// Its bytes are no such message.
+    /// The bytes are not a message of the type.
     #[error(transparent)]
     Cdr(#[from] CdrError),
 }
 
-/// The definition of a type, and those of the types in it, by their files.
+/// Joins the definition of a type and those of the types in it, from their files.
 macro_rules! definition {
     ($own:literal $(, $used:literal)*) => {
         concat!(
@@ -61,12 +61,12 @@ use definition;
 
 const NANOS: u64 = 1_000_000_000;
 
-/// What a message begins with: `std_msgs/Header`.
+/// The header of a message: `std_msgs/Header`.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Header<'a> {
-    /// When, in ns since 1970. Written seconds end in 2038; the recording's own times do not.
+    /// The time, in ns since 1970. Encoded seconds end in 2038; the times of records do not.
     pub nanos: u64,
-    /// What the message is about: a bus, a link, or nothing.
+    /// The subject of the message: a bus, a link, or empty.
     pub frame_id: &'a str,
 }
 
@@ -85,10 +85,10 @@ impl<'a> Decode<'a> for Header<'a> {
     }
 }
 
-/// Returns a message's time in ns since 1970.
+/// Returns the time of a message in ns since 1970.
 ///
 /// # Errors
-/// When it is before 1970, or has more nanoseconds than a second.
+/// Returns [`CdrError::Time`] if the time is before 1970, or if `nanosec` is a second or more.
 pub fn nanos(sec: i64, nanosec: u32) -> Result<u64, CdrError> {
     let whole = u64::try_from(sec).ok().filter(|_| u64::from(nanosec) < NANOS);
     let nanos = whole.and_then(|sec| sec.checked_mul(NANOS)?.checked_add(nanosec.into()));

@@ -1,4 +1,4 @@
-//! Messages of the control loop, read back from a recording.
+//! Decodes messages of the control loop from a recording.
 
 use super::Header;
 use super::cdr::{CdrError, Reader};
@@ -7,27 +7,27 @@ use super::skin::LoopTiming;
 /// The robot's joints at a tick.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Joints {
-    /// In rad.
+    /// Positions in rad.
     pub position: Vec<f64>,
-    /// In rad/s.
+    /// Velocities in rad/s.
     pub velocity: Vec<f64>,
 }
 
-/// The cells' torque and the central one at a tick.
+/// The torques of the cells and of the central computation at a tick.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Torques {
-    /// The cells', in Nm.
+    /// The joint torques of the cells, in Nm.
     pub distributed: Vec<f64>,
-    /// In Nm; empty without a central computation.
+    /// The joint torques of the central computation, in Nm; empty in ticks without one.
     pub central: Vec<f64>,
-    /// Cells in contact.
+    /// The number of cells in contact.
     pub active: u32,
 }
 
-/// `sensor_msgs/JointState`.
+/// Decodes `sensor_msgs/JointState`.
 ///
 /// # Errors
-/// When the bytes are no such message.
+/// Returns [`CdrError`] if the bytes are not such a message.
 pub fn joints(message: &[u8]) -> Result<Joints, CdrError> {
     let mut from = Reader::new(message)?;
     from.get::<Header<'_>>()?;
@@ -35,10 +35,10 @@ pub fn joints(message: &[u8]) -> Result<Joints, CdrError> {
     Ok(Joints { position: from.get()?, velocity: from.get()? })
 }
 
-/// `skinbus_msgs/Torques`.
+/// Decodes `skinbus_msgs/Torques`.
 ///
 /// # Errors
-/// When the bytes are no such message.
+/// Returns [`CdrError`] if the bytes are not such a message.
 pub fn torques(message: &[u8]) -> Result<Torques, CdrError> {
     let mut from = Reader::new(message)?;
     from.get::<Header<'_>>()?;
@@ -46,10 +46,10 @@ pub fn torques(message: &[u8]) -> Result<Torques, CdrError> {
     Ok(Torques { distributed, central, active: from.get()? })
 }
 
-/// `skinbus_msgs/LoopTiming`.
+/// Decodes `skinbus_msgs/LoopTiming`.
 ///
 /// # Errors
-/// When the bytes are no such message.
+/// Returns [`CdrError`] if the bytes are not such a message.
 pub fn timing(message: &[u8]) -> Result<LoopTiming, CdrError> {
     Reader::new(message)?.get()
 }

@@ -1,27 +1,27 @@
-//! Types of ROS 2 that show a robot: where its links are, and its description.
+//! ROS 2 message types that show a robot: the poses of its links, and its description.
 
 use super::cdr::{Encode, Writer};
 use super::{Header, Message, definition};
 
-/// Where a frame is, seen from its parent.
+/// The pose of a frame relative to its parent.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Transform<'a> {
-    /// The parent.
+    /// The parent frame.
     pub parent: &'a str,
     /// The frame.
     pub child: &'a str,
-    /// In m.
+    /// The translation in m.
     pub translation: [f64; 3],
     /// A unit quaternion: x, y, z, w.
     pub rotation: [f64; 4],
 }
 
-/// `tf2_msgs/TFMessage`: where frames are.
+/// `tf2_msgs/TFMessage`: the poses of frames.
 #[derive(Clone, Copy, Debug)]
 pub struct Transforms<'a> {
-    /// When, in ns since 1970.
+    /// The time, in ns since 1970.
     pub nanos: u64,
-    /// Each frame.
+    /// One transform for each frame.
     pub transforms: &'a [Transform<'a>],
 }
 

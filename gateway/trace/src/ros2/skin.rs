@@ -1,38 +1,38 @@
-//! Our own types of a run: the loop's timing, torques, and what cells feel.
+//! Message types of skinbus for a run: the timing of the loop, torques, and the state of cells.
 
 use super::cdr::{CdrError, Decode, Encode, Reader, Writer};
 use super::{Header, Message, definition};
 
-/// What a tick was like, in numbers that any viewer plots.
+/// The timing and state of a tick, in numbers that any viewer can plot.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct LoopTiming {
-    /// When it should have begun, in ns since 1970.
+    /// The scheduled start, in ns since 1970.
     pub nanos: u64,
-    /// Its number; skipped ticks are counted in.
+    /// The number of the tick, counting skipped ones.
     pub tick: u64,
-    /// Ticks skipped just before it.
+    /// The number of ticks skipped just before it.
     pub skipped: u64,
-    /// How late it began, in µs.
+    /// The delay of the start, in µs.
     pub late_us: f64,
-    /// How long it took, in µs.
+    /// The duration of the tick, in µs.
     pub took_us: f64,
-    /// How long the central computation took of that, in µs; 0 in ticks without one.
+    /// The part of the duration used by the central computation, in µs; 0 in ticks without one.
     pub central_us: f64,
-    /// Cells in the torque.
+    /// The number of cells in the torque.
     pub contributing: u32,
-    /// Epochs that the oldest of them has missed.
+    /// The number of epochs that the oldest of them has missed.
     pub age: u32,
-    /// Cells in contact that missed the last epoch.
+    /// The number of cells in contact that missed the last epoch.
     pub stale: u32,
-    /// Cells that have fallen silent.
+    /// The number of cells that have timed out.
     pub dead: u32,
-    /// Why the cycle was bad, one of the definition's constants.
+    /// The reason for a bad cycle, one of the definition's constants.
     pub bad: u8,
-    /// Why the robot is halted, one of the definition's constants.
+    /// The reason for a halt of the robot, one of the definition's constants.
     pub halted: u8,
-    /// Of joints 1 to 8 those that stand at a limit and were told to go on, one bit each, joint 1 lowest.
+    /// A bit for each of joints 1 to 8 that is at a limit and was commanded beyond it; joint 1 is the lowest bit.
     pub at_limit: u8,
-    /// Whether a velocity was not finite and was taken as zero.
+    /// True if a velocity was not finite and was replaced by zero.
     pub refused: bool,
 }
 
@@ -42,7 +42,7 @@ impl Message for LoopTiming {
         definition!("skinbus_msgs/LoopTiming", "std_msgs/Header", "builtin_interfaces/Time");
 }
 
-/// Writes and reads a header without a name, and then these fields in this order.
+/// Encodes and decodes a header without a frame id, followed by these fields in this order.
 macro_rules! fields {
     ($message:ty: $($field:ident),+) => {
         impl Encode for $message {
@@ -65,16 +65,16 @@ fields!(
     refused
 );
 
-/// The cells' torque beside the central one.
+/// The torques of the cells and of the central computation.
 #[derive(Clone, Copy, Debug)]
 pub struct Torques<'a> {
-    /// When the tick should have begun, in ns since 1970.
+    /// The scheduled start of the tick, in ns since 1970.
     pub nanos: u64,
-    /// The sum of what cells said, in Nm.
+    /// The sum of the cells' joint torques, in Nm.
     pub distributed: &'a [f64],
-    /// What the gateway computed of the same joints and touches, in Nm; empty in ticks without it.
+    /// The gateway's joint torques for the same joints and touches, in Nm; empty in ticks without the computation.
     pub central: &'a [f64],
-    /// Cells with a force above zero, by the central computation.
+    /// The number of cells with a force above zero, by the central computation.
     pub active: u32,
 }
 
@@ -95,29 +95,29 @@ impl Encode for Torques<'_> {
     }
 }
 
-/// What a cell of a patch feels, and how it is.
+/// The state and sensor values of a cell.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ContactState {
-    /// Its number on the bus.
+    /// The node id of the cell.
     pub node: u16,
-    /// The force in N that Algorithm 1 makes of its sensors; not a number while nobody knows.
+    /// The force in N that Algorithm 1 computes from its sensors; NaN while it is unknown.
     pub force: f32,
-    /// Proximity, 0 to 1; not a number while nobody knows.
+    /// The proximity, 0 to 1; NaN while it is unknown.
     pub proximity: f32,
-    /// One of the definition's constants.
+    /// The status, one of the definition's constants.
     pub status: u8,
 }
 
-/// The cells of a patch when joints stood on the bus.
+/// The cells of a patch at the time when the joints were on the bus.
 #[derive(Clone, Copy, Debug)]
 pub struct PatchState<'a> {
-    /// When the joints stood on the bus, in ns since 1970.
+    /// The time of the joints on the bus, in ns since 1970.
     pub nanos: u64,
     /// The link that the patch is on.
     pub frame_id: &'a str,
-    /// The joints' epoch.
+    /// The epoch of the joints.
     pub epoch: u8,
-    /// Each cell.
+    /// The cells.
     pub cells: &'a [ContactState],
 }
 

@@ -1,14 +1,14 @@
-//! Types that ROS 2 has: every viewer knows what to make of them.
+//! Standard ROS 2 message types, which every viewer supports.
 
 use super::cdr::{Encode, Writer};
 use super::{Header, Message, definition};
 
-/// `sensor_msgs/JointState`: a robot's joints. What is not known is empty.
+/// `sensor_msgs/JointState`: the joints of a robot. Unknown values are empty.
 #[derive(Clone, Copy, Debug)]
 pub struct JointState<'a> {
-    /// When, in ns since 1970.
+    /// The time, in ns since 1970.
     pub nanos: u64,
-    /// The joints' names.
+    /// The names of the joints.
     pub names: &'a [String],
     /// Positions in rad.
     pub position: &'a [f64],
@@ -34,30 +34,30 @@ impl Encode for JointState<'_> {
     }
 }
 
-/// A point of a cloud, and the force there.
+/// A point of a cloud, with the force on it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
-    /// Where, in m, in the cloud's frame.
+    /// The position in the cloud's frame, in m.
     pub position: [f32; 3],
-    /// In N.
+    /// The force, in N.
     pub force: f32,
 }
 
 /// `sensor_msgs/PointCloud2` with the fields x, y, z and force.
 #[derive(Clone, Copy, Debug)]
 pub struct PointCloud<'a> {
-    /// When, in ns since 1970.
+    /// The time, in ns since 1970.
     pub nanos: u64,
-    /// The frame that positions are in.
+    /// The reference frame of the positions.
     pub frame_id: &'a str,
     /// The points.
     pub points: &'a [Point],
 }
 
 impl PointCloud<'_> {
-    /// Bytes of a point.
+    /// The size of a point in bytes.
     const STEP: u32 = 16;
-    /// The number that stands for single precision.
+    /// The `PointField` constant for single precision.
     const FLOAT32: u8 = 7;
 }
 
@@ -90,37 +90,37 @@ impl Encode for PointCloud<'_> {
     }
 }
 
-/// How something is.
+/// The level of a diagnosis.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 #[repr(u8)]
 pub enum Level {
-    /// As it should be.
+    /// Normal operation.
     Ok = 0,
-    /// It works, and somebody should look.
+    /// A working component that needs attention.
     Warn = 1,
-    /// It does not work.
+    /// A failed component.
     Error = 2,
 }
 
-/// How one part of a system is.
+/// The state of one component.
 #[derive(Clone, Debug)]
 pub struct Diagnosis {
-    /// How.
+    /// The level.
     pub level: Level,
-    /// Of what.
+    /// The name of the component.
     pub name: String,
-    /// In words.
+    /// A description.
     pub message: String,
-    /// Figures, by name.
+    /// Values by name.
     pub values: Vec<(&'static str, String)>,
 }
 
-/// `diagnostic_msgs/DiagnosticArray`: how the parts of a system are.
+/// `diagnostic_msgs/DiagnosticArray`: the states of components.
 #[derive(Clone, Copy, Debug)]
 pub struct Diagnostics<'a> {
-    /// When, in ns since 1970.
+    /// The time, in ns since 1970.
     pub nanos: u64,
-    /// Each part.
+    /// One diagnosis for each component.
     pub parts: &'a [Diagnosis],
 }
 

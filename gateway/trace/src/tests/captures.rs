@@ -1,4 +1,4 @@
-//! Captures of either format come back from the other one as they were, and damaged ones as far as they are sound.
+//! Captures survive the conversion into the other format and back, and damaged ones are read as far as they are intact.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::collections::BTreeMap;
@@ -31,12 +31,12 @@ fn converted(bytes: &[u8], format: Format) -> (Vec<u8>, Converted) {
     (out, done)
 }
 
-/// To the other format and back.
+/// Converts to the other format and back.
 fn there_and_back(log: &[u8]) -> Vec<u8> {
     converted(&converted(log, Format::Mcap).0, Format::Candump).0
 }
 
-/// All entries in words, and how it ended.
+/// Returns all entries as text, and the end of the capture.
 fn entries(bytes: &[u8]) -> (Vec<String>, End) {
     let mut reader = match Reader::from_read("the capture", Cursor::new(bytes.to_vec())) {
         Ok(reader) => reader,
@@ -52,7 +52,7 @@ fn entries(bytes: &[u8]) -> (Vec<String>, End) {
     }
 }
 
-/// What a line of a log can be.
+/// Generates frames of all kinds that a log can hold.
 fn frame() -> impl Strategy<Value = Frame> {
     let data = proptest::collection::vec(any::<u8>(), 0..=64);
     (0..8, any::<u32>(), 0_u8..16, 9_u8..16, data).prop_map(|(kind, id, flags, dlc, data)| {
@@ -99,7 +99,7 @@ fn line() -> impl Strategy<Value = Vec<u8>> {
     ]
 }
 
-/// Lines of a log; one in them is a frame, and none has an end in it.
+/// Generates logs with at least one frame, and without line ends inside a line.
 fn log() -> impl Strategy<Value = Vec<u8>> {
     proptest::collection::vec(line(), 0..40).prop_map(|mut lines| {
         lines.push(b"(1.000000) vcan0 123#".to_vec());
@@ -149,7 +149,7 @@ fn of_the_odd_lines_nothing_is_lost() {
     assert_eq!(before, after);
     let same = CORPUS.split(|&byte| byte == b'\n').zip(back.split(|&byte| byte == b'\n'));
     let other: Vec<_> = same.filter(|(before, after)| before != after).collect();
-    // Other spellings of the same: padding, dots, lower case, indentation.
+    // The other lines differ in padding, dots, case or indentation only.
     assert_eq!(
         other.len(),
         17,
@@ -190,7 +190,7 @@ fn notes_before_the_first_frame_have_its_time_in_a_recording() {
     assert_eq!(entries(&mcap).0, entries(log).0);
 }
 
-/// Remarks on a log.
+/// Returns the remarks on a log.
 fn backwards(log: &str) -> Vec<String> {
     let mut reader = reader(log.as_bytes());
     while reader.next().unwrap().is_some() {}
@@ -214,7 +214,7 @@ fn times_of_each_bus_are_compared_with_its_own() {
     assert_eq!(backwards(&earlier), ["times run backwards 1 times, first at frame 4; the order is kept"]);
 }
 
-/// A recording of several chunks, and its frames' times and data.
+/// Returns a recording of several chunks, and the times and data of its frames.
 fn recording() -> (Vec<u8>, Vec<(u64, Vec<u8>)>) {
     let mut log = String::new();
     for line in 0..9_000_u32 {
@@ -225,10 +225,10 @@ fn recording() -> (Vec<u8>, Vec<(u64, Vec<u8>)>) {
     (converted(log.as_bytes(), Format::Mcap).0, frames(log.as_bytes()).0)
 }
 
-/// How a capture ended, by its own account.
+/// The end of a capture, according to its reader.
 type End = Result<Option<String>, CaptureError>;
 
-/// The times and data of all frames, and how it ended.
+/// Returns the times and data of all frames, and the end of the capture.
 fn frames(bytes: &[u8]) -> (Vec<(u64, Vec<u8>)>, End) {
     let mut reader = reader(bytes);
     let mut frames = Vec::new();
@@ -270,7 +270,7 @@ fn a_damaged_recording_is_read_up_to_the_damage() {
         partly += usize::from((1..all.len()).contains(&found.len()));
         match end {
             Ok(None) => {
-                // Only what is written twice, or is not looked at.
+                // The damaged byte is stored twice, or is never read.
                 assert_eq!(found, all, "byte {at}");
                 silent += 1;
             }

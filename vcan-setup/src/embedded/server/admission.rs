@@ -1,4 +1,4 @@
-//! Letting clients in, and turning away those for whom there is no room.
+//! Accepts clients, and turns away those that find no room.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -14,21 +14,21 @@ use super::{LISTENER, Server};
 use crate::embedded::client::Client;
 use crate::embedded::routing::ClientId;
 
-/// The most that a client's socket may hold, whatever it requests.
+/// The maximum send buffer of a client's socket in bytes, whatever it requests.
 const BUFFER_MAX: usize = 64 << 20;
 
-/// Clients taken before others have their turn.
+/// The maximum number of clients accepted before other work is done.
 const ADMISSIONS: usize = 64;
 
 impl Server {
-    /// Lets waiting clients in, or as many as may come before the next event.
+    /// Accepts waiting clients, up to the limit per event.
     pub(super) fn accept(&mut self) {
         for _ in 0..ADMISSIONS {
             match self.accepted() {
                 Ok(socket) => self.admit(socket),
                 Err(Errno::INTR | Errno::CONNABORTED) => {}
                 Err(Errno::AGAIN) => return,
-                // The system looks for a file before it looks whether anybody waits.
+                // The system checks for a free file descriptor before it checks for a waiting client.
                 Err(Errno::MFILE | Errno::NFILE) => match self.turn_away() {
                     Ok(()) => {}
                     Err(Errno::AGAIN) => return,
@@ -43,8 +43,8 @@ impl Server {
         rustix::net::accept_with(&self.place.listener, SocketFlags::CLOEXEC | SocketFlags::NONBLOCK)
     }
 
-    /// Hangs up on a client for which there is no file, with the file that is spared for this. A client that has not sent
-    /// its hello yet keeps that until [`Server::part`].
+    /// Hangs up on a client that finds no free file descriptor, by means of the reserved one. A client that has not
+    /// sent its hello yet keeps that descriptor until [`Server::part`].
     fn turn_away(&mut self) -> Result<(), Errno> {
         drop(self.spare.take());
         let accepted = self.accepted();
@@ -63,7 +63,7 @@ impl Server {
         Ok(())
     }
 
-    /// Closes the connection of a client that was turned away, and spares its file for the next one.
+    /// Closes the connection of a client that was turned away, and reserves its descriptor for the next one.
     pub(super) fn part(&mut self) {
         if let Some(socket) = self.parting.take() {
             hang_up(&socket);
@@ -92,7 +92,7 @@ impl Server {
         }
     }
 
-    /// Reads a client's first datagram and sets its filters.
+    /// Reads a client's first datagram, and sets its filters.
     pub(super) fn greet(&mut self, id: ClientId) {
         let Some(client) = self.client(id) else { return };
         let mut bytes = [0; HELLO_MAX + 1];
@@ -103,14 +103,14 @@ impl Server {
             Ok((len, _)) => Hello::decode(bytes.get(..len).unwrap_or_default()),
         };
         let Some(hello) = hello else {
-            // It may not wait for an answer at all.
+            // The client may not wait for an answer.
             let _ = send_one(&client.socket, &Answer::Refused { version: VERSION }.encode());
             self.post.totals.refused += 1;
             return self.forget(id);
         };
         let target = usize::try_from(hello.buffer).unwrap_or(BUFFER_MAX).min(BUFFER_MAX);
         if sockopt::set_socket_send_buffer_size_force(&client.socket, target).is_err() {
-            // What was granted is reported, whatever it is.
+            // The granted size is reported, whatever it is.
             let _ = sockopt::set_socket_send_buffer_size(&client.socket, target);
         }
         let granted = sockopt::socket_send_buffer_size(&client.socket).unwrap_or(0) as u64;
@@ -124,14 +124,14 @@ impl Server {
     }
 }
 
-/// Ends a connection without an answer; whether the other end had sent something. When that is read, the other end sees
-/// an end, and no reset, which would say that the server ended.
+/// Ends a connection without an answer. Returns true if the other end had sent something. Reading that data makes the
+/// other end see an end of file rather than a reset, which would mean that the server ended.
 fn hang_up(socket: &OwnedFd) -> bool {
     let _ = shutdown(socket, Shutdown::Write);
     rustix::net::recv(socket, &mut [0; HELLO_MAX + 1], RecvFlags::DONTWAIT).err() != Some(Errno::AGAIN)
 }
 
-/// Sends the answer, the first datagram in its socket. Only a lack of memory is in its way.
+/// Sends the answer, the first datagram in the socket. Only a lack of memory can prevent that.
 fn welcome(socket: &OwnedFd, granted: u64) -> io::Result<usize> {
     let answer = Answer::Welcome { granted }.encode();
     let mut tries = 0..10;

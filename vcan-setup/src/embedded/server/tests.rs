@@ -7,12 +7,12 @@ use tempfile::TempDir;
 
 use super::*;
 
-/// Receives what a socket has, after errors that are given.
+/// Receives from a socket after given errors.
 struct Faulty {
     batch: Batch,
-    /// Before each reception one of these, if it is an error.
+    /// The results before each reception, each an error or none.
     errors: VecDeque<Option<Errno>>,
-    /// After those it is always this one.
+    /// The error of all receptions after those.
     last: Option<Errno>,
 }
 
@@ -29,7 +29,7 @@ impl Receive for Faulty {
     }
 }
 
-/// A bus that is served by a thread of this test.
+/// A bus that a thread of this test serves.
 struct Bench {
     directory: TempDir,
     stop: UnixStream,
@@ -67,12 +67,12 @@ impl Bench {
     }
 }
 
-/// Waits for so many frames: their identifiers.
+/// Waits for `count` frames, and returns their identifiers.
 fn receives(bus: &Bus, count: usize) -> Vec<u32> {
     arrivals(bus, count).into_iter().map(|(_, id)| id).collect()
 }
 
-/// Waits for so many frames: their time stamps and identifiers.
+/// Waits for `count` frames, and returns their time stamps and identifiers.
 fn arrivals(bus: &Bus, count: usize) -> Vec<(u64, u32)> {
     let (mut inbox, mut all) = (Inbox::new(), Vec::new());
     while all.len() < count {
@@ -90,7 +90,7 @@ fn errors_of_a_reception_that_pass_cost_a_client_no_frame() {
     let bench = Bench::new(&errors, None);
     let [sender, receiver] = [bench.open(), bench.open()];
     let frames: Vec<_> = (0..500).map(|id| Frame::classic(id, &[1]).unwrap()).collect();
-    // In pieces, so that every error meets some.
+    // Frames are sent in pieces, so that every error affects some.
     for piece in frames.chunks(5) {
         sender.send(piece).unwrap();
         let ids: Vec<_> = piece.iter().map(Frame::id).collect();
@@ -105,9 +105,9 @@ fn errors_of_a_reception_that_pass_cost_a_client_no_frame() {
 fn time_stamps_of_a_process_with_two_sockets_are_in_the_order_of_the_bus() {
     let bench = Bench::new(&[], None);
     let open = |id| bench.open_with(vec![Filter { id, mask: STANDARD_MASK }]);
-    // The first two of a process are a pair, and the next two.
+    // The first two clients of a process are a pair, and so are the next two.
     let [sender, _idle, first, second] = [bench.open(), open(3), open(1), open(2)];
-    // One round of the server: every socket is written to once when it ends, or more often.
+    // Within one round of the server every socket is written to once, at its end, or more often.
     let expected = [1, 2, 1, 2, 2, 1];
     sender.send(&expected.map(|id| Frame::classic(id, &[]).unwrap())).unwrap();
     let mut came: Vec<_> = [first, second].iter().flat_map(|bus| arrivals(bus, 3)).collect();

@@ -1,11 +1,11 @@
-//! A world that steps change, and what any plan does in it.
+//! Properties that every plan must have, in a simulated world that steps change.
 
 use proptest::prelude::*;
 
 use super::*;
 use crate::link::Peer;
 
-/// What steps do, as far as the kernel is concerned. A step on what is not ours stops the test.
+/// A simulation of the kernel's interfaces. A step on an interface that this program did not make fails the test.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub(super) struct World {
     pub(super) here: Vec<Interface>,
@@ -90,14 +90,14 @@ impl World {
     }
 }
 
-/// An end of a pair that has this number here.
+/// Returns an end of a pair with this index, in this namespace.
 fn number(index: u32) -> Peer {
     Peer { index, name: None, namespace: None, namespace_id: None }
 }
 
 const NAMES: [&str; 5] = ["vcan0", "vcan1", "vcan2", "can0", "eth0"];
 
-/// Interfaces of distinct names, two of which may be the ends of a pair.
+/// Generates interfaces with distinct names, two of which may be the ends of a pair.
 fn any_world() -> impl Strategy<Value = World> {
     let one = (0..5_u8, any::<bool>(), any::<bool>(), any::<bool>(), 0..3_u32, 0..3_u32);
     (proptest::collection::vec(proptest::option::of(one), NAMES.len()), any::<bool>()).prop_map(
@@ -139,7 +139,7 @@ fn any_target() -> impl Strategy<Value = Vec<Target>> {
         let data = (rate > 0 && data > 0 && fd).then_some(data * 1_000_000);
         in_skin(name, format, bitrate, data)
     });
-    // A name once: two skins may want different things of one bus.
+    // Each name occurs once, because two skins may give one bus different values.
     proptest::collection::vec(target, 0..5).prop_map(|mut all| {
         let mut seen = std::collections::HashSet::new();
         all.retain(|target| seen.insert(target.name.clone()));

@@ -1,4 +1,4 @@
-//! A geometry's `mesh`: its vertices, and the triangles of its primitives.
+//! The `mesh` of a geometry: its vertices, and the triangles of its primitives.
 
 use nalgebra::Point3;
 use roxmltree::Node;
@@ -7,27 +7,27 @@ use super::{Named as _, Names, child, children, floats, numbers};
 use crate::mesh::polygon::{Filled, fan};
 use crate::mesh::{MAX_TRIANGLES, MeshError, Triangle, syntax, too_many};
 
-/// The most indices of one corner.
+/// The maximum number of indices per corner.
 const MAX_OFFSET: usize = 64;
 
 /// A `mesh` element.
 #[derive(Debug)]
 pub(super) struct Mesh<'a, 'i, 'n> {
-    /// The file's name, for errors.
+    /// The name of the file, for errors.
     name: &'a str,
     mesh: Node<'a, 'i>,
-    /// Those of the mesh's own elements.
+    /// The ids of the mesh's own elements.
     own: Names<'a, 'i>,
-    /// Those of the whole file.
+    /// The ids of the whole file.
     all: &'n Names<'a, 'i>,
 }
 
-/// The corners of a primitive, by their indices.
+/// The corners of a primitive, as indices into a list of points.
 struct Corners {
     kind: &'static str,
-    /// Where in each group of indices that of the vertex is.
+    /// The position of the vertex index in each group of indices.
     offset: usize,
-    /// Indices for each corner.
+    /// The number of indices per corner.
     stride: usize,
     points: Vec<Point3<f64>>,
 }
@@ -41,7 +41,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         syntax(self.name, reason)
     }
 
-    /// The triangles, as the file has them.
+    /// Returns the triangles in the file's own coordinates.
     pub(super) fn triangles(&self) -> Result<Vec<Triangle>, MeshError> {
         let mut filled = Filled::default();
         for element in self.mesh.children().filter(Node::is_element) {
@@ -70,7 +70,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         filled.finish().map_err(|why| self.error(&why))
     }
 
-    /// Triangles with three corners each.
+    /// Reads triangles with three corners each.
     fn plain(
         &self,
         element: Node<'a, 'i>,
@@ -89,7 +89,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         self.counted(element, "triangles", triangles.len() - before)
     }
 
-    /// Polygons whose corners are all in one list.
+    /// Reads polygons whose corners are all in one list.
     fn polylist(
         &self,
         element: Node<'a, 'i>,
@@ -115,7 +115,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         Ok(())
     }
 
-    /// Polygons with a list of corners each, some with holes.
+    /// Reads polygons with a list of corners each, some with holes.
     fn polygons(
         &self,
         element: Node<'a, 'i>,
@@ -149,7 +149,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         }
     }
 
-    /// The points of a list of indices.
+    /// Returns the points of a list of indices.
     fn points(&self, indices: Node<'_, '_>, corners: &Corners) -> Result<Vec<Point3<f64>>, MeshError> {
         let Corners { kind, offset, stride, points } = corners;
         let indices = numbers(self.name, indices, str::parse::<usize>)?;
@@ -171,7 +171,8 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         groups.map(point).collect()
     }
 
-    /// An element of this kind that a reference of this mesh names: of its own; else the only one of the file.
+    /// Returns the element of this kind that a reference of this mesh names: one of its own, or else the only one of
+    /// the file.
     fn referred(&self, kind: &'static str, input: Node<'_, '_>) -> Result<Node<'a, 'i>, MeshError> {
         let source = input.attribute("source").unwrap_or_default();
         let own = self.own.find(kind, source)?;
@@ -179,7 +180,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         found.ok_or_else(|| self.error(&format!("{kind} {source:?} is not there")))
     }
 
-    /// How a primitive's indices name points.
+    /// Reads the inputs that relate a primitive's indices to points.
     fn corners(&self, element: Node<'a, 'i>, kind: &'static str) -> Result<Corners, MeshError> {
         let mut stride = 0;
         let mut vertex = None;
@@ -202,7 +203,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         Ok(Corners { kind, offset, stride, points })
     }
 
-    /// The points of a source.
+    /// Returns the points of a source.
     fn positions(&self, source: Node<'a, 'i>) -> Result<Vec<Point3<f64>>, MeshError> {
         let accessor = child(source, "technique_common").and_then(|common| child(common, "accessor"));
         let number = |name: &str| accessor?.attribute(name)?.trim().parse::<usize>().ok();
@@ -227,7 +228,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
     }
 }
 
-/// The triangles of a strip, of which every other one is wound the other way.
+/// Returns the triangles of a strip, every other one of which has the opposite winding.
 fn strip(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
     triangles.extend(corners.windows(3).enumerate().filter_map(|(at, corners)| {
         let &[a, b, c] = corners else { return None };

@@ -1,9 +1,9 @@
-//! COLLADA files: unit, axis, the scene's nodes with their transforms, and what geometry they place.
+//! Reads COLLADA files: unit, axis, the scene's nodes with their transforms, and the geometries that they place.
 //!
-//! Triangles, polygons with and without holes, strips and fans are read; lines, materials and animations are
-//! ignored. A reference names one element of one kind: identifiers that several elements of that kind share are
-//! refused where they are referred to. A geometry's sources and vertices are its own: many exporters give those of
-//! all geometries the same identifiers.
+//! Triangles, polygons with and without holes, strips and fans are read; lines, materials and animations are ignored. A
+//! reference names one element of one kind: identifiers that several elements of that kind share are refused where they
+//! are referred to. A geometry's sources and vertices are its own: many exporters give those of all geometries the same
+//! identifiers.
 
 mod geometry;
 #[cfg(test)]
@@ -19,13 +19,13 @@ use roxmltree::{Document, Node};
 use super::{Affine, MAX_TRIANGLES, MeshError, Triangle, UpAxis, syntax, too_many};
 use geometry::Mesh;
 
-/// How deep nodes may be nested. A circle of `instance_node` ends here.
+/// The maximum nesting depth of nodes. A cycle of `instance_node` ends here.
 const MAX_DEPTH: usize = 64;
 
-/// How many nodes may be visited, so that nodes which are placed again and again come to an end.
+/// The maximum number of visited nodes, which limits nodes that are placed repeatedly.
 const MAX_NODES: usize = 100_000;
 
-/// The triangles of a file's scene, in m.
+/// Returns the triangles of a file's scene, in m.
 pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Triangle>, MeshError> {
     let wrong = |fault: Fault| MeshError::Xml { file: name.to_owned(), fault };
     let text = protocol::xml::text(bytes).map_err(wrong)?;
@@ -52,7 +52,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Tria
             }
         }
         None => {
-            // A file of geometry alone.
+            // The file contains only geometries.
             for geometry in root.descendants().filter(|node| node.has_tag_name_of("geometry")) {
                 reader.place(geometry, &outer)?;
             }
@@ -61,7 +61,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Tria
     Ok(reader.triangles)
 }
 
-/// Names without their namespace, which some files have and some have not.
+/// Compares element names without their namespace, which only some files have.
 trait Named {
     fn has_tag_name_of(&self, name: &str) -> bool;
 }
@@ -80,7 +80,7 @@ fn child<'a, 'i>(node: Node<'a, 'i>, name: &'static str) -> Option<Node<'a, 'i>>
     children(node, name).next()
 }
 
-/// The file's unit and axis.
+/// Returns the transform for the file's unit and axis.
 fn outer(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine, MeshError> {
     let asset = child(root, "asset");
     let meter = asset.and_then(|asset| child(asset, "unit")?.attribute("meter"));
@@ -94,9 +94,9 @@ fn outer(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine, MeshError
     let axis = asset.and_then(|asset| child(asset, "up_axis")?.text()).map_or("Y_UP", str::trim);
     let turn = match (up, axis) {
         (UpAxis::Ignore, _) | (UpAxis::Follow, "Z_UP") => Matrix3::identity(),
-        // x stays; y to z.
+        // x stays, and y becomes z.
         (UpAxis::Follow, "Y_UP") => Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0),
-        // x to z, y to -x, z to -y: X_UP has y to the left, and z towards the viewer.
+        // x becomes z, y becomes -x, and z becomes -y: X_UP has y to the left, and z towards the viewer.
         (UpAxis::Follow, "X_UP") => Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0),
         (UpAxis::Follow, _) => {
             return Err(syntax(name, &format!("its up_axis is {axis:?}, none of X_UP, Y_UP and Z_UP")));
@@ -108,7 +108,7 @@ fn outer(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine, MeshError
 /// Elements by kind and id.
 #[derive(Debug)]
 struct Names<'a, 'i> {
-    /// The file's name, for errors.
+    /// The name of the file, for errors.
     file: &'a str,
     elements: HashMap<(&'a str, &'a str), Vec<Node<'a, 'i>>>,
 }
@@ -124,7 +124,7 @@ impl<'a, 'i> Names<'a, 'i> {
         Self { file, elements }
     }
 
-    /// The element of this kind that `reference` names; none if there is none.
+    /// Returns the element of this kind that `reference` names, if it exists.
     fn find(&self, kind: &str, reference: &str) -> Result<Option<Node<'a, 'i>>, MeshError> {
         let wrong = |reason: String| Err(syntax(self.file, &reason));
         let Some(id) = reference.strip_prefix('#') else {
@@ -140,12 +140,12 @@ impl<'a, 'i> Names<'a, 'i> {
 
 #[derive(Debug)]
 struct Reader<'a, 'i> {
-    /// The file's name, for errors.
+    /// The name of the file, for errors.
     name: &'a str,
     names: Names<'a, 'i>,
-    /// What was read of a geometry.
+    /// The triangles of geometries that were already read.
     geometry: HashMap<roxmltree::NodeId, Vec<Triangle>>,
-    /// Nodes visited.
+    /// The number of visited nodes.
     visited: usize,
     triangles: Vec<Triangle>,
 }
@@ -155,7 +155,7 @@ impl<'a, 'i> Reader<'a, 'i> {
         syntax(self.name, reason)
     }
 
-    /// The element of this kind that an element's `url` names, in this file.
+    /// Returns the element of this kind that an element's `url` names, in this file.
     fn referred(&self, node: Node<'_, '_>, kind: &str) -> Result<Node<'a, 'i>, MeshError> {
         let url = node.attribute("url").unwrap_or_default();
         let missing = || self.error(&format!("{kind} {url:?} is not there"));
@@ -186,7 +186,7 @@ impl<'a, 'i> Reader<'a, 'i> {
                     let geometry = self.referred(element, "geometry")?;
                     self.place(geometry, &here)?;
                 }
-                // Where its vertices are is up to joints.
+                // Joints would determine the positions of its vertices.
                 "instance_controller" => {
                     let url = element.attribute("url").unwrap_or_default();
                     return Err(self.error(&format!("controller {url:?} deforms a mesh; apply it first")));
@@ -197,7 +197,7 @@ impl<'a, 'i> Reader<'a, 'i> {
         Ok(())
     }
 
-    /// A node's element as a transform, if it is one.
+    /// Returns the transform of a node's element; `None` for other elements.
     fn transform(&self, element: Node<'_, '_>) -> Result<Option<Affine>, MeshError> {
         let kind = element.tag_name().name();
         if !matches!(kind, "matrix" | "translate" | "rotate" | "scale") {
@@ -248,7 +248,7 @@ impl<'a, 'i> Reader<'a, 'i> {
     }
 }
 
-/// The numbers of an element's text.
+/// Returns the numbers in an element's text.
 fn floats(file: &str, element: Node<'_, '_>) -> Result<Vec<f64>, MeshError> {
     numbers(file, element, str::parse::<f64>)
 }

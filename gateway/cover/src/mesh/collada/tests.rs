@@ -2,7 +2,8 @@ use std::fmt::Write as _;
 
 use crate::mesh::{Mesh, UpAxis};
 
-/// A geometry with a tetrahedron at x, whose sources are named as those of all others, and these primitives.
+/// Returns a geometry with a tetrahedron at x and with these primitives. Its sources have the same ids as those of all
+/// others.
 fn geometry(id: &str, x: f64, primitives: &str) -> String {
     format!(
         r##"<geometry id="{id}"><mesh>
@@ -36,7 +37,7 @@ fn parse(text: &str) -> Result<Mesh, String> {
     Mesh::parse("a.dae", text.as_bytes(), UpAxis::Ignore).map_err(|error| error.to_string())
 }
 
-/// The smallest x of each tetrahedron.
+/// Returns the smallest x of each tetrahedron.
 fn places(mesh: &Mesh) -> Vec<f64> {
     let x = mesh.triangles().chunks(4).map(|four| four.iter().flatten().map(|corner| corner.x));
     x.map(|x| x.fold(f64::INFINITY, f64::min)).collect()
@@ -44,11 +45,11 @@ fn places(mesh: &Mesh) -> Vec<f64> {
 
 #[test]
 fn geometries_may_share_the_names_of_their_sources() {
-    // The scene, a geometry, its sources and its vertices have one name.
+    // The scene, a geometry, its sources and its vertices share one id.
     let geometries = geometry("a", 0.0, TRIANGLES) + &geometry("b", 5.0, TRIANGLES);
     let mesh = parse(&file(&geometries, &placed(&["a", "b", "a"]), "")).unwrap();
     assert_eq!(places(&mesh), [0.0, 5.0, 0.0]);
-    // The last one is shorter.
+    // The second geometry is shorter.
     let short =
         geometry("b", 5.0, "").replace("count=\"12\"", "count=\"3\"").replace("  6 0 0  5 2 0  5 0 3", "");
     let mesh = parse(&file(&(geometry("a", 0.0, TRIANGLES) + &short), &placed(&["a", "b"]), "")).unwrap();
@@ -66,7 +67,7 @@ fn a_name_of_several_elements_is_refused_where_it_is_used() {
     assert!(
         parse(&file(&sources, &placed(&["a"]), "")).unwrap_err().contains("belongs to 2 source elements")
     );
-    // A source of no geometry is looked for in the whole file, where several have the name.
+    // A source outside the geometry is searched in the whole file, where several have the id.
     let elsewhere =
         geometry("c", 0.0, TRIANGLES).replace("source=\"#pos\"/></vertices>", "source=\"#far\"/></vertices>");
     let missing = parse(&file(&elsewhere, &placed(&["c"]), "")).unwrap_err();
@@ -95,7 +96,7 @@ fn nodes_and_scenes_are_found_by_kind_and_missed_in_words() {
 
 #[test]
 fn polygons_of_each_kind_have_their_own_area() {
-    // A square with a notch and one with a hole, by their corners in the plane of x and y.
+    // The points are a square with a notch and a square with a hole, in the plane of x and y.
     let points = "0 0 0 3 0 0 3 3 0 1.5 1 0 0 3 0  1 0.2 0 2 0.2 0 2 0.6 0 1 0.6 0";
     let with = |primitives: &str| {
         let text = geometry("a", 0.0, primitives).replace("count=\"12\"", "count=\"27\"");

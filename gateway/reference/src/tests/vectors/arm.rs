@@ -1,4 +1,4 @@
-//! Arms with a cell on them, the same ones each time, and Eq. 8 for them in double precision.
+//! Reproducible arms with a cell on them, and Eq. 8 for them in double precision.
 
 use crate::Reference;
 use nalgebra::{IsometryMatrix3, Point3, Rotation3, Translation3, Unit, Vector3};
@@ -15,7 +15,7 @@ pub(crate) struct Case {
     contact: [Q5_10; 3],
 }
 
-/// Numbers in [-1, 1) that are the same each time (Knuth's MMIX).
+/// A reproducible generator of numbers in [-1, 1) (Knuth's MMIX).
 struct Dice(u64);
 
 impl Dice {
@@ -29,7 +29,7 @@ impl Dice {
     }
 }
 
-/// Arms of 1 to 6 joints, each with a cell on each of its links.
+/// Returns arms of 1 to 6 joints, each with a cell on each of its links.
 pub(crate) fn cases() -> impl Iterator<Item = Case> {
     let mut dice = Dice(1);
     let sizes = (1..=6_u8).flat_map(|joints| (1..=joints).map(move |joint| (joint, joints)));
@@ -65,40 +65,40 @@ pub(crate) fn cases() -> impl Iterator<Item = Case> {
 }
 
 impl Case {
-    /// The words of the robot's rows in use.
+    /// Returns the words of the robot's rows in use.
     pub(crate) fn rows(&self) -> Vec<[i16; WORDS]> {
         (0..self.parameters.joints).map(|row| self.parameters.words(Parameter::Row(row))).collect()
     }
 
-    /// Of a value for each joint those that a packet of this chain has.
+    /// Selects from a value for each joint those that a packet of this chain has.
     pub(crate) fn of_chain(&self, all: [i16; MAX_JOINTS]) -> Vec<i16> {
         all[..Length::for_joints(self.parameters.joints.into()).words()].to_vec()
     }
 
-    /// The words of sensors page 0.
+    /// Returns the words of sensors page 0.
     pub(crate) fn sensors(&self) -> [i16; WORDS] {
         packet::words(self.contact.map(Q::to_bits))
     }
 
-    /// J and the torques, as the cell computes them.
+    /// Returns the Jacobian and the torques, as the cell computes them.
     pub(crate) fn answer(&self) -> ([Q1_14; MAX_JOINTS], [i16; MAX_JOINTS]) {
         let sensors = SkinSensors { contact: self.contact, ..SkinSensors::default() };
         let cell = Reference::new(&self.parameters);
         (cell.jacobian(&self.q), cell.torque(&self.q, &sensors))
     }
 
-    /// J in double precision, rounded once.
+    /// Returns the Jacobian in double precision, rounded once.
     pub(crate) fn exact_jacobian(&self) -> [Q1_14; MAX_JOINTS] {
         let mut real = self.under(1.0).into_iter();
         core::array::from_fn(|_| Q1_14::nearest(real.next().unwrap_or(0.0)))
     }
 
-    /// The torques in Nm: what a force against the normal does about each axis below the cell.
+    /// Returns the torques in Nm: the moments of a force against the normal about each axis below the cell.
     pub(crate) fn real(&self) -> Vec<f64> {
         self.under(self.contact.iter().map(|word| word.to_f64()).sum())
     }
 
-    /// The same under so many newtons.
+    /// Returns the torques of a force in N.
     fn under(&self, force_n: f64) -> Vec<f64> {
         let Pose { position, normal } = self.parameters.pose;
         let turn =

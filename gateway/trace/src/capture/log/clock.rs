@@ -1,7 +1,7 @@
-//! The times of frames whose lines do not say when they were.
+//! Times of frames whose lines do not hold an absolute time.
 //!
-//! `candump -t d` prints the time since the line before, `-t z` since the first one, and nothing says which of them it was:
-//! times that run backwards on one bus do. Without `-t` there are no times.
+//! `candump -t d` prints the time since the line before, `-t z` that since the first one. The log does not say which
+//! one was used, but only differences run backwards on one bus. Without `-t` there are no times.
 
 use std::fmt;
 
@@ -10,24 +10,24 @@ use protocol::candump::Timestamp;
 use super::console::Stamp;
 use crate::capture::last_times::LastTimes;
 
-/// From one frame to the next where there are no times.
+/// The step from one frame to the next if there are no times.
 const STEP_NS: u64 = 1_000;
-/// Buses whose times are compared.
+/// The maximum number of buses whose times are compared.
 const BUSES: usize = 16;
-/// Comparisons that are enough.
+/// The number of comparisons that decide.
 const ENOUGH: u32 = 20;
 
-/// What is to be known of the times and flags of a capture.
+/// A remark on the times and flags of a capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 #[non_exhaustive]
 pub enum Remark {
-    /// There are no times.
+    /// The lines have no times.
     NoTimes,
-    /// They are dates of an unknown time zone.
+    /// The times are dates of an unknown time zone.
     LocalTimes,
-    /// They count from the first frame.
+    /// The times count from the first frame.
     SinceFirst,
-    /// They are differences.
+    /// The times are differences between lines.
     Differences,
     /// FD frames have no flags.
     NoFlags,
@@ -51,32 +51,32 @@ impl fmt::Display for Remark {
     }
 }
 
-/// What relative times are relative to.
+/// The reference of relative times.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Relative {
     First,
     Before,
 }
 
-/// Gives frames their times, one after the other.
+/// Assigns times to frames, one after the other.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(crate) struct Clock {
-    /// What relative times are relative to, once that is known.
+    /// The reference of relative times, once it is known.
     relative: Option<Relative>,
-    /// When the last frame was, in ns.
+    /// The time of the last frame, in ns.
     last: Option<u64>,
 }
 
 impl Clock {
-    /// Before the first frame.
+    /// The clock before the first frame.
     pub(crate) const NEW: Self = Self { relative: None, last: None };
 
-    /// When the last frame was, in ns; 0 before the first one.
+    /// Returns the time of the last frame, in ns; 0 before the first one.
     pub(super) fn last(self) -> u64 {
         self.last.unwrap_or(0)
     }
 
-    /// Whether it is not known yet what relative times are relative to.
+    /// Returns true if the reference of relative times is not known yet.
     pub(super) const fn is_open(self) -> bool {
         self.relative.is_none()
     }
@@ -85,12 +85,12 @@ impl Clock {
         self.relative = Some(relative);
     }
 
-    /// The next frame was at this time.
+    /// Sets the time of the last frame.
     pub(super) const fn at(&mut self, nanos: u64) {
         self.last = Some(nanos);
     }
 
-    /// The time of the next frame, and what is to be said of it.
+    /// Returns the time of the next frame, and a remark on it.
     pub(super) fn time(&mut self, stamp: Stamp) -> (Timestamp, Option<Remark>) {
         let (time, remark) = match stamp {
             Stamp::None => {
@@ -110,7 +110,7 @@ impl Clock {
     }
 }
 
-/// What times of several lines say of what they are relative to.
+/// Compares the times of several lines to find out their reference.
 #[derive(Debug, Default)]
 pub(super) struct Evidence {
     last: LastTimes<BUSES>,
@@ -131,7 +131,7 @@ impl Evidence {
         self.compared >= ENOUGH
     }
 
-    /// Times since the first frame grow on each bus; a few may not where the clock was set.
+    /// Returns the reference. Times since the first frame grow on each bus, except for a few where the clock was set.
     pub(super) const fn verdict(&self) -> Relative {
         if self.smaller * 8 > self.compared || self.same * 2 > self.compared {
             Relative::Before

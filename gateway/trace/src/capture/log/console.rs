@@ -1,7 +1,7 @@
-//! One line of what candump prints on a terminal.
+//! Parser of single lines of candump's console output.
 //!
 //! ```text
-//!    can0  123   [8]  11 22 33 44 55 66 77 88   '."3DUfw.'        -a: the same as characters
+//!    can0  123   [8]  11 22 33 44 55 66 77 88   '."3DUfw.'        -a: as characters too
 //!    (1700000000.123456)  can0  1F334455   [2]  11 22             -t a; z and d (000.001234), A a date
 //!    can0  TX B -  123  [12]  11 22 33 44 55 66 77 88 99 AA BB CC -x: direction, flags; two digits: FD
 //!    can0  123   [3]  33`22`11                                    -S: the last byte first
@@ -13,46 +13,48 @@
 //!    (2023-11-14 22:13:20.123456) can0 123#1122                   a log with dates
 //! ```
 //!
-//! Colours (`-c`) may stand between words, anything before it, as a prompt, and anything behind the data but a further byte.
+//! Colours (`-c`) may stand between words. Any text may stand before a frame, such as a prompt, and any text except a
+//! further byte after its data.
 
 use protocol::can::{BIT_RATE_SWITCH, ERROR_STATE, Frame, REMOTE, identifier};
 use protocol::candump::{self, Direction, LineError, Timestamp, eight_digit_identifier};
 
-/// A line that is a frame.
+/// A line that holds a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Seen<'a> {
     pub(super) stamp: Stamp,
     pub(super) interface: &'a str,
     pub(super) frame: Frame,
     pub(super) direction: Option<Direction>,
-    /// Whether it says the flags of an FD frame, or needs none.
+    /// True if the line holds the flags of an FD frame, or needs none.
     pub(super) has_flags: bool,
 }
 
-/// What a line says of its time.
+/// The time of a line.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Stamp {
-    /// Nothing.
+    /// The line has no time.
     None,
-    /// Since 1970.
+    /// The time since 1970.
     Absolute(Timestamp),
-    /// A date and a time of day somewhere, read as UTC.
+    /// A date and a time of day in an unknown time zone, read as UTC.
     Local(Timestamp),
-    /// Since the first frame, or the one before it.
+    /// The time since the first frame, or since the one before.
     Relative(Timestamp),
 }
 
-/// What a line of console text is.
+/// A line of console output.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Console<'a> {
     Frame(Seen<'a>),
     CanXl,
 }
 
-/// Reads one line without its end; `None` when it is no console text: a name, an identifier and a length. Never panics.
+/// Parses one line without its end. Returns `None` if it is not console output, that is, a name, an identifier and a
+/// length. Never panics.
 ///
 /// # Errors
-/// When it begins so, and what follows the length is no frame.
+/// Returns [`LineError`] if the line begins like console output, but the text after the length is not a frame.
 pub(super) fn parse(line: &[u8]) -> Option<Result<Console<'_>, LineError>> {
     let text = line.trim_ascii_end();
     memchr::memchr3(b'[', b'{', b'#', text)?;
@@ -65,7 +67,8 @@ pub(super) fn parse(line: &[u8]) -> Option<Result<Console<'_>, LineError>> {
     if first.is_some() || cursor.rest().starts_with(b"(") {
         return first;
     }
-    // A frame behind a prompt; what is like one there may be anything.
+    // Text before the frame may be a prompt. A line that only resembles a frame there is ignored, as it may be
+    // anything.
     while !cursor.word().is_empty() {
         cursor.blanks();
         if let Some(Ok(frame)) = cursor.line() {
@@ -75,7 +78,7 @@ pub(super) fn parse(line: &[u8]) -> Option<Result<Console<'_>, LineError>> {
     None
 }
 
-/// What stands in brackets.
+/// The length in brackets.
 #[derive(Clone, Copy)]
 enum Length {
     Classic(u8),
@@ -89,7 +92,7 @@ fn identifier_of(digits: &[u8]) -> Option<u32> {
     let id = u32::from_str_radix(core::str::from_utf8(digits).ok()?, 16).ok()?;
     match digits.len() {
         3 => identifier(id, 0).ok(),
-        // Whether it is remote stands behind it.
+        // The text after the length shows whether the frame is remote.
         _ => Some(eight_digit_identifier(id) & !REMOTE),
     }
 }
@@ -101,7 +104,7 @@ struct Cursor<'a> {
 }
 
 impl<'a> Cursor<'a> {
-    /// What a line is from here on, behind blanks.
+    /// Parses the line from here on, after blanks.
     fn line(mut self) -> Option<Result<Console<'a>, LineError>> {
         let stamp = if self.take(b'(') { self.stamp()? } else { Stamp::None };
         self.blanks();
@@ -112,7 +115,7 @@ impl<'a> Cursor<'a> {
         let id_at = self.at;
         let id = self.word();
         if let (Stamp::Local(_), None) = (stamp, marks) {
-            // A log whose times are dates.
+            // The line is from a log whose times are dates.
             let frame = id.contains(&b'#').then(|| core::str::from_utf8(id).ok()).flatten();
             if let Some(frame) = frame.and_then(|text| candump::parse_frame(text).ok()) {
                 let seen = Seen { stamp, interface, frame, direction: self.direction(), has_flags: true };
@@ -137,7 +140,7 @@ impl<'a> Cursor<'a> {
         Some(frame.map(|frame| Console::Frame(Seen { stamp, interface, frame, direction, has_flags })))
     }
 
-    /// A direction behind a frame of a log.
+    /// Parses the direction after a frame of a log.
     fn direction(&mut self) -> Option<Direction> {
         self.blanks();
         match self.word() {
@@ -147,7 +150,8 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Looks for a dash and a quoted text behind the data: isotpsniffer prints so the messages that it joins from frames.
+    /// Returns true if a dash and a quoted text follow the data: isotpsniffer prints messages this way that it joins
+    /// from frames.
     fn is_of_isotpsniffer(&self, has_frame: bool) -> bool {
         if has_frame {
             self.rest().starts_with(b"- '")
@@ -170,7 +174,7 @@ impl<'a> Cursor<'a> {
         LineError { column: self.at + 1, expected }
     }
 
-    /// Passes over blanks and colours; whether there are any.
+    /// Skips blanks and colours. Returns true if there were any.
     fn blanks(&mut self) -> bool {
         let from = self.at;
         loop {
@@ -185,17 +189,17 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Passes over blanks, colours, and the marks of a quotation in mails and issues.
+    /// Skips blanks, colours, and the quotation marks of mails and issues.
     fn quotes(&mut self) {
         while self.blanks() || self.take(b'>') || self.take(b'|') {}
     }
 
-    /// What stands up to the next blank or colour.
+    /// Returns the text up to the next blank or colour.
     fn word(&mut self) -> &'a [u8] {
         self.run(|byte| !matches!(byte, b' ' | b'\t' | 0x1B))
     }
 
-    /// The bytes from here on that are of a kind.
+    /// Returns the bytes from here on that match `is`.
     fn run(&mut self, is: impl Fn(u8) -> bool) -> &'a [u8] {
         let rest = self.rest();
         let len = rest.iter().take_while(|&&byte| is(byte)).count();
@@ -203,13 +207,13 @@ impl<'a> Cursor<'a> {
         rest.get(..len).unwrap_or_default()
     }
 
-    /// A number, and in how many decimal digits.
+    /// Returns a number and the count of its decimal digits.
     fn number(&mut self) -> Option<(u64, usize)> {
         let digits = self.run(|byte| byte.is_ascii_digit());
         Some((core::str::from_utf8(digits).ok()?.parse().ok()?, digits.len()))
     }
 
-    /// What stands in the parentheses before the name, and the one that closes them.
+    /// Parses the time in the parentheses before the name, with the closing one.
     fn stamp(&mut self) -> Option<Stamp> {
         let is_padded = self.rest().first() == Some(&b'0');
         let (number, digits) = self.number()?;
@@ -227,7 +231,7 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// The rest of `2026-11-24 03:55:42` behind the year, in seconds since 1970.
+    /// Parses the rest of `2026-11-24 03:55:42` after the year. Returns seconds since 1970.
     fn date(&mut self, year: u64) -> Option<u64> {
         let mut two_digits = |end: Option<u8>| {
             let (number, digits) = self.number()?;
@@ -240,7 +244,7 @@ impl<'a> Cursor<'a> {
             .then(|| ((days(year, month, day) * 24 + hour) * 60 + minute) * 60 + second)
     }
 
-    /// What `-x` says: a direction, and two flags unless somebody left them out.
+    /// Parses the output of `-x`: a direction, and the flags, which may be missing.
     fn marks(&mut self) -> Option<(Direction, Option<u8>)> {
         let mut cursor = *self;
         let direction = match cursor.word() {
@@ -306,7 +310,7 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// So many bytes, in hexadecimal or binary digits, and no more; `too_long` when there is no room for them.
+    /// Parses exactly `len` bytes, in hexadecimal or binary digits. Returns `too_long` if `len` exceeds 64.
     fn data(&mut self, len: usize, too_long: LineError) -> Result<[u8; 64], LineError> {
         let mut data = [0; 64];
         let mut is_swapped = false;
@@ -334,7 +338,7 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// A byte in two hexadecimal digits or eight binary ones.
+/// Parses a byte of two hexadecimal or eight binary digits.
 fn byte(digits: &[u8]) -> Option<u8> {
     let base = match digits.len() {
         2 => 16,
@@ -345,11 +349,11 @@ fn byte(digits: &[u8]) -> Option<u8> {
     u8::from_str_radix(digits, base).ok()
 }
 
-/// Days from 1970-01-01 to a day of the Gregorian calendar, of a year from 1970 on.
+/// Returns the days from 1970-01-01 to a day of the Gregorian calendar, for years from 1970 on.
 const fn days(year: u64, month: u64, day: u64) -> u64 {
-    // Years begin in March, so that a leap day is the last one.
+    // Years begin in March here, so that a leap day is the last one.
     let (year, month) = if month > 2 { (year, month - 3) } else { (year - 1, month + 9) };
     let of_years = year * 365 + year / 4 - year / 100 + year / 400;
-    // Up to 1970-03-01 less January and February, in the same count.
+    // The constant is the number of days up to 1970-03-01 less January and February, in the same count.
     of_years + (153 * month + 2) / 5 + day - 1 - 719_468
 }

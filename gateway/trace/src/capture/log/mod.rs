@@ -1,4 +1,4 @@
-//! Captures as candump text.
+//! Reading and writing captures as candump text.
 
 mod clock;
 mod console;

@@ -1,4 +1,4 @@
-//! Captures as candump text: read line by line, in bounded memory whatever the file is.
+//! Reads captures as candump text, line by line, in bounded memory whatever the file contains.
 
 use std::io::{self, Read};
 use std::ops::Range;
@@ -10,36 +10,36 @@ use super::console::{self, Console, Seen, Stamp};
 use crate::capture::{Entry, Note, NoteKind};
 use crate::container::read_some;
 
-/// The longest line that is read, with its end: twice that of the longest CAN XL frame.
+/// The longest line that is read with its end, in bytes: twice the longest CAN XL frame.
 pub const LONGEST: usize = 8_192;
-/// Bytes that are read at once; several of the longest lines.
+/// The number of bytes that are read at once; a multiple of the longest line.
 const CHUNK: usize = 1 << 18;
-/// Bytes of the lines before the first frame that are kept to tell what they are.
+/// The length of the sample of lines before the first frame, from which the kind of a text is recognised.
 const SAMPLE: usize = 4_096;
-/// What some editors write before the first line.
+/// The bytes that some editors write before the first line.
 const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
 
 /// Reads the entries of a log.
 pub(crate) struct LogReader {
     input: Box<dyn Read + Send>,
     buffer: Vec<u8>,
-    /// What of the buffer is not used up.
+    /// The range of unused bytes in the buffer.
     rest: Range<usize>,
     at_end: bool,
-    /// Bytes that came from the input, with those before the place where it began.
+    /// Bytes taken from the input, including those before the position where it began.
     taken: u64,
-    /// Lines so far.
+    /// Lines read so far.
     lines: u64,
     clock: Clock,
-    /// Each once.
+    /// Each remark once.
     remarks: Vec<Remark>,
-    /// The beginning of the lines before the first frame; nothing more once there is one.
+    /// The sample of lines before the first frame. It does not grow afterwards.
     sample: Vec<u8>,
     any_frame: bool,
 }
 
 impl LogReader {
-    /// Goes on behind `head`, which has been read already.
+    /// Continues after `head`, which has already been read.
     pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>) -> Self {
         let mut buffer = vec![0; CHUNK];
         let taken = head.len() as u64;
@@ -52,17 +52,17 @@ impl LogReader {
         Self { input, buffer, rest, at_end: false, taken, lines: 0, clock, remarks, sample, any_frame }
     }
 
-    /// Goes on counting lines behind those of other logs.
+    /// Continues counting lines after those of other logs.
     pub(crate) fn behind(self, lines: u64) -> Self {
         Self { lines, ..self }
     }
 
-    /// Goes on behind so many bytes and lines, which have been passed over.
+    /// Continues after bytes and lines that were skipped.
     pub(crate) fn at((bytes, lines, clock): (u64, u64, Clock), input: Box<dyn Read + Send>) -> Self {
         Self { taken: bytes, lines, clock, ..Self::new(&[], input) }
     }
 
-    /// Bytes of the input that are used up.
+    /// Returns the number of input bytes that are used up.
     pub(crate) const fn offset(&self) -> u64 {
         self.taken - (self.rest.end - self.rest.start) as u64
     }
@@ -75,22 +75,22 @@ impl LogReader {
         self.clock
     }
 
-    /// What is to be said of the frames so far.
+    /// Returns the remarks on the frames so far.
     pub(crate) fn remarks(&self) -> &[Remark] {
         &self.remarks
     }
 
-    /// The beginning of the lines before the first frame.
+    /// Returns the sample of the lines before the first frame.
     pub(crate) fn sample(&self) -> &[u8] {
         &self.sample
     }
 
-    /// Returns true when the buffer has no whole line.
+    /// Returns true if the buffer has no complete line.
     pub(crate) fn is_drained(&self) -> bool {
         self.buffer.get(self.rest.clone()).is_none_or(|rest| line_end(rest).is_none())
     }
 
-    /// Returns true behind the last line. Reads more if it has to.
+    /// Returns true after the last line. Reads more if necessary.
     pub(crate) fn is_at_its_end(&mut self) -> io::Result<bool> {
         while self.rest.is_empty() && !self.at_end {
             self.fill()?;
@@ -98,7 +98,7 @@ impl LogReader {
         Ok(self.rest.is_empty())
     }
 
-    /// The next entry: one for each line. Never panics.
+    /// Returns the next entry, one per line. Never panics.
     #[inline]
     pub(crate) fn next(&mut self) -> io::Result<Option<Entry<'_>>> {
         let Some((line, long)) = self.next_line()? else { return Ok(None) };
@@ -141,7 +141,8 @@ impl LogReader {
         Ok(Some(Entry::Note(note)))
     }
 
-    /// Finds out what relative times are relative to, by the lines from here on, as many as are needed and have room.
+    /// Finds out the reference of relative times from the lines that follow, as many as are needed and fit into the
+    /// buffer.
     #[cold]
     fn look_ahead(&mut self) -> io::Result<()> {
         let mut evidence = Evidence::default();
@@ -167,8 +168,8 @@ impl LogReader {
         Ok(())
     }
 
-    /// Where the next line stands in the buffer, without its end, and whether it was longer than is read. A line ends with
-    /// a line feed, a carriage return, or both.
+    /// Returns the next line's range in the buffer, without its end, and true if the line was too long. A line ends
+    /// with a line feed, a carriage return, or both.
     #[inline]
     fn next_line(&mut self) -> io::Result<Option<(Range<usize>, bool)>> {
         let Range { start, end } = self.rest;
@@ -183,7 +184,7 @@ impl LogReader {
         }
     }
 
-    /// Uses up the next line with its end, and returns where it stands.
+    /// Consumes the next line with its end, and returns its range.
     #[inline]
     const fn end_line(&mut self, end: usize, length: usize) -> Range<usize> {
         let start = self.rest.start;
@@ -191,16 +192,16 @@ impl LogReader {
         start..end
     }
 
-    /// The same for a line that is not whole in the buffer, or too long.
+    /// Returns the next line if it is not complete in the buffer, or too long.
     fn line_beyond(&mut self) -> io::Result<Option<(Range<usize>, bool)>> {
         let mut seen = 0;
         loop {
             let Range { start, end } = self.rest;
             let fresh = self.buffer.get(start + seen..end).unwrap_or_default();
-            // A line end beyond the limit is as good as none.
+            // A line end beyond the limit does not count.
             let within = fresh.get(..LONGEST - seen).unwrap_or(fresh);
             match line_end(within).map(|at| (at, fresh.get(at..).unwrap_or_default())) {
-                // Its line feed may come yet.
+                // The line feed of this line end may follow.
                 Some((at, [b'\r'])) if !self.at_end => {
                     seen += at;
                     self.fill()?;
@@ -224,7 +225,7 @@ impl LogReader {
         }
     }
 
-    /// Goes to the end of a line, of which `line` is kept. Where that is in the buffer afterwards.
+    /// Skips to the end of a line of which `line` is kept. Returns the range of the kept bytes in the buffer.
     fn skip_line(&mut self, line: Range<usize>) -> io::Result<Range<usize>> {
         self.buffer.copy_within(line.clone(), 0);
         let kept = line.len();
@@ -246,7 +247,7 @@ impl LogReader {
         }
     }
 
-    /// Reads more behind the rest; 0 at the end.
+    /// Reads more bytes into the buffer. Returns 0 at the end of the input.
     fn fill(&mut self) -> io::Result<usize> {
         if self.rest.start > 0 {
             self.buffer.copy_within(self.rest.clone(), 0);
@@ -261,13 +262,13 @@ impl LogReader {
     }
 }
 
-/// Where a line ends.
+/// Returns the offset of the line end.
 #[inline]
 fn line_end(text: &[u8]) -> Option<usize> {
     memchr::memchr2(b'\n', b'\r', text)
 }
 
-/// The bus and the time of a frame whose time is relative.
+/// Returns the bus and the time of a frame whose time is relative.
 #[inline]
 fn relative(line: &[u8]) -> Option<(&str, u64)> {
     // Lines of a log have ten digits before the point.
@@ -282,7 +283,8 @@ fn relative(line: &[u8]) -> Option<(&str, u64)> {
     }
 }
 
-/// The time in a line that is a frame, in ns since 1970; `Some(None)` of one whose time depends on the lines before it.
+/// Returns the time of a line that holds a frame, in ns since 1970; `Some(None)` if the time depends on the lines
+/// before it.
 pub(crate) fn known_time(line: &[u8]) -> Option<Option<u64>> {
     let line = line.trim_ascii_end();
     if let Ok(Line::Frame(record)) = candump::parse_bytes(line) {
@@ -297,7 +299,8 @@ pub(crate) fn known_time(line: &[u8]) -> Option<Option<u64>> {
     }
 }
 
-/// A line that is no frame. One that does not begin with a parenthesis is never a fault: it is no frame anyway.
+/// Makes the note of a line that is not a frame. A line that does not begin with a parenthesis is text and never counts
+/// as unreadable.
 #[cold]
 fn note(text: &[u8], long: bool, nanos: u64, line: u64) -> Note<'_> {
     let why = format!("a line of more than {LONGEST} bytes, whose rest is left out");
@@ -312,7 +315,7 @@ fn note(text: &[u8], long: bool, nanos: u64, line: u64) -> Note<'_> {
     Note { kind, nanos, interface, line, text }
 }
 
-/// The bus that candump's word about lost frames is about: `... frames on 'vcan0' socket ...`.
+/// Returns the bus of candump's message on lost frames: `... frames on 'vcan0' socket ...`.
 fn quoted(text: &[u8]) -> &str {
     text.split(|&byte| byte == b'\'').nth(1).and_then(|name| core::str::from_utf8(name).ok()).unwrap_or("")
 }
@@ -321,7 +324,7 @@ fn quoted(text: &[u8]) -> &str {
 mod tests {
     use super::*;
 
-    /// Reads in pieces of so many bytes, as pipes do.
+    /// A reader that returns a fixed number of bytes at a time, as pipes do.
     struct Pieces(Vec<u8>, usize);
 
     impl Read for Pieces {
@@ -334,7 +337,7 @@ mod tests {
         }
     }
 
-    /// Each line's number and text, and what it is.
+    /// Returns each note's line number, text and kind.
     fn all(bytes: &[u8], piece: usize) -> Vec<(u64, Vec<u8>, NoteKind)> {
         let mut log = LogReader::new(&[], Box::new(Pieces(bytes.to_vec(), piece)));
         let mut all = Vec::new();

@@ -1,4 +1,4 @@
-//! What candump prints, read and compared with the same frames in a log.
+//! Output of candump, compared with the same frames in a log.
 
 use std::fmt::Write as _;
 
@@ -8,11 +8,11 @@ use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, STANDARD_MASK
 use super::*;
 use crate::capture::{Entry, NoteKind};
 
-/// Written by hand in the forms of candump 2020.11 and 2025: each line, and the frame as a log has it, a note's kind, or an
-/// error.
+/// Lines in the forms of candump 2020.11 and 2025, written by hand. Each is followed by the frame as a log has it, a
+/// note's kind, or an error.
 const CONSOLE: &str = include_str!("console.txt");
 
-/// Entries in words: frames as lines of a log, notes by their kind.
+/// Returns the entries as text: frames as lines of a log, notes by their kind.
 fn entries(text: &[u8]) -> (Vec<String>, Vec<Remark>) {
     let mut log = LogReader::new(&[], Box::new(std::io::Cursor::new(text.to_vec())));
     let mut all = Vec::new();
@@ -78,7 +78,7 @@ fn differences_are_told_from_times_since_the_first_frame() {
     let mut times: Vec<u64> = (0..40).map(|at| at * 10).collect();
     times[7] = 50;
     assert_eq!(last(&times), ("0.390000".to_owned(), zero()));
-    // Alternately on two buses: those of one bus are compared.
+    // The lines alternate between two buses; only times of the same bus are compared.
     let text: String = (0..40)
         .map(|at| {
             format!(
@@ -109,10 +109,10 @@ fn no_more_of_a_pipe_is_waited_for_than_is_needed() {
     }
 }
 
-/// How a line is printed, as the options of candump say.
+/// The format of a printed line, as selected by candump's options.
 #[derive(Clone, Copy, Debug)]
 struct Print {
-    /// `-t a`, `z`, `d`, `A`, or none.
+    /// `-t a`, `z`, `d`, `A`, or no option.
     time: char,
     nine_digits: bool,
     marks: bool,
@@ -151,7 +151,7 @@ fn frame() -> impl Strategy<Value = Frame> {
     })
 }
 
-/// A frame as candump's source prints it, written from that source and not from the reader.
+/// Prints a frame as candump does. Follows the source of candump, not the parser under test.
 fn printed(print: Print, nanos: u64, step: u64, bus: &str, sent: bool, frame: &Frame) -> String {
     let mut line = " ".to_owned();
     let on = "\u{1b}[1m\u{1b}[34m";
@@ -267,7 +267,7 @@ proptest! {
             times.push((record.time.nanos, *nanos));
         }
         prop_assert!(log.next().unwrap().is_none());
-        // Of few differences it may be that none says so.
+        // A few differences may be indistinguishable from times since the first frame.
         if print.time != 'd' || log.remarks().contains(&Remark::Differences) {
             prop_assert!(times.iter().all(|(found, expected)| found == expected), "{}\n{:?}", text, times);
         } else {

@@ -1,4 +1,4 @@
-//! Captures as candump text: written.
+//! Writes captures as candump text.
 
 use std::collections::{HashMap, HashSet};
 use std::fmt;
@@ -9,46 +9,48 @@ use protocol::usage::is_unprintable;
 
 use crate::capture::{Entry, Note, NoteKind};
 
-/// Bytes that are written together.
+/// The number of bytes that are written together.
 const PIECE: usize = 1 << 16;
-/// Bytes of lines before the first frame that wait for it: what has no frame is no log.
+/// The maximum size of lines that wait for the first frame, in bytes. A text without frames is not a log, so nothing is
+/// written before.
 const WAITING: usize = 1 << 20;
 
-/// How many digits of a second are written.
+/// The number of digits after the point of a time in seconds.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Digits {
     /// As many as the capture has.
     #[default]
     Own,
-    /// 6, as candump does unless told otherwise.
+    /// 6, candump's default.
     Six,
-    /// 9, as `candump -N` does.
+    /// 9, as with `candump -N`.
     Nine,
 }
 
-/// What a log is to look like.
+/// The style of a log.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Style {
-    /// Digits of a second.
+    /// The digits of times.
     pub digits: Digits,
-    /// Only what every tool reads: frames, without raw DLC.
+    /// True to write only what every tool reads: frames, without raw DLC.
     pub plain: bool,
-    /// `T` or `R` behind frames whose direction is known, as `candump -x` does. Wireshark does not read that.
+    /// True to write `T` or `R` after frames whose direction is known, as `candump -x` does. Wireshark does not read
+    /// that.
     pub directions: bool,
 }
 
-/// What became of an entry.
+/// The result of writing an entry.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Wrote {
-    /// All of it is in the log.
+    /// The log holds the whole entry.
     All,
-    /// Its line says less than what is known.
+    /// The line holds less than the entry.
     Less(Less),
-    /// It is not in the log: a note that was not asked for, or that a log has no place for.
+    /// The log omits the entry: a note that was not requested, or that a log cannot hold.
     Nothing,
 }
 
-/// Properties of a frame that its line does not have.
+/// Properties of a frame that its line omits.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Less {
     /// Digits of its time.
@@ -57,7 +59,7 @@ pub struct Less {
     pub direction: bool,
     /// Its raw DLC.
     pub raw_dlc: bool,
-    /// The name of its bus, which has another one in the log.
+    /// The name of its bus, which is replaced in the log.
     pub name: bool,
 }
 
@@ -69,12 +71,12 @@ pub struct LogWriter<W> {
     /// Lines that wait to be written.
     lines: Lines,
     any_frame: bool,
-    /// Frames that were lost so far, by bus.
+    /// The number of frames lost so far, by bus.
     lost: HashMap<String, u64>,
     names: Names,
 }
 
-/// Text that is written to as a string, and holds any bytes.
+/// A text buffer that can hold any bytes.
 #[derive(Debug, Default)]
 struct Lines(Vec<u8>);
 
@@ -88,18 +90,18 @@ impl fmt::Write for Lines {
 /// The names of buses in a log.
 #[derive(Debug, Default)]
 struct Names {
-    /// The bus of the last frame, and its name in the log if that is another one.
+    /// The bus of the last frame, and its name in the log if that differs.
     last: (String, Option<String>),
-    /// Names in the log, by those of the buses.
+    /// Names in the log, by bus.
     written: HashMap<String, String>,
     taken: HashSet<String>,
 }
 
 impl Names {
-    /// Names with an entry of their own.
+    /// The maximum number of buses with an entry.
     const MOST: usize = 4_096;
 
-    /// Makes `bus` the last one, and returns its name in the log if that is another one.
+    /// Makes `bus` the last one, and returns its name in the log if that differs.
     #[inline]
     fn of(&mut self, bus: &str) -> Option<&str> {
         if self.last.0 != bus || self.taken.is_empty() {
@@ -109,7 +111,8 @@ impl Names {
         self.last.1.as_deref()
     }
 
-    /// A name that a line can have, and that no other bus has there: blanks, and what a terminal obeys, are replaced.
+    /// Returns a name that a line can hold and that no other bus has there. Blanks and terminal control characters are
+    /// replaced.
     fn assign(&mut self, bus: &str) -> String {
         if let Some(name) = self.written.get(bus) {
             return name.clone();
@@ -132,7 +135,7 @@ impl Names {
 }
 
 impl<W: Write> LogWriter<W> {
-    /// Writes to `out`, many lines at once.
+    /// Creates a writer that buffers lines.
     pub fn new(out: W, style: Style) -> Self {
         let lines = Lines(Vec::with_capacity(2 * PIECE));
         Self { out, style, lines, any_frame: false, lost: HashMap::new(), names: Names::default() }
@@ -141,7 +144,7 @@ impl<W: Write> LogWriter<W> {
     /// Writes an entry.
     ///
     /// # Errors
-    /// When `out` fails.
+    /// Returns an error if `out` fails.
     pub fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote> {
         match entry {
             Entry::Frame(record) => self.frame(record),
@@ -178,18 +181,18 @@ impl<W: Write> LogWriter<W> {
             less.name = true;
         }
         self.any_frame = true;
-        // They take everything.
+        // Writing to memory cannot fail.
         let _ = write_record(&mut self.lines, &written);
         self.lines.0.extend_from_slice(way.as_bytes());
         self.end_line()?;
         Ok(if less == Less::default() { Wrote::All } else { Wrote::Less(less) })
     }
 
-    /// A line of a log as it was; what a recording says itself in candump's words, or as a comment.
+    /// Writes a line of a log unchanged. A recording's own note becomes candump's message on lost frames, or a comment.
     fn note(&mut self, note: &Note<'_>) -> io::Result<Wrote> {
         let lines = &mut self.lines.0;
         match note.kind {
-            // A line feed in it would begin a line that no log had.
+            // A line feed in the text would begin a line that is not in the source.
             _ if note.line > 0 => {
                 let ends = |byte: &u8| if matches!(byte, b'\n' | b'\r') { b' ' } else { *byte };
                 lines.extend(note.text.iter().map(ends));
@@ -227,18 +230,18 @@ impl<W: Write> LogWriter<W> {
         Ok(())
     }
 
-    /// Hands on what waits, unless there was no frame yet.
+    /// Flushes the buffer if there was a frame.
     ///
     /// # Errors
-    /// When `out` fails.
+    /// Returns an error if `out` fails.
     pub fn pass_on(&mut self) -> io::Result<()> {
         if self.any_frame { self.flush() } else { Ok(()) }
     }
 
-    /// Hands on what waits.
+    /// Flushes the buffer.
     ///
     /// # Errors
-    /// When `out` fails.
+    /// Returns an error if `out` fails.
     pub fn flush(&mut self) -> io::Result<()> {
         self.put()?;
         self.out.flush()

@@ -1,29 +1,29 @@
-//! The buses of other people's frames: topic and `frame_id` together say which bus a frame was on.
+//! Names the buses of other programs' frames: topic and `frame_id` together identify the bus of a frame.
 //!
 //! ```text
-//!   /can0/from_can_bus  can ──┬─ one frame_id ──> /can0/from_can_bus
-//!   /can1/from_can_bus  can ──┘                   /can1/from_can_bus
-//!   /left               can7 ───────────────────> can7
+//! /can0/from_can_bus  can ──┬─ one frame_id ──> /can0/from_can_bus
+//! /can1/from_can_bus  can ──┘                   /can1/from_can_bus
+//! /left               can7 ───────────────────> can7
 //! ```
 //!
-//! Nodes write one `frame_id` whatever their interface is. Of a file all pairs are known from the beginning; of a pipe
-//! the first topic with a `frame_id` keeps it as its bus' name, and later ones get their own.
+//! ROS nodes write the same `frame_id` whatever their interface is. All pairs of a file are known from the beginning.
+//! In a pipe the first topic with a `frame_id` keeps it as the name of its bus, and later ones get their own.
 
 use std::collections::{HashMap, HashSet};
 
-/// Pairs that are kept; frames of further ones have the bus that they name.
+/// The maximum number of pairs. Frames of further ones use their `frame_id` as the bus.
 const PAIRS: usize = 4_096;
-/// Letters of a topic's name that stand for a bus.
+/// The maximum length of a bus name made from a topic, in bytes.
 const LONGEST: usize = 255;
 
 /// The names of buses.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Buses {
-    /// By topic and `frame_id`.
+    /// Names by topic and `frame_id`.
     names: HashMap<String, HashMap<String, String>>,
     /// The topics with each `frame_id`.
     topics: HashMap<String, HashSet<String>>,
-    /// Pairs of topic and `frame_id`, in the order in which they came.
+    /// Pairs of topic and `frame_id`, in the order of their first frames.
     pairs: Vec<(String, String)>,
     taken: HashSet<String>,
     is_shared: bool,
@@ -41,7 +41,7 @@ impl Buses {
         self.names.get(topic).and_then(|names| names.get(frame_id)).map_or(frame_id, String::as_str)
     }
 
-    /// Returns the names as they are when all pairs are known.
+    /// Returns the names that result when all pairs are known in advance.
     pub(crate) fn settled(self) -> Self {
         let mut all = Self { topics: self.topics, ..Self::default() };
         for (topic, frame_id) in &self.pairs {
@@ -50,12 +50,12 @@ impl Buses {
         Self { pairs: self.pairs, ..all }
     }
 
-    /// Returns true when several topics have one `frame_id`.
+    /// Returns true if several topics share one `frame_id`.
     pub(crate) const fn is_shared(&self) -> bool {
         self.is_shared
     }
 
-    /// Gives a pair a name that no other one has.
+    /// Gives a pair a unique name.
     fn assign(&mut self, topic: &str, frame_id: &str) {
         let is_shared = self.topics.get(frame_id).is_some_and(|topics| topics.len() > 1);
         let own = Some(frame_id).filter(|name| !name.is_empty() && !is_shared).map(str::to_owned);
@@ -72,7 +72,7 @@ impl Buses {
     }
 }
 
-/// The beginning of a topic's name, which may be as long as anything.
+/// Returns the beginning of a topic's name, at most [`LONGEST`] bytes.
 pub(super) fn beginning(topic: &str) -> &str {
     let ends = (0..=LONGEST.min(topic.len())).rev();
     ends.filter_map(|end| topic.get(..end)).next().unwrap_or_default()

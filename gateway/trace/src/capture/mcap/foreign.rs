@@ -1,4 +1,4 @@
-//! Frames as other people's recordings have them, of bridges between CAN and ROS.
+//! Decodes frames in recordings of other programs, which bridge CAN and ROS.
 //!
 //! ```text
 //!   can_msgs/msg/Frame, can_msgs/Frame of ROS 1    ros2_socketcan_msgs/msg/FdFrame
@@ -15,7 +15,7 @@ use protocol::candump::{Record, Timestamp};
 use crate::ros2::cdr::{CdrError, Reader};
 use crate::ros2::{Header, nanos};
 
-/// A type of frames that is not ours.
+/// A message type of other programs' frames.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Foreign {
     Classic,
@@ -25,7 +25,7 @@ pub(super) enum Foreign {
 }
 
 impl Foreign {
-    /// By the encoding of messages and the type's name; `None` when it is another type.
+    /// Returns the type for an encoding and a schema name; `None` if it does not hold frames.
     pub(super) fn of(encoding: &str, schema: &str) -> Option<Self> {
         match (encoding, schema) {
             ("cdr", "can_msgs/msg/Frame") => Some(Self::Classic),
@@ -35,7 +35,7 @@ impl Foreign {
         }
     }
 
-    /// The header of a message, and the reader behind it.
+    /// Returns the header of a message, and the reader positioned after it.
     fn header(self, message: &[u8]) -> Result<(Header<'_>, Reader<'_>), CdrError> {
         let mut from;
         let header = match self {
@@ -52,8 +52,8 @@ impl Foreign {
         Ok((header, from))
     }
 
-    /// Reads a message. Its time is that of its header, or of the recording when that has none; its bus the
-    /// header's name. FD flags are not in it: the frame has FDF alone.
+    /// Decodes a message. Its time is that of its header, or `log_time` if the header has none; its bus is the header's
+    /// `frame_id`. The message holds no FD flags, so the frame has FDF alone.
     pub(super) fn decode(self, message: &[u8], log_time: u64) -> Result<Record<'_>, CdrError> {
         let (Header { nanos: stamp, frame_id: interface }, mut from) = self.header(message)?;
         let number = from.get::<u32>()?;
@@ -103,7 +103,7 @@ mod tests {
         }
         let record = Foreign::of("cdr", "can_msgs/msg/Frame").unwrap().decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#AABB");
-        // Remote instead, and then too long.
+        // The bytes become a remote frame, and then one that is too long.
         let at = bytes.len() - 12;
         bytes[at] = 1;
         let record = Foreign::Classic.decode(&bytes, 9).unwrap();

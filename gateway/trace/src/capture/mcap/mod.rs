@@ -1,4 +1,5 @@
-//! Captures as MCAP recordings: the channels of frames and notes are read and written, other topics are counted.
+//! Captures as MCAP recordings: channels of frames and notes are read and written, messages of other topics are
+//! counted.
 
 mod buses;
 mod foreign;
@@ -20,12 +21,12 @@ use thiserror::Error;
 
 use crate::container::Damage;
 
-/// Returns whether messages of an encoding and a type are frames of another program.
+/// Returns true if messages of an encoding and a type are frames of another program.
 pub(crate) fn is_foreign_frame(encoding: &str, schema: &str) -> bool {
     foreign::Foreign::of(encoding, schema).is_some()
 }
 
-/// Why nothing more comes.
+/// An error of reading a recording, before it is given the name of the file.
 #[derive(Debug, Error)]
 pub(super) enum Fault {
     #[error(transparent)]

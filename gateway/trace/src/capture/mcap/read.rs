@@ -1,4 +1,4 @@
-//! The entries of an MCAP recording, and what else it has.
+//! Reads the entries and other contents of an MCAP recording.
 
 use std::fs::File;
 use std::io::{self, BufReader, Chain, Cursor, Read, Seek, SeekFrom};
@@ -12,7 +12,7 @@ use super::state::{KEPT, State, Target};
 use crate::capture::{Extras, Item};
 use crate::container::{Chunk, Damage, Framed, LONGEST, MAGIC, Record, Source, first_record, parse};
 
-/// Bytes that are read at once.
+/// The number of bytes that are read at once.
 const PIECE: usize = 1 << 18;
 
 type Input = BufReader<Chain<Cursor<Vec<u8>>, Box<dyn Read + Send>>>;
@@ -23,19 +23,19 @@ pub(crate) struct McapReader {
     chunk: Chunk,
     place: Place,
     state: State,
-    /// What was read when it was opened: the first requested message, or why there is none.
+    /// The first requested message, or the error before it, read when the recording was opened.
     first: Option<Result<Target, Fault>>,
-    /// Where the record begins from which the next messages are, and how many of its messages were given out.
+    /// The offset of the record that holds the next messages, and the number of its messages that were returned.
     anchor: (u64, u32),
-    /// The file itself, where it can be looked at behind a place.
+    /// The file, if it can be read at other offsets.
     file: Option<File>,
-    /// Messages so far, from the beginning; `None` when it was begun elsewhere.
+    /// The number of messages from the beginning; `None` if reading began elsewhere.
     messages: Option<u64>,
-    /// Messages by the statistics.
+    /// The number of messages in the statistics record.
     stated: Option<u64>,
 }
 
-/// Where a reader is in its file.
+/// The phase of reading.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Place {
     Magic,
@@ -45,7 +45,7 @@ enum Place {
 }
 
 impl McapReader {
-    /// Goes on behind `head`, which has been read already; of a regular file with the `file`.
+    /// Continues after `head`, which has already been read. `file` is the input if it is a regular file.
     pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>, state: State, file: Option<File>) -> Self {
         let input = BufReader::with_capacity(PIECE, Cursor::new(head.to_vec()).chain(input));
         let (source, chunk) = (Source::new(input, KEPT as u64), Chunk::default());
@@ -60,12 +60,12 @@ impl McapReader {
             messages: Some(0),
             stated: None,
         };
-        // What stands before the first message is known from the beginning.
+        // The contents before the first message are known from the beginning.
         reader.first = reader.advance().transpose();
         reader
     }
 
-    /// Goes on at a record, which begins behind so many bytes, with what is known of the file.
+    /// Continues at a record that begins at the offset `bytes`, with the known state of the file.
     pub(crate) fn at(bytes: u64, input: Box<dyn Read + Send>, state: State, file: Option<File>) -> Self {
         let input = BufReader::with_capacity(PIECE, Cursor::new(Vec::new()).chain(input));
         let (source, chunk) = (Source::at(bytes, input, KEPT as u64), Chunk::default());
@@ -86,8 +86,8 @@ impl McapReader {
         self.state
     }
 
-    /// Where the record begins from which the next message is, unless it is from a later one, and how many of its
-    /// messages come before.
+    /// Returns the offset of the record that holds the next message, unless a later record does, and the number of its
+    /// messages before that one.
     pub(crate) const fn anchor(&self) -> (u64, u32) {
         self.anchor
     }
@@ -100,12 +100,12 @@ impl McapReader {
         self.state.buses()
     }
 
-    /// Returns true when a channel so far has frames of another program's type.
+    /// Returns true if a channel so far has frames of another program's type.
     pub(crate) fn has_foreign(&self) -> bool {
         self.state.has_foreign()
     }
 
-    /// Whether nothing more comes. Reads on up to the next message, which [`McapReader::next`] then gives out.
+    /// Returns true after the last message. Reads up to the next message, which [`McapReader::next`] then returns.
     pub(crate) fn is_at_its_end(&mut self) -> Result<bool, Fault> {
         if self.first.is_none() {
             self.first = self.advance()?.map(Ok);
@@ -113,7 +113,7 @@ impl McapReader {
         Ok(self.first.is_none())
     }
 
-    /// The next entry, or message of another topic where these are requested. Never panics.
+    /// Returns the next entry, or the next message of another topic if these are requested. Never panics.
     pub(crate) fn next(&mut self) -> Result<Option<Item<'_>>, Fault> {
         let target = match self.first.take() {
             Some(first) => Some(first?),
@@ -141,7 +141,7 @@ impl McapReader {
         Ok(None)
     }
 
-    /// Reads on by a record.
+    /// Reads one record.
     fn step(&mut self) -> Result<Option<Target>, Fault> {
         let Self { source, chunk, place, state, anchor, messages, .. } = self;
         let began = source.read();
@@ -178,7 +178,7 @@ impl McapReader {
                     }
                     Framed::Record(op::FOOTER) => {
                         *place = Place::Over;
-                        // Of a damaged summary nothing is needed.
+                        // Reading goes on without a damaged summary.
                         if source.check_section(op::FOOTER).is_err() {
                             self.stated = None;
                         }
@@ -209,7 +209,7 @@ impl McapReader {
         Ok(None)
     }
 
-    /// The magic bytes, which have to be here.
+    /// Checks the magic bytes, which must be here.
     fn take_magic(&mut self) -> Result<(), Fault> {
         if !self.source.magic()? {
             if !MAGIC.starts_with(self.source.body()) {
@@ -220,7 +220,7 @@ impl McapReader {
         Ok(())
     }
 
-    /// Compares what came with the file's statistics, and that nothing follows.
+    /// Checks that the number of messages is that of the statistics and that the file ends here.
     fn end(&self) -> Result<(), Fault> {
         if let (Some(found), Some(stated)) = (self.messages, self.stated)
             && found != stated
@@ -233,8 +233,8 @@ impl McapReader {
         }
     }
 
-    /// Nothing more comes, within a record of so many bytes: it is cut off, unless its end is there or other records are,
-    /// and so it is a length that is wrong.
+    /// Handles an input that ends within a record after `bytes` of it. The recording was cut off, unless its end or
+    /// other records follow: then the record's length is wrong.
     fn truncated(&mut self, bytes: u64) -> Result<(), Fault> {
         self.place = Place::Over;
         if self.source.ends_with_magic() && self.source.read() > 2 * MAGIC.len() as u64 {
@@ -246,7 +246,7 @@ impl McapReader {
             && file.metadata()?.len() == read
         {
             let any = self.source.plain_chunk().is_none();
-            // A message before it may have led over others, into the middle of one.
+            // A message before it may have a wrong length, which skipped other records and led into the middle of one.
             let before = self.source.message_before().filter(|_| any);
             let began = before.unwrap_or_else(|| self.source.began());
             if first_record(&mut Apart { file, at: 0 }, began + 1, read, any)?.is_some() {
@@ -258,7 +258,7 @@ impl McapReader {
     }
 }
 
-/// A file that is read without moving its own place.
+/// A reader with an offset of its own in a shared file.
 struct Apart<'a> {
     file: &'a File,
     at: u64,

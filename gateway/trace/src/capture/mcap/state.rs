@@ -1,4 +1,4 @@
-//! The schemas, channels and extras of an MCAP recording, and how its messages are read.
+//! Schemas, channels and extras of an MCAP recording, and the decoding of its messages.
 
 use std::collections::HashMap;
 use std::fmt::Display;
@@ -18,37 +18,37 @@ use crate::recording::TOPIC_OF_STATE;
 use crate::ros2::cdr::CdrError;
 use crate::ros2::{Message, MessageError, messages};
 
-/// Bytes of attachments, metadata and latched frames that are kept.
+/// The maximum size of the attachments, metadata and latched frames that are kept, in bytes.
 pub(super) const KEPT: usize = 16 << 20;
-/// Bytes that a file, a fact or a frame costs beside its own.
+/// The memory overhead of an attachment, a metadata value or a frame, in bytes.
 const ENTRY: usize = Names::ENTRY;
-/// The longest message that is a frame.
+/// The longest message that is decoded as a frame, in bytes.
 const LONGEST_FRAME: usize = 4 << 10;
-/// The longest message that is a note: a line and its place.
+/// The longest message that is decoded as a note, in bytes: a line and its position.
 const LONGEST_NOTE: usize = LONGEST_LINE + (1 << 10);
 
-/// What is known of a recording.
+/// The state of reading a recording.
 pub(crate) struct State {
     schemas: HashMap<u16, String>,
     channels: HashMap<u16, Channel>,
-    /// The places of topics that are only counted, by name and type.
+    /// The indices of topics that are only counted, by name and type.
     counted: HashMap<(String, String), usize>,
     names: Names,
     extras: Extras,
-    /// Bytes of attachments and metadata so far.
+    /// The size of the attachments and metadata so far, in bytes.
     kept: usize,
-    /// Whether attachments and metadata are known already.
+    /// True if attachments and metadata are already known.
     knows_files: bool,
     any_frame: bool,
-    /// The buses of other people's frames.
+    /// The buses of other programs' frames.
     buses: Buses,
-    /// Whether messages that are only counted are requested too.
+    /// True if messages that are only counted are requested too.
     others: bool,
-    /// Whether no other part of the recording came before.
+    /// True if no other part of the recording came before.
     is_first: bool,
 }
 
-/// A requested message; its content is the record that was read last.
+/// A requested message. Its contents are in the record that was read last.
 #[derive(Clone, Copy)]
 pub(crate) struct Target {
     pub(super) channel: u16,
@@ -59,13 +59,13 @@ pub(crate) struct Target {
 /// The times of a message, in ns since 1970.
 #[derive(Clone, Copy)]
 pub(crate) struct Times {
-    /// Where it stands in the order of the file.
+    /// The time that orders the file.
     pub(super) logged: u64,
-    /// Its own.
+    /// The time at which the message was published.
     pub(super) published: u64,
 }
 
-/// A channel: its topic, and what is done with its messages.
+/// A channel: its topic and its use.
 struct Channel {
     topic: String,
     what: What,
@@ -73,19 +73,20 @@ struct Channel {
 
 #[derive(Clone, Copy)]
 enum What {
-    /// Their times are written in this form.
+    /// Frames, whose times are written in this form.
     Frames(Timestamp),
     /// Earlier frames that are latched when the recording begins.
     Latched,
     Notes,
     Foreign(Foreign),
-    /// They are counted, here in the list of topics.
+    /// Messages that are counted, under this index in the list of topics.
     Counted(usize),
 }
 
 impl State {
-    /// Nothing yet, or the extras of the parts `before` this one: frames that are latched when this part begins are known
-    /// then, and its topics are theirs. `others` if messages are requested that are only counted.
+    /// Creates an empty state, or one that continues the extras of the parts `before` this one. In the latter case
+    /// latched frames at the beginning of this part are already known, and its topics are those of the earlier parts.
+    /// `others` requests the messages that are otherwise only counted.
     pub(crate) fn new(others: bool, before: Option<Extras>) -> Self {
         let is_first = before.is_none();
         let extras = before.unwrap_or_default();
@@ -105,7 +106,7 @@ impl State {
         }
     }
 
-    /// Takes over buses that are known already.
+    /// Uses buses that are already known.
     pub(crate) fn with_buses(self, buses: Buses) -> Self {
         Self { buses, ..self }
     }
@@ -118,7 +119,7 @@ impl State {
         self.buses
     }
 
-    /// Returns true when a channel so far has frames of another program's type.
+    /// Returns true if a channel so far has frames of another program's type.
     pub(super) fn has_foreign(&self) -> bool {
         self.channels.values().any(|channel| matches!(channel.what, What::Foreign(_)))
     }
@@ -127,14 +128,14 @@ impl State {
         &self.extras
     }
 
-    /// Nothing more comes, and it has no end.
+    /// Records that the file ends after `read` bytes without a footer.
     pub(super) fn truncated(&mut self, read: u64) {
         let why = || format!("it has no end: after {read} bytes it was cut off, or never finished");
         self.extras.unfinished.get_or_insert_with(why);
     }
 
-    /// Takes the attachments and metadata of a file that can be gone through without reading all of it: they are known
-    /// from the beginning then, wherever they stand; and that it has no end.
+    /// Reads the attachments and metadata of a seekable file in advance without reading all of it, and detects a
+    /// missing end.
     pub(crate) fn find_files(&mut self, file: &mut (impl Read + Seek)) -> io::Result<()> {
         let size = file.seek(SeekFrom::End(0))?;
         file.seek(SeekFrom::Start(size.saturating_sub(MAGIC.len() as u64)))?;
@@ -148,7 +149,7 @@ impl State {
         if self.knows_files {
             return Ok(());
         }
-        // Most of what is passed over is longer than this.
+        // Most of the skipped data is longer than this.
         let mut from = BufReader::with_capacity(4 << 10, file);
         if from.read_exact(&mut [0; MAGIC.len()]).is_err() {
             return Ok(());
@@ -171,11 +172,11 @@ impl State {
             match parse(opcode, &body) {
                 Ok(Raw::Attachment { name, data, .. }) => self.attachment(name, data),
                 Ok(Raw::Metadata { name, facts }) => self.metadata(name, &facts),
-                // Its errors are reported when it is read.
+                // Errors are reported when the record is read.
                 _ => {}
             }
         }
-        // A wrong length may have led over some: then they are taken as they are read.
+        // A wrong length may have skipped some attachments. They are then added when their records are read.
         self.knows_files = !has_end || footer.is_some_and(|end| end + MAGIC.len() as u64 == size);
         if !self.knows_files {
             self.extras.attachments.clear();
@@ -185,7 +186,7 @@ impl State {
         Ok(())
     }
 
-    /// Takes a record.
+    /// Processes a record. Returns the message if it is requested.
     pub(crate) fn take(&mut self, opcode: u8, body: &[u8], in_chunk: bool) -> Result<Option<Target>, Fault> {
         match parse(opcode, body)? {
             Raw::Schema { id, name, .. } => {
@@ -194,7 +195,7 @@ impl State {
                     self.schemas.insert(id, name.to_owned());
                 }
             }
-            // Repeated in the summary, or in every chunk.
+            // A channel is repeated in the summary, or in every chunk.
             Raw::Channel { id, .. } if self.channels.contains_key(&id) => {}
             Raw::Channel { id, schema, topic, encoding, facts } => {
                 self.channel(id, schema, topic, encoding, &facts)?;
@@ -216,7 +217,7 @@ impl State {
         Ok(None)
     }
 
-    /// Counts or keeps a message; whether it is requested.
+    /// Counts or keeps a message. Returns true if it is requested.
     fn is_requested(&mut self, channel: u16, data: &[u8]) -> Result<bool, Fault> {
         let Channel { topic, what } = self.channels.get(&channel).ok_or(Damage::Channel(channel))?;
         match *what {
@@ -241,7 +242,7 @@ impl State {
         }
     }
 
-    /// Keeps something of so many bytes, while there is room.
+    /// Keeps something of `size` bytes while there is room.
     fn keep(&mut self, size: usize, keep: impl FnOnce(&mut Extras)) {
         self.kept = self.kept.saturating_add(size);
         if self.is_first && self.kept <= KEPT {
@@ -274,7 +275,7 @@ impl State {
         facts: &Facts<'_>,
     ) -> Result<(), Fault> {
         let schema = self.schemas.get(&schema).cloned().unwrap_or_default();
-        // Each of them may be kept twice.
+        // Topic and schema may be stored twice each.
         self.names.add(2 * (topic.len() + schema.len()))?;
         let what = if let Some(foreign) = Foreign::of(encoding, &schema) {
             Some(What::Foreign(foreign))
@@ -303,7 +304,7 @@ impl State {
     }
 
     pub(super) fn item<'a>(&'a mut self, channel: u16, times: Times, message: &'a [u8]) -> Item<'a> {
-        // Other programs' messages may have been published by another clock.
+        // Other programs may have published their messages by another clock.
         let Times { logged: log_time, published } = times;
         let Some(Channel { topic, what }) = self.channels.get(&channel) else {
             return Item::Entry(unreadable("", log_time, message, &"no channel"));
@@ -314,7 +315,7 @@ impl State {
                 let (topic, schema) = topic.map_or(("", ""), |topic| (&topic.name, &topic.schema));
                 return Item::Other(Other { topic, schema, nanos: published, message });
             }
-            // They are never requested.
+            // Latched frames are never requested.
             What::Latched => latched(message).map(Entry::Frame),
             What::Frames(form) => {
                 let time = Timestamp { nanos: published, ..form };
@@ -343,7 +344,7 @@ impl State {
     }
 }
 
-/// How the metadata of a channel says that times are written.
+/// Returns the form of times that the metadata of a channel specify.
 fn form(facts: &Facts<'_>) -> Timestamp {
     let nine_digits = facts.get(TIME_DIGITS).is_none_or(|digits| digits != "6");
     let min_digits = facts.get(SECONDS_DIGITS).and_then(|digits| digits.parse().ok()).unwrap_or(1);
@@ -360,14 +361,14 @@ fn decode<'a, T>(
     if bytes > limit { Err(MessageError::Long { bytes, limit }) } else { Ok(decode(message)?) }
 }
 
-/// A latched frame, with its own time.
+/// Decodes a latched frame, with its own time.
 fn latched(message: &[u8]) -> Result<Record<'_>, MessageError> {
     decode(message, LONGEST_FRAME, |message| {
         messages::frame(message, Timestamp::nine_digits(messages::stamp(message)?))
     })
 }
 
-/// A message that does not have the type of its channel.
+/// Makes the note of a message that does not match the type of its channel.
 fn unreadable<'a>(topic: &str, nanos: u64, message: &'a [u8], why: &dyn Display) -> Entry<'a> {
     let topic = beginning(topic);
     let kind = NoteKind::Unreadable(format!("a message of {topic}: {why}"));

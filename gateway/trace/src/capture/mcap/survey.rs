@@ -1,4 +1,4 @@
-//! A look at the topics of a recording for frames of other programs, before it is read.
+//! Surveys the topics of recordings for frames of other programs, before they are read.
 
 use std::collections::HashSet;
 use std::fs::File;
@@ -12,22 +12,22 @@ use super::read::McapReader;
 use super::state::State;
 use crate::container::{LONGEST_DESCRIPTION, MAGIC, Record, find, parse};
 
-/// Topics that are counted.
+/// The maximum number of topics.
 const TOPICS: usize = 4_096;
 
-/// Finds out the buses of recordings whose frames other programs wrote.
+/// Finds the buses of recordings whose frames other programs wrote.
 #[derive(Debug, Default)]
 pub(crate) struct Survey {
     topics: HashSet<String>,
-    /// Set by a file without channels outside of its chunks.
+    /// True once a file had no channels outside its chunks.
     is_silent: bool,
 }
 
 impl Survey {
-    /// Takes in the topics of a file, which its summary repeats; its place is moved.
+    /// Adds the topics of a file, which its summary repeats. Moves the position in the file.
     ///
     /// # Errors
-    /// When it cannot be read.
+    /// Returns an error if the file cannot be read.
     pub(crate) fn look(&mut self, file: &mut File) -> io::Result<()> {
         let mut from = BufReader::with_capacity(4 << 10, file);
         from.seek(SeekFrom::Start(MAGIC.len() as u64))?;
@@ -60,17 +60,17 @@ impl Survey {
         Ok(())
     }
 
-    /// Returns true when only reading all messages tells the buses.
+    /// Returns true if all messages must be read to find the buses.
     pub(crate) fn is_needed(&self) -> bool {
         self.is_silent || self.topics.len() > 1
     }
 
-    /// Reads the frames of a recording for their buses, beside those that are known.
+    /// Reads the frames of a recording to find their buses. Adds them to the `known` ones.
     pub(crate) fn buses_of(&self, input: Box<dyn Read + Send>, known: Buses) -> Buses {
         let mut reader = McapReader::new(&[], input, State::new(false, None).with_buses(known), None);
-        // Where topics are not known, the first messages are of the frames' type.
+        // If the topics are unknown, the type of the first messages decides.
         if self.topics.len() > 1 || reader.has_foreign() {
-            // Its faults are reported when it is read.
+            // Errors are reported when the recording is read.
             while let Ok(Some(_)) = reader.next() {}
         }
         reader.into_state().into_buses()

@@ -1,4 +1,4 @@
-//! The entries of a capture as an MCAP recording.
+//! Writes the entries of a capture as an MCAP recording.
 
 use std::collections::HashMap;
 use std::fs::Metadata;
@@ -11,41 +11,41 @@ use crate::capture::{Entry, Note, NoteKind};
 use crate::recording::file::{Channel, FileWriter};
 use crate::recording::{NOTES, TOPIC_OF_BUS};
 
-/// Channels of frames at most: each costs a reader memory, and a log may name any number of buses.
+/// The maximum number of frame channels. Each costs a reader memory, and a log may contain any number of buses.
 const CHANNELS: usize = 64;
-/// The topic of the frames of further buses; each has its bus' name.
+/// The topic of the frames of further buses. Each message holds the name of its bus.
 const FURTHER: &str = "/further";
-/// The metadata with the source of a recording that was made from a capture.
+/// The name of the metadata record that holds the source of a converted recording.
 pub const ORIGIN: &str = "capture";
-/// Its content.
+/// The key and value of [`ORIGIN`] in a recording that was converted from a log.
 pub(crate) const SOURCE: (&str, &str) = ("from", "candump log");
-/// Its content in a recording that was made of another one.
+/// The key and value of [`ORIGIN`] in a recording that was converted from another recording.
 const OTHER_SOURCE: (&str, &str) = ("from", "MCAP recording");
-/// The metadata of a channel: digits of a second, 6 or 9.
+/// The key in a channel's metadata for the digits of a fraction of a second, 6 or 9.
 pub(super) const TIME_DIGITS: &str = "time_digits";
-/// The same: digits that seconds are padded to; missing where they are not.
+/// The key in a channel's metadata for the number of digits that seconds are padded to; missing if they are not padded.
 pub(super) const SECONDS_DIGITS: &str = "seconds_digits";
-/// Bytes of notes that wait for the first frame.
+/// The maximum size of notes that wait for the first frame, in bytes.
 const WAITING: usize = 1 << 20;
 
-/// Writes entries as messages. Until a first frame tells the time, notes wait for it.
+/// Writes entries as messages. Notes before the first frame wait for its time.
 #[derive(Debug)]
 pub(crate) struct McapWriter<W: Write> {
     file: FileWriter<W>,
     channels: Vec<BusChannel>,
-    /// By bus, its topic: of [`CHANNELS`] buses at most.
+    /// The topic of each bus, for at most [`CHANNELS`] buses.
     topics: HashMap<String, String>,
     taken: Taken,
-    /// The channel of the last frame.
+    /// The index of the last frame's channel.
     last: usize,
     notes: Option<Channel>,
     /// Notes before the first frame.
     waiting: Option<Vec<Waiting>>,
-    /// Their bytes.
+    /// The size of these notes, in bytes.
     bytes: usize,
 }
 
-/// The channel of a bus' frames with times in one form.
+/// The channel for frames of one bus with times in one form.
 #[derive(Debug)]
 struct BusChannel {
     interface: String,
@@ -53,7 +53,7 @@ struct BusChannel {
     channel: Channel,
 }
 
-/// A note that waits.
+/// A waiting note.
 #[derive(Debug)]
 struct Waiting {
     kind: NoteKind,
@@ -62,12 +62,12 @@ struct Waiting {
     text: Vec<u8>,
 }
 
-/// Source and file of a recording.
+/// The source and the file of a recording.
 #[derive(Clone, Copy, Debug)]
 pub struct Origin<'a> {
-    /// Set if the source is a log, and not a recording.
+    /// True if the source is a log, false if it is a recording.
     pub of_log: bool,
-    /// The file that it is written to while it grows, whose mark it gets.
+    /// The file that is being written, whose identity is stored in the recording.
     pub file: Option<&'a Metadata>,
 }
 
@@ -120,7 +120,8 @@ impl<W: Write> McapWriter<W> {
         }
     }
 
-    /// Notes before the first frame get its time, so that a viewer's time line does not begin in 1970.
+    /// Writes the waiting notes. They get the time of the first frame, so that a viewer's time line does not begin in
+    /// 1970.
     fn write_waiting(&mut self, nanos: u64) -> io::Result<()> {
         for Waiting { kind, interface, line, text } in self.waiting.take().unwrap_or_default() {
             self.note(&Note { kind, nanos, interface: &interface, line, text: &text })?;
@@ -136,7 +137,7 @@ impl<W: Write> McapWriter<W> {
         self.file.write(channel, note.nanos, note)
     }
 
-    /// The place of a frame's channel, which is created for its first frame.
+    /// Returns the index of a frame's channel, which is created for its first frame.
     fn channel(&mut self, record: &Record<'_>) -> io::Result<usize> {
         let form = Timestamp { nanos: 0, ..record.time };
         let is = |name: &str, bus: &BusChannel| bus.form == form && bus.interface == name;
@@ -166,12 +167,12 @@ impl<W: Write> McapWriter<W> {
         Ok(self.last)
     }
 
-    /// Ends the chunk, and hands everything on but notes that wait for the first frame.
+    /// Ends the chunk, and flushes everything except notes that wait for the first frame.
     pub(crate) fn flush(&mut self) -> io::Result<()> {
         self.file.flush()
     }
 
-    /// Writes the end.
+    /// Writes the end of the file.
     pub(crate) fn finish(&mut self) -> io::Result<()> {
         self.write_waiting(0)?;
         self.file.finish()

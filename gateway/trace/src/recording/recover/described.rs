@@ -1,8 +1,9 @@
-//! What a file says of its types and topics, wherever it says it.
+//! Collects the schemas and channels of a damaged file from all places that describe them.
 //!
-//! A writer may say it in the chunk of the first message, again between chunks, and in the summary. A statement that a
-//! checksum covers counts more than any number of those that none does; of these the one that stands there most often
-//! counts. Where they contradict each other equally, none does: a message under another's topic is worse than none.
+//! A writer may describe them in the chunk of the first message, again between chunks, and in the summary. A
+//! description that a checksum covers counts more than any number of those that none covers; among the latter the most
+//! frequent one counts. If two contradict each other equally, neither counts: a message under a wrong topic is worse
+//! than a lost one.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -12,30 +13,30 @@ use crate::container::{Damage, Names, Record, parse};
 use crate::recording::file::{FileWriter, is_frames};
 use mcap::records::op;
 
-/// How far a statement is to be trusted.
+/// The reliability of a description.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Trust {
-    /// A checksum covers it.
+    /// A correct checksum covers it.
     Certain,
-    /// No checksum does.
+    /// No checksum covers it.
     Plain,
     /// The checksum over it is wrong.
     Doubtful,
 }
 
-/// A statement, as its record has it.
+/// A description, as stored in its record.
 #[derive(Debug)]
 struct Statement {
     body: Vec<u8>,
-    /// How often it stands under a checksum, and how often under none that is wrong.
+    /// The number of occurrences under a checksum, and that of all except those under a wrong one.
     certain: u32,
     times: u32,
 }
 
-/// Statements by the number of what they describe.
+/// Descriptions by the number of the schema or channel.
 type Statements = BTreeMap<u16, Vec<Statement>>;
 
-/// Types and topics.
+/// The described schemas and channels.
 #[derive(Debug, Default)]
 pub(super) struct Described {
     schemas: Statements,
@@ -44,7 +45,7 @@ pub(super) struct Described {
 }
 
 impl Described {
-    /// Takes a statement. Other records are none.
+    /// Adds a description. Ignores other records.
     pub(super) fn take(&mut self, code: u8, body: &[u8], trust: Trust) -> Result<(), Damage> {
         let (id, statements) = match parse(code, body)? {
             Record::Schema { id, .. } => (id, &mut self.schemas),
@@ -74,7 +75,8 @@ impl Described {
         Ok(())
     }
 
-    /// Writes all that is known into a new file; the topics in it, and whether their messages are frames.
+    /// Writes all known descriptions into a new file. Returns the channel numbers, each with true if its messages are
+    /// frames.
     pub(super) fn write<W: Write>(&self, writer: &mut FileWriter<W>) -> io::Result<BTreeMap<u16, bool>> {
         let mut types = BTreeMap::new();
         for body in self.schemas.values().filter_map(|all| chosen(all)) {
@@ -101,7 +103,7 @@ impl Described {
     }
 }
 
-/// The statement that counts, unless another one counts as much.
+/// Returns the description that counts; `None` if another one counts as much.
 fn chosen(all: &[Statement]) -> Option<&[u8]> {
     let weight = |it: &Statement| (it.certain, it.times);
     let best = all.iter().max_by_key(|it| weight(it))?;

@@ -1,4 +1,4 @@
-//! Where in a damaged file the records are that are whole and right.
+//! Finds the intact records of a damaged file.
 //!
 //! ```text
 //!   magic │ head │ chunk │ index │ ch#nk │ index │ chunk │ … │ summary │ footer
@@ -17,22 +17,22 @@ use crate::container::{
     Chunk, Damage, Framed, HEAD, LONGEST, MAGIC, Record, Source, first_record, is_record, parse,
 };
 
-/// Records before a wrong one that are looked into for others.
+/// The number of records before a wrong one that are searched for other records.
 const UNSURE: usize = 4;
 
-/// Bytes of a footer's record.
+/// The length of a footer record in bytes.
 const FOOTER: usize = 29;
 
-/// Records of a file that are right.
+/// A range of intact records.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Piece {
-    /// All from a place to another.
+    /// All records from one offset to another.
     Records { from: u64, to: u64 },
-    /// One whose length is wrong, and what it is by its content.
+    /// One record whose length field is wrong, with the length of its contents.
     Record { at: u64, code: u8, length: u64 },
 }
 
-/// What a file contains.
+/// The contents of a file.
 #[derive(Debug, Default)]
 pub(super) struct Survey {
     pub(super) profile: String,
@@ -43,46 +43,47 @@ pub(super) struct Survey {
 
 /// The summary of a file, found from its end.
 struct Summary {
-    /// Where the data section ends: behind its last record.
+    /// The offset of the end of the data section, after its last record.
     data_end: u64,
-    /// Messages by the statistics.
+    /// The number of messages according to the statistics.
     stated: Option<u64>,
-    /// Whether its checksum is not wrong.
+    /// False if its checksum is wrong.
     is_right: bool,
 }
 
-/// A record that was examined.
+/// The result of examining a record.
 enum Found {
-    /// It is right, and ends where its length says.
+    /// The record is intact.
     Right,
-    /// It is right, and one of its lengths is not: its operation code, the length by its content, and where it ends.
+    /// The record is intact except for one of its lengths: its operation code, the length of its contents, and the
+    /// offset of its end.
     As(u8, u64, u64),
-    /// The data section, or the file, ends here.
+    /// The data section or the file ends here.
     End,
-    /// It looks like the end, and records follow, where the source is.
+    /// The record looks like the end, but records follow. The source is positioned at them.
     NoEnd,
-    /// It is wrong. Where it ends by its length, if that may be right; and from where on records in a row are taken for
-    /// some: those in a damaged chunk that is not compressed are none.
+    /// The record is wrong: the offset of its end by its length, if that may be correct, and the offset from which on
+    /// rows of records are accepted. Records inside a damaged, uncompressed chunk are not accepted.
     Wrong { end: Option<u64>, rows: u64 },
 }
 
-/// A survey on its way.
+/// The state of a survey.
 struct Surveyor<R> {
     source: Source<R>,
     size: u64,
-    /// Where nothing of the data section follows.
+    /// The offset at which the data section ends at the latest.
     limit: u64,
-    /// Whether the file ends with the magic bytes.
+    /// True if the file ends with the magic bytes.
     has_magic: bool,
     chunk: Chunk,
     survey: Survey,
-    /// The last records of whose lengths no checksum says that they are right, one behind the other: where each begins,
-    /// and from where on records in a row that stand in it are taken for some.
+    /// The last records whose lengths no checksum confirms: the offset of each, and the offset from which on rows of
+    /// records inside it are accepted.
     unsure: VecDeque<(u64, u64)>,
 }
 
 impl Survey {
-    /// Goes through a file.
+    /// Surveys a file.
     pub(super) fn of(from: impl Read + Seek) -> Result<Self, RecoverError> {
         let mut source = Source::new(from, LONGEST_ATTACHMENT);
         let is_begun = source.magic().map_err(RecoverError::Read)?;
@@ -104,14 +105,14 @@ impl Survey {
 }
 
 impl<R: Read + Seek> Surveyor<R> {
-    /// Goes through all of it; whether it is a recording.
+    /// Surveys the whole file. Returns true if it is a recording.
     fn go(&mut self, is_begun: bool) -> io::Result<bool> {
         let summary = self.summary()?;
         let mut at = MAGIC.len() as u64;
         if !is_begun {
             let known = summary.is_some() || self.is_header(at)?;
             if !known {
-                // A chunk says that it is one; other records may stand before that.
+                // A chunk proves that the file is a recording; other records may stand before it.
                 let Some(certain) = self.first(0, self.size, false)? else { return Ok(false) };
                 at = self.first(0, certain, true)?.unwrap_or(certain);
             }
@@ -146,12 +147,12 @@ impl<R: Read + Seek> Surveyor<R> {
             }
         }
         self.survey.recovered.whole |= summary.is_some();
-        // The record that ends the data section has its checksum.
+        // The record that ends the data section holds its checksum.
         self.survey.recovered.checksum |= summary.is_some() && !is_ended;
         Ok(true)
     }
 
-    /// The header's record begins here.
+    /// Returns true if the header record begins at `at`.
     fn is_header(&mut self, at: u64) -> io::Result<bool> {
         self.source.move_to(at)?;
         let framed = self.source.next()?;
@@ -164,7 +165,7 @@ impl<R: Read + Seek> Surveyor<R> {
         first_record(self.source.input(), from, until, any)
     }
 
-    /// The first record from a place on; from another one on also the first of some in a row.
+    /// Returns the first certain record from `from` on, or from `rows` on the first row of records.
     fn first_of_two(&mut self, from: u64, rows: u64, until: u64) -> io::Result<Option<u64>> {
         match self.first(from, rows.min(until), false)? {
             None => self.first(rows, until, true),
@@ -172,13 +173,13 @@ impl<R: Read + Seek> Surveyor<R> {
         }
     }
 
-    /// So many bytes are lost at a damaged place.
+    /// Counts `bytes` lost bytes at a damaged place.
     fn lost(&mut self, bytes: u64) {
         self.survey.recovered.damaged.0 += 1;
         self.survey.recovered.damaged.1 += bytes;
     }
 
-    /// A record is right up to where the source is.
+    /// Adds an intact record that ends at the source's position.
     fn right(&mut self, began: u64) {
         let to = self.source.read();
         match self.survey.pieces.last_mut() {
@@ -193,7 +194,8 @@ impl<R: Read + Seek> Surveyor<R> {
         let (began, end) = (self.source.began(), self.source.read());
         let checked = self.source.check(framed);
         let content = began + HEAD as u64;
-        // What is compressed looks like no records, and where bytes are gone others have moved up to where it would end.
+        // Compressed data does not look like records. Where bytes are missing, later records have moved up to before
+        // the end of the chunk.
         let own = self.source.plain_chunk();
         let rows = own.map_or(0, |own| content.saturating_add(own));
         let wrong = Found::Wrong { end: Some(end), rows };
@@ -235,7 +237,7 @@ impl<R: Read + Seek> Surveyor<R> {
         Ok(Found::Right)
     }
 
-    /// No checksum says that the length of a record is right.
+    /// Remembers a record whose length no checksum confirms.
     fn doubt(&mut self, began: u64, rows: u64) {
         if self.unsure.len() == UNSURE {
             self.unsure.pop_front();
@@ -243,7 +245,7 @@ impl<R: Read + Seek> Surveyor<R> {
         self.unsure.push_back((began, rows));
     }
 
-    /// The record that was framed last, if its content is right and says that it has another length.
+    /// Returns the last record with the length of its contents, if these are intact and only the length field is wrong.
     fn by_content(&mut self, code: u8, checked: &Result<(), Damage>) -> io::Result<Option<Found>> {
         let &Err(Damage::Length { own, bytes, .. }) = checked else { return Ok(None) };
         let content = self.source.began() + HEAD as u64;
@@ -252,10 +254,10 @@ impl<R: Read + Seek> Surveyor<R> {
         if own > limit || end > self.limit || matches!(code, op::DATA_END | op::FOOTER) {
             return Ok(None);
         }
-        // Either of them may be the wrong one: records stand behind the right one, and none before that.
+        // Either length may be the wrong one: records follow after the correct one, and not before it.
         let by_length = content.saturating_add(bytes);
         let is_shorter = by_length < end && is_record(self.source.input(), by_length, self.limit)?;
-        // Of these a checksum says that all of it is there.
+        // The contents of these records prove that they are complete.
         let is_sure = matches!(code, op::CHUNK | op::ATTACHMENT);
         if !is_sure && !is_record(self.source.input(), end, self.limit)? {
             return Ok(None);
@@ -265,7 +267,7 @@ impl<R: Read + Seek> Surveyor<R> {
         Ok(is_right.then_some(Found::As(code, own, end)))
     }
 
-    /// Looks into a record that the source has; its types and topics are noted.
+    /// Checks the current record, and collects its schemas and channels.
     fn take(&mut self, code: u8) -> Result<(), Damage> {
         let Self { source, chunk, survey, .. } = self;
         let Survey { described, profile, .. } = survey;
@@ -290,7 +292,7 @@ impl<R: Read + Seek> Surveyor<R> {
         Ok(())
     }
 
-    /// The end of the data section, unless damage looks like it: then records follow.
+    /// Handles the end of the data section, unless it is damage that looks like it: then records follow.
     fn data_end(&mut self, began: u64) -> io::Result<Found> {
         let checked = self.source.check_section(op::DATA_END).is_ok();
         let end = self.source.read();
@@ -329,7 +331,7 @@ impl<R: Read + Seek> Surveyor<R> {
             }
         }
         for (code, body) in all {
-            // What it describes wrongly is not described.
+            // Wrong descriptions are ignored.
             let _ = self.survey.described.take(code, &body, of_all);
         }
         self.source.end_summary();
@@ -340,13 +342,13 @@ impl<R: Read + Seek> Surveyor<R> {
         Ok(Found::NoEnd)
     }
 
-    /// Goes to where records go on behind a wrong one; whether they do.
+    /// Seeks to the next records after a wrong one. Returns false if none follow.
     fn resume(&mut self, began: u64, end: Option<u64>, rows: u64) -> io::Result<bool> {
         let end = match end.filter(|end| *end <= self.limit) {
             Some(end) => is_record(self.source.input(), end, self.limit)?.then_some(end),
             None => None,
         };
-        // The length of one of the records before it may have led over others, to what looked like some.
+        // The wrong length of an earlier record may have skipped others and led to something that looked like a record.
         let mut until = began;
         while let Some((at, within)) = self.unsure.pop_back() {
             if let Some(found) = self.first_of_two(at + 1, within.max(at + 1), until)? {
@@ -377,7 +379,7 @@ impl<R: Read + Seek> Surveyor<R> {
         Ok(true)
     }
 
-    /// The last record is none: it contains others.
+    /// Removes the last record from the intact ones, because it contains others.
     fn cut(&mut self, at: u64) {
         if let Some(Piece::Records { from, to }) = self.survey.pieces.last_mut() {
             *to = at;
@@ -387,7 +389,7 @@ impl<R: Read + Seek> Surveyor<R> {
         }
     }
 
-    /// The summary, where the file has its end: what it describes is taken.
+    /// Reads the summary if the file has its end, and collects its descriptions.
     fn summary(&mut self) -> io::Result<Option<Summary>> {
         let Some(footer) = self.size.checked_sub((FOOTER + MAGIC.len()) as u64) else { return Ok(None) };
         let mut at_end = [0; FOOTER + MAGIC.len()];
@@ -438,14 +440,14 @@ impl<R: Read + Seek> Surveyor<R> {
         let is_right = checksum.is_ok();
         let trust = trust(is_right, at_end.ends_with(&[&[0; 4][..], MAGIC].concat()));
         for (code, body) in all {
-            // What it describes wrongly is not described.
+            // Wrong descriptions are ignored.
             let _ = self.survey.described.take(code, &body, trust);
         }
         Ok(Some(Summary { data_end: start, stated: stated.filter(|_| is_right), is_right }))
     }
 }
 
-/// How far statements of a summary are to be trusted whose checksum is right, or missing.
+/// Returns the reliability of a summary's descriptions.
 const fn trust(is_right: bool, has_none: bool) -> Trust {
     match (is_right, has_none) {
         (false, _) => Trust::Doubtful,

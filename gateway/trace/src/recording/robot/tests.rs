@@ -16,7 +16,7 @@ const ARM: &str = r#"<robot name="arm">
   </joint>
 </robot>"#;
 
-/// A skin with a cell at the end of the arm, whose one row begins at a height.
+/// Returns a skin with a cell at the end of the arm, whose only row begins at `height`.
 fn skin(height: f64) -> Skin {
     let text = format!(
         r#"

@@ -8,7 +8,7 @@ use crate::ros2::standard::JointState;
 const MS: u64 = 1_000_000;
 const START: u64 = 1_000_000_000 * MS;
 
-/// A message as it is in the file: topic, when it was logged and published, its number on its topic.
+/// A message in the file: topic, time of logging, time of publishing, and sequence number on its topic.
 type Seen = (String, u64, u64, u32);
 
 struct Bench {
@@ -45,7 +45,7 @@ impl Bench {
         written
     }
 
-    /// All messages, and how many came too late.
+    /// Returns all messages, and the number of those that came too late.
     fn end(mut self) -> (Vec<Seen>, u64) {
         self.window.release_all(&mut self.file).unwrap();
         assert_eq!(self.window.count(), Count::default());
