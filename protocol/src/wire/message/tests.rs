@@ -2,8 +2,7 @@ use super::*;
 use proptest::prelude::*;
 
 proptest! {
-    /// What is decoded from a packet is encoded to a packet with the same meaning; words
-    /// that a page does not use may differ.
+    /// A message encodes to a packet with the same meaning. Words that a page does not use may differ.
     #[test]
     fn a_meaning_comes_back(id in 0_u16..0x800, words: [i16; MAX_JOINTS], length in 0_usize..4, epoch: u8, count: u8) {
         let words = Words::new(Length::ALL[length], words);
