@@ -57,7 +57,7 @@ pub struct Attempt<T = u64> {
     pub start: u64,
     /// When the bus was free again, in ns: the end of the intermission, of the frame or of an error frame.
     pub end: u64,
-    /// Whether it was damaged. Then it waits again and is sent again.
+    /// True if it was damaged. Then it waits again and is sent again.
     pub is_damaged: bool,
 }
 

@@ -38,7 +38,7 @@ impl BitErrors {
     /// Errors by their rate, in [0, [`BitErrors::MAX`]].
     ///
     /// # Errors
-    /// When the rate is outside.
+    /// Returns an error if the rate is outside.
     pub fn new(rate: f64, seed: u64) -> Result<Self, BitErrorsError> {
         if !(0.0..=Self::MAX).contains(&rate) {
             return Err(BitErrorsError { got: rate });

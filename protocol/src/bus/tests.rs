@@ -29,7 +29,7 @@ fn a_bus_of_either_kind_that_is_absent_names_both_ways() {
                     the interface with `vcan-setup up nosuchcan0`, or serve the bus with `vcan-setup serve nosuchcan0`";
     assert_eq!(error.to_string(), expected);
     assert!(error.may_open_later());
-    // An interface of the name is taken, and not passed by, whatever its sort.
+    // An interface of that name is chosen, whatever its type.
     assert_eq!(
         [Choice::Auto.resolve("lo"), Choice::Auto.resolve("nosuchcan0")],
         [BusKind::SocketCan, BusKind::Embedded]
@@ -55,7 +55,7 @@ fn too_many_filters_are_refused_before_anything_is_opened() {
     assert_eq!(error.to_string(), "513 filters are too many for one socket on vcan0: at most 512");
 }
 
-/// A bus whose other end is in the test.
+/// Returns a bus, and the other end of its connection.
 fn pair() -> (Bus, std::os::fd::OwnedFd) {
     use rustix::net::{AddressFamily, SocketFlags, SocketType, socketpair};
     let (near, far) =

@@ -79,7 +79,7 @@ impl Place {
     /// What a word means, one of a few.
     ///
     /// # Errors
-    /// When it is none of them.
+    /// Returns an error if it is none of them.
     pub fn word<T: Copy>(&self, got: &str, words: &[(&str, T)]) -> Result<T, Fault> {
         let found = words.iter().find(|(word, _)| *word == got);
         found.map(|&(_, meaning)| meaning).ok_or_else(|| {
@@ -92,7 +92,7 @@ impl Place {
     /// A whole number within a range; `unit` is printed behind the range.
     ///
     /// # Errors
-    /// When it is outside.
+    /// Returns an error if it is outside.
     pub fn within(&self, got: i64, range: RangeInclusive<u32>, unit: &str) -> Result<u32, Fault> {
         u32::try_from(got).ok().filter(|value| range.contains(value)).ok_or_else(|| {
             let (min, max) = range.into_inner();
@@ -103,7 +103,7 @@ impl Place {
     /// A number that is neither infinite nor none at all.
     ///
     /// # Errors
-    /// When it is.
+    /// Returns an error if it is.
     pub fn finite(&self, value: f64) -> Result<f64, Fault> {
         if value.is_finite() { Ok(value) } else { Err(self.fault(value, "a finite number is needed")) }
     }
@@ -111,7 +111,7 @@ impl Place {
     /// A finite number above 0.
     ///
     /// # Errors
-    /// When it is not.
+    /// Returns an error if it is not.
     pub fn positive(&self, value: f64) -> Result<f64, Fault> {
         let positive = value.is_finite() && value > 0.0;
         if positive { Ok(value) } else { Err(self.fault(value, "must be above 0")) }
@@ -120,7 +120,7 @@ impl Place {
     /// The word that holds a number, as `fit` rounds it.
     ///
     /// # Errors
-    /// When it is outside the word's range.
+    /// Returns an error if it is outside the word's range.
     pub fn fit<const F: u32>(&self, value: f64, fit: Fit<F>) -> Result<Q<F>, Fault> {
         fit(value).map_err(|OutOfRange { min, bound, .. }| {
             self.fault(value, format_args!("its word holds [{min}, {bound})"))
@@ -130,7 +130,7 @@ impl Place {
     /// Sets a word that must not be negative, when a number is given for it.
     ///
     /// # Errors
-    /// When it is negative, or outside the word's range.
+    /// Returns an error if it is negative, or outside the word's range.
     pub fn set<const F: u32>(&self, given: Option<f64>, word: &mut Q<F>, fit: Fit<F>) -> Result<(), Fault> {
         match given {
             None => {}
@@ -223,7 +223,7 @@ pub fn span(seconds: f64) -> Span {
 /// The text of a file of at most [`LONGEST`] bytes.
 ///
 /// # Errors
-/// When it is longer, or cannot be read as UTF-8.
+/// Returns an error if it is longer, or cannot be read as UTF-8.
 pub fn text(path: &Path) -> Result<String, DocumentError> {
     text_within(path, LONGEST)
 }
@@ -231,7 +231,7 @@ pub fn text(path: &Path) -> Result<String, DocumentError> {
 /// The text of a file of at most so many bytes.
 ///
 /// # Errors
-/// When it is longer, or cannot be read as UTF-8.
+/// Returns an error if it is longer, or cannot be read as UTF-8.
 pub fn text_within(path: &Path, longest: u64) -> Result<String, DocumentError> {
     let read =
         || String::from_utf8(input::bytes(path, longest)?).map_err(|_| io::Error::other("it is not UTF-8"));

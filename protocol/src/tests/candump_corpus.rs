@@ -129,8 +129,8 @@ fn second_opinion(line: &str) -> Result<Option<CanDumpRecord>, dump::ParseError>
     Reader::from_reader(line.as_bytes()).next_record()
 }
 
-/// Whether the other reader found the same frame at the same time on the same bus. It sets FDF in every
-/// FD frame.
+/// Returns true if the other reader found the same frame at the same time on the same bus. It sets FDF in
+/// every FD frame.
 fn same(record: &Record<'_>, other: &CanDumpRecord) -> bool {
     let Record { time, interface, frame, direction } = record;
     let direction = direction.map(|direction| match direction {

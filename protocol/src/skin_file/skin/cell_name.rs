@@ -20,7 +20,7 @@ impl FromStr for CellName {
     /// Parses a name.
     ///
     /// # Errors
-    /// When there is no node id from 1 to 254 at its end, or nothing before the colon.
+    /// Returns an error if there is no node id from 1 to 254 at its end, or nothing before the colon.
     fn from_str(text: &str) -> Result<Self, String> {
         let (bus, number) = split_bus(text)?;
         let node = number.parse().map_err(|_| format!("{number:?} is no node id: 1 to 254 are"))?;
@@ -31,7 +31,7 @@ impl FromStr for CellName {
 /// Splits `BUS:NODE`, or `NODE` alone, into bus and node; the name of a bus may have colons.
 ///
 /// # Errors
-/// When nothing stands before the colon.
+/// Returns an error if nothing stands before the colon.
 pub fn split_bus(text: &str) -> Result<(Option<&str>, &str), String> {
     match text.rsplit_once(':') {
         Some(("", _)) => Err("no bus stands before the colon: a cell is NODE or BUS:NODE".to_owned()),

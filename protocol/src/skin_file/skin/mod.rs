@@ -92,7 +92,7 @@ pub enum Reply {
     Sum {
         /// Width of a slot in µs.
         slot_us: u32,
-        /// Whether what rounding takes away is carried into a cell's next value.
+        /// True if what rounding takes away is carried into a cell's next value.
         carry: bool,
     },
 }
@@ -202,7 +202,7 @@ pub struct Cell {
     pub orientation: Option<[f64; 4]>,
     /// What is wired to its ports.
     pub neighbors: [Option<CellId>; 4],
-    /// Whether it is wired to the gateway's side.
+    /// True if it is wired to the gateway's side.
     pub root: bool,
     /// Its gains and thresholds as words.
     pub contact: Contact,
@@ -240,7 +240,7 @@ impl Skin {
     /// Reads and checks a file.
     ///
     /// # Errors
-    /// When it cannot be read, or the first thing that is wrong with it.
+    /// Returns an error if it cannot be read, or the first thing that is wrong with it.
     pub fn read(path: &Path) -> Result<Self, DocumentError> {
         Self::parse(&path.display().to_string(), &document::text(path)?)
     }

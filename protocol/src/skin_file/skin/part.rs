@@ -10,7 +10,7 @@ impl Skin {
     /// Reads a file's part on a bus, as [`Skin::parse_on`].
     ///
     /// # Errors
-    /// When it cannot be read, or the first thing that is wrong with it.
+    /// Returns an error if it cannot be read, or the first thing that is wrong with it.
     pub fn read_on(path: &Path, bus: &str) -> Result<Self, DocumentError> {
         Self::parse_on(&path.display().to_string(), &document::text(path)?, bus)
     }

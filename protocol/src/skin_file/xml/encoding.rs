@@ -12,11 +12,12 @@ const WINDOWS_1252: [char; 32] = [
     '\u{203a}', '\u{153}', '\u{9d}', '\u{17e}', '\u{178}',
 ];
 
-/// The text of a file: in UTF-8, in UTF-16 with a byte order mark or a declaration, or in Latin-1 or Windows-1252 that is
-/// declared. A file that is UTF-8 is read as such, whatever it declares. A declaration of what was decoded is changed to UTF-8.
+/// The text of a file: in UTF-8, in UTF-16 with a byte order mark or a declaration, or in Latin-1 or
+/// Windows-1252 that is declared. A file that is UTF-8 is read as such, whatever it declares. A declaration
+/// of what was decoded is changed to UTF-8.
 ///
 /// # Errors
-/// When it is none of these.
+/// Returns an error if it is none of these.
 pub fn text(bytes: &[u8]) -> Result<Cow<'_, str>, Fault> {
     let wide = |bytes: &[u8], read: fn([u8; 2]) -> u16| {
         let words: Vec<_> = bytes.as_chunks().0.iter().map(|word| read(*word)).collect();

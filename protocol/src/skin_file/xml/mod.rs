@@ -70,8 +70,8 @@ pub struct Prepared<'a> {
 /// Repairs what changes no value.
 ///
 /// # Errors
-/// When it has a document type with definitions, an element with more than [`MAX_ATTRIBUTES`] attributes, or anything behind
-/// its outermost element.
+/// Returns an error if it has a document type with definitions, an element with more than [`MAX_ATTRIBUTES`]
+/// attributes, or anything behind its outermost element.
 pub fn prepare(file: &str) -> Result<Prepared<'_>, Fault> {
     let end = file.trim_end_matches(|letter: char| letter == '\0' || letter.is_whitespace()).len();
     let whole = file.get(..end).unwrap_or(file);

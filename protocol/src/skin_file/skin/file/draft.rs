@@ -53,7 +53,7 @@ pub struct DraftCell<'a> {
     pub facing: Facing,
     /// The nodes at its ports, 0 for none; absent where that is not written.
     pub neighbors: Option<[u8; 4]>,
-    /// Whether it is wired to the gateway.
+    /// True if it is wired to the gateway.
     pub root: bool,
 }
 

@@ -44,7 +44,7 @@ impl<'a> Edit<'a> {
     /// Reads a skin's text.
     ///
     /// # Errors
-    /// When the text is no TOML, or has another number of cells than the skin.
+    /// Returns an error if the text is no TOML, or has another number of cells than the skin.
     pub fn new(skin: &Skin, text: &'a str) -> Result<Self, EditError> {
         let edit = Self { text, document: Document::parse(text)?, changes: Vec::new() };
         let (found, expected) = (edit.count().ok_or(EditError::NoCells)?, skin.cells.len());
