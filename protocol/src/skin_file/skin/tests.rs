@@ -47,8 +47,7 @@ alpha_c = 0.5
 neighbors = [0, 0, 0, 1]
 "#;
 
-/// A skin whose only bus has these cells, numbered from 1: what is wired to their ports, and whether they are
-/// roots.
+/// Returns a skin with one bus whose cells, numbered from 1, have these neighbours and are roots or not.
 pub(super) fn wired(cells: &[([i64; 4], bool)]) -> Skin {
     Skin::parse("skin.toml", &wired_text("reply = \"torque\"", cells)).unwrap()
 }
@@ -66,7 +65,7 @@ fn wired_text(reply: &str, cells: &[([i64; 4], bool)]) -> String {
     text
 }
 
-/// What is wrong, by its line; columns have a test of their own.
+/// Formats an error with its line but without its column.
 fn by_line(error: DocumentError) -> String {
     let DocumentError::Wrong { path, line, what, .. } = error else { return error.to_string() };
     format!("{path}:{line}: {what}")
@@ -460,7 +459,7 @@ normal = [0.0, 0.6, 0.8]
     let mut long = Skin::parse("skin.toml", &format!("{head}{long}")).unwrap();
     let (given, same) = (short.cells[0].normal, long.cells[0].normal);
     assert!(given.iter().zip(same).all(|(given, same)| (given - same).abs() < 1e-12), "{same:?}");
-    // Of an orientation it has more than the normal.
+    // An orientation contains more than the normal.
     assert!(long.cells[0].orientation.take().is_some() && short.cells[0].orientation.is_none());
     long.cells[0].normal = given;
     assert_eq!(short, long);

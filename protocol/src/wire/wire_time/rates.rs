@@ -55,8 +55,8 @@ impl BitRates {
     /// Creates a pair of rates in bit/s.
     ///
     /// # Errors
-    /// Returns an error if `nominal` is not in [10 000, 1 000 000], or `data` is not in [`nominal`, 8 000
-    /// 000].
+    /// Returns an error if `nominal` is not in [10 000, 1 000 000], or `data` is not
+    /// between `nominal` and 8 000 000.
     pub const fn new(nominal: u32, data: u32) -> Result<Self, BitRatesError> {
         if nominal < Self::MIN_NOMINAL || nominal > Self::MAX_NOMINAL {
             return Err(BitRatesError::Nominal { got: nominal });
