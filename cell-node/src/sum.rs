@@ -36,7 +36,7 @@ impl Words {
     /// Nothing is to come any more.
     const END: Self = Self { torque: [Q7_8::ZERO; MAX_JOINTS], count: 0 };
 
-    /// Whether it ends the lease: nothing more is to come.
+    /// Returns true if it ends the lease: nothing more is to come.
     #[must_use]
     pub const fn is_end(&self) -> bool {
         self.count == 0
@@ -48,7 +48,7 @@ impl Words {
 struct Child {
     /// The epoch of the last sum that came, while the lease runs.
     last: Option<Epoch>,
-    /// Whether any sum came in the present epoch, of whatever epoch it was.
+    /// True if any sum came in the present epoch, of whatever epoch it was.
     heard: bool,
     /// The sum of the present epoch.
     taken: Option<Words>,
@@ -81,7 +81,7 @@ pub struct Sum {
     said: Option<(Epoch, Words)>,
     /// The parent did not take the last sum: the state is resent with the next.
     pub(crate) restate: bool,
-    /// Whether missing sums of this epoch have been checked.
+    /// True if missing sums of this epoch have been checked.
     is_checked: bool,
     /// When they are checked, if not only at the next joints.
     check: Option<Micros>,
@@ -104,7 +104,7 @@ pub struct Begin {
     pub period: Span,
     /// Wires to the root; `None` where it is unreachable.
     pub depth: Option<u8>,
-    /// Whether sums may be sent in this epoch.
+    /// True if sums may be sent in this epoch.
     pub speaks: bool,
     /// Bit p: the cell at port p is a child.
     pub children: u8,
@@ -119,7 +119,7 @@ impl Sum {
         self.slots = slots;
     }
 
-    /// Whether sums are sent.
+    /// Returns true if sums are sent.
     pub(crate) const fn is_on(&self) -> bool {
         self.slots.is_some()
     }
@@ -246,7 +246,7 @@ impl Sum {
         Span(self.settles().0.saturating_sub(u64::from(self.depth()) * width / 2))
     }
 
-    /// Whether a child's sum is waited for in each epoch: its lease runs.
+    /// Returns true if a child's sum is waited for in each epoch: its lease runs.
     pub(crate) fn awaits_children(&self) -> bool {
         self.children.iter().any(|child| child.last.is_some())
     }
@@ -322,7 +322,7 @@ impl Sum {
         Some(Words { torque, count: u8::try_from(count).unwrap_or(u8::MAX) })
     }
 
-    /// Whether the last sum was sent in this epoch.
+    /// Returns true if the last sum was sent in this epoch.
     pub(crate) fn said_in(&self, epoch: Epoch) -> bool {
         self.said.is_some_and(|(of, _)| of == epoch)
     }
@@ -351,7 +351,7 @@ impl Sum {
         }
     }
 
-    /// Whether all of this epoch is done.
+    /// Returns true if all of this epoch is done.
     pub(crate) fn is_settled(&self, now: Micros) -> bool {
         self.epoch.is_none() || now >= self.begin.at + self.settles()
     }

@@ -125,12 +125,12 @@ impl Network {
         self.next_hello = self.next_hello + phase::by_serial(HELLO, serial);
     }
 
-    /// Whether it is wired at all.
+    /// Returns true if it is wired at all.
     pub(crate) const fn exists(&self) -> bool {
         self.wired != 0
     }
 
-    /// Whether a port receives: it is wired, and its link is not down.
+    /// Returns true if a port receives: it is wired, and its link is not down.
     pub(crate) const fn hears(&self, port: usize) -> bool {
         self.wired & !self.deaf & 1 << port != 0
     }
@@ -168,7 +168,7 @@ impl Network {
         self.ports.get(port)?.number()
     }
 
-    /// Whether the cell at a port is a child.
+    /// Returns true if the cell at a port is a child.
     pub(crate) fn is_child(&self, port: usize) -> bool {
         self.ports.get(port).is_some_and(Port::is_child)
     }
@@ -210,7 +210,7 @@ impl Network {
         core::array::from_fn(|port| self.ports.get(port).map(|port| port.state(now)).unwrap_or_default())
     }
 
-    /// Whether what the ports lead to has changed since the last call.
+    /// Returns true if what the ports lead to has changed since the last call.
     pub(crate) fn ports_changed(&mut self, now: Micros) -> bool {
         let states = self.port_states(now);
         self.reported.replace(states) != Some(states)

@@ -41,7 +41,7 @@ impl Port {
         self.heard.as_ref().filter(|(_, at)| now.since(*at) <= SILENT).map(|(hello, _)| hello)
     }
 
-    /// Whether it works in both directions, and the other end uses this version.
+    /// Returns true if it works in both directions, and the other end uses this version.
     pub(super) fn works(&self, now: Micros) -> bool {
         self.hello(now).is_some_and(|hello| hello.hears && hello.version == VERSION)
     }
@@ -63,7 +63,8 @@ impl Port {
         self.child.is_some() && self.heard.is_some_and(|(hello, _)| hello.unnumbered)
     }
 
-    /// Whether a later round has to be announced there at once: to a child, and to a cell that is unreachable.
+    /// Returns true if a later round has to be announced there at once: to a child, and to a cell that is
+    /// unreachable.
     pub(super) fn needs_round(&self, now: Micros) -> bool {
         self.child.is_some() || self.sought || self.hello(now).is_some_and(|hello| hello.rank.is_none())
     }

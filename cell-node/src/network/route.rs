@@ -7,7 +7,7 @@ use super::port::Port;
 use super::{ALL, FormerParent, JOIN_TIMEOUT, Lost, Network, Parent, REPAIR};
 
 impl Network {
-    /// Whether nothing is lost by moving: no sums are sent, or the parent is unreachable itself.
+    /// Returns true if nothing is lost by moving: no sums are sent, or the parent is unreachable itself.
     const fn may_move(&self) -> bool {
         !self.busy || self.deserted
     }

@@ -49,7 +49,7 @@ impl AddressClaim {
         Self { stage: Claim::Unsent, next_heartbeat, sync_waits: false, defended: None, taken: None }
     }
 
-    /// Whether this cell owns the node id.
+    /// Returns true if this cell owns the node id.
     pub(super) fn is_settled(&self) -> bool {
         self.stage == Claim::Settled
     }

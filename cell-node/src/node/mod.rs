@@ -200,9 +200,9 @@ impl Node {
         self.slots().flatten()
     }
 
-    /// Whether it need not be woken for one of them (deferred receive), as long as it gets it before whatever comes
-    /// next: the parent's sum, which only shows that the parent is there; and joints while it would only wait for its
-    /// children's sums, which come after them, or while nothing touches it.
+    /// Returns true if it need not be woken for one of them (deferred receive), as long as it gets it before
+    /// whatever comes next: the parent's sum, which only shows that the parent is there; and joints while it
+    /// would only wait for its children's sums, which come after them, or while nothing touches it.
     #[must_use]
     pub fn defers(&self, id: Id) -> bool {
         if id == Id::command(Command::Joints) {

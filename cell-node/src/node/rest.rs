@@ -23,12 +23,12 @@ impl Rest {
         self.quiet = 0;
     }
 
-    /// Whether joints are received deferred.
+    /// Returns true if joints are received deferred.
     pub(super) const fn rests(&self) -> bool {
         self.rests
     }
 
-    /// Whether that has changed since the last call.
+    /// Returns true if that has changed since the last call.
     pub(super) fn poll(&mut self) -> bool {
         let rests = self.quiet == QUIET;
         core::mem::replace(&mut self.rests, rests) != rests

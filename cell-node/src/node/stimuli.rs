@@ -70,7 +70,7 @@ impl Stimuli {
         });
     }
 
-    /// Whether some wait for their epoch.
+    /// Returns true if some wait for their epoch.
     pub(super) fn are_pending(&self) -> bool {
         !self.pending.is_empty()
     }

@@ -58,7 +58,7 @@ pub(super) struct Summing {
     pub(super) heard: [Option<CellId>; PORTS],
     hears_changed: bool,
     parent: Parent,
-    /// Whether a sum was sent in the epoch before the present one.
+    /// True if a sum was sent in the epoch before the present one.
     said_before: bool,
     /// The parent may not have taken a sum: it is probed until it answers. Epochs in a row in which it did not.
     unanswered: Option<u16>,

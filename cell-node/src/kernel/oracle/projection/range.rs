@@ -3,13 +3,15 @@
 use super::{Link, Vector};
 use crate::kernel::Number;
 
-/// Whether nothing can leave the range of a word between the cell and the base, wherever the joints are.
+/// Returns true if nothing can leave the range of a word between the cell and the base, wherever the joints
+/// are.
 ///
-/// The three axes are those of an exact turn and an error: nine components, whose norm is the root of the sum of their
-/// squares. A turn or a twist by words for sine and cosine, each at most 5e-4 off, makes that norm longer by a factor of at
-/// most 1 + 2^-10 and adds at most 17 steps of 2^-14 to it; rounding six components adds less than two. A vector becomes
-/// longer by at most that norm times itself when its components are multiplied by the axes, or when it is multiplied by an
-/// axis; and no component of an axis is beyond 1 and that norm. Of 32 rows that is still below 1.1.
+/// The three axes are those of an exact turn and an error: nine components, whose norm is the root of the sum
+/// of their squares. A turn or a twist by words for sine and cosine, each at most 5e-4 off, makes that norm
+/// longer by a factor of at most 1 + 2^-10 and adds at most 17 steps of 2^-14 to it; rounding six components
+/// adds less than two. A vector becomes longer by at most that norm times itself when its components are
+/// multiplied by the axes, or when it is multiplied by an axis; and no component of an axis is beyond 1 and
+/// that norm. Of 32 rows that is still below 1.1.
 pub(super) fn is_bounded<N: Number>(force: Vector<N>, position: Vector<N>, links: &[Link<N>]) -> bool {
     let off = links.iter().fold(0, |off, _| further_off(further_off(off)));
     let axes = (1 << 14) + off;
