@@ -75,7 +75,7 @@ pub enum FlashError {
         serial: u32,
     },
     /// The parameters are invalid.
-    #[error("its parameters cannot be: {0}")]
+    #[error("its parameters are invalid: {0}")]
     Parameters(#[from] protocol::parameters::ParameterError),
 }
 

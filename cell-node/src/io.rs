@@ -87,8 +87,8 @@ pub enum Stopped {
     },
     /// Wires must be simulated, but the bus is real.
     #[error(
-        "{bus} is real hardware, and cells that answer with sums simulate their wires by frames that may not go there: \
-         use a vcan or the embedded bus, or reply = \"torque\""
+        "{bus} is real hardware, but cells that answer with sums simulate their wires with frames that \
+         must not be sent there: use a vcan or the embedded bus, or reply = \"torque\""
     )]
     Real {
         /// The interface.
@@ -288,7 +288,7 @@ impl Cells {
             self.cells.iter_mut().for_each(|hosted_cell| hosted_cell.node.handle_frame(now, age, frame));
             return Ok(());
         };
-        // Of frames from this process, its other cells receive only sums. A frame with a cell's own node id
+        // The other cells of this process receive only sums from among its own frames. A frame with a cell's own node id
         // is not from another cell.
         if received.own && id.kind != Kind::Sum {
             return Ok(());

@@ -1,4 +1,4 @@
-//! The same Jacobian with a matrix library, for any real number type.
+//! The Jacobian of the benchmark, computed with a matrix library, for any real number type.
 
 use nalgebra::{IsometryMatrix3, Point3, RealField, Rotation3, Translation3, Vector3, convert};
 use protocol::fixed::Q1_14;

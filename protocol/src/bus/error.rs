@@ -14,7 +14,9 @@ use super::embedded::DirectoryError;
 #[non_exhaustive]
 pub enum BusError {
     /// The name is not valid for a bus.
-    #[error("{0:?} is no bus name: 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'")]
+    #[error(
+        "{0:?} is not a valid bus name: use 1 to 15 bytes without spaces, '/' or ':', except '.' and '..'"
+    )]
     Name(String),
     /// There are more filters than the kernel accepts.
     #[error("{got} filters are too many for one socket on {name}: at most {max}", max = Filter::MAX)]
@@ -95,7 +97,8 @@ pub enum BusError {
     Directory(#[from] DirectoryError),
     /// The embedded bus uses another version, or did not understand the hello.
     #[error(
-        "the embedded bus {name} refuses: it speaks version {theirs}, this program version {ours}; use both from one build"
+        "the embedded bus {name} refused the connection: it uses version {theirs}, this program uses version {ours}; \
+         use both from the same build"
     )]
     Refused {
         /// The bus.
@@ -132,7 +135,10 @@ pub enum BusError {
     )]
     HungUp(String),
     /// The transmit queue stayed full.
-    #[error("{name} took no frame for {} ms: its queue is full; send less, or ask whether anybody is on the bus", waited.as_millis())]
+    #[error(
+        "{name} accepted no frame for {} ms: its queue is full; send less, or check that another node is on the bus",
+        waited.as_millis()
+    )]
     Full {
         /// The bus.
         name: String,

@@ -93,7 +93,7 @@ impl fmt::Display for Choice {
 
 /// The error for a word that is not a kind of bus.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
-#[error("{got:?} is no kind of bus: auto, socketcan and embedded are")]
+#[error("{got:?} is not a kind of bus: use auto, socketcan or embedded")]
 pub struct UnknownKind {
     /// The word.
     pub got: String,
@@ -151,7 +151,7 @@ pub enum KindsError {
         second: Choice,
     },
     /// `--bus-kind` names a bus that does not exist.
-    #[error("--bus-kind {bus}={kind}: there is no bus {bus} here, but {}", known.join(", "))]
+    #[error("--bus-kind {bus}={kind}: there is no bus {bus}; the buses are {}", known.join(", "))]
     Unknown {
         /// The bus.
         bus: String,
@@ -232,7 +232,7 @@ mod tests {
             assert_eq!(word.parse::<Choice>().unwrap().to_string(), word);
         }
         let error = "vcan".parse::<Choice>().unwrap_err().to_string();
-        assert_eq!(error, "\"vcan\" is no kind of bus: auto, socketcan and embedded are");
+        assert_eq!(error, "\"vcan\" is not a kind of bus: use auto, socketcan or embedded");
     }
 
     #[test]
@@ -259,11 +259,14 @@ mod tests {
         );
         assert_eq!(
             wrong(&["vcan7=embedded"]).to_string(),
-            "--bus-kind vcan7=embedded: there is no bus vcan7 here, but vcan0, vcan1"
+            "--bus-kind vcan7=embedded: there is no bus vcan7; the buses are vcan0, vcan1"
         );
         for word in ["vcan", "vcan1=vcan", "=embedded", "a/b=embedded", "vcan1=embedded=x"] {
             assert!(
-                word.parse::<OneKind>().unwrap_err().to_string().starts_with(&format!("{word:?} is no kind"))
+                word.parse::<OneKind>()
+                    .unwrap_err()
+                    .to_string()
+                    .starts_with(&format!("{word:?} is not a kind"))
             );
         }
     }

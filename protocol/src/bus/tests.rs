@@ -7,7 +7,8 @@ fn names_are_those_that_an_interface_can_have() {
     }
     for name in ["", "a234567890123456", ".", "..", "a/b", "a b", "a:b"] {
         let error = check_name(name).unwrap_err().to_string();
-        let rest = "is no bus name: 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'";
+        let rest =
+            "is not a valid bus name: use 1 to 15 bytes without spaces, '/' or ':', except '.' and '..'";
         assert_eq!(error, format!("{name:?} {rest}"));
     }
 }

@@ -21,7 +21,7 @@ fn take(descriptor: u32) -> io::Result<()> {
     let mut taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
     if taken.contains(&descriptor) {
         return Err(io::Error::other(
-            "it is read once, and was read already: name a file for one of the two",
+            "it can be read only once and was already read: use a file for one of the two",
         ));
     }
     taken.push(descriptor);
@@ -85,7 +85,7 @@ pub fn bytes(path: &Path, longest: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(longest.saturating_add(1)).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > longest {
-        return Err(io::Error::other(format!("it is longer than {longest} bytes, the most that are read")));
+        return Err(io::Error::other(format!("it is longer than {longest} bytes, the maximum")));
     }
     Ok(bytes)
 }
@@ -144,7 +144,7 @@ mod tests {
         let (reader, mut writer) = io::pipe().unwrap();
         let name = format!("/dev/fd/{}", reader.as_raw_fd());
         let mut file = open(Path::new(&name)).unwrap();
-        assert!(error(Path::new(&name)).starts_with("it is read once, and was read already"));
+        assert!(error(Path::new(&name)).starts_with("it can be read only once and was already read"));
         let writing = std::thread::spawn(move || {
             std::thread::sleep(std::time::Duration::from_millis(20));
             io::Write::write_all(&mut writer, b"late")

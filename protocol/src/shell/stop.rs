@@ -50,7 +50,7 @@ impl<F: AsFd> Stoppable<F> {
             match poll(&mut [PollFd::new(&self.file, PollFlags::OUT)], timeout.as_ref()) {
                 Ok(0) if flag().load(Ordering::Relaxed) => {
                     if self.looks == 0 {
-                        return Err(io::Error::new(io::ErrorKind::TimedOut, "nobody reads it"));
+                        return Err(io::Error::new(io::ErrorKind::TimedOut, "its reader does not read"));
                     }
                     self.looks -= 1;
                 }

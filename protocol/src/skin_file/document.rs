@@ -79,10 +79,7 @@ impl Place {
     /// Converts one of a few words to its meaning.
     ///
     /// # Errors
-    /// Returns an error if it is none of them.
-    ///
-    /// # Errors
-    /// Returns an error if it is none of them.
+    /// Returns an error if it is not one of them.
     pub fn word<T: Copy>(&self, got: &str, words: &[(&str, T)]) -> Result<T, Fault> {
         let found = words.iter().find(|(word, _)| *word == got);
         found.map(|&(_, meaning)| meaning).ok_or_else(|| {
@@ -126,7 +123,7 @@ impl Place {
     /// Returns an error if it is outside the range of the word.
     pub fn fit<const F: u32>(&self, value: f64, fit: Fit<F>) -> Result<Q<F>, Fault> {
         fit(value).map_err(|OutOfRange { min, bound, .. }| {
-            self.fault(value, format_args!("its word holds [{min}, {bound})"))
+            self.fault(value, format_args!("the range is [{min}, {bound})"))
         })
     }
 
@@ -261,7 +258,8 @@ pub fn parse<Raw: DeserializeOwned, T>(
     };
     let signs = text.bytes().filter(|byte| b"=.,[{".contains(byte)).count();
     if signs > MOST_SIGNS {
-        let reason = format!("it has {signs} of the signs = . , [ {{ and at most {MOST_SIGNS} are read");
+        let reason =
+            format!("it has {signs} of the characters = . , [ {{, and at most {MOST_SIGNS} are allowed");
         return Err(DocumentError::Unreadable { path: path.to_owned(), reason });
     }
     let raw = deserialize(text).map_err(|(at, what)| wrong(at, what))?;
@@ -314,7 +312,7 @@ mod tests {
             parse("x.toml", &text, |_: toml::Table| Ok(())).map_err(|error| error.to_string())
         };
         assert_eq!(of(MOST_SIGNS), Ok(()));
-        assert!(of(MOST_SIGNS + 1).unwrap_err().contains("it has 500001 of the signs"));
+        assert!(of(MOST_SIGNS + 1).unwrap_err().contains("it has 500001 of the characters"));
         assert!(of(MOST_SIGNS * 2).is_err());
     }
 }

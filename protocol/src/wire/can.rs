@@ -159,7 +159,7 @@ pub struct Frame {
 #[non_exhaustive]
 pub enum FrameError {
     /// The size is neither that of `struct can_frame` nor that of `struct canfd_frame`.
-    #[error("{got} bytes are no CAN frame: a classic one has 16, an FD one 72")]
+    #[error("{got} bytes are not a CAN frame: a classic frame has 16 bytes, an FD frame 72")]
     Size {
         /// Bytes received.
         got: usize,

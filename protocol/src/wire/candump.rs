@@ -165,9 +165,6 @@ fn behind_prefix(text: &[u8]) -> Option<Line<'_>> {
 ///
 /// # Errors
 /// Returns an error if it is not a frame, is a CAN XL frame, or is followed by other text.
-///
-/// # Errors
-/// Returns an error if it is no frame, is CAN XL, or something follows it.
 pub fn parse_frame(text: &str) -> Result<Frame, LineError> {
     let mut cursor = Cursor::new(text.as_bytes(), 0);
     let frame =
@@ -345,9 +342,9 @@ mod tests {
             says("(1.000000) can0 123#112233445566778899"),
             "column 39: at most 8 bytes in a classic frame"
         );
-        let further = "the end of the data: a byte stands behind a space";
+        let further = "the end of the data: a byte follows a space";
         assert_eq!(says("(1.000000) can0 123#11 22"), format!("column 24: {further}"));
-        let remote = "no data in a remote frame, whose flag the identifier has";
+        let remote = "no data, because the identifier has the flag of a remote frame";
         assert_eq!(says("(1.000000) can0 C0000123#11"), format!("column 26: {remote}"));
         assert_eq!(says("(1.000000) can0 123##"), "column 22: one digit of FD flags");
         assert_eq!(says("(1.000000) "), "column 11: a space");

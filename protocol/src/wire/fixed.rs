@@ -176,9 +176,6 @@ impl<const F: u32> Q<F> {
     ///
     /// # Errors
     /// Returns an error if the result is outside the range, or `value` is NaN.
-    ///
-    /// # Errors
-    /// Returns an error if the nearest step lies outside the range, or `value` is not a number.
     pub fn try_nearest(value: f64) -> Result<Self, OutOfRange> {
         if value.is_nan() {
             return Err(Self::out_of_range(value));

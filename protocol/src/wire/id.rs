@@ -17,7 +17,7 @@ pub struct CellId(u8);
 
 /// The error for a number that is not a cell's node id.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
-#[error("{got} is no node id: 1 to {max} are (0 is the gateway, 255 everyone)", max = CellId::MAX.0)]
+#[error("{got} is not a node id: use 1 to {max} (0 is the gateway, 255 is everyone)", max = CellId::MAX.0)]
 pub struct CellIdOutOfRange {
     /// The number that was requested.
     pub got: i64,
@@ -355,6 +355,6 @@ mod tests {
         assert_eq!(CellId::all().count(), CellId::COUNT);
         assert!(CellId::all().all(|cell| Node::from_byte(cell.get()) == Node::Cell(cell)));
         let error = CellId::new(255).unwrap_err().to_string();
-        assert_eq!(error, "255 is no node id: 1 to 254 are (0 is the gateway, 255 everyone)");
+        assert_eq!(error, "255 is not a node id: use 1 to 254 (0 is the gateway, 255 is everyone)");
     }
 }

@@ -213,9 +213,6 @@ impl Packet {
     ///
     /// # Errors
     /// Returns an error if packets of this kind cannot have that length, or the CRC is wrong.
-    ///
-    /// # Errors
-    /// Returns an error if this kind has no packet of that length, or the CRC is wrong.
     pub fn decode(id: Id, bytes: &[u8]) -> Result<Self, PacketError> {
         let lengths = Lengths::of(id);
         let wrong = PacketError::Length { expected: lengths.first().bytes(), got: bytes.len() };

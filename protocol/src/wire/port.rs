@@ -16,8 +16,8 @@
 //! | 1 | hello | version, node id, port + flags, round, depth | periodic: the sender's state and rank |
 //! | 2 | join | | requests to send sums to the receiver |
 //! | 3 | grant | round, depth | accepts a join; the sender's rank |
-//! | 4 | refuse | | rejects a join, or a hello from a cell that is no child |
-//! | 5 | leave | | the sender is no child of the receiver any more |
+//! | 4 | refuse | | rejects a join, or a hello from a cell that is not a child |
+//! | 5 | leave | | the sender is no longer a child of the receiver |
 //! | 6 | leave_ack | | acknowledges leave: no sum of the receiver is taken from now on |
 //! | 7 | state | epoch | the sender's sums from this epoch on are for the receiver |
 //! | 8 | nack | epoch | the receiver's sum of this epoch was not taken |
@@ -106,7 +106,7 @@ pub enum PortMessage {
     Join,
     /// Accepts a join, with the sender's rank.
     Grant(Rank),
-    /// Rejects a join, or a hello from a cell that is no child.
+    /// Rejects a join, or a hello from a cell that is not a child.
     Refuse,
     /// Reports that the sender is no longer a child of the receiver.
     Leave,

@@ -7,8 +7,8 @@
 //!           ──────── 0 ───────────────────────── free
 //! ```
 //!
-//! A cell in event mode and whoever counts what it tells use the same rule: as the cell tells every turn, they
-//! agree.
+//! A cell in event mode and the receivers of its events use the same rule. The cell reports every change, so
+//! their states agree.
 
 use crate::fixed::Q1_14;
 use crate::message::SkinSensors;

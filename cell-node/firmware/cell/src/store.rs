@@ -137,9 +137,6 @@ pub fn read(flash: &impl Flash, into: &mut [u8]) -> Found {
 /// # Errors
 /// Returns an error if the image is too long, or flash does not hold it afterwards. The old image stays valid
 /// then.
-///
-/// # Errors
-/// Returns an error if it is too long, or flash does not hold it afterwards; then the old one still counts.
 pub fn write(flash: &mut impl Flash, image: &[u8]) -> Result<(), NotWritten> {
     let (newest, damaged) = newest(flash);
     let (page, number) = match newest {

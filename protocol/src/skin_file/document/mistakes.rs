@@ -67,9 +67,9 @@ fn cell_of_bus(got: &str) -> Option<CellName> {
 /// Rewrites the message about text that is not TOML. The parser's advice only fits strings.
 fn unparsed(message: &str) -> String {
     let more = if message.starts_with("string values must be quoted") {
-        "; a number has neither unit nor formula, as 5000000 or 1.5708"
+        "; write numbers without units or formulas, such as 5000000 or 1.5708"
     } else if message.starts_with("duplicate key") {
-        "; of several buses, cells, touches or faults each begins with [[bus]], [[cell]], [[touch]] or [[fault]]"
+        "; begin each bus, cell, touch or fault with [[bus]], [[cell]], [[touch]] or [[fault]]"
     } else {
         ""
     };

@@ -24,7 +24,7 @@ impl FromStr for CellName {
     /// colon.
     fn from_str(text: &str) -> Result<Self, String> {
         let (bus, number) = split_bus(text)?;
-        let node = number.parse().map_err(|_| format!("{number:?} is no node id: 1 to 254 are"))?;
+        let node = number.parse().map_err(|_| format!("{number:?} is not a node id: use 1 to 254"))?;
         Ok(Self { bus: bus.map(str::to_owned), node })
     }
 }
@@ -35,7 +35,7 @@ impl FromStr for CellName {
 /// Returns an error if nothing precedes the colon.
 pub fn split_bus(text: &str) -> Result<(Option<&str>, &str), String> {
     match text.rsplit_once(':') {
-        Some(("", _)) => Err("no bus stands before the colon: a cell is NODE or BUS:NODE".to_owned()),
+        Some(("", _)) => Err("no bus precedes the colon: write NODE or BUS:NODE".to_owned()),
         Some((bus, node)) => Ok((Some(bus), node)),
         None => Ok((None, text)),
     }
@@ -70,11 +70,11 @@ mod tests {
         }
         assert_eq!("a:b:1".parse::<CellName>().unwrap().bus.as_deref(), Some("a:b"));
         for (text, why) in [
-            ("", "\"\" is no node id"),
-            ("vcan0", "\"vcan0\" is no node id"),
-            ("vcan0:", "\"\" is no node id"),
-            ("vcan0:255", "\"255\" is no node id: 1 to 254 are"),
-            (":3", "no bus stands before the colon"),
+            ("", "\"\" is not a node id"),
+            ("vcan0", "\"vcan0\" is not a node id"),
+            ("vcan0:", "\"\" is not a node id"),
+            ("vcan0:255", "\"255\" is not a node id: use 1 to 254"),
+            (":3", "no bus precedes the colon"),
         ] {
             assert!(text.parse::<CellName>().unwrap_err().contains(why), "{text}");
         }

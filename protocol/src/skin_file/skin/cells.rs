@@ -149,7 +149,7 @@ fn place(at: &Place, raw: &raw::Cell, robot: &Robot, chain: usize) -> Checked<(u
     match (joint, row) {
         (None, None) => Err(at
             .key("joint")
-            .fault("", format_args!("which joint moves the cell? there are 1 to {joints}"))),
+            .fault("", format_args!("which joint moves the cell? the joints are 1 to {joints}"))),
         (Some(joint), None) => Ok((joint, chain.row_of(joint).unwrap_or_default())),
         (given, Some(row)) => match chain.joint_below(row) {
             0 => Err(at.key("row").fault(row, "no joint moves what this row carries")),

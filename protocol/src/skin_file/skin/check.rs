@@ -66,7 +66,7 @@ fn checked(raw: raw::Skin, has_cells: impl Fn(&Bus) -> bool) -> Checked<Skin> {
 fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> {
     let at = Place::named("bus").nth(index);
     if !skin.cells_of(index).any(|cell| cell.root) {
-        let why = "sums need a way to the gateway, and no cell of this bus has root = true: give it to one";
+        let why = "sums need a path to the gateway, but no cell of this bus has root = true: set it for one";
         return Err(at.key("reply").fault("\"sum\"", why));
     }
     let depths = skin.wires(index).depths();
@@ -95,7 +95,9 @@ fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> 
     } else {
         "no slots fit: send joints less often, or use more roots or buses".to_owned()
     };
-    let why = format!("the tree needs {slots} slots within the {period_us} us from joints to joints: {hint}");
+    let why = format!(
+        "the tree needs {slots} slots within the {period_us} us between two broadcasts of joints: {hint}"
+    );
     Err(at.key("slot_us").fault(slot_us, why))
 }
 

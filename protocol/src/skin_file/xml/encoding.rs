@@ -23,7 +23,7 @@ pub fn text(bytes: &[u8]) -> Result<Cow<'_, str>, Fault> {
         let words: Vec<_> = bytes.as_chunks().0.iter().map(|word| read(*word)).collect();
         let text = String::from_utf16(&words).ok().filter(|_| bytes.len().is_multiple_of(2));
         let wrong =
-            || "it begins as UTF-16 and is none: it is truncated or damaged; copy or download it again";
+            || "it begins like UTF-16 but is invalid: it is truncated or damaged; copy or download it again";
         text.map(|text| Cow::Owned(redeclared(text)))
             .ok_or_else(|| Fault { line: None, what: wrong().to_owned() })
     };
@@ -53,9 +53,9 @@ pub fn text(bytes: &[u8]) -> Result<Cow<'_, str>, Fault> {
             let from = if matches!(other, "" | "utf-8" | "utf8" | "us-ascii") { "latin1" } else { other };
             let declared = if other.is_empty() { String::new() } else { format!(", declared as {other}") };
             let what = format!(
-                "it is not UTF-8{declared}: save it as UTF-8, as with `iconv -f {from} -t utf-8 FILE > NEW` (of what is in Latin-1)"
+                "it is not UTF-8{declared}: save it as UTF-8, as with `iconv -f {from} -t utf-8 FILE > NEW` (if it is in Latin-1)"
             );
-            let what = if from == "latin1" { what } else { what.replace(" (of what is in Latin-1)", "") };
+            let what = if from == "latin1" { what } else { what.replace(" (if it is in Latin-1)", "") };
             Err(Fault { line: Some(line), what })
         }
     }
@@ -137,7 +137,7 @@ mod tests {
         let refused = |bytes: &[u8]| text(bytes).unwrap_err().to_string();
         assert_eq!(
             refused(b"<r>\n<!-- \xfc --></r>"),
-            "line 2: it is not UTF-8: save it as UTF-8, as with `iconv -f latin1 -t utf-8 FILE > NEW` (of what is in Latin-1)"
+            "line 2: it is not UTF-8: save it as UTF-8, as with `iconv -f latin1 -t utf-8 FILE > NEW` (if it is in Latin-1)"
         );
         assert_eq!(
             refused(b"<?xml version='1.0' encoding='GBK'?>\n<r n='\xc4\xe3'/>"),

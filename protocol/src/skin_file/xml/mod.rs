@@ -72,10 +72,6 @@ pub struct Prepared<'a> {
 /// # Errors
 /// Returns an error if the text has a document type with definitions, an element with more than
 /// [`MAX_ATTRIBUTES`] attributes, or content after the root element.
-///
-/// # Errors
-/// Returns an error if it has a document type with definitions, an element with more than [`MAX_ATTRIBUTES`]
-/// attributes, or anything behind its outermost element.
 pub fn prepare(file: &str) -> Result<Prepared<'_>, Fault> {
     let end = file.trim_end_matches(|letter: char| letter == '\0' || letter.is_whitespace()).len();
     let whole = file.get(..end).unwrap_or(file);
@@ -121,7 +117,7 @@ impl<'a> Survey<'a> {
         if self.is_over
             && let Some(range) = content
         {
-            let what = "something stands behind the end of the outermost element: delete it";
+            let what = "there is content after the root element: delete it";
             return Err((range.end - of(range).trim_start().len(), what.to_owned()));
         }
         match part {
@@ -283,7 +279,7 @@ mod tests {
 
     #[test]
     fn nothing_stands_behind_the_outermost_element() {
-        let behind = "line 2: something stands behind the end of the outermost element: delete it";
+        let behind = "line 2: there is content after the root element: delete it";
         for text in ["<r></r>\n<r/>", "<r/>\njunk", "<r><r/></r>\n</r>"] {
             assert_eq!(refused(text), behind, "{text}");
         }

@@ -210,7 +210,7 @@ impl<'a> Cursor<'a> {
         if frame.data().iter().any(|byte| *byte != 0) {
             return Err(LineError {
                 column,
-                expected: "no data in a remote frame, whose flag the identifier has",
+                expected: "no data, because the identifier has the flag of a remote frame",
             });
         }
         let remote = Frame::remote(id, frame.len()).map_err(|_| self.error("a length of 0 to 8"))?;
@@ -268,7 +268,7 @@ impl<'a> Cursor<'a> {
             Some(b"T") => Ok(Some(Direction::Sent)),
             Some(b"R") => Ok(Some(Direction::Received)),
             Some([high, low]) if value(*high) < 16 && value(*low) < 16 => {
-                Err(self.error("the end of the data: a byte stands behind a space"))
+                Err(self.error("the end of the data: a byte follows a space"))
             }
             Some(_) | None => Ok(None),
         }

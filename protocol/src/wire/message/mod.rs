@@ -202,10 +202,10 @@ pub enum Message {
 #[non_exhaustive]
 pub enum MessageError {
     /// The command does not exist.
-    #[error("command {0} does not exist: 0 halt, 1 joints, 2 sync, 3 resume, 4 report do")]
+    #[error("command {0} does not exist: use 0 halt, 1 joints, 2 sync, 3 resume or 4 report")]
     Command(u8),
     /// The node field is not a valid sender of this kind.
-    #[error("{kind} from node {node}, which is no cell", kind = .kind.name())]
+    #[error("{kind} from node {node}, which is not a cell", kind = .kind.name())]
     Sender {
         /// The kind.
         kind: Kind,
@@ -213,7 +213,7 @@ pub enum MessageError {
         node: u8,
     },
     /// The node field is not a valid addressee of this kind.
-    #[error("{kind} to node {node}, which is no cell", kind = .kind.name())]
+    #[error("{kind} to node {node}, which is not a cell", kind = .kind.name())]
     Addressee {
         /// The kind.
         kind: Kind,
@@ -245,10 +245,6 @@ impl Message {
     ///
     /// # Errors
     /// Returns an error if this version of the protocol does not define the packet's kind, page or value.
-    ///
-    /// # Errors
-    /// Returns an error if the packet has a kind, page or value that this version of the protocol does not
-    /// know.
     pub fn decode(packet: &Packet) -> Result<Self, MessageError> {
         let Packet { id: Id { kind, node }, words, epoch, count } = *packet;
         let sender = || match Node::from_byte(node) {

@@ -77,9 +77,6 @@ impl Segment {
     ///
     /// # Errors
     /// Returns an error if no segment of these lengths has that size. The buffer does not change.
-    ///
-    /// # Errors
-    /// Returns an error if it carries so many bytes as no segment of theirs; those that wait keep waiting.
     pub fn push(
         &mut self,
         at: Micros,

@@ -294,10 +294,6 @@ impl Parameters {
     /// # Errors
     /// Returns an error if the parameter is not stored, a count does not fit a byte, or the kind of a row or
     /// the torque format is undefined. The parameters do not change then.
-    ///
-    /// # Errors
-    /// Returns an error if the parameter is not one that is stored, a count does not fit its byte, or there
-    /// is no such kind of row or format; then nothing is changed.
     pub fn set(&mut self, parameter: Parameter, words: [i16; WORDS]) -> Result<(), ParameterError> {
         let [w0, w1, w2, w3, w4, w5, ..] = words;
         match parameter {
@@ -450,10 +446,6 @@ impl Parameters {
     /// # Errors
     /// Returns an error if [`Parameters::set`] or [`Parameters::check`] refuses it, or its length does not
     /// match its rows.
-    ///
-    /// # Errors
-    /// Returns an error if [`Parameters::set`] or [`Parameters::check`] refuses it, or it is longer or
-    /// shorter than its rows.
     pub fn from_image(image: &[u8]) -> Result<Self, ParameterError> {
         let mut parameters = Self::default();
         let mut words = image.as_chunks::<2>().0.as_chunks::<WORDS>().0.iter();

@@ -30,7 +30,7 @@ position = [0.0, 0.0, 0.06]
 neighbors = [1, 0, 0, 0]
 orientation = [0.0, 0.0, 0.0, 1.0]"#;
 
-/// The same cells as inline tables in an array.
+/// The cells of [`HAND`] as inline tables in an array.
 const INLINE: &str = r#"cell = [
   { node = 1, joint = 2, position = [-0.2, 0.0, 0.06], normal = [0.0, 1.0, 0.0], neighbors = [2, 0, 0, 0] }, # one
   {node=2,joint=1,position=[0.0,0.0,0.06],orientation=[0.0,0.0,0.0,1.0],neighbors=[1,0,0,0]},
