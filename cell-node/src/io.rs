@@ -288,8 +288,8 @@ impl Cells {
             self.cells.iter_mut().for_each(|hosted_cell| hosted_cell.node.handle_frame(now, age, frame));
             return Ok(());
         };
-        // The other cells of this process receive only sums from among its own frames. A frame with a cell's own node id
-        // is not from another cell.
+        // The other cells of this process receive only sums from among its own frames. A frame with a cell's own
+        // node id is not from another cell.
         if received.own && id.kind != Kind::Sum {
             return Ok(());
         }
