@@ -1,6 +1,7 @@
-//! Instructions of one Jacobian and of the sines: `cargo bench -p cell-node --bench instructions`
+//! Instruction counts of one Jacobian and of the sines: `cargo bench -p cell-node --bench instructions`
 //!
-//! Counted by valgrind, so that they are the same on a busy machine. `docs/explanation/benchmarks.md` says what has to be installed.
+//! Valgrind counts them, so the results do not depend on the load of the machine.
+//! `docs/explanation/benchmarks.md` lists the required programs.
 
 #![expect(
     missing_docs,
@@ -23,15 +24,15 @@ mod setting;
 
 use setting::Setting;
 
-/// Made before the count begins, and never dropped.
+/// Creates the setting before the count begins, and never drops it.
 fn cell() -> &'static Setting {
     Box::leak(Box::new(Setting::new()))
 }
 
-/// The words of all angles of the circle, combined.
+/// Combines the results of a function for all angles of the circle.
 fn circle(function: impl Fn(Q1_14) -> Q1_14) -> i16 {
     let word = |angle| function(black_box(Q1_14::from_bits(angle))).to_bits();
-    // Turned, for a sine and its opposite would cancel out.
+    // The rotation keeps a sine and its negative from cancelling out.
     (i16::MIN..=i16::MAX).fold(0_i16, |sum, angle| sum.rotate_left(1) ^ word(angle))
 }
 
@@ -76,7 +77,7 @@ library_benchmark_group!(
 );
 library_benchmark_group!(name = sines; benchmarks = seventh_order, fifth_order);
 
-/// All that is counted, once and with a look at what comes of it.
+/// Runs each benchmark once and checks its result.
 fn once() {
     cell().check();
     assert_ne!(circle(sine::sine), circle(sine::paper_sine));

@@ -1,6 +1,7 @@
-//! How long one Jacobian and one sine take: `cargo bench -p cell-node --bench kernels`
+//! Run time of one Jacobian and one sine: `cargo bench -p cell-node --bench kernels`
 //!
-//! On a processor with floating point; what a small one without it has to do is better told by `--bench instructions`.
+//! The results are for a processor with floating point; for a small one without it, `--bench instructions` is
+//! more meaningful.
 
 use std::hint::black_box;
 use std::time::Duration;

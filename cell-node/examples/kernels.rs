@@ -1,4 +1,4 @@
-//! Prints what the kernels cost and how well they do on a UR5, as tables.
+//! Prints the operation counts and the errors of the kernels on a UR5, as tables.
 //!
 //! ```text
 //! cargo run -p cell-node --example kernels

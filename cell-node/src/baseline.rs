@@ -1,49 +1,51 @@
-//! What the force sensor reads when nothing touches it: its zero, which is subtracted from its readings.
+//! The baseline of the force sensor: its reading without a touch, the zero, which is subtracted from its
+//! readings.
 //!
 //! ```text
 //!   untared ── 32 joints steady, within the limit ──> tared, free <──> touched
-//!      ^        what is within the limit is none       follows         holds
+//!      ^        readings within the limit count as 0    follows         holds
 //!      └───── a write of parameter 5 or 11, or of parameter 12 with 0 ─────┘
 //! ```
 //!
-//! Integers only, no division. The zero moves at joints, by what fits into a period, so that it is a function of the
-//! frames that came, and a replay brings it back. With the temperature it moves by the coefficient, in contact too: there
-//! nothing else shows how the sensor drifts.
+//! The code uses integers only and no division. The zero moves only when joints arrive, by the step of one
+//! period, so it is a function of the received frames, and a replay reproduces it. With the temperature it
+//! moves by the coefficient, also in contact, because nothing else shows the sensor's drift then.
 
 use protocol::fixed::{Q1_14, Q5_10, Q9_6};
 use protocol::message::{BaselinePage, SkinSensors};
 use protocol::parameters::{Baseline as Rule, Tare, Zeroing};
 use protocol::touch::{Touch, contact};
 
-/// Joints with a steady reading before the first tare.
+/// Number of joints with a steady reading before the first tare.
 pub const STEADY: u8 = 32;
 /// Fraction bits of the zero, in N, beyond those of a contact word.
 const FINER: u32 = 12;
-/// The mean is over 2 to this many joints.
+/// Shift of the running mean, which is over 2^`MEAN` joints.
 const MEAN: u32 = 3;
-/// At each joints the zero comes nearer by this part of what is left, 2 to the minus this many, if the rate allows it.
+/// Shift of the zero's approach: at each joints it moves by 2^-`NEARER` of the difference, limited by the
+/// rate.
 const NEARER: u32 = 4;
-/// Temperature differences beyond 64 °C are taken for 64 °C.
+/// Maximum temperature difference that moves the zero: 64 °C.
 const MAX_DEGREES: i32 = 64 << 6;
-/// The coefficient is learned over 2 °C.
+/// Temperature change over which the coefficient is learned: 2 °C.
 const LEARNED: i32 = 2 << 6;
-/// With a quicker change the zero has not come along.
+/// Maximum temperature change for learning; after a faster one, the zero has not caught up.
 const TOO_QUICK: i32 = LEARNED + (LEARNED >> 2);
-/// In more joints the zero may have drifted for another reason.
+/// Maximum number of joints for learning; over more, the zero may have drifted for another reason.
 const TOO_SLOW: u16 = 1 << 14;
 
-/// Why there is no tare.
+/// The reason of a refused tare.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Refused {
-    /// There is no baseline.
+    /// The baseline is off.
     Off,
-    /// Something touches it, or no joints have been taken.
+    /// The cell is touched, or has received no joints.
     Touched,
-    /// What it reads is beyond the limit.
+    /// The reading exceeds the limit.
     Limit,
 }
 
-/// The zero of one force sensor. Forces have 22 fraction bits, in N.
+/// The baseline of one force sensor. Forces have 22 fraction bits, in N.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Baseline {
     rule: Rule,
@@ -52,33 +54,33 @@ pub struct Baseline {
     /// The zero at the present temperature.
     zero: i32,
     reference: Q9_6,
-    /// The coefficient in use: the rule's, or what was learned.
+    /// The coefficient in use: the configured or the learned one.
     n_per_c: Q1_14,
-    /// Something is known of it: half of what it lacks is added.
+    /// True if the coefficient was configured or learned before; then only half of a correction is applied.
     is_n_per_c_known: bool,
-    /// The mean of the last readings; none before the first joints.
+    /// The mean of the last readings; `None` before the first joints.
     mean: Option<i32>,
     is_steady: bool,
-    /// How many readings were steady, until the first tare.
+    /// Number of consecutive steady readings, until the first tare.
     steady: u8,
     is_tared: bool,
     is_limited: bool,
     touch: Touch,
     refused: u16,
-    /// Tares and settings: a change of it is reported.
+    /// Number of tares and settings; a change is reported.
     changes: u8,
     anchor: Option<Anchor>,
     pace: Pace,
 }
 
-/// How far the zero may go at each joints.
+/// The maximum movement of the zero per joints.
 #[derive(Clone, Copy, Debug, Default)]
 struct Pace {
     period_us: u16,
     step: i32,
 }
 
-/// Where learning of the coefficient began.
+/// The start of learning the coefficient.
 #[derive(Clone, Copy, Debug)]
 struct Anchor {
     temperature: Q9_6,
@@ -87,26 +89,26 @@ struct Anchor {
 }
 
 impl Baseline {
-    /// Another rule: the zero is found again.
+    /// Sets the rule and forgets the zero.
     pub fn set(&mut self, rule: Rule) {
         self.rule = rule;
         self.forget();
         self.pace = Pace::default();
     }
 
-    /// The rule.
+    /// Returns the rule.
     #[must_use]
     pub const fn rule(&self) -> Rule {
         self.rule
     }
 
-    /// Whether there is a zero.
+    /// Returns true if a zero has been found.
     #[must_use]
     pub const fn is_tared(&self) -> bool {
         self.is_tared
     }
 
-    /// Begins as after a start; the rule and the count of refused tares stay.
+    /// Restores the state after a start, except for the rule and the count of refused tares.
     #[inline(never)]
     pub fn forget(&mut self) {
         let Self { rule, refused, changes, pace, .. } = *self;
@@ -116,7 +118,7 @@ impl Baseline {
         *self = Self { rule, refused, changes, pace, n_per_c, is_n_per_c_known, ..Self::default() };
     }
 
-    /// Joints were taken with these readings, in this period.
+    /// Processes the readings at joints; `period_us` is the broadcast period.
     #[inline(never)]
     pub fn take(&mut self, raw: &SkinSensors, period_us: u16) {
         let Rule::On(rule) = self.rule else { return };
@@ -152,7 +154,7 @@ impl Baseline {
         }
     }
 
-    /// What is left of readings when the zero is subtracted.
+    /// Returns the readings with the zero subtracted.
     #[must_use]
     pub fn net(&self, raw: &SkinSensors) -> SkinSensors {
         let Rule::On(rule) = self.rule else { return *raw };
@@ -161,17 +163,17 @@ impl Baseline {
             return if is_none { SkinSensors { contact: [Q5_10::ZERO; 3], ..*raw } } else { *raw };
         }
         let zero = self.coarse_zero();
-        // A third, rounded down; the last word gets what is left of it.
+        // One third, rounded down; the last word gets the remainder.
         let third = (zero * 21_845) >> 16;
         let [first, second, last] = raw.contact;
         let contact = [less(first, third), less(second, third), less(last, zero - 2 * third)];
         SkinSensors { contact, ..*raw }
     }
 
-    /// A tare by command, with the present readings.
+    /// Tares with the present readings, by command.
     ///
     /// # Errors
-    /// Why there is none; then nothing has changed but the count of these.
+    /// Returns the reason if the tare is refused. Only the count of refused tares changes then.
     pub fn tare(&mut self, raw: &SkinSensors, how: Tare) -> Result<(), Refused> {
         let done = self.tared(raw, how);
         if done.is_err() {
@@ -196,7 +198,7 @@ impl Baseline {
         Ok(())
     }
 
-    /// Sensors page 3; none while there is no baseline.
+    /// Returns page 3 of the sensors; `None` if the baseline is off.
     #[must_use]
     pub fn page(&self) -> Option<BaselinePage> {
         let page = BaselinePage {
@@ -211,12 +213,12 @@ impl Baseline {
         self.is_on().then_some(page)
     }
 
-    /// Whether a zero is subtracted.
+    /// Returns true if the baseline is on.
     pub(crate) fn is_on(&self) -> bool {
         self.rule != Rule::Off
     }
 
-    /// What makes page 3 worth sending when it changes.
+    /// Returns the state whose changes are worth sending page 3.
     #[must_use]
     pub fn status(&self) -> Status {
         (self.is_tared, self.touch == Touch::Touched, self.is_limited, self.refused, self.changes)
@@ -228,20 +230,20 @@ impl Baseline {
         self.changes = self.changes.wrapping_add(1);
     }
 
-    /// How far a temperature moves the zero.
+    /// Returns the shift of the zero at a temperature.
     fn shift(&self, temperature: Q9_6) -> i32 {
         let degrees = i32::from(temperature.to_bits()) - i32::from(self.reference.to_bits());
         let degrees = degrees.clamp(-MAX_DEGREES, MAX_DEGREES);
-        // 14 and 6 fraction bits.
+        // 14 + 6 fraction bits.
         (i32::from(self.n_per_c.to_bits()) * degrees) << 2
     }
 
-    /// The zero in steps of a contact word.
+    /// Returns the zero in steps of a contact word.
     const fn coarse_zero(&self) -> i32 {
         (self.zero + (1 << (FINER - 1))) >> FINER
     }
 
-    /// Nothing touches it: the zero comes nearer to what it reads.
+    /// Moves the zero towards the reading of an untouched sensor.
     fn follow(&mut self, reading: i32, shift: i32, limit: i32) {
         let step = self.pace.step;
         let target = self.zero + ((reading - self.zero) >> NEARER).clamp(-step, step);
@@ -250,7 +252,7 @@ impl Baseline {
         self.base = self.zero - shift;
     }
 
-    /// How far the zero had to follow while the temperature changed is what the coefficient lacks.
+    /// Corrects the coefficient by the drift of the zero during a temperature change.
     fn learn(&mut self, temperature: Q9_6) {
         let fresh = Anchor { temperature, base: self.base, joints: 0 };
         let anchor = self.anchor.get_or_insert(fresh);
@@ -260,7 +262,8 @@ impl Baseline {
             return;
         }
         if degrees.abs() <= TOO_QUICK && anchor.joints <= TOO_SLOW && !self.is_limited {
-            // Per 2 °C, with 14 fraction bits; from the second time on the half of it, so that one error is not taken for all.
+            // Per 2 °C, with 14 fraction bits. From the second time on only half is applied, to limit the
+            // effect of a single error.
             let lacks = (self.base - anchor.base) >> (FINER + 10 - 14 + 1 + u32::from(self.is_n_per_c_known));
             self.is_n_per_c_known = true;
             let lacks = if degrees < 0 { -lacks } else { lacks };
@@ -272,10 +275,10 @@ impl Baseline {
     }
 }
 
-/// See [`Baseline::status`].
+/// The state returned by [`Baseline::status`]: tared, touched, limited, refused tares, changes.
 pub type Status = (bool, bool, bool, u16, u8);
 
-/// Steps of a zero's fraction.
+/// Conversion to the fraction bits of a zero.
 trait Finer {
     fn finer(self) -> i32;
 }
@@ -286,19 +289,19 @@ impl Finer for Q5_10 {
     }
 }
 
-/// Whether a reading of an untared sensor may be its zero.
+/// Returns true if a reading of an untared sensor is within the limit and counts as zero.
 fn is_none(sum: i32, rule: &Zeroing) -> bool {
     sum.abs() <= i32::from(rule.limit.to_bits())
 }
 
-/// How far the zero may go in a period, in steps of 2^-22 N, rounded down.
+/// Returns the maximum movement of the zero per period, in steps of 2^-22 N, rounded down.
 fn step(rate_un_per_s: u16, period_us: u16) -> i32 {
     // 2^22 / 10^12 is 18 014.398 / 2^32.
     let rate = u64::from(u32::from(rate_un_per_s) * u32::from(period_us));
     i32::try_from((rate * 18_014) >> 32).unwrap_or(0)
 }
 
-/// Held in the range of a word.
+/// Saturates a value to a word.
 fn word(value: i32) -> i16 {
     i16::try_from(value).unwrap_or(if value < 0 { i16::MIN } else { i16::MAX })
 }

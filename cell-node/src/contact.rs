@@ -1,26 +1,27 @@
-//! From a cell's sensor words to joint torques: the paper's Algorithm 1 and `tau = J F_z`.
+//! The path from a cell's sensor words to joint torques: the paper's Algorithm 1 and `tau = J F_z`.
 //!
-//! Integers only, exact up to three roundings that each have a name: [`Force`] (16 fraction bits),
-//! [`Torque::words`] (Q3.12), and whatever a sum does with [`Torque::exact`]. Never panics, bounded work.
+//! The code uses integers only, exact except for three named roundings: [`Force`] (16 fraction bits),
+//! [`Torque::words`] (Q3.12), and the rounding of a sum of [`Torque::exact`]. It never panics, and its work
+//! is bounded.
 
 use protocol::fixed::{Acc, Q1_14, Q5_10, TorqueFormat};
 use protocol::parameters::{Contact, MAX_JOINTS};
 
-/// A normal force in N, [0, 32 768) in steps of 2^-16; what pushes on the cell is above zero.
+/// A normal force in N, in the range [0, 32 768) in steps of 2^-16. A push on the cell is positive.
 #[derive(Clone, Copy, Debug, Default, Eq, Ord, PartialEq, PartialOrd)]
 pub struct Force(i32);
 
 impl Force {
-    /// No contact.
+    /// Zero: no contact.
     pub const ZERO: Self = Self(0);
 
-    /// F_z of Algorithm 1, from the three contact words in N and the proximity.
+    /// Computes F_z of Algorithm 1 from the three contact words in N and the proximity.
     ///
     /// The contact force F_c is the exact sum of the three words. Contact and proximity below their
-    /// thresholds count as none, as does a fused force below its own; comparisons are exact, and what
-    /// equals its threshold counts. The fused force `alpha_c F_c + alpha_p F_p` is exact at 24
-    /// fraction bits and rounded to 16 after the comparison, ties up. A contact cannot pull: a fused force
-    /// below zero is none, whatever the threshold.
+    /// thresholds count as zero, as does a fused force below its own threshold. Comparisons are exact, and a
+    /// value equal to its threshold counts. The fused force `alpha_c F_c + alpha_p F_p` is exact with 24
+    /// fraction bits, and is rounded to 16 after the comparison, ties up. A contact cannot pull, so a
+    /// negative fused force is zero for every threshold.
     #[must_use]
     pub fn fuse(contact: [Q5_10; 3], proximity: Q1_14, rule: &Contact) -> Self {
         let touch = contact.into_iter().fold(Acc::<10>::ZERO, |sum, word| sum.plus(word.widen()));
@@ -36,26 +37,26 @@ impl Force {
         Self::from_steps((fused.steps() + (1 << 7)) >> 8)
     }
 
-    /// The force of this many steps of 2^-16 N, held within its range.
+    /// Creates a force from steps of 2^-16 N, clamped to its range.
     #[must_use]
     pub fn from_steps(steps: i64) -> Self {
         Self(i32::try_from(steps.max(0)).unwrap_or(i32::MAX))
     }
 
-    /// How many steps of 2^-16 N this is; never below zero.
+    /// Returns the number of steps of 2^-16 N; never negative.
     #[must_use]
     pub const fn steps(self) -> i32 {
         self.0
     }
 
-    /// Whether the cell is active: there is a force. (Less than 2^-17 N is none.)
+    /// Returns true if the force is not zero: the cell is active. Forces below 2^-17 N round to zero.
     #[must_use]
     pub const fn is_active(self) -> bool {
         self.0 > 0
     }
 }
 
-/// What one cell does to the joints.
+/// The torques that one cell causes in the joints.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Torque<'a> {
     jacobian: &'a [Q1_14],
@@ -63,14 +64,14 @@ pub struct Torque<'a> {
 }
 
 impl<'a> Torque<'a> {
-    /// `tau_l = J_l F_z` (Eq. 8), exactly: J in m, Q1.14, as a [`Kernel`](crate::kernel::Kernel) gives it, or as much of
-    /// it as is not zero.
+    /// Computes `tau_l = J_l F_z` (Eq. 8) exactly. J is in m, Q1.14, as returned by a
+    /// [`Kernel`](crate::kernel::Kernel), or its leading nonzero part.
     #[must_use]
     pub const fn new(jacobian: &'a [Q1_14], force: Force) -> Self {
         Self { jacobian, force }
     }
 
-    /// The torques in Nm at full width, as they enter a sum inside the cell.
+    /// Returns the torques in Nm at full width, as they enter a sum inside the cell.
     #[must_use]
     pub fn exact(&self) -> [Acc<30>; MAX_JOINTS] {
         let mut exact = [Acc::ZERO; MAX_JOINTS];
@@ -81,15 +82,15 @@ impl<'a> Torque<'a> {
         exact
     }
 
-    /// The torques in Nm as words for the bus, rounded once, ties up; what does not fit in [-8, 8)
-    /// becomes the largest or the smallest word, which mean *saturated*. The error of the others is at
-    /// most half a step, 1.3e-4 Nm.
+    /// Returns the torques in Nm as words for the bus, rounded once, ties up. Torques outside the range
+    /// become the largest or smallest word, which mean *saturated*. The error of all others is at most half a
+    /// step, for Q3.12 1.3e-4 Nm.
     #[must_use]
     pub fn words(&self, format: TorqueFormat) -> [i16; MAX_JOINTS] {
         self.words_by(&TorqueRounding::new(format, MAX_J))
     }
 
-    /// The same, for a J that is within the rounding's bound.
+    /// Like [`Torque::words`], with a precomputed rounding whose bound J satisfies.
     #[must_use]
     #[inline]
     pub fn words_by(&self, rounding: &TorqueRounding) -> [i16; MAX_JOINTS] {
@@ -98,7 +99,7 @@ impl<'a> Torque<'a> {
         words
     }
 
-    /// The same; words beyond those of J stay as they are.
+    /// Like [`Torque::words_by`], into an array; words beyond those of J do not change.
     #[inline]
     pub fn write_words(&self, rounding: &TorqueRounding, words: &mut [i16; MAX_JOINTS]) {
         if self.force.0 > rounding.fits {
@@ -111,7 +112,7 @@ impl<'a> Torque<'a> {
         }
     }
 
-    /// Words, of which some may not fit.
+    /// Writes words of which some may saturate.
     #[cold]
     #[inline(never)]
     fn write_held_words(&self, format: TorqueFormat, words: &mut [i16; MAX_JOINTS]) {
@@ -121,7 +122,8 @@ impl<'a> Torque<'a> {
         });
     }
 
-    /// The word of each J, from the last joint's. It stays a loop: for several at once a Cortex-M0 has too few registers.
+    /// Writes the word of each J, last joint first. `black_box` prevents unrolling, for which a Cortex-M0 has
+    /// too few registers.
     #[inline(always)]
     fn write_each(&self, words: &mut [i16; MAX_JOINTS], word_of: impl Fn(Q1_14) -> i16) {
         for index in (0..self.jacobian.len().min(MAX_JOINTS)).rev() {
@@ -132,11 +134,11 @@ impl<'a> Torque<'a> {
         }
     }
 
-    /// One torque, rounded, in steps of so many fraction bits.
+    /// Returns one torque, rounded, in steps of 2^-`fraction`.
     #[inline(always)]
     fn steps(&self, row: Q1_14, fraction: u32) -> i32 {
-        // Products of 16 and 32 bits in 32: (J high + (J low >> 16)) 2^16 is below J F by less than that, and so little is
-        // lost in the shift too.
+        // A 16 by 32 bit product in 32 bits: (J high + (J low >> 16)) 2^16 is less than 2^16 below J F, which
+        // does not change the rounded result.
         let (high, low) = (self.force.0 >> 16, self.force.0 & 0xFFFF);
         let shift = 14 - fraction; // of 2^-14 Nm
         let half = (1 << shift) >> 1;
@@ -145,29 +147,29 @@ impl<'a> Torque<'a> {
     }
 }
 
-/// No |J| is above it, in steps of 2^-14.
+/// Upper bound of |J| in steps of 2^-14.
 pub const MAX_J: u16 = 1 << 15;
 
-/// How torques become words: worked out once per configuration.
+/// The conversion of torques to words, computed once per configuration.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct TorqueRounding {
     format: TorqueFormat,
-    /// The largest force, in steps of 2^-16 N, whose torques are all within the range of a word; they are not compared
-    /// with it.
+    /// The largest force, in steps of 2^-16 N, whose torques all fit a word without saturation.
     fits: i32,
 }
 
 impl TorqueRounding {
-    /// For torques of a J that is never beyond `bound`, in steps of 2^-14 ([`MAX_J`] where nothing better is known).
+    /// Creates the conversion for a J bounded by `bound`, in steps of 2^-14 ([`MAX_J`] if no better bound is
+    /// known).
     #[must_use]
     pub fn new(format: TorqueFormat, bound: u16) -> Self {
-        // J F is at most a word's largest step, so no rounding takes it further.
+        // J F is at most the largest word, so rounding cannot exceed it.
         let largest = i64::from(i16::MAX) << (14 + 16 - format.fraction());
         Self { format, fits: i32::try_from(largest / i64::from(bound.max(1))).unwrap_or(i32::MAX) }
     }
 }
 
-/// What is known to be a word.
+/// Converts steps that are known to fit a word.
 #[inline]
 fn low_word(steps: i32) -> i16 {
     debug_assert!(i16::try_from(steps).is_ok(), "{steps} is no word");
@@ -183,7 +185,7 @@ mod tests {
     use protocol::fixed::Q3_12;
 
     impl Force {
-        /// In N, exactly.
+        /// Converts to N, exactly.
         fn to_f64(self) -> f64 {
             f64::from(self.0) / 65_536.0
         }

@@ -1,4 +1,4 @@
-//! What a cell keeps when the power is off: its node id and its parameters, as bytes with a version and a CRC.
+//! The contents of a cell's flash: its node id and parameters, as bytes with a version and a CRC.
 //!
 //! ```text
 //!   byte 0..3  "SKIN"      4  version, 2      5  the node id, 0 for none
@@ -18,15 +18,15 @@ const MAGIC: &[u8; 4] = b"SKIN";
 const VERSION: u8 = 2;
 const HEAD_BYTES: usize = 11;
 
-/// Bytes of a flash image: of parameters of up to 6 rows.
+/// Size of a flash image in bytes, with parameters of up to 6 rows.
 pub const BYTES: usize = HEAD_BYTES + IMAGE_BYTES + 2;
-/// Bytes of the longest one.
+/// Maximum size of a flash image in bytes.
 pub const MAX_BYTES: usize = HEAD_BYTES + MAX_IMAGE_BYTES + 2;
 
 /// A flash image.
 pub type Bytes = heapless::Vec<u8, MAX_BYTES>;
 
-/// What flash holds.
+/// The node id and parameters kept in flash.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Kept {
     /// The node id, if the cell has one.
@@ -35,51 +35,51 @@ pub struct Kept {
     pub parameters: Option<Parameters>,
 }
 
-/// What flash held when the cell started.
+/// The contents of flash when the cell started.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "a cell has no heap")]
 pub enum Flash {
-    /// Nothing yet.
+    /// No image.
     Empty,
-    /// An image whose CRC does not match.
+    /// An image with a wrong CRC.
     Damaged,
-    /// Sound parameters.
+    /// Valid parameters.
     Sound(Parameters),
 }
 
-/// Why an image is not used.
+/// The error for an image that cannot be used.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum FlashError {
-    /// Its size.
+    /// The size is wrong.
     #[error("{got} bytes, not {BYTES} to {MAX_BYTES}")]
     Size {
-        /// Bytes that it has.
+        /// The actual size in bytes.
         got: usize,
     },
-    /// Its CRC.
+    /// The CRC is wrong.
     #[error("its CRC is wrong")]
     Damaged,
-    /// Its version.
+    /// The version is unknown.
     #[error("version {got}, not {VERSION}")]
     Version {
-        /// The version that it has.
+        /// The version of the image.
         got: u8,
     },
-    /// Another cell's.
+    /// The image belongs to another cell.
     #[error("it belongs to cell {cell} with serial number {serial}")]
     OtherCell {
-        /// Its number, 0 for none.
+        /// Its node id, 0 for none.
         cell: u8,
         /// Its serial number.
         serial: u32,
     },
-    /// Parameters that cannot be.
-    #[error("its parameters cannot be: {0}")]
+    /// The parameters are invalid.
+    #[error("its parameters are invalid: {0}")]
     Parameters(#[from] protocol::parameters::ParameterError),
 }
 
-/// The bytes to keep.
+/// Encodes a flash image.
 #[must_use]
 pub fn encode(serial: u32, kept: &Kept) -> Bytes {
     let mut bytes = Bytes::new();
@@ -87,7 +87,7 @@ pub fn encode(serial: u32, kept: &Kept) -> Bytes {
     bytes
 }
 
-/// The same into an empty buffer, so that a small stack has it once.
+/// Encodes a flash image into an empty buffer, so that a small stack holds only one copy.
 pub fn encode_into(bytes: &mut Bytes, serial: u32, kept: &Kept) {
     let number = kept.number.map_or(0, CellId::get);
     let serial = serial.to_le_bytes();
@@ -100,11 +100,11 @@ pub fn encode_into(bytes: &mut Bytes, serial: u32, kept: &Kept) {
     bytes.extend(crc16(bytes).to_le_bytes());
 }
 
-/// What was kept. Never panics.
+/// Decodes a flash image. Never panics.
 ///
 /// # Errors
-/// When the bytes are not whole, sound, of this version, of this cell (by its serial number, and by its number
-/// if it is given one), or no parameters.
+/// Returns an error if the image has a wrong size, CRC or version, belongs to another cell (by its serial
+/// number, and by its node id if `identity` has one), or its parameters are invalid.
 pub fn decode(identity: Identity, bytes: &[u8]) -> Result<Kept, FlashError> {
     let size = FlashError::Size { got: bytes.len() };
     let Some((body, crc)) = bytes.split_last_chunk().filter(|_| (BYTES..=MAX_BYTES).contains(&bytes.len()))

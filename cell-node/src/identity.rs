@@ -1,22 +1,22 @@
-//! A cell's identity, and the identifiers that it receives for that.
+//! The identity of a cell, and the identifiers that it receives for it.
 
 use protocol::id::{CellId, Id};
 
-/// Identifiers that every cell with a node id receives.
+/// Number of identifiers that every cell with a node id receives.
 pub const OWN: usize = 10;
 
-/// A cell's identity.
+/// The identity of a cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Identity {
-    /// Its number on the bus; none until the network gives it one.
+    /// The node id; `None` until the network assigns one.
     pub cell: Option<CellId>,
-    /// Its serial number.
+    /// The serial number.
     pub serial: u32,
 }
 
 impl Identity {
-    /// The identifiers that this cell receives whatever the state of the network ([`Id::of_cell`]). A cell without a
-    /// node id receives only what comes in at its ports.
+    /// Returns the identifiers that this cell receives in every network state ([`Id::of_cell`]). A cell
+    /// without a node id receives only at its ports.
     #[must_use]
     pub fn hears(&self) -> [Option<Id>; OWN] {
         self.cell.map_or([None; OWN], |cell| Id::of_cell(cell).map(Some))

@@ -1,4 +1,4 @@
-//! The shell around the cells of a process: clock, bus, flash files. All decisions are in the core.
+//! Input and output for the cells of a process: clock, bus and flash files. The core makes all decisions.
 
 mod clock;
 mod flash_file;
@@ -28,38 +28,39 @@ pub use flash_file::FlashFile;
 pub use line::Line;
 pub use sockets::Sockets;
 
-/// From one attempt to open a bus that is away to the next.
+/// Retry interval for opening a bus that is not there.
 const AGAIN: Duration = Duration::from_millis(100);
-/// Waits while an interface is down before it is tried again.
+/// Retry interval while an interface is down.
 const DOWN: Duration = Duration::from_millis(100);
 
-/// Time for which frames are kept that a bus did not take. Epochs count modulo 256: older torques might be taken for others.
+/// Maximum age of unsent frames. Epochs count modulo 256, so older torques could be mistaken for newer ones.
 const KEPT: Duration = Duration::from_millis(250);
 
-/// Cells in a process that may rest: more are woken as often by their heartbeats as by joints.
+/// Maximum number of cells in a process that may rest. With more, heartbeats wake the process as often as
+/// joints.
 const RESTING: usize = 8;
 
-/// Link ids that a cell sends with, by port; the last one leads to the gateway's side.
+/// The link ids that a cell sends with, by port; the last one is the uplink to the gateway's side.
 pub type LinkIds = [Option<LinkId>; PORTS + 1];
 
-/// Some cells that share a process and a socket.
+/// Cells that share a process and a socket.
 #[derive(Debug)]
 pub struct Cells {
     cells: Vec<HostedCell>,
     format: Format,
     clock: Clock,
     subscriptions: Subscriptions,
-    /// The subscriptions may have changed since the filters were set.
+    /// True if the subscriptions may have changed since the filters were set.
     hears_changed: bool,
-    /// What waits in the socket has been received since a timer was due.
+    /// True if pending frames have been received since a timer became due.
     heard_first: bool,
     hearing: Hearing,
     outbox: Outbox,
-    /// Since when the bus has not taken what is in the outbox.
+    /// The time since which the bus has not accepted the outbox.
     unsent_since: Option<Instant>,
 }
 
-/// One cell and what is its own. What is used together lies in the same cache lines in each of many.
+/// A cell with its own resources. The alignment keeps data that is used together in the same cache lines.
 #[derive(Debug)]
 #[repr(align(64))]
 struct HostedCell {
@@ -68,38 +69,38 @@ struct HostedCell {
     link_ids: LinkIds,
 }
 
-/// Why cells stop.
+/// The reason for which cells stop.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Stopped {
-    /// Another cell has a number.
+    /// Another cell has the node id.
     #[error(
         "cell {cell} is on {bus} already, with serial number {serial}: stop that one or give this one another number"
     )]
     Taken {
         /// The bus.
         bus: String,
-        /// The number.
+        /// The node id.
         cell: u8,
-        /// The serial number of the owner.
+        /// The serial number of the other cell.
         serial: u32,
     },
-    /// Wires are simulated, and the bus is not.
+    /// Wires must be simulated, but the bus is real.
     #[error(
-        "{bus} is real hardware, and cells that answer with sums simulate their wires by frames that may not go there: \
-         use a vcan or the embedded bus, or reply = \"torque\""
+        "{bus} is real hardware, but cells that answer with sums simulate their wires with frames that \
+         must not be sent there: use a vcan or the embedded bus, or reply = \"torque\""
     )]
     Real {
         /// The interface.
         bus: String,
     },
-    /// The bus is gone.
+    /// The bus failed.
     #[error(transparent)]
     Bus(#[from] BusError),
 }
 
 impl Cells {
-    /// No cells yet, on a bus of this format.
+    /// Creates an empty set of cells for a bus of this format.
     #[must_use]
     pub fn new(format: Format) -> Self {
         Self {
@@ -115,8 +116,8 @@ impl Cells {
         }
     }
 
-    /// Starts a cell with what flash holds and the wires it has; a simulated cell has no sensors, so it obeys
-    /// stimuli.
+    /// Starts a cell with the contents of its flash and its wires. A simulated cell has no sensors, so it
+    /// uses stimuli.
     pub fn start(&mut self, identity: Identity, flash: &Flash, file: FlashFile, link_ids: LinkIds) {
         let mut wired = 0;
         for (port, link_id) in
@@ -130,13 +131,13 @@ impl Cells {
         self.hears_changed = true;
     }
 
-    /// Opens their bus.
+    /// Opens the bus of the cells.
     ///
-    /// Cells that are wired to each other receive each other's sums and wires. When they share a socket it has to
-    /// give them their own frames back.
+    /// Cells that are wired to each other receive each other's sums and wire messages. If they share a
+    /// socket, it must return their own frames.
     ///
     /// # Errors
-    /// When it cannot be used as requested.
+    /// Returns an error if the bus cannot be used as requested.
     pub fn open(&mut self, line: &Line) -> Result<Sockets, Stopped> {
         self.listen();
         let options = Options {
@@ -148,10 +149,10 @@ impl Cells {
         Sockets::open(line, &options, &self.hearing.deferred)
     }
 
-    /// Opens it as soon as it is there.
+    /// Opens the bus as soon as it exists.
     ///
     /// # Errors
-    /// When it cannot be used as requested, and waiting would not help.
+    /// Returns an error if the bus cannot be used as requested and waiting would not help.
     pub fn open_again(&mut self, line: &Line) -> Result<Sockets, Stopped> {
         loop {
             std::thread::sleep(AGAIN);
@@ -162,7 +163,8 @@ impl Cells {
         }
     }
 
-    /// Updates the subscriptions, if they may have changed; the filters until now, if they have.
+    /// Updates the subscriptions if they may have changed. Returns the previous filters if the filters have
+    /// changed.
     fn listen(&mut self) -> Option<Hearing> {
         if !core::mem::take(&mut self.hears_changed) {
             return None;
@@ -176,16 +178,16 @@ impl Cells {
         (hearing != self.hearing).then(|| core::mem::replace(&mut self.hearing, hearing))
     }
 
-    /// Runs the cells until the bus is gone or a number turns out to be taken.
+    /// Runs the cells until the bus fails or another cell has one of their node ids.
     ///
     /// # Errors
-    /// Always: it only ends by stopping.
+    /// Always returns the reason of the end.
     pub fn run(&mut self, mut sockets: Sockets, line: &Line) -> Result<core::convert::Infallible, Stopped> {
         let mut now = self.clock.now();
         loop {
             match self.turn(&mut sockets, now) {
                 Ok(()) => {}
-                // What was received before has been taken already.
+                // Frames received before the error have already been processed.
                 Err(Stopped::Bus(error)) => {
                     self.recover(error, &mut sockets, line)?;
                     now = self.clock.now();
@@ -196,16 +198,16 @@ impl Cells {
             now = self.clock.now();
             for &Arrived { ref received, waited } in sockets.frames() {
                 let age = self.clock.age(now, received.at_nanos);
-                // What a resting cell need only count is taken as if it had been woken for each. A sum's epoch is as
-                // old as its joints.
+                // A frame that a resting cell only counts is processed as if it had woken the process. With
+                // sums, its epoch is as old as its joints.
                 let (now, age) = if waited && !line.wires { (now - age, Span(0)) } else { (now, age) };
                 self.take(received, age, sockets.name(), now)?;
             }
         }
     }
 
-    /// Waits for a bus that does not work, or opens it again. What it did not take is sent then; what is too old for
-    /// that is lost, as on a microcontroller without a bus.
+    /// Waits for a bus that does not work, or opens it again. Unsent frames are sent afterwards; those that
+    /// are too old are lost, as on a microcontroller without a bus.
     fn recover(&mut self, error: BusError, sockets: &mut Sockets, line: &Line) -> Result<(), Stopped> {
         let since = *self.unsent_since.get_or_insert_with(Instant::now);
         if line.reconnect && error.is_closed() {
@@ -222,7 +224,7 @@ impl Cells {
         Ok(())
     }
 
-    /// Drops what the bus did not take, and takes it back from what the cells have sent.
+    /// Drops the unsent frames and subtracts them from the cells' counts of sent packets.
     fn lose_outbox(&mut self) {
         for place in self.outbox.lose() {
             if let Some(hosted_cell) = self.cells.get_mut(place) {
@@ -231,11 +233,11 @@ impl Cells {
         }
     }
 
-    /// Lets time pass, sends, and waits for frames.
+    /// Handles due timers, sends, and waits for frames.
     fn turn(&mut self, sockets: &mut Sockets, now: Micros) -> Result<(), Stopped> {
         let timeouts = self.cells.iter().map(|hosted_cell| hosted_cell.node.poll_timeout());
         let due = timeouts.min().filter(|&due| due <= now);
-        // What arrived before a timer was due is processed first, once.
+        // Frames that arrived before a timer became due are processed first, once.
         if let Some(due) = due
             && !core::mem::replace(&mut self.heard_first, true)
             && sockets.look(self.clock.wall_nanos(due))?
@@ -252,7 +254,7 @@ impl Cells {
             next = next.min(hosted_cell.node.poll_timeout());
         }
         self.clock.keep(now);
-        // Before the answers to what is sent now.
+        // Set the filters before the answers to the following frames can arrive.
         if let Some(before) = self.listen()
             && let Err(error) = sockets.set_filters(&self.hearing, &before)
         {
@@ -269,7 +271,7 @@ impl Cells {
         Ok(sockets.wait(Duration::from_micros(next.since(now).0))?)
     }
 
-    /// Passes a frame to the cells that receive it, and takes their answers at once.
+    /// Passes a frame to the cells that receive it, and collects their answers at once.
     fn take(&mut self, received: &Received, age: Span, bus: &str, now: Micros) -> Result<(), Stopped> {
         let frame = &received.frame;
         if let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) {
@@ -282,12 +284,12 @@ impl Cells {
             return Ok(());
         }
         let Ok(id) = packet::data_id(frame) else {
-            // Each counts what it cannot use.
+            // Each cell counts frames that it cannot use.
             self.cells.iter_mut().for_each(|hosted_cell| hosted_cell.node.handle_frame(now, age, frame));
             return Ok(());
         };
-        // Of what the cells of this process say, the others of them hear sums only; who speaks under its own number
-        // is no other cell.
+        // The other cells of this process receive only sums from among its own frames. A frame with a cell's own
+        // node id is not from another cell.
         if received.own && id.kind != Kind::Sum {
             return Ok(());
         }
@@ -305,7 +307,8 @@ impl Cells {
 }
 
 impl HostedCell {
-    /// Writes what the cell has for flash, and takes what it has to send; whether its subscriptions have changed.
+    /// Writes the cell's pending parameters to flash and collects its pending frames. Returns true if its
+    /// subscriptions have changed.
     fn collect(&mut self, place: usize, format: Format, outbox: &mut Outbox) -> bool {
         if let Some(kept) = self.node.poll_store() {
             self.node.handle_stored(self.file.store(&kept).is_ok());

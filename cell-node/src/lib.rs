@@ -14,7 +14,7 @@ mod phase;
 pub mod sine;
 pub mod sum;
 
-// Its oracle is shared with benchmarks and examples, which name the crate.
+// The oracle of the tests is shared with benchmarks and examples, which refer to the crate by name.
 #[cfg(test)]
 extern crate self as cell_node;
 

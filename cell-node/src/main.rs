@@ -1,4 +1,4 @@
-//! One skin cell as a process, or several in one.
+//! A process with one or several skin cells.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -65,12 +65,13 @@ fn range(text: &str) -> Result<(u8, u8), String> {
 }
 
 impl Arguments {
-    /// The first and the last node id.
+    /// Returns the first and the last node id.
     fn nodes(&self) -> Option<(u8, u8)> {
         self.node.map(|node| (node, node)).or(self.nodes)
     }
 
-    /// Writes why this process ends; as last words that the program that started it can read, if one did.
+    /// Reports the reason for the end of this process: as a line of [`LastWords`] if another program started
+    /// it.
     fn say_why(&self, why: impl core::fmt::Display) {
         match self.nodes().filter(|_| self.with_parent.is_some()) {
             Some((first, last)) => {
@@ -81,7 +82,7 @@ impl Arguments {
     }
 }
 
-/// One line in one piece, for hundreds of cells may share this standard error.
+/// Writes a line to standard error in one write, because hundreds of cells may share it.
 fn say(text: impl core::fmt::Display) {
     protocol::usage::say(&format!("cell-node: {text}"));
 }
@@ -89,14 +90,14 @@ fn say(text: impl core::fmt::Display) {
 fn main() -> ExitCode {
     let arguments = match Arguments::try_parse() {
         Ok(arguments) => arguments,
-        // Help and version, which are asked for, are printed as they are.
+        // Help and version were requested and are printed unchanged.
         Err(requested) if !requested.use_stderr() => requested.exit(),
         Err(wrong) => {
             say(protocol::usage::one_line(&wrong.render().to_string()));
             return ExitCode::from(2);
         }
     };
-    // Hundreds of cells are woken at once; each waits for its turn.
+    // Hundreds of cells wake up at once; each waits for its turn.
     protocol::bus::never_interrupt();
     match prepare(&arguments) {
         Ok((mut cells, sockets, line)) => {
@@ -117,9 +118,9 @@ fn main() -> ExitCode {
 
 fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, Line)> {
     if let Some(parent) = arguments.with_parent {
-        // Not TERM, which a stopped process would not take before it is continued.
+        // A stopped process would not receive SIGTERM before it is continued.
         set_parent_process_death_signal(Some(Signal::KILL))?;
-        // It may have ended before that.
+        // The parent may have ended before that call.
         ensure!(getppid() == Pid::from_raw(parent), "process {parent} is not the parent of this one");
     }
     if let Some(flash) = arguments.flash.as_deref().filter(|flash| !flash.is_dir()) {
@@ -159,7 +160,7 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, Line)> {
     Ok((cells, sockets, line))
 }
 
-/// Starts a cell with what its flash holds, which is first filled from the description.
+/// Starts a cell with the contents of its flash, which is first initialised from the skin.
 fn start(
     cells: &mut Cells,
     arguments: &Arguments,

@@ -1,18 +1,19 @@
-//! Sine and cosine of an angle in quarter turns, integers only.
+//! Sine and cosine of an angle in quarter turns, with integers only.
 //!
-//! An angle is a Q1.14 word in quarter turns (paper, Eq. 11), so 16 bits hold exactly one turn and
-//! wrap by themselves; the period of the paper's Eq. 12 is 4 of these units, not 2. A polynomial is
-//! evaluated on [-1, 1] and continued by `sin(z) = sin(2 - z)` (Eq. 18), which in wrapping words also
-//! holds below -1. All products stay within 32 bits.
+//! An angle is a Q1.14 word in quarter turns (paper, Eq. 11), so 16 bits hold exactly one turn and wrap
+//! without further code; the period of the paper's Eq. 12 is 4 of these units, not 2. A polynomial is
+//! evaluated on [-1, 1] and continued by `sin(z) = sin(2 - z)` (Eq. 18), which in wrapping words also holds
+//! below -1. All products stay within 32 bits.
 //!
 //! | function | order | mean error | max error |
 //! |---|---|---|---|
 //! | [`sine`], [`cosine`] | 7 | 1.6e-5 | 6.1e-5 |
 //! | `paper_sine`, `paper_cosine` | 5 | 1.9e-4 | 4.4e-4 |
 //!
-//! over all 65 536 angles; rounding to Q1.14 alone costs 1.5e-5 in the mean. All four are exact at 0
-//! and at the quarter turns, exactly odd (or even), and never beyond 1. Never panics, bounded work. Cells
-//! compute with the seventh order; the paper's fifth is there with the feature `oracle`, to compare with.
+//! The errors are over all 65 536 angles; rounding to Q1.14 alone costs 1.5e-5 in the mean. All four
+//! functions are exact at 0 and at the quarter turns, exactly odd (or even), and within [-1, 1]. They never
+//! panic, and their work is bounded. Cells use the seventh order; the paper's fifth order is available for
+//! comparison with the feature `oracle`.
 
 use core::f64::consts::FRAC_PI_2;
 
@@ -24,40 +25,40 @@ pub(crate) mod paper;
 #[cfg(feature = "oracle")]
 pub use paper::{paper_cosine, paper_sine};
 
-/// One, in the 16 fraction bits in which the polynomials are evaluated.
+/// One, with the 16 fraction bits of the polynomials.
 const ONE: i32 = 1 << 16;
 /// A quarter turn as a word.
 pub(crate) const QUARTER: Q1_14 = Q1_14::from_bits(1 << 14);
 
 /// The odd polynomial of seventh order for a quarter turn: coefficients of z, z^3, z^5, z^7.
 ///
-/// Of the integers whose sum is one (so that the sine of a quarter turn is one) these have the smallest
-/// mean error when every intermediate result is truncated, not rounded; found by search.
+/// Of all integers whose sum is one (so that the sine of a quarter turn is one), these have the smallest mean
+/// error when every intermediate result is truncated; found by search.
 const SEVENTH: [i32; 4] = [ONE + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
 
-/// The sine of an angle in quarter turns; in [-1, 1].
+/// Returns the sine of an angle in quarter turns, in [-1, 1].
 ///
-/// Seventh order; the mean error over all angles is below 1.6e-5 and no error is above 6.2e-5.
+/// Seventh order; the mean error over all angles is below 1.6e-5, and the maximum below 6.2e-5.
 #[must_use]
 pub fn sine(angle: Q1_14) -> Q1_14 {
     odd_polynomial(angle, SEVENTH)
 }
 
-/// The cosine of an angle in quarter turns: the [`sine`] a quarter turn later (Eq. 19).
+/// Returns the cosine of an angle in quarter turns: the [`sine`] a quarter turn later (Eq. 19).
 #[must_use]
 pub fn cosine(angle: Q1_14) -> Q1_14 {
     sine(angle.wrapping_add(QUARTER))
 }
 
-/// [`sine`] and [`cosine`] of one angle together, in steps of 2^-14: bit for bit the same, in less time.
+/// Returns [`sine`] and [`cosine`] of one angle in steps of 2^-14: bit for bit the same, in less time.
 #[inline]
 pub(crate) fn sine_cosine(angle: Q1_14) -> [i32; 2] {
     both(angle, SEVENTH)
 }
 
-/// Sine and cosine by the odd polynomial whose coefficients sum up to one. With |z| folded into one quarter turn, |sin z|
-/// is the polynomial of that and |cos z| the polynomial of what is left of the quarter; nothing below is negative but what
-/// coefficients make it.
+/// Returns sine and cosine, computed with the odd polynomial whose coefficients add up to one. With |z|
+/// folded into one quarter turn, |sin z| is the polynomial of that, and |cos z| the polynomial of the rest of
+/// the quarter. Only coefficients can make intermediate results negative.
 #[inline]
 fn both<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i32; 2] {
     let quarter = 1 << 14;
@@ -72,20 +73,20 @@ fn both<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i32; 2
         [coefficient + (product(squares[0], s) >> 15), coefficient + (product(squares[1], c) >> 15)]
     };
     let factors = coefficients.map(|it| [it, it]).into_iter().rev().reduce(horner).unwrap_or([0; 2]);
-    // Rounded, ties away from zero, as the sign is put on later.
+    // Rounded, ties away from zero, because the sign is applied later.
     let sine = ((product(folded, factors[0]) >> 15) + 1) >> 1;
     let cosine = ((product(left_over, factors[1]) >> 15) + 1) >> 1;
     [(sine ^ negative) - negative, (cosine ^ beyond) - beyond]
 }
 
-/// The same sine as a word within [-1, 1] quarter turns.
+/// Folds an angle to a word within [-1, 1] quarter turns with the same sine.
 fn fold(angle: Q1_14) -> i32 {
     let z = angle.to_bits();
     let folded = if z.unsigned_abs() <= 1 << 14 { z } else { i16::MIN.wrapping_sub(z) };
     i32::from(folded)
 }
 
-/// An odd polynomial of the folded angle whose coefficients sum up to one.
+/// Evaluates an odd polynomial of the folded angle whose coefficients add up to one.
 fn odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> Q1_14 {
     let z = fold(angle);
     let square = product(z, z) >> 13; // 15 fraction bits, at most 2^15
@@ -97,18 +98,18 @@ fn odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) 
     Q1_14::from_bits(i16::from_le_bytes([low, high]))
 }
 
-/// A product that fits 32 bits, for every angle there is; unchecked in a release build, where checking
-/// it would cost a small processor more than the product.
+/// Returns a product that fits 32 bits for every angle. A release build does not check this, because the
+/// check would cost a small processor more than the product.
 fn product(lhs: i32, rhs: i32) -> i32 {
     debug_assert!(lhs.checked_mul(rhs).is_some(), "{lhs} x {rhs} is wider than 32 bits");
     lhs.wrapping_mul(rhs)
 }
 
-/// Fraction bits of [`fine_sine_cosine`].
+/// Number of fraction bits of [`fine_sine_cosine`].
 pub(crate) const FINE: u32 = 28;
 
-/// Sine and cosine with 28 fraction bits, exact at the quarter turns: for constants that are computed
-/// once. No error is above 1e-8.
+/// Returns sine and cosine with 28 fraction bits, exact at the quarter turns, for constants that are computed
+/// once. No error exceeds 1e-8.
 pub(crate) fn fine_sine_cosine(angle: Q1_14) -> [i64; 2] {
     [angle, angle.wrapping_add(QUARTER)].map(|angle| {
         let z = i64::from(fold(angle));
@@ -139,7 +140,7 @@ mod tests {
     use super::*;
     use protocol::fixed::Acc;
 
-    /// Mean and maximum error over all angles.
+    /// Returns the mean and maximum error over all angles.
     fn errors(function: impl Fn(Q1_14) -> f64, oracle: impl Fn(f64) -> f64) -> (f64, f64) {
         let mut sum = 0.0;
         let mut max = 0.0_f64;

@@ -6,10 +6,9 @@
 //!   state of a child ──> state               ┘                └─> missing: children whose sums did not come
 //! ```
 //!
-//! A child's sums are taken while its *lease* runs: from the epoch that its state message names, epoch by epoch without
-//! a gap. So a child that was silent for one epoch is free to send its sums to another parent, and one that is late
-//! loses nothing but that epoch.
-//! A sum of no cells, count 0, ends the lease: nothing more is to come.
+//! A child's sums are accepted while its *lease* runs: from the epoch in its state message on, without a
+//! missing epoch. A child that sent nothing for one epoch is therefore free to send its sums to another
+//! parent, and a child that is late loses only that epoch. A sum of no cells (count 0) ends the lease.
 
 use protocol::fixed::{Acc, Q7_8};
 use protocol::packet::Epoch;
@@ -18,25 +17,25 @@ use protocol::parameters::Slots;
 use protocol::port::PORTS;
 use protocol::time::{Micros, Span};
 
-/// A missing sum is NACKed in so many epochs, because the child's reply may be lost too.
+/// Number of epochs in which a missing sum is NACKed, because the child's reply may be lost too.
 const MISSING: u8 = 4;
-/// Fraction bits that rounding takes away.
+/// Number of fraction bits that rounding removes.
 const SHORTENED: u32 = 30 - 8;
 
 /// A sum as it is sent on the bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Words {
-    /// Nm.
+    /// The sums in Nm.
     pub torque: [Q7_8; MAX_JOINTS],
-    /// Cells in it.
+    /// Number of contributing cells.
     pub count: u8,
 }
 
 impl Words {
-    /// Nothing is to come any more.
+    /// The sum that ends the lease.
     const END: Self = Self { torque: [Q7_8::ZERO; MAX_JOINTS], count: 0 };
 
-    /// Whether it ends the lease: nothing more is to come.
+    /// Returns true if the sum ends the lease.
     #[must_use]
     pub const fn is_end(&self) -> bool {
         self.count == 0
@@ -46,15 +45,15 @@ impl Words {
 /// The state of one child's sums.
 #[derive(Clone, Copy, Debug, Default)]
 struct Child {
-    /// The epoch of the last sum that came, while the lease runs.
+    /// The epoch of the last sum that arrived, while the lease runs.
     last: Option<Epoch>,
-    /// Whether any sum came in the present epoch, of whatever epoch it was.
+    /// True if any sum arrived in the present epoch, of any epoch.
     heard: bool,
     /// The sum of the present epoch.
     taken: Option<Words>,
-    /// One that came before the child's state message.
+    /// A sum that arrived before the child's state message.
     waiting: Option<(Epoch, Words)>,
-    /// For so many epochs more a NACK is sent, unless a sum comes.
+    /// Number of further epochs in which a NACK is sent, unless a sum arrives.
     missing: u8,
 }
 
@@ -64,54 +63,54 @@ pub struct Sum {
     slots: Option<Slots>,
     /// The present epoch.
     pub(crate) epoch: Option<Epoch>,
-    /// How it began, or the last one that did.
+    /// The start of the present or last epoch.
     begin: Begin,
-    /// The rounded own torque, in steps of Q7.8, if it belongs into the sum.
+    /// The rounded own torque in steps of Q7.8, if it contributes to the sum.
     own: Option<[i32; MAX_JOINTS]>,
-    /// It sent a sum in the epoch before: without anything to add it sends one end.
+    /// True if a sum was sent in the previous epoch: without contributions, the cell then sends one end.
     ends: bool,
-    /// What rounding took away, in steps of 2^-30 Nm.
+    /// The rounding error in steps of 2^-30 Nm.
     carry: [i64; MAX_JOINTS],
     children: [Child; PORTS],
-    /// The sum to be sent waits for a sign of the parent.
+    /// True if the sum waits for a sign of the parent.
     pub(crate) held: bool,
-    /// When it is to be sent.
+    /// The time to send the sum.
     due: Option<Micros>,
-    /// The last one that was sent, and its epoch.
+    /// The last sent sum, and its epoch.
     said: Option<(Epoch, Words)>,
-    /// The parent did not take the last sum: the state is resent with the next.
+    /// True if the parent did not accept the last sum: the state is resent with the next one.
     pub(crate) restate: bool,
-    /// Whether missing sums of this epoch have been checked.
+    /// True if missing sums of this epoch have been checked.
     is_checked: bool,
-    /// When they are checked, if not only at the next joints.
+    /// The time of that check, if it is not left to the next joints.
     check: Option<Micros>,
-    /// Sums sent, resends among them.
+    /// Sums sent, including repetitions.
     pub sent: u16,
-    /// Sums taken from children.
+    /// Sums accepted from children.
     pub taken: u16,
-    /// Sums of children that were not taken.
+    /// Sums of children that were dropped.
     pub dropped: u16,
 }
 
-/// An epoch, as sums see it.
+/// The start of an epoch.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Begin {
-    /// Its number.
+    /// The number of the epoch.
     pub epoch: Epoch,
-    /// When its joints were on the bus.
+    /// The time at which its joints were on the bus.
     pub at: Micros,
-    /// From one broadcast to the next.
+    /// The period of the joint broadcast.
     pub period: Span,
-    /// Wires to the root; `None` where it is unreachable.
+    /// Number of wires to the root; `None` while it is unreachable.
     pub depth: Option<u8>,
-    /// Whether sums may be sent in this epoch.
+    /// True if sums may be sent in this epoch.
     pub speaks: bool,
-    /// Bit p: the cell at port p is a child.
+    /// Bit p is set if the cell at port p is a child.
     pub children: u8,
 }
 
 impl Sum {
-    /// Sums are sent in these slots from the next joints on, or not at all.
+    /// Sets the slots of sums from the next joints on; `None` to send no sums.
     pub fn set_slots(&mut self, slots: Option<Slots>) {
         if slots.is_none() {
             *self = Self { sent: self.sent, taken: self.taken, dropped: self.dropped, ..Self::default() };
@@ -119,12 +118,12 @@ impl Sum {
         self.slots = slots;
     }
 
-    /// Whether sums are sent.
+    /// Returns true if sums are sent.
     pub(crate) const fn is_on(&self) -> bool {
         self.slots.is_some()
     }
 
-    /// New joints: `own` is this cell's torque at full width, `None` without contact.
+    /// Starts an epoch. `own` is this cell's torque at full width, `None` without contact.
     pub fn begin(&mut self, begin: &Begin, own: Option<&[Acc<30>; MAX_JOINTS]>) {
         let Some(slots) = self.slots else { return };
         let before = self.epoch.replace(begin.epoch);
@@ -141,7 +140,7 @@ impl Sum {
             self.carry = [0; MAX_JOINTS];
         }
         self.own = own.map(|exact| self.round(exact, slots.carry));
-        // The parent must not keep the last sum for ever.
+        // Send an end, so that the parent does not keep the last sum forever.
         self.ends = follows && self.said.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
         self.due = None;
         self.plan(begin.at);
@@ -151,19 +150,19 @@ impl Sum {
         }
     }
 
-    /// Missing sums are checked before the next joints, while there is time to react.
+    /// Schedules the check for missing sums before the next joints, while there is time to react.
     pub(crate) fn watch(&mut self) {
         if !self.is_checked && self.epoch.is_some() {
             self.check = Some(self.begin.at + self.settles());
         }
     }
 
-    /// How long after joints all sums of an epoch have been sent.
+    /// Returns the time after joints by which all sums of an epoch have been sent.
     const fn settles(&self) -> Span {
         Span(self.begin.period.0 * 7 / 8)
     }
 
-    /// Q7.8, to the nearest; what that took away goes into the next one.
+    /// Rounds to Q7.8. The rounding error is carried into the next value if `carries` is true.
     fn round(&mut self, exact: &[Acc<30>; MAX_JOINTS], carries: bool) -> [i32; MAX_JOINTS] {
         let mut words = [0; MAX_JOINTS];
         for ((word, carry), exact) in words.iter_mut().zip(&mut self.carry).zip(exact) {
@@ -175,7 +174,7 @@ impl Sum {
         words
     }
 
-    /// A child's state message: its sums from this epoch on are for this cell.
+    /// Handles a child's state message: its sums from this epoch on are for this cell.
     pub fn state(&mut self, now: Micros, port: usize, epoch: Epoch) {
         let Some(child) = self.children.get_mut(port) else { return };
         child.last = Some(epoch.before());
@@ -185,7 +184,7 @@ impl Sum {
         }
     }
 
-    /// A child's sum: the one with the largest count stays.
+    /// Handles a child's sum. The one with the largest count is kept.
     pub fn take(&mut self, now: Micros, port: usize, epoch: Epoch, words: Words) {
         let present = self.epoch == Some(epoch);
         let Some(child) = self.children.get_mut(port) else { return };
@@ -206,8 +205,9 @@ impl Sum {
         self.plan(now);
     }
 
-    /// When to send: at once when the sum of every child is there; else in this cell's slot; where a child is late that
-    /// sent in the epoch before, as late as is still useful. What comes after that is sent in the next slot.
+    /// Schedules sending: at once if the sum of every child has arrived, otherwise in this cell's slot. If a
+    /// child that sent in the previous epoch is late, the time is as late as is still useful. Later changes
+    /// are sent in the next slot.
     fn plan(&mut self, now: Micros) {
         let Some(slots) = self.slots else { return };
         if self.count() == 0 && !self.ends {
@@ -234,51 +234,51 @@ impl Sum {
         self.due = Some(self.begin.at + Span(at));
     }
 
-    /// Wires to the root; the maximum where it is unreachable.
+    /// Returns the number of wires to the root; the maximum while it is unreachable.
     fn depth(&self) -> u8 {
         self.begin.depth.or_else(|| self.slots.map(|slots| slots.deepest)).unwrap_or(0)
     }
 
-    /// After joints, by when a sum that waits for a late child is sent: half a slot earlier for each wire to the root,
-    /// so that the sum still reaches those above that wait for it.
+    /// Returns the time after joints by which a sum that waits for a late child is sent: half a slot earlier
+    /// for each wire to the root, so that the sum still reaches the cells above that wait for it.
     fn late(&self) -> Span {
         let width = self.slots.map_or(0, |slots| u64::from(slots.slot_us));
         Span(self.settles().0.saturating_sub(u64::from(self.depth()) * width / 2))
     }
 
-    /// Whether a child's sum is waited for in each epoch: its lease runs.
+    /// Returns true if a child's sum is expected in each epoch: its lease runs.
     pub(crate) fn awaits_children(&self) -> bool {
         self.children.iter().any(|child| child.last.is_some())
     }
 
-    /// By when the sum of the next epoch has to be sent that waits for a late child.
+    /// Returns the time by which the sum of the next epoch must be sent if a child is late.
     pub(crate) fn late_at_next(&self) -> Micros {
         self.begin.at + self.begin.period + self.late()
     }
 
-    /// The cell at a port is no child any more.
+    /// Handles the loss of a child at a port.
     pub(crate) fn disown(&mut self, port: usize) {
         if let Some(child) = self.children.get_mut(port) {
-            // What was taken in this epoch stays: its sender sends no other for it.
+            // A sum of this epoch is kept, because its sender sends no other one for it.
             child.last = None;
             child.waiting = None;
             child.missing = 0;
         }
     }
 
-    /// The parent is lost: nothing more of this epoch is sent.
+    /// Handles the loss of the parent: sends no more sums in this epoch.
     pub(crate) const fn fall_silent(&mut self) {
         self.begin.speaks = false;
         self.due = None;
     }
 
-    /// When there is something to do.
+    /// Returns the time of the next action.
     pub(crate) fn poll_timeout(&self) -> Option<Micros> {
         self.due.filter(|_| !self.held).into_iter().chain(self.check).min()
     }
 
-    /// The sum to be sent, when its time has come: cumulative, all that is known of this epoch. With it, whether a
-    /// state message has to go before it.
+    /// Returns the sum to send if it is due, cumulative over all contributions of this epoch. The last value
+    /// is true if a state message must precede it.
     pub fn say(&mut self, now: Micros) -> Option<(Epoch, Words, bool)> {
         let epoch = self.epoch.filter(|_| !self.held)?;
         self.due.take_if(|due| *due <= now)?;
@@ -296,13 +296,13 @@ impl Sum {
         Some((epoch, words, !goes_on))
     }
 
-    /// Cells in all that is known of this epoch.
+    /// Returns the number of cells that have contributed in this epoch.
     fn count(&self) -> u32 {
         let children = self.children.iter().filter_map(|child| child.taken);
         u32::from(self.own.is_some()) + children.map(|words| u32::from(words.count)).sum::<u32>()
     }
 
-    /// All that is known of this epoch; `None` when there is nothing to send.
+    /// Returns the sum of all contributions of this epoch; `None` if there is nothing to send.
     fn words(&self) -> Option<Words> {
         let count = self.count();
         if count == 0 {
@@ -322,18 +322,18 @@ impl Sum {
         Some(Words { torque, count: u8::try_from(count).unwrap_or(u8::MAX) })
     }
 
-    /// Whether the last sum was sent in this epoch.
+    /// Returns true if the last sum was sent in this epoch.
     pub(crate) fn said_in(&self, epoch: Epoch) -> bool {
         self.said.is_some_and(|(of, _)| of == epoch)
     }
 
-    /// Whether a sum was sent in this epoch or the one before, and others are to follow.
+    /// Returns true if a sum was sent in this epoch or the previous one, and more will follow.
     pub(crate) fn is_busy(&self) -> bool {
         let recent = |of: Epoch| self.epoch.is_some_and(|epoch| of == epoch || of.next() == epoch);
         self.said.is_some_and(|(of, words)| recent(of) && !words.is_end())
     }
 
-    /// Joints that are not answered: the leases end, and children that go on have to state again.
+    /// Handles joints that are not answered: all leases end, and the children must send their states again.
     pub(crate) fn skip(&mut self) {
         self.epoch = None;
         self.children = Default::default();
@@ -342,8 +342,8 @@ impl Sum {
         self.is_checked = true;
     }
 
-    /// A frame was received so long after it was on the bus. Beyond a quarter of a period the machine itself is late,
-    /// and missing sums are not checked in this epoch.
+    /// Records that a frame was received `age` after it was on the bus. If that exceeds a quarter of a
+    /// period, the machine itself is slow, and missing sums are not checked in this epoch.
     pub(crate) const fn heard_after(&mut self, age: Span) {
         if age.0 * 4 > self.begin.period.0 && self.begin.period.0 > 0 {
             self.is_checked = true;
@@ -351,25 +351,25 @@ impl Sum {
         }
     }
 
-    /// Whether all of this epoch is done.
+    /// Returns true if all sums of this epoch have been sent.
     pub(crate) fn is_settled(&self, now: Micros) -> bool {
         self.epoch.is_none() || now >= self.begin.at + self.settles()
     }
 
-    /// When the check before the next joints is due: how late it is.
+    /// Returns the lateness of the check before the next joints, if it is due.
     pub(crate) fn check(&mut self, now: Micros) -> Option<Span> {
         self.check.take_if(|check| *check <= now).map(|check| now.since(check))
     }
 
-    /// Missing sums, once in an epoch: bit p is set when the sum of the child at port p should have come and did not.
-    /// The lease of such a child ends.
+    /// Returns the children whose sums are missing, once per epoch: bit p is set for the child at port p. The
+    /// lease of such a child ends.
     pub(crate) fn missing(&mut self) -> Option<(Epoch, u8)> {
         if core::mem::replace(&mut self.is_checked, true) {
             return None;
         }
         let mut nack = 0;
         for (port, child) in self.children.iter_mut().enumerate() {
-            // Nothing came, or a sum without a state message.
+            // No sum arrived, or one without a state message.
             let unsaid = child.waiting.is_some_and(|(of, _)| Some(of) == self.epoch);
             if unsaid || (child.last.is_some() && !child.heard) {
                 child.last = None;

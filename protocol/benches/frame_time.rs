@@ -1,4 +1,4 @@
-//! How long it takes to say how long a frame takes: `cargo bench -p protocol --bench frame_time`
+//! Time to compute the duration of a frame: `cargo bench -p protocol --bench frame_time`
 
 use std::hint::black_box;
 use std::time::Duration;
@@ -9,7 +9,7 @@ use protocol::id::{CellId, Id, Kind, Node};
 use protocol::packet::{Epoch, Packet};
 use protocol::wire_time::Bits;
 
-/// What cells 1 to 253 answer in an epoch.
+/// Returns the replies of cells 1 to 253 in one epoch.
 fn replies(format: Format) -> Vec<Frame> {
     let packets = CellId::all().take(253).map(|cell| {
         let word = i16::from(cell.get()).wrapping_mul(-0x3D4D);

@@ -1,6 +1,7 @@
-//! Instructions of packets and frame times: `cargo bench -p protocol --bench instructions`
+//! Instruction counts of packets and frame times: `cargo bench -p protocol --bench instructions`
 //!
-//! Counted by valgrind, so that they are the same on a busy machine. `docs/explanation/benchmarks.md` says what has to be installed.
+//! Valgrind counts them, so the results do not depend on the load of the machine.
+//! `docs/explanation/benchmarks.md` lists the required programs.
 
 #![expect(
     missing_docs,
@@ -20,7 +21,7 @@ use protocol::wire_time::Bits;
 
 mod counted;
 
-/// A torque of a cell.
+/// Returns a torque packet of a cell.
 fn packet() -> Packet {
     let cell = CellId::all().nth(11).expect("there are 254 cells");
     let words = [0x1234, -0x0102, 0x0055, -1, 0, 0x4000];
@@ -86,7 +87,7 @@ fn bits(frame: Frame) -> Option<Bits> {
 library_benchmark_group!(name = packets; benchmarks = encoded, decoded, paired);
 library_benchmark_group!(name = frame_time; benchmarks = bits);
 
-/// All that is counted, once and with a look at what comes of it.
+/// Runs each benchmark once and checks its result.
 fn once() {
     let packet = packet();
     assert_eq!(encode(packet, Format::Fd), [Some(fd_frame()), None]);

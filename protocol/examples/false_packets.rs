@@ -1,11 +1,12 @@
-//! How often frames of another protocol are taken for a packet, because their CRC is right by chance.
+//! Measures how often frames of another protocol are mistaken for a packet because their CRC is correct by
+//! chance.
 //!
 //! ```text
 //!   cargo run --release -p protocol --example false_packets [MILLION_FRAMES]
 //! ```
 //!
-//! Classic frames of random bytes, one every ms under one identifier of torques, go through the reassembly: where the chain is
-//! known, so that packets have one length, and where each length is tried.
+//! Classic frames of random bytes, one per ms with one torque identifier, pass through reassembly: with one
+//! possible length, as for a known chain, and with all lengths.
 #![expect(clippy::print_stdout, reason = "the figures are its output")]
 #![expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
 
@@ -15,10 +16,10 @@ use protocol::time::Micros;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-/// From frame to frame.
+/// Time between two frames.
 const BETWEEN_US: u64 = 1_000;
 
-/// What became of so many frames of `min` to 8 random bytes.
+/// Prints the result for `frames` frames of `min` to 8 random bytes.
 fn row(name: &str, lengths: Lengths, min: usize, frames: u64) {
     let mut dice = Pcg64Mcg::seed_from_u64(1);
     let id = Id { kind: Kind::Torque, node: 12 };

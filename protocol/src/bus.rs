@@ -1,4 +1,4 @@
-//! Opening a bus: SocketCAN or the embedded bus, behind one type.
+//! A CAN bus: SocketCAN or the embedded bus, behind one type.
 //!
 //! ```no_run
 //! use protocol::bus::{Bus, Choice, Filter, Inbox, Options};
@@ -19,7 +19,7 @@
 //! # }
 //! ```
 //!
-//! All of it works on `&Bus`, so one thread may receive while others send.
+//! All methods take `&Bus`, so one thread can receive while others send.
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
@@ -56,27 +56,29 @@ pub use inbox::{Inbox, Received};
 pub use kernel::{GATEWAY_RECEIVE_BUFFER, has_socketcan, set_receive_buffer};
 pub use kinds::{BusKind, Choice, Kinds, KindsError, OneKind, UnknownKind};
 
-/// How a bus is opened.
+/// Options for opening a bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Options {
-    /// What to receive; nothing at all when empty, as a sender wants it. At most [`Filter::MAX`].
+    /// Filters for received frames, at most [`Filter::MAX`]. Without filters the socket receives nothing, as
+    /// a pure sender wants.
     pub filters: Vec<Filter>,
-    /// Whether to receive, marked as own, what this socket itself sends.
+    /// True to receive the frames that this socket sends, marked as own.
     pub own_frames: bool,
-    /// Whether CAN FD frames are sent and received; an interface must then have MTU 72.
+    /// True to send and receive CAN FD frames; a kernel interface must then have an MTU of 72.
     pub fd: bool,
-    /// Which error frames to receive, as the bits of `linux/can/error.h`.
+    /// Error frames to receive, as a mask of the bits in `linux/can/error.h`.
     pub error_mask: u32,
-    /// Bytes that may wait unread, as the kernel counts them: about 1 KiB a frame.
+    /// Size of the receive buffer in bytes, as the kernel counts them: about 1 KiB per frame.
     pub receive_buffer: usize,
-    /// How long [`Bus::send`] waits for room before it gives up.
+    /// Maximum time that [`Bus::send`] waits for room.
     pub send_timeout: Duration,
-    /// Where embedded buses live; `None` is [`embedded::usual_directory`].
+    /// The directory of embedded buses; `None` for [`embedded::usual_directory`].
     pub directory: Option<PathBuf>,
 }
 
 impl Default for Options {
-    /// Every data frame, classic and FD, no own ones, room for four answers of each of 254 cells.
+    /// Receives all data frames, classic and FD, except own ones, with room for four answers from each of 254
+    /// cells.
     fn default() -> Self {
         Self {
             filters: vec![Filter::ALL],
@@ -90,11 +92,11 @@ impl Default for Options {
     }
 }
 
-/// From now on this thread, and what it starts, takes no processor from another that is at work when it is woken
-/// (`SCHED_BATCH`); whether the system granted it.
+/// Sets the policy `SCHED_BATCH` for this thread and its future children, so that they do not preempt a
+/// running process when they wake up. Returns true if the system granted it.
 ///
-/// For those of a bench that wake each other by hundreds: cells, and who serves their bus. A bus that is interrupted by
-/// each cell that it hands a frame to switches between processes once for every frame.
+/// This is for the processes of a bench that wake each other by the hundreds: cells, and the server of their
+/// bus. A server that is preempted by every cell it sends a frame to switches processes once per frame.
 pub fn never_interrupt() -> bool {
     calls::set_batch()
 }
@@ -108,27 +110,27 @@ pub struct Bus {
     receive_buffer: usize,
     fd: bool,
     send_timeout: Duration,
-    /// Where an embedded bus lives, as in [`Options`].
+    /// The directory of embedded buses, as in [`Options`].
     directory: Option<PathBuf>,
-    /// A send failed because the interface is down, and the next receive will report it: the kernel reports to a
-    /// socket once.
+    /// Set when a send fails because the interface is down. The next receive reports it, because the kernel
+    /// reports it to a socket only once.
     down: AtomicBool,
-    /// The next receive returns an error that came behind the frames of the last one.
+    /// Set when an error followed the frames of the last receive. The next receive returns it.
     failed: AtomicBool,
-    /// The socket's `SO_RCVTIMEO`, in ms; 0 before it is set.
+    /// The socket's `SO_RCVTIMEO` in ms; 0 before it is set.
     receive_timeout: AtomicU32,
-    /// The last wait that used it ended without a frame.
+    /// Set when the last wait with `SO_RCVTIMEO` ended without a frame.
     expired: AtomicBool,
 }
 
 impl Bus {
-    /// How long [`Bus::wait_and_receive`] waits with the socket's own timeout.
+    /// The timeouts that [`Bus::wait_and_receive`] sets as `SO_RCVTIMEO`.
     const WAITS: [Duration; 2] = [Duration::from_millis(25), Duration::from_millis(100)];
 
-    /// Opens a bus. When this returns, the filters are set.
+    /// Opens a bus. The filters are active when this returns.
     ///
     /// # Errors
-    /// When the bus cannot be used as requested; the error has a hint.
+    /// Returns an error, with a hint for the user, if the bus cannot be used as requested.
     pub fn open(name: &str, choice: Choice, options: &Options) -> Result<Self, BusError> {
         check_name(name)?;
         check_count(name, &options.filters)?;
@@ -155,28 +157,28 @@ impl Bus {
         })
     }
 
-    /// The name under which it was opened.
+    /// Returns the name that the bus was opened with.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// What carries the frames.
+    /// Returns the kind of the bus.
     #[must_use]
     pub const fn kind(&self) -> BusKind {
         self.kind
     }
 
-    /// Whether it was opened for CAN FD frames.
+    /// Returns true if the bus was opened for CAN FD frames.
     #[must_use]
     pub const fn carries_fd(&self) -> bool {
         self.fd
     }
 
-    /// Whether nothing real hangs on this bus: the embedded one, a vcan or a vxcan.
+    /// Returns true if the bus has no hardware: an embedded bus, a vcan or a vxcan.
     ///
     /// # Errors
-    /// When the kernel does not report it.
+    /// Returns an error if the kernel does not report it.
     pub fn is_virtual(&self) -> Result<bool, BusError> {
         self.carrier().is_virtual(&self.name).map_err(|error| self.io_error("look at", error))
     }
@@ -185,18 +187,18 @@ impl Bus {
         self.kind.carrier()
     }
 
-    /// How many bytes may wait unread, as the kernel granted and counts them (twice what was requested when
-    /// all was granted).
+    /// Returns the size of the receive buffer in bytes, as granted and counted by the kernel: twice the
+    /// requested size if it was granted in full.
     #[must_use]
     pub const fn receive_buffer(&self) -> usize {
         self.receive_buffer
     }
 
-    /// Waits until there is something to receive; `None` waits without end. `false` when the time is over
-    /// or a signal came.
+    /// Waits until a receive would return something; `None` waits without limit. Returns false after the
+    /// timeout or a signal.
     ///
     /// # Errors
-    /// When the system cannot wait.
+    /// Returns an error if the system cannot wait.
     pub fn wait(&self, timeout: Option<Duration>) -> Result<bool, BusError> {
         if self.has_error() {
             return Ok(true);
@@ -204,10 +206,11 @@ impl Bus {
         self.poll(PollFlags::IN, timeout).map_err(|errno| self.error("wait for", errno))
     }
 
-    /// Waits until there is something to receive here or on another bus. `false` when the time is over or a signal came.
+    /// Waits until a receive on this bus or on `other` would return something. Returns false after the
+    /// timeout or a signal.
     ///
     /// # Errors
-    /// When the system cannot wait.
+    /// Returns an error if the system cannot wait.
     pub fn wait_with(&self, other: &Self, timeout: Duration) -> Result<bool, BusError> {
         if self.has_error() || other.has_error() {
             return Ok(true);
@@ -216,28 +219,28 @@ impl Bus {
         wait_on(&mut both, Some(timeout)).map_err(|errno| self.error("wait for", errno))
     }
 
-    /// Returns whether the next receive reports an error that the kernel does not report again.
+    /// Returns true if the next receive will report a stored error.
     fn has_error(&self) -> bool {
         self.down.load(Ordering::Relaxed) || self.failed.load(Ordering::Relaxed)
     }
 
-    /// Receives what has come, at most 64 frames, and forgets what was in `inbox`; how many frames there
-    /// are now. Never waits and never allocates, unless the system lacks memory for so long as 0.1 s. 0 when nothing
-    /// has come.
+    /// Receives up to 64 frames into `inbox`, replacing its contents, and returns their number: 0 if nothing
+    /// has arrived. Never waits and never allocates, except that it retries for up to 0.1 s while the system
+    /// lacks memory.
     ///
     /// # Errors
-    /// [`BusError::Down`] and [`BusError::Gone`] for an interface, [`BusError::Closed`] or [`BusError::HungUp`] for an
-    /// embedded bus; frames that came before are received first.
+    /// Returns [`BusError::Down`] or [`BusError::Gone`] for an interface, [`BusError::Closed`] or
+    /// [`BusError::HungUp`] for an embedded bus. Frames that arrived before the error are returned first.
     pub fn receive(&self, inbox: &mut Inbox) -> Result<usize, BusError> {
         self.take(inbox, |batch, socket| batch.receive(socket))
     }
 
-    /// The same, but waits up to `timeout` for the first frame; it may return earlier without any. One system call
-    /// instead of two, which then takes one frame, when the time is 25 ms or more: for a receiver that has nothing else
-    /// to do and is woken for each frame.
+    /// Like [`Bus::receive`], but waits up to `timeout` for the first frame; may return early without one.
+    /// For timeouts of 25 ms and more this takes one system call instead of two, which returns a single
+    /// frame. It suits a receiver that has nothing else to do and wakes up for each frame.
     ///
     /// # Errors
-    /// As [`Bus::wait`] and [`Bus::receive`].
+    /// Returns the errors of [`Bus::wait`] and [`Bus::receive`].
     pub fn wait_and_receive(&self, inbox: &mut Inbox, timeout: Duration) -> Result<usize, BusError> {
         let Some(wait) = Self::WAITS.into_iter().rfind(|&wait| wait <= timeout) else {
             inbox.clear();
@@ -245,7 +248,8 @@ impl Bus {
             return if comes { self.receive(inbox) } else { Ok(0) };
         };
         let millis = u32::try_from(wait.as_millis()).unwrap_or(u32::MAX);
-        // Setting it is a system call. Most waits end with a frame before, so a shorter one is kept until it ran out.
+        // Setting the timeout is a system call. Most waits end with a frame, so a shorter timeout is kept
+        // until it expires.
         let set = self.receive_timeout.load(Ordering::Relaxed);
         let is_kept = set == millis || (0 < set && set < millis && !self.expired.load(Ordering::Relaxed));
         if !is_kept {
@@ -273,7 +277,7 @@ impl Bus {
             let received = inbox.failure.take().map_or_else(|| receive(&mut inbox.batch, &self.socket), Err);
             match received {
                 Ok(_) => break,
-                // The server ended with frames of ours unread: what it had sent can still be read.
+                // The server ended with unread frames of ours. Its own frames can still be received.
                 Err(error) if is(&error, Errno::CONNRESET) => {}
                 Err(error) if is(&error, Errno::AGAIN) || is(&error, Errno::INTR) => return Ok(0),
                 Err(error) if batch::is_shortage(&error) && is_before(&mut give_up, SHORTAGE) => {
@@ -291,11 +295,11 @@ impl Bus {
         }
     }
 
-    /// Sends frames, in order. When the bus takes no more, waits for room, as long as
-    /// [`Options::send_timeout`] says since the last frame was taken. Never allocates unless it fails.
+    /// Sends frames in order. If the bus accepts no more, waits for room, at most [`Options::send_timeout`]
+    /// after the last accepted frame. Never allocates except on failure.
     ///
     /// # Errors
-    /// The reason, and how many were sent before it.
+    /// Returns the cause and the number of frames sent before it.
     pub fn send(&self, frames: &[Frame]) -> Result<(), SendError> {
         if !self.carries(frames) {
             let cause = BusError::FdFrame(self.name.clone());
@@ -304,12 +308,13 @@ impl Bus {
         self.patiently(frames.len(), |sent| self.send_some(frames.get(sent..).unwrap_or_default()))
     }
 
-    /// Whether it was opened for frames like these.
+    /// Returns true if the bus was opened for frames of these formats.
     fn carries(&self, frames: &[Frame]) -> bool {
         self.fd || frames.iter().all(|frame| frame.format() == Format::Classic)
     }
 
-    /// Has everything sent, waiting for room in between; `some` sends from so many on, and returns how many.
+    /// Sends `target` items and waits for room in between. `some` sends from the given index on and returns
+    /// the number sent.
     fn patiently(&self, target: usize, some: impl Fn(usize) -> io::Result<usize>) -> Result<(), SendError> {
         let (mut sent, mut give_up) = (0, None);
         while sent < target {
@@ -327,9 +332,9 @@ impl Bus {
         Ok(())
     }
 
-    /// Waits for room, if that is what was missing, until it is time to give up.
+    /// Waits for room if `error` means that there was none; fails after the send timeout.
     fn wait_for_room(&self, error: io::Error, give_up: &mut Option<Instant>) -> Result<(), BusError> {
-        // A full queue of an interface, or no memory for the frame.
+        // The transmit queue of the interface is full, or there is no memory for the frame.
         let interface = batch::is_shortage(&error);
         if !interface && !is(&error, Errno::AGAIN) {
             return Err(self.io_error("send to", error));
@@ -340,7 +345,7 @@ impl Bus {
             return Err(BusError::Full { name: self.name.clone(), waited: self.send_timeout });
         }
         let waited = if interface {
-            // Its queue is shared and nothing signals when it has room, so look again soon.
+            // The queue is shared and nothing signals room in it, so retry soon.
             wait_on(&mut [], Some(left.min(RECHECK)))
         } else {
             self.poll(PollFlags::OUT, Some(left))
@@ -348,9 +353,9 @@ impl Bus {
         waited.map(|_| ()).map_err(|errno| self.error("wait for", errno))
     }
 
-    /// Sends frames, at most 64, if the bus takes them all at once, and returns whether it did. Never waits,
-    /// never allocates, and returns no reason: for a loop that has its own deadline. That the interface is
-    /// down is reported by the next [`Bus::receive`].
+    /// Sends at most 64 frames if the bus accepts all of them at once. Returns true if it did. Never waits,
+    /// never allocates, and returns no cause: for a loop with its own deadline. The next [`Bus::receive`]
+    /// reports an interface that is down.
     #[must_use]
     pub fn offer(&self, frames: &[Frame]) -> bool {
         if !self.carries(frames) {
@@ -363,12 +368,11 @@ impl Bus {
         sent.is_ok_and(|sent| sent == frames.len())
     }
 
-    /// Receives what passes these filters from now on, at most [`Filter::MAX`], in place of what was requested
-    /// before. What was sent on the bus before by this socket, or has come to it already, is not touched. For one
-    /// thread at a time.
+    /// Replaces the filters, at most [`Filter::MAX`]. Frames already received or sent by this socket are not
+    /// affected. Only one thread may call this at a time.
     ///
     /// # Errors
-    /// When there are too many, or the bus does not take them.
+    /// Returns an error if there are too many filters, or the bus does not accept them.
     pub fn set_filters(&self, filters: &[Filter]) -> Result<(), BusError> {
         check_count(&self.name, filters)?;
         self.carrier().set_filters(self, filters)
@@ -385,7 +389,7 @@ impl Bus {
         }
     }
 
-    // Not inlined: its stack depends on N.
+    // Not inlined, because its stack frame depends on N.
     #[inline(never)]
     fn send_up_to<const N: usize>(&self, frames: &[Frame]) -> io::Result<usize> {
         let mut outgoing = batch::Outgoing::<N>::new();
@@ -401,7 +405,7 @@ impl Bus {
         wait_on(&mut [PollFd::new(&self.socket, what)], timeout)
     }
 
-    /// The error for the end of the connection to an embedded bus.
+    /// Returns the error for the end of the connection to an embedded bus.
     fn closed(&self) -> BusError {
         embedded::closed(&self.name, self.directory.as_deref())
     }
@@ -425,9 +429,9 @@ impl AsFd for Bus {
     }
 }
 
-/// How long a full transmit queue is left alone: a few frames at 1 Mbit/s.
+/// Retry interval while a transmit queue is full: the duration of a few frames at 1 Mbit/s.
 const RECHECK: Duration = Duration::from_micros(500);
-/// Time for which the system may lack the memory to receive before that is an error.
+/// Maximum time for which a shortage of memory is retried.
 const SHORTAGE: Duration = Duration::from_millis(100);
 
 fn wait_on(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, Errno> {
@@ -443,7 +447,7 @@ fn wait_on(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, E
     }
 }
 
-/// Returns whether it is before the time to give up, which the first call sets.
+/// Returns true until the deadline, which the first call sets to `after` from now.
 fn is_before(give_up: &mut Option<Instant>, after: Duration) -> bool {
     let now = Instant::now();
     now < *give_up.get_or_insert(now + after)
@@ -458,18 +462,19 @@ fn check_count(name: &str, filters: &[Filter]) -> Result<(), BusError> {
     if got <= Filter::MAX { Ok(()) } else { Err(BusError::Filters { name: name.to_owned(), got }) }
 }
 
-/// Sees that a bus can have this name: the rule of interfaces, so that a bench runs on either kind.
+/// Checks that a bus can have this name. The rule is that of network interfaces, so that a bench runs on
+/// either kind of bus.
 ///
 /// # Errors
-/// When it cannot.
+/// Returns an error if the name is invalid.
 pub fn check_name(name: &str) -> Result<(), BusError> {
     let fits = (1..=15).contains(&name.len()) && name != "." && name != "..";
     let bad = |c: char| c == '/' || c == ':' || c.is_whitespace() || c.is_control();
     if fits && !name.contains(bad) { Ok(()) } else { Err(BusError::Name(name.to_owned())) }
 }
 
-/// Whether a name has 1 to 15 characters that the kernel takes in every interface's name, and a shell as they are:
-/// ASCII letters and digits, `-`, `_` and `.`.
+/// Returns true if a name is valid for every kernel interface and needs no quotes in a shell: 1 to 15 ASCII
+/// letters, digits, `-`, `_` and `.`.
 #[must_use]
 pub fn is_plain(name: &str) -> bool {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);

@@ -1,4 +1,4 @@
-//! One cell on the last link of a UR5, for each way to compute its Jacobian.
+//! A cell on the last link of a UR5, for each way to compute its Jacobian.
 
 #[path = "../../src/tests/kernel/oracle.rs"]
 mod oracle;
@@ -12,7 +12,7 @@ use protocol::parameters::MAX_JOINTS;
 use oracle::Case;
 use peer::Peer;
 
-/// A cell that joint 6 moves, and joints.
+/// A cell moved by joint 6, with joint positions.
 pub(crate) struct Setting {
     pub(crate) wrench: Wrench,
     pub(crate) projection: Projection,
@@ -20,14 +20,14 @@ pub(crate) struct Setting {
     pub(crate) single: Peer<f32>,
     /// Joint positions in quarter turns.
     pub(crate) words: [Q1_14; MAX_JOINTS],
-    /// The same in rad.
+    /// Joint positions in rad.
     pub(crate) radians: [f64; MAX_JOINTS],
-    /// The same in rad.
+    /// Joint positions in rad.
     pub(crate) radians_f32: [f32; MAX_JOINTS],
 }
 
 impl Setting {
-    /// The first of the tests' cases on joint 6.
+    /// Creates the setting from the first test case on joint 6.
     pub(crate) fn new() -> Self {
         let case = Case::all().into_iter().find(|case| case.joint == 6).expect("there are some");
         let parameters = case.parameters();
@@ -46,10 +46,10 @@ impl Setting {
         }
     }
 
-    /// Sees that all of them compute the same.
+    /// Checks that all of them compute the same.
     ///
     /// # Panics
-    /// When one is more than 5e-4 m from the double precision, or f32 more than 1e-6 m.
+    /// Panics if one is more than 5e-4 m from the double precision, or f32 more than 1e-6 m.
     pub(crate) fn check(&self) {
         let target = self.double.jacobian(&self.radians);
         let wrench = self.wrench.jacobian(&self.words).map(Q1_14::to_f64);

@@ -1,20 +1,20 @@
-//! The same Jacobian as the kernels' with a matrix library, in any real numbers.
+//! The Jacobian of the benchmark, computed with a matrix library, for any real number type.
 
 use nalgebra::{IsometryMatrix3, Point3, RealField, Rotation3, Translation3, Vector3, convert};
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters, Row};
 
-/// One cell: Eq. 8 by frames that are multiplied from the base to the cell, as one writes it down.
+/// One cell: Eq. 8 with frames multiplied from the base to the cell, without optimisations.
 #[derive(Debug)]
 pub(crate) struct Peer<T: RealField> {
-    /// What does not move of each link.
+    /// The constant part of each link's transform.
     fixed: Vec<IsometryMatrix3<T>>,
     position: Point3<T>,
     force: Vector3<T>,
 }
 
 impl<T: RealField + Copy> Peer<T> {
-    /// A cell that pushes against its normal by one newton.
+    /// Creates a cell that is pushed against its normal with one newton.
     pub(crate) fn new(parameters: &Parameters) -> Self {
         let number = |word: Q1_14| convert::<f64, T>(word.to_f64());
         let link = |row: &Row| {
@@ -28,7 +28,7 @@ impl<T: RealField + Copy> Peer<T> {
         }
     }
 
-    /// J_l in m of joints that stand at these angles in rad.
+    /// Returns J_l in m for joint angles in rad.
     pub(crate) fn jacobian(&self, joints: &[T; MAX_JOINTS]) -> [T; MAX_JOINTS] {
         let mut frames = [IsometryMatrix3::identity(); MAX_JOINTS];
         let mut tip = IsometryMatrix3::identity();

@@ -1,4 +1,4 @@
-//! Puts the memory of the chosen board where the linker looks for it.
+//! Copies the linker script of the chosen board to the linker's search path.
 
 use std::path::PathBuf;
 use std::{env, fs};

@@ -1,4 +1,4 @@
-//! Turns the vectors into tables of words, and says where the machines' memory is.
+//! Converts the test vectors to tables of words, and writes the memory layout of the emulated machines.
 
 #![allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "wrapped or held before")]
 #![allow(clippy::indexing_slicing, clippy::unwrap_used, clippy::panic, reason = "a build may stop")]
@@ -10,7 +10,8 @@ use std::{env, fs};
 
 const UR5: &str = "../../tests/vectors/ur5_torque.csv";
 const CHAINS: &str = "../../tests/vectors/chains.csv";
-/// Flash and RAM. The micro:bit's nRF51822 is the smallest; the boards of Arm's FPGA images have more than enough.
+/// Flash and RAM. The micro:bit's nRF51822 is the smallest; the boards of Arm's FPGA images have ample
+/// memory.
 const MICROBIT: &str =
     "MEMORY { FLASH : ORIGIN = 0, LENGTH = 256K  RAM : ORIGIN = 0x20000000, LENGTH = 16K }";
 const MPS2: &str = "MEMORY { FLASH : ORIGIN = 0, LENGTH = 4M  RAM : ORIGIN = 0x20000000, LENGTH = 4M }";
@@ -19,12 +20,12 @@ fn word(value: f64) -> i16 {
     (value * 16_384.0).round().clamp(-32_768.0, 32_767.0) as i16
 }
 
-/// An angle in quarter turns, wrapped into one turn.
+/// Converts an angle to quarter turns, wrapped into one turn.
 fn angle(radians: f64) -> i16 {
     (radians / TAU % 1.0 * 65_536.0).round() as i32 as i16
 }
 
-/// The UR5's table: a, d, alpha, theta offset, kind.
+/// Returns the UR5's table: a, d, alpha, theta offset, kind.
 fn ur5() -> Vec<[i16; 5]> {
     let d = [0.089_159, 0.0, 0.0, 0.109_15, 0.094_65, 0.082_3];
     let a = [0.0, -0.425, -0.392_25, 0.0, 0.0, 0.0];
@@ -32,7 +33,7 @@ fn ur5() -> Vec<[i16; 5]> {
     (0..6).map(|row| [word(a[row]), word(d[row]), angle(alpha[row]), 0, 0]).collect()
 }
 
-/// A chain of so many joints: the rows of a seven-joint arm again and again, shorter so that they stay in reach.
+/// Returns a chain of `joints` joints: the repeated rows of a seven-joint arm, shortened to stay in reach.
 fn repeated(rows: &[[i16; 5]], joints: usize) -> Vec<[i16; 5]> {
     let shorter = |[a, d, alpha, offset, kind]: [i16; 5]| [a / 3, d / 3, alpha, offset, kind];
     rows.iter().cycle().take(joints).copied().map(shorter).collect()
@@ -91,7 +92,7 @@ fn main() {
         tables.case(*chain, carries, &short(parts[3]), &short(parts[5]), words(parts[4])[0]);
     }
 
-    // Long chains, for what they cost: a cell on the last joint.
+    // Long chains, to measure their cost, with a cell on the last joint.
     let panda = &known.iter().find(|(name, ..)| name == "panda").expect("the panda").2;
     let seven: Vec<[i16; 5]> = panda.iter().filter(|row| row[4] != 2).copied().collect();
     for joints in [7_u8, 10, 14] {
@@ -123,7 +124,7 @@ fn main() {
     fs::write(out.join("cases.rs"), text).expect("cargo's folder is writable");
     let memory = if env::var("TARGET").is_ok_and(|it| it.starts_with("thumbv6m")) { MICROBIT } else { MPS2 };
     fs::write(out.join("memory.x"), memory).expect("cargo's folder is writable");
-    // What the cell's linker arguments name, and this program has no use for.
+    // The linker arguments of the cell name this file, which this program does not need.
     fs::write(out.join("cell.x"), "").expect("cargo's folder is writable");
     println!("cargo::rustc-link-search={}", out.display());
     for file in ["build.rs", UR5, CHAINS] {

@@ -41,7 +41,7 @@ impl Baseline {
     }
 }
 
-/// A sensor that reads 0.3 N when nothing touches it, at 25 °C.
+/// Returns the baseline of a sensor that reads 0.3 N without a touch, at 25 °C.
 fn tared(rule: Zeroing) -> Baseline {
     let mut baseline = with(rule);
     baseline.run(STEADY.into(), &reads(0.3, 25.0));
@@ -76,7 +76,7 @@ fn a_touch_at_the_start_beyond_the_limit_is_a_touch_and_no_zero() {
     let mut baseline = with(rule());
     assert_eq!(baseline.run(500, &reads(0.6, 25.0)), reads_as(0.6));
     assert!(!baseline.is_tared());
-    // Nor is one that moves.
+    // A changing reading is not used as zero either.
     for joints in 0..500 {
         baseline.run(1, &reads(if joints % 2 == 0 { 0.2 } else { 0.4 }, 25.0));
     }
@@ -125,7 +125,7 @@ fn the_coefficient_is_learned_from_a_warm_up_without_a_touch() {
         let mut baseline = with(rule());
         baseline.run(STEADY.into(), &reads(0.1, start));
         let up = if start > 30.0 { -1.0 } else { 1.0 };
-        // A degree a minute, in steps of 1/64 °C.
+        // One degree per minute, in steps of 1/64 °C.
         for step in 0..640 {
             let degrees = f64::from(step) / 64.0;
             baseline.run(58, &reads(0.1 + slope * up * degrees, start + up * degrees));

@@ -1,20 +1,20 @@
-//! The time that cells go by, and the wall's beside it.
+//! The clock of the cells, and its relation to the wall clock.
 
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use protocol::time::{Micros, Span};
 
-/// From one comparison with the wall's clock to the next.
+/// Interval between comparisons with the wall clock.
 const MEASURE: Span = Span::from_millis(250);
 
-/// A monotonic clock, and how the wall's time is had from it without asking twice.
+/// A monotonic clock with a known offset to the wall clock.
 #[derive(Debug)]
 pub(super) struct Clock {
     start: Instant,
-    /// The wall's time at the start, in µs since 1970; measured again now and then, because it may be set
-    /// the wall's clock.
+    /// The wall clock at the start, in µs since 1970. It is measured again from time to time, because the
+    /// wall clock may be set.
     wall: u64,
-    /// When it was measured.
+    /// The time of the last measurement.
     measured: Micros,
 }
 
@@ -29,7 +29,7 @@ impl Clock {
         Micros::after(self.start.elapsed())
     }
 
-    /// Compares itself with the wall's clock, when it is time to.
+    /// Measures the offset to the wall clock if the interval has elapsed.
     pub(super) fn keep(&mut self, now: Micros) {
         if now.since(self.measured) >= MEASURE {
             self.set(now);
@@ -42,12 +42,12 @@ impl Clock {
         self.measured = now;
     }
 
-    /// The wall's time in ns at a time of this clock.
+    /// Converts a time of this clock to the wall clock, in ns.
     pub(super) const fn wall_nanos(&self, at: Micros) -> u64 {
         (self.wall + at.0).saturating_mul(1_000)
     }
 
-    /// How long before `now` a wall's time in ns was.
+    /// Returns the age at `now` of a wall clock time in ns.
     pub(super) const fn age(&self, now: Micros, at_nanos: u64) -> Span {
         Span((self.wall + now.0).saturating_sub(at_nanos / 1_000))
     }

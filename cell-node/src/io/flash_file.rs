@@ -1,7 +1,7 @@
-//! Flash as a file, which one process at a time uses.
+//! Flash in a file, used by one process at a time.
 //!
-//! A lock on the file keeps other processes away, and ends with the process. A file that takes the place of another one is
-//! locked before that.
+//! A lock on the file excludes other processes, and ends with the process. A file that replaces another is
+//! locked before the replacement.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -15,20 +15,21 @@ use rustix::io::Errno;
 use crate::flash::{self, FlashError, Kept};
 use crate::identity::Identity;
 
-/// The most bytes that are read of a file; what flash holds is far less.
+/// Maximum number of bytes read from a file; a flash image is far smaller.
 const LONGEST: u64 = 64 << 10;
 
-/// Where a cell keeps its parameters; without a directory, in memory only.
+/// The flash of a cell: a file, or memory only if there is no directory.
 #[derive(Debug)]
 pub struct FlashFile {
     identity: Identity,
     path: Option<PathBuf>,
-    /// The file at that path while it is locked; `None` while there is none.
+    /// The locked file at that path; `None` if there is none.
     held: Option<File>,
 }
 
 impl FlashFile {
-    /// The file `BUS-NODE.flash` in a directory, or `BUS-sSERIAL.flash` of a cell that came without a number.
+    /// Creates the flash `BUS-NODE.flash` in a directory, or `BUS-sSERIAL.flash` for a cell that started
+    /// without a node id.
     #[must_use]
     pub fn new(directory: Option<&Path>, bus: &str, identity: Identity) -> Self {
         let name = identity.cell.map_or_else(|| format!("s{}", identity.serial), |cell| cell.to_string());
@@ -36,7 +37,7 @@ impl FlashFile {
         Self { identity, path, held: None }
     }
 
-    /// What people call it: `flash of cell 12 (DIR/vcan0-12.flash)`.
+    /// Returns the name for messages: `flash of cell 12 (DIR/vcan0-12.flash)`.
     #[must_use]
     pub fn name(&self) -> String {
         let Identity { cell, serial } = self.identity;
@@ -47,10 +48,11 @@ impl FlashFile {
         )
     }
 
-    /// Locks it, and reads what it holds, which is nothing where there is no file; or why that is not used.
+    /// Locks and reads the file. Returns an empty content if there is no file, and an inner error if the
+    /// content cannot be used.
     ///
     /// # Errors
-    /// When the file is there and cannot be read, or another process has it.
+    /// Returns an error if the file exists but cannot be read, or another process uses it.
     pub fn load(&mut self) -> io::Result<Result<Kept, FlashError>> {
         let Some(path) = &self.path else { return Ok(Ok(Kept::default())) };
         lock(path, &mut self.held)?;
@@ -60,16 +62,16 @@ impl FlashFile {
         Ok(flash::decode(self.identity, &input::bytes(path, LONGEST)?))
     }
 
-    /// Keeps a number and parameters: a whole new file takes the old one's place, or nothing changes.
+    /// Writes a node id and parameters. A complete new file replaces the old one, or nothing changes.
     ///
     /// # Errors
-    /// When the disk will not have it, or another process has the file.
+    /// Returns an error if writing fails, or another process uses the file.
     pub fn store(&mut self, kept: &Kept) -> io::Result<()> {
         let Some(path) = &self.path else { return Ok(()) };
         lock(path, &mut self.held)?;
         let part = path.with_extension("flash.part");
         let store = || {
-            // A leftover of an earlier attempt, or of another program.
+            // Left over from an earlier attempt or another program.
             match fs::remove_file(&part) {
                 Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
                 _ => {}
@@ -81,23 +83,23 @@ impl FlashFile {
             if self.held.is_some() {
                 fs::rename(&part, path)?;
             } else {
-                // Another process may have made one meanwhile.
+                // Another process may have created the file meanwhile.
                 match renameat_with(CWD, &part, CWD, path, RenameFlags::NOREPLACE) {
                     Err(Errno::INVAL | Errno::NOSYS) => fs::rename(&part, path)?,
                     renamed => renamed?,
                 }
             }
-            // Its name outlives a loss of power too, where the file system can promise that.
+            // Make the rename durable, where the file system supports that.
             let _ = File::open(folder_of(path)).and_then(|folder| folder.sync_all());
             Ok(file)
         };
-        // It may not even have been made.
+        // The file may not exist if its creation failed.
         self.held = Some(store().inspect_err(|_| drop(fs::remove_file(&part)))?);
         Ok(())
     }
 }
 
-/// Makes `held` the locked file that is at a path now.
+/// Sets `held` to the locked file at this path.
 fn lock(path: &Path, held: &mut Option<File>) -> io::Result<()> {
     loop {
         let file = match input::open(path) {
@@ -114,7 +116,7 @@ fn lock(path: &Path, held: &mut Option<File>) -> io::Result<()> {
             return Ok(());
         }
         hold(&file)?;
-        // Another process may have replaced it before it was locked.
+        // Another process may have replaced the file before it was locked.
         if fs::metadata(path).is_ok_and(|about| (about.dev(), about.ino()) == is) {
             *held = Some(file);
             return Ok(());
@@ -122,7 +124,7 @@ fn lock(path: &Path, held: &mut Option<File>) -> io::Result<()> {
     }
 }
 
-/// Locks a file; where the file system has no locks, it stays without.
+/// Locks a file. On a file system without locks, it stays unlocked.
 fn hold(file: &File) -> io::Result<()> {
     match flock(file, FlockOperation::NonBlockingLockExclusive) {
         Err(Errno::WOULDBLOCK) => {
@@ -134,13 +136,13 @@ fn hold(file: &File) -> io::Result<()> {
     }
 }
 
-/// The device and the inode of a file.
+/// Returns the device and inode of a file.
 fn identity(file: &File) -> io::Result<(u64, u64)> {
     let about = file.metadata()?;
     Ok((about.dev(), about.ino()))
 }
 
-/// The process that has locked a file, by id and name, as the kernel lists it.
+/// Returns the id and name of the process that has locked a file, from the kernel's list.
 fn holder(file: &File) -> Option<String> {
     let (device, inode) = identity(file).ok()?;
     let place = format!("{:02x}:{:02x}:{inode}", rustix::fs::major(device), rustix::fs::minor(device));

@@ -1,27 +1,27 @@
-//! Where the bus of a process comes from.
+//! The bus that a process opens.
 
 use protocol::bus::{Bus, BusKind, Choice, Options};
 
 use super::Stopped;
 
-/// A bus that can be opened, and opened again.
+/// The parameters for opening a bus, also repeatedly.
 #[derive(Clone, Debug)]
 pub struct Line {
-    /// Its name.
+    /// The name of the bus.
     pub name: String,
-    /// What kind of bus it shall be.
+    /// The requested kind of bus.
     pub choice: Choice,
-    /// Whether wires between cells are simulated on it, which no real bus may carry.
+    /// True if wires between cells are simulated on the bus, which must then not be real hardware.
     pub wires: bool,
-    /// Whether to open it again when it is gone, instead of stopping.
+    /// True to open the bus again after it has closed, instead of stopping.
     pub reconnect: bool,
 }
 
 impl Line {
-    /// Opens it.
+    /// Opens the bus.
     ///
     /// # Errors
-    /// When it cannot be used as requested.
+    /// Returns an error if the bus cannot be used as requested.
     pub fn open(&self, options: &Options) -> Result<Bus, Stopped> {
         let bus = Bus::open(&self.name, self.choice, options)?;
         if self.wires && bus.kind() == BusKind::SocketCan && !bus.is_virtual()? {

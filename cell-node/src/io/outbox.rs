@@ -1,17 +1,17 @@
-//! Frames that are to be sent, and whose packets they are.
+//! Frames to send, with the cells that count their packets.
 
 use protocol::can::Frame;
 
-/// Frames of the cells of a process, in the order in which they are to be sent.
+/// The frames of the cells of a process, in sending order.
 #[derive(Debug, Default)]
 pub(super) struct Outbox {
     frames: Vec<Frame>,
-    /// For the last frame of a packet: the place of the cell that counts it.
+    /// For the last frame of each packet, the index of the cell that counts it.
     ends: Vec<Option<usize>>,
 }
 
 impl Outbox {
-    /// Appends a packet of the cell at this place.
+    /// Appends a packet of the cell with this index.
     pub(super) fn push_packet(&mut self, place: usize, frames: impl IntoIterator<Item = Frame>) {
         self.frames.extend(frames);
         self.ends.resize(self.frames.len(), None);
@@ -26,18 +26,18 @@ impl Outbox {
         self.ends.push(None);
     }
 
-    /// The frames that wait.
+    /// Returns the pending frames.
     pub(super) fn frames(&self) -> &[Frame] {
         &self.frames
     }
 
-    /// Removes the first frames, which were sent.
+    /// Removes the first `count` frames after they were sent.
     pub(super) fn sent(&mut self, count: usize) {
         self.frames.drain(..count);
         self.ends.drain(..count);
     }
 
-    /// Removes all frames, which are lost: for each packet the place of the cell that counts it.
+    /// Removes all frames as lost. Returns the index of the counting cell for each packet.
     pub(super) fn lose(&mut self) -> impl Iterator<Item = usize> {
         self.frames.clear();
         self.ends.drain(..).flatten()

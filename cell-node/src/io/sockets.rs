@@ -1,4 +1,4 @@
-//! The sockets of a process: one wakes it, the other is only read while it is awake (deferred receive).
+//! The two sockets of a process: one wakes it, the other is read only while it is awake (deferred receive).
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -13,53 +13,55 @@ use super::Stopped;
 /// The receive filters of a process.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub(super) struct Hearing {
-    /// Of the socket that wakes it.
+    /// Filters of the socket that wakes the process.
     pub(super) at_once: Vec<Filter>,
-    /// Of the socket that is read before frames that woke it.
+    /// Filters of the deferred socket, which is read before frames that woke the process.
     pub(super) deferred: Vec<Filter>,
 }
 
-/// How long after a filter was taken from the second socket frames may still come there.
+/// Time for which frames may still arrive at the deferred socket after a filter was removed from it.
 const SETTLED: Duration = Duration::from_millis(50);
-/// Batches that are read from the second socket at once: what its buffer holds.
+/// Number of batches read from the deferred socket at once: the capacity of its buffer.
 const BATCHES: usize = 16;
 
 /// The open bus, and a second socket for deferred frames.
 ///
-/// Waking a process costs more than processing a frame, so a frame that is only needed together with a later one, or
-/// need only be counted, does not wake it.
+/// Waking a process costs more than processing a frame. A frame that is only needed together with a later
+/// one, or is only counted, therefore does not wake it.
 #[derive(Debug)]
 pub struct Sockets {
     bus: Bus,
     deferred: Bus,
-    /// In a network a frame comes before most timers; a cell that rests is woken by timers alone.
+    /// True for cells in a network, where a frame arrives before most timers are due; only timers wake a
+    /// resting cell.
     is_network: bool,
-    /// The second socket has filters.
+    /// True if the deferred socket has filters.
     keeps: bool,
-    /// Until then they may belong to those that wake, because a filter was moved.
+    /// Until this time, frames at the deferred socket may belong to the waking socket, because a filter was
+    /// moved.
     settled: Option<Instant>,
-    /// Received deferred, and not taken yet.
+    /// Frames from the deferred socket that have not been processed yet.
     deferred_frames: VecDeque<Received>,
     inbox: Inbox,
-    /// Received by the socket that wakes the process.
+    /// Frames from the waking socket.
     woke: Inbox,
-    /// Both, in the order of the kernel's time stamps.
+    /// Frames from both sockets, in the order of the kernel's time stamps.
     came: Vec<Arrived>,
 }
 
-/// A frame that was received.
+/// A received frame.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Arrived {
     pub(super) received: Received,
-    /// It was deferred, and came before anything that woke the process: it waited because it could.
+    /// True if it was deferred and arrived before any frame that woke the process.
     pub(super) waited: bool,
 }
 
 impl Sockets {
-    /// Opens the bus.
+    /// Opens both sockets.
     ///
     /// # Errors
-    /// When it cannot be used as requested.
+    /// Returns an error if the bus cannot be used as requested.
     pub(super) fn open(line: &Line, options: &Options, deferred: &[Filter]) -> Result<Self, Stopped> {
         let second = Options { filters: deferred.to_vec(), own_frames: false, ..options.clone() };
         Ok(Self {
@@ -102,18 +104,18 @@ impl Sockets {
         self.bus.send(frames)
     }
 
-    /// Drops the last frames and receives those that are there, for a timer that was due at a wall's time in ns; whether
-    /// there are any.
+    /// Receives pending frames without waiting, before a timer that was due at a wall clock time in ns.
+    /// Returns true if there are any.
     pub(super) fn look(&mut self, due_nanos: u64) -> Result<bool, BusError> {
         self.clear();
         self.bus.receive(&mut self.woke)?;
-        // Also what a late server put there after it was settled.
+        // Includes frames that a slow server delivered after the settling time.
         self.receive_deferred()?;
         self.order(due_nanos);
         Ok(!self.came.is_empty())
     }
 
-    /// Drops the last frames and waits for one that wakes; the deferred ones are received with it.
+    /// Waits for a frame that wakes the process, and receives it with the deferred ones.
     pub(super) fn wait(&mut self, wait: Duration) -> Result<(), BusError> {
         self.clear();
         if let Some(settled) = self.settled {
@@ -158,8 +160,8 @@ impl Sockets {
         Ok(())
     }
 
-    /// Puts the frames of both in order. Deferred ones from before the first that woke the process, and before `until`,
-    /// waited because they could.
+    /// Merges the frames of both sockets in order. Deferred frames from before the first waking frame, and
+    /// before `until`, are marked as having waited.
     fn order(&mut self, until: u64) {
         let until = self.woke.frames().next().map_or(until, |first| first.at_nanos.min(until));
         let mut earlier = |than: u64, came: &mut Vec<Arrived>| {
@@ -172,19 +174,19 @@ impl Sockets {
             earlier(received.at_nanos, &mut self.came);
             self.came.push(Arrived { received, waited: false });
         }
-        // When more of those that wake are waiting, they come first.
+        // If the waking socket has more pending frames, those come first.
         if self.woke.frames().len() < BATCH {
             earlier(u64::MAX, &mut self.came);
         }
     }
 
-    /// The frames received last.
+    /// Returns the frames of the last receive.
     pub(super) fn frames(&self) -> &[Arrived] {
         &self.came
     }
 }
 
-/// What is in one list and not in the other.
+/// Returns the elements of the first list that are not in the second.
 fn only_in(these: &[Filter], those: &[Filter]) -> Vec<Filter> {
     these.iter().filter(|filter| !those.contains(filter)).copied().collect()
 }

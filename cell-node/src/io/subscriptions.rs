@@ -1,4 +1,4 @@
-//! Which cell of a process receives which frames.
+//! Subscriptions: the frames that each cell of a process receives.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,7 +9,7 @@ use protocol::port::{FLAG, LinkId};
 
 use super::sockets::Hearing;
 
-/// The frames of all simulated wires of a bus.
+/// Passes the frames of all simulated wires of a bus.
 const ALL_WIRES: Filter = Filter { id: EXTENDED | FLAG, mask: EXTENDED | REMOTE | FLAG };
 
 /// The receiving cells, as indices within the process, by identifier and by link id.
@@ -23,7 +23,7 @@ pub(super) struct Subscriptions {
 #[derive(Debug, Default)]
 struct Heard {
     by: Vec<usize>,
-    /// At least one receiver has to be woken for it.
+    /// True if at least one receiver must be woken for it.
     wakes: bool,
 }
 
@@ -33,8 +33,7 @@ impl Subscriptions {
         self.by_link_id.insert(link_id, (cell, port));
     }
 
-    /// Replaces all subscriptions to identifiers by these: cell, identifier, and whether it may be received
-    /// deferred.
+    /// Replaces all subscriptions to identifiers by these: cell, identifier, and true if it may be deferred.
     pub(super) fn listen(&mut self, hears: impl Iterator<Item = (usize, Id, bool)>) {
         self.by_id.clear();
         for (cell, id, deferred) in hears {
@@ -44,18 +43,18 @@ impl Subscriptions {
         }
     }
 
-    /// The cells that receive an identifier.
+    /// Returns the cells that receive an identifier.
     pub(super) fn of_id(&self, id: Id) -> &[usize] {
         self.by_id.get(&id).map_or(&[], |heard| &heard.by)
     }
 
-    /// The cell, and its port, that receives a link id.
+    /// Returns the cell and port that receive a link id.
     pub(super) fn of_link_id(&self, link_id: LinkId) -> Option<(usize, usize)> {
         self.by_link_id.get(&link_id).copied()
     }
 
-    /// One exact filter for each identifier and each link id. If these are more than a socket takes: one for each
-    /// kind that is received, and one for all wires.
+    /// Returns an exact filter for each identifier and link id. If these are too many for a socket, returns
+    /// one for each kind that is received, and one for all wires.
     pub(super) fn hearing(&self) -> Hearing {
         let ids = |wakes| self.by_id.iter().filter(move |(_, heard)| heard.wakes == wakes).map(|(id, _)| *id);
         let link_ids = self.by_link_id.keys().copied();

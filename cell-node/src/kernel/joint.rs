@@ -1,8 +1,8 @@
-//! Which joint moves a row.
+//! Joint indices that need no bounds checks.
 
 use protocol::parameters::MAX_JOINTS;
 
-/// A joint. There are no more than an array of joints has, so that no access to one is checked.
+/// A joint. There are as many as elements of a joint array, so the compiler can omit bounds checks.
 #[repr(u8)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Joint {
@@ -29,7 +29,7 @@ impl Joint {
         Self::J8, Self::J9, Self::J10, Self::J11, Self::J12, Self::J13, Self::J14,
     ];
 
-    /// It, of one thing for each joint.
+    /// Returns the element of this joint.
     #[inline(always)]
     pub(super) fn of<T>(self, joints: &[T; MAX_JOINTS]) -> Option<&T> {
         joints.get(self as usize)

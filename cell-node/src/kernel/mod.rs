@@ -1,4 +1,4 @@
-//! The cell's kernel: the effect of one newton on the cell on each joint.
+//! The cell's kernel: the effect of a one-newton force on the cell on each joint.
 //!
 //! It computes the paper's Eq. 8 for a cell on the link that joint k moves,
 //!
@@ -7,21 +7,22 @@
 //! tau_l = J_l F_z
 //! ```
 //!
-//! where z_(l-1) is the axis of joint l, t_i the cell's position and f the direction of the force. A
-//! contact pushes *against* the outward normal, f = -normal: press a cell, and the joint gives way.
-//! J is in m, so a newton on the cell makes J_l newton metres in joint l; of a prismatic joint it is a number, and
-//! makes newtons.
+//! where z_(l-1) is the axis of joint l, t_i the cell's position and f the direction of the force. A contact
+//! pushes *against* the outward normal, f = -normal: press a cell, and the joint yields. For revolute joints
+//! J_l is in m: a force of one newton on the cell causes a torque of J_l newton metres. For prismatic joints
+//! J_l is dimensionless, and the effect is a force in newtons.
 //!
-//! [`Wrench`] carries the contact's force and moment from the cell's link down to the base. J is at most 2 steps of
-//! 2^-14 m from the nearest word on a UR5, and on arms of any shape that reach less than 2 m within the 8 steps that every
-//! cell of up to 6 rows is allowed; each further row adds one. With the feature `oracle` there is a second kernel, the
-//! paper's, `oracle::Projection`, which has 2.5 times the operations and a larger mean error: tests, benchmarks and the
-//! paper's experiments compare the two.
+//! [`Wrench`] carries the contact's force and moment from the cell's link down to the base. On a UR5, its J
+//! is at most 2 steps of 2^-14 m from the nearest word. On arms of any shape that reach less than 2 m it
+//! stays within the 8 steps that every cell of up to 6 rows is allowed; each further row adds one. The
+//! feature `oracle` adds a second kernel, the paper's `oracle::Projection`, which takes 2.5 times the
+//! operations and has a larger mean error: tests, benchmarks and the paper's experiments compare the two.
 //!
-//! Any chain of 1 to 14 joints in up to 32 rows of standard Denavit-Hartenberg form will do: revolute, prismatic and
-//! fixed ones. Angles are words that wrap, `theta_l = q_l + theta_offset_l`. Twists of whole quarter turns cost no multiplication, other
-//! twists four for each vector; lengths that are zero cost nothing. Parameters that
-//! [`Parameters::check`] refuses are safe: with a joint k that does not exist, every J is zero.
+//! The kernels support any chain of 1 to 14 joints in up to 32 rows of standard Denavit-Hartenberg form:
+//! revolute, prismatic and fixed. Angles are words that wrap, `theta_l = q_l + theta_offset_l`. Twists of
+//! whole quarter turns need no multiplication, other twists four per vector; lengths of zero cost nothing.
+//! Parameters that [`Parameters::check`] refuses are safe: for a joint k that does not exist, every J is
+//! zero.
 
 mod joint;
 #[cfg(feature = "oracle")]
@@ -38,20 +39,21 @@ use protocol::parameters::{MAX_JOINTS, Parameters, Row};
 
 use crate::sine::FINE;
 
-/// A way to compute the Jacobian of a cell's normal force.
+/// A method to compute the Jacobian of a cell's normal force.
 pub trait Kernel<S: Scalar = Q1_14>: Sized {
-    /// Prepares what does not depend on the joints: once per configuration, not in the loop.
+    /// Prepares the part that does not depend on the joints, once per configuration.
     ///
-    /// Never panics, whatever the words are.
+    /// Never panics, for any words.
     fn new(parameters: &Parameters) -> Self;
 
-    /// Writes J_l in m, [-2, 2), for the joints l = 1..=k that move the cell, and leaves the others as they are: from
-    /// joint positions in quarter turns; of prismatic joints a number, from positions in m.
+    /// Writes J_l for the joints l = 1..=k that move the cell, and leaves the other elements unchanged.
+    /// `joints` are positions in quarter turns, or in m for prismatic joints. J_l is in m, in the range [-2,
+    /// 2), and dimensionless for prismatic joints.
     ///
-    /// Never panics and never wraps: what does not fit is held at the ends of its range. Bounded work.
+    /// Never panics and never wraps: out-of-range values saturate. The work is bounded.
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]);
 
-    /// The same, returned; zero for l > k.
+    /// Returns J_l; zero for l > k.
     #[must_use]
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
         let mut jacobian = [S::from_number(S::Number::zero()); MAX_JOINTS];
@@ -60,42 +62,42 @@ pub trait Kernel<S: Scalar = Q1_14>: Sized {
     }
 }
 
-/// The rows from the base to the cell; none where they have not the joints that are to move it, as in parameters that
-/// [`Parameters::check`] refuses.
+/// Returns the rows from the base to the cell. Returns no rows if their number of joints is inconsistent, as
+/// in parameters that [`Parameters::check`] refuses.
 fn chain(parameters: &Parameters) -> &[Row] {
     let chain = parameters.chain();
     let joints = chain.iter().filter(|row| row.moves()).count();
     if joints == usize::from(parameters.joint) && joints <= MAX_JOINTS { chain } else { &[] }
 }
 
-/// A length of the robot's table; none where it is zero, for then it costs nothing.
+/// Returns a length of the robot's table; `None` for zero, which then costs nothing.
 fn length<N: Number>(word: Q1_14) -> Option<N> {
     (word != Q1_14::ZERO).then(|| N::word(word))
 }
 
-/// Where this is called the compiler keeps out of the straight path.
+/// Marks a branch as unlikely, so that the compiler keeps it out of the main path.
 #[cold]
 #[inline(always)]
 const fn seldom() {}
 
-/// Sine and cosine of a constant angle.
+/// Returns sine and cosine of a constant angle.
 fn settled_turn<N: Number>(angle: Q1_14) -> [N; 2] {
     let [sine, cosine, _] = N::fine_turn(angle);
     [N::settle::<FINE>(sine), N::settle::<FINE>(cosine)]
 }
 
-/// How a link's twist alpha turns y and z into each other.
+/// The rotation of y and z by a link's twist alpha.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Twist<N> {
-    /// Not at all.
+    /// No rotation.
     None,
-    /// By a quarter turn.
+    /// A quarter turn.
     Ahead,
-    /// By half a turn.
+    /// Half a turn.
     Half,
-    /// By a quarter turn the other way.
+    /// A quarter turn backwards.
     Back,
-    /// By any other angle.
+    /// Any other angle.
     Other { sine: N, cosine: N },
 }
 

@@ -1,7 +1,8 @@
-//! Comparisons for the cell's kernel: the paper's method, its sine, real numbers, and operation counts.
+//! Alternatives to compare the cell's kernel with: the paper's method and sine, real numbers, and operation
+//! counts.
 //!
-//! Cells are built without this module, the feature `oracle`. [`Projection`] computes the same Jacobian as [`Wrench`] by the paper's way:
-//! it carries the frames from the base up to the cell (Eq. 20 to 25).
+//! Cells are built without this module (feature `oracle`). [`Projection`] computes the same Jacobian as
+//! [`Wrench`] with the paper's method: it carries the frames from the base up to the cell (Eq. 20 to 25).
 //!
 //! | UR5, cell on the last link | mul | add | sin | cos | mean torque error | max |
 //! |---|---|---|---|---|---|---|
@@ -9,9 +10,10 @@
 //! | [`Projection`] | 103 | 56 | 6 | 6 | 1.4e-4 Nm | 1.5e-3 Nm |
 //! | the paper (Eq. 27) | 103 | 57 | 6 | 6 | 5.4e-3 Nm | |
 //!
-//! The operations are counted by running the code on numbers that count, `Counted`; real numbers, `f64`, have neither
-//! rounding nor a sine of their own. Both need the feature `std` too. The errors, of Q3.12 words against Eq. 8 in double
-//! precision, are bounds over 300 poses with up to 6 N. `cargo run -p cell-node --example kernels` prints what was measured.
+//! The operations are counted by running the code with the number type `Counted`. Real numbers, `f64`, have
+//! no rounding and use the library's sine. Both also need the feature `std`. The errors, of Q3.12 words
+//! against Eq. 8 in double precision, are bounds over 300 poses with up to 6 N. `cargo run -p cell-node
+//! --example kernels` prints the measured values.
 //!
 //! [`Wrench`]: super::Wrench
 
@@ -28,7 +30,7 @@ use protocol::fixed::Q1_14;
 use super::Word;
 use crate::sine::paper::paper_sine_cosine;
 
-/// The words that the cell computes with, but with the paper's fifth-order sine (Eq. 17 to 19).
+/// The cell's words, but with the paper's fifth-order sine (Eq. 17 to 19).
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct PaperWord(pub Q1_14);
 

@@ -1,24 +1,24 @@
-//! How sums become words: held at the ends of their range, or known to be within it.
+//! Rounding of sums to words: with saturation, or without it where the range is known.
 
 use super::Number;
 
-/// How sums become words.
+/// A way to round sums to words.
 pub(super) trait Rounding {
-    /// The sum of two products, in each of which one factor is within 1.
+    /// Rounds the sum of two products, in each of which one factor is within [-1, 1].
     fn sum<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N;
-    /// The difference of the same.
+    /// Rounds the difference of two such products.
     fn difference<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N;
-    /// A number and a product.
+    /// Rounds a number plus a product.
     fn more<N: Number>(number: N, product: N::Wide) -> N;
-    /// A number less a product.
+    /// Rounds a number minus a product.
     fn less<N: Number>(number: N, product: N::Wide) -> N;
-    /// A number and a product, less another one.
+    /// Rounds a number plus a product, minus another one.
     fn more_and_less<N: Number>(number: N, more: N::Wide, less: N::Wide) -> N;
-    /// The negative.
+    /// Negates a number.
     fn negative<N: Number>(number: N) -> N;
 }
 
-/// What does not fit is held at the ends of the range.
+/// Rounding with saturation.
 pub(super) enum Held {}
 
 impl Rounding for Held {
@@ -53,7 +53,7 @@ impl Rounding for Held {
     }
 }
 
-/// All fits.
+/// Rounding of numbers that are known to fit.
 pub(super) enum Bounded {}
 
 impl Rounding for Bounded {

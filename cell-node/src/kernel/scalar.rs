@@ -1,4 +1,4 @@
-//! The number that a kernel computes with: fixed point on the cell; other types for tests and counts.
+//! The number type of a kernel: fixed point on the cell, other types for tests and operation counts.
 
 use core::fmt::Debug;
 use core::marker::PhantomData;
@@ -8,122 +8,123 @@ use protocol::fixed::{Acc, Q1_14};
 
 use crate::sine::{FINE, fine_sine_cosine, sine_cosine};
 
-/// What a kernel returns, and by which numbers it computes it.
+/// The result type of a kernel, and the number type of its computation.
 pub trait Scalar: Copy {
-    /// What it is computed with.
+    /// The number type of the computation.
     type Number: Number;
 
-    /// A result.
+    /// Converts a result.
     fn from_number(number: Self::Number) -> Self;
 }
 
-/// A number that the kernels can compute with, and the wider sums of products in which they do it.
+/// A number type for kernels, with the wider type of its sums of products.
 ///
-/// Words of state are rounded once per sum of products; nothing else loses bits.
+/// Words are rounded once per sum of products; no other operation loses bits.
 pub trait Number: Copy + Debug + PartialEq {
-    /// A sum of products, before it is rounded.
+    /// A sum of products before rounding.
     type Wide: Copy;
-    /// What constants are computed with, once, when a kernel is built. An integer here counts steps
-    /// whose size the program follows; see [`Number::settle`].
+    /// The type for constants, which are computed once when a kernel is created. For integers it counts
+    /// steps, whose size the code tracks; see [`Number::settle`].
     type Fine: Copy
         + Add<Output = Self::Fine>
         + Sub<Output = Self::Fine>
         + Mul<Output = Self::Fine>
         + Neg<Output = Self::Fine>;
 
-    /// The number that a parameter's word means.
+    /// Converts a parameter's word.
     fn word(word: Q1_14) -> Self;
-    /// Nothing.
+    /// Returns zero.
     #[must_use]
     fn zero() -> Self {
         Self::word(Q1_14::ZERO)
     }
-    /// The product.
+    /// Multiplies two numbers.
     fn times(self, rhs: Self) -> Self::Wide;
-    /// The number as a sum.
+    /// Converts a number to a sum.
     fn widen(self) -> Self::Wide;
-    /// The sum.
+    /// Adds two sums.
     fn plus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide;
-    /// The difference.
+    /// Subtracts two sums.
     fn minus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide;
     /// Rounds a sum to the nearest word, ties up, and saturates.
     fn round(sum: Self::Wide) -> Self;
-    /// The sum of two products, or of a number and a product, that is rounded: quicker than [`Number::plus`]. In each of
-    /// two products one factor must be within 1, as sines are.
+    /// Adds two products, or a number and a product, and rounds; faster than [`Number::plus`] with
+    /// [`Number::round`]. In each of two products one factor must be within [-1, 1], as sines are.
     #[must_use]
     fn rounded_sum(lhs: Self::Wide, rhs: Self::Wide) -> Self {
         Self::round(Self::plus(lhs, rhs))
     }
-    /// The difference of the same, rounded.
+    /// Subtracts two such terms and rounds.
     #[must_use]
     fn rounded_difference(lhs: Self::Wide, rhs: Self::Wide) -> Self {
         Self::round(Self::minus(lhs, rhs))
     }
-    /// The negative.
+    /// Negates a number.
     #[must_use]
     fn negative(self) -> Self;
-    /// The sum, where it is known to be within the range of a word.
+    /// Adds two sums whose result is known to fit a word.
     fn bounded_plus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide {
         Self::plus(lhs, rhs)
     }
-    /// The difference, where it is known to be within the range of a word.
+    /// Subtracts two sums whose result is known to fit a word.
     fn bounded_minus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide {
         Self::minus(lhs, rhs)
     }
-    /// Rounds a sum that is known to be within the range of a word.
+    /// Rounds a sum that is known to fit a word.
     #[must_use]
     fn bounded(sum: Self::Wide) -> Self {
         Self::round(sum)
     }
-    /// The number and a product, rounded, where it is known to be within the range of a word.
+    /// Adds a product and rounds, if the result is known to fit a word.
     #[must_use]
     fn bounded_more(self, product: Self::Wide) -> Self {
         Self::round(Self::plus(self.widen(), product))
     }
-    /// The number less a product, of the same kind.
+    /// Subtracts a product and rounds, if the result is known to fit a word.
     #[must_use]
     fn bounded_less(self, product: Self::Wide) -> Self {
         Self::round(Self::minus(self.widen(), product))
     }
-    /// The negative of a number that is known not to be the smallest word.
+    /// Negates a number that is known not to be the smallest word.
     #[must_use]
     fn bounded_negative(self) -> Self {
         self.negative()
     }
-    /// The length of a vector in steps of 2^-14, rounded up; none where it is not known.
+    /// Returns the length of a vector in steps of 2^-14, rounded up; `None` if it is unknown.
     fn norm(vector: [Self; 3]) -> Option<u32>;
-    /// Sine and cosine of an angle in quarter turns.
+    /// Returns sine and cosine of an angle in quarter turns.
     fn sine_cosine(angle: Q1_14) -> [Self; 2];
-    /// The sum of two angles, wrapped into one turn.
+    /// Adds two angles, wrapped into one turn.
     #[must_use]
     fn plus_angle(lhs: Q1_14, rhs: Q1_14) -> Q1_14 {
         lhs.wrapping_add(rhs)
     }
 
-    /// A parameter's word, to compute a constant with.
+    /// Converts a parameter's word for the computation of a constant.
     fn fine(word: Q1_14) -> Self::Fine;
-    /// Sine, cosine and one, in the same steps (of 2^-28 where they are integers).
+    /// Returns sine, cosine and one in the same steps: 2^-28 for integers.
     fn fine_turn(angle: Q1_14) -> [Self::Fine; 3];
-    /// A computed constant as a word; where it is an integer, in steps of 2^-F.
+    /// Rounds a computed constant to a word. Integers are in steps of 2^-F.
     fn settle<const F: u32>(constant: Self::Fine) -> Self;
 }
 
-/// A number of 16 bits in the format Q1.14, computed with as [`Steps`].
+/// A 16-bit number in the format Q1.14, for computations with [`Steps`].
 pub trait Word: Copy + Debug + PartialEq {
-    /// The number that a word means.
+    /// Creates the number from a word.
     fn from_word(word: Q1_14) -> Self;
-    /// The word.
+    /// Returns the word.
     fn to_word(self) -> Q1_14;
-    /// Sine and cosine of an angle in quarter turns, in steps of 2^-14, of seventh order unless it says otherwise.
+    /// Returns sine and cosine of an angle in quarter turns, in steps of 2^-14. The default is the
+    /// seventh-order polynomial.
     #[must_use]
     fn sine_cosine(angle: Q1_14) -> [i32; 2] {
         sine_cosine(angle)
     }
-    /// Takes note of an operation, if it counts them.
+    /// Records an operation, if this type counts operations.
     fn note(_operation: impl FnOnce(&mut Operations)) {}
 }
 
-/// How often a computation did what.
+/// Operation counts of a computation.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Operations {
     /// Multiplications of two words.
@@ -142,7 +143,7 @@ pub struct Operations {
     pub roundings: u32,
 }
 
-/// What the cell computes with.
+/// The cell's number type.
 impl Word for Q1_14 {
     fn from_word(word: Q1_14) -> Self {
         word
@@ -163,7 +164,8 @@ impl<W: Word> Scalar for W {
     }
 }
 
-/// Steps of 2^-14 within the range of a word, as wide as a processor's register; products and sums take 32 bits too.
+/// Steps of 2^-14 within the range of a word, stored in 32 bits, the width of a register. Products and sums
+/// also take 32 bits.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Steps<W> {
     steps: i32,
@@ -176,7 +178,7 @@ impl<W> Steps<W> {
         Self { steps, of: PhantomData }
     }
 
-    /// Steps of 2^-28 that are already half a step of 2^-14 too many.
+    /// Converts steps of 2^-28, to which half a step of 2^-14 has been added, with saturation.
     #[inline]
     fn held(sum: i32) -> Self {
         let steps = sum >> 14;
@@ -186,13 +188,14 @@ impl<W> Steps<W> {
     }
 }
 
-/// Steps of 2^-28 in steps of 2^-14, rounded, ties up. In two steps, because the half that is added fits an instruction.
+/// Rounds steps of 2^-28 to steps of 2^-14, ties up. Shifting twice keeps the added half small enough for an
+/// immediate operand.
 #[inline]
 const fn to_steps(sum: i32) -> i32 {
     ((sum >> 13) + 1) >> 1
 }
 
-/// What is known to be a word.
+/// Checks in debug builds that steps fit a word.
 #[inline]
 fn within_word(steps: i32) -> i32 {
     debug_assert!(i16::try_from(steps).is_ok(), "{steps} is no word");
@@ -240,7 +243,7 @@ impl<W: Word> Number for Steps<W> {
         Self::held(sum.saturating_add(HALF))
     }
 
-    /// At most 2^29 + 2^30 steps of 2^-28.
+    /// The sum is at most 2^29 + 2^30 steps of 2^-28.
     #[inline]
     fn rounded_sum(lhs: i32, rhs: i32) -> Self {
         W::note(|done| (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1));
@@ -298,7 +301,7 @@ impl<W: Word> Number for Steps<W> {
         Some(square.isqrt() + 1)
     }
 
-    /// The smallest word becomes the largest.
+    /// Negates; the smallest word becomes the largest.
     #[inline]
     fn negative(self) -> Self {
         W::note(|done| done.negations += 1);

@@ -1,8 +1,8 @@
-//! The wrench kernel: the contact, carried down the chain.
+//! The wrench kernel: carries the contact force and moment down the chain.
 //!
-//! Eq. 8 is a scalar triple product, and a contact on a link is a constant wrench in that link's frame:
-//! the force f and its moment m = t x f about the frame's origin. From frame l to frame l-1, whose
-//! transform is `Rz(theta_l) Tz(d_l) Tx(a_l) Rx(alpha_l)`, the wrench goes in three steps:
+//! Eq. 8 is a scalar triple product, and a contact on a link is a constant wrench in that link's frame: the
+//! force f and its moment m = t x f about the frame's origin. From frame l to frame l-1, whose transform is
+//! `Rz(theta_l) Tz(d_l) Tx(a_l) Rx(alpha_l)`, the wrench is transformed in three steps:
 //!
 //! ```text
 //! twist   f, m by Rx(alpha_l)
@@ -11,10 +11,11 @@
 //! turn    f, m by Rz(theta_l)
 //! ```
 //!
-//! A prismatic joint adds its position to d, a revolute one to theta; a fixed row has neither. The turn leaves m_z and
-//! f_z alone, so J_l can be read before it, and the base's own angle theta_1 is never needed. Twist and shift of the row
-//! that carries the cell are constant, but for a slide, as are fixed rows right below it: they are folded into the six
-//! stored words. What nobody reads further down the chain is not computed: [`Live`] says what is, worked out once.
+//! A prismatic joint adds its position to d, a revolute joint to theta; a fixed row has neither. The turn
+//! does not change m_z and f_z, so J_l can be read before it, and the base's own angle theta_1 is never
+//! needed. Twist and shift of the row that carries the cell are constant, except for the position of a
+//! prismatic joint, as are fixed rows right below it: they are folded into the six stored words. Components
+//! that no row further down reads are not computed: [`Live`] tracks them, once per configuration.
 
 mod fold;
 mod range;
@@ -29,111 +30,110 @@ use super::rounding::{Bounded, Held, Rounding};
 use super::{Kernel, Number, Scalar, Twist, chain, length, seldom, settled_turn};
 use crate::contact::{MAX_J, TorqueRounding};
 
-/// The wrench kernel, of one cell.
+/// The wrench kernel of one cell.
 ///
-/// For a UR5 and a cell on its last link: 40 multiplications, 24 additions or subtractions, 5 sines and
-/// 5 cosines. Over 300 poses of a UR5 the torques err by 1.2e-4 Nm in the mean and 1.5e-3 Nm at most.
+/// For a UR5 and a cell on its last link: 40 multiplications, 24 additions or subtractions, 5 sines and 5
+/// cosines. Over 300 poses of a UR5 the mean torque error is 1.2e-4 Nm and the maximum 1.5e-3 Nm.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Wrench<S: Scalar = Q1_14> {
-    /// The joint that moves the cell; 0 when there is none.
+    /// The joint that moves the cell; 0 if there is none.
     joint: usize,
     /// The contact's wrench, twisted and shifted by the row of joint k.
     contact: Wrenched<S::Number>,
-    /// From joint k's row down to the base; the first `rows` are in use.
+    /// The links from joint k's row down to the base; the first `rows` are in use.
     links: [Link<S::Number>; MAX_ROWS],
     rows: usize,
-    /// What no |J| is beyond, in steps of 2^-14, wherever the joints are. Below [`MAX_J`] no number on the way can leave the
-    /// range of a word either; then nothing is held.
+    /// Upper bound of |J| in steps of 2^-14, for any joint positions. If it is below [`MAX_J`], no
+    /// intermediate number can leave the range of a word either, and saturation is omitted.
     bound: u16,
-    /// How torques of this J become words.
+    /// The conversion of torques of this J to words.
     rounding: TorqueRounding,
 }
 
-/// A force of one newton and its moment in m (that is, Nm per N); or something that is known of each of their
-/// components.
+/// A force of one newton and its moment in m (Nm per N); or a property of each of their components.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Wrenched<T> {
     force: [T; 3],
     moment: [T; 3],
 }
 
-/// Which components of a wrench are used.
+/// The components of a wrench that are used.
 type Live = Wrenched<bool>;
 
 impl Live {
     const NOTHING: Self = Self { force: [false; 3], moment: [false; 3] };
     const ALL: Self = Self { force: [true; 3], moment: [true; 3] };
 
-    /// The same of both.
+    /// Applies a function to force and moment.
     fn each(self, before: impl Fn([bool; 3]) -> [bool; 3]) -> Self {
         Self { force: before(self.force), moment: before(self.moment) }
     }
 }
 
 /// The steps from the frame of a row to the one below.
-// In this order: what is read first lies where a short instruction of a Cortex-M0 reaches it.
+// In this order, the fields that are read first are in reach of a short instruction of a Cortex-M0.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Link<N> {
-    /// What has to be computed: bits of [`due`].
+    /// The values to compute: bits of [`due`].
     due: u32,
-    /// Which joint moves it; of a fixed row the one above it.
+    /// The joint of the row; for a fixed row, the joint above it.
     joint: Joint,
     kind: RowKind,
     a: Q1_14,
-    /// Without the position of a prismatic joint.
+    /// The offset without the position of a prismatic joint.
     d: Q1_14,
     /// theta_offset.
     offset: Q1_14,
     twist: Twist<N>,
-    /// Sine and cosine of theta_offset, where the row does not turn; none of a zero.
+    /// Sine and cosine of theta_offset, if the row does not turn; `None` for an offset of zero.
     constant: Option<[N; 2]>,
 }
 
-/// What of a row is computed, because its own row of J or a row further down reads it.
+/// The values that are computed for a row, because its own element of J or a row further down reads them.
 mod due {
-    /// Each of what the turn computes.
+    /// Each result of the turn.
     pub(super) const FX: u32 = 1;
     pub(super) const FY: u32 = 2;
     pub(super) const MX: u32 = 4;
     pub(super) const MY: u32 = 8;
-    /// All of it.
+    /// All results of the turn.
     pub(super) const TURN: u32 = FX | FY | MX | MY;
-    /// The moments that d shifts.
+    /// The shift of moments by d.
     pub(super) const D: u32 = 16;
-    /// The moments that a shifts.
+    /// The shift of moments by a.
     pub(super) const A: u32 = 32;
-    /// Each of what a twist computes that is none by quarter turns.
+    /// Each result of a twist that is not a multiple of quarter turns.
     pub(super) const TWISTED_FY: u32 = 64;
     pub(super) const TWISTED_FZ: u32 = 128;
     pub(super) const TWISTED_MY: u32 = 256;
     pub(super) const TWISTED_MZ: u32 = 512;
-    /// By how much it is twisted.
+    /// Twists by multiples of quarter turns.
     pub(super) const AHEAD: u32 = 1 << 11;
     pub(super) const BACK: u32 = 1 << 12;
     pub(super) const HALF: u32 = 1 << 13;
-    /// A row without a joint.
+    /// The row has no joint.
     pub(super) const PASS: u32 = 1 << 14;
-    /// All that a turn can compute.
+    /// The turn has all results.
     pub(super) const ALL: u32 = 1 << 15;
-    /// A twist, or no joint.
+    /// The row has a twist or no joint.
     pub(super) const MORE: u32 = 1 << 16;
 }
 
 impl<S: Scalar> Wrench<S> {
-    /// What no |J| is beyond, in steps of 2^-14, wherever the joints are; [`MAX_J`] where that is not known.
+    /// Returns an upper bound of |J| in steps of 2^-14, for any joint positions; [`MAX_J`] if it is unknown.
     #[must_use]
     pub const fn bound(&self) -> u16 {
         self.bound
     }
 
-    /// How torques of J become words, in the format of the parameters.
+    /// Returns the conversion of torques of J to words, in the format of the parameters.
     #[must_use]
     pub const fn rounding(&self) -> &TorqueRounding {
         &self.rounding
     }
 
-    /// The kernel of no cell: every J is zero.
+    /// Returns a kernel without a cell: every J is zero.
     pub(crate) fn nothing() -> Self {
         Self {
             joint: 0,
@@ -145,7 +145,7 @@ impl<S: Scalar> Wrench<S> {
         }
     }
 
-    /// Becomes the kernel of these parameters, in its place: it is large for a stack.
+    /// Prepares the kernel for these parameters in place, because it is large for a stack.
     pub(crate) fn prepare(&mut self, parameters: &Parameters) {
         let chain = chain(parameters);
         let mut read = Live::NOTHING; // by the rows further down: nothing below joint 1
@@ -158,7 +158,7 @@ impl<S: Scalar> Wrench<S> {
         }
         let nothing = Wrenched { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] };
         let mut contact = chain.last().map_or(nothing, |last| fold(&parameters.pose, last));
-        // Fixed rows between the cell and the joint that moves it.
+        // Fold fixed rows between the cell and the joint that moves it.
         let mut rows = chain.len();
         let is_fixed = |row: Option<&Row>| row.is_some_and(|row| row.kind == RowKind::Fixed);
         while is_fixed(rows.checked_sub(1).and_then(|last| chain.get(last))) {
@@ -167,7 +167,7 @@ impl<S: Scalar> Wrench<S> {
             rows -= 1;
             above.turn_by_offset(&mut contact);
             if let Some(row) = rows.checked_sub(1).and_then(|last| chain.get(last)) {
-                // Not the slide of a prismatic joint.
+                // Without the position of a prismatic joint.
                 let link = Link::new(row, Live::ALL).0;
                 link.twist_and_shift::<Held>(&mut contact, length(row.d));
             }
@@ -203,8 +203,8 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
     }
 }
 
-/// The contact's wrench down to the base, and J on the way, of revolute joints and fixed rows: where no number can leave
-/// its range.
+/// Carries the contact's wrench down to the base and writes J, for chains of revolute joints and fixed rows
+/// in which no number can leave its range.
 #[inline(always)]
 fn down_bounded<S: Scalar>(
     mut wrench: Wrenched<S::Number>,
@@ -232,12 +232,12 @@ fn down_bounded<S: Scalar>(
             }
             link.twist_by_alpha::<Bounded>(&mut wrench);
         }
-        // Only now: it would be in the way of the twist.
+        // Only now, because it would delay the twist.
         Link::shift::<Bounded>(&mut wrench, link.own_d(), link.own_a());
     }
 }
 
-/// The same of any chain.
+/// Like [`down_bounded`], for any chain, with saturation.
 #[inline(never)]
 fn down<'a, S: Scalar + 'a>(
     mut wrench: Wrenched<S::Number>,
@@ -256,7 +256,7 @@ fn down<'a, S: Scalar + 'a>(
                 .map_or_else(|| link.own_d(), |slide| Some(S::Number::word(link.d.saturating_add(slide))));
             link.twist_and_shift::<Held>(&mut wrench, d);
         } else if let Some(slide) = slide {
-            // Its own row is folded, without the slide.
+            // The own row is folded without the position of its joint.
             let d = Some(S::Number::word(slide));
             Link::shift::<Held>(&mut wrench, d, None);
         }
@@ -273,13 +273,14 @@ fn down<'a, S: Scalar + 'a>(
 }
 
 impl<N: Number> Link<N> {
-    /// The link of no row.
+    /// An unused link.
     const NOTHING: Self = {
         let (joint, kind, zero) = (Joint::J1, RowKind::Revolute, Q1_14::ZERO);
         Self { due: 0, joint, kind, a: zero, d: zero, offset: zero, twist: Twist::None, constant: None }
     };
 
-    /// The link of a row, when the rows below it read `read` of what it turned; and what it reads itself.
+    /// Returns the link of a row whose results `read` the rows below read, and the components that the row
+    /// itself reads.
     fn new(row: &Row, read: Live) -> (Self, Live) {
         let twist = Twist::new(row.alpha);
         let (a, d) = (row.a != Q1_14::ZERO, row.d != Q1_14::ZERO);
@@ -287,7 +288,7 @@ impl<N: Number> Link<N> {
         let constant = (!turns && row.theta_offset != Q1_14::ZERO).then(|| settled_turn(row.theta_offset));
         let slides = row.kind == RowKind::Prismatic;
 
-        // Backwards: the turn, the shift, whose m_z is J, the twist.
+        // Backwards: the turn, the shift (whose m_z is J), the twist.
         let shifted = if turns || constant.is_some() { read.each(before_turn) } else { read };
         let ([fx, fy, mut fz], [mx, my, mut mz]) = (shifted.force, shifted.moment);
         (fz, mz) = (fz || slides, mz || turns);
@@ -326,26 +327,26 @@ impl<N: Number> Link<N> {
         self.due & bit != 0
     }
 
-    /// d where the row does not slide, and where somebody reads what it shifts.
+    /// Returns d, if its shift is read and the row has no prismatic joint.
     #[inline(always)]
     fn own_d(&self) -> Option<N> {
         self.is_due(due::D).then(|| N::word(self.d))
     }
 
-    /// a, where somebody reads what it shifts.
+    /// Returns a, if its shift is read.
     #[inline(always)]
     fn own_a(&self) -> Option<N> {
         self.is_due(due::A).then(|| N::word(self.a))
     }
 
-    /// `Tz(d) Tx(a) Rx(alpha)`.
+    /// Applies `Tz(d) Tx(a) Rx(alpha)`.
     #[inline(always)]
     fn twist_and_shift<R: Rounding>(&self, wrench: &mut Wrenched<N>, d: Option<N>) {
         self.twist_by_alpha::<R>(wrench);
         Self::shift::<R>(wrench, d, self.own_a());
     }
 
-    /// `Rx(alpha)`.
+    /// Applies `Rx(alpha)`.
     #[inline(always)]
     fn twist_by_alpha<R: Rounding>(&self, wrench: &mut Wrenched<N>) {
         let Wrenched { force: [_, fy, fz], moment: [_, my, mz] } = wrench;
@@ -364,7 +365,7 @@ impl<N: Number> Link<N> {
         }
     }
 
-    /// `Rx` of an angle that is no quarter turn, but only what is due.
+    /// Applies `Rx` with an angle that is not a multiple of quarter turns, computing only what is due.
     #[inline(never)]
     fn twist_by(&self, [sine, cosine]: [N; 2], wrench: &mut Wrenched<N>) {
         let Wrenched { force: [_, fy, fz], moment: [_, my, mz] } = *wrench;
@@ -385,7 +386,7 @@ impl<N: Number> Link<N> {
         }
     }
 
-    /// The moment about an origin that lies (a, 0, d) further down.
+    /// Moves the reference point of the moment by (a, 0, d) towards the base.
     #[inline(always)]
     fn shift<R: Rounding>(wrench: &mut Wrenched<N>, d: Option<N>, a: Option<N>) {
         let Wrenched { force: [fx, fy, fz], moment: [mx, my, mz] } = wrench;
@@ -407,7 +408,7 @@ impl<N: Number> Link<N> {
         }
     }
 
-    /// `Rz(theta)` of a revolute joint at this position, but only what is due.
+    /// Applies `Rz(theta)` of a revolute joint at this position, computing only what is due.
     #[inline(always)]
     fn turn<R: Rounding>(&self, wrench: &mut Wrenched<N>, position: Q1_14) {
         let turn = Turn(N::sine_cosine(N::plus_angle(position, self.offset)));
@@ -418,7 +419,7 @@ impl<N: Number> Link<N> {
         }
     }
 
-    /// `Rz(theta)` of a row that does not turn.
+    /// Applies `Rz(theta)` of a row that does not turn.
     fn turn_by_offset(&self, wrench: &mut Wrenched<N>) {
         if let Some(turn) = self.constant
             && self.is_due(due::TURN)
@@ -427,7 +428,7 @@ impl<N: Number> Link<N> {
         }
     }
 
-    /// A whole row without a joint.
+    /// Applies a whole row without a joint.
     #[inline(never)]
     fn pass(&self, wrench: &mut Wrenched<N>) {
         self.twist_and_shift::<Held>(wrench, self.own_d());
@@ -435,7 +436,7 @@ impl<N: Number> Link<N> {
     }
 }
 
-/// `Rz` by its sine and cosine.
+/// `Rz`, given by its sine and cosine.
 struct Turn<N>([N; 2]);
 
 impl<N: Number> Turn<N> {
@@ -457,7 +458,7 @@ impl<N: Number> Turn<N> {
         (*mx, *my) = (self.x::<R>(*mx, *my), self.y::<R>(*mx, *my));
     }
 
-    /// Only what is due.
+    /// Computes only what is due.
     #[inline(always)]
     fn some<R: Rounding>(&self, wrench: &mut Wrenched<N>, due: u32) {
         let Wrenched { force: [fx, fy, _], moment: [mx, my, _] } = *wrench;
@@ -477,7 +478,7 @@ impl<N: Number> Turn<N> {
     }
 }
 
-/// What must be there before a twist, for these to be there after it.
+/// Returns the components needed before a twist for these components after it.
 fn before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
     match twist {
         Twist::None | Twist::Half => [x, y, z],
@@ -486,7 +487,7 @@ fn before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
     }
 }
 
-/// What must be there before a turn about z, for these to be there after it.
+/// Returns the components needed before a turn about z for these components after it.
 fn before_turn([x, y, z]: [bool; 3]) -> [bool; 3] {
     [x || y, x || y, z]
 }

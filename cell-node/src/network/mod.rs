@@ -1,4 +1,4 @@
-//! How cells that are wired to each other become a tree, and stay one.
+//! The formation and repair of the tree of wired cells.
 //!
 //! ```text
 //!   message of a port ─> handle ─────┐             ┌─> poll_transmit ─> message for a port
@@ -6,13 +6,13 @@
 //!   no sum was taken ──> lose_parent ┘             └─> given ─────────> a node id for this cell
 //! ```
 //!
-//! A cell with a route to the root announces it in its hellos, with a [`Rank`]: its depth, and the round (version) of
-//! the tree. A cell without a parent sends a join to the nearest port whose rank is better than every rank that it had
-//! itself, and the neighbour answers with a grant. A cell's rank only improves, and a parent's is better than its
-//! child's: so the tree has no loops, whatever is lost or late. While no sums are sent, a cell moves to a port that is
-//! nearer than its parent, so that the tree does not stay deeper than necessary. Where no rank is good enough, the cell
-//! starts a local repair: it requests a new round, which is forwarded to the root and spreads from there as better
-//! ranks for all.
+//! A cell with a route to the root announces it in its hellos with a [`Rank`]: its depth, and the round
+//! (version) of the tree. A cell without a parent sends a join to the nearest port whose rank is better than
+//! any rank it had itself, and the neighbour answers with a grant. A cell's rank only improves, and a
+//! parent's is better than its child's, so the tree has no loops, even if messages are lost or late. While no
+//! sums are sent, a cell moves to a port that is nearer than its parent, so that the tree does not stay
+//! deeper than necessary. If no rank is good enough, the cell starts a local repair: it requests a new round,
+//! which is forwarded to the root and spreads from there as better ranks for all.
 
 mod node_ids;
 mod port;
@@ -29,44 +29,44 @@ use crate::phase;
 use node_ids::NodeIds;
 use port::Port;
 
-/// From one hello to the next.
+/// Interval of hellos.
 const HELLO: Span = Span::from_millis(250);
-/// How long a cell waits for a grant before it tries another port.
+/// Maximum time to wait for a grant before trying another port.
 const JOIN_TIMEOUT: Span = Span::from_millis(5);
-/// From one local repair to the next: the first interval, and the maximum.
+/// Interval of local repairs: the first, and the maximum.
 const REPAIR: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
-/// From one leave to the gateway's side to the next, until it acknowledges; it takes sums until then.
+/// Interval of leaves to the gateway's side until it acknowledges; it accepts sums until then.
 const AGAIN: Span = Span::from_millis(20);
-/// Ports, and a root's wire to the gateway's side.
+/// Number of ports, including a root's wire to the gateway's side.
 const ALL: usize = PORTS + 1;
-/// Outgoing messages, which a shell takes after every call.
+/// Capacity for outgoing messages, which the shell collects after every call.
 const OUTBOX: usize = 32;
 
-/// How a parent was lost, and so whether it may still take a sum.
+/// The reason for the loss of a parent, which determines whether the parent may still accept a sum.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(crate) enum Lost {
-    /// It did not take the last sums, or refuses this child: it takes no more.
+    /// The parent did not accept the last sums, or refuses this child: it accepts no more.
     Done,
-    /// The link is down in one direction, or the parent is unreachable itself: it may take sums until it acknowledges
-    /// the leave.
+    /// The link is down in one direction, or the parent is unreachable itself: it may accept sums until it
+    /// acknowledges the leave.
     Unsure,
 }
 
-/// The neighbour that takes this cell's sums.
+/// The neighbour that receives this cell's sums.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 struct Parent {
     port: usize,
     rank: Rank,
 }
 
-/// A parent that was left.
+/// A parent that this cell has left.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 struct FormerParent {
     port: usize,
-    /// It acknowledged: it takes no sum any more.
+    /// True after it acknowledged the leave: it accepts no more sums.
     heard: bool,
     since: Micros,
-    /// When the leave is resent.
+    /// The time to resend the leave.
     again: Micros,
 }
 
@@ -89,73 +89,74 @@ pub(crate) struct Network {
     node_ids: NodeIds,
     ports: [Port; ALL],
     parent: Option<Parent>,
-    /// The best rank that this cell ever had: only better ones are followed.
+    /// The best rank that this cell ever had; it follows only better ones.
     best: Option<Rank>,
-    /// The rank that was announced last, if any.
+    /// The last announced rank.
     offered: Option<Rank>,
     joining: Option<(usize, Micros)>,
-    /// Sums are being sent: a parent is not left without need.
+    /// True while sums are sent: the parent is then not changed without need.
     pub(crate) busy: bool,
-    /// The parent itself is unreachable.
+    /// True if the parent itself is unreachable.
     deserted: bool,
-    /// When the next local repair is due, and the interval after that.
+    /// The time of the next local repair, and the interval after it.
     repair: Option<(Micros, Span)>,
-    /// The last repair that was forwarded: its round, whether to all ports or to the parent only, and when.
+    /// The last forwarded repair: its round, true if it went to all ports instead of the parent only, and its
+    /// time.
     passed_on: Option<(u8, bool, Micros)>,
-    /// The parent that was left last.
+    /// The last parent that was left.
     former_parent: Option<FormerParent>,
     reported: Option<[PortState; PORTS]>,
-    /// How often the parent changed.
+    /// Number of changes of the parent.
     pub(crate) changes: u16,
-    /// The place in the tree has changed since this was read last.
+    /// True if the place in the tree has changed since the last read.
     pub(crate) tree_changed: bool,
     next_hello: Micros,
     outbox: Deque<(usize, PortMessage), OUTBOX>,
 }
 
 impl Network {
-    /// A cell that is not wired.
+    /// Creates the network of a cell without wires.
     pub(crate) fn new(now: Micros) -> Self {
         Self { next_hello: now, ..Self::default() }
     }
 
-    /// Wires are at the ports `wired`; hellos of many cells are spread by serial number.
+    /// Connects wires to the ports `wired`. The hellos of many cells are spread by serial number.
     pub(crate) fn wire(&mut self, wired: u8, number: Option<CellId>, serial: u32) {
         (self.wired, self.node_ids.own) = (wired, number);
         self.next_hello = self.next_hello + phase::by_serial(HELLO, serial);
     }
 
-    /// Whether it is wired at all.
+    /// Returns true if the cell has wires.
     pub(crate) const fn exists(&self) -> bool {
         self.wired != 0
     }
 
-    /// Whether a port receives: it is wired, and its link is not down.
+    /// Returns true if a port receives: it is wired, and its link is not down.
     pub(crate) const fn hears(&self, port: usize) -> bool {
         self.wired & !self.deaf & 1 << port != 0
     }
 
-    /// The port that leads to the parent.
+    /// Returns the port of the parent.
     pub(crate) fn up(&self) -> Option<usize> {
         self.parent.map(|parent| parent.port)
     }
 
-    /// Wires to the root of the tree; 0 is a root.
+    /// Returns the number of wires to the root of the tree; 0 for a root.
     pub(crate) fn depth(&self) -> Option<u8> {
         self.parent.map(|parent| parent.rank.depth)
     }
 
-    /// The rank that it announces to those below it.
+    /// Returns the rank that this cell announces to cells below it.
     fn rank(&self) -> Option<Rank> {
         self.parent.map(|parent| parent.rank.below())
     }
 
-    /// The round of its rank.
+    /// Returns the round of its rank.
     pub(crate) fn round(&self) -> u8 {
         self.best.map_or(0, |rank| rank.round)
     }
 
-    /// The parent's node id: 0 for the gateway's side.
+    /// Returns the parent's node id; 0 for the gateway's side.
     pub(crate) fn parent_node(&self) -> Option<u8> {
         match self.up()? {
             UPLINK => Some(0),
@@ -163,39 +164,39 @@ impl Network {
         }
     }
 
-    /// The node id of the cell at a port.
+    /// Returns the node id of the cell at a port.
     pub(crate) fn number_at(&self, port: usize) -> Option<CellId> {
         self.ports.get(port)?.number()
     }
 
-    /// Whether the cell at a port is a child.
+    /// Returns true if the cell at a port is a child.
     pub(crate) fn is_child(&self, port: usize) -> bool {
         self.ports.get(port).is_some_and(Port::is_child)
     }
 
-    /// The port of the child with this node id.
+    /// Returns the port of the child with this node id.
     pub(crate) fn child_with(&self, number: CellId) -> Option<usize> {
         (0..PORTS).find(|&port| self.is_child(port) && self.number_at(port) == Some(number))
     }
 
-    /// Whether the former parent has acknowledged the leave, or there is none: then it takes no sum any more.
+    /// Returns true if no former parent can accept a sum: it has acknowledged the leave, or does not exist.
     pub(crate) fn is_released(&self) -> bool {
         self.former_parent.is_none_or(|former_parent| former_parent.heard)
     }
 
-    /// The cell was silent for an epoch: a former parent takes no sum any more. The gateway's side needs longer,
-    /// because it goes by the messages of the wire.
+    /// Forgets a former parent after an epoch in which this cell sent no sum, so that the former parent
+    /// accepts no more. The gateway's side needs longer, because it relies on the messages of the wire.
     pub(crate) fn forget_former_parent(&mut self, now: Micros) {
         self.former_parent
             .take_if(|former_parent| former_parent.port != UPLINK || now.since(former_parent.since) >= HELLO);
     }
 
-    /// Bit p: the cell at port p is a child.
+    /// Returns the children: bit p is set if the cell at port p is a child.
     pub(crate) fn children(&self) -> u8 {
         self.bits(Port::is_child)
     }
 
-    /// Bit p: port p works in both directions.
+    /// Returns the working ports: bit p is set if port p works in both directions.
     pub(crate) fn working(&self, now: Micros) -> u8 {
         self.bits(|port| port.works(now))
     }
@@ -205,28 +206,28 @@ impl Network {
         self.ports.iter().take(PORTS).enumerate().map(bit).sum()
     }
 
-    /// What each port leads to.
+    /// Returns the state of each port.
     pub(crate) fn port_states(&self, now: Micros) -> [PortState; PORTS] {
         core::array::from_fn(|port| self.ports.get(port).map(|port| port.state(now)).unwrap_or_default())
     }
 
-    /// Whether what the ports lead to has changed since the last call.
+    /// Returns true if the state of a port has changed since the last call.
     pub(crate) fn ports_changed(&mut self, now: Micros) -> bool {
         let states = self.port_states(now);
         self.reported.replace(states) != Some(states)
     }
 
-    /// A node id that a walk assigned to this cell, once.
+    /// Returns a node id that a walk assigned to this cell, once.
     pub(crate) const fn given(&mut self) -> Option<CellId> {
         self.node_ids.given.take()
     }
 
-    /// The next message for a port.
+    /// Returns the next message for a port.
     pub(crate) fn poll_transmit(&mut self) -> Option<(usize, PortMessage)> {
         self.outbox.pop_front()
     }
 
-    /// When [`Network::handle_time`] has something to do.
+    /// Returns the time at which [`Network::handle_time`] must be called.
     pub(crate) fn poll_timeout(&self) -> Micros {
         if !self.exists() {
             return Micros(u64::MAX);
@@ -241,7 +242,8 @@ impl Network {
     /// Sends a message to the cell at a port.
     pub(crate) fn say(&mut self, port: usize, message: PortMessage) {
         if self.wired >> port & 1 != 0 {
-            // A shell takes messages after every call; for what does not fit, the next hello stands in.
+            // The shell collects messages after every call; the next hello makes up for one that does not
+            // fit.
             let _ = self.outbox.push_back((port, message));
         }
     }
@@ -270,7 +272,7 @@ impl Network {
         }
     }
 
-    /// Takes a message of a port that receives, except those about sums: `State` and `Nack`.
+    /// Handles a message from a port that receives, except those about sums: `State` and `Nack`.
     pub(crate) fn handle(&mut self, now: Micros, port: usize, message: PortMessage) {
         match message {
             PortMessage::Hello(hello) => self.take_hello(now, port, hello),
@@ -318,11 +320,12 @@ impl Network {
         match self.parent {
             Some(parent) if parent.port == port => match hello.rank {
                 _ if !hello.hears => self.lose_parent(now, Lost::Unsure),
-                // It is as near as it was, or nearer, or of a later round.
+                // The parent is as near as before, nearer, or of a later round.
                 Some(rank) if !parent.rank.is_better_than(rank) => self.follow(now, port, rank),
-                // The parent is unreachable and repairs its route: this cell helps, and its sums are NACKed meanwhile.
+                // The parent is unreachable and repairs its route. This cell helps, and its sums are NACKed
+                // meanwhile.
                 None => self.pass_on(now, port, parent.rank.round),
-                // It restarted.
+                // The parent restarted.
                 Some(_) => self.lose_parent(now, Lost::Unsure),
             },
             Some(parent) => self.improve(now, port, parent),
@@ -330,7 +333,7 @@ impl Network {
         }
     }
 
-    /// Sends the hellos that are due by then: while the cell is awake anyway, it need not wake for them.
+    /// Sends the hellos that are due by `until`, so that the cell need not wake up for them.
     pub(crate) fn hello_by(&mut self, now: Micros, until: Micros) {
         if self.exists() && until >= self.next_hello {
             self.next_hello = phase::next(self.next_hello, HELLO, now);
@@ -341,13 +344,13 @@ impl Network {
         }
     }
 
-    /// A former parent that has not acknowledged the leave.
+    /// Returns a former parent that has not acknowledged the leave.
     fn to_be_reported(&self) -> Option<FormerParent> {
         self.former_parent
             .filter(|former_parent| !former_parent.heard && self.up() != Some(former_parent.port))
     }
 
-    /// Takes in that time has passed. Harmless when called early.
+    /// Handles timers that are due at `now`. An early call does nothing.
     pub(crate) fn handle_time(&mut self, now: Micros) {
         if !self.exists() {
             return;
@@ -362,7 +365,7 @@ impl Network {
         let silent = |parent: &Parent| self.ports.get(parent.port).is_none_or(|it| it.hello(now).is_none());
         if self.parent.as_ref().is_some_and(silent) {
             if self.up() == Some(UPLINK) {
-                // The gateway's side may notice it later, and takes sums until then.
+                // The gateway's side may notice it later, and accepts sums until then.
                 self.joining = Some((UPLINK, now + HELLO));
             }
             self.lose_parent(now, Lost::Unsure);

@@ -1,4 +1,4 @@
-//! Node ids for cells that have none: a walk over the tree assigns them, depth first.
+//! Assignment of node ids to cells without one, in a depth-first walk over the tree.
 
 use protocol::id::CellId;
 use protocol::port::{PORTS, PortMessage, Walk};
@@ -7,14 +7,14 @@ use protocol::time::Micros;
 use super::Network;
 use super::port::Port;
 
-/// The cell's node id, and the state of the walk that assigns node ids to those below it.
+/// The cell's node id, and the state of a walk in its subtree.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct NodeIds {
-    /// Its own, if it has one.
+    /// The cell's node id, if it has one.
     pub(super) own: Option<CellId>,
     /// The node id that a walk assigned, until it is read.
     pub(super) given: Option<CellId>,
-    /// The walk that is in this subtree, and the port that it is at.
+    /// The current walk in this subtree, and the port that it has gone to.
     walking: Option<(Walk, usize)>,
     last_walk: Option<u8>,
     was_unnumbered: bool,
@@ -25,7 +25,8 @@ impl Network {
         self.node_ids.own.is_none() || self.ports.iter().any(Port::is_unnumbered)
     }
 
-    /// Node ids are assigned: this cell takes the first if it has none, then the walk goes to each child in turn.
+    /// Starts a walk: this cell takes the first node id if it has none, then the walk goes to each child in
+    /// turn.
     pub(super) fn begin_walk(&mut self, now: Micros, mut walk: Walk) {
         if self.node_ids.last_walk.replace(walk.walk) == Some(walk.walk) {
             return;

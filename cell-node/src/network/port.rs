@@ -5,30 +5,30 @@ use protocol::message::{PortState, VERSION};
 use protocol::port::{Hello, Rank};
 use protocol::time::{Micros, Span};
 
-/// After so long without a hello a port leads nowhere: two hellos and some jitter.
+/// Time without a hello after which the port counts as disconnected: two hellos and some jitter.
 pub(super) const SILENT: Span = Span::from_millis(600);
-/// So long after its grant a child names this cell as its parent in its hellos.
+/// Time after its grant in which a child must name this cell as its parent in its hellos.
 const KNOWS: Span = Span::from_millis(300);
 
-/// One port.
+/// A port.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Port {
-    /// The last hello, and when it came.
+    /// The last hello, and its time.
     heard: Option<(Hello, Micros)>,
-    /// Since when the cell there is a child of this one.
+    /// The time at which the cell there became a child.
     pub(super) child: Option<Micros>,
-    /// It was a parent and was lost: only later hellos count again.
+    /// Set when the cell there was lost as parent: only later hellos count again.
     pub(super) distrusted: Option<Micros>,
-    /// The cell there requested a later round, and no rank was announced to it since.
+    /// True if the cell there requested a later round and has not received a rank since.
     pub(super) sought: bool,
 }
 
 impl Port {
-    /// Takes a hello; whether it is the first one after a silence.
+    /// Records a hello. Returns true if it is the first after a silence.
     pub(super) fn take(&mut self, now: Micros, hello: Hello) -> bool {
         let restarted = self.hello(now).is_none();
         self.heard = Some((hello, now));
-        // It had time to learn of the grant and names another parent: it is a child no longer.
+        // The child has had time to learn of the grant but names another parent.
         let forgot = !hello.up && self.child.is_some_and(|since| now.since(since) > KNOWS);
         if forgot {
             self.child = None;
@@ -36,34 +36,34 @@ impl Port {
         restarted
     }
 
-    /// The last hello, unless it is long ago.
+    /// Returns the last hello, unless it is too old.
     pub(super) fn hello(&self, now: Micros) -> Option<&Hello> {
         self.heard.as_ref().filter(|(_, at)| now.since(*at) <= SILENT).map(|(hello, _)| hello)
     }
 
-    /// Whether it works in both directions, and the other end uses this version.
+    /// Returns true if the port works in both directions, and the other end uses this version.
     pub(super) fn works(&self, now: Micros) -> bool {
         self.hello(now).is_some_and(|hello| hello.hears && hello.version == VERSION)
     }
 
-    /// How far the cell at the other end is, if sums could go there.
+    /// Returns the rank of the cell at the other end, if sums could be sent to it.
     pub(super) fn rank(&self, now: Micros) -> Option<Rank> {
         let at = self.heard.map(|(_, at)| at)?;
         let trusted = self.distrusted.is_none_or(|since| at > since);
         self.hello(now).filter(|_| trusted && self.works(now) && self.child.is_none()).and_then(|it| it.rank)
     }
 
-    /// The node id of the cell at the other end, if it has one.
+    /// Returns the node id of the cell at the other end, if it has one.
     pub(super) fn number(&self) -> Option<CellId> {
         CellId::new(self.heard?.0.number.into()).ok()
     }
 
-    /// Whether a cell without a node id is there or below.
+    /// Returns true if the cell there is a child without a node id, or has such a cell below it.
     pub(super) fn is_unnumbered(&self) -> bool {
         self.child.is_some() && self.heard.is_some_and(|(hello, _)| hello.unnumbered)
     }
 
-    /// Whether a later round has to be announced there at once: to a child, and to a cell that is unreachable.
+    /// Returns true if a later round must be announced there at once: to a child or an unreachable cell.
     pub(super) fn needs_round(&self, now: Micros) -> bool {
         self.child.is_some() || self.sought || self.hello(now).is_some_and(|hello| hello.rank.is_none())
     }
@@ -72,19 +72,19 @@ impl Port {
         self.child.is_some()
     }
 
-    /// Time has passed: a silent child is no child any more.
+    /// Handles the passage of time: a silent child is no longer a child.
     pub(super) fn pass(&mut self, now: Micros) {
         if self.hello(now).is_none() {
             self.child = None;
         }
     }
 
-    /// When it falls silent, if nothing more comes.
+    /// Returns the time at which the port counts as disconnected without a further hello.
     pub(super) fn silent_at(&self) -> Option<Micros> {
         self.heard.map(|(_, at)| at + SILENT + Span(1))
     }
 
-    /// As it is reported.
+    /// Returns the state for reports.
     pub(super) fn state(&self, now: Micros) -> PortState {
         let Some(hello) = self.hello(now) else { return PortState::default() };
         PortState {

@@ -1,4 +1,4 @@
-//! The route to the root: which parent a cell joins, follows and leaves, and which children it grants.
+//! The route to the root: joining, following and leaving a parent, and granting joins of children.
 
 use protocol::port::{PortMessage, Rank, UPLINK};
 use protocol::time::{Micros, Span};
@@ -7,12 +7,12 @@ use super::port::Port;
 use super::{ALL, FormerParent, JOIN_TIMEOUT, Lost, Network, Parent, REPAIR};
 
 impl Network {
-    /// Whether nothing is lost by moving: no sums are sent, or the parent is unreachable itself.
+    /// Returns true if moving loses no sums: none are sent, or the parent is unreachable itself.
     const fn may_move(&self) -> bool {
         !self.busy || self.deserted
     }
 
-    /// Sends a join to a port that is nearer than the parent, when nothing is lost by moving.
+    /// Sends a join to a port that is nearer than the parent, if moving loses no sums.
     pub(super) fn improve(&mut self, now: Micros, port: usize, parent: Parent) {
         let rank = self.ports.get(port).and_then(|port| port.rank(now));
         let nearer = rank.is_some_and(|rank| rank.is_better_than(parent.rank));
@@ -22,8 +22,8 @@ impl Network {
         }
     }
 
-    /// The parent's rank is this. A new depth is announced on all ports; a new round only where it is needed: to
-    /// children and to unreachable cells. So a round costs one message per cell, not one per port.
+    /// Sets the parent and its rank. A new depth is announced on all ports, a new round only to children and
+    /// unreachable cells. A round therefore costs one message per cell, not one per port.
     pub(super) fn follow(&mut self, now: Micros, port: usize, rank: Rank) {
         let before = self.parent.replace(Parent { port, rank });
         if before == self.parent {
@@ -45,13 +45,13 @@ impl Network {
         }
     }
 
-    /// A cell requests to send its sums here.
+    /// Handles a join: a cell requests to send its sums here.
     pub(super) fn let_in(&mut self, now: Micros, port: usize) {
         let Some(rank) = self.rank().filter(|_| self.up() != Some(port)) else {
             return self.say(port, PortMessage::Refuse);
         };
         let number = self.number_at(port);
-        // Two wires may lead to the same cell, whose sums come by one of them.
+        // Two wires may lead to the same cell, whose sums use one of them.
         for (other, there) in self.ports.iter_mut().enumerate() {
             if other == port {
                 there.child = Some(now);
@@ -67,7 +67,7 @@ impl Network {
         self.best.is_none_or(|best| rank.is_better_than(best))
     }
 
-    /// A neighbour granted the join.
+    /// Handles a grant of a neighbour.
     pub(super) fn join(&mut self, now: Micros, port: usize, rank: Rank) {
         if self.up() == Some(port) {
             return;
@@ -85,12 +85,12 @@ impl Network {
         self.changes = self.changes.wrapping_add(1);
         self.follow(now, port, rank);
         if port == UPLINK {
-            // The gateway's side takes sums from then on.
+            // The gateway's side accepts sums from then on.
             self.hello(now, port);
         }
     }
 
-    /// The parent does not take this cell's sums any more: another route has to be found.
+    /// Handles the loss of the parent, and searches for another route.
     pub(crate) fn lose_parent(&mut self, now: Micros, how: Lost) {
         let Some(parent) = self.parent.take() else { return };
         self.tree_changed = true;
@@ -105,7 +105,7 @@ impl Network {
         self.ports.get_mut(port).into_iter().for_each(|port| port.distrusted = Some(now));
     }
 
-    /// Sends a join to the nearest port that is good enough, or starts a local repair where none is.
+    /// Sends a join to the nearest port that is good enough, or starts a local repair.
     pub(super) fn search(&mut self, now: Micros) {
         if self.parent.is_some() {
             return;
@@ -125,20 +125,21 @@ impl Network {
             self.joining = Some((port, now));
             return self.say(port, PortMessage::Join);
         }
-        // A cell that never had a rank has nothing to compare: the first hello with a rank is good enough.
+        // A cell that never had a rank accepts any rank, so it waits for the first hello with one.
         let Some(best) = self.best else { return };
         let (at, wait) = self.repair.unwrap_or((now, REPAIR.0));
         if now >= at {
             self.repair = Some((now + wait, Span(wait.0 * 2).min(REPAIR.1)));
-            // Where no other port leads to the gateway, or the first repair found none, the route may be through a
-            // child or through a former parent.
+            // If no other port leads to the gateway, or the first repair found no route, it may be through a
+            // child or a former parent.
             let is_first = wait == REPAIR.0;
             let leads = self.ports.iter().any(|port| port.rank(now).is_some());
             self.repair_at(now, best.round, None, !(leads && is_first));
         }
     }
 
-    /// Requests a round later than this one, on all ports that lead to the gateway but one, or on all that work.
+    /// Requests a round later than `round` on the ports that lead to the gateway, or on all working ports,
+    /// except `but`.
     fn repair_at(&mut self, now: Micros, round: u8, but: Option<usize>, all: bool) {
         for port in (0..ALL).filter(|port| Some(*port) != but) {
             let leads = |port: &Port| port.rank(now).is_some() || (all && port.works(now));
@@ -148,8 +149,8 @@ impl Network {
         }
     }
 
-    /// A neighbour needs a round later than this one. A child's repair is forwarded to the parent; a parent's to all
-    /// other ports, one of which may have another route.
+    /// Handles a repair: a neighbour needs a round later than `round`. A child's repair is forwarded to the
+    /// parent; a parent's to all other ports, one of which may have another route.
     pub(super) fn pass_on(&mut self, now: Micros, port: usize, round: u8) {
         let Some(parent) = self.parent else { return };
         if parent.rank.round.wrapping_sub(round).cast_signed() > 0 {
@@ -158,8 +159,8 @@ impl Network {
         self.ports.get_mut(port).into_iter().for_each(|port| port.sought = true);
         let is_deserted = parent.port == port;
         self.deserted |= is_deserted;
-        // A repair forwarded to the parent only does not count for a deserted cell: a parent may have two wires to this
-        // cell, and repair on both.
+        // A repair that went to the parent only does not count for a deserted cell: the parent may have two
+        // wires to this cell, and repair on both.
         let again =
             |(of, everywhere, at)| of == round && now.since(at) < REPAIR.0 && (everywhere || !is_deserted);
         if self.passed_on.is_some_and(again) {

@@ -3,7 +3,7 @@ use protocol::port::Walk;
 
 const MS: u64 = 1_000;
 
-/// A cell with a node id, and wires at these ports.
+/// Returns a cell with a node id and wires at these ports.
 fn network(wired: u8) -> Network {
     let mut network = Network::new(Micros(0));
     network.wire(wired, CellId::new(12).ok(), 0);
@@ -14,7 +14,7 @@ fn said(network: &mut Network) -> Vec<(usize, PortMessage)> {
     core::iter::from_fn(|| network.poll_transmit()).collect()
 }
 
-/// What it sends except hellos.
+/// Returns the sent messages except hellos.
 fn asked(network: &mut Network) -> Vec<(usize, PortMessage)> {
     let mut messages = said(network);
     messages.retain(|(_, message)| !matches!(message, PortMessage::Hello(_)));
@@ -29,7 +29,7 @@ fn neighbour(number: u8, rank: Option<Rank>) -> Hello {
     Hello { version: VERSION, number, port: 3, hears: true, up: false, unnumbered: false, rank }
 }
 
-/// A cell whose parent at port 0 has this rank, after so many milliseconds.
+/// Returns a cell whose parent at port 0 has this rank, at a time in ms.
 fn below(at: u64, parent: Rank) -> Network {
     let mut network = network(0b1111);
     network.handle(Micros(at * MS), 0, PortMessage::Hello(neighbour(1, Some(parent))));
@@ -39,7 +39,7 @@ fn below(at: u64, parent: Rank) -> Network {
     network
 }
 
-/// The cell at this port becomes a child.
+/// Makes the cell at this port a child.
 fn adopt(network: &mut Network, now: Micros, port: usize, number: u8) {
     network.handle(now, port, PortMessage::Hello(neighbour(number, None)));
     network.handle(now, port, PortMessage::Join);
@@ -118,7 +118,7 @@ fn of_a_cell_that_is_wired_twice_the_latest_wire_counts() {
     assert_eq!(network.children(), 0b0110);
     adopt(&mut network, now, 3, 7);
     assert_eq!(network.children(), 0b1100);
-    // Cells without a node id are all different.
+    // Cells without a node id count as different cells.
     let mut network = below(100, rank(1, 1));
     adopt(&mut network, now, 1, 0);
     adopt(&mut network, now, 2, 0);
@@ -138,7 +138,7 @@ fn a_grant_is_taken_while_it_is_good_enough_and_no_sums_are_sent() {
     assert_eq!(after(false, rank(1, 2)), (vec![(0, PortMessage::Leave)], Some(1)), "nearer");
     assert_eq!(after(true, rank(1, 2)), (vec![(1, PortMessage::Leave)], Some(0)), "sums are sent");
     assert_eq!(after(false, rank(1, 3)), (vec![(1, PortMessage::Leave)], Some(0)), "as far");
-    // Without a parent it has to be better than what the cell had itself.
+    // Without a parent, the rank must be better than the cell's own.
     for (granted, up) in [(rank(1, 4), None), (rank(1, 3), Some(1))] {
         let mut network = below(100, rank(1, 3));
         network.handle(now, 0, PortMessage::Refuse);

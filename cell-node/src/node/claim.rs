@@ -1,4 +1,4 @@
-//! A cell's address claim: claimed, defended, and stated with each heartbeat.
+//! The address claim of a cell: claimed at the start, defended, and stated in each heartbeat.
 
 use protocol::message::{Heartbeat, NetworkPage, Refused, State};
 use protocol::time::{Micros, Span};
@@ -7,22 +7,22 @@ use super::Node;
 use crate::identity::Identity;
 use crate::phase;
 
-/// From one heartbeat to the next.
+/// Interval of heartbeats.
 pub const HEARTBEAT: Span = Span::from_millis(250);
-/// How long a new cell listens at least for another one with its node id.
+/// Minimum time for which a new cell checks for another one with its node id.
 pub const CLAIM: Span = Span::from_millis(250);
-/// First heartbeats are spread over this time by serial number: two cells with one node id that are switched
-/// on together would otherwise send different data with one identifier in the same bit time.
+/// Time over which first heartbeats are spread by serial number. Otherwise two cells with one node id that
+/// are switched on together would send different data with one identifier in the same bit time.
 const FIRST_WORD: Span = Span::from_millis(64);
-/// The shortest time between two answers to another cell with our node id.
+/// Minimum interval between two defences of the node id.
 const DEFEND: Span = Span::from_millis(10);
 
 /// The stage of an address claim.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Claim {
-    /// Nothing has been sent yet.
+    /// The claim has not been sent yet.
     Unsent,
-    /// The claim has been sent; the cell listens whether another one owns the node id.
+    /// The claim has been sent; the cell waits for objections of another owner.
     Sent,
     /// The cell owns the node id.
     Settled,
@@ -33,30 +33,31 @@ pub(super) enum Claim {
 pub(super) struct AddressClaim {
     pub(super) stage: Claim,
     pub(super) next_heartbeat: Micros,
-    /// A sync requested a heartbeat, which waits for the present epoch's end.
+    /// True if a sync requested a heartbeat, which waits for the end of the present epoch.
     pub(super) sync_waits: bool,
-    /// When the node id was defended last.
+    /// The time of the last defence of the node id.
     defended: Option<Micros>,
-    /// The serial number of the cell that owns the node id already.
+    /// The serial number of another cell that owns the node id.
     pub(super) taken: Option<u32>,
 }
 
 impl AddressClaim {
-    /// A claim that starts now; without a node id it never starts.
+    /// Starts a claim. Without a node id it never becomes due.
     pub(super) fn new(identity: Identity, now: Micros) -> Self {
         let wait = phase::by_serial(FIRST_WORD, identity.serial);
         let next_heartbeat = identity.cell.map_or(Micros(u64::MAX), |_| now + wait);
         Self { stage: Claim::Unsent, next_heartbeat, sync_waits: false, defended: None, taken: None }
     }
 
-    /// Whether this cell owns the node id.
+    /// Returns true if this cell owns the node id.
     pub(super) fn is_settled(&self) -> bool {
         self.stage == Claim::Settled
     }
 }
 
 impl Node {
-    /// Sends the heartbeat that is due: the first is the address claim, with the next the cell owns the node id.
+    /// Sends the heartbeat if it is due: the first one is the address claim, and with the second the cell
+    /// owns the node id.
     pub(super) fn claim_in_time(&mut self, now: Micros) {
         let Some(cell) = self.identity.cell.filter(|_| now >= self.claim.next_heartbeat) else { return };
         if self.claim.stage == Claim::Unsent {
@@ -68,7 +69,7 @@ impl Node {
         self.regular_heartbeat(now);
     }
 
-    /// One of four a second, with what has changed.
+    /// Sends a regular heartbeat with all changed pages, four times a second.
     pub(super) fn regular_heartbeat(&mut self, now: Micros) {
         self.push_heartbeat();
         self.beat_network(now);
@@ -78,9 +79,9 @@ impl Node {
         self.claim.next_heartbeat = phase::next(self.claim.next_heartbeat, HEARTBEAT, now);
     }
 
-    /// Another cell sent with our node id. While we claim it we give way, unless the other claims it
-    /// too and has the larger serial number. Once we own it we defend it, but only against claims:
-    /// two settled cells would answer each other for ever.
+    /// Handles a frame that another cell sent with our node id. While claiming it, this cell gives way,
+    /// unless the other one also claims it and has the larger serial number. Once it owns the node id, it
+    /// defends it, but only against claims: two settled cells would answer each other forever.
     pub(super) fn hear_own_number(&mut self, now: Micros, page: &NetworkPage) {
         self.flags = self.flags.with(State::DUPLICATE, true);
         let other = if let NetworkPage::Heartbeat(other) = page { Some(other) } else { None };
@@ -94,7 +95,7 @@ impl Node {
         }
     }
 
-    /// The cell's state: its flags, and what can be derived.
+    /// Returns the state: the stored flags, and the derived ones.
     pub(super) fn state(&self) -> State {
         let in_use = self.configuration.in_use();
         self.flags

@@ -1,4 +1,4 @@
-//! The cell as a state machine: frames and times go in, packets and times come out.
+//! The cell as a state machine: frames and times in, packets and times out.
 //!
 //! ```text
 //!   frame, now, age ─> handle_frame ───┐          ┌─> poll_transmit ─> packet
@@ -7,8 +7,8 @@
 //!                                                 └─> taken ─────────> who owns this node id already
 //! ```
 //!
-//! It never blocks, allocates or panics, and reads no clock. A frame that it cannot use is counted by
-//! its reason, and nothing else.
+//! It never blocks, allocates or panics, and reads no clock. A frame that it cannot use is counted by its
+//! reason and otherwise ignored.
 
 mod claim;
 mod configuration;
@@ -48,12 +48,12 @@ use zero::Reported;
 pub use claim::{CLAIM, HEARTBEAT};
 pub use stimuli::PENDING;
 
-/// Identifiers that a cell can receive: its own, and the sums of the cells at its ports.
+/// Maximum number of identifiers that a cell receives: its own, and the sums of the cells at its ports.
 pub const HEARD: usize = OWN + PORTS;
-/// Packets that wait to be sent; a shell takes them after every call.
+/// Capacity for outgoing packets, which the shell collects after every call.
 const OUTBOX: usize = 16;
 
-/// One cell.
+/// A cell.
 #[derive(Debug)]
 pub struct Node {
     identity: Identity,
@@ -67,9 +67,9 @@ pub struct Node {
     summing: Summing,
     receiver: Receiver,
     heard: Heard,
-    /// Halted, duplicate and so on; what can be derived is added when a heartbeat is made.
+    /// Stored flags such as halted and duplicate; derived flags are added in each heartbeat.
     flags: State,
-    /// The last joints taken.
+    /// The epoch of the last accepted joints.
     epoch: Option<Epoch>,
     active: bool,
     rest: Rest,
@@ -79,8 +79,8 @@ pub struct Node {
 }
 
 impl Node {
-    /// A cell that starts now: its first heartbeat is its address claim, and it obeys stimuli in
-    /// `test_mode`.
+    /// Starts a cell. Its first heartbeat is its address claim. In `test_mode` it uses stimuli instead of
+    /// sensors.
     #[must_use]
     pub fn new(identity: Identity, format: Format, flash: &Flash, test_mode: bool, now: Micros) -> Self {
         let mut node = Self::unconfigured(identity, format, test_mode, now);
@@ -88,9 +88,10 @@ impl Node {
         node
     }
 
-    /// The same before it has what flash holds: [`Node::restore`] comes next, before anything else.
+    /// Starts a cell without the contents of its flash. The caller must call [`Node::restore`] next.
     #[must_use]
-    // Built where the caller wants it: inlined, it is built on the stack and copied. So are its large parts.
+    // Not inlined, so that it is constructed in place instead of on the stack; the same holds for its large
+    // parts.
     #[inline(never)]
     pub fn unconfigured(identity: Identity, format: Format, test_mode: bool, now: Micros) -> Self {
         Self {
@@ -115,7 +116,7 @@ impl Node {
         }
     }
 
-    /// Starts with what flash holds.
+    /// Loads the contents of flash.
     pub fn restore(&mut self, flash: &Flash) {
         self.flags = self.flags.with(State::FLASH_DAMAGED, *flash == Flash::Damaged);
         if let Flash::Sound(parameters) = flash {
@@ -123,48 +124,49 @@ impl Node {
         }
     }
 
-    /// The same cell in a network: bit p means that port p leads somewhere, bit 4 that it is wired to the
-    /// gateway's side.
+    /// Connects the cell to a network: bit p is set if port p is wired, bit 4 for a wire to the gateway's
+    /// side.
     #[must_use]
     pub fn with_ports(mut self, wired: u8) -> Self {
         self.wire(wired);
         self
     }
 
-    /// The same where the cell must not be moved: it has more than half of a small microcontroller's memory. Before
-    /// anything else.
+    /// Like [`Node::with_ports`], without moving the node, which takes more than half of a small
+    /// microcontroller's memory. Must be called before anything else.
     pub fn wire(&mut self, wired: u8) {
         let Identity { cell, serial } = self.identity;
         self.summing.network.wire(wired, cell, serial);
     }
 
-    /// The next message for a port: to be sent before the packets of the same call.
+    /// Returns the next message for a port. Must be sent before the packets of the same call.
     pub fn poll_port_transmit(&mut self) -> Option<(usize, PortMessage)> {
         self.summing.network.poll_transmit()
     }
 
-    /// Whether the identifiers that it receives, or those that wake it, have changed since the last call.
+    /// Returns true if the received identifiers, or those that wake the cell, have changed since the last
+    /// call.
     pub fn poll_hears(&mut self) -> bool {
         let rest = self.rest.poll();
         self.summing.poll_hears() || rest
     }
 
-    /// Its identity.
+    /// Returns its identity.
     #[must_use]
     pub const fn identity(&self) -> Identity {
         self.identity
     }
 
-    /// The serial number of the cell that owns this node id already; then this one must fall silent.
+    /// Returns the serial number of another cell that owns this node id; this cell must then stop sending.
     #[must_use]
     pub const fn taken(&self) -> Option<u32> {
         self.claim.taken
     }
 
-    /// The next packet to send.
+    /// Returns the next packet to send.
     pub fn poll_transmit(&mut self) -> Option<Packet> {
         let mut message = self.outbox.pop_front()?;
-        // The counter covers the packets before this one, so it is filled in when the heartbeat itself goes out.
+        // The counter covers the packets before this one, so it is filled in when the heartbeat is sent.
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = &mut message {
             heartbeat.sent = self.sent;
         }
@@ -172,20 +174,20 @@ impl Node {
         Some(message.encode())
     }
 
-    /// Takes back a packet that was never sent, because the shell has no bus; what was taken for sending after it was not
-    /// sent either.
+    /// Corrects the counter for a packet that was collected but not sent, because the shell has no bus. The
+    /// packets collected after it were not sent either.
     pub const fn handle_unsent(&mut self) {
         self.sent = self.sent.wrapping_sub(1);
     }
 
-    /// When [`Node::handle_timeout`] has something to do; calling it earlier does no harm.
+    /// Returns the time at which [`Node::handle_timeout`] must be called; an earlier call is harmless.
     #[must_use]
     pub fn poll_timeout(&self) -> Micros {
         let next = self.claim.next_heartbeat.min(self.summing.poll_timeout());
         self.sensing_due().map_or(next, |due| next.min(due))
     }
 
-    /// What has to go into flash; then comes [`Node::handle_stored`].
+    /// Returns the contents to be written to flash. The shell answers with [`Node::handle_stored`].
     #[must_use]
     pub fn poll_store(&self) -> Option<Kept> {
         let parameters = match self.storing.as_ref()? {
@@ -195,14 +197,16 @@ impl Node {
         Some(Kept { number: self.identity.cell, parameters })
     }
 
-    /// The identifiers that this cell receives now; a shell reads them again after [`Node::poll_hears`].
+    /// Returns the identifiers that this cell receives now. The shell reads them again after
+    /// [`Node::poll_hears`].
     pub fn hears(&self) -> impl Iterator<Item = Id> + use<'_> {
         self.slots().flatten()
     }
 
-    /// Whether it need not be woken for one of them (deferred receive), as long as it gets it before whatever comes
-    /// next: the parent's sum, which only shows that the parent is there; and joints while it would only wait for its
-    /// children's sums, which come after them, or while nothing touches it.
+    /// Returns true if an identifier need not wake the cell (deferred receive), as long as the cell gets its
+    /// frames before any later frame. This holds for the parent's sums, which only show that the parent is
+    /// alive; and for joints while the cell would only wait for its children's sums, which follow them, or
+    /// while nothing touches it.
     #[must_use]
     pub fn defers(&self, id: Id) -> bool {
         if id == Id::command(Command::Joints) {
@@ -211,18 +215,18 @@ impl Node {
         self.summing.heard_parent().is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
     }
 
-    /// How long joints, torques and sums are, once it is configured.
+    /// Returns the packet length of joints, torques and sums, if the cell is configured.
     fn length(&self) -> Option<Length> {
         self.configuration.in_use().map(InUse::length)
     }
 
-    /// By slot of the reassembly, [`HEARD`] of them.
+    /// Returns the identifier of each reassembly slot, [`HEARD`] of them.
     fn slots(&self) -> impl Iterator<Item = Option<Id>> + use<'_> {
         let sums = self.summing.heard.iter().map(|cell| Some(Id::new(Kind::Sum, Address::Cell((*cell)?))));
         self.identity.hears().into_iter().chain(sums)
     }
 
-    /// Takes in that time has passed. Harmless when called early.
+    /// Handles timers that are due at `now`. An early call does nothing.
     pub fn handle_timeout(&mut self, now: Micros) {
         self.summing.handle_time(now);
         self.after_network(now);
@@ -231,7 +235,7 @@ impl Node {
         self.claim_in_time(now);
     }
 
-    /// Takes a frame that came `age` ago. Identifiers that this cell does not receive are ignored.
+    /// Handles a frame that arrived `age` ago. Identifiers that this cell does not receive are ignored.
     pub fn handle_frame(&mut self, now: Micros, age: Span, frame: &Frame) {
         let Ok(id) = packet::data_id(frame) else {
             count(&mut self.receiver.refused.foreign);
@@ -254,7 +258,7 @@ impl Node {
             Message::Joints { epoch, joints } => {
                 let taken = self.heard.joints;
                 self.take_joints(now, age, epoch, &joints);
-                // What was latched at joints that were too old is sent with the next.
+                // Stimuli latched at joints that were too old are sent with the next ones.
                 if self.heard.joints != taken {
                     self.sense(now);
                     self.report_zero();
@@ -269,7 +273,7 @@ impl Node {
             Message::Resume => self.flags = self.flags.with(State::HALTED, false),
             Message::Stimulus { from, page, .. } => self.take_stimulus(from, page),
             Message::Network { page, .. } => self.hear_own_number(now, &page),
-            // A cell answers nothing until it owns its node id.
+            // A cell does not answer until it owns its node id.
             Message::Sync | Message::Report | Message::Configure { .. } if !self.claim.is_settled() => {}
             Message::Sync if self.summing.sum.is_settled(now) => self.push_heartbeat(),
             Message::Sync => {
@@ -288,7 +292,7 @@ impl Node {
             }
             Message::Configure { tag, request, .. } => {
                 self.configure(now, tag, request);
-                // Another mode starts again, and a cell that leaves test mode measures no contact any more.
+                // A new mode starts from the present state, and a cell that leaves test mode has no contact.
                 self.sense(now);
                 self.report_zero();
             }
@@ -301,12 +305,12 @@ impl Node {
                     self.handle_sums(now);
                 }
             }
-            // None of these is received, see `Identity::hears`.
+            // These are never received, see `Identity::hears`.
             Message::Torque { .. } | Message::Sensors { .. } | Message::Configured { .. } => {}
         }
     }
 
-    /// Computes and answers; the paper's Eq. 8 and Algorithm 1.
+    /// Computes the torques and answers: the paper's Eq. 8 and Algorithm 1.
     fn take_joints(&mut self, now: Micros, age: Span, epoch: Epoch, joints: &Joints) {
         if self.epoch == Some(epoch) {
             count(&mut self.heard.joints_repeated);
@@ -319,8 +323,8 @@ impl Node {
             count(&mut self.receiver.refused.meaning);
             return;
         }
-        // Old joints are not answered, but their stimuli are latched: a cell that hung would otherwise keep
-        // the contact state from before.
+        // Old joints are not answered, but their stimuli are latched. Otherwise a cell that hung would keep
+        // its previous contact state.
         self.epoch = Some(epoch);
         self.stimuli.latch(epoch);
         if let Some(in_use) = in_use {
@@ -352,7 +356,7 @@ impl Node {
         self.answer_joints(epoch, torque);
     }
 
-    /// Answers with its own torque; one answer of zero marks the end of a contact.
+    /// Answers with its own torque. A single answer of zero marks the end of a contact.
     fn answer_joints(&mut self, epoch: Epoch, torque: Option<Torque<'_>>) {
         let (Some(from), Some(in_use)) = (self.identity.cell, self.configuration.in_use()) else { return };
         let torque = match torque {
@@ -361,9 +365,10 @@ impl Node {
                 torque.words_by(in_use.kernel.rounding())
             }
             None if core::mem::take(&mut self.active) => Default::default(),
-            // A stimulus that waits, or a zero that follows the sensor, changes the contact state at some joints.
+            // A pending stimulus, or a zero that follows the sensor, may change the contact state at any
+            // joints.
             None if self.stimuli.are_pending() || self.baseline.is_on() => return,
-            // A cell of a network is awake for its neighbours.
+            // A cell of a network stays awake for its neighbours.
             None if self.summing.network.exists() => return,
             None => return self.rest.lengthen(),
         };
@@ -373,7 +378,7 @@ impl Node {
         self.push(Message::Torque { from, epoch, torque });
     }
 
-    /// What is due before the next joints is sent now, while the cell is awake: hellos and a heartbeat.
+    /// Sends hellos and a heartbeat that are due before the next joints now, while the cell is awake.
     fn speak_before_the_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use() else { return };
         let next_joints = now + in_use.period();
@@ -397,7 +402,7 @@ impl Node {
         }
     }
 
-    /// A word that is sent may be saturated, which the next heartbeat flags.
+    /// Sets the flag for the next heartbeat if a sent word is saturated.
     fn mark_saturated(&mut self, saturated: bool) {
         self.flags = self.flags.with(State::SATURATED, saturated || self.flags.has(State::SATURATED));
     }
@@ -408,7 +413,8 @@ impl Node {
         self.push(Message::Network { from, epoch: self.epoch.unwrap_or_default(), page });
     }
 
-    /// One frame leads to four packets at most, and a shell takes them after each, so that there is room.
+    /// Queues a message. One frame causes at most four packets, and the shell collects them after each, so
+    /// there is room.
     fn push(&mut self, message: Message) {
         let fits = self.outbox.push_back(message).is_ok();
         debug_assert!(fits, "a shell takes what is to be sent after each call");

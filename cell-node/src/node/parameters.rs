@@ -1,4 +1,4 @@
-//! Parameters as they are read and written over the bus.
+//! Reading and writing parameters over the bus.
 
 use protocol::message::{Answer, Message, Request, State, VERSION};
 use protocol::packet::WORDS;
@@ -10,20 +10,20 @@ use protocol::time::Micros;
 use super::Node;
 use crate::baseline::Refused;
 
-/// What is switched at run time and not kept: parameters 6 to 9.
+/// Volatile parameters set at run time: 6 to 9.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Switches {
-    /// What joints are answered with.
+    /// The reply to joints.
     reply: Reply,
-    /// When it sends what it measures.
+    /// The times at which the cell sends measurements.
     pub(super) sensing: Sensing,
-    /// Which changes are events.
+    /// The thresholds of event mode.
     pub(super) events: Events,
-    /// Which ports receive nothing.
+    /// Ports that receive nothing.
     links_down: LinksDown,
 }
 
-/// What is being written into flash.
+/// The contents being written to flash.
 #[derive(Clone, Copy, Debug)]
 #[expect(clippy::large_enum_variant, reason = "a cell has no heap")]
 pub(super) enum Storing {
@@ -34,7 +34,7 @@ pub(super) enum Storing {
 }
 
 impl Node {
-    /// Reads or writes a parameter, and answers; a commit is answered when flash is written.
+    /// Reads or writes a parameter and answers. A commit is answered after the write to flash.
     pub(super) fn configure(&mut self, now: Micros, tag: u8, request: Request) {
         let (written, number) = match request {
             Request::Read { number } => (false, number),
@@ -57,7 +57,7 @@ impl Node {
         self.answer(tag, number, written, words);
     }
 
-    /// Flash was written, or could not be.
+    /// Handles the result of a write to flash; `written` is true on success.
     pub fn handle_stored(&mut self, written: bool) {
         // A node id that could not be stored is assigned again after the next start.
         let Some(Storing::Parameters(parameters, tag)) = &self.storing else {
@@ -75,7 +75,7 @@ impl Node {
         self.answer(tag, Parameter::Commit.number(), true, words);
     }
 
-    /// The value, or the reason why there is none.
+    /// Answers a request with the value or the reason of a refusal.
     fn answer(&mut self, tag: u8, number: u8, written: bool, words: Result<[i16; WORDS], i16>) {
         let Some(from) = self.identity.cell else { return };
         let answer = match words {
@@ -104,8 +104,8 @@ impl Node {
         }
     }
 
-    /// Sets a switch at once, or stages what is kept: the words as they are now, or why not. Without ports there are
-    /// neither sums nor links; links go down in test mode only.
+    /// Sets a volatile parameter at once, or stages a stored one. Returns the new words, or the reason of a
+    /// refusal. Without ports there are neither sums nor links; links go down only in test mode.
     fn write(&mut self, now: Micros, parameter: Parameter, words: [i16; WORDS]) -> Result<[i16; WORDS], i16> {
         let (switches, has_ports) = (&mut self.switches, self.summing.network.exists());
         let set = match parameter {
@@ -163,7 +163,7 @@ impl Node {
     }
 }
 
-/// These words, and zeros.
+/// Returns these words, padded with zeros.
 pub(super) fn padded<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
     let mut first = first.into_iter();
     core::array::from_fn(|_| first.next().unwrap_or(0))

@@ -1,4 +1,4 @@
-//! From frames to packets: reassembly of segments by slot, and counts of what cannot be used.
+//! Reassembly of frames to packets, with counters of rejected frames.
 
 use protocol::can::{Format, Frame};
 use protocol::id::Id;
@@ -8,13 +8,13 @@ use protocol::time::Micros;
 
 use super::{HEARD, count};
 
-/// First segments that wait for the second, and counts of what was refused.
+/// The reassembly buffers, and the counters of rejected frames.
 #[derive(Debug)]
 pub(super) struct Receiver {
     format: Format,
-    /// By slot of the identifier among those that are received.
+    /// One buffer per slot of the received identifiers.
     segments: [Segment; HEARD],
-    /// What cannot be used, by its reason.
+    /// Counters of rejected frames, by reason.
     pub(super) refused: Refused,
 }
 
@@ -24,8 +24,8 @@ impl Receiver {
         Self { format, segments: [Segment::NONE; HEARD], refused: Refused::default() }
     }
 
-    /// The packet that this frame, which arrived then, is or completes.
-    /// Joints, torques and sums have one of these lengths.
+    /// Returns the packet that this frame contains or completes. Joints, torques and sums have one of
+    /// `lengths`.
     pub(super) fn take(
         &mut self,
         arrived: Micros,

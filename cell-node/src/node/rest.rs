@@ -1,34 +1,35 @@
-//! When a cell need not be woken for joints: nothing touches it, so that it would only count them.
+//! Resting: joints need not wake a cell that nothing touches, because it would only count them.
 
-/// Joints in a row to which there was nothing to say, before it rests: a touch that flickers changes no filters.
+/// Number of consecutive joints without an answer before the cell rests, so that a flickering touch does not
+/// change filters.
 const QUIET: u8 = 16;
 
-/// Whether a cell rests.
+/// The state of resting.
 #[derive(Debug, Default)]
 pub(super) struct Rest {
-    /// Joints in a row to which there was nothing to say, up to [`QUIET`].
+    /// Number of consecutive joints without an answer, up to [`QUIET`].
     quiet: u8,
-    /// As it was read last.
+    /// The state at the last poll.
     rests: bool,
 }
 
 impl Rest {
-    /// Joints were taken in time to which there was nothing to say.
+    /// Counts joints that were on time and needed no answer.
     pub(super) fn lengthen(&mut self) {
         self.quiet = self.quiet.saturating_add(1).min(QUIET);
     }
 
-    /// From now on joints wake it again.
+    /// Ends the rest: joints wake the cell again.
     pub(super) const fn end(&mut self) {
         self.quiet = 0;
     }
 
-    /// Whether joints are received deferred.
+    /// Returns true if joints are received deferred.
     pub(super) const fn rests(&self) -> bool {
         self.rests
     }
 
-    /// Whether that has changed since the last call.
+    /// Returns true if the state has changed since the last call.
     pub(super) fn poll(&mut self) -> bool {
         let rests = self.quiet == QUIET;
         core::mem::replace(&mut self.rests, rests) != rests

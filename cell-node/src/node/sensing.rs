@@ -1,4 +1,4 @@
-//! When a cell sends its contact state without a request: continuously, on events, or not at all.
+//! Sending of the contact state without a request: continuously, on events, or not at all.
 //!
 //! ```text
 //!   Off         silence, except for a report
@@ -6,9 +6,10 @@
 //!   Event       |s   s ss    s             s             s     on change, on release, with each heartbeat
 //! ```
 //!
-//! A change is measured against what was *sent* last and not against the last measurement, so that a slow drift
-//! is reported. Touch and release have two thresholds, so that noise at one of them is no stream of events. What is
-//! sent depends on the contact state and the times alone: the same inputs, the same frames.
+//! A change is measured relative to the last *sent* value instead of the last measurement, so that a slow
+//! drift is reported. Touch and release have two thresholds, so that noise near one of them does not cause a
+//! stream of events. The frames depend only on the contact state and the times: the same inputs give the same
+//! frames.
 
 use protocol::fixed::Q;
 use protocol::id::CellId;
@@ -21,10 +22,10 @@ use super::stimuli::Sensed;
 use super::{Node, Switches};
 use crate::phase;
 
-/// Every so many heartbeats carry the acceleration too: it shows no touch and is rarely needed.
+/// Number of heartbeats per acceleration page, which shows no touch and is rarely needed.
 const BEATS_PER_ACCELERATION: u8 = 4;
 
-/// Which pages are to be sent.
+/// The pages to send.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) struct Pages {
     skin: bool,
@@ -36,24 +37,24 @@ impl Pages {
     pub(super) const BOTH: Self = Self { skin: true, acceleration: true };
 }
 
-/// What was sent, and when the next is due.
+/// The last sent values, and the time of the next page.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Sensing {
     mode: Mode,
-    /// When the next one is due; in continuous mode only.
+    /// The time of the next page in continuous mode.
     due: Option<Micros>,
-    /// What was sent last, requested or not.
+    /// The last sent values, requested or not.
     sent: Sensed,
-    /// When page 0 was sent last without a request.
+    /// The time of the last page 0 sent without a request.
     said: Option<Micros>,
     contact: Touch,
     proximity: Touch,
-    /// Heartbeats since the acceleration went with one.
+    /// Number of heartbeats since the last one with the acceleration.
     beats: u8,
 }
 
 impl Sensing {
-    /// Something may have been latched, measured or switched.
+    /// Returns the pages to send after sensor values or the mode may have changed.
     fn look(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &Sensed) -> Pages {
         let Switches { sensing, events, .. } = switches;
         if *sensing != self.mode {
@@ -71,7 +72,7 @@ impl Sensing {
         self.says(now, pages)
     }
 
-    /// Another mode, which starts with the present contact state.
+    /// Switches to another mode, which starts with the present contact state.
     fn switch(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &Sensed) -> Pages {
         let mode = switches.sensing;
         *self = Self { mode, sent: self.sent, ..Self::default() };
@@ -88,7 +89,7 @@ impl Sensing {
         self.says(now, Pages::BOTH)
     }
 
-    /// Tracks contact and proximity; whether there is an event: a touch or a release.
+    /// Tracks contact and proximity. Returns true for an event: a touch or a release.
     fn follow(&mut self, skin: &SkinSensors, events: &Events) -> bool {
         let contact = self.contact.next(contact(skin), events.contact.to_bits(), events.hysteresis);
         let proximity = i32::from(skin.proximity.to_bits());
@@ -98,7 +99,7 @@ impl Sensing {
         before != (contact, proximity)
     }
 
-    /// A regular heartbeat goes out. What was sent at this very moment is not resent.
+    /// Returns the pages to send with a regular heartbeat. A page sent at this very time is not repeated.
     pub(super) fn beat(&mut self, now: Micros) -> Pages {
         if self.mode == Mode::Off {
             return Pages::NONE;
@@ -108,7 +109,7 @@ impl Sensing {
         self.says(now, Pages { skin, acceleration: self.beats == 0 })
     }
 
-    /// Time has passed: what is due before `until` is sent, overdue periods are skipped; the phase is kept.
+    /// Returns the page that is due before `until`. Overdue periods are skipped; the phase is kept.
     fn pass(&mut self, now: Micros, until: Micros) -> Pages {
         let (Mode::Continuous { period_ms }, Some(due)) = (self.mode, self.due) else { return Pages::NONE };
         if due >= until {
@@ -133,7 +134,7 @@ fn has_moved(now: &SkinSensors, sent: &SkinSensors, events: &Events) -> bool {
         || is_far(&[now.proximity], &[sent.proximity], events.proximity)
 }
 
-/// Whether one of them is by a threshold or more; a threshold of 0 means every change.
+/// Returns true if a value differs by the threshold or more; a threshold of 0 means any difference.
 fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
     let threshold = u32::from(threshold.to_bits().unsigned_abs().max(1));
     let far = |(now, sent): (&Q<F>, &Q<F>)| i32::from(now.to_bits()).abs_diff(sent.to_bits().into());
@@ -141,21 +142,21 @@ fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
 }
 
 impl Node {
-    /// Sends what is due after something was latched, measured or switched.
+    /// Sends the pages that are due after sensor values or the mode may have changed.
     pub(super) fn sense(&mut self, now: Micros) {
-        // Nothing is sent until the cell owns its node id; the contact state is compared with what was sent, so that
-        // nothing is lost.
+        // Pages are sent only once the cell owns its node id. The comparison with the last sent values
+        // ensures that no change is lost.
         let Some(cell) = self.identity.cell.filter(|_| self.claim.is_settled()) else { return };
         let pages = self.sensing.look(now, &self.switches, cell, &self.net());
         self.push_sensors(pages);
     }
 
-    /// When it has something to send by itself; not until it owns its node id.
+    /// Returns the time of the next page in continuous mode, if the cell owns its node id.
     pub(super) fn sensing_due(&self) -> Option<Micros> {
         self.sensing.due.filter(|_| self.claim.is_settled())
     }
 
-    /// Sends what is due.
+    /// Sends the page that is due.
     pub(super) fn sense_in_time(&mut self, now: Micros) {
         if self.sensing_due().is_some() {
             let pages = self.sensing.pass(now, now + Span(1));
@@ -163,8 +164,8 @@ impl Node {
         }
     }
 
-    /// What is due before the next joints is sent now, while the cell is awake. Not where the period is that of
-    /// the joints or shorter: all cells would send at once, each time.
+    /// Sends a page that is due before the next joints now, while the cell is awake. Not for periods up to
+    /// that of the joints: all cells would send at once, each time.
     pub(super) fn sense_before_the_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use() else { return };
         let joints = in_use.period();
@@ -176,7 +177,7 @@ impl Node {
         }
     }
 
-    /// Sends the present contact state.
+    /// Sends pages with the present contact state.
     pub(super) fn push_sensors(&mut self, Pages { skin, acceleration }: Pages) {
         let Some(from) = self.identity.cell else { return };
         let net = self.net();

@@ -1,24 +1,24 @@
-//! A cell's contact state, and stimuli that set it from a later epoch on.
+//! The contact state of a cell, and stimuli that change it from a later epoch on.
 //!
-//! A stimulus is not latched when it arrives but when the joints of its epoch do, so that a torque is a
-//! function of one joints frame and not of the order of frames on the bus.
+//! A stimulus is not latched on arrival but with the joints of its epoch, so that a torque is a function of
+//! one joints frame and not of the order of frames on the bus.
 
 use heapless::Vec;
 use protocol::fixed::Q3_12;
 use protocol::message::{From, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 
-/// How many stimuli can wait for their epoch.
+/// Maximum number of pending stimuli.
 pub const PENDING: usize = 8;
 
-/// What became of a stimulus.
+/// The result of receiving a stimulus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Arrival {
     /// It waits for its joints.
     InTime,
-    /// The joints of its epoch were taken already; it waits for the next.
+    /// The joints of its epoch have already been accepted; it waits for the next ones.
     Late,
-    /// There was no room for it.
+    /// The queue is full.
     Refused,
 }
 
@@ -26,12 +26,12 @@ pub(super) enum Arrival {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Sensed {
     pub(super) skin: SkinSensors,
-    /// In g.
+    /// Acceleration in g.
     pub(super) acceleration: [Q3_12; 3],
 }
 
 impl Sensed {
-    /// One page of it is this.
+    /// Sets the values of one page.
     pub(super) const fn set(&mut self, page: &SensorPage) {
         match *page {
             SensorPage::Skin(skin) => self.skin = skin,
@@ -41,7 +41,7 @@ impl Sensed {
     }
 }
 
-/// The sensors of a cell in test mode.
+/// The simulated sensors of a cell in test mode.
 #[derive(Debug, Default)]
 pub(super) struct Stimuli {
     pending: Vec<(From, SensorPage), PENDING>,
@@ -50,7 +50,7 @@ pub(super) struct Stimuli {
 }
 
 impl Stimuli {
-    /// Takes a stimulus that shall hold from some joints on; `last` are the last joints taken.
+    /// Queues a stimulus that applies from some joints on; `last` is the epoch of the last accepted joints.
     pub(super) fn push(&mut self, from: From, page: SensorPage, last: Option<Epoch>) -> Arrival {
         let (from, arrival) = match (from, last) {
             (From::Epoch(first), Some(last)) if last.since(first) >= 0 => (From::Next, Arrival::Late),
@@ -59,7 +59,7 @@ impl Stimuli {
         if self.pending.push((from, page)).is_ok() { arrival } else { Arrival::Refused }
     }
 
-    /// Latches, in the order of their arrival, all stimuli that hold from `epoch` on or earlier.
+    /// Latches all stimuli that apply from `epoch` or earlier, in order of arrival.
     pub(super) fn latch(&mut self, epoch: Epoch) {
         self.pending.retain(|(from, page)| {
             let waits = matches!(from, From::Epoch(first) if epoch.since(*first) < 0);
@@ -70,12 +70,12 @@ impl Stimuli {
         });
     }
 
-    /// Whether some wait for their epoch.
+    /// Returns true if stimuli wait for their epoch.
     pub(super) fn are_pending(&self) -> bool {
         !self.pending.is_empty()
     }
 
-    /// Forgets everything: nothing touches the cell.
+    /// Clears the queue and the contact state: nothing touches the cell.
     pub(super) fn clear(&mut self) {
         *self = Self::default();
     }

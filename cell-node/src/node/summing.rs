@@ -1,4 +1,4 @@
-//! The cell in a network: which sums are for which parent, and when they are sent.
+//! Summing in a network: the parent of each sum, and the time to send it.
 
 use protocol::fixed::Q7_8;
 use protocol::id::CellId;
@@ -12,40 +12,41 @@ use crate::contact::Torque;
 use crate::network::{Lost, Network};
 use crate::sum::{Begin, Sum, Words};
 
-/// So many more epochs (in sixteenths) without an answer are tolerated each time that a parent which was lost for that
-/// reason acknowledges the leave: it was there all the time.
+/// Increase of the tolerance, in sixteenths of an epoch, each time a parent lost for lack of answers
+/// acknowledges the leave, and so was alive all the time.
 const TOLERANCE_STEP: u16 = 2 * FORGETS;
-/// So many at most.
+/// Maximum tolerance, in sixteenths of an epoch.
 const TOLERANCE: u16 = 12 * FORGETS;
-/// One less after so many epochs with a sum of the parent.
+/// Number of epochs with a sum of the parent after which the tolerance decreases by one epoch.
 const FORGETS: u16 = 16;
-/// After so many complete epochs in a row, a cell is woken by its children and not by joints.
+/// Number of consecutive complete epochs after which the children's sums instead of joints wake the cell.
 const STEADY: u8 = 8;
-/// A check for missing sums that runs later than this finds nothing: the sums may still wait in the socket.
+/// Maximum lateness of a check for missing sums. A later check is skipped, because the sums may still wait in
+/// the socket.
 const PUNCTUAL: Span = Span::from_millis(1);
-/// The shortest time between two reports of its place in the tree.
+/// Minimum interval between reports of the place in the tree.
 const TREE: Span = Span::from_millis(50);
 
-/// The parent that an epoch's sum is for.
+/// The parent that receives the sum of an epoch.
 #[derive(Clone, Copy, Debug, Default)]
 enum Parent {
-    /// There is none.
+    /// No parent.
     #[default]
     None,
     /// The gateway's side, which sends no sums.
     Gateway,
-    /// The cell at a port, its node id if known, and whether one of its sums was received in this epoch.
+    /// The cell at a port, its node id if known, and true if one of its sums arrived in this epoch.
     Cell { port: usize, number: Option<CellId>, heard: bool },
 }
 
-/// When a cell reports its place in the tree.
+/// The schedule of reports of the place in the tree.
 #[derive(Debug, Default)]
 pub(super) struct TreeReport {
-    /// The place has changed.
+    /// True if the place has changed.
     pub(super) due: bool,
-    /// Not before this.
+    /// The earliest time of the next report.
     next: Micros,
-    /// The round that was reported last.
+    /// The last reported round.
     pub(super) round: u8,
 }
 
@@ -54,42 +55,44 @@ pub(super) struct TreeReport {
 pub(super) struct Summing {
     pub(super) network: Network,
     pub(super) sum: Sum,
-    /// By port, the cell whose sums are received.
+    /// The cell whose sums are received at each port.
     pub(super) heard: [Option<CellId>; PORTS],
     hears_changed: bool,
     parent: Parent,
-    /// Whether a sum was sent in the epoch before the present one.
+    /// True if a sum was sent in the previous epoch.
     said_before: bool,
-    /// The parent may not have taken a sum: it is probed until it answers. Epochs in a row in which it did not.
+    /// Set while the parent may have missed a sum and is probed until it answers: the number of consecutive
+    /// epochs without an answer.
     unanswered: Option<u16>,
-    /// How many of them are tolerated, in sixteenths: a cell that lost parents that were there all the time runs on a
-    /// machine that is late, and would only lose the next one too.
+    /// Tolerated epochs without an answer, in sixteenths. A cell that loses parents which are alive runs on a
+    /// slow machine, and would lose the next one as well.
     tolerance: u16,
-    /// The port of a parent that was lost for lack of answers, and may have been there all the time.
+    /// The port of a parent that was lost for lack of answers, but may have been alive.
     suspected: Option<usize>,
-    /// Complete epochs in a row in which a child was waited for.
+    /// Number of consecutive complete epochs in which the cell waited for a child.
     steady: u8,
-    /// Joints are received deferred: this cell is woken by its children.
+    /// True if joints are received deferred, because the children's sums wake this cell.
     pub(super) waits_for_children: bool,
-    /// The count of changes of the parent when it was read last.
+    /// The number of parent changes at the last read.
     changes: u16,
     pub(super) report: TreeReport,
 }
 
 impl Summing {
-    /// A cell that is not wired.
+    /// Creates the state of a cell without wires.
     #[inline(never)]
     pub(super) fn new(now: Micros) -> Self {
         let report = TreeReport { due: true, next: now, round: 0 };
         Self { network: Network::new(now), report, ..Self::default() }
     }
 
-    /// The parent whose sums are received.
+    /// Returns the parent whose sums are received.
     pub(super) fn heard_parent(&self) -> Option<CellId> {
         self.heard.get(self.network.up()?).copied().flatten()
     }
 
-    /// Whether the received identifiers, or those that wake the cell, have changed since the last call.
+    /// Returns true if the received identifiers, or those that wake the cell, have changed since the last
+    /// call.
     pub(super) fn poll_hears(&mut self) -> bool {
         let waits = self.steady == STEADY && self.unanswered.is_none() && self.sum.awaits_children();
         self.hears_changed |= core::mem::replace(&mut self.waits_for_children, waits) != waits;
@@ -103,13 +106,13 @@ impl Summing {
 
     pub(super) fn handle_time(&mut self, now: Micros) {
         if self.waits_for_children && now >= self.sum.late_at_next() {
-            // No joints arrived: from now on they wake it again.
+            // No joints arrived: from now on they wake the cell again.
             self.steady = 0;
         }
         self.network.handle_time(now);
     }
 
-    /// Takes a message of a port that receives.
+    /// Handles a message from a port that receives.
     fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
         let is_parent = self.network.up() == Some(port);
         self.sum.heard_after(age);
@@ -138,7 +141,7 @@ impl Summing {
         self.network.handle(now, port, message);
     }
 
-    /// Follows changes of the network.
+    /// Applies changes of the network.
     fn follow_network(&mut self) {
         for port in (0..PORTS).filter(|&port| !self.network.is_child(port)) {
             self.sum.disown(port);
@@ -146,7 +149,7 @@ impl Summing {
         if core::mem::replace(&mut self.changes, self.network.changes) != self.network.changes {
             self.unanswered = None;
             self.sum.restate = true;
-            // What was sent in this epoch may have been taken by the parent before.
+            // The previous parent may have accepted what was sent in this epoch.
             self.sum.fall_silent();
         }
         if self.network.up().is_none() {
@@ -161,7 +164,7 @@ impl Summing {
         self.hears_changed |= core::mem::replace(&mut self.heard, heard) != heard;
     }
 
-    /// New joints, which were on the bus `age` ago; their sums use the tree as it is now.
+    /// Starts an epoch with joints that were on the bus `age` ago. Its sums use the tree as it is now.
     pub(super) fn begin(
         &mut self,
         now: Micros,
@@ -171,7 +174,7 @@ impl Summing {
     ) {
         let (at, up) = (now - age, self.network.up());
         self.said_before = self.sum.said_in(epoch.before());
-        // A former parent takes no sum from a cell that was silent for an epoch.
+        // A former parent accepts no sum from a cell that sent none for an epoch.
         if !self.said_before {
             self.network.forget_former_parent(at);
         }
@@ -189,12 +192,13 @@ impl Summing {
             children: self.network.children(),
         };
         self.sum.begin(&begin, own.map(|torque| torque.exact()).as_ref());
-        // The age of deferred frames is no sign of a late machine.
+        // The age of deferred frames does not indicate a slow machine.
         if !self.waits_for_children {
             self.sum.heard_after(age);
         }
         if let Some(unanswered) = self.unanswered {
-            // Without an answer the parent is lost in this epoch, and a sum that was not sent may go to another.
+            // Without an answer the parent is lost in this epoch, and a sum not sent yet may go to another
+            // parent.
             if unanswered >= self.tolerated() {
                 self.sum.held = true;
             }
@@ -202,25 +206,26 @@ impl Summing {
         }
     }
 
-    /// A neighbour's sum; whether it is a child's.
+    /// Handles a neighbour's sum. Returns true if it is a child's.
     pub(super) fn take(&mut self, now: Micros, age: Span, from: CellId, epoch: Epoch, words: Words) -> bool {
         if let Parent::Cell { port, number, heard } = &mut self.parent
             && *number == Some(from)
         {
-            // A late sum of an earlier epoch is a sign of life too.
+            // A late sum of an earlier epoch also shows that the parent is alive.
             *heard |= self.network.hears(*port);
             return false;
         }
         let Some(port) = self.network.child_with(from).filter(|&port| self.network.hears(port)) else {
             return false;
         };
-        // Unlike a parent's, a child's is not deferred.
+        // Unlike a parent's sum, a child's is not deferred.
         self.sum.heard_after(age);
         self.sum.take(now, port, epoch, words);
         true
     }
 
-    /// Sends a NACK to each child whose sum is missing in this epoch, once; whether the parent is lost.
+    /// Sends a NACK to each child whose sum is missing in this epoch, once. Returns true if the parent is
+    /// lost.
     fn check_missing(&mut self, now: Micros) -> bool {
         let Some((epoch, nack)) = self.sum.missing() else { return false };
         for port in (0..PORTS).filter(|port| nack >> port & 1 == 1) {
@@ -232,7 +237,7 @@ impl Summing {
         match (&mut self.unanswered, self.parent) {
             (Some(unanswered), _) => {
                 *unanswered += 1;
-                // A cell that was silent all this epoch has no lease any more.
+                // A cell that sent nothing in this epoch has no lease any more.
                 lost = (*unanswered > tolerated).then_some(if said { Lost::Unsure } else { Lost::Done });
             }
             (None, Parent::Cell { heard: true, .. }) => self.tolerance = self.tolerance.saturating_sub(1),
@@ -252,19 +257,18 @@ impl Summing {
         lost.is_some()
     }
 
-    /// The parent did not take a sum: the state is resent, and the parent is probed whether it receives this cell at
-    /// all.
+    /// Handles a NACK: resends the state, and probes whether the parent receives this cell at all.
     fn was_nack(&mut self, epoch: Epoch) {
         self.sum.restate = true;
         let before = self.sum.epoch.is_some_and(|present| epoch.next() == present);
         if (self.sum.epoch == Some(epoch) && self.sum.said_in(epoch)) || (before && self.said_before) {
-            // It was thought to be taken.
+            // The sum was assumed to be accepted.
             self.unanswered = self.unanswered.or(Some(0));
             self.probe_parent();
         }
     }
 
-    /// Epochs in a row without an answer that are tolerated.
+    /// Returns the tolerated number of consecutive epochs without an answer.
     const fn tolerated(&self) -> u16 {
         self.tolerance.div_ceil(FORGETS)
     }
@@ -279,7 +283,7 @@ impl Summing {
 }
 
 impl Node {
-    /// Takes a message that came in through a port `age` ago.
+    /// Handles a message that arrived at a port `age` ago.
     pub fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
         if self.summing.network.hears(port) {
             self.summing.handle_port(now, age, port, message);
@@ -287,7 +291,7 @@ impl Node {
         }
     }
 
-    /// Follows changes of the network.
+    /// Applies changes of the network.
     pub(super) fn after_network(&mut self, now: Micros) {
         if !self.summing.network.exists() {
             return;
@@ -335,7 +339,7 @@ impl Node {
         }
     }
 
-    /// Reports its place in the tree if that has changed, at a limited rate.
+    /// Reports the place in the tree if it has changed, at a limited rate.
     pub(super) fn tell_tree(&mut self, now: Micros) {
         let report = &mut self.summing.report;
         let may = self.summing.network.exists() && self.claim.is_settled();
@@ -345,11 +349,11 @@ impl Node {
         }
     }
 
-    /// With a regular heartbeat: reports its place in the tree and its ports if they have changed.
+    /// Reports changes of the place in the tree and of the ports, with a regular heartbeat.
     pub(super) fn beat_network(&mut self, now: Micros) {
         let Summing { network, report, .. } = &mut self.summing;
         if network.exists() {
-            // Another round alone waits for the heartbeat.
+            // A new round alone waits for the heartbeat.
             report.due |= report.round != network.round();
             self.tell_tree(now);
             if self.summing.network.ports_changed(now) {

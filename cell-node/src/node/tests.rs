@@ -6,7 +6,8 @@ use protocol::message::{Answer, Heartbeat, Refused, Request, SkinSensors};
 use protocol::packet::{Segment, WORDS, Words};
 use protocol::parameters::{Contact, MAX_JOINTS, Parameter, Parameters, Pose, Row};
 
-/// A wheel: one joint about z, a cell on its rim that looks along the direction of motion.
+/// Returns the parameters of a wheel: one joint about z, and a cell on the rim that faces the direction of
+/// motion.
 fn wheel() -> Parameters {
     let [zero, one] = [Q1_14::ZERO, Q1_14::nearest(1.0)];
     let mut parameters = Parameters {
@@ -33,7 +34,7 @@ fn identity() -> Identity {
     Identity { cell: Some(cell()), serial: 100_012 }
 }
 
-/// A cell that owns its node id.
+/// Returns a cell that owns its node id.
 fn settled(flash: Flash) -> Node {
     settle(Node::new(identity(), Format::Fd, &flash, true, Micros(0)))
 }
@@ -46,7 +47,7 @@ fn settle(mut node: Node) -> Node {
     node
 }
 
-/// A cell that has just sent its address claim, and the claim.
+/// Returns a cell that has just sent its address claim, and the claim.
 fn claiming(identity: Identity) -> (Node, Message) {
     let mut node = Node::new(identity, Format::Fd, &Flash::Sound(wheel()), true, Micros(0));
     node.handle_timeout(node.poll_timeout());
@@ -108,7 +109,7 @@ fn a_pressed_cell_answers_each_joints_frame_and_the_end_of_contact_with_one_zero
     assert_eq!(tell(&mut node, &joints(0)), [], "quiet: nothing touches it");
     assert_eq!(tell(&mut node, &press(4.0, From::Epoch(Epoch(2)))), []);
     assert_eq!(tell(&mut node, &joints(1)), [], "not yet");
-    // It is pushed against its normal, 4 N at 0.5 m: the wheel gives way.
+    // A push of 4 N against the normal at 0.5 m turns the wheel.
     assert_eq!(tell(&mut node, &joints(2)), [torque(2, -2.0)]);
     assert_eq!(tell(&mut node, &joints(3)), [torque(3, -2.0)]);
     assert_eq!(tell(&mut node, &press(0.0, From::Next)), []);
@@ -189,7 +190,7 @@ fn a_heartbeat_that_is_due_before_the_next_joints_is_sent_with_the_answer_and_ke
     assert_eq!(node.poll_timeout(), due + HEARTBEAT, "neither drifts nor comes twice");
     node.handle_timeout(due);
     assert_eq!(drain(&mut node), []);
-    // Without joints it comes when it is due.
+    // Without joints it is sent when it is due.
     node.handle_timeout(due + HEARTBEAT);
     assert_eq!(drain(&mut node).len(), 1);
 }
@@ -227,7 +228,7 @@ fn a_claiming_cell_gives_way_to_the_owner_of_the_node_id() {
     tell(&mut newcomer, &defence[0]);
     assert_eq!(newcomer.taken(), Some(100_012));
     assert_eq!(other.taken(), None);
-    // Two settled cells notice each other and do not answer each other for ever.
+    // Two settled cells notice each other and do not answer each other forever.
     assert_eq!(tell(&mut other, &defence[0]), []);
     assert!(heartbeat(&tell(&mut other, &Message::Sync)).state.has(State::DUPLICATE));
 }
@@ -310,7 +311,7 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
     let state = heartbeat(&tell(&mut node, &Message::Sync)).state;
     assert!(state.has(State::CONFIGURED) && !state.has(State::FLASH_DAMAGED), "repaired");
 
-    // What cannot be is refused, and what was in use stays in use.
+    // An invalid value is refused, and the active parameters stay in use.
     let mut words = wheel().words(Parameter::Mount);
     words[0] = 2;
     request(&mut node, Request::Write { number: 1, words });
@@ -399,11 +400,11 @@ fn the_classic_format_works_in_segments() {
     };
     assert_eq!(hear(&mut node, &press(4.0, From::Next)), []);
     assert_eq!(hear(&mut node, &joints(0)), [torque(0, -2.0)]);
-    // One segment is lost: its packet is lost, the next one is not.
+    // A lost segment loses its packet but not the next one.
     let first = joints(1).encode().frames(Format::Classic).next().unwrap();
     node.handle_frame(NOW, Span(0), &first);
     assert_eq!(hear(&mut node, &joints(2)), [torque(2, -2.0)]);
-    // How far apart they are is a matter of when they arrived, not of when the cell processed them.
+    // The distance of segments depends on their arrival, not on the time of processing.
     let within = Segment::within(Id::command(Command::Joints));
     let mut apart = |epoch, second: Micros, age| {
         let mut segments = joints(epoch).encode().frames(Format::Classic);
@@ -417,7 +418,7 @@ fn the_classic_format_works_in_segments() {
 
 #[test]
 fn the_age_of_a_packet_is_that_of_its_last_segment() {
-    // JOINTS-4: the segments come 10 ms apart, which is twice the period.
+    // JOINTS-4: the segments arrive 10 ms apart, twice the period.
     let flash = Flash::Sound(Parameters { period_us: 5_000, ..wheel() });
     let mut node = settle(Node::new(identity(), Format::Classic, &flash, true, Micros(0)));
     for (segment, age) in [(0, Span(0)), (1, Span(5_000))] {
@@ -474,7 +475,7 @@ fn no_frame_makes_a_cell_panic() {
     proptest!(|(frames in frames)| {
         let mut node = settled(Flash::Sound(wheel()));
         for (id, data) in frames {
-            // With a right CRC, so that what lies behind it is reached.
+            // With a correct CRC, so that the code after the check is reached.
             let id = Id::from_bits(u16::try_from(id).unwrap() & 0x70F | 12);
             let length = Length::ALL[data.len() % 4];
             let mut words = [0_i16; MAX_JOINTS];

@@ -1,4 +1,4 @@
-//! When a cell reports the zero of its force sensor, sensors page 3: when its state changes, and once a second.
+//! Reports of the force sensor's zero (sensors page 3): when its state changes, and once a second.
 
 use protocol::message::{Message, SensorPage};
 
@@ -6,10 +6,10 @@ use super::Node;
 use super::stimuli::Sensed;
 use crate::baseline::Status;
 
-/// Every so many heartbeats carry the page.
+/// Number of heartbeats per page.
 const BEATS: u8 = 4;
 
-/// What was reported last.
+/// The last reported state.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Reported {
     status: Status,
@@ -17,20 +17,20 @@ pub(super) struct Reported {
 }
 
 impl Node {
-    /// What the sensors read, less the zero.
+    /// Returns the sensor values with the zero subtracted.
     pub(super) fn net(&self) -> Sensed {
         let Sensed { skin, acceleration } = self.stimuli.sensed;
         Sensed { skin: self.baseline.net(&skin), acceleration }
     }
 
-    /// Reports the zero if its state has changed. Nothing is sent until the cell owns its node id.
+    /// Reports the zero if its state has changed and the cell owns its node id.
     pub(super) fn report_zero(&mut self) {
         if self.claim.is_settled() && self.reported.status != self.baseline.status() {
             self.push_zero();
         }
     }
 
-    /// A regular heartbeat goes out.
+    /// Reports the zero with every fourth regular heartbeat.
     pub(super) fn beat_zero(&mut self) {
         self.reported.beats = (self.reported.beats + 1) % BEATS;
         if self.reported.beats == 0 {

@@ -13,7 +13,7 @@ fn begin(epoch: u8, depth: u8) -> Begin {
     Begin { epoch: Epoch(epoch), at, period: PERIOD, depth: Some(depth), speaks: true, children: 0b1111 }
 }
 
-/// In steps of Q7.8 and thousandths of them.
+/// Returns a torque in thousandths of a step of Q7.8.
 fn own(thousandths: i64) -> [Acc<30>; MAX_JOINTS] {
     [Acc::from_steps(thousandths * (1 << 22) / 1_000); MAX_JOINTS]
 }
@@ -26,7 +26,7 @@ fn at(epoch: u8, micros: u64) -> Micros {
     Micros(u64::from(epoch) * PERIOD.0 + micros)
 }
 
-/// What it sends from now to the end of the epoch, and when.
+/// Returns the sums sent until the end of the epoch, with their times.
 fn says(sum: &mut Sum, epoch: u8) -> Vec<(u64, i16, u8, bool)> {
     let mut said = Vec::new();
     for micros in (0..PERIOD.0).step_by(100) {

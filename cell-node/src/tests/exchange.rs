@@ -1,5 +1,5 @@
-//! The cell against `protocol/tests/golden/exchange.log`, which another program wrote from the document: it gets the frames
-//! of the log, and has to send the log's frames, at the log's times, and no others.
+//! Test of the cell with `protocol/tests/golden/exchange.log`, which another program wrote from the document.
+//! The cell receives the frames of the log, and must send the log's frames at the log's times, and no others.
 #![allow(clippy::indexing_slicing, clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 use std::collections::{BTreeMap, VecDeque};
@@ -17,10 +17,10 @@ use protocol::time::{Micros, Span};
 
 const EXCHANGE: &str = include_str!("../../../protocol/tests/golden/exchange.log");
 const SESSION: &str = include_str!("../../../protocol/tests/golden/session.log");
-/// Each exchange begins at a multiple of this after 1970.
+/// Interval between the starts of exchanges.
 const APART: u64 = 10_000_000;
 
-/// A cell and what it has sent, with the times.
+/// A cell and the frames that it sent, with their times.
 struct Cell {
     node: Node,
     format: Format,
@@ -28,7 +28,7 @@ struct Cell {
 }
 
 impl Cell {
-    /// Starts one as a line of the log says.
+    /// Starts a cell as a line of the log describes.
     fn start(fields: &str) -> Self {
         let fields: BTreeMap<_, _> = fields.split(' ').map(|field| field.split_once('=').unwrap()).collect();
         let format = if fields["format"] == "fd" { Format::Fd } else { Format::Classic };
@@ -50,7 +50,7 @@ impl Cell {
         }
     }
 
-    /// Lets time pass; a cell that has given way does nothing more.
+    /// Advances the time. A cell that has given way does nothing more.
     fn until(&mut self, at: u64) {
         while self.node.taken().is_none() && self.node.poll_timeout() <= Micros(at) {
             let due = self.node.poll_timeout();
@@ -65,7 +65,7 @@ impl Cell {
     }
 }
 
-/// What the writes of the session come to.
+/// Returns the parameters that the writes of the session result in.
 fn configuration() -> Parameters {
     let mut parameters = Parameters::default();
     for line in SESSION.lines() {
@@ -89,7 +89,8 @@ fn the_cell_sends_what_the_log_says_when_the_log_says_it() {
             title = line.strip_prefix("## ").unwrap_or(title);
             comment = line.strip_prefix("# ").unwrap_or(comment);
             if let Some(fields) = line.strip_prefix("# start ") {
-                // Nothing more in the second that follows is a heartbeat too few, so only what was sent so far counts.
+                // Heartbeats of the second after an exchange are not in the log, so only what was sent so far
+                // counts.
                 let rest = cell.replace(Cell::start(fields)).map(|cell| cell.sent).unwrap_or_default();
                 assert!(rest.is_empty(), "before {title}: {rest:?}");
             }

@@ -1,5 +1,4 @@
-//! The kernels against torques that were computed elsewhere, against Eq. 8 in real numbers, and against
-//! each other.
+//! Tests of the kernels with externally computed torques, with Eq. 8 in real numbers, and with each other.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -38,7 +37,7 @@ fn the_bound_of_j_is_little_more_than_an_arms_reach_and_of_a_slide_not_known() {
 
 #[test]
 fn a_pressed_cell_lets_the_joint_give_way() {
-    // A link of 0 m with a cell at x = 0.5 m that looks along +y: pressing it turns the joint back.
+    // A link of length 0 with a cell at x = 0.5 m that faces +y: a push on it turns the joint backwards.
     let pose =
         Pose { position: [0.5, 0.0, 0.0].map(Q1_14::nearest), normal: [0.0, 1.0, 0.0].map(Q1_14::nearest) };
     let parameters = Parameters { joint: 1, joints: 1, pose, ..Parameters::default() };
@@ -78,7 +77,7 @@ fn words_of_j_err_by_2_steps_at_most_on_a_ur5() {
 
 #[test]
 fn a_slide_is_pushed_along_its_axis() {
-    // A lift: a prismatic joint along z, then an arm of 0.5 m that turns about z, with a cell that looks up.
+    // A prismatic joint along z, then an arm of 0.5 m that turns about z, with a cell that faces up.
     let mut parameters = Parameters {
         joint: 2,
         joints: 2,
@@ -101,7 +100,7 @@ fn a_slide_is_pushed_along_its_axis() {
 // J-2
 #[test]
 fn an_arm_longer_than_q1_14_saturates_and_does_not_wrap() {
-    // Two links of 1.5 m, stretched out, and a cell at the end that looks up or down.
+    // Two links of 1.5 m, stretched out, and a cell at the end that faces up or down.
     let link = Row { a: Q1_14::nearest(1.5), ..Row::default() };
     let zero = Q1_14::ZERO;
     for (up, expected) in [(-1.0, Q1_14::MAX), (1.0, Q1_14::MIN)] {
@@ -111,7 +110,7 @@ fn an_arm_longer_than_q1_14_saturates_and_does_not_wrap() {
         let wrench = Wrench::<Q1_14>::new(&parameters).jacobian(&[zero; MAX_JOINTS]);
         let projection = Projection::<Q1_14>::new(&parameters).jacobian(&[zero; MAX_JOINTS]);
         assert_eq!(wrench[..2], [expected, Q1_14::nearest(-1.5 * up)]);
-        // Here the position saturates before it meets the force; the last step may differ.
+        // Here the position saturates before the product with the force; the last step may differ.
         assert!(projection[0].to_bits().unsigned_abs() >= 0x7FFF);
         assert_eq!(projection[0].to_bits() < 0, expected == Q1_14::MIN);
         assert_eq!(projection[1..], wrench[1..]);
@@ -132,7 +131,7 @@ fn an_offset_is_added_to_the_position_and_wraps() {
     assert!(apart(in_words::<Projection>(&case, &shifted), expected) < 2e-4);
 }
 
-/// What a kernel does for the UR5 and a cell on its last link.
+/// Returns the operation counts for the UR5 and a cell on its last link.
 fn operations<K: Kernel<Counted>>() -> Operations {
     let last = Case::all().into_iter().find(|case| case.joint == 6).unwrap();
     let kernel = K::new(&last.parameters());
@@ -160,7 +159,7 @@ fn unused_components_are_not_computed_behind_an_odd_twist_either() {
     assert_eq!((done.multiplications, done.additions, done.sines, done.cosines), (4, 2, 1, 1));
 }
 
-/// The words of an arm of 1 to 6 joints, any at all, with quarter turns and zeros more often than by chance.
+/// Generates any arm of 1 to 6 joints, in which quarter turns and zeros are more frequent than by chance.
 fn any_arm() -> impl Strategy<Value = Parameters> {
     let length = prop_oneof![1 => Just(0), 3 => any::<i16>()];
     let alpha = prop_oneof![
@@ -186,7 +185,7 @@ fn any_arm() -> impl Strategy<Value = Parameters> {
     )
 }
 
-/// The words of a chain of up to 14 joints in up to 32 rows of all kinds, any at all.
+/// Generates any chain of up to 14 joints in up to 32 rows of all kinds.
 fn any_chain() -> impl Strategy<Value = Parameters> {
     let kinds = prop_oneof![
         3 => Just(RowKind::Revolute), 1 => Just(RowKind::Prismatic), 2 => Just(RowKind::Fixed)
@@ -207,8 +206,8 @@ fn any_chain() -> impl Strategy<Value = Parameters> {
         .prop_filter("a joint moves the cell", |parameters| parameters.joint > 0)
 }
 
-/// The same chain, made shorter until the lengths of its rows, the way that it slides and the cell's position add up to
-/// less than 2 m; and positions of its joints.
+/// Generates such a chain whose rows, prismatic travel and cell position add up to less than 2 m, with joint
+/// positions.
 fn chain_in_reach() -> impl Strategy<Value = (Parameters, [Q1_14; MAX_JOINTS])> {
     let positions = any::<[i16; MAX_JOINTS]>();
     (in_reach(any_chain()), positions).prop_map(|(mut parameters, positions)| {
@@ -217,7 +216,7 @@ fn chain_in_reach() -> impl Strategy<Value = (Parameters, [Q1_14; MAX_JOINTS])> 
             parameters.table().iter().filter(|row| row.moves()).map(|row| row.kind).collect();
         let mut positions = positions.map(Q1_14::from_bits);
         if slides > 0 {
-            // Half of the length for the slides.
+            // Half of the length is for the prismatic joints.
             for row in &mut parameters.rows {
                 (row.a, row.d) = (half(row.a), half(row.d));
             }
@@ -236,7 +235,7 @@ fn half(word: Q1_14) -> Q1_14 {
     Q1_14::from_bits(word.to_bits() / 2)
 }
 
-/// An arm of any shape in reach: the lengths of its rows and of the cell's position add up to less than 2 m.
+/// Generates an arm of any shape whose rows and cell position add up to less than 2 m.
 fn arm_in_reach() -> impl Strategy<Value = Parameters> {
     in_reach(any_arm())
 }
@@ -259,20 +258,20 @@ fn in_reach(any: impl Strategy<Value = Parameters>) -> impl Strategy<Value = Par
     })
 }
 
-/// The largest difference of two Jacobians.
+/// Returns the largest difference of two Jacobians.
 fn apart(lhs: [f64; MAX_JOINTS], rhs: [f64; MAX_JOINTS]) -> f64 {
     lhs.iter().zip(rhs).map(|(l, r)| (l - r).abs()).fold(0.0, f64::max)
 }
 
-/// J-3: how many steps of 2^-14 m a cell's J may differ from the nearest word of the exact one; of chains of more than
-/// six rows one more for each further row.
+/// J-3: maximum difference of a cell's J from the nearest word of the exact value, in steps of 2^-14 m; one
+/// more for each row beyond six.
 const STEPS_OF_J: u32 = 8;
 
 fn steps_of_j(parameters: &Parameters) -> u32 {
     STEPS_OF_J + u32::try_from(parameters.chain().len().saturating_sub(6)).unwrap()
 }
 
-/// How many steps a kernel's J differs from the nearest word of the exact one.
+/// Returns the difference of a kernel's J from the nearest word of the exact value, in steps.
 fn steps_apart<K: Kernel>(
     parameters: &Parameters,
     joints: &[Q1_14; MAX_JOINTS],

@@ -1,4 +1,4 @@
-//! A cell with ports and one without: what they say over wires, and what parameter 6 is to them.
+//! Tests of cells with and without ports: their messages over wires, and parameter 6.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 use crate::flash::Flash;
@@ -33,7 +33,7 @@ fn start_with(wired: u8, cell: Option<CellId>) -> Node {
     Node::new(identity, Format::Fd, &Flash::Sound(parameters), true, Micros(0)).with_ports(wired)
 }
 
-/// Lets time pass; what it says over its wires.
+/// Advances the time. Returns the messages sent over wires.
 fn until(node: &mut Node, at: Micros) -> Vec<(usize, PortMessage)> {
     while node.poll_timeout() <= at {
         node.handle_timeout(node.poll_timeout());
@@ -58,7 +58,7 @@ fn sum_with(words: [i16; WORDS]) -> Message {
 #[test]
 fn hellos_of_a_claiming_cell_have_the_node_id_that_it_claims() {
     let mut node = start(0b1);
-    // It is settled 250 ms after its first heartbeat at the earliest.
+    // It is settled at the earliest 250 ms after its first heartbeat.
     let hellos = until(&mut node, Micros(200_000));
     assert!(
         matches!(hellos[..], [(0, PortMessage::Hello(Hello { number: 12, rank: None, .. }))]),
@@ -103,7 +103,7 @@ fn a_root_sends_its_sums_to_the_gateways_side_without_a_state() {
     assert!(!said.iter().any(|(_, message)| matches!(message, PortMessage::State(_))), "{said:?}");
 }
 
-/// The gateway's side takes it as a root.
+/// Makes the cell a root: the gateway's side grants its join.
 fn join_gateway(node: &mut Node, now: Micros) {
     let rank = Rank { round: 1, depth: 0 };
     let hello =

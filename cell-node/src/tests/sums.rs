@@ -1,4 +1,4 @@
-//! Sums of children that come late.
+//! Tests of late sums of children.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use crate::sum::{Begin, Sum, Words};
@@ -8,7 +8,7 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::Slots;
 use protocol::time::{Micros, Span};
 
-/// A parent that feels nothing itself, at the root of a tree of two, with its child at port 0.
+/// Starts an epoch of a parent without contact, at the root of a tree of two, with its child at port 0.
 fn begin(sum: &mut Sum, epoch: u8, at: u64) {
     let begin = Begin {
         epoch: Epoch(epoch),
@@ -25,7 +25,7 @@ fn words(bits: i16) -> Words {
     Words { torque: [Q7_8::from_bits(bits); MAX_JOINTS], count: 1 }
 }
 
-/// What is sent until half a period later.
+/// Returns the sum sent within half a period.
 fn said(sum: &mut Sum, after: u64) -> Option<Words> {
     sum.say(Micros(after + 8_000)).map(|(_, words, _)| words)
 }
@@ -36,7 +36,7 @@ fn a_sum_that_arrives_after_its_epoch_is_not_taken_for_another_epoch() {
     let mut sum = Sum::default();
     sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 1, carry: true }));
     begin(&mut sum, 129, 0);
-    // A machine that was late delivers it late; then the child's state message arrives.
+    // A slow machine delivers it late; then the child's state message arrives.
     sum.take(Micros(100), 0, Epoch(126), words(-154));
     sum.state(Micros(200), 0, Epoch(129));
     assert_eq!(said(&mut sum, 0), None, "nothing of this epoch has come");

@@ -477,7 +477,7 @@ fn what_is_no_file_or_too_long_is_not_read() {
     let long = folder.path().join("long.toml");
     std::fs::File::create(&long).unwrap().set_len((16 << 20) + 1).unwrap();
     let long = long.to_str().unwrap();
-    let too_long = "it is longer than 16777216 bytes, the most that are read";
+    let too_long = "it is longer than 16777216 bytes, the maximum";
     for (file, why) in [("/dev/zero", "it is a device, a file is needed"), (long, too_long)] {
         for command in [
             format!("check {file}"),

@@ -163,7 +163,7 @@ fn standard_input_is_read_for_one_thing() {
     {
         let Output { status, stderr, .. } = piped(&skin, command);
         let said = String::from_utf8(stderr).unwrap();
-        let expected = "it is read once, and was read already: name a file for one of the two\n";
+        let expected = "it can be read only once and was already read: use a file for one of the two\n";
         assert_eq!((status.code(), said.contains(expected)), (Some(2), true), "{command}: {said}");
     }
     let Output { status, stderr, .. } = piped(&skin, "fit -");

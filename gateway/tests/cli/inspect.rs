@@ -318,7 +318,7 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain run.log --skin skin.toml --epoch 7 --cell 300",
             2,
-            "invalid value '300' for '--cell <[BUS:]NODE>': \"300\" is no node id: 1 to 254 are; try '--help'",
+            "invalid value '300' for '--cell <[BUS:]NODE>': \"300\" is not a node id: use 1 to 254; try '--help'",
         ),
         (
             "explain empty.log --skin skin.toml --epoch 7",

@@ -1,12 +1,12 @@
-//! How benches that count instructions begin: what they need is looked for before it is used.
+//! The entry point of benches that count instructions. It checks for the required programs first.
 
 use std::process::{Command, Stdio, exit};
 
-/// The workspace's manifest, which says which version of gungraun this is.
+/// The workspace's manifest, which pins the version of gungraun.
 const MANIFEST: &str = include_str!("../../../Cargo.toml");
 
-/// Counts what `counted` does. Without `--bench`, which `cargo bench` says and `cargo test` does not, and with `--test`,
-/// everything is run `once` instead, which needs nothing that Rust does not bring.
+/// Runs `counted`, the benches under valgrind. Runs `once` instead, which needs no other programs, without
+/// `--bench` (which `cargo bench` passes and `cargo test` does not) or with `--test`.
 pub(crate) fn main(once: impl Fn(), counted: impl Fn()) {
     let said = |word: &str| std::env::args_os().any(|said| said == word);
     // The runner starts this program again for each benchmark, under valgrind.
@@ -26,7 +26,7 @@ pub(crate) fn main(once: impl Fn(), counted: impl Fn()) {
         let mut command = Command::new(program);
         command.arg("--version").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         if command.status().is_err() {
-            eprintln!("instructions are not counted, for there is no {program} here: {hint}");
+            eprintln!("cannot count instructions: {program} is not installed: {hint}");
             exit(1);
         }
     }

@@ -1,4 +1,4 @@
-//! One CAN bus with its bit rates, in virtual time: who sends when, and until when.
+//! A model of one CAN bus with its bit rates, in virtual time.
 //!
 //! ```text
 //!                    in order of time                     the bus, free ─┐
@@ -7,15 +7,17 @@
 //!                                        └──────── damaged: again ────────┘
 //! ```
 //!
-//! A frame takes exactly the time of its bits ([`protocol::wire_time`]), intermission included; when it ends, whatever waits is
-//! arbitrated as on the wire, and what was asked for at that very instant takes part. No frame is interrupted. With a bit-error
-//! rate frames are damaged, which costs what was sent of them and an error frame, and they take part again.
+//! A frame takes exactly the time of its bits ([`protocol::wire_time`]), including the intermission. When it
+//! ends, the waiting frames are arbitrated as on the wire; frames requested at that very instant take part.
+//! No frame is interrupted. With a bit-error rate, frames are damaged: a damaged frame costs the bits sent of
+//! it and an error frame, and takes part in arbitration again.
 //!
-//! The same requests give the same attempts, on any machine and however they are taken. Times are ns on any clock.
+//! The same requests give the same attempts on every machine, however time is advanced. Times are in ns from
+//! any origin.
 //!
-//! What it leaves out: bus-off and the error counters that lead to it, overload frames, clocks that are not alike, the time from
-//! one end of the cable to the other (which the bit rate has to allow for), and two nodes that send under one
-//! identifier, which is a fault on a real bus; here the earlier request is sent first.
+//! The model does not include bus-off and its error counters, overload frames, clock differences, the
+//! propagation delay of the cable (which the bit rate must allow for), or two nodes that send with one
+//! identifier. The latter is a fault on a real bus; here the earlier request is sent first.
 
 mod noise;
 mod priority;
@@ -30,47 +32,49 @@ use protocol::wire_time::{BitRates, Bits};
 pub use noise::{BitErrors, BitErrorsError, ERROR_FRAME};
 pub use priority::Priority;
 
-/// A frame that is to be sent.
+/// A frame to send.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Request<T = u64> {
-    /// From when on, in ns.
+    /// The earliest time to send it, in ns.
     pub at: u64,
-    /// What arbitration compares.
+    /// Its priority in arbitration.
     pub priority: Priority,
-    /// How long it takes.
+    /// Its number of bits.
     pub bits: Bits,
-    /// The transmit queue that it waits in: its frames go out in the order in which they were asked for, as from SocketCAN. Any
-    /// small numbers. Without one it takes part in every arbitration, as from a controller with room for each identifier.
+    /// The transmit queue in which it waits, any small number. The frames of a queue are sent in the order of
+    /// their requests, as by SocketCAN. Without a queue it takes part in every arbitration, as from a
+    /// controller with a buffer for each identifier.
     pub queue: Option<u16>,
-    /// The caller's own tag.
+    /// An arbitrary tag of the caller.
     pub tag: T,
 }
 
-/// A frame that was on the wire.
+/// A frame that was sent, successfully or not.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Attempt<T = u64> {
     /// The request's tag.
     pub tag: T,
-    /// When it was requested, in ns; at the earliest the time of the request before it.
+    /// Time of the request in ns, at least that of the previous request.
     pub at: u64,
-    /// Its first bit, in ns.
+    /// Start of the first bit, in ns.
     pub start: u64,
-    /// When the bus was free again, in ns: the end of the intermission, of the frame or of an error frame.
+    /// Time at which the bus was free again, in ns: the end of the intermission after the frame or the error
+    /// frame.
     pub end: u64,
-    /// Whether it was damaged. Then it waits again and is sent again.
+    /// True if the frame was damaged. It then waits again.
     pub is_damaged: bool,
 }
 
-/// A bus, whose frames each carry a tag `T` of the caller.
+/// A bus whose frames each carry a tag `T` of the caller.
 #[derive(Debug)]
 pub struct BusModel<T = u64> {
     rates: BitRates,
     errors: Option<BitErrors>,
-    /// The time of the newest request.
+    /// Time of the newest request.
     newest: u64,
-    /// Everything that begins before this is decided.
+    /// All arbitration before this time is decided.
     free_at: u64,
-    /// When the oldest of what waits was asked for, if nothing waited before.
+    /// Time of the request that ended the last idle period.
     ready_at: u64,
     on_wire: Option<(Waiting<T>, Attempt<T>)>,
     contenders: BinaryHeap<Waiting<T>>,
@@ -81,24 +85,24 @@ pub struct BusModel<T = u64> {
     most_waiting: usize,
 }
 
-/// One that waits.
+/// A waiting frame.
 #[derive(Clone, Copy, Debug)]
 struct Waiting<T> {
     request: Request<T>,
-    /// Which request it was: of one identifier the older one goes first.
+    /// The number of the request. Of two frames with one identifier, the older goes first.
     number: u64,
 }
 
 /// A transmit queue.
 #[derive(Debug)]
 struct Queue<T> {
-    /// Whether a frame of its own takes part, or is on the wire.
+    /// True if one of its frames takes part in arbitration or is on the wire.
     is_heard: bool,
     behind: VecDeque<Waiting<T>>,
 }
 
 impl<T> Ord for Waiting<T> {
-    /// The maximum leaves the heap first: the frame that wins the arbitration.
+    /// Orders frames so that the maximum, which leaves the heap first, wins the arbitration.
     fn cmp(&self, other: &Self) -> Ordering {
         (other.request.priority, other.number).cmp(&(self.request.priority, self.number))
     }
@@ -119,7 +123,7 @@ impl<T> PartialEq for Waiting<T> {
 impl<T> Eq for Waiting<T> {}
 
 impl<T: Copy> BusModel<T> {
-    /// An idle bus without errors.
+    /// Creates an idle bus without errors.
     #[must_use]
     pub const fn new(rates: BitRates) -> Self {
         Self {
@@ -138,22 +142,22 @@ impl<T: Copy> BusModel<T> {
         }
     }
 
-    /// The same, with errors from now on.
+    /// Adds bit errors from now on.
     #[must_use]
     pub fn with_errors(mut self, errors: BitErrors) -> Self {
         self.errors = Some(errors);
         self
     }
 
-    /// Its bit rates.
+    /// Returns the bit rates.
     #[must_use]
     pub const fn rates(&self) -> BitRates {
         self.rates
     }
 
-    /// Requests to send from a time on. A time before that of the newest request counts as that one's.
+    /// Requests to send a frame. A time before the newest request counts as the time of that request.
     ///
-    /// Time passes up to then: attempts that ended are there to be polled.
+    /// Advances the time to the request, so that earlier attempts can be polled.
     pub fn request(&mut self, mut request: Request<T>) {
         request.at = request.at.max(self.newest);
         self.run_until(request.at);
@@ -173,7 +177,8 @@ impl<T: Copy> BusModel<T> {
         }
     }
 
-    /// Lets time pass. What waits at `until` is not arbitrated yet, for more may be asked for at that instant.
+    /// Advances the time. Frames that wait at `until` are not arbitrated yet, because more requests may
+    /// follow for that instant.
     pub fn run_until(&mut self, until: u64) {
         self.newest = self.newest.max(until);
         loop {
@@ -200,19 +205,20 @@ impl<T: Copy> BusModel<T> {
         }
     }
 
-    /// Lets all that waits go out.
+    /// Advances the time until all waiting frames are sent.
     pub fn finish(&mut self) {
         while let Some(at) = self.poll_timeout() {
             self.run_until(at);
         }
     }
 
-    /// The next attempt that ended, in order of time.
+    /// Returns the next completed attempt, in order of time.
     pub fn poll(&mut self) -> Option<Attempt<T>> {
         self.ended.pop_front()
     }
 
-    /// Until when time has to pass for anything to happen, if nothing more is requested; `None` when no frame waits.
+    /// Returns the time to which the model must advance for the next event, if no further request is made;
+    /// `None` if no frame waits.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<u64> {
         match self.on_wire {
@@ -222,13 +228,13 @@ impl<T: Copy> BusModel<T> {
         }
     }
 
-    /// How many frames wait, the one on the wire among them.
+    /// Returns the number of waiting frames, including the one on the wire.
     #[must_use]
     pub const fn waiting(&self) -> usize {
         self.waiting
     }
 
-    /// The most that ever waited at the same time.
+    /// Returns the maximum number of frames that ever waited at the same time.
     #[must_use]
     pub const fn most_waiting(&self) -> usize {
         self.most_waiting
@@ -243,7 +249,7 @@ impl<T: Copy> BusModel<T> {
         self.queues.get_mut(index).expect("there are as many now")
     }
 
-    /// A queue's next frame takes part from now on.
+    /// Moves the next frame of a queue into arbitration.
     fn next_of_queue(&mut self, queue: Option<u16>) {
         let Some(queue) = queue.map(|queue| self.queue(queue)) else { return };
         let next = queue.behind.pop_front();

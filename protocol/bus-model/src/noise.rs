@@ -1,44 +1,44 @@
-//! Bits that arrive wrong.
+//! Random bit errors.
 
 use protocol::wire_time::Bits;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use thiserror::Error;
 
-/// Bits of an error frame and of the intermission behind it, at the nominal bit rate: flags of 6 bits, the last of which begins
-/// when the first one ends, a delimiter of 8, and 3.
+/// Number of bits of an error frame and the intermission after it, at the nominal bit rate: two consecutive
+/// flags of 6 bits, a delimiter of 8, and 3.
 pub const ERROR_FRAME: u32 = 12 + 8 + 3;
-/// The intermission, in which nothing can be damaged.
+/// Number of bits of the intermission, which cannot be damaged.
 const INTERMISSION: u32 = 3;
-/// Bits of an FD frame's tail that are at the nominal bit rate, the intermission among them.
+/// Number of nominal bits at the end of an FD frame, including the intermission.
 const FD_TAIL: u32 = 12;
 
-/// A bit-error rate out of range: not a number, or too high for frames to arrive.
+/// The error for a bit-error rate that is out of range: not a number, or too high for frames to arrive.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[error("bit-error rate {got}: 0 to {} are possible", BitErrors::MAX)]
 pub struct BitErrorsError {
-    /// What was asked for.
+    /// The requested rate.
     pub got: f64,
 }
 
-/// Which bits are damaged: each by itself with the same probability, drawn from a seed.
+/// Independent bit errors with a constant probability, drawn from a seed.
 #[derive(Clone, Debug)]
 pub struct BitErrors {
     dice: Pcg64Mcg,
-    /// The logarithm of the probability that a bit is not damaged.
+    /// Logarithm of the probability that a bit is undamaged.
     sound: f64,
-    /// Good bits that come before the next one that is damaged.
+    /// Number of undamaged bits before the next damaged one.
     good: u64,
 }
 
 impl BitErrors {
-    /// The maximum rate: a frame of 200 bits is then undamaged in one of seven attempts.
+    /// The maximum rate. A frame of 200 bits is then undamaged in one of seven attempts.
     pub const MAX: f64 = 0.01;
 
-    /// Errors by their rate, in [0, [`BitErrors::MAX`]].
+    /// Creates errors with a rate in the range 0 to [`BitErrors::MAX`].
     ///
     /// # Errors
-    /// When the rate is outside.
+    /// Returns an error if the rate is outside that range.
     pub fn new(rate: f64, seed: u64) -> Result<Self, BitErrorsError> {
         if !(0.0..=Self::MAX).contains(&rate) {
             return Err(BitErrorsError { got: rate });
@@ -48,7 +48,7 @@ impl BitErrors {
         Ok(errors)
     }
 
-    /// The distance to the next damaged bit, geometrically distributed.
+    /// Draws the distance to the next damaged bit, which is geometrically distributed.
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
@@ -56,11 +56,12 @@ impl BitErrors {
     )]
     fn draw(&mut self) {
         let uniform: f64 = self.dice.random();
-        // In (0, 1]; without errors the distance has no end.
+        // `1 - uniform` is in (0, 1]. Without errors the distance is unlimited.
         self.good = if self.sound < 0.0 { ((1.0 - uniform).ln() / self.sound) as u64 } else { u64::MAX };
     }
 
-    /// What is sent of a frame, and the error frame after it, if one of its bits is damaged.
+    /// Returns the bits that were sent of a damaged frame, including the error frame; `None` if the frame is
+    /// undamaged.
     pub(super) fn spoils(&mut self, bits: Bits) -> Option<Bits> {
         let exposed = bits.total().saturating_sub(INTERMISSION);
         if self.good >= u64::from(exposed) {
@@ -87,7 +88,8 @@ mod tests {
         let rate = 1e-3;
         let mut errors = BitErrors::new(rate, 7).unwrap();
         let damaged = (0..FRAMES).filter(|_| errors.spoils(FRAME).is_some()).count();
-        // A frame is damaged if one of its first 197 bits is. Six standard deviations: once in 500 million seeds.
+        // A frame is damaged if one of its first 197 bits is. Six standard deviations: one failure in 500
+        // million seeds.
         let (frames, one) = (f64::from(FRAMES), 1.0 - (1.0 - rate).powi(197));
         let deviation = (frames * one * (1.0 - one)).sqrt();
         assert!((damaged as f64 - frames * one).abs() < 6.0 * deviation, "{damaged}");
@@ -100,7 +102,7 @@ mod tests {
         for _ in 0..10_000 {
             let Some(Bits { nominal, data }) = errors.spoils(FRAME) else { continue };
             let sent = nominal - ERROR_FRAME;
-            // Head: 18 nominal bits. Tail: 9 before the intermission.
+            // Head: 18 nominal bits. Tail: 9 bits before the intermission.
             match (sent, data) {
                 (1..=18, 0) => seen[0] = true,
                 (18, 1..170) => seen[1] = true,

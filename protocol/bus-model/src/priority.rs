@@ -1,8 +1,9 @@
-//! Who wins an arbitration.
+//! Priorities in arbitration.
 
 use protocol::can::{Format, Frame};
 
-/// The bits of a frame that are compared on the wire, in their order, where a 0 wins: the lesser one goes first.
+/// The bits of a frame that arbitration compares, in their order on the wire. A 0 wins, so the lower value
+/// has priority.
 ///
 /// ```text
 ///   bit       31 .. 21        20        19       18 .. 1          0
@@ -10,12 +11,13 @@ use protocol::can::{Format, Frame};
 ///   29-bit    its upper 11    SRR 1     IDE 1    its lower 18     RTR
 /// ```
 ///
-/// So of two identifiers that begin alike the one with 11 bits wins, and data before a request for it.
+/// Of two identifiers with the same first 11 bits, the 11-bit one wins, and a data frame wins over a remote
+/// frame.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct Priority(u32);
 
 impl Priority {
-    /// Of a frame.
+    /// Returns the priority of a frame.
     #[must_use]
     pub const fn of(frame: &Frame) -> Self {
         let id = frame.id();
@@ -34,7 +36,8 @@ mod tests {
     use proptest::prelude::*;
     use protocol::can::{BIT_RATE_SWITCH, EXTENDED};
 
-    /// The bits themselves: the identifier's 11, RTR or SRR, IDE, and if it has 29 its other 18 and RTR.
+    /// Returns the arbitration bits one by one: the first 11 of the identifier, RTR or SRR, IDE, and for 29
+    /// bits the other 18 and RTR.
     fn bits(frame: &Frame) -> Vec<bool> {
         let (id, remote) = (frame.id(), frame.is_remote());
         let of = |word: u32, count: u32| (0..count).rev().map(move |place| word >> place & 1 == 1);
@@ -45,14 +48,14 @@ mod tests {
         }
     }
 
-    /// The first bit that is not alike decides; on the wire 0 is dominant.
+    /// Returns true if `one` wins: at the first bit that differs, it sends the dominant 0.
     fn wins(one: &Frame, other: &Frame) -> bool {
         let unlike = bits(one).into_iter().zip(bits(other)).find(|(one, other)| one != other);
         unlike.is_some_and(|(one, _)| !one)
     }
 
     fn any_frame() -> impl Strategy<Value = Frame> {
-        // Few, so that many begin alike.
+        // A small range, so that many identifiers begin alike.
         let id = prop_oneof![
             0..4_u32,
             (0..4_u32, 0..4_u32).prop_map(|(upper, lower)| EXTENDED | upper << 18 | lower)

@@ -1,4 +1,5 @@
-//! The model against a plain one that looks at every request again for each frame, and by hand.
+//! Tests of the model against a simple one that examines all requests for each frame, and against results by
+//! hand.
 
 use super::*;
 use proptest::prelude::*;
@@ -13,7 +14,7 @@ fn request(at: u64, id: u32, nominal: u32, tag: u64) -> Request {
     Request { at, priority, bits: Bits { nominal, data: 0 }, queue: None, tag }
 }
 
-/// All attempts of some requests.
+/// Returns all attempts of some requests.
 fn all(mut bus: BusModel, requests: &[Request]) -> Vec<Attempt> {
     requests.iter().for_each(|&request| bus.request(request));
     bus.finish();
@@ -21,7 +22,7 @@ fn all(mut bus: BusModel, requests: &[Request]) -> Vec<Attempt> {
     std::iter::from_fn(|| bus.poll()).collect()
 }
 
-/// Tag, start and end in µs.
+/// Returns tag, start and end in µs.
 fn times(attempts: &[Attempt]) -> Vec<(u64, u64, u64)> {
     attempts.iter().map(|it| (it.tag, it.start / 1_000, it.end / 1_000)).collect()
 }
@@ -42,7 +43,7 @@ fn a_frame_is_not_interrupted_and_then_the_lowest_identifier_goes() {
 fn all_that_is_requested_for_at_one_instant_takes_part() {
     let idle = [request(5_000, 3, 50, 1), request(5_000, 1, 50, 2), request(5_000, 2, 50, 3)];
     assert_eq!(times(&all(BusModel::new(rates()), &idle)), [(2, 5, 55), (3, 55, 105), (1, 105, 155)]);
-    // The instant at which the bus is free again.
+    // Requests at the instant at which the bus becomes free.
     let busy = [
         request(0, 9, 50, 1),
         request(10_000, 8, 50, 2),
@@ -103,10 +104,10 @@ fn damaged_frames_come_again_until_they_are_whole() {
     assert_eq!(attempts, run(11));
     assert_ne!(attempts, run(12));
     let damaged: Vec<_> = attempts.iter().filter(|it| it.is_damaged).collect();
-    // One in eleven is expected, 460; its deviation is 20.
+    // One in eleven is expected: 460, with a standard deviation of 20.
     assert!((300..700).contains(&damaged.len()), "{}", damaged.len());
     for attempt in damaged {
-        // At least one bit and the error frame, at most all but the intermission and the error frame.
+        // At least one bit and the error frame; at most all bits but the intermission, and the error frame.
         let bits = (attempt.end - attempt.start) / 1_000;
         let error_frame = u64::from(ERROR_FRAME);
         assert!((1 + error_frame..=97 + error_frame).contains(&bits), "{bits}");
@@ -120,7 +121,7 @@ fn damaged_frames_come_again_until_they_are_whole() {
 
 #[test]
 fn a_damaged_frame_lets_a_more_urgent_one_go_first() {
-    // Every frame of 100 bits or more is damaged sooner or later at this rate: a seed at which the first one is.
+    // At this rate some seed damages the first attempt of the frame.
     let requests = [request(0, 0x700, 100, 1), request(1, 0x100, 10, 2)];
     let seed = (0..1_000).find(|&seed| {
         let bus = BusModel::new(rates()).with_errors(BitErrors::new(0.01, seed).unwrap());
@@ -131,7 +132,7 @@ fn a_damaged_frame_lets_a_more_urgent_one_go_first() {
     assert_eq!(all(bus, &requests).iter().map(|it| it.tag).collect::<Vec<_>>(), [1, 2, 1]);
 }
 
-/// The same by looking at all that is left for each frame.
+/// The simple model: examines all remaining requests for each frame.
 fn plain(requests: &[Request]) -> Vec<Attempt> {
     let mut left: Vec<_> = requests.iter().enumerate().collect();
     let (mut free, mut attempts) = (0, Vec::new());
@@ -154,7 +155,7 @@ fn any_requests() -> impl Strategy<Value = Vec<Request>> {
     let id =
         prop_oneof![0..8_u32, (0..4_u32, 0..4_u32).prop_map(|(upper, lower)| EXTENDED | upper << 18 | lower)];
     let queue = prop_oneof![Just(None), (0..3_u16).prop_map(Some)];
-    // In steps of the frames' own lengths, so that ends and requests often meet.
+    // Steps of the frames' own lengths, so that ends and requests often coincide.
     let one = (0..4_u64, id, 1..4_u32, queue);
     proptest::collection::vec(one, 0..60).prop_map(|steps| {
         let mut at = 0;

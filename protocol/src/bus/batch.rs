@@ -1,6 +1,6 @@
-//! Many datagrams in one system call: what both ends of a bus receive and send with.
+//! Batches of datagrams, received and sent with one system call. Both ends of a bus use them.
 //!
-//! Nothing here waits, and nothing allocates after [`Batch::new`].
+//! No function here waits, except those that say so, and nothing allocates after [`Batch::new`].
 
 use std::io;
 use std::os::fd::AsFd;
@@ -14,34 +14,34 @@ use crate::can::FD_BYTES;
 
 pub use super::slot::Notes;
 
-/// How many datagrams one call moves at most.
+/// Maximum number of datagrams per system call.
 pub const BATCH: usize = 64;
-/// So many are requested first: most reads find one or two, and room for 64 costs more to lay out than a
-/// datagram to read.
+/// Number of datagrams of the first receive call. Most calls return one or two, and preparing 64 slots costs
+/// more than receiving a datagram.
 const FEW: usize = 4;
-/// Most sends are of so many at most; as with [`FEW`], room for 64 costs more.
+/// Capacity of the smaller send call, which suffices for most sends; see [`FEW`].
 pub(super) const SMALL: usize = 8;
 
-/// Buffers for up to [`BATCH`] datagrams of at most 72 bytes.
+/// A receive buffer for up to [`BATCH`] datagrams of at most 72 bytes.
 pub struct Batch {
     slots: Box<[Slot; BATCH]>,
     count: usize,
-    /// An error behind the datagrams of the last reception, which the kernel reports once.
+    /// The error after the datagrams of the last receive, which the kernel reports only once.
     failure: Option<io::Error>,
 }
 
 impl Batch {
-    /// Empty buffers.
+    /// Creates an empty buffer.
     #[must_use]
     pub fn new() -> Self {
         let slot = || Slot { bytes: [0; FD_BYTES], control: [0; 8], len: 0, control_len: 0, flags: 0 };
         Self { slots: Box::new(std::array::from_fn(|_| slot())), count: 0, failure: None }
     }
 
-    /// Takes what is waiting in a socket, and forgets what was here. Never waits.
+    /// Receives the pending datagrams of a socket, replacing the contents. Never waits.
     ///
     /// # Errors
-    /// The error of `recvmmsg`; [`io::ErrorKind::WouldBlock`] when nothing is waiting.
+    /// Returns the error of `recvmmsg`: [`io::ErrorKind::WouldBlock`] if nothing is pending.
     pub fn receive(&mut self, fd: impl AsFd) -> io::Result<usize> {
         (self.count, self.failure) = (0, None);
         let (fd, slots) = (fd.as_fd(), self.slots.as_mut_slice());
@@ -56,7 +56,7 @@ impl Batch {
         Ok(self.count)
     }
 
-    /// The error behind what was received last, if there was one.
+    /// Takes the error that followed the last received datagrams.
     pub(super) const fn take_failure(&mut self) -> Option<io::Error> {
         self.failure.take()
     }
@@ -66,8 +66,8 @@ impl Batch {
         self.failure = Some(error);
     }
 
-    /// Waits for one datagram for at most the socket's `SO_RCVTIMEO`, and takes only this one: who is
-    /// woken for each would look for a second in vain.
+    /// Receives one datagram, waiting up to the socket's `SO_RCVTIMEO`. It does not look for a second one,
+    /// because a receiver that wakes up for each datagram rarely finds another.
     pub(super) fn receive_one_patiently(&mut self, fd: impl AsFd) -> io::Result<usize> {
         (self.count, self.failure) = (0, None);
         let Some((one, _)) = self.slots.split_first_chunk_mut::<1>() else { return Ok(0) };
@@ -75,7 +75,7 @@ impl Batch {
         Ok(self.count)
     }
 
-    /// What the last [`Batch::receive`] brought, in order.
+    /// Returns the datagrams of the last receive, in order.
     pub fn datagrams(&self) -> impl ExactSizeIterator<Item = Datagram<'_>> {
         self.slots.iter().take(self.count).map(Datagram)
     }
@@ -98,20 +98,19 @@ impl std::fmt::Debug for Batch {
 pub struct Datagram<'a>(&'a Slot);
 
 impl<'a> Datagram<'a> {
-    /// Its bytes, or `None` when it was longer than 72 and is truncated.
+    /// Returns its bytes; `None` if it was longer than 72 bytes and thus truncated.
     #[must_use]
     pub fn bytes(self) -> Option<&'a [u8]> {
         if self.0.flags & libc::MSG_TRUNC == 0 { self.0.bytes.get(..self.0.len) } else { None }
     }
 
-    /// Whether this very socket sent it, as the kernel reports.
+    /// Returns true if this socket sent it (`MSG_CONFIRM`).
     #[must_use]
     pub const fn is_own(self) -> bool {
         self.0.flags & libc::MSG_CONFIRM != 0
     }
 
-    /// When it came, in nanoseconds of the wall clock, and how many the kernel had dropped before it,
-    /// each if the kernel reported it.
+    /// Returns its time of arrival and the socket's drop count, each if the kernel reported it.
     #[must_use]
     pub fn notes(self) -> Notes {
         let words = self.0.control.map(u64::to_ne_bytes);
@@ -125,7 +124,7 @@ impl std::fmt::Debug for Datagram<'_> {
     }
 }
 
-/// Datagrams on their way out: at most N of at most 72 bytes.
+/// A send buffer for up to N datagrams of at most 72 bytes.
 pub struct Outgoing<const N: usize = BATCH> {
     bytes: [[u8; FD_BYTES]; N],
     lens: [usize; N],
@@ -133,18 +132,18 @@ pub struct Outgoing<const N: usize = BATCH> {
 }
 
 impl<const N: usize> Outgoing<N> {
-    /// Nothing to send yet.
+    /// Creates an empty buffer.
     #[must_use]
     pub const fn new() -> Self {
         Self { bytes: [[0; FD_BYTES]; N], lens: [0; N], count: 0 }
     }
 
-    /// Forgets what was put in.
+    /// Removes all datagrams.
     pub const fn clear(&mut self) {
         self.count = 0;
     }
 
-    /// Adds the first `len` of these bytes (at most 72); whether there was room.
+    /// Appends the first `len` of these bytes (at most 72). Returns false if the buffer is full.
     pub fn push(&mut self, bytes: &[u8; FD_BYTES], len: usize) -> bool {
         let room = self.bytes.get_mut(self.count).zip(self.lens.get_mut(self.count));
         let Some((to, to_len)) = room else { return false };
@@ -154,10 +153,10 @@ impl<const N: usize> Outgoing<N> {
         true
     }
 
-    /// Sends them all, in order, without waiting; how many the socket took.
+    /// Sends all datagrams in order without waiting, and returns the number that the socket accepted.
     ///
     /// # Errors
-    /// The error of `sendmmsg` when it could not send even one; [`io::ErrorKind::WouldBlock`] when the socket
+    /// Returns the error of `sendmmsg` if no datagram was sent: [`io::ErrorKind::WouldBlock`] if the socket
     /// is full.
     pub fn send(&self, fd: impl AsFd) -> io::Result<usize> {
         let datagrams = self.bytes.iter().zip(&self.lens).take(self.count);
@@ -171,24 +170,24 @@ impl<const N: usize> Outgoing<N> {
     }
 }
 
-/// Sends one datagram, without waiting: one when the socket took it.
+/// Sends one datagram without waiting, and returns 1.
 ///
 /// # Errors
-/// The error of `send`; [`io::ErrorKind::WouldBlock`] when the socket is full.
+/// Returns the error of `send`: [`io::ErrorKind::WouldBlock`] if the socket is full.
 pub fn send_one(fd: impl AsFd, bytes: &[u8]) -> io::Result<usize> {
     let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
     rustix::io::retry_on_intr(|| rustix::net::send(&fd, bytes, flags))?;
     Ok(1)
 }
 
-/// Returns whether an error means that the system lacks memory: it passes, and says nothing about the socket.
+/// Returns true if an error means a temporary shortage of memory, unrelated to the socket.
 #[must_use]
 pub fn is_shortage(error: &io::Error) -> bool {
     let errno = error.raw_os_error().map(Errno::from_raw_os_error);
     matches!(errno, Some(Errno::NOMEM | Errno::NOBUFS))
 }
 
-/// Repeats a call that does not wait, and that a signal interrupted.
+/// Repeats a non-blocking call that a signal interrupted.
 fn uninterrupted(mut call: impl FnMut() -> io::Result<usize>) -> io::Result<usize> {
     loop {
         match call() {
@@ -292,7 +291,7 @@ mod tests {
             let datagram = batch.datagrams().next().unwrap();
             assert_eq!(datagram.bytes().unwrap(), [7; 16]);
             assert!(datagram.notes().at_nanos.is_some());
-            // Nobody has the pipe's other end open.
+            // All write ends of the pipe are closed, so the read returns 0.
             assert_eq!(rustix::io::read(&read, &mut [0]).unwrap(), 0, "{count}");
         }
     }

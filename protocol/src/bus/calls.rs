@@ -1,6 +1,5 @@
-//! The system calls that have no safe wrapper: many datagrams at once, the process at the other end, and how a process
-//! is scheduled.
-//! Decides nothing.
+//! System calls without a safe wrapper: batches of datagrams, credentials of a peer, and scheduling. This
+//! module contains no policy.
 
 use std::io;
 use std::mem;
@@ -8,14 +7,15 @@ use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
 
 use super::slot::{Slot, each_passed};
 
-/// Asks for `SCHED_BATCH`; whether it was granted.
+/// Requests `SCHED_BATCH` for this thread. Returns true if it was granted.
 pub(super) fn set_batch() -> bool {
     let parameters = libc::sched_param { sched_priority: 0 };
     // SAFETY: the pointer is to a live, initialised struct, which the call only reads.
     unsafe { libc::sched_setscheduler(0, libc::SCHED_BATCH, &raw const parameters) == 0 }
 }
 
-/// `SO_PEERCRED`: the process that connected a socket; none if it is in another pid namespace, where its id is 0.
+/// Returns the id of the process that connected a socket (`SO_PEERCRED`); `None` if it is in another pid
+/// namespace, where the id is 0.
 pub(super) fn peer_process(fd: BorrowedFd<'_>) -> Option<u32> {
     let mut peer = libc::ucred { pid: 0, uid: 0, gid: 0 };
     let mut len = libc::socklen_t::try_from(size_of_val(&peer)).ok()?;
@@ -27,9 +27,9 @@ pub(super) fn peer_process(fd: BorrowedFd<'_>) -> Option<u32> {
     if result == 0 { u32::try_from(peer.pid).ok().filter(|pid| *pid > 0) } else { None }
 }
 
-/// `recvmmsg`: how many slots were filled. It waits for the first datagram, as long as the socket's
-/// `SO_RCVTIMEO` says, or not at all. Descriptors that were passed along are closed.
-// Not inlined: a caller's stack would grow by the largest N, and each of its pages is touched.
+/// Calls `recvmmsg` and returns the number of filled slots. If `wait` is true, it waits for the first
+/// datagram up to the socket's `SO_RCVTIMEO`. Passed file descriptors are closed.
+// Not inlined: a caller's stack frame would grow by the largest N, and all its pages would be touched.
 #[inline(never)]
 pub(super) fn receive<const N: usize>(
     fd: BorrowedFd<'_>,
@@ -64,15 +64,16 @@ pub(super) fn receive<const N: usize>(
         slot.control_len = header.msg_hdr.msg_controllen;
         slot.flags = header.msg_hdr.msg_flags;
         each_passed(slot, |descriptor| {
-            // SAFETY: the kernel has just opened this descriptor for this process, and nothing else knows of it.
+            // SAFETY: the kernel has just opened this descriptor for this process, and no other code knows
+            // it.
             drop(unsafe { OwnedFd::from_raw_fd(descriptor) });
         });
     }
     Ok(count)
 }
 
-/// `sendmmsg`, without waiting: how many of the datagrams (at most N are looked at) were sent.
-// Not inlined, as above.
+/// Calls `sendmmsg` without waiting, with at most N datagrams, and returns the number sent.
+// Not inlined, for the same reason as `receive`.
 #[inline(never)]
 pub(super) fn send<'a, const N: usize>(
     fd: BorrowedFd<'_>,

@@ -1,4 +1,4 @@
-//! What each kind of bus does in its own way.
+//! The interface that each kind of bus implements.
 
 use std::io;
 
@@ -8,24 +8,24 @@ use socketcan::CanFdSocket;
 use super::batch::Datagram;
 use super::{Bus, BusError, Filter, Options};
 
-/// What each kind of bus does in its own way; the rest of [`Bus`] is the same for all.
+/// The operations in which the kinds of buses differ; the rest of [`Bus`] is common to all.
 pub(super) trait Carrier {
-    /// Opens a bus with its filters set and time stamps on what arrives: the socket, and how many bytes may wait for
-    /// it, as the kernel counts them.
+    /// Opens a bus, with filters and time stamps enabled. Returns the socket, and the size of its receive
+    /// buffer as the kernel counts it.
     fn open(&self, name: &str, options: &Options) -> Result<(CanFdSocket, usize), BusError>;
 
     /// Replaces the filters.
     fn set_filters(&self, bus: &Bus, filters: &[Filter]) -> Result<(), BusError>;
 
-    /// Whether nothing real hangs on the bus of this name.
+    /// Returns true if the bus of this name has no hardware.
     fn is_virtual(&self, name: &str) -> io::Result<bool>;
 
-    /// Whether a frame came back to the very socket that sent it.
+    /// Returns true if the socket that received this frame also sent it.
     fn is_own(&self, frame: Datagram<'_>) -> bool;
 
-    /// How many frames were dropped so far, from a datagram that reports it instead of a frame.
+    /// Decodes a drop notice and returns the number of frames dropped so far; `None` for other datagrams.
     fn dropped(&self, notice: &[u8]) -> Option<u32>;
 
-    /// The state of the bus that an error of an open socket shows, when it shows any.
+    /// Returns the bus error that an error of an open socket stands for; `None` if it is not specific.
     fn cause(&self, errno: Errno) -> Option<fn(String) -> BusError>;
 }

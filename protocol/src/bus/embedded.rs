@@ -1,7 +1,7 @@
-//! The embedded bus as a client sees it: where it is, and the control datagrams beside frames.
+//! The client side of the embedded bus: its directory, and the control datagrams besides frames.
 //!
-//! docs/reference/embedded-bus.md describes each byte. A frame is a datagram of 16 or 72 bytes, exactly the kernel's
-//! struct; no control datagram has either length.
+//! docs/reference/embedded-bus.md describes each byte. A frame is a datagram of 16 or 72 bytes, exactly the
+//! kernel's struct; no control datagram has either length.
 
 use std::os::fd::AsFd;
 
@@ -17,40 +17,40 @@ pub use directory::{
 mod client;
 mod directory;
 
-/// The version of the control messages beside frames.
+/// The version of the control datagrams.
 pub const VERSION: u8 = 2;
-/// Which byte of a frame marks it as the receiver's own.
+/// Index of the byte that marks a frame as the receiver's own.
 pub const OWN_BYTE: usize = 6;
-/// The longest hello in bytes.
+/// Maximum length of a hello in bytes.
 pub const HELLO_MAX: usize = HELLO_HEAD + 8 * Filter::MAX;
 
 const MAGIC: &[u8; 7] = b"skinbus";
 const HELLO_HEAD: usize = 23;
 const ANSWER_LEN: usize = 17;
 
-/// Returns the id of the process that connected a socket; none if it is in another pid namespace.
+/// Returns the id of the process that connected a socket; `None` if it is in another pid namespace.
 #[must_use]
 pub fn peer_process(socket: impl AsFd) -> Option<u32> {
     calls::peer_process(socket.as_fd())
 }
 
-/// A client's request when it connects.
+/// The request of a connecting client.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Hello {
-    /// What it wants to receive.
+    /// Filters for received frames.
     pub filters: Vec<Filter>,
-    /// Whether it wants its own frames back.
+    /// True to receive the client's own frames.
     pub own_frames: bool,
-    /// Whether it wants CAN FD frames.
+    /// True to receive CAN FD frames.
     pub fd: bool,
-    /// Which error frames it wants.
+    /// Mask of error frames to receive.
     pub error_mask: u32,
-    /// How many bytes may wait for it.
+    /// Requested size of the receive buffer in bytes.
     pub buffer: u64,
 }
 
 impl Hello {
-    /// The datagram.
+    /// Encodes the datagram.
     #[must_use]
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(HELLO_HEAD + 8 * self.filters.len());
@@ -63,7 +63,7 @@ impl Hello {
         bytes
     }
 
-    /// Reads the datagram; `None` when it is no hello of this version. Never panics.
+    /// Decodes a datagram. Returns `None` if it is not a hello of this version. Never panics.
     #[must_use]
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let (head, filters) = bytes.split_first_chunk::<HELLO_HEAD>()?;
@@ -80,14 +80,14 @@ impl Hello {
     }
 }
 
-/// Filters that replace the present ones: all of them when it is the first and the last part.
+/// A part of a list of filters that replaces the present filters.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct FilterPart {
-    /// What came of an unfinished change before is forgotten.
+    /// True for the first part, which discards an unfinished list.
     pub first: bool,
-    /// All filters are known.
+    /// True for the last part, which activates the list.
     pub last: bool,
-    /// Some of them.
+    /// The filters of this part.
     pub filters: Vec<Filter>,
 }
 
@@ -95,10 +95,11 @@ impl FilterPart {
     const HEAD: u8 = b'F';
     const FIRST: u8 = 1;
     const LAST: u8 = 2;
-    /// So many fit into a datagram that is no longer than an FD frame's, which is what a bus reads.
+    /// Maximum number of filters in a part. The datagram must not be longer than an FD frame, the longest
+    /// that a bus reads.
     const FILTERS: usize = 8;
 
-    /// These filters in as many parts as they need.
+    /// Splits a list of filters into parts.
     pub fn split(filters: &[Filter]) -> impl Iterator<Item = Self> + use<'_> {
         let parts = filters.len().div_ceil(Self::FILTERS).max(1);
         (0..parts).map(move |part| Self {
@@ -108,7 +109,7 @@ impl FilterPart {
         })
     }
 
-    /// The datagram.
+    /// Encodes the datagram.
     #[must_use]
     pub fn encode(&self) -> Vec<u8> {
         let flag = |set, flag| if set { flag } else { 0 };
@@ -117,7 +118,7 @@ impl FilterPart {
         bytes
     }
 
-    /// Reads the datagram; `None` when it is none. Never panics.
+    /// Decodes a datagram. Returns `None` if it is not a part of filters. Never panics.
     #[must_use]
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let &[Self::HEAD, flags @ 0..=3, ref rest @ ..] = bytes else { return None };
@@ -145,9 +146,9 @@ fn decode_filters(bytes: &[u8]) -> Option<Vec<Filter>> {
 /// The bus's answer to a hello.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Answer {
-    /// The filters are set.
+    /// The client is connected and its filters are set.
     Welcome {
-        /// How many bytes may wait for this client, as the kernel counts them.
+        /// Size of the client's receive buffer in bytes, as the kernel counts it.
         granted: u64,
     },
     /// The hello was not understood.
@@ -158,7 +159,7 @@ pub enum Answer {
 }
 
 impl Answer {
-    /// The datagram.
+    /// Encodes the datagram.
     #[must_use]
     pub fn encode(self) -> [u8; ANSWER_LEN] {
         let (code, version, granted) = match self {
@@ -174,7 +175,7 @@ impl Answer {
         bytes
     }
 
-    /// Reads the datagram; `None` when it is no answer. Never panics.
+    /// Decodes a datagram. Returns `None` if it is not an answer. Never panics.
     #[must_use]
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let &[version, code, ref value @ ..] = bytes.strip_prefix(MAGIC)? else { return None };
@@ -187,14 +188,14 @@ impl Answer {
     }
 }
 
-/// The notice of how many frames were dropped so far.
+/// Encodes a drop notice: the total number of frames dropped for a client.
 #[must_use]
 pub const fn encode_dropped(total: u32) -> [u8; 5] {
     let [a, b, c, d] = total.to_le_bytes();
     [b'D', a, b, c, d]
 }
 
-/// Reads that notice.
+/// Decodes a drop notice.
 #[must_use]
 pub const fn decode_dropped(bytes: &[u8]) -> Option<u32> {
     match *bytes {

@@ -1,4 +1,4 @@
-//! What can be wrong with a bus, in one line each: what, which value, what is allowed, what to do.
+//! Errors of a bus, in one line each: the bus, the value, what is allowed, and what to do.
 
 use std::io;
 use std::path::PathBuf;
@@ -9,36 +9,38 @@ use thiserror::Error;
 use super::Filter;
 use super::embedded::DirectoryError;
 
-/// Why a bus cannot be opened or used.
+/// The error for a bus that cannot be opened or used.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum BusError {
-    /// No interface can have this name.
-    #[error("{0:?} is no bus name: 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'")]
+    /// The name is not valid for a bus.
+    #[error(
+        "{0:?} is not a valid bus name: use 1 to 15 bytes without spaces, '/' or ':', except '.' and '..'"
+    )]
     Name(String),
-    /// The kernel takes only so many filters.
+    /// There are more filters than the kernel accepts.
     #[error("{got} filters are too many for one socket on {name}: at most {max}", max = Filter::MAX)]
     Filters {
         /// The bus.
         name: String,
-        /// How many were requested.
+        /// Requested number of filters.
         got: usize,
     },
-    /// SocketCAN was requested and the kernel has none.
+    /// SocketCAN was requested, but the kernel does not support it.
     #[error(
         "{0}: this kernel has no SocketCAN; load it with `modprobe can_raw`, or use the embedded bus \
          (--bus-kind embedded)"
     )]
     NoSocketCan(String),
-    /// The kernel has SocketCAN and no such interface.
+    /// The kernel supports SocketCAN, but there is no interface of this name.
     #[error("there is no interface {0}: make it with `vcan-setup up {0}`, or plug it in if it is hardware")]
     NoInterface(String),
-    /// An interface of another sort.
+    /// The interface is not a CAN interface.
     #[error(
         "{0} is an interface, but no CAN interface: name one that `ip -br link show type can` or `type vcan` lists"
     )]
     NotCan(String),
-    /// A classic interface where CAN FD is required.
+    /// CAN FD was requested on an interface for classic CAN.
     #[error(
         "{name} has MTU {mtu} and CAN FD needs 72: set it with `ip link set {name} down && ip link set \
          {name} mtu 72 up`, or use the classic format (CAN hardware: `vcan-setup doctor SKIN.toml` says how)"
@@ -49,7 +51,7 @@ pub enum BusError {
         /// Its MTU in bytes.
         mtu: u32,
     },
-    /// The interface is down: found when it was opened, or while it was in use. It may come back.
+    /// The interface was down when it was opened, or went down later. It may come up again.
     #[error(
         "{0} is down: bring it up with `ip link set {0} up`; if that is refused, `vcan-setup doctor {0}` says why"
     )]
@@ -57,17 +59,17 @@ pub enum BusError {
     /// The interface was removed while it was in use.
     #[error("{0} was removed while it was in use: make it again and open it again")]
     Gone(String),
-    /// Not allowed.
+    /// The process lacks permission.
     #[error("not allowed to {doing} {name}: {source}")]
     Permission {
         /// The bus.
         name: String,
-        /// What was tried.
+        /// The attempted operation.
         doing: &'static str,
         /// The system's error.
         source: io::Error,
     },
-    /// Nobody serves this embedded bus.
+    /// No process serves this embedded bus.
     #[error(
         "no embedded bus {name} is served in {}: start `vcan-setup serve {name}`, or `skinbus run`, which \
          serves it", directory.display()
@@ -75,10 +77,11 @@ pub enum BusError {
     NotServed {
         /// The bus.
         name: String,
-        /// Where its socket would be.
+        /// The directory that was searched.
         directory: PathBuf,
     },
-    /// There is neither an interface nor an embedded bus of this name, and either would do.
+    /// There is neither an interface nor an embedded bus of this name. Returned for
+    /// [`Choice::Auto`](super::Choice::Auto).
     #[error(
         "there is no interface {name}, and no embedded bus of this name is served in {}: make the interface with \
          `vcan-setup up {name}`, or serve the bus with `vcan-setup serve {name}`", directory.display()
@@ -86,15 +89,16 @@ pub enum BusError {
     Absent {
         /// The bus.
         name: String,
-        /// Where its socket would be.
+        /// The directory that was searched.
         directory: PathBuf,
     },
-    /// The directory of embedded buses is not as private as it must be.
+    /// The directory of embedded buses cannot be used or is not private.
     #[error(transparent)]
     Directory(#[from] DirectoryError),
-    /// The embedded bus uses another version, or did not understand the request.
+    /// The embedded bus uses another version, or did not understand the hello.
     #[error(
-        "the embedded bus {name} refuses: it speaks version {theirs}, this program version {ours}; use both from one build"
+        "the embedded bus {name} refused the connection: it uses version {theirs}, this program uses version {ours}; \
+         use both from the same build"
     )]
     Refused {
         /// The bus.
@@ -104,7 +108,7 @@ pub enum BusError {
         /// The version of the bus.
         theirs: u8,
     },
-    /// The embedded bus does not answer.
+    /// The embedded bus did not answer in time.
     #[error(
         "the embedded bus {name} did not answer within {} ms: is its server stopped, or out of files (`ulimit -n`)?",
         waited.as_millis()
@@ -112,32 +116,36 @@ pub enum BusError {
     NoAnswer {
         /// The bus.
         name: String,
-        /// How long it was waited for.
+        /// The time waited.
         waited: Duration,
     },
-    /// The server of the embedded bus has no room for another client.
+    /// The server of the embedded bus cannot accept another client.
     #[error(
         "the embedded bus {0} has no room for another client: its server may have no more files open; end other clients, or \
          raise `ulimit -Hn` where it is started"
     )]
     TurnedAway(String),
-    /// The server of the embedded bus has ended. The bus has to be opened again.
+    /// The server of the embedded bus has ended. The bus must be opened again.
     #[error("the embedded bus {0} was closed: its server ended")]
     Closed(String),
-    /// The server of the embedded bus has closed this connection, and goes on. The bus has to be opened again.
+    /// The server of the embedded bus has closed this connection, but still serves others. The bus must be
+    /// opened again.
     #[error(
         "the embedded bus {0} was closed: its server hung up on this program alone and serves others still; attach again"
     )]
     HungUp(String),
-    /// The queue stayed full.
-    #[error("{name} took no frame for {} ms: its queue is full; send less, or ask whether anybody is on the bus", waited.as_millis())]
+    /// The transmit queue stayed full.
+    #[error(
+        "{name} accepted no frame for {} ms: its queue is full; send less, or check that another node is on the bus",
+        waited.as_millis()
+    )]
     Full {
         /// The bus.
         name: String,
-        /// How long room was waited for.
+        /// The time waited.
         waited: Duration,
     },
-    /// An FD frame for a bus that was opened for classic frames only.
+    /// An FD frame cannot be sent on a bus that was opened for classic frames only.
     #[error("a CAN FD frame cannot be sent on {0}, which was opened for classic frames only")]
     FdFrame(String),
     /// Any other error of the system.
@@ -145,7 +153,7 @@ pub enum BusError {
     Io {
         /// The bus.
         name: String,
-        /// What was tried.
+        /// The attempted operation.
         doing: &'static str,
         /// The system's error.
         source: io::Error,
@@ -153,7 +161,7 @@ pub enum BusError {
 }
 
 impl BusError {
-    /// The system does not let a bus be opened.
+    /// Creates the error for a bus that the system does not open.
     pub(super) fn refused(name: &str, doing: &'static str, source: impl Into<io::Error>) -> Self {
         let (name, source) = (name.to_owned(), source.into());
         if source.kind() == io::ErrorKind::PermissionDenied {
@@ -162,13 +170,13 @@ impl BusError {
         Self::Io { name, doing, source }
     }
 
-    /// Whether the same bus may work again later without being opened again: it is down, or full.
+    /// Returns true if the bus may work again without being opened again: it is down, or its queue is full.
     #[must_use]
     pub const fn may_pass(&self) -> bool {
         matches!(self, Self::Down(_) | Self::Full { .. })
     }
 
-    /// Whether to open the bus again later may succeed without a change to this process.
+    /// Returns true if opening the bus again later may succeed.
     #[must_use]
     pub const fn may_open_later(&self) -> bool {
         matches!(
@@ -187,22 +195,22 @@ impl BusError {
         )
     }
 
-    /// Whether the bus has ended and has to be opened again.
+    /// Returns true if the connection has ended and the bus must be opened again.
     #[must_use]
     pub const fn is_closed(&self) -> bool {
         matches!(self, Self::Closed(_) | Self::HungUp(_) | Self::Gone(_))
     }
 }
 
-/// Not all frames were sent; those before were.
+/// The error for frames that were not all sent.
 #[derive(Debug, Error)]
 #[error("{cause} ({sent} of {target} frames sent)")]
 pub struct SendError {
-    /// How many frames were sent, from the first one on.
+    /// Number of frames sent before the error.
     pub sent: usize,
-    /// How many there were.
+    /// Number of frames to send.
     pub target: usize,
-    /// What happened.
+    /// The cause.
     #[source]
     pub cause: BusError,
 }

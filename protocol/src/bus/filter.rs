@@ -1,51 +1,52 @@
-//! Which frames a socket wants, by the rule of the kernel's `CAN_RAW`.
+//! Filters for received frames, with the semantics of the kernel's `CAN_RAW`.
 
 use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK};
 use crate::id::{Id, Kind};
 use crate::port::LinkId;
 
-/// A frame passes when `identifier & mask == id & mask`; with [`Filter::INVERTED`] in `id`, when not.
+/// A receive filter. A frame passes if `identifier & mask == id & mask`, or if not, when `id` contains
+/// [`Filter::INVERTED`].
 ///
-/// Both words hold the flags [`EXTENDED`] and [`REMOTE`] above the identifier. A socket receives a frame
-/// once when any of its filters lets it pass; with no filters at all, nothing. Two words of 32 bits, like
-/// `struct can_filter`.
+/// Both words hold the flags [`EXTENDED`] and [`REMOTE`] above the identifier. A socket receives a frame once
+/// if any of its filters passes it, and nothing without filters. The layout is that of `struct can_filter`.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub struct Filter {
-    /// What the identifier is compared with.
+    /// The identifier to compare with.
     pub id: u32,
-    /// Which bits of it count.
+    /// The bits that are compared.
     pub mask: u32,
 }
 
 impl Filter {
-    /// Every data and remote frame.
+    /// Passes every data and remote frame.
     pub const ALL: Self = Self { id: 0, mask: 0 };
-    /// In `id`: what matches does not pass, and the rest does (`CAN_INV_FILTER`).
+    /// Flag in `id` that inverts the filter (`CAN_INV_FILTER`).
     pub const INVERTED: u32 = ERROR;
-    /// The mask that makes a filter of one 11-bit identifier exact, so that it costs the kernel nothing.
+    /// The mask for exactly one 11-bit identifier. The kernel looks such filters up in a table, without a
+    /// cost per filter.
     pub const EXACT_MASK: u32 = STANDARD_MASK | EXTENDED | REMOTE;
-    /// The most that a socket may have (the kernel's `CAN_RAW_FILTER_MAX`).
+    /// Maximum number of filters of a socket (the kernel's `CAN_RAW_FILTER_MAX`).
     pub const MAX: usize = 512;
 
-    /// Exactly the data frames with this identifier: the fast path.
+    /// Creates a filter for the data frames with this identifier.
     #[must_use]
     pub const fn exact(id: Id) -> Self {
         Self { id: id.to_bits() as u32, mask: Self::EXACT_MASK }
     }
 
-    /// The data frames of a kind, whatever their node.
+    /// Creates a filter for the data frames of a kind, from or to any node.
     #[must_use]
     pub const fn kind(kind: Kind) -> Self {
         Self { id: Id { kind, node: 0 }.to_bits() as u32, mask: Self::EXACT_MASK & !0xFF }
     }
 
-    /// Exactly the data frames of one direction of a simulated wire.
+    /// Creates a filter for the frames of one direction of a simulated wire.
     #[must_use]
     pub const fn link_id(link_id: LinkId) -> Self {
         Self { id: link_id.raw_id(), mask: EXTENDED_MASK | EXTENDED | REMOTE }
     }
 
-    /// What this one does not let pass, and only that.
+    /// Returns the complement of the filter.
     #[must_use]
     pub const fn inverted(self) -> Self {
         Self { id: self.id ^ Self::INVERTED, mask: self.mask }

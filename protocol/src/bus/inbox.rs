@@ -1,4 +1,4 @@
-//! Where received frames land.
+//! The buffer of received frames.
 
 use std::io;
 
@@ -6,24 +6,23 @@ use super::batch::{BATCH, Batch};
 use super::carrier::Carrier;
 use crate::can::Frame;
 
-/// One received frame.
+/// A received frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Received {
     /// The frame.
     pub frame: Frame,
-    /// When it reached this socket, in nanoseconds of the wall clock (`SO_TIMESTAMPNS`); 0 if the kernel
-    /// did not say.
+    /// Time of arrival at this socket, in nanoseconds of the wall clock (`SO_TIMESTAMPNS`); 0 if the kernel
+    /// did not report it.
     pub at_nanos: u64,
-    /// Whether this very socket sent it.
+    /// True if this socket sent it.
     pub own: bool,
 }
 
-/// Buffers for [`super::Bus::receive`], filled again and again: nothing is allocated after
-/// [`Inbox::new`].
+/// A reusable buffer for [`super::Bus::receive`]. It does not allocate after [`Inbox::new`].
 #[derive(Debug)]
 pub struct Inbox {
     pub(super) batch: Batch,
-    /// An error behind the frames, for the next reception.
+    /// The error after the frames, to be returned by the next receive.
     pub(super) failure: Option<io::Error>,
     frames: Vec<Received>,
     dropped: u32,
@@ -31,7 +30,7 @@ pub struct Inbox {
 }
 
 impl Inbox {
-    /// Empty buffers for up to 64 frames.
+    /// Creates an empty buffer for up to 64 frames.
     #[must_use]
     pub fn new() -> Self {
         Self {
@@ -43,31 +42,32 @@ impl Inbox {
         }
     }
 
-    /// The frames of the last [`super::Bus::receive`], in the order in which they came.
+    /// Returns the frames of the last [`super::Bus::receive`], in order of arrival.
     pub fn frames(&self) -> impl ExactSizeIterator<Item = Received> + '_ {
         self.frames.iter().copied()
     }
 
-    /// How many frames the kernel, or the embedded bus, has dropped for this socket so far because it was
-    /// not read in time: a running total that wraps (`SO_RXQ_OVFL`). The kernel reports it with the next frame
-    /// that arrives, the embedded bus also when the socket has been read empty.
+    /// Returns the number of frames that the kernel or the embedded bus has dropped for this socket because
+    /// it was not read in time: a running total that wraps (`SO_RXQ_OVFL`). The kernel reports it with the
+    /// next frame that arrives, the embedded bus also when the socket has been read empty.
     #[must_use]
     pub const fn dropped(&self) -> u32 {
         self.dropped
     }
 
-    /// How many datagrams were neither a frame nor a notice; 0 unless the other end is broken.
+    /// Returns the number of datagrams that were neither a frame nor a notice; 0 unless the other end is
+    /// faulty.
     #[must_use]
     pub const fn unreadable(&self) -> u64 {
         self.unreadable
     }
 
-    /// Forgets the frames.
+    /// Removes the frames.
     pub fn clear(&mut self) {
         self.frames.clear();
     }
 
-    /// Reads the batch's datagrams into frames; whether the other end is gone, after these.
+    /// Decodes the datagrams of the batch. Returns true if the other end closed the connection after them.
     pub(super) fn take(&mut self, carrier: &dyn Carrier) -> bool {
         let Self { batch, frames, dropped, unreadable, failure: _ } = self;
         frames.clear();

@@ -1,4 +1,4 @@
-//! Buses that are interfaces of the kernel: SocketCAN.
+//! SocketCAN: buses that are network interfaces of the kernel.
 
 use std::io;
 use std::os::fd::{AsFd, OwnedFd};
@@ -15,17 +15,19 @@ use super::{Bus, BusError, Filter, Options};
 /// The MTU of an interface that carries CAN FD.
 const FD_MTU: u32 = 72;
 
-/// Bytes that a gateway lets wait unread in its socket of each bus, unless configured otherwise: all cells may
-/// answer a report at once.
+/// Default receive buffer of a gateway for each bus, in bytes: room for the answers of all cells to a report
+/// at once.
 pub const GATEWAY_RECEIVE_BUFFER: u32 = 8 << 20;
 
-/// Returns whether the kernel has `CAN_RAW` sockets: anything but "no such protocol" counts as yes.
+/// Returns true if the kernel has `CAN_RAW` sockets. Any error except "protocol not supported" counts as
+/// true.
 #[must_use]
 pub fn has_socketcan() -> bool {
     !matches!(probe(), Err(Errno::AFNOSUPPORT | Errno::PROTONOSUPPORT))
 }
 
-/// Returns whether there is an interface of this name, CAN or not; anything but "no such device" counts as yes.
+/// Returns true if there is an interface of this name, CAN or not. Any error except "no such device" counts
+/// as true.
 pub(super) fn has_interface(name: &str) -> bool {
     !Link::named(name).is_err_and(|error| matches!(error.raw_os_error(), Some(libc::ENODEV | libc::ENXIO)))
 }
@@ -36,7 +38,7 @@ fn probe() -> Result<OwnedFd, Errno> {
     rustix::net::socket_with(AddressFamily::CAN, SocketType::RAW, SocketFlags::CLOEXEC, protocol)
 }
 
-/// Interfaces of the kernel.
+/// SocketCAN interfaces.
 pub(super) struct SocketCan;
 
 impl Carrier for SocketCan {
@@ -95,7 +97,7 @@ impl Carrier for SocketCan {
     }
 }
 
-/// Sets the options of a new socket; how many bytes may wait for it.
+/// Sets the options of a new socket. Returns the size of its receive buffer.
 fn set_up(socket: &CanFdSocket, options: &Options) -> io::Result<usize> {
     set_filters(socket, &options.filters)?;
     socket.set_error_filter(options.error_mask)?;
@@ -113,20 +115,20 @@ fn set_filters(socket: &CanFdSocket, filters: &[Filter]) -> io::Result<()> {
     socket.set_filters(&filters)
 }
 
-/// Lets so many bytes wait unread in a socket of any sort; how many the kernel granted and counts, which is twice
-/// what was requested when all was granted.
+/// Sets the receive buffer of a socket in bytes. Returns the granted size as the kernel counts it: twice the
+/// requested size if it was granted in full.
 ///
 /// # Errors
-/// When the system refuses. To get less than was requested is no error.
+/// Returns an error if the system call fails. A smaller size than requested is not an error.
 pub fn set_receive_buffer(socket: impl AsFd, bytes: usize) -> io::Result<usize> {
-    // Forcing needs CAP_NET_ADMIN; without it the system's limit holds.
+    // Exceeding the system's limit requires CAP_NET_ADMIN.
     if sockopt::set_socket_recv_buffer_size_force(&socket, bytes).is_err() {
         sockopt::set_socket_recv_buffer_size(&socket, bytes)?;
     }
     Ok(sockopt::socket_recv_buffer_size(&socket)?)
 }
 
-/// Throws away what came between the opening and the filters: no more than a default buffer holds.
+/// Discards frames that arrived before the filters were set: no more than a default buffer holds.
 fn discard(socket: &CanFdSocket) {
     let mut batch = Batch::new();
     for _ in 0..16 {

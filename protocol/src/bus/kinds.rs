@@ -1,7 +1,6 @@
-//! Which kinds of buses there are, and which kind each of several is: `--bus-kind embedded --bus-kind
-//! can0=socketcan`.
+//! Kinds of buses, and the kind of each of several buses: `--bus-kind embedded --bus-kind can0=socketcan`.
 //!
-//! A further kind is named here, and implements [`Carrier`].
+//! A new kind is added here and implements [`Carrier`].
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -14,20 +13,20 @@ use super::check_name;
 use super::embedded::Embedded;
 use super::kernel::SocketCan;
 
-/// What carries the frames.
+/// A kind of bus: the transport of its frames.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum BusKind {
-    /// An interface of the kernel: `can0`, `vcan0`.
+    /// A network interface of the kernel: `can0`, `vcan0`.
     SocketCan,
-    /// A process that serves a socket, for this user on this machine.
+    /// A socket served by a process, for this user on this machine.
     Embedded,
 }
 
 impl BusKind {
-    /// All that there are.
+    /// All kinds.
     pub const ALL: [Self; 2] = [Self::SocketCan, Self::Embedded];
 
-    /// What it does in its own way.
+    /// Returns the implementation of the kind.
     pub(super) const fn carrier(self) -> &'static dyn Carrier {
         match self {
             Self::SocketCan => &SocketCan,
@@ -35,7 +34,7 @@ impl BusKind {
         }
     }
 
-    /// The kind in words, as it is printed in sentences.
+    /// Returns the name of the kind in sentences.
     #[must_use]
     pub const fn words(self) -> &'static str {
         match self {
@@ -44,7 +43,7 @@ impl BusKind {
         }
     }
 
-    /// The kind's name, as it is printed and as `--bus-kind` takes it.
+    /// Returns the name of the kind in tables and in `--bus-kind`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -60,18 +59,19 @@ impl fmt::Display for BusKind {
     }
 }
 
-/// Which kind of bus is requested.
+/// A requested kind of bus.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub enum Choice {
     /// SocketCAN if there is an interface of the bus's name, else the embedded bus.
     #[default]
     Auto,
-    /// This one and no other.
+    /// This kind only.
     Only(BusKind),
 }
 
 impl Choice {
-    /// The kind that this choice comes to for the bus of this name on this machine, now.
+    /// Returns the kind of the bus of this name, which for [`Choice::Auto`] depends on the interfaces that
+    /// exist now.
     #[must_use]
     pub fn resolve(self, name: &str) -> BusKind {
         match self {
@@ -91,9 +91,9 @@ impl fmt::Display for Choice {
     }
 }
 
-/// A word that is no kind of bus.
+/// The error for a word that is not a kind of bus.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
-#[error("{got:?} is no kind of bus: auto, socketcan and embedded are")]
+#[error("{got:?} is not a kind of bus: use auto, socketcan or embedded")]
 pub struct UnknownKind {
     /// The word.
     pub got: String,
@@ -109,12 +109,12 @@ impl FromStr for Choice {
     }
 }
 
-/// One `--bus-kind`: of a bus that is named, or of all that are not.
+/// The value of one `--bus-kind`: for one bus, or for all buses that are not named.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct OneKind {
-    /// The bus, if one is named.
+    /// The name of the bus; `None` for all others.
     pub bus: Option<String>,
-    /// Its kind.
+    /// The requested kind.
     pub kind: Choice,
 }
 
@@ -129,57 +129,57 @@ impl FromStr for OneKind {
     }
 }
 
-/// Which kind each bus is.
+/// The requested kind of each bus.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct Kinds {
     named: BTreeMap<String, Choice>,
     others: Choice,
 }
 
-/// Kinds that contradict each other, or name what is not there.
+/// The error for contradictory values of `--bus-kind`, or for an unknown bus.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum KindsError {
-    /// Two words about the same.
+    /// `--bus-kind` is given twice for the same buses.
     #[error("--bus-kind is given twice for {what}: {first} and {second}; leave out one")]
     Twice {
-        /// A bus, or all others.
+        /// The bus, or all other buses.
         what: String,
-        /// The first.
+        /// The first kind.
         first: Choice,
-        /// The second.
+        /// The second kind.
         second: Choice,
     },
-    /// A bus that no other test uses.
-    #[error("--bus-kind {bus}={kind}: there is no bus {bus} here, but {}", known.join(", "))]
+    /// `--bus-kind` names a bus that does not exist.
+    #[error("--bus-kind {bus}={kind}: there is no bus {bus}; the buses are {}", known.join(", "))]
     Unknown {
         /// The bus.
         bus: String,
-        /// What it was to be.
+        /// Its requested kind.
         kind: Choice,
-        /// The buses that are there.
+        /// The existing buses.
         known: Vec<String>,
     },
 }
 
 impl Kinds {
-    /// Every bus is of this kind.
+    /// Requests the same kind for every bus.
     #[must_use]
     pub const fn all(kind: Choice) -> Self {
         Self { named: BTreeMap::new(), others: kind }
     }
 
-    /// These buses are what they are.
+    /// Requests these kinds for these buses, and [`Choice::Auto`] for others.
     #[must_use]
     pub fn exactly<'a>(buses: impl IntoIterator<Item = (&'a str, BusKind)>) -> Self {
         let named = buses.into_iter().map(|(name, kind)| (name.to_owned(), Choice::Only(kind)));
         Self { named: named.collect(), others: Choice::Auto }
     }
 
-    /// Decodes the words; buses that none of them speaks of are as `otherwise` says.
+    /// Combines values of `--bus-kind`; `otherwise` applies to buses without a value.
     ///
     /// # Errors
-    /// When two of them speak of the same.
+    /// Returns an error if two values are for the same bus, or both for all other buses.
     pub fn of_words(words: &[OneKind], otherwise: Choice) -> Result<Self, KindsError> {
         let (mut named, mut others) = (BTreeMap::new(), None);
         for OneKind { bus, kind } in words {
@@ -195,10 +195,10 @@ impl Kinds {
         Ok(Self { named, others: others.unwrap_or(otherwise) })
     }
 
-    /// Sees that every bus that is named is one of these.
+    /// Checks that all named buses are in `known`.
     ///
     /// # Errors
-    /// When one is not.
+    /// Returns an error if one is not.
     pub fn only<'a>(self, known: impl IntoIterator<Item = &'a str>) -> Result<Self, KindsError> {
         let known: Vec<_> = known.into_iter().map(str::to_owned).collect();
         match self.named.iter().find(|(bus, _)| !known.contains(bus)) {
@@ -207,7 +207,7 @@ impl Kinds {
         }
     }
 
-    /// The kind of this bus.
+    /// Returns the requested kind of a bus.
     #[must_use]
     pub fn of(&self, bus: &str) -> Choice {
         self.named.get(bus).copied().unwrap_or(self.others)
@@ -232,7 +232,7 @@ mod tests {
             assert_eq!(word.parse::<Choice>().unwrap().to_string(), word);
         }
         let error = "vcan".parse::<Choice>().unwrap_err().to_string();
-        assert_eq!(error, "\"vcan\" is no kind of bus: auto, socketcan and embedded are");
+        assert_eq!(error, "\"vcan\" is not a kind of bus: use auto, socketcan or embedded");
     }
 
     #[test]
@@ -259,11 +259,14 @@ mod tests {
         );
         assert_eq!(
             wrong(&["vcan7=embedded"]).to_string(),
-            "--bus-kind vcan7=embedded: there is no bus vcan7 here, but vcan0, vcan1"
+            "--bus-kind vcan7=embedded: there is no bus vcan7; the buses are vcan0, vcan1"
         );
         for word in ["vcan", "vcan1=vcan", "=embedded", "a/b=embedded", "vcan1=embedded=x"] {
             assert!(
-                word.parse::<OneKind>().unwrap_err().to_string().starts_with(&format!("{word:?} is no kind"))
+                word.parse::<OneKind>()
+                    .unwrap_err()
+                    .to_string()
+                    .starts_with(&format!("{word:?} is not a kind"))
             );
         }
     }

@@ -1,4 +1,4 @@
-//! An interface as the kernel reports it over netlink, because `/sys` may show another network.
+//! Network interfaces, queried over netlink, because `/sys` may show another network namespace.
 
 use std::io;
 
@@ -7,20 +7,20 @@ use netlink_packet_route::link::{InfoKind, LinkAttribute, LinkFlags, LinkHeader,
 
 use super::netlink::{Exchange, attributes};
 
-/// An interface.
+/// A network interface.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Link {
     pub(super) index: u32,
-    /// The largest frame in bytes: 16 classic, 72 FD.
+    /// MTU in bytes: 16 for classic CAN, 72 for CAN FD.
     pub(super) mtu: u32,
-    /// Whether it is up (`IFF_UP`).
+    /// True if it is up (`IFF_UP`).
     pub(super) up: bool,
-    /// Whether it is one that the kernel only simulates: a vcan, or an end of a vxcan.
+    /// True if the kernel simulates the interface: a vcan, or an end of a vxcan.
     pub(super) is_virtual: bool,
 }
 
 impl Link {
-    /// Asks for the interface of this name.
+    /// Queries the interface of this name.
     pub(super) fn named(name: &str) -> io::Result<Self> {
         let mut message = LinkMessage::default();
         message.attributes.push(LinkAttribute::IfName(name.to_owned()));

@@ -1,4 +1,4 @@
-//! A socket to the kernel's rtnetlink: one request, and all answers to it.
+//! Requests to the kernel's rtnetlink, with all their answers.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -14,14 +14,14 @@ use rustix::net::netlink::SocketAddrNetlink;
 use rustix::net::sockopt::{Timeout, set_socket_timeout};
 use rustix::net::{RecvFlags, SendFlags, SocketFlags, SocketType};
 
-/// How long the kernel may take to answer; it answers at once.
+/// Maximum time to wait for the kernel, which normally answers at once.
 const TIMEOUT: Duration = Duration::from_secs(5);
-/// How often a list that changed while it was read is read again.
+/// Maximum number of attempts to read a list that changes meanwhile.
 const RETRIES: usize = 8;
-/// Bytes of `struct ifinfomsg`, after which the attributes begin.
+/// Size of `struct ifinfomsg` in bytes; the attributes follow it.
 const HEADER: usize = 16;
 
-/// A socket of the namespace in which it was opened.
+/// A netlink socket in the network namespace in which it was opened.
 #[derive(Debug)]
 pub struct Exchange {
     socket: OwnedFd,
@@ -29,10 +29,10 @@ pub struct Exchange {
 }
 
 impl Exchange {
-    /// A socket of the calling thread's namespace.
+    /// Opens a socket in the calling thread's network namespace.
     ///
     /// # Errors
-    /// When the system gives no such socket.
+    /// Returns an error if the system cannot create the socket.
     pub fn open() -> io::Result<Self> {
         let socket = rustix::net::socket_with(
             rustix::net::AddressFamily::NETLINK,
@@ -46,10 +46,10 @@ impl Exchange {
         Ok(Self { socket, sequence: 0 })
     }
 
-    /// Sends one request and takes all that answers it: the messages, each without its netlink header.
+    /// Sends a request and returns all answers, each without its netlink header.
     ///
     /// # Errors
-    /// The kernel's error, or that it does not answer.
+    /// Returns the kernel's error, or a timeout.
     pub fn request(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<Vec<Vec<u8>>> {
         for _ in 0..RETRIES {
             let (answers, interrupted) = self.query(payload.clone(), flags)?;
@@ -101,8 +101,8 @@ impl Exchange {
     }
 }
 
-/// Reads one answer about an interface. What is not understood is left out: an unusual interface must not
-/// hide the others.
+/// Decodes the attributes of an interface in an answer. Unknown attributes are skipped, so that an unusual
+/// interface does not hide the others.
 pub fn attributes(answer: &[u8]) -> impl Iterator<Item = LinkAttribute> {
     NlasIterator::new(answer.get(HEADER..).unwrap_or_default())
         .flatten()

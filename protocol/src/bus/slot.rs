@@ -1,8 +1,8 @@
-//! Room for one datagram, and what the kernel notes beside it.
+//! The buffer of one datagram, and the kernel's control messages about it.
 
 use crate::can::FD_BYTES;
 
-/// Room for one datagram and the kernel's data about it.
+/// The buffer of one datagram and its control messages.
 pub(super) struct Slot {
     pub(super) bytes: [u8; FD_BYTES],
     /// Control messages: a time stamp (32 bytes) and a drop count (24 bytes).
@@ -12,12 +12,12 @@ pub(super) struct Slot {
     pub(super) flags: i32,
 }
 
-/// What the kernel notes beside a datagram.
+/// The kernel's notes about a datagram.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Notes {
     /// `SO_TIMESTAMPNS`: nanoseconds of the wall clock.
     pub at_nanos: Option<u64>,
-    /// `SO_RXQ_OVFL`: how many the socket has dropped so far.
+    /// `SO_RXQ_OVFL`: number of datagrams that the socket has dropped so far.
     pub dropped: Option<u32>,
 }
 
@@ -42,7 +42,7 @@ struct ControlMessage<'a> {
     data: &'a [u8],
 }
 
-/// Walks control messages: length, level, type, then the data, each padded to a word.
+/// An iterator over control messages: length, level, type, then the data, each padded to a word.
 struct ControlMessages<'a>(&'a [u8]);
 
 impl<'a> Iterator for ControlMessages<'a> {
@@ -67,7 +67,7 @@ impl<'a> Iterator for ControlMessages<'a> {
     }
 }
 
-/// Hands out the descriptors that came with a datagram (`SCM_RIGHTS`).
+/// Calls `take` with each file descriptor passed with a datagram (`SCM_RIGHTS`).
 pub(super) fn each_passed(slot: &Slot, mut take: impl FnMut(i32)) {
     let words = slot.control.map(u64::to_ne_bytes);
     let messages = ControlMessages(words.as_flattened().get(..slot.control_len).unwrap_or_default());
@@ -77,7 +77,7 @@ pub(super) fn each_passed(slot: &Slot, mut take: impl FnMut(i32)) {
     }
 }
 
-/// A `struct timespec` of two 64-bit words.
+/// Converts a `struct timespec` of two 64-bit words to nanoseconds.
 fn nanoseconds(timespec: &[u8]) -> Option<u64> {
     let (seconds, rest) = timespec.split_first_chunk()?;
     let nanos = rest.first_chunk()?;

@@ -7,7 +7,8 @@ fn names_are_those_that_an_interface_can_have() {
     }
     for name in ["", "a234567890123456", ".", "..", "a/b", "a b", "a:b"] {
         let error = check_name(name).unwrap_err().to_string();
-        let rest = "is no bus name: 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'";
+        let rest =
+            "is not a valid bus name: use 1 to 15 bytes without spaces, '/' or ':', except '.' and '..'";
         assert_eq!(error, format!("{name:?} {rest}"));
     }
 }
@@ -29,7 +30,7 @@ fn a_bus_of_either_kind_that_is_absent_names_both_ways() {
                     the interface with `vcan-setup up nosuchcan0`, or serve the bus with `vcan-setup serve nosuchcan0`";
     assert_eq!(error.to_string(), expected);
     assert!(error.may_open_later());
-    // An interface of the name is taken, and not passed by, whatever its sort.
+    // An interface of that name is chosen, whatever its type.
     assert_eq!(
         [Choice::Auto.resolve("lo"), Choice::Auto.resolve("nosuchcan0")],
         [BusKind::SocketCan, BusKind::Embedded]
@@ -55,7 +56,7 @@ fn too_many_filters_are_refused_before_anything_is_opened() {
     assert_eq!(error.to_string(), "513 filters are too many for one socket on vcan0: at most 512");
 }
 
-/// A bus whose other end is in the test.
+/// Returns a bus, and the other end of its connection.
 fn pair() -> (Bus, std::os::fd::OwnedFd) {
     use rustix::net::{AddressFamily, SocketFlags, SocketType, socketpair};
     let (near, far) =

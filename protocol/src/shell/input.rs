@@ -1,5 +1,5 @@
-//! Files from outside, opened in one place: regular files, and what the shell hands over. Nothing else is read, because
-//! nothing else has to end: a named pipe waits for a writer who may never come, a device has no last byte.
+//! Input files. They must be regular files or pipes of the shell, because other files need not end: a named
+//! pipe may wait forever for a writer, and a device has no last byte.
 
 use std::fs::{self, File, FileType, OpenOptions};
 use std::io::{self, Read};
@@ -10,48 +10,49 @@ use std::sync::{Mutex, PoisonError};
 
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 
-/// The name of standard input; a file of this name is `./-`.
+/// The name of standard input. A file of this name is written as `./-`.
 pub const STANDARD_INPUT: &str = "-";
 
-/// The descriptors that were opened, of which what was read is gone.
+/// Descriptors already opened; their data can be read only once.
 static TAKEN: Mutex<Vec<u32>> = Mutex::new(Vec::new());
 
-/// Takes a descriptor, the only time that this is possible.
+/// Marks a descriptor as opened; fails the second time.
 fn take(descriptor: u32) -> io::Result<()> {
     let mut taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
     if taken.contains(&descriptor) {
         return Err(io::Error::other(
-            "it is read once, and was read already: name a file for one of the two",
+            "it can be read only once and was already read: use a file for one of the two",
         ));
     }
     taken.push(descriptor);
     Ok(())
 }
 
-/// Returns true for the name of standard input, `-`.
+/// Returns true if `path` is `-`, the name of standard input.
 #[must_use]
 pub fn is_standard_input(path: &Path) -> bool {
     path == Path::new(STANDARD_INPUT)
 }
 
-/// Returns true for a regular file, which [`open`] opens as often as it is needed; anything else once.
+/// Returns true for a regular file, which [`open`] can open repeatedly. Other inputs can be opened once.
 #[must_use]
 pub fn can_be_read_again(path: &Path) -> bool {
     !is_standard_input(path) && path.is_file()
 }
 
-/// Opens a regular file for reading, or one of this program's own descriptors (`-`, `/dev/stdin`, and `<(...)` of a shell),
-/// whatever that is, but only once. Does not wait.
+/// Opens a regular file for reading, or one of this process's own descriptors (`-`, `/dev/stdin`, or `<(...)`
+/// of a shell) of any type, but only once. Does not block.
 ///
 /// # Errors
-/// When it is a folder, a named pipe, a socket or a device, a descriptor that was opened before, or cannot be opened.
+/// Returns an error if it is a folder, a named pipe, a socket, a device, or a descriptor opened before, or if
+/// it cannot be opened.
 pub fn open(path: &Path) -> io::Result<File> {
     if is_standard_input(path) {
         take(0)?;
         return Ok(io::stdin().as_fd().try_clone_to_owned()?.into());
     }
     let flags = (OFlags::NONBLOCK | OFlags::NOCTTY).bits().cast_signed();
-    // A socket cannot be opened at all, and the error says only that there is no such device.
+    // `open` fails for a socket too, but its error says only that there is no such device.
     let is_socket = fs::metadata(path).is_ok_and(|about| about.file_type().is_socket());
     if is_socket {
         return Err(io::Error::other("it is a socket, a file is needed"));
@@ -76,25 +77,25 @@ fn refused(kind: FileType) -> io::Error {
     io::Error::other(what)
 }
 
-/// All bytes of a file that [`open`] opens.
+/// Reads all bytes of a file, opened with [`open`].
 ///
 /// # Errors
-/// As [`open`]; when there are more than `longest` bytes.
+/// Returns the errors of [`open`], or an error if there are more than `longest` bytes.
 pub fn bytes(path: &Path, longest: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(longest.saturating_add(1)).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > longest {
-        return Err(io::Error::other(format!("it is longer than {longest} bytes, the most that are read")));
+        return Err(io::Error::other(format!("it is longer than {longest} bytes, the maximum")));
     }
     Ok(bytes)
 }
 
-/// Which of this program's own descriptors a name such as `/dev/stdout` stands for.
+/// Returns the descriptor of this process that a path such as `/dev/stdout` names.
 #[must_use]
 pub fn own_descriptor(path: &Path) -> Option<u32> {
     let own = fs::canonicalize("/proc/self/fd").ok()?;
     let mut path = path.to_owned();
-    // More links than this lead nowhere.
+    // The kernel follows at most 40 links as well.
     for _ in 0..40 {
         let folder = fs::canonicalize(folder_of(&path)).ok()?;
         if folder == own {
@@ -105,7 +106,7 @@ pub fn own_descriptor(path: &Path) -> Option<u32> {
     None
 }
 
-/// The folder of a file.
+/// Returns the folder of a file.
 #[must_use]
 pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."))
@@ -143,7 +144,7 @@ mod tests {
         let (reader, mut writer) = io::pipe().unwrap();
         let name = format!("/dev/fd/{}", reader.as_raw_fd());
         let mut file = open(Path::new(&name)).unwrap();
-        assert!(error(Path::new(&name)).starts_with("it is read once, and was read already"));
+        assert!(error(Path::new(&name)).starts_with("it can be read only once and was already read"));
         let writing = std::thread::spawn(move || {
             std::thread::sleep(std::time::Duration::from_millis(20));
             io::Write::write_all(&mut writer, b"late")

@@ -1,9 +1,9 @@
-//! The reason for which a process of cells ends: a line on its standard error that people read, and the program that has
-//! started it.
+//! The reason for the end of a cell process: a line on its standard error, for people and for the parent
+//! process.
 
 use std::fmt::{self, Display, Formatter};
 
-/// The first and the last cell of one process as text: `cell 3`, `cells 1 to 4`.
+/// The first and last cell of a process, displayed as `cell 3` or `cells 1 to 4`.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct CellRange(pub u8, pub u8);
 
@@ -16,7 +16,7 @@ impl Display for CellRange {
     }
 }
 
-/// The reason for which a process of cells ends.
+/// The reason for the end of a cell process.
 ///
 /// ```
 /// use protocol::last_words::{CellRange, LastWords};
@@ -28,11 +28,11 @@ impl Display for CellRange {
 /// ```
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct LastWords {
-    /// Its cells.
+    /// The cells of the process.
     pub cells: CellRange,
-    /// Their bus.
+    /// The name of their bus.
     pub bus: String,
-    /// The reason, one line.
+    /// The reason, in one line.
     pub why: String,
 }
 
@@ -44,11 +44,11 @@ impl Display for LastWords {
 }
 
 impl LastWords {
-    /// Reads the line back; `None` if it is another one.
+    /// Parses the line. Returns `None` for any other line.
     #[must_use]
     pub fn parse(line: &str) -> Option<Self> {
         let (head, why) = line.split_once(": ")?;
-        // No name of a bus has a space.
+        // Bus names contain no spaces.
         let (cells, bus) = match head.split(' ').collect::<Vec<_>>().as_slice() {
             ["cell", one, "on", bus, "ends"] => {
                 let one = one.parse().ok()?;
@@ -60,7 +60,7 @@ impl LastWords {
             _ => return None,
         };
         let words = Self { cells, bus: bus.to_owned(), why: why.to_owned() };
-        // Only what this program would have written.
+        // Rejects variants that `Display` would not produce.
         (words.to_string() == line).then_some(words)
     }
 }

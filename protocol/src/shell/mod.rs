@@ -1,4 +1,4 @@
-//! The operating system around a program: input files, command lines, requests to stop, and the reason of an exit.
+//! The process environment: input files, command lines, requests to stop, and the reason of an exit.
 
 pub mod input;
 pub mod last_words;

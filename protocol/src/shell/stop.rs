@@ -1,4 +1,4 @@
-//! Requests to end, also while the reader of the output does not read.
+//! Requests to stop, and output that obeys them even if its reader does not read.
 
 use std::io::{self, Write};
 use std::os::fd::AsFd;
@@ -10,47 +10,47 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{FileType, fstat};
 use rustix::io::Errno;
 
-/// How often a waiting program checks whether to end.
+/// Interval at which a waiting writer checks for a stop request.
 const LOOK: Duration = Duration::from_millis(100);
-/// How many looks long a reader is waited for after that.
+/// Number of intervals for which a writer still waits after a stop request.
 const LOOKS: u32 = 10;
-/// What a pipe that takes anything takes at once, without waiting.
+/// Number of bytes that a writable pipe accepts without blocking (`PIPE_BUF`).
 const PIECE: usize = 4_096;
 
-/// Set by the signal handler when the program shall end.
+/// Returns the stop flag, which the signal handler sets.
 #[must_use]
 pub fn flag() -> &'static Arc<AtomicBool> {
     static FLAG: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
     &FLAG
 }
 
-/// Writes to a pipe or a terminal without being held up there when the program is to end: a reader who takes nothing
-/// then is given a second, and the rest is an error.
+/// A writer for pipes and terminals that does not block a stop. After a stop request it waits one second for
+/// the reader, then returns an error.
 #[derive(Debug)]
 pub struct Stoppable<F> {
     file: F,
-    /// Whether writing may have to wait.
+    /// True if a write may block.
     waits: bool,
-    /// Looks that are left once the program is to end.
+    /// Number of intervals left after a stop request.
     looks: u32,
 }
 
 impl<F: AsFd> Stoppable<F> {
-    /// Writes to a file of any kind.
+    /// Creates a writer for a file of any type.
     pub fn new(file: F) -> Self {
         let waits =
             fstat(&file).is_ok_and(|about| FileType::from_raw_mode(about.st_mode) != FileType::RegularFile);
         Self { file, waits, looks: LOOKS }
     }
 
-    /// Waits until something can be written, or an error reported.
+    /// Waits until the file is writable or has an error.
     fn wait(&mut self) -> io::Result<()> {
         let timeout = Timespec::try_from(LOOK).ok();
         loop {
             match poll(&mut [PollFd::new(&self.file, PollFlags::OUT)], timeout.as_ref()) {
                 Ok(0) if flag().load(Ordering::Relaxed) => {
                     if self.looks == 0 {
-                        return Err(io::Error::new(io::ErrorKind::TimedOut, "nobody reads it"));
+                        return Err(io::Error::new(io::ErrorKind::TimedOut, "its reader does not read"));
                     }
                     self.looks -= 1;
                 }
@@ -71,7 +71,7 @@ impl<F: AsFd> Write for Stoppable<F> {
         loop {
             self.wait()?;
             match rustix::io::write(&self.file, piece) {
-                // Somebody else was quicker.
+                // Another process filled the pipe first.
                 Err(Errno::AGAIN | Errno::INTR) => {}
                 done => return Ok(done?),
             }
@@ -101,7 +101,7 @@ mod tests {
         });
         Stoppable::new(write).write_all(&all).unwrap();
         assert_eq!(reader.join().unwrap(), all);
-        // Nobody reads this one.
+        // This pipe has no reader.
         let (_read, write) = io::pipe().unwrap();
         flag().store(true, Ordering::Relaxed);
         let mut out = Stoppable::new(File::from(std::os::fd::OwnedFd::from(write)));

@@ -1,5 +1,5 @@
-//! Command lines: errors in one line with their exit codes, wrong use, output whose reader may leave, text that a
-//! terminal only shows, and words that can be typed again.
+//! Command-line conventions: one-line errors with exit codes, output whose reader may leave, text that is
+//! safe to show on a terminal, and words quoted for a shell.
 
 use std::borrow::Cow;
 use std::ffi::OsStr;
@@ -10,7 +10,7 @@ use std::process::ExitCode;
 
 use crate::stop::Stoppable;
 
-/// An error for people, and the exit code that goes with it.
+/// An error message with its exit code.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Failure {
     text: String,
@@ -18,31 +18,31 @@ pub struct Failure {
 }
 
 impl Failure {
-    /// Wrong use or configuration: exit code 2.
+    /// Creates an error for wrong usage or configuration: exit code 2.
     #[must_use]
     pub fn usage(text: impl Display) -> Self {
         Self::with_code(2, text)
     }
 
-    /// Something failed, or is not possible here: exit code 1.
+    /// Creates an error for a failed or impossible operation: exit code 1.
     #[must_use]
     pub fn run(text: impl Display) -> Self {
         Self::with_code(1, text)
     }
 
-    /// Exit code 1 after the output is complete.
+    /// Creates an error without a message, for a failure that the output already reports: exit code 1.
     #[must_use]
     pub const fn said() -> Self {
         Self { text: String::new(), code: 1 }
     }
 
-    /// An error with its exit code.
+    /// Creates an error with an exit code.
     #[must_use]
     pub fn with_code(code: u8, text: impl Display) -> Self {
         Self { text: text.to_string(), code }
     }
 
-    /// The same, with what failed after it.
+    /// Appends a further error to the message.
     #[must_use]
     pub fn and(mut self, more: impl Display) -> Self {
         self.text += &format!("; and {more}");
@@ -56,8 +56,8 @@ impl Display for Failure {
     }
 }
 
-/// How a program ends: with 0, or with its error on standard error, in one piece and after its name, and the exit
-/// code of that.
+/// Returns the exit code of a program. Prints the error, prefixed with the program's name, to standard error
+/// in one write.
 #[must_use]
 pub fn end(program: &str, done: Result<(), Failure>) -> ExitCode {
     let Err(Failure { text, code }) = done else { return ExitCode::SUCCESS };
@@ -67,55 +67,56 @@ pub fn end(program: &str, done: Result<(), Failure>) -> ExitCode {
     ExitCode::from(code)
 }
 
-/// Writes a line to standard error in one piece, as [`shown`]. When that is closed, there is no reader.
+/// Writes a line to standard error in one write, made printable by [`shown`]. Errors are ignored.
 pub fn say(line: &str) {
     let _ = Stoppable::new(io::stderr()).write_all(format!("{}\n", shown(line)).as_bytes());
 }
 
-/// Writes lines to standard error in one piece, as [`shown_lines`]. When that is closed, there is no reader.
+/// Writes lines to standard error in one write, made printable by [`shown_lines`]. Errors are ignored.
 pub fn say_lines(text: &str) {
     let _ = Stoppable::new(io::stderr()).write_all(shown_lines(text).as_bytes());
 }
 
-/// Writes a text to standard output; to a terminal as [`shown_lines`].
+/// Writes text to standard output; on a terminal it is made printable by [`shown_lines`].
 ///
 /// # Errors
-/// As [`written`].
+/// Returns the errors of [`written`].
 pub fn print(text: &str) -> Result<(), Failure> {
     if io::stdout().is_terminal() { draw(&shown_lines(text)) } else { draw(text) }
 }
 
-/// Writes a text to standard output as it is, also what a terminal obeys.
+/// Writes text to standard output unchanged, including terminal control sequences.
 ///
 /// # Errors
-/// As [`written`].
+/// Returns the errors of [`written`].
 pub fn draw(text: &str) -> Result<(), Failure> {
     written(put(text))
 }
 
-/// Writes a text to standard output as it is, for who goes on writing only while somebody reads.
+/// Writes text to standard output unchanged, for callers that stop when the reader leaves.
 ///
 /// # Errors
-/// When it cannot be written; also when its reader has left.
+/// Returns an error if the text cannot be written, including when its reader has left.
 pub fn put(text: &str) -> io::Result<()> {
     Stoppable::new(io::stdout()).write_all(text.as_bytes())
 }
 
-/// A name or a line as a terminal shows it and does not obey it: controls, and what turns the direction of text, are
-/// written like `\u{1b}`.
+/// Makes a name or line printable: control characters and marks of text direction become escapes like
+/// `\u{1b}`.
 #[must_use]
 pub fn shown(text: &str) -> Cow<'_, str> {
     with_codes(text, is_unprintable)
 }
 
-/// The same of a text of several lines: its line feeds and tabs stay.
+/// Makes a text of several lines printable, like [`shown`], but keeps line feeds and tabs.
 #[must_use]
 pub fn shown_lines(text: &str) -> Cow<'_, str> {
     with_codes(text, |letter| is_unprintable(letter) && !matches!(letter, '\n' | '\t'))
 }
 
-/// Returns true for controls, marks and overrides of the direction of text, separators of lines, invisible characters that
-/// make two names look alike, and code points that are no characters (Unicode 16, 23.7 and 23.8).
+/// Returns true for control characters, marks and overrides of text direction, line separators, invisible
+/// characters that make two names look alike, and code points that are not characters (Unicode 16, 23.7 and
+/// 23.8).
 #[must_use]
 pub const fn is_unprintable(letter: char) -> bool {
     matches!(
@@ -134,7 +135,7 @@ pub const fn is_unprintable(letter: char) -> bool {
     ) || letter as u32 & 0xfffe == 0xfffe
 }
 
-/// Writes the letters that `is_coded` chooses as their code points, like `\u{1b}`.
+/// Replaces the characters that `is_coded` selects with escapes like `\u{1b}`.
 fn with_codes(text: &str, is_coded: impl Fn(char) -> bool) -> Cow<'_, str> {
     if !text.contains(&is_coded) {
         return Cow::Borrowed(text);
@@ -150,10 +151,10 @@ fn with_codes(text: &str, is_coded: impl Fn(char) -> bool) -> Cow<'_, str> {
     Cow::Owned(whole)
 }
 
-/// The end of writing to standard output: who read it may have left, as `head` does, and that is fine.
+/// Converts the result of a write to standard output. A reader that left, as `head` does, is not an error.
 ///
 /// # Errors
-/// When it could not be written for another reason.
+/// Returns an error if the write failed for another reason.
 pub fn written(done: io::Result<()>) -> Result<(), Failure> {
     match done {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
@@ -163,19 +164,19 @@ pub fn written(done: io::Result<()>) -> Result<(), Failure> {
     }
 }
 
-/// clap's message in one line: what is wrong and its tip, without the usage.
+/// Shortens clap's error message to one line: the error and its tip, without the usage.
 #[must_use]
 pub fn one_line(text: &str) -> String {
     let text = text.strip_prefix("error: ").unwrap_or(text);
     let wrong = text.split("\n\nUsage:").flat_map(|text| text.split("\n\nFor more information")).next();
     let lines = wrong.unwrap_or(text).lines().map(str::trim).filter(|line| !line.is_empty());
-    // An option has no value of that kind, and rarely a file has that name.
+    // This tip is rarely useful: options take no such values, and files rarely have such names.
     let lines = lines.filter(|line| !line.starts_with("tip: to pass '"));
     let lines = lines.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
     format!("{lines}; try '--help'")
 }
 
-/// A word as a shell takes it: as it is, or in quotes.
+/// Quotes a word for a shell if necessary.
 #[must_use]
 pub fn quoted(word: &str) -> Cow<'_, str> {
     let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"_-./:=,@%+".contains(&byte);
@@ -186,7 +187,7 @@ pub fn quoted(word: &str) -> Cow<'_, str> {
     Cow::Owned(format!("'{}'", word.replace('\'', quote)))
 }
 
-/// Returns any word as a shell takes it: one that is not UTF-8 as `$'...'`, which bash and zsh know.
+/// Quotes any word for a shell. A word that is not UTF-8 becomes `$'...'`, which bash and zsh support.
 #[must_use]
 pub fn quoted_os(word: &OsStr) -> String {
     if let Some(word) = word.to_str() {
@@ -196,22 +197,22 @@ pub fn quoted_os(word: &OsStr) -> String {
     for chunk in word.as_encoded_bytes().utf8_chunks() {
         whole += &chunk.valid().replace('\\', r"\\").replace('\'', r"\'");
         for byte in chunk.invalid() {
-            // A string takes whatever is written.
+            // Writing to a string cannot fail.
             let _ = write!(whole, r"\x{byte:02x}");
         }
     }
     whole + "'"
 }
 
-/// Returns the path that an environment variable has, if it has one. A bare name is that of a file here: it would be searched
-/// in `PATH`.
+/// Returns the path in an environment variable, if it is set. A bare name gets the prefix `./`, because it
+/// would otherwise be searched in `PATH`.
 #[must_use]
 pub fn path_in(variable: &str) -> Option<PathBuf> {
     let path = std::env::var_os(variable).filter(|path| !path.is_empty()).map(PathBuf::from)?;
     Some(if path.components().count() == 1 { Path::new(".").join(path) } else { path })
 }
 
-/// Returns the words of the command line, the program's own name first. Bytes that are not UTF-8 are replaced.
+/// Returns the words of the command line, including the program name. Bytes that are not UTF-8 are replaced.
 #[must_use]
 pub fn command_line() -> Vec<String> {
     std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect()
@@ -263,7 +264,7 @@ mod tests {
         assert_eq!(shown("\u{202a}\u{202e}\u{2066}\u{2069}"), r"\u{202a}\u{202e}\u{2066}\u{2069}");
         assert_eq!(shown("\u{200f}\u{feff}\u{fffe}\u{1ffff}"), r"\u{200f}\u{feff}\u{fffe}\u{1ffff}");
         assert!(matches!(shown("\u{200d}\u{fffd}\u{ffee}\u{10000}"), Cow::Borrowed(_)));
-        // A name that was shown once is the same when it is shown again.
+        // A text that was made printable once does not change again.
         assert_eq!(shown(&shown("\x1b")), shown("\x1b"));
     }
     #[test]

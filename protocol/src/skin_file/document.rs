@@ -1,9 +1,9 @@
-//! Files that people write, in TOML, and the errors when something in them is wrong: one line that
-//! names the file, the line and column, the key, the value and what is allowed.
+//! TOML files that users write, and their errors: one line with the file, line and column, key, value and
+//! what is allowed.
 //!
-//! The file is read into a plain struct (`serde`, unknown keys refused); a `check` function
-//! makes of it what it means, or a [`Fault`]. The file is read without positions, which is quick; only
-//! when something is wrong is it read again with them.
+//! The file is deserialised into a plain struct (`serde`, unknown keys refused). A `check` function then
+//! converts it to checked types or returns a [`Fault`]. Deserialisation records no positions, which is fast;
+//! only after an error is the file parsed again with positions.
 
 mod mistakes;
 
@@ -21,16 +21,16 @@ use crate::fixed::{OutOfRange, Q};
 use crate::input;
 use crate::time::Span;
 
-/// One step from the file's root to a value.
+/// A step of the path from the root of a file to a value.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Step {
     /// Into a table.
     Key(&'static str),
-    /// Into an array, counted from 0.
+    /// Into an array, at an index counted from 0.
     Index(usize),
 }
 
-/// What is wrong with a value, and where it stands.
+/// An invalid value, with its path and the reason.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Fault {
     path: Vec<Step>,
@@ -38,48 +38,48 @@ pub struct Fault {
     why: String,
 }
 
-/// What was checked, or what is wrong with it.
+/// The result of a check.
 pub type Checked<T> = Result<T, Fault>;
 
-/// Where a value stands in a file, or a table of them; what is wrong there, and what is not.
+/// The path of a value or table in a file. Its methods check values and create faults with this path.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Place(Vec<Step>);
 
 impl Place {
-    /// The file itself.
+    /// Returns the path of the file itself.
     #[must_use]
     pub const fn root() -> Self {
         Self(Vec::new())
     }
 
-    /// A key of the file itself.
+    /// Returns the path of a key at the top level.
     #[must_use]
     pub fn named(key: &'static str) -> Self {
         Self(vec![Step::Key(key)])
     }
 
-    /// A key of the table that stands here.
+    /// Returns the path of a key in the table at this path.
     #[must_use]
     pub fn key(&self, key: &'static str) -> Self {
         Self([&self.0[..], &[Step::Key(key)]].concat())
     }
 
-    /// One of the values that stand here, counted from 0.
+    /// Returns the path of an element of the array at this path, counted from 0.
     #[must_use]
     pub fn nth(&self, index: usize) -> Self {
         Self([&self.0[..], &[Step::Index(index)]].concat())
     }
 
-    /// What stands here cannot be, and why; an empty value is not printed.
+    /// Creates a fault with this path. An empty value is not printed.
     #[must_use]
     pub fn fault(&self, value: impl fmt::Display, why: impl fmt::Display) -> Fault {
         Fault { path: self.0.clone(), value: value.to_string(), why: why.to_string() }
     }
 
-    /// What a word means, one of a few.
+    /// Converts one of a few words to its meaning.
     ///
     /// # Errors
-    /// When it is none of them.
+    /// Returns an error if it is not one of them.
     pub fn word<T: Copy>(&self, got: &str, words: &[(&str, T)]) -> Result<T, Fault> {
         let found = words.iter().find(|(word, _)| *word == got);
         found.map(|&(_, meaning)| meaning).ok_or_else(|| {
@@ -89,10 +89,10 @@ impl Place {
         })
     }
 
-    /// A whole number within a range; `unit` is printed behind the range.
+    /// Checks that an integer is within a range. The error prints `unit` after the range.
     ///
     /// # Errors
-    /// When it is outside.
+    /// Returns an error if it is outside the range.
     pub fn within(&self, got: i64, range: RangeInclusive<u32>, unit: &str) -> Result<u32, Fault> {
         u32::try_from(got).ok().filter(|value| range.contains(value)).ok_or_else(|| {
             let (min, max) = range.into_inner();
@@ -100,37 +100,37 @@ impl Place {
         })
     }
 
-    /// A number that is neither infinite nor none at all.
+    /// Checks that a number is finite.
     ///
     /// # Errors
-    /// When it is.
+    /// Returns an error if it is infinite or NaN.
     pub fn finite(&self, value: f64) -> Result<f64, Fault> {
         if value.is_finite() { Ok(value) } else { Err(self.fault(value, "a finite number is needed")) }
     }
 
-    /// A finite number above 0.
+    /// Checks that a number is finite and above 0.
     ///
     /// # Errors
-    /// When it is not.
+    /// Returns an error if it is not.
     pub fn positive(&self, value: f64) -> Result<f64, Fault> {
         let positive = value.is_finite() && value > 0.0;
         if positive { Ok(value) } else { Err(self.fault(value, "must be above 0")) }
     }
 
-    /// The word that holds a number, as `fit` rounds it.
+    /// Converts a number to a word with the rounding of `fit`.
     ///
     /// # Errors
-    /// When it is outside the word's range.
+    /// Returns an error if it is outside the range of the word.
     pub fn fit<const F: u32>(&self, value: f64, fit: Fit<F>) -> Result<Q<F>, Fault> {
         fit(value).map_err(|OutOfRange { min, bound, .. }| {
-            self.fault(value, format_args!("its word holds [{min}, {bound})"))
+            self.fault(value, format_args!("the range is [{min}, {bound})"))
         })
     }
 
-    /// Sets a word that must not be negative, when a number is given for it.
+    /// Sets a word from an optional number, which must not be negative.
     ///
     /// # Errors
-    /// When it is negative, or outside the word's range.
+    /// Returns an error if the number is negative, or outside the range of the word.
     pub fn set<const F: u32>(&self, given: Option<f64>, word: &mut Q<F>, fit: Fit<F>) -> Result<(), Fault> {
         match given {
             None => {}
@@ -141,11 +141,11 @@ impl Place {
     }
 }
 
-/// How a number is rounded to a word.
+/// A rounding function from a number to a word.
 pub type Fit<const F: u32> = fn(f64) -> Result<Q<F>, OutOfRange>;
 
 impl fmt::Display for Fault {
-    /// `cell[3].joint = 9: the robot has joints 1 to 6`.
+    /// Formats the fault like `cell[3].joint = 9: the robot has joints 1 to 6`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (index, step) in self.path.iter().enumerate() {
             match step {
@@ -161,19 +161,19 @@ impl fmt::Display for Fault {
     }
 }
 
-/// What is wrong with a file.
+/// The error for a file that cannot be used.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum DocumentError {
-    /// It cannot be read.
+    /// The file cannot be read.
     #[error("{path}: {reason}")]
     Unreadable {
         /// The file.
         path: String,
-        /// Why.
+        /// The reason.
         reason: String,
     },
-    /// Something in it is wrong.
+    /// A value in the file is invalid.
     #[error("{path}:{line}:{column}: {what}")]
     Wrong {
         /// The file.
@@ -185,18 +185,19 @@ pub enum DocumentError {
         /// The key, the value, and what is allowed.
         what: String,
     },
-    /// It is a file of another kind.
+    /// The file is of another kind.
     #[error("{path}: {what}")]
     Mistaken {
         /// The file.
         path: String,
-        /// What it is, and where it belongs.
+        /// The kind of the file, and its proper use.
         what: &'static str,
     },
 }
 
 impl DocumentError {
-    /// What is said instead of a text that has one of the keys `has` and none of `lacks`: it is of another kind.
+    /// Returns [`DocumentError::Mistaken`] with `what` if the text has one of the keys `has` and none of the
+    /// keys `lacks`: it is a file of another kind. Otherwise returns the error unchanged.
     #[must_use]
     pub fn or_mistaken(self, text: &str, has: &[&str], lacks: &[&str], what: &'static str) -> Self {
         let Self::Wrong { path, .. } = &self else { return self };
@@ -206,32 +207,33 @@ impl DocumentError {
     }
 }
 
-/// The most bytes of a file that people write; a skin of 253 cells has 60 KB.
+/// Maximum size of a user-written file in bytes; a skin of 253 cells has 60 KB.
 pub const LONGEST: u64 = 16 << 20;
 
-/// The most keys, values and tables of a TOML file, by the signs that each of them needs. A skin of 10 000 cells has 280 000;
-/// this many cost at most 0.5 GB of memory.
+/// Maximum number of keys, values and tables in a TOML file, estimated by their punctuation. A skin of 10 000
+/// cells has 280 000; this many take at most 0.5 GB of memory.
 const MOST_SIGNS: usize = 500_000;
 
-/// A length of time of so many seconds, which are not negative and no more than a file allows.
+/// Converts seconds to a duration. The caller checks that they are not negative and within the limits of the
+/// file.
 #[must_use]
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "bounded by whoever calls")]
 pub fn span(seconds: f64) -> Span {
     Span((seconds * 1e6).round() as u64)
 }
 
-/// The text of a file of at most [`LONGEST`] bytes.
+/// Reads a file of at most [`LONGEST`] bytes.
 ///
 /// # Errors
-/// When it is longer, or cannot be read as UTF-8.
+/// Returns an error if it is longer, or cannot be read as UTF-8.
 pub fn text(path: &Path) -> Result<String, DocumentError> {
     text_within(path, LONGEST)
 }
 
-/// The text of a file of at most so many bytes.
+/// Reads a file of at most `longest` bytes.
 ///
 /// # Errors
-/// When it is longer, or cannot be read as UTF-8.
+/// Returns an error if it is longer, or cannot be read as UTF-8.
 pub fn text_within(path: &Path, longest: u64) -> Result<String, DocumentError> {
     let read =
         || String::from_utf8(input::bytes(path, longest)?).map_err(|_| io::Error::other("it is not UTF-8"));
@@ -241,10 +243,10 @@ pub fn text_within(path: &Path, longest: u64) -> Result<String, DocumentError> {
     })
 }
 
-/// Reads a text and checks it; `path` is what errors call it.
+/// Parses a text and checks it. `path` is its name in errors.
 ///
 /// # Errors
-/// The first thing that is wrong with it.
+/// Returns the first error in the text.
 pub fn parse<Raw: DeserializeOwned, T>(
     path: &str,
     text: &str,
@@ -256,14 +258,15 @@ pub fn parse<Raw: DeserializeOwned, T>(
     };
     let signs = text.bytes().filter(|byte| b"=.,[{".contains(byte)).count();
     if signs > MOST_SIGNS {
-        let reason = format!("it has {signs} of the signs = . , [ {{ and at most {MOST_SIGNS} are read");
+        let reason =
+            format!("it has {signs} of the characters = . , [ {{, and at most {MOST_SIGNS} are allowed");
         return Err(DocumentError::Unreadable { path: path.to_owned(), reason });
     }
     let raw = deserialize(text).map_err(|(at, what)| wrong(at, what))?;
     check(raw).map_err(|fault| wrong(offset_of(text, &fault.path), fault.to_string()))
 }
 
-/// Parses a document; the error is where it stands, in bytes, and one line of text.
+/// Deserialises a document. The error is an offset in bytes and one line of text.
 fn deserialize<T: DeserializeOwned>(text: &str) -> Result<T, (usize, String)> {
     toml::from_str(text).map_err(|error| {
         let at = error.span().unwrap_or_default();
@@ -271,7 +274,7 @@ fn deserialize<T: DeserializeOwned>(text: &str) -> Result<T, (usize, String)> {
     })
 }
 
-/// Where the value at the end of the path stands, or the nearest thing above it that exists.
+/// Returns the offset of the value at a path, or of its nearest existing ancestor.
 fn offset_of(text: &str, path: &[Step]) -> usize {
     let Ok(root) = DeTable::parse(text) else { return 0 };
     let mut at = root.span().start;
@@ -290,7 +293,7 @@ fn offset_of(text: &str, path: &[Step]) -> usize {
     at
 }
 
-/// A place in a text as people and editors count, both from 1.
+/// Converts an offset to a line and column, both counted from 1.
 fn line_and_column(text: &str, at: usize) -> (usize, usize) {
     let before = text.get(..at).unwrap_or(text);
     let line = before.rsplit('\n').next().unwrap_or(before);
@@ -309,7 +312,7 @@ mod tests {
             parse("x.toml", &text, |_: toml::Table| Ok(())).map_err(|error| error.to_string())
         };
         assert_eq!(of(MOST_SIGNS), Ok(()));
-        assert!(of(MOST_SIGNS + 1).unwrap_err().contains("it has 500001 of the signs"));
+        assert!(of(MOST_SIGNS + 1).unwrap_err().contains("it has 500001 of the characters"));
         assert!(of(MOST_SIGNS * 2).is_err());
     }
 }

@@ -1,4 +1,5 @@
-//! Files that describe a skin: TOML documents with errors by line and column, the XML of robots, and the skin itself.
+//! Skin files: TOML documents with errors by line and column, the XML of robot descriptions, and the skin
+//! itself.
 
 pub mod document;
 pub mod skin;

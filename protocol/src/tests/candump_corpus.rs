@@ -1,6 +1,6 @@
-//! Odd lines of candump text, each with what it is: `golden/candump_corpus.log`, written by hand.
+//! Unusual lines of candump text with their expected results: `golden/candump_corpus.log`, written by hand.
 //!
-//! The crate `socketcan` reads the same lines as a second opinion; where it reads less, the corpus notes it.
+//! The crate `socketcan` parses the same lines as a second opinion; the corpus notes where it accepts less.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a test may stop")]
 
@@ -13,14 +13,14 @@ use socketcan::{CanAnyFrame, EmbeddedFrame as _, Frame as _};
 
 const CORPUS: &str = include_str!("../../tests/golden/candump_corpus.log");
 
-/// What a line is said to be: a word, and fields.
+/// The expected result of a line: a word, and fields.
 struct Expected<'a> {
     what: &'a str,
     fields: BTreeMap<&'a str, &'a str>,
 }
 
 impl<'a> Expected<'a> {
-    /// `None` for a line of explanation.
+    /// Parses an expectation. Returns `None` for a line of explanation.
     fn new(text: &'a str) -> Option<Self> {
         let mut words = text.split_whitespace();
         let what = words.next()?;
@@ -34,7 +34,7 @@ impl<'a> Expected<'a> {
     }
 }
 
-/// Each line of the corpus under what it is said to be.
+/// Returns each line of the corpus with its expected result.
 fn corpus() -> Vec<(Expected<'static>, &'static str)> {
     let mut cases = Vec::new();
     let mut expected = None;
@@ -55,7 +55,7 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02X}")).collect()
 }
 
-/// A frame in the corpus' own words, from what its accessors say and not from its text.
+/// Describes a frame in the notation of the corpus, from its accessors rather than its text.
 fn describe(record: &Record<'_>) -> BTreeMap<&'static str, String> {
     let Record { time, interface, frame, direction } = record;
     let kind = match (frame.is_error(), frame.is_remote(), frame.is_extended()) {
@@ -129,8 +129,8 @@ fn second_opinion(line: &str) -> Result<Option<CanDumpRecord>, dump::ParseError>
     Reader::from_reader(line.as_bytes()).next_record()
 }
 
-/// Whether the other reader found the same frame at the same time on the same bus. It sets FDF in every
-/// FD frame.
+/// Returns true if the other parser found the same frame at the same time on the same bus. It sets FDF in
+/// every FD frame.
 fn same(record: &Record<'_>, other: &CanDumpRecord) -> bool {
     let Record { time, interface, frame, direction } = record;
     let direction = direction.map(|direction| match direction {

@@ -1,8 +1,8 @@
-//! The tables of `docs/reference/protocol.md` that list fields come from the schema, and every requirement on a cell has an
-//! id of its own and a test that names it.
+//! Checks that the field tables of `docs/reference/protocol.md` match the schema, and that every requirement
+//! on a cell has its own id and a test that names it.
 //!
-//! Each table stands between `<!-- fields: NAME -->` and `<!-- end -->`. With `SKINBUS_TAKE_OVER=yes` this test writes them
-//! instead of comparing.
+//! Each table stands between `<!-- fields: NAME -->` and `<!-- end -->`. With `SKINBUS_TAKE_OVER=yes` this
+//! test writes the tables instead of comparing them.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a test may stop")]
 
@@ -15,18 +15,18 @@ use crate::message::State;
 use crate::parameters::Parameter;
 use crate::schema::{Field, Format, Layout, PacketSchema, Range, packets, reasons, wires};
 
-/// Where the requirements are.
+/// The documents with the requirements.
 const REQUIREMENTS: [&str; 3] = [
     include_str!("../../../docs/reference/cell.md"),
     include_str!("../../../docs/reference/sensing.md"),
     include_str!("../../../docs/reference/tree.md"),
 ];
-/// Where the tests are that name them.
+/// The folders with tests that name requirements.
 const TESTS: [&str; 4] = ["cell-node", "protocol", "gateway/reference/src/tests", "tests/tests"];
 
 const PATH: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/reference/protocol.md");
 
-/// Every table by its name.
+/// Returns every table with its name.
 fn tables() -> [(&'static str, String); 4] {
     let of = |kind| packets().iter().find(|schema| schema.kind == kind).unwrap();
     [
@@ -37,7 +37,7 @@ fn tables() -> [(&'static str, String); 4] {
     ]
 }
 
-/// One line a kind or command.
+/// Returns the table of kinds and commands, one per line.
 fn kinds() -> String {
     let head = "| identifier | name | from | node field | words | epoch byte | count byte |\n|---|---|---|---|---|---|---|\n";
     let mut out = head.to_owned();
@@ -83,7 +83,7 @@ fn kinds() -> String {
     out
 }
 
-/// One line a field.
+/// Returns a table of fields, one per line.
 fn fields(of: &str, layouts: &[Layout]) -> String {
     let mut out =
         format!("| {of} | word | field | format | unit | range | meaning |\n|---|---|---|---|---|---|---|\n");
@@ -132,12 +132,12 @@ fn range(field: &Field) -> String {
     }
 }
 
-/// The unit on the wire, where angles are in quarter turns.
+/// Returns the unit on the wire, where angles are in quarter turns.
 fn unit(field: &Field) -> &str {
     if matches!(field.format, Format::Angle | Format::Position) { "quarter turns" } else { &field.unit }
 }
 
-/// Where a field stands: `0`, `0 to 2`, `2, bits 8 to 15`.
+/// Formats the position of a field: `0`, `0 to 2`, `2, bits 8 to 15`.
 fn words(field: &Field, within: bool) -> String {
     let (word, bit, width) = (field.at() / 16, field.at() % 16, usize::from(field.width()));
     let bits = if width == 1 { format!("bit {bit}") } else { format!("bits {bit} to {}", bit + width - 1) };
@@ -209,7 +209,7 @@ fn the_document_names_every_bit_of_the_state() {
     }
 }
 
-/// What looks like the id of a requirement: letters, a dash, a number.
+/// Finds requirement ids in a text: letters, a dash, a number.
 fn ids(text: &str) -> impl Iterator<Item = (&str, u32)> {
     let words = text.split(|c: char| !(c.is_ascii_alphanumeric() || c == '-'));
     words.filter_map(|word| {
@@ -219,14 +219,14 @@ fn ids(text: &str) -> impl Iterator<Item = (&str, u32)> {
     })
 }
 
-/// The requirements in their order.
+/// Returns the requirements in their order.
 fn requirements() -> Vec<(&'static str, u32)> {
     let lines = REQUIREMENTS.into_iter().flat_map(str::lines);
     let bold = lines.filter_map(|line| line.strip_prefix("- **")?.split_once("**"));
     bold.flat_map(|(id, _)| ids(id)).collect()
 }
 
-/// Test sources, and the program that writes the golden logs.
+/// Collects test sources, and the program that writes the golden logs.
 fn test_sources(path: &Path, found: &mut String) {
     for entry in std::fs::read_dir(path).unwrap() {
         let path = entry.unwrap().path();

@@ -1,7 +1,7 @@
-//! The frames of `golden/*.log`, which another program wrote from the document: `golden/make.py`.
+//! Tests with the frames of `golden/*.log`, which another program wrote from the document: `golden/make.py`.
 //!
-//! Each frame stands under a comment that says its meaning. The tests build the message from the
-//! comment alone and compare both ways, so that an error made in both `encode` and `decode` shows.
+//! A comment above each frame gives its meaning. The tests construct the message from the comment alone and
+//! compare in both directions, so that an error made in both `encode` and `decode` shows.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a test may stop")]
 
@@ -31,7 +31,7 @@ const WIRE: &str = include_str!("../../tests/golden/wire.log");
 const DOCUMENT: &str = include_str!("../../tests/golden/document.log");
 const EXCHANGE: &str = include_str!("../../tests/golden/exchange.log");
 
-/// One frame of a log, with the comment above it.
+/// A frame of a log, with the comment above it.
 struct Golden<'a> {
     comment: &'a str,
     micros: u64,
@@ -91,7 +91,7 @@ fn the_exchanges_mean_what_they_say() {
             both_ways += u32::from(only_frame(&message) == golden.text);
         }
     }
-    // The others write words into parameters that have none.
+    // The others write words into parameters that use none.
     assert!(both_ways > 150, "{both_ways}");
 }
 
@@ -144,7 +144,8 @@ fn bad_frames_are_refused_for_the_reason_given() {
     }
 }
 
-/// The bus of the log has chains of six joints, but for the packets of eight words, all of which are of epoch 1.
+/// Returns the packet lengths of the log's bus: six words, except for the packets of eight words, all of
+/// which belong to epoch 1.
 fn lengths_of(golden: &Golden<'_>) -> Lengths {
     let log = lines(CLASSIC);
     let at = log.iter().position(|it| it.micros == golden.micros).unwrap();
@@ -210,7 +211,7 @@ fn the_first_classic_frames_are_written_as_the_log_has_them() {
     assert!(pairs >= 10, "{pairs}");
 }
 
-/// What the writes of a session leave behind.
+/// Returns the parameters that the writes of a session leave behind, and its commits.
 fn staged(session: &str) -> (Parameters, Vec<(u16, bool)>) {
     let mut parameters = Parameters::default();
     let mut commits = Vec::new();
@@ -308,8 +309,7 @@ fn wires_bytes_and_meaning_agree_both_ways() {
     assert!(DOCUMENTS.contains(hello.text), "the document's hello is {}", hello.text);
 }
 
-/// The document's arithmetic of Algorithm 1, on its own example: 3 N on a cell with
-/// J = (-1433, 4260, 0, 0, 0, 0) / 2^14.
+/// Computes the document's example of Algorithm 1: 3 N on a cell with J = (-1433, 4260, 0, 0, 0, 0) / 2^14.
 #[test]
 fn the_documents_torque_comes_out() {
     let (parameters, _) = staged(SESSION);
@@ -326,7 +326,7 @@ fn the_documents_torque_comes_out() {
     assert!(lines(SESSION).iter().any(|golden| golden.text == expected), "{expected}");
 }
 
-/// The documents of the protocol, one after the other.
+/// The documents of the protocol, concatenated.
 const DOCUMENTS: &str = concat!(
     include_str!("../../../docs/reference/protocol.md"),
     include_str!("../../../docs/reference/cell.md"),

@@ -1,4 +1,4 @@
-//! Frame times against frames that were counted elsewhere, a second implementation, and every frame there is.
+//! Frame times compared with external counts, a second implementation, and all possible frames.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
 
@@ -9,7 +9,7 @@ use crate::can::{BIT_RATE_SWITCH, ERROR, ERROR_STATE, EXTENDED, Format, Frame, R
 use crate::wire_time::{BitRates, Bits, Coding, Shape};
 use proptest::prelude::*;
 
-/// Frames and their bits, counted by another program.
+/// Frames and their numbers of bits, counted by another program.
 const VECTORS: &str = include_str!("../../tests/vectors/can_frame_bits.csv");
 
 fn frame(format: &str, id: u32, data: &[u8]) -> Frame {
@@ -84,7 +84,7 @@ fn times_are_rounded_up_where_they_are_no_whole_nanoseconds() {
 fn any_frame() -> impl Strategy<Value = Frame> {
     let data = prop_oneof![
         proptest::collection::vec(any::<u8>(), 0..=64),
-        // Long runs.
+        // Data with long runs.
         proptest::collection::vec(
             prop_oneof![Just(0x00), Just(0xFF), Just(0x83), Just(0xE0), Just(0xF8), Just(0x3E)],
             0..=64

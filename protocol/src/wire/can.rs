@@ -1,4 +1,5 @@
-//! One CAN frame of any kind, laid out as the kernel lays it out.
+//! A CAN frame of any kind: classic or FD; data, remote or error. Conversion to and from the kernel's
+//! structs:
 //!
 //! ```text
 //!   struct can_frame, 16 bytes                     struct canfd_frame, 72 bytes
@@ -16,21 +17,21 @@ use thiserror::Error;
 pub const EXTENDED: u32 = 0x8000_0000;
 /// Set in a remote frame.
 pub const REMOTE: u32 = 0x4000_0000;
-/// Set in an error frame, which is a message of the driver and never was on the wire.
+/// Set in an error frame: a report from the driver that was never on the wire.
 pub const ERROR: u32 = 0x2000_0000;
-/// The bits of an 11-bit identifier.
+/// Mask of an 11-bit identifier.
 pub const STANDARD_MASK: u32 = 0x7FF;
-/// The bits of a 29-bit identifier.
+/// Mask of a 29-bit identifier.
 pub const EXTENDED_MASK: u32 = 0x1FFF_FFFF;
 
 /// FD flag: the data phase ran at the data bit rate.
 pub const BIT_RATE_SWITCH: u8 = 1;
 /// FD flag: the sender is error passive.
 pub const ERROR_STATE: u8 = 2;
-/// FD flag: "this is an FD frame"; kernels set it from 6.1 on.
+/// FD flag: marks an FD frame (`CANFD_FDF`). Kernels set it from version 6.1 on.
 pub const FD_FORMAT: u8 = 4;
 
-/// The bits of FD flags that a log has a digit for; the kernel reserves the others.
+/// FD flags that fit the one hexadecimal digit of a log; the kernel reserves the others.
 const FD_FLAGS: u8 = 0xF;
 
 /// Bytes of `struct can_frame`.
@@ -38,13 +39,14 @@ pub const CLASSIC_BYTES: usize = 16;
 /// Bytes of `struct canfd_frame`.
 pub const FD_BYTES: usize = 72;
 
-/// The length on the wire of so many bytes in an FD frame: the next one that CAN FD has, up to 64.
+/// Returns the data length that carries `len` bytes in an FD frame: the next of 0 to 8, 12, 16, 20, 24, 32,
+/// 48 and 64.
 #[must_use]
 pub const fn fd_len(len: usize) -> usize {
     dlc_len(fd_dlc(len))
 }
 
-/// The DLC of so many bytes in an FD frame, or of the next length that CAN FD has.
+/// Returns the DLC of an FD frame that carries `len` bytes, rounded up to the next length of CAN FD.
 #[must_use]
 pub const fn fd_dlc(len: usize) -> u8 {
     match len {
@@ -59,7 +61,7 @@ pub const fn fd_dlc(len: usize) -> u8 {
     }
 }
 
-/// How many bytes an FD frame of this DLC (its lower four bits) has.
+/// Returns the number of data bytes that a DLC stands for in an FD frame. Only the lower four bits count.
 #[must_use]
 pub const fn dlc_len(dlc: u8) -> usize {
     let dlc = (dlc & 15) as usize;
@@ -70,7 +72,7 @@ pub const fn dlc_len(dlc: u8) -> usize {
     }
 }
 
-/// A number that does not fit its identifier.
+/// The error for an identifier that does not fit its 11 or 29 bits.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[error("{got:X} does not fit an identifier of {bits} bits: at most {max:X}")]
 pub struct IdentifierError {
@@ -78,15 +80,15 @@ pub struct IdentifierError {
     pub got: u32,
     /// Bits of the identifier: 11 or 29.
     pub bits: u8,
-    /// The largest identifier of that many bits.
+    /// The largest identifier with that many bits.
     pub max: u32,
 }
 
-/// Checks an identifier that comes from elsewhere, and returns it as [`Frame`] keeps it. `flags` are those of [`EXTENDED`],
-/// [`REMOTE`] and [`ERROR`] that it has; an extended identifier and an error's kind have 29 bits, any other one 11.
+/// Checks an untrusted identifier and returns it with its flags, as [`Frame`] stores it. `flags` may contain
+/// [`EXTENDED`], [`REMOTE`] and [`ERROR`]; extended identifiers and error frames have 29 bits, all others 11.
 ///
 /// # Errors
-/// When the number has more bits than that.
+/// Returns an error if the number has more bits than that.
 pub const fn identifier(number: u32, flags: u32) -> Result<u32, IdentifierError> {
     let (bits, max) = if flags & (EXTENDED | ERROR) == 0 { (11, STANDARD_MASK) } else { (29, EXTENDED_MASK) };
     if number > max {
@@ -95,17 +97,17 @@ pub const fn identifier(number: u32, flags: u32) -> Result<u32, IdentifierError>
     Ok(number | flags & !EXTENDED_MASK)
 }
 
-/// Classic CAN or CAN FD.
+/// A frame format: classic CAN or CAN FD.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Format {
-    /// Up to 8 bytes, one bit rate.
+    /// Up to 8 bytes at one bit rate.
     Classic,
-    /// Up to 64 bytes, and a faster data phase when the bit rate switches.
+    /// Up to 64 bytes, optionally with a faster data phase (bit rate switch).
     Fd,
 }
 
 impl Format {
-    /// What descriptions and options call it: `classic` or `fd`.
+    /// Returns the name that descriptions and options use: `classic` or `fd`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -114,7 +116,7 @@ impl Format {
         }
     }
 
-    /// The one that this is not.
+    /// Returns the other format.
     #[must_use]
     pub const fn other(self) -> Self {
         match self {
@@ -123,7 +125,7 @@ impl Format {
         }
     }
 
-    /// How many data bytes a frame has at most: 8 or 64.
+    /// Returns the maximum number of data bytes: 8 or 64.
     #[must_use]
     pub const fn max_len(self) -> usize {
         match self {
@@ -132,7 +134,7 @@ impl Format {
         }
     }
 
-    /// How many bytes the kernel's struct of a frame has: 16 or 72.
+    /// Returns the size of the kernel's struct in bytes: 16 or 72.
     #[must_use]
     pub const fn byte_len(self) -> usize {
         8 + self.max_len()
@@ -140,7 +142,7 @@ impl Format {
 }
 
 /// A CAN frame: data, remote or error; classic or FD.
-// In this order and at multiples of 8, or else copies of it wait for the bytes that have just been written.
+// This field order and alignment keep copies of a frame from stalling on bytes that were just written.
 #[derive(Clone, Copy, Eq, Hash, PartialEq)]
 #[repr(C, align(8))]
 pub struct Frame {
@@ -152,51 +154,51 @@ pub struct Frame {
     data: [u8; 64],
 }
 
-/// Bytes that are no frame of the kernel's.
+/// The error for bytes that are not a CAN frame.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum FrameError {
-    /// Neither `struct can_frame` nor `struct canfd_frame`.
-    #[error("{got} bytes are no CAN frame: a classic one has 16, an FD one 72")]
+    /// The size is neither that of `struct can_frame` nor that of `struct canfd_frame`.
+    #[error("{got} bytes are not a CAN frame: a classic frame has 16 bytes, an FD frame 72")]
     Size {
-        /// Bytes that came.
+        /// Bytes received.
         got: usize,
     },
-    /// More data than the format carries.
+    /// The format cannot carry that much data.
     #[error("{got} data bytes do not fit: at most {max}")]
     Length {
         /// Bytes given.
         got: usize,
-        /// Bytes that fit.
+        /// The maximum of the format.
         max: usize,
     },
 }
 
 impl Frame {
-    /// A classic frame with identifier 0 and no data, to fill buffers with.
+    /// A classic frame with identifier 0 and no data; an initial value for buffers.
     pub const EMPTY: Self =
         Self { id: 0, format: Format::Classic, flags: 0, raw_dlc: 0, len: 0, data: [0; 64] };
 
-    /// A classic data frame. `id` carries the flag [`EXTENDED`] for 29 bits.
+    /// Creates a classic data frame. For a 29-bit identifier, `id` includes the flag [`EXTENDED`].
     ///
     /// # Errors
-    /// When there are more than 8 bytes.
+    /// Returns an error if there are more than 8 bytes.
     pub fn classic(id: u32, data: &[u8]) -> Result<Self, FrameError> {
         Self::with_data(id, Format::Classic, 0, data)
     }
 
-    /// An FD data frame with the given FD flags; the FDF flag is set as the kernel sets it.
+    /// Creates an FD data frame with the given FD flags, and sets [`FD_FORMAT`] as the kernel does.
     ///
     /// # Errors
-    /// When there are more than 64 bytes.
+    /// Returns an error if there are more than 64 bytes.
     pub fn fd(id: u32, flags: u8, data: &[u8]) -> Result<Self, FrameError> {
         Self::with_data(id, Format::Fd, flags | FD_FORMAT, data)
     }
 
-    /// A frame with every field given; what captures are read into.
+    /// Creates a frame from all its fields, as read from a capture.
     ///
     /// # Errors
-    /// When the data does not fit the format.
+    /// Returns an error if the data does not fit the format.
     pub fn with_data(id: u32, format: Format, flags: u8, data: &[u8]) -> Result<Self, FrameError> {
         let mut bytes = [0; 64];
         if let Some(bytes) = bytes.get_mut(..data.len()) {
@@ -205,7 +207,7 @@ impl Frame {
         Self::filled(id, format, flags, bytes, data.len())
     }
 
-    /// The same with the data in its place already; what is behind `len` has to be 0.
+    /// Like [`Frame::with_data`], with the data already in a full-size buffer. Bytes after `len` must be 0.
     #[inline(always)]
     pub(crate) fn filled(
         id: u32,
@@ -220,10 +222,10 @@ impl Frame {
         Ok(Self { id, format, flags, raw_dlc: 0, len, data })
     }
 
-    /// A remote frame that requests `len` bytes.
+    /// Creates a remote frame that requests `len` bytes.
     ///
     /// # Errors
-    /// When more than 8 bytes are requested.
+    /// Returns an error if more than 8 bytes are requested.
     pub fn remote(id: u32, len: u8) -> Result<Self, FrameError> {
         if len > 8 {
             return Err(FrameError::Length { got: usize::from(len), max: 8 });
@@ -233,82 +235,83 @@ impl Frame {
         Ok(frame)
     }
 
-    /// The same classic frame with the DLC as it was on the wire (9 to 15, when the length is 8).
+    /// Sets the DLC as seen on the wire: 9 to 15 in a classic frame with 8 data bytes.
     #[must_use]
     pub const fn with_raw_dlc(mut self, raw_dlc: u8) -> Self {
         self.raw_dlc = raw_dlc;
         self
     }
 
-    /// Identifier and flags, as the kernel keeps them in one word.
+    /// Returns identifier and flags in one word, as the kernel stores them.
     #[must_use]
     pub const fn raw_id(&self) -> u32 {
         self.id
     }
 
-    /// The identifier without its flags.
+    /// Returns the identifier without its flags.
     #[must_use]
     pub const fn id(&self) -> u32 {
         if self.is_extended() || self.is_error() { self.id & EXTENDED_MASK } else { self.id & STANDARD_MASK }
     }
 
-    /// Whether the identifier has 29 bits.
+    /// Returns true if the identifier has 29 bits.
     #[must_use]
     pub const fn is_extended(&self) -> bool {
         self.id & EXTENDED != 0
     }
 
-    /// Whether this requests data instead of carrying it. In CAN FD no frame does, whatever its flag says.
+    /// Returns true if this is a remote frame, which requests data. CAN FD has no remote frames, so the flag
+    /// is ignored there.
     #[must_use]
     pub const fn is_remote(&self) -> bool {
         matches!(self.format, Format::Classic) && self.id & REMOTE != 0
     }
 
-    /// Whether this is the driver's report of an error.
+    /// Returns true if this is an error report from the driver.
     #[must_use]
     pub const fn is_error(&self) -> bool {
         self.id & ERROR != 0
     }
 
-    /// Classic or FD.
+    /// Returns the format.
     #[must_use]
     pub const fn format(&self) -> Format {
         self.format
     }
 
-    /// The FD flags; 0 in a classic frame.
+    /// Returns the FD flags; 0 in a classic frame.
     #[must_use]
     pub const fn flags(&self) -> u8 {
         self.flags
     }
 
-    /// The DLC as it was on the wire, when it said 9 to 15 for 8 bytes; else 0.
+    /// Returns the DLC as seen on the wire if it was 9 to 15 (8 data bytes); otherwise 0.
     #[must_use]
     pub const fn raw_dlc(&self) -> u8 {
         self.raw_dlc
     }
 
-    /// How many bytes it carries, or requests when remote.
+    /// Returns the number of data bytes, or of requested bytes in a remote frame.
     #[must_use]
     pub const fn len(&self) -> u8 {
         self.len
     }
 
-    /// Whether it carries nothing.
+    /// Returns true if the length is 0.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// The bytes it carries; none in a remote frame.
+    /// Returns the data bytes; empty for a remote frame.
     #[must_use]
     pub fn data(&self) -> &[u8] {
         let len = if self.is_remote() { 0 } else { usize::from(self.len) };
         self.data.get(..len).unwrap_or_default()
     }
 
-    /// The bytes between control field and checksum on a wire: an FD frame of a length that CAN FD does not have is
-    /// filled up with zeros, and its remote flag means nothing.
+    /// Returns the bytes between control field and checksum on the wire. An FD frame with a length that CAN
+    /// FD does not have is padded with zeros; its remote flag is ignored.
     pub(crate) fn on_wire(&self) -> &[u8] {
         let len = match self.format {
             Format::Classic => self.data().len(),
@@ -317,7 +320,7 @@ impl Frame {
         self.data.get(..len).unwrap_or(&self.data)
     }
 
-    /// The kernel's struct; only the first [`Frame::byte_len`] bytes are its own.
+    /// Returns the kernel's struct. Only the first [`Frame::byte_len`] bytes are valid.
     #[must_use]
     pub fn to_bytes(&self) -> [u8; FD_BYTES] {
         let [a, b, c, d] = self.id.to_ne_bytes();
@@ -332,16 +335,17 @@ impl Frame {
         bytes
     }
 
-    /// How many bytes the kernel's struct has: 16 or 72.
+    /// Returns the size of the kernel's struct in bytes: 16 or 72.
     #[must_use]
     pub const fn byte_len(&self) -> usize {
         self.format.byte_len()
     }
 
-    /// Reads the kernel's struct. Never panics.
+    /// Decodes the kernel's struct. Never panics.
     ///
     /// # Errors
-    /// When the size is that of neither struct, or the length byte is above what the format carries.
+    /// Returns an error if the size is that of neither struct, or the length byte is above what the format
+    /// carries.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, FrameError> {
         let format = match bytes.len() {
             CLASSIC_BYTES => Format::Classic,
@@ -355,7 +359,7 @@ impl Frame {
         let body = data.get(..got).ok_or(FrameError::Length { got, max: data.len() })?;
         let id = u32::from_ne_bytes([a, b, c, d]);
         match format {
-            // Other values there are padding that nobody cleared.
+            // Any other value of this byte is uninitialised padding.
             Format::Classic => {
                 let dlc = if got == 8 && matches!(dlc, 9..=15) { dlc } else { 0 };
                 Self::with_data(id, format, 0, body).map(|frame| frame.with_raw_dlc(dlc))

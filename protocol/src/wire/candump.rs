@@ -1,4 +1,5 @@
-//! The text of `candump -L`: read widely, written in the subset that every tool reads.
+//! The text format of `candump -L`. The parser accepts many variants; the writer uses the subset that every
+//! tool reads.
 //!
 //! ```text
 //!   (1700000000.123456) vcan0 123#DEADBEEF       classic, 3 hex digits: 11-bit identifier
@@ -7,11 +8,18 @@
 //!   (1700000000.123456) vcan0 20000004#0001...   error frame: 8 digits with 0x20000000 set
 //! ```
 //!
-//! Also read: lines that are indented or quoted by `>` or `|`, or stand behind a prefix as journald's, several spaces or
-//! tabs, any number of digits of a second (9: `-N`), a direction `T` or `R` behind the frame (`-x`), other words there, dots
-//! between bytes, a raw DLC (`_9` to `_F`), the kernel's flags in an identifier of 8 digits (80000000 extended, 40000000
-//! remote, 20000000 error). Lines without a parenthesis are other text, as can-utils has it; CAN XL frames
-//! (`00242#81:00:12345678#...`) are named but not read.
+//! The parser also accepts:
+//!
+//! - lines that are indented, quoted with `>` or `|`, or prefixed, for example by journald
+//! - several spaces or tabs between fields
+//! - any number of digits after the decimal point (9: `candump -N`)
+//! - a direction `T` or `R` after the frame (`-x`), and other words there
+//! - dots between bytes
+//! - a raw DLC (`_9` to `_F`)
+//! - the kernel's flags in an identifier of 8 digits (80000000 extended, 40000000 remote, 20000000 error)
+//!
+//! Lines without a parenthesis are treated as other text, as can-utils does. CAN XL frames
+//! (`00242#81:00:12345678#...`) are recognised but not decoded.
 
 mod portable;
 mod read;
@@ -26,32 +34,32 @@ use read::{Cursor, is_blank};
 pub use read::{eight_digit_identifier, fraction};
 pub use write::{write_frame, write_record};
 
-/// When a line's frame was on the bus.
+/// The time of a frame, and how it is written.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
 pub struct Timestamp {
     /// Nanoseconds since 1970.
     pub nanos: u64,
-    /// Whether it was given, or is to be written, with 9 digits instead of 6.
+    /// True if the fraction of a second has 9 digits instead of 6.
     pub nine_digits: bool,
-    /// How many digits the seconds have at least, with zeros in front: candump pads them to 10.
+    /// Minimum number of digits of the seconds, padded with zeros; candump pads to 10.
     pub min_digits: u8,
 }
 
 impl Timestamp {
-    /// A time with 6 digits of a second.
+    /// Creates a time that is written with 6 fractional digits.
     #[must_use]
     pub const fn six_digits(nanos: u64) -> Self {
         Self { nanos, nine_digits: false, min_digits: 1 }
     }
 
-    /// A time with 9 digits of a second.
+    /// Creates a time that is written with 9 fractional digits.
     #[must_use]
     pub const fn nine_digits(nanos: u64) -> Self {
         Self { nine_digits: true, ..Self::six_digits(nanos) }
     }
 }
 
-/// Whether the frame was sent or received by the node that took the capture.
+/// The direction of a frame, seen from the node that took the capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Direction {
     /// `T`.
@@ -63,63 +71,65 @@ pub enum Direction {
 /// One frame of a capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Record<'a> {
-    /// When.
+    /// The time of the frame.
     pub time: Timestamp,
-    /// On which bus.
+    /// The name of the CAN interface.
     pub interface: &'a str,
-    /// What.
+    /// The frame.
     pub frame: Frame,
-    /// Which way, when the capture has it.
+    /// The direction, if the capture contains it.
     pub direction: Option<Direction>,
 }
 
-/// What a line is.
+/// The content of one line.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Line<'a> {
     /// A frame.
     Frame(Record<'a>),
-    /// candump's own word that it lost frames.
+    /// candump's report that it lost frames.
     Dropped {
-        /// How many.
+        /// Number of lost frames.
         frames: u64,
     },
-    /// A CAN XL frame, which is not read.
+    /// A CAN XL frame, which is not decoded.
     CanXl,
-    /// A comment, an empty line, anything that can-utils skip too.
+    /// A comment, an empty line, or other text that can-utils also skip.
     Other,
 }
 
-/// What is wrong with a line that begins like a frame.
+/// The error for a line that begins like a frame but is not one.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[error("column {column}: {expected}")]
 pub struct LineError {
-    /// Where, from 1.
+    /// Column of the error, counted from 1.
     pub column: usize,
-    /// What should stand there.
+    /// The text that was expected there.
     pub expected: &'static str,
 }
 
-/// Reads one line, with or without its end. Never panics.
+/// Parses one line, with or without its line ending. Never panics.
 ///
 /// # Errors
-/// When it begins with a parenthesis, behind blanks and quotation marks or not, and is no frame.
+/// Returns an error if the line begins with a parenthesis, possibly after blanks and quotation marks, but is
+/// not a frame.
 pub fn parse(line: &str) -> Result<Line<'_>, LineError> {
     parse_bytes(line.as_bytes())
 }
 
-/// As [`parse`], of bytes that need not be text: only the interface's name has to be. Never panics.
+/// Like [`parse`], for bytes that need not be UTF-8. Only the interface name must be. Never panics.
 ///
 /// # Errors
-/// When it begins with a parenthesis, behind blanks and quotation marks or not, and is no frame.
+/// Returns an error if the line begins with a parenthesis, possibly after blanks and quotation marks, but is
+/// not a frame.
 #[inline]
 pub fn parse_bytes(line: &[u8]) -> Result<Line<'_>, LineError> {
     portable::record(line).map_or_else(|| parse_widely(line), |record| Ok(Line::Frame(record)))
 }
 
-/// Reads all that can be read.
+/// Parses every accepted variant of a line.
 fn parse_widely(line: &[u8]) -> Result<Line<'_>, LineError> {
     let text = trim_end(line);
-    // In mails and issues.
+    // Blanks and quotation marks of e-mails and issue trackers.
     let indent = text.iter().take_while(|byte| matches!(byte, b' ' | b'\t' | b'>' | b'|')).count();
     match text.get(indent..).unwrap_or_default() {
         [b'(', next, ..] if indent > 0 && next.is_ascii_digit() => parse_at(text, indent),
@@ -129,7 +139,7 @@ fn parse_widely(line: &[u8]) -> Result<Line<'_>, LineError> {
     }
 }
 
-/// Reads a line whose parenthesis is at this place.
+/// Parses a line whose opening parenthesis is at `at`.
 fn parse_at(text: &[u8], at: usize) -> Result<Line<'_>, LineError> {
     let mut cursor = Cursor::new(text, at + 1);
     let time = cursor.time()?;
@@ -144,17 +154,17 @@ fn parse_at(text: &[u8], at: usize) -> Result<Line<'_>, LineError> {
     Ok(Line::Frame(Record { time, interface, frame, direction }))
 }
 
-/// A frame behind words, as journald writes them before each line; what is like one there may be anything.
+/// Finds a frame after a prefix such as journald's. A candidate that does not parse is part of the prefix.
 fn behind_prefix(text: &[u8]) -> Option<Line<'_>> {
     let begins = |pair: &[u8]| matches!(pair, [before, b'('] if is_blank(*before));
     let places = text.windows(2).enumerate().filter(|(_, pair)| begins(pair));
     places.map(|(at, _)| parse_at(text, at + 1)).find_map(Result::ok)
 }
 
-/// Reads a frame alone, as cansend takes it: `123#DEADBEEF`. Never panics.
+/// Parses a frame without time and interface, in the notation of cansend: `123#DEADBEEF`. Never panics.
 ///
 /// # Errors
-/// When it is no frame, is CAN XL, or something follows it.
+/// Returns an error if it is not a frame, is a CAN XL frame, or is followed by other text.
 pub fn parse_frame(text: &str) -> Result<Frame, LineError> {
     let mut cursor = Cursor::new(text.as_bytes(), 0);
     let frame =
@@ -174,17 +184,18 @@ impl fmt::Display for Record<'_> {
     }
 }
 
-/// Without the spaces and ends of lines behind it, also those that are not ASCII.
+/// Strips trailing white space and line endings, including those of Unicode.
 fn trim_end(line: &[u8]) -> &[u8] {
     match line.last() {
-        // Nearly every line ends in a digit.
+        // Fast path: nearly every line ends in a digit.
         Some(b'!'..=b'~') | None => line,
         Some(_) => core::str::from_utf8(line)
             .map_or_else(|_| line.trim_ascii_end(), |line| line.trim_end().as_bytes()),
     }
 }
 
-/// Other text; candump's own `DROPCOUNT: dropped 12 CAN frames on 'vcan0' socket ...` is understood.
+/// Classifies a line without a frame. Recognises candump's `DROPCOUNT: dropped 12 CAN frames on 'vcan0'
+/// socket ...`.
 fn other(text: &[u8]) -> Line<'_> {
     text.strip_prefix(b"DROPCOUNT: dropped ")
         .and_then(|rest| rest.split(|&byte| byte == b' ').next())
@@ -252,7 +263,7 @@ mod tests {
         assert!(matches!(parse_bytes("(1.000000) kän 123# \u{A0}".as_bytes()), Ok(Line::Frame(_))));
     }
 
-    /// Compares lines in all manners of writing with the values in `vectors/candump.tsv`.
+    /// Compares lines in many notations with the values in `vectors/candump.tsv`.
     #[test]
     fn lines_have_the_values_that_can_utils_and_python_can_read() {
         let vectors = include_str!("../../tests/vectors/candump.tsv");
@@ -331,9 +342,9 @@ mod tests {
             says("(1.000000) can0 123#112233445566778899"),
             "column 39: at most 8 bytes in a classic frame"
         );
-        let further = "the end of the data: a byte stands behind a space";
+        let further = "the end of the data: a byte follows a space";
         assert_eq!(says("(1.000000) can0 123#11 22"), format!("column 24: {further}"));
-        let remote = "no data in a remote frame, whose flag the identifier has";
+        let remote = "no data, because the identifier has the flag of a remote frame";
         assert_eq!(says("(1.000000) can0 C0000123#11"), format!("column 26: {remote}"));
         assert_eq!(says("(1.000000) can0 123##"), "column 22: one digit of FD flags");
         assert_eq!(says("(1.000000) "), "column 11: a space");
@@ -354,7 +365,7 @@ mod tests {
                 _ => Frame::with_data(id & STANDARD_MASK, Format::Fd, flags, &data),
             }.unwrap();
             let nanos = if nine { nanos } else { nanos / 1_000 * 1_000 };
-            // Zeros in front are told by one.
+            // Only padded seconds begin with a zero.
             let is_padded = |&digits: &u8| nanos / 1_000_000_000 < 10_u64.pow(u32::from(digits) - 1);
             let min_digits = [1, 3, 10].into_iter().nth(pad).filter(is_padded).unwrap_or(1);
             let record = Record { time: Timestamp { nine_digits: nine, min_digits, ..Timestamp::six_digits(nanos) }, interface: "vcan0", frame, direction: None };

@@ -1,5 +1,5 @@
-//! What a cell of firmware knows from the factory: a record in its flash, which whoever makes the cell writes into the
-//! program's file before it is loaded.
+//! The factory record of a firmware cell: a section in its flash that the manufacturer writes into the
+//! program file before it is loaded.
 //!
 //! ```text
 //!   byte 0..3  "CELL"                         4  version, 1       5  the node id, 0 for none
@@ -11,18 +11,18 @@
 //!        24..29 0                          30..31 CRC-16 over all bytes before it, little endian
 //! ```
 //!
-//! Only cells on a bench have wires here: they are simulated by frames ([`crate::port`]).
+//! Only cells on a bench have wires here: the bench simulates them with frames ([`crate::port`]).
 
 use crate::can::Format;
 use crate::id::CellId;
 use crate::packet::crc16;
 use crate::port::{LinkId, PORTS};
 
-/// Bytes of a record.
+/// Size of a record in bytes.
 pub const BYTES: usize = 32;
-/// The section of the program that holds it.
+/// The linker section that holds the record.
 pub const SECTION: &str = ".factory";
-/// A record that nobody has written: erased flash.
+/// An unwritten record: erased flash.
 pub const ERASED: [u8; BYTES] = [0xFF; BYTES];
 
 const MAGIC: &[u8; 4] = b"CELL";
@@ -30,23 +30,23 @@ const VERSION: u8 = 1;
 const CLASSIC: u8 = 1;
 const HOSTED: u8 = 2;
 
-/// What a cell knows from the factory.
+/// The factory settings of a cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Factory {
-    /// Its node id, if it has one.
+    /// The node id, if assigned at the factory.
     pub node: Option<CellId>,
-    /// Its serial number.
+    /// The serial number.
     pub serial: u32,
-    /// The format of its bus.
+    /// The frame format of its bus.
     pub format: Format,
-    /// Whether it runs in an emulator that keeps its flash in a file.
+    /// True if the cell runs in an emulator that keeps its flash in a file.
     pub hosted: bool,
-    /// By port, the link id that it sends with; the last one leads to the gateway's side.
+    /// The link id that each port sends with. The last entry is the uplink to the gateway's side.
     pub link_ids: [Option<LinkId>; PORTS + 1],
 }
 
 impl Factory {
-    /// The record.
+    /// Encodes the record.
     #[must_use]
     pub fn encode(&self) -> [u8; BYTES] {
         let flag = |set, flag| if set { flag } else { 0 };
@@ -71,7 +71,7 @@ impl Factory {
         bytes
     }
 
-    /// Reads a record; `None` when it was never written, or is damaged. Never panics.
+    /// Decodes a record. Returns `None` for a blank or damaged record. Never panics.
     #[must_use]
     pub fn decode(bytes: &[u8; BYTES]) -> Option<Self> {
         let (body, crc) = bytes.split_last_chunk()?;

@@ -1,12 +1,11 @@
-//! Fixed-point numbers of 16 bits, and the exact sums in which they meet.
+//! Fixed-point numbers of 16 bits, and exact sums of their products.
 //!
-//! `Qm_n` is read as one sign bit, `m` integer bits and `n` fraction bits, as the robot-skin
-//! literature does: Q1.14 spans [-2, 2). The crate `fixed` counts the sign bit in and calls the same
-//! format `I2F14`.
+//! `Qm_n` has one sign bit, `m` integer bits and `n` fraction bits, as in the robot-skin literature: Q1.14
+//! spans [-2, 2). The crate `fixed` includes the sign bit in its count and calls the same format `I2F14`.
 //!
-//! A format is the resolution of a number, not its quantity: [`crate::message`] defines which word is a
-//! force and which a torque. There are no overloaded operators, so that every place where bits can be
-//! lost has a name: [`Acc::round`] and the saturating operations.
+//! A format is the resolution of a number, not its quantity: [`crate::message`] defines which word is a force
+//! and which a torque. Operators are not overloaded, so that every operation that can lose bits has a name:
+//! [`Acc::round`] and the saturating operations.
 
 use thiserror::Error;
 
@@ -26,13 +25,13 @@ pub type Q7_8 = Q<8>;
 /// Temperatures in degrees Celsius: [-512, 512) in steps of 1.6e-2.
 pub type Q9_6 = Q<6>;
 
-/// Whether a word of any format means *saturated* where saturation is marked (torques and sums).
+/// Returns true if a word means *saturated* in a torque or a sum. The marks are the same in all formats.
 #[must_use]
 pub const fn is_saturated(word: i16) -> bool {
     word == i16::MAX || word == i16::MIN
 }
 
-/// In which format the cells of a bus send their own torques: a wider range for a coarser step. Sums are Q7.8.
+/// The format of a cell's own torques on a bus: a wider range has a coarser step. Sums are always Q7.8.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub enum TorqueFormat {
     /// [-8, 8) Nm or N in steps of 2.4e-4.
@@ -45,10 +44,10 @@ pub enum TorqueFormat {
 }
 
 impl TorqueFormat {
-    /// Every format, the finest first; a format's place is the number that stands for it.
+    /// All formats, the finest first. The index of a format is its number in a parameter.
     pub const ALL: [Self; 3] = [Self::Q3_12, Self::Q5_10, Self::Q7_8];
 
-    /// Its name.
+    /// Returns the name of the format.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -58,19 +57,19 @@ impl TorqueFormat {
         }
     }
 
-    /// The number that stands for it in a parameter.
+    /// Returns the number that stands for the format in a parameter.
     #[must_use]
     pub const fn number(self) -> u8 {
         self as u8
     }
 
-    /// The format that a number stands for.
+    /// Returns the format with this number, if it exists.
     #[must_use]
     pub fn from_number(number: i16) -> Option<Self> {
         usize::try_from(number).ok().and_then(|number| Self::ALL.get(number)).copied()
     }
 
-    /// Fraction bits of its words.
+    /// Returns the number of fraction bits of a word.
     #[must_use]
     pub const fn fraction(self) -> u32 {
         match self {
@@ -80,19 +79,20 @@ impl TorqueFormat {
         }
     }
 
-    /// What one step is worth, in Nm or N.
+    /// Returns the value of one step, in Nm or N.
     #[must_use]
     pub fn step(self) -> f64 {
         1.0 / f64::from(1_u32 << self.fraction())
     }
 
-    /// What a word is worth, in Nm or N.
+    /// Converts a word to Nm or N.
     #[must_use]
     pub fn real(self, word: i16) -> f64 {
         f64::from(word) * self.step()
     }
 
-    /// The nearest word, ties away from zero; out of range it saturates, and what is not a number becomes zero.
+    /// Rounds a value to the nearest word, ties away from zero. Values out of range saturate; NaN becomes
+    /// zero.
     #[must_use]
     pub fn nearest(self, value: f64) -> i16 {
         match self {
@@ -102,19 +102,19 @@ impl TorqueFormat {
         }
     }
 
-    /// A word in steps of 2^-12 Nm or N, the finest of all formats: exact.
+    /// Converts a word to steps of 2^-12 Nm or N, the finest of all formats. The result is exact.
     #[must_use]
     pub fn finest_steps(self, word: i16) -> i32 {
         i32::from(word) << (Self::Q3_12.fraction() - self.fraction())
     }
 
-    /// The first torque beyond its range, in Nm or N.
+    /// Returns the upper bound of the range, in Nm or N: the smallest positive torque that does not fit.
     #[must_use]
     pub fn bound(self) -> f64 {
         -self.real(i16::MIN)
     }
 
-    /// The word of an exact torque, rounded to the nearest step, ties up, and held within the range.
+    /// Rounds an exact torque to the nearest word, ties up, and saturates it.
     #[must_use]
     pub fn round<const F: u32>(self, exact: Acc<F>) -> i16 {
         match self {
@@ -125,7 +125,7 @@ impl TorqueFormat {
     }
 }
 
-/// A real number that is outside the range of a `Q` format.
+/// The error for a real number outside the range of a `Q` format.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[error("{got} is not in [{min}, {bound})")]
 pub struct OutOfRange {
@@ -133,49 +133,49 @@ pub struct OutOfRange {
     pub got: f64,
     /// The smallest number of the format.
     pub min: f64,
-    /// The first number above the format's range.
+    /// The upper bound of the format, exclusive.
     pub bound: f64,
 }
 
 impl<const F: u32> Q<F> {
-    /// Nothing.
+    /// Zero.
     pub const ZERO: Self = Self(0);
-    /// The largest number; in a torque it means *saturated*.
+    /// The largest number; in a torque or a sum it means *saturated*.
     pub const MAX: Self = Self(i16::MAX);
-    /// The smallest number; in a torque it means *saturated*.
+    /// The smallest number; in a torque or a sum it means *saturated*.
     pub const MIN: Self = Self(i16::MIN);
-    /// Steps in one.
+    /// Steps per unit.
     const SCALE: f64 = (1_u32 << F) as f64;
 
-    /// The number whose word on the wire is `bits`.
+    /// Creates a number from its word on the wire.
     #[must_use]
     pub const fn from_bits(bits: i16) -> Self {
         Self(bits)
     }
 
-    /// The word on the wire.
+    /// Returns the word on the wire.
     #[must_use]
     pub const fn to_bits(self) -> i16 {
         self.0
     }
 
-    /// The number as a real one, exactly.
+    /// Converts the number to `f64`, exactly.
     #[must_use]
     pub fn to_f64(self) -> f64 {
         f64::from(self.0) / Self::SCALE
     }
 
-    /// The nearest number of this format, ties away from zero; out of range it saturates, and what
-    /// is not a number becomes zero.
+    /// Rounds to the nearest number of this format, ties away from zero. Values out of range saturate; NaN
+    /// becomes zero.
     #[must_use]
     pub fn nearest(value: f64) -> Self {
         Self(saturate(round_half_away(value * Self::SCALE)))
     }
 
-    /// The nearest number of this format, ties away from zero.
+    /// Rounds to the nearest number of this format, ties away from zero.
     ///
     /// # Errors
-    /// When the nearest step lies outside the range, or `value` is not a number.
+    /// Returns an error if the result is outside the range, or `value` is NaN.
     pub fn try_nearest(value: f64) -> Result<Self, OutOfRange> {
         if value.is_nan() {
             return Err(Self::out_of_range(value));
@@ -183,11 +183,11 @@ impl<const F: u32> Q<F> {
         i16::try_from(round_half_away(value * Self::SCALE)).map(Self).map_err(|_| Self::out_of_range(value))
     }
 
-    /// The smallest number of this format that is not below `value`: how thresholds are rounded, so that
-    /// nothing below the requested threshold gets through.
+    /// Returns the smallest number of this format that is at least `value`. Thresholds are rounded this way,
+    /// so that no value below the requested threshold passes.
     ///
     /// # Errors
-    /// When that number lies outside the range, or `value` is not a number.
+    /// Returns an error if that number is outside the range, or `value` is NaN.
     pub fn try_at_least(value: f64) -> Result<Self, OutOfRange> {
         let nearest = Self::try_nearest(value)?;
         if nearest.to_f64() >= value {
@@ -200,37 +200,37 @@ impl<const F: u32> Q<F> {
         OutOfRange { got, min: Self::MIN.to_f64(), bound: -Self::MIN.to_f64() }
     }
 
-    /// Whether this word means *saturated* where saturation is marked (torques and sums).
+    /// Returns true if the word means *saturated* in a torque or a sum.
     #[must_use]
     pub const fn is_saturated(self) -> bool {
         is_saturated(self.0)
     }
 
-    /// The negative; the smallest number becomes the largest.
+    /// Negates the number; the smallest number becomes the largest.
     #[must_use]
     pub const fn saturating_neg(self) -> Self {
         Self(self.0.saturating_neg())
     }
 
-    /// The sum; held at the ends of the range.
+    /// Adds two numbers; the result saturates.
     #[must_use]
     pub const fn saturating_add(self, rhs: Self) -> Self {
         Self(self.0.saturating_add(rhs.0))
     }
 
-    /// The sum, wrapped into range: for angles, whose range is one turn.
+    /// Adds two numbers and wraps: for angles, whose range is one turn.
     #[must_use]
     pub const fn wrapping_add(self, rhs: Self) -> Self {
         Self(self.0.wrapping_add(rhs.0))
     }
 
-    /// The number as an exact sum, to add to and to round again.
+    /// Converts the number to an exact sum.
     #[must_use]
     pub fn widen(self) -> Acc<F> {
         Acc(i64::from(self.0))
     }
 
-    /// The exact product. `P` must be `F + G`, which the compiler checks.
+    /// Multiplies two numbers exactly. `P` must be `F + G`, which is checked at compile time.
     ///
     /// ```compile_fail
     /// # use protocol::fixed::{Acc, Q1_14, Q7_8};
@@ -244,11 +244,11 @@ impl<const F: u32> Q<F> {
 }
 
 impl Q1_14 {
-    /// An angle in radians as quarter turns, `z = angle / (pi/2)` wrapped into [-2, 2), to the nearest
-    /// step (ties away from zero). `None` when the angle is not finite.
+    /// Converts an angle in radians to quarter turns, `z = angle / (pi/2)` wrapped into [-2, 2), rounded to
+    /// the nearest step (ties away from zero). Returns `None` if the angle is not finite.
     ///
-    /// The range of Q1.14 is one whole turn, so wrapping is what 16-bit words do by themselves
-    /// (paper, Eq. 11; the period of its Eq. 12 is 4, not 2).
+    /// The range of Q1.14 is one whole turn, so 16-bit words wrap without further code (paper, Eq. 11; the
+    /// period of its Eq. 12 is 4, not 2).
     #[must_use]
     pub fn from_radians(angle: f64) -> Option<Self> {
         if !angle.is_finite() {
@@ -260,48 +260,49 @@ impl Q1_14 {
         Some(Self(i16::from_le_bytes([low, high])))
     }
 
-    /// The angle in radians, in [-pi, pi).
+    /// Converts quarter turns to radians, in [-pi, pi).
     #[must_use]
     pub fn to_radians(self) -> f64 {
         self.to_f64() * core::f64::consts::FRAC_PI_2
     }
 }
 
-/// An exact sum of products, `F` bits fractional; room for 2^33 products of two words.
+/// An exact sum of products with `F` fraction bits. It holds at least 2^33 products of two words without
+/// overflow.
 #[derive(Clone, Copy, Debug, Default, Eq, Ord, PartialEq, PartialOrd)]
 pub struct Acc<const F: u32>(i64);
 
 impl<const F: u32> Acc<F> {
-    /// Nothing.
+    /// Zero.
     pub const ZERO: Self = Self(0);
 
-    /// The sum of the steps of 2^-F given as an integer.
+    /// Creates a sum from an integer number of steps of 2^-F.
     #[must_use]
     pub const fn from_steps(steps: i64) -> Self {
         Self(steps)
     }
 
-    /// How many steps of 2^-F this is.
+    /// Returns the number of steps of 2^-F.
     #[must_use]
     pub const fn steps(self) -> i64 {
         self.0
     }
 
-    /// The sum; saturates at the ends of 64 bits.
+    /// Adds two sums; saturates at the limits of 64 bits.
     #[must_use]
     pub const fn plus(self, rhs: Self) -> Self {
         Self(self.0.saturating_add(rhs.0))
     }
 
-    /// The same number in finer steps. `G` must not be below `F`, which the compiler checks.
+    /// Converts to finer steps. `G` must be at least `F`, which is checked at compile time.
     #[must_use]
     pub const fn finer<const G: u32>(self) -> Acc<G> {
         const { assert!(G >= F, "finer means more fractional bits") }
         Acc(self.0.saturating_mul(1_i64 << (G - F)))
     }
 
-    /// Rounds to `G` fractional bits, ties up, and holds the result within 16 bits: one of the few
-    /// places where bits may be lost.
+    /// Rounds to `G` fraction bits, ties up, and saturates at 16 bits. This is one of the few operations that
+    /// may lose bits.
     ///
     /// The error is at most half a step of 2^-G unless the result saturates.
     #[must_use]
@@ -311,7 +312,7 @@ impl<const F: u32> Acc<F> {
         Q(saturate(self.0.saturating_add(half) >> (F - G)))
     }
 
-    /// The number as a real one; exact up to 53 significant bits.
+    /// Converts to `f64`; exact up to 53 significant bits.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "documented: exact up to 53 bits")]
     pub fn to_f64(self) -> f64 {
@@ -331,7 +332,7 @@ fn round_half_away(value: f64) -> i64 {
     whole.saturating_add(i64::from(rest >= 0.5)).saturating_sub(i64::from(rest <= -0.5))
 }
 
-/// Holds an integer within 16 bits.
+/// Saturates an integer at 16 bits.
 fn saturate(steps: i64) -> i16 {
     i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX })
 }

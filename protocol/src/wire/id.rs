@@ -1,29 +1,29 @@
-//! Identifiers: kind of packet and node in eleven bits.
+//! Identifiers: the kind of a packet and a node in eleven bits.
 //!
 //! ```text
 //!   bit   10 9 8 | 7 6 5 4 3 2 1 0
-//!          kind  |  node, or what is commanded
+//!          kind  |  node, or the command
 //! ```
 //!
-//! Identifiers are fixed per cell and kind, so that a kernel filter matches exactly one of them. The
-//! lower identifier wins arbitration: halt, joints, sums and torques come first.
+//! Identifiers are fixed per cell and kind, so that a kernel filter can match exactly one of them. The lower
+//! identifier wins arbitration: halt and joints come first, then sums and torques.
 
 use thiserror::Error;
 
-/// The number of a cell on its bus, 1 to 254; 0 is the gateway and 255 is everyone.
+/// The node id of a cell on its bus, 1 to 254. 0 is the gateway and 255 is everyone.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 #[cfg_attr(feature = "host", derive(serde::Serialize))]
 pub struct CellId(u8);
 
-/// A number that is no node id of a cell.
+/// The error for a number that is not a cell's node id.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
-#[error("{got} is no node id: 1 to {max} are (0 is the gateway, 255 everyone)", max = CellId::MAX.0)]
+#[error("{got} is not a node id: use 1 to {max} (0 is the gateway, 255 is everyone)", max = CellId::MAX.0)]
 pub struct CellIdOutOfRange {
     /// The number that was requested.
     pub got: i64,
 }
 
-/// A text that is no node id of a cell.
+/// The error for a text that is not a cell's node id.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[error("a node id is needed, 1 to 254")]
 pub struct NoNodeId;
@@ -31,13 +31,13 @@ pub struct NoNodeId;
 impl CellId {
     /// The largest node id of a cell.
     pub const MAX: Self = Self(254);
-    /// How many cells a bus can have.
+    /// The maximum number of cells on a bus.
     pub const COUNT: usize = 254;
 
-    /// The cell with this number.
+    /// Creates a node id from a number.
     ///
     /// # Errors
-    /// When the number is not in 1..=254.
+    /// Returns an error if the number is not in 1..=254.
     pub fn new(number: i64) -> Result<Self, CellIdOutOfRange> {
         match u8::try_from(number) {
             Ok(number @ 1..=254) => Ok(Self(number)),
@@ -45,19 +45,19 @@ impl CellId {
         }
     }
 
-    /// The number.
+    /// Returns the number.
     #[must_use]
     pub const fn get(self) -> u8 {
         self.0
     }
 
-    /// Where this cell stands in a table of all cells of a bus: 0 to 253.
+    /// Returns the index of this cell in a table of all cells of a bus: 0 to 253.
     #[must_use]
     pub const fn index(self) -> usize {
         self.0 as usize - 1
     }
 
-    /// All node ids of cells, in order.
+    /// Returns all node ids of cells, in ascending order.
     pub fn all() -> impl Iterator<Item = Self> {
         (1..=Self::MAX.0).map(Self)
     }
@@ -78,7 +78,7 @@ impl core::fmt::Display for CellId {
     }
 }
 
-/// Whom the node field names.
+/// The sender or addressee in the node field of an identifier.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Node {
     /// 0.
@@ -90,7 +90,7 @@ pub enum Node {
 }
 
 impl Node {
-    /// Whom a node field names.
+    /// Decodes a node field.
     #[must_use]
     pub const fn from_byte(byte: u8) -> Self {
         match byte {
@@ -100,7 +100,7 @@ impl Node {
         }
     }
 
-    /// The node field.
+    /// Encodes the node field.
     #[must_use]
     pub const fn to_byte(self) -> u8 {
         match self {
@@ -110,7 +110,7 @@ impl Node {
         }
     }
 
-    /// Whether `cell` is meant.
+    /// Returns true if `cell` is addressed, alone or with everyone.
     #[must_use]
     pub fn names(self, cell: CellId) -> bool {
         self == Self::Cell(cell) || self == Self::Everyone
@@ -127,30 +127,30 @@ impl core::fmt::Display for Node {
     }
 }
 
-/// What a packet is about.
+/// The kind of a packet.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 #[repr(u8)]
 pub enum Kind {
-    /// From the gateway's side to everyone; the node field is the command.
+    /// A command from the gateway's side to everyone; the node field is the [`Command`].
     Command = 0,
     /// A partial sum of torques.
     Sum = 1,
-    /// One cell's own torque.
+    /// The own torque of one cell.
     Torque = 2,
-    /// What a cell measures.
+    /// Measurements of a cell.
     Sensors = 3,
     /// Heartbeat, counters, tree.
     Network = 4,
     /// Writes or reads a parameter of a cell.
     Configure = 5,
-    /// A cell's answer to that.
+    /// A cell's reply to a configure request.
     Configured = 6,
-    /// What a cell shall feel.
+    /// Simulated sensor values for a cell.
     Stimulus = 7,
 }
 
 impl Kind {
-    /// All kinds, by number.
+    /// All kinds, in the order of their numbers.
     pub const ALL: [Self; 8] = [
         Self::Command,
         Self::Sum,
@@ -162,7 +162,7 @@ impl Kind {
         Self::Stimulus,
     ];
 
-    /// The kind's name, as every table and every error prints it.
+    /// Returns the name that tables and errors use.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -177,7 +177,7 @@ impl Kind {
         }
     }
 
-    /// Whether cells send it; the others the gateway's side sends.
+    /// Returns true if cells send this kind, false if the gateway's side does.
     #[must_use]
     pub const fn is_from_cells(self) -> bool {
         match self {
@@ -200,27 +200,27 @@ impl Kind {
     }
 }
 
-/// What a command packet commands: the node field of kind 0.
+/// A command: the node field of an identifier of kind 0.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 #[repr(u8)]
 pub enum Command {
-    /// Stop answering until [`Command::Resume`].
+    /// Cells stop answering until [`Command::Resume`].
     Halt = 0,
-    /// The joint positions of a new epoch.
+    /// Joint positions of a new epoch.
     Joints = 1,
-    /// Answer with a heartbeat when all answers to the last joints are sent.
+    /// Cells send a heartbeat after all replies to the last joints.
     Sync = 2,
-    /// Leave the halted state.
+    /// Cells leave the halted state.
     Resume = 3,
-    /// Answer with the pages of counters.
+    /// Cells send the pages of counters.
     Report = 4,
 }
 
 impl Command {
-    /// All commands, by number.
+    /// All commands, in the order of their numbers.
     pub const ALL: [Self; 5] = [Self::Halt, Self::Joints, Self::Sync, Self::Resume, Self::Report];
 
-    /// The command with this number, if there is one.
+    /// Returns the command with this number, if it exists.
     #[must_use]
     pub const fn from_byte(byte: u8) -> Option<Self> {
         match byte {
@@ -233,7 +233,7 @@ impl Command {
         }
     }
 
-    /// The command's name.
+    /// Returns the name of the command.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -246,31 +246,31 @@ impl Command {
     }
 }
 
-/// An 11-bit identifier: the kind and the node field.
+/// An 11-bit identifier: kind and node field.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct Id {
-    /// What it is about.
+    /// The kind of the packet.
     pub kind: Kind,
-    /// The node field; in a command, what is commanded.
+    /// The node field; the number of the command for [`Kind::Command`].
     pub node: u8,
 }
 
 impl Id {
-    /// The identifier of a command.
+    /// Returns the identifier of a command.
     #[must_use]
     pub const fn command(command: Command) -> Self {
         Self { kind: Kind::Command, node: command as u8 }
     }
 
-    /// The identifier of a packet from or to a node.
+    /// Returns the identifier of a packet from or to a node.
     #[must_use]
     pub const fn new(kind: Kind, node: Node) -> Self {
         Self { kind, node: node.to_byte() }
     }
 
-    /// What every cell with a node id receives, whatever the state of its network: halt, joints, sync, resume, report;
-    /// its own heartbeats' identifier (to notice another cell under its node id); what configures and presses it, alone
-    /// or with everyone. Beside these a cell receives the sums of the cells at its ports.
+    /// Returns the identifiers that every cell with a node id receives in every network state: halt, joints,
+    /// sync, resume and report; its own heartbeats (to detect another cell with its node id); configuration
+    /// and stimuli, addressed to it or to everyone. A cell also receives the sums of the cells at its ports.
     #[must_use]
     pub const fn of_cell(cell: CellId) -> [Self; 10] {
         let cell = Node::Cell(cell);
@@ -288,20 +288,20 @@ impl Id {
         ]
     }
 
-    /// The eleven bits.
+    /// Returns the eleven bits.
     #[must_use]
     pub const fn to_bits(self) -> u16 {
         ((self.kind as u16) << 8) | self.node as u16
     }
 
-    /// Reads eleven bits; what is above them is ignored.
+    /// Decodes eleven bits; higher bits are ignored.
     #[must_use]
     pub const fn from_bits(bits: u16) -> Self {
         let [node, _] = bits.to_le_bytes();
         Self { kind: Kind::from_bits(bits >> 8), node }
     }
 
-    /// The cell that sends frames of this identifier; `None` when the gateway's side does.
+    /// Returns the cell that sends frames with this identifier; `None` if the gateway's side does.
     #[must_use]
     pub const fn sender(self) -> Option<CellId> {
         match Node::from_byte(self.node) {
@@ -310,7 +310,7 @@ impl Id {
         }
     }
 
-    /// The name of what it bears: a command's own, else the kind's.
+    /// Returns the name of the command, or of the kind for other packets.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match (self.kind, Command::from_byte(self.node)) {
@@ -355,6 +355,6 @@ mod tests {
         assert_eq!(CellId::all().count(), CellId::COUNT);
         assert!(CellId::all().all(|cell| Node::from_byte(cell.get()) == Node::Cell(cell)));
         let error = CellId::new(255).unwrap_err().to_string();
-        assert_eq!(error, "255 is no node id: 1 to 254 are (0 is the gateway, 255 everyone)");
+        assert_eq!(error, "255 is not a node id: use 1 to 254 (0 is the gateway, 255 is everyone)");
     }
 }

@@ -1,5 +1,5 @@
-//! The bytes on the bus: frames, identifiers, packets, messages and their timing, without an operating system and without a
-//! heap. Cells, firmware and gateway share this room; only [`schema`] needs a host.
+//! The wire format: frames, identifiers, packets, messages and their timing. These modules need neither an
+//! operating system nor a heap; cells, firmware and gateway share them. Only [`schema`] needs a host.
 
 pub mod can;
 pub mod candump;

@@ -1,4 +1,4 @@
-//! The packet: its words, an epoch, a count and a CRC, in one CAN FD frame or in classic frames of 8 bytes.
+//! Packets: words, an epoch, a count and a CRC, in one CAN FD frame or in several classic frames of 8 bytes.
 //!
 //! ```text
 //!   byte   0   1   2   3   4   5   6   7   8   9  10  11    12     13     14  15
@@ -9,7 +9,8 @@
 //!          '---- first classic frame ----' '---- second classic frame -----------'
 //! ```
 //!
-//! Joints, torques and sums of a chain of more than six joints have more words, and what follows the words moves back:
+//! Joints, torques and sums of a chain with more than six joints have more words; epoch, count and CRC follow
+//! the last word:
 //!
 //! | joints of the chain | words | bytes | classic frames |
 //! |---|---|---|---|
@@ -18,9 +19,9 @@
 //! | 9, 10 | 10 | 24 | 8 + 8 + 8 |
 //! | 11 to 14 | 14 | 32 | 8 + 8 + 8 + 8 |
 //!
-//! The CRC is CRC-16/CCITT-FALSE (polynomial 0x1021, initial value 0xFFFF, nothing reflected, no final
-//! XOR) over the identifier as two bytes, little endian, and all bytes before the CRC. The identifier is in it so
-//! that a packet which arrives under another cell's name is refused.
+//! The CRC is CRC-16/CCITT-FALSE (polynomial 0x1021, initial value 0xFFFF, not reflected, no final XOR) over
+//! the identifier as two bytes, little endian, and all bytes before the CRC. It includes the identifier so
+//! that a packet with another cell's identifier is refused.
 
 mod length;
 mod reassembly;
@@ -33,37 +34,37 @@ use thiserror::Error;
 use crate::can::{self, ERROR, EXTENDED, Format, Frame, REMOTE};
 use crate::id::Id;
 
-/// CRC-16/CCITT-FALSE, which the catalogue of CRCs calls IBM-3740.
+/// CRC-16/CCITT-FALSE, also known as CRC-16/IBM-3740.
 const CRC: crc::Crc<u16> = crc::Crc::<u16>::new(&crc::CRC_16_IBM_3740);
 
-/// Words in a packet, but for joints, torques and sums of longer chains.
+/// Number of words in a packet, except in joints, torques and sums of chains with more than six joints.
 pub const WORDS: usize = 6;
-/// Words in the longest packet.
+/// Number of words in the longest packet.
 pub const MAX_WORDS: usize = 14;
-/// Bytes in a packet of [`WORDS`].
+/// Size of a packet with [`WORDS`] words, in bytes.
 pub const BYTES: usize = Length::Six.bytes();
-/// Bytes in the longest packet.
+/// Size of the longest packet in bytes.
 const MAX_BYTES: usize = Length::Fourteen.bytes();
-/// Bytes in each of its classic frames but the last.
+/// Size of each classic frame of a packet except the last, in bytes.
 const SEGMENT_BYTES: usize = 8;
 
-/// The bytes of a packet.
+/// An encoded packet.
 pub type Bytes = heapless::Vec<u8, MAX_BYTES>;
 
-/// The CRC of this protocol over some bytes.
+/// Returns the CRC of this protocol over `bytes`.
 #[must_use]
 pub fn crc16(bytes: &[u8]) -> u16 {
     CRC.checksum(bytes)
 }
 
-/// The same of bytes that come in parts.
+/// Like [`crc16`], for bytes in several parts.
 pub(crate) fn crc16_of<const N: usize>(parts: impl Iterator<Item = [u8; N]>) -> u16 {
     let mut digest = CRC.digest();
     parts.for_each(|part| digest.update(&part));
     digest.finalize()
 }
 
-/// The words that begin so; the others are 0.
+/// Returns the words of a packet that begins with `first`, padded with zeros.
 #[must_use]
 pub fn words<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
     const { assert!(N <= WORDS, "a packet has no more words") }
@@ -74,7 +75,7 @@ pub fn words<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
     words
 }
 
-/// The values that begin so; the others are the default, and those beyond are left out.
+/// Returns an array that begins with `first`, padded with default values. Elements beyond `N` are dropped.
 #[must_use]
 pub fn padded<T: Copy + Default, const N: usize>(first: &[T]) -> [T; N] {
     core::array::from_fn(|index| first.get(index).copied().unwrap_or_default())
@@ -85,25 +86,25 @@ pub fn padded<T: Copy + Default, const N: usize>(first: &[T]) -> [T; N] {
 pub struct Epoch(pub u8);
 
 impl Epoch {
-    /// The epoch after this one.
+    /// Returns the next epoch.
     #[must_use]
     pub const fn next(self) -> Self {
         self.plus(1)
     }
 
-    /// The epoch before this one.
+    /// Returns the previous epoch.
     #[must_use]
     pub const fn before(self) -> Self {
         Self(self.0.wrapping_sub(1))
     }
 
-    /// The epoch `steps` later.
+    /// Returns the epoch `steps` later.
     #[must_use]
     pub const fn plus(self, steps: u8) -> Self {
         Self(self.0.wrapping_add(steps))
     }
 
-    /// How many epochs this one comes after `earlier`, in [-128, 127].
+    /// Returns the number of epochs since `earlier`, in [-128, 127].
     #[must_use]
     pub const fn since(self, earlier: Self) -> i8 {
         self.0.wrapping_sub(earlier.0).cast_signed()
@@ -116,53 +117,53 @@ impl core::fmt::Display for Epoch {
     }
 }
 
-/// A packet whose CRC was right; what its words mean is [`crate::message`]'s business.
-// Aligned, or else a Cortex-M0 copies it byte by byte.
+/// A packet with a correct CRC. [`crate::message`] defines the meaning of its words.
+// Aligned to words; otherwise a Cortex-M0 copies it byte by byte.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 #[repr(align(4))]
 pub struct Packet {
-    /// Kind and node.
+    /// The identifier: kind and node.
     pub id: Id,
-    /// Its words of 16 bits.
+    /// The words.
     pub words: Words,
-    /// The joint broadcast it belongs to.
+    /// The epoch of the joint broadcast that it belongs to.
     pub epoch: Epoch,
-    /// Cells whose torque is in the words, or as the kind defines it.
+    /// The number of contributing cells, or another value that the kind defines.
     pub count: u8,
 }
 
-/// Why a frame is not a packet.
+/// The error for a frame that is not a packet.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 pub enum PacketError {
     /// A 29-bit identifier, a remote frame or an error frame.
     #[error("not a data frame with an 11-bit identifier")]
     Foreign,
-    /// Wrong length.
+    /// The length is wrong.
     #[error("{got} data bytes, not {expected}")]
     Length {
-        /// Bytes that the format has.
+        /// The expected number of bytes.
         expected: usize,
-        /// Bytes that came.
+        /// The received number of bytes.
         got: usize,
     },
-    /// Wrong checksum.
+    /// The CRC is wrong.
     #[error("CRC {got:04X}, not {expected:04X}")]
     Crc {
-        /// What the bytes give.
+        /// The CRC of the received bytes.
         expected: u16,
         /// The CRC in the packet.
         got: u16,
     },
-    /// A classic frame that gives no packet with those before it or those after it.
+    /// A classic frame that completes no packet with its neighbours.
     #[error("no other segment")]
     Incomplete,
-    /// Classic frames that give packets of several lengths, of which one at most was sent.
+    /// Classic frames that decode as packets of several lengths, at most one of which was sent.
     #[error("packets of several lengths have a right CRC")]
     Ambiguous,
 }
 
 impl PacketError {
-    /// One word for it.
+    /// Returns a name of one word.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -176,7 +177,7 @@ impl PacketError {
 }
 
 impl Packet {
-    /// Its bytes, and how many of them are sent.
+    /// Encodes the packet into a buffer. Returns the buffer and the number of bytes to send.
     fn encode_all(&self) -> ([u8; MAX_BYTES], usize) {
         let mut bytes = [0; MAX_BYTES];
         let length = self.words.length();
@@ -191,8 +192,8 @@ impl Packet {
         (bytes, length.bytes())
     }
 
-    /// What the fields of [`crate::schema`] are read from: six words, epoch and count as they are sent in a packet of
-    /// six words, and then the other words.
+    /// Returns the bytes that the fields of [`crate::schema`] refer to: the first six words, epoch and count
+    /// as in a packet of six words, then the other words.
     #[must_use]
     pub fn fields(&self) -> Bytes {
         let (first, rest) = self.words.as_slice().split_at(WORDS);
@@ -201,17 +202,17 @@ impl Packet {
         bytes(first).into_iter().chain(end).chain(bytes(rest)).collect()
     }
 
-    /// Its bytes.
+    /// Encodes the packet.
     #[must_use]
     pub fn encode(&self) -> Bytes {
         let (bytes, sent) = self.encode_all();
         bytes.into_iter().take(sent).collect()
     }
 
-    /// Reads the bytes that came under `id`. Never panics.
+    /// Decodes the bytes received with identifier `id`. Never panics.
     ///
     /// # Errors
-    /// When this kind has no packet of that length, or the CRC is wrong.
+    /// Returns an error if packets of this kind cannot have that length, or the CRC is wrong.
     pub fn decode(id: Id, bytes: &[u8]) -> Result<Self, PacketError> {
         let lengths = Lengths::of(id);
         let wrong = PacketError::Length { expected: lengths.first().bytes(), got: bytes.len() };
@@ -231,8 +232,8 @@ impl Packet {
         Ok(Self { id, words: Words::new(length, all), epoch: Epoch(end[0]), count: end[1] })
     }
 
-    /// The frames that carry this packet: one FD frame with bit-rate switch, or classic ones of 8 bytes, of which the
-    /// last is as long as what is left.
+    /// Returns the frames that carry this packet: one FD frame with bit rate switch, or classic frames of 8
+    /// bytes, the last of which may be shorter.
     pub fn frames(&self, format: Format) -> impl Iterator<Item = Frame> + use<> {
         let id = u32::from(self.id.to_bits());
         let (bytes, sent) = self.encode_all();
@@ -249,10 +250,10 @@ impl Packet {
         })
     }
 
-    /// Reads an FD frame. Never panics.
+    /// Decodes an FD frame. Never panics.
     ///
     /// # Errors
-    /// When it is not an FD data frame with an 11-bit identifier, or not a packet.
+    /// Returns an error if it is not an FD data frame with an 11-bit identifier, or not a packet.
     pub fn from_fd(frame: &Frame) -> Result<Self, PacketError> {
         let id = data_id(frame)?;
         if frame.format() != Format::Fd {
@@ -262,10 +263,10 @@ impl Packet {
     }
 }
 
-/// The identifier of a frame that could be one of ours.
+/// Returns the identifier of a frame that may belong to this protocol.
 ///
 /// # Errors
-/// When it is a remote or error frame, or has a 29-bit identifier.
+/// Returns an error if it is a remote or error frame, or has a 29-bit identifier.
 pub fn data_id(frame: &Frame) -> Result<Id, PacketError> {
     if frame.raw_id() & (EXTENDED | REMOTE | ERROR) != 0 {
         return Err(PacketError::Foreign);
@@ -360,7 +361,7 @@ mod tests {
             assert_eq!(push(apart, &segments(2)[1]), Reassembly::Incomplete);
             assert_eq!(push(50_000, &segments(3)[0]), Reassembly::Waiting, "that packet is counted");
             assert_eq!(push(50_100, &segments(3)[1]), Reassembly::Complete(make(3)));
-            // Segments of two packets, each of which lost its other one, are counted each.
+            // Segments of two packets, each of which lost its other segment, count as two losses.
             assert_eq!(push(90_000, &segments(4)[0]), Reassembly::Waiting);
             assert_eq!(push(110_000, &segments(5)[0]), Reassembly::Incomplete);
             assert_eq!(push(130_000, &segments(6)[0]), Reassembly::Incomplete);
@@ -378,7 +379,8 @@ mod tests {
         assert_eq!(Packet::from_fd(&short), Err(PacketError::Length { expected: 16, got: 12 }));
     }
 
-    /// What becomes of each of these frames, so many µs apart, when these lengths are possible.
+    /// Returns the outcome of each frame, received `apart` µs after the previous one, with the given possible
+    /// lengths.
     fn pushed(id: Id, lengths: Lengths, apart: u64, frames: &[Frame]) -> Vec<Reassembly> {
         let mut segment = Segment::NONE;
         let times = (0..).map(|index| Micros(index * apart));
@@ -409,7 +411,7 @@ mod tests {
                     let expected = [packets[0], packets[2]].map(Reassembly::Complete);
                     assert_eq!(whole, expected.iter().collect::<Vec<_>>(), "{length:?} {lost} {lengths:?}");
                     let lost = outcomes.iter().filter(|it| **it == Reassembly::Incomplete).count();
-                    // Where the length is not known, the next packet is needed to notice.
+                    // Without a known length, the loss is noticed only with the next packet.
                     assert!(lost == 1 || lengths == Lengths::ALL && lost == 0, "{length:?} {outcomes:?}");
                 }
             }
@@ -435,7 +437,7 @@ mod tests {
 
     #[test]
     fn packets_of_two_lengths_that_end_together_are_ambiguous() {
-        // A packet of fourteen words whose last two segments are one of six as well: a word is chosen for that.
+        // Finds a packet of fourteen words whose last two segments also form a packet of six words.
         let id = Id::command(Command::Joints);
         let found = (0..=u16::MAX).find_map(|word| {
             let mut words = [0; MAX_WORDS];

@@ -1,7 +1,9 @@
-//! The messages between two cells over the wire between their ports, and how a bench simulates such a wire.
+//! Messages between two cells over the wire between their ports, and the simulation of such a wire on a
+//! bench.
 //!
-//! A wire leads from one port to another and belongs to no bus. The bench simulates it on the cells' bus by
-//! classic frames with 29-bit identifiers that only its other end takes; they never go onto a real bus.
+//! A wire leads from one port to another and belongs to no bus. The bench simulates it on the cells' bus with
+//! classic frames with 29-bit identifiers, which only the other end of the wire accepts. They are never sent
+//! to a real bus.
 //!
 //! ```text
 //!   identifier   28 | 27 ... 1 | 0                byte  0     1 ... 5     6  7
@@ -14,8 +16,8 @@
 //! | 1 | hello | version, node id, port + flags, round, depth | periodic: the sender's state and rank |
 //! | 2 | join | | requests to send sums to the receiver |
 //! | 3 | grant | round, depth | accepts a join; the sender's rank |
-//! | 4 | refuse | | rejects a join, or a hello from a cell that is no child |
-//! | 5 | leave | | the sender is no child of the receiver any more |
+//! | 4 | refuse | | rejects a join, or a hello from a cell that is not a child |
+//! | 5 | leave | | the sender is no longer a child of the receiver |
 //! | 6 | leave_ack | | acknowledges leave: no sum of the receiver is taken from now on |
 //! | 7 | state | epoch | the sender's sums from this epoch on are for the receiver |
 //! | 8 | nack | epoch | the receiver's sum of this epoch was not taken |
@@ -27,40 +29,40 @@
 use crate::can::{EXTENDED, EXTENDED_MASK, Frame, REMOTE};
 use crate::packet::{Epoch, crc16};
 
-/// Set in the identifier of every simulated wire.
+/// The identifier flag of every simulated wire.
 pub const FLAG: u32 = 0x1000_0000;
-/// Wires that a bus can simulate: as many as two bytes number.
+/// Maximum number of wires that a bus can simulate.
 pub const MAX: usize = 1 << 16;
-/// Ports of a cell.
+/// Number of ports of a cell.
 pub const PORTS: usize = 4;
-/// Where a root is wired to the gateway's side: beside its ports.
+/// The index of the uplink, which connects a root to the gateway's side, after the ports.
 pub const UPLINK: usize = PORTS;
-/// Bytes of a message, its CRC among them.
+/// Size of a message with its CRC, in bytes.
 pub const BYTES: usize = 8;
 
-/// One direction of one simulated wire, named by its sender.
+/// One direction of a simulated wire, identified by its sender.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct LinkId {
-    /// The wire's number on its bus.
+    /// The number of the wire on its bus.
     pub wire: u16,
-    /// Which of its two directions.
+    /// True for the second of its two directions.
     pub back: bool,
 }
 
-/// The distance to the gateway, and the version of the tree in which it holds.
+/// The distance to the gateway, and the version of the tree to which it belongs.
 ///
-/// A rank only ever improves: a later round, or the same with a smaller depth. A cell takes a parent only
-/// whose rank is better than its own, so that parents never form a loop.
+/// A rank only ever improves: a later round, or a smaller depth in the same round. A cell accepts a parent
+/// only if its rank is better than the cell's own, so that parents never form a loop.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub struct Rank {
-    /// The round (version of the tree) from which the depth is, modulo 2^8.
+    /// The round (version of the tree) of the depth, modulo 2^8.
     pub round: u8,
-    /// Wires to the gateway's side: 0 is the gateway, 1 a root.
+    /// Number of wires to the gateway's side: 0 for the gateway, 1 for a root.
     pub depth: u8,
 }
 
 impl Rank {
-    /// Whether this one is better: of a later round, or nearer in the same.
+    /// Returns true if this rank is better: of a later round, or nearer in the same round.
     #[must_use]
     pub const fn is_better_than(self, other: Self) -> bool {
         match self.round.wrapping_sub(other.round).cast_signed() {
@@ -69,29 +71,29 @@ impl Rank {
         }
     }
 
-    /// The rank of a child.
+    /// Returns the rank of a child.
     #[must_use]
     pub const fn below(self) -> Self {
         Self { round: self.round, depth: self.depth.saturating_add(1) }
     }
 }
 
-/// What is sent periodically over every port.
+/// The message that is sent periodically over every port.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Hello {
     /// The protocol's version.
     pub version: u8,
-    /// The node id; 0 of a cell without one, and of the gateway.
+    /// The node id; 0 for the gateway and for a cell without a node id.
     pub number: u8,
-    /// The port that it is sent on.
+    /// The sending port.
     pub port: u8,
-    /// The sender receives the other end.
+    /// True if the sender receives the other end.
     pub hears: bool,
-    /// Its sums go out here: the receiver is its parent.
+    /// True if the sender sends its sums over this port: the receiver is its parent.
     pub up: bool,
-    /// It, or a cell below it, has no node id yet.
+    /// True if the sender, or a cell below it, has no node id yet.
     pub unnumbered: bool,
-    /// Its rank; none where it is unreachable.
+    /// The rank of the sender; `None` while it is unreachable.
     pub rank: Option<Rank>,
 }
 
@@ -104,34 +106,34 @@ pub enum PortMessage {
     Join,
     /// Accepts a join, with the sender's rank.
     Grant(Rank),
-    /// Rejects a join, or a hello from a cell that is no child.
+    /// Rejects a join, or a hello from a cell that is not a child.
     Refuse,
-    /// The sender is no child of the receiver any more.
+    /// Reports that the sender is no longer a child of the receiver.
     Leave,
     /// Acknowledges a leave.
     LeaveAck,
-    /// The sender's sums from this epoch on are for the receiver.
+    /// Announces that the sender's sums from this epoch on are for the receiver.
     State(Epoch),
-    /// The receiver's sum of this epoch was not taken.
+    /// Reports that the receiver's sum of this epoch was not accepted.
     Nack(Epoch),
-    /// The sender is unreachable and requests a round later than this one.
+    /// Requests a round later than this one, because the sender is unreachable.
     Repair(u8),
-    /// Node ids for the receiver and the cells below it.
+    /// Assigns node ids to the receiver and the cells below it.
     NodeId(Walk),
-    /// All cells below the sender have a node id, as far as there were enough.
+    /// Reports that all cells below the sender have a node id, as far as there were enough.
     Return(Walk),
     /// Requests a hello.
     Probe,
 }
 
-/// Node ids to assign, in a walk over the tree.
+/// Node ids to assign in a walk over the tree.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Walk {
-    /// Which walk.
+    /// The number of the walk.
     pub walk: u8,
-    /// The first node id that is free.
+    /// The first free node id.
     pub first: u8,
-    /// The last of them.
+    /// The last free node id.
     pub last: u8,
 }
 
@@ -141,7 +143,7 @@ const UNNUMBERED: u8 = 1 << 5;
 const HAS_RANK: u8 = 1 << 6;
 
 impl PortMessage {
-    /// Its bytes, up to the CRC.
+    /// Encodes the message without its CRC.
     #[must_use]
     pub fn encode(self) -> [u8; 6] {
         match self {
@@ -198,13 +200,13 @@ impl PortMessage {
 }
 
 impl LinkId {
-    /// The identifier of its frames, with the flag of 29 bits.
+    /// Returns the identifier of its frames, with the flag [`EXTENDED`].
     #[must_use]
     pub const fn raw_id(self) -> u32 {
         EXTENDED | FLAG | ((self.wire as u32) << 1) | self.back as u32
     }
 
-    /// The link id whose frames have this identifier, with its flags.
+    /// Returns the link id whose frames have this identifier. `raw_id` includes the flags.
     #[must_use]
     pub const fn from_raw_id(raw_id: u32) -> Option<Self> {
         let bits = raw_id & EXTENDED_MASK & !FLAG;
@@ -215,13 +217,13 @@ impl LinkId {
         Some(Self { wire: u16::from_le_bytes([low, high]), back: bits & 1 == 1 })
     }
 
-    /// The same wire, the other way.
+    /// Returns the other direction of the same wire.
     #[must_use]
     pub const fn reversed(self) -> Self {
         Self { wire: self.wire, back: !self.back }
     }
 
-    /// The frame of a message.
+    /// Encodes a message as a frame.
     #[must_use]
     pub fn frame(self, message: PortMessage) -> Frame {
         let body = message.encode();
@@ -230,7 +232,8 @@ impl LinkId {
         Frame::classic(self.raw_id(), &[a, b, c, d, e, f, low, high]).unwrap_or(Frame::EMPTY)
     }
 
-    /// The message of a frame; `None` when it has another link id, is damaged, or of a kind that does not exist.
+    /// Decodes the message of a frame. Returns `None` if the frame has another link id, is damaged, or has an
+    /// undefined kind.
     #[must_use]
     pub fn read(self, frame: &Frame) -> Option<PortMessage> {
         let &[a, b, c, d, e, f, low, high] = frame.data() else { return None };

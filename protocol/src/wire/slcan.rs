@@ -1,4 +1,5 @@
-//! slcan: CAN frames and an adapter's commands as lines of ASCII over a serial line (Lawicel's, with CANable's FD).
+//! slcan: CAN frames and adapter commands as lines of ASCII over a serial line (the protocol of Lawicel, with
+//! the FD extension of CANable).
 //!
 //! ```text
 //!   t 123 2 1122 CR              classic data frame: identifier, DLC, data
@@ -15,10 +16,11 @@
 //!   e1a CR  sp128057 CR  E2310800C CR  F80 CR                  from the adapter: faults, [`Report`]
 //! ```
 //!
-//! Spaces are for the reader only. The digits are hexadecimal, of either case when read, upper case when written.
+//! The spaces are only for readability. Digits are hexadecimal; both cases are accepted, upper case is
+//! written.
 //!
-//! Dialects differ in what they answer: some firmware acknowledges each line, some none. So who writes never waits for
-//! an acknowledgement, and who reads passes over lines that it does not know.
+//! Dialects differ in their replies: some firmware acknowledges every line, some none. A writer therefore
+//! never waits for an acknowledgement, and a reader skips unknown lines.
 
 mod decoder;
 #[cfg(feature = "host")]
@@ -32,33 +34,33 @@ pub use decoder::{Decoder, Line, Refusal, Refused};
 #[cfg(feature = "host")]
 pub use report::{BusState, ErrorCounters, Fault, Report};
 
-/// Bytes of the longest line without its end: a switched FD frame of 64 bytes, 29 bits, 8 digits of time and the state of
-/// its sender.
+/// Maximum length of a line without its line ending: an FD frame with bit rate switch, 64 bytes, a 29-bit
+/// identifier, 8 digits of time and the state of its sender.
 pub const MAX_LINE: usize = 1 + 8 + 1 + 2 * 64 + 8 + 1;
-/// Ends each line in either direction.
+/// The line ending in both directions.
 pub const CR: u8 = b'\r';
-/// The adapter refused a line.
+/// Sent by the adapter when it refuses a line.
 pub const BEL: u8 = 0x07;
 
-/// A line as it is sent, with its end: 1 to [`MAX_LINE`] bytes.
+/// An encoded line with its line ending: 1 to [`MAX_LINE`] bytes.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct Text {
     bytes: heapless::Vec<u8, MAX_LINE>,
 }
 
 impl Text {
-    /// What to send.
+    /// Returns the bytes to send.
     #[must_use]
     pub fn as_bytes(&self) -> &[u8] {
         &self.bytes
     }
 
     fn push(&mut self, byte: u8) {
-        // Time stamps are never written, so that there is room for all else and the end.
+        // The buffer cannot overflow: time stamps are never written, which leaves room for the line ending.
         let _ = self.bytes.push(byte);
     }
 
-    /// The lower four bits.
+    /// Appends the lower four bits as a hexadecimal digit.
     fn digit(&mut self, value: u8) {
         let value = value & 15;
         self.push(if value < 10 { b'0' + value } else { b'A' - 10 + value });
@@ -74,10 +76,10 @@ impl Text {
     }
 }
 
-/// A frame as a line; `None` for an error frame, which never was on a bus.
+/// Encodes a frame as a line. Returns `None` for an error frame, which was never on the bus.
 ///
-/// An FD frame of a length that CAN FD does not have is filled up with zeros. Its error state is not carried, and of a
-/// classic frame with a DLC of 9 to 15 only that it has 8 bytes.
+/// The data of an FD frame is padded with zeros to a length that CAN FD has. The error state is dropped, and
+/// a raw DLC of 9 to 15 in a classic frame becomes 8.
 #[must_use]
 pub fn encode(frame: &Frame) -> Option<Text> {
     if frame.is_error() {
@@ -106,38 +108,39 @@ pub fn encode(frame: &Frame) -> Option<Text> {
     Some(text)
 }
 
-/// What a host has an adapter do, beside sending frames.
+/// A command from a host to an adapter, other than sending a frame.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 #[non_exhaustive]
 pub enum Command {
-    /// `C`: leave the bus. The bit rates are set before it is joined.
+    /// `C`: leaves the bus. Bit rates are set before joining it.
     Close,
-    /// `O`: join the bus.
+    /// `O`: joins the bus.
     Open,
-    /// `L`: join the bus without sending, not even acknowledgements.
+    /// `L`: joins the bus in listen-only mode, without acknowledging frames.
     Listen,
     /// `S0` to `S9`: the nominal bit rate, see [`Command::nominal`].
     BitRate(u8),
     /// `Y0` to `Y9`: the data bit rate, see [`Command::data`].
     DataBitRate(u8),
-    /// `V` or `v`: which firmware is it?
+    /// `V` or `v`: requests the firmware version.
     Version,
-    /// `N`: which adapter is it?
+    /// `N`: requests the serial number.
     SerialNumber,
-    /// `F`: what went wrong?
+    /// `F`: requests the fault flags.
     Flags,
-    /// `Z0`, `Z1`: time stamps of 4 digits behind received frames.
+    /// `Z0`, `Z1`: time stamps of 4 digits after received frames off, on.
     TimeStamps(bool),
-    /// `M` and 8 digits: acceptance code of an SJA1000.
+    /// `M` and 8 digits: the acceptance code of an SJA1000.
     Code(u32),
-    /// `m` and 8 digits: acceptance mask of an SJA1000; its ones do not count.
+    /// `m` and 8 digits: the acceptance mask of an SJA1000; bits that are 1 are ignored.
     Mask(u32),
 }
 
 impl Command {
-    /// Sets this nominal bit rate, in bit/s; `None` when slcan has no command for it.
+    /// Returns the command that sets this nominal bit rate, in bit/s; `None` if slcan has none.
     ///
-    /// `S7` is 800 kbit/s by Lawicel and 750 kbit/s by CANable and python-can: it stands for either.
+    /// `S7` is 800 kbit/s in Lawicel's protocol and 750 kbit/s in CANable's and python-can; it is returned
+    /// for both.
     #[must_use]
     pub const fn nominal(bit_rate: u32) -> Option<Self> {
         Some(Self::BitRate(match bit_rate {
@@ -155,9 +158,10 @@ impl Command {
         }))
     }
 
-    /// Sets this data bit rate, in bit/s: 500 k, or 1 M to 8 M; `None` when slcan has no command for it.
+    /// Returns the command that sets this data bit rate, in bit/s: 500 k, or 1 M to 8 M. Returns `None` if
+    /// slcan has none.
     ///
-    /// All CANable firmware has 2 M and 5 M; the others depend on the firmware.
+    /// All CANable firmware supports 2 M and 5 M; the other rates depend on the firmware.
     #[must_use]
     pub const fn data(bit_rate: u32) -> Option<Self> {
         Some(Self::DataBitRate(match bit_rate {
@@ -174,7 +178,7 @@ impl Command {
         }))
     }
 
-    /// The command as a line.
+    /// Encodes the command as a line.
     #[must_use]
     pub fn encode(self) -> Text {
         let mut text = Text::default();
@@ -205,7 +209,7 @@ impl Command {
         text
     }
 
-    /// The command that a line without its end is.
+    /// Decodes a line without its line ending.
     fn decode(line: &[u8]) -> Option<Self> {
         Some(match line {
             b"C" => Self::Close,
@@ -225,7 +229,7 @@ impl Command {
     }
 }
 
-/// A hexadecimal digit's value.
+/// Returns the value of a hexadecimal digit.
 fn digit(byte: u8) -> Option<u8> {
     match byte {
         b'0'..=b'9' => Some(byte - b'0'),
@@ -235,7 +239,7 @@ fn digit(byte: u8) -> Option<u8> {
     }
 }
 
-/// The value of at most 8 hexadecimal digits.
+/// Returns the value of at most 8 hexadecimal digits.
 fn number(digits: &[u8]) -> Option<u32> {
     digits.iter().try_fold(0, |number, &byte| Some((number << 4) | u32::from(digit(byte)?)))
 }

@@ -1,6 +1,7 @@
-//! Points in time and lengths of time in whole microseconds, passed in by the caller.
+//! Points in time and durations in whole microseconds.
 //!
-//! The cores never read a clock: a test, a simulation and a microcontroller each bring their own.
+//! The core modules never read a clock: callers pass the time in, which may be that of a test, a simulation
+//! or a microcontroller.
 
 use core::ops::{Add, Sub};
 use core::time::Duration;
@@ -9,18 +10,18 @@ use core::time::Duration;
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct Micros(pub u64);
 
-/// A length of time in microseconds.
+/// A duration in microseconds.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct Span(pub u64);
 
 impl Span {
-    /// A length given in milliseconds.
+    /// Creates a duration from milliseconds.
     #[must_use]
     pub const fn from_millis(millis: u64) -> Self {
         Self(millis * 1_000)
     }
 
-    /// The same in seconds.
+    /// Returns the duration in seconds.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "lengths far below 2^53 us")]
     pub const fn seconds(self) -> f64 {
@@ -29,13 +30,13 @@ impl Span {
 }
 
 impl Micros {
-    /// Returns the point in time so long after the start, or the last one that there is.
+    /// Returns the point in time `start` after the origin; saturates.
     #[must_use]
     pub fn after(start: Duration) -> Self {
         Self(u64::try_from(start.as_micros()).unwrap_or(u64::MAX))
     }
 
-    /// How long ago `earlier` was; nothing when it lies ahead.
+    /// Returns the time since `earlier`; zero if `earlier` is in the future.
     #[must_use]
     pub const fn since(self, earlier: Self) -> Span {
         Span(self.0.saturating_sub(earlier.0))

@@ -1,4 +1,5 @@
-//! Touch and release: two thresholds for one value, so that noise at one of them is no stream of events.
+//! Touch detection with hysteresis: two thresholds for one value, so that noise near one of them does not
+//! cause a stream of events.
 //!
 //! ```text
 //!   value   ──────── threshold ───────────────── touched from here on
@@ -6,32 +7,32 @@
 //!           ──────── 0 ───────────────────────── free
 //! ```
 //!
-//! A cell in event mode and whoever counts what it tells use the same rule: as the cell tells every turn, they
-//! agree.
+//! A cell in event mode and the receivers of its events use the same rule. The cell reports every change, so
+//! their states agree.
 
 use crate::fixed::Q1_14;
 use crate::message::SkinSensors;
 
-/// How a value stands to its threshold.
+/// The state of a value relative to its threshold.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Touch {
-    /// There has been no touch, or the value came to zero after it.
+    /// The value has not been touched, or has returned to zero after a release.
     #[default]
     Free,
-    /// At the threshold or above it, or not far enough below since.
+    /// The value has reached the threshold and has not fallen far enough below it since.
     Touched,
-    /// Released, and not at zero yet.
+    /// The value was released but has not returned to zero yet.
     Fading,
 }
 
 impl Touch {
-    /// How the next value stands, which may be a sum of several words; a threshold of 0 means: whatever is there
-    /// at all.
+    /// Returns the state after the next value, which may be a sum of several words. A threshold of 0 counts
+    /// as one step.
     #[must_use]
     pub fn next(self, value: i32, threshold: i16, hysteresis: Q1_14) -> Self {
         let threshold = i32::from(threshold).max(1);
         let kept = (1 << 14) - i64::from(hysteresis.to_bits());
-        // Below threshold * (1 - hysteresis), exactly: both sides with 14 fraction bits more.
+        // Below threshold * (1 - hysteresis), compared exactly with 14 more fraction bits on both sides.
         let is_released = value <= 0 || i64::from(value) << 14 < i64::from(threshold) * kept;
         match self {
             _ if value >= threshold => Self::Touched,
@@ -42,7 +43,7 @@ impl Touch {
     }
 }
 
-/// The contact of a cell, in steps of Q5.10: its three contact words are one touch.
+/// Returns the contact force of a cell in steps of Q5.10: the sum of its three contact words.
 #[must_use]
 pub fn contact(skin: &SkinSensors) -> i32 {
     skin.contact.iter().map(|word| i32::from(word.to_bits())).sum()

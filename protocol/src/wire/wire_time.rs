@@ -1,4 +1,4 @@
-//! How long a frame takes on a real bus: its bits with the stuff bits that its own bits make, and two bit rates.
+//! The time that a frame takes on a real bus: its bits with their stuff bits, at two bit rates.
 //!
 //! ```text
 //!   classic  SOF id RTR IDE r0 DLC data CRC15 | del ACK del EOF7 int3      34 + 8n stuffed | 13     11-bit identifier
@@ -9,11 +9,12 @@
 //!            17 (29-bit: 36), stuffed        | 5 + 8n, st.  | 28, n > 16: 33   | 12
 //! ```
 //!
-//! After ISO 11898-1. After five equal bits comes a stuff bit, counted at the rate of the bit that follows it. In classic CAN
-//! that holds from SOF to the last bit of the CRC; in CAN FD to the last bit of the data, where a run of five makes the first
-//! of the *fixed* stuff bits (fsb: 6 of them, or 7 with the longer CRC) and not one more. BRS is counted as nominal and the
-//! CRC delimiter as data: each is in part the other, and together they are one bit of each for every sample point.
-//! The intermission (int3) is counted: no node can send earlier.
+//! The rules are those of ISO 11898-1. A stuff bit follows five equal bits and is counted at the rate of the
+//! bit after it. In classic CAN, stuffing covers SOF to the last bit of the CRC. In CAN FD it covers SOF to
+//! the last bit of the data; a run of five there makes the first of the *fixed* stuff bits (fsb: 6 of them,
+//! or 7 with the longer CRC) and not an additional one. BRS is counted as nominal and the CRC delimiter as
+//! data: the rate switches within each of them, and together they take one bit of each rate for every sample
+//! point. The intermission (int3) is counted, because no node can send earlier.
 
 mod extremes;
 mod rates;
@@ -25,31 +26,33 @@ pub use rates::{BitRates, BitRatesError, bit_rate};
 use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Format, Frame, fd_dlc};
 use stuffing::Run;
 
-/// CRC-15/CAN: polynomial 0x4599, initial value 0; leading zeros change nothing.
+/// CRC-15/CAN: polynomial 0x4599, initial value 0. Leading zeros do not change it.
 const CRC: crc::Crc<u16> = crc::Crc::<u16>::new(&crc::CRC_15_CAN);
 
-/// Classic: delimiters, ACK, end of frame, intermission.
+/// Unstuffed bits at the end of a classic frame: delimiters, ACK, end of frame, intermission.
 const CLASSIC_TAIL: u32 = 13;
-/// FD: ACK and its delimiter, end of frame, intermission.
+/// Nominal bits at the end of an FD frame: ACK and its delimiter, end of frame, intermission.
 const FD_TAIL: u32 = 12;
-/// FD, up to 16 bytes: stuff bit count, CRC of 17 bits, 6 fixed stuff bits, delimiter.
+/// Bits of the check sequence of an FD frame with up to 16 bytes: stuff bit count, CRC of 17 bits, 6 fixed
+/// stuff bits, delimiter.
 const FD_CHECK: u32 = 28;
-/// FD, above 16 bytes: the same with a CRC of 21 bits and 7 fixed stuff bits.
+/// Bits of the check sequence of an FD frame with more than 16 bytes: CRC of 21 bits and 7 fixed stuff bits.
 const FD_LONG_CHECK: u32 = 33;
 
-/// The bits of a frame on the wire, stuff bits and intermission included.
+/// The bits of a frame on the wire, including stuff bits and intermission.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub struct Bits {
-    /// Bits at the nominal bit rate; all of them, unless the bit rate switches.
+    /// Bits at the nominal bit rate: all bits of a frame without bit rate switch.
     pub nominal: u32,
     /// Bits at the data bit rate.
     pub data: u32,
 }
 
 impl Bits {
-    /// The bits of this very frame. Nothing for a driver's error frame, which never was on a wire.
+    /// Counts the bits of a frame. Returns `None` for an error frame of the driver, which was never on the
+    /// wire.
     ///
-    /// A length that CAN FD does not have counts as the next one that it has, filled up with zeros.
+    /// A length that CAN FD does not have is padded with zeros to the next one.
     #[must_use]
     pub fn of(frame: &Frame) -> Option<Self> {
         match frame.format() {
@@ -59,20 +62,20 @@ impl Bits {
         }
     }
 
-    /// All bits, of both rates.
+    /// Returns the number of bits at both rates.
     #[must_use]
     pub const fn total(self) -> u32 {
         self.nominal + self.data
     }
 
-    /// How long they take, in s.
+    /// Returns the duration in s.
     #[must_use]
     pub fn seconds(self, rates: BitRates) -> f64 {
         f64::from(self.nominal) / f64::from(rates.nominal()) + f64::from(self.data) / f64::from(rates.data())
     }
 
-    /// How long they take, in ns; the nominal and the data part are rounded up each, so that the sum is exact at all rates
-    /// that divide 1 GHz and never short.
+    /// Returns the duration in ns. The nominal and the data part are each rounded up, so the sum is exact at
+    /// all rates that divide 1 GHz and never too short.
     #[must_use]
     pub const fn nanoseconds(self, rates: BitRates) -> u64 {
         const SECOND: u64 = 1_000_000_000;
@@ -82,7 +85,7 @@ impl Bits {
     }
 }
 
-/// All bits of a classic frame.
+/// Counts the bits of a classic frame.
 fn classic(frame: &Frame) -> u32 {
     let remote = u64::from(frame.is_remote());
     let dlc = u64::from(if frame.raw_dlc() > 8 { frame.raw_dlc() & 15 } else { frame.len() });
@@ -104,7 +107,7 @@ fn classic(frame: &Frame) -> u32 {
     len + 8 * u32::try_from(data.len()).unwrap_or(0) + 15 + run.stuffed + CLASSIC_TAIL
 }
 
-/// Both kinds of bits of an FD frame.
+/// Counts the bits of an FD frame.
 fn fd(frame: &Frame) -> Bits {
     let switched = frame.flags() & BIT_RATE_SWITCH != 0;
     let passive = frame.flags() & ERROR_STATE != 0;
@@ -128,7 +131,8 @@ fn fd(frame: &Frame) -> Bits {
     parts(switched, len + head.stuffed, data.len(), stuffed)
 }
 
-/// The bits of an FD frame from those of its head and the number of bytes and of stuff bits in what follows.
+/// Returns the bits of an FD frame with `head` bits up to BRS, `bytes` data bytes and `stuffed` stuff bits
+/// after BRS.
 fn parts(switched: bool, head: u32, bytes: usize, stuffed: u32) -> Bits {
     let check = if bytes > 16 { FD_LONG_CHECK } else { FD_CHECK };
     let data = 5 + 8 * u32::try_from(bytes).unwrap_or(0) + check + stuffed;
@@ -136,7 +140,7 @@ fn parts(switched: bool, head: u32, bytes: usize, stuffed: u32) -> Bits {
     if switched { Bits { nominal, data } } else { Bits { nominal: nominal + data, data: 0 } }
 }
 
-/// SOF, the first 11 bits of the identifier, SRR and IDE, the other 18 bits.
+/// Returns SOF, the first 11 bits of the identifier, SRR and IDE, and the other 18 bits.
 const fn extended(id: u64) -> u64 {
     ((id >> 18) << 20) | (0b11 << 18) | (id & 0x3_FFFF)
 }

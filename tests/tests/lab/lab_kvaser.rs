@@ -323,8 +323,8 @@ fn a_queue_that_stays_full_is_given_up_in_time_and_used_again() {
     let sent = error.sent;
     assert!((11..=12).contains(&sent) && error.target == 40, "{error}");
     assert!(error.cause.may_pass() && matches!(error.cause, BusError::Full { .. }), "{error}");
-    let said =
-        "can0 took no frame for 50 ms: its queue is full; send less, or ask whether anybody is on the bus";
+    let said = "can0 accepted no frame for 50 ms: its queue is full; send less, or check that another node is on \
+                the bus";
     assert_eq!(error.to_string(), format!("{said} ({sent} of 40 frames sent)"));
     // It polls every half millisecond, without a busy loop.
     let tries = refused("can0") - before;
@@ -387,8 +387,8 @@ fn wires_are_not_simulated_on_a_real_bus() {
     let text = generate(&Target { cells: CELLS, reply, format, ..Target::default() }).unwrap();
     place.write("skin.toml", &text.replace("\"vcan0\"", "\"can0\""));
     let cell = place.start("cell-node", "--bus can0 --bus-kind socketcan --node 1 --skin skin.toml");
-    let said = "cell-node: can0 is real hardware, and cells that answer with sums simulate their wires by frames that \
-                may not go there: use a vcan or the embedded bus, or reply = \"torque\"";
+    let said = "cell-node: can0 is real hardware, but cells that answer with sums simulate their wires with frames that \
+                must not be sent there: use a vcan or the embedded bus, or reply = \"torque\"";
     assert_eq!(cell.end().refusal(2), said);
     drop(controllers);
 }

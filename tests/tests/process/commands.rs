@@ -94,7 +94,8 @@ fn wrong_use_is_said_in_one_line() {
         ("down lo", "lo is the loopback interface that vcan-setup has not made, and is left alone"),
         (
             "up a23456789012345678",
-            "\"a23456789012345678\" is no bus name: 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'",
+            "\"a23456789012345678\" is not a valid bus name: use 1 to 15 bytes without spaces, '/' or ':', \
+             except '.' and '..'",
         ),
         (
             "up vcan%d",
@@ -109,7 +110,8 @@ fn wrong_use_is_said_in_one_line() {
         ("doctor rates.toml", "rates.toml:36:11: bus[0].bitrate = 5: 10000 to 1000000 bit/s are possible"),
         (
             "doctor --bus-kind vcan",
-            "invalid value 'vcan' for '--bus-kind <KIND>': \"vcan\" is no kind of bus: auto, socketcan and embedded are; try '--help'",
+            "invalid value 'vcan' for '--bus-kind <KIND>': \"vcan\" is not a kind of bus: use auto, socketcan or \
+             embedded; try '--help'",
         ),
         (
             "up vcan0 --peer vcan1 --namespace nosuch",

@@ -282,15 +282,15 @@ fn each_bus_has_the_requested_kind() {
     let refused = |kinds: &str| run(kinds).end().refusal(2).to_owned();
     assert_eq!(
         refused("--bus-kind embedded --bus-kind vcan7=embedded"),
-        "skinbus: --bus-kind vcan7=embedded: there is no bus vcan7 here, but vcan0, vcan1, vcan2"
+        "skinbus: --bus-kind vcan7=embedded: there is no bus vcan7; the buses are vcan0, vcan1, vcan2"
     );
     assert_eq!(
         refused("--bus-kind vcan1=embedded --bus-kind vcan1=socketcan"),
         "skinbus: --bus-kind is given twice for vcan1: embedded and socketcan; leave out one"
     );
     let said = refused("--bus-kind vcan1=vcan");
-    assert!(said.contains("\"vcan1=vcan\" is no kind of bus: auto, socketcan and embedded are"), "{said}");
-    // Whatever interfaces the kernel has, it does not have this vcan1.
+    assert!(said.contains("\"vcan1=vcan\" is not a kind of bus: use auto, socketcan or embedded"), "{said}");
+    // Whatever the kernel has, it has no vcan1 of ours.
     let said = refused("--bus-kind embedded --bus-kind vcan1=socketcan");
     assert!(
         said.starts_with("skinbus: vcan1: this kernel has no") || said.contains("no interface vcan1"),

@@ -274,8 +274,8 @@ fn wrong_options_are_one_line() {
         (
             "skinbus",
             "run skin.toml --bus-kind ethernet",
-            "invalid value 'ethernet' for '--bus-kind <[BUS=]KIND>': \"ethernet\" is no kind of bus: auto, socketcan and \
-             embedded are; try '--help'"
+            "invalid value 'ethernet' for '--bus-kind <[BUS=]KIND>': \"ethernet\" is not a kind of bus: use auto, socketcan or \
+             embedded; try '--help'"
                 .to_owned(),
         ),
         (
@@ -296,7 +296,7 @@ fn wrong_options_are_one_line() {
         (
             "cell-node",
             "--bus vcan0 --skin skin.toml --node 0",
-            "0 is no node id: 1 to 254 are (0 is the gateway, 255 everyone)".to_owned(),
+            "0 is not a node id: use 1 to 254 (0 is the gateway, 255 is everyone)".to_owned(),
         ),
     ] {
         let said = refusal(&place, program, words, 2);

@@ -186,7 +186,7 @@ fn wrong_use_is_2_and_failure_is_1_each_in_one_line() {
     };
     let (code, said) = run("much-too-long-a-name");
     assert_eq!(code, Some(2));
-    assert!(said.contains("\"much-too-long-a-name\" is no bus name: 1 to 15 bytes"), "{said}");
+    assert!(said.contains("\"much-too-long-a-name\" is not a valid bus name: use 1 to 15 bytes"), "{said}");
 
     let child = serve(&directory, &[]);
     let (code, said) = run("vcan0");

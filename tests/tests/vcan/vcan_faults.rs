@@ -143,7 +143,7 @@ fn a_transmit_queue_that_stays_full_costs_what_could_not_be_sent_and_nothing_aft
     bench.hears(&format!("the robot is halted: too many bad cycles in a row: {INVALID}"));
     bench.tells(1, "fallen silent");
     let full = place.start("skinbus", "frame sync --bus vcan0 --bus-kind socketcan").end();
-    let said = "skinbus: vcan0 took no frame for 100 ms: its queue is full; send less, or ask whether anybody is on \
+    let said = "skinbus: vcan0 accepted no frame for 100 ms: its queue is full; send less, or check that another node is on \
                 the bus";
     assert_eq!(full.refusal(1), said);
     vcan0.empty();

@@ -1,4 +1,4 @@
-//! What a board has to offer.
+//! The interface between the cell and a board.
 
 use cell_node::node::Node;
 use protocol::can::Frame;
@@ -9,33 +9,36 @@ use crate::store::Flash;
 
 /// A microcontroller with a bus, a clock, flash and a watchdog.
 pub trait Board {
-    /// Its flash for parameters.
+    /// The flash for parameters.
     type Flash: Flash;
 
-    /// What it knows from the factory; `None` where nobody has written that. Asked once, at the start.
+    /// Returns the factory record; `None` if it is blank. Called once, at the start.
     fn factory(&mut self) -> Option<Factory>;
 
-    /// Opens the bus; nothing is received before.
+    /// Opens the bus. Nothing is received before.
     fn open(&mut self, factory: &Factory);
 
-    /// The time since the start, in µs. Never goes back, and is asked for at least once a second.
+    /// Returns the time since the start, which never decreases. Called at least once a second.
     fn now(&mut self) -> Micros;
 
-    /// The next frame that came, and when it did; at most once it returns `None`, [`Board::sleep_until`] waits.
+    /// Returns the next received frame and its time of arrival. After `None`, the cell calls
+    /// [`Board::sleep_until`].
     fn receive(&mut self) -> Option<(Frame, Micros)>;
 
-    /// Gives a frame to the CAN controller; waits while that has no room. What cannot be sent is lost.
+    /// Passes a frame to the CAN controller, waiting while that has no room. A frame that cannot be sent is
+    /// lost.
     fn send(&mut self, frame: &Frame);
 
-    /// Sets the receive filters to what the cell receives now. Frames that pass although they need not do no harm.
+    /// Sets the receive filters to the identifiers that the cell receives now. Passing additional frames is
+    /// allowed.
     fn filter(&mut self, node: &Node, factory: &Factory) {
         let _ = (node, factory);
     }
 
-    /// Sleeps until then, or until something comes; may return earlier. At most [`LONGEST_SLEEP`].
+    /// Sleeps until `due` or until a frame arrives, at most [`LONGEST_SLEEP`]. May return early.
     fn sleep_until(&mut self, due: Micros);
 
-    /// Nothing more to do, until somebody loads another program.
+    /// Idles until another program is loaded.
     fn rest(&mut self) -> ! {
         loop {
             self.feed();
@@ -44,30 +47,32 @@ pub trait Board {
         }
     }
 
-    /// Tells the watchdog that the loop turns; it must bite after 2 s without.
+    /// Feeds the watchdog, which must reset the processor after 2 s without.
     fn feed(&mut self);
 
-    /// Its flash for parameters.
+    /// Returns the flash for parameters.
     fn flash(&mut self) -> &mut Self::Flash;
 
-    /// What another keeper has of this cell's parameters, which goes before what flash holds: its bytes in `into`,
-    /// and how many there are. Boards have none; an emulator does, because its flash ends with it.
+    /// Reads the parameters of this cell from an external copy, which takes precedence over flash. Returns
+    /// the number of bytes written to `into`. Boards have no such copy; an emulator does, because its flash
+    /// does not persist.
     fn kept_elsewhere(&mut self, into: &mut [u8]) -> Option<usize> {
         let _ = into;
         None
     }
 
-    /// Gives the image that flash holds now to that keeper; whether it has it.
+    /// Writes the image that flash holds now to the external copy. Returns true on success.
     fn keep_elsewhere(&mut self, image: &[u8]) -> bool {
         let _ = image;
         true
     }
 }
 
-/// The longest sleep, in µs: the watchdog is fed after it, and the clock does not miss a wrap of its counter.
+/// Maximum sleep in µs. It is short enough to feed the watchdog, and for the clock to notice each wrap of its
+/// counter.
 pub const LONGEST_SLEEP: u64 = 500_000;
 
-/// A counter of 32 bits and 1 MHz as a clock that does not wrap.
+/// A clock that does not wrap, from a 32-bit counter with 1 MHz.
 #[derive(Debug, Default)]
 pub struct Clock {
     wraps: u64,
@@ -75,7 +80,7 @@ pub struct Clock {
 }
 
 impl Clock {
-    /// The time when the counter has this value; call it at least once in 71 minutes.
+    /// Returns the time for the present counter value. Must be called at least every 71 minutes.
     pub fn at(&mut self, counter: u32) -> Micros {
         if counter < self.last {
             self.wraps += 1 << 32;
@@ -84,14 +89,14 @@ impl Clock {
         Micros(self.wraps | u64::from(counter))
     }
 
-    /// The time when the counter had this value, less than 71 minutes before `now`.
+    /// Returns the time at which the counter had this value, less than 71 minutes before `now`.
     #[must_use]
     pub fn before(now: Micros, counter: u32) -> Micros {
         Micros(now.0 - u64::from(low(now).wrapping_sub(counter)))
     }
 }
 
-/// The counter's value at a time.
+/// Returns the counter value at a time.
 #[must_use]
 pub const fn low(at: Micros) -> u32 {
     let [a, b, c, d, ..] = at.0.to_le_bytes();

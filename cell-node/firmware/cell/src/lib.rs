@@ -1,10 +1,10 @@
-//! One skin cell as firmware: `cell-node`'s core, a loop around it, and boards.
+//! A skin cell as firmware: the core of `cell-node`, the main loop, and the boards.
 //!
-//! | module | what |
+//! | module | content |
 //! |---|---|
-//! | [`board`] | what a board has to offer |
+//! | [`board`] | the interface to a board |
 //! | [`run`] | the cell's loop |
-//! | `place` | its state, built in a static |
+//! | `place` | construction of the node in a static |
 //! | [`store`] | parameters in two pages of flash, safe against a loss of power |
 //! | [`slcan`] | a board without a CAN controller: frames as lines over a serial line |
 //! | `boards` | the boards: a file each |

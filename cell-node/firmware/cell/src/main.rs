@@ -19,16 +19,16 @@ mod start {
 
     #[entry]
     fn main() -> ! {
-        // The cell's state, off the stack: `entry` makes the only reference to it.
+        // The node is in a static instead of on the stack; `entry` makes the only reference to it.
         static mut NODE: MaybeUninit<Node> = MaybeUninit::uninit();
         let mut board = Chosen::take();
-        // Nobody has written who this is, so that it must not send; it waits to be loaded again.
+        // Without a factory record the cell has no identity and must not send; it waits to be loaded again.
         let Some((factory, node)) = begin(&mut board, NODE) else { board.rest() };
         match Cell::start(board, factory, node).run() {}
     }
 
-    /// What the factory wrote, and the node that begins now.
-    // Not inlined, so that what flash held is off the stack when the cell runs.
+    /// Returns the factory record and the initial node.
+    // Not inlined, so that the contents of flash are off the stack when the cell runs.
     #[inline(never)]
     fn begin<'a>(board: &mut Chosen, place: &'a mut MaybeUninit<Node>) -> Option<(Factory, &'a mut Node)> {
         let beginning = Beginning::read(board)?;
@@ -38,7 +38,7 @@ mod start {
         Some((*beginning.factory(), node))
     }
 
-    /// The cell starts again, with what flash holds.
+    /// Restarts the cell with the contents of flash.
     #[panic_handler]
     fn panic(_: &PanicInfo<'_>) -> ! {
         SCB::sys_reset()
@@ -50,7 +50,7 @@ mod start {
     }
 }
 
-/// This program is for microcontrollers.
+/// Explains that this program is for microcontrollers.
 #[cfg(not(target_os = "none"))]
 fn main() {
     eprintln!("cell: built for this machine, where it does nothing: docs/how-to/firmware.md");

@@ -1,5 +1,5 @@
-//! The cell's loop: frames and times into the node, packets out, parameters into flash. All decisions are in
-//! `cell_node::node`.
+//! The main loop of a cell: passes frames and times to the node, sends its packets and writes its parameters
+//! to flash. `cell_node::node` makes all decisions.
 
 use core::convert::Infallible;
 
@@ -23,7 +23,7 @@ pub struct Cell<'a, B> {
     node: &'a mut Node,
 }
 
-/// What a cell begins with: what the factory wrote, and what flash holds.
+/// The initial state of a cell: the factory record and the contents of flash.
 #[derive(Debug)]
 pub struct Beginning {
     factory: Factory,
@@ -32,8 +32,8 @@ pub struct Beginning {
 }
 
 impl Beginning {
-    /// Reads it; `None` where nobody has written who this is: it must not send.
-    // Not inlined, so that what it needs is off the stack when the cell runs.
+    /// Reads it. Returns `None` for a blank factory record: the cell must not send.
+    // Not inlined, so that its buffers are off the stack when the cell runs.
     #[inline(never)]
     pub fn read<B: Board>(board: &mut B) -> Option<Self> {
         let factory = board.factory()?;
@@ -44,27 +44,27 @@ impl Beginning {
         Some(Self { factory, identity, held })
     }
 
-    /// What the factory wrote.
+    /// Returns the factory record.
     #[must_use]
     pub const fn factory(&self) -> &Factory {
         &self.factory
     }
 
-    /// The node that begins now; it has to [`restore`](Self::restore) what flash holds.
+    /// Returns the initial node. The caller must [`restore`](Self::restore) the contents of flash.
     #[must_use]
     pub fn node(&self, now: Micros) -> Node {
-        // There are no sensors on these boards: contacts come as stimuli.
+        // These boards have no sensors: contacts come as stimuli.
         Node::unconfigured(self.identity, self.factory.format, true, now)
     }
 
-    /// Gives the node what flash holds.
+    /// Passes the contents of flash to the node.
     pub fn restore(&self, node: &mut Node) {
         node.restore(&self.held);
     }
 }
 
 impl<'a, B: Board> Cell<'a, B> {
-    /// A cell that starts now, and joins its bus.
+    /// Starts a cell and joins its bus.
     pub fn start(mut board: B, factory: Factory, node: &'a mut Node) -> Self {
         board.open(&factory);
         let wired = factory.link_ids.iter().enumerate();
@@ -76,14 +76,15 @@ impl<'a, B: Board> Cell<'a, B> {
         Self { board, factory, node }
     }
 
-    /// Runs for ever.
+    /// Runs forever.
     pub fn run(&mut self) -> Infallible {
         loop {
             self.turn();
         }
     }
 
-    /// One turn of the loop: what came, what is due, then sleep. A cell that gave way receives and does nothing.
+    /// Runs one iteration of the loop: received frames, due timers, then sleep. A cell that lost its node id
+    /// to another cell only receives.
     pub fn turn(&mut self) {
         self.board.feed();
         while let Some((frame, at)) = self.board.receive() {
@@ -107,7 +108,7 @@ impl<'a, B: Board> Cell<'a, B> {
         self.board.sleep_until(self.node.poll_timeout().min(longest));
     }
 
-    /// Gives a frame to the node: one of a simulated wire to the port at its other end.
+    /// Passes a frame to the node; a frame of a simulated wire goes to the port at its end.
     fn take(&mut self, now: Micros, age: Span, frame: &Frame) {
         let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) else {
             return self.node.handle_frame(now, age, frame);
@@ -119,15 +120,15 @@ impl<'a, B: Board> Cell<'a, B> {
         }
     }
 
-    /// Writes what the node has for flash, and tells it.
+    /// Writes the node's pending parameters to flash and reports the result to the node.
     fn keep(&mut self) {
         if let Some(written) = self.write() {
             self.node.handle_stored(written);
         }
     }
 
-    /// The image of what the node has for flash; whether it has any.
-    // Not inlined, so that the parameters are off the stack when it is written.
+    /// Encodes the node's pending parameters. Returns false if there are none.
+    // Not inlined, so that the parameters are off the stack when the image is written.
     #[inline(never)]
     fn image(&self, into: &mut flash::Bytes) -> bool {
         let Some(kept) = self.node.poll_store() else { return false };
@@ -135,8 +136,8 @@ impl<'a, B: Board> Cell<'a, B> {
         true
     }
 
-    /// Writes what the node has for flash; whether it is there.
-    // Not inlined, so that the image is off the stack when the node takes its parameters into use.
+    /// Writes the node's pending parameters to flash. Returns true on success, `None` if there are none.
+    // Not inlined, so that the image is off the stack when the node activates its parameters.
     #[inline(never)]
     fn write(&mut self) -> Option<bool> {
         let mut image = flash::Bytes::new();
@@ -147,7 +148,7 @@ impl<'a, B: Board> Cell<'a, B> {
         Some(written && self.board.keep_elsewhere(&image))
     }
 
-    /// Writes what the node has for flash, and sends what it has to send.
+    /// Writes the node's pending parameters to flash and sends its pending packets.
     fn collect(&mut self) {
         if self.node.taken().is_some() {
             return;
@@ -168,7 +169,7 @@ impl<'a, B: Board> Cell<'a, B> {
     }
 }
 
-/// Takes what another keeper has into flash, where that holds something else.
+/// Copies the external image to flash if they differ.
 #[inline(never)]
 fn restore<B: Board>(board: &mut B) {
     let mut theirs = [0; flash::MAX_BYTES];
@@ -178,12 +179,12 @@ fn restore<B: Board>(board: &mut B) {
     let mut ours = [0; flash::MAX_BYTES];
     let same = matches!(store::read(board.flash(), &mut ours), Found::Image(count) if ours.get(..count) == Some(theirs));
     if !same {
-        // What cannot be written is read as it is, and noticed there.
+        // A failed write is noticed when the image is read.
         let _ = store::write(board.flash(), theirs);
     }
 }
 
-/// The node id that the network assigned, if it did, and the parameters.
+/// Reads the node id assigned by the network, if any, and the parameters.
 #[inline(never)]
 fn read<B: Board>(board: &mut B, identity: Identity) -> (Option<CellId>, Held) {
     let mut image = [0; flash::MAX_BYTES];

@@ -1,4 +1,4 @@
-//! A board without a CAN controller: frames as lines over a serial line, whose other end joins a bus
+//! Frames over a serial line, for a board without a CAN controller. The other end connects the line to a bus
 //! (`vcan-setup slcan`).
 
 use core::fmt::Debug;
@@ -7,27 +7,28 @@ use heapless::Deque;
 use protocol::can::Frame;
 use protocol::slcan::{self, Decoder, Line};
 
-/// Bytes that may wait for the loop: five FD frames of joints and more, or 40 ms at 115 200 baud.
+/// Size of the receive buffer in bytes: at least five FD frames of joints, or 40 ms at 115 200 baud.
 const BYTES: usize = 512;
-/// Ends of lines that may wait.
+/// Maximum number of complete lines in the buffer.
 const LINES: usize = 32;
 
-/// What came and was not read yet. An interrupt puts it in, the loop takes it out.
+/// The receive buffer of the serial line. An interrupt handler writes to it and the main loop reads from it.
 #[derive(Debug)]
 pub struct Waiting {
     bytes: Deque<u8, BYTES>,
-    /// When the ends of the lines in there came.
+    /// Time of arrival of the end of each line.
     ends: Deque<u32, LINES>,
 }
 
 impl Waiting {
-    /// Nothing.
+    /// Creates an empty buffer.
     #[must_use]
     pub const fn new() -> Self {
         Self { bytes: Deque::new(), ends: Deque::new() }
     }
 
-    /// Takes a byte that came now. What does not fit is lost, and the line with it: its length is wrong then.
+    /// Appends a received byte. If the buffer is full the byte is lost, and with it the line, whose length is
+    /// then wrong.
     pub fn push(&mut self, byte: u8, now: u32) {
         let ends_line = byte == slcan::CR;
         if ends_line && self.ends.is_full() || self.bytes.push_back(byte).is_err() {
@@ -38,13 +39,13 @@ impl Waiting {
         }
     }
 
-    /// Whether no whole line waits.
+    /// Returns true if the buffer contains no complete line.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.ends.is_empty()
     }
 
-    /// Gives the next line to the decoder: what it says, and when its end came.
+    /// Decodes the next line. Returns it with the time of arrival of its end.
     pub fn take(&mut self, decoder: &mut Decoder) -> Option<(Line, u32)> {
         let at = self.ends.pop_front()?;
         loop {

@@ -1,5 +1,5 @@
-//! Parameters in two pages of flash. A new image goes into the page that does not hold the present one, and is marked
-//! as complete last: a loss of power at any moment leaves the old image or the new one.
+//! Parameters in two pages of flash. A new image is written to the page without the present one and marked as
+//! complete last, so that a loss of power at any moment leaves either the old or the new image.
 //!
 //! ```text
 //!   byte 0..3  which image this is: the higher number is the newer one      4..7  bytes of the image
@@ -7,17 +7,17 @@
 //!        last  8 bytes: "COMPLETE"
 //! ```
 //!
-//! Flash is written in units of 8 bytes, each once after its page was erased, as an STM32 demands it.
+//! Flash is written in units of 8 bytes, each at most once after its page was erased, as an STM32 requires.
 
-/// Bytes that flash writes at once.
+/// Size of a write in bytes.
 pub const UNIT: usize = 8;
-/// The longest image, in bytes.
+/// Maximum size of an image in bytes.
 pub const MAX_IMAGE: usize = 496;
 
 const COMPLETE: &[u8; UNIT] = b"COMPLETE";
 const ERASED: [u8; UNIT] = [0xFF; UNIT];
 
-/// Flash could not be written.
+/// The error for a failed write to flash.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct NotWritten;
 
@@ -31,7 +31,7 @@ pub enum Page {
 }
 
 impl Page {
-    /// The other one.
+    /// Returns the other page.
     #[must_use]
     pub const fn other(self) -> Self {
         match self {
@@ -43,34 +43,34 @@ impl Page {
 
 /// Two pages of flash of at least 512 bytes.
 pub trait Flash {
-    /// The unit that begins at this byte, a multiple of 8.
+    /// Reads the unit at this offset, a multiple of 8.
     fn unit(&self, page: Page, at: usize) -> [u8; UNIT];
 
-    /// Makes all bytes of a page 0xFF. The processor may stand still meanwhile.
+    /// Sets all bytes of a page to 0xFF. The processor may stall meanwhile.
     ///
     /// # Errors
-    /// When the controller reports it.
+    /// Returns an error if the controller reports one.
     fn erase(&mut self, page: Page) -> Result<(), NotWritten>;
 
-    /// Writes a unit that is erased.
+    /// Writes an erased unit.
     ///
     /// # Errors
-    /// When the controller reports it.
+    /// Returns an error if the controller reports one.
     fn program(&mut self, page: Page, at: usize, unit: [u8; UNIT]) -> Result<(), NotWritten>;
 }
 
-/// What the pages hold.
+/// The content of the pages.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Found {
-    /// Nothing: they are erased, or the first image was never completed.
+    /// No image: the pages are erased, or the first image was never completed.
     Nothing,
-    /// An image of so many bytes.
+    /// An image with this many bytes.
     Image(usize),
-    /// Something that is none.
+    /// A page contains something else than an image.
     Damaged,
 }
 
-/// The head of a page that holds a completed image.
+/// The header of a page with a complete image.
 #[derive(Clone, Copy, Debug)]
 struct Head {
     number: u32,
@@ -78,13 +78,14 @@ struct Head {
 }
 
 impl Head {
-    /// Where the mark is.
+    /// Returns the offset of the mark.
     const fn mark(&self) -> usize {
         UNIT + self.len.next_multiple_of(UNIT)
     }
 }
 
-/// What a page holds: `Err` where it is neither a completed image nor one that was being written.
+/// Reads the header of a page. Returns `None` for an erased page or an incomplete image, and an error for any
+/// other content.
 fn head(flash: &impl Flash, page: Page) -> Result<Option<Head>, NotWritten> {
     let unit = flash.unit(page, 0);
     if unit == ERASED {
@@ -103,7 +104,7 @@ fn head(flash: &impl Flash, page: Page) -> Result<Option<Head>, NotWritten> {
     }
 }
 
-/// The page with the newest image, and whether a page is damaged.
+/// Returns the page with the newest image, and true if a page is damaged.
 fn newest(flash: &impl Flash) -> (Option<(Page, Head)>, bool) {
     let (a, b) = (head(flash, Page::A), head(flash, Page::B));
     let damaged = a.is_err() || b.is_err();
@@ -115,7 +116,8 @@ fn newest(flash: &impl Flash) -> (Option<(Page, Head)>, bool) {
     (newest, damaged)
 }
 
-/// Reads the newest image. With a damaged page it is unknown whether that held a newer one, so nothing else counts.
+/// Reads the newest image. A damaged page may have held a newer image, so the result is then
+/// [`Found::Damaged`].
 pub fn read(flash: &impl Flash, into: &mut [u8]) -> Found {
     let (newest, damaged) = newest(flash);
     if damaged {
@@ -130,10 +132,11 @@ pub fn read(flash: &impl Flash, into: &mut [u8]) -> Found {
     Found::Image(len)
 }
 
-/// Writes an image beside the newest one, and reads it back.
+/// Writes an image to the page without the newest one, and verifies it.
 ///
 /// # Errors
-/// When it is too long, or flash does not hold it afterwards; then the old one still counts.
+/// Returns an error if the image is too long, or flash does not hold it afterwards. The old image stays valid
+/// then.
 pub fn write(flash: &mut impl Flash, image: &[u8]) -> Result<(), NotWritten> {
     let (newest, damaged) = newest(flash);
     let (page, number) = match newest {
@@ -153,11 +156,12 @@ pub fn write(flash: &mut impl Flash, image: &[u8]) -> Result<(), NotWritten> {
         program(flash, page, UNIT * (index + 1), unit)?;
     }
     program(flash, page, UNIT + image.len().next_multiple_of(UNIT), *COMPLETE)?;
-    // Only now, so that damage is not forgotten before something sound is there.
+    // Erased last, so that the damage stays detectable until a sound image exists.
     if damaged { flash.erase(page.other()) } else { Ok(()) }
 }
 
-/// Writes a unit and reads it back. Erased ones stay so: some flash cannot write 0xFF and then something else.
+/// Writes a unit and verifies it. Units of 0xFF stay erased, because some flash cannot be written again after
+/// that.
 fn program(flash: &mut impl Flash, page: Page, at: usize, unit: [u8; UNIT]) -> Result<(), NotWritten> {
     if unit != ERASED {
         flash.program(page, at, unit)?;

@@ -1,4 +1,4 @@
-//! The rows of the vectors, as words.
+//! The cases of the test vectors, as words.
 
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::parameters::{Contact, MAX_JOINTS, Parameters, Pose, Row, RowKind};
@@ -10,24 +10,24 @@ pub(crate) struct Chain {
     pub(crate) rows: &'static [[i16; 5]],
 }
 
-/// A cell, joints and a force.
+/// A cell with joint positions and a force.
 pub(crate) struct Case {
     pub(crate) chain: u8,
     pub(crate) joint: u8,
     row: u8,
     pose: [i16; 6],
     joints: [i16; MAX_JOINTS],
-    /// In steps of 2^-16 N.
+    /// Force in steps of 2^-16 N.
     pub(crate) force: i32,
 }
 
 include!(concat!(env!("OUT_DIR"), "/cases.rs"));
 
-/// No robot.
+/// A chain without rows.
 static NOTHING: Chain = Chain { name: "", rows: &[] };
 
 impl Chain {
-    /// How many joints it has.
+    /// Returns the number of joints.
     pub(crate) fn joints(&self) -> u8 {
         self.rows.iter().map(|row| u8::from(row[4] != 2)).sum()
     }
@@ -38,7 +38,7 @@ impl Case {
         CHAINS.get(usize::from(self.chain)).unwrap_or(&NOTHING)
     }
 
-    /// Whether the rows of this chain are counted: those of the UR5, and of the long chains.
+    /// Returns true for a chain whose instructions are counted: the UR5 and the long chains.
     pub(crate) fn is_counted(&self) -> bool {
         self.chain().name == "ur5" || self.chain().name.starts_with("chain-")
     }

@@ -1,4 +1,4 @@
-//! What is counted, each under a name that stands in the program.
+//! The measured functions, each with an exported name.
 
 use cell_node::contact::{Force, Torque, TorqueRounding};
 use cell_node::flash::Flash;
@@ -14,7 +14,7 @@ use protocol::packet::Epoch;
 use protocol::parameters::{MAX_JOINTS, Parameters};
 use protocol::time::{Micros, Span};
 
-/// J of the wrench kernel.
+/// Computes J with the wrench kernel.
 #[inline(never)]
 #[unsafe(export_name = "measure_wrench")]
 pub(crate) extern "C" fn wrench(
@@ -25,7 +25,7 @@ pub(crate) extern "C" fn wrench(
     kernel.write_jacobian(joints, out);
 }
 
-/// J of the projection kernel.
+/// Computes J with the projection kernel.
 #[inline(never)]
 #[unsafe(export_name = "measure_projection")]
 pub(crate) extern "C" fn projection(
@@ -36,8 +36,8 @@ pub(crate) extern "C" fn projection(
     kernel.write_jacobian(joints, out);
 }
 
-/// The torque's words from J, for a cell that so many joints move, and a force in steps of 2^-16 N; rounded as its
-/// configuration says.
+/// Computes the torque words from J, for a cell moved by `joints` joints and a force in steps of 2^-16 N,
+/// with the rounding of its configuration.
 #[inline(never)]
 #[unsafe(export_name = "measure_torque_words")]
 pub(crate) extern "C" fn torque_words(
@@ -51,19 +51,20 @@ pub(crate) extern "C" fn torque_words(
     Torque::new(moved, Force::from_steps(force.into())).write_words(rounding, out);
 }
 
-/// A cell with its node id; [`configure`] comes next. Apart from that, because a microcontroller has no room for two.
+/// Returns a cell with a node id; [`configure`] follows. They are separate because a microcontroller has no
+/// memory for two nodes.
 pub(crate) fn node() -> Node {
     let identity = Identity { cell: CellId::new(12).ok(), serial: 100_012 };
     Node::unconfigured(identity, Format::Fd, true, Micros(0))
 }
 
-/// Gives the cell its parameters.
+/// Sets the cell's parameters.
 #[inline(never)]
 pub(crate) fn configure(node: &mut Node, parameters: &Parameters) {
     node.restore(&Flash::Sound(*parameters));
 }
 
-/// Waits until the cell owns its node id and presses it with 3 N; the joints that it has to answer.
+/// Waits until the cell owns its node id, and presses it with 3 N. Returns the joints to answer.
 pub(crate) fn pressed(node: &mut Node, joints: Joints) -> Option<Frame> {
     let mut now = Micros(0);
     for _ in 0..2 {
@@ -79,10 +80,10 @@ pub(crate) fn pressed(node: &mut Node, joints: Joints) -> Option<Frame> {
     frame(&Message::Joints { epoch: Epoch(1), joints })
 }
 
-/// When it has to answer, after its address claim and before its next heartbeat.
+/// The time of the answer, after the address claim and before the next heartbeat.
 const AT: Micros = Micros(600_000);
 
-/// A frame in, the answer's frame out.
+/// Passes a frame to the node and returns the frame of its answer in `answer`.
 #[inline(never)]
 #[unsafe(export_name = "measure_reply")]
 pub(crate) extern "C" fn reply(node: &mut Node, joints: &Frame, answer: &mut Frame) {

@@ -1,9 +1,9 @@
-//! Where words are written, and what is asked for: the emulator's semihosting, or a process' output and arguments.
+//! Input and output: semihosting on the emulator, standard output and arguments on the host.
 
-/// The longest line: four times fourteen words.
+/// Maximum length of a line: four times fourteen words.
 const LINE: usize = 4 * 14 * 4 + 64;
 
-/// A line that is being written.
+/// The buffer of an output line.
 pub(crate) struct Machine {
     line: [u8; LINE],
     filled: usize,
@@ -23,7 +23,7 @@ impl Machine {
         }
     }
 
-    /// Words as four hexadecimal digits each.
+    /// Appends words as four hexadecimal digits each.
     pub(crate) fn words(&mut self, words: impl Iterator<Item = i16>) {
         for word in words {
             for shift in [12, 8, 4, 0] {
@@ -33,25 +33,25 @@ impl Machine {
         }
     }
 
-    /// A name.
+    /// Appends a name and a space.
     pub(crate) fn text(&mut self, text: &str) {
         text.bytes().chain([b' ']).for_each(|byte| self.byte(byte));
     }
 
-    /// A number, as two words.
+    /// Appends a number as two words.
     pub(crate) fn number(&mut self, number: u32) {
         let [a, b, c, d] = number.to_be_bytes();
         self.words([[a, b], [c, d]].into_iter().map(i16::from_be_bytes));
     }
 
-    /// Ends the line.
+    /// Ends and writes the line.
     pub(crate) fn line(&mut self) {
         self.byte(b'\n');
         put(self.line.get(..self.filled).unwrap_or_default());
         self.filled = 0;
     }
 
-    /// The first letter of the task that is asked for; `w` where there is none.
+    /// Returns the first letter of the requested task; `w` by default.
     pub(crate) fn task(&self) -> u8 {
         task().unwrap_or(b'w')
     }
@@ -65,12 +65,12 @@ mod emulated {
     use cortex_m_semihosting::nr::open;
     use cortex_m_semihosting::{hio, syscall};
 
-    /// The number of the call that asks for the command line.
+    /// The semihosting call that returns the command line.
     const GET_CMDLINE: usize = 0x15;
-    /// With what the stack is painted before it is used.
+    /// The fill pattern for unused stack.
     const PAINT: u32 = 0xCCCC_CCCC;
 
-    /// More than the registers that a function saves, maybe after it has read the stack pointer.
+    /// Distance from the stack pointer that is not painted: more than the registers that a function saves.
     const OWN: usize = 64;
 
     unsafe extern "C" {
@@ -87,23 +87,23 @@ mod emulated {
     pub(super) fn task() -> Option<u8> {
         let mut text = [0_u8; 64];
         let block = [text.as_mut_ptr() as usize, text.len()];
-        // SAFETY: the call writes at most as many bytes as the block says, to where it says.
+        // SAFETY: the call writes at most the given number of bytes to the given address.
         let failed = unsafe { syscall(GET_CMDLINE, &block) };
         let letter = core::hint::black_box(&text).first().copied();
         letter.filter(|letter| failed == 0 && *letter != 0)
     }
 
-    /// The stack pointer.
+    /// Returns the stack pointer.
     #[inline(always)]
     fn stack_pointer() -> usize {
         let pointer;
-        // SAFETY: it reads a register.
+        // SAFETY: only reads a register.
         unsafe { asm!("mov {}, sp", out(reg) pointer, options(nomem, nostack, preserves_flags)) };
         pointer
     }
 
-    /// Paints the stack that is free; where the caller's frame ends.
-    // Inlined: the caller's stack pointer, and not its own.
+    /// Paints the free stack, and returns the address at which the caller's frame ends.
+    // Inlined, to read the caller's stack pointer.
     #[inline(always)]
     pub(crate) fn painted_stack() -> usize {
         let top = stack_pointer();
@@ -116,14 +116,14 @@ mod emulated {
         let mut place = &raw mut _stack_end;
         let top = stack_pointer() - OWN;
         while place.addr() < top {
-            // SAFETY: memory from the stack's end to below this frame, which nothing uses: there are no interrupts, and
-            // this function calls none.
+            // SAFETY: memory from the stack's end to below this frame, which is unused: there are no
+            // interrupts, and this function calls no other.
             unsafe { place.write_volatile(PAINT) };
             place = place.wrapping_add(1);
         }
     }
 
-    /// Bytes of stack that were in use at some time since it was painted, below this address.
+    /// Returns the number of bytes of stack below this address that have been used since it was painted.
     pub(crate) fn used_stack(top: usize) -> u32 {
         let mut place = &raw const _stack_end;
         // SAFETY: all words from the stack's end to its start are readable memory.
@@ -164,7 +164,7 @@ fn task() -> Option<u8> {
     std::env::args_os().nth(1)?.as_encoded_bytes().first().copied()
 }
 
-/// Here that is not known.
+/// Returns 0: the stack is not measured on the host.
 #[cfg(not(target_os = "none"))]
 pub(crate) fn painted_stack() -> usize {
     0

@@ -1,8 +1,8 @@
-//! The cell's arithmetic on emulated microcontrollers and on the host: `tests/firmware/count` runs it.
+//! The cell's arithmetic on emulated microcontrollers and on the host, run by `tests/firmware/count`.
 //!
-//! Of each row of the vectors it prints the words of J and of the torques by both kernels, for comparison; or it computes
-//! them once while the emulator counts the instructions of what is named `measure_...`. On the host it prints the same
-//! words.
+//! It prints the words of J and of the torques from both kernels for each case, for comparison. Alternatively
+//! it computes each once while the emulator counts the instructions of the functions `measure_...`. The host
+//! prints the same words.
 #![cfg_attr(target_os = "none", no_std, no_main)]
 
 mod cases;
@@ -19,10 +19,10 @@ use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::message::Joints;
 use protocol::parameters::MAX_JOINTS;
 
-/// Rows of one joint of one chain that are counted.
+/// Number of counted cases per joint of a chain.
 const COUNTED: usize = 10;
 
-/// What is asked for on the command line.
+/// Runs the task requested on the command line.
 fn run(machine: &mut Machine) {
     match machine.task() {
         b'c' => count(machine),
@@ -31,7 +31,8 @@ fn run(machine: &mut Machine) {
     }
 }
 
-/// A line for each row: the words of J and of the torques by the wrench kernel, and by the projection kernel.
+/// Prints a line for each case: the words of J and of the torques from the wrench kernel, then from the
+/// projection kernel.
 fn words(machine: &mut Machine) {
     for case in CASES {
         wrench_words(machine, case);
@@ -55,7 +56,7 @@ fn projection_words(machine: &mut Machine, case: &cases::Case) {
     torque_words(machine, case, &jacobian, &TorqueRounding::new(TorqueFormat::Q3_12, MAX_J));
 }
 
-/// The words of a J and of its torques.
+/// Appends the words of J and of its torques.
 fn torque_words(
     machine: &mut Machine,
     case: &cases::Case,
@@ -69,7 +70,7 @@ fn torque_words(
     machine.words(torque.iter().take(count).copied());
 }
 
-/// A line for each row that is counted: chain, joint.
+/// Runs the counted cases and prints a line for each: chain, joint.
 fn count(machine: &mut Machine) {
     let mut done = [[0; MAX_JOINTS + 1]; 8];
     for case in CASES.iter().filter(|case| case.is_counted()) {
@@ -87,7 +88,7 @@ fn count(machine: &mut Machine) {
     }
 }
 
-/// How much of the stack one reply took, and how large the cell's state is, which may lie anywhere.
+/// Prints the stack used by one reply, and the size of a node, which need not be on the stack.
 fn stack(machine: &mut Machine) {
     let case = CASES.iter().rfind(|case| case.is_counted());
     machine.number(case.map_or(0, |case| reply(case, true)));
@@ -95,7 +96,7 @@ fn stack(machine: &mut Machine) {
     machine.line();
 }
 
-/// Both kernels and the torque's words of a row.
+/// Runs both kernels and the rounding to torque words for one case.
 #[inline(never)]
 fn kernels(case: &cases::Case) {
     let (parameters, joints) = (case.parameters(), case.joints());
@@ -107,7 +108,8 @@ fn kernels(case: &cases::Case) {
     counted::torque_words(&jacobian, parameters.joint, case.force, &mut torque, kernel.rounding());
 }
 
-/// One reply of a cell on this chain; how many bytes of stack it took, if that is asked for.
+/// Runs one reply of a cell on this chain. Returns the number of bytes of stack used, if `measures_stack` is
+/// true.
 #[inline(never)]
 fn reply(case: &cases::Case, measures_stack: bool) -> u32 {
     let mut node = counted::node();
@@ -119,7 +121,7 @@ fn reply(case: &cases::Case, measures_stack: bool) -> u32 {
         counted::reply(&mut node, &frame, &mut answer);
         return 0;
     }
-    // The state is in this function's frame, above what is painted.
+    // The node is in this function's frame, above the painted stack.
     let top = machine::painted_stack();
     counted::reply(&mut node, &frame, &mut answer);
     machine::used_stack(top)

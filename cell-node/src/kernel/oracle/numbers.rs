@@ -1,4 +1,4 @@
-//! Numbers of kernels: real ones, and words that count the operations on them.
+//! Number types for kernels: real numbers, and words that count their operations.
 
 use std::cell::Cell;
 

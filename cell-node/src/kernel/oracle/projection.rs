@@ -1,8 +1,7 @@
-//! The projection kernel: the paper's own, with the frames carried up to the cell.
+//! The projection kernel: the paper's method, which carries the frames up to the cell.
 //!
-//! The axes of each frame l in the base frame (Eq. 20) give the cell's position relative to each frame
-//! from the tip down (Eq. 22 to 24), and with the force in the base frame (Eq. 25) the triple product of
-//! Eq. 8:
+//! The axes of each frame l in the base frame (Eq. 20) give the cell's position relative to each frame from
+//! the tip down (Eq. 22 to 24), and with the force in the base frame (Eq. 25) the triple product of Eq. 8:
 //!
 //! ```text
 //! x_l = c X + s Y     v_l = c Y - s X          X, Y: the axes before the turn by theta_l
@@ -12,10 +11,10 @@
 //! p_(l-1) = p_l + a_l x_l + d_l z_(l-1)        J_l = (z_(l-1) x p_(l-1)) . f
 //! ```
 //!
-//! Reused as in the paper's count: `a_l x_l` is the joint's own translation without a further product;
-//! joints whose axes are parallel (alpha = 0) turn by one sum of angles, so that X and Y are those of
-//! the first of them; and components that are 0 or 1 whatever the joints are neither multiplied nor
-//! added: [`Frame`] says which they are, worked out once. What no later step reads is not computed.
+//! The savings are those of the paper's count: `a_l x_l` is the joint's own translation without a further
+//! product; joints with parallel axes (alpha = 0) turn by one sum of angles, so that X and Y are those of the
+//! first of them; and components that are 0 or 1 for all joint positions are neither multiplied nor added.
+//! [`Frame`] records these, once per configuration. Values that no later step reads are not computed.
 
 mod axes;
 mod range;
@@ -32,67 +31,67 @@ use crate::kernel::rounding::{Bounded, Held};
 use crate::kernel::{Kernel, Number, Scalar, Twist, chain, seldom};
 use crate::sine::QUARTER;
 
-/// The projection kernel, of one cell.
+/// The projection kernel of one cell.
 ///
-/// For a UR5 and a cell on its last link: 103 multiplications, 56 additions or subtractions, 6 sines and
-/// 6 cosines; the paper counts 103, 57, 6 and 6 (Eq. 27).
+/// For a UR5 and a cell on its last link: 103 multiplications, 56 additions or subtractions, 6 sines and 6
+/// cosines; the paper counts 103, 57, 6 and 6 (Eq. 27).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Projection<S: Scalar = Q1_14> {
-    /// Where the contact pushes, in the frame of joint k.
+    /// The direction of the contact force, in the frame of joint k.
     force: Vector<S::Number>,
-    /// The cell in the same frame.
+    /// The cell's position in the same frame.
     position: Vector<S::Number>,
-    /// How a vector of this frame becomes one of the base's.
+    /// The transform of a vector from this frame to the base.
     to_base: ToBase,
-    /// Whether no number can leave the range of a word; then nothing is held.
+    /// True if no number can leave the range of a word; then saturation is omitted.
     bounded: bool,
-    /// From the first row up; those of `rows` are in use.
+    /// The links from the first row up; the first `rows` are in use.
     links: [Link<S::Number>; MAX_ROWS],
     rows: usize,
 }
 
-/// One row of the robot's table.
-// In this order: what is read first lies where a short instruction of a Cortex-M0 reaches it.
+/// A row of the robot's table.
+// In this order, the fields that are read first are in reach of a short instruction of a Cortex-M0.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Link<N> {
-    /// What has to be computed: bits of [`due`].
+    /// The values to compute: bits of [`due`].
     due: u32,
-    /// Which joint moves it; nobody asks that of a fixed row.
+    /// The joint of the row; unused for a fixed row.
     joint: Joint,
-    /// How its turn mixes x and y, and its twist the other two.
+    /// The mixes of x and y by its turn, and of the other two axes by its twist.
     mixes: [Mix; 2],
-    /// What is known of z_(l-1).
+    /// The known components of z_(l-1).
     axis: Axis,
     kind: RowKind,
     a: Q1_14,
-    /// Without the position of a prismatic joint; nothing of the first row: it shifts along the axis of joint 1, which has
-    /// no moment about it.
+    /// The offset without the position of a prismatic joint. It is zero for the first row, whose offset is
+    /// along the axis of joint 1 and has no moment about it.
     d: Q1_14,
     /// theta_offset.
     offset: Q1_14,
     twist: Twist<N>,
 }
 
-/// What of a row is computed.
+/// The values that are computed for a row.
 mod due {
-    /// x_l, and so a sine.
+    /// x_l, which requires a sine.
     pub(super) const X: u32 = 1;
-    /// All axes: it ends a group of parallel axes.
+    /// All axes: the row ends a group of parallel axes.
     pub(super) const ENDS: u32 = 2;
-    /// z_(l-1), kept for the joints of this group.
+    /// z_(l-1), stored for the joints of this group.
     pub(super) const Z: u32 = 4;
-    /// a, and x_l is kept.
+    /// The length a, for which x_l is stored.
     pub(super) const A: u32 = 8;
-    /// d.
+    /// The offset d.
     pub(super) const D: u32 = 16;
-    /// Its joint turns it.
+    /// The row has a revolute joint.
     pub(super) const TURNS: u32 = 32;
-    /// It turns from the axes before the group of parallel axes that it goes on with.
+    /// The row continues a group of parallel axes, and turns from the axes before the group.
     pub(super) const GOES_ON: u32 = 64;
 }
 
-/// What the steps down need of the axes: z_(l-1) of a group of parallel axes, below it x_l of its rows.
+/// The axes that the steps down need: z_(l-1) of each group of parallel axes, then x_l of its rows.
 type Kept<N> = heapless::Vec<Vector<N>, { 2 * MAX_ROWS }>;
 
 impl<S: Scalar> Kernel<S> for Projection<S> {
@@ -146,13 +145,13 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
 }
 
 impl<S: Scalar> Projection<S> {
-    /// The rows from the base to the cell.
+    /// Returns the rows from the base to the cell.
     #[inline(always)]
     fn links(&self) -> &[Link<S::Number>] {
         self.links.get(..self.rows).unwrap_or_default()
     }
 
-    /// The axes of the cell's frame, from the base up: x, y, z.
+    /// Computes the axes x, y, z of the cell's frame, from the base up.
     #[inline(always)]
     fn axes<'a>(
         &self,
@@ -168,7 +167,7 @@ impl<S: Scalar> Projection<S> {
             }
             let turn = Turn(S::Number::sine_cosine(group));
             let [mix, _] = link.mixes;
-            // There is room for two of each row.
+            // The capacity is two vectors per row.
             if !link.is_due(due::ENDS) {
                 let _ = kept.push(turn.ahead(mix, x, y));
                 continue;
@@ -185,7 +184,8 @@ impl<S: Scalar> Projection<S> {
         [x, y, z]
     }
 
-    /// J, from the cell down to the base; with the positions of joints where some may slide.
+    /// Computes J from the cell down to the base. `slides` are the joint positions if the chain may have
+    /// prismatic joints.
     #[inline(always)]
     fn down<R: Sums>(
         &self,
@@ -219,7 +219,7 @@ impl<S: Scalar> Projection<S> {
         }
     }
 
-    /// The same of any chain.
+    /// Like `down`, for any chain, with saturation.
     #[inline(never)]
     fn down_held(
         &self,
@@ -231,7 +231,7 @@ impl<S: Scalar> Projection<S> {
         self.down::<Held>(axes, kept, Some(joints), jacobian);
     }
 
-    /// The force and the cell's position in the base frame.
+    /// Transforms the force and the cell's position to the base frame.
     #[inline(always)]
     fn in_base<R: Sums>(&self, [x, y, z]: [&Vector<S::Number>; 3]) -> [Vector<S::Number>; 2] {
         let ([x0, x1, x2], [y0, y1, y2], [z0, z1, z2]) = (*x, *y, *z);
@@ -262,7 +262,7 @@ impl<S: Scalar> Projection<S> {
 }
 
 impl<N: Number> Link<N> {
-    /// The link of a row that turns such a frame; the last one, or not.
+    /// Creates the link of a row that follows `frame`. `last` is true for the last row.
     fn new(row: &Row, joint: Joint, frame: Frame, last: bool) -> Self {
         let ends = last || row.alpha != Q1_14::ZERO;
         let (a, d) = (row.a != Q1_14::ZERO, row.d != Q1_14::ZERO);
@@ -294,7 +294,8 @@ impl<N: Number> Link<N> {
         self.due & bit != 0
     }
 
-    /// The angle from the axes before the group of parallel joints to this joint's; with that of the joint before it.
+    /// Returns the angle from the axes before the group of parallel joints to this joint, given that of the
+    /// previous joint.
     #[inline(always)]
     fn angle(&self, group: Q1_14, joints: &[Q1_14; MAX_JOINTS]) -> Q1_14 {
         let mut angle = self.offset;
@@ -306,7 +307,7 @@ impl<N: Number> Link<N> {
         if self.is_due(due::GOES_ON) { N::plus_angle(group, angle) } else { angle }
     }
 
-    /// y_l and z_l, in place of v_l and the z before it; these two change places where they have to.
+    /// Computes y_l and z_l from v_l and the previous z, in place; y and z are swapped if necessary.
     #[inline(always)]
     fn twist_by_alpha<'a>(&self, y: &mut &'a mut Vector<N>, z: &mut &'a mut Vector<N>) {
         match self.twist {
@@ -330,7 +331,7 @@ impl<N: Number> Link<N> {
         }
     }
 
-    /// p_(l-1) from p_l (Eq. 24), and J of a joint that turns: (z x p) . f (Eq. 8).
+    /// Computes p_(l-1) from p_l (Eq. 24), and J of a revolute joint: (z x p) . f (Eq. 8).
     #[inline(always)]
     fn step_down<'a, R: Sums>(
         &self,
@@ -347,7 +348,7 @@ impl<N: Number> Link<N> {
         let a = || N::word(self.a);
         let level = |m0: N, m1: N| R::plus::<N>(f0.times(m0), f1.times(m1));
         let moment = match self.axis {
-            // Below an upright axis all are upright, and nobody reads a height.
+            // Below an upright axis all axes are upright, and no height is needed.
             Axis::Up | Axis::Down => {
                 if self.is_due(due::A) {
                     let ([x0, x1, _], a) = (*kept()?, a());
@@ -403,7 +404,7 @@ impl<N: Number> Link<N> {
         Some(R::round(moment))
     }
 
-    /// z . f, of a prismatic joint.
+    /// Returns z . f, for a prismatic joint.
     fn along<R: Sums>(&self, &[z0, z1, z2]: &Vector<N>, &[f0, f1, f2]: &Vector<N>) -> N {
         match self.axis {
             Axis::Up => f2,
@@ -414,7 +415,7 @@ impl<N: Number> Link<N> {
     }
 }
 
-/// A component of the position with the product of a, and with that of d.
+/// Adds the product of a, and that of d, to a component of the position.
 #[inline(always)]
 fn shift<R: Sums, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N) {
     *position = match d {
@@ -423,7 +424,7 @@ fn shift<R: Sums, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N
     };
 }
 
-/// The same of a twist that is none by quarter turns.
+/// Applies a twist that is not a multiple of quarter turns.
 #[inline(never)]
 fn twist_by<N: Number>(turn: Turn<N>, [_, mix]: [Mix; 2], y: &mut Vector<N>, z: &mut Vector<N>) {
     turn.both(mix, y, z);

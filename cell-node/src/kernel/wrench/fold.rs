@@ -1,4 +1,4 @@
-//! What does not change with the joints, computed once.
+//! The constant part of the wrench, computed once per configuration.
 
 use core::ops::{Add, Mul, Neg, Sub};
 
@@ -6,7 +6,7 @@ use protocol::parameters::{Pose, Row};
 
 use super::{Number, Wrenched};
 
-/// The contact's wrench, twisted and shifted by joint k's row, rounded once.
+/// Returns the contact's wrench, twisted and shifted by joint k's row, rounded once.
 pub(super) fn fold<N: Number>(pose: &Pose, row: &Row) -> Wrenched<N> {
     let (force, moment) = folded(
         pose.normal.map(N::fine),
@@ -14,11 +14,11 @@ pub(super) fn fold<N: Number>(pose: &Pose, row: &Row) -> Wrenched<N> {
         N::fine_turn(row.alpha),
         (N::fine(row.a), N::fine(row.d)),
     );
-    // 14 bits of a word and 28 of the twist; and for the moment 14 more of a length.
+    // 14 fraction bits of a word and 28 of the twist; for the moment 14 more of a length.
     Wrenched { force: force.map(N::settle::<42>), moment: moment.map(N::settle::<56>) }
 }
 
-/// The same before rounding. Words of 16 bits give no number above 2^61.
+/// Returns the wrench before rounding. Words of 16 bits give no number above 2^61.
 fn folded<N: Copy + Add<Output = N> + Sub<Output = N> + Mul<Output = N> + Neg<Output = N>>(
     [nx, ny, nz]: [N; 3],
     [tx, ty, tz]: [N; 3],

@@ -1,4 +1,4 @@
-//! The range of a word: what a wrench can become on its way.
+//! Bounds of the wrench kernel: the range of force and moment on their way down.
 
 use protocol::parameters::Row;
 
@@ -6,12 +6,13 @@ use super::Wrenched;
 use crate::contact::MAX_J;
 use crate::kernel::Number;
 
-/// What no moment of a wrench is beyond on its way down these rows, in steps of 2^-14, wherever the joints are; none if
-/// that or a force may be more than a word can be. The wrench is turned by the joint above them first.
+/// Returns an upper bound of the moments of a wrench on its way down these rows, in steps of 2^-14, for any
+/// joint positions; `None` if a moment or force may exceed the range of a word. The joint above the rows
+/// turns the wrench first.
 ///
-/// With |f| and |m| at most F and M: a twist or a turn by words for sine and cosine, each at most 5e-4 off, makes a vector
-/// longer by a factor of at most 1 + 2^-10, and rounding its components by less than one step; a shift adds at most
-/// |(a, d)| F to M, and its rounding less than one step.
+/// With |f| and |m| at most F and M: a twist or a turn with words for sine and cosine, each at most 5e-4 off,
+/// lengthens a vector by a factor of at most 1 + 2^-10, and rounding its components adds less than one step.
+/// A shift adds at most |(a, d)| F to M, and its rounding less than one step.
 pub(super) fn bound<N: Number>(contact: &Wrenched<N>, rows: &[Row]) -> Option<u16> {
     let turned = |norm: u32| norm + (norm >> 10) + 2;
     let (mut force, mut moment) = (turned(N::norm(contact.force)?), turned(N::norm(contact.moment)?));

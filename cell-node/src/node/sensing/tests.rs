@@ -12,11 +12,11 @@ use crate::node::claim::Claim;
 use crate::node::{HEARTBEAT, Node};
 
 const NODE: u8 = 51;
-/// Node 51 sends a fifth into a period.
+/// The period; node 51 sends after one fifth of it.
 const PERIOD: Span = Span::from_millis(10);
 const JOINTS: Span = Span::from_millis(16);
 
-/// A cell in a time of its own.
+/// A cell with its own clock.
 struct Cell {
     node: Node,
     format: Format,
@@ -25,7 +25,7 @@ struct Cell {
 }
 
 impl Cell {
-    /// A settled one, in this mode.
+    /// Creates a settled cell in this mode.
     fn new(mode: Mode) -> Self {
         Self::of(Format::Fd, mode)
     }
@@ -51,7 +51,7 @@ impl Cell {
         cell
     }
 
-    /// What it sends of what it feels.
+    /// Returns the sensor pages that it sends.
     fn sends(&mut self) -> Vec<SensorPage> {
         let packets = core::iter::from_fn(|| self.node.poll_transmit());
         let page = |packet| {
@@ -80,7 +80,7 @@ impl Cell {
         self.write(Parameter::Sensing, mode.words())
     }
 
-    /// The next joints come, at this very moment; nothing but joints and stimuli moves a cell.
+    /// Sends the next joints at the present time. Only joints and stimuli change the cell's state.
     fn joints(&mut self) -> Vec<SensorPage> {
         self.joints_aged(Span(0))
     }
@@ -91,14 +91,14 @@ impl Cell {
         self.hears(&Message::Joints { epoch: self.epoch, joints }, age)
     }
 
-    /// It feels this from the next joints on, which come.
+    /// Applies a stimulus with the next joints, and sends them.
     fn feels(&mut self, page: SensorPage) -> Vec<SensorPage> {
         let to = Address::Everyone;
         assert_eq!(self.hears(&Message::Stimulus { to, from: From::Next, page }, Span(0)), []);
         self.joints()
     }
 
-    /// One contact word is set to so many steps; whether it sends that, and nothing else.
+    /// Sets one contact word. Returns true if the cell sends exactly that page.
     fn says(&mut self, bits: i16) -> bool {
         let page = pressed(bits);
         match self.feels(page).as_slice() {
@@ -108,14 +108,14 @@ impl Cell {
         }
     }
 
-    /// Time passes until it wants to be woken.
+    /// Advances the time to its next timer.
     fn waits(&mut self) -> (Micros, Vec<SensorPage>) {
         self.now = self.node.poll_timeout();
         self.node.handle_timeout(self.now);
         (self.now, self.sends())
     }
 
-    /// The times at which it sends page 0 by itself.
+    /// Returns the times of the next `count` pages 0 that it sends unrequested.
     fn times(&mut self, count: usize) -> Vec<u64> {
         let mut times = Vec::new();
         while times.len() < count {
@@ -133,7 +133,7 @@ fn pressed(bits: i16) -> SensorPage {
 
 const NOTHING: SensorPage = SensorPage::Acceleration([Q3_12::ZERO; 3]);
 
-/// A threshold of 100 steps everywhere, and a release below 50.
+/// Returns thresholds of 100 steps, with a release below 50.
 fn events() -> Events {
     Events {
         contact: Q5_10::from_bits(100),
@@ -241,7 +241,7 @@ fn a_heartbeat_in_event_mode_carries_the_present_state_and_every_fourth_the_acce
         assert_eq!(pages.as_slice(), &both[..if beat % 4 == 3 { 2 } else { 1 }], "{beat}");
     }
     assert!(beats.windows(2).all(|pair| pair[1].0.since(pair[0].0) == HEARTBEAT));
-    // What was sent is known, whatever it was sent for.
+    // A page counts as sent for whatever reason it was sent.
     assert!(!cell.says(60) && cell.says(160));
 }
 
@@ -274,7 +274,7 @@ fn continuous_keeps_its_period_and_the_phase_of_its_node_id() {
     let first = switched.0 + PERIOD.0 + PERIOD.0 / 5;
     let expected: Vec<_> = (0..60).map(|n| first + n * PERIOD.0).collect();
     assert_eq!(cell.times(60), expected, "heartbeats shift none of them");
-    // Early is harmless, and sends nothing.
+    // An early call is harmless and sends nothing.
     cell.node.handle_timeout(cell.node.poll_timeout() - Span(1));
     assert_eq!(cell.sends(), []);
 }
@@ -418,7 +418,7 @@ fn the_same_inputs_make_the_same_frames() {
             let mut cell = eventful();
             let mut said = Vec::new();
             for &(what, bits, later) in &steps {
-                // Never later than it wants to be woken, as a shell does it.
+                // Never later than its next timer, as a shell ensures.
                 let until = cell.now + Span(later);
                 while cell.node.poll_timeout() <= until {
                     said.push(cell.waits());

@@ -1,4 +1,4 @@
-//! What the kernels are held against: the UR5, torques computed elsewhere, and Eq. 8 in real numbers.
+//! References for the kernels: the UR5, externally computed torques, and Eq. 8 in real numbers.
 
 #![allow(
     dead_code,
@@ -13,8 +13,8 @@ use cell_node::contact::{Force, Torque};
 use protocol::fixed::{Q1_14, Q3_12, TorqueFormat};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 
-/// One line of `vectors/ur5_torque.csv`: computed from Eq. 8 in double precision, and in agreement with
-/// a rigid-body library on the robot's URDF to 1e-11 Nm.
+/// A line of `vectors/ur5_torque.csv`, computed from Eq. 8 in double precision. It agrees with a rigid-body
+/// library and the robot's URDF to 1e-11 Nm.
 pub(crate) struct Case {
     /// The joint that moves the cell, 1 to 6.
     pub(crate) joint: u8,
@@ -22,7 +22,7 @@ pub(crate) struct Case {
     pub(crate) positions: [f64; MAX_JOINTS],
     /// The cell's position in the frame of that joint, in m.
     pub(crate) position: [f64; 3],
-    /// Where the force points, in the same frame.
+    /// The direction of the force in the same frame.
     pub(crate) direction: [f64; 3],
     /// The force in N.
     pub(crate) force: f64,
@@ -31,7 +31,7 @@ pub(crate) struct Case {
 }
 
 impl Case {
-    /// All cases.
+    /// Returns all cases.
     pub(crate) fn all() -> Vec<Self> {
         include_str!("../../../tests/vectors/ur5_torque.csv").lines().skip(1).map(Self::read).collect()
     }
@@ -49,7 +49,7 @@ impl Case {
         }
     }
 
-    /// The cell as its words describe it: its outward normal is where the force comes from.
+    /// Returns the cell's parameters; its outward normal is opposite to the force.
     pub(crate) fn parameters(&self) -> Parameters {
         let pose = Pose {
             position: self.position.map(Q1_14::nearest),
@@ -58,22 +58,22 @@ impl Case {
         Parameters { joint: self.joint, joints: 6, pose, rows: ur5(), ..Parameters::default() }
     }
 
-    /// The joint positions as words.
+    /// Returns the joint positions as words.
     pub(crate) fn words(&self) -> [Q1_14; MAX_JOINTS] {
         self.positions.map(|angle| Q1_14::from_radians(angle).unwrap())
     }
 }
 
-/// How far torques are from those of the cases, in Nm.
+/// Errors of torques relative to the cases, in Nm.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Errors {
     /// The mean of the absolute errors.
     pub(crate) mean: f64,
     /// The largest absolute error.
     pub(crate) max: f64,
-    /// How many torques were compared: those of loaded joints.
+    /// Number of compared torques: those of loaded joints.
     pub(crate) torques: usize,
-    /// How many cases were left out, because a torque lies beyond Q3.12.
+    /// Number of cases left out because a torque exceeds Q3.12.
     pub(crate) omitted: usize,
 }
 
@@ -113,7 +113,7 @@ impl Errors {
     }
 }
 
-/// The UR5's table, in words.
+/// Returns the UR5's table in words.
 pub(crate) fn ur5() -> [Row; MAX_ROWS] {
     let d = [0.089_159, 0.0, 0.0, 0.109_15, 0.094_65, 0.082_3];
     let a = [0.0, -0.425, -0.392_25, 0.0, 0.0, 0.0];
@@ -126,7 +126,7 @@ pub(crate) fn ur5() -> [Row; MAX_ROWS] {
     rows
 }
 
-/// One value a joint, and nothing for joints that the robot has not.
+/// Returns one value per joint, with defaults for joints that the robot does not have.
 pub(crate) fn per_joint<T: Copy + Default>(values: &[T]) -> [T; MAX_JOINTS] {
     std::array::from_fn(|joint| values.get(joint).copied().unwrap_or_default())
 }
@@ -141,7 +141,7 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// Rz(theta) Tz(d) Tx(a) Rx(alpha), the four multiplied out one by one.
+/// Returns Rz(theta) Tz(d) Tx(a) Rx(alpha), multiplied out one by one.
 fn transform(row: &Row, position: Q1_14) -> Transform {
     let (theta, d) = match row.kind {
         RowKind::Revolute => (position.wrapping_add(row.theta_offset), row.d),
@@ -161,8 +161,8 @@ fn transform(row: &Row, position: Q1_14) -> Transform {
     product(&product(&about_z, &along), &about_x)
 }
 
-/// Eq. 8 as it stands: frames by multiplying 4x4 matrices, then `(z_(l-1) x (t_i - t_(l-1))) . f`, of a prismatic joint
-/// `z_(l-1) . f`.
+/// Computes Eq. 8 literally: frames as products of 4x4 matrices, then `(z_(l-1) x (t_i - t_(l-1))) . f`, or
+/// `z_(l-1) . f` for a prismatic joint.
 pub(crate) fn equation_8(parameters: &Parameters, positions: &[Q1_14; MAX_JOINTS]) -> [f64; MAX_JOINTS] {
     let mut frames: Vec<Transform> =
         vec![std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))))];

@@ -101,7 +101,7 @@ mod tests {
     #[test]
     fn hints_do_not_contradict_each_other() {
         let latin = refused("a.dae", b"<COLLADA>\xfc</COLLADA>");
-        assert!(latin.ends_with("(of what is in Latin-1)"), "{latin}");
+        assert!(latin.ends_with("(if it is in Latin-1)"), "{latin}");
         let typed = refused("a.dae", b"<!DOCTYPE a [<!ENTITY a 'b'>]><COLLADA/>");
         assert!(typed.ends_with("write what its entities stand for in their places"), "{typed}");
         assert!(refused("a", STL.as_bytes()).ends_with("; add the one that it is"));

@@ -268,7 +268,7 @@ fn what_is_no_packet_is_foreign_with_a_reason() {
             _ => assert!(text.starts_with("meaning "), "{comment}: {text}"),
         }
     }
-    let odd = "command 9: command 9 does not exist: 0 halt, 1 joints, 2 sync, 3 resume, 4 report do";
+    let odd = "command 9: command 9 does not exist: use 0 halt, 1 joints, 2 sync, 3 resume or 4 report";
     assert_eq!(decoded(CLASSIC, None).last().unwrap().1, format!("meaning {odd}"));
 }
 

@@ -267,7 +267,10 @@ mod tests {
                 "touch[0].cells[0] = \"can0:1\": no such bus; there is \"vcan0\", \"vcan1\"",
             ),
             ("cells = [\"vcan0:1\", 2]", &format!("touch[0].bus: {which}")),
-            ("cells = [\"vcan0:x\"]", "touch[0].cells[0] = \"vcan0:x\": \"x\" is no node id: 1 to 254 are"),
+            (
+                "cells = [\"vcan0:x\"]",
+                "touch[0].cells[0] = \"vcan0:x\": \"x\" is not a node id: use 1 to 254",
+            ),
             ("cells = [2.5]", "touch[0].cells[0] = 2.5: either a node id or \"BUS:NODE\" is needed"),
             ("cells = [99999999999999999999]", "touch[0].cells[0] = 99999999999999999999: "),
             ("bus = \"can9\"\ncells = [\"vcan0:1\"]", "touch[0].bus = \"can9\": no such bus"),

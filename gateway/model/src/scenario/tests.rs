@@ -262,10 +262,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
         says("\"step\"", "\"poke\""),
         "s.toml:31: touch[1].profile = \"poke\": \"half-sine\", \"step\", \"ramp\" or points [[t_s, force_n], ...]"
     );
-    assert_eq!(
-        says("31.5]", "600.0]"),
-        "s.toml:33: touch[1].temperature_c = 600: its word holds [-512, 512)"
-    );
+    assert_eq!(says("31.5]", "600.0]"), "s.toml:33: touch[1].temperature_c = 600: the range is [-512, 512)");
     assert_eq!(
         says("cells = [2]\nforce_n = 1.0", "all = true\nforce_n = 94.0"),
         "s.toml:30: touch[1].force_n = 94: together with earlier touches this makes 97 N on cell 1 of \

@@ -55,11 +55,7 @@ fn what_changes_no_value_is_read() {
 fn other_faults_have_their_line_and_what_to_do() {
     let good = wrap(ARM);
     for (from, to, expected) in [
-        (
-            "</robot>\n",
-            "</robot>\n<robot/>",
-            "t.urdf:6: something stands behind the end of the outermost element: delete it",
-        ),
+        ("</robot>\n", "</robot>\n<robot/>", "t.urdf:6: there is content after the root element: delete it"),
         (
             "</robot>",
             "",

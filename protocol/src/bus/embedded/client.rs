@@ -1,4 +1,4 @@
-//! A client of an embedded bus.
+//! A client's connection to an embedded bus.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -16,14 +16,14 @@ use crate::bus::batch::{self, Datagram};
 use crate::bus::carrier::Carrier;
 use crate::bus::{Bus, BusError, Filter, Options};
 
-/// How long a client waits for a server: it answers at once unless it is stopped.
+/// Maximum time to wait for a server, which answers at once unless it is stopped.
 const TIMEOUT: Duration = Duration::from_secs(2);
-/// Time in which a server that ends resets connections.
+/// Time within which a server that is ending resets connections.
 const RESET: Duration = Duration::from_millis(50);
-/// Room for what the server has not read yet: some 700 FD frames, a whole skin's answers in one go.
+/// Size of the send buffer: some 700 FD frames, the answers of a whole skin at once.
 const SEND_BUFFER: usize = 1 << 18;
 
-/// Buses that a process of this user serves.
+/// The embedded bus: served by another process of this user.
 pub(in crate::bus) struct Embedded;
 
 impl Carrier for Embedded {
@@ -52,7 +52,7 @@ impl Carrier for Embedded {
         let mut bytes = [0; 64];
         let (len, _) = rustix::net::recv(&socket, &mut bytes, RecvFlags::DONTWAIT).map_err(gone)?;
         sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, None).map_err(failed)?;
-        // A server that ends resets the connection; one that hangs up without an answer has no room.
+        // A server that is ending resets the connection; one without room hangs up without an answer.
         if len == 0 {
             return Err(BusError::TurnedAway(name.to_owned()));
         }
@@ -88,13 +88,14 @@ impl Carrier for Embedded {
     }
 }
 
-/// The error for a connection that is over: its server has ended, or serves others and has hung up on this client.
+/// Returns the error for a lost connection: its server has ended, or still serves others and hung up on this
+/// client.
 pub(in crate::bus) fn closed(name: &str, directory: Option<&Path>) -> BusError {
     let is_served = connect(name, directory).is_ok_and(|socket| is_kept(&socket));
     if is_served { BusError::HungUp(name.to_owned()) } else { BusError::Closed(name.to_owned()) }
 }
 
-/// Returns whether a server keeps a new connection: one that is just ending resets it.
+/// Returns true if a server keeps a new connection open. A server that is ending resets it.
 fn is_kept(socket: &OwnedFd) -> bool {
     let wait = Timespec::try_from(RESET).unwrap_or_default();
     let mut polled = [PollFd::new(socket, PollFlags::IN)];
@@ -102,7 +103,8 @@ fn is_kept(socket: &OwnedFd) -> bool {
     is_quiet || rustix::net::recv(socket, &mut [0; 64], RecvFlags::DONTWAIT).is_ok()
 }
 
-/// A socket that a server has taken, or that waits among those that it will take; it gives up sending in time.
+/// Connects to a server. The socket may still be in the server's queue; sending on it is limited by a
+/// timeout.
 fn connect(name: &str, directory: Option<&Path>) -> Result<OwnedFd, BusError> {
     let directory = directory.map_or_else(usual_directory, Path::to_owned);
     let failed = |errno: Errno| BusError::refused(name, "connect to", errno);
@@ -111,7 +113,7 @@ fn connect(name: &str, directory: Option<&Path>) -> Result<OwnedFd, BusError> {
         .map_err(|error| if error.is_absent() { not_served() } else { error.into() })?;
     let address = address(&directory, name)?;
     let socket = seqpacket(SocketFlags::empty()).map_err(failed)?;
-    // A connection waits while the server's list of new clients is full; the timeout bounds that.
+    // `connect` blocks while the server's queue of new clients is full; the timeout limits that.
     sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, Some(TIMEOUT)).map_err(failed)?;
     sockopt::set_socket_send_buffer_size(&socket, SEND_BUFFER).map_err(failed)?;
     match rustix::net::connect(&socket, &address) {
@@ -122,10 +124,10 @@ fn connect(name: &str, directory: Option<&Path>) -> Result<OwnedFd, BusError> {
     }
 }
 
-/// A socket as both ends of an embedded bus have it.
+/// Creates a socket of the type that both ends of an embedded bus use.
 ///
 /// # Errors
-/// When the system gives none.
+/// Returns an error if the system cannot create the socket.
 pub fn seqpacket(flags: SocketFlags) -> rustix::io::Result<OwnedFd> {
     rustix::net::socket_with(AddressFamily::UNIX, SocketType::SEQPACKET, flags | SocketFlags::CLOEXEC, None)
 }

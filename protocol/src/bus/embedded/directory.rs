@@ -1,4 +1,4 @@
-//! Where embedded buses live, and that the place is private.
+//! The directory of embedded buses, which must be private to the user.
 
 use std::fs::DirBuilder;
 use std::io;
@@ -11,10 +11,10 @@ use rustix::io::Errno;
 use rustix::net::SocketAddrUnix;
 use thiserror::Error;
 
-/// The file in a directory that a program made for its buses, and so may remove with the last of them.
+/// The file that marks a directory as created by a program, which may therefore remove it with its last bus.
 pub const MARK: &str = ".skinbus";
 
-/// Where embedded buses live unless told otherwise: `$SKINBUS_DIR`, else `$XDG_RUNTIME_DIR/skinbus`, else
+/// Returns the default directory of embedded buses: `$SKINBUS_DIR`, else `$XDG_RUNTIME_DIR/skinbus`, else
 /// `/tmp/skinbus-<user>`.
 #[must_use]
 pub fn usual_directory() -> PathBuf {
@@ -24,36 +24,36 @@ pub fn usual_directory() -> PathBuf {
         .unwrap_or_else(|| PathBuf::from(format!("/tmp/skinbus-{}", rustix::process::geteuid().as_raw())))
 }
 
-/// The file name of a bus's socket within its directory.
+/// Returns the file name of a bus's socket within the directory.
 #[must_use]
 pub fn socket_name(bus: &str) -> String {
     format!("{bus}.bus")
 }
 
-/// The socket's address.
+/// Returns the address of a bus's socket.
 ///
 /// # Errors
-/// When the path is longer than a socket's can be.
+/// Returns an error if the path is too long for a socket.
 pub fn address(directory: &Path, bus: &str) -> Result<SocketAddrUnix, DirectoryError> {
     let path = directory.join(socket_name(bus));
     SocketAddrUnix::new(&path).map_err(|_| DirectoryError::TooLong(path))
 }
 
-/// Why a directory is not used for embedded buses.
+/// The error for a directory that cannot be used for embedded buses.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum DirectoryError {
-    /// Somebody else's.
+    /// The directory belongs to another user.
     #[error("{} belongs to user {owner}, and this is user {us}: set SKINBUS_DIR to a directory of your own", path.display())]
     Owner {
         /// The directory.
         path: PathBuf,
-        /// Whose it is.
+        /// User id of the owner.
         owner: u32,
-        /// Who asks.
+        /// User id of this process.
         us: u32,
     },
-    /// Open to others.
+    /// Other users have access to the directory.
     #[error("{} has mode {mode:04o}, and the bus is private: `chmod 700` it, or set SKINBUS_DIR to another directory", path.display())]
     Mode {
         /// The directory.
@@ -61,10 +61,10 @@ pub enum DirectoryError {
         /// Its permission bits.
         mode: u32,
     },
-    /// No socket can have this path.
+    /// The path of the socket is too long.
     #[error("{} is too long for a socket, whose path has at most 107 bytes: set SKINBUS_DIR to a shorter one", .0.display())]
     TooLong(PathBuf),
-    /// It cannot be opened or made; a link is not followed.
+    /// The directory cannot be opened or created. Symbolic links are not followed.
     #[error("cannot use {} as the directory of embedded buses: {source}; set SKINBUS_DIR to a directory of your own", path.display())]
     Io {
         /// The directory.
@@ -75,17 +75,18 @@ pub enum DirectoryError {
 }
 
 impl DirectoryError {
-    /// Whether it is not there at all.
+    /// Returns true if the directory does not exist.
     #[must_use]
     pub fn is_absent(&self) -> bool {
         matches!(self, Self::Io { source, .. } if source.kind() == io::ErrorKind::NotFound)
     }
 }
 
-/// Opens the directory and sees that it is ours alone.
+/// Opens the directory and checks that it is private to this user.
 ///
 /// # Errors
-/// When it is not there, not a directory (a link is none), somebody else's, or open to others.
+/// Returns an error if it does not exist, is not a directory (a symbolic link is not followed), belongs to
+/// another user, or is accessible to others.
 pub fn open_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
     let io = |errno: Errno| DirectoryError::Io { path: path.to_owned(), source: errno.into() };
     let flags = OFlags::DIRECTORY | OFlags::NOFOLLOW | OFlags::CLOEXEC | OFlags::RDONLY;
@@ -102,10 +103,11 @@ pub fn open_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
     Ok(directory)
 }
 
-/// Makes the directory (mode 0700) unless it is there, then opens it. One that was made here has a [`MARK`].
+/// Creates the directory with mode 0700 if it does not exist, then opens it. A directory created here
+/// contains a [`MARK`].
 ///
 /// # Errors
-/// As [`open_directory`], or when it cannot be made.
+/// Returns the errors of [`open_directory`], or an error if the directory cannot be created.
 pub fn make_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
     let io = |source| DirectoryError::Io { path: path.to_owned(), source };
     match DirBuilder::new().mode(0o700).create(path) {
@@ -119,10 +121,10 @@ pub fn make_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
     }
 }
 
-/// Leaves the [`MARK`] in a directory that was made here.
+/// Writes the [`MARK`] into a directory that was created here.
 ///
 /// # Errors
-/// When it cannot be written.
+/// Returns an error if it cannot be written.
 pub fn mark(directory: impl AsFd) -> Result<(), Errno> {
     let flags = OFlags::CREATE | OFlags::EXCL | OFlags::WRONLY | OFlags::CLOEXEC;
     match rustix::fs::openat(directory, MARK, flags, Mode::RUSR | Mode::WUSR) {
@@ -131,11 +133,11 @@ pub fn mark(directory: impl AsFd) -> Result<(), Errno> {
     }
 }
 
-/// Removes a directory in which there is nothing but the [`MARK`]: the user's own directory has none and stays.
-/// Whoever calls this holds the lock on it.
+/// Removes a directory that contains only the [`MARK`]. A directory that the user created has no mark and
+/// stays. The caller holds the lock on it.
 ///
 /// # Errors
-/// When there is something else in it, no mark, or it cannot be removed.
+/// Returns an error if it contains other files, has no mark, or cannot be removed.
 pub fn remove_directory(directory: impl AsFd, path: &Path) -> Result<(), Errno> {
     for entry in rustix::fs::Dir::read_from(&directory)? {
         if ![".", "..", MARK].map(str::as_bytes).contains(&entry?.file_name().to_bytes()) {
@@ -143,7 +145,7 @@ pub fn remove_directory(directory: impl AsFd, path: &Path) -> Result<(), Errno> 
         }
     }
     rustix::fs::unlinkat(&directory, MARK, AtFlags::empty())?;
-    // Somebody may have put a file in it meanwhile; it is still one that was made here.
+    // Another process may have added a file meanwhile; the directory is still one that was created here.
     rustix::fs::rmdir(path).inspect_err(|_| {
         let _ = mark(&directory);
     })

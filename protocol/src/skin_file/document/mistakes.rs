@@ -1,4 +1,4 @@
-//! What the parser of TOML says is wrong, in the words of the file: which key, its value, and what is allowed.
+//! Error messages for mistakes that the TOML parser finds: the key, its value and what is allowed.
 
 use core::ops::Range;
 
@@ -7,14 +7,14 @@ use toml::de::{DeTable, DeValue};
 
 use crate::skin::CellName;
 
-/// The most characters of a value that are quoted.
+/// Maximum number of characters quoted from a value.
 const QUOTED: usize = 40;
 
-/// The parser's message about what stands at these bytes.
+/// Rewrites the parser's message about the value at these bytes.
 pub(super) fn explained(text: &str, at: Range<usize>, message: &str) -> String {
     let found = DeTable::parse(text).ok().and_then(|root| find(root.get_ref(), at.start));
     if let Some(field) = message.strip_prefix("missing field ") {
-        // A key that is missing in the file itself has no table.
+        // A key that is missing at the top level has no table.
         let table = found.filter(|found| found.value == at).map(|found| format!("{}: ", found.path));
         return format!("{}key {field} is missing", table.unwrap_or_default());
     }
@@ -28,7 +28,7 @@ pub(super) fn explained(text: &str, at: Range<usize>, message: &str) -> String {
     }
 }
 
-/// What a value of the right type is.
+/// Describes the values that the parser expected.
 fn allowed(path: &str, message: &str) -> Option<String> {
     if let Some((got, target)) = message
         .strip_prefix("invalid length ")
@@ -53,36 +53,36 @@ fn allowed(path: &str, message: &str) -> Option<String> {
         list if list == "a sequence" || list.starts_with("an array") || list.starts_with("a tuple") => {
             "a list of values in brackets is needed".to_owned()
         }
-        // A value of several types names them itself.
+        // A value of several types lists them itself.
         either if either.starts_with("either ") => format!("{either} is needed"),
         _ => return None,
     })
 }
 
-/// Returns a cell that is written as `string "BUS:NODE"`, as on the command line.
+/// Parses a cell that is written as `string "BUS:NODE"`, as on the command line.
 fn cell_of_bus(got: &str) -> Option<CellName> {
     got.strip_prefix("string \"")?.strip_suffix('"')?.parse().ok()
 }
 
-/// What is no TOML at all; the parser's advice fits texts only.
+/// Rewrites the message about text that is not TOML. The parser's advice only fits strings.
 fn unparsed(message: &str) -> String {
     let more = if message.starts_with("string values must be quoted") {
-        "; a number has neither unit nor formula, as 5000000 or 1.5708"
+        "; write numbers without units or formulas, such as 5000000 or 1.5708"
     } else if message.starts_with("duplicate key") {
-        "; of several buses, cells, touches or faults each begins with [[bus]], [[cell]], [[touch]] or [[fault]]"
+        "; begin each bus, cell, touch or fault with [[bus]], [[cell]], [[touch]] or [[fault]]"
     } else {
         ""
     };
     format!("{message}{more}")
 }
 
-/// A value and where it stands.
+/// A value and its path.
 struct Found {
     path: String,
     value: Range<usize>,
 }
 
-/// The innermost value of a table at this byte.
+/// Returns the innermost value at this byte of a table.
 fn find(table: &DeTable<'_>, at: usize) -> Option<Found> {
     table.iter().find_map(|(key, value)| within(key.get_ref(), value, at))
 }

@@ -1,11 +1,11 @@
-//! What cells take for the zero of their force sensors, as a skin's file has it.
+//! The baseline of the force sensors in a skin file.
 
 use super::raw;
 use crate::document::{Fault, Place};
 use crate::fixed::{Q1_14, Q5_10};
 use crate::parameters::{Baseline, Zeroing};
 
-/// What is meant where the file says nothing else.
+/// Values for omitted keys.
 const DEFAULT: Zeroing = Zeroing {
     threshold: Q5_10::from_bits(103),
     hysteresis: Q1_14::from_bits(8_192),
@@ -14,7 +14,7 @@ const DEFAULT: Zeroing = Zeroing {
     n_per_c: Q1_14::ZERO,
 };
 
-/// The table `[baseline]`.
+/// Checks the table `[baseline]`.
 pub(super) fn of_skin(raw: Option<raw::Baseline>) -> Result<Baseline, Fault> {
     let Some(raw) = raw else { return Ok(Baseline::Off) };
     let at = Place::named("baseline");
@@ -42,7 +42,7 @@ pub(super) fn of_skin(raw: Option<raw::Baseline>) -> Result<Baseline, Fault> {
     })
 }
 
-/// What a cell overrides.
+/// Applies the overrides of a cell.
 pub(super) fn of_cell(at: &Place, raw: &raw::Cell, base: Baseline) -> Result<Baseline, Fault> {
     let Baseline::On(mut to) = base else {
         let given = [("baseline_limit_n", raw.baseline_limit_n), ("baseline_n_per_c", raw.baseline_n_per_c)];
@@ -56,7 +56,7 @@ pub(super) fn of_cell(at: &Place, raw: &raw::Cell, base: Baseline) -> Result<Bas
     Ok(Baseline::On(to))
 }
 
-/// Of either sign.
+/// Sets the temperature slope, which may be negative.
 fn slope(at: &Place, given: Option<f64>, to: &mut Zeroing) -> Result<(), Fault> {
     if let Some(given) = given {
         to.n_per_c = at.fit(given, Q1_14::try_nearest)?;

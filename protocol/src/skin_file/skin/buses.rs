@@ -1,4 +1,4 @@
-//! Buses, from the file's words to checked types.
+//! Checks of the buses in a skin file.
 
 use std::collections::HashSet;
 
@@ -8,7 +8,7 @@ use crate::document::{Checked, Place};
 use crate::fixed::TorqueFormat;
 use crate::wire_time::BitRates;
 
-/// Buses of a skin.
+/// Maximum number of buses of a skin.
 const BUSES: usize = 64;
 
 pub(super) fn buses(raw: &[raw::Bus], robot: &Robot) -> Checked<Vec<Bus>> {
@@ -42,7 +42,7 @@ pub(super) fn buses(raw: &[raw::Bus], robot: &Robot) -> Checked<Vec<Bus>> {
     raw.iter().enumerate().map(bus).collect()
 }
 
-/// The chain that a bus names; it need not name the only one.
+/// Returns the chain of a bus. The name may be omitted if there is only one chain.
 fn chain(at: &Place, bus: &raw::Bus, robot: &Robot) -> Checked<usize> {
     let names =
         || robot.chains.iter().map(|chain| format!("{:?}", chain.name)).collect::<Vec<_>>().join(", ");
@@ -56,7 +56,8 @@ fn chain(at: &Place, bus: &raw::Bus, robot: &Robot) -> Checked<usize> {
     }
 }
 
-/// In which format its cells send their own torques: the finest, but where a joint slides 8 N would be no push.
+/// Returns the torque format of a bus. The default is the finest, or Q5.10 for a chain with prismatic joints,
+/// where a range of 8 N would be too small.
 fn torque_format(at: &Place, bus: &raw::Bus, robot: &Robot, chain: usize) -> Checked<TorqueFormat> {
     if let Some(name) = &bus.torque_format {
         let formats = TorqueFormat::ALL.map(|format| (format.name(), format));
@@ -67,7 +68,7 @@ fn torque_format(at: &Place, bus: &raw::Bus, robot: &Robot, chain: usize) -> Che
     Ok(if joints.iter().any(slides) { TorqueFormat::Q5_10 } else { TorqueFormat::Q3_12 })
 }
 
-/// What the cells of a bus answer with.
+/// Checks the reply of a bus.
 fn reply(at: &Place, bus: &raw::Bus) -> Checked<Reply> {
     let sums = at.key("reply").word(&bus.reply, &[("torque", false), ("sum", true)])?;
     let only_sum = "only with reply = \"sum\"";
@@ -83,7 +84,7 @@ fn reply(at: &Place, bus: &raw::Bus) -> Checked<Reply> {
     }
 }
 
-/// The bit rates of hardware, which are optional.
+/// Checks the optional bit rates of real hardware.
 fn bit_rates(at: &Place, bus: &raw::Bus, format: Format) -> Checked<(Option<u32>, Option<u32>)> {
     let within = |key, got, min, max| at.key(key).within(got, min..=max, " bit/s");
     let (min, max) = (BitRates::MIN_NOMINAL, BitRates::MAX_NOMINAL);

@@ -1,16 +1,16 @@
-//! Names of cells, as people write them.
+//! Names of cells on the command line and in files.
 
 use core::fmt;
 use core::str::FromStr;
 
 use crate::id::CellId;
 
-/// The name of a cell: `NODE`, or `BUS:NODE` where several buses may have that node id.
+/// The name of a cell: `NODE`, or `BUS:NODE` if several buses may have that node id.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct CellName {
-    /// Its bus, if that is named.
+    /// The bus, if given.
     pub bus: Option<String>,
-    /// Its node id there.
+    /// The node id on that bus.
     pub node: CellId,
 }
 
@@ -20,28 +20,29 @@ impl FromStr for CellName {
     /// Parses a name.
     ///
     /// # Errors
-    /// When there is no node id from 1 to 254 at its end, or nothing before the colon.
+    /// Returns an error if the text does not end with a node id from 1 to 254, or has nothing before the
+    /// colon.
     fn from_str(text: &str) -> Result<Self, String> {
         let (bus, number) = split_bus(text)?;
-        let node = number.parse().map_err(|_| format!("{number:?} is no node id: 1 to 254 are"))?;
+        let node = number.parse().map_err(|_| format!("{number:?} is not a node id: use 1 to 254"))?;
         Ok(Self { bus: bus.map(str::to_owned), node })
     }
 }
 
-/// Splits `BUS:NODE`, or `NODE` alone, into bus and node; the name of a bus may have colons.
+/// Splits `BUS:NODE` or `NODE` into bus and node. The bus name may contain colons.
 ///
 /// # Errors
-/// When nothing stands before the colon.
+/// Returns an error if nothing precedes the colon.
 pub fn split_bus(text: &str) -> Result<(Option<&str>, &str), String> {
     match text.rsplit_once(':') {
-        Some(("", _)) => Err("no bus stands before the colon: a cell is NODE or BUS:NODE".to_owned()),
+        Some(("", _)) => Err("no bus precedes the colon: write NODE or BUS:NODE".to_owned()),
         Some((bus, node)) => Ok((Some(bus), node)),
         None => Ok((None, text)),
     }
 }
 
 impl CellName {
-    /// Returns whether the name fits a cell, by its bus and its node id.
+    /// Returns true if the name denotes the cell with this bus and node id.
     #[must_use]
     pub fn fits(&self, bus: &str, node: CellId) -> bool {
         self.node == node && self.bus.as_deref().is_none_or(|own| own == bus)
@@ -69,11 +70,11 @@ mod tests {
         }
         assert_eq!("a:b:1".parse::<CellName>().unwrap().bus.as_deref(), Some("a:b"));
         for (text, why) in [
-            ("", "\"\" is no node id"),
-            ("vcan0", "\"vcan0\" is no node id"),
-            ("vcan0:", "\"\" is no node id"),
-            ("vcan0:255", "\"255\" is no node id: 1 to 254 are"),
-            (":3", "no bus stands before the colon"),
+            ("", "\"\" is not a node id"),
+            ("vcan0", "\"vcan0\" is not a node id"),
+            ("vcan0:", "\"\" is not a node id"),
+            ("vcan0:255", "\"255\" is not a node id: use 1 to 254"),
+            (":3", "no bus precedes the colon"),
         ] {
             assert!(text.parse::<CellName>().unwrap_err().contains(why), "{text}");
         }

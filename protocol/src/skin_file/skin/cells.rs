@@ -1,4 +1,4 @@
-//! Cells, from the file's words to checked types.
+//! Checks of the cells in a skin file.
 
 use std::collections::HashMap;
 
@@ -10,7 +10,7 @@ use crate::fixed::Q;
 use crate::id::CellId;
 use crate::parameters::{Baseline, Contact};
 
-/// What a cell has that overrides none of it.
+/// The values that cells inherit from the skin.
 #[derive(Clone, Copy)]
 pub(super) struct Base {
     pub(super) contact: Contact,
@@ -45,7 +45,7 @@ pub(super) fn cells(raw: &[raw::Cell], robot: &Robot, buses: &[Bus], base: Base)
     Ok(cells)
 }
 
-/// By cell and port, the neighbors that each cell names.
+/// Iterates over the neighbours that cells name: cell index, port, cell and neighbour.
 fn mentions(cells: &[Cell]) -> impl Iterator<Item = (usize, usize, &Cell, CellId)> {
     cells.iter().enumerate().flat_map(|(index, cell)| {
         let ports = cell.neighbors.iter().enumerate();
@@ -53,7 +53,7 @@ fn mentions(cells: &[Cell]) -> impl Iterator<Item = (usize, usize, &Cell, CellId
     })
 }
 
-/// Every wire has two ends: two cells must name each other equally often.
+/// Checks that every wire has two ends: two cells must name each other equally often.
 fn contradictions(cells: &[Cell]) -> Checked<()> {
     let mut all = HashMap::new();
     for (.., cell, neighbor) in mentions(cells) {
@@ -119,7 +119,7 @@ fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Base) -
     })
 }
 
-/// Takes what is given, and the rest from `base`.
+/// Applies the given gains and thresholds to `base`.
 pub(super) fn contact(at: &Place, raw: raw::Contact, base: Contact) -> Checked<Contact> {
     let raw::Contact { alpha_c, alpha_p, contact_threshold_n, proximity_threshold, force_threshold_n } = raw;
     let mut to = base;
@@ -131,12 +131,12 @@ pub(super) fn contact(at: &Place, raw: raw::Contact, base: Contact) -> Checked<C
     Ok(to)
 }
 
-/// A cell that is given no serial number gets one that no other such cell gets.
+/// Returns the default serial number, which is unique among default numbers.
 fn default_serial(bus: usize, node: CellId) -> i64 {
     i64::try_from(bus).unwrap_or(0) * 1_000 + i64::from(node.get())
 }
 
-/// The joint that moves a cell, and the row that carries it: one of them need be said.
+/// Returns the joint that moves a cell and the row that carries it. Either may be omitted, but not both.
 fn place(at: &Place, raw: &raw::Cell, robot: &Robot, chain: usize) -> Checked<(u8, u8)> {
     let Some(chain) = robot.chains.get(chain) else { return Ok((0, 0)) };
     let (joints, rows) = (chain.joints.len(), chain.rows.len());
@@ -149,7 +149,7 @@ fn place(at: &Place, raw: &raw::Cell, robot: &Robot, chain: usize) -> Checked<(u
     match (joint, row) {
         (None, None) => Err(at
             .key("joint")
-            .fault("", format_args!("which joint moves the cell? there are 1 to {joints}"))),
+            .fault("", format_args!("which joint moves the cell? the joints are 1 to {joints}"))),
         (Some(joint), None) => Ok((joint, chain.row_of(joint).unwrap_or_default())),
         (given, Some(row)) => match chain.joint_below(row) {
             0 => Err(at.key("row").fault(row, "no joint moves what this row carries")),
@@ -162,7 +162,7 @@ fn place(at: &Place, raw: &raw::Cell, robot: &Robot, chain: usize) -> Checked<(u
     }
 }
 
-/// The bus that a cell names; it need not name the only one.
+/// Returns the bus of a cell. The name may be omitted if there is only one bus.
 fn bus(at: &Place, raw: &raw::Cell, buses: &[Bus]) -> Checked<usize> {
     let names = || buses.iter().map(|bus| format!("{:?}", bus.name)).collect::<Vec<_>>().join(", ");
     let at = at.key("bus");
@@ -175,7 +175,7 @@ fn bus(at: &Place, raw: &raw::Cell, buses: &[Bus]) -> Checked<usize> {
     }
 }
 
-/// The outward normal, as it is given or as the z axis of an orientation.
+/// Returns the outward normal: the given one, or the z axis of the orientation.
 fn normal(at: &Place, raw: &raw::Cell) -> Checked<[f64; 3]> {
     match (raw.orientation, raw.normal) {
         (Some(orientation), None) => {

@@ -1,4 +1,4 @@
-//! The robot's joints and chains, from the file's words to checked types.
+//! Checks of the robot's joints and chains in a skin file.
 
 use core::f64::consts::TAU;
 
@@ -8,14 +8,14 @@ use crate::document::{Checked, Place};
 use crate::fixed::Q1_14;
 use crate::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
 
-/// Positions in m that a word holds: [-2, 2), less some steps for rounding.
+/// Maximum position of a prismatic joint in m: the 2 m of a word, less a margin for rounding.
 const SLIDE: f64 = 2.0 - 1e-3;
-/// How far a chain begins from the robot's base, in m.
+/// Maximum coordinate of a chain's base relative to the robot's base, in m.
 const FAR: f64 = 100.0;
-/// How far a quaternion's length may be from one.
+/// Maximum deviation of a vector's or quaternion's length from one.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
-/// The robot of the file's words.
+/// Checks the robot.
 pub(super) fn robot(raw: raw::Robot) -> Checked<Robot> {
     let at = Place::named("robot");
     if raw.urdf.as_ref().is_some_and(String::is_empty) {
@@ -42,7 +42,7 @@ pub(super) fn robot(raw: raw::Robot) -> Checked<Robot> {
     }
 }
 
-/// A robot of one chain of revolute joints, a row each.
+/// Creates a robot with one chain of revolute joints, one row per joint.
 fn serial(
     at: &Place,
     name: String,
@@ -78,7 +78,7 @@ fn serial(
     Ok(Robot { name, urdf: None, joints: all.iter().enumerate().map(joint).collect(), chains: vec![chain] })
 }
 
-/// Whether the lengths of a row fit their words, and its angles are numbers.
+/// Checks that the lengths of a row fit their words and its angles are finite.
 fn fits(at: &Place, row: &DenavitHartenberg) -> Checked<()> {
     at.key("a").fit(row.a, Q1_14::try_nearest)?;
     at.key("d").fit(row.d, Q1_14::try_nearest)?;
@@ -89,7 +89,7 @@ fn fits(at: &Place, row: &DenavitHartenberg) -> Checked<()> {
 
 fn limits(at: &Place, [min, max]: [f64; 2], kind: JointKind) -> Checked<[f64; 2]> {
     let got = format!("[{min}, {max}]");
-    // Written so that NaN is refused too.
+    // This form also refuses NaN.
     if !(min.is_finite() && max.is_finite() && min < max) {
         return Err(at.fault(got, "the smaller position comes first"));
     }
@@ -217,7 +217,7 @@ pub(super) fn same_length(at: &Place, got: usize, joints: usize) -> Checked<()> 
     Err(at.fault(format_args!("{got} values"), why))
 }
 
-/// Parts of length one, exactly.
+/// Normalises a vector or quaternion, whose length must be one within the tolerance.
 pub(super) fn unit<const N: usize>(at: &Place, what: &str, parts: [f64; N]) -> Checked<[f64; N]> {
     let length = parts.iter().map(|part| part * part).sum::<f64>().sqrt();
     if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {

@@ -1,4 +1,4 @@
-//! From the file's words to checked types.
+//! Checks of a skin file: conversion from raw values to checked types.
 
 use super::chains::{self, same_length};
 use super::{Bus, Cell, Controller, ControllerKind, LostBus, Reply, Safety, Skin, Timing};
@@ -7,19 +7,19 @@ use crate::document::{Checked, Place, span};
 use crate::fixed::Q;
 use crate::parameters::Contact;
 
-/// A whole skin.
+/// Checks a whole skin.
 pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
     names::check(&raw)?;
     checked(raw, |_| true)
 }
 
-/// A whole skin out of a recording, whose names are escaped instead of refused.
+/// Checks a whole skin from a recording. Unprintable characters in names are escaped instead of refused.
 pub(super) fn recorded_skin(mut raw: raw::Skin) -> Checked<Skin> {
     names::escape(&mut raw);
     checked(raw, |_| true)
 }
 
-/// A skin that has the cells of a bus of this name, and of no other.
+/// Checks a skin that contains the cells of one bus only.
 pub(super) fn skin_on(raw: raw::Skin, bus: &str) -> Checked<Skin> {
     let skin = checked(raw, |of| of.name == bus)?;
     let is_other = |cell: &Cell| skin.buses.get(cell.bus).is_some_and(|of| of.name != bus);
@@ -29,14 +29,14 @@ pub(super) fn skin_on(raw: raw::Skin, bus: &str) -> Checked<Skin> {
     }
 }
 
-/// Checks everything; `has_cells` says of which buses the cells are there.
+/// Checks everything. `has_cells` returns true for the buses whose cells are present.
 fn checked(raw: raw::Skin, has_cells: impl Fn(&Bus) -> bool) -> Checked<Skin> {
     if raw.version != 1 {
         return Err(Place::named("version").fault(raw.version, "this program reads version 1"));
     }
     let robot = chains::robot(raw.robot)?;
     let timing = timing(&raw.timing)?;
-    // The default for a skin without contacts: the force is the sum of the three words.
+    // The default of a skin without `[contact]`: the force is the sum of the three words.
     let plain = Contact { alpha_c: Q::nearest(1.0), ..Contact::default() };
     let contact = cells::contact(&Place::named("contact"), raw.contact, plain)?;
     let events = sensing::events(raw.events)?;
@@ -61,11 +61,12 @@ fn checked(raw: raw::Skin, has_cells: impl Fn(&Bus) -> bool) -> Checked<Skin> {
     Ok(skin)
 }
 
-/// Sums need a way from every cell to the gateway's side, and a slot for each depth of the tree in one period.
+/// Checks the tree of a bus with sums: every cell needs a path to the gateway's side, and every depth a slot
+/// within one period.
 fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> {
     let at = Place::named("bus").nth(index);
     if !skin.cells_of(index).any(|cell| cell.root) {
-        let why = "sums need a way to the gateway, and no cell of this bus has root = true: give it to one";
+        let why = "sums need a path to the gateway, but no cell of this bus has root = true: set it for one";
         return Err(at.key("reply").fault("\"sum\"", why));
     }
     let depths = skin.wires(index).depths();
@@ -94,7 +95,9 @@ fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> 
     } else {
         "no slots fit: send joints less often, or use more roots or buses".to_owned()
     };
-    let why = format!("the tree needs {slots} slots within the {period_us} us from joints to joints: {hint}");
+    let why = format!(
+        "the tree needs {slots} slots within the {period_us} us between two broadcasts of joints: {hint}"
+    );
     Err(at.key("slot_us").fault(slot_us, why))
 }
 

@@ -1,7 +1,7 @@
-//! The description of a skin: the robot, its buses, and where every cell sits.
+//! The description of a skin: the robot, its buses, and the place of every cell.
 //!
-//! A [`Skin`] exists only when everything in its file has been checked. Every error names the line, the key, the value and what is
-//! allowed, in one line.
+//! A [`Skin`] exists only if everything in its file has been checked. Every error names the line, the key,
+//! the value and what is allowed, in one line.
 
 mod baseline;
 mod buses;
@@ -33,145 +33,145 @@ pub use reach::{REACH, reach};
 pub use robot::{Base, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
 pub use wires::Wires;
 
-/// The keys by which a skin is known from a scenario, and the other way round.
+/// Keys that distinguish a skin from a scenario.
 pub const KEYS: &[&str] = &["robot", "cell"];
-/// See [`KEYS`].
+/// Keys that distinguish a scenario from a skin; see [`KEYS`].
 const SCENARIO_KEYS: &[&str] = &["duration_s", "motion", "mode", "touch", "fault", "sensors"];
 
-/// A checked description.
+/// A checked skin description.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Skin {
     /// The skin's name.
     pub name: String,
-    /// The robot that wears it.
+    /// The robot that wears the skin.
     pub robot: Robot,
-    /// How often things happen.
+    /// The rates of the control loop and the joint broadcast.
     pub timing: Timing,
-    /// Which changes of what cells measure are events.
+    /// The thresholds of event mode.
     pub events: Events,
-    /// The buses, in the file's order.
+    /// The buses, in the order of the file.
     pub buses: Vec<Bus>,
-    /// What turns torques into motion.
+    /// The controller that turns torques into motion.
     pub controller: Controller,
-    /// When torques are held, and when the robot is halted.
+    /// Limits for holding torques and halting the robot.
     pub safety: Safety,
-    /// The cells, in the file's order.
+    /// The cells, in the order of the file.
     pub cells: Vec<Cell>,
 }
 
-/// How often things happen.
+/// The rates of the control loop and the joint broadcast.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Timing {
-    /// Ticks of the control loop in a second.
+    /// Frequency of the control loop in Hz.
     pub control_hz: f64,
-    /// Ticks from one joint broadcast to the next.
+    /// Ticks per joint broadcast.
     pub ticks_per_broadcast: u32,
 }
 
 impl Timing {
-    /// Length of a tick in nanoseconds.
+    /// Returns the duration of a tick in ns.
     #[must_use]
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "1 Hz to 10 kHz: checked")]
     pub fn tick_nanos(&self) -> u64 {
         (1e9 / self.control_hz).round() as u64
     }
 
-    /// Joint broadcasts in a second.
+    /// Returns the frequency of the joint broadcast in Hz.
     #[must_use]
     pub fn broadcast_hz(&self) -> f64 {
         self.control_hz / f64::from(self.ticks_per_broadcast)
     }
 }
 
-/// What a bus' cells answer with.
+/// The reply of the cells of a bus to joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Reply {
-    /// Each cell its own torque, in the bus' [`Bus::torque_format`].
+    /// Each cell sends its own torque, in the bus' [`Bus::torque_format`].
     Torque,
-    /// Sums along the tree, Q7.8.
+    /// Cells send sums along the tree, Q7.8.
     Sum {
         /// Width of a slot in µs.
         slot_us: u32,
-        /// Whether what rounding takes away is carried into a cell's next value.
+        /// True if the rounding error is carried into a cell's next value.
         carry: bool,
     },
 }
 
-/// One bus.
+/// A bus of a skin.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Bus {
-    /// The interface's name.
+    /// The name of the interface.
     pub name: String,
-    /// What its cells answer with.
+    /// The reply of its cells.
     pub reply: Reply,
-    /// One FD frame a packet, or several classic ones.
+    /// The frame format: one FD frame per packet, or several classic ones.
     pub format: Format,
-    /// The chain whose skin it carries: an index into [`Robot::chains`].
+    /// The chain that carries its cells: an index into [`Robot::chains`].
     pub chain: usize,
-    /// In which format its cells send their own torques.
+    /// The format of its cells' own torques.
     pub torque_format: TorqueFormat,
-    /// Bits in a second, of hardware; of an FD frame's head and tail.
+    /// Nominal bit rate of hardware in bit/s, if given.
     pub bitrate: Option<u32>,
-    /// Bits in a second of an FD frame's data, of hardware.
+    /// Data bit rate of hardware in bit/s, if given.
     pub data_bitrate: Option<u32>,
-    /// When its cells send what they measure.
+    /// The times at which its cells send measurements.
     pub sensing: Sensing,
 }
 
-/// What turns torques into motion.
+/// The controller that turns torques into motion.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Controller {
-    /// Which one.
+    /// The kind of controller.
     pub kind: ControllerKind,
-    /// The maximum speed of each joint in rad/s, of prismatic ones in m/s.
+    /// Maximum speed of each joint in rad/s, or m/s for prismatic joints.
     pub max_speed: Vec<f64>,
 }
 
-/// Which controller.
+/// The kind of controller.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ControllerKind {
-    /// `M q'' + D q' = tau`, joint by joint: who pushes the skin moves the arm.
+    /// `M q'' + D q' = tau`, independently for each joint: pushing the skin moves the arm.
     Kinesthetic {
-        /// M in kg m2, of prismatic joints in kg.
+        /// M in kg m2, or kg for prismatic joints.
         inertia: Vec<f64>,
-        /// D in Nm s/rad, of prismatic joints in N s/m.
+        /// D in Nm s/rad, or N s/m for prismatic joints.
         damping: Vec<f64>,
     },
-    /// Somebody else's program behind a Unix datagram socket.
+    /// Another program, connected by a Unix datagram socket.
     External {
         /// Path of the socket that the gateway listens on.
         socket: String,
-        /// How long it may take to begin: until then it may be missing, and the robot stands.
+        /// Maximum time until the program sends its first command. The robot stands still meanwhile.
         start: Span,
     },
 }
 
-/// When torques are held, and when the robot is halted.
+/// Limits for holding torques and halting the robot.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Safety {
-    /// Epochs for which the last torque of a cell that fell silent in contact is held.
+    /// Epochs for which the last torque of a cell is held after it stops sending in contact.
     pub hold_epochs: u32,
-    /// Epochs over which it then falls to zero, linearly.
+    /// Epochs over which the torque then decays linearly to zero.
     pub decay_epochs: u32,
-    /// Bad cycles in a row that halt the robot.
+    /// Number of consecutive bad cycles that halt the robot.
     pub bad_cycles: u32,
-    /// What is done while some of several buses are lost.
+    /// The reaction to the loss of some of several buses.
     pub lost_bus: LostBus,
 }
 
-/// What is done while some buses are lost and others are not. When all are lost the torque may not be used,
-/// whatever this is.
+/// The reaction to the loss of some of several buses. If all are lost, the torque is invalid in any case.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum LostBus {
-    /// The torques of a lost bus decay to zero like those of silent cells, and the robot goes on with the others.
+    /// The torques of a lost bus decay to zero like those of missing cells; the robot continues with the
+    /// others.
     #[default]
     GoOn,
-    /// The torque may not be used: bad cycles, which halt the robot.
+    /// The torque is invalid; the bad cycles halt the robot.
     Halt,
 }
 
 impl LostBus {
-    /// The word in the file.
+    /// Returns the word in the file.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -181,37 +181,38 @@ impl LostBus {
     }
 }
 
-/// One cell.
+/// A cell of a skin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cell {
-    /// Which bus it is on: an index into [`Skin::buses`].
+    /// Its bus: an index into [`Skin::buses`].
     pub bus: usize,
-    /// Its number there.
+    /// Its node id on that bus.
     pub node: CellId,
     /// Its serial number.
     pub serial: u32,
-    /// The joint k of its chain that moves the link it sits on, from 1.
+    /// The joint k that moves its link, counted from 1 in its chain.
     pub joint: u8,
-    /// The row of its chain in whose frame it sits, from 1: that of joint k, or a fixed one after it.
+    /// The row whose frame carries it, counted from 1 in its chain: that of joint k, or a fixed one after it.
     pub row: u8,
     /// Position in the frame of that row, in m.
     pub position: [f64; 3],
     /// Outward normal in the same frame: the cell's z axis.
     pub normal: [f64; 3],
-    /// Its orientation in the same frame, a quaternion x, y, z, w, if the file has more than its normal.
+    /// Its orientation in the same frame, a quaternion x, y, z, w; `None` if the file only gives the normal.
     pub orientation: Option<[f64; 4]>,
-    /// What is wired to its ports.
+    /// The cell wired to each port.
     pub neighbors: [Option<CellId>; 4],
-    /// Whether it is wired to the gateway's side.
+    /// True if it is wired to the gateway's side.
     pub root: bool,
     /// Its gains and thresholds as words.
     pub contact: Contact,
-    /// What it takes for the zero of its force sensor.
+    /// The baseline of its force sensor.
     pub baseline: Baseline,
 }
 
 impl Skin {
-    /// The part of it on some of its buses, given as indices into [`Skin::buses`]; indices that are none are left out.
+    /// Returns the part of the skin on some buses, given as indices into [`Skin::buses`]. Invalid indices are
+    /// ignored.
     #[must_use]
     pub fn on_buses(&self, kept: &[usize]) -> Self {
         let place = |bus: usize| kept.iter().position(|&it| it == bus);
@@ -221,7 +222,7 @@ impl Skin {
         Self { buses: buses.collect(), ..self.with_cells(cells.collect()) }
     }
 
-    /// The same with other cells; its own are not copied.
+    /// Returns a copy with other cells, without copying its own.
     #[must_use]
     pub fn with_cells(&self, cells: Vec<Cell>) -> Self {
         let Self { name, robot, timing, events, buses, controller, safety, cells: _ } = self;
@@ -240,32 +241,32 @@ impl Skin {
     /// Reads and checks a file.
     ///
     /// # Errors
-    /// When it cannot be read, or the first thing that is wrong with it.
+    /// Returns an error if it cannot be read, or the first error in it.
     pub fn read(path: &Path) -> Result<Self, DocumentError> {
         Self::parse(&path.display().to_string(), &document::text(path)?)
     }
 
-    /// Checks a text; `path` is what errors call it.
+    /// Parses and checks a text. `path` is its name in errors.
     ///
     /// # Errors
-    /// The first thing that is wrong with it.
+    /// Returns the first error in the text.
     pub fn parse(path: &str, text: &str) -> Result<Self, DocumentError> {
         let what = "this is a scenario, not a skin: `skinbus run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, check::skin)
             .map_err(|error: DocumentError| error.or_mistaken(text, SCENARIO_KEYS, KEYS, what))
     }
 
-    /// Checks the text of a skin in a recording; `path` is what errors call it.
+    /// Parses and checks the text of a skin in a recording. `path` is its name in errors.
     ///
-    /// Unprintable characters of its names are written like `\u{1b}`; [`Skin::parse`] refuses them.
+    /// Unprintable characters in names are escaped like `\u{1b}`; [`Skin::parse`] refuses them.
     ///
     /// # Errors
-    /// The first thing that is wrong with it.
+    /// Returns the first error in the text.
     pub fn parse_recorded(path: &str, text: &str) -> Result<Self, DocumentError> {
         document::parse(path, text, check::recorded_skin)
     }
 
-    /// The words that a cell computes with.
+    /// Returns the parameters of a cell.
     #[must_use]
     #[expect(clippy::missing_panics_doc, reason = "only a checked skin exists, and checking made sure of it")]
     pub fn parameters(&self, cell: &Cell) -> Parameters {
@@ -300,7 +301,7 @@ impl Skin {
         Some(parameters.shortest())
     }
 
-    /// The chain of a bus, given as an index into [`Skin::buses`].
+    /// Returns the chain of a bus, given as an index into [`Skin::buses`].
     #[must_use]
     #[expect(clippy::missing_panics_doc, reason = "each bus of a checked skin has a chain")]
     pub fn chain(&self, bus: usize) -> &Chain {
@@ -308,7 +309,7 @@ impl Skin {
         self.robot.chains.get(chain).expect("a checked skin has the chains of its buses")
     }
 
-    /// The joints of a bus' chain, base to tip, each with its index into [`Robot::joints`].
+    /// Returns the joints of a bus' chain from base to tip, each with its index into [`Robot::joints`].
     pub fn joints_of(&self, bus: usize) -> impl ExactSizeIterator<Item = (usize, &Joint)> {
         self.chain(bus).joints.iter().map(|&joint| (joint, self.joint(joint)))
     }
@@ -318,13 +319,13 @@ impl Skin {
         self.robot.joints.get(joint).expect("a checked skin has the joints of its chains")
     }
 
-    /// How long joints, torques and sums on a bus are.
+    /// Returns the packet length of joints, torques and sums on a bus.
     #[must_use]
     pub fn length_of(&self, bus: usize) -> Length {
         Length::for_joints(self.chain(bus).joints.len())
     }
 
-    /// From one broadcast of joints to the next, in µs; `None` for more than a word holds.
+    /// Returns the period of the joint broadcast in µs; `None` if it does not fit a word.
     #[must_use]
     #[expect(
         clippy::cast_possible_truncation,
@@ -335,18 +336,18 @@ impl Skin {
         u16::try_from((1e6 / self.timing.broadcast_hz()).round() as u64).ok()
     }
 
-    /// The cells of one bus, in the file's order.
+    /// Returns the cells of a bus, in the order of the file.
     pub fn cells_of(&self, bus: usize) -> impl Iterator<Item = &Cell> {
         self.cells.iter().filter(move |cell| cell.bus == bus)
     }
 
-    /// The same skin with the cells of one bus only.
+    /// Returns a copy with the cells of one bus only. All buses are kept.
     #[must_use]
     pub fn part_on(&self, bus: usize) -> Self {
         self.with_cells(self.cells_of(bus).cloned().collect())
     }
 
-    /// The bus of this name, as an index into [`Skin::buses`].
+    /// Returns the index of the bus with this name in [`Skin::buses`].
     #[must_use]
     pub fn bus_named(&self, name: &str) -> Option<usize> {
         self.buses.iter().position(|bus| bus.name == name)

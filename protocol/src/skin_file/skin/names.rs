@@ -1,14 +1,15 @@
-//! Names in a skin file: they reach terminals, URDF, SVG and topics, and nobody may be misled by one.
+//! Checks of names in a skin file. Names appear on terminals and in URDF, SVG and topics, and must not be
+//! misleading there.
 
 use super::raw;
 use crate::document::{Checked, Place};
 use crate::usage::{is_unprintable, shown};
 
-/// The longest name, in characters.
+/// Maximum length of a name in characters.
 const MAX_CHARACTERS: usize = 200;
 
-/// Refuses names that are empty, too long, or have characters that a terminal obeys, that turn the direction of text, or
-/// that XML cannot hold.
+/// Refuses names that are empty, too long, or contain characters that control a terminal, change the
+/// direction of text, or are not allowed in XML.
 pub(super) fn check(skin: &raw::Skin) -> Checked<()> {
     let robot = Place::named("robot");
     for (at, given) in [(Place::named("name"), &skin.name), (robot.key("name"), &skin.robot.name)] {
@@ -39,8 +40,8 @@ fn name(at: &Place, name: &str) -> Checked<()> {
     Ok(())
 }
 
-/// Writes unprintable characters of names like `\u{1b}`: a recording is read whatever its skin's names are, and names that
-/// differ stay different.
+/// Escapes unprintable characters in names like `\u{1b}`, so that every recording can be read. Different
+/// names stay different.
 pub(super) fn escape(skin: &mut raw::Skin) {
     let robot = &mut skin.robot;
     let named = [&mut skin.name, &mut robot.name].into_iter();

@@ -1,5 +1,5 @@
-//! A skin's text without the cells of other buses: whoever has the cells of one bus of many need not read the others,
-//! which are most of the file.
+//! Parsing of a skin without the cells of other buses. A process with the cells of one of many buses need not
+//! parse the others, which are most of the file.
 
 use std::path::Path;
 
@@ -7,20 +7,20 @@ use super::{DocumentError, Skin, check};
 use crate::document;
 
 impl Skin {
-    /// Reads a file's part on a bus, as [`Skin::parse_on`].
+    /// Reads the part of a file on one bus, like [`Skin::parse_on`].
     ///
     /// # Errors
-    /// When it cannot be read, or the first thing that is wrong with it.
+    /// Returns an error if it cannot be read, or the first error in it.
     pub fn read_on(path: &Path, bus: &str) -> Result<Self, DocumentError> {
         Self::parse_on(&path.display().to_string(), &document::text(path)?, bus)
     }
 
-    /// As [`Skin::parse`], with the cells of one bus only, as [`Skin::part_on`] has them; with all of them when there is
-    /// no such bus. The cells of other buses are not looked at, unless something is wrong with the rest: then the whole
-    /// text is read, for its first error.
+    /// Like [`Skin::parse`], but with the cells of one bus only, as from [`Skin::part_on`]; with all cells if
+    /// there is no such bus. The cells of other buses are not checked, unless the rest has an error: then the
+    /// whole text is parsed, to report its first error.
     ///
     /// # Errors
-    /// The first thing that is wrong with it.
+    /// Returns the first error in the text.
     pub fn parse_on(path: &str, text: &str, bus: &str) -> Result<Self, DocumentError> {
         if let Some(part) = without_others(text, bus)
             && let Ok(skin) = document::parse(path, &part, |raw| check::skin_on(raw, bus))
@@ -33,17 +33,19 @@ impl Skin {
     }
 }
 
-/// The text without each `[[cell]]` that names another bus; none where a line may stand within a string.
+/// Returns the text without each `[[cell]]` that names another bus; `None` if a line may be inside a
+/// multi-line string.
 fn without_others(text: &str, bus: &str) -> Option<String> {
     if text.contains("\"\"\"") || text.contains("'''") {
         return None;
     }
     let mut part = String::new();
-    // Where the section begins that is being read, whether it is a cell, and whether that is another bus'.
+    // The start of the current section, whether it is a cell, and whether that is on another bus.
     let (mut begun, mut is_cell, mut is_other, mut at) = (0, false, false, 0);
     for line in text.split_inclusive('\n') {
         let word = line.trim_start();
-        // A line within an array ends a section too early at worst, and what is left of it then is no skin.
+        // A line of a multi-line array may look like a header. The rest of such a section does not parse as a
+        // skin.
         if word.starts_with('[') {
             part.push_str(text.get(begun..at).filter(|_| !is_other).unwrap_or_default());
             (begun, is_cell, is_other) = (at, word.starts_with("[[cell]]"), false);
@@ -56,7 +58,7 @@ fn without_others(text: &str, bus: &str) -> Option<String> {
     Some(part)
 }
 
-/// The bus that a line of a cell names in the usual way.
+/// Returns the bus that a line of a cell names in the usual notation.
 fn named_bus(line: &str) -> Option<&str> {
     let value = line.strip_prefix("bus")?.trim_start().strip_prefix('=')?.trim_start().strip_prefix('"')?;
     let (name, _) = value.split_once('"')?;
@@ -68,7 +70,7 @@ mod tests {
     use super::super::tests::GOOD;
     use super::*;
 
-    /// The cells of [`GOOD`] on each of two buses, in turn.
+    /// Returns [`GOOD`] with two buses, each with its cells.
     fn two_buses(reply: &str) -> String {
         let bus = "[[bus]]\nname = \"vcan0\"\nreply = \"torque\"\nformat = \"fd\"\n\n";
         let other = bus.replace("vcan0", "vcan1").replace("\"torque\"", reply);

@@ -1,4 +1,4 @@
-//! A skin's file as it is written, before it is checked.
+//! The structure of a skin file before it is checked.
 
 use serde::Deserialize;
 
@@ -76,7 +76,7 @@ pub(super) struct Chain {
     pub(super) rows: Vec<Row>,
 }
 
-/// Where a chain begins.
+/// The base of a chain.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Base {
@@ -85,7 +85,7 @@ pub(super) struct Base {
     pub(super) orientation: Option<[f64; 4]>,
 }
 
-/// A row of a chain; without a joint it is fixed.
+/// A row of a chain; fixed if it has no joint.
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Row {
@@ -108,13 +108,13 @@ pub(super) struct Timing {
 }
 
 impl Default for Timing {
-    /// The paper's.
+    /// The rates of the paper.
     fn default() -> Self {
         Self { control_hz: 500.0, joint_broadcast_hz: 62.5 }
     }
 }
 
-/// Gains and thresholds; in a cell, those that differ from the skin's.
+/// Gains and thresholds; in a cell, overrides of those of the skin.
 #[derive(Clone, Copy, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Contact {
@@ -159,7 +159,7 @@ impl Default for Bus {
     }
 }
 
-/// Which changes of what cells measure are events.
+/// The thresholds of event mode.
 #[derive(Clone, Copy, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Events {
@@ -170,7 +170,7 @@ pub(super) struct Events {
     pub(super) hysteresis: Option<f64>,
 }
 
-/// What cells take for the zero of their force sensors.
+/// The baseline of the force sensors.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Baseline {
@@ -219,7 +219,7 @@ pub(super) struct Safety {
 }
 
 impl Default for Safety {
-    /// Two missing replies are held, four more decay to zero; a twentieth of a second of bad cycles halts.
+    /// Two missing replies are held, four more decay to zero, and 25 bad cycles (1/20 s) halt the robot.
     fn default() -> Self {
         Self { hold_epochs: 2, decay_epochs: 4, bad_cycles: 25, lost_bus: LostBus::GoOn.name().to_owned() }
     }
@@ -250,7 +250,7 @@ pub(super) struct Cell {
 }
 
 impl Cell {
-    /// What this cell overrides.
+    /// Returns the overrides of this cell.
     pub(super) const fn contact(&self) -> Contact {
         Contact {
             alpha_c: self.alpha_c,

@@ -1,19 +1,19 @@
-//! How far a cell can come from the joints that move it.
+//! The reach of a cell: its maximum distance from the joints that move it.
 //!
-//! A bound of every moment of a unit force that a kernel meets on its way: the distance of the cell from the origin of
-//! each frame below it. Where the cell can be is followed from its row down to the base as the hull of circles: a
-//! revolute joint spreads it around its axis, a prismatic one along it, and rows that do not move only carry it, so that
-//! long rows that fold back cost nothing.
+//! The reach bounds every moment of a unit force that a kernel computes on its way: the distance of the cell
+//! from the origin of each frame below it. The algorithm follows the possible positions of the cell from its
+//! row down to the base, as the hull of circles. A revolute joint spreads them around its axis and a
+//! prismatic joint along it; fixed rows only move them, so that long rows that fold back cost nothing.
 
 use super::robot::{ChainRow, DenavitHartenberg};
 use crate::parameters::RowKind;
 
-/// Metres that words in Q1.14 can hold, less some steps for what a chain of roundings adds.
+/// Maximum reach in m: the range of Q1.14, less a margin for accumulated rounding.
 pub const REACH: f64 = 2.0 - 1e-3;
 
 type Vector = [f64; 3];
 
-/// All points at a distance from a centre, in the plane across an axis of length one.
+/// The points at a distance from a centre, in the plane perpendicular to a unit axis.
 #[derive(Clone, Copy, Debug)]
 struct Circle {
     center: Vector,
@@ -25,7 +25,8 @@ fn dot([a, b, c]: Vector, [x, y, z]: Vector) -> f64 {
     a * x + b * y + c * z
 }
 
-/// `Tz(d) Tx(a) Rx(alpha)`, and with a given angle `Rz(theta)` before it: from a row's frame to the one below.
+/// Applies `Rz(theta) Tz(d) Tx(a) Rx(alpha)`: from a row's frame to the frame below. Translations apply to
+/// points only.
 fn carry(row: &DenavitHartenberg, d: f64, theta: f64, [x, y, z]: Vector, is_point: bool) -> Vector {
     let (sine, cosine) = row.alpha.sin_cos();
     let (a, d) = if is_point { (row.a, d) } else { (0.0, 0.0) };
@@ -40,14 +41,14 @@ impl Circle {
         Self { center, axis: carry(row, d, theta, self.axis, false), radius: self.radius }
     }
 
-    /// The distance of its farthest point from the origin.
+    /// Returns the distance of its farthest point from the origin.
     fn farthest(&self) -> f64 {
         let along = dot(self.center, self.axis);
         let across = (dot(self.center, self.center) - along * along).max(0.0).sqrt();
         (across + self.radius).hypot(along)
     }
 
-    /// The distance of its farthest point from the z axis, and what it spans along that.
+    /// Returns the distance of its farthest point from the z axis, and its range along the axis.
     fn around_z(&self) -> (f64, [f64; 2]) {
         let [x, y, z] = self.center;
         let [ax, ay, _] = self.axis;
@@ -56,15 +57,16 @@ impl Circle {
     }
 }
 
-/// The farthest that a point of a row's frame can come from the origin of any frame below it, down to the first revolute
-/// joint's, of which its axis counts, in m: an upper bound, while revolute joints turn freely and prismatic ones are
-/// within their limits. `rows` are those from the base to that row. No moment of a unit force at that point is greater.
+/// Returns an upper bound in m of the distance of a point from the origin of each frame below it, for joints
+/// within their limits; revolute joints turn freely. At the first revolute joint only the distance from its
+/// axis counts. `rows` are the rows from the base to that of the point. No moment of a unit force at the
+/// point exceeds the bound.
 #[must_use]
 pub fn reach(rows: &[ChainRow], position: [f64; 3]) -> f64 {
     let mut circles = vec![Circle { center: position, axis: [0.0, 0.0, 1.0], radius: 0.0 }];
     let farthest = |circles: &[Circle]| circles.iter().map(Circle::farthest).fold(0.0, f64::max);
     let mut most = farthest(&circles);
-    // A bound that does not know directions: no distance grows by more than a row's length.
+    // A simpler bound without directions: no distance grows by more than the length of a row.
     let mut sphere = most;
     let first = rows.iter().position(|row| row.kind == RowKind::Revolute).unwrap_or(rows.len());
     for (index, row) in rows.iter().enumerate().skip(first).rev() {
@@ -75,7 +77,7 @@ pub fn reach(rows: &[ChainRow], position: [f64; 3]) -> f64 {
             circles.iter().map(move |circle| circle.carry(table, table.d + slide, table.theta_offset))
         });
         let carried: Vec<_> = carried.collect();
-        // What lies along the first axis has no moment about it.
+        // An offset along the first axis has no moment about it.
         let along = slides.iter().map(|slide| (table.d + slide).abs()).fold(0.0, f64::max);
         sphere += table.a.hypot(if index == first { 0.0 } else { along });
         circles = carried;

@@ -5,51 +5,51 @@ use serde::Deserialize;
 use crate::fixed::Q1_14;
 use crate::parameters::RowKind;
 
-/// Joints that a robot can have, over all of its chains.
+/// Maximum number of joints of a robot, over all of its chains.
 pub const MAX_ROBOT_JOINTS: usize = 32;
 
-/// A tree of joints, as chains from its base that may share their first joints.
+/// A tree of joints, given as chains from the base that may share their first joints.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Robot {
     /// Its name.
     pub name: String,
-    /// The file that describes what it looks like: a path from the skin's file.
+    /// The path of its URDF file, relative to the skin file.
     pub urdf: Option<String>,
-    /// Its joints, in the order in which controllers and recordings have them.
+    /// Its joints, in the order of controllers and recordings.
     pub joints: Vec<Joint>,
-    /// Its chains, each of which has a joint at least.
+    /// Its chains, each with at least one joint.
     pub chains: Vec<Chain>,
 }
 
-/// One joint.
+/// A joint of the robot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Joint {
     /// Its name.
     pub name: String,
-    /// What it does.
+    /// Its kind.
     pub kind: JointKind,
     /// Minimum and maximum position, in the unit of its kind.
     pub limits: [f64; 2],
 }
 
-/// What a joint does.
+/// The kind of a joint.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum JointKind {
-    /// It turns: positions in rad, torques in Nm.
+    /// Revolute: positions in rad, torques in Nm.
     #[default]
     Revolute,
-    /// It slides: positions in m, forces in N.
+    /// Prismatic: positions in m, forces in N.
     Prismatic,
 }
 
 impl JointKind {
-    /// Its name.
+    /// Returns the name of the kind.
     #[must_use]
     pub const fn name(self) -> &'static str {
         self.row().name()
     }
 
-    /// The kind of its row.
+    /// Returns the kind of its row.
     #[must_use]
     pub const fn row(self) -> RowKind {
         match self {
@@ -58,7 +58,7 @@ impl JointKind {
         }
     }
 
-    /// The unit of its position.
+    /// Returns the unit of its position.
     #[must_use]
     pub const fn unit(self) -> &'static str {
         match self {
@@ -67,7 +67,7 @@ impl JointKind {
         }
     }
 
-    /// The unit of its torque or force.
+    /// Returns the unit of its torque or force.
     #[must_use]
     pub const fn torque_unit(self) -> &'static str {
         match self {
@@ -76,7 +76,7 @@ impl JointKind {
         }
     }
 
-    /// A position as a word: quarter turns or m. `None` when it is not finite.
+    /// Converts a position in rad or m to a word: quarter turns or m. Returns `None` if it is not finite.
     #[must_use]
     pub fn word(self, position: f64) -> Option<Q1_14> {
         match self {
@@ -85,7 +85,7 @@ impl JointKind {
         }
     }
 
-    /// The position that a word stands for, in rad or m.
+    /// Converts a word to a position in rad or m.
     #[must_use]
     pub fn position(self, word: Q1_14) -> f64 {
         match self {
@@ -95,25 +95,25 @@ impl JointKind {
     }
 }
 
-/// A chain of joints, base to tip.
+/// A chain of joints, from base to tip.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Chain {
     /// Its name.
     pub name: String,
-    /// Where frame 0 of its table is, seen from the robot's base.
+    /// The pose of frame 0 of its table, relative to the robot's base.
     pub base: Base,
     /// Its joints as indices into [`Robot::joints`]; 1 to 14.
     pub joints: Vec<usize>,
-    /// Its table, base to tip: a row for each joint, and fixed ones; at most 32.
+    /// Its table from base to tip: a row for each joint, and fixed rows; at most 32.
     pub rows: Vec<ChainRow>,
 }
 
-/// A pose: where a chain begins. No cell computes with it.
+/// The pose of a chain's base. No cell uses it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Base {
-    /// In m.
+    /// Position in m.
     pub position: [f64; 3],
-    /// A unit quaternion: x, y, z, w.
+    /// Orientation as a unit quaternion x, y, z, w.
     pub orientation: [f64; 4],
 }
 
@@ -124,7 +124,7 @@ impl Default for Base {
 }
 
 impl Base {
-    /// From frame 0 to the robot's base, as a matrix of 4 by 4 in columns, lengths in m.
+    /// Returns the transform from frame 0 to the robot's base, as a 4 by 4 matrix in columns, lengths in m.
     #[must_use]
     pub fn matrix(&self) -> [[f64; 4]; 4] {
         let norm = self.orientation.iter().map(|it| it * it).sum::<f64>().sqrt();
@@ -139,18 +139,18 @@ impl Base {
     }
 }
 
-/// One row of a chain's table.
+/// A row of a chain's table.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ChainRow {
-    /// What its joint does.
+    /// The kind of its joint.
     pub kind: RowKind,
     /// Its constants.
     pub table: DenavitHartenberg,
-    /// The range of its joint's position; zeros of a fixed row.
+    /// The range of its joint's position; zeros for a fixed row.
     pub limits: [f64; 2],
 }
 
-/// One row of a table, `Rz(theta + theta_offset) Tz(d) Tx(a) Rx(alpha)`; what is not said is 0.
+/// A row of a table, `Rz(theta + theta_offset) Tz(d) Tx(a) Rx(alpha)`; omitted values are 0.
 #[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq)]
 #[serde(deny_unknown_fields, default)]
 pub struct DenavitHartenberg {
@@ -160,19 +160,20 @@ pub struct DenavitHartenberg {
     pub alpha: f64,
     /// Offset along the joint's axis in m; the position of a prismatic joint is added to it.
     pub d: f64,
-    /// What is added to the position of a revolute joint, in rad; the whole angle of other rows.
+    /// Angle added to the position of a revolute joint, in rad; the whole angle of other rows.
     pub theta_offset: f64,
 }
 
 impl Chain {
-    /// The row of a joint, which is counted from 1; from 1.
+    /// Returns the row of a joint; both are counted from 1.
     #[must_use]
     pub fn row_of(&self, joint: u8) -> Option<u8> {
         let moving = (1..).zip(&self.rows).filter(|(_, row)| row.kind != RowKind::Fixed);
         moving.map(|(number, _)| number).nth(usize::from(joint).checked_sub(1)?)
     }
 
-    /// The joint that moves the link of a row, both counted from 1; 0 below the first joint.
+    /// Returns the joint that moves the link of a row, both counted from 1; 0 for rows before the first
+    /// joint.
     #[must_use]
     pub fn joint_below(&self, row: u8) -> u8 {
         let moving = self.rows.iter().take(row.into()).filter(|row| row.kind != RowKind::Fixed);

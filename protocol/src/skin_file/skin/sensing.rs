@@ -1,14 +1,14 @@
-//! When cells send what they measure, as a skin's file has it.
+//! The sensing modes of buses in a skin file.
 
 use super::raw;
 use crate::document::{Fault, Place};
 use crate::fixed::{OutOfRange, Q};
 use crate::parameters::{Events, Sensing};
 
-/// Continuous sensing at so many frames a second.
+/// Returns continuous sensing with a frequency in Hz.
 ///
 /// # Errors
-/// What is possible instead: a period is a whole number of ms, 1 to 65 535.
+/// Returns a text with the possible values: the period must be a whole number of ms, 1 to 65 535.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within 1 to 65535")]
 pub fn continuous(hz: f64) -> Result<Sensing, String> {
     let period = 1_000.0 / hz;
@@ -25,9 +25,9 @@ pub fn continuous(hz: f64) -> Result<Sensing, String> {
     Ok(Sensing::Continuous { period_ms: nearest as u16 })
 }
 
-/// When the cells of a bus send what they measure.
+/// Checks the sensing mode of a bus.
 pub(super) fn of_bus(at: &Place, bus: &raw::Bus) -> Result<Sensing, Fault> {
-    /// The defaults of a mode.
+    /// The words for a mode.
     #[derive(Clone, Copy)]
     enum Mode {
         Off,
@@ -49,9 +49,9 @@ pub(super) fn of_bus(at: &Place, bus: &raw::Bus) -> Result<Sensing, Fault> {
     }
 }
 
-/// Which changes are events; what is omitted is a cell's default.
+/// Checks the thresholds of event mode; omitted values are a cell's defaults.
 pub(super) fn events(raw: raw::Events) -> Result<Events, Fault> {
-    /// In errors, a threshold's range begins with 0.
+    /// Rounds a threshold; the range in its errors begins with 0.
     fn magnitude<const F: u32>(value: f64) -> Result<Q<F>, OutOfRange> {
         Q::try_nearest(value).map_err(|error| OutOfRange { min: 0.0, ..error })
     }

@@ -47,8 +47,7 @@ alpha_c = 0.5
 neighbors = [0, 0, 0, 1]
 "#;
 
-/// A skin whose only bus has these cells, numbered from 1: what is wired to their ports, and whether they are
-/// roots.
+/// Returns a skin with one bus whose cells, numbered from 1, have these neighbours and are roots or not.
 pub(super) fn wired(cells: &[([i64; 4], bool)]) -> Skin {
     Skin::parse("skin.toml", &wired_text("reply = \"torque\"", cells)).unwrap()
 }
@@ -66,7 +65,7 @@ fn wired_text(reply: &str, cells: &[([i64; 4], bool)]) -> String {
     text
 }
 
-/// What is wrong, by its line; columns have a test of their own.
+/// Formats an error with its line but without its column.
 fn by_line(error: DocumentError) -> String {
     let DocumentError::Wrong { path, line, what, .. } = error else { return error.to_string() };
     format!("{path}:{line}: {what}")
@@ -145,10 +144,10 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
         says("inertia = [1.0, 1.0]", "inertia = [1.0]"),
         "skin.toml:26: controller.inertia = 1 values: one for each of the robot's 2 joints is needed"
     );
-    assert_eq!(says("a = 0.5", "a = 2.5"), "skin.toml:8: robot.joints[1].a = 2.5: its word holds [-2, 2)");
+    assert_eq!(says("a = 0.5", "a = 2.5"), "skin.toml:8: robot.joints[1].a = 2.5: the range is [-2, 2)");
     assert_eq!(
         says("alpha_c = 0.5", "alpha_c = 8.5"),
-        "skin.toml:44: cell[1].alpha_c = 8.5: its word holds [-8, 8)"
+        "skin.toml:44: cell[1].alpha_c = 8.5: the range is [-8, 8)"
     );
     assert_eq!(
         says("neighbors = [2,", "neighbors = [9,"),
@@ -269,15 +268,15 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
     );
     assert_eq!(
         fault("reply = \"sum\"\nslot_us = 4001", &CHAIN),
-        "skin.toml:22: bus[0].slot_us = 4001: the tree needs 4 slots within the 16000 us from joints to joints: \
-         at most 4000 us fit"
+        "skin.toml:22: bus[0].slot_us = 4001: the tree needs 4 slots within the 16000 us between two \
+         broadcasts of joints: at most 4000 us fit"
     );
     let mut cells = CHAIN;
     cells[0].1 = false;
     assert_eq!(
         fault(without, &cells),
-        "skin.toml:21: bus[0].reply = \"sum\": sums need a way to the gateway, and no cell of this bus has \
-         root = true: give it to one"
+        "skin.toml:21: bus[0].reply = \"sum\": sums need a path to the gateway, but no cell of this bus has \
+         root = true: set it for one"
     );
     let link_down = |cells: &[_]| fault(without, cells).split_once(": no wire").unwrap().1.to_owned();
     cells = CHAIN;
@@ -340,7 +339,7 @@ fn a_broken_file_says_where_in_one_line() {
     let error = says("version = 1", "version = = 1");
     assert!(error.starts_with("skin.toml:1: ") && error.lines().count() == 1, "{error}");
     for (from, to, said) in [
-        ("joint = 2\n", "", "skin.toml:30: cell[0].joint: which joint moves the cell? there are 1 to 2"),
+        ("joint = 2\n", "", "skin.toml:30: cell[0].joint: which joint moves the cell? the joints are 1 to 2"),
         ("joint = 2", "joint = \"two\"", "skin.toml:33: cell[0].joint = \"two\": a whole number is needed"),
         ("joint = 2", "joint = 18446744073709551616", "= 18446744073709551616: the number is too large"),
         ("joint = 2", "joint = \"vcan0:2\"", ": write 2, and bus = \"vcan0\" as a key of its own"),
@@ -348,7 +347,11 @@ fn a_broken_file_says_where_in_one_line() {
         ("joint = 2", "joint = 2.5", "skin.toml:33: cell[0].joint = 2.5: a whole number is needed"),
         ("control_hz = 500.0", "control_hz = \"500\"", "timing.control_hz = \"500\": a number is needed"),
         ("[[bus]]", "[bus]", "bus: it is a list of tables: write [[bus]]"),
-        ("alpha_c = 1.0", "alpha_c = pi/2", "; a number has neither unit nor formula, as 5000000 or 1.5708"),
+        (
+            "alpha_c = 1.0",
+            "alpha_c = pi/2",
+            "; write numbers without units or formulas, such as 5000000 or 1.5708",
+        ),
     ] {
         let got = says(from, to);
         assert!(got.ends_with(said) && got.lines().count() == 1, "{got}");
@@ -408,7 +411,7 @@ fn thresholds_of_events_have_defaults_and_fit_their_words() {
 
     let fault = |lines: &str| by_line(Skin::parse("skin.toml", &with(lines)).unwrap_err());
     assert_eq!(fault("contact_n = -1.0"), "skin.toml:25: events.contact_n = -1: must not be negative");
-    assert_eq!(fault("contact_n = 32.0"), "skin.toml:25: events.contact_n = 32: its word holds [0, 32)");
+    assert_eq!(fault("contact_n = 32.0"), "skin.toml:25: events.contact_n = 32: the range is [0, 32)");
     assert_eq!(
         fault("hysteresis = 1.5"),
         "skin.toml:25: events.hysteresis = 1.5: a part of a threshold: 0 to 1 is possible"
@@ -460,7 +463,7 @@ normal = [0.0, 0.6, 0.8]
     let mut long = Skin::parse("skin.toml", &format!("{head}{long}")).unwrap();
     let (given, same) = (short.cells[0].normal, long.cells[0].normal);
     assert!(given.iter().zip(same).all(|(given, same)| (given - same).abs() < 1e-12), "{same:?}");
-    // Of an orientation it has more than the normal.
+    // An orientation contains more than the normal.
     assert!(long.cells[0].orientation.take().is_some() && short.cells[0].orientation.is_none());
     long.cells[0].normal = given;
     assert_eq!(short, long);

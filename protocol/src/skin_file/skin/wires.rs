@@ -1,9 +1,9 @@
-//! The wires of a bus: which port leads where, and the link id that each end sends with.
+//! The wires of a bus: the end of each port, and the link id that each end sends with.
 //!
-//! Wires are numbered in the order of their first mention: cells in the file's order, ports 0 to 3. After them
-//! comes one wire for each root, to the gateway's side, in the file's order. Two wires between the same two
-//! cells pair in the order of their ports. The end mentioned first sends with [`LinkId::back`] = false, the
-//! other end on true; of a root's wire the cell is the first end.
+//! Wires are numbered in the order of their first mention: cells in the order of the file, ports 0 to 3.
+//! After them comes one wire for each root, to the gateway's side, in the order of the file. Two wires
+//! between the same two cells pair in the order of their ports. The end mentioned first sends with
+//! [`LinkId::back`] = false, the other end with true. The cell is the first end of a root's wire.
 //!
 //! ```text
 //!   cell 1   neighbors = [2, 2, 0, 0], root = true      wire 0   1 port 0 <-> 2 port 1
@@ -18,23 +18,23 @@ use super::{Cell, Skin};
 use crate::id::CellId;
 use crate::port::{LinkId, MAX, PORTS, UPLINK};
 
-/// A port of a cell; [`UPLINK`] is where a root is wired to the gateway's side.
+/// A port of a cell; [`UPLINK`] for a root's wire to the gateway's side.
 type End = (CellId, usize);
 
-// A bus never has more wires than there are link ids.
+// A bus never has more wires than link ids.
 const _: () = assert!(CellId::COUNT * (PORTS + 1) <= MAX);
 
 /// The wires of one bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Wires {
-    /// By cell ([`CellId::index`]) and port, the link id that it sends with.
+    /// The link id that each port sends with, by cell ([`CellId::index`]) and port.
     link_ids: Vec<[Option<LinkId>; PORTS + 1]>,
-    /// By wire, the end mentioned first and the other one, which is none at the gateway's side.
+    /// The ends of each wire: the one mentioned first, and the other, which is `None` at the gateway's side.
     ends: Vec<(End, Option<End>)>,
 }
 
 impl Skin {
-    /// The wires of one bus, given as an index into [`Skin::buses`].
+    /// Returns the wires of a bus, given as an index into [`Skin::buses`].
     #[must_use]
     pub fn wires(&self, bus: usize) -> Wires {
         let cells: Vec<_> = self.cells_of(bus).collect();
@@ -43,8 +43,8 @@ impl Skin {
 }
 
 impl Wires {
-    /// The wires of these cells, all of one bus. A mention that has no other end, which no checked skin has,
-    /// is no wire.
+    /// Returns the wires of these cells, all of one bus. A mention without another end, which a checked skin
+    /// does not have, is ignored.
     pub(super) fn new(cells: &[&Cell]) -> Self {
         let mut wires = Self { link_ids: vec![[None; PORTS + 1]; CellId::COUNT], ends: Vec::new() };
         for cell in cells {
@@ -89,21 +89,20 @@ impl Wires {
         *self.link_ids.get(cell.index())?.get(port)?
     }
 
-    /// The link ids that a cell sends with, by port, with [`UPLINK`] for a root's wire to the gateway's side. It
-    /// receives with the reversed link id.
+    /// Returns the link id that each port of a cell sends with; [`UPLINK`] is a root's wire to the gateway's
+    /// side. The cell receives with the reversed link ids.
     #[must_use]
     pub fn of_cell(&self, cell: CellId) -> [Option<LinkId>; PORTS + 1] {
         self.link_ids.get(cell.index()).copied().unwrap_or_default()
     }
 
-    /// The roots in the file's order, each with the link id that the gateway's side sends with.
+    /// Returns the roots in the order of the file, each with the link id that the gateway's side sends with.
     pub fn roots(&self) -> impl Iterator<Item = (CellId, LinkId)> {
         let uplinks = self.ends.iter().filter(|(_, second)| second.is_none());
         uplinks.filter_map(|&((cell, port), _)| Some((cell, self.link_id(cell, port)?.reversed())))
     }
 
-    /// Where a port leads: to a port of another cell; `None` for a free one, and for an uplink, which leads to
-    /// the gateway's side.
+    /// Returns the cell and port at the other end of a port; `None` for a free port and for an uplink.
     #[must_use]
     pub fn other_end(&self, cell: CellId, port: usize) -> Option<(CellId, usize)> {
         let link_id = self.link_id(cell, port)?;
@@ -111,14 +110,14 @@ impl Wires {
         if link_id.back { Some(first) } else { second }
     }
 
-    /// How many wires there are, those of the roots among them.
+    /// Returns the number of wires, including those of the roots.
     #[must_use]
     pub const fn count(&self) -> usize {
         self.ends.len()
     }
 
-    /// By cell ([`CellId::index`]), how many wires it is from the nearest root, which itself is at 0; `None`
-    /// when no wire leads there from a root.
+    /// Returns the depth of each cell ([`CellId::index`]): the number of wires to the nearest root, whose
+    /// depth is 0; `None` without a path to a root.
     #[must_use]
     pub fn depths(&self) -> [Option<u8>; CellId::COUNT] {
         let mut depths = [None; CellId::COUNT];
@@ -172,7 +171,7 @@ mod tests {
 
     #[test]
     fn a_cell_is_as_deep_as_its_shortest_way_to_a_root() {
-        // 1 - 2 - 3 - 4 - 1 in a ring; 5 hangs below 3.
+        // 1 - 2 - 3 - 4 - 1 form a ring; 5 is connected to 3.
         let skin = wired(&[
             ([2, 4, 0, 0], true),
             ([1, 3, 0, 0], false),
@@ -184,7 +183,7 @@ mod tests {
         assert_eq!(depths[..6], [Some(0), Some(1), Some(2), Some(1), Some(3), None]);
     }
 
-    /// Cells whose ports are joined at random, and of which the first is a root.
+    /// Generates cells whose ports are connected at random, with random roots.
     fn wiring() -> impl Strategy<Value = Vec<([i64; PORTS], bool)>> {
         let joints = proptest::collection::vec((0..24_usize, 0..PORTS, 0..24_usize, 0..PORTS), 0..60);
         (joints, proptest::collection::vec(any::<bool>(), 24)).prop_map(|(joints, roots)| {

@@ -1,4 +1,4 @@
-//! The characters of an XML file.
+//! Character encodings of XML files.
 
 use std::borrow::Cow;
 
@@ -12,17 +12,18 @@ const WINDOWS_1252: [char; 32] = [
     '\u{203a}', '\u{153}', '\u{9d}', '\u{17e}', '\u{178}',
 ];
 
-/// The text of a file: in UTF-8, in UTF-16 with a byte order mark or a declaration, or in Latin-1 or Windows-1252 that is
-/// declared. A file that is UTF-8 is read as such, whatever it declares. A declaration of what was decoded is changed to UTF-8.
+/// Decodes a file: UTF-8, UTF-16 with a byte order mark or a declaration, or declared Latin-1 or
+/// Windows-1252. Valid UTF-8 is read as such, whatever the declaration. The declaration of a decoded file is
+/// changed to UTF-8.
 ///
 /// # Errors
-/// When it is none of these.
+/// Returns an error for any other encoding.
 pub fn text(bytes: &[u8]) -> Result<Cow<'_, str>, Fault> {
     let wide = |bytes: &[u8], read: fn([u8; 2]) -> u16| {
         let words: Vec<_> = bytes.as_chunks().0.iter().map(|word| read(*word)).collect();
         let text = String::from_utf16(&words).ok().filter(|_| bytes.len().is_multiple_of(2));
         let wrong =
-            || "it begins as UTF-16 and is none: it is truncated or damaged; copy or download it again";
+            || "it begins like UTF-16 but is invalid: it is truncated or damaged; copy or download it again";
         text.map(|text| Cow::Owned(redeclared(text)))
             .ok_or_else(|| Fault { line: None, what: wrong().to_owned() })
     };
@@ -52,15 +53,15 @@ pub fn text(bytes: &[u8]) -> Result<Cow<'_, str>, Fault> {
             let from = if matches!(other, "" | "utf-8" | "utf8" | "us-ascii") { "latin1" } else { other };
             let declared = if other.is_empty() { String::new() } else { format!(", declared as {other}") };
             let what = format!(
-                "it is not UTF-8{declared}: save it as UTF-8, as with `iconv -f {from} -t utf-8 FILE > NEW` (of what is in Latin-1)"
+                "it is not UTF-8{declared}: save it as UTF-8, as with `iconv -f {from} -t utf-8 FILE > NEW` (if it is in Latin-1)"
             );
-            let what = if from == "latin1" { what } else { what.replace(" (of what is in Latin-1)", "") };
+            let what = if from == "latin1" { what } else { what.replace(" (if it is in Latin-1)", "") };
             Err(Fault { line: Some(line), what })
         }
     }
 }
 
-/// The name by which `iconv` knows the encoding of a file in UTF-16; `None` for other encodings.
+/// Returns `iconv`'s name for the encoding of a file in UTF-16; `None` for other encodings.
 #[must_use]
 pub fn utf16(bytes: &[u8]) -> Option<&'static str> {
     match bytes {
@@ -71,7 +72,7 @@ pub fn utf16(bytes: &[u8]) -> Option<&'static str> {
     }
 }
 
-/// The encoding that the declaration names, in small letters.
+/// Returns the encoding in the XML declaration, in lower case.
 fn declared(bytes: &[u8]) -> Option<String> {
     let head = bytes.get(..bytes.len().min(1024)).unwrap_or_default();
     let head = String::from_utf8_lossy(head);
@@ -80,7 +81,7 @@ fn declared(bytes: &[u8]) -> Option<String> {
     name.bytes().all(|byte| byte.is_ascii_graphic()).then(|| name.to_ascii_lowercase())
 }
 
-/// Where the declaration has the name of the encoding.
+/// Returns the byte range of the encoding's name in the declaration.
 fn place(text: &str) -> Option<(usize, usize)> {
     let begin = text.find("<?xml")?;
     let declaration = text.get(begin..begin + text.get(begin..)?.find("?>")?)?;
@@ -125,7 +126,7 @@ mod tests {
             assert_eq!(text(&big).unwrap(), expected);
             assert_eq!([&little, &big].map(|bytes| utf16(bytes).unwrap()), names);
         }
-        // What is UTF-8 is no Latin-1, whatever it declares.
+        // Valid UTF-8 is not read as Latin-1, whatever the declaration.
         let both = WORDS.replace("ENC", "latin1");
         assert_eq!(utf16(both.as_bytes()), None);
         assert_eq!(text(both.as_bytes()).unwrap(), both);
@@ -136,7 +137,7 @@ mod tests {
         let refused = |bytes: &[u8]| text(bytes).unwrap_err().to_string();
         assert_eq!(
             refused(b"<r>\n<!-- \xfc --></r>"),
-            "line 2: it is not UTF-8: save it as UTF-8, as with `iconv -f latin1 -t utf-8 FILE > NEW` (of what is in Latin-1)"
+            "line 2: it is not UTF-8: save it as UTF-8, as with `iconv -f latin1 -t utf-8 FILE > NEW` (if it is in Latin-1)"
         );
         assert_eq!(
             refused(b"<?xml version='1.0' encoding='GBK'?>\n<r n='\xc4\xe3'/>"),

@@ -1,9 +1,10 @@
-//! Text that is put into XML or HTML.
+//! Escaping of text for XML and HTML.
 
 use crate::usage::is_unprintable;
 
-/// Returns a text as XML and HTML have it between tags and in quoted attributes. Controls and other unprintable characters become
-/// U+FFFD, because XML has no form for most of them; line feeds and tabs stay.
+/// Escapes a text for use between tags and in quoted attributes of XML and HTML. Control and other
+/// unprintable characters become U+FFFD, because XML cannot represent most of them; line feeds and tabs are
+/// kept.
 #[must_use]
 pub fn escaped(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());

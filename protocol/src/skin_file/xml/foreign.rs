@@ -1,20 +1,20 @@
-//! Files that are not what their name says.
+//! Detection of files that are not what their name says.
 
-/// A file that stands for another one, and a hint.
+/// The detected kind of a file, and a hint.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Foreign {
-    /// The line, from 1, where it has one.
+    /// The line, from 1, if it matters.
     pub line: Option<usize>,
-    /// The kind of file, after "it is".
+    /// The kind of the file, as the continuation of "it is".
     pub what: &'static str,
-    /// The hint, as an order.
+    /// The hint, as an imperative.
     pub hint: &'static str,
 }
 
 const CONFLICT: &[u8] = b"<<<<<<< ";
 
-/// Names a file that stands for another one: a pointer of Git LFS, a saved web page, an archive, or one in which git left both
-/// sides of a conflict.
+/// Detects a file that stands for another one: a Git LFS pointer, a saved web page, an archive, or a file
+/// with an unresolved merge conflict.
 #[must_use]
 pub fn foreign(bytes: &[u8]) -> Option<Foreign> {
     let whole = |what, hint| Some(Foreign { line: None, what, hint });
@@ -40,7 +40,7 @@ pub fn foreign(bytes: &[u8]) -> Option<Foreign> {
     Some(Foreign { line: Some(conflict + 1), what: "a merge conflict of git", hint })
 }
 
-/// Names the format whose outermost element has this name.
+/// Returns the file format whose root element has this name.
 #[must_use]
 pub fn kind_of_root(name: &str) -> Option<&'static str> {
     Some(match name {

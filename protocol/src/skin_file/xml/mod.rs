@@ -1,9 +1,9 @@
-//! XML that other programs read and a strict parser refuses, made readable; and files that are something else.
+//! Tolerant reading of XML that a strict parser refuses, and detection of other files.
 //!
-//! [`text`] decodes a file by its byte order mark or its declaration. [`prepare`] repairs what changes no value: it binds
-//! prefixes that the file does not, blanks comments with `--` inside and a document type without definitions, and takes
-//! NUL bytes off the end. Lines stay where they are. [`foreign`] names files that are no XML or the wrong one. [`escaped`] makes
-//! a text safe to be written into XML or HTML.
+//! [`text`] decodes a file by its byte order mark or its declaration. [`prepare`] makes repairs that change
+//! no value: it binds unbound prefixes, blanks comments that contain `--` and document types without
+//! definitions, and strips trailing NUL bytes. Line numbers do not change. [`foreign`] detects files that are
+//! not XML or not the expected ones. [`escaped`] escapes a text for XML or HTML.
 
 mod encoding;
 mod escape;
@@ -20,20 +20,20 @@ pub use escape::escaped;
 pub use foreign::{Foreign, foreign, kind_of_root};
 use tags::{Part, Tag, parts};
 
-/// The most attributes of an element: a parser compares each with all others.
+/// Maximum number of attributes of an element; a parser compares each with all others.
 pub const MAX_ATTRIBUTES: usize = 256;
 
-/// The most prefixes of a file, and how often it may bind them: a parser compares those that are bound around an element that
-/// binds one more.
+/// Maximum number of prefixes in a file, and of bindings; for each binding, a parser compares all those in
+/// scope.
 const MAX_PREFIXES: usize = 64;
 const MAX_BINDINGS: usize = 10_000;
 
-/// A fault of a file, and what to do.
+/// An error in a file, with advice.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Fault {
-    /// The line, from 1, where it has one.
+    /// The line, from 1, if it is known.
     pub line: Option<usize>,
-    /// One line: what is there, and what to do.
+    /// The problem and the remedy, in one line.
     pub what: String,
 }
 
@@ -52,7 +52,7 @@ impl fmt::Display for Fault {
     }
 }
 
-/// Returns the line, from 1, of a place in a text.
+/// Returns the line number, from 1, of an offset.
 fn line_of(text: &[u8], offset: usize) -> usize {
     let before = text.get(..offset).unwrap_or(text);
     before.iter().filter(|byte| **byte == b'\n').count() + 1
@@ -61,17 +61,17 @@ fn line_of(text: &[u8], offset: usize) -> usize {
 /// A text that is ready for a parser.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Prepared<'a> {
-    /// It begins with the first `<`; its lines are those of the file.
+    /// The text, from the first `<` of the file; its line breaks are those of the file.
     pub text: Cow<'a, str>,
-    /// Lines of the file before it.
+    /// Number of lines of the file before the text.
     pub lines_before: usize,
 }
 
-/// Repairs what changes no value.
+/// Repairs a text without changing a value.
 ///
 /// # Errors
-/// When it has a document type with definitions, an element with more than [`MAX_ATTRIBUTES`] attributes, or anything behind
-/// its outermost element.
+/// Returns an error if the text has a document type with definitions, an element with more than
+/// [`MAX_ATTRIBUTES`] attributes, or content after the root element.
 pub fn prepare(file: &str) -> Result<Prepared<'_>, Fault> {
     let end = file.trim_end_matches(|letter: char| letter == '\0' || letter.is_whitespace()).len();
     let whole = file.get(..end).unwrap_or(file);
@@ -85,27 +85,27 @@ pub fn prepare(file: &str) -> Result<Prepared<'_>, Fault> {
     Ok(Prepared { text: survey.repaired(text), lines_before: line_of(whole.as_bytes(), before) - 1 })
 }
 
-/// The findings of one pass over the parts of a text.
+/// The results of one pass over the parts of a text.
 #[derive(Debug, Default)]
 struct Survey<'a> {
-    /// Comments and document types that become blanks.
+    /// Comments and document types to be blanked.
     blanked: Vec<Range<usize>>,
     /// Prefixes of elements and attributes.
     used: BTreeSet<&'a str>,
-    /// Prefixes that the outermost element binds.
+    /// Prefixes bound at the root element.
     bound: BTreeSet<&'a str>,
-    /// All prefixes, and how often the text binds one.
+    /// All prefixes, and the number of bindings.
     prefixes: BTreeSet<&'a str>,
     bindings: usize,
-    /// The end of the outermost element's name.
+    /// The end of the root element's name.
     root: Option<usize>,
     depth: usize,
-    /// The outermost element has ended.
+    /// True after the root element has ended.
     is_over: bool,
 }
 
 impl<'a> Survey<'a> {
-    /// Takes the next part; an error has the offset of what it is about.
+    /// Processes the next part. An error has the offset of its cause.
     fn take(&mut self, text: &str, part: Part<'a>) -> Result<(), (usize, String)> {
         let of = |range: &Range<usize>| text.get(range.clone()).unwrap_or_default();
         let content = match &part {
@@ -117,7 +117,7 @@ impl<'a> Survey<'a> {
         if self.is_over
             && let Some(range) = content
         {
-            let what = "something stands behind the end of the outermost element: delete it";
+            let what = "there is content after the root element: delete it";
             return Err((range.end - of(range).trim_start().len(), what.to_owned()));
         }
         match part {
@@ -176,7 +176,7 @@ impl<'a> Survey<'a> {
         Ok(())
     }
 
-    /// Checks what a parser's time grows with.
+    /// Checks the limits on which a parser's running time depends.
     fn check(&self) -> Result<(), Fault> {
         for (count, what, most) in [
             (self.prefixes.len(), "prefixes of names", MAX_PREFIXES),
@@ -192,7 +192,7 @@ impl<'a> Survey<'a> {
         Ok(())
     }
 
-    /// Binds the prefixes that the outermost element does not, and blanks what a parser refuses.
+    /// Binds unbound prefixes at the root element, and blanks what a parser refuses.
     fn repaired(self, text: &str) -> Cow<'_, str> {
         let unbound = self.used.difference(&self.bound).filter(|prefix| is_name(prefix));
         let names = unbound.map(|prefix| format!(" xmlns:{prefix}=\"unbound:{prefix}\"")).collect::<String>();
@@ -218,7 +218,7 @@ impl<'a> Survey<'a> {
     }
 }
 
-/// Returns true for a prefix that a file may bind; `xml` and `xmlns` are bound to begin with.
+/// Returns true for a prefix that a file may bind; `xml` and `xmlns` are predefined.
 fn is_name(prefix: &str) -> bool {
     let mut letters = prefix.chars();
     !matches!(prefix, "xml" | "xmlns")
@@ -255,7 +255,7 @@ mod tests {
             repaired("<r n='1'><a drake:x='1'/><s:b/><s:b/></r>"),
             "<r xmlns:drake=\"unbound:drake\" xmlns:s=\"unbound:s\" n='1'><a drake:x='1'/><s:b/><s:b/></r>"
         );
-        // A binding within the file stands for what is within it only.
+        // A binding inside the file applies only within its element.
         let inner = repaired("<r><a xmlns:s='x'/><s:b/></r>");
         assert!(inner.starts_with("<r xmlns:s=\"unbound:s\">"), "{inner}");
         let many: String = (0..65).map(|number| format!("<p{number}:a/>")).collect();
@@ -279,7 +279,7 @@ mod tests {
 
     #[test]
     fn nothing_stands_behind_the_outermost_element() {
-        let behind = "line 2: something stands behind the end of the outermost element: delete it";
+        let behind = "line 2: there is content after the root element: delete it";
         for text in ["<r></r>\n<r/>", "<r/>\njunk", "<r><r/></r>\n</r>"] {
             assert_eq!(refused(text), behind, "{text}");
         }

@@ -1,4 +1,4 @@
-//! The parts of an XML text, found in one pass; a text that is not well formed has parts too.
+//! The parts of an XML text, found in one pass. Malformed text is split as well.
 
 use std::ops::Range;
 
@@ -21,13 +21,13 @@ pub(super) enum Part<'a> {
 pub(super) struct Tag<'a> {
     pub(super) range: Range<usize>,
     pub(super) name: &'a str,
-    /// The attributes' names.
+    /// The names of the attributes.
     pub(super) attributes: Vec<&'a str>,
-    /// `<name/>`.
+    /// True for `<name/>`.
     pub(super) is_empty: bool,
 }
 
-/// The parts in the text's order.
+/// Returns the parts in the order of the text.
 pub(super) fn parts(text: &str) -> impl Iterator<Item = Part<'_>> {
     let mut at = 0;
     core::iter::from_fn(move || {
@@ -38,7 +38,7 @@ pub(super) fn parts(text: &str) -> impl Iterator<Item = Part<'_>> {
     })
 }
 
-/// The part that a rest begins with, and its length.
+/// Returns the first part of `rest`, and its length.
 fn part(rest: &str, at: usize) -> (Part<'_>, usize) {
     let until = |end: &str, from: usize| {
         let found = rest.get(from..).and_then(|rest| rest.find(end));
@@ -69,7 +69,7 @@ fn part(rest: &str, at: usize) -> (Part<'_>, usize) {
     tag(rest, at)
 }
 
-/// The length of a document type: its definitions stand in brackets, and quotes hide both.
+/// Returns the length of a document type. Brackets enclose its definitions; quotes hide brackets and the end.
 fn type_length(rest: &str) -> usize {
     let (mut quote, mut depth) = (None, 0_usize);
     for (index, byte) in rest.bytes().enumerate() {

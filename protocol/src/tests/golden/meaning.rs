@@ -1,4 +1,4 @@
-//! What the comments of the logs mean.
+//! The language of the comments in the golden logs.
 
 use std::collections::BTreeMap;
 use std::str::FromStr;
@@ -47,7 +47,7 @@ impl<'a> Meaning<'a> {
         u16::from_str_radix(self.take(key), 16).expect(self.text)
     }
 
-    /// A real number that must be a step of the format, exactly.
+    /// Parses a real number, which must be an exact step of the format.
     #[expect(clippy::float_cmp, reason = "the comments hold exact decimals")]
     fn q<const F: u32>(&self, text: &str) -> Q<F> {
         let value: f64 = text.parse().expect(self.text);
@@ -67,7 +67,7 @@ impl<'a> Meaning<'a> {
         all.try_into().unwrap_or_else(|_| panic!("{}: {key} needs {N} numbers", self.text))
     }
 
-    /// The words of joints, a torque or a sum, as many as there are.
+    /// Returns the words of joints, a torque or a sum.
     fn words_of<const F: u32>(&mut self, key: &str) -> Words {
         let text = self.take(key);
         let mut words = [0; MAX_WORDS];
@@ -125,7 +125,7 @@ impl<'a> Meaning<'a> {
         State(bits)
     }
 
-    /// Bit numbers with a plus between them, or `none`.
+    /// Parses bit numbers separated by `+`, or `none`.
     fn bits(&mut self, key: &str) -> u8 {
         let text = self.take(key);
         text.split('+')
@@ -133,7 +133,7 @@ impl<'a> Meaning<'a> {
             .fold(0, |bits, bit| bits | 1 << bit.parse::<u8>().unwrap())
     }
 
-    /// Flags with a plus between them, or `none`; each must be one of `known`.
+    /// Parses flags separated by `+`, or `none`; each must be one of `known`.
     fn flags<const N: usize>(&self, text: &str, known: [&str; N]) -> [bool; N] {
         let set: Vec<_> = text.split('+').filter(|&flag| flag != "none").collect();
         assert!(set.iter().all(|flag| known.contains(flag)), "{}: {text}", self.text);
@@ -242,7 +242,7 @@ impl<'a> Meaning<'a> {
         Baseline::On(zeroing)
     }
 
-    /// The words of a parameter, through the struct that gives them their meaning.
+    /// Returns the words of a parameter, encoded with its own type.
     fn words(&mut self, number: u8) -> [i16; WORDS] {
         if self.has("words") {
             let mut words = [0; WORDS];
@@ -406,7 +406,7 @@ impl<'a> Meaning<'a> {
         message
     }
 
-    /// The error that a comment `bad ...` names.
+    /// Returns the error that a comment `bad ...` names.
     pub(crate) fn error(text: &'a str) -> Error {
         let mut meaning = Self::new(text.strip_prefix("bad ").expect(text));
         let kind = |meaning: &mut Self| {
@@ -454,7 +454,7 @@ impl<'a> Meaning<'a> {
     }
 }
 
-/// Why a frame says nothing.
+/// The error of a frame without a message.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Error {
     Packet(PacketError),

@@ -1,21 +1,22 @@
-//! The worst and the best classic frame, by going through every frame there is.
+//! The longest and shortest classic frames, determined from all possible frames.
 //!
-//! A frame's stuff bits depend on its past only through the state of the run (8 of them) and, for what the CRC will be, through
-//! its register (2^15). Whatever identifier and data lead to the same pair are the same from there on, so all of
-//! them are gone through together: backwards from the CRC over the data, and forwards over the identifier.
+//! A frame's stuff bits depend on its history only through the state of the run (8 states) and, for the
+//! future CRC, the CRC register (2^15 values). All identifiers and data that lead to the same pair continue
+//! alike, so they are processed together: backwards from the CRC over the data, and forwards over the
+//! identifier.
 
 use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Frame};
 use crate::wire_time::{Bits, Coding, Shape};
 
-/// States of a run times values of the register.
+/// Number of pairs: states of a run times values of the register.
 const PAIRS: usize = 8 << 15;
-/// Nothing leads here.
+/// The counts of an unreachable pair.
 const NEVER: [u8; 2] = [u8::MAX, 0];
 
-/// The minimum and the maximum number of stuff bits, for each pair.
+/// The minimum and maximum number of stuff bits for each pair.
 type Counts = Vec<[u8; 2]>;
 
-/// A run of one to four equal bits, and one bit more: the run that follows, and whether a stuff bit came.
+/// Appends a bit to a run of one to four equal bits. Returns the next run, and 1 if a stuff bit was inserted.
 fn run_on(run: usize, bit: usize) -> (usize, u8) {
     let (last, length) = (run / 4, run % 4 + 1);
     match (last == bit, length) {
@@ -25,7 +26,7 @@ fn run_on(run: usize, bit: usize) -> (usize, u8) {
     }
 }
 
-/// For each pair and bit the pair that follows, and whether a stuff bit came.
+/// The next pair for each pair and bit, and 1 if a stuff bit was inserted.
 struct Steps(Vec<[(u32, u8); 2]>);
 
 impl Steps {
@@ -44,7 +45,7 @@ impl Steps {
         (next as usize, stuffed)
     }
 
-    /// Adds what one free bit before them adds.
+    /// Prepends one free bit to the counts.
     fn with_a_free_bit(&self, after: &Counts) -> Counts {
         let mut counts = Vec::with_capacity(PAIRS);
         for &[(zero, if_zero), (one, if_one)] in &self.0 {
@@ -55,7 +56,7 @@ impl Steps {
         counts
     }
 
-    /// Goes forward over some bits: each fixed, or (`None`) both ways.
+    /// Proceeds over some bits: fixed ones, or free ones (`None`).
     fn forward(&self, mut reached: Counts, bits: impl IntoIterator<Item = Option<usize>>) -> Counts {
         for bit in bits {
             let mut then = vec![NEVER; PAIRS];
@@ -73,7 +74,7 @@ impl Steps {
         reached
     }
 
-    /// Up to the DLC: of requests and of data frames.
+    /// Returns the counts up to the DLC, of remote frames and of data frames.
     fn heads(&self, extended: bool) -> [Counts; 2] {
         let mut idle = vec![NEVER; PAIRS];
         // One recessive bit, which the first bit of the frame ends.
@@ -88,7 +89,7 @@ impl Steps {
         }
     }
 
-    /// Over all identifiers and all that follows the DLC.
+    /// Returns the range over all identifiers and all bits after the DLC.
     fn over_all(&self, heads: &Counts, dlc: usize, rest: &Counts) -> [u32; 2] {
         let mut over_all = NEVER;
         for (pair, &[min, max]) in heads.iter().enumerate().filter(|&(_, &counts)| counts != NEVER) {
@@ -111,7 +112,7 @@ fn plus([min, max]: [u8; 2], stuffed: u8) -> [u8; 2] {
     [min + stuffed, max + stuffed]
 }
 
-/// What the 15 bits of the CRC add.
+/// Returns the stuff bits within the 15 bits of the CRC.
 fn of_the_crc() -> Counts {
     let count = |pair: usize| {
         let step = |(run, sum), place: usize| {
@@ -123,7 +124,7 @@ fn of_the_crc() -> Counts {
     (0..PAIRS).map(|pair| [count(pair); 2]).collect()
 }
 
-/// The bits of a classic frame that are not stuff bits.
+/// Returns the number of bits of a classic frame without stuff bits.
 fn plain(extended: bool, bytes: usize) -> u32 {
     let head_and_tail = if extended { 67 } else { 47 };
     head_and_tail + 8 * u32::try_from(bytes).unwrap()
@@ -155,7 +156,7 @@ fn no_classic_frame_is_longer_or_shorter_and_one_is_as_long_and_one_as_short() {
     }
 }
 
-/// The minimum and the maximum of all bits, and of the data bits, of some frames.
+/// Returns the minimum and maximum of nominal and data bits of some frames.
 fn ends(frames: impl Iterator<Item = Frame>) -> (Bits, Bits) {
     let start = (Bits { nominal: u32::MAX, data: u32::MAX }, Bits::default());
     frames.map(|frame| Bits::of(&frame).unwrap()).fold(start, |(best, worst), bits| {
@@ -169,13 +170,13 @@ fn ends(frames: impl Iterator<Item = Frame>) -> (Bits, Bits) {
 #[test]
 fn short_frames_one_by_one_are_within_the_bounds_and_reach_them() {
     let flags = [0, BIT_RATE_SWITCH].map(|switch| [switch, switch | ERROR_STATE]);
-    // Each identifier with each byte.
+    // Every identifier with every byte.
     let short = || (0..0x800_u32).flat_map(|id| (0..=u8::MAX).map(move |byte| (id, byte)));
     let classic = short().map(|(id, byte)| Frame::classic(id, &[byte]).unwrap());
     let shape = Shape { coding: Coding::Classic, extended: false, len: 1 };
     assert_eq!(ends(classic), (shape.best(), shape.worst()));
     for (coding, flags) in [Coding::Fd, Coding::FdSwitched].into_iter().zip(flags) {
-        // What follows BRS does not know the identifier: every identifier, then every content.
+        // The bits after BRS do not depend on the identifier, so vary the identifier first, then the content.
         let ids = (0..0x800).flat_map(|id| flags.map(|flags| Frame::fd(id, flags, &[0x55]).unwrap()));
         let ids = ends(ids);
         let id = (0..0x800).find(|&id| {

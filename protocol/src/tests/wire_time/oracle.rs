@@ -1,14 +1,14 @@
-//! A frame written out bit by bit, with nothing clever in it.
+//! A straightforward second implementation that writes a frame bit by bit.
 
 use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Format, Frame};
 use crate::wire_time::Bits;
 
-/// The `count` lowest bits of a word, the most significant first.
+/// Appends the `count` lowest bits of a word, the most significant first.
 fn push(to: &mut Vec<bool>, word: u32, count: u32) {
     to.extend((0..count).rev().map(|place| (word >> place) & 1 == 1));
 }
 
-/// CRC-15/CAN by its shift register, as ISO 11898-1 gives it.
+/// Computes CRC-15/CAN with the shift register of ISO 11898-1.
 pub(crate) fn crc15(bits: &[bool]) -> u32 {
     bits.iter().fold(0, |register, &bit| {
         let feedback = bit != (register >> 14 & 1 == 1);
@@ -17,7 +17,7 @@ pub(crate) fn crc15(bits: &[bool]) -> u32 {
     })
 }
 
-/// Where stuff bits come: the number of plain bits before each.
+/// Returns the positions of stuff bits: the number of plain bits before each.
 fn stuff_bits(bits: &[bool]) -> Vec<usize> {
     let (mut places, mut last, mut run) = (Vec::new(), None, 0);
     for (at, &bit) in bits.iter().enumerate() {
@@ -31,7 +31,7 @@ fn stuff_bits(bits: &[bool]) -> Vec<usize> {
     places
 }
 
-/// The bits of a frame.
+/// Counts the bits of a frame.
 pub(crate) fn bits(frame: &Frame) -> Bits {
     let mut plain = Vec::new();
     let (fd, id) = (frame.format() == Format::Fd, frame.id());

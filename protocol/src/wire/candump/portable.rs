@@ -1,6 +1,6 @@
-//! The short way through a line that is written as nearly all of them are: the subset that every tool reads.
+//! The fast path of the parser, for lines in the subset that every tool reads: nearly all lines.
 //!
-//! It knows nothing that the long way does not know, and leaves to it whatever is not exactly like this:
+//! It accepts only this layout and leaves all other lines to the general parser, which gives the same result:
 //!
 //! ```text
 //!   (1700000000.123456) vcan0 22C##5AABBCC
@@ -11,10 +11,10 @@ use super::read::{eight_digits, four_bytes, is_blank, value};
 use super::{Record, Timestamp};
 use crate::can::{EXTENDED, EXTENDED_MASK, Format, Frame, STANDARD_MASK};
 
-/// Bytes of a time of ten and six digits, with what stands around it.
+/// Length of a time with 10 + 6 digits, its parentheses and the space after it.
 const TIME: usize = 20;
 
-/// Reads a line without its end; `None` when it is to be read the long way.
+/// Parses a line without its line ending. Returns `None` if the line needs the general parser.
 #[inline(always)]
 pub(super) fn record(line: &[u8]) -> Option<Record<'_>> {
     let (time, rest) = line.split_first_chunk::<TIME>()?;
@@ -26,7 +26,7 @@ pub(super) fn record(line: &[u8]) -> Option<Record<'_>> {
         [_, a, b, c, b'#', rest @ ..] => {
             let [a, b, c] = [value(*a), value(*b), value(*c)];
             let id = u32::from(a) << 8 | u32::from(b) << 4 | u32::from(c);
-            // Of a digit that is none more than three digits would be left.
+            // `value` returns 0xFF for other bytes, so more than the low four bits would be set.
             if a | b | c > 0xF || id > STANDARD_MASK {
                 return None;
             }
@@ -61,7 +61,7 @@ fn nanos(time: &[u8; TIME]) -> Option<u64> {
     Some(seconds * 1_000_000_000 + micros * 1_000)
 }
 
-/// A frame's data from behind its first `#` to the end of the line.
+/// Parses the data of a frame, from the byte after the first `#` to the end of the line.
 #[inline(always)]
 fn data(id: u32, text: &[u8]) -> Option<Frame> {
     let (format, flags, digits) = match text {
@@ -74,7 +74,7 @@ fn data(id: u32, text: &[u8]) -> Option<Frame> {
     }
     let mut data = [0; 64];
     let (fours, rest) = digits.as_chunks();
-    // Not a zip, which is slower here.
+    // An iterator with `next` is faster here than `zip`.
     let mut places = data.as_chunks_mut().0.iter_mut();
     for four in fours {
         *places.next()? = four_bytes(*four)?;

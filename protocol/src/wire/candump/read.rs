@@ -1,10 +1,10 @@
-//! A place in a line, and what is read from there on.
+//! A cursor over the bytes of a line, and the parsers of each field.
 
 use super::write::MAX_PAD;
 use super::{Direction, LineError, Timestamp};
 use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, identifier};
 
-/// What a byte is as a hexadecimal digit; [`NONE`] when it is none.
+/// The value of each byte as a hexadecimal digit; [`NONE`] for other bytes.
 #[expect(clippy::indexing_slicing, reason = "when this is compiled")]
 const NIBBLES: [u8; 256] = {
     let mut nibbles = [NONE; 256];
@@ -18,7 +18,7 @@ const NIBBLES: [u8; 256] = {
 };
 const NONE: u8 = 0xFF;
 
-/// The value of a digit; [`NONE`] and more when it is none.
+/// Returns the value of a hexadecimal digit; [`NONE`] for any other byte.
 #[expect(clippy::indexing_slicing, reason = "a byte is less than 256")]
 #[inline]
 pub(super) const fn value(digit: u8) -> u8 {
@@ -29,10 +29,10 @@ fn nibble(digit: u8) -> Option<u8> {
     Some(value(digit)).filter(|&value| value < 16)
 }
 
-/// Four bytes of eight hexadecimal digits; `None` when one is none.
+/// Decodes eight hexadecimal digits to four bytes. Returns `None` if one of them is not a digit.
 #[inline]
 pub(super) const fn four_bytes(digits: [u8; 8]) -> Option<[u8; 4]> {
-    /// The same byte eight times.
+    /// Returns `byte` repeated eight times.
     const fn all(byte: u8) -> u64 {
         u64::from_le_bytes([byte; 8])
     }
@@ -40,39 +40,40 @@ pub(super) const fn four_bytes(digits: [u8; 8]) -> Option<[u8; 4]> {
     let letters = text & all(0x40);
     // '1' is 31, 'A' is 41 and 'a' is 61: a letter's value is 9 more than its lower half.
     let values = (text & all(0x0F)).wrapping_add((letters >> 6).wrapping_mul(9));
-    // The upper half of a digit is 3, of a letter 4, or 6, which is made 4.
+    // The upper half of a digit is 3, that of a letter 4 or 6; this maps 6 to 4.
     let segments = (text & all(0xF0) & !(letters >> 1)) ^ (letters >> 2).wrapping_add(all(0x30));
-    // A value has 4 bits, and is 10 or more when it is a letter's.
+    // A value has 4 bits; that of a letter is 10 or more.
     let tens = (values.wrapping_add(all(6)) ^ (letters >> 2)) & all(0x10);
     if segments | values & all(0xF0) | tens != 0 {
         return None;
     }
-    // Neighbours are put together: into a byte, into two, into four.
+    // Combine neighbours into one, two, then four bytes.
     let bytes = (values << 4 | values >> 8) & 0x00FF_00FF_00FF_00FF;
     let twos = (bytes | bytes >> 8) & 0x0000_FFFF_0000_FFFF;
     let [a, b, c, d, ..] = (twos | twos >> 16).to_le_bytes();
     Some([a, b, c, d])
 }
 
-/// The number at the beginning of eight bytes, and of how many digits it is.
+/// Returns the decimal number at the start of eight bytes, and its number of digits.
 #[inline]
 pub(super) fn eight_digits(text: [u8; 8]) -> (u64, usize) {
     const ZEROS: u64 = 0x3030_3030_3030_3030;
     let text = u64::from_le_bytes(text);
     let digits = text ^ ZEROS;
-    // A digit is 0 to 9: neither it nor it and 6 more has a bit in the upper half.
+    // For a digit 0 to 9, neither the value nor the value plus 6 has a bit in the upper half.
     let others = (digits | digits.wrapping_add(0x0606_0606_0606_0606)) & 0xF0F0_F0F0_F0F0_F0F0;
     let bits = others.trailing_zeros() & !7;
-    // Digits that are not there are zeros in front. What a carry may have spoilt is behind the first other byte.
+    // Missing digits become leading zeros. Carries can only corrupt bytes after the first non-digit, which
+    // are shifted out.
     let digits = digits.checked_shl(64 - bits).unwrap_or(0);
-    // Neighbours are put together: of one digit each, then of two, then of four.
+    // Combine neighbours: single digits, pairs, then groups of four.
     let digits = digits.wrapping_mul(10).wrapping_add(digits >> 8) & 0x00FF_00FF_00FF_00FF;
     let digits = digits.wrapping_mul(100).wrapping_add(digits >> 16) & 0x0000_FFFF_0000_FFFF;
     (digits.wrapping_mul(10_000).wrapping_add(digits >> 32) & 0xFFFF_FFFF, (bits >> 3) as usize)
 }
 
-/// Whether a frame goes on as CAN XL behind so many digits: as can-utils write it, `#81:00:12345678#`, or as they did
-/// in drafts, `###`.
+/// Returns true if the rest of a frame is CAN XL after an identifier of `digits` digits: `#81:00:12345678#`
+/// as can-utils write it, or `###` as early drafts did.
 fn is_can_xl(digits: usize, rest: &[u8]) -> bool {
     let is_header = |text: &[u8]| {
         text.iter().zip(b"#00:00:00000000#").all(|(byte, like)| match like {
@@ -120,14 +121,14 @@ impl<'a> Cursor<'a> {
         if self.take(byte) { Ok(()) } else { Err(self.error(expected)) }
     }
 
-    /// At least one space or tab.
+    /// Skips spaces and tabs; at least one is required.
     pub(super) fn blanks(&mut self) -> Result<(), LineError> {
         let blanks = self.rest().iter().take_while(|byte| is_blank(**byte)).count();
         self.at += blanks;
         if blanks == 0 { Err(self.error("a space")) } else { Ok(()) }
     }
 
-    /// Up to the next space or tab.
+    /// Reads the interface name up to the next space or tab.
     pub(super) fn word(&mut self) -> Result<&'a str, LineError> {
         let rest = self.rest();
         let len = rest.iter().position(|&byte| is_blank(byte)).unwrap_or(rest.len());
@@ -138,7 +139,7 @@ impl<'a> Cursor<'a> {
         Ok(word)
     }
 
-    /// Decimal digits: their value and how many there are.
+    /// Reads decimal digits. Returns their value and count.
     fn digits(&mut self, expected: &'static str) -> Result<(u64, usize), LineError> {
         let start = self.at;
         let mut value = 0_u64;
@@ -160,7 +161,7 @@ impl<'a> Cursor<'a> {
         Ok(Timestamp { nanos, nine_digits: digits > 6, min_digits })
     }
 
-    /// The fraction of a second in ns, and how many digits it has.
+    /// Reads the fraction of a second. Returns nanoseconds and the number of digits.
     fn fraction(&mut self) -> Result<(u64, usize), LineError> {
         let count = self.rest().iter().take_while(|byte| byte.is_ascii_digit()).count();
         let digits = self.rest().get(..count).unwrap_or_default();
@@ -169,7 +170,7 @@ impl<'a> Cursor<'a> {
         Ok((nanos, digits))
     }
 
-    /// A frame, or `None` for CAN XL, whose text is skipped.
+    /// Reads a frame. Returns `None` for CAN XL, whose text is skipped.
     pub(super) fn frame(&mut self) -> Result<Option<Frame>, LineError> {
         let expected = "an identifier of 3 or 8 hexadecimal digits";
         let start = self.at;
@@ -193,7 +194,7 @@ impl<'a> Cursor<'a> {
         if self.take(b'#') {
             let flags = self.peek().and_then(nibble).ok_or_else(|| self.error("one digit of FD flags"))?;
             self.at += 1;
-            // In CAN FD no frame is remote.
+            // CAN FD has no remote frames.
             return self.data(id & !REMOTE, Format::Fd, flags).map(Some);
         }
         if matches!(self.peek(), Some(b'R' | b'r')) {
@@ -205,11 +206,11 @@ impl<'a> Cursor<'a> {
         if id & REMOTE == 0 {
             return Ok(Some(frame));
         }
-        // The flag is the kernel's: its struct has a length and bytes without a meaning.
+        // The kernel's struct of a remote frame has a length and data bytes that carry no information.
         if frame.data().iter().any(|byte| *byte != 0) {
             return Err(LineError {
                 column,
-                expected: "no data in a remote frame, whose flag the identifier has",
+                expected: "no data, because the identifier has the flag of a remote frame",
             });
         }
         let remote = Frame::remote(id, frame.len()).map_err(|_| self.error("a length of 0 to 8"))?;
@@ -255,7 +256,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// The direction behind a frame; other words there are left out, and a further byte is an error.
+    /// Reads the direction after a frame. Other words are ignored; a further data byte is an error.
     pub(super) fn direction(&mut self) -> Result<Option<Direction>, LineError> {
         if self.is_at_end() {
             return Ok(None);
@@ -267,7 +268,7 @@ impl<'a> Cursor<'a> {
             Some(b"T") => Ok(Some(Direction::Sent)),
             Some(b"R") => Ok(Some(Direction::Received)),
             Some([high, low]) if value(*high) < 16 && value(*low) < 16 => {
-                Err(self.error("the end of the data: a byte stands behind a space"))
+                Err(self.error("the end of the data: a byte follows a space"))
             }
             Some(_) | None => Ok(None),
         }
@@ -279,8 +280,8 @@ pub(super) const fn is_blank(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t')
 }
 
-/// Returns the fraction of a second that digits are, in ns, and their count; `None` without a digit. What is below a
-/// nanosecond is left out.
+/// Converts the digits of a fraction of a second to nanoseconds. Also returns the number of digits. Digits
+/// below a nanosecond are dropped. Returns `None` if `digits` is empty or contains other bytes.
 #[must_use]
 pub fn fraction(digits: &[u8]) -> Option<(u64, usize)> {
     if digits.is_empty() || !digits.iter().all(u8::is_ascii_digit) {
@@ -290,8 +291,9 @@ pub fn fraction(digits: &[u8]) -> Option<(u64, usize)> {
     Some((nine.fold(0, |nanos, digit| nanos * 10 + u64::from(digit - b'0')), digits.len()))
 }
 
-/// Returns the identifier that 8 digits are, with its flags. One with the kernel's flags has them in its upper three
-/// bits; one without any is extended, as can-utils and python-can take it, and an error's kind is not.
+/// Converts an identifier of 8 hexadecimal digits to one with flags. The kernel's flags are in the upper
+/// three bits. Without flags the identifier is extended, as in can-utils and python-can, except for an error
+/// frame.
 #[must_use]
 pub const fn eight_digit_identifier(word: u32) -> u32 {
     let number = word & EXTENDED_MASK;

@@ -1,11 +1,12 @@
-//! Text of frames, put together in a buffer of its own and handed on in few pieces.
+//! The writer of frames and records. It formats into a buffer on the stack and passes the text on in few
+//! pieces.
 
 use core::fmt::{self, Write};
 
 use super::Record;
 use crate::can::{ERROR, EXTENDED_MASK, Format, Frame};
 
-/// Both digits of each byte.
+/// The two hexadecimal digits of each byte.
 #[expect(clippy::indexing_slicing, reason = "when this is compiled")]
 const HEX: [[u8; 2]; 256] = {
     let digits = *b"0123456789ABCDEF";
@@ -18,17 +19,17 @@ const HEX: [[u8; 2]; 256] = {
     pairs
 };
 
-/// 8 digits of an identifier, `##`, flags, 64 bytes, a raw DLC.
+/// Maximum length of a frame: 8 digits of an identifier, `##`, flags, 64 bytes, a raw DLC.
 const FRAME: usize = 8 + 2 + 1 + 128 + 2;
-/// The most digits that seconds are padded to.
+/// Maximum number of digits that seconds are padded to.
 pub(super) const MAX_PAD: u8 = 20;
-/// Two parentheses, digits of seconds, a point, 9 digits, a space.
+/// Maximum length of a time: two parentheses, digits of seconds, a point, 9 digits, a space.
 const TIME: usize = 2 + MAX_PAD as usize + 1 + 9 + 1;
 
-/// Writes one line without its end: single spaces, upper case, no direction.
+/// Writes one line without a line ending: single spaces, upper case, no direction.
 ///
 /// # Errors
-/// When `out` fails.
+/// Returns an error if `out` fails.
 pub fn write_record(out: &mut impl Write, record: &Record<'_>) -> fmt::Result {
     let mut time = Text::<TIME>::new();
     let (seconds, nanos) = (record.time.nanos / 1_000_000_000, record.time.nanos % 1_000_000_000);
@@ -48,10 +49,10 @@ pub fn write_record(out: &mut impl Write, record: &Record<'_>) -> fmt::Result {
     write_frame(out, &record.frame)
 }
 
-/// Writes a frame alone, as cansend takes it.
+/// Writes a frame without time and interface, in the notation of cansend.
 ///
 /// # Errors
-/// When `out` fails.
+/// Returns an error if `out` fails.
 pub fn write_frame(out: &mut impl Write, frame: &Frame) -> fmt::Result {
     let mut text = Text::<FRAME>::new();
     if frame.is_error() || frame.is_extended() {
@@ -94,7 +95,7 @@ impl fmt::Debug for Frame {
     }
 }
 
-/// ASCII of at most `N` bytes.
+/// An ASCII buffer of at most `N` bytes.
 struct Text<const N: usize> {
     bytes: [u8; N],
     len: usize,
@@ -112,13 +113,13 @@ impl<const N: usize> Text<N> {
         }
     }
 
-    /// The last hexadecimal digit of a value.
+    /// Appends the lower hexadecimal digit of a value.
     fn digit(&mut self, value: u8) {
         let [_, digit] = pair(value);
         self.push(digit);
     }
 
-    /// Both hexadecimal digits of a value.
+    /// Appends both hexadecimal digits of a value.
     fn byte(&mut self, value: u8) {
         if let Some(place) = self.bytes.get_mut(self.len..).and_then(<[u8]>::first_chunk_mut) {
             *place = pair(value);
@@ -126,7 +127,7 @@ impl<const N: usize> Text<N> {
         }
     }
 
-    /// A number in so many decimal digits or more.
+    /// Appends a number with at least `min` decimal digits.
     fn decimal(&mut self, value: u64, min: usize) {
         let mut digits = [b'0'; 20];
         let (mut rest, mut from) = (value, digits.len());

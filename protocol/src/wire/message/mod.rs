@@ -1,4 +1,4 @@
-//! What a packet means.
+//! Messages: the meaning of packets.
 //!
 //! | kind | node field | words | count |
 //! |---|---|---|---|
@@ -7,7 +7,7 @@
 //! | 2 torque | sender | own torque in Nm or N, in the format of the bus, [`crate::fixed::TorqueFormat`] | 1 |
 //! | 3 sensors | sender | a [`SensorPage`] | page |
 //! | 4 network | sender | a [`NetworkPage`] | page |
-//! | 5 configure | destination | what to write | parameter, + 0x80 to write; the epoch byte is a tag |
+//! | 5 configure | destination | the value to write | parameter, + 0x80 to write; the epoch byte is a tag |
 //! | 6 configured | sender | the present value, or a refusal | parameter, + 0x80 if written; tag |
 //! | 7 stimulus | destination | a [`SensorPage`] | page, + 0x80: from the next joints on |
 //!
@@ -30,26 +30,26 @@ use crate::id::{CellId, Command, Id, Kind, Node};
 use crate::packet::{self, Epoch, Length, Packet, WORDS, Words};
 use crate::parameters::MAX_JOINTS;
 
-/// The version of this protocol, in every heartbeat.
+/// The version of this protocol, sent in every heartbeat.
 pub const VERSION: u8 = 1;
 
-/// Set in a stimulus' count: it holds from the next joints on, whatever their epoch.
+/// Set in the count of a stimulus: it applies from the next joints on, whatever their epoch.
 pub(crate) const FROM_THE_NEXT: u8 = 0x80;
-/// Set in the count of `configure` and `configured`: the parameter is written.
+/// Set in the count of `configure` and `configured`: the request is a write.
 pub(crate) const WRITE: u8 = 0x80;
-/// The parameter number that stands for a refusal.
+/// The parameter number of a refusal.
 pub(crate) const REFUSED: u8 = 126;
 
 /// The joint positions of one epoch.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Joints {
-    /// Positions in quarter turns, of prismatic joints in m; those beyond the joints in use are zero.
+    /// Positions: quarter turns of revolute joints, m of prismatic joints, zero for unused joints.
     pub positions: [Q1_14; MAX_JOINTS],
-    /// Joints in use.
+    /// Number of joints in use.
     pub in_use: u8,
 }
 
-/// When a stimulus begins to hold.
+/// The time from which a stimulus applies.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum From {
     /// From the joints of this epoch on.
@@ -58,15 +58,15 @@ pub enum From {
     Next,
 }
 
-/// The request of a `configure` packet.
+/// The request in a `configure` packet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Request {
-    /// The value of a parameter.
+    /// Reads a parameter.
     Read {
         /// The parameter's number, known or not.
         number: u8,
     },
-    /// A new value for a parameter.
+    /// Writes a parameter.
     Write {
         /// The parameter's number, known or not.
         number: u8,
@@ -75,151 +75,152 @@ pub enum Request {
     },
 }
 
-/// What a `configured` packet answers.
+/// The reply in a `configured` packet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Answer {
-    /// The value that was read, or that is now written.
+    /// The value that was read or written.
     Value {
         /// The parameter's number.
         number: u8,
-        /// Whether it was written.
+        /// True after a write, false after a read.
         written: bool,
         /// Its words.
         words: [i16; WORDS],
     },
-    /// The parameter cannot be had or written so.
+    /// The request was refused.
     Refused {
         /// The parameter's number.
         number: u8,
-        /// Why, [`crate::parameters::ParameterError::code`] or [`Answer::WRONG_HASH`] and so on.
+        /// The reason: [`crate::parameters::ParameterError::code`], or a constant of [`Answer`] such as
+        /// [`Answer::WRONG_HASH`].
         reason: i16,
     },
 }
 
 impl Answer {
-    /// A commit whose hash is not that of what was written.
+    /// Refusal: the hash of a commit differs from that of the written parameters.
     pub const WRONG_HASH: i16 = 16;
-    /// Flash could not be written.
+    /// Refusal: writing to flash failed.
     pub const FLASH_FAILED: i16 = 17;
-    /// No such parameter.
+    /// Refusal: the parameter does not exist.
     pub const UNKNOWN: i16 = 18;
-    /// Words that this parameter cannot have, or `links_down` outside test mode.
+    /// Refusal: the words are invalid for this parameter, or `links_down` was written outside test mode.
     pub const CANNOT_BE: i16 = 19;
-    /// It is no tare while something touches the cell, or before it has taken joints.
+    /// Refusal: a tare while the cell is touched, or before it has received joints.
     pub const TOUCHED: i16 = 20;
-    /// What the sensor reads is farther from 0 than the baseline's limit.
+    /// Refusal: the sensor value exceeds the limit of the baseline.
     pub const BEYOND_LIMIT: i16 = 21;
 }
 
-/// A packet's meaning.
+/// A decoded packet.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Message {
-    /// Stop answering until a resume.
+    /// Cells stop answering until a resume.
     Halt,
     /// New joint positions.
     Joints {
-        /// The number of this broadcast.
+        /// The epoch of this broadcast.
         epoch: Epoch,
         /// The positions.
         joints: Joints,
     },
-    /// Answer with a heartbeat.
+    /// Cells answer with a heartbeat.
     Sync,
-    /// Leave the halted state.
+    /// Cells leave the halted state.
     Resume,
-    /// Answer with the pages of counters.
+    /// Cells answer with the pages of counters.
     Report,
-    /// A partial sum.
+    /// The torque sum of a subtree.
     Sum {
-        /// Who sends it.
+        /// The sender.
         from: CellId,
-        /// The joints it answers.
+        /// The epoch of the joints it answers.
         epoch: Epoch,
-        /// Nm or N, Q7.8, a word for each joint.
+        /// Sum in Nm or N, Q7.8, one word per joint.
         torque: Words,
-        /// Cells in it; 0 ends the sums before.
+        /// Number of contributing cells; 0 ends earlier sums.
         count: u8,
     },
-    /// One cell's torque.
+    /// The own torque of a cell.
     Torque {
-        /// Who sends it.
+        /// The sender.
         from: CellId,
-        /// The joints it answers.
+        /// The epoch of the joints it answers.
         epoch: Epoch,
-        /// Nm or N in the format of the bus, a word for each joint.
+        /// Torque in Nm or N, in the format of the bus, one word per joint.
         torque: Words,
     },
-    /// What a cell measures.
+    /// Measurements of a cell.
     Sensors {
-        /// Who sends it.
+        /// The sender.
         from: CellId,
-        /// The last joints it took.
+        /// The epoch of the last accepted joints.
         epoch: Epoch,
         /// The measurements.
         page: SensorPage,
     },
-    /// What a cell, or the gateway (node 0), reports of itself.
+    /// Status of a cell, or of the gateway (node 0).
     Network {
-        /// Who sends it.
+        /// The sender.
         from: Node,
-        /// The last joints it took.
+        /// The epoch of the last accepted joints.
         epoch: Epoch,
-        /// What it reports.
+        /// The status page.
         page: NetworkPage,
     },
-    /// Read or write a parameter.
+    /// A request to read or write a parameter.
     Configure {
         /// Destination.
         to: Node,
-        /// Comes back in the answer.
+        /// An arbitrary tag that the reply repeats.
         tag: u8,
         /// The request.
         request: Request,
     },
-    /// The answer.
+    /// The reply to a request.
     Configured {
-        /// Who answers.
+        /// The sender.
         from: CellId,
         /// The request's tag.
         tag: u8,
-        /// What it answers.
+        /// The value or refusal.
         answer: Answer,
     },
-    /// What a cell shall feel.
+    /// Simulated sensor values for a cell.
     Stimulus {
-        /// Who shall feel it.
+        /// The addressee.
         to: Node,
-        /// From when on.
+        /// The time from which it applies.
         from: From,
-        /// What it shall feel.
+        /// The sensor values.
         page: SensorPage,
     },
 }
 
-/// Why a packet has no meaning.
+/// The error for a packet that does not decode to a message.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum MessageError {
-    /// A command that does not exist.
-    #[error("command {0} does not exist: 0 halt, 1 joints, 2 sync, 3 resume, 4 report do")]
+    /// The command does not exist.
+    #[error("command {0} does not exist: use 0 halt, 1 joints, 2 sync, 3 resume or 4 report")]
     Command(u8),
-    /// A sender that cannot be.
-    #[error("{kind} from node {node}, which is no cell", kind = .kind.name())]
+    /// The node field is not a valid sender of this kind.
+    #[error("{kind} from node {node}, which is not a cell", kind = .kind.name())]
     Sender {
         /// The kind.
         kind: Kind,
         /// The node field.
         node: u8,
     },
-    /// An addressee that cannot be.
-    #[error("{kind} to node {node}, which is no cell", kind = .kind.name())]
+    /// The node field is not a valid addressee of this kind.
+    #[error("{kind} to node {node}, which is not a cell", kind = .kind.name())]
     Addressee {
         /// The kind.
         kind: Kind,
         /// The node field.
         node: u8,
     },
-    /// A page that does not exist.
+    /// The page does not exist.
     #[error("{kind} page {page} does not exist", kind = .kind.name())]
     Page {
         /// The kind.
@@ -227,23 +228,23 @@ pub enum MessageError {
         /// The page.
         page: u8,
     },
-    /// A count that cannot be.
+    /// The count is out of range.
     #[error("{kind} with count {got}; {allowed} is allowed", kind = .kind.name())]
     Count {
         /// The kind.
         kind: Kind,
         /// The count.
         got: u8,
-        /// What is allowed.
+        /// The allowed range.
         allowed: &'static str,
     },
 }
 
 impl Message {
-    /// The packet's meaning. Never panics.
+    /// Decodes a packet. Never panics.
     ///
     /// # Errors
-    /// When the packet has a kind, page or value that this version of the protocol does not know.
+    /// Returns an error if this version of the protocol does not define the packet's kind, page or value.
     pub fn decode(packet: &Packet) -> Result<Self, MessageError> {
         let Packet { id: Id { kind, node }, words, epoch, count } = *packet;
         let sender = || match Node::from_byte(node) {
@@ -310,7 +311,7 @@ impl Message {
         })
     }
 
-    /// Encodes it to a packet.
+    /// Encodes the message as a packet.
     #[must_use]
     pub fn encode(&self) -> Packet {
         let with = |words, epoch, count| Packet { id: self.id(), words, epoch, count };
@@ -359,7 +360,7 @@ impl Message {
 }
 
 impl Message {
-    /// The identifier under which it is sent.
+    /// Returns the identifier that the message is sent with.
     #[must_use]
     pub fn id(&self) -> Id {
         let cell = |kind, from| Id::new(kind, Node::Cell(from));
@@ -379,13 +380,13 @@ impl Message {
         }
     }
 
-    /// The cell that sends it; `None` when the gateway's side does.
+    /// Returns the sending cell; `None` if the gateway's side sends it.
     #[must_use]
     pub fn sender(&self) -> Option<CellId> {
         self.id().sender()
     }
 
-    /// Its epoch, if it has one.
+    /// Returns the epoch, if the message has one.
     #[must_use]
     pub const fn epoch(&self) -> Option<Epoch> {
         match *self {
@@ -405,26 +406,26 @@ impl Message {
         }
     }
 
-    /// The tag of a request or of its answer.
+    /// Returns the tag of a request or reply.
     #[must_use]
     pub const fn tag(&self) -> Option<u8> {
         if let Self::Configure { tag, .. } | Self::Configured { tag, .. } = *self { Some(tag) } else { None }
     }
 
-    /// What a cell measures, or shall feel.
+    /// Returns the sensor page of a measurement or a stimulus.
     #[must_use]
     pub const fn sensor_page(&self) -> Option<SensorPage> {
         if let Self::Sensors { page, .. } | Self::Stimulus { page, .. } = *self { Some(page) } else { None }
     }
 
-    /// Whether a word of it means *saturated*; `None` of what is neither a torque nor a sum.
+    /// Returns true if a word of a torque or sum means *saturated*; `None` for other messages.
     #[must_use]
     pub fn is_saturated(&self) -> Option<bool> {
         self.torque_words().map(|words| words.is_saturated())
     }
 
-    /// Whether it reports a touch: a torque or a sum that is not all zero, a stimulus or sensors with a contact force
-    /// or a proximity, a heartbeat of an active cell.
+    /// Returns true if the message reports a touch: a nonzero torque or sum, a sensor page or stimulus with a
+    /// contact force or proximity, or the heartbeat of an active cell.
     #[must_use]
     pub fn is_contact(&self) -> bool {
         if let Self::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = self {
@@ -436,20 +437,20 @@ impl Message {
         self.torque_words().is_some_and(|words| !words.is_zero())
     }
 
-    /// The words of a torque or a sum.
+    /// Returns the words of a torque or a sum.
     const fn torque_words(&self) -> Option<Words> {
         if let Self::Torque { torque, .. } | Self::Sum { torque, .. } = *self { Some(torque) } else { None }
     }
 }
 
 impl Joints {
-    /// The words that travel: as many as the joints in use need.
+    /// Returns the positions as words, in the shortest packet that fits the joints in use.
     fn words(&self) -> Words {
         Words::new(Length::for_joints(self.in_use.into()), self.positions.map(Q1_14::to_bits))
     }
 }
 
-/// The joints that words of this length are for.
+/// Returns the numbers of joints that use words of this length, and the text for errors.
 const fn allowed_joints(length: Length) -> (RangeInclusive<u8>, &'static str) {
     match length {
         Length::Six => (1..=6, "1 to 6"),

@@ -1,122 +1,123 @@
-//! What a cell reports of itself and its part of the network.
+//! Network pages: the state of a cell and its part of the network.
 
 use super::{MessageError, State};
 use crate::id::Kind;
 use crate::packet::{self, WORDS};
 
-/// In a tree page: no parent.
+/// The parent field of a tree page without a parent.
 const NOBODY: u8 = 255;
-/// What a cell reports of itself and its part of the network.
+/// A page of a cell's state and its part of the network.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum NetworkPage {
-    /// Page 0.
+    /// Page 0: the heartbeat.
     Heartbeat(Heartbeat),
-    /// Page 1: what became of the packets that it received.
+    /// Page 1: counters of accepted packets.
     Heard(Heard),
-    /// Page 2: what it refused, by reason.
+    /// Page 2: counters of rejected frames, by reason.
     Refused(Refused),
-    /// Page 3: its place in the tree, and what became of sums.
+    /// Page 3: the place in the tree, and counters of sums.
     Tree(Tree),
-    /// Page 4: what its ports lead to.
+    /// Page 4: the state of each port.
     Ports(Ports),
 }
 
-/// Page 0: sign of life, four times a second and after each sync. The epoch byte is that of the last
-/// joints taken.
+/// Page 0: the heartbeat, sent four times a second and after each sync. The epoch byte is that of the last
+/// accepted joints.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Heartbeat {
     /// The cell's serial number.
     pub serial: u32,
-    /// Hash of its configuration, [`crate::parameters::Parameters::hash`].
+    /// Hash of its configuration: [`crate::parameters::Parameters::hash`].
     pub configuration: u16,
-    /// Packets sent before this one, modulo 2^16.
+    /// Number of packets sent before this one, modulo 2^16.
     pub sent: u16,
-    /// Frames refused, modulo 2^16; page 2 has the reasons.
+    /// Number of rejected frames, modulo 2^16; page 2 has the reasons.
     pub rejected: u16,
-    /// How it is.
+    /// State bits, the joint that moves the cell, and the protocol version.
     pub state: State,
 }
 
-/// Page 1: what became of received packets, each modulo 2^16.
+/// Page 1: counters of accepted packets, each modulo 2^16.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 #[cfg_attr(feature = "host", derive(serde::Serialize))]
 pub struct Heard {
-    /// Joints taken and answered if in contact.
+    /// Joints accepted (and answered if the cell is in contact).
     pub joints: u16,
     /// Joints skipped because they were older than one period.
     pub joints_late: u16,
-    /// Joints of the epoch that was the last already.
+    /// Joints with the same epoch as the last ones.
     pub joints_repeated: u16,
-    /// Stimuli taken.
+    /// Stimuli accepted.
     pub stimuli: u16,
-    /// Stimuli that came after the epoch they were meant for (taken from the next one on).
+    /// Stimuli that arrived after their epoch; they apply from the next epoch on.
     pub stimuli_late: u16,
     /// Torques sent.
     pub torques: u16,
 }
 
-/// Page 2: frames refused, each modulo 2^16.
+/// Page 2: counters of rejected frames, each modulo 2^16.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 #[cfg_attr(feature = "host", derive(serde::Serialize))]
 pub struct Refused {
-    /// Neither 16 bytes FD nor 8 bytes classic, as the bus has it.
+    /// Frames with a length or format that the bus does not use: 16 bytes FD, or classic segments of 8 bytes.
     pub length: u16,
-    /// Wrong CRC.
+    /// Packets with a wrong CRC.
     pub crc: u16,
-    /// Remote frame, error frame, 29-bit identifier.
+    /// Remote frames, error frames and frames with a 29-bit identifier.
     pub foreign: u16,
-    /// A kind, page or command that does not exist, or words that cannot be.
+    /// Packets with an undefined kind, page or command, or with invalid words.
     pub meaning: u16,
-    /// First segments whose second segment did not come.
+    /// Packets whose later segments did not arrive.
     pub incomplete: u16,
-    /// Stimuli for which there was no room, or that a measuring cell was sent.
+    /// Stimuli that did not fit into the queue, or were sent to a cell outside test mode.
     pub stimuli: u16,
 }
 
-/// Page 3: a cell's place in the tree. The epoch byte is that of the last joints taken.
+/// Page 3: a cell's place in the tree. The epoch byte is that of the last accepted joints.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Tree {
-    /// Where its sums go: the node id of a cell, 0 for the gateway's side; `None` where it is unreachable.
+    /// The parent, which receives its sums: the node id of a cell, or 0 for the gateway's side. `None` while
+    /// the cell is unreachable.
     pub parent: Option<u8>,
-    /// The port that leads there, 0 to 4; not looked at without a parent.
+    /// The port that leads to the parent, 0 to 4; undefined without a parent.
     pub up: u8,
-    /// Wires to the root of its tree: 0 is a root; not looked at without a parent.
+    /// Number of wires to the root of its tree; 0 for a root. Undefined without a parent.
     pub depth: u8,
-    /// The exploration from which the depth is.
+    /// The round of the exploration that determined the depth.
     pub round: u8,
-    /// Bit p: the cell at port p is its child.
+    /// Bit p is set if the cell at port p is a child.
     pub children: u8,
-    /// Bit p: port p works in both directions.
+    /// Bit p is set if port p works in both directions.
     pub works: u8,
-    /// Sums sent, resends among them, modulo 2^16.
+    /// Sums sent, including repetitions, modulo 2^16.
     pub sent: u16,
-    /// Sums taken from children, modulo 2^16.
+    /// Sums accepted from children, modulo 2^16.
     pub taken: u16,
-    /// Sums of children that were not taken: too late, or without a state message; modulo 2^16.
+    /// Sums of children that were dropped, because they were late or lacked a state message; modulo 2^16.
     pub dropped: u16,
 }
 
-/// Page 4: what a cell's ports lead to.
+/// Page 4: the state of a cell's ports.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Ports {
-    /// Each port.
+    /// The state of each port.
     pub ports: [PortState; 4],
-    /// How often its parent changed, modulo 2^16.
+    /// Number of changes of the parent, modulo 2^16.
     pub changes: u16,
 }
 
-/// What one port leads to.
+/// The cell at the other end of a port, and the state of the link.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct PortState {
-    /// The node id of the cell at the other end; 0 when nothing is received from there, or it has no node id.
+    /// The node id of the cell at the other end; 0 if it has none, or the port receives nothing.
     pub number: u8,
-    /// The other end's port.
+    /// The port at the other end.
     pub port: u8,
-    /// Hellos are received from there.
+    /// True if hellos arrive from the other end.
     pub hears: bool,
-    /// The other end receives this cell too.
+    /// True if the other end also receives this cell.
     pub works: bool,
-    /// It uses another version of the protocol.
+    /// True if the other end uses another version of the protocol.
     pub other_version: bool,
 }
 

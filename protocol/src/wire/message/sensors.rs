@@ -1,46 +1,46 @@
-//! What a cell measures, or shall feel.
+//! Sensor pages: measurements, and the simulated values of a stimulus.
 
 use super::MessageError;
 use crate::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use crate::id::Kind;
 use crate::packet::{self, WORDS};
 
-/// What a cell measures, or shall feel.
+/// A page of sensor values: measured by a cell, or simulated by a stimulus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum SensorPage {
-    /// Page 0: what touches the skin.
+    /// Page 0: contact forces, proximity and temperatures.
     Skin(SkinSensors),
     /// Page 1: accelerometer x, y, z in g.
     Acceleration([Q3_12; 3]),
-    /// Page 3: the zero of the force sensor; no stimulus has it.
+    /// Page 3: the baseline of the force sensor; only measured.
     Baseline(BaselinePage),
 }
 
-/// Page 3 of the sensors.
+/// Page 3 of the sensors: the baseline of the force sensor.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct BaselinePage {
-    /// The zero, in N, which is subtracted from the sum of the contact words.
+    /// The zero in N, which is subtracted from the sum of the contact words.
     pub zero: Q5_10,
-    /// The zero's shift with temperature, in N/°C.
+    /// The drift of the zero with temperature, in N/°C.
     pub n_per_c: Q1_14,
-    /// The temperature at which the zero was found, in degrees Celsius.
+    /// The temperature at which the zero was measured, in degrees Celsius.
     pub temperature: Q9_6,
-    /// There is a zero.
+    /// True if the cell has a zero.
     pub tared: bool,
-    /// Something touches the cell: the zero holds.
+    /// True while the cell is touched, during which the zero does not follow the sensor.
     pub touched: bool,
-    /// The zero would go further than its limit.
+    /// True if the zero has reached its limit.
     pub limited: bool,
-    /// Tares that were refused, modulo 2^16.
+    /// Number of refused tares, modulo 2^16.
     pub refused: u16,
 }
 
-/// Page 0 of the sensors.
+/// Page 0 of the sensors: the skin.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct SkinSensors {
-    /// Three capacitive contact forces in N; their sum is the touch.
+    /// Three capacitive contact forces in N; the touch is their sum.
     pub contact: [Q5_10; 3],
-    /// Proximity, 0 (nothing near) to 1.
+    /// Proximity, from 0 (nothing near) to 1.
     pub proximity: Q1_14,
     /// Two temperatures in degrees Celsius.
     pub temperature: [Q9_6; 2],

@@ -1,4 +1,4 @@
-//! How many words a packet has.
+//! Packet lengths, and the words of a packet.
 
 use core::fmt;
 
@@ -6,10 +6,10 @@ use super::{MAX_WORDS, SEGMENT_BYTES, WORDS};
 use crate::fixed::is_saturated;
 use crate::id::{Command, Id, Kind};
 
-/// The length of a packet, by its words.
+/// The length of a packet, by its number of words.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub enum Length {
-    /// 6 words in 16 bytes: chains of up to 6 joints, and all that is not about joints.
+    /// 6 words in 16 bytes: chains of up to 6 joints, and all packets without a word per joint.
     #[default]
     Six,
     /// 8 words in 20 bytes.
@@ -21,10 +21,10 @@ pub enum Length {
 }
 
 impl Length {
-    /// Every length, the shortest first.
+    /// All lengths, the shortest first.
     pub const ALL: [Self; 4] = [Self::Six, Self::Eight, Self::Ten, Self::Fourteen];
 
-    /// The words.
+    /// Returns the number of words.
     #[must_use]
     pub const fn words(self) -> usize {
         match self {
@@ -35,28 +35,29 @@ impl Length {
         }
     }
 
-    /// The bytes: the words, epoch, count and CRC.
+    /// Returns the size in bytes: words, epoch, count and CRC.
     #[must_use]
     pub const fn bytes(self) -> usize {
         2 * self.words() + 4
     }
 
-    /// Classic frames of the longest packet.
+    /// Number of classic frames of the longest packet.
     pub const MAX_SEGMENTS: usize = Self::Fourteen.segments();
 
-    /// Classic frames of a packet.
+    /// Returns the number of classic frames.
     #[must_use]
     pub const fn segments(self) -> usize {
         self.bytes().div_ceil(SEGMENT_BYTES)
     }
 
-    /// Bytes of the last of them; the others have 8.
+    /// Returns the size of the last classic frame in bytes; the others have 8.
     #[must_use]
     pub const fn last_segment(self) -> usize {
         self.bytes() - (self.segments() - 1) * SEGMENT_BYTES
     }
 
-    /// That of joints, torques and sums on the bus of a chain; the longest for more joints than a chain can have.
+    /// Returns the length of joints, torques and sums for a chain of `joints` joints. More joints than a
+    /// chain can have give the longest.
     #[must_use]
     pub const fn for_joints(joints: usize) -> Self {
         match joints {
@@ -67,87 +68,89 @@ impl Length {
         }
     }
 
-    /// The length of so many bytes.
+    /// Returns the length with this size in bytes, if there is one.
     #[must_use]
     pub fn of_bytes(bytes: usize) -> Option<Self> {
         Self::ALL.into_iter().find(|length| length.bytes() == bytes)
     }
 }
 
-/// A set of lengths: those that packets may have.
+/// A set of packet lengths.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Lengths(u8);
 
 impl Lengths {
-    /// All of them: where the chain is not known.
+    /// All lengths; for a bus whose chain is unknown.
     pub const ALL: Self = Self(0b1111);
 
-    /// One of them: where the chain is known.
+    /// The set of one length; for a bus whose chain is known.
     #[must_use]
     pub const fn only(length: Length) -> Self {
         Self(1 << length as u8)
     }
 
-    /// Those of a chain, if it is known.
+    /// Returns the set for a chain: one length if it is known, else all.
     #[must_use]
     pub fn of_chain(length: Option<Length>) -> Self {
         length.map_or(Self::ALL, Self::only)
     }
 
-    /// Those that the packets of an identifier may have, whatever the chain: only joints, torques and sums grow.
+    /// Returns the lengths that packets with this identifier can have on any chain. Only joints, torques and
+    /// sums vary.
     #[must_use]
     pub fn of(id: Id) -> Self {
         let grows = matches!(id.kind, Kind::Torque | Kind::Sum) || id == Id::command(Command::Joints);
         if grows { Self::ALL } else { Self::only(Length::Six) }
     }
 
-    /// Those of these that the packets of an identifier may have: six words where they do not grow.
+    /// Restricts this set to the lengths that packets with this identifier can have. Kinds with a fixed
+    /// length always get six words.
     #[must_use]
     pub fn of_these(self, id: Id) -> Self {
         let own = Self::of(id);
         if own == Self::ALL { self } else { own }
     }
 
-    /// Whether this is one of them.
+    /// Returns true if the set contains `length`.
     #[must_use]
     pub const fn has(self, length: Length) -> bool {
         self.0 & 1 << length as u8 != 0
     }
 
-    /// Each of them, the shortest first.
+    /// Returns the lengths in the set, the shortest first.
     pub fn iter(self) -> impl Iterator<Item = Length> {
         Length::ALL.into_iter().filter(move |&length| self.has(length))
     }
 
-    /// The shortest.
+    /// Returns the shortest length.
     pub(super) fn first(self) -> Length {
         self.iter().next().unwrap_or_default()
     }
 
-    /// The longest.
+    /// Returns the longest length.
     pub(super) fn longest(self) -> Length {
         self.iter().last().unwrap_or_default()
     }
 }
 
-/// The words of a packet, as many as its length says.
-// Aligned, or else a Cortex-M0 copies them byte by byte.
+/// The words of a packet, with their [`Length`].
+// Aligned to words; otherwise a Cortex-M0 copies them byte by byte.
 #[derive(Clone, Copy, Default, Eq, Hash, PartialEq)]
 #[repr(align(4))]
 pub struct Words {
     length: Length,
-    /// Those beyond the length are zero.
+    /// Words beyond the length are zero.
     words: [i16; MAX_WORDS],
 }
 
 impl Words {
-    /// Zeros.
+    /// Returns `length` words, all zero.
     #[must_use]
     pub const fn zeros(length: Length) -> Self {
         Self { length, words: [0; MAX_WORDS] }
     }
 
-    /// The first of these, as many as the length says.
+    /// Creates words of this length; further elements of `words` are dropped.
     #[must_use]
     pub fn new(length: Length, words: [i16; MAX_WORDS]) -> Self {
         let mut it = Self { length, words };
@@ -155,25 +158,25 @@ impl Words {
         it
     }
 
-    /// How many there are.
+    /// Returns the length.
     #[must_use]
     pub const fn length(&self) -> Length {
         self.length
     }
 
-    /// The words.
+    /// Returns the words as a slice.
     #[must_use]
     pub fn as_slice(&self) -> &[i16] {
         self.words.get(..self.length.words()).unwrap_or_default()
     }
 
-    /// The words, and zeros after them.
+    /// Returns the words, padded with zeros.
     #[must_use]
     pub const fn padded(&self) -> [i16; MAX_WORDS] {
         self.words
     }
 
-    /// The same with another word at a place; none changes at a place beyond them.
+    /// Returns a copy with one word replaced. An index beyond the length changes nothing.
     #[must_use]
     pub fn with(mut self, place: usize, word: i16) -> Self {
         if let Some(there) = self.words.get_mut(..self.length.words()).and_then(|words| words.get_mut(place))
@@ -183,20 +186,20 @@ impl Words {
         self
     }
 
-    /// The first six: all of them in a packet that is not about joints.
+    /// Returns the first six words: all of them in a packet that does not vary with the chain.
     #[must_use]
     pub const fn six(&self) -> [i16; WORDS] {
         let [a, b, c, d, e, f, ..] = self.words;
         [a, b, c, d, e, f]
     }
 
-    /// Whether each is zero.
+    /// Returns true if all words are zero.
     #[must_use]
     pub fn is_zero(&self) -> bool {
         self.words == [0; MAX_WORDS]
     }
 
-    /// Whether one is at an end of its range, which in torques and sums means *saturated*.
+    /// Returns true if a word has the largest or smallest value, which means *saturated* in torques and sums.
     #[must_use]
     pub fn is_saturated(&self) -> bool {
         self.words.iter().any(|&word| is_saturated(word))

@@ -1,4 +1,4 @@
-//! From classic frames to packets: segments that wait for the others of their packet.
+//! Reassembly of packets from classic frames.
 
 use heapless::Deque;
 
@@ -6,31 +6,33 @@ use super::{Length, Lengths, MAX_BYTES, Packet, PacketError, SEGMENT_BYTES};
 use crate::id::{Command, Id, Kind};
 use crate::time::{Micros, Span};
 
-/// What became of a classic frame.
+/// The result of a classic frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Reassembly {
-    /// A segment; others are awaited.
+    /// The packet still lacks segments.
     Waiting,
-    /// All segments arrived and the CRC is right.
+    /// The packet is complete and its CRC is correct.
     Complete(Packet),
-    /// A packet is lost: segments that do not belong together, or that came too far apart. The oldest is dropped, and
-    /// the one after it is now the first. Returned once for a packet of which several segments came.
+    /// A packet is lost: its segments do not fit together, or arrived too far apart. The oldest segment is
+    /// dropped, and the next one is now the first. Returned once for a packet of which several segments
+    /// arrived.
     Incomplete,
-    /// Packets of several lengths end with this segment, each with a right CRC: none of them is taken.
+    /// The segment completes packets of several lengths with correct CRCs; all of them are dropped.
     Ambiguous,
 }
 
-/// The segments of a packet in classic frames that came so far, one of these per identifier.
+/// The reassembly buffer of one identifier: the segments of a packet received so far.
 ///
-/// Segments come in order and within [`Segment::within`] of each other. A packet's length follows from its kind and
-/// the chain of its bus; where the chain is not known, each length is tried. When the CRC fails, only the oldest segment
-/// is dropped, so that a lost frame costs one packet and not every later one.
+/// Segments arrive in order and within [`Segment::within`] of each other. The length of a packet follows from
+/// its kind and the chain of its bus; where the chain is unknown, every length is tried. When the CRC fails,
+/// only the oldest segment is dropped, so that a lost frame costs one packet and not all later ones.
 #[derive(Clone, Debug, Default)]
 pub struct Segment {
     waiting: Deque<Waiting, { Length::MAX_SEGMENTS }>,
-    /// So many of the oldest may belong to a packet that has been counted as incomplete: they are not counted again.
+    /// The number of oldest segments that may belong to a packet already reported as incomplete; they are not
+    /// reported again.
     counted: usize,
-    /// A packet was lost before the last complete one, and is not counted yet.
+    /// True if a packet was lost before the last complete one and has not been reported yet.
     owed: bool,
 }
 
@@ -42,39 +44,39 @@ struct Waiting {
 }
 
 impl Segment {
-    /// The longest time between the segments of joints and of the answers to them: less than the 16 ms after which
-    /// the next ones usually come, because one in 65 536 groups of segments of different packets has a right CRC.
+    /// The maximum time between the segments of joints, torques and sums. It is below the usual 16 ms between
+    /// two broadcasts, because one in 65 536 groups of segments of different packets has a correct CRC.
     const WITHIN_A_PERIOD: Span = Span::from_millis(15);
-    /// The longest time between those of everything else, most of which is sent once.
+    /// The maximum time between the segments of all other packets, most of which are sent once.
     const WITHIN: Span = Span::from_millis(100);
 
-    /// Nothing waiting.
+    /// An empty buffer.
     pub const NONE: Self = Self { waiting: Deque::new(), counted: 0, owed: false };
 
-    /// The longest time between the arrivals of the first and the last segment of a packet.
+    /// Returns the maximum time between the arrivals of the first and the last segment of a packet.
     #[must_use]
     pub fn within(id: Id) -> Span {
         let is_periodic = matches!(id.kind, Kind::Sum | Kind::Torque) || id == Id::command(Command::Joints);
         if is_periodic { Self::WITHIN_A_PERIOD } else { Self::WITHIN }
     }
 
-    /// Whether a segment waits for others.
+    /// Returns true if the buffer holds a segment of an incomplete packet.
     #[must_use]
     pub fn is_waiting(&self) -> bool {
         !self.waiting.is_empty()
     }
 
-    /// How many segments wait for others.
+    /// Returns the number of segments in the buffer.
     #[must_use]
     pub fn waiting(&self) -> usize {
         self.waiting.len()
     }
 
-    /// Takes the next classic frame of this identifier, whose packets have one of these lengths. A kind whose packets
-    /// do not grow needs none: [`Lengths::of`] the identifier is respected.
+    /// Adds the next classic frame of this identifier, whose packets can have one of `lengths`. The set is
+    /// restricted to the lengths of the identifier ([`Lengths::of`]).
     ///
     /// # Errors
-    /// When it carries so many bytes as no segment of theirs; those that wait keep waiting.
+    /// Returns an error if no segment of these lengths has that size. The buffer does not change.
     pub fn push(
         &mut self,
         at: Micros,
@@ -115,7 +117,8 @@ impl Segment {
         Ok(self.drop_oldest(at, within, lengths.longest().segments(), belong_together))
     }
 
-    /// The packet of this length that ends with the newest segment, if its CRC is right, and when its first one came.
+    /// Returns the packet of this length that ends with the newest segment, if its CRC is correct, and the
+    /// arrival time of its first segment.
     fn ends_with(&self, id: Id, length: Length) -> Option<(Packet, Micros)> {
         let skipped = self.waiting.len().checked_sub(length.segments())?;
         let mut bytes = [0; MAX_BYTES];
@@ -134,7 +137,8 @@ impl Segment {
         Some((packet, since?))
     }
 
-    /// No packet ends with the newest segment: what is too old is dropped, and of as many as a packet has the oldest.
+    /// Handles a segment that completes no packet: drops the segments that are too old, or else the oldest
+    /// one if the buffer holds as many as a packet has.
     fn drop_oldest(
         &mut self,
         now: Micros,

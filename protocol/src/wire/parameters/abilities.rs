@@ -1,11 +1,11 @@
-//! What a cell can compute, as it says in its identity.
+//! The abilities that a cell reports in its identity.
 
 use core::fmt;
 
 use super::{MAX_JOINTS, MAX_ROWS, Parameters, RowKind};
 use crate::fixed::TorqueFormat;
 
-/// What a cell can compute: word 5 of parameter 0.
+/// The abilities of a cell: word 5 of parameter 0.
 ///
 /// | bits | meaning |
 /// |---|---|
@@ -18,21 +18,21 @@ use crate::fixed::TorqueFormat;
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Abilities(u16);
 
-/// Something that parameters ask for and a cell cannot compute.
+/// An ability that parameters require and a cell lacks.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Ability {
-    /// A chain of so many joints.
+    /// A chain of this length.
     Joints {
-        /// How many are asked for.
+        /// Required number of joints.
         needed: usize,
-        /// How many it can have.
+        /// Maximum of the cell.
         most: usize,
     },
-    /// A table of so many rows.
+    /// A table of this length.
     Rows {
-        /// How many are asked for.
+        /// Required number of rows.
         needed: usize,
-        /// How many it can have.
+        /// Maximum of the cell.
         most: usize,
     },
     /// Rows of this kind.
@@ -59,7 +59,7 @@ impl Abilities {
     const Q5_10: u16 = 1 << 12;
     const Q7_8: u16 = 1 << 13;
 
-    /// Everything that this version of the protocol knows.
+    /// All abilities of this version of the protocol.
     #[expect(clippy::cast_possible_truncation, reason = "14 joints and 32 rows")]
     pub const ALL: Self = Self(
         MAX_JOINTS as u16
@@ -70,25 +70,25 @@ impl Abilities {
             | Self::Q7_8,
     );
 
-    /// What a word says.
+    /// Decodes the word.
     #[must_use]
     pub const fn from_word(word: i16) -> Self {
         Self(word.cast_unsigned())
     }
 
-    /// The word.
+    /// Returns the word.
     #[must_use]
     pub const fn word(self) -> i16 {
         self.0.cast_signed()
     }
 
-    /// Joints of the longest chain that it can compute.
+    /// Returns the maximum number of joints of a chain.
     #[must_use]
     pub fn joints(self) -> usize {
         Self::or_six(self.0 & 0xF)
     }
 
-    /// Rows of the longest table that it can compute.
+    /// Returns the maximum number of rows of a table.
     #[must_use]
     pub fn rows(self) -> usize {
         Self::or_six(self.0 >> Self::ROWS & 0x3F)
@@ -102,7 +102,7 @@ impl Abilities {
         self.0 & bit != 0
     }
 
-    /// The first thing that these parameters ask for and the cell cannot.
+    /// Returns the first ability that `parameters` require and the cell lacks.
     #[must_use]
     pub fn lacks(self, parameters: &Parameters) -> Option<Ability> {
         let (joints, table) = (usize::from(parameters.joints), parameters.table());

@@ -1,30 +1,30 @@
-//! The baseline of a cell's force sensor, parameter 11: what the sensor reads when nothing touches it.
+//! The baseline of a cell's force sensor, parameter 11: the reading without a touch.
 
 use crate::fixed::{Q1_14, Q5_10};
 use crate::packet::{self, WORDS};
 
-/// What a cell takes for its zero, parameter 11. Volatile: a cell starts with [`Baseline::Off`].
+/// The baseline mode, parameter 11. Volatile: a cell starts with [`Baseline::Off`].
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Baseline {
-    /// Zero is zero.
+    /// The raw sensor value is used.
     #[default]
     Off,
-    /// Zero is what a tare found.
+    /// The zero found by a tare is subtracted.
     On(Zeroing),
 }
 
-/// How a cell finds its zero, and follows it.
+/// The way a cell finds its zero and follows its drift.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Zeroing {
-    /// At this force above the zero, in N, something touches the cell; above 0.
+    /// Force above the zero from which the cell counts as touched, in N; greater than 0.
     pub threshold: Q5_10,
-    /// What part of the threshold the force has to fall below it for a release, 0 to 1.
+    /// Fraction of the threshold by which the force must fall below it for a release, 0 to 1.
     pub hysteresis: Q1_14,
-    /// How quickly the zero follows without a touch, in µN/s; 0: it does not.
+    /// Rate at which the zero follows the sensor while the cell is not touched, in µN/s; 0 holds the zero.
     pub rate_un_per_s: u16,
-    /// How far the zero may be from 0, in N.
+    /// Maximum distance of the zero from 0, in N.
     pub limit: Q5_10,
-    /// The zero's shift with temperature, in N/°C.
+    /// Drift of the zero with temperature, in N/°C.
     pub n_per_c: Q1_14,
 }
 
@@ -32,7 +32,7 @@ impl Baseline {
     const HOLD: i16 = 1;
     const FOLLOW: i16 = 2;
 
-    /// The words of the parameter.
+    /// Encodes the words of the parameter.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
         let Self::On(zeroing) = self else { return [0; WORDS] };
@@ -47,8 +47,8 @@ impl Baseline {
         ])
     }
 
-    /// Decodes the words; `None` when they cannot be: no such mode, a threshold of 0 or below, a hysteresis below 0 or
-    /// above 1, a limit below 0, or a zero that follows at a rate of 0.
+    /// Decodes the words. Returns `None` if they are invalid: an undefined mode, a threshold of 0 or below, a
+    /// hysteresis outside 0 to 1, a negative limit, or a zero that follows at a rate of 0.
     #[must_use]
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
         let [mode, threshold, hysteresis, rate, limit, n_per_c] = words;
@@ -69,19 +69,19 @@ impl Baseline {
     }
 }
 
-/// What a write of parameter 12 asks for.
+/// A tare command: a write of parameter 12.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Tare {
-    /// 0: the zero is forgotten, and found again as after a start.
+    /// 0: forgets the zero; it is found again as after a start.
     Forget,
-    /// 1: what the sensor reads is its zero, unless something touches it.
+    /// 1: uses the present reading as zero, unless the cell is touched.
     Untouched,
-    /// 2: what the sensor reads is its zero, whatever touches it.
+    /// 2: uses the present reading as zero, even if the cell is touched.
     Anyhow,
 }
 
 impl Tare {
-    /// Decodes the words; `None` when there is no such tare.
+    /// Decodes the words. Returns `None` for an undefined command.
     #[must_use]
     pub const fn from_words(words: [i16; WORDS]) -> Option<Self> {
         match words {

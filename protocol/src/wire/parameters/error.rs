@@ -1,81 +1,81 @@
-//! Why a parameter is refused.
+//! Errors of parameters.
 
 use thiserror::Error;
 
 use super::{MAX_JOINTS, MAX_ROWS};
 
-/// Why words cannot be taken for a parameter.
+/// The error for words that are invalid for a parameter.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ParameterError {
-    /// No such number, or one that cannot be written this way.
+    /// The parameter does not exist, or cannot be written this way.
     #[error("parameter {0} cannot be written")]
     NotWritable(u8),
-    /// The number of joints.
+    /// The number of joints is out of range.
     #[error("{got} joints; 1 to {MAX_JOINTS} are possible")]
     Joints {
-        /// What was asked for.
+        /// The requested number of joints.
         got: i16,
     },
-    /// The joint that moves the cell.
+    /// The joint that moves the cell does not exist.
     #[error("joint {got} does not exist; the chain has joints 1 to {joints}")]
     Joint {
-        /// What was asked for.
+        /// The requested joint.
         got: i16,
-        /// How many there are.
+        /// The number of joints of the chain.
         joints: i16,
     },
-    /// The normal's length.
+    /// The normal does not have unit length.
     #[error("the outward normal has length^2 {got} / 2^28; within 1/64 of 2^28 is allowed")]
     Normal {
-        /// Its square, in steps of 2^-28.
+        /// The square of its length, in steps of 2^-28.
         got: i64,
     },
-    /// A threshold below zero, or a gain.
+    /// A gain or threshold is negative.
     #[error("word {word} of the contact parameter is {got}; it must not be negative")]
     Negative {
-        /// Which word, from 0.
+        /// The index of the word, from 0.
         word: u8,
-        /// What it is.
+        /// The value of the word.
         got: i16,
     },
-    /// The broadcast period.
+    /// The broadcast period is zero.
     #[error("a joint broadcast every 0 us is not possible")]
     Period,
-    /// The number of rows, or their joints.
+    /// The number of rows is out of range, or does not match the joints.
     #[error("{got} rows; a row for each of the {joints} joints is needed, and {MAX_ROWS} are possible")]
     Rows {
-        /// How many rows there should be.
+        /// The requested number of rows.
         got: i16,
-        /// How many joints there are.
+        /// The number of joints of the chain.
         joints: i16,
     },
-    /// The row that carries the cell.
+    /// The row that carries the cell does not follow its joint.
     #[error("row {got} of {rows} does not follow the joint that moves the cell")]
     Row {
-        /// What was asked for.
+        /// The requested row.
         got: i16,
-        /// How many there are.
+        /// The number of rows of the table.
         rows: i16,
     },
-    /// The kind of a row.
+    /// The kind of a row is undefined.
     #[error("row {row} has kind {got}; 0 revolute, 1 prismatic and 2 fixed are possible")]
     Kind {
-        /// Which row, from 1.
+        /// The number of the row, from 1.
         row: u8,
-        /// What was asked for.
+        /// The requested kind.
         got: i16,
     },
-    /// The torque format.
+    /// The torque format is undefined.
     #[error("torque format {got} does not exist: 0 Q3.12, 1 Q5.10, 2 Q7.8 do")]
     Format {
-        /// What was asked for.
+        /// The requested format.
         got: i16,
     },
 }
 
 impl ParameterError {
-    /// The number that stands for this error in a refusal.
+    /// Returns the number that stands for this error in a refusal.
     #[must_use]
     pub const fn code(self) -> i16 {
         match self {

@@ -1,7 +1,7 @@
-//! What a cell stores: the robot's table, its own pose, its gains and thresholds, as the words
-//! in which they travel and lie in flash.
+//! The parameters of a cell: the robot's table, the cell's pose, its gains and thresholds, as words on the
+//! bus and in flash.
 //!
-//! Each parameter is one packet's six words (unused words are not looked at, and are stored and answered as 0):
+//! Each parameter is the six words of one packet. Unused words are ignored, and are stored and answered as 0:
 //!
 //! | number | parameter | words |
 //! |---|---|---|
@@ -11,7 +11,7 @@
 //! | 3 | contact (Algorithm 1) | alpha_c Q3.12, alpha_p in N Q5.10, F_c,th in N Q5.10, F_p,th Q1.14, F_z,th in N Q5.10 |
 //! | 4 | timing | period of the joint broadcast in µs, unsigned |
 //! | 5 | mode, volatile | 1: obey stimuli, 0: measure |
-//! | 6 | reply, volatile | 0: own torque, 1: sum; width of a slot in µs, unsigned; depth of the deepest cell; 1: carry what rounding took away |
+//! | 6 | reply, volatile | 0: own torque, 1: sum; width of a slot in µs, unsigned; depth of the deepest cell; 1: carry the rounding error |
 //! | 7 | sensing, volatile | 0: off, 1: continuous, 2: event; period in ms |
 //! | 8 | events, volatile | thresholds: contact N Q5.10, proximity Q1.14, temperature °C Q9.6, acceleration g Q3.12; hysteresis, a part of each, Q1.14 |
 //! | 9 | links_down, volatile | bit p: port p receives nothing (only in test mode) |
@@ -20,8 +20,8 @@
 //! | 16..=47 | Denavit-Hartenberg row 1..=32 | a, d in m, Q1.14; alpha, theta offset in quarter turns, Q1.14; kind (0 revolute, 1 prismatic, 2 fixed) |
 //! | 127 | commit, write only | hash that the written parameters must have |
 //!
-//! Writing changes a staged copy; a commit with the right hash takes the copy into flash and into use,
-//! all of it or nothing.
+//! A write changes a staged copy. A commit with the correct hash stores the whole copy in flash and activates
+//! it; any other commit changes nothing.
 
 mod abilities;
 mod baseline;
@@ -38,55 +38,55 @@ pub use switches::{Events, LinksDown, Reply, Sensing, Slots};
 use crate::fixed::{Q1_14, Q3_12, Q5_10, TorqueFormat};
 use crate::packet::{MAX_WORDS, WORDS, crc16_of, words};
 
-/// The longest chain of joints.
+/// Maximum number of joints of a chain.
 pub const MAX_JOINTS: usize = MAX_WORDS;
-/// The most rows of a chain's table.
+/// Maximum number of rows of a chain's table.
 pub const MAX_ROWS: usize = 32;
-/// Rows that each image has; a longer chain's rows follow them.
+/// Number of rows in every image; rows of a longer chain follow them.
 const IMAGE_ROWS: usize = 6;
-/// The number of row 1.
+/// The parameter number of row 1.
 const FIRST_ROW: u8 = 16;
-/// The number after that of the last row.
+/// The parameter number after the last row.
 #[expect(clippy::cast_possible_truncation, reason = "32 rows")]
 const AFTER_ROWS: u8 = FIRST_ROW + MAX_ROWS as u8;
 
-/// The parameters' numbers in `configure` and `configured` packets.
+/// A parameter. `configure` and `configured` packets carry its number.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Parameter {
-    /// 0: who the cell is.
+    /// 0: serial number, version, state and abilities.
     Identity,
-    /// 1: which joint moves it.
+    /// 1: the joint and row that carry the cell, and the torque format.
     Mount,
-    /// 2: where it sits and where it points.
+    /// 2: position and normal.
     Pose,
     /// 3: gains and thresholds.
     Contact,
     /// 4: the period of the joint broadcast.
     Timing,
-    /// 5: whether it obeys stimuli.
+    /// 5: stimuli or sensors.
     Mode,
-    /// 6: what it answers joints with.
+    /// 6: the reply to joints.
     Reply,
-    /// 7: when it sends what it measures.
+    /// 7: the times at which the cell sends measurements.
     Sensing,
-    /// 8: which changes are events.
+    /// 8: the thresholds of event mode.
     Events,
-    /// 9: the ports whose links are down, for tests.
+    /// 9: ports whose links are down, for tests.
     LinksDown,
-    /// 11: what it takes for the zero of its force sensor.
+    /// 11: the baseline of the force sensor.
     Baseline,
-    /// 12: it takes what it reads for its zero now.
+    /// 12: a tare command.
     Tare,
     /// 16 to 47: one row of the chain's table, counted from 0.
     Row(u8),
-    /// 127: take what was written into use.
+    /// 127: stores and activates the written parameters.
     Commit,
 }
 
-/// The parameters that are kept in flash before the rows, in the order in which they are hashed.
+/// The stored parameters before the rows, in the order in which they are hashed.
 const STORED: [Parameter; 4] = [Parameter::Mount, Parameter::Pose, Parameter::Contact, Parameter::Timing];
 
-/// Every parameter that is no row, and its number.
+/// Every parameter except the rows, with its number.
 const NUMBERS: [(Parameter, u8); 13] = [
     (Parameter::Identity, 0),
     (Parameter::Mount, 1),
@@ -104,19 +104,20 @@ const NUMBERS: [(Parameter, u8); 13] = [
 ];
 
 impl Parameter {
-    /// The parameters that are kept in flash for a chain of so many rows, in the order in which they are hashed.
+    /// Returns the parameters that are stored for a chain with `rows` rows, in the order in which they are
+    /// hashed.
     pub fn stored(rows: usize) -> impl Iterator<Item = Self> {
         let rows = rows.clamp(IMAGE_ROWS, MAX_ROWS);
         STORED.into_iter().chain((0..).take(rows).map(Self::Row))
     }
 
-    /// Whether it is kept in flash.
+    /// Returns true if the parameter is kept in flash.
     #[must_use]
     pub fn is_stored(self) -> bool {
         matches!(self, Self::Row(_)) || STORED.contains(&self)
     }
 
-    /// The parameter with this number, if there is one.
+    /// Returns the parameter with this number, if it exists.
     #[must_use]
     pub fn from_number(number: u8) -> Option<Self> {
         if (FIRST_ROW..AFTER_ROWS).contains(&number) {
@@ -125,7 +126,7 @@ impl Parameter {
         NUMBERS.iter().find(|(_, known)| *known == number).map(|(parameter, _)| *parameter)
     }
 
-    /// Its number; that of a commit, which no row has, for a row that does not exist.
+    /// Returns the parameter number. A row that does not exist has the number of the commit.
     #[must_use]
     pub fn number(self) -> u8 {
         if let Self::Row(row) = self
@@ -136,7 +137,7 @@ impl Parameter {
         NUMBERS.iter().find(|(known, _)| *known == self).map_or(127, |(_, number)| *number)
     }
 
-    /// Whether it applies as soon as it is written, is not stored, and is lost at a restart.
+    /// Returns true if a write takes effect at once and is lost at a restart.
     #[must_use]
     pub const fn is_volatile(self) -> bool {
         matches!(
@@ -151,7 +152,8 @@ impl Parameter {
         )
     }
 
-    /// Whether a cell can have these words; those of stored parameters it checks at the commit.
+    /// Returns true if a cell accepts these words. Stored parameters are accepted here and checked at the
+    /// commit.
     #[must_use]
     pub fn can_be(self, words: [i16; WORDS]) -> bool {
         match self {
@@ -173,50 +175,51 @@ impl Parameter {
     }
 }
 
-/// Where a cell sits and where it points, in the frame of the row that carries it.
+/// Position and orientation of a cell, in the frame of the row that carries it.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Pose {
     /// Position in m.
     pub position: [Q1_14; 3],
-    /// Outward normal, of unit length; contacts push against it.
+    /// Outward unit normal; contact forces push against it.
     pub normal: [Q1_14; 3],
 }
 
 /// Gains and thresholds of the paper's Algorithm 1.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Contact {
-    /// Weight of the contact force.
+    /// Gain of the contact force.
     pub alpha_c: Q3_12,
-    /// Weight of the proximity, in N.
+    /// Gain of the proximity, in N.
     pub alpha_p: Q5_10,
-    /// Contact forces below this count as none, in N.
+    /// Contact forces below this threshold, in N, count as zero.
     pub contact_threshold: Q5_10,
-    /// Proximities below this count as none.
+    /// Proximities below this threshold count as zero.
     pub proximity_threshold: Q1_14,
-    /// Fused forces below this count as none, in N.
+    /// Fused forces below this threshold, in N, count as zero.
     pub force_threshold: Q5_10,
 }
 
-/// All that a cell computes with.
+/// The stored parameters of a cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Parameters {
     /// The joint k that moves the cell's link, 1 to `joints`.
     pub joint: u8,
-    /// How many joints the chain has, 1 to 14.
+    /// Number of joints of the chain, 1 to 14.
     pub joints: u8,
-    /// The row that carries the cell, 1 to `table_rows`; 0, with `table_rows` 0: row k.
+    /// The row that carries the cell, 1 to `table_rows`. It is 0 if `table_rows` is 0: then row k carries the
+    /// cell.
     pub row: u8,
-    /// How many rows the chain has, `joints` to 32; 0: one for each joint, all of them revolute.
+    /// Number of rows of the chain, `joints` to 32. 0 stands for one revolute row per joint.
     pub table_rows: u8,
-    /// How it sends its own torque.
+    /// The format of the cell's own torque.
     pub torque_format: TorqueFormat,
-    /// Where the cell sits.
+    /// The pose of the cell.
     pub pose: Pose,
-    /// How it feels.
+    /// Gains and thresholds.
     pub contact: Contact,
-    /// The period of the joint broadcast in µs; joints older than this are skipped.
+    /// The period of the joint broadcast in µs. Joints older than this are skipped.
     pub period_us: u16,
-    /// The chain; rows beyond those in use are zero.
+    /// The table of the chain; unused rows are zero.
     pub rows: [Row; MAX_ROWS],
 }
 
@@ -239,21 +242,21 @@ impl Default for Parameters {
             period_us: 0,
             rows: [Row::ZERO; MAX_ROWS],
         };
-        // A constant: the default of an array is code for each of its elements.
+        // A constant, because the default of an array compiles to code for each element.
         ZERO
     }
 }
 
-/// Bytes of the parameters of a chain of up to 6 rows, as they are hashed and kept.
+/// Size of the image of a chain with up to 6 rows, in bytes.
 pub const IMAGE_BYTES: usize = (STORED.len() + IMAGE_ROWS) * WORDS * 2;
-/// Bytes of those of a chain of 32 rows.
+/// Size of the image of a chain with 32 rows, in bytes.
 pub const MAX_IMAGE_BYTES: usize = (STORED.len() + MAX_ROWS) * WORDS * 2;
 
-/// The parameters as bytes: [`IMAGE_BYTES`], and 12 more for each row after the sixth.
+/// The stored parameters as bytes: [`IMAGE_BYTES`], and 12 more for each row after the sixth.
 pub type Image = heapless::Vec<u8, MAX_IMAGE_BYTES>;
 
 impl Parameters {
-    /// The words of a stored parameter; zeros for the others.
+    /// Returns the words of a stored parameter; zeros for other parameters.
     #[must_use]
     pub fn words(&self, parameter: Parameter) -> [i16; WORDS] {
         match parameter {
@@ -286,11 +289,11 @@ impl Parameters {
         }
     }
 
-    /// Takes the words of one parameter as they are; [`Parameters::check`] looks at the whole.
+    /// Sets one parameter from its words. [`Parameters::check`] validates the result as a whole.
     ///
     /// # Errors
-    /// When the parameter is not one that is stored, a count does not fit its byte, or there is no such kind of row or
-    /// format; then nothing is changed.
+    /// Returns an error if the parameter is not stored, a count does not fit a byte, or the kind of a row or
+    /// the torque format is undefined. The parameters do not change then.
     pub fn set(&mut self, parameter: Parameter, words: [i16; WORDS]) -> Result<(), ParameterError> {
         let [w0, w1, w2, w3, w4, w5, ..] = words;
         match parameter {
@@ -339,10 +342,10 @@ impl Parameters {
         Ok(())
     }
 
-    /// Whether a cell can compute with this.
+    /// Checks that a cell can compute with these parameters.
     ///
     /// # Errors
-    /// The first thing that is wrong: joints, the normal's length, negative gains, no period, rows.
+    /// Returns the first error: in the joints, the normal, the gains and thresholds, the period or the rows.
     pub fn check(&self) -> Result<(), ParameterError> {
         let (joint, joints) = (i16::from(self.joint), i16::from(self.joints));
         if self.joints == 0 || usize::from(self.joints) > MAX_JOINTS {
@@ -366,7 +369,7 @@ impl Parameters {
         self.check_rows(joints)
     }
 
-    /// Whether the rows have as many joints as the chain, and the row that carries the cell follows joint k.
+    /// Checks that the rows have as many joints as the chain, and that the row of the cell follows joint k.
     fn check_rows(&self, joints: i16) -> Result<(), ParameterError> {
         let (row, rows) = (i16::from(self.row), i16::from(self.table_rows));
         let moving = |rows: &[Row]| rows.iter().filter(|row| row.moves()).count();
@@ -386,26 +389,26 @@ impl Parameters {
         Ok(())
     }
 
-    /// Whether each row in use is revolute.
+    /// Returns true if all rows in use are revolute.
     fn is_plain(&self) -> bool {
         self.table().iter().all(|row| row.kind == RowKind::Revolute)
     }
 
-    /// The rows of the whole chain.
+    /// Returns the rows of the whole chain.
     #[must_use]
     pub fn table(&self) -> &[Row] {
         let rows = if self.table_rows == 0 { self.joints } else { self.table_rows };
         self.rows.get(..usize::from(rows)).unwrap_or_default()
     }
 
-    /// The rows from the base to the cell.
+    /// Returns the rows from the base to the cell.
     #[must_use]
     pub fn chain(&self) -> &[Row] {
         let row = if self.row == 0 { self.joint } else { self.row };
         self.rows.get(..usize::from(row)).unwrap_or_default()
     }
 
-    /// These parameters with the shortest words that mean the same: no rows are named where they follow from the
+    /// Returns equivalent parameters in the shortest form: row numbers are 0 where they follow from the
     /// joints.
     #[must_use]
     pub fn shortest(self) -> Self {
@@ -417,18 +420,18 @@ impl Parameters {
         }
     }
 
-    /// All stored parameters as bytes, in the order of [`Parameter::stored`], words little endian.
+    /// Encodes all stored parameters, in the order of [`Parameter::stored`], words little endian.
     #[must_use]
     pub fn image(&self) -> Image {
         self.image_parts().flatten().collect()
     }
 
-    /// [`Parameters::image`], one parameter after the other: a small stack has no room for all of them.
+    /// Returns the parts of [`Parameters::image`], one parameter each, for callers with a small stack.
     pub fn image_parts(&self) -> impl Iterator<Item = [u8; WORDS * 2]> {
         Parameter::stored(self.table().len()).map(|parameter| self.image_part(parameter))
     }
 
-    /// The bytes of one parameter.
+    /// Encodes one parameter.
     #[inline(never)]
     fn image_part(&self, parameter: Parameter) -> [u8; WORDS * 2] {
         let mut bytes = [0; WORDS * 2];
@@ -438,10 +441,11 @@ impl Parameters {
         bytes
     }
 
-    /// Reads an image and checks it.
+    /// Decodes an image and checks it.
     ///
     /// # Errors
-    /// When [`Parameters::set`] or [`Parameters::check`] refuses it, or it is longer or shorter than its rows.
+    /// Returns an error if [`Parameters::set`] or [`Parameters::check`] refuses it, or its length does not
+    /// match its rows.
     pub fn from_image(image: &[u8]) -> Result<Self, ParameterError> {
         let mut parameters = Self::default();
         let mut words = image.as_chunks::<2>().0.as_chunks::<WORDS>().0.iter();
@@ -458,7 +462,7 @@ impl Parameters {
         Ok(parameters)
     }
 
-    /// The configuration hash that heartbeats carry: CRC-16 (as in packets) over [`Parameters::image`].
+    /// Returns the configuration hash of heartbeats: the CRC-16 of packets over [`Parameters::image`].
     #[must_use]
     pub fn hash(&self) -> u16 {
         crc16_of(self.image_parts())

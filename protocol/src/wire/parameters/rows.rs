@@ -1,26 +1,26 @@
-//! The table of a chain.
+//! Rows of the Denavit-Hartenberg table of a chain.
 
 use super::ParameterError;
 use crate::fixed::Q1_14;
 use crate::packet::{WORDS, words};
 
-/// What a row of the table does when its joint moves.
+/// The joint of a row.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum RowKind {
-    /// It turns about z: the position is added to theta.
+    /// A revolute joint about z: its position is added to theta.
     #[default]
     Revolute,
-    /// It slides along z: the position, in m, is added to d.
+    /// A prismatic joint along z: its position, in m, is added to d.
     Prismatic,
-    /// Nothing: it has no joint.
+    /// A fixed row, without a joint.
     Fixed,
 }
 
 impl RowKind {
-    /// Every kind; a kind's place is the number that stands for it.
+    /// All kinds. The index of a kind is its number in a parameter.
     pub const ALL: [Self; 3] = [Self::Revolute, Self::Prismatic, Self::Fixed];
 
-    /// Its name.
+    /// Returns the name of the kind.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -34,7 +34,7 @@ impl RowKind {
 /// One row of a chain's table in standard Denavit-Hartenberg form, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Row {
-    /// What its joint does.
+    /// The kind of the joint.
     pub kind: RowKind,
     /// Length of the link in m.
     pub a: Q1_14,
@@ -42,12 +42,12 @@ pub struct Row {
     pub d: Q1_14,
     /// Twist in quarter turns.
     pub alpha: Q1_14,
-    /// What is added to the joint's position, in quarter turns; the whole angle where the joint does not turn.
+    /// Angle added to the joint position, in quarter turns; the whole angle of a row that does not turn.
     pub theta_offset: Q1_14,
 }
 
 impl Row {
-    /// A revolute row without lengths and angles.
+    /// A revolute row in which all lengths and angles are zero.
     pub(super) const ZERO: Self = Self {
         kind: RowKind::Revolute,
         a: Q1_14::ZERO,
@@ -56,20 +56,20 @@ impl Row {
         theta_offset: Q1_14::ZERO,
     };
 
-    /// Whether it has a joint.
+    /// Returns true if the row has a joint.
     #[must_use]
     pub fn moves(&self) -> bool {
         self.kind != RowKind::Fixed
     }
 
-    /// The words of the parameter.
+    /// Encodes the words of the parameter.
     #[must_use]
     pub(super) fn words(self) -> [i16; WORDS] {
         let [a, d, alpha, theta_offset] = [self.a, self.d, self.alpha, self.theta_offset].map(Q1_14::to_bits);
         words([a, d, alpha, theta_offset, self.kind as i16])
     }
 
-    /// Decodes the words of a row, which is counted from 0.
+    /// Decodes the words. `row` is counted from 0.
     pub(super) fn from_words(row: u8, words: [i16; WORDS]) -> Result<Self, ParameterError> {
         let [a, d, alpha, theta_offset, kind, _] = words;
         let known = usize::try_from(kind).ok().and_then(|kind| RowKind::ALL.get(kind));

@@ -1,31 +1,32 @@
-//! What is switched at run time: the parameters 6 to 9, which are volatile. So is the baseline, in a file of its own.
+//! Volatile parameters that are set at run time: 6 to 9. The baseline is volatile too, but has its own
+//! module.
 
 use crate::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use crate::packet::{self, WORDS};
 
-/// What a cell answers joints with, parameter 6. Volatile: a cell starts with [`Reply::Torque`].
+/// The reply to joints, parameter 6. Volatile: a cell starts with [`Reply::Torque`].
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Reply {
-    /// Its own torque, Q3.12.
+    /// The cell's own torque, Q3.12.
     #[default]
     Torque,
-    /// The sum of its own and its children's, Q7.8, in slots by depth.
+    /// The sum of its own and its children's torques, Q7.8, in slots by depth.
     Sum(Slots),
 }
 
-/// When sums are sent.
+/// The schedule of sums.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Slots {
     /// Width of a slot in µs.
     pub slot_us: u16,
-    /// Depth of the deepest cell; a root's is 0. A cell at depth d sends in slot `deepest - d`.
+    /// Depth of the deepest cell; a root has depth 0. A cell at depth d sends in slot `deepest - d`.
     pub deepest: u8,
-    /// Whether what rounding took away is carried into a cell's next value.
+    /// True if the rounding error is carried into the cell's next value.
     pub carry: bool,
 }
 
 impl Reply {
-    /// The words of the parameter.
+    /// Encodes the words of the parameter.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
         match self {
@@ -36,8 +37,8 @@ impl Reply {
         }
     }
 
-    /// Decodes the words; `None` when they cannot be: no such reply, no slot, a depth above 253, or a carry that is
-    /// neither 0 nor 1.
+    /// Decodes the words. Returns `None` if they are invalid: an undefined reply, a slot of 0, a depth above
+    /// 253, or a carry other than 0 and 1.
     #[must_use]
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
         match words {
@@ -52,24 +53,24 @@ impl Reply {
     }
 }
 
-/// When a cell sends what it measures without a request, parameter 7. Volatile: a cell starts with
+/// The times at which a cell sends measurements without a request, parameter 7. Volatile: a cell starts with
 /// [`Sensing::Off`].
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Sensing {
-    /// Only for a report.
+    /// Only in response to a report command.
     #[default]
     Off,
-    /// Every so many ms.
+    /// Periodically.
     Continuous {
-        /// From one to the next.
+        /// The period in ms.
         period_ms: u16,
     },
-    /// On change beyond a threshold, on release, and with each heartbeat.
+    /// When a value exceeds a threshold or is released, and with each heartbeat.
     Event,
 }
 
 impl Sensing {
-    /// The words of the parameter.
+    /// Encodes the words of the parameter.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
         match self {
@@ -79,7 +80,7 @@ impl Sensing {
         }
     }
 
-    /// Decodes the words; `None` when they cannot be: no such mode, or a period of 0.
+    /// Decodes the words. Returns `None` for an undefined mode or a period of 0.
     #[must_use]
     pub const fn from_words(words: [i16; WORDS]) -> Option<Self> {
         match words {
@@ -93,24 +94,24 @@ impl Sensing {
     }
 }
 
-/// Which changes of what a cell measures are events, parameter 8. Volatile: a cell starts with
+/// The changes of measurements that are events, parameter 8. Volatile: a cell starts with
 /// [`Events::default`].
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Events {
-    /// Of each contact word, in N.
+    /// Threshold of each contact word, in N.
     pub contact: Q5_10,
-    /// Of the proximity.
+    /// Threshold of the proximity.
     pub proximity: Q1_14,
-    /// Of each temperature, in degrees Celsius.
+    /// Threshold of each temperature, in degrees Celsius.
     pub temperature: Q9_6,
-    /// Of each axis' acceleration, in g.
+    /// Threshold of the acceleration on each axis, in g.
     pub acceleration: Q3_12,
-    /// What part of a threshold a value has to fall below it for a release, 0 to 1.
+    /// Fraction of the threshold by which a value must fall below it for a release, 0 to 1.
     pub hysteresis: Q1_14,
 }
 
 impl Default for Events {
-    /// 0.1 N, 0.05, 0.5 °C, 0.1 g; a release is half a threshold below it.
+    /// Thresholds of 0.1 N, 0.05, 0.5 °C and 0.1 g, and a hysteresis of one half.
     fn default() -> Self {
         Self {
             contact: Q5_10::from_bits(102),
@@ -123,7 +124,7 @@ impl Default for Events {
 }
 
 impl Events {
-    /// The words of the parameter.
+    /// Encodes the words of the parameter.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
         packet::words([
@@ -135,7 +136,7 @@ impl Events {
         ])
     }
 
-    /// Decodes the words; `None` when one is negative, or the hysteresis above 1.
+    /// Decodes the words. Returns `None` if a word is negative or the hysteresis is above 1.
     #[must_use]
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
         let [thresholds @ .., _] = words;
@@ -152,13 +153,13 @@ impl Events {
 }
 
 impl LinksDown {
-    /// The words of the parameter.
+    /// Encodes the words of the parameter.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
         packet::words([i16::from(self.deaf)])
     }
 
-    /// Decodes the words; other bits than those of ports are not looked at.
+    /// Decodes the words; bits without a port are ignored.
     #[must_use]
     pub const fn from_words(words: [i16; WORDS]) -> Self {
         let [deaf, ..] = words;
@@ -166,11 +167,11 @@ impl LinksDown {
     }
 }
 
-/// The ports of a cell that receive nothing, neither messages nor sums, parameter 9: how a bench takes a link down, in
-/// one direction at each end. Obeyed in test mode only.
+/// The ports of a cell that receive nothing, neither messages nor sums, parameter 9. A bench takes a link
+/// down with it, one direction at each end. Effective only in test mode.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct LinksDown {
-    /// Bit p: port p receives nothing; bit 4 is the wire to the gateway's side.
+    /// Bit p is set if port p receives nothing; bit 4 is the wire to the gateway's side.
     pub deaf: u8,
 }
 

@@ -1,130 +1,131 @@
-//! One field: where its bits stand, and what they are worth.
+//! Fields of a packet: the position of their bits, their format and their values.
 
 use serde::Deserialize;
 
 use crate::fixed::TorqueFormat;
 use crate::packet::{MAX_WORDS, WORDS};
 
-/// Bytes of the words of a packet of six.
+/// Size of six words in bytes.
 const WORD_BYTES: usize = 2 * WORDS;
-/// The byte that counts the joints in use.
+/// The index of the count byte; in joints, it is the number of joints in use.
 const COUNT: usize = WORD_BYTES + 1;
 
-/// What a field's bits are.
+/// The format of a field's bits.
 #[derive(Clone, Debug, Default, Deserialize, PartialEq)]
 #[serde(rename_all = "snake_case")]
 pub enum Format {
-    /// A word, unsigned.
+    /// An unsigned word.
     #[default]
     Word,
-    /// So many bits, unsigned.
+    /// An unsigned number of this many bits.
     Unsigned(u8),
     /// A signed word.
     Signed,
-    /// A signed word that stands for the name at its place in [`Field::names`].
+    /// A signed word that selects a name in [`Field::names`].
     Choice,
-    /// So many bits of which the lowest is the flag.
+    /// A flag in the lowest of this many bits.
     Flag(u8),
-    /// A word that is written in hexadecimal.
+    /// A word in hexadecimal.
     Hex,
-    /// A word with so many fraction bits; to the nearest step.
+    /// A word with this many fraction bits, rounded to the nearest step.
     Fixed(u32),
-    /// The same, rounded to the smallest step that is not below.
+    /// Like `Fixed`, but rounded up to the next step.
     Threshold(u32),
-    /// The same, where the largest and the smallest word mean *saturated*.
+    /// Like `Fixed`, but the largest and the smallest word mean *saturated*.
     Saturating(u32),
-    /// The same, with as many fraction bits as the torque format of the bus.
+    /// Like `Saturating`, with the fraction bits of the bus' torque format.
     Torque,
-    /// The sum of three neighbouring words with so many fraction bits; no field of its own.
+    /// The sum of three neighbouring words with this many fraction bits, which are fields of their own.
     Total(u32),
-    /// A word in quarter turns, shown in rad.
+    /// An angle in quarter turns, shown in rad.
     Angle,
-    /// The same, of the joints in use, which byte 13 counts.
+    /// Like `Angle`, for the joints in use, whose number is in byte 13.
     Position,
-    /// A port of a cell in 8 bits; the last one leads to the gateway's side.
+    /// A port in 8 bits; the last number is the uplink to the gateway's side.
     Port,
-    /// So many bits, of which bit p stands for port p; the second number is that of the ports there are.
+    /// This many bits, in which bit p stands for port p. The second number is the number of ports.
     Ports(u8, u8),
-    /// A state word, [`crate::message::State`].
+    /// A state word: [`crate::message::State`].
     State,
-    /// A parameter's number, in so many bits.
+    /// A parameter number of this many bits.
     Parameter(u8),
-    /// The page's number, in so many bits: it selects the layout of the words.
+    /// A page number of this many bits, which selects the layout of the words.
     Page(u8),
-    /// Why something was refused, [`super::reasons`].
+    /// The reason of a refusal: [`super::reasons`].
     Reason,
     /// Fields within a word.
     Group(Vec<Field>),
 }
 
-/// Which values mean something.
+/// The valid values of a field.
 #[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq)]
 #[serde(rename_all = "snake_case")]
 pub enum Range {
-    /// All values of the bits.
+    /// All values.
     #[default]
     All,
-    /// None below zero.
+    /// Zero and above.
     NotNegative,
-    /// None below zero, which only the cell checks, at the commit.
+    /// Zero and above; checked only by the cell, at the commit.
     NotNegativeAtCommit,
-    /// These and what is between.
+    /// Values between these bounds, inclusive.
     Within(u16, u16),
 }
 
-/// What becomes of a field when `when` does not hold.
+/// The representation of a field whose condition `when` is false.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq)]
 #[serde(rename_all = "snake_case")]
 pub enum Absent {
-    /// It is left out.
+    /// The field is omitted.
     #[default]
     Omitted,
-    /// It is there, without a value.
+    /// The field is present without a value.
     Null,
 }
 
-/// One field of a packet, or several neighbouring words of one meaning.
+/// A field of a packet, or several neighbouring words with one meaning.
 #[derive(Clone, Debug, Default, Deserialize, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Field {
-    /// Its name, the unit at its end: in JSON, and where it is written. Empty: only a DBC has it.
+    /// The name in JSON and on the command line, ending with the unit. Empty for a field that only a DBC has.
     pub name: String,
-    /// Its name in a DBC, when that differs; `{}` stands for the label.
+    /// The signal name in a DBC, if it differs; `{}` stands for the label.
     pub signal: String,
-    /// Where it stands, [`Field::at`].
+    /// The position of the first bit: see [`Field::at`].
     word: u8,
     byte: u8,
     bit: u8,
-    /// What its bits are.
+    /// The format of the bits.
     pub format: Format,
-    /// The unit of its values.
+    /// The unit of the values.
     pub unit: String,
-    /// Which values mean something.
+    /// The valid values.
     pub range: Range,
-    /// Of several words, what each is called.
+    /// The names of the elements, if the field has several words.
     pub labels: Vec<String>,
-    /// Values that have a name.
+    /// Values with a name.
     pub names: Vec<(i16, String)>,
-    /// It is there while the first field of its layout lies within these bounds, which are inclusive; always without.
+    /// The condition of the field: the first field of its layout lies within these bounds, inclusive. Without
+    /// bounds the field is always present.
     when: Option<[u16; 2]>,
-    /// What becomes of it otherwise.
+    /// The representation while the condition is false.
     pub absent: Absent,
-    /// Whether it may be left out where it is written: 0 then.
+    /// True if it may be omitted on the command line; its value is then 0.
     pub optional: bool,
-    /// What may be written, beyond the format and the range.
+    /// A description of further restrictions on its values.
     pub allowed: String,
-    /// What it means, in one line.
+    /// The meaning, in one line.
     pub meaning: String,
 }
 
 impl Field {
-    /// The first bit, counted from the lowest bit of byte 0.
+    /// Returns the position of the first bit, counted from the lowest bit of byte 0.
     #[must_use]
     pub fn at(&self) -> usize {
         usize::from(self.word) * 16 + usize::from(self.byte) * 8 + usize::from(self.bit)
     }
 
-    /// The bits of one element, how many of them are a fraction, and whether they are two's complement.
+    /// Returns the bits of one element, its fraction bits, and true if it is two's complement.
     fn shape(&self) -> (u8, u32, bool) {
         match self.format {
             Format::Unsigned(bits)
@@ -144,40 +145,41 @@ impl Field {
         }
     }
 
-    /// How many bits each of its elements has.
+    /// Returns the number of bits of one element.
     #[must_use]
     pub fn width(&self) -> u8 {
         self.shape().0
     }
 
-    /// The fraction bits of its words; 0 of whole numbers.
+    /// Returns the number of fraction bits; 0 for integers.
     #[must_use]
     pub fn fraction(&self) -> u32 {
         self.shape().1
     }
 
-    /// Whether its bits are two's complement.
+    /// Returns true if the value is two's complement.
     #[must_use]
     pub fn is_signed(&self) -> bool {
         self.shape().2
     }
 
-    /// How many elements it has: 1, or as many as it has labels.
+    /// Returns the number of elements: 1, or the number of labels.
     #[must_use]
     pub fn elements(&self) -> usize {
         if self.labels.is_empty() { 1 } else { self.labels.len() }
     }
 
-    /// Whether it has as many elements as its packet has words.
+    /// Returns true if the number of elements varies with the length of the packet.
     #[must_use]
     pub fn grows(&self) -> bool {
         self.labels.len() == MAX_WORDS
     }
 
-    /// The bits of one element in [`crate::packet::Packet::fields`], with their sign; 0 of what is not there.
+    /// Returns the raw value of an element in [`crate::packet::Packet::fields`], with its sign; 0 beyond the
+    /// end.
     #[must_use]
     pub fn raw(&self, bytes: &[u8], element: usize) -> i64 {
-        // Epoch and count stand after the sixth word.
+        // Epoch and count follow the sixth word.
         let element = element + usize::from(element >= WORDS);
         let (at, width) = (self.at() + element * 16, u32::from(self.width()));
         let there = bytes.get(at / 8..).unwrap_or_default();
@@ -186,14 +188,14 @@ impl Field {
         if self.is_signed() && bits >> (width - 1) == 1 { bits - (1 << width) } else { bits }
     }
 
-    /// The sum of its word and the two after it.
+    /// Returns the sum of the field's word and the two after it.
     #[must_use]
     pub fn total(&self, bytes: &[u8]) -> f64 {
         (0..3).map(|element| self.real(self.raw(bytes, element))).sum()
     }
 
-    /// The elements that mean something: of positions those of the joints in use, of what grows the words of the
-    /// packet, of all others each.
+    /// Returns the number of elements in use: the joints in use for positions, the words of the packet for
+    /// other fields that vary with it, otherwise all.
     #[must_use]
     pub fn elements_in(&self, bytes: &[u8]) -> usize {
         let there = bytes.len().saturating_sub(WORD_BYTES + 2) / 2 + WORDS;
@@ -204,31 +206,32 @@ impl Field {
         }
     }
 
-    /// The name of a value.
+    /// Returns the name of a value.
     #[must_use]
     pub fn name_of(&self, raw: i64) -> Option<&str> {
         self.names.iter().find(|(value, _)| i64::from(*value) == raw).map(|(_, name)| name.as_str())
     }
 
-    /// The value of a name.
+    /// Returns the value of a name.
     #[must_use]
     pub fn value_of(&self, name: &str) -> Option<i16> {
         self.names.iter().find(|(_, known)| known == name).map(|(value, _)| *value)
     }
 
-    /// Whether its ends mean *saturated*.
+    /// Returns true if the largest and the smallest value mean *saturated*.
     #[must_use]
     pub fn is_saturating(&self) -> bool {
         matches!(self.format, Format::Saturating(_) | Format::Torque)
     }
 
-    /// Whether it is there, in these bytes of a packet whose layout begins with this field.
+    /// Returns true if the field is present in these bytes of a packet; `first` is the first field of its
+    /// layout.
     #[must_use]
     pub fn is_there(&self, bytes: &[u8], first: &Self) -> bool {
         self.follows(Some(first.raw(bytes, 0)))
     }
 
-    /// Whether it is there when the first field of its layout is this.
+    /// Returns true if the field is present when the first field of its layout has the value `first`.
     #[must_use]
     pub fn follows(&self, first: Option<i64>) -> bool {
         let within = |[min, max]: [u16; 2]| {
@@ -237,7 +240,7 @@ impl Field {
         self.when.is_none_or(within)
     }
 
-    /// What a DBC calls one element of it.
+    /// Returns the signal name of one element in a DBC.
     #[must_use]
     pub fn signal_name(&self, prefix: &str, label: &str) -> String {
         let name = if self.signal.is_empty() {
@@ -252,7 +255,7 @@ impl Field {
         }
     }
 
-    /// Its name without the unit.
+    /// Returns the name without the unit.
     #[must_use]
     pub fn bare_name(&self) -> &str {
         match self.name.rsplit_once('_') {
@@ -261,7 +264,7 @@ impl Field {
         }
     }
 
-    /// What each value is called where they are written one by one.
+    /// Returns the name of each element on the command line.
     pub fn written_names(&self) -> Vec<String> {
         let label = |label: &String| match self.name.rsplit_once('_') {
             Some((_, unit)) if !self.unit.is_empty() => format!("{label}_{unit}"),

@@ -1,4 +1,4 @@
-//! The file, `schema.toml`.
+//! The schema file, `schema.toml`.
 
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
@@ -15,37 +15,37 @@ static SCHEMA: LazyLock<Schema> = LazyLock::new(|| {
     Schema::from(file)
 });
 
-/// Every kind of packet and every command, by identifier.
+/// Returns every kind of packet and every command, in the order of their identifiers.
 #[must_use]
 pub fn packets() -> &'static [PacketSchema] {
     &SCHEMA.packets
 }
 
-/// The parameters, by number.
+/// Returns the parameters, in the order of their numbers.
 #[must_use]
 pub fn parameters() -> &'static [Layout] {
     &SCHEMA.parameters
 }
 
-/// Messages of wires, by the first byte. The fields of hello and return depend on several fields: they have no
-/// text.
+/// Returns the messages over wires, by their first byte. Hello and return have no text, because their fields
+/// depend on several other fields.
 #[must_use]
 pub fn wires() -> &'static [Layout] {
     &SCHEMA.wires
 }
 
-/// Why a parameter was refused, by the number that stands for it.
+/// Returns the reasons of refusals, each with its number.
 #[must_use]
 pub fn reasons() -> &'static [(i16, String)] {
     &SCHEMA.reasons
 }
 
-/// A packet whose words are unused.
+/// The layout of a packet that uses no words.
 pub(super) fn empty() -> &'static Layout {
     &SCHEMA.empty
 }
 
-/// Words without a meaning.
+/// The layout of words with an unknown meaning.
 pub(super) fn unknown() -> &'static Layout {
     &SCHEMA.unknown
 }
@@ -59,40 +59,40 @@ struct Schema {
     unknown: Layout,
 }
 
-/// One part of a text for people.
+/// One part of a human-readable text.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Part {
-    /// It is there while a number lies within these bounds, which are inclusive.
+    /// The part is used while a number lies within these bounds, inclusive.
     pub when: [u16; 2],
-    /// The field whose number that is; by default the one that selects a part.
+    /// The field with that number; by default the one that selects a part.
     pub of: Option<String>,
-    /// What it is made of.
+    /// The pieces of the text.
     pub pieces: Vec<Piece>,
 }
 
-/// What a part of a text is made of.
+/// A piece of a text.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Piece {
-    /// Words as they are.
+    /// Literal text.
     Words(String),
-    /// `{name}`: a field; `{name:3}`: with so many decimals; `{}`: the text of the page.
+    /// `{name}`: a field; `{name:3}`: with this many decimals; `{}`: the text of the page.
     Field {
-        /// Its name.
+        /// The name of the field.
         name: String,
-        /// Digits after the point.
+        /// Digits after the decimal point.
         decimals: usize,
     },
-    /// `{name?no|yes}`: one of two words, by a field.
+    /// `{name?no|yes}`: one of two texts, selected by a field.
     Either {
-        /// Its name.
+        /// The name of the field.
         name: String,
-        /// The word where it is not 1, and the one where it is.
+        /// The text for values other than 1, and the text for 1.
         words: [String; 2],
     },
 }
 
 impl Piece {
-    /// What stands between braces.
+    /// Parses the text between braces.
     fn inside(text: &str) -> Self {
         if let Some((name, (no, yes))) =
             text.split_once('?').and_then(|(name, words)| Some((name, words.split_once('|')?)))
@@ -134,26 +134,26 @@ impl<'de> Deserialize<'de> for Part {
     }
 }
 
-/// What one page, one parameter or one whole kind of packet holds.
+/// The layout of one page, one parameter or one kind of packet.
 #[derive(Clone, Debug, Default, Deserialize, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Layout {
-    /// The page's or the parameter's number; 0 of a kind that has only one layout.
+    /// The number of the page or parameter; 0 for a kind with a single layout.
     pub number: u8,
-    /// How many numbers in a row have it; `{}` in its name stands for 1, 2 and so on.
+    /// The number of consecutive numbers with this layout; `{}` in its name stands for 1, 2 and so on.
     times: Option<u8>,
-    /// What it is called; empty where the packet's name is enough.
+    /// The name; empty where the name of the packet suffices.
     pub name: String,
-    /// What stands before the signals of a DBC.
+    /// The prefix of the signals in a DBC.
     pub prefix: String,
-    /// The words for people; the number that selects a part is that of the first field.
+    /// The human-readable text; the number that selects a part is the first field.
     pub text: Vec<Part>,
     /// The fields, in order.
     pub fields: Vec<Field>,
 }
 
 impl Layout {
-    /// One for each number that has it.
+    /// Returns one layout for each of its numbers.
     fn each(&self) -> impl Iterator<Item = Self> {
         (0..self.times.unwrap_or(1)).map(|index| {
             let named = |text: &str| text.replace("{}", &(index + 1).to_string());
@@ -163,20 +163,20 @@ impl Layout {
     }
 }
 
-/// One kind of packet, or one command.
+/// The schema of a kind of packet, or of a command.
 #[derive(Clone, Debug)]
 pub struct PacketSchema {
     /// The kind.
     pub kind: Kind,
-    /// The command, of the kind of commands.
+    /// The command, if the kind is [`Kind::Command`].
     pub command: Option<Command>,
-    /// What it means, in a sentence or a few.
+    /// The meaning, in a sentence or a few.
     pub meaning: String,
-    /// The words for people; the number that selects a part is byte 13.
+    /// The human-readable text; the number that selects a part is byte 13.
     pub text: Vec<Part>,
-    /// The fields of bytes 12 and 13; in the order in which JSON has them.
+    /// The fields of bytes 12 and 13, in the order of JSON output.
     pub end: Vec<Field>,
-    /// The fields of the words, by page or parameter.
+    /// The layouts of the words, by page or parameter.
     pub layouts: Vec<Layout>,
 }
 
@@ -202,7 +202,7 @@ struct RawPacket {
     layouts: Vec<String>,
 }
 
-/// The kind or the command of this name.
+/// Decodes the name of a kind or command.
 fn named<'de, D: Deserializer<'de>>(deserializer: D) -> Result<(Kind, Option<Command>), D::Error> {
     let name = String::deserialize(deserializer)?;
     let command = Command::ALL.into_iter().find(|command| command.name() == name);

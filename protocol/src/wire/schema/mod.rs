@@ -1,11 +1,13 @@
-//! The layout of every packet, in one place: each field's name, place, format, unit, range and meaning.
+//! The schema: the layout of every packet in one place, with each field's name, position, format, unit, range
+//! and meaning.
 //!
 //! ```text
 //!   schema.toml ──> packets, parameters, messages over wires ──> Layout ──> Fields ──> raw bits, real values
 //! ```
 //!
-//! [`crate::message`] reads and writes packets as types. Everything that shows, lists or takes fields by name reads
-//! these tables: `dump` (text and JSON), DBC files, `skinbus frame`, the tables of `docs/reference/protocol.md`.
+//! [`crate::message`] encodes and decodes packets as types. All code that displays, lists or parses fields by
+//! name uses these tables: `dump` (text and JSON), DBC files, `skinbus frame`, the tables of
+//! `docs/reference/protocol.md`.
 
 mod field;
 mod file;
@@ -20,11 +22,11 @@ use crate::message::{FROM_THE_NEXT, Message, REFUSED, Request, WRITE};
 use crate::packet::{Packet, WORDS};
 use crate::parameters::Parameter;
 
-/// Bounds that every number is in.
+/// Bounds that contain every number.
 const ALWAYS: [u16; 2] = [0, u16::MAX];
 
 impl PacketSchema {
-    /// That of an identifier; `None` of a command that does not exist.
+    /// Returns the schema of an identifier; `None` for an undefined command.
     #[must_use]
     pub fn of(id: Id) -> Option<&'static Self> {
         let is_it = |schema: &&Self| {
@@ -33,14 +35,14 @@ impl PacketSchema {
         packets().iter().find(is_it)
     }
 
-    /// The fields of bytes 12 and 13, beside what this layout has there.
+    /// Returns the fields of bytes 12 and 13 that apply with this layout.
     #[must_use]
     pub fn end(&self, layout: &Layout) -> &[Field] {
         if self.kind == Kind::Configured && layout.number == REFUSED { &[] } else { &self.end }
     }
 }
 
-/// The layout of a message's packet, which [`Message::encode`] gave.
+/// Returns the layout of a packet that [`Message::encode`] returned.
 #[must_use]
 pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
     let number = match packet.id.kind {
@@ -60,26 +62,27 @@ pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
     layouts.iter().find(|layout| layout.number == number).unwrap_or_else(file::empty)
 }
 
-/// The layout of a parameter's words; of words that it cannot have, and of a parameter that does not exist, words.
+/// Returns the layout of a parameter's words. Invalid words and unknown parameters get a layout of plain
+/// words.
 #[must_use]
 pub fn value(number: u8, words: [i16; WORDS]) -> &'static Layout {
     let can_be = Parameter::from_number(number).is_some_and(|parameter| parameter.can_be(words));
     parameters().iter().find(|layout| can_be && layout.number == number).unwrap_or_else(file::unknown)
 }
 
-/// What a parameter is called, if it has a name.
+/// Returns the name of a parameter.
 #[must_use]
 pub fn parameter_name(number: u8) -> Option<&'static str> {
     parameters().iter().find(|layout| layout.number == number).map(|layout| layout.name.as_str())
 }
 
-/// The parameter of this name.
+/// Returns the layout of the parameter with this name.
 #[must_use]
 pub fn parameter_named(name: &str) -> Option<&'static Layout> {
     parameters().iter().find(|layout| layout.name == name)
 }
 
-/// What a refusal's reason means.
+/// Returns the meaning of a refusal's reason.
 #[must_use]
 pub fn reason(number: i64) -> &'static str {
     let found = reasons().iter().find(|(known, _)| i64::from(*known) == number);

@@ -1,9 +1,9 @@
-//! The file holds together.
+//! Checks that the schema file is consistent.
 
 use super::*;
 use crate::packet::{Epoch, MAX_WORDS};
 
-/// Every layout with what belongs to it in bytes 12 and 13.
+/// Returns every layout with the fields of bytes 12 and 13 that go with it.
 fn all() -> impl Iterator<Item = (&'static [Field], &'static Layout)> {
     let packets = packets()
         .iter()
@@ -18,7 +18,7 @@ fn fields_stand_side_by_side_within_the_packet() {
         let real = |field: &&Field| !matches!(field.format, Format::Total(_));
         for field in end.iter().chain(&layout.fields).filter(real) {
             for element in 0..field.elements() {
-                // Epoch and count stand after the sixth word.
+                // Epoch and count follow the sixth word.
                 let at = field.at() + (element + usize::from(element >= 6)) * 16;
                 for bit in &mut taken[at..at + usize::from(field.width())] {
                     assert!(!*bit, "{} {}", layout.name, field.name);

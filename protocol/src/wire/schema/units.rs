@@ -1,4 +1,4 @@
-//! What the words of a bus' joints, torques and sums are worth.
+//! Units and resolution of the words of joints, torques and sums on a bus.
 
 use core::f64::consts::FRAC_PI_2;
 
@@ -6,17 +6,17 @@ use super::{Field, Format};
 use crate::fixed::TorqueFormat;
 use crate::skin::{JointKind, Skin};
 
-/// What depends on the bus: its torque format, and which joints of its chain are prismatic. The default is Q3.12 and
-/// revolute joints.
+/// The properties of a bus that determine units: its torque format, and the prismatic joints of its chain.
+/// The default is Q3.12 and revolute joints.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Units {
     torque: TorqueFormat,
-    /// Bit j: joint j + 1 is prismatic.
+    /// Bit j is set if joint j + 1 is prismatic.
     prismatic: u16,
 }
 
 impl Units {
-    /// Those of a bus, given as an index into [`Skin::buses`].
+    /// Returns the units of a bus, given as an index into [`Skin::buses`].
     #[must_use]
     pub fn of(skin: &Skin, bus: usize) -> Self {
         let torque = skin.buses.get(bus).map(|bus| bus.torque_format).unwrap_or_default();
@@ -25,13 +25,13 @@ impl Units {
         Self { torque, prismatic: bits.fold(0, |all, bit| all | bit) }
     }
 
-    /// In which format cells send their torques.
+    /// Returns the torque format of the cells.
     #[must_use]
     pub const fn torque_format(self) -> TorqueFormat {
         self.torque
     }
 
-    /// The unit of a joint's torque, by its place in the chain from 0.
+    /// Returns the unit of a joint's torque. `joint` is the index in the chain, from 0.
     #[must_use]
     pub const fn torque_unit(self, joint: usize) -> &'static str {
         if self.slides(joint) {
@@ -45,14 +45,14 @@ impl Units {
         joint < 16 && self.prismatic >> joint & 1 == 1
     }
 
-    /// Whether a field's element is a position or a torque of a prismatic joint.
+    /// Returns true if the element of a field is a position or torque of a prismatic joint.
     fn is_prismatic(self, field: &Field, element: usize) -> bool {
         field.grows() && self.slides(element)
     }
 }
 
 impl Field {
-    /// What one step of an element is worth, in [`Self::unit_in`].
+    /// Returns the value of one step of an element, in [`Self::unit_in`].
     #[must_use]
     pub fn step_in(&self, element: usize, units: Units) -> f64 {
         let step = 1.0 / f64::from(1_u32 << self.fraction());
@@ -67,19 +67,19 @@ impl Field {
         }
     }
 
-    /// What the bits of an element are worth, in [`Self::unit_in`].
+    /// Converts the raw value of an element to [`Self::unit_in`].
     #[must_use]
     pub fn real_in(&self, raw: i64, element: usize, units: Units) -> f64 {
         f64::from(i16::try_from(raw).unwrap_or_default()) * self.step_in(element, units)
     }
 
-    /// What bits are worth where they mean the same on each bus.
+    /// Converts a raw value whose unit is the same on every bus.
     #[must_use]
     pub fn real(&self, raw: i64) -> f64 {
         self.real_in(raw, 0, Units::default())
     }
 
-    /// The unit of an element: that of the field, but m and N of prismatic joints.
+    /// Returns the unit of an element: that of the field, or m and N for prismatic joints.
     #[must_use]
     pub fn unit_in(&self, element: usize, units: Units) -> &str {
         let (turns, slides) = (JointKind::Revolute, JointKind::Prismatic);

@@ -1,4 +1,4 @@
-//! Bytes of a serial line become frames, commands and acknowledgements.
+//! The decoder of slcan: from bytes to frames, commands and acknowledgements.
 
 #[cfg(feature = "host")]
 use super::Report;
@@ -7,44 +7,46 @@ use crate::can::{
     BIT_RATE_SWITCH, ERROR_STATE, EXTENDED, EXTENDED_MASK, FD_FORMAT, Format, Frame, STANDARD_MASK,
 };
 
-/// What a line says.
+/// A decoded line.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Line {
-    /// A frame: of the bus when an adapter writes it, for the bus when a host does. Its time stamp is passed over.
+    /// A frame: received from the bus if an adapter wrote the line, to be sent if a host did. Its time stamp
+    /// is ignored.
     Frame(Frame),
-    /// A host's command.
+    /// A command of a host.
     Command(Command),
-    /// An empty line: done. Hosts send it as well, for nothing.
+    /// An empty line: the acknowledgement of an adapter. Hosts send it too, without a meaning.
     Done,
-    /// `z` or `Z`: the adapter has taken a frame to send.
+    /// `z` or `Z`: the adapter has accepted a frame for sending.
     Sent,
     /// BEL: the adapter refused a line.
     Failed,
-    /// A fault, or a state of the adapter's bus. A board's own line has no adapter behind it.
+    /// A fault or the bus state, reported by an adapter. Only hosts decode it, because a board has no
+    /// adapter.
     #[cfg(feature = "host")]
     Reported(Report),
-    /// A line of printable characters that is none of these, such as an adapter's version: to be passed over.
+    /// Any other line of printable characters, such as the version of an adapter. To be ignored.
     Other,
-    /// A line that cannot be used; [`Decoder::refused`] has counted it.
+    /// An invalid line, counted in [`Decoder::refused`].
     Refused(Refusal),
 }
 
-/// Why a line is refused.
+/// The reason of a refused line.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Refusal {
-    /// A byte that no line has, or a frame with what is no hexadecimal digit.
+    /// The line contains an unprintable byte, or a frame contains a byte that is not a hexadecimal digit.
     Garbage,
-    /// More bytes than a line has, or than the DLC and a time stamp say.
+    /// The line is longer than [`MAX_LINE`], or than its DLC and a time stamp allow.
     Long,
-    /// Fewer digits than the DLC says, or no DLC.
+    /// The frame has fewer digits than its DLC requires, or has no DLC.
     Short,
-    /// A classic frame with a DLC above 8.
+    /// A classic frame has a DLC above 8.
     Dlc,
-    /// An identifier above 7FF, or above 1FFFFFFF.
+    /// The identifier is above 7FF, or above 1FFFFFFF in an extended frame.
     Identifier,
 }
 
-/// How many lines were refused, by reason. The counts stop at their maximum.
+/// Numbers of refused lines, by reason. The counters saturate.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Refused {
     /// [`Refusal::Garbage`].
@@ -60,7 +62,7 @@ pub struct Refused {
 }
 
 impl Refused {
-    /// All of them.
+    /// Returns the sum of all counters.
     #[must_use]
     pub fn total(&self) -> u64 {
         let Self { garbage, long, short, dlc, identifier } = *self;
@@ -79,8 +81,8 @@ impl Refused {
     }
 }
 
-/// Takes the bytes of a serial line one by one. Never allocates, never panics; after whatever came, the next line that
-/// is sound is read.
+/// Decodes a serial line byte by byte. It never allocates and never panics, and decodes the next valid line
+/// after any input.
 ///
 /// ```
 /// use protocol::can::Frame;
@@ -92,34 +94,35 @@ impl Refused {
 /// ```
 #[derive(Clone, Debug, Default)]
 pub struct Decoder {
-    /// What has come of this line.
+    /// The bytes of the current line so far.
     line: heapless::Vec<u8, MAX_LINE>,
-    /// The line is refused when it ends.
+    /// The reason for which the current line will be refused.
     fault: Option<Refusal>,
     refused: Refused,
     endings: Endings,
 }
 
-/// Tells by earlier frames whether an adapter's frames end with a digit for the state of their sender. Either all of them
-/// do or none: so a line that lost a byte is not mistaken for one that ends otherwise.
+/// Learns from earlier frames whether an adapter ends each frame with a digit for the state of the sender.
+/// Adapters do this for all frames or for none, so a line that lost a byte is not mistaken for one with
+/// another ending.
 #[derive(Clone, Debug, Default)]
 struct Endings {
     has_state: bool,
-    /// Number of frames in succession that ended in this way.
+    /// Number of consecutive frames with this ending.
     same: u8,
-    /// The last one ended in the other way.
+    /// True if the last frame had the other ending.
     other: bool,
 }
 
 impl Endings {
-    /// Frames after which one that ends otherwise is refused, unless another one follows it.
+    /// Number of frames after which a single frame with the other ending is refused; two in a row switch.
     const SURE: u8 = 16;
 
     const fn new() -> Self {
         Self { has_state: false, same: 0, other: false }
     }
 
-    /// Takes the end of a frame; whether it is to be believed.
+    /// Records the ending of a frame. Returns true if it is plausible.
     const fn take(&mut self, has_state: bool) -> bool {
         if self.has_state == has_state {
             self.same = self.same.saturating_add(1);
@@ -137,7 +140,7 @@ impl Endings {
 }
 
 impl Decoder {
-    /// Before the first byte.
+    /// Creates a decoder before the first byte.
     #[must_use]
     pub const fn new() -> Self {
         Self {
@@ -148,10 +151,10 @@ impl Decoder {
         }
     }
 
-    /// Takes a byte; the line that it ends. Bounded work.
+    /// Processes one byte and returns the line that it ends, if any. The work per byte is bounded.
     ///
-    /// CR ends a line, and so does LF, but an empty line that LF ends is none. BEL is a line of its own: what came
-    /// before it without an end is counted as garbage.
+    /// CR and LF both end a line, but an empty line that ends with LF is ignored. BEL is a line of its own;
+    /// an unfinished line before it is counted as garbage.
     pub fn push(&mut self, byte: u8) -> Option<Line> {
         match byte {
             CR => Some(self.end()),
@@ -176,13 +179,14 @@ impl Decoder {
         }
     }
 
-    /// How many lines were refused so far.
+    /// Returns the numbers of refused lines so far.
     #[must_use]
     pub const fn refused(&self) -> Refused {
         self.refused
     }
 
-    /// Forgets a line that has begun, because its sender is gone; whether there was one. It is counted as short.
+    /// Discards an unfinished line whose sender is gone, and counts it as short. Returns true if there was
+    /// one.
     pub fn restart(&mut self) -> bool {
         let begun = !self.is_empty();
         if begun {
@@ -212,7 +216,7 @@ impl Decoder {
     }
 }
 
-/// What a line of printable characters, without its end, says.
+/// Decodes a line of printable characters without its line ending.
 fn read(line: &[u8], endings: &mut Endings) -> Line {
     let [kind, rest @ ..] = line else { return Line::Done };
     let flags = match kind.to_ascii_lowercase() {
@@ -235,7 +239,7 @@ fn read(line: &[u8], endings: &mut Endings) -> Line {
     }
 }
 
-/// A frame from behind its letter; `flags` are those of an FD frame.
+/// Decodes a frame after its letter. `flags` are the FD flags, or `None` for a classic frame.
 fn frame(
     text: &[u8],
     is_extended: bool,
@@ -259,7 +263,8 @@ fn frame(
     let (text, rest) = rest.split_at_checked(2 * len).ok_or(Refusal::Short)?;
     let (time, state) = match rest {
         [time @ .., b'S'] => (time, Some(b'S')),
-        // Whoever ends so writes capitals, and a small one may begin the next line, whose CR was lost.
+        // Adapters that append a state write upper case; a lower-case digit may belong to the next line after
+        // a lost CR.
         [time @ .., state @ b'0'..=b'1']
             if time.len().is_multiple_of(4) && !time.iter().any(u8::is_ascii_lowercase) =>
         {
@@ -276,7 +281,7 @@ fn frame(
     for (byte, &[high, low]) in data.iter_mut().zip(pairs) {
         *byte = (digit(high).ok_or(Refusal::Garbage)? << 4) | digit(low).ok_or(Refusal::Garbage)?;
     }
-    // A letter cannot be a digit of what stands before it.
+    // `S` cannot be mistaken for a digit, so it is always plausible.
     let has_state = matches!(state, Some(b'0' | b'1'));
     if state != Some(b'S') && !endings.take(has_state) {
         return Err(if has_state { Refusal::Long } else { Refusal::Short });

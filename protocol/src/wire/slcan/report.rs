@@ -35,17 +35,17 @@ const TRANSMITTING: u8 = 0x80;
 const AT_CRC: u8 = 0x08;
 const AT_ACK: u8 = 0x19;
 
-/// The state of a CAN controller by its error counters.
+/// The state of a CAN controller, which follows from its error counters.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub enum BusState {
-    /// Error active: it takes part without restriction.
+    /// Error active: no restrictions.
     #[default]
     Active,
-    /// A counter has reached 96.
+    /// Error warning: a counter has reached 96.
     Warning,
     /// Error passive: a counter has reached 128.
     Passive,
-    /// Off the bus: the transmit counter has passed 255.
+    /// Bus off: the transmit counter has passed 255.
     Off,
 }
 
@@ -53,7 +53,7 @@ impl BusState {
     /// All states, from the best to the worst.
     pub const ALL: [Self; 4] = [Self::Active, Self::Warning, Self::Passive, Self::Off];
 
-    /// The state in words.
+    /// Returns the name of the state.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -64,7 +64,7 @@ impl BusState {
         }
     }
 
-    /// The bits of a controller of which the transmitter, the receiver, or both have this state.
+    /// Returns the controller bits of an error frame for this state of the transmitter, the receiver or both.
     const fn bits(self, transmits: bool, receives: bool) -> u8 {
         let (transmit, receive) = match self {
             Self::Active => (ERROR_ACTIVE, ERROR_ACTIVE),
@@ -82,13 +82,13 @@ impl BusState {
 pub enum Fault {
     /// No receiver acknowledged a frame.
     Ack = 0x001,
-    /// A dominant bit was sent and a recessive one read.
+    /// A dominant bit was sent and a recessive one received.
     Bit0 = 0x002,
-    /// A recessive bit was sent and a dominant one read.
+    /// A recessive bit was sent and a dominant one received.
     Bit1 = 0x004,
     /// A wrong checksum.
     Crc = 0x008,
-    /// A wrong bit where the format allows one value only.
+    /// A bit of fixed value was wrong.
     Form = 0x010,
     /// Six equal bits in succession.
     Stuff = 0x020,
@@ -126,7 +126,7 @@ impl Fault {
         Self::TransmitFailed,
     ];
 
-    /// The fault in words.
+    /// Returns the name of the fault.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -146,7 +146,7 @@ impl Fault {
         }
     }
 
-    /// Class, controller, protocol and location of an error frame.
+    /// Returns class, controller, protocol and location of the error frame.
     const fn error(self) -> (u32, u8, u8, u8) {
         const BUS: u32 = CLASS_PROTOCOL | CLASS_BUS_ERROR;
         match self {
@@ -169,42 +169,42 @@ impl Fault {
 /// Error counters of a CAN controller.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub struct ErrorCounters {
-    /// When sending.
+    /// Transmit error counter.
     pub transmit: u16,
-    /// When receiving.
+    /// Receive error counter.
     pub receive: u16,
 }
 
-/// One report of an adapter.
+/// A fault report of an adapter.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub struct Report {
     faults: u16,
     state: Option<BusState>,
     counters: Option<ErrorCounters>,
-    /// A line of bus errors, which is an error frame of its own class whatever else is in it.
+    /// True for a line of bus errors, whose error frame always has the class of bus errors.
     is_bus_error: bool,
 }
 
 impl Report {
-    /// The faults in it.
+    /// Returns the faults.
     pub fn faults(self) -> impl Iterator<Item = Fault> {
         Fault::ALL.into_iter().filter(move |&fault| self.has(fault))
     }
 
-    /// The state in it.
+    /// Returns the controller state, if the report contains it.
     #[must_use]
     pub const fn state(self) -> Option<BusState> {
         self.state
     }
 
-    /// The error counters in it.
+    /// Returns the error counters, if the report contains them.
     #[must_use]
     pub const fn counters(self) -> Option<ErrorCounters> {
         self.counters
     }
 
-    /// The error frame for it, as Linux' slcan driver makes it, when the controller was in the state `before`. `None` for
-    /// a report without a fault that states what is known.
+    /// Returns the error frame that Linux' slcan driver creates for this report, given the controller state
+    /// `before` it. Returns `None` if the report contains no fault and no change.
     #[must_use]
     pub fn frame(self, before: BusState) -> Option<Frame> {
         let bus_error = if self.is_bus_error { CLASS_PROTOCOL | CLASS_BUS_ERROR } else { 0 };
@@ -222,7 +222,7 @@ impl Report {
             Some(BusState::Off) => class |= CLASS_BUS_OFF,
             Some(state) => {
                 class |= CLASS_CONTROLLER;
-                // The side with more errors has the state.
+                // The side with more errors caused the state.
                 controller |= counters.map_or_else(
                     || state.bits(true, true),
                     |it| state.bits(it.transmit >= it.receive, it.receive >= it.transmit),
@@ -256,7 +256,7 @@ impl Report {
         set.fold(self, |report, &(_, fault)| report.with(fault))
     }
 
-    /// The report that a line without its end is.
+    /// Decodes a line without its line ending.
     pub(super) fn read(line: &[u8]) -> Option<Self> {
         match line {
             [b'e', count @ b'1'..=b'8', letters @ ..] => {
@@ -297,7 +297,7 @@ impl Report {
         }
     }
 
-    /// A letter that is none makes the whole line unknown.
+    /// An unknown letter makes the whole line unknown.
     fn bus_errors(letters: &[u8]) -> Option<Self> {
         letters.iter().try_fold(Self { is_bus_error: true, ..Self::default() }, |report, letter| {
             Some(report.with(match letter {
@@ -332,7 +332,7 @@ impl Report {
         Some(Self { state: Some(state), counters: Some(counters), ..Self::default() })
     }
 
-    /// The last error of a controller, by its number.
+    /// Adds the last error of the controller, by its number.
     const fn with_last(self, last: u8) -> Self {
         match last {
             1 => self.with(Fault::Stuff),
@@ -346,7 +346,7 @@ impl Report {
     }
 }
 
-/// Six hexadecimal digits as three bytes.
+/// Decodes six hexadecimal digits to three bytes.
 fn bytes(digits: &[u8]) -> Option<[u8; 3]> {
     let [_, bytes @ ..] = number(<&[u8; 6]>::try_from(digits).ok()?)?.to_be_bytes();
     Some(bytes)

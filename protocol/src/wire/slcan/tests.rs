@@ -17,7 +17,7 @@ fn fd(id: u32, flags: u8, data: &[u8]) -> Frame {
     Frame::fd(id, flags, data).unwrap()
 }
 
-/// Lines by hand and the frames that they are, both ways.
+/// Lines written by hand, and their frames, in both directions.
 #[test]
 fn frames_are_these_lines() {
     let count: Vec<u8> = (0..12).collect();
@@ -68,7 +68,7 @@ fn what_slcan_cannot_say_is_left_out() {
     let raw = Frame::classic(1, &[9; 8]).unwrap().with_raw_dlc(15);
     assert_eq!(encode(&raw).unwrap().as_bytes(), b"t00180909090909090909\r");
     assert_eq!(encode(&fd(1, ERROR_STATE, &[])).unwrap().as_bytes(), b"d0010\r");
-    // A remote flag means nothing in an FD frame.
+    // The remote flag is ignored in an FD frame.
     assert_eq!(encode(&fd(REMOTE | 1, 0, &[2])).unwrap().as_bytes(), b"d001102\r");
 }
 
@@ -156,7 +156,7 @@ fn the_state_of_a_sender_behind_the_data_is_read() {
         ("t1232AABB0S", Refusal::Long),
         ("t1232AABBG000S", Refusal::Garbage),
         ("t1232AABS", Refusal::Garbage),
-        // The end between two lines is lost.
+        // The line ending between two lines is lost.
         ("t1230d0010", Refusal::Long),
         ("t1230b0012AAB0", Refusal::Long),
     ] {
@@ -174,7 +174,7 @@ fn an_adapter_ends_all_frames_in_one_way_and_two_in_another_show_that_it_has_cha
         let bytes = [usual.repeat(16), other.clone(), usual.clone(), other.repeat(2), usual.clone()].concat();
         let refused = Line::Refused(refusal);
         assert_eq!(lines(&bytes)[16..], [refused, frame, refused, frame, frame]);
-        // A letter is no digit, and may be missing.
+        // `S` is not a digit, and may be missing.
         let letters = [usual.repeat(16), b"t123111S\r".to_vec()].concat();
         assert_eq!(lines(&letters)[16], frame);
     }
@@ -188,7 +188,7 @@ fn reported(text: &str) -> Report {
 #[test]
 fn faults_of_an_adapter_are_the_error_frames_of_the_kernels_driver() {
     use BusState::{Active, Off, Passive, Warning};
-    // Classes and bits as in linux/can/error.h, by hand from what slcan-core.c does with each line.
+    // Classes and bits of linux/can/error.h, derived by hand from the handling of each line in slcan-core.c.
     for (text, before, class, data) in [
         ("e1a", Active, 0xA8, [0, 0, 0, 0x19, 0, 0, 0, 0]),
         ("e1b", Active, 0x88, [0, 0, 0x08, 0, 0, 0, 0, 0]),
@@ -222,7 +222,7 @@ fn faults_of_an_adapter_are_the_error_frames_of_the_kernels_driver() {
         let frame = Frame::classic(ERROR | class, &data).unwrap();
         assert_eq!(reported(text).frame(before), Some(frame), "{text}");
     }
-    // What is known already is no event.
+    // A known state is not an event.
     for (text, before) in
         [("sb256256", Off), ("sp130000", Passive), ("F20", Passive), ("F00", Active), ("E20001000", Passive)]
     {
@@ -363,7 +363,7 @@ fn the_longest_line_fits_and_one_byte_more_does_not() {
     assert_eq!(one(&"x".repeat(1_000_000)), Line::Refused(Refusal::Long));
 }
 
-/// Any frame that slcan can carry as it is.
+/// Frames that slcan carries without loss.
 fn frames() -> impl Strategy<Value = Frame> {
     let id = prop_oneof![0_u32..0x800, (0_u32..0x2000_0000).prop_map(|id| id | EXTENDED)];
     (id, 0_u8..4, 0_u8..16, any::<[u8; 64]>()).prop_map(|(id, kind, dlc, data)| {
@@ -428,7 +428,7 @@ proptest! {
         let text = encode(&frame).unwrap();
         let mut bytes = text.as_bytes().to_vec();
         bytes.remove(at.index(bytes.len() - 1));
-        // Once it is known that no line ends with the state of its sender.
+        // The decoder has learnt that lines do not end with the state of the sender.
         let mut decoder = Decoder::new();
         for &byte in b"t1230\r".repeat(16).iter() {
             decoder.push(byte);

@@ -1,39 +1,41 @@
-//! The fewest and the most bits that any frame of a kind and length can have.
+//! The minimum and maximum number of bits of a frame with a given kind and length.
 //!
-//! For FD they are worked out: bits that are the same in all such frames are walked through, free ones both ways, and of all ways
-//! to one of the eight states of stuffing only the one with the fewest and the one with the most stuff bits matter. What follows the
-//! data stuffs by a rule of its own. In classic CAN the CRC is stuffed too, and the data decides it, so there is a table, which the
-//! test `every_frame` computes from all frames there are. It is one to four bits below the usual formula, which takes the CRC for free.
+//! For FD they are computed: the algorithm walks over the bits of a frame, follows both values of each free
+//! bit, and keeps only the minimum and maximum number of stuff bits for each of the eight states of stuffing.
+//! The bits after the data follow a separate rule. In classic CAN the CRC is stuffed too and depends on the
+//! data, so a table is used, which the test `every_frame` computes from all possible frames. Its maxima are
+//! one to four bits below the usual formula, which treats the CRC as free.
 
 use super::{Bits, CLASSIC_TAIL, parts, stuffing};
 use crate::can::{BIT_RATE_SWITCH, Format, Frame, fd_dlc, fd_len};
 
-/// Which bits a frame consists of, beside its identifier and its data.
+/// The kind of a frame as far as it determines the number of bits.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Coding {
-    /// Classic CAN, with data.
+    /// A classic data frame.
     Classic,
-    /// Classic CAN, a request.
+    /// A classic remote frame.
     Remote,
-    /// CAN FD at one bit rate.
+    /// A CAN FD frame with one bit rate.
     Fd,
-    /// CAN FD that switches to the data bit rate.
+    /// A CAN FD frame that switches to the data bit rate.
     FdSwitched,
 }
 
-/// A kind of frame and its length: what is known of a frame before its identifier and its data are.
+/// The kind and length of a frame: its bits without the values of identifier and data.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub struct Shape {
-    /// What it consists of.
+    /// The kind of frame.
     pub coding: Coding,
-    /// Whether its identifier has 29 bits.
+    /// True for a 29-bit identifier.
     pub extended: bool,
-    /// Bytes, up to 8 (FD: 64); more count as the most there can be, and an FD length that is none as the next one.
+    /// Data bytes, at most 8 (FD: 64). Greater values are clamped, and FD lengths are rounded up to the next
+    /// valid one.
     pub len: u8,
 }
 
 impl Shape {
-    /// The shape of a frame.
+    /// Returns the shape of a frame.
     #[must_use]
     pub const fn of(frame: &Frame) -> Self {
         let coding = match frame.format() {
@@ -45,13 +47,13 @@ impl Shape {
         Self { coding, extended: frame.is_extended(), len: frame.len() }
     }
 
-    /// The fewest bits that a frame of this shape can have.
+    /// Returns the minimum number of bits of a frame of this shape.
     #[must_use]
     pub fn best(self) -> Bits {
         self.bits(|range| range.0)
     }
 
-    /// The most bits that a frame of this shape can have.
+    /// Returns the maximum number of bits of a frame of this shape.
     #[must_use]
     pub fn worst(self) -> Bits {
         self.bits(|range| range.1)
@@ -90,11 +92,11 @@ impl Shape {
         } else {
             (sof_id.fixed(fdf_res_brs, 5), 17)
         };
-        // Behind BRS there is one state only, whatever the identifier was: what follows can be taken by itself.
+        // After BRS only one state is possible for every identifier, so the rest is independent of it.
         let head = head + pick(ways.stuffed());
         let dlc = u64::from(fd_dlc(len));
         let ways = ways.restarted().free(1);
-        // What the last bit makes is a fixed stuff bit.
+        // A stuff bit after the last bit is the first fixed stuff bit, and is not counted here.
         let ways = match u32::try_from(len) {
             Ok(0) | Err(_) => ways.fixed(dlc >> 1, 3),
             Ok(len) => ways.fixed(dlc, 4).free(8 * len - 1),
@@ -103,29 +105,29 @@ impl Shape {
     }
 }
 
-/// The fewest and the most stuff bits.
+/// The minimum and maximum number of stuff bits.
 type Range = (u32, u32);
 
-/// Of classic data frames, by length.
+/// Ranges of classic data frames with 11-bit identifiers, by length.
 const CLASSIC: [Range; 9] = [(1, 6), (1, 7), (1, 9), (1, 12), (0, 14), (0, 15), (0, 18), (0, 21), (0, 22)];
-/// The same with an identifier of 29 bits.
+/// Ranges of classic data frames with 29-bit identifiers, by length.
 const CLASSIC_EXTENDED: [Range; 9] =
     [(1, 11), (1, 13), (1, 15), (1, 17), (0, 19), (0, 21), (0, 23), (0, 25), (0, 27)];
-/// Of remote requests, by the requested length.
+/// Ranges of remote frames with 11-bit identifiers, by requested length.
 const REMOTE: [Range; 9] = [(1, 5), (1, 6), (0, 5), (0, 6), (0, 4), (0, 4), (0, 4), (0, 5), (0, 5)];
-/// The same with an identifier of 29 bits.
+/// Ranges of remote frames with 29-bit identifiers, by requested length.
 const REMOTE_EXTENDED: [Range; 9] =
     [(1, 10), (1, 11), (0, 10), (0, 11), (0, 10), (0, 10), (0, 9), (0, 10), (0, 10)];
 
-/// Of all ways to each state of stuffing: the fewest and the most stuff bits.
+/// The minimum and maximum number of stuff bits on all paths to each state of stuffing.
 #[derive(Clone, Copy)]
 struct Ways([Option<Range>; stuffing::STATES]);
 
 impl Ways {
-    /// The bus before SOF: state 4, as [`stuffing::Run::IDLE`].
+    /// The bus before SOF: state 4, as in [`stuffing::Run::IDLE`].
     const IDLE: Self = Self([None, None, None, None, Some((0, 0)), None, None, None]);
 
-    /// Goes on with the lowest `count` bits of a word.
+    /// Appends the lowest `count` bits of a word.
     fn fixed(self, word: u64, count: u32) -> Self {
         (0..count).rev().fold(self, |ways, place| {
             let bit = (word >> place) & 1 == 1;
@@ -133,17 +135,17 @@ impl Ways {
         })
     }
 
-    /// Goes on with bits that may be anything.
+    /// Appends `count` bits of any value.
     fn free(self, count: u32) -> Self {
         (0..count).fold(self, |ways, _| ways.step(true, true))
     }
 
-    /// The same states, and no stuff bits yet.
+    /// Keeps the reachable states and resets the number of stuff bits.
     fn restarted(self) -> Self {
         Self(self.0.map(|range| range.map(|_| (0, 0))))
     }
 
-    /// Over all states.
+    /// Returns the range over all states.
     fn stuffed(self) -> Range {
         self.0.into_iter().flatten().reduce(wider).unwrap_or((0, 0))
     }

@@ -1,61 +1,62 @@
-//! Bit rates, as people write them and as CAN has them.
+//! Bit rates of a bus, and their text form.
 
 use core::fmt;
 use core::str::FromStr;
 
 use thiserror::Error;
 
-/// The two bit rates of a bus, within what CAN allows.
+/// The nominal and data bit rate of a bus, within the limits of CAN.
 ///
-/// Written `1M/5M`, or `1M` alone when nothing goes quicker (classic CAN).
+/// The text form is `1M/5M`, or `1M` if both are equal (classic CAN).
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub struct BitRates {
     nominal: u32,
     data: u32,
 }
 
-/// What is no bit rate of CAN's.
+/// The error for an invalid bit rate.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum BitRatesError {
-    /// Not a number of bits in a second.
+    /// The text is not a bit rate.
     #[error("not a bit rate: write bit/s, as 1000000, 500k or 1M")]
     Text,
-    /// Outside what a nominal bit rate may be.
+    /// The nominal bit rate is out of range.
     #[error(
         "nominal bit rate {got} bit/s: CAN allows {} to {} (10k to 1M)",
         BitRates::MIN_NOMINAL,
         BitRates::MAX_NOMINAL
     )]
     Nominal {
-        /// Bits in a second.
+        /// The requested rate in bit/s.
         got: u32,
     },
-    /// Outside what a data bit rate may be.
+    /// The data bit rate is out of range.
     #[error(
         "data bit rate {got} bit/s: CAN FD allows {min} (the nominal one) to {} (8M)",
         BitRates::MAX_DATA
     )]
     Data {
-        /// Bits in a second.
+        /// The requested rate in bit/s.
         got: u32,
-        /// The nominal bit rate beside it.
+        /// The minimum in bit/s: the nominal bit rate.
         min: u32,
     },
 }
 
 impl BitRates {
-    /// The lowest nominal bit rate, in bit/s; so has a skin's description.
+    /// The minimum nominal bit rate in bit/s, also for skin descriptions.
     pub const MIN_NOMINAL: u32 = 10_000;
-    /// The highest nominal bit rate, in bit/s.
+    /// The maximum nominal bit rate in bit/s.
     pub const MAX_NOMINAL: u32 = 1_000_000;
-    /// The highest data bit rate, in bit/s.
+    /// The maximum data bit rate in bit/s.
     pub const MAX_DATA: u32 = 8_000_000;
 
-    /// Both rates, in bit/s.
+    /// Creates a pair of rates in bit/s.
     ///
     /// # Errors
-    /// When the nominal one is not in [10 000, 1 000 000], or the data one not between it and 8 000 000.
+    /// Returns an error if `nominal` is not in [10 000, 1 000 000], or `data` is not
+    /// between `nominal` and 8 000 000.
     pub const fn new(nominal: u32, data: u32) -> Result<Self, BitRatesError> {
         if nominal < Self::MIN_NOMINAL || nominal > Self::MAX_NOMINAL {
             return Err(BitRatesError::Nominal { got: nominal });
@@ -66,31 +67,31 @@ impl BitRates {
         Ok(Self { nominal, data })
     }
 
-    /// One rate for everything, in bit/s: a classic bus.
+    /// Creates the rates of a classic bus: one rate in bit/s for all bits.
     ///
     /// # Errors
-    /// When it is not in [10 000, 1 000 000].
+    /// Returns an error if it is not in [10 000, 1 000 000].
     pub const fn classic(nominal: u32) -> Result<Self, BitRatesError> {
         Self::new(nominal, nominal)
     }
 
-    /// Bits in a second while identifiers are compared, and of all of a frame that does not switch.
+    /// Returns the nominal rate in bit/s: of arbitration, and of whole frames without bit rate switch.
     #[must_use]
     pub const fn nominal(self) -> u32 {
         self.nominal
     }
 
-    /// Bits in a second of the data of a frame that switches.
+    /// Returns the data rate in bit/s: of the data phase of frames with bit rate switch.
     #[must_use]
     pub const fn data(self) -> u32 {
         self.data
     }
 }
 
-/// Reads one bit rate: `1000000`, `500k`, `1M`, `2.5M`. Whether CAN allows it is [`BitRates::new`]'s business.
+/// Parses one bit rate: `1000000`, `500k`, `1M`, `2.5M`. [`BitRates::new`] checks the limits of CAN.
 ///
 /// # Errors
-/// When it is not a whole number of bits in a second in [0, 2^32).
+/// Returns an error if it is not a whole number of bit/s in [0, 2^32).
 pub fn bit_rate(text: &str) -> Result<u32, BitRatesError> {
     let (number, unit) = match text.as_bytes().last() {
         Some(b'k' | b'K') => (text.get(..text.len() - 1).unwrap_or(""), 1_000),

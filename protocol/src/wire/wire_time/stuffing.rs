@@ -1,34 +1,35 @@
-//! Stuff bits: after five equal bits a sender puts in one of the other kind, which is the first of the next run.
+//! Bit stuffing: after five equal bits a sender inserts one of the opposite value, which starts the next run.
 //!
-//! A run is one of eight states: which bit, and how often it has come, one to four times; the fifth makes a stuff bit,
-//! and so the state in which the other bit came once. What up to eight bits do to a state stands in a table.
+//! A run is one of eight states: the value of the bit, and its number of repetitions, one to four. The fifth
+//! makes a stuff bit, and thus the state in which the other bit has come once. A table holds the effect of up
+//! to eight bits on a state.
 
-/// The states, three bits wide: the bit, then how often it came less one.
+/// Number of states. A state has three bits: the value of the bit, and its repetitions minus one.
 pub(super) const STATES: usize = 8;
-/// Up to eight bits behind a leading one, which says how many they are.
+/// Number of sequences of up to eight bits, each encoded behind a leading one.
 const WORDS: usize = 512;
-/// By state and bits: how many stuff bits came, above the three bits of the state that follows.
+/// The result for each state and sequence: the number of stuff bits above the three bits of the next state.
 static STEPS: [u8; STATES * WORDS] = steps();
 
-/// A run of equal bits, and the stuff bits on the way to it.
+/// The current run of equal bits, and the number of stuff bits so far.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Run {
     state: u8,
-    /// Stuff bits so far.
+    /// Number of stuff bits.
     pub(super) stuffed: u32,
 }
 
 impl Run {
-    /// The idle bus before the first bit of a frame, which is the other one.
+    /// The idle bus before the first bit of a frame, which has the opposite value.
     pub(super) const IDLE: Self = Self { state: 0b100, stuffed: 0 };
 
-    /// Goes on with eight bits, the most significant first.
+    /// Appends eight bits, most significant first.
     #[inline]
     pub(super) fn byte(self, byte: u8) -> Self {
         self.step(0x100 | usize::from(byte))
     }
 
-    /// Goes on with the lowest `count` bits of a word, the most significant of them first.
+    /// Appends the lowest `count` bits of a word, most significant first.
     #[inline]
     pub(super) fn bits(mut self, word: u64, count: u32) -> Self {
         let mut left = count;
@@ -41,7 +42,7 @@ impl Run {
         self
     }
 
-    /// Whether the last bit of a sequence made a stuff bit: then the run is of the other one.
+    /// Returns true if `last`, the last bit of a sequence, caused a stuff bit.
     #[inline]
     pub(super) const fn ended_on(self, last: u8) -> bool {
         self.state >> 2 != last & 1
@@ -55,7 +56,7 @@ impl Run {
     }
 }
 
-/// One bit more: the state that follows, and 1 when a stuff bit came.
+/// Appends one bit. Returns the next state, and 1 if a stuff bit was inserted.
 pub(super) const fn next(state: u8, bit: u8) -> (u8, u8) {
     let (same, run) = (state >> 2 == bit, state & 3);
     match (same, run) {

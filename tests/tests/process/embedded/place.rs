@@ -109,7 +109,7 @@ fn a_link_a_file_in_the_way_and_a_path_that_is_too_long_are_refused() {
     let error = Served::start_in(&parent.path().join("x".repeat(100)), BUS).unwrap_err().to_string();
     assert!(error.contains("is too long for a socket"), "{error}");
     let error = Served::start_in(&real, "a/b").unwrap_err().to_string();
-    assert!(error.starts_with("\"a/b\" is no bus name"), "{error}");
+    assert!(error.starts_with("\"a/b\" is not a valid bus name"), "{error}");
     let error = Served::start_in(&parent.path().join("no/such"), BUS).unwrap_err().to_string();
     assert!(error.contains("cannot use") && error.contains("No such file"), "{error}");
 }

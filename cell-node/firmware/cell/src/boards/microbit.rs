@@ -1,8 +1,8 @@
-//! BBC micro:bit: nRF51822, Cortex-M0 at 16 MHz, 256 KiB of flash, 16 KiB of RAM. It has no CAN controller: frames
-//! are lines of slcan over its USB serial line, at 115 200 baud.
+//! BBC micro:bit: nRF51822, Cortex-M0 at 16 MHz, 256 KiB of flash, 16 KiB of RAM. It has no CAN controller:
+//! frames are lines of slcan over its USB serial line, at 115 200 baud.
 //!
-//! In QEMU's `microbit` the serial line is a `-chardev` of any rate, the watchdog does nothing, and flash ends with the
-//! process: a factory record with `hosted` keeps it in a file by semihosting.
+//! In QEMU's `microbit` the serial line is a `-chardev` without a baud rate, the watchdog does nothing, and
+//! flash does not persist: with `hosted` in the factory record, semihosting keeps it in a file.
 
 use core::cell::RefCell;
 
@@ -23,15 +23,15 @@ use crate::store::{Flash, NotWritten, Page, UNIT};
 
 mod hosted;
 
-/// Bytes of a page of flash.
+/// Size of a flash page in bytes.
 const PAGE: usize = 1 << 10;
-/// Pins of the line to the USB interface.
+/// Pins of the serial line to the USB interface.
 const TX: u32 = 24;
 const RX: u32 = 25;
-/// The watchdog's clock, in Hz, and the word that feeds it.
+/// Frequency of the watchdog's clock in Hz, and the word that feeds the watchdog.
 const WATCHDOG_HZ: u32 = 32_768;
 const FEED: u32 = 0x6E52_4635;
-/// A compare that is nearer than this, in µs, may be past when it is set.
+/// Minimum lead of a timer compare in µs; a nearer one may have passed when it is set.
 const NEAR: u64 = 10;
 
 static WAITING: Mutex<RefCell<Waiting>> = Mutex::new(RefCell::new(Waiting::new()));
@@ -46,12 +46,12 @@ pub struct Chosen {
 }
 
 impl Chosen {
-    /// The board, started; call it once.
+    /// Initialises the board. Must be called only once.
     #[must_use]
     pub fn take() -> Self {
-        // SAFETY: the only place that takes the peripherals, and this type is the only one that uses them.
+        // SAFETY: this is the only place that takes the peripherals, and only this type uses them.
         let pac = unsafe { pac::Peripherals::steal() };
-        // The crystal: the UART needs it, and so do the 1 % of TIME-1.
+        // Start the crystal oscillator, which the UART and the 1 % of TIME-1 require.
         set(&pac.CLOCK.tasks_hfclkstart, 1);
         while pac.CLOCK.events_hfclkstarted.read().bits() == 0 {}
 
@@ -61,7 +61,7 @@ impl Chosen {
         set(&pac.TIMER0.intenset, 1 << 17); // COMPARE[1]
         set(&pac.TIMER0.tasks_start, 1);
 
-        set(&pac.WDT.config, 1); // it goes on while the processor sleeps, and stands while a debugger halts it
+        set(&pac.WDT.config, 1); // runs while the processor sleeps, pauses while a debugger halts it
         set(&pac.WDT.crv, 2 * WATCHDOG_HZ - 1);
         set(&pac.WDT.rren, 1);
         set(&pac.WDT.tasks_start, 1);
@@ -87,7 +87,7 @@ impl Board for Chosen {
         set(&uart.intenset, 1 << 2); // RXDRDY
         set(&uart.tasks_startrx, 1);
         set(&uart.tasks_starttx, 1);
-        // SAFETY: both handlers are below, and everything they share with the loop is behind a mutex.
+        // SAFETY: both handlers are defined below, and share data with the loop only through a mutex.
         unsafe {
             NVIC::unmask(Interrupt::UART0);
             NVIC::unmask(Interrupt::TIMER0);
@@ -95,7 +95,7 @@ impl Board for Chosen {
     }
 
     fn now(&mut self) -> Micros {
-        // An interrupt captures too.
+        // Interrupt handlers capture the counter as well.
         free(|_| self.clock.at(counter()))
     }
 
@@ -122,14 +122,14 @@ impl Board for Chosen {
         free(|cs| {
             let now = self.clock.at(counter());
             if due.since(now).0 > NEAR && WAITING.borrow(cs).borrow().is_empty() {
-                // It wakes although no handler runs before the end of this block.
+                // A pending interrupt ends the wait although its handler runs only after this block.
                 wfi();
             }
         });
     }
 
     fn feed(&mut self) {
-        // SAFETY: one word that feeds the watchdog and changes nothing else.
+        // SAFETY: a write of one word that only feeds the watchdog.
         set(unsafe { &(*WDT::ptr()).rr[0] }, FEED);
     }
 
@@ -143,7 +143,7 @@ impl Board for Chosen {
         }
         let count = hosted::load(into);
         if count.is_none() {
-            // The emulator's flash begins with zeros, a real one erased.
+            // The emulator's flash starts with zeros instead of erased.
             let erased = [Page::A, Page::B].map(|page| self.flash.erase(page));
             debug_assert_eq!(erased, [Ok(()); 2], "this board's erase cannot fail");
         }
@@ -155,7 +155,7 @@ impl Board for Chosen {
     }
 }
 
-/// The two pages before the factory's.
+/// The two pages before the factory record's page.
 #[derive(Debug)]
 pub struct Pages;
 
@@ -167,10 +167,11 @@ impl Pages {
         }
     }
 
-    /// Has the controller of the flash do something: 1 to write, 2 to erase. Until it is done the processor stands
-    /// still: 46 µs for a word, 21 ms for a page, while which the UART keeps six bytes and loses the rest.
+    /// Enables a flash operation (1 write, 2 erase) and waits until it is done. The processor stalls
+    /// meanwhile: 46 µs for a word, 21 ms for a page, during which the UART buffers six bytes and loses the
+    /// rest.
     fn controlled(enabled: u32, work: impl FnOnce(&pac::nvmc::RegisterBlock)) {
-        // SAFETY: this type alone uses the controller.
+        // SAFETY: only this type uses the flash controller.
         let nvmc = unsafe { &*NVMC::ptr() };
         set(&nvmc.config, enabled);
         work(nvmc);
@@ -181,7 +182,7 @@ impl Pages {
 
 impl Flash for Pages {
     fn unit(&self, page: Page, at: usize) -> [u8; UNIT] {
-        // SAFETY: within a page of flash, which the linker leaves to this type, and aligned.
+        // SAFETY: the address is aligned and within a page that the linker reserves for this type.
         let word =
             |at| unsafe { core::ptr::read_volatile(Self::address(page, at) as *const u32) }.to_le_bytes();
         let ([a, b, c, d], [e, f, g, h]) = (word(at), word(at + 4));
@@ -207,22 +208,22 @@ impl Flash for Pages {
 
 /// Writes a register.
 fn set<R: RegisterSpec<Ux = u32> + Writable>(register: &Reg<R>, value: u32) {
-    // SAFETY: the values are the reference manual's, and none of these registers has to do with memory, except for the
-    // flash controller's, which have the address of a page that the linker leaves to this board.
+    // SAFETY: the values are those of the reference manual. These registers do not affect memory, except for
+    // the flash controller's, which get the address of a page that the linker reserves for this board.
     unsafe { register.as_ptr().write_volatile(value) };
 }
 
 fn uart() -> &'static pac::uart0::RegisterBlock {
-    // SAFETY: the loop sends by it, the handler receives by it: different registers.
+    // SAFETY: the loop sends with it and the handler receives with it, through different registers.
     unsafe { &*UART0::ptr() }
 }
 
 fn timer() -> &'static pac::timer0::RegisterBlock {
-    // SAFETY: captures, which both use, happen while no handler runs.
+    // SAFETY: both use captures only while no handler runs.
     unsafe { &*TIMER0::ptr() }
 }
 
-/// The counter, in µs; only where no handler interrupts.
+/// Returns the counter in µs. Must be called only while no handler can interrupt.
 fn counter() -> u32 {
     set(&timer().tasks_capture[0], 1);
     timer().cc[0].read().bits()
@@ -238,7 +239,7 @@ fn UART0() {
     }
 }
 
-/// It only wakes.
+/// Wakes the processor.
 #[interrupt]
 fn TIMER0() {
     set(&timer().events_compare[1], 0);

@@ -1,4 +1,4 @@
-//! The boards, a file each: `board::Board` by the registers of a microcontroller.
+//! The boards, one file each: `board::Board` implemented with the registers of a microcontroller.
 
 #[cfg(feature = "microbit")]
 mod microbit;
@@ -14,23 +14,23 @@ use core::ptr::read_volatile;
 
 use protocol::factory::{BYTES, ERASED, Factory};
 
-/// The record in its own page of flash. It is erased until whoever makes the cell writes it.
+/// The factory record in its own page of flash, erased until the manufacturer writes it.
 #[used]
 #[unsafe(link_section = ".factory")]
 static FACTORY: [u8; BYTES] = ERASED;
 
 unsafe extern "C" {
-    /// Where the pages for parameters begin: an address, not a value.
+    /// The start of the pages for parameters; only its address is meaningful.
     static _store: u32;
 }
 
-/// What the factory has written; read from flash, not from what the compiler knows of it.
+/// Reads the factory record from flash. The volatile read keeps the compiler from using the initial value.
 fn factory() -> Option<Factory> {
-    // SAFETY: a static of this very type; it is only read.
+    // SAFETY: a static of this type, which is only read.
     Factory::decode(&unsafe { read_volatile(&raw const FACTORY) })
 }
 
-/// The address of the first page for parameters.
+/// Returns the address of the first page for parameters.
 fn store() -> usize {
     (&raw const _store).addr()
 }

@@ -1,8 +1,9 @@
-//! STM32G431 with a CAN transceiver, as on a Nucleo-G431RB: Cortex-M4 at 80 MHz, FDCAN1 on PA11 and PA12, 1 Mbit/s and
-//! 5 Mbit/s. Built by every test run, and never run: there is no emulator of it.
+//! STM32G431 with a CAN transceiver, as on a Nucleo-G431RB: Cortex-M4 at 80 MHz, FDCAN1 on PA11 and PA12, 1
+//! Mbit/s and 5 Mbit/s. Every test run builds it, but no emulator exists to run it.
 //!
-//! By the registers of the reference manual (RM0440), whose names the constants have. The crate `fdcan` 0.2 would not
-//! do: it knows no delay compensation, replaces frames that wait to be sent, and sends empty frames as remote ones.
+//! It uses the registers of the reference manual (RM0440), whose names the constants have. The crate `fdcan`
+//! 0.2 is unsuitable: it lacks delay compensation, replaces frames that wait to be sent, and sends empty
+//! frames as remote ones.
 
 use core::mem::size_of;
 use core::ptr::{read_volatile, write_volatile};
@@ -19,7 +20,7 @@ use crate::store::{Flash, NotWritten, Page, UNIT};
 
 mod can1;
 
-/// Bytes of a page of flash, and where flash begins.
+/// Size of a flash page in bytes, and the address of flash.
 const PAGE: usize = 2 << 10;
 const FLASH_BASE: usize = 0x0800_0000;
 
@@ -46,25 +47,25 @@ const IWDG_RLR: usize = IWDG_KR + 0x08;
 const GPIOA_MODER: usize = 0x4800_0000;
 const GPIOA_OSPEEDR: usize = GPIOA_MODER + 0x08;
 const GPIOA_AFRH: usize = GPIOA_MODER + 0x24;
-/// Interrupts that wake: enabled in the NVIC, and never taken, because they are masked.
+/// Wake-up interrupts: enabled in the NVIC but masked, so that they end `wfi` without a handler.
 const NVIC_ISER: usize = 0xE000_E100;
 const NVIC_ICPR: usize = 0xE000_E280;
 const FDCAN1_IT0: u32 = 1 << 21;
 const TIM2_IRQ: u32 = 1 << 28;
-/// Of `FLASH_SR`.
+/// Bits of `FLASH_SR`.
 const BUSY: u32 = 1 << 16;
 const ERRORS: u32 = 0xC3FA;
 
-/// A compare that is nearer than this, in µs, may be past when it is set.
+/// Minimum lead of a timer compare in µs; a nearer one may have passed when it is set.
 const NEAR: u64 = 10;
 
 fn read(address: usize) -> u32 {
-    // SAFETY: the address of a register of this microcontroller, or a word of its message RAM.
+    // SAFETY: the address of a register of this microcontroller, or of a word of its message RAM.
     unsafe { read_volatile(address as *const u32) }
 }
 
 fn write(address: usize, value: u32) {
-    // SAFETY: as above; none of them touches memory that the program uses.
+    // SAFETY: as above; none of these addresses is memory that the program uses.
     unsafe { write_volatile(address as *mut u32, value) }
 }
 
@@ -84,11 +85,11 @@ pub struct Chosen {
 }
 
 impl Chosen {
-    /// The board, started; call it once.
+    /// Initialises the board. Must be called only once.
     #[must_use]
     pub fn take() -> Self {
         cortex_m::interrupt::disable();
-        // 24 MHz of the crystal / 6 * 80 / 4 = 80 MHz, for which flash waits two cycles.
+        // The 24 MHz crystal / 6 * 80 / 4 = 80 MHz, for which flash needs two wait states.
         change(RCC_CR, 0, 1 << 16);
         wait(RCC_CR, 1 << 17, 1 << 17);
         write(RCC_PLLCFGR, 3 | 5 << 4 | 80 << 8 | 1 << 24 | 1 << 25);
@@ -101,11 +102,11 @@ impl Chosen {
 
         change(RCC_AHB2ENR, 0, 1); // GPIOA
         change(RCC_APB1ENR1, 0, 1 | 1 << 25); // TIM2, FDCAN
-        change(RCC_CCIPR, 3 << 24, 2 << 24); // FDCAN by PCLK1
+        change(RCC_CCIPR, 3 << 24, 2 << 24); // PCLK1 clocks FDCAN
         wait(RCC_APB1ENR1, 1, 1);
 
         write(TIM2_PSC, 80 - 1);
-        write(TIM2_EGR, 1); // take the prescaler over
+        write(TIM2_EGR, 1); // load the prescaler
         write(TIM2_SR, 0);
         write(TIM2_DIER, 1 << 1); // compare 1
         write(TIM2_CR1, 1);
@@ -127,7 +128,7 @@ impl Board for Chosen {
     }
 
     fn open(&mut self, factory: &Factory) {
-        // PA11 and PA12: alternate function 9, fast.
+        // PA11 and PA12: alternate function 9, high speed.
         change(GPIOA_AFRH, 0xFF << 12, 0x99 << 12);
         change(GPIOA_OSPEEDR, 0xF << 22, 0xA << 22);
         change(GPIOA_MODER, 0xF << 22, 0xA << 22);
@@ -140,7 +141,8 @@ impl Board for Chosen {
     }
 
     fn receive(&mut self) -> Option<(Frame, Micros)> {
-        // The loop comes here as soon as something wakes it, so that what waits has just arrived, but for an erase.
+        // The loop comes here as soon as it wakes, so a pending frame has just arrived, except after an
+        // erase.
         let frame = can1::receive()?;
         Some((frame, self.now()))
     }
@@ -162,7 +164,7 @@ impl Board for Chosen {
         write(TIM2_CCR1, low(due));
         write(TIM2_SR, 0);
         write(NVIC_ICPR, FDCAN1_IT0 | TIM2_IRQ);
-        // What came before this is seen here, and what comes after it wakes.
+        // `is_empty` sees frames from before this; later ones end `wfi`.
         can1::acknowledge();
         if due.since(self.now()).0 > NEAR && can1::is_empty() {
             wfi();
@@ -178,7 +180,7 @@ impl Board for Chosen {
     }
 }
 
-/// The two pages before the factory's.
+/// The two pages before the factory record's page.
 #[derive(Debug)]
 pub struct Pages;
 
@@ -190,8 +192,9 @@ impl Pages {
         }
     }
 
-    /// Has the controller of the flash do something. The processor stands still until it is done, because it runs from
-    /// the same bank: 82 µs for 8 bytes, 22 ms for a page; the controller's FIFO keeps three frames meanwhile.
+    /// Runs a flash operation and waits until it is done. The processor stalls meanwhile, because it runs
+    /// from the same bank: 82 µs for 8 bytes, 22 ms for a page. The CAN controller's FIFO buffers three
+    /// frames.
     fn controlled(bits: u32, work: impl FnOnce()) -> Result<(), NotWritten> {
         wait(FLASH_SR, BUSY, 0);
         write(FLASH_SR, ERRORS);
@@ -223,7 +226,7 @@ impl Flash for Pages {
     fn program(&mut self, page: Page, at: usize, unit: [u8; UNIT]) -> Result<(), NotWritten> {
         let address = Self::address(page, at);
         let [a, b, c, d, e, f, g, h] = unit;
-        // Both words of a unit, one after the other: that programs it, with its check bits.
+        // Writing both words of a unit in sequence programs it with its check bits.
         Self::controlled(1, || {
             write(address, u32::from_le_bytes([a, b, c, d]));
             write(address + size_of::<u32>(), u32::from_le_bytes([e, f, g, h]));
@@ -231,7 +234,7 @@ impl Flash for Pages {
     }
 }
 
-/// The frame of an element of the message RAM, by its first two words.
+/// Decodes an element of the message RAM from its first two words and its data.
 fn frame_of(head: [u32; 2], data: &[u8; 64]) -> Option<Frame> {
     let [first, second] = head;
     let id = if first & 1 << 30 == 0 {

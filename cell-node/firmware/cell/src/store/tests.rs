@@ -2,7 +2,7 @@ use super::*;
 
 const PAGE: usize = 1 << 10;
 
-/// Two pages that lose power after so many writes of the present attempt.
+/// Two pages that lose power after `left` writes.
 struct Simulated {
     pages: [[u8; PAGE]; 2],
     left: usize,
@@ -109,7 +109,7 @@ fn damage_is_noticed_and_gone_after_the_next_image() {
         write(&mut flash, &image(3, 133)).unwrap();
         assert_eq!(flash.held(), Ok(image(3, 133)));
     }
-    // Bytes of the image itself are its CRC's business.
+    // Damage within the image itself is detected by its CRC.
     sound.pages[1][20] ^= 1;
     assert_ne!(sound.held(), Ok(image(2, 133)));
 }

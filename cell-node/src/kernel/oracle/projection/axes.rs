@@ -1,31 +1,32 @@
-//! The axes of a frame in the base frame: what is known of them whatever the joints are, and how they turn.
+//! The axes of a frame in the base frame: their components that are known for all joint positions, and their
+//! rotation.
 //!
-//! The first two components of an axis are alike: both are numbers that depend on the joints, but in the axes that are
-//! upright, and in those of the base. So an axis is told by its third one, [`Axis`], and two axes that turn into each
-//! other by how those go together, [`Mix`].
+//! The first two components of an axis are of the same kind: both depend on the joints, except in upright
+//! axes and in those of the base. An axis is therefore characterised by its third component, [`Axis`], and a
+//! pair of axes that is rotated by the combination of both, [`Mix`].
 
 use crate::kernel::{Number, Twist};
 
-/// The components of an axis, or of another vector, in the base frame.
+/// The components of an axis or another vector in the base frame.
 pub(super) type Vector<N> = [N; 3];
 
-/// What is known of an axis.
+/// The known components of an axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Axis {
-    /// It is (0, 0, 1).
+    /// The axis is (0, 0, 1).
     Up,
-    /// It is (0, 0, -1).
+    /// The axis is (0, 0, -1).
     Down,
-    /// Its third component is 0.
+    /// The third component is 0.
     Level,
-    /// Nothing.
+    /// No component is known.
     Any,
 }
 
-/// Which products there are where a turn makes two axes of two: `c a + s b` and `c b - s a`.
+/// The products that a turn of two axes a and b needs: `c a + s b` and `c b - s a`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Mix {
-    /// None: they are the base's first two.
+    /// No products: a and b are the first two axes of the base.
     Base,
     /// b is up.
     Up,
@@ -33,38 +34,39 @@ pub(super) enum Mix {
     Down,
     /// Both third components are 0.
     Level,
-    /// That of a is 0.
+    /// The third component of a is 0.
     Second,
-    /// That of b is 0.
+    /// The third component of b is 0.
     First,
-    /// All.
+    /// All products.
     Both,
 }
 
-/// What is known of the axes of a frame: x, y and z.
+/// The known components of a frame's axes x, y and z.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Frame {
     known: [Axis; 3],
-    /// Whether x and y are the base's.
+    /// True if x and y are those of the base.
     base: bool,
 }
 
 impl Frame {
     pub(super) const BASE: Self = Self { known: [Axis::Level, Axis::Level, Axis::Up], base: true };
 
-    /// What is known of z.
+    /// Returns the known components of z.
     pub(super) fn z(self) -> Axis {
         let [.., z] = self.known;
         z
     }
 
-    /// How a turn about z mixes x and y.
+    /// Returns the mix of x and y for a turn about z.
     pub(super) fn turn(self) -> Mix {
         let [x, y, _] = self.known;
         if self.base { Mix::Base } else { Mix::new(x, y) }
     }
 
-    /// The frame after a turn about z and a twist about the new x; and how that mixes the other two.
+    /// Returns the frame after a turn about z and a twist about the new x, and the mix of the other two axes
+    /// in the twist.
     pub(super) fn after<N>(self, twist: Twist<N>) -> (Self, Mix) {
         let (x, v) = self.turn().axes();
         let z = self.z();
@@ -85,7 +87,7 @@ impl Axis {
         matches!(self, Self::Up | Self::Down)
     }
 
-    /// What is known of the opposite axis.
+    /// Returns the known components of the opposite axis.
     fn opposite(self) -> Self {
         match self {
             Self::Up => Self::Down,
@@ -103,12 +105,12 @@ impl Mix {
             (Axis::Level, Axis::Level) => Self::Level,
             (Axis::Level, Axis::Any) => Self::Second,
             (Axis::Any, Axis::Level) => Self::First,
-            // The first of them is never upright.
+            // The first axis of a pair is never upright.
             (Axis::Up | Axis::Down | Axis::Any, _) => Self::Both,
         }
     }
 
-    /// What is known of both results.
+    /// Returns the known components of both results.
     fn axes(self) -> (Axis, Axis) {
         match self {
             Self::Base | Self::Level => (Axis::Level, Axis::Level),
@@ -117,14 +119,14 @@ impl Mix {
     }
 }
 
-/// How a vector of a frame becomes one of the base's: by which products of its components and the axes'.
+/// The products that transform a vector from a frame to the base.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct ToBase {
     pub(super) level: Level,
     pub(super) height: Height,
 }
 
-/// By which of the axes the vector's first two components are computed.
+/// The axes that contribute to the first two components.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Level {
     Xy,
@@ -132,12 +134,12 @@ pub(super) enum Level {
     All,
 }
 
-/// The same of its third one.
+/// The axes that contribute to the third component.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Height {
-    /// Nobody reads it.
+    /// The component is not needed.
     Nothing,
-    /// No product: the axis is up or down.
+    /// One axis is upright; no product is needed.
     Y,
     MinusY,
     Z,
@@ -149,7 +151,7 @@ pub(super) enum Height {
 }
 
 impl ToBase {
-    /// By what is known of the frame's axes; without a height where nobody reads one.
+    /// Creates the transform for the known axes of a frame. `upright` is true if no height is needed.
     pub(super) fn new(Frame { known, .. }: Frame, upright: bool) -> Self {
         let [_, y, z] = known;
         let level = if y.is_upright() {
@@ -174,15 +176,15 @@ impl ToBase {
     }
 }
 
-/// A turn, by its sine and cosine.
+/// A turn, given by its sine and cosine.
 ///
-/// Axes are of length 1 but for what rounding and the sine's error add; so that no component of one can leave the range
-/// of a word, and none is held: see [`super::range`].
+/// Axes have length 1 except for rounding and the error of the sine, so no component can leave the range of a
+/// word, and no saturation is needed: see [`super::range`].
 #[derive(Clone, Copy)]
 pub(super) struct Turn<N>(pub(super) [N; 2]);
 
 impl<N: Number> Turn<N> {
-    /// `c a + s b`.
+    /// Returns `c a + s b`.
     #[inline(always)]
     pub(super) fn ahead(self, mix: Mix, &[a0, a1, a2]: &Vector<N>, &[b0, b1, b2]: &Vector<N>) -> Vector<N> {
         let Self([sine, cosine]) = self;
@@ -197,12 +199,12 @@ impl<N: Number> Turn<N> {
         }
     }
 
-    /// That in place of a, and `c b - s a` in place of b.
+    /// Replaces a by `c a + s b`, and b by `c b - s a`.
     #[inline(always)]
     pub(super) fn both(self, mix: Mix, [a0, a1, a2]: &mut Vector<N>, [b0, b1, b2]: &mut Vector<N>) {
         let Self([sine, cosine]) = self;
         let turn = |a: &mut N, b: &mut N| (*a, *b) = (self.sum(*a, *b), self.difference(*b, *a));
-        // Where b is nothing, and where a is.
+        // The cases in which the component of b or of a is zero.
         let first =
             |a: &mut N, b: &mut N| (*a, *b) = (product(cosine, *a), product(sine.bounded_negative(), *a));
         let second = |a: &mut N, b: &mut N| (*a, *b) = (product(sine, *b), product(cosine, *b));
@@ -248,7 +250,7 @@ fn product<N: Number>(factor: N, number: N) -> N {
     N::bounded(factor.times(number))
 }
 
-/// The opposite axis.
+/// Negates an axis.
 #[inline(always)]
 pub(super) fn negate<N: Number>([x, y, z]: &mut Vector<N>) {
     (*x, *y, *z) = (x.bounded_negative(), y.bounded_negative(), z.bounded_negative());

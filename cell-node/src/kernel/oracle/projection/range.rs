@@ -1,15 +1,17 @@
-//! The range of a word: what the axes, the force, the cell's position and its moments can become.
+//! Bounds of the projection kernel: the range of axes, force, position and moments.
 
 use super::{Link, Vector};
 use crate::kernel::Number;
 
-/// Whether nothing can leave the range of a word between the cell and the base, wherever the joints are.
+/// Returns true if no number can leave the range of a word between the cell and the base, for any joint
+/// positions.
 ///
-/// The three axes are those of an exact turn and an error: nine components, whose norm is the root of the sum of their
-/// squares. A turn or a twist by words for sine and cosine, each at most 5e-4 off, makes that norm longer by a factor of at
-/// most 1 + 2^-10 and adds at most 17 steps of 2^-14 to it; rounding six components adds less than two. A vector becomes
-/// longer by at most that norm times itself when its components are multiplied by the axes, or when it is multiplied by an
-/// axis; and no component of an axis is beyond 1 and that norm. Of 32 rows that is still below 1.1.
+/// The three axes are those of an exact rotation plus an error of nine components, whose norm is the root of
+/// the sum of their squares. A turn or a twist with words for sine and cosine, each at most 5e-4 off,
+/// increases that norm by a factor of at most 1 + 2^-10 and adds at most 17 steps of 2^-14; rounding six
+/// components adds less than two. Multiplying a vector by the axes, or by an axis, increases its length by at
+/// most that norm times itself; and no component of an axis exceeds 1 plus that norm. For 32 rows this is
+/// still below 1.1.
 pub(super) fn is_bounded<N: Number>(force: Vector<N>, position: Vector<N>, links: &[Link<N>]) -> bool {
     let off = links.iter().fold(0, |off, _| further_off(further_off(off)));
     let axes = (1 << 14) + off;
@@ -31,7 +33,7 @@ pub(super) fn is_bounded<N: Number>(force: Vector<N>, position: Vector<N>, links
     [force, reach, moment, most].iter().all(within)
 }
 
-/// How far off the axes are after one more turn.
+/// Returns the error of the axes after one more turn.
 fn further_off(off: u32) -> u32 {
     off + (off >> 10) + 20
 }
@@ -45,7 +47,8 @@ mod tests {
     use crate::kernel::oracle::{Counted, Projection};
     use crate::kernel::{Kernel, Operations};
 
-    /// An arm of so many rows, with quarter turns and zeros more often than by chance, some rows fixed.
+    /// Returns an arm with `rows` rows, in which quarter turns and zeros are more frequent than by chance,
+    /// and some rows are fixed.
     fn arm(rows: usize, words: &[i16]) -> Parameters {
         let mut words = words.iter().copied().cycle();
         let mut next = || words.next().unwrap_or_default();
@@ -95,7 +98,7 @@ mod tests {
         let is_bounded = |length, normal| Projection::<Q1_14>::new(&arm(length, normal)).bounded;
         assert!(is_bounded(1.5, 1.0) && is_bounded(1.9, 1.0));
         assert!(!is_bounded(2.0, 1.0) && !is_bounded(1.5, 1.9));
-        // The turns of six rows may make each of position, axis and force 1.5 % longer.
+        // The turns of six rows may lengthen position, axis and force by 1.5 % each.
         assert!(!is_bounded(1.95, 1.0));
         let mut slides = arm(0.5, 1.0);
         slides.rows[3].kind = RowKind::Prismatic;

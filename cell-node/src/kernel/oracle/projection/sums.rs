@@ -1,15 +1,15 @@
-//! How sums of more than two products become words.
+//! Rounding of sums with more than two products.
 
 use crate::kernel::Number;
 use crate::kernel::rounding::{Bounded, Held, Rounding};
 
-/// Sums of products of vectors with three components, beside those of the cell's kernel.
+/// Sums of products of three-component vectors, in addition to those of the cell's kernel.
 pub(super) trait Sums: Rounding {
-    /// A number and two products.
+    /// Adds two products to a number and rounds.
     fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N;
-    /// The sum of any two products, not rounded.
+    /// Adds two products without rounding.
     fn plus<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N::Wide;
-    /// Any sum, rounded.
+    /// Rounds a sum.
     fn round<N: Number>(sum: N::Wide) -> N;
 }
 

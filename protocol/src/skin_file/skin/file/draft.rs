@@ -1,4 +1,4 @@
-//! Makes the text of a skin that did not exist.
+//! The writer of new skin files.
 
 use core::fmt::Write;
 
@@ -6,7 +6,7 @@ use super::Value;
 use crate::can::Format;
 use crate::usage::shown;
 
-/// The text of a new skin, from its first line to its last.
+/// The text of a new skin, written from top to bottom.
 #[derive(Clone, Debug, Default)]
 pub struct Draft(String);
 
@@ -15,9 +15,9 @@ pub struct Draft(String);
 pub struct DraftBus<'a> {
     /// Its name.
     pub name: &'a str,
-    /// Its chain, where that is written.
+    /// Its chain; `None` to omit the key.
     pub chain: Option<&'a str>,
-    /// The slot of a sum in µs; without it, cells answer with their torques.
+    /// The slot of a sum in µs; `None` for cells that answer with their torques.
     pub slot_us: Option<u64>,
     /// The format of its frames.
     pub format: Format,
@@ -28,37 +28,37 @@ pub struct DraftBus<'a> {
 pub enum Facing {
     /// The outward normal in the frame of the cell's row.
     Normal([f64; 3]),
-    /// The cell's orientation there, as a quaternion x, y, z, w.
+    /// The cell's orientation in that frame, as a quaternion x, y, z, w.
     Orientation([f64; 4]),
 }
 
 /// A cell of a new skin.
 #[derive(Clone, Copy, Debug)]
 pub struct DraftCell<'a> {
-    /// What is remarked beside its head.
+    /// A comment beside the table header.
     pub remark: Option<&'a str>,
     /// Its bus.
     pub bus: &'a str,
     /// Its node id.
     pub node: usize,
-    /// Its serial number, where that is written.
+    /// Its serial number; `None` to omit the key.
     pub serial: Option<usize>,
-    /// The joint that moves it, from 1.
+    /// The joint that moves it, counted from 1.
     pub joint: usize,
-    /// Its row, where that is not the joint's.
+    /// Its row; `None` for the row of the joint.
     pub row: Option<usize>,
-    /// Its middle in the frame of its row, in m.
+    /// Its centre in the frame of its row, in m.
     pub position: [f64; 3],
-    /// Where it faces.
+    /// Its normal or orientation.
     pub facing: Facing,
-    /// The nodes at its ports, 0 for none; absent where that is not written.
+    /// The node ids at its ports, 0 for a free port; `None` to omit the key.
     pub neighbors: Option<[u8; 4]>,
-    /// Whether it is wired to the gateway.
+    /// True if it is wired to the gateway.
     pub root: bool,
 }
 
 impl Draft {
-    /// Adds a line of a comment.
+    /// Adds a comment line.
     pub fn comment(&mut self, text: &str) {
         match text {
             "" => self.0.push_str("#\n"),
@@ -70,7 +70,7 @@ impl Draft {
         let _ = writeln!(self.0, "{text}");
     }
 
-    /// Begins a table behind an empty line; `head` with its brackets, and a remark beside it.
+    /// Adds an empty line and a table header, with an optional comment. `head` includes the brackets.
     pub fn table(&mut self, head: &str, remark: Option<&str>) {
         match remark {
             Some(remark) => self.line(format_args!("\n{head}   # {}", shown(remark))),
@@ -78,12 +78,12 @@ impl Draft {
         }
     }
 
-    /// Adds a key and its value.
+    /// Adds a key with a value.
     pub fn set(&mut self, key: &str, value: Value<'_>) {
         self.line(format_args!("{key} = {value}"));
     }
 
-    /// Adds a key and its value with a remark, which begins behind so many blanks.
+    /// Adds a key with a value and a comment, separated by this many spaces.
     pub fn set_remarked(&mut self, key: &str, value: Value<'_>, blanks: usize, remark: &str) {
         self.line(format_args!("{key} = {value}{:blanks$}# {}", "", shown(remark)));
     }
@@ -93,7 +93,7 @@ impl Draft {
         self.line(format_args!("{key} = {}", inline(values)));
     }
 
-    /// Adds a key with an array of inline tables, one in each line.
+    /// Adds a key with an array of inline tables, one per line.
     pub fn set_rows<'v>(
         &mut self,
         key: &str,
@@ -108,7 +108,7 @@ impl Draft {
         self.0.push_str("]\n");
     }
 
-    /// Adds the times and the gains that the paper has.
+    /// Adds the timing and the gains of the paper.
     pub fn paper(&mut self, broadcast_hz: f64) {
         self.table("[timing]", None);
         self.set("control_hz", Value::Number(500.0));
@@ -165,7 +165,7 @@ impl Draft {
         }
     }
 
-    /// Returns the whole text.
+    /// Returns the text.
     #[must_use]
     pub fn text(self) -> String {
         self.0

@@ -1,4 +1,4 @@
-//! Changes values of a text that somebody wrote.
+//! The editor of existing skin files.
 
 use core::ops::Range;
 
@@ -8,43 +8,43 @@ use toml_edit::{Document, Item, Key, Table, TableLike};
 use super::Value;
 use crate::skin::Skin;
 
-/// The error for a text that is not the text of a skin.
+/// The error for a text that does not match the skin.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum EditError {
-    /// It cannot be read.
+    /// The text is not TOML.
     #[error(transparent)]
     Toml(#[from] toml_edit::TomlError),
-    /// It has no cells.
+    /// The text has no cells.
     #[error("its cells are not [[cell]] tables")]
     NoCells,
-    /// It has other cells.
+    /// The text has another number of cells than the skin.
     #[error("{found} cells, not {expected}")]
     Count {
-        /// Cells of the text.
+        /// Number of cells in the text.
         found: usize,
-        /// Cells of the skin.
+        /// Number of cells in the skin.
         expected: usize,
     },
 }
 
-/// The text of a skin's file, of whose cells some values are changed.
+/// The text of a skin file in which values of cells are changed.
 ///
-/// Every byte that is not of a changed value stays: comments, order, spelling, spaces, line ends, a byte order mark. Without a
-/// change the text is the given one.
+/// All bytes outside the changed values are kept: comments, order, spelling, spaces, line endings and a byte
+/// order mark. Without changes the text is the original.
 #[derive(Debug)]
 pub struct Edit<'a> {
     text: &'a str,
     document: Document<&'a str>,
-    /// Texts in the place of others, in any order; they do not overlap.
+    /// Replacements of byte ranges, in any order and without overlap.
     changes: Vec<(Range<usize>, String)>,
 }
 
 impl<'a> Edit<'a> {
-    /// Reads a skin's text.
+    /// Parses a skin's text.
     ///
     /// # Errors
-    /// When the text is no TOML, or has another number of cells than the skin.
+    /// Returns an error if the text is not TOML, or its number of cells differs from that of the skin.
     pub fn new(skin: &Skin, text: &'a str) -> Result<Self, EditError> {
         let edit = Self { text, document: Document::parse(text)?, changes: Vec::new() };
         let (found, expected) = (edit.count().ok_or(EditError::NoCells)?, skin.cells.len());
@@ -54,7 +54,7 @@ impl<'a> Edit<'a> {
         Ok(edit)
     }
 
-    /// The cells of the text: `[[cell]]` tables, or tables in an array.
+    /// Counts the cells in the text: `[[cell]]` tables, or inline tables in an array.
     fn count(&self) -> Option<usize> {
         let cells = self.document.get("cell")?;
         if let Item::ArrayOfTables(cells) = cells { Some(cells.len()) } else { Some(cells.as_array()?.len()) }
@@ -68,7 +68,7 @@ impl<'a> Edit<'a> {
         cells.as_array()?.get(index)?.as_inline_table().map(|table| table as &dyn TableLike)
     }
 
-    /// The places of a cell's key and of its value.
+    /// Returns the byte ranges of a cell's key and its value.
     fn places(&self, cell: usize, key: &str) -> Option<(Range<usize>, Range<usize>)> {
         let (key, item) = self.cell(cell)?.get_key_value(key)?;
         Some((Key::span(key)?, item.span()?))
@@ -80,14 +80,14 @@ impl<'a> Edit<'a> {
         self.places(cell, key).is_some()
     }
 
-    /// Puts a value in the place of a cell's, if the cell has the key.
+    /// Replaces the value of a key, if the cell has it.
     pub fn set(&mut self, cell: usize, key: &str, value: Value<'_>) {
         if let Some((_, place)) = self.places(cell, key) {
             self.changes.push((place, value.to_string()));
         }
     }
 
-    /// Puts a value in the place of an element of a cell's array, if there is one.
+    /// Replaces an element of a cell's array, if it exists.
     pub fn set_element(&mut self, cell: usize, key: &str, index: usize, value: Value<'_>) {
         let array = self.cell(cell).and_then(|cell| cell.get(key)?.as_array());
         if let Some(place) = array.and_then(|array| array.get(index)?.span()) {
@@ -95,7 +95,7 @@ impl<'a> Edit<'a> {
         }
     }
 
-    /// Puts another key and its value in the place of a cell's, if the cell has that.
+    /// Replaces a key and its value by another key and value, if the cell has it.
     pub fn replace(&mut self, cell: usize, key: &str, other: &str, value: Value<'_>) {
         if let Some((name, place)) = self.places(cell, key) {
             self.changes.push((name, other.to_owned()));
@@ -103,7 +103,7 @@ impl<'a> Edit<'a> {
         }
     }
 
-    /// Adds a key that a cell does not have: on a line of its own below that of `after`, or behind its value in an inline table.
+    /// Adds a key after the key `after`: on a new line, or in an inline table after the value.
     pub fn insert(&mut self, cell: usize, key: &str, value: Value<'_>, after: &str) {
         let Some((name, place)) = self.places(cell, after) else { return };
         let rest = self.text.get(place.end..).unwrap_or_default();
@@ -111,7 +111,7 @@ impl<'a> Edit<'a> {
         let (offset, text) = if is_inline {
             (0, format!(", {key} = {value}"))
         } else {
-            // The new line is indented and ends as the one above it.
+            // The new line has the indentation and line ending of the one above it.
             let before = self.text.get(..name.start).unwrap_or_default();
             let indent = before.rsplit('\n').next().unwrap_or_default();
             let line = rest.find('\n').unwrap_or(rest.len());
@@ -125,10 +125,10 @@ impl<'a> Edit<'a> {
         self.changes.push((at..at, text));
     }
 
-    /// Returns the text with its changes.
+    /// Returns the text with all changes.
     #[must_use]
     pub fn text(mut self) -> String {
-        // What is inserted at one place stays in the order of the calls.
+        // The sort is stable: insertions at one position keep the order of the calls.
         self.changes.sort_by_key(|(place, _)| (place.start, place.end));
         let mut out = String::with_capacity(self.text.len());
         let mut at = 0;

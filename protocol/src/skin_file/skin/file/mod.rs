@@ -1,5 +1,5 @@
-//! The one writer of skin files: an [`Edit`] changes values of a given text and keeps every other byte, a [`Draft`] makes a new
-//! text.
+//! Writing of skin files: an [`Edit`] changes values in an existing text and keeps all other bytes, a
+//! [`Draft`] creates a new text.
 
 mod draft;
 mod edit;

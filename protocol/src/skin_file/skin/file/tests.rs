@@ -1,10 +1,11 @@
-//! Given texts keep their bytes; new ones can be read.
+//! Existing texts keep their bytes; new texts parse.
 
 use super::*;
 use crate::can::Format;
 use crate::skin::Skin;
 
-/// A text of a hand: comments, odd spaces, arrays over several lines, quoted keys, no line end behind the last line.
+/// A text with the irregularities of hand-written files: comments, odd spaces, multi-line arrays, quoted
+/// keys, and no final line ending.
 const HAND: &str = r#"# of a hand
 version=1
 robot = { name = "odd \u00e9",   joints = [{ d = 0.1, alpha = 1.5707963267948966 },
@@ -29,7 +30,7 @@ position = [0.0, 0.0, 0.06]
 neighbors = [1, 0, 0, 0]
 orientation = [0.0, 0.0, 0.0, 1.0]"#;
 
-/// The same cells as tables in an array.
+/// The cells of [`HAND`] as inline tables in an array.
 const INLINE: &str = r#"cell = [
   { node = 1, joint = 2, position = [-0.2, 0.0, 0.06], normal = [0.0, 1.0, 0.0], neighbors = [2, 0, 0, 0] }, # one
   {node=2,joint=1,position=[0.0,0.0,0.06],orientation=[0.0,0.0,0.0,1.0],neighbors=[1,0,0,0]},
@@ -42,7 +43,7 @@ fn parsed(text: &str) -> Skin {
     Skin::parse("skin.toml", text).unwrap()
 }
 
-/// The text with carriage returns, and in three more forms.
+/// Returns the text in four forms: as it is, with CRLF, with mixed line endings, and with a byte order mark.
 fn forms(text: &str) -> [String; 4] {
     let dos = text.replace('\n', "\r\n");
     let mixed = text.replacen('\n', "\r\n", 3);
@@ -91,7 +92,7 @@ fn a_new_key_has_a_line_of_its_own() {
         edit.insert(1, "root", Value::Flag(true), "orientation");
         edit.insert(1, "serial", Value::Integer(13), "nothing");
         let expected = text.replace("1 # one", &format!("1 # one{end}  serial = 12")) + end + "root = true";
-        // The last line of the text has no line end to be like.
+        // The last line has no line ending to copy.
         let expected = expected.replace("\r\nroot = true", "\nroot = true");
         let new = edit.text();
         assert_eq!(new, expected);

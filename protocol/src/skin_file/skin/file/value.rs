@@ -1,23 +1,23 @@
-//! A value as it stands in a file.
+//! Values in a skin file.
 
 use core::fmt::{self, Write};
 
 use crate::usage::is_unprintable;
 
-/// A value that is written. Numbers are finite.
+/// A value to write. Numbers must be finite.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Value<'a> {
-    /// A whole number.
+    /// An integer.
     Integer(i64),
-    /// A number, with as many digits as tell it from its neighbours.
+    /// A number, with the fewest digits that identify it.
     Number(f64),
     /// An array of numbers.
     Numbers(&'a [f64]),
-    /// An array of node ids; 0 for a port without a wire.
+    /// An array of node ids; 0 for a free port.
     Nodes(&'a [u8]),
-    /// A text, which is quoted.
+    /// A string, which is quoted.
     Text(&'a str),
-    /// `true` or `false`.
+    /// A boolean.
     Flag(bool),
 }
 
@@ -34,7 +34,7 @@ impl fmt::Display for Value<'_> {
     }
 }
 
-/// Writes a basic string of TOML, which has other escapes than Rust.
+/// Writes a basic string of TOML, whose escapes differ from Rust's.
 fn quoted(f: &mut fmt::Formatter<'_>, text: &str) -> fmt::Result {
     f.write_char('"')?;
     for letter in text.chars() {

@@ -1,36 +1,36 @@
-//! Flash of an emulated cell: a file of the host, by Arm's semihosting. Its path is the program's command line. A new
-//! image goes into a file beside it, which then takes its place, so that an emulator that is killed leaves the old
-//! one or the new one.
+//! Flash of an emulated cell in a file of the host, accessed with Arm semihosting. The program's command line
+//! is the path. A new image is written to a second file, which then replaces the first, so that killing the
+//! emulator leaves either the old or the new image.
 
 use cortex_m_semihosting::syscall;
 
-/// Bytes of a path, with what is added to it.
+/// Size of the path buffer, including the suffix.
 const MAX_PATH: usize = 256;
-/// Behind the path of a file that is being written.
+/// Suffix of the file that is being written.
 const PART: &[u8] = b".part";
-/// Modes of opening: `rb` and `wb`.
+/// Modes of OPEN: `rb` and `wb`.
 const READ: usize = 1;
 const WRITE: usize = 5;
-/// What a call answers that failed.
+/// The result of a failed call.
 const FAILED: usize = usize::MAX;
 
-/// A path with a 0 at its end.
+/// A path with a terminating 0.
 struct Path {
     bytes: [u8; MAX_PATH],
     len: usize,
 }
 
 impl Path {
-    /// The file's path; `None` where the emulator was given none.
+    /// Returns the path on the command line; `None` if the emulator got none.
     fn given() -> Option<Self> {
         let mut bytes = [0; MAX_PATH];
-        // SAFETY: a buffer of this frame, and its size.
+        // SAFETY: the buffer is on this stack frame, and its size is passed.
         let answer = unsafe { syscall!(GET_CMDLINE, bytes.as_mut_ptr(), MAX_PATH - PART.len() - 1) };
         let len = bytes.iter().position(|byte| *byte == 0)?;
         (answer == 0 && len > 0).then_some(Self { bytes, len })
     }
 
-    /// The path of the file that is being written.
+    /// Returns the path of the file that is being written.
     fn part(&self) -> Self {
         let mut bytes = self.bytes;
         bytes.iter_mut().skip(self.len).zip(PART).for_each(|(byte, part)| *byte = *part);
@@ -38,7 +38,7 @@ impl Path {
     }
 
     fn open(&self, mode: usize) -> Option<File> {
-        // SAFETY: a path that ends with 0, and its length.
+        // SAFETY: the path ends with 0, and its length is passed.
         let handle = unsafe { syscall!(OPEN, self.bytes.as_ptr(), mode, self.len) };
         (handle != FAILED).then_some(File(handle))
     }
@@ -49,31 +49,31 @@ struct File(usize);
 
 impl Drop for File {
     fn drop(&mut self) {
-        // SAFETY: a handle that is open.
+        // SAFETY: the handle is open.
         unsafe { syscall!(CLOSE, self.0) };
     }
 }
 
-/// What the file holds, as far as there is room; `None` where there is no file.
+/// Reads the file into `into`, as far as there is room. Returns the number of bytes; `None` without a file.
 #[inline(never)]
 pub(super) fn load(into: &mut [u8]) -> Option<usize> {
     let file = Path::given()?.open(READ)?;
-    // SAFETY: a buffer and its size.
+    // SAFETY: the buffer and its size are passed.
     let left = unsafe { syscall!(READ, file.0, into.as_mut_ptr(), into.len()) };
     into.len().checked_sub(left)
 }
 
-/// Puts the image in the file's place; whether it is there.
-// Not inlined, so that the paths are off the stack of whoever calls it.
+/// Replaces the file by the image. Returns true on success.
+// Not inlined, to keep the paths off the caller's stack.
 #[inline(never)]
 pub(super) fn store(image: &[u8]) -> bool {
     let Some(path) = Path::given() else { return false };
     let part = path.part();
     let Some(file) = part.open(WRITE) else { return false };
-    // SAFETY: a buffer and its size.
+    // SAFETY: the buffer and its size are passed.
     let left = unsafe { syscall!(WRITE, file.0, image.as_ptr(), image.len()) };
     drop(file);
-    // SAFETY: two paths that end with 0, and their lengths.
+    // SAFETY: both paths end with 0, and their lengths are passed.
     let renamed = unsafe { syscall!(RENAME, part.bytes.as_ptr(), part.len, path.bytes.as_ptr(), path.len) };
     left == 0 && renamed == 0
 }

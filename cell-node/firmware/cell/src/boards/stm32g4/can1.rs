@@ -1,4 +1,4 @@
-//! FDCAN1 and its message RAM.
+//! The CAN controller FDCAN1 and its message RAM.
 //!
 //! ```text
 //!   4000A400 + 000  28 standard filters, a word each       + 0B0  FIFO 0: 3 elements of 18 words
@@ -29,34 +29,35 @@ const RAM: usize = 0x4000_A400;
 const EXTENDED_FILTERS: usize = RAM + 0x70;
 const FIFO_0: usize = RAM + 0xB0;
 const TO_SEND: usize = RAM + 0x278;
-/// Bytes of an element: two words and the data.
+/// Size of an element in bytes: two words and the data.
 const ELEMENT: usize = 72;
-/// Filters that there is room for.
+/// Number of standard filters, and of extended ones.
 const STANDARD: usize = 28;
 const EXTENDED: usize = 8;
 
-/// Of `CCCR`.
+/// Bits of `CCCR`.
 const INIT: u32 = 1;
 const CONFIGURE: u32 = 1 << 1;
 const FD: u32 = 1 << 8 | 1 << 9; // FD frames, bit rate switch
-/// Of `IR`: a frame is in FIFO 0.
+/// Bit of `IR`: a frame is in FIFO 0.
 const RECEIVED: u32 = 1;
-/// Of `PSR`.
+/// Bit of `PSR`.
 const BUS_OFF: u32 = 1 << 7;
 
-/// Joins the bus. Nothing passes before filters are set.
+/// Joins the bus. No frames pass before filters are set.
 pub(super) fn open(format: Format) {
     change(CCCR, 0, INIT);
     wait(CCCR, INIT, INIT);
     change(CCCR, 0, CONFIGURE);
-    // 1 Mbit/s of 80 MHz: 80 quanta, 1 + 63 before the sample point, 16 after it, and to jump at most.
+    // 1 Mbit/s from 80 MHz: 80 quanta, 1 + 63 before the sample point, 16 after it; the jump width is 16.
     write(NBTP, 15 << 25 | 62 << 8 | 15);
-    // 5 Mbit/s: 16 quanta, 1 + 11 and 4; the transceiver's delay is measured, and sampled 12 quanta after it.
+    // 5 Mbit/s: 16 quanta, 1 + 11 and 4. The transceiver's delay is measured, and the sample point is 12
+    // quanta after it.
     write(DBTP, 1 << 23 | 10 << 8 | 3 << 4 | 3);
     write(TDCR, 12 << 8);
     change(CCCR, FD, if format == Format::Fd { FD } else { 0 });
-    write(TXBC, 0); // first in, first out: what a cell sends at once leaves in its order
-    // What passes none of the filters is rejected.
+    write(TXBC, 0); // first in, first out: keeps the order of a cell's frames
+    // Reject frames that pass no filter.
     write(RXGFC, 8 << 24 | 28 << 16 | 2 << 4 | 2 << 2);
     filter(core::iter::empty(), core::iter::empty());
     write(IE, RECEIVED);
@@ -64,10 +65,11 @@ pub(super) fn open(format: Format) {
     change(CCCR, INIT, 0);
 }
 
-/// Passes these identifiers to FIFO 0, of 11 bits and of 29 bits. There is room for all that a cell receives. An element
-/// of zeros is no filter, so that this can be done while the controller is on the bus.
+/// Passes these identifiers to FIFO 0: `standard` of 11 bits, `extended` of 29 bits. There is room for all
+/// that a cell receives. An element of zeros is a disabled filter, so this can be called while the controller
+/// is on the bus.
 pub(super) fn filter(standard: impl Iterator<Item = u32>, extended: impl Iterator<Item = u32>) {
-    // Either of two identifiers, which are the same; to FIFO 0.
+    // A dual filter with two equal identifiers, to FIFO 0.
     let mut standard = standard.map(|id| 1 << 30 | 1 << 27 | id << 16 | id);
     for index in 0..STANDARD {
         write(RAM + 4 * index, standard.next().unwrap_or(0));
@@ -80,19 +82,19 @@ pub(super) fn filter(standard: impl Iterator<Item = u32>, extended: impl Iterato
     }
 }
 
-/// Forgets that frames came.
+/// Clears the flag for received frames.
 pub(super) fn acknowledge() {
     write(IR, RECEIVED);
 }
 
-/// Whether no frame waits.
+/// Returns true if FIFO 0 is empty.
 pub(super) fn is_empty() -> bool {
     read(RXF0S) & 15 == 0
 }
 
-/// Takes the next frame.
+/// Returns the next frame.
 pub(super) fn receive() -> Option<Frame> {
-    // A controller that was too often alone gives up; this has it try again, after 129 idle phases of the bus.
+    // After too many errors the controller leaves the bus; this makes it rejoin after 129 idle phases.
     if read(PSR) & BUS_OFF != 0 {
         change(CCCR, INIT, 0);
     }
@@ -116,7 +118,7 @@ pub(super) fn receive() -> Option<Frame> {
     None
 }
 
-/// Gives a frame to the controller; whether it had room.
+/// Passes a frame to the controller. Returns false if it has no room.
 pub(super) fn send(frame: &Frame) -> bool {
     let state = read(TXFQS);
     if state & 1 << 21 != 0 {
@@ -133,7 +135,7 @@ pub(super) fn send(frame: &Frame) -> bool {
     };
     write(element, id | remote);
     write(element + 4, flags | u32::from(can::fd_dlc(frame.len().into())) << 16);
-    // What is behind the data up to a length that CAN FD has is zeros.
+    // Pad with zeros to a length that CAN FD has.
     let mut data = [0; 64];
     data.iter_mut().zip(frame.data()).for_each(|(byte, value)| *byte = *value);
     for (place, bytes) in data.as_chunks().0.iter().enumerate() {
