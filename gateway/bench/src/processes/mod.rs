@@ -281,7 +281,7 @@ impl Processes {
         self.all.iter().any(|process| process.state().runs(bus, node))
     }
 
-    /// The process ids.
+    /// Ids of the running processes.
     pub fn pids(&self) -> impl Iterator<Item = u32> {
         self.all.iter().filter(|process| process.lives()).map(|process| process.child.id())
     }

@@ -12,7 +12,7 @@ use rustix::time::{clock_getres, clock_gettime};
 use model::decode::parameter::Words;
 use model::quantiles::Quantiles;
 
-/// Facts by name.
+/// Metadata values by key.
 pub type Facts = BTreeMap<String, String>;
 
 /// Metadata of the program and its command line.

@@ -86,9 +86,9 @@ pub enum OutputError {
     /// The recording cannot be written.
     #[error("--record {}: {source}", .path.display())]
     Mcap {
-        /// The first file.
+        /// Path of the first file.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         source: io::Error,
     },
     /// The name of the recording does not end in `.mcap`.
