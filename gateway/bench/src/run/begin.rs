@@ -110,7 +110,7 @@ impl Bench<'_> {
         if halted(self) == 0 {
             return Ok(());
         }
-        // Their next heartbeats show it.
+        // Their next heartbeats show their state.
         self.say(&Message::Sync)?;
         self.wait(SHOWING, |bench, timeout| Ok(halted(bench) == 0 || timeout.is_over(0)))
     }

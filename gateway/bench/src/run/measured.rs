@@ -31,7 +31,7 @@ pub(super) struct Measured {
     pub(super) halts: Halts,
     last: Option<Timed>,
     before: Option<Timed>,
-    /// Since when ticks are recorded in `recent`, and how late they began.
+    /// Start of the interval that `recent` covers.
     since: Instant,
     recent: Histogram<u64>,
     /// Lateness figures, renewed once a second.

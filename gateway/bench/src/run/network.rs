@@ -36,7 +36,7 @@ pub(super) struct Network {
     reported_links_down: Repeats<CellId>,
     /// Cells that send but are unreachable, with the start of that state.
     without: BTreeMap<CellId, Micros>,
-    /// Cells that were reported as unreachable, and since when they are; until they have a route again.
+    /// Cells reported as unreachable, with the start of that state, until they have a route again.
     said: BTreeMap<CellId, Micros>,
     said_too_deep: bool,
     /// Longest time that a cell was unreachable.

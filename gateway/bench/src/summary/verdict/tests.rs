@@ -1,4 +1,4 @@
-//! Each verdict, and their order.
+//! Verdicts and their order.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::collections::BTreeSet;
@@ -106,10 +106,10 @@ fn nothing_is_well_that_is_not_known() {
     assert!(nan[0].starts_with("mean error of single cells NaN"), "{nan:?}");
 }
 
-/// A change of a run that is well, and the begin of what there is to look at then.
+/// The beginning of the expected finding, and the change of a good run that causes it.
 type Case = (&'static str, fn(&mut Summary));
 
-/// All faults, the most important first.
+/// All findings, the most important first.
 const CASES: &[Case] = &[
     ("the run failed: no memory", |it| it.failure = Some("no memory".to_owned())),
     ("the robot was halted at 1.500 s and not resumed: a halt frame", |it| {
@@ -229,7 +229,7 @@ fn the_most_important_fault_comes_first() {
             });
             let place = |begin: &str| found.iter().position(|one| one.starts_with(begin));
             let [first, second] = [begin, after].map(|begin| place(begin));
-            // A failure of the run has the reason of a recording that is not complete.
+            // A failed run already names the reason of an incomplete recording.
             let is_named = second.is_some() || after.starts_with("the recording is incomplete");
             assert!(first == Some(0) && is_named, "{begin}, {after}: {found:?}");
         }
