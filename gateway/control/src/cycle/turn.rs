@@ -16,7 +16,7 @@ use crate::external::Absence;
 use model::scenario::{Mode, Scenario};
 use model::table::Snapshot;
 
-/// While the robot is halted, the halt is resent before every so many joints.
+/// Interval in epochs between repeated halts while the robot is halted.
 const HALT_AGAIN: u8 = 8;
 
 /// State shared by all threads of a run.

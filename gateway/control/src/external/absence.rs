@@ -16,9 +16,9 @@ pub enum Absence {
         .socket.display(), .others
     )]
     NoHello {
-        /// The gateway's socket.
+        /// Path of the gateway's socket.
         socket: PathBuf,
-        /// What came in its place.
+        /// Datagrams that came instead.
         others: Others,
     },
     /// It sent a hello, but no answer in time.
