@@ -190,7 +190,7 @@ fn verdict(
     }
     if answers.present().is_empty() {
         return Err(Failure::run(format!(
-            "no {who} was heard on {bus} for {waited} s: `skinbus cells {bus}` lists who is there; the bus' format \
+            "no {who} sent anything on {bus} for {waited} s: `skinbus cells {bus}` lists the cells; the format of the bus \
              may be --format {other}"
         )));
     }

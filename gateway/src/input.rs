@@ -57,7 +57,7 @@ pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
     );
     if is_path(Path::new(name)) && is_absent {
         return Failure::usage(format!(
-            "there is no file {name}, and no bus of that name: say where the file is"
+            "there is no file {name}, and no bus of that name: name the path of the file"
         ));
     }
     Failure::usage(format!("there is no file {name}, and as a bus: {error}"))
@@ -157,7 +157,7 @@ pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
         files.iter().find(|file| file.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
     {
         return Err(Failure::usage(format!(
-            "{} is no regular file and is read once: name the skin with --skin",
+            "{} is not a regular file and can be read only once: name the skin with --skin",
             pipe.display()
         )));
     }

@@ -246,11 +246,11 @@ fn expectation(rows: &mut Rows, expect: &Expect) {
     off(rows, "sum", &tally.sum_words, 1);
     let late = match expect.joints_skipped {
         0 => String::new(),
-        skipped => format!("cells took joints too late {}", count(skipped, "time")),
+        skipped => format!("cells received joints too late {}", count(skipped, "time")),
     };
     rows.row("missing", tally.missing, late);
     rows.row("extra", tally.extra, "");
-    rows.any("not requested", tally.not_requested, "a bus did not take the joints");
+    rows.any("not requested", tally.not_requested, "a bus refused the joints");
     for (reason, count) in tally.lacking.reasons() {
         rows.row("not in the recording", count, reason);
     }

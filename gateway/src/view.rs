@@ -161,7 +161,7 @@ impl View {
         let Some(file) = &self.skin else {
             let name = self.sources.first().map(|it| it.display().to_string()).unwrap_or_default();
             return Err(Failure::usage(format!(
-                "there is no file {name}: name a skin, whose buses are listened to, a recording, or a bus and its --skin"
+                "there is no file {name}: name a skin, to show its buses, a recording, or a bus and its --skin"
             )));
         };
         if self.at.is_some() {
@@ -229,7 +229,7 @@ impl View {
             return Ok(false);
         }
         if first.metadata().is_ok_and(|about| !about.is_file()) {
-            let what = "is no regular file: name a skin, whose buses are listened to, or a recording";
+            let what = "is not a regular file: name a skin, to show its buses, or a recording";
             return Err(Failure::usage(format!("{} {what}", first.display())));
         }
         let mut reader = Reader::open(first).map_err(Failure::usage)?;

@@ -128,7 +128,7 @@ impl<'a> Visuals<'a> {
             None if self.packages.only_beside => {
                 format!("put the folder of package {name} beside the URDF, or above it")
             }
-            None => format!("say where the package is with --package {name}=DIR"),
+            None => format!("name its directory with --package {name}=DIR"),
         };
         Err(format!("mesh {uri}: {shown} is no file: {hint}"))
     }
@@ -167,7 +167,7 @@ mod tests {
         let hint = |packages: &Packages| {
             Visuals::new(&urdf, Path::new("none/r.urdf"), packages).find("package://p/a.stl").unwrap_err()
         };
-        assert!(hint(&Packages::default()).ends_with("say where the package is with --package p=DIR"));
+        assert!(hint(&Packages::default()).ends_with("name its directory with --package p=DIR"));
         let beside = hint(&Packages::beside());
         assert!(beside.ends_with("put the folder of package p beside the URDF, or above it"), "{beside}");
     }

@@ -30,7 +30,7 @@ impl Answers {
     /// Waits up to 20 ms for packets and records them.
     ///
     /// # Errors
-    /// When the bus is down, gone or closed.
+    /// Returns [`BusError`] if the bus is down, gone or closed.
     pub fn hear(&mut self, listener: &mut Listener) -> Result<(), BusError> {
         listener.hear(Duration::from_millis(20))?;
         for (_, decoded) in listener.decoded() {

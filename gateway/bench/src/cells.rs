@@ -37,7 +37,7 @@ impl Watch {
     /// else in the format of the cells.
     ///
     /// # Errors
-    /// When the bus cannot be opened.
+    /// Returns [`BusError`] if the bus cannot be opened.
     pub fn open(name: &str, kind: Choice, format: Option<Format>) -> Result<Self, BusError> {
         let kinds = Kind::ALL.into_iter().filter(|kind| kind.is_from_cells());
         let mut filters: Vec<_> = kinds.map(Filter::kind).collect();
@@ -82,7 +82,7 @@ impl Watch {
     /// Queries the cells once the format of their frames is known; queries them repeatedly if `again`.
     ///
     /// # Errors
-    /// When the bus is gone or closed.
+    /// Returns [`BusError`] if the bus is gone or closed.
     pub fn request(&mut self, again: bool) -> Result<(), BusError> {
         let due = self.requested.is_none_or(|requested| again && requested.elapsed() >= REQUEST);
         let waited = (self.elapsed() >= FORMAT).then_some(Format::Fd);
@@ -102,7 +102,7 @@ impl Watch {
     /// Receives for the time of one poll. Waits while the bus is down, unless `stopped`.
     ///
     /// # Errors
-    /// When the bus is gone or closed.
+    /// Returns [`BusError`] if the bus is gone or closed.
     pub fn hear(&mut self, stopped: &AtomicBool) -> Result<(), BusError> {
         let heard = self.listener.hear(LOOK);
         if stopped.load(Ordering::Relaxed) {

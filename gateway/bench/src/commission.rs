@@ -54,7 +54,7 @@ pub struct Done {
 /// Opens a bus of a skin for commissioning.
 ///
 /// # Errors
-/// When it cannot be opened.
+/// Returns [`BusError`] if the bus cannot be opened.
 pub fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, BusError> {
     let described = skin.buses.get(index);
     let (name, format) = described.map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));

@@ -146,7 +146,7 @@ impl Summary {
         };
         let parts: String = parts.map(hint).collect();
         (!errors.is_empty() || *lost_write > 0).then(|| match lost_write {
-            0 => format!("the recording is not as it should be: {first}{parts}"),
+            0 => format!("the recording has an error: {first}{parts}"),
             _ => format!("the recording is incomplete, {lost_write} frames were not written: {first}{parts}"),
         })
     }

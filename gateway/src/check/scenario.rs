@@ -163,7 +163,7 @@ impl Plan {
         );
         let remarks: String = remarks.iter().map(|remark| format!("remark: {}\n", shown(remark))).collect();
         if events.is_empty() {
-            return head + "nobody touches the skin, and nothing breaks\n" + &remarks;
+            return head + "no touches and no faults\n" + &remarks;
         }
         let rows = events.iter().map(Event::row);
         head + &format!(

@@ -120,7 +120,7 @@ fn describe(skin: &Skin) -> String {
     }
     for [first, second] in at_one_place(skin) {
         let name = |cell: &Cell| format!("{} on {}", cell.node, bus_name(skin, cell));
-        text += &format!("remark: cells {} and {} sit at one place\n", name(first), name(second));
+        text += &format!("remark: cells {} and {} sit at the same place\n", name(first), name(second));
     }
     text + &format!("hash: {:04X} over the parameters of all cells; --list lists each cell's\n", hash(skin))
 }

@@ -164,7 +164,7 @@ fn control(rows: &mut Rows, summary: &Summary, is_verbose: bool) {
     for (name, count, skipped) in counts.into_iter().filter(|(_, _, skipped)| is_verbose || *skipped > 0) {
         rows.row(name, count, format!("{skipped} skipped"));
     }
-    let why = "the bus did not take them, or this machine was busy";
+    let why = "the bus refused them, or this machine was busy";
     rows.any("frames not sent", control.unsent, why);
     rows.any("records of ticks lost", control.records_lost, why);
     for (name, count) in &control.controller {

@@ -270,8 +270,11 @@ fn wrong_use_is_one_line_and_exit_code_2() {
             "scenario.toml comes after the skin: a scenario is given by --scenario scenario.toml",
         ),
         ("skin chek", "unrecognized subcommand 'chek'; try '--help'"),
-        ("dump nosuch.mcap", "there is no file nosuch.mcap, and no bus of that name: say where the file is"),
-        ("dump a/b.log", "there is no file a/b.log, and no bus of that name: say where the file is"),
+        (
+            "dump nosuch.mcap",
+            "there is no file nosuch.mcap, and no bus of that name: name the path of the file",
+        ),
+        ("dump a/b.log", "there is no file a/b.log, and no bus of that name: name the path of the file"),
     ] {
         assert_eq!(refusal(arguments, 2), format!("skinbus: {expected}"), "{arguments}");
     }
@@ -341,7 +344,7 @@ fn a_check_shows_bit_rates_and_cells_at_one_place() {
     std::fs::write(&file, format!("{text}\n{another}")).unwrap();
     let shown = output(gateway(&format!("check {}", file.display())));
     assert!(shown.contains("bus vcan0 (fd, 500000 bit/s, torque): 2 cells"), "{shown}");
-    assert!(shown.contains("remark: cells 1 on vcan1 and 7 on vcan1 sit at one place"), "{shown}");
+    assert!(shown.contains("remark: cells 1 on vcan1 and 7 on vcan1 sit at the same place"), "{shown}");
 }
 
 /// Checks a scenario file beside a skin of three cells. Returns the output.

@@ -239,7 +239,7 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     place.is_left_clean();
     assert_eq!((ended.code(), &replayed.replies()[1..]), (Some(1), &[1, 0, 0][..]), "{:#}", replayed.0);
     assert!(
-        ended.stderr.contains("skinbus: replies are not as they were recorded: 1 different"),
+        ended.stderr.contains("skinbus: replies differ from the recorded ones: 1 different"),
         "{ended:#?}"
     );
     let text = replayed.text("/expect/first/text");

@@ -3,14 +3,14 @@
 //!
 //! | state | event | next state | returned |
 //! |---|---|---|---|
-//! | `Works`, `Lost` | frames arrive | `Works` | [`Step::Frames`] |
-//! | `Works`, `Lost` | timeout | unchanged | [`Step::Nothing`] |
-//! | `Works` | the bus goes down | `Drains` | [`Step::Down`], once |
+//! | `Working`, `Lost` | frames arrive | `Working` | [`Step::Frames`] |
+//! | `Working`, `Lost` | timeout | unchanged | [`Step::Nothing`] |
+//! | `Working` | the bus goes down | `Draining` | [`Step::Down`], once |
 //! | `Lost` | the bus is still down | unchanged, after a pause | [`Step::Nothing`] |
-//! | `Drains` | frames from before the loss | unchanged | [`Step::Leftover`] |
-//! | `Drains` | all leftover frames are read | `Lost` | [`Step::Drained`] |
+//! | `Draining` | frames from before the loss | unchanged | [`Step::Leftover`] |
+//! | `Draining` | all leftover frames are read | `Lost` | [`Step::Drained`] |
 //! | any but `Gone` | the bus is removed | `Gone` | [`Step::Gone`], once |
-//! | `Gone` | the bus opens | `Works` | [`Step::Nothing`] |
+//! | `Gone` | the bus opens | `Working` | [`Step::Nothing`] |
 //! | `Gone` | the bus is still absent | unchanged | [`Step::Nothing`] |
 //! | `Gone` | the bus exists but does not open | unchanged | [`Step::Refused`], once per reason |
 
@@ -112,7 +112,7 @@ pub struct Follower {
 /// number of frames.
 ///
 /// # Errors
-/// When the bus is down, gone or closed.
+/// Returns [`BusError`] if the bus is down, gone or closed.
 pub fn fill(bus: &Bus, inbox: &mut Inbox, wait: Duration) -> Result<usize, BusError> {
     inbox.clear();
     if bus.wait(Some(wait))? { bus.receive(inbox) } else { Ok(0) }

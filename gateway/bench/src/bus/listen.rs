@@ -15,7 +15,7 @@ use super::realtime::wall;
 /// those.
 ///
 /// # Errors
-/// When it cannot be opened.
+/// Returns [`BusError`] if the bus cannot be opened.
 pub fn open(name: &str, kind: Choice, format: Option<Format>, options: Options) -> Result<Bus, BusError> {
     let options = Options { fd: format != Some(Format::Classic), ..options };
     match Bus::open(name, kind, &options) {
@@ -71,7 +71,7 @@ impl Listener {
     /// Receives the frames that are waiting or arrive within `wait`. Returns true if there are any.
     ///
     /// # Errors
-    /// When the bus is down, gone or closed.
+    /// Returns [`BusError`] if the bus is down, gone or closed.
     pub fn hear(&mut self, wait: Duration) -> Result<bool, BusError> {
         fill(&self.bus, &mut self.inbox, wait).map(|count| count > 0)
     }

@@ -18,7 +18,7 @@ const LONGEST: u64 = 64 << 20;
 #[non_exhaustive]
 pub enum FirmwareError {
     /// The file cannot be read.
-    #[error("--firmware {path}: {source}; docs/how-to/firmware.md says how one is built")]
+    #[error("--firmware {path}: {source}; docs/how-to/firmware.md explains how to build one")]
     Read {
         /// Path of the file.
         path: PathBuf,
@@ -27,7 +27,7 @@ pub enum FirmwareError {
     },
     /// The file is not for this kind of microcontroller.
     #[error(
-        "--firmware {path}: no ELF file of a 32-bit ARM microcontroller; docs/how-to/firmware.md builds one"
+        "--firmware {path}: not an ELF file of a 32-bit ARM microcontroller; docs/how-to/firmware.md explains how to build one"
     )]
     NotArm {
         /// Path of the file.
@@ -110,10 +110,10 @@ mod tests {
     fn what_is_no_firmware_is_named() {
         let missing = Firmware::read(Path::new("/nowhere/cell")).unwrap_err().to_string();
         assert!(missing.starts_with("--firmware /nowhere/cell: No such file"), "{missing}");
-        assert!(error(b"nothing").contains("no ELF file of a 32-bit ARM microcontroller"));
+        assert!(error(b"nothing").contains("not an ELF file of a 32-bit ARM microcontroller"));
         let own = std::fs::read(std::env::current_exe().unwrap()).unwrap();
         assert!(
-            error(&own).contains("no ELF file of a 32-bit ARM microcontroller"),
+            error(&own).contains("not an ELF file of a 32-bit ARM microcontroller"),
             "this test's own program"
         );
     }

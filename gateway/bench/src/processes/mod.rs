@@ -66,11 +66,11 @@ pub enum LaunchError {
     #[error("cannot catch SIGCHLD: {0}")]
     Signal(std::io::Error),
     /// The pipe for the processes' standard error cannot be made.
-    #[error("a pipe for the messages of cells: {0}")]
+    #[error("cannot create a pipe for the messages of cells: {0}")]
     Pipe(std::io::Error),
     /// The limit of open files is below the number that buses and cells need.
     #[error(
-        "{limit} files may be open at once, and this bench needs {needed}: say `ulimit -n {needed}` before it"
+        "at most {limit} files may be open at once, and this bench needs {needed}: run `ulimit -n {needed}` first"
     )]
     Files {
         /// The limit.
@@ -90,7 +90,7 @@ pub enum LaunchError {
 
 /// The error of a system that grants no file in memory.
 #[derive(Debug, Error)]
-#[error("a file in memory: {0}")]
+#[error("cannot create a file in memory: {0}")]
 pub struct MemoryError(#[source] std::io::Error);
 
 /// Raises the limit of open files, for this process and all that it starts, to what a gateway needs for `buses` buses

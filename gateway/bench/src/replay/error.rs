@@ -15,7 +15,7 @@ use trace::capture::CaptureError;
 pub enum Mismatch {
     /// All cells differ.
     #[error(
-        "the recording is of another skin: all {count} cells have another configuration than then, {cells}; {}",
+        "the recording is of another skin: the configurations of all {count} cells differ, {cells}; {}",
         hint(*.spawned)
     )]
     Skin {
@@ -67,7 +67,7 @@ pub enum ReplayError {
     #[error("a capture is read twice, which standard input cannot be: write it to a file, and name that")]
     StandardInput,
     /// A pipe cannot be read twice.
-    #[error("{} is no regular file, and a capture is read twice: write it to a file, and name that", .0.display())]
+    #[error("{} is not a regular file, and a capture is read twice: write it to a file, and name that", .0.display())]
     Pipe(PathBuf),
     /// The capture does not open.
     #[error(transparent)]

@@ -96,7 +96,7 @@ impl Stage for Live {
         if let Err(SendError { cause: error @ BusError::Down(_), .. }) = &sent {
             if self.down.insert(index) {
                 self.shared_state.comparator().is_down(index);
-                self.say(format!("{error}; what is due meanwhile is lost, and counted"));
+                self.say(format!("{error}; frames due meanwhile are lost, and counted"));
             }
             // At a timed pace, waiting would lose frames.
             let Options { pace, lockstep, .. } = self.shared_state.checks.options;

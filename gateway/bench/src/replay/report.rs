@@ -102,19 +102,19 @@ impl Lacking {
     pub fn reasons(&self) -> Vec<(&'static str, u64)> {
         nonzero([
             ("the cell was silent", self.silent),
-            ("the cell had not taken the joints", self.untaken),
+            ("the cell had not received the joints", self.untaken),
             ("the reply was not recorded", self.unrecorded),
             ("the recording ended", self.ended),
             ("the end of a contact was sent later", self.said_later),
-            ("no counters tell whether the cell took the joints", self.uncounted),
+            ("no counters show whether the cell received the joints", self.uncounted),
             ("the joints were not recorded", self.joints_unrecorded),
             ("the joints came before the replayed part", self.joints_earlier),
             ("the configure came before the replayed part", self.requested_earlier),
             ("the cell measured", self.measured),
             ("unrequested sensors were sent at other joints", self.sensed_otherwise),
-            ("the cell did not come to its slot", self.slot_skipped),
+            ("the cell missed its slot", self.slot_skipped),
             ("a cell was changing its parent", self.parent_changing),
-            ("a cell had not reported where its sums go", self.tree_unknown),
+            ("a cell had not reported its parent", self.tree_unknown),
             ("a sum lacked one of its children's", self.sums_not_taken),
         ])
     }
@@ -150,12 +150,11 @@ impl Summary {
                 } else {
                     String::new()
                 };
-                wrong.push(format!("replies are not as they were recorded: {}{by}", counts.join(", ")));
+                wrong.push(format!("replies differ from the recorded ones: {}{by}", counts.join(", ")));
             }
             if expect.tally.lacks_the_tree() {
                 wrong.push(
-                    "no sum could be compared: cells have not reported where their sums go, then or now"
-                        .to_owned(),
+                    "no sum could be compared: cells have not reported their parents, then or now".to_owned(),
                 );
             }
             if expect.joints_skipped > 0 && self.lockstep.is_none() {
@@ -282,7 +281,7 @@ mod tests {
             (|_, expect| expect.tally.equal = 0, "look at: no reply was compared"),
             (
                 |_, expect| expect.tally.different = 3,
-                "look at: replies are not as they were recorded: 3 different",
+                "look at: replies differ from the recorded ones: 3 different",
             ),
             (|it, _| it.refused = 1, "look at: 1 frame was refused"),
             (|it, _| it.failure = Some("no bus".to_owned()), "look at: no bus"),

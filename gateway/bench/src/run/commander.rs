@@ -105,7 +105,7 @@ pub(super) enum Refused {
     ComesUp,
     #[error("another program serves it: end that one")]
     NotServed,
-    #[error("it is no virtual interface: only vcan, vxcan and embedded buses are taken down here")]
+    #[error("it is not a virtual interface: only vcan, vxcan and embedded buses can be taken down here")]
     NotVirtual,
     #[error("there is no such interface")]
     NoInterface,

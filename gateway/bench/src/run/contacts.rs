@@ -32,7 +32,7 @@ impl Bench<'_> {
         let unclear = self.names(|cell| cell.unclear);
         if !unclear.is_empty() && !self.options.quiet {
             say(&format!(
-                "the contact of these cells is not known, their torques are not compared: {unclear}; they have taken \
+                "the contact of these cells is unknown, so their torques are not compared: {unclear}; they received \
                  stimuli before this run (`skinbus frame configure --cell N --write mode 1` clears one)"
             ));
         }

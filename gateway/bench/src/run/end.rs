@@ -57,7 +57,7 @@ impl Bench<'_> {
             return;
         }
         for file in recording.into_iter().flat_map(|recording| &recording.files) {
-            say(&format!("{} frames until then are in {}", file.frames, file.path));
+            say(&format!("{} frames received until then are in {}", file.frames, file.path));
         }
     }
 

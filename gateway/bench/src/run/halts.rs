@@ -114,7 +114,7 @@ fn tick(timed: &Timed, skin: &Skin) -> TickBefore {
 fn reason(why: Halt) -> String {
     match why {
         Halt::BadCycles(why) => format!("too many bad cycles in a row: {why}"),
-        Halt::Frame => "somebody sent a halt frame".to_owned(),
+        Halt::Frame => "a halt frame was received".to_owned(),
     }
 }
 
@@ -207,7 +207,7 @@ mod tests {
         for _ in 0..150 {
             bench.sums.halts += 1;
             bench.ticks(3);
-            assert_eq!(bench.halts.why(), Some("somebody sent a halt frame"));
+            assert_eq!(bench.halts.why(), Some("a halt frame was received"));
             bench.sums.resumes += 1;
             bench.ticks(2);
             assert_eq!(bench.halts.why(), None);

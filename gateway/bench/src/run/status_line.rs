@@ -182,12 +182,12 @@ mod tests {
 
     #[test]
     fn what_is_wrong_stays_in_a_narrow_line() {
-        let (lost, halted) = (&["vcan1"][..], Some("somebody sent a halt frame"));
+        let (lost, halted) = (&["vcan1"][..], Some("a halt frame was received"));
         let wrong = StatusLine { lost, halted, dead: 3, ..line(6) };
         for (width, text) in [
             (
                 150,
-                "  3.2 of 12.0 s  LOST: vcan1  HALTED: somebody sent a halt frame    4 of 253 in contact, 3 dead  torque  \
+                "  3.2 of 12.0 s  LOST: vcan1  HALTED: a halt frame was received    4 of 253 in contact, 3 dead  torque  \
                  0.00 -12.35  1.00  0.50 -0.25  0.00 Nm",
             ),
             (80, "  3.2 of 12.0 s  LOST: 1  HALTED  torque  0.0 -12.3  1.0  0.5 -0.2  0.0 Nm"),

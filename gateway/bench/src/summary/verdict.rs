@@ -349,7 +349,7 @@ fn control(look_at: &mut Vec<String>, summary: &Summary) {
     }
     if control.unsent > 0 {
         let frames = many(control.unsent, "frame", "frames");
-        look_at.push(format!("{frames} of the gateway not sent: a bus did not take them"));
+        look_at.push(format!("{frames} of the gateway not sent: a bus refused them"));
     }
     if control.records_lost > 0 {
         let records = many(control.records_lost, "record of a tick", "records of ticks");
@@ -379,7 +379,7 @@ fn ticks(look_at: &mut Vec<String>, summary: &Summary) {
 fn late(look_at: &mut Vec<String>, bus: &BusSummary) {
     let RepliesSummary { due, late, too_late, skipped, .. } = bus.replies;
     let parts =
-        nonzero([(late + too_late, "late"), (skipped, "skipped by cells that took the joints too late")]);
+        nonzero([(late + too_late, "late"), (skipped, "skipped by cells that received the joints too late")]);
     if !parts.is_empty() {
         look_at.push(format!(
             "{} of {} on {}: this machine was busy, or the cells are slow; -v has the times",

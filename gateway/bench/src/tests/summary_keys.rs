@@ -45,12 +45,12 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
         failure: Some("lost at the end of the run: vcan0".to_owned()),
         duration_s: 1.0,
         interrupted: false,
-        halted: Some("somebody sent a halt frame".to_owned()),
+        halted: Some("a halt frame was received".to_owned()),
         halts: vec![Halted {
             at_s: 0.5,
             tick: 250,
             epoch: 31,
-            reason: "somebody sent a halt frame".to_owned(),
+            reason: "a halt frame was received".to_owned(),
             until_s: None,
         }],
         further_halts: 0,
@@ -74,7 +74,7 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
             command_rad_s: vec![0.0; 6],
             halted: true,
         }],
-        no_controller: Some("no external controller said hello".to_owned()),
+        no_controller: Some("no external controller sent a hello".to_owned()),
         cell_errors: vec![CellError {
             reason: "cannot send to vcan0".to_owned(),
             cells: vec![ErrorCells { bus: "vcan0".to_owned(), nodes: vec![1] }],

@@ -11,7 +11,7 @@ use thiserror::Error;
 pub enum Absence {
     /// No program sent a hello.
     #[error(
-        "no external controller said hello on {}{}: start it before the run or within [controller] start_s; \
+        "no external controller sent a hello on {}{}: start it before the run or within [controller] start_s; \
          docs/how-to/external-controller.md has an example",
         .socket.display(), .others
     )]
@@ -23,7 +23,7 @@ pub enum Absence {
     },
     /// It sent a hello, but no answer in time.
     #[error(
-        "the external controller on {} said hello and answered no tick in time ({missing} without an answer, {late} \
+        "the external controller on {} sent a hello and answered no tick in time ({missing} without an answer, {late} \
          answered late, {nonsense} datagrams of nonsense): it must answer each state before the next tick, as in \
          docs/how-to/external-controller.md", .socket.display()
     )]

@@ -337,7 +337,7 @@ fn absent(gateway: &External, path: &Path, silent: Option<u32>, words: &str) {
 fn a_controller_that_never_says_hello_is_absent_whatever_else_comes() {
     let (folder, path, mut gateway) = gateway();
     gateway.step(&input(0));
-    absent(&gateway, &path, None, "no external controller said hello on ");
+    absent(&gateway, &path, None, "no external controller sent a hello on ");
     let program = program(&folder, "program");
     let of_another_version = [&HELLO[..4], &[2, 0, 3, 0]].concat();
     program.send(&of_another_version).unwrap();

@@ -163,8 +163,8 @@ fn a_cell_that_is_requested_answers_and_one_that_is_not_there_is_missed() {
             let nobody = says(&format!("frame stimulus --cell 250 {with}"));
             assert_eq!((nobody.0, nobody.1.as_str()), (Some(1), ""));
             let expected = format!(
-                "skinbus: no cell 250 was heard on vcan0 for 1 s: `skinbus cells vcan0` lists who is there; the bus' \
-                 format may be --format {}\n",
+                "skinbus: no cell 250 sent anything on vcan0 for 1 s: `skinbus cells vcan0` lists the cells; the format \
+                 of the bus may be --format {}\n",
                 format.other().name()
             );
             assert_eq!(nobody.2, expected);
@@ -206,7 +206,7 @@ fn too_few_files_are_refused_before_anything_is_started() {
     command.arg(env!("CARGO_BIN_EXE_skinbus")).arg(&skin).env("SKINBUS_DIR", parent.path().join("skinbus"));
     let Output { status, stderr, .. } = command.output().unwrap();
     let said =
-        "skinbus: 12 files may be open at once, and this bench needs 33: say `ulimit -n 33` before it\n";
+        "skinbus: at most 12 files may be open at once, and this bench needs 33: run `ulimit -n 33` first\n";
     assert_eq!((status.code(), text(&stderr)), (Some(2), said));
 }
 

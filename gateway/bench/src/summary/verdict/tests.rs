@@ -116,8 +116,8 @@ const CASES: &[Case] = &[
         it.halted = Some("a halt frame".to_owned());
         it.halts.push(halt(1.5, None));
     }),
-    ("no external controller said hello", |it| {
-        it.no_controller = Some("no external controller said hello".to_owned());
+    ("no external controller sent a hello", |it| {
+        it.no_controller = Some("no external controller sent a hello".to_owned());
     }),
     ("2 cells ended by errors of their own: 7, 8 on vcan0 (no memory)", |it| {
         let cells = vec![ErrorCells { bus: "vcan0".to_owned(), nodes: vec![7, 8] }];
@@ -180,7 +180,7 @@ const CASES: &[Case] = &[
         _ = it.control.bad_cycles.insert("the torque is not valid".to_owned(), 2);
     }),
     ("3 frames of the gateway not sent: ", |it| it.control.unsent = 3),
-    ("9 late and 2 skipped by cells that took the joints too late of 17772 replies on vcan0: ", |it| {
+    ("9 late and 2 skipped by cells that received the joints too late of 17772 replies on vcan0: ", |it| {
         let replies = &mut it.buses[0].replies;
         replies.in_time -= 11;
         (replies.late, replies.too_late, replies.skipped) = (8, 1, 2);
@@ -246,7 +246,7 @@ fn the_error_of_a_file_says_what_to_do_with_it_and_no_other_hint_does() {
         Summary { recording: Some(recording), ..well() }.lost_frames().unwrap()
     };
     let taken = "r.mcap: taken; r.mcap.part is the whole recording: rename it";
-    assert_eq!(failure(0, &[taken]), format!("the recording is not as it should be: {taken}"));
+    assert_eq!(failure(0, &[taken]), format!("the recording has an error: {taken}"));
     let both = failure(2, &["r.mcap: no room", taken]);
     assert_eq!(
         both,
