@@ -1,8 +1,8 @@
 //! Remote control of a run by another process: lines of JSON over two pipes, on which neither side blocks.
 //!
 //! ```text
-//!   server of the page ── Command ──> main thread of the run
-//!   server of the page <── State ──── main thread of the run
+//!   server of the page ── BenchCommand ──> main thread of the run
+//!   server of the page <── BenchState ──── main thread of the run
 //! ```
 //!
 //! Each [`State`] is complete: a state that did not fit into the pipe is superseded by the next one.

@@ -1,8 +1,8 @@
 //! Controllers, which turn torques into motion, once per tick.
 //!
 //! ```text
-//!   Input { q, qdot, torque, age, valid, .. } ─> Controller::step ─> Step::Move(joint velocities)
-//!                                                                └─> Step::Bad(why)
+//!   Input { q, qdot, torque, age, valid, .. } ─> Controller::step ─┬─> Move(joint velocities)
+//!                                                                  └─> Bad(reason)
 //! ```
 //!
 //! [`Kinesthetic`] moves the arm with the torque of a push. [`Planned`] follows a motion that is known in advance and

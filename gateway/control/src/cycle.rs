@@ -2,9 +2,9 @@
 //! come out.
 //!
 //! ```text
-//!   Tick, Heard ─────> Cycle::tick ─┬─> Outcome::joints ─> a new epoch for every bus
-//!                                   ├─> Outcome::command > a halt or a resume for every bus
-//!                                   └─> Record ──────────> the record of this tick
+//!   Tick, BusInput ──> Cycle::tick ─┬─> TickOutcome::broadcast ──> a new epoch for every bus
+//!                                   ├─> TickOutcome::command ────> a halt or a resume for every bus
+//!                                   └─> TickOutcome::record ─────> the record of this tick
 //! ```
 //!
 //! A lost bus does not affect others: the last torques of its cells decay to zero ([`carried`]), and the loop continues

@@ -2,9 +2,9 @@
 //! whether more input comes or not.
 //!
 //! ```text
-//!   pipe ──> convert ──> Shared ──┬──> a log, under its name from the first line on
+//!   pipe ──> convert ──> output ──┬──> a log, under its name from the first line on
 //!                          ▲      └──> OUT.mcap.part, which gets its name at the end
-//!                        keep, every 50 ms
+//!              flush, every 50 ms
 //! ```
 
 use std::fs::File;

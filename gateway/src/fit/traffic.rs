@@ -1,4 +1,4 @@
-//! Fate of traffic on real buses: `skinbus fit` for captures and live buses.
+//! Traffic on real buses: `skinbus fit` for captures and live buses.
 
 mod show;
 
@@ -36,7 +36,7 @@ struct Taken {
 }
 
 impl Fit {
-    /// Computes and prints the fate of each frame.
+    /// Computes and prints the outcome for each frame.
     pub(super) fn of_traffic(&self) -> Result<(), Failure> {
         let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
         if let (Some(path), Some(skin)) = (&self.skin, &skin) {

@@ -397,7 +397,7 @@ fn frames(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
     }
 }
 
-/// Rows on the packets from the cells, by their fate.
+/// Rows on the packets from the cells, by outcome.
 fn packets(rows: &mut Rows, bus: &BusSummary, lost: u64) {
     let up = &bus.uplink;
     rows.row("packets sent by cells", up.sent, "by their own count");

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// Reason why an external controller counts as absent. Each message names the remedy.
+/// Reason why an external controller counts as absent. Each message says what to do.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum Absence {

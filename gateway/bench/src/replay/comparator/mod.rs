@@ -2,9 +2,9 @@
 //! whether their replies are those of the capture.
 //!
 //! ```text
-//!   recorded joints, replies ─> record_joints, record ─┐                  ┌─> is_done, unanswered ─> lockstep
-//!          joints to be sent ─> announce ──────────────┼─ [ Comparator ] ─┼─> present, other_gateway
-//!        frames on the buses ─> hear ──────────────────┘                  └─> tally, first difference
+//!   recorded joints, replies ─> expect_joints, expect ─┐                  ┌─> is_done, unanswered ─> lockstep
+//!          joints to be sent ─> announce ──────────────┼─ [ Comparator ] ─┼─> present_cells, other_gateway
+//!        frames on the buses ─> observe ───────────────┘                  └─> tally, first difference
 //! ```
 //!
 //! A reply belongs to the joints that it answers: the latest joints of its epoch, in the capture and on the bus

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!   tree pages, joints by joints ──> [Trees] ─┐
-//!                                             ├─> Side: own = sum - sums of the children
+//!                                             ├─> EpochSums: own = sum - sums of the children
 //!   sums of one epoch, the last of each ──────┘        recorded and now: compare
 //! ```
 //!
