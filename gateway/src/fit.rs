@@ -24,7 +24,7 @@ use super::print::list;
 /// frames do not. Default bit rates: those of the skin if it has them for all buses, else a table over common ones.
 ///
 /// For a capture (a candump log or an MCAP recording, of any CAN bus), or for live buses until Ctrl-C, computes the
-/// fate of each frame on a bus with bit rates: exact stuff bits, arbitration by identifier, no frame interrupted. A
+/// outcome for each frame on a bus with bit rates: exact stuff bits, arbitration by identifier, no frame interrupted. A
 /// frame's time stamp counts as the time of the request to send it. Leaves out bench-only frames, reports start-up
 /// separately, and adds the worst case when the skin is known. docs/how-to/size-a-bus.md explains both.
 #[derive(Args, Debug)]

@@ -3,7 +3,7 @@
 //!
 //! ```text
 //!   recorded joints, replies ─> expect_joints, expect ─┐                  ┌─> is_done, unanswered ─> lockstep
-//!          joints to be sent ─> announce ──────────────┼─ [ Comparator ] ─┼─> present_cells, other_gateway
+//!          joints to be sent ─> sent_joints ───────────┼─ [ Comparator ] ─┼─> present_cells, other_gateway
 //!        frames on the buses ─> observe ───────────────┘                  └─> tally, first difference
 //! ```
 //!
