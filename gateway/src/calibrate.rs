@@ -139,7 +139,7 @@ impl Calibrate {
         match calibration.summary.troubled {
             0 => Ok(()),
             troubled => Err(Failure::run(format!(
-                "{}: {} of {} cannot be trusted: look at the lines above",
+                "{}: {} of {} cannot be trusted: see the lines above",
                 skin.name,
                 troubled,
                 count(skin.cells.len(), "cell")

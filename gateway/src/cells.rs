@@ -96,7 +96,7 @@ impl Cells {
             let (name, seconds) = (&self.bus, watch.elapsed().as_secs_f64());
             let others = match watch.others() {
                 0 => String::new(),
-                others => format!(" ({others} frames are of no cell; `skinbus dump` shows them)"),
+                others => format!(" ({others} frames are not from cells; `skinbus dump` shows them)"),
             };
             return Err(Failure::run(format!(
                 "no cell sent anything on {name} for {seconds:.1} s{others}: start them, or switch them on"

@@ -285,7 +285,7 @@ impl Compare {
         }
         comparison.other_configurations(which).map_or(Ok(()), |(all, same)| {
             Err(Failure::usage(format!(
-                "{name} is of another skin than {}: of {} {same} have its parameters; name the right one with --skin",
+                "{name} belongs to another skin than {}: of {}, {same} have its parameters; name the right one with --skin",
                 skin.name,
                 count(all, "cell")
             )))

@@ -98,7 +98,7 @@ impl Conformance {
         if self.restore.is_none() && path.exists() {
             let path = path.display();
             return Err(Failure::usage(format!(
-                "{path} is there from an earlier test that did not put the cell back: do that with --restore {path}, \
+                "{path} is left from an earlier test that did not restore the cell: do that with --restore {path}, \
                  or delete it"
             )));
         }
@@ -134,7 +134,7 @@ impl Conformance {
             junit.map_or(Ok(()), |(file, out)| output::finish("--junit", file, out, &whole.junit()));
         back.and(shown).and(reported)?;
         match stopped {
-            Some(Stop::Interrupted) => Err(Failure::run("interrupted; the cell has been put back")),
+            Some(Stop::Interrupted) => Err(Failure::run("interrupted; the cell has been restored")),
             Some(stopped) => Err(Failure::run(stopped)),
             None if whole.has_failed() => Err(Failure::said()),
             None => Ok(()),
@@ -155,7 +155,7 @@ fn put_back(session: &mut Session<'_>, saved: &Saved, path: &PathBuf) -> Result<
     let keep = |why: &dyn std::fmt::Display| {
         let path = path.display();
         Failure::run(format!(
-            "the cell was not put back: {why}; {path} has what it had: put it back with --restore {path}"
+            "the cell was not restored: {why}; {path} holds its configuration: restore it with --restore {path}"
         ))
     };
     let left = session.restore(saved).map_err(|stop| keep(&stop))?;

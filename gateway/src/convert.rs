@@ -75,7 +75,7 @@ pub(crate) struct Convert {
 }
 
 /// Hint for a refused capture that is truncated.
-const WITHOUT_STRICT: &str = "without --strict what is there would be written";
+const WITHOUT_STRICT: &str = "without --strict the intact part would be written";
 
 const DIGITS: &[Word<Digits>] = &[("6", "", Digits::Six), ("9", "", Digits::Nine)];
 
@@ -235,7 +235,7 @@ impl Convert {
         let done = torques::write(&mut reader, &skin, out);
         bar.finish_and_clear();
         let (epochs, missing) = done.map_err(|error| match error {
-            SeriesError::Taken(error) => Failure::run(format!("{to}: {error}; nothing is left of it")),
+            SeriesError::Taken(error) => Failure::run(format!("{to}: {error}; no file was kept")),
             error @ (SeriesError::Capture(_) | SeriesError::NotFound { .. }) => Failure::run(error),
         })?;
         if stopped.load(Ordering::Relaxed) && !live {
@@ -326,7 +326,7 @@ impl Sink {
     /// Names the file that holds the frames after an error.
     fn left(&self) -> String {
         match self {
-            Self::Whole(..) => "nothing is left of it".to_owned(),
+            Self::Whole(..) => "no file was kept".to_owned(),
             Self::Live(live) => live.left(),
         }
     }
@@ -397,12 +397,12 @@ fn remarks(reader: &Reader, done: &Converted, style: &Style, text: bool) -> Vec<
     for (count, [one, more], what) in [
         (
             done.unreadable,
-            ["begins like a frame and is none", "begin like a frame and are none"],
+            ["line begins like a frame but is not one", "lines begin like frames but are not"],
             ": not read",
         ),
         (
             done.unreadable_messages,
-            ["message is not of its type", "messages are none of their type"],
+            ["message is not of its type", "messages are not of their type"],
             ": not read",
         ),
         (done.can_xl, ["is a CAN XL frame", "are CAN XL frames"], ": not read"),

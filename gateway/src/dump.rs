@@ -171,7 +171,7 @@ impl Dump {
             reader.extras().run_began().into_iter().for_each(|zero| show.count_from(zero));
             let done = captured(&mut reader, &mut show);
             if let (Ok(()), Some(absent)) = (&done, show.absent_buses()) {
-                output::note(format_args!("{title}: no frame is of {absent}"));
+                output::note(format_args!("{title}: no frame comes from {absent}"));
             }
             (input::format(&reader), Some(reader.extras().clone()), done)
         } else {

@@ -123,7 +123,9 @@ impl Fit {
         match given {
             Some(option) if !is_skin => {
                 let names = list(self.sources.iter().map(|source| source.display()));
-                Err(Failure::usage(format!("{option} is for a skin, and {names} is none: leave it out")))
+                Err(Failure::usage(format!(
+                    "{option} is for a skin, and {names} is not a skin: leave it out"
+                )))
             }
             _ => Ok(is_skin.then_some(source)),
         }

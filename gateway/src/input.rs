@@ -220,7 +220,7 @@ pub(crate) fn no_frame(reader: &Reader) -> Failure {
     let what = match (reader.format(), reader.lines()) {
         (Format::Candump, 0) => "it is empty: there is no frame in it".to_owned(),
         (Format::Candump, lines) => format!(
-            "there is no frame in {}; what candump prints or logs is read: lines like \
+            "there is no frame in {}; the output of candump is expected: lines like \
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
             count(lines, "line")
         ),

@@ -55,7 +55,7 @@ impl Recover {
             None if recovered.is_sound() => {
                 let rename = if names::goal_of(&self.file) == self.file { "" } else { "; rename it" };
                 format!(
-                    "{name} is whole, there is nothing to recover: {} messages{rename}",
+                    "{name} is intact, there is nothing to recover: {} messages{rename}",
                     recovered.messages
                 )
             }
@@ -63,7 +63,7 @@ impl Recover {
             Some(bytes) => format!("{out}, {bytes} bytes: {recovered}"),
         };
         if recovered.is_little() {
-            return Err(Failure::run(format!("more is lost of {name} than came back: {line}")));
+            return Err(Failure::run(format!("more of {name} is lost than was recovered: {line}")));
         }
         print_beside([Some(output.as_path())], &format!("{}\n", shown(&line)))
     }

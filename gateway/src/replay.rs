@@ -155,7 +155,9 @@ impl Replay {
         let needs = answered.into_iter().find_map(|(name, given)| given.then_some(name));
         if let Some(skin) = self.skin.as_ref().filter(|_| !self.spawn) {
             let skin = skin.display();
-            return Err(Failure::usage(format!("--skin {skin} is of the cells that --spawn starts: add it")));
+            return Err(Failure::usage(format!(
+                "--skin {skin} is for the cells that --spawn starts: add --spawn"
+            )));
         }
         let only = match (self.frames.only, needs) {
             (Some(Only::Replies | Only::All), Some(name)) => {
@@ -213,7 +215,7 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
     for (reason, count) in &summary.skipped {
         rows.row("not sent", count, reason);
     }
-    rows.any("sent at once", summary.sent_at_once, "older than what was sent before");
+    rows.any("sent at once", summary.sent_at_once, "older than frames sent before");
     if let (Some(late), Some(idle)) = (&summary.late_us, &summary.idle_late_us) {
         rows.section("lateness", "50 % / 90 % / 99 % / max, µs", "");
         rows.row("frames sent", quantiles(late), format!("idle {}", quantiles(idle)));

@@ -300,7 +300,7 @@ fn emulated(firmware: Option<PathBuf>, named: &[CellName], skin: &Skin) -> Resul
     for named in named {
         let cell = cell_of(skin, named, "--emulate")?;
         if cells.contains(&cell) {
-            return Err(Failure::usage(format!("--emulate {named} is there twice: name each cell once")));
+            return Err(Failure::usage(format!("--emulate {named} is given twice: name each cell once")));
         }
         cells.push(cell);
     }

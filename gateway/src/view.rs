@@ -138,7 +138,7 @@ impl View {
             [one, ..] if !one.exists() => self.on_buses()?,
             [one] if self.skin.is_none() && self.at.is_none() => self.read(one)?,
             [one] => {
-                let why = "is of a recording, and this is a skin, whose buses are listened to";
+                let why = "is for a recording, and this is a skin";
                 return Err(Failure::usage(format!("{}: --skin or --at {why}", one.display())));
             }
             _ => {
@@ -165,7 +165,7 @@ impl View {
             )));
         };
         if self.at.is_some() {
-            return Err(Failure::usage("--at is of a recording, and buses are listened to"));
+            return Err(Failure::usage("--at is for a recording, not for live buses"));
         }
         let (skin, surface) = self.read(file)?;
         let of = |source: &PathBuf| bus_of(&skin, &file.display().to_string(), &source.to_string_lossy());

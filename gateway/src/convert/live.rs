@@ -134,9 +134,9 @@ impl Live {
         match &self.part {
             Some(_) => {
                 let part = format!("{}.part", self.path.display());
-                format!("what was written before is in {part}: skinbus recover {part}")
+                format!("the part written before is in {part}: `skinbus recover {part}` repairs it")
             }
-            None => format!("{} has what was written before", self.path.display()),
+            None => format!("{} holds the part written before", self.path.display()),
         }
     }
 
@@ -213,7 +213,7 @@ pub(super) fn check(path: &Path) -> io::Result<()> {
             part.display()
         ))),
         Ok(_) => Err(io::Error::other(format!(
-            "{0} is there, of a program that was killed: `skinbus recover {0}`, then move it away",
+            "{0} was left by a program that was killed: `skinbus recover {0}`, then move it away",
             part.display()
         ))),
         Err(_) => Ok(()),

@@ -216,7 +216,7 @@ fn two_skins_and_what_is_no_capture_are_refused_in_one_line() {
     for (arguments, code, begin) in [
         ("fd.mcap sums.mcap", 2, "fd.mcap and sums.mcap have two skins: cells 3, in the other 5"),
         ("fd.mcap fd.log --skin sums.toml", 2, "sums.toml and fd.mcap have two skins: "),
-        ("fd.log fd.log --skin moved.toml", 2, "fd.log is of another skin than "),
+        ("fd.log fd.log --skin moved.toml", 2, "fd.log belongs to another skin than "),
         ("fd.log fd.log", 2, "neither fd.log nor fd.log has a skin in it: name one with --skin"),
         ("fd.toml fd.log", 2, "fd.toml is a skin or a scenario, and no candump log or MCAP recording: "),
         ("fd.mcap other.log", 2, "other.log: none of its buses (can7) is one of the skin's (vcan0)"),

@@ -159,7 +159,7 @@ fn what_is_no_capture_is_refused_by_its_name() {
     );
     assert_eq!(
         folder.refuses("convert words.txt run.mcap", 1),
-        "skinbus: words.txt: there is no frame in 3 lines; what candump prints or logs is read: \
+        "skinbus: words.txt: there is no frame in 3 lines; the output of candump is expected: \
          lines like `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`"
     );
     assert!(folder.refuses("convert run.pcapng run.mcap", 2).contains("is a packet capture"));
@@ -206,7 +206,7 @@ fn a_bad_line_is_named_and_kept_and_with_strict_it_is_the_end() {
     assert_eq!(
         folder.says("convert run.log run.mcap", 0),
         "run.log:2: column 4: digits of a second\n\
-         run.log: 1 begins like a frame and is none: not read\n\
+         run.log: 1 line begins like a frame but is not one: not read\n\
          run.log -> run.mcap: 2 frames, 1 notes\n"
     );
     folder.says("convert run.mcap back.log", 0);
@@ -220,7 +220,7 @@ fn of_many_bad_lines_some_are_named_and_all_are_counted() {
     let said = folder.says("convert run.log run.mcap", 0);
     assert_eq!(said.lines().count(), 103, "{said}");
     assert!(said.contains("run.log:100: column 3:") && !said.contains("run.log:101:"), "{said}");
-    assert!(said.contains("run.log: 1000 begin like a frame and are none"), "{said}");
+    assert!(said.contains("run.log: 1000 lines begin like frames but are not"), "{said}");
 }
 
 #[test]
@@ -301,7 +301,7 @@ fn of_a_recording_without_its_end_all_that_is_there_is_converted_and_that_is_sai
     );
     let strict = folder.refuses("convert cut.mcap strict.log --strict", 1);
     let expected = expected.trim_end();
-    assert_eq!(strict, format!("skinbus: {expected}; without --strict what is there would be written"));
+    assert_eq!(strict, format!("skinbus: {expected}; without --strict the intact part would be written"));
 }
 
 #[test]

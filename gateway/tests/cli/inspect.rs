@@ -323,7 +323,7 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain empty.log --skin skin.toml --epoch 7",
             1,
-            "empty.log: there is no frame in 1 line; what candump prints or logs is read: lines like \
+            "empty.log: there is no frame in 1 line; the output of candump is expected: lines like \
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
         ),
         (

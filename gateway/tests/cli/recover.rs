@@ -415,7 +415,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     assert!(says("recover run.mcap.part", 0).starts_with("run-recovered-1.mcap, "));
     assert_eq!(
         says("recover whole.mcap", 0),
-        "whole.mcap is whole, there is nothing to recover: 100 messages"
+        "whole.mcap is intact, there is nothing to recover: 100 messages"
     );
     assert!(!path("whole-recovered.mcap").exists());
     // No message came back, or too few.
@@ -431,7 +431,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     fs::write(path("gap.mcap"), &gap).unwrap();
     let said = says("recover gap.mcap", 1);
     assert!(
-        said.contains("gap.mcap than came back: gap-recovered.mcap, ")
+        said.contains("gap.mcap is lost than was recovered: gap-recovered.mcap, ")
             && said.contains(" 20 of 100 messages"),
         "{said}"
     );

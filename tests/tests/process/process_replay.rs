@@ -211,7 +211,9 @@ fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
     let ended = place.replay("run.log", "--expect --spawn --skin other.toml --quiet").end();
     let line = ended.refusal(1);
     assert!(
-        line.starts_with("skinbus: the recording is of another skin: all 8 cells have another "),
+        line.starts_with(
+            "skinbus: the recording is of another skin: the configurations of all 8 cells differ, "
+        ),
         "{line}"
     );
     place.is_left_clean();

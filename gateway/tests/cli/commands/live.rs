@@ -239,7 +239,7 @@ fn cells_on_a_foreign_bus_reports_that_frames_came_and_none_of_a_cell() {
     let Output { status, stderr, .. } = child.wait_with_output().unwrap();
     let said = text(&stderr);
     assert_eq!(status.code(), Some(1), "{said}");
-    assert!(said.contains(" frames are of no cell; `skinbus dump` shows them): start them"), "{said}");
+    assert!(said.contains(" frames are not from cells; `skinbus dump` shows them): start them"), "{said}");
 }
 
 #[test]
@@ -356,7 +356,7 @@ fn what_the_options_of_a_dump_leave_out_is_said() {
     std::fs::write(&log, "(1.000000) vcan0 003##500000000000000000000000000004782\n").unwrap();
     let log = log.display().to_string();
     for (arguments, expected) in
-        [("--bus vcan3", "no frame is of vcan3"), ("--cell vcan3:1", "no frame is of vcan3")]
+        [("--bus vcan3", "no frame comes from vcan3"), ("--cell vcan3:1", "no frame comes from vcan3")]
     {
         let Output { status, stdout, stderr } = gateway(&format!("dump {log} {arguments}")).output().unwrap();
         let expected = format!("{log}: {expected}\n");

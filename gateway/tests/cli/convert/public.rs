@@ -276,9 +276,7 @@ fn a_capture_is_shown_and_another_text_is_named_as_dump_names_it() {
             "{command}: {said}"
         );
     }
-    assert!(
-        folder.refuses("view skin.toml --at 1", 2).contains("this is a skin, whose buses are listened to")
-    );
+    assert!(folder.refuses("view skin.toml --at 1", 2).contains("and this is a skin"));
     assert!(
         folder
             .refuses("skin dbc late.log", 2)
@@ -327,7 +325,7 @@ fn what_came_through_a_pipe_outlives_a_killed_convert() {
         assert!(!folder.path(to).exists());
         let said = folder.refuses("convert - run.mcap", 2);
         assert!(
-            said.contains("run.mcap.part is there, of a program that was killed: `skinbus recover"),
+            said.contains("run.mcap.part was left by a program that was killed: `skinbus recover"),
             "{said}"
         );
         let (code, said, _) = run(&folder, "recover run.mcap.part -o run.mcap");
