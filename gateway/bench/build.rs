@@ -1,4 +1,4 @@
-//! Finds out the revision of the sources for the metadata of recordings.
+//! Passes the git revision of the sources to the compiler, for the metadata of recordings.
 
 use std::process::Command;
 
@@ -9,10 +9,10 @@ fn main() {
             Command::new("git").args(arguments).output().ok().filter(|output| output.status.success())?;
         Some(String::from_utf8(output.stdout).ok()?.trim().to_owned())
     };
-    // What is not a checkout (a downloaded archive) has no revision.
+    // Sources without a git checkout (a downloaded archive) have no revision.
     let revision = git(&["rev-parse", "HEAD"]).unwrap_or_else(|| "unknown".to_owned());
     println!("cargo::rustc-env=SKINBUS_GIT_REVISION={revision}");
-    // Changes with every commit and every change of branch.
+    // This log changes with every commit and every change of branch.
     if let Some(log) = git(&["rev-parse", "--git-path", "logs/HEAD"]) {
         println!("cargo::rerun-if-changed={log}");
     }

@@ -1,7 +1,7 @@
-//! How fast candump text is read, beside the crate socketcan's reader: `cargo bench -p gateway --bench captures`
+//! Speed of reading candump text, beside the reader of the crate socketcan: `cargo bench -p gateway --bench captures`
 //!
-//! Half of the lines are classic frames of 8 bytes, half FD frames of 16; the text stands in memory. Converting files, and
-//! the memory that takes, is measured by the example `capture_speed`.
+//! Half of the lines are classic frames of 8 bytes, half FD frames of 16; the text is in memory. The example
+//! `capture_speed` measures the conversion of files and its memory.
 
 use std::fmt::Write;
 use std::hint::black_box;
@@ -13,7 +13,7 @@ use trace::capture::{Entry, Reader};
 
 const LINES: u64 = 20_000;
 
-/// As `candump -L` writes it.
+/// A log as `candump -L` writes it.
 fn log() -> &'static [u8] {
     let mut log = String::new();
     for line in 0..LINES {

@@ -1,9 +1,9 @@
-//! How long it takes to receive an epoch's 253 replies, beside the plainest C loop with `recv`:
-//! `cargo bench -p gateway --bench epoch`
+//! Time to receive the 253 replies of an epoch, beside the plainest C loop with `recv`: `cargo bench -p gateway --bench
+//! epoch`
 //!
-//! All frames wait in the socket when the clock starts, as they do when a receiver has let them gather. *Frames* is what the
-//! receiver does to have them with their time stamps (`recvmmsg`), *table* is that and their processing: CRC, accounts,
-//! sums. The C program (`recv.c`) asks for each frame alone, without a time stamp, and looks at one byte of it.
+//! All frames wait in the socket when the clock starts, as when a receiver has let them gather. *Frames* is the
+//! receiver's work to get them with their time stamps (`recvmmsg`); *table* adds their processing: CRC, accounts, sums.
+//! The C program (`recv.c`) receives each frame alone, without a time stamp, and reads one byte of it.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, exit};
@@ -23,7 +23,7 @@ use protocol::time::Micros;
 use vcan_setup::embedded::Served;
 
 const CELLS: usize = 253;
-/// Its receiver knows that the replies before it have been delivered.
+/// Identifier of a frame that shows the delivery of all replies before it.
 const AFTER: u32 = 0x7FF;
 
 /// An embedded bus with replies, their sender, and their receiver.
@@ -48,16 +48,16 @@ impl Wire {
         Self { cells: open(Vec::new()), gateway, bell, inbox: Inbox::new(), _served: served }
     }
 
-    /// Queues all of these in the gateway's socket.
+    /// Queues all these frames in the gateway's socket.
     fn put(&mut self, replies: &[Frame]) {
         self.cells.send(replies).expect("there is room");
         self.cells.send(&[Frame::classic(AFTER, &[]).expect("an empty frame")]).expect("there is room");
-        // The server sends to its clients in the order in which frames for them came.
+        // The server sends frames to its clients in the order of arrival.
         assert!(self.bell.wait(Some(Duration::from_secs(10))).expect("it is served"), "it is delivered");
         self.bell.receive(&mut self.inbox).expect("it is served");
     }
 
-    /// Takes what waits, and gives it to `hear`; how long that took.
+    /// Receives all waiting frames, and passes them to `hear`. Returns the time.
     fn take(&mut self, mut hear: impl FnMut(u64, &Frame)) -> Duration {
         let (mut taken, began) = (0, Instant::now());
         while taken < CELLS {
@@ -70,7 +70,7 @@ impl Wire {
     }
 }
 
-/// An epoch's replies.
+/// The replies of an epoch.
 fn replies(epoch: Epoch) -> Vec<Frame> {
     let reply = |from: CellId| {
         let torque = [0.1, -0.2, 0.3, 0.05, 0.01, 0.0].map(Q3_12::nearest);
@@ -94,7 +94,7 @@ impl Listener {
         Self { table, number: 0 }
     }
 
-    /// Opens the next epoch, as the gateway's own joints do that it reads back.
+    /// Opens the next epoch, like the gateway's own joints when they are read back.
     fn open(&mut self) -> Epoch {
         let epoch = Epoch(self.number.to_le_bytes()[0]);
         let joints = Joints { in_use: 6, ..Joints::default() };
@@ -128,7 +128,7 @@ fn compile() -> PathBuf {
     program
 }
 
-/// Lets the C program take so many epochs; the time that it prints.
+/// Lets the C program receive `epochs` epochs. Returns the time that it prints.
 fn in_c(program: &Path, epochs: u64) -> Duration {
     let output = Command::new(program).args([epochs.to_string(), CELLS.to_string()]).output();
     let output = output.expect("it was compiled");

@@ -1,8 +1,8 @@
-//! How long one tick of the control loop takes: `cargo bench -p gateway --bench tick`
+//! Duration of one tick of the control loop: `cargo bench -p gateway --bench tick`
 //!
-//! From 1 to 10 000 cells, 253 on a bus, over complete epochs (one tick in eight sends joints to every bus, which take no
-//! time here). *Distributed* leaves the torques to the cells, *central* computes them in the tick, of cells none of which
-//! is in contact, or all. What fills the snapshots is the receivers' work, and not counted.
+//! Measures 1 to 10 000 cells, 253 per bus, over complete epochs (one tick in eight sends joints to every bus, which
+//! takes no time here). *Distributed* leaves the torques to the cells; *central* computes them in the tick, with no
+//! cell in contact, or all. The receivers fill the snapshots, which is not measured.
 
 use std::hint::black_box;
 use std::sync::Arc;
@@ -25,12 +25,12 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Bus, Skin};
 use protocol::time::{Micros, Span};
 
-/// Cells on a bus, at most.
+/// Maximum number of cells per bus.
 const ON_A_BUS: usize = 253;
-/// Ticks from one broadcast to the next.
+/// Number of ticks per broadcast.
 const EPOCH: u64 = 8;
 
-/// What the loop does, and the contact states.
+/// Work of the loop, and the contact states.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Case {
     Distributed,
@@ -61,7 +61,7 @@ impl Case {
     }
 }
 
-/// A UR5 with so many cells; further buses repeat the cells of the first one.
+/// A UR5 with `cells` cells; further buses repeat the cells of the first one.
 fn skin(cells: usize) -> Skin {
     let text = generate(&Target { cells: cells.min(ON_A_BUS), ..Target::default() }).expect("a UR5 has room");
     let mut skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");
@@ -79,13 +79,13 @@ fn skin(cells: usize) -> Skin {
     skin
 }
 
-/// What a bus' receiver holds.
+/// A bus's receiving ends.
 struct Receiver {
     snapshots: triple_buffer::Input<Snapshot>,
     positions: rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
 }
 
-/// A loop, and the ends of it that threads hold in a run.
+/// A loop, with the ends that other threads hold in a run.
 struct Bench {
     turn: Turn,
     buses: Vec<Receiver>,
@@ -114,7 +114,7 @@ impl Bench {
         Self { turn, buses, records, tick: 0 }
     }
 
-    /// Eight ticks, of which the first sends joints; how long they took, and cells that they found active.
+    /// Runs eight ticks, of which the first sends joints. Returns their duration and the number of active cells.
     fn epoch(&mut self) -> (Duration, u32) {
         let last = (self.tick / EPOCH).checked_sub(1).map(|epoch| Epoch(epoch.to_le_bytes()[0]));
         for Receiver { snapshots, .. } in &mut self.buses {

@@ -1,12 +1,12 @@
-//! How fast captures are converted, and what memory that takes. How fast text is read is `cargo bench -p gateway --bench
-//! captures`.
+//! Speed and memory use of the conversion of captures. `cargo bench -p gateway --bench captures` measures the reading
+//! of text.
 //!
 //! ```text
 //!   cargo build --release -p gateway && cargo run --release -p gateway --example capture_speed [LINES [FOLDER]]
 //! ```
 //!
-//! Half of the lines are classic frames of 8 bytes, half FD frames of 16. Files of LINES lines (10 million unless told) lie
-//! in FOLDER for the conversions, and are gone afterwards.
+//! Half of the lines are classic frames of 8 bytes, half FD frames of 16. The files of LINES lines (default: 10
+//! million) are created in FOLDER, and removed afterwards.
 #![expect(clippy::unwrap_used, reason = "a measurement may stop")]
 #![expect(clippy::print_stdout, reason = "the figures are its output")]
 #![expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
@@ -19,7 +19,7 @@ use std::process::{Command, Stdio};
 
 mod watched;
 
-/// A line as `candump -L` writes it.
+/// Writes a line as `candump -L` does.
 fn write_line(log: &mut String, line: u64) {
     let micros = 1_700_000_000_000_000 + line * 63;
     let (sec, micro, id) = (micros / 1_000_000, micros % 1_000_000, 0x200 + line % 253);
@@ -32,7 +32,7 @@ fn write_line(log: &mut String, line: u64) {
     }
 }
 
-/// Million lines a second, and the peak memory of the process in MB.
+/// Converts a file. Returns million lines per second, and the peak memory of the process in MB.
 fn convert(gateway: &Path, from: &Path, to: &Path, lines: u64) -> (f64, f64) {
     let mut command = Command::new(gateway);
     command.arg("convert").arg(from).arg(to).arg("--overwrite").stderr(Stdio::null());

@@ -1,13 +1,13 @@
-//! How fast the recorder is, what a frame costs it, and how many bytes a frame takes.
+//! Speed of the recorder, its cost per frame, and bytes per frame.
 //!
 //! ```sh
 //! cargo run --release -p gateway --example recorder_speed -- [FOLDER] [LOG]
 //! ```
 //!
-//! Frames are those of 253 cells that are all pressed by an arm that moves, or those of a candump log. First they go
-//! through the recorder as fast as it takes them, for ten seconds, into a file in FOLDER (the present one unless it is
-//! told), which is removed again. Then they are written in their own time: handed on every 40 ms, as in a run, with
-//! nothing but frames in the file.
+//! The frames are those of 253 cells that are all pressed on a moving arm, or those of a candump log. First they go
+//! through the recorder as fast as it accepts them, for ten seconds, into a file in FOLDER (default: the working
+//! directory), which is removed again. Then only frames are written at their own times, flushed every 40 ms as in a
+//! run.
 #![allow(clippy::print_stdout, reason = "the figures are its output")]
 
 use std::error::Error;
@@ -33,9 +33,9 @@ use trace::recording::layout::Layout;
 use trace::recording::series::{Head, Split};
 
 const SKIN: &str = include_str!("ur5-253.toml");
-/// How long frames are pushed.
+/// Time for which frames are pushed.
 const PUSHED: Duration = Duration::from_secs(10);
-/// What a run hands on at once.
+/// Interval between flushes of a run in ns.
 const FLUSH_NANOS: u64 = 40_000_000;
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -57,7 +57,7 @@ fn seconds(frames: &[Seen]) -> f64 {
     ends.map_or(0.0, |(first, last)| last.at_nanos.saturating_sub(first.at_nanos) as f64 * 1e-9)
 }
 
-/// What 253 cells send that are pressed by 1.5 N each, while each joint swings to and fro.
+/// Frames of 253 cells that are pressed by 1.5 N each, while each joint swings to and fro.
 fn of_run(skin: &Skin, seconds: u32) -> Vec<Seen> {
     let central = Central::new(skin);
     let (hz, began) = (skin.timing.broadcast_hz(), 1_700_000_000_000_000_000_u64);
@@ -85,7 +85,7 @@ fn of_run(skin: &Skin, seconds: u32) -> Vec<Seen> {
         for (place, cell) in skin.cells.iter().enumerate() {
             let torque = central.torque(place, &links, 1.5).map(|nm| Q3_12::nearest(nm).to_bits());
             let torque = Words::new(Length::Six, torque);
-            // Cells wake one after the other, and never twice in the same order of ns.
+            // Cells wake one after the other, in an order that varies by ns.
             let after = 150_000
                 + place as u64 * 22_000
                 + (u64::from(number) * 7_919 + place as u64 * 104_729) % 9_973;
@@ -105,7 +105,7 @@ fn of_log(text: &str) -> Result<Vec<Seen>, Box<dyn Error>> {
     Ok(frames)
 }
 
-/// Pushes frames into the recorder as fast as it takes them.
+/// Pushes frames into the recorder as fast as it accepts them.
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
 fn speed(skin: &Skin, folder: &std::path::Path, frames: &[Seen]) -> Result<(), Box<dyn Error>> {
     let path = folder.join("recorder_speed.mcap");
@@ -124,7 +124,7 @@ fn speed(skin: &Skin, folder: &std::path::Path, frames: &[Seen]) -> Result<(), B
             if began.elapsed() >= PUSHED {
                 break 'pushed;
             }
-            // A bus never waits; this does, so that what is measured is what can be sustained.
+            // A bus never waits; this loop does, so that it measures the sustainable rate.
             while outlet.free() < chunk.len() {
                 std::thread::sleep(Duration::from_micros(200));
             }
@@ -148,7 +148,7 @@ fn speed(skin: &Skin, folder: &std::path::Path, frames: &[Seen]) -> Result<(), B
     Ok(())
 }
 
-/// Counts bytes.
+/// A writer that counts bytes.
 #[derive(Default)]
 struct Counter(u64);
 
@@ -163,7 +163,7 @@ impl Write for Counter {
     }
 }
 
-/// Writes frames and nothing else, handed on as in a run.
+/// Writes only frames, flushed as in a run.
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
 fn size(frames: &[Seen]) -> Result<(), Box<dyn Error>> {
     let mut writer = FileWriter::new(Counter::default())?;

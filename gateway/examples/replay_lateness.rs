@@ -1,7 +1,7 @@
-//! How late a replay sends frames that come every 2 ms, on an embedded bus with a reader, for some spinning times:
+//! Lateness of a replay that sends a frame every 2 ms on an embedded bus with a reader, for several spinning times:
 //! `cargo run --release -p gateway --example replay_lateness [SECONDS]`
 //!
-//! Beside it stands how late the same machine wakes a thread that has nothing to do.
+//! The output also shows the lateness at which the same machine wakes an idle thread.
 #![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a measurement may stop")]
 
 use std::fmt::Write as _;

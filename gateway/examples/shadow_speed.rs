@@ -1,12 +1,12 @@
-//! How fast a capture goes through the model of a real bus, and what memory that takes.
+//! Speed and memory use of the model of a real bus on a capture.
 //!
 //! ```text
 //!   cargo build --release -p gateway && cargo run --release -p gateway --example shadow_speed [MINUTES [FOLDER]]
 //! ```
 //!
-//! The capture (60 minutes unless told, 4 GB in FOLDER, gone afterwards) is a skin's: joints at 62.5 Hz, after which each of
-//! 253 cells answers, 16 thousand frames a second in all, with every fourth cell's heartbeat. Replies are spread as processes
-//! spread them, over 6 ms.
+//! The capture (default: 60 minutes, 4 GB in FOLDER, removed afterwards) is that of a skin: joints at 62.5 Hz, answered
+//! by each of 253 cells, 16 thousand frames per second in all, with every fourth cell's heartbeat. Replies are spread
+//! over 6 ms, as processes spread them.
 #![expect(clippy::unwrap_used, reason = "a measurement may stop")]
 #![expect(clippy::print_stdout, reason = "the figures are its output")]
 #![expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
@@ -23,12 +23,12 @@ use protocol::packet::{Epoch, Packet, WORDS};
 
 mod watched;
 
-/// From joints to joints, in µs.
+/// Time between joints in µs.
 const PERIOD: u64 = 16_000;
-/// Cells.
+/// Number of cells.
 const CELLS: i64 = 253;
 
-/// The frames of one epoch, as candump writes them.
+/// Writes the frames of one epoch as candump does.
 fn write_epoch(log: &mut impl std::io::Write, line: &mut String, number: u64) -> u64 {
     let mut frames = 0;
     let mut say = |micros: u64, id: Id, word: i16| {
@@ -52,7 +52,7 @@ fn write_epoch(log: &mut impl std::io::Write, line: &mut String, number: u64) ->
         let word = (number * 31 + place * 977).to_le_bytes();
         say(100 + place * 23, Id::new(id::Kind::Torque, node), i16::from_le_bytes([word[0], word[1]]));
     }
-    // Heartbeats and the like: 2 in an epoch make 16 thousand frames a second.
+    // Two heartbeats per epoch make 16 thousand frames per second.
     for beat in 0..2 {
         let cell = i64::try_from((number * 2 + beat) % 253).unwrap() + 1;
         let node = id::Node::Cell(CellId::new(cell).unwrap());

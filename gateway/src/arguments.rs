@@ -1,4 +1,4 @@
-//! Arguments that several commands share, and how words become values.
+//! Arguments that several commands share, and parsers of their values.
 
 use std::ops::RangeInclusive;
 
@@ -11,14 +11,14 @@ use protocol::usage::Failure;
 
 use super::print::list;
 
-/// A word that may be given, what it means where that is not plain, and its value.
+/// A possible value of an option: its word, its help unless the word is plain, and its value.
 pub(crate) type Word<T> = (&'static str, &'static str, T);
 
-/// The frame format of a packet.
+/// Frame formats of a packet.
 pub(crate) const FORMATS: &[Word<Format>] =
     &[("fd", "One CAN FD frame", Format::Fd), ("classic", "Two to four classic frames", Format::Classic)];
 
-/// Parses one of a few words.
+/// Creates a parser that accepts one of these words.
 pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
     words: &'static [Word<T>],
 ) -> impl TypedValueParser<Value = T> {
@@ -32,7 +32,7 @@ pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
     })
 }
 
-/// A time in seconds: a number with a unit, or of seconds.
+/// Parses a time in seconds: a number, with or without a unit.
 pub(crate) fn time(text: &str) -> Option<f64> {
     let units = [("ms", 1e-3), ("min", 60.0), ("h", 3_600.0), ("s", 1.0)];
     let given = units.iter().find_map(|(unit, each)| Some((text.strip_suffix(unit)?, *each)));
@@ -40,13 +40,13 @@ pub(crate) fn time(text: &str) -> Option<f64> {
     number.parse::<f64>().ok().map(|number| number * each)
 }
 
-/// Seconds above 0, up to 1e7.
+/// Parses a time above 0 s, up to 1e7 s.
 pub(crate) fn seconds(text: &str) -> Result<f64, String> {
     let seconds = time(text).filter(|seconds| *seconds > 0.0 && *seconds <= 1e7);
     seconds.ok_or_else(|| "a time above 0 s, up to 1e7 s (10, 500ms, 90s, 10min, 2h)".to_owned())
 }
 
-/// Seconds from 0 to 1e9, in ns.
+/// Parses a time from 0 s to 1e9 s, and returns it in ns.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e18: checked")]
 pub(crate) fn nanos(text: &str) -> Result<u64, String> {
     let seconds = time(text).filter(|seconds| (0.0..=1e9).contains(seconds));
@@ -54,33 +54,33 @@ pub(crate) fn nanos(text: &str) -> Result<u64, String> {
     nanos.ok_or_else(|| "a time from 0 s to 1e9 s (10, 500ms, 90s, 10min, 2h)".to_owned())
 }
 
-/// The kinds of several buses.
+/// The option for the kinds of one or several buses.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct BusKinds {
-    /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus; for one bus of
-    /// several BUS=KIND, as often as there are buses
+    /// Bus kind: socketcan or embedded. Default: socketcan if an interface has this name, else embedded. For one of
+    /// several buses, BUS=KIND; repeat the option for further buses
     #[arg(long, value_name = "[BUS=]KIND")]
     bus_kind: Vec<OneKind>,
 }
 
 impl BusKinds {
-    /// The kinds of any buses.
+    /// Kinds of any buses.
     pub(crate) fn of_any(&self) -> Result<Kinds, Failure> {
         self.or(Choice::Auto)
     }
 
-    /// The kinds of any buses; this one of those that no option names.
+    /// Kinds of any buses; `otherwise` is the kind of buses that the option does not name.
     pub(crate) fn or(&self, otherwise: Choice) -> Result<Kinds, Failure> {
         Kinds::of_words(&self.bus_kind, otherwise).map_err(Failure::usage)
     }
 
-    /// The kinds of these buses, and of no others.
+    /// Kinds of these buses. Fails if the option names another bus.
     pub(crate) fn of<'a>(&self, buses: impl IntoIterator<Item = &'a str>) -> Result<Kinds, Failure> {
         self.of_any()?.only(buses).map_err(Failure::usage)
     }
 }
 
-/// A whole number from the environment, for what few set: `name` is the variable.
+/// Reads a whole number from the environment variable `name`, for settings that few users need.
 pub(crate) fn of_environment(name: &str, allowed: RangeInclusive<u32>) -> Result<Option<u32>, Failure> {
     let Some(given) = std::env::var_os(name).filter(|given| !given.is_empty()) else { return Ok(None) };
     let number = given.to_str().and_then(|text| text.parse().ok()).filter(|number| allowed.contains(number));
@@ -90,12 +90,12 @@ pub(crate) fn of_environment(name: &str, allowed: RangeInclusive<u32>) -> Result
     })
 }
 
-/// The cells that share a process, from the environment, for what few set.
+/// Number of cells per process from the environment, for the few users who need it.
 pub(crate) fn cells_per_process() -> Result<usize, Failure> {
     Ok(of_environment("SKINBUS_CELLS_PER_PROCESS", 1..=254)?.unwrap_or(1) as usize)
 }
 
-/// How many cells share a process.
+/// The option for the number of cells per process.
 #[derive(Args, Clone, Copy, Debug)]
 pub(crate) struct Processes {
     /// Put up to N cells into one process
@@ -103,12 +103,12 @@ pub(crate) struct Processes {
     pub(crate) cells_per_process: u8,
 }
 
-/// The names of a skin's buses.
+/// Names of a skin's buses.
 pub(crate) fn bus_names(skin: &Skin) -> impl Iterator<Item = &str> {
     skin.buses.iter().map(|bus| bus.name.as_str())
 }
 
-/// The place of a bus in the skin that a file describes.
+/// Finds a bus by name in the skin that `file` describes. Returns its index.
 pub(crate) fn bus_of(skin: &Skin, file: &str, name: &str) -> Result<usize, Failure> {
     skin.bus_named(name).ok_or_else(|| {
         let names = list(bus_names(skin));
@@ -116,7 +116,7 @@ pub(crate) fn bus_of(skin: &Skin, file: &str, name: &str) -> Result<usize, Failu
     })
 }
 
-/// Finds the only cell of a name: its index into [`Skin::cells`]; `option` names it in errors.
+/// Finds the only cell of a name. Returns its index into [`Skin::cells`]; `option` names the option in errors.
 pub(crate) fn cell_of(skin: &Skin, name: &CellName, option: &str) -> Result<usize, Failure> {
     let CellName { bus, node } = name;
     let names = || list(bus_names(skin));

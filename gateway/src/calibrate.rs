@@ -37,56 +37,57 @@ use super::output::{Overwrite, apart, note, print_beside};
 use super::print::{count, json};
 use super::robot_file::{RobotOfSkin, urdf_of};
 
-/// Find where cells sit, from their accelerometers
+/// Find the poses of cells from their accelerometers
 ///
-/// Moves the robot through poses and swings within its limits, records what the cells' accelerometers show, and estimates
-/// for every cell which joint moves it, its position, its orientation, and bias and gain of its sensor, each with how far
-/// it is certain. Simulated cells get accelerometers with the errors of a data sheet. With --recording a recording is used instead,
-/// also one of a robot that another program moved. Exit code 0: every cell can be trusted; 1: some cannot, or it failed; 2:
-/// wrong use or configuration.
+/// Moves the robot through poses and swings within its limits and records the cells' accelerations. Estimates for each
+/// cell the joint that moves it, its position and orientation, and the bias and gain of its sensor, each with its
+/// uncertainty. Simulated cells get accelerometers with the errors of a data sheet. With --recording, uses a recording
+/// instead, also of a robot that another program moved. Exit code 0: all cells can be trusted; 1: some cannot, or the
+/// command failed; 2: wrong use or configuration.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus calibrate skin.toml -o found.toml && skinbus commission found.toml
   skinbus calibrate skin.toml --recording run.mcap --page found.html
   skinbus calibrate skin.toml --dry-run > motion.json")]
 pub(crate) struct Calibrate {
-    /// The skin's description: robot, buses and cells; poses of cells need not be right
+    /// The skin: robot, buses and cells; the poses of its cells may be wrong
     skin: PathBuf,
-    /// Write a copy of the description with the poses that were found
+    /// Write a copy of the skin with the poses found
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Use a recording or candump log instead of a run; all parts of a split one
+    /// Use a recording or candump log instead of a run; name all parts of a split one
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["record", "no_spawn", "dry_run"])]
     recording: Vec<PathBuf>,
     /// Keep the recording of the run
     #[arg(long, value_name = "FILE.mcap")]
     record: Option<PathBuf>,
-    /// Write what was found as one HTML page in 3D, with a line from each old position to the new one
+    /// Write the result as an HTML page in 3D, with a line from each old position to the new one
     #[arg(long, value_name = "FILE.html")]
     page: Option<PathBuf>,
-    /// The pose about which the robot moves, a position of each joint in rad or m, with spaces between them; else the
-    /// middle of the limits
+    /// Start pose of the robot: a position in rad or m for each joint, separated by spaces. Default: the middle of the
+    /// limits
     #[arg(long, value_name = "POSITIONS", allow_hyphen_values = true)]
     start: Option<String>,
-    /// How far joints go from there, in rad or m: choose it so that the robot hits nothing
+    /// Maximum distance of each joint from the start, in rad or m: choose it so that the robot hits nothing
     #[arg(long, value_name = "RAD", default_value_t = 1.0)]
     within: f64,
-    /// How long the motion may take
+    /// Maximum duration of the motion
     #[arg(long, value_name = "TIME", default_value = "150s", value_parser = seconds)]
     duration: f64,
-    /// How far wired cells are apart, in mm: makes positions better
+    /// Distance between wired cells in mm: improves positions
     #[arg(long, value_name = "MM")]
     spacing: Option<f64>,
-    /// Also estimate what has to be added to the positions of each joint
+    /// Also estimate a zero offset for each joint
     #[arg(long)]
     zero_offsets: bool,
-    /// What the data sheet of the accelerometers says, as TOML, with the keys of a scenario's [sensors.acceleration]. Else a BMA250
+    /// Data sheet of the accelerometers as TOML, with the keys of a scenario's [sensors.acceleration]. Default: a
+    /// BMA250
     #[arg(long, value_name = "FILE")]
     data_sheet: Option<PathBuf>,
-    /// Move nothing: print the motion as JSON
+    /// Print the motion as JSON and move nothing
     #[arg(long)]
     dry_run: bool,
-    /// Start no cells: they are on the bus already, or are real
+    /// Start no cells: they are already on the bus, or are real
     #[arg(long)]
     no_spawn: bool,
     #[command(flatten)]
@@ -94,7 +95,7 @@ pub(crate) struct Calibrate {
     /// Show no progress
     #[arg(long, short)]
     quiet: bool,
-    /// One JSON object instead of text
+    /// Print one JSON object instead of text
     #[arg(long, short)]
     json: bool,
     #[command(flatten)]
@@ -138,7 +139,7 @@ impl Calibrate {
         match calibration.summary.troubled {
             0 => Ok(()),
             troubled => Err(Failure::run(format!(
-                "{}: {} of {} cannot be trusted: look at the lines above",
+                "{}: {} of {} cannot be trusted: see the lines above",
                 skin.name,
                 troubled,
                 count(skin.cells.len(), "cell")
@@ -178,7 +179,7 @@ impl Calibrate {
         Ok(Settings { sheet, gravity: UPRIGHT, spacing, zero_offsets, threads, bounds })
     }
 
-    /// Moves the robot, and uses what was recorded.
+    /// Moves the robot, and evaluates the recording.
     fn live(
         &self,
         skin: &Skin,
@@ -215,7 +216,7 @@ impl Calibrate {
         read(&[path], skin, settings)
     }
 
-    /// A run in which each cell sends every acceleration.
+    /// Options of a run in which each cell sends all accelerations.
     fn options(
         &self,
         skin: &Skin,
@@ -242,7 +243,7 @@ impl Calibrate {
         scenario.sensors.acceleration = (!self.no_spawn).then_some(settings.sheet);
         let mut sensing = skin.clone();
         sensing.buses.iter_mut().for_each(|bus| bus.sensing = Sensing::Event);
-        // Every acceleration is an event, and nothing else is.
+        // Every acceleration is an event, and no other value is.
         sensing.events = Events {
             contact: Q5_10::MAX,
             proximity: Q1_14::MAX,
@@ -258,7 +259,7 @@ impl Calibrate {
             directory: None,
             spawn: !self.no_spawn,
             emulated: None,
-            // A process a bus: what is looked at is not how cells share a machine.
+            // One process per bus: cells that share a machine do not affect the result.
             cells_per_process: usize::from(CellId::MAX.get()),
             flash: None,
             receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
@@ -270,7 +271,7 @@ impl Calibrate {
     }
 }
 
-/// What a capture says of the cells of a skin.
+/// Reads the accelerations of a skin's cells from a capture, and calibrates the skin.
 fn read(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibration, Failure> {
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
     let name = reader.name().to_owned();
@@ -302,7 +303,7 @@ fn read(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibrati
     calibrate(skin, &seen, settings).map_err(|refusal| Failure::run(format_args!("{name}: {refusal}")))
 }
 
-/// What was found, for people.
+/// Text report of the result.
 fn report(skin: &Skin, calibration: &Calibration) -> String {
     let summary = &calibration.summary;
     let mut lines = vec![format!(

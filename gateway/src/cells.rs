@@ -17,17 +17,17 @@ use super::arguments::{BusKinds, bus_of, seconds};
 use super::input;
 use super::print::{json, json_line};
 
-/// How long it listens by default.
+/// Default listening time in s.
 const LISTEN_S: f64 = 1.0;
-/// Time between two drawings.
+/// Interval between updates of the list.
 const DRAW: Duration = Duration::from_millis(500);
 
-/// List the cells on a bus: what each reports of itself
+/// List the cells on a bus with their reports
 ///
-/// Asks all cells for their counters and their place in the network, and listens for a second. What a cell has not
-/// reported is `-`; empty columns are left out, and so are the counters where a terminal is too narrow. Ports: the
-/// node id of the neighbour, `?` after it when that one receives nothing from here, `!` when it has another protocol
-/// version, `.` where nothing is received.
+/// Queries all cells for their counters and their position in the network, and listens for one second. `-` marks values
+/// that a cell has not reported. Empty columns are omitted, and so are the counters on narrow terminals. Ports show the
+/// node id of the neighbour; `?` after it means that the neighbour receives nothing from this cell, `!` that it has
+/// another protocol version, and `.` that the port receives nothing.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus cells vcan0
@@ -36,16 +36,16 @@ const DRAW: Duration = Duration::from_millis(500);
 pub(crate) struct Cells {
     /// The bus
     bus: String,
-    /// Compare with this description: which cells have its configuration, and which are missing
+    /// Compare with this skin: show which cells have its configuration, and which are missing
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     /// Update the list until Ctrl-C
     #[arg(long)]
     watch: bool,
-    /// One JSON object; with --watch, one a line
+    /// Print one JSON object; with --watch, one per line
     #[arg(long, short)]
     json: bool,
-    /// Listen for this time [default: 1s; without end with --watch]
+    /// Listen for this time [default: 1s; no limit with --watch]
     #[arg(long, value_name = "TIME", value_parser = seconds, allow_negative_numbers = true)]
     duration: Option<f64>,
     #[command(flatten)]
@@ -96,7 +96,7 @@ impl Cells {
             let (name, seconds) = (&self.bus, watch.elapsed().as_secs_f64());
             let others = match watch.others() {
                 0 => String::new(),
-                others => format!(" ({others} frames are of no cell; `skinbus dump` shows them)"),
+                others => format!(" ({others} frames are not from cells; `skinbus dump` shows them)"),
             };
             return Err(Failure::run(format!(
                 "no cell sent anything on {name} for {seconds:.1} s{others}: start them, or switch them on"
@@ -105,7 +105,7 @@ impl Cells {
         print(&show(&watch)?)
     }
 
-    /// This bus in the description.
+    /// Finds this bus in the skin.
     fn known(&self) -> Result<Option<Known>, Failure> {
         let Some(path) = &self.skin else { return Ok(None) };
         let skin = Skin::read(path).map_err(Failure::usage)?;

@@ -12,11 +12,11 @@ use protocol::usage::{Failure, print};
 
 use self::skin::Listed;
 
-/// Check skins and scenarios, and say what they describe
+/// Check skins and scenarios, and summarise them
 ///
-/// Of a skin its URDF is read too, and it is summarised in a few lines. Of a scenario it lists in the order of time who is
-/// touched with what force, what breaks, and what the gateway computes. Exit code 2, and one line with the line and column,
-/// the key, the value and what is allowed, when something is wrong.
+/// For a skin, also reads its URDF, and summarises the skin in a few lines. For a scenario, lists touches with their
+/// forces, faults and changes of the gateway's mode in the order of time. If a file is wrong, exits with code 2 and one
+/// line that gives the line and column, the key, the value and the allowed values.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus check gateway/examples/ur5-253.toml gateway/examples/demo.toml
@@ -26,25 +26,25 @@ pub(crate) struct Check {
     /// Skins and scenarios; - for standard input
     #[arg(value_name = "FILE", required = true)]
     files: Vec<PathBuf>,
-    /// The skin that scenarios are for; else the one among the files
+    /// The skin of the scenarios [default: the skin among the files]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Also list the cells of skins, one a line: where each sits in the frame of its joint, whom its ports lead to, and the
-    /// configuration hash that its heartbeats carry
+    /// Also list the cells of skins, one per line: position in the frame of the joint, neighbours, and configuration
+    /// hash
     #[arg(long)]
     list: bool,
-    /// List this cell alone
+    /// List only this cell
     #[arg(long, value_name = "[BUS:]NODE", conflicts_with = "list")]
     cell: Option<CellName>,
-    /// One JSON object for each file; numbers have the names of the files' keys
+    /// Print one JSON object per file; numbers have the names of the files' keys
     #[arg(long, short)]
     json: bool,
 }
 
-/// What a file describes.
+/// Content of a file.
 enum Described {
     Skin(Box<Skin>),
-    /// As its text, until its skin is known.
+    /// Text of the file, kept until its skin is known.
     Scenario(String),
 }
 
@@ -92,8 +92,8 @@ fn ambiguous(file: &Path, found: &str) -> Failure {
     ))
 }
 
-/// Reads a skin, or finds that a file is a scenario: by its tables, which the two have not in common; of a file with none of
-/// them, a scenario where `has_skin`, a skin where not.
+/// Reads a skin, or recognises a scenario by its tables, which differ from those of a skin. A file without any of these
+/// tables counts as a scenario if `has_skin`, else as a skin.
 fn described(file: &Path, has_skin: bool) -> Result<Described, Failure> {
     const OF_SKINS: [&str; 8] =
         ["robot", "chain", "bus", "cell", "timing", "controller", "contact", "safety"];

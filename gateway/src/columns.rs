@@ -1,14 +1,14 @@
-//! CSV files: a header, then a line for each row. Errors name the file, the line, the column and the value.
+//! CSV files with a header and one line per row. Errors name the file, the line, the column and the value.
 
 use csv::{StringRecord, StringRecordsIntoIter, Trim};
 use protocol::usage::Failure;
 
 use super::print::{count, list};
 
-/// Characters of a first line that an error repeats.
+/// Maximum number of characters of a first line that an error repeats.
 const REPEATED: usize = 60;
 
-/// Which columns a file has, in any order.
+/// Columns of a file, in any order.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Columns {
     pub(crate) needed: &'static [&'static str],
@@ -16,7 +16,7 @@ pub(crate) struct Columns {
 }
 
 impl Columns {
-    /// Whether it is a header: each of the columns once, and no others.
+    /// Returns true for a valid header: each needed column once, and no unknown column.
     fn are(self, names: &StringRecord) -> bool {
         let is_known = |name: &str| self.needed.contains(&name) || self.optional.contains(&name);
         let once = |name: &str| names.iter().filter(|other| *other == name).count() == 1;
@@ -24,7 +24,7 @@ impl Columns {
     }
 }
 
-/// A file of rows. Lines that are empty or begin with `#` are no rows.
+/// A file of rows. Empty lines and lines that begin with `#` are skipped.
 pub(crate) struct Table<'a> {
     file: String,
     names: StringRecord,
@@ -37,7 +37,7 @@ pub(crate) struct Row<'a> {
     file: &'a str,
     names: &'a StringRecord,
     values: StringRecord,
-    /// Its line in the file, from 1.
+    /// Line number in the file, from 1.
     pub(crate) line: usize,
 }
 
@@ -69,7 +69,7 @@ impl<'a> Table<'a> {
         Ok(Self { file: file.to_owned(), names, rows: reader.into_records(), lines })
     }
 
-    /// The next row.
+    /// Returns the next row.
     pub(crate) fn row(&mut self) -> Result<Option<Row<'_>>, Failure> {
         let Some(values) = self.rows.next() else { return Ok(None) };
         let file = self.file.as_str();
@@ -87,26 +87,26 @@ impl<'a> Table<'a> {
 }
 
 impl Row<'_> {
-    /// What stands in a column; nothing if the file does not have it.
+    /// Text of a column; empty if the file does not have the column.
     pub(crate) fn text(&self, column: &str) -> &str {
         let place = self.names.iter().position(|name| name == column);
         place.and_then(|place| self.values.get(place)).unwrap_or_default()
     }
 
-    /// The number in a column.
+    /// Number in a column.
     pub(crate) fn number(&self, column: &str) -> Result<f64, Failure> {
         let number = self.text(column).parse().ok().filter(|number: &f64| number.is_finite());
         number.ok_or_else(|| self.wrong(column, "a finite number is needed"))
     }
 
-    /// The error for a value.
+    /// Error for a value.
     pub(crate) fn wrong(&self, column: &str, needed: &str) -> Failure {
         let (file, line, value) = (self.file, self.line, self.text(column));
         Failure::usage(format!("{file}: line {line}: {column} = {value:?}: {needed}"))
     }
 }
 
-/// Counts lines up to one place of a text after the other.
+/// Counts the lines of a text up to increasing positions.
 struct Lines<'a> {
     text: &'a str,
     at: usize,
@@ -114,7 +114,7 @@ struct Lines<'a> {
 }
 
 impl Lines<'_> {
-    /// The line of the row at this byte, or behind the empty lines and comments there.
+    /// Line number of the row at this byte, or after the empty lines and comments there.
     fn of(&mut self, byte: usize) -> usize {
         self.line += self.text.get(self.at..byte).unwrap_or_default().matches('\n').count();
         self.at = byte;

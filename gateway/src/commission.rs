@@ -22,11 +22,11 @@ use super::{input, output};
 
 /// Write a skin's description into its cells, and read it back
 ///
-/// Finds every cell by its serial number, writes the robot's table, pose, gains and thresholds into its flash,
-/// reads all of it back and compares. A cell takes its new parameters as a whole, so this may be interrupted at any
-/// moment, and be run again: cells that have the right configuration are left as they are. Cells that the
-/// description does not have are listed and left alone. Exit code 0: all cells have the skin's configuration; 1: some
-/// have not, and the table gives the reason; 2: wrong use or configuration.
+/// Finds each cell by its serial number, writes the robot's table, the pose, gains and thresholds into its flash, reads
+/// everything back and compares. A cell applies its new parameters all at once, so the command may be interrupted at
+/// any moment and run again: cells with the right configuration are skipped. Cells that the skin does not have are
+/// listed and left alone. Exit code 0: all cells have the skin's configuration; 1: some do not, and the table gives the
+/// reason; 2: wrong use or configuration.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus commission skin.toml
@@ -34,20 +34,20 @@ use super::{input, output};
   skinbus commission skin.toml --verify --json | jq '.buses[0].failed'
   skinbus commission skin.toml --node-ids as-wired.toml && skinbus run as-wired.toml --no-spawn")]
 pub(crate) struct Commission {
-    /// The skin's description
+    /// The skin
     skin: PathBuf,
-    /// Only this bus of the skin's
+    /// Commission only this bus of the skin
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
     #[command(flatten)]
     kinds: BusKinds,
-    /// Write nothing: list which cells are there and which would be written
+    /// Write nothing: list the cells found and those that would be written
     #[arg(long)]
     dry_run: bool,
-    /// Read back and compare also the cells that have the right hash already
+    /// Also read back and compare cells that already have the right hash
     #[arg(long)]
     verify: bool,
-    /// Write a copy of the description with the node ids that the cells have on their buses
+    /// Write a copy of the skin with the node ids that the cells have on their buses
     #[arg(long, value_name = "FILE")]
     node_ids: Option<PathBuf>,
     #[command(flatten)]
@@ -55,7 +55,7 @@ pub(crate) struct Commission {
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
-    /// One JSON object instead of the table
+    /// Print one JSON object instead of the table
     #[arg(long, short)]
     json: bool,
 }
@@ -70,13 +70,13 @@ impl Commission {
             None => (0..skin.buses.len()).collect(),
         };
         apart([("--node-ids", self.node_ids.as_deref())], [self.skin.as_path()])?;
-        // Before cells are written, so that a file that cannot be written is reported first.
+        // Opened before cells are written, so that an error of the file is reported first.
         let begun =
             self.node_ids.as_ref().map(|path| self.overwrite.create("--node-ids", path)).transpose()?;
         let wish = Wish { dry_run: self.dry_run, verify: self.verify };
         let stopped = input::stopped()?;
         let kinds = self.kinds.of(bus_names(&skin))?;
-        // All are opened before anything is sent.
+        // All buses are opened before anything is sent.
         let benches = target.into_iter().map(|bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
         let benches = benches.map_err(Failure::usage)?;
         let began = Instant::now();
@@ -110,18 +110,18 @@ impl Commission {
     }
 }
 
-/// All buses in one line.
+/// Progress of all buses in one line.
 fn how_far(all: &[Progress]) -> String {
     let sum = |part: fn(&Progress) -> usize| all.iter().map(part).sum::<usize>();
     let [cells, found] = [sum(|it| it.cells), sum(|it| it.found)];
     let [done, failed] = [sum(|it| it.done), sum(|it| it.failed)];
-    // The bus that is behind the others determines what is being done.
+    // The slowest bus determines the displayed activity.
     let doing = all.iter().filter(|it| it.doing != "done").map(|it| it.doing).next().unwrap_or("done");
     let failed = if failed == 0 { String::new() } else { format!(", {failed} failed") };
     format!("{doing}: {found} of {cells} cells found, {done} done{failed}")
 }
 
-/// An error where nothing was begun: one line with the reason.
+/// Returns an error with the reason if no cell was reached.
 fn check_begun(file: &str, done: &[Done], interrupted: bool) -> Result<(), Failure> {
     let begun = done.iter().any(|done| {
         let is_well = |outcome| !matches!(outcome, Outcome::Failed(_));

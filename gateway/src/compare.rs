@@ -27,9 +27,9 @@ use super::print::{count, json};
 
 /// Compare two recordings or logs of one skin, epoch by epoch
 ///
-/// Joints and their replies are aligned by the number of their epoch. What one run has before the other begins or after it
-/// ends is not compared, and said. Times from joints to replies, late replies and lost packets are shown beside each other
-/// and are no difference. docs/how-to/compare.md explains what counts. Exit code 0: equal; 1: different, or a file is
+/// Aligns joints and their replies by the number of their epoch. Epochs that one run has before the other starts, or
+/// after it ends, are reported but not compared. Reply times, late replies and lost packets are shown side by side and
+/// are no differences. docs/how-to/compare.md explains the rules. Exit code 0: equal; 1: different, or a file is
 /// damaged; 2: wrong use, or two skins.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -40,7 +40,7 @@ use super::print::{count, json};
 
 Keys of --json:
   a, b, skin         names; tolerance, joints_tolerance, allow_missing as given
-  equal, differs     whether nothing differs that counts; the aspects that differ
+  equal, differs     true if nothing relevant differs; the aspects that differ
   captures.a, .b     frames, epochs, first and last number, last_s, torques, sums,
                      late, lost, restarts, reply_us; dropped, unfinished
   epochs             compared; missing_in_a, missing_in_b; before, after: only_a, only_b
@@ -48,40 +48,40 @@ Keys of --json:
   torques, sums      equal, tolerated, different, different_with_same_inputs, missing_in_a,
                      missing_in_b, open (the other run ended first), max_steps
   contacts, halts    both; only_a, only_b
-  cells, extra_cells cells that differ or lost something; cells of one run alone
+  cells, extra_cells cells with differences or losses; cells in only one run
   first              the first difference: what, how, bus, cell, joint, epoch, number, time_s,
                      words, values, unit, steps, inputs, unknown_inputs, occurrence")]
 pub(crate) struct Compare {
-    /// An MCAP recording or a candump log, - for standard input; of a split recording the first part: those behind it are
-    /// found beside it
+    /// An MCAP recording or a candump log; - for standard input. For a split recording name the first part; the other
+    /// parts beside it are read too
     #[arg(value_name = "A")]
     a: PathBuf,
-    /// The other one
+    /// The other recording or log
     #[arg(value_name = "B")]
     b: PathBuf,
-    /// The skin's description; else the one in a recording
+    /// The skin [default: the skin in a recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Take torques for equal whose words differ by at most so many steps of 1/4096 Nm, and sums, of 1/256 Nm
+    /// Accept differences between torque words of up to this many steps of 1/4096 Nm, and between sums of 1/256 Nm
     #[arg(long, value_name = "STEPS", default_value_t = 0)]
     tolerance: u16,
-    /// Take joints for equal whose words differ by at most so many steps of 1/16384 quarter turn or m
+    /// Accept differences between joint words of up to this many steps of 1/16384 quarter turn or m
     #[arg(long, value_name = "STEPS", default_value_t = 0)]
     joints_tolerance: u16,
-    /// Up to so many replies and joints that one run alone has are no difference
+    /// Accept up to this many replies and joints that only one run has
     #[arg(long, value_name = "N", default_value_t = 0)]
     allow_missing: u64,
     /// Print one JSON object instead of the table
     #[arg(long, short)]
     json: bool,
-    /// Write a JUnit report too: a test case for each aspect
+    /// Also write a JUnit report, with a test case for each aspect
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
     #[command(flatten)]
     overwrite: Overwrite,
 }
 
-/// All that is printed.
+/// The printed result.
 #[derive(Serialize)]
 struct Whole<'a> {
     a: &'a str,
@@ -94,7 +94,7 @@ struct Whole<'a> {
     report: &'a Report,
 }
 
-/// One capture, as it is read.
+/// One capture while it is read.
 struct Input {
     files: Vec<PathBuf>,
     name: String,
@@ -102,7 +102,7 @@ struct Input {
     decoder: Decoder,
     missing: input::Missing,
     has_frames: bool,
-    /// The error that ended it.
+    /// Error that ended it.
     damage: Option<Failure>,
 }
 
@@ -114,7 +114,7 @@ impl Input {
         Ok(Self { files, name, reader, decoder, missing, has_frames: false, damage: None })
     }
 
-    /// Hands on the frames that are latched when the capture begins.
+    /// Passes the frames that are latched at the start of the capture to the comparison.
     fn begin(&mut self, which: Which, comparison: &mut Comparison<'_>) {
         for before in &self.reader.extras().latched {
             let at = Micros(before.nanos / 1_000);
@@ -124,7 +124,7 @@ impl Input {
         }
     }
 
-    /// Hands on the next entry.
+    /// Passes the next entry to the comparison.
     fn read(&mut self, which: Which, comparison: &mut Comparison<'_>) {
         match self.reader.next() {
             Ok(Some(Entry::Frame(record))) => {
@@ -225,12 +225,13 @@ impl Compare {
         }
     }
 
-    /// The skin of both: that of the option, else of a recording. A recording of another one is refused.
+    /// Returns the skin of both captures: from the option, or else from a recording. Refuses a recording of another
+    /// skin.
     fn skin(&self, files: &Both<Vec<PathBuf>>) -> Result<Skin, Failure> {
         let named = self.skin.as_deref().map(input::read_skin).transpose()?;
         let (mut skin, mut name) = (named, self.skin.clone());
         for (path, files) in [(&self.a, &files.a), (&self.b, &files.b)] {
-            // A log has none; of standard input it is compared at the end.
+            // A log has no skin; that of standard input is compared at the end.
             if !can_be_read_again(path)
                 || Reader::open_all(files).map_err(Failure::usage)?.format() == Format::Candump
             {
@@ -248,7 +249,7 @@ impl Compare {
         if let Some(skin) = skin {
             return Ok(skin);
         }
-        // What has no frames would be refused with a skin too.
+        // A capture without frames would be refused with a skin too.
         for (path, files) in [(&self.a, &files.a), (&self.b, &files.b)] {
             if can_be_read_again(path) {
                 needs_frames(files)?;
@@ -258,7 +259,7 @@ impl Compare {
         Err(Failure::usage(format!("neither {a} nor {b} has a skin in it: name one with --skin")))
     }
 
-    /// Refuses a capture without frames or joints, and one of another skin.
+    /// Refuses a capture without frames or joints, or of another skin.
     fn check(
         &self,
         input: &mut Input,
@@ -284,7 +285,7 @@ impl Compare {
         }
         comparison.other_configurations(which).map_or(Ok(()), |(all, same)| {
             Err(Failure::usage(format!(
-                "{name} is of another skin than {}: of {} {same} have its parameters; name the right one with --skin",
+                "{name} belongs to another skin than {}: of {}, {same} have its parameters; name the right one with --skin",
                 skin.name,
                 count(all, "cell")
             )))
@@ -292,7 +293,7 @@ impl Compare {
     }
 }
 
-/// Refuses two skins.
+/// Refuses two different skins.
 fn same_skin(
     (one, skin): (impl AsRef<Path>, &Skin),
     (other, own): (impl AsRef<Path>, &Skin),

@@ -1,4 +1,4 @@
-//! `skinbus completions` and `skinbus man`.
+//! Shell completions and man pages: `skinbus completions` and `skinbus man`.
 
 use std::io;
 use std::path::PathBuf;
@@ -28,13 +28,13 @@ impl Completions {
     }
 }
 
-/// Write man pages: skinbus.1, and one for each command
+/// Write man pages: skinbus.1, and one per command
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus man ~/.local/share/man/man1
   skinbus man - | man -l -")]
 pub(crate) struct Man {
-    /// The folder, which has to exist; - for skinbus.1 on standard output
+    /// An existing directory; - for skinbus.1 on standard output
     #[arg(value_name = "DIR")]
     folder: PathBuf,
     #[command(flatten)]

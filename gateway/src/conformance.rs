@@ -22,15 +22,15 @@ use super::arguments::{BusKinds, FORMATS, one_of};
 use super::output::{Overwrite, print_beside};
 use super::{input, output};
 
-/// How long a test may take, beside listening and putting back.
+/// Maximum duration of a test, besides listening and restoring.
 const LONGEST: Span = Span::from_millis(80_000);
 
-/// Test one cell, whoever wrote it, against the requirements of its documents
+/// Test one cell of any make against the requirements of the documents
 ///
-/// Takes the cell through every numbered requirement of cell.md and sensing.md, in at most 90 s, and prints what came of
-/// each; of a failure also the frames that show it. The test brings its own configurations: it first saves the cell's to a
-/// file, and puts it back at the end, also when it is interrupted. The cell has to be alone with it on the bus. Exit code
-/// 0: nothing failed; 1: something failed, or the test could not be done; 2: wrong use.
+/// Takes the cell through all numbered requirements of cell.md and sensing.md in at most 90 s, and prints the result of
+/// each; for failures also the frames that show it. The test brings its own configurations: it first saves the cell's
+/// configuration to a file, and restores it at the end, even if interrupted. The cell and the test must be alone on the
+/// bus. Exit code 0: no requirement failed; 1: one failed, or the test could not run; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus conformance --bus can0 --cell 12
@@ -46,28 +46,28 @@ pub(crate) struct Conformance {
     cell: CellName,
     #[command(flatten)]
     kinds: BusKinds,
-    /// The frame format of the bus [default: that of the cell's heartbeats]
+    /// Frame format of the bus [default: the format of the cell's heartbeats]
     #[arg(long, value_parser = one_of(FORMATS))]
     format: Option<Format>,
-    /// Test these requirements only: CONF-7, or CONF for all of that name
+    /// Test only these requirements: CONF-7, or CONF for all that begin so
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     requirement: Vec<String>,
-    /// A command that switches the cell off and on, for what shows only at a start; run by sh -c
+    /// Shell command that switches the cell off and on, for requirements that only a start shows
     #[arg(long, value_name = "COMMAND")]
     restart: Option<String>,
-    /// Other cells on the bus do not matter: joints and halts of the test reach them too
+    /// Continue although other cells are on the bus: joints and halts of the test reach them too
     #[arg(long)]
     others_will_stop: bool,
-    /// Where to save what the cell has [default: conformance-BUS-NODE.json]
+    /// File for the cell's saved configuration [default: conformance-BUS-NODE.json]
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
-    /// Test nothing: put back what an earlier test saved, and delete the file
+    /// Test nothing: restore a configuration that an earlier test saved, and delete the file
     #[arg(long, value_name = "FILE", conflicts_with_all = ["requirement", "restart", "json", "junit", "save"])]
     restore: Option<PathBuf>,
     /// Print one JSON object instead of the table
     #[arg(long, short)]
     json: bool,
-    /// Write a JUnit report too
+    /// Also write a JUnit report
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
     #[command(flatten)]
@@ -98,7 +98,7 @@ impl Conformance {
         if self.restore.is_none() && path.exists() {
             let path = path.display();
             return Err(Failure::usage(format!(
-                "{path} is there from an earlier test that did not put the cell back: do that with --restore {path}, \
+                "{path} is left from an earlier test that did not restore the cell: do that with --restore {path}, \
                  or delete it"
             )));
         }
@@ -125,7 +125,7 @@ impl Conformance {
             session.findings.list(&only, stopped.as_ref()),
             stopped.as_ref(),
         );
-        // None of them keeps the others from being written.
+        // An error of one output does not keep the others from being written.
         let shown = super::print::json(&whole).and_then(|json| {
             let shown = if self.json { json } else { whole.text() };
             print_beside([self.junit.as_deref()], &shown)
@@ -134,7 +134,7 @@ impl Conformance {
             junit.map_or(Ok(()), |(file, out)| output::finish("--junit", file, out, &whole.junit()));
         back.and(shown).and(reported)?;
         match stopped {
-            Some(Stop::Interrupted) => Err(Failure::run("interrupted; the cell has been put back")),
+            Some(Stop::Interrupted) => Err(Failure::run("interrupted; the cell has been restored")),
             Some(stopped) => Err(Failure::run(stopped)),
             None if whole.has_failed() => Err(Failure::said()),
             None => Ok(()),
@@ -142,7 +142,7 @@ impl Conformance {
     }
 }
 
-/// What an earlier test saved.
+/// Reads the configuration that an earlier test saved.
 fn read(path: &Path) -> Result<Saved, Failure> {
     let wrong =
         |error: &dyn std::fmt::Display| Failure::usage(format!("--restore {}: {error}", path.display()));
@@ -150,12 +150,12 @@ fn read(path: &Path) -> Result<Saved, Failure> {
     serde_json::from_str(&text).map_err(|error| wrong(&error))
 }
 
-/// Puts back what the cell had, and deletes the file if that was possible.
+/// Restores the cell's configuration, and deletes the file on success.
 fn put_back(session: &mut Session<'_>, saved: &Saved, path: &PathBuf) -> Result<(), Failure> {
     let keep = |why: &dyn std::fmt::Display| {
         let path = path.display();
         Failure::run(format!(
-            "the cell was not put back: {why}; {path} has what it had: put it back with --restore {path}"
+            "the cell was not restored: {why}; {path} holds its configuration: restore it with --restore {path}"
         ))
     };
     let left = session.restore(saved).map_err(|stop| keep(&stop))?;

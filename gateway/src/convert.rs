@@ -26,19 +26,19 @@ use super::arguments::{Word, one_of};
 use super::input::{captures, no_frame, others, place, skin_for};
 use super::output::{Overwrite, apart, is_standard_output, note, refused};
 
-/// Lines that cannot be read and are reported; further ones are counted.
+/// Maximum number of unreadable lines that are reported one by one.
 const NAMED: u64 = 100;
-/// Bytes that are written at once.
+/// Number of bytes written at once.
 const PIECE: usize = 1 << 18;
 
-/// Convert a capture: a candump log to an MCAP recording, or back; or its torques to CSV
+/// Convert a capture between candump log and MCAP recording, or its torques to CSV
 ///
-/// The format of IN is detected from its first bytes, that of OUT from the end of its name: .mcap is a recording, .log
-/// or .txt a candump log, - a log on standard output, .csv the torques of each epoch, as `skinbus explain` computes
-/// them. Frames come back bit for bit: times, names of buses, directions, FD flags, raw
-/// DLCs, error and remote frames; comments, drop lines and lines that cannot be read keep their places. What OUT has no
-/// place for is reported. OUT appears when it is complete; of a pipe it grows, as a log under its name and as a recording
-/// under OUT.part, and has what came a tenth of a second after it came. Exit code 0: done, 1: it cannot be done, 2: wrong use.
+/// Detects the format of IN from its first bytes, and that of OUT from its name: .mcap is a recording, .log or .txt a
+/// candump log, - a log on standard output, and .csv the torques of each epoch, as computed by `skinbus explain`.
+/// Frames are preserved bit for bit: times, bus names, directions, FD flags, raw DLCs, error and remote frames.
+/// Comments, drop lines and unreadable lines keep their places. Information that OUT cannot hold is reported. OUT
+/// appears when it is complete. For a pipe it grows within a tenth of a second of the input: a log under its name, a
+/// recording as OUT.part. Exit code 0: done; 1: cannot be done; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus convert run.mcap run.log
@@ -48,34 +48,34 @@ const PIECE: usize = 1 << 18;
   skinbus convert run.log torques.csv --skin skin.toml
   candump -L can0 | skinbus convert - can0.mcap")]
 pub(crate) struct Convert {
-    /// A candump log or an MCAP recording, or several as one: all parts of a split one in any order, or others, which are read
-    /// in the order of their first frames; - for standard input
+    /// A candump log or an MCAP recording; - for standard input. Several are read as one: the parts of a split
+    /// recording in any order, other captures in the order of their first frames
     #[arg(value_name = "IN", required = true)]
     from: Vec<PathBuf>,
-    /// The new capture, or a CSV file; - for candump text on standard output
+    /// The new capture or CSV file; - for candump text on standard output
     #[arg(value_name = "OUT")]
     to: PathBuf,
     #[command(flatten)]
     overwrite: Overwrite,
-    /// End at the first line that is no frame though it begins like one, or when IN has no end; write nothing then
+    /// Fail at the first malformed frame line, or if IN is truncated; then write nothing
     #[arg(long)]
     strict: bool,
-    /// Digits of a second in a log: 6 or 9; else as many as IN has
+    /// Digits of a second in a log [default: as many as IN has]
     #[arg(long, value_parser = one_of(DIGITS), value_name = "N")]
     digits: Option<Digits>,
-    /// Write T or R behind frames in a log, which a log that had them has anyway; Wireshark does not read that
+    /// Write T or R behind frames in a log, which Wireshark cannot read; logs that have them keep them
     #[arg(long, conflicts_with = "plain")]
     direction: bool,
-    /// Write only what every tool reads: frames, without direction and raw DLC, 6 digits, no comments
+    /// Write only what every tool reads: frames with 6 digits, without direction, raw DLC and comments
     #[arg(long)]
     plain: bool,
-    /// For a CSV file: the skin's description; else the one in the recording
+    /// For a CSV file: the skin [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
 }
 
-/// The hint where a capture without an end is refused.
-const WITHOUT_STRICT: &str = "without --strict what is there would be written";
+/// Hint for a refused capture that is truncated.
+const WITHOUT_STRICT: &str = "without --strict the intact part would be written";
 
 const DIGITS: &[Word<Digits>] = &[("6", "", Digits::Six), ("9", "", Digits::Nine)];
 
@@ -178,7 +178,7 @@ impl Convert {
         Ok(())
     }
 
-    /// Sees that files that are read have a frame, before their other lines are written to standard output.
+    /// Checks that files have a frame before their other lines are written to standard output.
     fn check_frames(&self) -> Result<(), Failure> {
         if !self.from.iter().all(|file| can_be_read_again(file)) {
             return Ok(());
@@ -201,13 +201,13 @@ impl Convert {
                     unreadable.iter().for_each(note);
                     return Err(no_frame(&reader));
                 }
-                // What is wrong is reported when it is read again.
+                // An error is reported when the file is read again.
                 Ok(_) | Err(_) => return Ok(()),
             }
         }
     }
 
-    /// Tells a file that is created from a FIFO or a device, which is written to as it is.
+    /// Returns true for a new or regular file, false for a FIFO or a device, which is written to directly.
     fn is_new(&self) -> bool {
         !is_standard_output(&self.to) && fs::metadata(&self.to).map_or(true, |there| there.is_file())
     }
@@ -217,7 +217,7 @@ impl Convert {
         written(&self.to, &left, error)
     }
 
-    /// The torque of every epoch, in a CSV file.
+    /// Writes the torque of every epoch to a CSV file.
     fn torques(&self) -> Result<(), Failure> {
         let to = self.to.display();
         let options =
@@ -235,7 +235,7 @@ impl Convert {
         let done = torques::write(&mut reader, &skin, out);
         bar.finish_and_clear();
         let (epochs, missing) = done.map_err(|error| match error {
-            SeriesError::Taken(error) => Failure::run(format!("{to}: {error}; nothing is left of it")),
+            SeriesError::Taken(error) => Failure::run(format!("{to}: {error}; no file was kept")),
             error @ (SeriesError::Capture(_) | SeriesError::NotFound { .. }) => Failure::run(error),
         })?;
         if stopped.load(Ordering::Relaxed) && !live {
@@ -255,7 +255,7 @@ impl Convert {
         Ok(())
     }
 
-    /// The capture, its progress, and whether it goes on for as long as somebody writes it.
+    /// Opens the capture. Returns it with its progress bar, and true if it is a live pipe.
     fn open(&self) -> Result<(Reader, ProgressBar, bool), Failure> {
         let size = size(&self.from);
         let bar = bar(size);
@@ -264,7 +264,7 @@ impl Convert {
         Ok((reader, bar, size.is_none()))
     }
 
-    /// The output; standard output is written to as it is.
+    /// Opens the output; standard output is written to directly.
     fn create(
         &self,
         stopped: &AtomicBool,
@@ -279,7 +279,7 @@ impl Convert {
         Ok((whole, BufWriter::with_capacity(PIECE, Stoppable::new(file))))
     }
 
-    /// What OUT is to be, by its name.
+    /// Format of OUT, by its name.
     fn format(&self) -> Result<Format, Failure> {
         if is_standard_output(&self.to) && io::stdout().is_terminal() {
             let why = "standard output is a terminal, and a log may have anything in it";
@@ -301,13 +301,14 @@ impl Convert {
     }
 }
 
-/// How many bytes the input has, when that is known.
+/// Size of the input in bytes, if known.
 fn size(from: &[PathBuf]) -> Option<u64> {
     let of = |path: &PathBuf| fs::metadata(path).ok().filter(fs::Metadata::is_file).map(|about| about.len());
     from.iter().map(of).sum()
 }
 
-/// An error of the output, and what is left of that; a closed pipe is none: its reader may have ended, as `head` does.
+/// Returns an error of the output with the state of the file. A closed pipe is no error: its reader may have ended, as
+/// `head` does.
 fn written(to: &Path, left: &str, error: io::Error) -> Result<(), Failure> {
     if is_standard_output(to) {
         return protocol::usage::written(Err(error));
@@ -315,22 +316,22 @@ fn written(to: &Path, left: &str, error: io::Error) -> Result<(), Failure> {
     Err(Failure::run(format!("{}: {error}; {left}", to.display())))
 }
 
-/// Where entries go: a file that appears when it is whole, or one that grows.
+/// Destination of entries: a file that appears when it is complete, or one that grows.
 enum Sink {
     Whole(Option<WholeFile>, Output<BufWriter<Stoppable<File>>>),
     Live(Live),
 }
 
 impl Sink {
-    /// Says which file has the frames after an error.
+    /// Names the file that holds the frames after an error.
     fn left(&self) -> String {
         match self {
-            Self::Whole(..) => "nothing is left of it".to_owned(),
+            Self::Whole(..) => "no file was kept".to_owned(),
             Self::Live(live) => live.left(),
         }
     }
 
-    /// Ends it without its end; what was written stays.
+    /// Closes the output unfinished; entries written so far are kept.
     fn close(self, why: Failure) -> Failure {
         match self {
             Self::Whole(..) => why,
@@ -342,7 +343,7 @@ impl Sink {
         }
     }
 
-    /// Leaves nothing of it.
+    /// Removes the output.
     fn discard(self, why: Failure) -> Failure {
         if let Self::Live(live) = self {
             live.discard();
@@ -350,7 +351,7 @@ impl Sink {
         why
     }
 
-    /// Writes the end; an error says what is left.
+    /// Finishes the output; an error comes with the state of the file.
     fn finish(self) -> Result<(), (String, io::Error)> {
         let left = self.left();
         let finished = match self {
@@ -379,7 +380,7 @@ impl Target for Sink {
     }
 }
 
-/// Progress by bytes of the input, on a terminal.
+/// Progress in bytes of the input, on a terminal.
 fn bar(size: Option<u64>) -> ProgressBar {
     let Some(size) = size.filter(|_| io::stderr().is_terminal()) else { return ProgressBar::hidden() };
     let bar = ProgressBar::with_draw_target(Some(size), ProgressDrawTarget::stderr());
@@ -387,7 +388,7 @@ fn bar(size: Option<u64>) -> ProgressBar {
     bar.with_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
-/// Notes on a conversion, a line each.
+/// Notes on a conversion, one per line.
 fn remarks(reader: &Reader, done: &Converted, style: &Style, text: bool) -> Vec<String> {
     let mut lines = reader.remarks();
     let how = if style.plain { "" } else { ", which not every tool reads; --direction writes it" };
@@ -396,12 +397,12 @@ fn remarks(reader: &Reader, done: &Converted, style: &Style, text: bool) -> Vec<
     for (count, [one, more], what) in [
         (
             done.unreadable,
-            ["begins like a frame and is none", "begin like a frame and are none"],
+            ["line begins like a frame but is not one", "lines begin like frames but are not"],
             ": not read",
         ),
         (
             done.unreadable_messages,
-            ["message is not of its type", "messages are none of their type"],
+            ["message is not of its type", "messages are not of their type"],
             ": not read",
         ),
         (done.can_xl, ["is a CAN XL frame", "are CAN XL frames"], ": not read"),

@@ -32,12 +32,12 @@ use super::print::{json, list};
 
 /// Show the traffic of a bus or a capture, decoded beside the raw frames
 ///
-/// One line a frame: the frame as `candump -L` prints it, a tab, a verdict, and the decoded frame. The verdict is ok;
-/// segment, a frame of a packet on a classic bus, but its last; foreign, no packet of this protocol; length, CRC or
-/// incomplete, a damaged packet under an identifier that carries packets; or meaning, a packet of unknown meaning. So
-/// `cut -f1` gives a candump log. A capture is a candump log or an MCAP recording; lines that cannot be read are reported
-/// on standard error, and the rest is shown. With --json each line is an object, and keys end in their unit; with
-/// --stats there are tables at the end instead.
+/// Prints one line per frame: the frame as `candump -L` prints it, a tab, a verdict, and the decoded frame. Verdicts:
+/// ok; segment, a frame of a packet on a classic bus before the last; foreign, not a packet of this protocol; length,
+/// CRC or incomplete, a damaged packet under an identifier that carries packets; meaning, a packet of unknown meaning.
+/// So `cut -f1` gives a candump log. A capture is a candump log or an MCAP recording; unreadable lines are reported on
+/// standard error, and the rest is shown. With --json each line is an object whose keys end in their unit; with
+/// --stats, tables at the end replace the lines.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus dump vcan0 --kind torque --cell 12
@@ -49,12 +49,12 @@ use super::print::{json, list};
   skinbus dump can0 --stats --to 10
   candump -L can0 | skinbus dump - -n 100")]
 pub(crate) struct Dump {
-    /// A candump log or MCAP recording when there is a file of this name, - for standard input, else buses; all parts
-    /// of a split recording are one, in any order
+    /// Buses; or a candump log or MCAP recording if a file has this name, - for standard input. The parts of a split
+    /// recording count as one, in any order
     #[arg(required = true, value_name = "BUS|FILE")]
     sources: Vec<PathBuf>,
-    /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
-    /// joints, sync, resume, report alone, wire, foreign (also what is damaged), and damaged
+    /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt, joints,
+    /// sync, resume and report alone, wire, foreign (includes damaged), and damaged
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<Selector>,
     /// Only packets from or to these cells; also gateway and everyone
@@ -63,52 +63,52 @@ pub(crate) struct Dump {
     /// Only frames of these buses
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     bus: Vec<String>,
-    /// Only frames with this identifier, in hexadecimal: 3 digits are 11 bits, 8 digits 29; of two numbers the second is the mask
-    /// of the bits that are compared
+    /// Only frames with this identifier, in hexadecimal: 3 digits for 11 bits, 8 digits for 29. A second number masks
+    /// the bits to compare
     #[arg(long, value_name = "ID[:MASK]", value_delimiter = ',')]
     id: Vec<IdMask>,
-    /// Only traffic of touches: torques and sums that are not all zero, stimuli and sensors with a contact force
-    /// or a proximity, heartbeats of active cells
+    /// Only traffic of touches: torques and sums other than zero, stimuli and sensors with a contact force or a
+    /// proximity, heartbeats of active cells
     #[arg(long)]
     contact: bool,
-    /// Only from this second of the run on, or after the first frame where there is no run
+    /// Only from this second of the run on; counted from the first frame if there is no run
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
     from: Option<u64>,
-    /// Only up to, and without, this second of the run, or after the first frame; ends a live dump
+    /// Only before this second, counted like --from; ends a live dump
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
     to: Option<u64>,
-    /// End after so many frames that are shown or counted
+    /// End after this many frames that are shown or counted
     #[arg(long, short = 'n', value_name = "COUNT")]
     count: Option<u64>,
-    /// Without the raw frames: seconds of the run, or since the first frame; the bus, and the decoded frame
+    /// Replace the raw frame by the seconds of the run, or since the first frame, and the bus
     #[arg(long, conflicts_with_all = ["json", "stats"])]
     brief: bool,
-    /// One JSON object a line; with --stats, one in all
+    /// Print one JSON object per line; with --stats, one in total
     #[arg(long, short)]
     json: bool,
-    /// At the end, instead of lines: frames and rates by kind, gaps, losses, damaged frames, a line for each cell and
-    /// for each foreign identifier
+    /// Print tables at the end instead of lines: frames and rates by kind, gaps, losses, damaged frames, a line for
+    /// each cell and for each foreign identifier
     ///
-    /// A live bus is counted until --to, --count or Ctrl-C. Frames that the filters leave out would not be
-    /// counted, which makes losses and unanswered joints wrong; so only --bus, --from, --to and --count go with it.
+    /// Counts a live bus until --to, --count or Ctrl-C. Excluded frames would not be counted, which falsifies losses
+    /// and unanswered joints; so of the filters only --bus, --from, --to and --count are allowed.
     #[arg(long, conflicts_with_all = ["kind", "cell", "id", "contact"])]
     stats: bool,
-    /// The frame format of packets; auto accepts both
+    /// Frame format of packets; auto accepts both
     #[arg(long, value_parser = one_of(ANY_FORMAT), default_value = "auto")]
     format: Packets,
-    /// The skin's description, which gives torques and positions their units; else the one in the recording
+    /// The skin, which gives torques and positions their units [default: the skin in the recording]
     ///
-    /// Without one, torques are read as Q3.12, and joints as revolute.
+    /// Without a skin, torques are read as Q3.12, and joints as revolute.
     #[arg(long, value_name = "SKIN", conflicts_with = "stats")]
     skin: Option<PathBuf>,
-    /// Wait for buses that are not there yet
+    /// Wait for buses that do not exist yet
     #[arg(long)]
     wait: bool,
     #[command(flatten)]
     kinds: BusKinds,
 }
 
-/// The frame format of packets, or none in advance.
+/// Frame format of packets, or `None` if unknown in advance.
 type Packets = Option<Format>;
 
 const ANY_FORMAT: &[Word<Packets>] = &[
@@ -171,11 +171,11 @@ impl Dump {
             reader.extras().run_began().into_iter().for_each(|zero| show.count_from(zero));
             let done = captured(&mut reader, &mut show);
             if let (Ok(()), Some(absent)) = (&done, show.absent_buses()) {
-                output::note(format_args!("{title}: no frame is of {absent}"));
+                output::note(format_args!("{title}: no frame comes from {absent}"));
             }
             (input::format(&reader), Some(reader.extras().clone()), done)
         } else {
-            // Signals are caught before it reports that it listens.
+            // Catch signals before reporting that the dump listens.
             let stopped = stopped()?;
             let kinds = self.kinds.of_any()?;
             let until = self.wait.then_some(&*stopped);
@@ -187,7 +187,7 @@ impl Dump {
         let report = show.report();
         drop(show);
         if let Some(report) = report {
-            // The counts are shown whatever ended it.
+            // The counts are shown however the dump ended.
             print(&match self.json {
                 true => as_json(&title, what, &report, extras.as_ref())?,
                 false => table::text(&title, what, &report, extras.as_ref()),
@@ -196,7 +196,7 @@ impl Dump {
         done
     }
 
-    /// Whether the argument is a capture, and not a bus.
+    /// Returns true if the sources are a capture, false if they are buses.
     fn is_capture(&self) -> Result<bool, Failure> {
         let sources = &self.sources;
         let other = sources.iter().find(|source| !is_file(source));
@@ -214,7 +214,7 @@ impl Dump {
     }
 }
 
-/// The numbers as JSON.
+/// Statistics as JSON.
 fn as_json(source: &str, format: &str, report: &Report, extras: Option<&Extras>) -> Result<String, Failure> {
     #[derive(Serialize)]
     struct Whole<'a> {
@@ -272,7 +272,7 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>) -> Result<(), Fail
     if !reader.has_times() {
         show.without_times();
     }
-    // They have been named, each where it is.
+    // The missing frames have been reported at their places.
     missing.frames = 0;
     missing.tell(reader, "not shown");
     if frames == 0 && !stop::flag().load(Ordering::Relaxed) {
@@ -281,7 +281,7 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>) -> Result<(), Fail
     Ok(())
 }
 
-/// How often waiting first segments are checked for their timeout.
+/// Interval between checks of waiting first segments for their timeout.
 const SETTLE: Duration = Duration::from_millis(20);
 
 /// Shows buses until a signal, or until one is closed.
@@ -299,10 +299,10 @@ fn live(
         match received(receive_ends, show) {
             // Frames lost until then are reported all the same.
             Err(failure) => break Err(failure),
-            // A reader that has enough ends it, without an error.
+            // A reader that has read enough ends the dump without an error.
             Ok(Err(error)) => break written(Err(error)),
             Ok(Ok(true)) => {
-                // The end also comes when no more frames do.
+                // The end also comes if no further frames arrive.
                 end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
             }
             Ok(Ok(false)) => {}
@@ -320,13 +320,13 @@ fn live(
     done
 }
 
-/// Waits for frames, and shows those that have come: whether there were any, or why they cannot be written.
+/// Waits for frames and shows them. Returns true if there were any, or the error of the output.
 fn received(
     receive_ends: &mut [ReceiveEnd],
     show: &mut Show<impl Write>,
 ) -> Result<io::Result<bool>, Failure> {
     let wait = if show.is_waiting() { SETTLE } else { LOOK };
-    // A bus that is alone is waited for where it is received from: one system call instead of two.
+    // A single bus is waited for where it is received from: one system call instead of two.
     let is_alone = receive_ends.len() == 1;
     if !is_alone {
         input::wait(receive_ends, wait)?;

@@ -30,15 +30,15 @@ use super::print::{Rows, json};
 use benches::Benches;
 use folder::Folder;
 
-/// Do the paper's experiments, and draw and rate the results
+/// Repeat the paper's experiments, and draw and rate the results
 ///
-/// DIR gets report.html, each figure as SVG and its data as CSV, results.json with every finding beside the paper's and
-/// its verdict, and the recordings of the benches, when everything is measured; nothing is written when that fails or is
-/// interrupted. A folder that is not empty needs --overwrite. `skinbus experiment list` lists the experiments.
+/// Writes to DIR: report.html, each figure as SVG with its data as CSV, results.json with each finding beside the
+/// paper's and its verdict, and the recordings of the benches. Writes nothing if a measurement fails or is interrupted.
+/// A directory that is not empty needs --overwrite. `skinbus experiment list` lists the experiments.
 ///
-/// The moving arm's benches are 253 processes on an embedded bus of their own; those of scale have up to 10 000 cells, a
-/// process a bus. All of it takes about five minutes, half of that scale.
-/// Exit code 0: done, whatever the verdicts; 1: something failed, or was ended; 2: wrong use.
+/// The benches of the moving arm are 253 processes on an embedded bus of their own; those of scale have up to 10 000
+/// cells, one process per bus. All experiments take about five minutes, half of that for scale. Exit code 0: done,
+/// whatever the verdicts; 1: something failed or was ended; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus experiment list
@@ -48,12 +48,12 @@ pub(crate) struct Experiment {
     /// Experiments, or all, or list
     #[arg(value_name = "NAME", required = true)]
     names: Vec<Word>,
-    /// The folder for the results; made where there is none
+    /// Directory for the results; created if it does not exist
     #[arg(long, short, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
     overwrite: Overwrite,
-    /// Measure little: a few cells, a few seconds, to see that everything works
+    /// Measure little: a few cells for a few seconds, to see that everything works
     #[arg(long)]
     quick: bool,
     /// Show no progress and no findings
@@ -61,7 +61,7 @@ pub(crate) struct Experiment {
     quiet: bool,
 }
 
-/// What may be named.
+/// An argument: an experiment or a keyword.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Word {
     All,
@@ -94,11 +94,11 @@ impl Experiment {
         };
         let named: Vec<Named> = Named::ALL.into_iter().filter(target).collect();
         let stop = stopped()?;
-        // Before anything is measured, so that a folder that cannot be written is reported first.
+        // Created before any measurement, so that an error of the directory is reported first.
         let folder = Folder::create(output, self.overwrite)?;
         let page = self.perform(&named, &folder, stop)?;
         keep(&page, &folder)?;
-        // What was measured stays when it cannot be drawn.
+        // The measured data stays if it cannot be drawn.
         draw(&page, folder).map_err(|failure| {
             failure.and(format_args!(
                 "{} has the results, the data of the figures and the recordings",
@@ -127,7 +127,7 @@ impl Experiment {
 
     fn page(&self, sections: Vec<Section>, idle: Option<String>) -> Page {
         let words = std::env::args_os().enumerate().map(|(place, word)| {
-            // Without the folder of the program.
+            // Without the directory of the program.
             let name = Path::new(&word).file_name().filter(|_| place == 0);
             quoted_os(name.unwrap_or(&word))
         });
@@ -154,11 +154,11 @@ impl Experiment {
     }
 }
 
-/// This machine.
+/// The laboratory on this machine.
 struct Here {
     benches: Benches,
     stop: Arc<AtomicBool>,
-    /// How late the machine woke an idle thread before a bench.
+    /// Wake-up lateness of the idle machine before a bench.
     idle: Option<String>,
 }
 
@@ -171,7 +171,7 @@ impl Lab for Here {
 
     fn bench(&mut self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
         let run = self.benches.run(reply, effort);
-        // Its own end by the same signal is no failure of the bench.
+        // A bench that the same signal has ended did not fail.
         self.go_on()?;
         let run = run?;
         let late = |key: &str| run.figure(&["loop", "idle_late_us", key]);
@@ -195,7 +195,7 @@ impl Lab for Here {
     }
 }
 
-/// The processor and the kernel, in a line.
+/// Processor and kernel in one line.
 fn machine() -> String {
     let about = facts::machine(&Quantiles::default());
     let fact = |key: &str| about.get(key).cloned().unwrap_or_default();
@@ -216,7 +216,7 @@ fn list() -> Result<(), Failure> {
     print(&Named::ALL.into_iter().map(line).collect::<String>())
 }
 
-/// Writes the findings and the data of the figures, and gives them and the recordings their names.
+/// Writes the findings and the data of the figures, and publishes them with the recordings.
 fn keep(page: &Page, folder: &Folder) -> Result<(), Failure> {
     folder.write("results.json", &json(&files::results(page))?)?;
     for figure in page.sections.iter().flat_map(|section| &section.figures) {
@@ -234,7 +234,7 @@ fn draw(page: &Page, folder: Folder) -> Result<(), Failure> {
     folder.finish()
 }
 
-/// Prints every finding, and where the page is.
+/// Prints the findings and the path of the page.
 fn tell(page: &Page, report: &Path) -> Result<(), Failure> {
     let mut rows = Rows::new("", "here", "paper, bar");
     for section in &page.sections {
@@ -259,7 +259,7 @@ fn tell(page: &Page, report: &Path) -> Result<(), Failure> {
     print(&format!("{}{worse}{}\n", rows.text(), report.display()))
 }
 
-/// A bar on a terminal, a line for each experiment elsewhere.
+/// A progress bar on a terminal; elsewhere one line per experiment.
 struct Progress {
     bar: ProgressBar,
     lines: bool,

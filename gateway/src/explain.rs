@@ -21,14 +21,14 @@ use super::print::json;
 
 /// Explain the torque of one epoch, or compute that of a force on a cell
 ///
-/// Reads a capture up to the joints of that epoch and shows each cell's contact state, the force that it computes from
-/// it, the Jacobian, their product in double precision, the nearest step of 2^-12 Nm, and the word that the cell sent;
-/// and what all of them add up to, beside the central computation. What the capture does not contain is listed.
+/// Reads a capture up to the joints of that epoch. Shows each cell's contact state, the force that it computes, the
+/// Jacobian, their product in double precision, the nearest step of 2^-12 Nm, and the word that the cell sent; then the
+/// totals beside the central computation. Lists information that the capture does not contain.
 ///
-/// With --force or --batch it computes instead, for a skin or the one in a recording, the torques of a force on a cell: the
-/// central ones in double precision with the numbers of the skin's file, and the cell's with the code that a cell runs, on
-/// the words of its parameters and of the joints' positions. Positions of sliding joints are within their limits, angles
-/// within a turn each way or their limits, if those are wider.
+/// With --force or --batch, computes the torques of a force on a cell instead, for a skin or the skin in a recording:
+/// the central ones in double precision from the numbers of the skin's file, and the cell's with the code of a cell,
+/// from the words of its parameters and of the joints' positions. Positions of prismatic joints must be within their
+/// limits; angles within one turn each way, or within wider limits.
 #[derive(Args, Debug)]
 #[command(after_help = "ROWS.csv has a line for each row, positions with spaces between them:
   cell,force_n,q
@@ -42,36 +42,36 @@ Examples:
   skinbus explain skin.toml --cell 12 --force 2.5 --joints \"0 -1.2 1.0 -1.4 -1.57 0\"
   skinbus explain skin.toml --batch rows.csv --json > torques.jsonl")]
 pub(crate) struct Explain {
-    /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input. With --force or
-    /// --batch a skin's description, or a recording
+    /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input. With --force
+    /// or --batch: a skin or a recording
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// The number of the joints, modulo 256
+    /// Epoch of the joints: their number modulo 256
     #[arg(long, value_name = "E", required_unless_present_any = ["force", "batch"])]
     epoch: Option<u8>,
-    /// Only joints from this second of the run on, or after the first frame where there is no run
+    /// Only joints from this second of the run on; counted from the first frame if there is no run
     #[arg(long, value_name = "S", value_parser = nanos, default_value = "0", conflicts_with_all = ["force", "batch"])]
     at: u64,
-    /// Which joints of this epoch, when there are several
+    /// Use the Nth joints of this epoch, if there are several
     #[arg(long, value_name = "K", default_value_t = 1, conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u32).range(1..))]
     occurrence: u32,
-    /// One cell in every step
+    /// Show all steps of one cell
     #[arg(long, value_name = "[BUS:]NODE")]
     cell: Option<CellName>,
-    /// One joint, cell by cell
+    /// Show one joint, cell by cell
     #[arg(long, value_name = "J", conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u8).range(1..=32))]
     joint: Option<u8>,
     #[command(flatten)]
     given: torque::Given,
-    /// The skin's description; else the one in the recording
+    /// The skin [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// One JSON object; with --batch, one a row
+    /// Print one JSON object; with --batch, one per row
     #[arg(long, short)]
     json: bool,
 }
 
-/// What is printed as JSON.
+/// The printed JSON object.
 #[derive(Serialize)]
 struct Whole<'a> {
     source: String,
@@ -115,7 +115,7 @@ impl Explain {
             return Err(no_frame(&reader));
         }
         let moments = found.moments.map_err(|error| Failure::run(format!("{name}: {error}")))?;
-        // Where another skin is an error, that says all.
+        // If a different skin caused an error, that error has been reported.
         if let Some(path) = &self.skin {
             remark_another(&self.files, path, &skin);
         }
@@ -144,7 +144,7 @@ impl Explain {
         print(&show::text(&name, epoch, (found.zero_ns, found.is_of_run), &explanation, what))
     }
 
-    /// The cell and the joint must be the skin's.
+    /// Checks that the skin has the cell and the joint.
     fn check(&self, skin: &Skin) -> Result<(), Failure> {
         let joints = skin.robot.joints.len();
         if let Some(joint) = self.joint.filter(|joint| usize::from(*joint) > joints) {

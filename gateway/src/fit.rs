@@ -19,14 +19,14 @@ use super::print::list;
 
 /// Compute whether a skin, or the traffic of a capture or a live bus, fits on real buses
 ///
-/// Of a skin the worst case: load, time from joints to the last answer, cells and buses, with all frames as long as bit
-/// stuffing can make them, all cells answering, and no errors. Heartbeats count; commands and what only a bench sends do
-/// not. Default rates: those of the description where it has them for every bus, else a table over common ones.
+/// For a skin, computes the worst case: load, time from joints to the last answer, cells and buses, with the longest
+/// frames that bit stuffing allows, all cells answering, and no errors. Heartbeats count; commands and bench-only
+/// frames do not. Default bit rates: those of the skin if it has them for all buses, else a table over common ones.
 ///
-/// Of a capture (a candump log or an MCAP recording, of any CAN bus), or of live buses until Ctrl-C, what became of each
-/// frame on a bus with bit rates: exact stuff bits, arbitration by identifier, no frame interrupted. A frame's time stamp
-/// counts as the time at which it was to be sent. Bench-only frames are left out, start-up is reported separately, and the
-/// worst case is added when the skin is known. docs/how-to/size-a-bus.md explains both.
+/// For a capture (a candump log or an MCAP recording, of any CAN bus), or for live buses until Ctrl-C, computes the
+/// outcome for each frame on a bus with bit rates: exact stuff bits, arbitration by identifier, no frame interrupted. A
+/// frame's time stamp counts as the time of the request to send it. Leaves out bench-only frames, reports start-up
+/// separately, and adds the worst case when the skin is known. docs/how-to/size-a-bus.md explains both.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus fit gateway/examples/ur5-253.toml
@@ -37,49 +37,49 @@ use super::print::list;
   skinbus fit run.log --skin skin.toml --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
   skinbus fit vcan0 vcan1 --duration 10")]
 pub(crate) struct Fit {
-    /// A skin's description; a candump log or MCAP recording, all parts of a split recording in any order; or buses; - for
-    /// standard input, which is traffic unless an option is for a skin
+    /// A skin; a candump log or MCAP recording, all parts of a split recording in any order; or buses. - for standard
+    /// input, which is traffic unless an option is for a skin
     #[arg(value_name = "SKIN|FILE|BUS", required = true)]
     sources: Vec<PathBuf>,
-    /// The bit rate of identifiers, and of all of classic frames: bit/s, as 1000000, 500k or 1M
+    /// Bit rate of identifiers, and of classic frames as a whole, in bit/s: 1000000, 500k or 1M
     #[arg(long, value_name = "RATE", value_parser = bit_rate)]
     nominal: Option<u32>,
-    /// The bit rate of the data of CAN FD frames that switch
+    /// Bit rate of the data of CAN FD frames that switch rates
     #[arg(long, value_name = "RATE", value_parser = bit_rate)]
     data: Option<u32>,
-    /// A skin: a table over common bit rates, whatever the description has
+    /// For a skin: a table over common bit rates, whatever rates the skin has
     #[arg(long, conflicts_with = "nominal")]
     table: bool,
-    /// A skin: the frame format of packets on all buses, whatever the description has
+    /// For a skin: frame format of packets on all buses, whatever format the skin has
     #[arg(long, value_parser = one_of(FORMATS))]
     format: Option<Format>,
-    /// A skin: the longest that a cell takes from joints to its answer, in µs [the paper's cell: 68.5]
+    /// For a skin: longest time of a cell from joints to its answer, in µs [the paper's cell: 68.5]
     #[arg(long, value_name = "US", value_parser = computation)]
     computation: Option<u64>,
-    /// Traffic: other bit rates of one bus, as often as there are buses: can0=500k/2M, can1=1M
+    /// For traffic: bit rates of one bus; repeat the option for further buses: can0=500k/2M, can1=1M
     #[arg(long, value_name = "BUS=RATES", value_parser = rates_of_bus)]
     rates: Vec<(String, BitRates)>,
-    /// Traffic: the skin's description, for bit rates and the worst case; else the one attached to the recording
+    /// For traffic: the skin, for bit rates and the worst case [default: the skin attached to the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Traffic: count bench-only frames too: stimuli, sync and report with their answers, simulated wires
+    /// For traffic: also count bench-only frames: stimuli, sync and report with their answers, simulated wires
     #[arg(long)]
     bench_traffic: bool,
-    /// Traffic: the share of bits that arrive damaged, 0 to 0.01 [default: 0]: each costs an error frame, and its frame is
-    /// sent again
+    /// For traffic: share of bits that arrive damaged, 0 to 0.01 [default: 0]. Each costs an error frame, and its frame
+    /// is sent again
     #[arg(long, value_name = "SHARE", allow_negative_numbers = true)]
     ber: Option<f64>,
-    /// Traffic: what damaged bits are drawn from [default: 1]: the same seed, the same bits
+    /// For traffic: seed of the damaged bits [default: 1]
     #[arg(long, value_name = "N", requires = "ber")]
     seed: Option<u64>,
-    /// Live buses: end after this time
+    /// For live buses: end after this time
     #[arg(long, value_name = "TIME", value_parser = seconds, allow_negative_numbers = true)]
     duration: Option<f64>,
-    /// One JSON object; of traffic one a frame instead of tables, in the order of the file
+    /// Print one JSON object; for traffic, one per frame instead of tables, in the order of the file
     ///
-    /// Keys of a frame: time, start_s, end_s (s on the clock of the capture), bus, id (as candump prints it), nominal_bits and
-    /// data_bits (stuff bits and intermission included). What is left out has null bits and null times; what never went out
-    /// has null times.
+    /// Keys of a frame: time, start_s, end_s (s on the clock of the capture), bus, id (as candump prints it),
+    /// nominal_bits and data_bits (including stuff bits and intermission). Frames left out have null bits and null
+    /// times; frames that were never sent have null times.
     #[arg(long, short)]
     json: bool,
     #[command(flatten)]
@@ -109,7 +109,7 @@ impl Fit {
         self.of_skin(&skin)
     }
 
-    /// The file of the skin, if that is what was named.
+    /// File of the skin, if the sources name one.
     fn skin_file(&self) -> Result<Option<&Path>, Failure> {
         let [source] = self.sources.as_slice() else { return Ok(None) };
         let is_text = source.extension().is_some_and(|end| end == "toml");
@@ -123,14 +123,17 @@ impl Fit {
         match given {
             Some(option) if !is_skin => {
                 let names = list(self.sources.iter().map(|source| source.display()));
-                Err(Failure::usage(format!("{option} is for a skin, and {names} is none: leave it out")))
+                Err(Failure::usage(format!(
+                    "{option} is for a skin, and {names} is not a skin: leave it out"
+                )))
             }
             _ => Ok(is_skin.then_some(source)),
         }
     }
 }
 
-/// Returns whether a file is a capture, or is none of its kind to be read as a skin either. What can be read only once is.
+/// Returns true for a capture. Files that cannot be identified, and those that can be read only once, count as
+/// captures.
 fn is_capture(file: &Path) -> bool {
     if !can_be_read_again(file) {
         return true;
@@ -148,7 +151,7 @@ fn rates_of_bus(text: &str) -> Result<(String, BitRates), String> {
     Ok((bus.to_owned(), rates))
 }
 
-/// µs, with up to three decimals, as ns.
+/// Parses µs with up to three decimals, and returns ns.
 fn computation(text: &str) -> Result<u64, String> {
     let allowed = "0 to 65000 µs";
     let us: f64 = text.parse().map_err(|_| format!("not a number; allowed is {allowed}"))?;

@@ -1,5 +1,5 @@
-//! Former names of commands and options: refused in a line that names the present one. They are in no help, completion or man
-//! page.
+//! Former names of commands and options: refused with a line that gives the present name. They appear in no help,
+//! completion or man page.
 
 /// The line for a former command; `words` are the command line.
 pub(crate) fn command(words: &[String], name: &str) -> Option<String> {

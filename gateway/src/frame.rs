@@ -1,4 +1,4 @@
-//! `skinbus frame`: packets by hand.
+//! Single packets: `skinbus frame`.
 
 mod addressee;
 mod packets;
@@ -27,14 +27,14 @@ use super::print::list;
 use addressee::only_cell;
 use packets::What;
 
-/// Cells that are there send a heartbeat within this time, and answers.
+/// Time within which present cells send a heartbeat, and answers.
 const ANSWER: Duration = Duration::from_secs(1);
 
 /// Print a frame for cansend, with the right CRC; or send it
 ///
-/// Prints one line for a CAN FD bus, two for a classic one. With --bus, --skin or a bus in --cell it is sent instead, also on an
-/// embedded bus, to which cansend cannot attach. Then what a configure asks for is waited for and printed, and exit code 1 says that no
-/// cell for which a stimulus or a configure is meant was heard, or that one refused.
+/// Prints one line for a CAN FD bus, two for a classic one. With --bus, --skin or a bus in --cell, sends the frame
+/// instead, also on an embedded bus, which cansend cannot use. Then waits for the answers to a configure and prints
+/// them. Exit code 1: no addressed cell of a stimulus or configure is on the bus, or a cell refused.
 #[derive(Args, Debug)]
 #[command(mut_args(|arg| arg.global(true)), after_help = "Examples, of which the first three press cell 12 with 3 N from the next joints on:
   cansend vcan0 $(skinbus frame configure --cell 12 --write mode 1)
@@ -45,13 +45,13 @@ const ANSWER: Duration = Duration::from_secs(1);
 pub(crate) struct Frame {
     #[command(subcommand)]
     what: What,
-    /// The frame format of the packet; with --skin that of each bus, else fd
+    /// Frame format of the packet [default: with --skin the format of each bus, else fd]
     #[arg(long, value_parser = one_of(FORMATS))]
     format: Option<Format>,
-    /// Send it on these buses instead of printing it
+    /// Send the frame on these buses instead of printing it
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     bus: Vec<String>,
-    /// Send it on all buses of this skin, or on those of them that --bus names
+    /// Send the frame on all buses of this skin, or on those that --bus names
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     #[command(flatten)]
@@ -65,7 +65,7 @@ impl Frame {
         if targets.is_empty() {
             return print(&text(&message, self.format.unwrap_or(Format::Fd)));
         }
-        // All are opened before anything is sent.
+        // All buses are opened before anything is sent.
         let open = |(name, format): &(String, Format)| {
             self.open(name, kinds.of(name), *format).map_err(Failure::usage)
         };
@@ -77,7 +77,7 @@ impl Frame {
         failures.next().map_or(Ok(()), |first| Err(failures.fold(first, Failure::and)))
     }
 
-    /// The buses on which it is sent, with their formats, and their kinds; none prints it.
+    /// Buses on which the frame is sent, with their formats, and their kinds; without buses it is printed.
     fn targets(&self) -> Result<(Vec<(String, Format)>, Kinds), Failure> {
         let format = |of_skin: Format| self.format.unwrap_or(of_skin);
         let to = self.what.to();
@@ -87,7 +87,7 @@ impl Frame {
                 let skin = Skin::read(path).map_err(Failure::usage)?;
                 let file = path.display().to_string();
                 self.bus.iter().chain(of_cell).try_for_each(|name| bus_of(&skin, &file, name).map(drop))?;
-                // A node id of several buses is of several cells.
+                // A node id on several buses belongs to several cells.
                 let only = match to.filter(|_| self.bus.is_empty() && of_cell.is_none()).and_then(only_cell) {
                     Some(node) => {
                         let index = cell_of(&skin, &CellName { bus: None, node }, "--cell")?;
@@ -118,10 +118,10 @@ impl Frame {
         Ok((targets, kinds))
     }
 
-    /// Opens a bus to send on it; what cells answer is received where it is waited for.
+    /// Opens a bus for sending, and for receiving if answers are awaited.
     fn open(&self, name: &str, kind: Choice, format: Format) -> Result<Bus, BusError> {
         match self.what.to() {
-            // A send-only socket cannot tell whether a cell is there.
+            // A send-only socket cannot tell whether a cell is present.
             Some(_) => switching::open(name, kind, format),
             None => {
                 let nothing = Options { filters: Vec::new(), ..Options::default() };
@@ -130,7 +130,7 @@ impl Frame {
         }
     }
 
-    /// Sends it on a bus, and waits for what it makes cells answer.
+    /// Sends the frame on a bus, and waits for the cells' answers.
     fn send(&self, bus: Bus, format: Format, message: &Message) -> Result<(), Failure> {
         let (name, only) = (bus.name().to_owned(), self.what.to().and_then(only_cell));
         if let What::Sensing(switch) = &self.what {
@@ -150,7 +150,7 @@ impl Frame {
     }
 }
 
-/// Waits until nothing more is to come; how many cells everyone is shows in the time alone.
+/// Waits for answers. Only the time limit ends the wait for all cells, whose number is unknown.
 fn wait(mut listener: Listener, only: Option<CellId>, tag: Option<u8>) -> Result<Answers, BusError> {
     let mut answers = Answers::new(only, tag);
     let are_complete = |answers: &Answers| match (only, tag) {
@@ -165,7 +165,7 @@ fn wait(mut listener: Listener, only: Option<CellId>, tag: Option<u8>) -> Result
     Ok(answers)
 }
 
-/// Prints the values that cells answered; an error if one refused, or none is there or answered.
+/// Prints the values that cells answered. Returns an error if a cell refused, or none is present or answered.
 fn verdict(
     answers: &Answers,
     only: Option<CellId>,
@@ -190,7 +190,7 @@ fn verdict(
     }
     if answers.present().is_empty() {
         return Err(Failure::run(format!(
-            "no {who} was heard on {bus} for {waited} s: `skinbus cells {bus}` lists who is there; the bus' format \
+            "no {who} sent anything on {bus} for {waited} s: `skinbus cells {bus}` lists the cells; the format of the bus \
              may be --format {other}"
         )));
     }
@@ -201,11 +201,11 @@ fn verdict(
     Ok(())
 }
 
-/// The lines for cansend.
+/// Lines for cansend.
 fn text(message: &Message, format: Format) -> String {
     let mut text = String::new();
     for frame in message.encode().frames(format) {
-        // cansend needs only the flag of the bit-rate switch: `##1`, as the document has it.
+        // cansend needs only the flag of the bit-rate switch: `##1`, as documented.
         let flags = frame.flags() & BIT_RATE_SWITCH;
         let frame = CanFrame::with_data(frame.id(), format, flags, frame.data()).unwrap_or(frame);
         writeln!(text, "{frame}").expect("a string takes whatever is written");

@@ -1,10 +1,10 @@
-//! The commands in groups, as the help lists them.
+//! Groups of the commands in the help.
 
 use std::fmt::Write;
 
 use clap::Command;
 
-/// The groups, and their commands in order.
+/// The groups with their commands in order.
 const GROUPS: [(&str, &[&str]); 7] = [
     ("Run", &["demo", "run", "view"]),
     ("Look", &["dump", "explain", "report", "cells", "compare"]),
@@ -15,16 +15,16 @@ const GROUPS: [(&str, &[&str]); 7] = [
     ("Shell", &["completions", "man"]),
 ];
 
-/// The rest of the help.
+/// End of the help.
 const AFTER: &str =
     "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
-`skinbus COMMAND -h` has the options of a command, `--help` explains them.
+`skinbus COMMAND -h` lists the options of a command, `--help` explains them.
 
 Examples:
   skinbus demo
   skinbus run skin.toml --scenario scenario.toml --record run.mcap";
 
-/// The program with its commands in groups instead of one list.
+/// Replaces the list of commands in the help by groups.
 pub(crate) fn grouped(program: Command) -> Command {
     let help = format!(
         "{{about-with-newline}}\n{{usage-heading}} {{usage}}\n{}\nOptions:\n{{options}}\n\n{AFTER}\n",
@@ -45,7 +45,7 @@ fn list(program: &Command) -> String {
     text
 }
 
-/// The refusal of a name that is no command: the one that was perhaps meant, else all of them.
+/// Error for an unknown command: suggests a similar name, or lists all.
 pub(crate) fn unknown(program: &Command, name: &str) -> String {
     let names: Vec<_> = program.get_subcommands().map(Command::get_name).collect();
     let likely = names.iter().map(|it| (strsim::jaro_winkler(name, it), it));
@@ -70,13 +70,13 @@ mod tests {
         program
     }
 
-    /// A command and those below it.
+    /// Collects a command and its subcommands.
     fn all<'a>(command: &'a Command, found: &mut Vec<&'a Command>) {
         found.push(command);
         command.get_subcommands().for_each(|it| all(it, found));
     }
 
-    /// The visible options of a command, without help and version.
+    /// Visible options of a command, without help and version.
     fn options(command: &Command) -> impl Iterator<Item = &Arg> {
         let is_own = |arg: &&Arg| !matches!(arg.get_id().as_str(), "help" | "version");
         command.get_arguments().filter(is_own).filter(|arg| !arg.is_hide_set() && !arg.is_positional())
@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn there_are_at_most_210_options() {
-        // Not built: options for all commands below one stand once, where they are defined.
+        // The program is not built: global options count once, where they are defined.
         let program = crate::Arguments::command();
         let mut commands = Vec::new();
         all(&program, &mut commands);
@@ -119,7 +119,7 @@ mod tests {
             let names = arg.get_value_names().unwrap_or_default();
             let takes =
                 if arg.get_action().takes_values() { crate::print::words(names) } else { String::new() };
-            // A path is one, whatever it leads to.
+            // FILE and DIR both name a path.
             let takes = if takes == "DIR" { "FILE".to_owned() } else { takes };
             meanings.entry(long.clone()).or_default().insert(takes);
             if let Some(short) = arg.get_short() {
@@ -130,7 +130,7 @@ mod tests {
         assert_eq!(several, Vec::<(&String, &BTreeSet<String>)>::new());
         let several: Vec<_> = shorts.iter().filter(|(_, longs)| longs.len() > 1).collect();
         assert_eq!(several, Vec::<(&char, &BTreeSet<String>)>::new());
-        // In other words than `FILE`, what is overwritten and what a force is.
+        // Two options with other values than `FILE`: --overwrite has none, --force is in newtons.
         assert_eq!(meanings["overwrite"], BTreeSet::from([String::new()]));
         assert_eq!(meanings["force"], BTreeSet::from(["N".to_owned()]));
     }

@@ -24,28 +24,28 @@ use trace::capture::{CaptureError, DESCRIPTION, Format, Note, NoteKind, ORIGIN, 
 use super::output;
 use super::print::{count, some};
 
-/// How often a bus that is waited for is looked for.
+/// Interval between attempts to open an awaited bus.
 const AGAIN: Duration = Duration::from_millis(20);
 
-/// How long a signal to end may wait, when nothing comes.
+/// Maximum delay of a signal while no frame arrives.
 pub(crate) const LOOK: Duration = Duration::from_millis(200);
 
-/// A flag that SIGINT and SIGTERM set.
+/// Catches SIGINT and SIGTERM, and returns the flag that they set.
 pub(crate) fn stopped() -> Result<Arc<AtomicBool>, Failure> {
     caught(&[SIGINT, SIGTERM]).map_err(Failure::run)
 }
 
-/// Whether it is the name of a capture, and not of a bus.
+/// Returns true for the name of a capture, false for that of a bus.
 pub(crate) fn is_file(source: &Path) -> bool {
     is_standard_input(source) || source.exists()
 }
 
-/// Returns true for a name that is a file's by its look: it has a folder or an extension, as no bus has.
+/// Returns true if the name looks like a file's: it has a directory or an extension, which buses never have.
 pub(crate) fn is_path(name: &Path) -> bool {
     name.components().count() > 1 || name.extension().is_some()
 }
 
-/// What is neither a file nor a bus that opens.
+/// The error for a source that is neither a file nor an openable bus.
 pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
     let is_absent = matches!(
         error,
@@ -57,14 +57,13 @@ pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
     );
     if is_path(Path::new(name)) && is_absent {
         return Failure::usage(format!(
-            "there is no file {name}, and no bus of that name: say where the file is"
+            "there is no file {name}, and no bus of that name: name the path of the file"
         ));
     }
     Failure::usage(format!("there is no file {name}, and as a bus: {error}"))
 }
 
-/// The skin that is named, else the one that a recording has with it. That the named one is another than the recording's is
-/// remarked.
+/// Returns the named skin, or else that of a recording. Prints a note if the named skin differs from the recording's.
 pub(crate) fn skin_for(files: &[PathBuf], named: Option<&Path>) -> Result<Skin, Failure> {
     let Some(path) = named else { return skin_of(files) };
     let skin = Skin::read(path).map_err(Failure::usage)?;
@@ -72,7 +71,7 @@ pub(crate) fn skin_for(files: &[PathBuf], named: Option<&Path>) -> Result<Skin, 
     Ok(skin)
 }
 
-/// Remarks that a skin is another than the one that a recording has with it, if that is found at its beginning.
+/// Prints a note if a skin differs from the one at the beginning of a recording.
 pub(crate) fn remark_another(files: &[PathBuf], path: &Path, skin: &Skin) {
     if !files.iter().all(|file| can_be_read_again(file)) {
         return;
@@ -87,7 +86,7 @@ pub(crate) fn remark_another(files: &[PathBuf], path: &Path, skin: &Skin) {
     }
 }
 
-/// The first thing in which two skins differ, and what each has.
+/// First difference between two skins, with the value of each.
 pub(crate) fn difference(one: &Skin, other: &Skin) -> Option<(String, String, String)> {
     let buses = |skin: &Skin| skin.buses.iter().map(|bus| bus.name.clone()).collect::<Vec<_>>().join(", ");
     let joints = |skin: &Skin| skin.robot.joints.len().to_string();
@@ -113,9 +112,9 @@ pub(crate) fn difference(one: &Skin, other: &Skin) -> Option<(String, String, St
     ))
 }
 
-/// The skin in a file, which is its own or a recording that has it with it.
+/// Reads the skin in a file, which is a skin or a recording with a skin.
 pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
-    // What is no capture either says so as a skin.
+    // The error for a file that is neither comes from reading it as a skin.
     let is_recording =
         can_be_read_again(file) && Reader::open(file).is_ok_and(|it| it.format() == Format::Mcap);
     if !is_recording {
@@ -124,12 +123,12 @@ pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
     attached(&[file.to_owned()], "name the skin's own file", || Ok(()))
 }
 
-/// Reads a skin's own file. The error for another text says what that is as a capture.
+/// Reads a skin file. The error for other text identifies it as a capture if possible.
 pub(crate) fn read_skin(file: &Path) -> Result<Skin, Failure> {
     Skin::read(file).map_err(|error| as_capture(file).unwrap_or_else(|| Failure::usage(error)))
 }
 
-/// The error for a capture or another text in the place of a skin; `None` for a description, by its name or by what is in it.
+/// The error for a capture or other text in place of a skin, or `None` for a skin, by its name or content.
 fn as_capture(file: &Path) -> Option<Failure> {
     if file.extension().is_some_and(|end| end == "toml") || !can_be_read_again(file) {
         return None;
@@ -149,7 +148,7 @@ fn as_capture(file: &Path) -> Option<Failure> {
     })
 }
 
-/// The skin that a recording has with it.
+/// Returns the skin attached to a recording.
 pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
     if files.iter().any(|file| is_standard_input(file)) {
         return Err(Failure::usage("standard input is read once: name the skin with --skin"));
@@ -158,17 +157,17 @@ pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
         files.iter().find(|file| file.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
     {
         return Err(Failure::usage(format!(
-            "{} is no regular file and is read once: name the skin with --skin",
+            "{} is not a regular file and can be read only once: name the skin with --skin",
             pipe.display()
         )));
     }
     attached(files, "name one with --skin", || needs_frames(files))
 }
 
-/// The skin that a recording has with it; `check` comes before the error for one without.
+/// Returns the skin attached to a recording; `check` runs before the error for a recording without one.
 fn attached(files: &[PathBuf], hint: &str, check: impl Fn() -> Result<(), Failure>) -> Result<Skin, Failure> {
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
-    // It may stand behind the frames.
+    // The attachment may follow the frames.
     while reader.format() == Format::Mcap
         && reader.extras().skin().is_none()
         && reader.next().map_err(Failure::run)?.is_some()
@@ -192,14 +191,14 @@ pub(crate) fn needs_frames(files: &[PathBuf]) -> Result<(), Failure> {
     if reader.has_frame().map_err(Failure::run)? { Ok(()) } else { Err(no_frame(&reader)) }
 }
 
-/// The skin that a reader has found so far; without one that can be read, `instead` is said.
+/// Returns the skin that a reader has found so far. If it is unreadable, prints a note that ends with `instead`.
 pub(crate) fn skin_beside(reader: &Reader, instead: &str) -> Option<Skin> {
     let name = reader.name();
     let skin = reader.extras().skin()?;
     skin.inspect_err(|error| output::note(format_args!("{name}, {error}; {instead}"))).ok()
 }
 
-/// What a capture is written in.
+/// Format of a capture.
 pub(crate) fn format(reader: &Reader) -> &'static str {
     match reader.format() {
         Format::Candump => "candump log",
@@ -207,7 +206,7 @@ pub(crate) fn format(reader: &Reader) -> &'static str {
     }
 }
 
-/// Where an entry stands: in a capture, and in a line of it if it has lines.
+/// Location of an entry: the capture, and the line if it has lines.
 pub(crate) fn place(name: &str, line: u64) -> String {
     if line > 0 { format!("{name}:{line}") } else { name.to_owned() }
 }
@@ -221,7 +220,7 @@ pub(crate) fn no_frame(reader: &Reader) -> Failure {
     let what = match (reader.format(), reader.lines()) {
         (Format::Candump, 0) => "it is empty: there is no frame in it".to_owned(),
         (Format::Candump, lines) => format!(
-            "there is no frame in {}; what candump prints or logs is read: lines like \
+            "there is no frame in {}; the output of candump is expected: lines like \
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
             count(lines, "line")
         ),
@@ -233,7 +232,7 @@ pub(crate) fn no_frame(reader: &Reader) -> Failure {
     Failure::run(format!("{name}: {what}"))
 }
 
-/// What is in a recording beside frames and notes.
+/// Contents of a recording besides frames and notes.
 pub(crate) fn others(reader: &Reader) -> String {
     let extras = reader.extras();
     let topics = extras.topics.iter().filter(|topic| topic.messages > 0);
@@ -244,21 +243,21 @@ pub(crate) fn others(reader: &Reader) -> String {
     some(&topics.chain(attached).chain(facts).collect::<Vec<_>>())
 }
 
-/// What a capture lacks.
+/// Counts of what a capture lacks.
 #[derive(Debug, Default)]
 pub(crate) struct Missing {
-    /// Lines that cannot be read.
+    /// Number of unreadable lines.
     pub(crate) lines: u64,
-    /// Messages that cannot be read.
+    /// Number of unreadable messages.
     messages: u64,
-    /// Frames that the recorder lost.
+    /// Number of frames that the recorder lost.
     pub(crate) frames: u64,
-    /// CAN XL frames.
+    /// Number of CAN XL frames.
     can_xl: u64,
 }
 
 impl Missing {
-    /// Counts an entry that is no frame.
+    /// Counts an entry other than a frame.
     pub(crate) fn take(&mut self, note: &Note<'_>) {
         match note.kind {
             NoteKind::Text => {}
@@ -269,15 +268,15 @@ impl Missing {
         }
     }
 
-    /// Lines and messages that cannot be read.
+    /// Number of unreadable lines and messages.
     pub(crate) const fn unreadable(&self) -> u64 {
         self.lines + self.messages
     }
 
-    /// Reports it at the end; also what has become of CAN XL frames.
+    /// Prints the counts at the end; `can_xl` names the handling of CAN XL frames.
     pub(crate) fn tell(&self, reader: &Reader, can_xl: &str) {
         let name = reader.name();
-        // Of a recording they are notes.
+        // In a recording, the lines are notes.
         let unread = match reader.lines() {
             0 => format!("{} of a log could not be read", count(self.lines, "line")),
             lines => format!("{} of {lines} lines could not be read", self.lines),
@@ -298,15 +297,14 @@ impl Missing {
     }
 }
 
-/// A live bus. That it is down is reported once, until it works again.
+/// A live bus. Its loss is reported once, until it works again.
 #[derive(Debug)]
 pub(crate) struct ReceiveEnd {
     bus: Bus,
     follower: Follower,
 }
 
-/// Opens each of several buses, as [`ReceiveEnd::open`] does; with a flag those that are not there are waited for until it
-/// is set.
+/// Opens buses as [`ReceiveEnd::open`] does. With a flag, waits for absent buses until it is set.
 pub(crate) fn receive_ends(
     sources: &[PathBuf],
     kinds: &Kinds,
@@ -330,7 +328,7 @@ pub(crate) fn receive_ends(
 }
 
 impl ReceiveEnd {
-    /// Opens a bus to receive all of it, and reports its kind; with `None` a classic interface too.
+    /// Opens a bus to receive all its frames, and prints its kind; without a format also a classic interface.
     fn open(
         name: &str,
         kind: Choice,
@@ -342,10 +340,10 @@ impl ReceiveEnd {
         Ok(Self { bus, follower: Follower::default() })
     }
 
-    /// Receives what is there or comes within this time; returns whether there is anything.
+    /// Receives the frames that are waiting or arrive within `wait`. Returns true if there are any.
     ///
     /// # Errors
-    /// When the bus is gone.
+    /// Returns [`BusError`] if the bus is gone.
     pub(crate) fn hear(&mut self, wait: Duration) -> Result<bool, BusError> {
         match self.follower.step(&mut Once(&self.bus), wait) {
             Step::Frames(_) | Step::Leftover(_) => Ok(true),
@@ -358,7 +356,7 @@ impl ReceiveEnd {
         }
     }
 
-    /// The frames that were received last.
+    /// The frames received last.
     pub(crate) fn frames(&self) -> impl Iterator<Item = Received> + '_ {
         self.follower.frames()
     }
@@ -367,7 +365,8 @@ impl ReceiveEnd {
         &self.bus
     }
 
-    /// Reports at the end how many frames are missing because they came faster than they were processed.
+    /// Prints and returns the number of frames lost because they arrived faster than they were processed; `done` names
+    /// the processing.
     pub(crate) fn missing(&self, done: &str) -> u64 {
         let (name, missing) = (self.bus().name(), self.follower.dropped());
         if missing > 0 {
@@ -379,7 +378,7 @@ impl ReceiveEnd {
     }
 }
 
-/// Waits until a frame comes on one of these buses, at most so long.
+/// Waits until a frame arrives on one of these buses, at most for `timeout`.
 pub(crate) fn wait(receive_ends: &[ReceiveEnd], timeout: Duration) -> Result<(), Failure> {
     let mut fds: Vec<_> =
         receive_ends.iter().map(|receive_end| PollFd::new(receive_end.bus(), PollFlags::IN)).collect();
@@ -389,22 +388,22 @@ pub(crate) fn wait(receive_ends: &[ReceiveEnd], timeout: Duration) -> Result<(),
     }
 }
 
-/// Opens a capture, standard input or the parts of a recording, so that a signal can stop its reader. Signals are caught
-/// from when a file is open: one that ends the program while it waits for a pipe's other end has nothing to put in order.
+/// Opens a capture, standard input or the parts of a recording, so that a signal can stop its reader. Signals are
+/// caught only once a file is open: a program that waits for the other end of a pipe has nothing to clean up.
 pub(crate) fn captures(
     sources: &[PathBuf],
     through: impl Fn(Interruptible) -> Box<dyn Read + Send> + Send + 'static,
 ) -> Result<Reader, Failure> {
     let flag = OnceLock::new();
     let interruptible = move |file| {
-        // Once, however many parts there are. Where signals cannot be caught they end the program at once.
+        // Once for all parts. If signals cannot be caught, they end the program at once.
         let caught = || stopped().unwrap_or_else(|_| Arc::clone(stop::flag()));
         through(Interruptible { file, stopped: Arc::clone(flag.get_or_init(caught)) })
     };
     Reader::open_through(sources, Box::new(interruptible)).map_err(Failure::usage)
 }
 
-/// A file whose reader can be stopped: then it is at its end.
+/// A file whose reader can be stopped: it then reports the end of the file.
 pub(crate) struct Interruptible {
     pub(crate) file: File,
     pub(crate) stopped: Arc<AtomicBool>,

@@ -1,19 +1,19 @@
-//! Reports in the format of JUnit, which CI servers show.
+//! Reports in the JUnit format, which CI servers show.
 
 use std::fmt::Write;
 
 use protocol::xml::escaped;
 
-/// A report: its test cases in their order.
+/// A report with its test cases in order.
 #[derive(Debug)]
 pub(crate) struct Suite {
     pub(crate) name: String,
-    /// How long it took.
+    /// Duration in s.
     pub(crate) seconds: f64,
     pub(crate) cases: Vec<Case>,
 }
 
-/// One test case.
+/// A test case.
 #[derive(Debug)]
 pub(crate) struct Case {
     pub(crate) class: String,
@@ -21,7 +21,7 @@ pub(crate) struct Case {
     pub(crate) outcome: Outcome,
 }
 
-/// The outcome of a test case.
+/// Outcome of a test case.
 #[derive(Debug)]
 pub(crate) enum Outcome {
     Passed,
@@ -30,7 +30,7 @@ pub(crate) enum Outcome {
 }
 
 impl Suite {
-    /// The report as XML.
+    /// Formats the report as XML.
     pub(crate) fn text(&self) -> String {
         let count = |is: fn(&Outcome) -> bool| self.cases.iter().filter(|case| is(&case.outcome)).count();
         let mut text = format!(

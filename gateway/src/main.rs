@@ -1,5 +1,6 @@
-//! `skinbus`: the bench's command line. A module a command, each a thin layer over the crates below; errors are one line, exit codes
-//! are 0 (done), 1 (failed, or different), 2 (wrong use or configuration) and 3 (the robot was halted at the end).
+//! `skinbus`: the bench's command line. One module per command, each a thin layer over the library crates. Errors are
+//! one line; exit codes are 0 (done), 1 (failed or different), 2 (wrong use or configuration) and 3 (the robot was
+//! halted at the end).
 
 #![allow(
     rustdoc::broken_intra_doc_links,
@@ -105,7 +106,7 @@ impl Command {
     }
 }
 
-/// The command line, with its commands in groups.
+/// The command line with its commands in groups.
 fn program() -> clap::Command {
     groups::grouped(Arguments::command())
 }
@@ -114,7 +115,7 @@ fn main() -> ExitCode {
     let parsed = program().try_get_matches().and_then(|matches| Arguments::from_arg_matches(&matches));
     let done = match parsed {
         Ok(arguments) => arguments.command.run(),
-        // Requested help and version are printed as they are.
+        // Requested help and version are printed unchanged.
         Err(requested) if !requested.use_stderr() => requested.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => Err(Failure::usage(refusal(&wrong))),
@@ -122,7 +123,7 @@ fn main() -> ExitCode {
     end("skinbus", done)
 }
 
-/// clap's message in one line; where its guess would mislead, a better one.
+/// Formats clap's error in one line, with a better text where clap's suggestion would mislead.
 fn refusal(wrong: &clap::Error) -> String {
     let text = |kind| match wrong.get(kind) {
         Some(ContextValue::String(text)) => Some(text.as_str()),

@@ -1,4 +1,4 @@
-//! Where commands write beside standard output: standard error, and files that are whole or not there.
+//! Outputs of commands besides standard output: standard error, and files that are complete or absent.
 
 use std::fmt::Display;
 use std::fs::{self, File};
@@ -9,27 +9,26 @@ use clap::Args;
 use protocol::usage::{Failure, draw, print, say, say_lines, written};
 use trace::files::{STANDARD_OUTPUT, WholeFile, check, folder_of, with_hint};
 
-/// Whether files that exist may be overwritten.
+/// The option that allows existing files to be overwritten.
 #[derive(Args, Clone, Copy, Debug)]
 pub(crate) struct Overwrite {
-    /// Overwrite files that exist
+    /// Overwrite existing files
     #[arg(long)]
     pub(crate) overwrite: bool,
 }
 
 impl Overwrite {
-    /// Begins a file that an option names, so that what makes that impossible is known before there is anything to
-    /// write.
+    /// Creates a file that an option names, so that errors show up before there is anything to write.
     pub(crate) fn create(self, option: &str, path: &Path) -> Result<(WholeFile, File), Failure> {
         WholeFile::create(path, self.overwrite).map_err(|error| refused(option, path, &error))
     }
 
-    /// Sees that a file may be written, long before it is.
+    /// Checks early that the file can be written.
     pub(crate) fn check(self, option: &str, path: &Path) -> Result<(), Failure> {
         check(path, self.overwrite).map_err(|error| refused(option, path, &error))
     }
 
-    /// Writes a whole file that an option names, or leaves what was there.
+    /// Writes a whole file that an option names, or leaves the former file unchanged.
     pub(crate) fn write(self, option: &str, path: &Path, text: &str) -> Result<(), Failure> {
         let (whole, file) = self.create(option, path)?;
         finish(option, whole, file, text)
@@ -41,7 +40,7 @@ pub(crate) fn is_standard_output(path: &Path) -> bool {
     path == Path::new(STANDARD_OUTPUT)
 }
 
-/// Prints a table: on standard error when one of these files is standard output, which then carries nothing else.
+/// Prints a table; on standard error if one of these files is standard output, which then carries only that file.
 pub(crate) fn print_beside<'a>(
     files: impl IntoIterator<Item = Option<&'a Path>>,
     text: &str,
@@ -53,7 +52,7 @@ pub(crate) fn print_beside<'a>(
     print(text)
 }
 
-/// Prints a table, as [`print_beside`], in colours where standard output takes them.
+/// Prints a table like [`print_beside`], in colours if standard output supports them.
 pub(crate) fn print_table<'a>(
     files: impl IntoIterator<Item = Option<&'a Path>>,
     text: impl FnOnce(bool) -> String,
@@ -65,11 +64,11 @@ pub(crate) fn print_table<'a>(
     if !is_coloured(&io::stdout()) {
         return print(&text(false));
     }
-    // A terminal is in place of a file too: its colours do no harm. Names in the text are escaped already.
+    // A terminal in place of a file may show colours too. Names in the text are already escaped.
     draw(&text(true))
 }
 
-/// Writes all of a file that was begun.
+/// Writes the whole content of a created file.
 pub(crate) fn finish(option: &str, whole: WholeFile, mut file: File, text: &str) -> Result<(), Failure> {
     if is_standard_output(whole.path()) {
         return written(file.write_all(text.as_bytes()));
@@ -79,7 +78,7 @@ pub(crate) fn finish(option: &str, whole: WholeFile, mut file: File, text: &str)
     written.map_err(|error: io::Error| Failure::run(format!("{name}: {}", with_hint(error))))
 }
 
-/// A name that cannot be written to is wrong use.
+/// The error for a file that cannot be written: wrong use.
 pub(crate) fn refused(option: &str, path: &Path, error: &io::Error) -> Failure {
     Failure::usage(format!("{}: {error}", named(option, path)))
 }
@@ -88,8 +87,8 @@ fn named(option: &str, path: &Path) -> String {
     format!("{option} {}", path.display()).trim_start().to_owned()
 }
 
-/// Sees that each file that is written, by its option, is a file of its own, and none that the command reads: `--overwrite`
-/// does not mean that one.
+/// Checks that the written files differ from each other and from all files that the command reads, which `--overwrite`
+/// must not affect.
 pub(crate) fn apart<'a>(
     written: impl IntoIterator<Item = (&'a str, Option<&'a Path>)>,
     read: impl IntoIterator<Item = &'a Path>,
@@ -115,18 +114,18 @@ pub(crate) fn apart<'a>(
     Ok(())
 }
 
-/// Where a name leads: two names of one file are the same, whether it is there or not.
+/// Absolute path of a file, existing or not: equal for two names of the same file.
 fn place(path: &Path) -> PathBuf {
     let inside = || Some(fs::canonicalize(folder_of(path)).ok()?.join(path.file_name()?));
     fs::canonicalize(path).ok().or_else(inside).unwrap_or_else(|| path.to_owned())
 }
 
-/// Returns true if what is written there may be coloured: on a terminal, unless NO_COLOR is set.
+/// Returns true if output there may be coloured: on a terminal, unless NO_COLOR is set.
 pub(crate) fn is_coloured(out: &impl IsTerminal) -> bool {
     out.is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
 
-/// Prints a line on standard error; if that is closed, the line is dropped.
+/// Prints a line on standard error, or drops it if that is closed.
 pub(crate) fn note(text: impl Display) {
     say(&text.to_string());
 }

@@ -1,4 +1,4 @@
-//! Output of values: words, rows, tables, JSON.
+//! Output of values: lists, rows, tables, JSON.
 
 use std::borrow::Cow;
 use std::fmt::Display;
@@ -8,35 +8,34 @@ use model::quantiles::Quantiles;
 use protocol::usage::{Failure, shown, shown_lines};
 use serde::Serialize;
 
-/// Colours of a terminal, and the end of them.
+/// Colours of a terminal, and the code that ends them.
 pub(crate) const RED: &str = "\x1b[31m";
 pub(crate) const GREEN: &str = "\x1b[32m";
 pub(crate) const YELLOW: &str = "\x1b[33m";
 pub(crate) const PLAIN: &str = "\x1b[0m";
 
-/// A space before a name that stays when the name takes two lines.
+/// Indent of a name that is kept when the name takes two lines.
 const INDENT: &str = "\u{a0}";
-/// Columns of a table that is not on a narrower terminal.
+/// Maximum width of a table in columns.
 const WIDTH: u16 = 110;
-/// Letters of a row's name in one line, where there is room for more.
+/// Maximum width of a row's name in one line.
 const NAME: u16 = 36;
-/// Names in a line; of more, the first few and how many there are.
+/// Maximum number of names in a line; of more names, the first few are shown with the total.
 const NAMES: usize = 12;
 
-/// A value as JSON in lines.
+/// Formats a value as JSON in several lines.
 pub(crate) fn json(value: &impl Serialize) -> Result<String, Failure> {
     serde_json::to_string_pretty(value).map(|text| harmless(text) + "\n").map_err(Failure::run)
 }
 
-/// The same in one line.
+/// Formats a value as JSON in one line.
 pub(crate) fn json_line(value: &impl Serialize) -> Result<String, Failure> {
     serde_json::to_string(value).map(|text| harmless(text) + "\n").map_err(Failure::run)
 }
 
-/// JSON that says the same without characters that a terminal obeys: those that stand as they are in its strings are
-/// written like `\u009b`.
+/// Replaces terminal control characters in the strings of a JSON text by escapes such as `\u009b`.
 pub(crate) fn harmless(json: String) -> String {
-    // Its own are line feeds, and it has no tabs.
+    // JSON itself has line feeds but no tabs.
     if matches!(shown_lines(&json), Cow::Borrowed(_)) {
         return json;
     }
@@ -47,12 +46,12 @@ pub(crate) fn harmless(json: String) -> String {
     json.chars().map(letter).collect()
 }
 
-/// What stands between commas.
+/// Joins items with commas.
 pub(crate) fn list(items: impl IntoIterator<Item: Display>) -> String {
     joined(", ", items)
 }
 
-/// What stands between spaces.
+/// Joins items with spaces.
 pub(crate) fn words(items: impl IntoIterator<Item: Display>) -> String {
     joined(" ", items)
 }
@@ -61,13 +60,13 @@ fn joined(between: &str, items: impl IntoIterator<Item: Display>) -> String {
     items.into_iter().map(|item| item.to_string()).collect::<Vec<_>>().join(between)
 }
 
-/// A few names, or the first of many.
+/// Lists all names, or the first of many with the total.
 pub(crate) fn some(names: &[String]) -> String {
     let few = names.get(..NAMES).filter(|_| names.len() > NAMES);
     few.map_or_else(|| list(names), |few| format!("{}, ... ({} in all)", list(few), names.len()))
 }
 
-/// So many of them.
+/// Formats a count with its noun.
 pub(crate) fn count(count: impl TryInto<u64>, one: &str) -> String {
     let count = count.try_into().unwrap_or(u64::MAX);
     match one {
@@ -77,24 +76,23 @@ pub(crate) fn count(count: impl TryInto<u64>, one: &str) -> String {
     }
 }
 
-/// A value, or what stands where there is none.
+/// Formats a value, or returns the text for an absent one.
 pub(crate) fn or(value: Option<impl Display>, none: &str) -> String {
     value.map_or_else(|| none.to_owned(), |value| value.to_string())
 }
 
-/// A number with so many decimals, or what stands where there is none.
+/// Formats a number with this many decimals, or returns the text for an absent one.
 pub(crate) fn decimals(value: Option<f64>, decimals: usize, none: &str) -> String {
     or(value.map(|value| format!("{value:.decimals$}")), none)
 }
 
-/// 50 %, 90 %, 99 % and the maximum.
+/// Formats 50 %, 90 %, 99 % and the maximum.
 pub(crate) fn quantiles(quantiles: &Quantiles) -> String {
     let Quantiles { p50, p90, p99, max, .. } = quantiles;
     format!("{p50:.0} / {p90:.0} / {p99:.0} / {max:.0}")
 }
 
-/// A table with a border, numbers to the right in the columns that are of numbers. A name in a row is [`shown`]; a head
-/// may have lines.
+/// Table with a border and right-aligned numeric columns. Texts in rows are [`shown`]; a header may have several lines.
 pub(crate) fn table<H: Into<String>>(
     head: impl IntoIterator<Item = H>,
     rows: impl IntoIterator<Item = Vec<String>>,
@@ -114,14 +112,14 @@ pub(crate) fn table<H: Into<String>>(
     table
 }
 
-/// The table as wide as the terminal, and not wider than is good to read.
+/// Limits a table to the width of the terminal, and to a readable width.
 pub(crate) fn readable(mut table: Table) -> Table {
     let width = table.width().map_or(WIDTH, |width| width.min(WIDTH));
     table.set_width(width);
     table
 }
 
-/// The columns in which there is something, and what stands there in each row; `nothing` where there is nothing.
+/// Returns the columns that have values, and their texts in each row; `nothing` stands for an absent value.
 pub(crate) fn filled<H, T, F: Fn(&T) -> Option<String>>(
     columns: impl IntoIterator<Item = (H, F)>,
     rows: &[T],
@@ -141,20 +139,20 @@ pub(crate) fn filled<H, T, F: Fn(&T) -> Option<String>>(
     (heads, lines)
 }
 
-/// What is printed: a name, a value, and what it is to be compared with.
+/// A table of names, values and values for comparison.
 pub(crate) struct Rows {
     table: Table,
-    /// The letters of a name in one line.
+    /// Width of a name in one line.
     name_width: Option<usize>,
 }
 
 impl Rows {
-    /// A [`readable`] table with this head and no rows.
+    /// Creates a [`readable`] table with this header and no rows.
     pub(crate) fn new(name: impl Display, value: impl Display, beside: impl Display) -> Self {
         Self::in_columns(None, name, value, beside)
     }
 
-    /// The same on a terminal of so many columns; of unknown width, as wide as the terminal is.
+    /// Creates the table for a terminal of this width; `None` detects the width.
     pub(crate) fn in_columns(
         columns: Option<u16>,
         name: impl Display,
@@ -173,7 +171,7 @@ impl Rows {
         Self { table, name_width: Some(usize::from(width)) }
     }
 
-    /// The same where names are not broken, however narrow the terminal.
+    /// Keeps names in one line, however narrow the terminal is.
     pub(crate) fn names_in_one_line(mut self) -> Self {
         self.name_width = None;
         if let Some(names) = self.table.column_mut(0) {
@@ -182,7 +180,7 @@ impl Rows {
         self
     }
 
-    /// The same with colours, or without any.
+    /// Enables or disables colours.
     pub(crate) fn coloured(mut self, is_coloured: bool) -> Self {
         self.table.force_no_tty();
         if is_coloured {
@@ -191,18 +189,18 @@ impl Rows {
         self
     }
 
-    /// The columns that it may take.
+    /// Width of the table in columns.
     pub(crate) fn columns(&self) -> usize {
         self.table.width().unwrap_or(WIDTH).into()
     }
 
-    /// The same with names in lines of at most so many letters.
+    /// Breaks names into lines of this width.
     pub(crate) const fn names_in(mut self, letters: usize) -> Self {
         self.name_width = Some(letters);
         self
     }
 
-    /// The table as it is printed.
+    /// Formats the table.
     pub(crate) fn text(&self) -> String {
         format!("{}\n", self.table).replace(INDENT, " ")
     }
@@ -216,7 +214,7 @@ impl Rows {
         self.section(format!("  {name}"), value, beside);
     }
 
-    /// Adds a row whose last text is in a colour, where colours are [`Rows::coloured`].
+    /// Adds a row whose last text is coloured if colours are enabled ([`Rows::coloured`]).
     pub(crate) fn row_in_colour(
         &mut self,
         name: impl Display,
@@ -229,7 +227,7 @@ impl Rows {
         self.table.add_row([name, Cell::new(value), Cell::new(beside).fg(colour)]);
     }
 
-    /// The same, whose last text is not broken.
+    /// Adds a row whose last text is not broken.
     pub(crate) fn row_in_one_line(&mut self, name: impl Display, value: impl Display, beside: &str) {
         self.row(name, value, beside);
         let width = u16::try_from(beside.chars().count() + 2).unwrap_or(WIDTH);
@@ -238,7 +236,7 @@ impl Rows {
         }
     }
 
-    /// A row of something that there is, or none.
+    /// Adds a row unless the count is zero.
     pub(crate) fn any(&mut self, name: impl Display, count: impl TryInto<u64>, beside: impl Display) {
         if let Some(count) = count.try_into().ok().filter(|&count| count > 0) {
             self.row(name, count, beside);
@@ -246,19 +244,20 @@ impl Rows {
     }
 }
 
-/// A row's texts, [`shown`].
+/// Texts of a row, [`shown`].
 fn line(name: impl Display, value: impl Display, beside: impl Display) -> [String; 3] {
     [name.to_string(), value.to_string(), beside.to_string()].map(|text| shown(&text).into_owned())
 }
 
-/// Breaks a text into lines of so many letters; all but the first, which begins with `begin`, are indented.
+/// Breaks a text into lines of `columns` columns. The first line begins with `begin`; the others are indented by its
+/// width.
 pub(crate) fn hanging(begin: &str, text: &str, columns: usize) -> String {
     let indent = begin.chars().count();
     let lines = folded(&format!("{}{text}", " ".repeat(indent)), Some(columns)).replace(INDENT, " ");
     format!("{begin}{}", lines.get(indent..).unwrap_or_default())
 }
 
-/// A name in lines of so many letters; all but the first are indented further. A longer word is broken.
+/// Breaks a name into lines of this width; all lines but the first are indented further. Longer words are broken too.
 fn folded(name: &str, width: Option<usize>) -> String {
     let words = name.trim_start_matches(' ');
     let indent = name.len() - words.len();

@@ -1,4 +1,4 @@
-//! `skinbus recover`: makes a recording whole whose writer was killed.
+//! Repair of recordings whose writer was killed: `skinbus recover`.
 
 use std::path::PathBuf;
 
@@ -11,17 +11,18 @@ use trace::recording::{names, repair};
 
 use super::output::{Overwrite, apart, print_beside};
 
-/// Make a recording whole that ends in the middle
+/// Repair a recording that was cut off
 ///
-/// Copies everything that is whole into a new file with its indexes, and reports what was not. The recording stays as
-/// it is. A run repairs by itself what earlier ones left in its recording's folder. Exit code 0: there is a new file,
-/// or nothing was wrong; 1: it cannot be done, no message came back, or fewer than are known to be lost; 2: wrong use.
+/// Copies all intact data into a new file with indexes, and reports the rest. The recording itself is not changed. A
+/// run repairs the files that earlier runs left in its recording's directory by itself. Exit code 0: a new file was
+/// written, or the recording is intact; 1: failed, recovered no message, or recovered fewer than are known to be lost;
+/// 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  skinbus recover run.mcap.part -o run.mcap")]
 pub(crate) struct Recover {
     /// The recording: an MCAP file of any program
     file: PathBuf,
-    /// The new file; else FILE-recovered.mcap
+    /// The new file [default: FILE-recovered.mcap]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
@@ -54,7 +55,7 @@ impl Recover {
             None if recovered.is_sound() => {
                 let rename = if names::goal_of(&self.file) == self.file { "" } else { "; rename it" };
                 format!(
-                    "{name} is whole, there is nothing to recover: {} messages{rename}",
+                    "{name} is intact, there is nothing to recover: {} messages{rename}",
                     recovered.messages
                 )
             }
@@ -62,7 +63,7 @@ impl Recover {
             Some(bytes) => format!("{out}, {bytes} bytes: {recovered}"),
         };
         if recovered.is_little() {
-            return Err(Failure::run(format!("more is lost of {name} than came back: {line}")));
+            return Err(Failure::run(format!("more of {name} is lost than was recovered: {line}")));
         }
         print_beside([Some(output.as_path())], &format!("{}\n", shown(&line)))
     }

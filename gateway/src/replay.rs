@@ -16,20 +16,20 @@ use super::arguments::{BusKinds, Word, cells_per_process, nanos, of_environment,
 use super::output::{self, Overwrite, apart, print_table};
 use super::print::{GREEN, PLAIN, Rows, YELLOW, count, hanging, json, list, or, quantiles};
 
-/// Bytes for frames that wait: all cells may answer a report at once.
+/// Receive buffer in bytes: all cells may answer a report at once.
 const RECEIVE_BUFFER: u32 = 8 << 20;
 
-/// How long before a frame is due the sender spins instead of sleeping.
+/// Time before a frame is due during which the sender spins instead of sleeping.
 const SPIN: Duration = Duration::from_micros(100);
 
-/// Milliseconds for which room on a full bus is waited for before a frame is refused.
+/// Time in ms to wait for room on a full bus before a frame is refused.
 const SEND_TIMEOUT_MS: u32 = 100;
 
 /// Send a capture on a bus, and compare the answers of the cells with the recorded ones
 ///
-/// Frames go out at the capture's own times, or as fast as the bus takes them. With --only inputs the cells on the
-/// bus answer; with --expect their answers have to be the recorded ones, bit for bit or within a tolerance.
-/// docs/how-to/replay.md says what is compared and how. Exit code 0: all was sent, and all answers were right; 1: not
+/// Sends frames at the capture's own times, or as fast as the bus accepts them. With --only inputs, the cells on the
+/// bus answer; with --expect, their answers must equal the recorded ones, bit for bit or within a tolerance.
+/// docs/how-to/replay.md explains the comparison. Exit code 0: everything was sent, and all answers were right; 1: not
 /// so; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(mut_args(|arg| match arg.get_id().as_str() {
@@ -42,38 +42,38 @@ const SEND_TIMEOUT_MS: u32 = 100;
   skinbus replay run.mcap run-*.mcap --expect --spawn --lockstep
   skinbus replay foreign.log --map can0=vcan0 --speed max --loop 10")]
 pub(crate) struct Replay {
-    /// A candump log or an MCAP recording; all parts of a split recording are one, in any order
+    /// A candump log or an MCAP recording; the parts of a split recording count as one, in any order
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     #[command(flatten)]
     kinds: BusKinds,
     #[command(flatten)]
     frames: Frames,
-    /// Do it N times; 0 is until Ctrl-C
+    /// Repeat N times; 0 repeats until Ctrl-C
     #[arg(long = "loop", value_name = "N", default_value_t = 1)]
     passes: u32,
-    /// So many times as fast, 0.1 to 100; or max, as fast as the bus takes it, whatever the times
+    /// Speed factor, 0.1 to 100; or max for as fast as the bus accepts frames, whatever their times
     #[arg(long, value_name = "X", default_value = "1", value_parser = speed, allow_negative_numbers = true)]
     speed: Pace,
-    /// Send the next joints only when every cell has answered: the same on any machine, however slow
+    /// Send joints only after every cell has answered the last ones: gives the same result on any machine, however slow
     #[arg(long)]
     lockstep: bool,
-    /// Compare the answers with the recorded ones; with --speed max in lockstep
+    /// Compare the answers with the recorded ones; --speed max then implies --lockstep
     #[arg(long)]
     expect: bool,
-    /// Take torques for equal whose words differ by at most so many steps of 1/4096 Nm; they are counted
+    /// Accept and count differences between torque words of up to this many steps of 1/4096 Nm
     #[arg(long, value_name = "STEPS", default_value_t = 0, requires = "expect")]
     tolerance: u16,
-    /// Start the cells, as processes, and end them afterwards
+    /// Start the cells as processes, and end them afterwards
     #[arg(long)]
     spawn: bool,
-    /// The skin of the cells that are started; else the recording's own
+    /// The skin of the started cells [default: the recording's own]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Let cells that measure obey stimuli while the replay lasts, and measure again afterwards
+    /// Let measuring cells obey stimuli during the replay, and measure again afterwards
     #[arg(long)]
     test_mode: bool,
-    /// Write the figures of the end as JSON, - for standard output; docs/how-to/replay.md explains its keys
+    /// Write the final figures as JSON, - for standard output; docs/how-to/replay.md explains the keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
     #[command(flatten)]
@@ -82,7 +82,7 @@ pub(crate) struct Replay {
     shown: Shown,
 }
 
-/// What is shown, and how.
+/// Output options of a replay.
 #[derive(Args, Debug)]
 struct Shown {
     /// Show no progress, only the table at the end
@@ -90,31 +90,31 @@ struct Shown {
     quiet: bool,
 }
 
-/// Which frames of the capture, and where they go.
+/// Options for the selection and the destination of frames.
 #[derive(Args, Debug)]
 struct Frames {
     /// Send the frames of one of the capture's buses on another bus
     #[arg(long, value_name = "FROM=TO", value_parser = route)]
     map: Vec<(String, String)>,
-    /// Only the frames of these buses of the capture
+    /// Send only the frames of these buses of the capture
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     bus: Vec<String>,
-    /// Which frames: inputs are commands, configuration and stimuli; --expect, --lockstep and --spawn mean inputs,
-    /// else all are sent
+    /// Send only these frames: inputs are commands, configuration and stimuli. Default: inputs with --expect,
+    /// --lockstep or --spawn, else all
     #[arg(long, value_parser = one_of(ONLY))]
     only: Option<Only>,
-    /// Begin at this second of the run, or after the first frame where there is no run; with inputs only, in the state that
-    /// was latched there
+    /// Begin at this second of the run, counted from the first frame if there is no run; with inputs only, in the state
+    /// that was latched there
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
     from: Option<u64>,
-    /// End before this second of the run, or after the first frame
+    /// End before this second, counted like --from
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
     to: Option<u64>,
 }
 
 const ONLY: &[Word<Only>] = &[
     ("inputs", "Commands, configuration, stimuli", Only::Inputs),
-    ("replies", "What cells sent", Only::Replies),
+    ("replies", "Frames from cells", Only::Replies),
     ("all", "Everything", Only::All),
 ];
 
@@ -138,7 +138,7 @@ impl Replay {
         let options = self.options()?;
         let read = self.files.iter().chain(&self.skin).map(PathBuf::as_path);
         apart([("--summary", self.summary.as_deref())], read)?;
-        // Before the replay, so that a file that cannot be written is reported first.
+        // Created before the replay, so that an error of the file is reported first.
         let file = self.summary.as_ref().map(|path| self.overwrite.create("--summary", path)).transpose()?;
         let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
@@ -155,7 +155,9 @@ impl Replay {
         let needs = answered.into_iter().find_map(|(name, given)| given.then_some(name));
         if let Some(skin) = self.skin.as_ref().filter(|_| !self.spawn) {
             let skin = skin.display();
-            return Err(Failure::usage(format!("--skin {skin} is of the cells that --spawn starts: add it")));
+            return Err(Failure::usage(format!(
+                "--skin {skin} is for the cells that --spawn starts: add --spawn"
+            )));
         }
         let only = match (self.frames.only, needs) {
             (Some(Only::Replies | Only::All), Some(name)) => {
@@ -191,7 +193,7 @@ impl Replay {
     }
 }
 
-/// The result of the replay in one line, and its table.
+/// Formats the result of the replay: one line and a table.
 fn table(summary: &Summary, is_coloured: bool) -> String {
     let ended = match (&summary.failure, summary.interrupted) {
         (Some(_), _) => "failed",
@@ -213,7 +215,7 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
     for (reason, count) in &summary.skipped {
         rows.row("not sent", count, reason);
     }
-    rows.any("sent at once", summary.sent_at_once, "older than what was sent before");
+    rows.any("sent at once", summary.sent_at_once, "older than frames sent before");
     if let (Some(late), Some(idle)) = (&summary.late_us, &summary.idle_late_us) {
         rows.section("lateness", "50 % / 90 % / 99 % / max, µs", "");
         rows.row("frames sent", quantiles(late), format!("idle {}", quantiles(idle)));
@@ -246,11 +248,11 @@ fn expectation(rows: &mut Rows, expect: &Expect) {
     off(rows, "sum", &tally.sum_words, 1);
     let late = match expect.joints_skipped {
         0 => String::new(),
-        skipped => format!("cells took joints too late {}", count(skipped, "time")),
+        skipped => format!("cells received joints too late {}", count(skipped, "time")),
     };
     rows.row("missing", tally.missing, late);
     rows.row("extra", tally.extra, "");
-    rows.any("not requested", tally.not_requested, "a bus did not take the joints");
+    rows.any("not requested", tally.not_requested, "a bus refused the joints");
     for (reason, count) in tally.lacking.reasons() {
         rows.row("not in the recording", count, reason);
     }
@@ -258,7 +260,7 @@ fn expectation(rows: &mut Rows, expect: &Expect) {
     rows.any("unknown configurations", expect.unchecked_cells, "not recorded before they were changed");
 }
 
-/// The words that differ by more than so many steps, where there are any: by how many steps how many do.
+/// Rows on the words that differ by more than `usual` steps, if any: the number of words for each difference.
 fn off(rows: &mut Rows, what: &str, steps: &Steps, usual: usize) {
     let counts = steps.by_steps.iter().enumerate().skip(1);
     let found: Vec<_> = counts.filter(|(_, count)| **count > 0).collect();

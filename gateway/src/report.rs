@@ -16,10 +16,10 @@ use super::output::{Overwrite, apart, is_standard_output, note};
 
 /// Report on a recorded run: one HTML page with figures, beside the paper's numbers
 ///
-/// The page needs nothing else, no network and no script; it is readable on a phone, on a dark screen and on paper. A
-/// recording that was cut off is reported as far as it goes, and what is missing is named in it and on standard error. So
-/// are the parts that a candump log cannot have: it holds frames only, and needs the skin that they are of. Exit code 0: the
-/// report is written; 1: it cannot be; 2: wrong use, or no recording of a run.
+/// The page is self-contained, without network access or scripts, and readable on a phone, on a dark screen and on
+/// paper. For a recording that was cut off, the report covers the intact part, and names what is missing on the page
+/// and on standard error. A candump log holds only frames and needs its skin; the report names the parts that it lacks.
+/// Exit code 0: the report is written; 1: it cannot be written; 2: wrong use, or not a recording of a run.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus report run.mcap -o run.html
@@ -27,23 +27,23 @@ use super::output::{Overwrite, apart, is_standard_output, note};
   skinbus report run.mcap run-*.mcap -o all.html
   skinbus report run.log --skin skin.toml -o - > log.html")]
 pub(crate) struct Report {
-    /// The recording of a run: what `skinbus run SKIN --record FILE` wrote; all parts of a split one in any order. Or frames
-    /// only: a candump log, or another program's MCAP file
+    /// The recording of a run, as written by `skinbus run SKIN --record FILE`; all parts of a split one in any order.
+    /// Or frames only: a candump log, or another program's MCAP file
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// The skin of a log; a recording has its own
+    /// The skin of a log; a recording contains its own
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// The page; - for standard output; else the recording's name with .html
+    /// The page; - for standard output [default: the recording's name with .html]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Also each figure as an SVG file, in this folder, which is made if it is not there
+    /// Also write each figure as an SVG file into this directory, which is created if necessary
     #[arg(long, value_name = "DIR")]
     svg: Option<PathBuf>,
-    /// Bits in a second of every bus, for its load: 500k, 1M; else the skin's, else 1M
+    /// Bit rate of all buses for their load: 500k, 1M [default: the skin's, else 1M]
     #[arg(long, value_name = "RATE", value_parser = bit_rate)]
     nominal: Option<u32>,
-    /// Bits in a second of FD frames' data: 2M, 5M; else the skin's, else 5M
+    /// Bit rate of FD data: 2M, 5M [default: the skin's, else 5M]
     #[arg(long, value_name = "RATE", value_parser = bit_rate)]
     data: Option<u32>,
     #[command(flatten)]
@@ -64,7 +64,7 @@ impl Report {
         let options = run::Options { command, nominal: self.nominal, data: self.data, skin };
         let refused = |error| refused(error, options.skin.as_ref());
         if let Err(taken) = self.is_free(&output, "-o") {
-            // What is read is looked at before what would be overwritten.
+            // Errors of the input are reported before those of an existing output.
             return Err(run::check(&self.files, &options).err().map_or(taken, refused));
         }
         let report = run::report(&self.files, &options).map_err(refused)?;
@@ -87,7 +87,7 @@ impl Report {
         let made = self.svg.as_deref().map(make).transpose()?.unwrap_or(false);
         if let Err(failure) = write(&files, self.overwrite) {
             if let Some(folder) = self.svg.filter(|_| made) {
-                // Only if nothing is in it.
+                // Fails unless the directory is empty.
                 let _ = fs::remove_dir(folder);
             }
             return Err(failure);
@@ -111,14 +111,15 @@ impl Report {
         }
     }
 
-    /// What is there is not overwritten unless that is asked for.
+    /// Checks that a file may be written: existing files need `--overwrite`.
     fn is_free(&self, path: &Path, option: &str) -> Result<(), Failure> {
         apart([(option, Some(path))], self.files.iter().map(PathBuf::as_path))?;
         self.overwrite.check(option, path)
     }
 }
 
-/// The failure for an error of a report: what is no recording of a run is wrong use, what cannot be read is not.
+/// The failure for an error of a report: a file that is not a recording of a run is wrong use, an unreadable one is
+/// not.
 fn refused(error: ReportError, skin: Option<&(String, Skin)>) -> Failure {
     match (error, skin) {
         (error @ (ReportError::Capture(_) | ReportError::Unfinished { .. }), _) => Failure::run(error),
@@ -134,7 +135,7 @@ fn refused(error: ReportError, skin: Option<&(String, Skin)>) -> Failure {
     }
 }
 
-/// Each figure's file name and drawing.
+/// File names and drawings of all figures.
 fn drawings(page: &Page) -> impl Iterator<Item = (String, String)> {
     page.sections.iter().flat_map(|section| {
         let cells = section.drawings.iter().map(|drawing| (drawing.name(), svg::draw_cells(drawing)));
@@ -143,7 +144,7 @@ fn drawings(page: &Page) -> impl Iterator<Item = (String, String)> {
     })
 }
 
-/// Makes a folder; whether it was not there.
+/// Creates a directory. Returns true if it did not exist.
 fn make(folder: &Path) -> Result<bool, Failure> {
     let new = !folder.is_dir();
     let made = fs::create_dir_all(folder).map(|()| new);
@@ -152,7 +153,7 @@ fn make(folder: &Path) -> Result<bool, Failure> {
     })
 }
 
-/// Writes all of them, each beside the option that is for it, or none: each gets its name when all are whole.
+/// Writes all files, or none: each gets its name after all are complete. Each path comes with its option.
 fn write(files: &[(&str, PathBuf, String)], overwrite: Overwrite) -> Result<(), Failure> {
     let failed = |option: &str, path: &Path, error: io::Error| {
         Failure::run(format!("{option} {}: {error}", path.display()))

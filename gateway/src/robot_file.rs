@@ -1,4 +1,4 @@
-//! The URDF that a skin names, or that is written for its rows.
+//! URDF that a skin names, or that is written from its rows.
 
 use std::fmt::Display;
 use std::path::{Component, Path, PathBuf};
@@ -13,7 +13,7 @@ use trace::recording::robot::Robot;
 
 use super::output::note;
 
-/// A skin's robot: what recordings show of it, and the text of the URDF that the skin names.
+/// Robot of a skin: its geometry for recordings, and the text of the URDF that the skin names.
 #[derive(Default)]
 pub(crate) struct RobotOfSkin {
     pub(crate) robot: Option<Robot>,
@@ -21,10 +21,11 @@ pub(crate) struct RobotOfSkin {
 }
 
 impl RobotOfSkin {
-    /// By the URDF in a file, if the skin names one, else by the skin's rows. A URDF of another robot is noted.
+    /// Reads the robot from a URDF file if the skin names one, else from the skin's rows. Prints a note if the URDF is
+    /// for another robot.
     ///
     /// # Errors
-    /// When the file cannot be read, or is no URDF.
+    /// Returns [`Failure`] if the file cannot be read or is not a URDF.
     pub(crate) fn read(skin: &Skin, file: Option<&Path>) -> Result<Self, Failure> {
         let of_rows = || {
             Robot::of_rows(skin).map_err(|error| note(format_args!("the robot is not shown: {error}"))).ok()
@@ -42,10 +43,10 @@ impl RobotOfSkin {
     }
 }
 
-/// Reads a URDF, in the encoding that it declares; its text too.
+/// Reads a URDF in its declared encoding. Returns it with its text.
 ///
 /// # Errors
-/// One line: the file cannot be read, or is no URDF.
+/// Returns a one-line text if the file cannot be read or is not a URDF.
 pub(crate) fn read_urdf(path: &Path) -> Result<(Urdf, String), String> {
     let file = path.display().to_string();
     let bytes = input::bytes(path, LONGEST).map_err(|error| format!("{file}: {error}"))?;
@@ -54,13 +55,13 @@ pub(crate) fn read_urdf(path: &Path) -> Result<(Urdf, String), String> {
     Ok((urdf, text))
 }
 
-/// Where the URDF of a skin's file is.
+/// Path of the URDF that a skin's file names.
 pub(crate) fn urdf_of(skin: &Path, urdf: &str) -> PathBuf {
     skin.parent().unwrap_or_else(|| Path::new("")).join(urdf)
 }
 
-/// The path of a file as seen from the folder of another one, which need not be there yet; `None` when a folder is
-/// not there, or a name is not UTF-8.
+/// Path of a file relative to the directory of another file, which need not exist. Returns `None` if a directory does
+/// not exist, or a name is not UTF-8.
 pub(crate) fn path_from(file: &Path, to: &Path) -> Option<String> {
     let real = |path: &Path| {
         let folder = folder_of(path);

@@ -33,60 +33,61 @@ use super::robot_file::{RobotOfSkin, urdf_of};
 use super::view::{Page, PageOptions};
 use show::Look;
 
-/// The skin and the scenario of the demonstration.
+/// Skin and scenario of the demonstration.
 const SKIN: &str = include_str!("../examples/ur5-253.toml");
 const SCENARIO: &str = include_str!("../examples/demo.toml");
 
-/// How long a run may last that is watched, in s.
+/// Maximum duration in s of a run with `--view`.
 const UNTIL_STOPPED: f64 = 24.0 * 3600.0;
 
-/// Where the demonstration's frames are recorded.
+/// Log of the demonstration's frames.
 const DEMO_LOG: &str = "skinbus-demo.log";
 
 /// Options of both commands.
 #[derive(Args, Debug)]
 struct Common {
-    /// End after this time, 10 or 10s or 2min; else after the scenario's duration, or 10 s
+    /// End after this time: 10, 10s or 2min [default: the scenario's duration, or 10s]
     #[arg(long, value_name = "TIME", value_parser = seconds, allow_negative_numbers = true)]
     duration: Option<f64>,
-    /// Write the figures of the end as JSON, also when the run fails; docs/reference/summary.md explains its keys
+    /// Write the final figures as JSON, also if the run fails; docs/reference/summary.md explains the keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
-    /// Print all rows of the table, also those of what is usual
+    /// Print all rows of the table, including those with usual values
     #[arg(long, short)]
     verbose: bool,
-    /// Show the skin live in a browser: a page is served until the run ends; docs/how-to/view.md. Without --duration the run
-    /// then ends with Ctrl-C
+    /// Show the skin live in a browser, on a page that is served until the run ends; docs/how-to/view.md. Without
+    /// --duration, only Ctrl-C ends the run then
     #[arg(long)]
     view: bool,
-    /// The address of the page; else any free port of this machine
+    /// Address of the page [default: any free port of this machine]
     #[arg(long, value_name = "ADDRESS:PORT", requires = "view")]
     listen: Option<SocketAddr>,
     #[command(flatten)]
     recording: Recording,
 }
 
-/// The files that a run is made of, as they are.
+/// Unchanged texts of the files of a run.
 struct Files {
     skin: String,
     scenario: Option<String>,
     robot: RobotOfSkin,
 }
 
-/// What is recorded beside frames as text.
+/// Options for a recording, besides candump text.
 #[derive(Args, Debug)]
 struct Recording {
-    /// Record everything as MCAP: frames, joints, torques, touches, timing; docs/reference/recording.md has the topics
+    /// Record everything as MCAP: frames, joints, torques, touches, timing; docs/reference/recording.md lists the
+    /// topics
     #[arg(long, value_name = "FILE.mcap")]
     record: Option<PathBuf>,
     #[command(flatten)]
     overwrite: Overwrite,
 }
 
-/// When another file of a recording is begun.
+/// Limit at which a new file of a recording is started.
 #[derive(Clone, Copy, Debug)]
 enum Limit {
     Bytes(u64),
@@ -102,14 +103,14 @@ fn limit(text: &str) -> Result<Limit, String> {
     if let Some(bytes) = each.and_then(|each| number?.checked_mul(*each)).filter(|bytes| *bytes > 0) {
         return Ok(Limit::Bytes(bytes));
     }
-    // A number alone may be meant as either.
+    // A number without a unit may mean either: refuse it.
     let age = time(text).filter(|seconds| *seconds >= 1.0 && !unit.is_empty());
     let age = age.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
     age.map(Limit::Age).ok_or_else(|| allowed.to_owned())
 }
 
 impl Recording {
-    /// What is recorded where; the files go with it as they are.
+    /// Returns the outputs of the recording, with the files attached.
     fn options(&self, candump: Option<Candump>, files: Files, limits: &[Limit]) -> record::Options {
         let mut split = Split::default();
         for &limit in limits {
@@ -134,20 +135,20 @@ impl Recording {
     }
 }
 
-/// Show everything at once: 253 cells on an arm, touched here and there
+/// Run a demonstration: 253 cells on an arm, touched here and there
 ///
-/// Needs nothing: the cells are processes on an embedded bus of the demonstration's own, unless SKINBUS_DIR names a
-/// directory, so any number of demonstrations and runs go on side by side. It prints the command that shows the frames on
-/// its bus, and where it records them as candump text. Exit codes are those of `skinbus run`.
+/// Needs no setup: the cells are processes on an embedded bus of the demonstration's own, unless SKINBUS_DIR names a
+/// directory, so any number of demonstrations and runs can go on side by side. Prints the command that shows the frames
+/// on its bus, and the path of its candump log. Exit codes are those of `skinbus run`.
 #[derive(Args, Debug)]
 #[command(
     after_help = "Example:\n  skinbus demo --duration 5",
-    mut_arg("bus_kind", |arg| arg.help("socketcan or embedded; auto is SocketCAN if there is an interface vcan0 [default: embedded]"))
+    mut_arg("bus_kind", |arg| arg.help("socketcan or embedded; auto is SocketCAN if an interface vcan0 exists [default: embedded]"))
 )]
 pub(crate) struct Demo {
     #[command(flatten)]
     common: Common,
-    /// Where the frames are recorded; else skinbus-demo.log, or skinbus-demo-1.log, ... where that exists
+    /// Write the frames to this file [default: skinbus-demo.log, or skinbus-demo-1.log, ... if that exists]
     #[arg(long, value_name = "FILE")]
     candump: Option<PathBuf>,
     #[command(flatten)]
@@ -156,25 +157,26 @@ pub(crate) struct Demo {
 
 /// Run a bench: cells, buses, the control loop
 ///
-/// Starts the skin's cells as processes, unless they are there already (--no-spawn), runs the control
-/// loop for the scenario's duration, and prints a table of what happened. Ctrl-C ends it early, with the
-/// table. Embedded buses lie in SKINBUS_DIR, if that is set: give a bench beside another one a directory of its
-/// own. Exit code 0: it came to its end; 1: it did not, a bus was lost at its end, or its recording is incomplete; 2:
-/// wrong use or configuration; 3: the robot was halted at its end; 4: there was no external controller; 5: a process of
-/// cells ended by an error of its own.
+/// Starts the skin's cells as processes, unless they run already (--no-spawn), runs the control loop for the scenario's
+/// duration, and prints a table of results. Ctrl-C ends the run early, with the table. The sockets of embedded buses
+/// are in SKINBUS_DIR, if that is set: give benches that run side by side a directory each. Exit code 0: the run came
+/// to its end; 1: it ended early, a bus was lost at its end, or its recording is incomplete; 2: wrong use or
+/// configuration; 3: the robot was halted at the end; 4: the external controller was absent; 5: a process of cells
+/// failed.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus run gateway/examples/ur5-253.toml --scenario gateway/examples/demo.toml
   skinbus run skin.toml --duration 60 --no-spawn --candump run.log --summary run.json")]
 pub(crate) struct Run {
-    /// The skin's description
+    /// The skin
     skin: PathBuf,
-    /// What happens: touches, motion, faults; else nothing touches the skin
+    /// The scenario: touches, motion, faults [default: nothing touches the skin]
     #[arg(long, value_name = "FILE")]
     scenario: Option<PathBuf>,
     #[command(flatten)]
     common: Common,
-    /// Begin another recording (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given twice
+    /// Start a new file of the recording (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given
+    /// twice
     #[arg(long, value_name = "SIZE|TIME", requires = "record", value_parser = limit)]
     record_split: Vec<Limit>,
     #[command(flatten)]
@@ -186,17 +188,17 @@ pub(crate) struct Run {
     candump: Option<PathBuf>,
     #[command(flatten)]
     kinds: BusKinds,
-    /// Start no cells: they are on the bus already, or are real
+    /// Start no cells: they are already on the bus, or are real
     #[arg(long)]
     no_spawn: bool,
     /// Let cells keep their parameters in files of this directory
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
-    /// The firmware of a cell (for the micro:bit) that emulated cells run; docs/how-to/firmware.md builds it
+    /// Firmware of a cell (for the micro:bit) that emulated cells run; docs/how-to/firmware.md explains how to build it
     #[arg(long, value_name = "ELF", requires = "emulate")]
     firmware: Option<PathBuf>,
-    /// Cells that run the firmware in QEMU instead of a process, by node id or as BUS:NODE. They are commissioned, keep
-    /// their flash in files as other cells do, and end with the run
+    /// Cells that run the firmware in QEMU instead of as a process, by node id or as BUS:NODE. They are commissioned,
+    /// keep their flash in files like other cells, and end with the run
     #[arg(
         long,
         value_name = "[BUS:]N,...",
@@ -263,7 +265,7 @@ impl Run {
         };
         let read = [Some(self.skin.clone()), self.scenario.clone(), urdf];
         let read: Vec<_> = read.into_iter().flatten().collect();
-        // What can be read once only is read by the cells from memory.
+        // Cells read a skin that can be read only once from memory.
         let (_file, skin_file) = if can_be_read_again(&self.skin) {
             (None, self.skin)
         } else {
@@ -282,7 +284,7 @@ impl Run {
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
         options.emulated = emulated(self.firmware, &self.emulate, &options.skin)?;
-        // The kernel grants the double, or less to those who may not have it.
+        // The kernel grants twice the size, or less without the privilege.
         let bytes = of_environment("SKINBUS_RECEIVE_BUFFER", 0..=1 << 30)?;
         options.receive_buffer = bytes.unwrap_or(GATEWAY_RECEIVE_BUFFER) as usize;
         options.cells_per_process = self.processes.cells_per_process.into();
@@ -291,14 +293,14 @@ impl Run {
     }
 }
 
-/// The cells that are emulated, by which firmware.
+/// The cells to emulate and their firmware.
 fn emulated(firmware: Option<PathBuf>, named: &[CellName], skin: &Skin) -> Result<Option<Emulated>, Failure> {
     let Some(firmware) = firmware else { return Ok(None) };
     let mut cells = Vec::new();
     for named in named {
         let cell = cell_of(skin, named, "--emulate")?;
         if cells.contains(&cell) {
-            return Err(Failure::usage(format!("--emulate {named} is there twice: name each cell once")));
+            return Err(Failure::usage(format!("--emulate {named} is given twice: name each cell once")));
         }
         cells.push(cell);
     }
@@ -344,9 +346,9 @@ fn bench(
         ("--summary", summary_file),
     ];
     apart(written, read.iter().map(PathBuf::as_path))?;
-    // Before the run, so that a file that cannot be written is reported first.
+    // Created before the run, so that an error of the file is reported first.
     let summary = summary_file.map(|path| overwrite.create("--summary", path)).transpose()?;
-    // A panic is reported in the summary too.
+    // The summary reports a panic too.
     let (page, lines) = page.unzip();
     let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options, lines)));
     drop(page);
@@ -363,7 +365,7 @@ fn bench(
     let files = written.map(|(_, path)| path);
     let table = |is_coloured| show::text(&ended, Look { is_verbose, is_coloured, columns: None });
     let printed = if ended.control.ticks > 0 { print_table(files, table) } else { Ok(()) };
-    // The last line is the failure's own; each of them is one line.
+    // The last line is the failure's own; each message is one line.
     let mut lines = ended.complaints(options.quiet);
     let lost: Vec<_> = unwritten.into_iter().chain(printed.err()).collect();
     let code = if lost.is_empty() { ended.outcome.exit_code() } else { 1 };

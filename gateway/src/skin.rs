@@ -20,7 +20,7 @@ pub(crate) use show::still;
 const REPLIES: &[Word<Answers>] =
     &[("torque", "Each cell its own torque", Answers::Torque), ("sum", "Sums along the tree", Answers::Sum)];
 
-/// Make and draw descriptions of skins, and convert them to URDF and DBC
+/// Create and draw skins, and convert them to URDF and DBC
 #[derive(Args, Debug)]
 pub(crate) struct Skin {
     #[command(subcommand)]
@@ -38,28 +38,28 @@ enum Command {
 
 /// Describe a skin of hexagonal cells on the arm of a UR5
 ///
-/// The same options give the same text; its first line is the command that generates it.
+/// The same options give the same text, whose first line is the command that generates it.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus skin generate -o skin.toml
   skinbus skin generate --cells 508 --buses 2 --format classic > skin.toml")]
 struct Generate {
-    /// How many cells, 1 to 254 a bus
+    /// Number of cells, 1 to 254 per bus
     #[arg(long, default_value_t = 253)]
     cells: usize,
-    /// How many buses; cells of one bus lie together
+    /// Number of buses; cells of one bus lie together
     #[arg(long, default_value_t = 1)]
     buses: usize,
-    /// Joint broadcasts in a second; must divide the 500 Hz of the control loop
+    /// Joint broadcasts per second; must divide the 500 Hz of the control loop
     #[arg(long, default_value_t = 62.5)]
     broadcast_hz: f64,
-    /// What the cells answer with
+    /// Reply of the cells
     #[arg(long, value_parser = one_of(REPLIES), default_value = "torque")]
     reply: Answers,
-    /// The frame format of their packets
+    /// Frame format of their packets
     #[arg(long, value_parser = one_of(FORMATS), default_value = "fd")]
     format: Format,
-    /// The file to write, whole or not at all; else standard output
+    /// The file to write, completely or not at all [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]

@@ -1,4 +1,4 @@
-//! What a skin's robot looks like: its URDF's links on the rows of the skin's chains.
+//! Appearance of a skin's robot: its URDF's links on the rows of the skin's chains.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,18 +14,18 @@ use super::print::count;
 use super::robot_file::{read_urdf, urdf_of};
 use super::visuals::{Packages, Visuals};
 
-/// A part of a link.
+/// A part of a link on a row.
 struct Placed {
-    /// The skin's chain.
+    /// Index of the skin's chain.
     chain: usize,
-    /// The row in whose frame it is, from 1; 0 is where the chain begins.
+    /// Row in whose frame the part is, from 1; 0 is the start of the chain.
     row: usize,
-    /// The part; its pose is from that frame.
+    /// The part; its pose is relative to that frame.
     part: Part,
 }
 
-/// Returns what a page draws of the robot of the skin in a file: for each row its triangles, at most `most` in all; more are
-/// simplified. Nothing, if the skin names no URDF. What cannot be drawn is noted.
+/// Returns the drawing of the robot of a skin's file: triangles for each row, simplified to at most `most` in all.
+/// Empty if the skin names no URDF. Prints a note on parts that cannot be drawn.
 pub(crate) fn shells(file: &Path, skin: &Skin, packages: &Packages, most: usize) -> Vec<Shell> {
     let Some(path) = skin.robot.urdf.as_deref().map(|urdf| urdf_of(file, urdf)) else { return Vec::new() };
     let parts = read_urdf(&path).and_then(|(urdf, _)| parts(&urdf, &path, skin, packages));
@@ -71,9 +71,9 @@ fn parts(urdf: &Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<V
     Ok(parts)
 }
 
-/// The URDF's chain with the same rows as a skin's.
+/// Finds the URDF's chain with the same rows as a skin's chain.
 fn chain_of(urdf: &Urdf, chain: &Chain) -> Option<robots::Chain> {
-    // Which link the chain begins at is not in the skin.
+    // The skin does not name the link at which the chain begins.
     let mut roots = urdf.links().filter_map(|root| urdf.chain(Some(root), &chain.name).ok());
     roots.find(|found| {
         let same = |(one, other): (&ChainRow, &Row)| {
@@ -91,8 +91,8 @@ fn chain_of(urdf: &Urdf, chain: &Chain) -> Option<robots::Chain> {
     })
 }
 
-/// The chain and the row that a link is fixed to, and the link's frame in that of the row. Joints that are in no chain are at rest; what
-/// no chain moves is fixed to where the first one begins.
+/// Finds the chain and the row to which a link is fixed, and the link's frame relative to the row's. Joints outside all
+/// chains are at rest; links that no chain moves are fixed to the start of the first chain.
 fn place(urdf: &Urdf, chains: &[robots::Chain], link: &str) -> Option<(usize, usize, Isometry3<f64>)> {
     let pose = |link: &str| urdf.pose(link, &|joint| urdf.rest(joint)).ok();
     let at = pose(link)?;

@@ -1,4 +1,4 @@
-//! `skinbus view`, and the option `--view` of runs.
+//! Pages in a browser: `skinbus view`, and the option `--view` of runs.
 
 mod address;
 mod token;
@@ -31,21 +31,21 @@ use super::surface::shells;
 use super::visuals::Packages;
 use address::AddressFile;
 
-/// The most triangles of a robot that a page draws; more are simplified.
+/// Maximum number of triangles of a robot that a page draws; larger meshes are simplified.
 const TRIANGLES: usize = 20_000;
 
-/// Where a page is served unless it is told.
+/// Default address of a page.
 const LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 
 /// Show a skin in a browser, live or recorded, and press its cells with the mouse
 ///
-/// Listens to the buses of a bench or of a robot, and serves one page that draws the arm and its cells: coloured by force,
-/// proximity or temperature, their state by their shape, each joint's torque beside the central computation. A click presses
-/// a cell with a stimulus, if it is in test mode. Of a recording the same page plays, scrubs, steps by epoch, and goes to
-/// the next touch, loss, silent cell or halt. The page needs no network but this server, which only answers this machine,
-/// unless --listen names another address. A page that can press and halt, or that others can reach, has a random token in its
-/// address, without which the server tells and does nothing. If the skin has robot.urdf, the robot is drawn by its meshes,
-/// as far as they are found. It ends with Ctrl-C.
+/// Receives on the buses of a bench or a robot, and serves one page that draws the arm and its cells: colours show
+/// force, proximity or temperature, shapes show states, and each joint's torque appears beside the central computation.
+/// A click presses a cell with a stimulus, if it is in test mode. For a recording, the page plays, scrubs, steps by
+/// epoch, and jumps to the next touch, loss, silent cell or halt. The page needs no network but this server, which
+/// serves only this machine, unless --listen names another address. A page that can press and halt, or that other
+/// machines can reach, has a random token in its address, which the server requires. If the skin has robot.urdf, the
+/// robot is drawn by its meshes, as far as they are found. Ctrl-C ends it.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus demo --view
@@ -55,34 +55,34 @@ const LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
   skinbus view run.log --skin skin.toml
   skinbus view skin.toml --listen 0.0.0.0:8100 --token-file token --read-only")]
 pub(crate) struct View {
-    /// A skin's description, whose buses are listened to; or some of its buses, with --skin; or a candump log or MCAP
-    /// recording, or all parts of a split one in any order
+    /// A skin, for its buses; or some of its buses, with --skin; or a candump log or MCAP recording, or all parts of a
+    /// split one in any order
     #[arg(required = true, value_name = "SKIN|BUS|FILE")]
     sources: Vec<PathBuf>,
-    /// The skin of buses that are named, or of a recording; without it a recording's is the one in it
+    /// The skin of named buses or of a recording [default: the skin in the recording]
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Stay at this second of the recorded run, or after the first frame of a log, instead of playing it
+    /// Show this second of the recorded run, counted from the first frame of a log, instead of playing
     #[arg(long, value_name = "S", value_parser = nanos)]
     at: Option<u64>,
-    /// The address of the page; port 0 is any that is free
+    /// Address of the page; port 0 is any free port
     #[arg(long, value_name = "ADDRESS:PORT", default_value_t = LISTEN)]
     listen: SocketAddr,
-    /// Take the token in the page's address from this file; else from the variable SKINBUS_TOKEN, else it is random
+    /// Read the token in the page's address from this file [default: the variable SKINBUS_TOKEN, else random]
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
-    /// Write the page's address to this file as well, for scripts: only you can read it, and it goes with the page; - is
-    /// standard output
+    /// Also write the page's address to this file, for scripts: only you can read it, and it is removed with the page;
+    /// - is standard output
     #[arg(long, value_name = "FILE")]
     address_file: Option<PathBuf>,
-    /// Let pages look, but not press, halt or resume
+    /// Let pages display only, without pressing, halting or resuming
     #[arg(long)]
     read_only: bool,
-    /// Wait for buses that are not there yet
+    /// Wait for buses that do not exist yet
     #[arg(long)]
     wait: bool,
-    /// Belong to the run that has started it: serve who comes to the listener at standard input, exchange commands and states
-    /// over the socket at standard output, end with it
+    /// Serve the run that started this program: accept connections on the listener at standard input, exchange commands
+    /// and states over the socket at standard output, and end with the run
     #[arg(long, hide = true)]
     of_run: bool,
     #[command(flatten)]
@@ -91,14 +91,14 @@ pub(crate) struct View {
     kinds: BusKinds,
 }
 
-/// The options of a run's page.
+/// Options of a run's page.
 #[derive(Args, Debug, Default)]
 pub(crate) struct PageOptions {
-    /// Write the page's address to this file as well, for scripts: only you can read it, and it goes with the page; - is
-    /// standard output
+    /// Also write the page's address to this file, for scripts: only you can read it, and it is removed with the page;
+    /// - is standard output
     #[arg(long, value_name = "FILE", requires = "view")]
     address_file: Option<PathBuf>,
-    /// Take the token in the page's address from this file; else from the variable SKINBUS_TOKEN, else it is random
+    /// Read the token in the page's address from this file [default: the variable SKINBUS_TOKEN, else random]
     #[arg(long, value_name = "FILE", requires = "view")]
     token_file: Option<PathBuf>,
 }
@@ -107,7 +107,7 @@ pub(crate) struct PageOptions {
 struct Served {
     listener: TcpListener,
     access: Access,
-    /// Its address, unless the run says that.
+    /// Address of the page, unless the run prints it.
     url: Option<String>,
 }
 
@@ -132,13 +132,13 @@ impl View {
         if is_recording { self.recorded(served) } else { self.live(served) }
     }
 
-    /// The skin of buses.
+    /// Serves the page of live buses.
     fn live(self, served: Served) -> Result<(), Failure> {
         let (skin, surface) = match self.sources.as_slice() {
             [one, ..] if !one.exists() => self.on_buses()?,
             [one] if self.skin.is_none() && self.at.is_none() => self.read(one)?,
             [one] => {
-                let why = "is of a recording, and this is a skin, whose buses are listened to";
+                let why = "is for a recording, and this is a skin";
                 return Err(Failure::usage(format!("{}: --skin or --at {why}", one.display())));
             }
             _ => {
@@ -156,16 +156,16 @@ impl View {
         Ok(())
     }
 
-    /// The part of a skin on the buses that are named.
+    /// Part of a skin on the named buses.
     fn on_buses(&self) -> Result<(Skin, Vec<Shell>), Failure> {
         let Some(file) = &self.skin else {
             let name = self.sources.first().map(|it| it.display().to_string()).unwrap_or_default();
             return Err(Failure::usage(format!(
-                "there is no file {name}: name a skin, whose buses are listened to, a recording, or a bus and its --skin"
+                "there is no file {name}: name a skin, to show its buses, a recording, or a bus and its --skin"
             )));
         };
         if self.at.is_some() {
-            return Err(Failure::usage("--at is of a recording, and buses are listened to"));
+            return Err(Failure::usage("--at is for a recording, not for live buses"));
         }
         let (skin, surface) = self.read(file)?;
         let of = |source: &PathBuf| bus_of(&skin, &file.display().to_string(), &source.to_string_lossy());
@@ -175,7 +175,7 @@ impl View {
         Ok((skin.on_buses(&buses), surface))
     }
 
-    /// A recording.
+    /// Serves the page of a recording.
     fn recorded(self, served: Served) -> Result<(), Failure> {
         let (skin, surface) = self.recorded_skin()?;
         #[expect(clippy::cast_precision_loss, reason = "to the µs")]
@@ -195,14 +195,14 @@ impl View {
         Ok(())
     }
 
-    /// The skin in a file, and its robot by its meshes, as far as they are found.
+    /// Reads a skin with the meshes of its robot, as far as they are found.
     fn read(&self, path: &Path) -> Result<(Skin, Vec<Shell>), Failure> {
         let skin = read_skin(path)?;
         let surface = shells(path, &skin, &self.packages, TRIANGLES);
         Ok((skin, surface))
     }
 
-    /// The skin of a recording; of the one in it the URDF is not beside it.
+    /// Skin of a recording. The skin inside a recording has no URDF beside it.
     fn recorded_skin(&self) -> Result<(Skin, Vec<Shell>), Failure> {
         match &self.skin {
             Some(path) => {
@@ -222,21 +222,21 @@ impl View {
         }
     }
 
-    /// Whether it is a recording, by what is in it, and not a skin.
+    /// Returns true for a recording, false for a skin, by the content of the file.
     fn is_recording(&self) -> Result<bool, Failure> {
         let Some(first) = self.sources.first() else { return Ok(false) };
         if !first.exists() {
             return Ok(false);
         }
         if first.metadata().is_ok_and(|about| !about.is_file()) {
-            let what = "is no regular file: name a skin, whose buses are listened to, or a recording";
+            let what = "is not a regular file: name a skin, to show its buses, or a recording";
             return Err(Failure::usage(format!("{} {what}", first.display())));
         }
         let mut reader = Reader::open(first).map_err(Failure::usage)?;
         if reader.format() == Format::Mcap || reader.has_frame().map_err(Failure::usage)? {
             return Ok(true);
         }
-        // What is to be shown with a skin of its own, or of which a moment is, is no skin.
+        // A file given with --skin or --at is not a skin.
         if (self.skin.is_some() || self.at.is_some()) && Skin::read(first).is_err() {
             return Err(no_frame(&reader));
         }
@@ -244,7 +244,7 @@ impl View {
     }
 }
 
-/// The error for an address that no page can have.
+/// Error for an address on which no page can be served.
 fn unbound(listen: SocketAddr, error: &io::Error) -> Failure {
     let is = |kind| error.kind() == kind;
     let hint = if is(io::ErrorKind::AddrNotAvailable) {
@@ -259,7 +259,7 @@ fn unbound(listen: SocketAddr, error: &io::Error) -> Failure {
     ))
 }
 
-/// Prints where the page is.
+/// Prints the address of the page.
 fn say(url: Option<String>) {
     url.iter().for_each(|url| note(format_args!("view: {url}")));
 }
@@ -279,7 +279,7 @@ fn failed(error: &io::Error) -> Failure {
     Failure::run(format!("--view: {error}"))
 }
 
-/// The page of a run, in a process of its own; it ends with this value.
+/// The page of a run in a process of its own; dropping it ends the process.
 #[derive(Debug)]
 pub(crate) struct Page {
     process: Child,
@@ -287,7 +287,7 @@ pub(crate) struct Page {
 }
 
 impl Page {
-    /// Serves the page of a run, whose buses open later; and where it sends what pages want of the run.
+    /// Serves the page of a run, whose buses open later. Returns it with the connection for its commands.
     pub(crate) fn of(
         run: &run::Options,
         listen: Option<SocketAddr>,
@@ -306,7 +306,7 @@ impl Page {
         }
         let listen = listen.unwrap_or(LISTEN);
         let token = token::needed(token::chosen(options.token_file.as_deref())?, true, listen)?;
-        // In its environment only this user can read it, on its command line everybody.
+        // Only this user can read the environment of a process; everyone can read its command line.
         match &token {
             Some(token) => command.env(token::VARIABLE, token.as_str()),
             None => command.env_remove(token::VARIABLE),
@@ -319,7 +319,7 @@ impl Page {
         let (here, there) = UnixStream::pair().map_err(|error| failed(&error))?;
         let lines =
             here.try_clone().and_then(|input| Lines::new(input, here)).map_err(|error| failed(&error))?;
-        // Its signals are its own: the run ends it, also on Ctrl-C.
+        // The page gets no signals of the terminal: the run ends it, also on Ctrl-C.
         command.process_group(0).stdin(OwnedFd::from(listener)).stdout(OwnedFd::from(there));
         let process = command.spawn().map_err(|error| failed(&error))?;
         say(Some(url));

@@ -1,4 +1,4 @@
-//! What a robot's links look like: the shapes of a URDF as meshes, from the files that it names.
+//! Appearance of a robot's links: the shapes of a URDF as meshes, from the files that it names.
 
 use std::path::{Path, PathBuf};
 
@@ -8,20 +8,20 @@ use cover::mesh::{Mesh, MeshError, UpAxis};
 use robots::{Geometry, Shape, Urdf};
 use trace::files::folder_of;
 
-/// Where the files of packages are.
+/// Directories of packages.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct Packages {
-    /// Where files are that the URDF names as package://NAME/..., as often as there are packages; else they are searched
-    /// for in the folder of the URDF and those above it
+    /// Directory of the files that the URDF names as package://NAME/...; repeat the option for further packages.
+    /// Default: search the directory of the URDF and those above it
     #[arg(long, value_name = "NAME=DIR", value_parser = package)]
     package: Vec<(String, PathBuf)>,
-    /// The command has no such option.
+    /// True for commands without this option.
     #[arg(skip)]
     only_beside: bool,
 }
 
 impl Packages {
-    /// Those beside the URDF, for a command without the option.
+    /// Packages beside the URDF, for a command without the option.
     pub(crate) fn beside() -> Self {
         Self { package: Vec::new(), only_beside: true }
     }
@@ -36,24 +36,24 @@ fn package(text: &str) -> Result<(String, PathBuf), String> {
     }
 }
 
-/// The shapes of a robot.
+/// Shapes of a robot.
 pub(crate) struct Visuals<'a> {
     urdf: &'a Urdf,
-    /// The folder of the URDF.
+    /// Directory of the URDF.
     folder: PathBuf,
     packages: &'a Packages,
 }
 
 impl<'a> Visuals<'a> {
-    /// Those of the URDF in this file.
+    /// Creates the shapes of the URDF in this file.
     pub(crate) fn new(urdf: &'a Urdf, file: &Path, packages: &'a Packages) -> Self {
         let folder = folder_of(file);
-        // From `.` there are no folders above.
+        // `.` has no parent directories.
         let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
         Self { urdf, folder, packages }
     }
 
-    /// What a link is made of; nothing, if the URDF has no visual of it.
+    /// Parts of a link; empty if the URDF has no visual for it.
     pub(crate) fn parts(&self, link: &str) -> Result<Vec<Part>, String> {
         let shapes = self.urdf.visuals(link).map_err(|error| error.to_string())?;
         let part =
@@ -81,7 +81,7 @@ impl<'a> Visuals<'a> {
         Ok(Part { pose: shape.origin, ..part })
     }
 
-    /// The file that a URI or a path of the URDF names.
+    /// Finds the file that a URI or a path of the URDF names.
     fn find(&self, uri: &str) -> Result<PathBuf, String> {
         let of_package = uri.strip_prefix("package://").or_else(|| uri.strip_prefix("model://"));
         let Some((name, rest)) = of_package.map(|path| path.split_once('/').unwrap_or((path, ""))) else {
@@ -112,7 +112,7 @@ impl<'a> Visuals<'a> {
         if let Some(path) = tried.iter().find(|path| path.is_file()) {
             return Ok(path.clone());
         }
-        // Of several folders the one that has the package's name.
+        // Prefer a directory that has the package's name.
         let named =
             |path: &&PathBuf| given.is_some() || path.ancestors().any(|it| it.ends_with(name) && it.is_dir());
         let shown = tried
@@ -128,20 +128,20 @@ impl<'a> Visuals<'a> {
             None if self.packages.only_beside => {
                 format!("put the folder of package {name} beside the URDF, or above it")
             }
-            None => format!("say where the package is with --package {name}=DIR"),
+            None => format!("name its directory with --package {name}=DIR"),
         };
         Err(format!("mesh {uri}: {shown} is no file: {hint}"))
     }
 }
 
-/// The path of a `file:` URI; anything else is a path.
+/// Path of a `file:` URI; other texts are paths already.
 fn path_of_uri(uri: &str) -> &str {
     let Some(rest) = uri.strip_prefix("file:") else { return uri };
     let local = rest.strip_prefix("//localhost").filter(|path| path.starts_with('/'));
     local.or_else(|| rest.strip_prefix("//")).unwrap_or(rest)
 }
 
-/// A path as it is written; of a URI also with its escapes, as in `%20`, decoded.
+/// A path as written; for a URI also with its escapes, such as `%20`, decoded.
 fn spellings(path: &str, is_uri: bool) -> impl Iterator<Item = String> {
     let decoded = is_uri.then(|| decoded(path)).flatten().filter(|decoded| decoded != path);
     core::iter::once(path.to_owned()).chain(decoded)
@@ -167,7 +167,7 @@ mod tests {
         let hint = |packages: &Packages| {
             Visuals::new(&urdf, Path::new("none/r.urdf"), packages).find("package://p/a.stl").unwrap_err()
         };
-        assert!(hint(&Packages::default()).ends_with("say where the package is with --package p=DIR"));
+        assert!(hint(&Packages::default()).ends_with("name its directory with --package p=DIR"));
         let beside = hint(&Packages::beside());
         assert!(beside.ends_with("put the folder of package p beside the URDF, or above it"), "{beside}");
     }

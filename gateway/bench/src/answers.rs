@@ -1,4 +1,4 @@
-//! The cells of a running bench that are there, and their answers to a request.
+//! The cells present on a running bench, and their answers to a request.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use protocol::message::{Answer, Message, NetworkPage, State};
 
 use crate::bus::listen::Listener;
 
-/// What was received of the cells that a packet is for.
+/// Answers received from the cells that a packet addresses.
 #[derive(Debug)]
 pub struct Answers {
     only: Option<CellId>,
@@ -20,16 +20,17 @@ pub struct Answers {
 }
 
 impl Answers {
-    /// Of one cell, or of all; `tag` is that of the request, none if the packet asks for no answer.
+    /// Collects answers of one cell (`only`) or of all cells. `tag` is the tag of the request, or `None` if the packet
+    /// asks for no answer.
     #[must_use]
     pub const fn new(only: Option<CellId>, tag: Option<u8>) -> Self {
         Self { only, tag, present: BTreeSet::new(), received: Vec::new() }
     }
 
-    /// Waits a moment for packets, and takes them.
+    /// Waits up to 20 ms for packets and records them.
     ///
     /// # Errors
-    /// When the bus is down, gone or closed.
+    /// Returns [`BusError`] if the bus is down, gone or closed.
     pub fn hear(&mut self, listener: &mut Listener) -> Result<(), BusError> {
         listener.hear(Duration::from_millis(20))?;
         for (_, decoded) in listener.decoded() {
@@ -40,7 +41,7 @@ impl Answers {
         Ok(())
     }
 
-    /// Takes one packet.
+    /// Records one packet.
     pub fn take(&mut self, message: &Message) {
         let Some(from) = message.sender().filter(|&from| self.only.is_none_or(|only| only == from)) else {
             return;
@@ -48,7 +49,7 @@ impl Answers {
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message
             && heartbeat.state.has(State::CLAIMING)
         {
-            // It has not got that node id yet.
+            // A claiming cell does not own that node id yet.
             return;
         }
         if let Message::Configured { tag, answer, .. } = *message
@@ -59,19 +60,19 @@ impl Answers {
         self.present.insert(from);
     }
 
-    /// The cells that are there, whether they answered or not.
+    /// The cells that are present, including those that have not answered.
     #[must_use]
     pub const fn present(&self) -> &BTreeSet<CellId> {
         &self.present
     }
 
-    /// The answers, in the order of their arrival.
+    /// The answers, in the order of arrival.
     #[must_use]
     pub fn received(&self) -> &[(CellId, Answer)] {
         &self.received
     }
 
-    /// Those that are there and have not answered, or the one that is asked.
+    /// The cells that have not answered: those present, and the addressed cell.
     #[must_use]
     pub fn missing(&self) -> BTreeSet<CellId> {
         let answered = |cell: &CellId| self.received.iter().any(|(from, _)| from == cell);

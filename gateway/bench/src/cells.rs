@@ -13,31 +13,31 @@ use protocol::time::Micros;
 
 use crate::bus::listen::{self, Listener, passing, send};
 
-/// Cells send four heartbeats a second, which show their frames' format.
+/// Time to wait for a heartbeat (sent four times a second), which shows the cells' frame format.
 const FORMAT: Duration = Duration::from_millis(300);
-/// How often all cells are queried again.
+/// Interval between queries to all cells.
 const REQUEST: Duration = Duration::from_secs(2);
-/// How long one poll of the bus waits for a frame.
+/// Time that one poll of the bus waits for a frame.
 const LOOK: Duration = Duration::from_millis(50);
 
-/// What was received from the cells of a bus, and when they were queried.
+/// Reports received from the cells of a bus, and the time of the last query.
 #[derive(Debug)]
 pub struct Watch {
     listener: Listener,
     began: Instant,
     listing: Listing,
     others: u64,
-    /// The format of packets, if it is known before the first frame.
+    /// Format of packets, if known before the first frame.
     format: Option<Format>,
     requested: Option<Instant>,
 }
 
 impl Watch {
-    /// Opens a bus, also a classic interface, to receive from cells and gateways. Queries are sent in this format,
-    /// or else in that of the cells.
+    /// Opens a bus, also a classic interface, to receive from cells and gateways. Queries are sent in this format, or
+    /// else in the format of the cells.
     ///
     /// # Errors
-    /// When the bus cannot be opened.
+    /// Returns [`BusError`] if the bus cannot be opened.
     pub fn open(name: &str, kind: Choice, format: Option<Format>) -> Result<Self, BusError> {
         let kinds = Kind::ALL.into_iter().filter(|kind| kind.is_from_cells());
         let mut filters: Vec<_> = kinds.map(Filter::kind).collect();
@@ -49,40 +49,40 @@ impl Watch {
         Ok(Self { listener, began: Instant::now(), listing, others: 0, format, requested: None })
     }
 
-    /// The bus.
+    /// The open bus.
     #[must_use]
     pub const fn bus(&self) -> &Bus {
         self.listener.bus()
     }
 
-    /// What was received.
+    /// The reports received so far.
     #[must_use]
     pub const fn listing(&self) -> &Listing {
         &self.listing
     }
 
-    /// Frames that are no packet.
+    /// Number of frames that are not packets.
     #[must_use]
     pub const fn others(&self) -> u64 {
         self.others
     }
 
-    /// How long it has been received on.
+    /// Time since the bus was opened.
     #[must_use]
     pub fn elapsed(&self) -> Duration {
         self.began.elapsed()
     }
 
-    /// The same as the time on the listing's clock.
+    /// The present time on the listing's clock.
     #[must_use]
     pub fn now(&self) -> Micros {
         Micros::after(self.began.elapsed())
     }
 
-    /// Queries the cells once their frames' format is known; repeatedly if `again`.
+    /// Queries the cells once the format of their frames is known; queries them repeatedly if `again`.
     ///
     /// # Errors
-    /// When the bus is gone or closed.
+    /// Returns [`BusError`] if the bus is gone or closed.
     pub fn request(&mut self, again: bool) -> Result<(), BusError> {
         let due = self.requested.is_none_or(|requested| again && requested.elapsed() >= REQUEST);
         let waited = (self.elapsed() >= FORMAT).then_some(Format::Fd);
@@ -93,16 +93,16 @@ impl Watch {
         let requested =
             [Message::Report, Message::Sync].iter().try_for_each(|it| send(self.bus(), it, format));
         match requested {
-            // Cells that cannot be queried are still received.
+            // Cells that cannot be queried can still be received.
             Err(BusError::FdFrame { .. }) => Ok(()),
             requested => passing(requested, Duration::ZERO).map(|_| ()),
         }
     }
 
-    /// Receives what comes within a poll. A bus that is down is waited for, unless `stopped`.
+    /// Receives for the time of one poll. Waits while the bus is down, unless `stopped`.
     ///
     /// # Errors
-    /// When the bus is gone or closed.
+    /// Returns [`BusError`] if the bus is gone or closed.
     pub fn hear(&mut self, stopped: &AtomicBool) -> Result<(), BusError> {
         let heard = self.listener.hear(LOOK);
         if stopped.load(Ordering::Relaxed) {

@@ -1,4 +1,5 @@
-//! Commissioning the buses of a skin, each by a thread of its own: clocks and sockets. It decides nothing.
+//! Commissioning of the buses of a skin, each in a thread of its own: clocks and sockets around [`Commission`], which
+//! makes all decisions.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,49 +17,49 @@ use protocol::time::Micros;
 use crate::bus::listen::{self, Listener, passing, send};
 use crate::bus::roots::Roots;
 
-/// How long a signal to end may wait if nothing comes.
+/// Longest time without a check for a signal.
 const LOOK: Duration = Duration::from_millis(50);
-/// How often progress is read.
+/// Interval between progress reports.
 const TELL: Duration = Duration::from_millis(20);
-/// The pause while an interface is down.
+/// Pause while an interface is down.
 const DOWN: Duration = Duration::from_millis(20);
-/// Bytes that a waiting frame takes in a socket, as the kernel counts.
+/// Bytes that the kernel counts in a socket's buffer for each waiting frame.
 const FRAME_BYTES: usize = 1_024;
 
-/// An open bus of a skin.
+/// An open bus whose cells are to be commissioned.
 #[derive(Debug)]
 pub struct Bench {
     index: usize,
     listener: Listener,
     format: Format,
-    /// The links to the roots of a network, whose cells may have no node ids yet.
+    /// Wires to the roots of a network, whose cells may have no node ids yet.
     roots: Option<Roots>,
 }
 
-/// The result of a bus.
+/// The result of commissioning a bus.
 #[derive(Debug)]
 pub struct Done {
-    /// The bus.
+    /// Name of the bus.
     pub name: String,
-    /// Its kind.
+    /// Kind of the bus.
     pub kind: String,
-    /// The result of its cells.
+    /// Results of the cells.
     pub report: Report,
-    /// Why it was ended: another gateway is there, or the bus is gone.
+    /// Reason for an early end: another gateway is on the bus, or the bus is gone.
     pub failure: Option<String>,
-    /// Frames that came faster than they were read.
+    /// Number of frames lost because they arrived faster than they were read.
     pub dropped: u32,
 }
 
-/// Opens a bus of a skin.
+/// Opens a bus of a skin for commissioning.
 ///
 /// # Errors
-/// When it cannot be opened.
+/// Returns [`BusError`] if the bus cannot be opened.
 pub fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, BusError> {
     let described = skin.buses.get(index);
     let (name, format) = described.map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));
     let mut roots = Roots::of(skin, index);
-    // Their messages are received from the beginning.
+    // The roots' messages are received from the beginning.
     roots.iter_mut().for_each(Roots::explore);
     let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(Filter::kind).to_vec();
     filters.push(Filter::exact(Id::command(Command::Joints)));
@@ -67,13 +68,13 @@ pub fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, BusError>
     let options = Options { filters, receive_buffer, ..Options::default() };
     let bus = listen::open(name, kinds.of(name), Some(format), options)?;
     if roots.is_some() && !bus.is_virtual()? {
-        // Real cells have real wires; simulated wires must not be used among them.
+        // Real cells have real wires; do not simulate wires among them.
         roots = None;
     }
     Ok(Bench { index, listener: Listener::new(bus, Some(format)), format, roots })
 }
 
-/// Commissions the cells of all buses, or as many as it can until it is stopped; shows the progress.
+/// Commissions the cells of all buses until done or stopped, and shows the progress.
 pub fn commission(
     benches: Vec<Bench>,
     skin: &Skin,
@@ -94,7 +95,7 @@ pub fn commission(
     thread::scope(|scope| {
         let start = |bench| thread::Builder::new().spawn_scoped(scope, move || work(bench)).ok();
         let started: Vec<_> = waiting.iter().enumerate().map(|bench| (bench, start(bench))).collect();
-        // A bus for which the system has no thread is commissioned by this one.
+        // If the system grants no thread, this thread commissions the bus.
         let here = |(bench, thread)| match thread {
             Some(thread) => (Some(thread), None),
             None => (None, work(bench)),
@@ -116,7 +117,7 @@ pub fn commission(
 }
 
 impl Bench {
-    /// Commissions the bus' cells, or as many as it can until it is stopped; reports the progress.
+    /// Commissions the cells of the bus until done or stopped, and reports the progress.
     fn work(mut self, skin: &Skin, wish: Wish, stopped: &AtomicBool, tell: impl FnMut(Progress)) -> Done {
         let frames = match self.format {
             Format::Fd => 1,
@@ -160,7 +161,7 @@ impl Bench {
                 roots.speak(listener.bus());
             }
             while let Some(message) = commission.poll_transmit() {
-                // What was not sent is not answered, and is sent again.
+                // A packet that was not sent gets no answer, and is sent again.
                 passing(send(listener.bus(), &message, *format), DOWN)?;
             }
             let Some(next) = commission.poll_timeout() else { return Ok(()) };

@@ -1,4 +1,4 @@
-//! Why a run did not come to its end.
+//! Errors that end a run early.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -20,10 +20,10 @@ use crate::signals::SignalError;
 use crate::threads::ThreadError;
 use control::external::SocketError;
 
-/// How benches on embedded buses avoid each other.
+/// The hint on how to separate benches on embedded buses.
 const ELSEWHERE: &str = "set SKINBUS_DIR to another directory for this run";
 
-/// Why a run did not come to its end.
+/// An error that ended a run early.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RunError {
@@ -36,29 +36,29 @@ pub enum RunError {
     /// A program does not start.
     #[error(transparent)]
     Launch(#[from] LaunchError),
-    /// No recording can be made.
+    /// The recording cannot be created.
     #[error(transparent)]
     Output(#[from] OutputError),
-    /// There is no socket for an external controller.
+    /// The socket for an external controller cannot be opened.
     #[error("{0}{cause}", cause = .0.source().map(|cause| format!(": {cause}")).unwrap_or_default())]
     Controller(#[from] SocketError),
     /// The tree of cells is too deep for their slots.
     #[error(transparent)]
     TooDeep(#[from] TooDeep),
-    /// Cells cannot keep their parameters there.
+    /// The directory for the cells' parameters cannot be used.
     #[error("--flash {}: there is no such directory; make it first", .0.display())]
     NoFlash(PathBuf),
-    /// A scenario requests what only a simulated bus can do.
+    /// A scenario asks for a fault that only a simulated bus can make.
     #[error(
         "the fault {kind:?} of {bus} at {at_s} s: a run with processes cannot make it; kill, stop, continue, restart, \
          link_down, link_up, stuck and drift it can"
     )]
     BusFault {
-        /// Its kind in the file.
+        /// Kind of the fault, as in the file.
         kind: &'static str,
-        /// The bus.
+        /// Name of the bus.
         bus: String,
-        /// When, in s.
+        /// Time of the fault in s.
         at_s: f64,
     },
     /// Simulated wires must not be used on a real bus.
@@ -70,30 +70,30 @@ pub enum RunError {
     /// Signals cannot be caught.
     #[error(transparent)]
     Signal(#[from] SignalError),
-    /// A signal ended it before it began.
+    /// A signal ended the run before it began.
     #[error("interrupted while starting")]
     Interrupted,
-    /// The system gives no thread.
+    /// The system grants no thread.
     #[error(transparent)]
     Thread(#[from] ThreadError),
-    /// The system gives no file in memory.
+    /// The system grants no file in memory.
     #[error(transparent)]
     Memory(#[from] MemoryError),
-    /// A bus is lost.
+    /// A bus was lost.
     #[error(transparent)]
     Lost(BusError),
     /// Another gateway is on a bus.
     #[error("{}", other_gateway(.0.as_ref()))]
     OtherGateway(Option<(String, BusKind)>),
-    /// Cells are on a bus on which some were to be started.
+    /// Other cells are on a bus on which cells were to be started.
     #[error(
         "cells are on the bus already: {cells}; use them with --no-spawn, {}",
         if *.embedded { format!("stop them, or {ELSEWHERE}") } else { "or stop them".to_owned() }
     )]
     CellsThere {
-        /// Which.
+        /// The cells found.
         cells: String,
-        /// Whether the bus is an embedded one.
+        /// True if the bus is embedded.
         embedded: bool,
     },
     /// Cells have no parameters.
@@ -108,37 +108,37 @@ pub enum RunError {
         if *.spawned { "see their own messages above" } else { "start them with cell-node, or leave out --no-spawn" }
     )]
     NotReady {
-        /// Which.
+        /// The cells.
         cells: String,
-        /// Whether they were started here.
+        /// True if this run started the cells.
         spawned: bool,
     },
-    /// Cells have another configuration.
+    /// Cells are configured for another skin.
     #[error(
         "cells that are configured for another skin than {}: {cells}; write it into them with `skinbus commission`, or \
          delete their flash files",
         .skin.display()
     )]
     OtherSkin {
-        /// The skin's file.
+        /// Path of the skin's file.
         skin: PathBuf,
-        /// Which.
+        /// The cells.
         cells: String,
     },
-    /// A cell's process ended too early.
+    /// The process of a cell ended too early.
     #[error("{cells} ended while starting ({status}){}", why(.said.as_deref()))]
     Ended {
-        /// Its cells.
+        /// The cells of the process.
         cells: String,
-        /// How.
+        /// Exit status of the process.
         status: ExitStatus,
-        /// Why, if it said so.
+        /// Reason that the process gave, if any.
         said: Option<String>,
     },
-    /// Cells are not emulated.
+    /// Cells cannot be emulated.
     #[error(transparent)]
     Emulate(#[from] EmulateError),
-    /// The network is not as it is described, and cannot carry sums.
+    /// The network differs from its description and cannot carry sums.
     #[error("{0}")]
     BrokenTree(String),
     /// Cells do not answer with sums.
@@ -147,13 +147,13 @@ pub enum RunError {
     /// A thread panicked.
     #[error("the {0} panicked")]
     Panicked(&'static str),
-    /// A receiver has ended.
+    /// A receiver ended.
     #[error("a receiver ended while the loop ran")]
     ReceiverEnded,
 }
 
 impl RunError {
-    /// The first fault of a bus in a scenario, if there is one.
+    /// The first bus fault in a scenario, if any.
     #[must_use]
     pub fn bus_fault(scenario: &Scenario, skin: &Skin) -> Option<Self> {
         scenario.faults.iter().find_map(|fault| match &fault.kind {
@@ -166,7 +166,7 @@ impl RunError {
         })
     }
 
-    /// 2 for wrong use or configuration, 1 for a run that failed.
+    /// Exit code: 2 for wrong use or configuration, 1 for a run that failed.
     #[must_use]
     pub const fn exit_code(&self) -> u8 {
         match self {
@@ -208,7 +208,7 @@ impl From<ServeError> for RunError {
     }
 }
 
-/// The reason that a process gave, or where else there may be one.
+/// The reason that a process gave, as the end of a sentence, or a reference to its own message.
 pub(crate) fn why(said: Option<&str>) -> String {
     said.map_or_else(|| "; see the message above".to_owned(), |said| format!(": {said}"))
 }

@@ -1,4 +1,4 @@
-//! Live benches: cells as processes, buses, the control loop, and what is recorded of them.
+//! Live benches: cells as processes, buses, the control loop, and recordings of them.
 //!
 //! | module | what |
 //! |---|---|
@@ -8,9 +8,9 @@
 //! | [`emulate`] | cells that run a microcontroller's machine code in an emulator |
 //! | [`run`] | a run: processes, buses, loop, and its result ([`summary`]) |
 //! | [`record`] | what a run records, and the thread that writes it |
-//! | [`remote`] | commands to a run from another process, and what that is sent |
-//! | [`replay`] | a capture on a bus again, compared |
-//! | [`view`] | the state of a bus' cells that a receiver shows |
+//! | [`remote`] | commands to a run from other processes, and the data that it sends them |
+//! | [`replay`] | plays a capture on a bus again and compares the answers |
+//! | [`view`] | the state of the cells of a bus, for display |
 //! | [`signals`] | signals that end a command |
 
 pub mod answers;

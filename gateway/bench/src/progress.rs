@@ -1,4 +1,4 @@
-//! The progress line of a run: rewritten in place on a terminal, as wide as that is, printed periodically elsewhere.
+//! The progress line of a run: rewritten in place and cut to the width on a terminal, printed periodically elsewhere.
 
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
@@ -7,33 +7,33 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::usage::{say, shown};
 use rustix::termios::tcgetwinsize;
 
-/// How often the line is renewed on a terminal, and elsewhere.
+/// Interval between updates on a terminal, and elsewhere.
 const PERIODS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
 
 /// The progress line, on standard error.
 #[derive(Debug)]
 pub struct Progress {
-    /// Hidden where there is no terminal.
+    /// Hidden without a terminal.
     bar: ProgressBar,
     quiet: bool,
     due: Instant,
 }
 
 impl Progress {
-    /// A line that has not been shown yet; never will be if `quiet`.
+    /// Creates a line that has not been shown yet, and never is if `quiet`.
     #[must_use]
     pub fn new(quiet: bool) -> Self {
         let terminal = std::io::stderr().is_terminal() && !quiet;
         Self { bar: if terminal { line() } else { ProgressBar::hidden() }, ..Self::lines(quiet) }
     }
 
-    /// Nothing but notes, as long as there is no [`Progress::bar`].
+    /// Shows only notes until [`Progress::bar`] is called.
     #[must_use]
     pub fn lines(quiet: bool) -> Self {
         Self { bar: ProgressBar::hidden(), quiet, due: Instant::now() }
     }
 
-    /// A bar of this length, or something that turns when it has no end; only a terminal shows it.
+    /// Starts a bar of this length, or a spinner if the length is unknown. Only terminals show it.
     pub fn bar(&mut self, length: Option<u64>) -> ProgressBar {
         if !self.quiet {
             let (bar, style) = match length {
@@ -45,7 +45,7 @@ impl Progress {
         self.bar.clone()
     }
 
-    /// Shows the line when its time has come. `text` gets the letters that a line has room for, `None` without a terminal.
+    /// Shows the line if it is due. `text` gets the number of columns, or `None` without a terminal.
     pub fn show(&mut self, text: impl FnOnce(Option<usize>) -> String) {
         let now = Instant::now();
         if self.quiet || now < self.due {
@@ -61,14 +61,14 @@ impl Progress {
         self.bar.tick();
     }
 
-    /// Writes something above the line.
+    /// Writes a line above the progress line.
     pub fn note(&self, text: &str) {
         if !self.quiet {
             self.bar.suspend(|| say(text));
         }
     }
 
-    /// Writes an error above the line, also if it is quiet.
+    /// Writes an error above the line, even if quiet.
     pub fn error(&self, text: &str) {
         self.bar.suspend(|| say(text));
     }
@@ -79,13 +79,13 @@ impl Progress {
     }
 }
 
-/// Returns the columns of the terminal on standard error; `None` if it does not report them.
+/// Columns of the terminal on standard error, or `None` if unknown.
 fn columns() -> Option<usize> {
     let size = tcgetwinsize(std::io::stderr()).ok()?;
     Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
 }
 
-/// A line that is cut where the terminal ends.
+/// A progress line that is cut at the terminal's width.
 fn line() -> ProgressBar {
     styled(ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr()), "{wide_msg}")
 }

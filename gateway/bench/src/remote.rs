@@ -1,11 +1,11 @@
-//! A run that another process commands: lines of JSON over two pipes, at which neither side waits.
+//! Remote control of a run by another process: lines of JSON over two pipes, on which neither side blocks.
 //!
 //! ```text
-//!   server of the page ── Command ──> main thread of the run
-//!   server of the page <── State ──── main thread of the run
+//!   server of the page ── BenchCommand ──> main thread of the run
+//!   server of the page <── BenchState ──── main thread of the run
 //! ```
 //!
-//! A [`State`] holds everything, so that one that did not fit into the pipe is not needed once the next one did.
+//! Each [`State`] is complete: a state that did not fit into the pipe is superseded by the next one.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -16,62 +16,62 @@ use rustix::io::{Errno, ioctl_fionbio, read, write};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-/// Bytes that are read at once.
+/// Number of bytes read at once.
 const PIECE: usize = 4_096;
-/// The longest line, in bytes: the state of 16 buses with a process for each cell is shorter.
+/// Maximum length of a line in bytes. The state of 16 buses with one process per cell is shorter.
 const LONGEST: usize = 1 << 20;
 
-/// A command to a bench. Buses are indices into the skin's.
+/// A command to a bench. Buses are indices into the skin's buses.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
 #[serde(tag = "on", rename_all = "lowercase", deny_unknown_fields)]
 pub enum Command {
-    /// Does something to the process of a cell, and so to all cells of that process.
+    /// Applies an action to the process of a cell, and so to all cells of that process.
     Process {
-        /// What.
+        /// The action.
         action: ProcessAction,
-        /// The cell's bus.
+        /// Bus of the cell.
         bus: usize,
-        /// Its node id.
+        /// Node id of the cell.
         node: u8,
     },
-    /// Takes the link between two cells down in both directions, or up again.
+    /// Takes the link between two cells down in both directions, or brings it up again.
     Link {
-        /// Whether it is to be down.
+        /// True to take the link down.
         down: bool,
-        /// The cells' bus.
+        /// Bus of the cells.
         bus: usize,
-        /// Their node ids.
+        /// Node ids of the cells.
         nodes: [u8; 2],
     },
-    /// Takes a bus down, or up again.
+    /// Takes a bus down, or brings it up again.
     Bus {
-        /// Whether it is to be down.
+        /// True to take the bus down.
         down: bool,
         /// The bus.
         bus: usize,
     },
 }
 
-/// What is known of a bench that is commanded.
+/// State of a bench that is under remote control.
 #[derive(Clone, Debug, Default, Deserialize, PartialEq, Serialize)]
 pub struct State {
-    /// The processes of cells that the run has started.
+    /// Processes of cells that the run has started.
     pub processes: Vec<ProcessState>,
     /// Links that are down, in one direction or in both.
     pub links_down: Vec<LinkDown>,
-    /// Each bus.
+    /// State of each bus.
     pub buses: Vec<BusState>,
-    /// How late ticks began.
+    /// Lateness of the ticks.
     pub lateness: Lateness,
-    /// The reason of a halt that lasts.
+    /// Reason of the present halt, if any.
     #[serde(default)]
     pub halted: Option<String>,
-    /// The last answers to commands, oldest first.
+    /// Latest answers to commands, oldest first.
     pub answers: Vec<Answer>,
 }
 
 impl State {
-    /// The same with the process of one cell only, or with none.
+    /// Returns a copy that contains only the process of one cell, or no process.
     #[must_use]
     pub fn seen_from(&self, cell: Option<(usize, u8)>) -> Self {
         let is_its = |process: &&ProcessState| cell.is_some_and(|(bus, node)| process.runs(bus, node));
@@ -83,91 +83,91 @@ impl State {
 /// A process of cells.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
 pub struct ProcessState {
-    /// Its bus.
+    /// Bus of its cells.
     pub bus: usize,
-    /// The first and the last of its cells.
+    /// Node ids of its first and last cell.
     pub nodes: (u8, u8),
-    /// What it does.
+    /// State of the process.
     pub phase: Phase,
 }
 
 impl ProcessState {
-    /// Whether it runs this cell.
+    /// Returns true if the process runs this cell.
     #[must_use]
     pub const fn runs(&self, bus: usize, node: u8) -> bool {
         self.bus == bus && self.nodes.0 <= node && node <= self.nodes.1
     }
 }
 
-/// What a process does.
+/// State of a process.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Phase {
-    /// It runs.
+    /// The process runs.
     Running,
-    /// This run has stopped it.
+    /// This run has stopped the process.
     Stopped,
-    /// It has ended.
+    /// The process has ended.
     Ended,
 }
 
 /// A link that is down.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
 pub struct LinkDown {
-    /// The bus of its cells.
+    /// Bus of its two cells.
     pub bus: usize,
-    /// Their node ids, the smaller one first.
+    /// Node ids of the cells, the smaller one first.
     pub nodes: [u8; 2],
 }
 
-/// A bus.
+/// State of a bus.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
 pub struct BusState {
-    /// Whether a command has taken it down.
+    /// True if a command has taken the bus down.
     pub down: bool,
-    /// Whether its cells have links that can be taken down: they answer with sums.
+    /// True if its cells have links that can be taken down: they answer with sums.
     pub links: bool,
 }
 
-/// How late ticks began, in µs.
+/// Lateness of ticks in µs.
 #[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Serialize)]
 pub struct Lateness {
-    /// Those of the last full second.
+    /// Ticks of the last full second.
     pub second: Quantiles,
-    /// All.
+    /// All ticks.
     pub all: Quantiles,
-    /// Ticks that were skipped, because they were late by a period or more.
+    /// Number of ticks that were skipped because they were late by a period or more.
     pub skipped: u64,
 }
 
 /// The answer to a command.
 #[derive(Clone, Debug, Deserialize, Eq, PartialEq, Serialize)]
 pub struct Answer {
-    /// Its number, from 1.
+    /// Number of the command, from 1.
     pub number: u64,
-    /// Whether the command was carried out; else it was refused.
+    /// True if the command was carried out, false if it was refused.
     pub done: bool,
-    /// What was done, or the command and why it was refused.
+    /// Description of the action, or the command and the reason of the refusal.
     pub text: String,
 }
 
-/// One side of two pipes.
+/// One side of two pipes that carry lines of JSON.
 #[derive(Debug)]
 pub struct Lines {
     input: OwnedFd,
     output: OwnedFd,
-    /// Received, and not taken.
+    /// Received bytes that have not been parsed.
     received: Vec<u8>,
-    /// Sent, and not written.
+    /// Sent bytes that have not been written.
     unwritten: Vec<u8>,
     ended: bool,
 }
 
 impl Lines {
-    /// Reads from one pipe and writes to another; both are set not to block.
+    /// Reads from one pipe and writes to another. Sets both to non-blocking.
     ///
     /// # Errors
-    /// When one of them cannot be set so.
+    /// Returns [`io::Error`] if a pipe cannot be set to non-blocking.
     pub fn new(input: impl Into<OwnedFd>, output: impl Into<OwnedFd>) -> io::Result<Self> {
         let (input, output) = (input.into(), output.into());
         ioctl_fionbio(&input, true)?;
@@ -175,13 +175,13 @@ impl Lines {
         Ok(Self { input, output, received: Vec::new(), unwritten: Vec::new(), ended: false })
     }
 
-    /// Whether the other side has ended.
+    /// Returns true if the other side has ended.
     #[must_use]
     pub const fn has_ended(&self) -> bool {
         self.ended
     }
 
-    /// Sends a value as one line. Whether there was room for it: as long as the one before is not written, there is none.
+    /// Sends a value as one line. Returns false, and drops the value, while the line before is not fully written.
     pub fn send(&mut self, value: &impl Serialize) -> bool {
         self.flush();
         if self.ended || !self.unwritten.is_empty() {
@@ -208,7 +208,7 @@ impl Lines {
         }
     }
 
-    /// The next line's value, if one has come. Lines that are no such value, or too long, are passed over.
+    /// Returns the value of the next line that has arrived. Skips lines that are too long or hold no such value.
     pub fn receive<T: DeserializeOwned>(&mut self) -> Option<T> {
         loop {
             if let Some(end) = self.received.iter().position(|&byte| byte == b'\n') {
@@ -222,7 +222,7 @@ impl Lines {
         }
     }
 
-    /// Reads what has come; whether that was anything.
+    /// Reads the bytes that have arrived. Returns true if there were any.
     fn read(&mut self) -> bool {
         let mut piece = [0; PIECE];
         if self.received.len() > LONGEST {
@@ -246,7 +246,7 @@ mod tests {
     use super::*;
     use std::io::{Write, pipe};
 
-    /// Both sides.
+    /// Creates both sides of two pipes.
     fn pair() -> (Lines, Lines) {
         let ((one_in, two_out), (two_in, one_out)) = (pipe().unwrap(), pipe().unwrap());
         (Lines::new(one_in, one_out).unwrap(), Lines::new(two_in, two_out).unwrap())
@@ -284,7 +284,7 @@ mod tests {
         let answers = vec![Answer { number: 1, done: false, text: "\"a\"\nb".to_owned() }];
         let process = ProcessState { bus: 1, nodes: (1, 63), phase: Phase::Stopped };
         let state = State { answers, processes: vec![process; 3_000], ..State::default() };
-        // More than a pipe holds.
+        // The state is larger than a pipe.
         assert!(run.send(&state) && !run.send(&state));
         let mut received = None;
         while received.is_none() {

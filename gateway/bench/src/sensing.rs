@@ -1,4 +1,4 @@
-//! Switches when the cells of a running bench send their sensors, until all that are there have confirmed it.
+//! Switches the sensor frames of the cells of a running bench until all present cells have confirmed it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -15,25 +15,25 @@ use thiserror::Error;
 use crate::answers::Answers;
 use crate::bus::listen::{self, Listener, send};
 
-/// How long cells are listened for: two heartbeats and a margin.
+/// Time to find cells: two heartbeats and a margin.
 const LISTEN: Duration = Duration::from_millis(600);
-/// The retry period for a cell that does not answer.
+/// Retry interval for a cell that does not answer.
 const AGAIN: Span = Span::from_millis(250);
-/// The timeout of an answer.
+/// Timeout of all answers.
 const TIMEOUT: Duration = Duration::from_secs(3);
-/// Comes back in the answers, which distinguishes them from those to other senders.
+/// Tag of the requests, which distinguishes their answers from those to other senders.
 const TAG: u8 = 0x57;
 
-/// Opens a bus on which cells are to be switched, whose packets travel in this format.
+/// Opens a bus whose cells are to be switched and whose packets have this format.
 ///
 /// # Errors
-/// When it cannot be opened.
+/// Returns [`BusError`] if the bus cannot be opened.
 pub fn open(name: &str, kind: Choice, format: Format) -> Result<Bus, BusError> {
     let filters = [Kind::Network, Kind::Configured].map(Filter::kind).to_vec();
     listen::open(name, kind, Some(format), Options { filters, ..Options::default() })
 }
 
-/// Why not all cells that should be were switched.
+/// An error that keeps cells from being switched.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum SensingError {
@@ -43,39 +43,39 @@ pub enum SensingError {
     /// No cell answers.
     #[error("{who} answers on {bus}: start it, or name the bus' format with --format {other}")]
     Nobody {
-        /// The cells that were asked.
+        /// Description of the addressed cells.
         who: String,
-        /// The bus.
+        /// Name of the bus.
         bus: String,
-        /// The format that the bus may have instead.
+        /// Format that the bus may have instead.
         other: &'static str,
     },
-    /// Some refused.
+    /// Some cells refused.
     #[error("{cells} on {bus} refused with reason {reason}: docs/reference/protocol.md explains it")]
     Refused {
-        /// Those, as text.
+        /// The cells as text.
         cells: String,
-        /// The bus.
+        /// Name of the bus.
         bus: String,
-        /// The first one's reason.
+        /// Reason of the first refusal.
         reason: i16,
     },
-    /// Some are there and do not answer.
+    /// Some cells are present and do not answer.
     #[error("{cells} on {bus} did not answer, {done} did: switch them again when they are back")]
     Silent {
-        /// Those, as text.
+        /// The cells as text.
         cells: String,
-        /// The bus.
+        /// Name of the bus.
         bus: String,
-        /// How many others did.
+        /// Number of cells that answered.
         done: usize,
     },
 }
 
-/// Switches one cell, or all that send on a bus that [`open`] gave; names those that were switched.
+/// Switches one cell, or all cells that send, on a bus from [`open`]. Returns the names of the switched cells.
 ///
 /// # Errors
-/// When not all of them confirm it, or the bus fails.
+/// Returns [`SensingError`] if a cell does not confirm, or the bus fails.
 pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> Result<String, SensingError> {
     let mut answers = Answers::new(only, Some(TAG));
     let mut listener = Listener::new(bus, Some(format));
@@ -96,12 +96,12 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
     verdict(&answers, only, listener.bus().name(), format)
 }
 
-/// Whether no cell is waited for any more; while `listened` is not set, further cells may show up.
+/// Returns true if no cell is awaited; before `listened` is true, further cells may appear.
 fn are_complete(answers: &Answers, only: Option<CellId>, listened: bool) -> bool {
     answers.missing().is_empty() && (only.is_some() || (listened && !answers.present().is_empty()))
 }
 
-/// The cells that were switched, as text; or why some were not.
+/// Returns the switched cells as text, or an error if some were not switched.
 fn verdict(
     answers: &Answers,
     only: Option<CellId>,
@@ -148,7 +148,7 @@ mod tests {
     use protocol::message::{Heartbeat, NetworkPage};
     use protocol::packet::{Epoch, WORDS};
 
-    /// The final verdict, on an FD bus.
+    /// Final verdict on an FD bus, as text.
     fn says(answers: &Answers, only: Option<CellId>) -> Result<String, String> {
         verdict(answers, only, "vcan0", Format::Fd).map_err(|error| error.to_string())
     }

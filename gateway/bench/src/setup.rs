@@ -1,4 +1,4 @@
-//! What a run and a replay share until their cells are ready.
+//! Start-up helpers that runs and replays share.
 
 use std::time::{Duration, Instant};
 
@@ -13,12 +13,12 @@ pub(crate) struct Timeout {
 }
 
 impl Timeout {
-    /// So long without progress.
+    /// Creates a timeout for this time without progress.
     pub(crate) fn new(length: Duration) -> Self {
         Self { length, most: 0, since: Instant::now() }
     }
 
-    /// Takes in the progress; whether there was none for too long.
+    /// Updates the progress. Returns true after too long a time without any.
     pub(crate) fn is_over(&mut self, far: usize) -> bool {
         if far > self.most {
             (self.most, self.since) = (far, Instant::now());
@@ -27,7 +27,7 @@ impl Timeout {
     }
 }
 
-/// The node ids of some cells as text, and their bus: `1, 2, 5 on vcan0`.
+/// Node ids of cells as text, followed by their place: `1, 2, 5 on vcan0`.
 pub(crate) fn names(cells: &[CellId], place: &str) -> String {
     let numbers: Vec<_> = cells.iter().map(ToString::to_string).collect();
     match numbers.len() {

@@ -7,20 +7,20 @@ use std::sync::atomic::AtomicBool;
 use protocol::stop;
 use thiserror::Error;
 
-/// A signal that cannot be caught.
+/// The error of a signal that cannot be caught.
 #[derive(Debug, Error)]
 #[error("cannot catch signal {signal}: {source}")]
 pub struct SignalError {
-    /// Which.
+    /// Number of the signal.
     pub signal: i32,
-    /// Why.
+    /// Cause.
     pub source: io::Error,
 }
 
-/// The flag that these signals set from now on: [`stop::flag`].
+/// Catches signals and returns the flag that they set: [`stop::flag`].
 ///
 /// # Errors
-/// Which signal cannot be caught, and why.
+/// Returns [`SignalError`] with the signal that cannot be caught.
 pub fn caught(signals: &[i32]) -> Result<Arc<AtomicBool>, SignalError> {
     let flag = stop::flag();
     for &signal in signals {

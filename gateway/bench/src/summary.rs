@@ -1,6 +1,6 @@
-//! The result of a run: the figures of the table at its end, and of `--summary`.
+//! Result of a run: the figures of the final table and of `--summary`.
 //!
-//! The keys of the JSON are the names of the fields here; `docs/reference/summary.md` explains them.
+//! The JSON keys are the field names; `docs/reference/summary.md` explains them.
 
 use std::collections::BTreeMap;
 
@@ -21,58 +21,58 @@ mod cells;
 mod outcome;
 mod verdict;
 
-/// A whole run.
+/// Summary of a run.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Summary {
-    /// The skin's name.
+    /// Name of the skin.
     pub skin: String,
-    /// All is well, or what to look at.
+    /// Verdict: all is well, or a list of findings.
     pub verdict: Verdict,
-    /// Each cell in it.
+    /// Summary of each cell of the skin.
     pub cells: Vec<CellSummary>,
-    /// How it ended.
+    /// Outcome of the run.
     pub outcome: Outcome,
-    /// Why it failed, if it did.
+    /// Reason of the failure, if any.
     pub failure: Option<String>,
-    /// How long the loop ran, in s.
+    /// Duration of the loop in s.
     pub duration_s: f64,
-    /// Whether it was ended by a signal.
+    /// True if a signal ended the run.
     pub interrupted: bool,
-    /// Why the robot was halted at the end, if it was.
+    /// Reason of the halt at the end of the run, if any.
     pub halted: Option<String>,
-    /// Each time that it was halted, oldest first.
+    /// All halts, oldest first.
     pub halts: Vec<Halted>,
-    /// Halts beyond the first 100 that have ended.
+    /// Number of ended halts beyond the first 100.
     pub further_halts: u64,
-    /// The ticks up to the last halt, oldest first.
+    /// Ticks up to the last halt, oldest first.
     pub before_halt: Vec<TickBefore>,
-    /// Why the external controller counts as absent, if it does; none of a halted robot.
+    /// Reason why the external controller counts as absent, if it does; `None` for a halted robot.
     pub no_controller: Option<String>,
-    /// Errors by which processes of cells ended.
+    /// Errors that ended processes of cells.
     pub cell_errors: Vec<CellError>,
-    /// From the start of the program to the first broadcast, in s.
+    /// Time from the start of the program to the first broadcast in s.
     pub first_broadcast_s: f64,
-    /// The control loop.
+    /// Figures of the control loop.
     #[serde(rename = "loop")]
     pub control: Loop,
-    /// Distributed against central torques.
+    /// Distributed torques compared with central ones.
     pub accuracy: Accuracy,
-    /// Packets of the whole machine, any interface's, that the kernel dropped before they came to a socket,
-    /// because a processor's backlog was full; none if it does not report them.
+    /// Number of packets that the kernel dropped before a socket because a processor's backlog was full, over the whole
+    /// machine and all interfaces; `None` if the kernel does not report it.
     pub backlog_dropped: Option<u64>,
-    /// Each bus.
+    /// Summary of each bus.
     pub buses: Vec<BusSummary>,
-    /// Processor time while the loop ran, in cores.
+    /// Processor use during the loop in cores.
     pub processor: Processor,
-    /// Private memory.
+    /// Private memory of the processes.
     #[serde(flatten)]
     pub memory: Memory,
-    /// What was recorded, and what was lost.
+    /// Summary of the recording, if any.
     pub recording: Option<Recording>,
 }
 
 impl Summary {
-    /// The summary of a run of which nothing is known yet.
+    /// Creates the summary of a run that has not started.
     #[must_use]
     pub fn empty(skin: &Skin) -> Self {
         Self {
@@ -83,16 +83,16 @@ impl Summary {
         }
     }
 
-    /// The summary of a run that failed before any bus was opened.
+    /// Creates the summary of a run that failed before any bus was opened.
     #[must_use]
     pub fn of_no_run(skin: &Skin, why: String) -> Self {
         Self::empty(skin).rated(Some(why))
     }
 
-    /// Sets the outcome and the verdict from what else is known; `failure` is why it did not come to its end.
+    /// Sets the outcome and the verdict from the other figures; `failure` is the reason of an early end.
     #[must_use]
     pub fn rated(mut self, failure: Option<String>) -> Self {
-        // A lost bus may be why the robot was halted, and the halt is the more precise outcome.
+        // A lost bus may have caused the halt, and the halt is the more precise outcome.
         let lost_buses = || self.lost_buses().filter(|_| self.halted.is_none());
         self.failure = failure.or_else(|| self.lost_frames()).or_else(lost_buses);
         self.outcome = match &self.failure {
@@ -107,8 +107,8 @@ impl Summary {
         self
     }
 
-    /// The messages about its end, a line each and the reason of its exit code last; none when all is well. Reasons of
-    /// cells' errors are not repeated unless the run was `quiet`.
+    /// Messages about the end of the run, one line each; the reason of the exit code is last. Empty if all is well.
+    /// Reasons of cells' errors are repeated only if `quiet`.
     #[must_use]
     pub fn complaints(&self, quiet: bool) -> Vec<String> {
         // The error of a failed run names the lost bus.
@@ -138,7 +138,7 @@ impl Summary {
         let Recording { errors, lost_write, files, .. } = self.recording.as_ref()?;
         let first = errors.first().map_or("", String::as_str);
         let parts = files.iter().map(|file| &file.path).filter(|path| path.ends_with(".part"));
-        // The error of such a file says what to do with it.
+        // The error of such a file says how to recover it.
         let hint = |path: &String| match errors.iter().find(|error| error.contains(path.as_str())) {
             Some(error) if error == first => String::new(),
             Some(error) => format!("; {error}"),
@@ -146,66 +146,66 @@ impl Summary {
         };
         let parts: String = parts.map(hint).collect();
         (!errors.is_empty() || *lost_write > 0).then(|| match lost_write {
-            0 => format!("the recording is not as it should be: {first}{parts}"),
+            0 => format!("the recording has an error: {first}{parts}"),
             _ => format!("the recording is incomplete, {lost_write} frames were not written: {first}{parts}"),
         })
     }
 }
 
-/// The control loop.
+/// Figures of the control loop.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Loop {
-    /// Ticks that happened.
+    /// Number of executed ticks.
     pub ticks: u64,
-    /// Ticks that were skipped because the machine was late.
+    /// Number of ticks skipped because the machine was late.
     pub ticks_skipped: u64,
-    /// Broadcasts sent.
+    /// Number of broadcasts sent.
     pub broadcasts: u64,
-    /// Broadcasts skipped with their ticks.
+    /// Number of broadcasts skipped with their ticks.
     pub broadcasts_skipped: u64,
-    /// Bad cycles, by reason.
+    /// Number of bad cycles by reason.
     pub bad_cycles: BTreeMap<String, u64>,
-    /// Outcomes of an external controller's datagrams, by name; empty for other controllers.
+    /// Counts of an external controller's datagrams by outcome; empty for other controllers.
     pub controller: BTreeMap<String, u64>,
-    /// How late ticks began.
+    /// Lateness of the ticks.
     pub late_us: Quantiles,
-    /// How late the same machine wakes an idle thread.
+    /// Wake-up lateness of the idle machine.
     pub idle_late_us: Quantiles,
-    /// How long a tick took.
+    /// Duration of the ticks.
     pub took_us: Quantiles,
-    /// How long the central computation took of that, in ticks that compared.
+    /// Duration of the central computation in ticks that compared.
     pub central_us: Quantiles,
-    /// How long a tick took in ticks that did not compare.
+    /// Duration of ticks that did not compare.
     pub took_distributed_us: Quantiles,
-    /// Whether the machine granted SCHED_FIFO.
+    /// True if the machine granted SCHED_FIFO.
     pub fifo: bool,
-    /// Whether it locked the memory.
+    /// True if the memory was locked.
     pub memory_locked: bool,
-    /// Records of ticks that did not fit into their queue.
+    /// Number of tick records that did not fit into their queue.
     pub records_lost: u64,
-    /// Frames that a bus did not take.
+    /// Number of frames that a bus refused.
     pub unsent: u64,
 }
 
-/// Processor time while the loop ran, in cores.
+/// Processor use during the loop in cores.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Processor {
     /// This program.
     pub gateway: f64,
     /// All cells together.
     pub cells: f64,
-    /// Embedded buses.
+    /// Servers of embedded buses.
     pub buses: f64,
 }
 
-/// Private memory, in KiB.
+/// Private memory in KiB.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Memory {
-    /// Of the largest cell process, if cells were started.
+    /// Memory of the largest cell process, if the run started cells.
     pub cell_private_kib: Option<u64>,
-    /// Of this program, at the end of the loop.
+    /// Memory of this program at the end of the loop.
     pub gateway_private_kib: Option<u64>,
-    /// Of all processes that were started to serve buses; none without any.
+    /// Memory of all bus servers that the run started, if any.
     pub buses_private_kib: Option<u64>,
 }
 
@@ -213,46 +213,45 @@ pub struct Memory {
 /// + unknown.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct UplinkSummary {
-    /// Sent, by the cells' own count, as of their last heartbeats.
+    /// Packets sent, by the cells' own count as of their last heartbeats.
     pub sent: u64,
-    /// Arrived and understood.
+    /// Packets that arrived and were decoded.
     pub delivered: u64,
-    /// Arrived and refused.
+    /// Packets that arrived and were rejected.
     pub rejected: u64,
-    /// Sums for another cell, which this gateway did not take.
+    /// Sums for another cell, which the gateway's filter excluded.
     pub unheard: u64,
-    /// Sent and not arrived, because the bus dropped frames that were not read in time.
+    /// Packets lost because the bus dropped frames that were not read in time.
     pub dropped: u64,
-    /// Sent and not arrived, as far as the kernel's backlog drops explain it.
+    /// Packets lost, as far as the kernel's backlog drops explain it.
     pub backlog: u64,
-    /// Sent and not arrived, while the bus was lost.
+    /// Packets lost while the bus was lost.
     pub outage: u64,
-    /// Sent and not arrived, explained by frames that were lost between hosts.
+    /// Packets lost between hosts.
     pub hosts: u64,
-    /// Sent and not arrived, for an unknown reason.
+    /// Packets lost for an unknown reason.
     pub unknown: u64,
-    /// Arrived more often than sent.
+    /// Packets that arrived in excess of those sent.
     pub surplus: u64,
-    /// Of these, heartbeats of other senders under a cell's node id.
+    /// Heartbeats of other senders under a cell's node id, included in the surplus.
     pub outsiders: u64,
-    /// Arrived of what a cell sent between its last heartbeat and its restart: what else it sent then is
-    /// unknown.
+    /// Packets that arrived from between a cell's last heartbeat and its restart: the number sent then is unknown.
     pub in_doubt: u64,
-    /// Arrived after a cell's last heartbeat, which nothing can be compared with.
+    /// Packets that arrived after a cell's last heartbeat, without a count to compare with.
     pub unsettled: u64,
-    /// Cells that restarted.
+    /// Number of restarts of cells.
     pub restarts: u32,
 }
 
 impl UplinkSummary {
-    /// Attributes unknown losses to links between hosts, at most so many.
+    /// Attributes up to `at_most` unknown losses to links between hosts.
     pub fn explain_by_hosts(&mut self, at_most: u64) {
         let explained = self.unknown.min(at_most);
         self.unknown -= explained;
         self.hosts += explained;
     }
 
-    /// Attributes unknown losses to the kernel's backlog, at most so many; how many.
+    /// Attributes up to `at_most` unknown losses to the kernel's backlog. Returns their number.
     pub fn explain_by_backlog(&mut self, at_most: u64) -> u64 {
         let explained = self.unknown.min(at_most);
         self.unknown -= explained;
@@ -264,131 +263,132 @@ impl UplinkSummary {
 /// Sums along the cells' tree.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct SumsSummary {
-    /// Cells that are wired to the gateway's side.
+    /// Number of cells wired to the gateway's side.
     pub roots: usize,
-    /// What was done with the received ones: received = first + resent + overheard + stale.
+    /// Received sums by their use: received = first + resent + overheard + stale.
     #[serde(flatten)]
     pub counts: SumCounts,
-    /// Cells that had to be in sums, and were: due = in time + late + missing.
+    /// Contributions that were due in sums: due = in time + late + missing.
     pub contributions: Contributions,
 }
 
-/// How often a bus was lost, and for how long.
+/// Number and duration of a bus's losses.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct OutagesSummary {
-    /// How often.
+    /// Number of losses.
     pub times: u64,
-    /// Its total time in s, each from when it was noticed to the first frame after it.
+    /// Total duration in s, each loss from its detection to the first frame after it.
     pub lost_s: f64,
-    /// Whether it was lost at the end.
+    /// True if the bus was lost at the end.
     pub at_end: bool,
-    /// Ticks without it.
+    /// Number of ticks without the bus.
     pub ticks: u64,
 }
 
-/// Another host that has the bus too.
+/// Another host connected to the bus.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct HostSummary {
-    /// Its name.
+    /// Name of the host.
     pub name: String,
-    /// Cells that sent from there.
+    /// Number of cells that sent from there.
     pub cells: usize,
-    /// How often it was gone, or not reached.
+    /// Number of times that the host was gone or unreachable.
     pub gone: u64,
-    /// For how long in total, in s.
+    /// Total duration of that in s.
     pub gone_s: f64,
-    /// Whether it was reached at the end.
+    /// True if the host was reachable at the end.
     pub at_end: bool,
-    /// Frames from there that did not get here.
+    /// Number of frames lost from the host to this one.
     pub lost_from: u64,
-    /// Frames from here that did not get there, as it reports.
+    /// Number of frames lost from this host to the other, as the other reports.
     pub lost_to: u64,
 }
 
-/// The network of a bus' cells.
+/// The network of a bus's cells.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct NetworkSummary {
-    /// From the time when all cells were ready until all had a route to a root, in s; none if some never had.
+    /// Time in s from the moment when all cells were ready until all had a route to a root; `None` if some never had
+    /// one.
     pub tree_ready_s: Option<f64>,
-    /// The largest depth for which there was a slot; a root's is 0.
+    /// Largest depth that had a slot; a root has depth 0.
     pub deepest: u8,
     /// Differences from the description at the start.
     pub differences: Vec<String>,
     /// Cells that sent and had no route to a root at the end.
     pub unreachable: Vec<u8>,
-    /// The longest time that a cell sent and had none while the loop ran, in s.
+    /// Longest time in s that a cell sent without a route while the loop ran.
     pub longest_unreachable_s: f64,
-    /// How often a cell's parent changed, by the cells' own count.
+    /// Number of parent changes, by the cells' own count.
     pub parent_changes: u64,
 }
 
-/// The sensors frames of a bus' cells.
+/// Sensor frames of a bus's cells.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct SensorsSummary {
-    /// Frames, of either page.
+    /// Number of frames of both pages.
     pub frames: u64,
-    /// Touches in them.
+    /// Number of touches in them.
     pub touches: u64,
-    /// Releases in them.
+    /// Number of releases in them.
     pub releases: u64,
-    /// Frames a second, without those that a report asked for, of the cell with the fewest; of cells that sent enough for
-    /// a rate.
+    /// Frames per second of the slowest cell, without frames that a report requested, over cells that sent enough for a
+    /// rate.
     pub min_hz: Option<f64>,
-    /// The mean over these cells.
+    /// Mean rate over these cells.
     pub mean_hz: Option<f64>,
-    /// Of the cell with the most.
+    /// Rate of the fastest cell.
     pub max_hz: Option<f64>,
 }
 
-/// One bus.
+/// Summary of one bus.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct BusSummary {
-    /// Its name.
+    /// Name of the bus.
     pub name: String,
-    /// socketcan or embedded.
+    /// Kind of the bus: `socketcan` or `embedded`.
     pub kind: String,
-    /// Bytes that the socket may hold.
+    /// Size of the socket's receive buffer in bytes.
     pub receive_buffer: usize,
-    /// How often it was lost.
+    /// Losses of the bus.
     pub outages: OutagesSummary,
-    /// Other hosts that `vcan-setup link` joins it with.
+    /// Other hosts that `vcan-setup link` connects to the bus.
     pub hosts: Vec<HostSummary>,
-    /// Cells by status at the end.
+    /// Number of cells by status at the end.
     pub cells: BTreeMap<&'static str, usize>,
-    /// Cells that were dead or were never received at the end.
+    /// Cells that were dead at the end, or from which no packet was received.
     pub silent_cells: Vec<u8>,
     /// Packets from the cells.
     pub uplink: UplinkSummary,
-    /// Replies of cells that answer themselves.
+    /// Replies of cells that answer with their own torques.
     pub replies: RepliesSummary,
-    /// Sums, where cells answer with them.
+    /// Sums, if cells answer with them.
     pub sums: Option<SumsSummary>,
-    /// The network that they go along.
+    /// Network that carries the sums.
     pub network: Option<NetworkSummary>,
-    /// Sensors frames of the cells.
+    /// Sensor frames of the cells.
     pub sensors: SensorsSummary,
-    /// Epochs that some cell had to answer, and those that all answered in time.
+    /// Number of epochs that some cell had to answer.
     pub epochs_due: u64,
-    /// See above.
+    /// Number of those that all cells answered in time.
     pub epochs_complete: u64,
-    /// Packets by kind, received from others.
+    /// Packets received from other senders, by kind.
     pub received: BTreeMap<&'static str, u64>,
-    /// Packets by kind, sent by this gateway as read back from the bus.
+    /// Packets sent by this gateway, as read back from the bus, by kind.
     pub sent: BTreeMap<&'static str, u64>,
-    /// Irregular events by reason; zeros are left out.
+    /// Irregular events by reason, without zeros.
     pub events: BTreeMap<&'static str, u64>,
-    /// Frames that the bus dropped because they were not read in time.
+    /// Number of frames that the bus dropped because they were not read in time.
     pub dropped_by_bus: u64,
-    /// From a broadcast to its last reply in time, by the kernel's time stamps.
+    /// Time from a broadcast to its last reply in time, by the kernel's time stamps.
     pub last_reply_us: Quantiles,
-    /// From a broadcast to each reply, late ones included.
+    /// Time from a broadcast to each reply, including late ones.
     pub reply_us: Quantiles,
-    /// At heartbeats, for how long joints had stood on the bus that the cell had not taken.
+    /// At heartbeats, age of joints on the bus that the cell had not received.
     pub joints_not_taken_us: Quantiles,
 }
 
 impl BusSummary {
-    /// The figures of a bus whose run is over.
+    /// Creates the summary of a bus after its run.
     #[must_use]
     pub fn new(
         name: &str,

@@ -1,20 +1,20 @@
-//! Threads that are started with a name, or not at all.
+//! Threads that are started by name.
 
 use std::thread::{self, JoinHandle};
 
 use thiserror::Error;
 
-/// The system gives no thread.
+/// The error of a thread that the system does not grant.
 #[derive(Debug, Error)]
 #[error("cannot start the thread {name}: {source}")]
 pub struct ThreadError {
-    /// The thread's name.
+    /// Name of the thread.
     pub name: String,
-    /// The system's error.
+    /// Error of the system.
     pub source: std::io::Error,
 }
 
-/// Starts a thread of this name.
+/// Starts a thread with this name.
 pub(crate) fn spawn<T: Send + 'static>(
     name: &str,
     work: impl FnOnce() -> T + Send + 'static,

@@ -1,4 +1,4 @@
-//! The state of a bus' cells that its receiver shows to the main thread and to the recorder.
+//! State of a bus's cells that its receiver publishes for the main thread and the recorder.
 
 use protocol::id::CellId;
 use protocol::message::State;
@@ -7,57 +7,56 @@ use protocol::packet::{Epoch, WORDS};
 use model::network::check::Seen;
 use model::table::{Cell, SWITCHES, Said, Status, Switch};
 
-/// The state of a bus' cells, renewed every 20 ms.
+/// State of a bus's cells, updated every 20 ms.
 #[derive(Clone, Debug, Default)]
 pub struct View {
-    /// Each cell, in the bus' order.
+    /// Cells in the order of the bus.
     pub cells: Vec<CellView>,
-    /// Whether any of them is to be switched to something and has not confirmed it.
+    /// True if a cell has not confirmed a switch.
     pub lacking: bool,
-    /// Whether any of them may have stimuli that did not come here.
+    /// True if a cell may hold stimuli that this gateway did not receive.
     pub unclear: bool,
-    /// Commands of our own that were read back from the bus, or were lost with it.
+    /// Number of the gateway's commands that were read back from the bus, or were lost with it.
     pub commands: u64,
-    /// What is known of the network's cells, those that are not described among them; none if cells
-    /// answer with their own torques.
+    /// Cells of the network, including undescribed ones; empty if cells answer with their own torques.
     pub network: Vec<Seen>,
 }
 
-/// The state of one cell.
+/// State of one cell.
 #[derive(Clone, Copy, Debug)]
 pub struct CellView {
-    /// Its node id.
+    /// Node id of the cell.
     pub node: CellId,
-    /// Whether anything was received from it.
+    /// True if a heartbeat was received from it.
     pub heard: bool,
-    /// Whether it has fallen silent.
+    /// True if it has fallen silent.
     pub dead: bool,
-    /// Whether it can be expected to answer, unless it is halted.
+    /// True if it can be expected to answer, unless it is halted.
     pub ready: bool,
-    /// Whether it waits for a resume.
+    /// True if it waits for a resume.
     pub halted: bool,
-    /// Whether it is settled and has no parameters to compute with.
+    /// True if it owns its node id and has no parameters to compute with.
     pub unconfigured: bool,
-    /// Whether it measures, so that stimuli do not touch it.
+    /// True if it measures, so that stimuli do not touch it.
     pub measures: bool,
-    /// Whether its configuration is not the skin's.
+    /// True if its configuration is not the skin's.
     pub other: bool,
-    /// The joints that it had taken last.
+    /// Epoch of the last joints that it received.
     pub last_joints: Epoch,
-    /// What it has sent since it was queried.
+    /// Reports that it has sent since it was queried.
     pub said: Said,
-    /// What it answers joints with, by its last report.
+    /// Reply mode by its last report, as the words of the parameter.
     pub reply: Option<[i16; WORDS]>,
-    /// Ports whose link it holds down, by its last report.
+    /// Ports whose link it holds down, by its last report; one bit each.
     pub deaf: u8,
-    /// What it is to be switched to and has not confirmed.
+    /// Switches that it has not confirmed.
     pub lacks: [Option<Switch>; SWITCHES],
-    /// Whether it computes with stimuli of which some may not have come here.
+    /// True if it computes with stimuli that this gateway may not have received.
     pub unclear: bool,
 }
 
 impl View {
-    /// The cells of a bus, with what else is known of it.
+    /// Creates the view of a bus.
     #[must_use]
     pub fn new(cells: Vec<CellView>, commands: u64, network: Vec<Seen>) -> Self {
         let lacking = cells.iter().any(CellView::is_lacking);
@@ -67,13 +66,13 @@ impl View {
 }
 
 impl CellView {
-    /// Whether it can receive, and is to be switched to something that it has not confirmed.
+    /// Returns true if the cell can receive and has not confirmed a switch.
     #[must_use]
     pub fn is_lacking(&self) -> bool {
         (self.ready || self.unconfigured) && self.lacks.iter().any(Option::is_some)
     }
 
-    /// What a table knows of a cell.
+    /// Creates the view of a cell from its table entry.
     #[must_use]
     pub fn of(cell: &Cell, status: Status) -> Self {
         let state = cell.heartbeat().map(|heartbeat| heartbeat.state);

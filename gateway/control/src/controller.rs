@@ -1,11 +1,11 @@
-//! What turns torques into motion, once a tick.
+//! Controllers, which turn torques into motion, once per tick.
 //!
 //! ```text
-//!   Input { q, qdot, torque, age, valid, .. } ─> Controller::step ─> Step::Move(joint velocities)
-//!                                                                └─> Step::Bad(why)
+//!   Input { q, qdot, torque, age, valid, .. } ─> Controller::step ─┬─> Move(joint velocities)
+//!                                                                  └─> Bad(reason)
 //! ```
 //!
-//! [`Kinesthetic`] moves the arm with the torque of a push. [`Planned`] follows a motion that is known beforehand and
+//! [`Kinesthetic`] moves the arm with the torque of a push. [`Planned`] follows a motion that is known in advance and
 //! ignores torques. [`crate::external::External`] queries another program.
 
 use protocol::packet::padded;
@@ -15,101 +15,102 @@ use thiserror::Error;
 
 use crate::external::Absence;
 
-/// A controller's input in a tick. Joints that the robot does not have are zero.
+/// Input of a controller in a tick. Values of joints that the robot does not have are zero.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Input {
-    /// The number of the tick.
+    /// Number of the tick.
     pub tick: u64,
-    /// When it began, since the run's start.
+    /// Nominal start of the tick since the start of the run.
     pub time: Micros,
     /// Joint positions in rad.
     pub q: [f64; MAX_ROBOT_JOINTS],
     /// Joint velocities in rad/s.
     pub qdot: [f64; MAX_ROBOT_JOINTS],
-    /// The skin's torque in Nm.
+    /// Torque of the skin in Nm.
     pub torque: [f64; MAX_ROBOT_JOINTS],
-    /// Epochs since the oldest contribution to the torque.
+    /// Age in epochs of the oldest contribution to the torque.
     pub age: u32,
-    /// Cells that contribute to the torque.
+    /// Number of cells that contribute to the torque.
     pub contributing: u32,
-    /// Whether the torque may be used.
+    /// True if the torque may be used.
     pub valid: bool,
-    /// Buses that are lost, whose cells are not in the torque, or decay in it: bit n is bus n of the skin, bit 31
-    /// stands for all from there on.
+    /// Lost buses, whose cells are missing from the torque or decay in it: bit n is bus n of the skin, bit 31 stands
+    /// for all buses from there on.
     pub missing: u32,
-    /// Whether the robot is halted: a controller's commands have no effect.
+    /// True if the robot is halted: a controller's commands have no effect.
     pub halted: bool,
 }
 
-/// What a controller answers.
+/// Answer of a controller.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "one at a time, on the stack: the loop allocates nothing")]
 pub enum Step {
-    /// Joint velocities in rad/s until the next tick; finite, and within the limits of speed.
+    /// Joint velocities in rad/s until the next tick; finite, and within the speed limits.
     Move([f64; MAX_ROBOT_JOINTS]),
-    /// It has no answer: a bad cycle. The caller decides what the robot then does.
+    /// A bad cycle: the controller has no answer. The caller decides how the robot then moves.
     Bad(BadCycle),
 }
 
-/// Why a cycle is bad.
+/// Reason of a bad cycle.
 #[derive(Clone, Copy, Debug, Eq, Error, Hash, Ord, PartialEq, PartialOrd)]
 pub enum BadCycle {
     /// The torque must not be used, or is not a number.
     #[error("the torque is not valid")]
     Torque,
-    /// An external controller has not yet sent a hello, or has ended.
+    /// The external controller has not sent a hello yet, or has ended.
     #[error("no external controller is connected")]
     NoPeer,
-    /// An external controller's answer to the last tick is missing.
+    /// The external controller's answer to the last tick is missing.
     #[error("the external controller's answer is missing")]
     NoAnswer,
-    /// An external controller sent something that is no answer.
+    /// The external controller sent an invalid datagram.
     #[error("the external controller sent nonsense")]
     Nonsense,
 }
 
-/// Turns torques into joint velocities.
+/// A controller, which turns torques into joint velocities.
 pub trait Controller: Send {
-    /// One tick. Must not block, allocate, lock or log.
+    /// Computes one tick. Must not block, allocate, lock or log.
     fn step(&mut self, input: &Input) -> Step;
 
-    /// Its counters with their names: for the end of a run, not for the tick.
+    /// Counters of the controller by name. Call it at the end of a run, not in the tick.
     fn counts(&self) -> Vec<(String, u64)> {
         Vec::new()
     }
 
-    /// Why it counts as absent at the end of a run, if it does; `silent` are the bad cycles in a row before that, where
-    /// they are as many as halt a robot. For the end, not for the tick. A controller in this program is never absent.
+    /// Reason why the controller counts as absent at the end of a run, if it does. `silent` is the number of bad cycles
+    /// in a row before that, if it is large enough to halt a robot. Call it at the end, not in the tick. A controller
+    /// in this program is never absent.
     fn absence(&self, silent: Option<u32>) -> Option<Absence> {
         let _ = silent;
         None
     }
 }
 
-/// `M q'' + D q' = tau`, joint by joint.
+/// Admittance control `M q'' + D q' = tau` of each joint.
 ///
-/// It has no state of its own: it starts from the velocity that the robot reports, so that a joint
-/// which stands at its limit, or a robot that was halted, begins from rest.
+/// The controller has no state of its own: it starts from the velocity that the robot reports, so that a joint at its
+/// limit, or a halted robot, starts from rest.
 ///
-/// Integrated exactly for a torque that is constant over the tick, which is stable whatever M, D and
-/// the tick are: `v' = tau/D + (v - tau/D) e^(-D/M T)`.
+/// The equation is integrated exactly for a torque that is constant over the tick, which is stable for any M, D and
+/// tick: `v' = tau/D + (v - tau/D) e^(-D/M T)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Kinesthetic {
     joints: [Admittance; MAX_ROBOT_JOINTS],
 }
 
-/// One joint.
+/// Admittance of one joint.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Admittance {
-    /// 1/D in rad/s per Nm.
+    /// Mobility 1/D in rad/s per Nm.
     mobility: f64,
-    /// The remaining part of a velocity after a tick: `e^(-D/M T)`.
+    /// Fraction of a velocity that remains after a tick: `e^(-D/M T)`.
     keep: f64,
     max_speed: f64,
 }
 
 impl Kinesthetic {
-    /// The controller that the skin describes; `None` when that is another kind.
+    /// Creates the skin's controller, or `None` if the skin has another kind.
     #[must_use]
     pub fn new(skin: &Skin) -> Option<Self> {
         match &skin.controller.kind {
@@ -140,7 +141,7 @@ impl Controller for Kinesthetic {
         }
         let mut velocity = input.qdot;
         for ((velocity, torque), joint) in velocity.iter_mut().zip(input.torque).zip(&self.joints) {
-            // Held finite, or the difference below would be none.
+            // Keep the value finite: the difference of two infinities below is not a number.
             let settled = (torque * joint.mobility).clamp(f64::MIN, f64::MAX);
             let next = settled + (*velocity - settled) * joint.keep;
             *velocity = next.clamp(-joint.max_speed, joint.max_speed);
@@ -149,7 +150,7 @@ impl Controller for Kinesthetic {
     }
 }
 
-/// Follows positions that are known for all times, as quickly as the joints may.
+/// Follows positions that are known for all times, as quickly as the joints allow.
 #[derive(Clone, Copy, Debug)]
 pub struct Planned<F> {
     at: F,
@@ -157,8 +158,8 @@ pub struct Planned<F> {
 }
 
 impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS]> Planned<F> {
-    /// Follows `at`: positions in rad or m, so many seconds after the run's start. It must not block, allocate, lock or
-    /// log.
+    /// Follows `at`, which returns positions in rad or m for a time in s since the start of the run. It must not block,
+    /// allocate, lock or log.
     #[must_use]
     pub fn new(skin: &Skin, at: F) -> Self {
         Self { at, pace: Pace::of(skin) }
@@ -166,14 +167,14 @@ impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS]> Planned<F> {
 }
 
 impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS] + Send> Controller for Planned<F> {
-    /// Aims at the position for the begin of the next tick, so that it neither lags nor drifts.
+    /// Aims at the position for the start of the next tick, so that the robot neither lags nor drifts.
     fn step(&mut self, input: &Input) -> Step {
         let next = (self.at)(seconds(input.time) + self.pace.tick);
         Step::Move(self.pace.towards(&next, input))
     }
 }
 
-/// The limits of joint speeds, and the length of a tick.
+/// Speed limits of the joints, and the length of a tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Pace {
     /// Length of a tick in s.
@@ -186,8 +187,7 @@ impl Pace {
         Self { tick: 1.0 / skin.timing.control_hz, max_speed: padded(&skin.controller.max_speed) }
     }
 
-    /// The velocities that bring the robot to `goal` by the next tick, as far as speed allows; none
-    /// while it is halted.
+    /// Velocities that bring the robot to `goal` by the next tick, within the speed limits; zero while it is halted.
     pub(crate) fn towards(&self, goal: &[f64; MAX_ROBOT_JOINTS], input: &Input) -> [f64; MAX_ROBOT_JOINTS] {
         let mut velocity = *goal;
         for (velocity, q) in velocity.iter_mut().zip(input.q) {
@@ -196,7 +196,7 @@ impl Pace {
         self.limited(velocity, input)
     }
 
-    /// The velocities, held within the limits of speed; none while the robot is halted.
+    /// Velocities within the speed limits; zero while the robot is halted.
     pub(crate) fn limited(
         &self,
         mut velocity: [f64; MAX_ROBOT_JOINTS],
@@ -239,7 +239,7 @@ mod tests {
         Input { torque, valid: true, ..Input::default() }
     }
 
-    /// Runs the controller on a simulated arm and returns where it ends.
+    /// Runs the controller on a simulated arm and returns the arm.
     fn run(controller: &mut impl Controller, start: [f64; 6], ticks: u64, torque: [f64; 6]) -> SimulatedArm {
         let mut arm = SimulatedArm::new(&skin(), padded(&start));
         for tick in 0..ticks {
@@ -258,7 +258,7 @@ mod tests {
         let target = 0.5 * (1.0 - (-2.0_f64).exp());
         let [v1, v2, v3, ..] = arm.velocities();
         assert!((v1 - target).abs() < 1e-12 && (v2 + target / 2.0).abs() < 1e-12 && v3.abs() < 1e-12);
-        // The position is a sum of the velocities at the ticks' ends: at most a tick ahead.
+        // The position sums the velocities at the ends of the ticks: at most one tick ahead.
         let exact = 0.5 * (0.5 - 0.25 * (1.0 - (-2.0_f64).exp()));
         assert!((arm.positions()[0] - exact).abs() < target * TICK);
     }

@@ -1,17 +1,17 @@
-//! One tick of the control loop, pure: what the buses know goes in, what has to be sent and recorded
-//! comes out.
+//! One tick of the control loop as a pure function: the state of the buses goes in, the messages to send and the record
+//! come out.
 //!
 //! ```text
-//!   Tick, Heard ─────> Cycle::tick ─┬─> Outcome::joints ─> a new epoch for every bus
-//!                                   ├─> Outcome::command > a halt or a resume for every bus
-//!                                   └─> Record ──────────> the record of this tick
+//!   Tick, BusInput ──> Cycle::tick ─┬─> TickOutcome::broadcast ──> a new epoch for every bus
+//!                                   ├─> TickOutcome::command ────> a halt or a resume for every bus
+//!                                   └─> TickOutcome::record ─────> the record of this tick
 //! ```
 //!
-//! A lost bus does not affect others: the last torques of its cells decay to zero ([`carried`]), and the loop goes on
-//! with the others.
+//! A lost bus does not affect others: the last torques of its cells decay to zero ([`carried`]), and the loop continues
+//! with the other buses.
 //!
-//! A tick allocates nothing, takes no lock, writes no log, and its work does not grow with the cells,
-//! unless it computes centrally beside them ([`Cycle::central`]).
+//! A tick does not allocate, lock or log, and its cost does not grow with the number of cells, unless it also computes
+//! centrally ([`Cycle::central`]).
 
 pub mod carried;
 mod chain;
@@ -32,104 +32,104 @@ use chain::Chain;
 use model::central::Central;
 use model::table::Snapshot;
 
-/// When a tick is.
+/// Number and time of a tick.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Tick {
-    /// Its number since the start; skipped ticks are counted in.
+    /// Number since the start, including skipped ticks.
     pub number: u64,
-    /// When it should begin, since the start.
+    /// Nominal time since the start.
     pub time: Micros,
 }
 
-/// Why the robot does not move.
+/// Reason why the robot is halted.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Halt {
-    /// So many bad cycles in a row.
+    /// The limit of bad cycles in a row was reached.
     BadCycles(BadCycle),
     /// A halt frame was received.
     Frame,
 }
 
-/// The record of a tick.
+/// Record of a tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Record {
-    /// When it was.
+    /// Number and time of the tick.
     pub tick: Tick,
-    /// Ticks skipped just before it, because the one before took too long or the machine was away.
+    /// Number of ticks skipped just before, because the one before took too long or the machine was busy.
     pub skipped: u64,
     /// Joint positions in rad.
     pub q: [f64; MAX_ROBOT_JOINTS],
     /// Joint velocities in rad/s.
     pub qdot: [f64; MAX_ROBOT_JOINTS],
-    /// The cells' torque in Nm.
+    /// Torque of the cells in Nm.
     pub torque: [f64; MAX_ROBOT_JOINTS],
-    /// Whether the torque could be used.
+    /// True if the torque could be used.
     pub valid: bool,
-    /// The epoch of the last joints.
+    /// Epoch of the last joints.
     pub epoch: Epoch,
-    /// The commanded joint velocities in rad/s.
+    /// Commanded joint velocities in rad/s.
     pub command: [f64; MAX_ROBOT_JOINTS],
-    /// Cells in the torque.
+    /// Number of cells in the torque.
     pub contributing: u32,
-    /// Epochs that the oldest of them has missed.
+    /// Number of epochs that the oldest of them has missed.
     pub age: u32,
-    /// Cells in contact that missed the last epoch.
+    /// Number of cells in contact that missed the last epoch.
     pub stale: u32,
-    /// Cells that have fallen silent.
+    /// Number of dead cells.
     pub dead: u32,
-    /// Buses that are lost: bit n is bus n of the skin, bit 31 stands for all from there on.
+    /// Lost buses: bit n is bus n of the skin, bit 31 stands for all buses from there on.
     pub missing: u32,
-    /// Why the cycle was bad, if it was.
+    /// Reason of a bad cycle.
     pub bad: Option<BadCycle>,
-    /// Why the robot is halted, if it is.
+    /// Reason of the halt while the robot is halted.
     pub halted: Option<Halt>,
-    /// Joints at their limits, and what the robot refused.
+    /// Joints at their limits, and refused commands.
     pub moved: Moved,
 }
 
-/// The torque of the whole skin, computed centrally.
+/// Torque of the whole skin, computed centrally.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Reference {
-    /// The sum of all cells' torques in Nm or N, by joint of the robot (paper, Eq. 1).
+    /// Sum of all cells' torques in Nm or N, by joint of the robot (paper, Eq. 1).
     pub torque: [f64; MAX_ROBOT_JOINTS],
-    /// Cells with a force above zero.
+    /// Number of cells with a force above zero.
     pub active: u32,
 }
 
-/// What a tick leads to.
+/// Outcome of a tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outcome {
-    /// The epoch of new joints for every bus, [`Cycle::joints`].
+    /// Epoch of new joints for all buses ([`Cycle::joints`]).
     pub broadcast: Option<Epoch>,
-    /// Broadcasts that should have been before this one and were skipped with their ticks.
+    /// Number of earlier broadcasts that were skipped with their ticks.
     pub broadcasts_skipped: u64,
-    /// A halt or a resume that has to be sent on every bus: because this loop halts itself, or because
-    /// it was received on one bus and has to be repeated on the others.
+    /// A halt or a resume to send on all buses: the loop halts itself, or received the command on one bus and must
+    /// repeat it on the others.
     pub command: Option<Command>,
-    /// The record.
+    /// Record of the tick.
     pub record: Record,
 }
 
-/// The control loop's state.
+/// State of the control loop.
 pub struct Cycle {
     controller: Box<dyn Controller>,
     robot: Box<dyn Robot + Send>,
     central: Vec<Central>,
-    /// Each once, though several buses may have it.
+    /// Distinct chains; several buses may share one.
     chains: Vec<Chain>,
-    /// By bus, which of them it has.
+    /// Index of each bus's chain.
     chain_of: Vec<usize>,
     tick_seconds: f64,
     ticks_per_broadcast: u64,
     safety: Safety,
-    /// How many of the broadcasts each bus has carried.
+    /// Number of broadcasts that each bus has carried.
     carried: Vec<Carried>,
     epoch: Epoch,
     broadcasts: u64,
-    /// The last broadcast's place in the schedule.
+    /// Position of the last broadcast in the schedule.
     slot: Option<u64>,
     bad_in_a_row: u32,
-    /// Until when a controller may take to begin; none once it has begun.
+    /// Deadline for the controller's start; `None` once it has started.
     starts: Option<Micros>,
     good_in_a_row: u32,
     halted: Option<Halt>,
@@ -147,7 +147,7 @@ impl core::fmt::Debug for Cycle {
 }
 
 impl Cycle {
-    /// A loop that has not begun; the first epoch will be 0.
+    /// Creates a loop that has not started; its first epoch is 0.
     #[must_use]
     pub fn new(skin: &Skin, controller: Box<dyn Controller>, robot: Box<dyn Robot + Send>) -> Self {
         let (mut chains, mut chain_of) = (Vec::<Chain>::new(), Vec::new());
@@ -183,7 +183,7 @@ impl Cycle {
         }
     }
 
-    /// Begins after this epoch: to cells that were there before, its joints would count as repeated.
+    /// Starts after this epoch: cells that were running before would take its joints for repeated ones.
     pub const fn start_after(&mut self, epoch: Epoch) {
         self.epoch = epoch;
     }
@@ -194,14 +194,14 @@ impl Cycle {
         self.robot.positions()
     }
 
-    /// What the controller has counted, by name.
+    /// Counters of the controller by name.
     #[must_use]
     pub fn counts(&self) -> Vec<(String, u64)> {
         self.controller.counts()
     }
 
-    /// Why the controller counts as absent, if it does: the robot stands without being halted, because the controller may
-    /// take its time to begin, or there never was an answer.
+    /// Reason why the controller counts as absent, if it does: the robot stands without a halt, because the controller
+    /// still has time to start, or never answered.
     #[must_use]
     pub fn absence(&self) -> Option<Absence> {
         if self.bad_in_a_row == 0 || self.halted.is_some() {
@@ -211,14 +211,14 @@ impl Cycle {
         self.controller.absence(stands.then_some(self.bad_in_a_row))
     }
 
-    /// Broadcasts so far.
+    /// Number of broadcasts so far.
     #[must_use]
     pub const fn broadcasts(&self) -> u64 {
         self.broadcasts
     }
 
-    /// One tick; `skipped` ticks before it did not happen. Its input is the buses' sums, in the skin's order, and no
-    /// cells, so its work cannot grow with them.
+    /// Computes one tick after `skipped` skipped ones. The inputs are totals of the buses, in the skin's order, without
+    /// cells, so that the cost does not grow with the number of cells.
     pub fn tick<'a>(
         &mut self,
         tick: Tick,
@@ -273,7 +273,7 @@ impl Cycle {
         let command = if self.count(bad, tick.time) { Some(Command::Halt) } else { heard };
         let velocity = match step {
             Step::Move(velocity) if self.halted.is_none() => velocity,
-            // Without an answer the robot goes on as it was for a while; then it stands, halted or not.
+            // Without an answer, the robot first keeps its velocity for some cycles; then it stands, halted or not.
             Step::Bad(_) if self.halted.is_none() && self.bad_in_a_row < self.safety.bad_cycles => input.qdot,
             Step::Move(_) | Step::Bad(_) => [0.0; MAX_ROBOT_JOINTS],
         };
@@ -301,8 +301,8 @@ impl Cycle {
         Outcome { broadcast, broadcasts_skipped, command, record }
     }
 
-    /// The reference torque: computed centrally from the last broadcast's words and the sensor values at it. This is
-    /// the work that distributed computation takes out of the tick. It grows with the cells.
+    /// Computes the reference torque centrally, from the words of the last broadcast and the sensor values at it.
+    /// Distributed computation takes this work out of the tick. Its cost grows with the number of cells.
     #[must_use]
     pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> Reference {
         let mut reference = Reference::default();
@@ -315,26 +315,26 @@ impl Cycle {
         reference
     }
 
-    /// The chain of a bus; buses with the same one have the same joints.
+    /// Index of a bus's chain. Buses with the same chain have the same joints.
     #[must_use]
     pub fn chain_of(&self, bus: usize) -> usize {
         self.chain_of.get(bus).copied().unwrap_or(usize::MAX)
     }
 
-    /// The joints of a chain as they were last broadcast.
+    /// Joints of a chain as last broadcast.
     #[must_use]
     pub fn joints(&self, chain: usize) -> Joints {
         self.chains.get(chain).map_or_else(Joints::default, Chain::said)
     }
 
-    /// What the newest broadcast said of a chain, before it was rounded to words.
+    /// Positions of a chain at the latest broadcast, before rounding to words.
     #[must_use]
     pub fn positions_of(&self, chain: usize) -> [f64; MAX_JOINTS] {
         self.chains.get(chain).map_or([0.0; MAX_JOINTS], |chain| chain.positions(&self.robot.positions()))
     }
 
-    /// Halts and resumes that others sent; a halt takes precedence over a resume. Returns what has to be sent on
-    /// the other buses.
+    /// Handles halts and resumes from other senders; a halt takes precedence over a resume. Returns the command to send
+    /// on the other buses.
     fn obey(&mut self, halts: u32, resumes: u32) -> Option<Command> {
         let mut heard = None;
         if resumes != self.resumes {
@@ -351,12 +351,12 @@ impl Cycle {
         heard
     }
 
-    /// Counts bad cycles; returns whether this one halts the robot.
+    /// Counts bad cycles. Returns true if this one halts the robot.
     fn count(&mut self, bad: Option<BadCycle>, now: Micros) -> bool {
         let Some(why) = bad else {
             self.bad_in_a_row = 0;
             self.good_in_a_row = self.good_in_a_row.saturating_add(1);
-            // It has begun when it has answered as often in a row as it may fail later.
+            // The controller has started once it has answered as often in a row as it may later fail.
             self.starts = self.starts.filter(|_| self.good_in_a_row < self.safety.bad_cycles);
             return false;
         };
@@ -371,7 +371,7 @@ impl Cycle {
         halt
     }
 
-    /// The joints, when their time has come: every so many ticks, also when ticks were skipped.
+    /// Broadcasts the joints when due: after a fixed number of ticks, also if ticks were skipped.
     fn broadcast(&mut self, tick: Tick) -> (Option<Epoch>, u64) {
         let slot = tick.number / self.ticks_per_broadcast;
         if self.slot == Some(slot) {

@@ -1,9 +1,9 @@
-//! One tick of the control loop: what the buses know goes in, what has to be sent and recorded comes out.
+//! One tick of the control loop: the state of the buses goes in, the messages to send and the record come out.
 //!
 //! | module | what |
 //! |---|---|
 //! | [`cycle`] | the tick itself, and its input and output |
-//! | [`controller`], [`motion`] | torques into joint velocities, and the controller of each motion |
+//! | [`controller`], [`motion`] | controllers that turn torques into joint velocities, and the controller of each motion |
 //! | [`external`] | a controller in another program, behind a Unix datagram socket |
 //! | [`robot`] | the simulated arm |
 

@@ -1,4 +1,4 @@
-//! The controller of a scenario's motion.
+//! Selection of the controller for a scenario's motion.
 
 use std::path::Path;
 
@@ -8,10 +8,10 @@ use crate::controller::{Controller, Kinesthetic, Planned};
 use crate::external::{External, SocketError};
 use model::scenario::{Motion, MotionKind};
 
-/// What moves the robot in this motion of a scenario: hold, sine, or the skin's controller.
+/// Creates the controller for a scenario's motion: hold, sine, or the skin's controller.
 ///
 /// # Errors
-/// When the skin's controller is another program, and there is no socket to listen on for it.
+/// Returns [`SocketError`] if the skin's controller is another program and its socket cannot be opened.
 pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>, SocketError> {
     let motion = *motion;
     Ok(match (motion.kind, &skin.controller.kind) {

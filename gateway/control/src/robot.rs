@@ -1,26 +1,26 @@
-//! What is moved: a robot that takes joint velocities, and a simulated one.
+//! Robots that follow joint velocities, and a simulated one.
 
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 
-/// A robot that takes joint velocities. Joints that it does not have stand at zero.
+/// A robot that follows joint velocities. Joints that it does not have stand at zero.
 pub trait Robot {
-    /// Moves for `seconds` with these joint velocities in rad/s. Called once a tick: must not block,
-    /// allocate, lock or log.
+    /// Moves for `seconds` with these joint velocities in rad/s. Called once per tick: must not block, allocate, lock
+    /// or log.
     fn step(&mut self, velocity: &[f64; MAX_ROBOT_JOINTS], seconds: f64) -> Moved;
 
-    /// Joint positions in rad, as far as the joints have turned: they may exceed half a turn.
+    /// Joint positions in rad, counting full turns: they may exceed half a turn.
     fn positions(&self) -> [f64; MAX_ROBOT_JOINTS];
 
     /// Joint velocities in rad/s.
     fn velocities(&self) -> [f64; MAX_ROBOT_JOINTS];
 }
 
-/// The result of a step.
+/// Result of a step.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Moved {
-    /// Joints that stand at a limit and were commanded beyond it, one bit each, joint 1 lowest.
+    /// Joints that stand at a limit and were commanded beyond it; one bit each, joint 1 lowest.
     pub at_limit: u32,
-    /// Whether a velocity was not finite and was taken as zero.
+    /// True if a velocity was not finite and was taken as zero.
     pub refused: bool,
 }
 
@@ -33,7 +33,7 @@ pub struct SimulatedArm {
 }
 
 impl SimulatedArm {
-    /// The skin's robot, at rest at `start` (in rad), held within its limits.
+    /// Creates the skin's robot, at rest at `start` (in rad), clamped to its limits.
     #[must_use]
     pub fn new(skin: &Skin, start: [f64; MAX_ROBOT_JOINTS]) -> Self {
         let mut limits = [[0.0; 2]; MAX_ROBOT_JOINTS];

@@ -1,16 +1,16 @@
-//! A command of the gateway, watched from outside: how long it takes, and what memory.
+//! Duration and memory use of a command, watched from outside.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::{Duration, Instant};
 
-/// The release build's gateway, which lies a folder above the examples.
+/// Path of the release build's program, one directory above the examples.
 pub(crate) fn gateway() -> PathBuf {
     let program = std::env::current_exe().expect("this program has a path");
     program.parent().and_then(Path::parent).expect("it lies in a folder of the build").join("skinbus")
 }
 
-/// Seconds until a command has done its work, and the peak memory of its process in MB.
+/// Runs a command. Returns its duration in s, and the peak memory of its process in MB.
 pub(crate) fn run(command: &mut Command) -> (f64, f64) {
     let begun = Instant::now();
     let mut child = command.spawn().expect("the release build's gateway: cargo build --release -p gateway");

@@ -1,4 +1,4 @@
-//! What was found beside what was described, in 3D.
+//! 3D page of a calibration: the poses found beside the described ones.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use view::{Moved, Scene};
 use crate::skin::still;
 use crate::visuals::Packages;
 
-/// Returns the page: cells where they were found, and a line from where each of them was described.
+/// Returns the page: cells at the positions found, each with a line from its described position.
 pub(super) fn page(file: &Path, skin: &Skin, calibration: &Calibration) -> String {
     let mut found = skin.clone();
     for (cell, result) in found.cells.iter_mut().zip(&calibration.cells) {

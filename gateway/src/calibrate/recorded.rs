@@ -1,10 +1,10 @@
-//! Comparison of a skin with the one that a recording was made with.
+//! Comparison of a skin with the skin of a recording.
 
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 
-/// Checks that a recording is one of this skin: the same cells on the same buses, on the same robot, at the same rate.
-/// Poses of cells and zeros of joints may differ: they are what a calibration finds.
+/// Checks that a recording belongs to this skin: the same cells on the same buses, on the same robot, at the same rate.
+/// Poses of cells and zero offsets of joints may differ, because a calibration finds them.
 pub(super) fn check(name: &str, skin: &Skin, recorded: &Skin) -> Result<(), Failure> {
     let Some((what, is, was)) = difference(skin, recorded) else { return Ok(()) };
     Err(Failure::usage(format!(
@@ -12,7 +12,7 @@ pub(super) fn check(name: &str, skin: &Skin, recorded: &Skin) -> Result<(), Fail
     )))
 }
 
-/// The first difference, by name, and the two values.
+/// Returns the first difference, by name, with the two values.
 fn difference(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, String)> {
     type Pick = fn(&Skin) -> String;
     let all: [(&str, Pick); 6] = [
@@ -30,7 +30,7 @@ fn difference(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, Str
     all.iter().find_map(differing).or_else(|| rows(skin, recorded))
 }
 
-/// The first of two lists' items that differ.
+/// Returns the first items in which two lists differ.
 fn first(what: &'static str, is: &str, was: &str) -> (&'static str, String, String) {
     let [mut left, mut right] = [is.split(", "), was.split(", ")];
     loop {
@@ -44,7 +44,7 @@ fn first(what: &'static str, is: &str, was: &str) -> (&'static str, String, Stri
     }
 }
 
-/// The first row of a table that differs; zeros of joints are left out.
+/// Returns the first table row that differs, apart from the zero offsets of joints.
 fn rows(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, String)> {
     let all = |skin: &Skin| -> Vec<_> {
         let chains = skin.robot.chains.iter();

@@ -1,4 +1,4 @@
-//! The list as a table and as JSON.
+//! The list of cells as a table and as JSON.
 
 use std::collections::BTreeMap;
 use std::fmt::Display;
@@ -16,15 +16,15 @@ use serde::Serialize;
 
 use crate::print::{filled, some, words};
 
-/// A bus in a description.
+/// A bus in a skin description.
 pub(super) struct Known {
     file: String,
     pub(super) format: Format,
-    /// Node ids and hashes, by serial number.
+    /// Node ids and configuration hashes by serial number.
     cells: BTreeMap<u32, (CellId, u16)>,
 }
 
-/// A column: its head, and the text of a cell that has reported it.
+/// A column: its header, and the text of a cell if it has reported the value.
 type Column = (&'static str, fn(&CellShown) -> Option<String>);
 
 const COLUMNS: [Column; 10] = [
@@ -40,7 +40,7 @@ const COLUMNS: [Column; 10] = [
     ("age", |it| Some(format!("{:.2}", it.age_s))),
 ];
 
-/// Columns for wide terminals.
+/// Columns for wide terminals only.
 const COUNTERS: [Column; 9] = [
     ("sent", |it| text(it.sent)),
     ("refused", |it| text(it.refused)),
@@ -53,21 +53,21 @@ const COUNTERS: [Column; 9] = [
     ("dropped", |it| text(it.tree.as_ref().map(|it| it.sums_dropped))),
 ];
 
-/// Columns that are not of numbers.
+/// Columns with text instead of numbers.
 const OF_WORDS: [&str; 3] = ["state", "ports", "skin"];
 
 fn text(value: Option<impl Display>) -> Option<String> {
     value.map(|value| value.to_string())
 }
 
-/// A bus and the cells that send on it.
+/// A bus with the cells that send on it.
 #[derive(Serialize)]
 pub(super) struct Shown<'a> {
     bus: &'a str,
     kind: String,
     gateway_heard: bool,
     cells: Vec<CellShown>,
-    /// Cells of the description that are missing.
+    /// Cells of the skin that are missing.
     #[serde(skip_serializing_if = "Option::is_none")]
     missing: Option<Vec<u8>>,
     #[serde(skip)]
@@ -75,7 +75,7 @@ pub(super) struct Shown<'a> {
 }
 
 impl<'a> Shown<'a> {
-    /// The cells of the bus, compared with a description.
+    /// Collects the cells of the bus, compared with a skin.
     pub(super) fn of(watch: &'a Watch, known: Option<&'a Known>) -> Self {
         let (bus, listing, now) = (watch.bus(), watch.listing(), watch.now());
         let missing = |known: &Known| {
@@ -92,7 +92,7 @@ impl<'a> Shown<'a> {
         }
     }
 
-    /// One line a cell, and anomalies; without counters where there is no room for them.
+    /// Table with one line per cell, and anomalies; without counters if the terminal is too narrow.
     pub(super) fn table(&self) -> String {
         let whole = self.lines(COLUMNS.into_iter().chain(COUNTERS));
         let text = match Table::new().width() {
@@ -102,7 +102,7 @@ impl<'a> Shown<'a> {
         text + &self.end()
     }
 
-    /// One line a cell; empty columns are left out.
+    /// One line per cell, without empty columns.
     fn lines(&self, columns: impl IntoIterator<Item = Column>) -> String {
         let (heads, lines) = filled(columns, &self.cells, "-");
         let mut table = Table::new();
@@ -117,7 +117,7 @@ impl<'a> Shown<'a> {
         table.lines().map(|line| format!("{}\n", line.trim_end())).collect()
     }
 
-    /// Counts, and anomalies.
+    /// Counts and anomalies below the table.
     fn end(&self) -> String {
         let mut text = format!("{} cells on {} ({})", self.cells.len(), self.bus, self.kind);
         let active = self.cells.iter().filter(|cell| cell.is("active")).count();
@@ -145,14 +145,14 @@ impl<'a> Shown<'a> {
 }
 
 impl Known {
-    /// One bus of a skin, from this file.
+    /// Selects one bus of a skin that comes from this file.
     pub(super) fn of(skin: &Skin, bus: usize, file: String) -> Self {
         let format = skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format);
         let cells = skin.cells_of(bus).map(|cell| (cell.serial, (cell.node, skin.parameters(cell).hash())));
         Self { file, format, cells: cells.collect() }
     }
 
-    /// Whether a cell is as the description has it.
+    /// Compares a cell with its description.
     fn compared(&self, node: u8, heartbeat: &Heartbeat) -> Option<String> {
         let Some((described, hash)) = self.cells.get(&heartbeat.serial) else {
             return Some("unknown".to_owned());
@@ -171,7 +171,7 @@ fn width(text: &str) -> usize {
     text.lines().map(|line| line.chars().count()).max().unwrap_or_default()
 }
 
-/// A screen that is drawn over the last one; what does not fit is left out.
+/// Text that redraws the terminal from the top; lines that do not fit are dropped.
 pub(super) fn screen(text: &str) -> String {
     let rows = tcgetwinsize(std::io::stdout()).map_or(0, |size| usize::from(size.ws_row));
     let all = text.lines().count();
@@ -182,7 +182,7 @@ pub(super) fn screen(text: &str) -> String {
     format!("\x1b[H{lines}\x1b[J")
 }
 
-/// What it has not reported is null.
+/// Values of one cell; unreported values are null.
 #[derive(Serialize)]
 struct CellShown {
     node: u8,
@@ -233,12 +233,12 @@ impl CellShown {
         }
     }
 
-    /// Whether it reports this state.
+    /// Returns true if the cell reports this state.
     fn is(&self, state: &str) -> bool {
         self.state.iter().flatten().any(|name| *name == state)
     }
 
-    /// The state in words; "configured" stands only where there is no other state.
+    /// State as text; "configured" appears only without any other state.
     fn state(&self) -> Option<String> {
         let bare = (self.configured == Some(false)).then_some(&"unconfigured");
         let others = self.state.as_ref()?.iter().filter(|name| **name != "configured");
@@ -249,7 +249,7 @@ impl CellShown {
 
 #[derive(Serialize)]
 struct TreeShown {
-    /// 0 is the gateway's side.
+    /// Node id of the parent; 0 is the gateway's side.
     parent: Option<u8>,
     depth: Option<u8>,
     sums_sent: u16,
@@ -264,7 +264,7 @@ impl TreeShown {
         Self { parent, depth, sums_sent: sent, sums_taken: taken, sums_dropped: dropped }
     }
 
-    /// The parent in words.
+    /// Parent as text.
     fn up(&self) -> String {
         match self.parent {
             None => "none".to_owned(),
@@ -276,7 +276,7 @@ impl TreeShown {
 
 #[derive(Serialize)]
 struct PortShown {
-    /// Node id of the neighbour; null where nothing is received, 0 of a cell without a node id.
+    /// Node id of the neighbour: null if the port receives nothing, 0 for a cell without a node id.
     node: Option<u8>,
     port: Option<u8>,
     works: bool,
@@ -289,7 +289,7 @@ impl PortShown {
         Self { node: hears.then_some(number), port: hears.then_some(port), works, other_version }
     }
 
-    /// In words: `?` after a cell that does not receive, `!` after one of another version.
+    /// Neighbour as text: `?` follows a cell that receives nothing, `!` one with another protocol version.
     fn leads_to(&self) -> String {
         match (self.node, self.works, self.other_version) {
             (None, _, _) => ".".to_owned(),

@@ -1,4 +1,4 @@
-//! What `skinbus check` prints of a scenario.
+//! Output of `skinbus check` for a scenario.
 
 use std::path::Path;
 
@@ -15,12 +15,12 @@ use serde_json::{Map, Value, json};
 
 use crate::print::{count, decimals, json as pretty, list, or, table, words};
 
-/// Values of a list that are shown one by one.
+/// Maximum number of listed values.
 const LISTED: usize = 8;
 
-/// Checks a scenario for a skin, by the text of its file, and says what it will do.
+/// Checks the text of a scenario file against a skin, and describes the scenario.
 ///
-/// Returns also why a run would refuse it, if it would: a bench in virtual time may not.
+/// Also returns the reason if a run would refuse the scenario; a bench in virtual time may accept it.
 pub(super) fn plan(
     file: &Path,
     text: &str,
@@ -34,30 +34,30 @@ pub(super) fn plan(
     Ok((text, refused))
 }
 
-/// What a scenario does.
+/// Content of a scenario.
 #[derive(Serialize)]
 struct Plan {
     skin: String,
     duration_s: f64,
-    /// The period after which the touches begin again.
+    /// Period after which the touches repeat.
     #[serde(skip_serializing_if = "Option::is_none")]
     touches_repeat_s: Option<f64>,
     seed: u64,
     motion: Motion,
     events: Vec<Event>,
-    /// How the sensors differ from perfect ones.
+    /// Errors of the sensors.
     #[serde(skip_serializing_if = "Map::is_empty")]
     sensors: Map<String, Value>,
-    /// What has no effect.
+    /// Parts of the scenario without effect.
     remarks: Vec<String>,
 }
 
 #[derive(Serialize)]
 struct Motion {
     kind: &'static str,
-    /// In the units of the joints.
+    /// Start position in the units of the joints.
     start: Vec<f64>,
-    /// By joint: rad, or m of those that slide.
+    /// Unit of each joint: rad, or m for prismatic joints.
     units: Vec<&'static str>,
     #[serde(flatten)]
     how: Map<String, Value>,
@@ -66,11 +66,11 @@ struct Motion {
 #[derive(Serialize)]
 struct Event {
     at_s: f64,
-    /// Null of what is done in a moment, and of what stays.
+    /// Duration; null for instantaneous and permanent events.
     for_s: Option<f64>,
     what: &'static str,
     bus: Option<String>,
-    /// The node ids; none of a whole bus.
+    /// Node ids of the cells; empty for an event of a whole bus.
     cells: Vec<u8>,
     #[serde(flatten)]
     how: Map<String, Value>,
@@ -163,7 +163,7 @@ impl Plan {
         );
         let remarks: String = remarks.iter().map(|remark| format!("remark: {}\n", shown(remark))).collect();
         if events.is_empty() {
-            return head + "nobody touches the skin, and nothing breaks\n" + &remarks;
+            return head + "no touches and no faults\n" + &remarks;
         }
         let rows = events.iter().map(Event::row);
         head + &format!(
@@ -192,7 +192,7 @@ impl Event {
     }
 }
 
-/// What is done to cells, one event for each bus on which there are some.
+/// Creates the events of cells, one for each bus that has some of them.
 fn on_cells(
     skin: &Skin,
     at: Micros,
@@ -210,7 +210,7 @@ fn on_cells(
     skin.buses.iter().enumerate().filter_map(of_bus).collect()
 }
 
-/// The errors of force sensors, by the file's keys.
+/// Errors of the force sensors, by the file's keys.
 const fn errors(errors: &ForceErrors) -> [(&'static str, f64); 9] {
     [
         ("offset_n", errors.offset_n),
@@ -225,7 +225,7 @@ const fn errors(errors: &ForceErrors) -> [(&'static str, f64); 9] {
     ]
 }
 
-/// What a fault does.
+/// Creates the events of a fault.
 fn broken(skin: &Skin, at: Micros, kind: &FaultKind) -> Vec<Event> {
     let what = kind.name();
     match kind {
@@ -249,7 +249,7 @@ fn broken(skin: &Skin, at: Micros, kind: &FaultKind) -> Vec<Event> {
     }
 }
 
-/// The values of a bus fault, by the file's keys.
+/// Parameters of a bus fault, by the file's keys.
 fn parameters(fault: &BusFault) -> Map<String, Value> {
     match *fault {
         BusFault::Drop { probability }
@@ -265,7 +265,7 @@ fn parameters(fault: &BusFault) -> Map<String, Value> {
     }
 }
 
-/// The file's keys and their values in words.
+/// Formats the file's keys and their values.
 fn described(how: &Map<String, Value>) -> String {
     let words_of = |value: &Value| match value {
         Value::String(text) => text.clone(),
@@ -285,7 +285,7 @@ fn map<const N: usize>(pairs: [(&str, Value); N]) -> Map<String, Value> {
     pairs.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
-/// How long something lasts that ends.
+/// Duration in s, or `None` if it has no end.
 fn length(span: Span) -> Option<f64> {
     (span != Span(u64::MAX)).then(|| span.seconds())
 }

@@ -1,4 +1,4 @@
-//! What `skinbus check` prints of a skin.
+//! Output of `skinbus check` for a skin.
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap};
@@ -14,16 +14,16 @@ use crate::arguments::bus_names;
 use crate::print::{count, list, or, words};
 use crate::robot_file::{RobotOfSkin, urdf_of};
 
-/// The cells that are listed beside the summary.
+/// Cells listed beside the summary.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Listed<'a> {
     None,
     All,
-    /// This one instead of the summary.
+    /// This cell instead of the summary.
     Only(&'a CellName),
 }
 
-/// Checks a skin that a file describes and its URDF, as a run that records does, and summarises it.
+/// Checks a skin and its URDF as a recording run does, and summarises the skin.
 pub(super) fn summary(
     file: &Path,
     skin: &Skin,
@@ -120,12 +120,12 @@ fn describe(skin: &Skin) -> String {
     }
     for [first, second] in at_one_place(skin) {
         let name = |cell: &Cell| format!("{} on {}", cell.node, bus_name(skin, cell));
-        text += &format!("remark: cells {} and {} sit at one place\n", name(first), name(second));
+        text += &format!("remark: cells {} and {} sit at the same place\n", name(first), name(second));
     }
     text + &format!("hash: {:04X} over the parameters of all cells; --list lists each cell's\n", hash(skin))
 }
 
-/// Cells that sit where a cell before them sits.
+/// Cells at the position of an earlier cell.
 fn at_one_place(skin: &Skin) -> Vec<[&Cell; 2]> {
     let mut known = HashMap::new();
     let place = |cell: &Cell| {
@@ -149,7 +149,7 @@ fn bus_name<'a>(skin: &'a Skin, cell: &Cell) -> &'a str {
     skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str())
 }
 
-/// A cell in a line.
+/// Describes a cell in one line.
 fn line(skin: &Skin, cell: &Cell) -> String {
     let on_bus = bus_name(skin, cell);
     let Cell { node, serial, joint, row, position, normal, neighbors, root, .. } = cell;
@@ -164,12 +164,12 @@ fn line(skin: &Skin, cell: &Cell) -> String {
     )
 }
 
-/// A unit vector with the four decimals that can be measured: one from a quaternion has more.
+/// Rounds a unit vector to four decimals, which can be measured: one from a quaternion has more.
 fn rounded(normal: &[f64; 3]) -> [f64; 3] {
     normal.map(|part| (part * 1e4).round() / 1e4 + 0.0)
 }
 
-/// The hash over the parameters of all cells.
+/// Hash over the parameters of all cells.
 fn hash(skin: &Skin) -> u16 {
     let images: Vec<u8> = skin.cells.iter().flat_map(|cell| skin.parameters(cell).image()).collect();
     crc16(&images)

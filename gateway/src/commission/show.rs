@@ -1,4 +1,4 @@
-//! The result of a commissioning, as a table, as JSON, and in notes.
+//! Result of a commissioning as a table, as JSON, and in notes.
 
 use std::collections::BTreeMap;
 
@@ -10,10 +10,10 @@ use serde::Serialize;
 
 use crate::print::{Rows, count, some};
 
-/// Cells with other node ids that get a line each.
+/// Maximum number of cells with other node ids that get a line each.
 const LINES: usize = 8;
 
-/// All of it.
+/// The whole result.
 #[derive(Debug, Serialize)]
 pub(super) struct Whole<'a> {
     pub(super) skin: &'a str,
@@ -26,7 +26,7 @@ pub(super) struct Whole<'a> {
     pub(super) buses: Vec<BusShown<'a>>,
 }
 
-/// One bus.
+/// Result of one bus.
 #[derive(Debug, Serialize)]
 pub(super) struct BusShown<'a> {
     name: &'a str,
@@ -65,7 +65,7 @@ impl<'a> BusShown<'a> {
         }
     }
 
-    /// Cells with another node id than in the description, and which.
+    /// Cells whose node id differs from the description, with their present ids.
     fn moved(&self) -> impl Iterator<Item = (CellId, &CellReport)> {
         self.cells.iter().filter_map(|it| Some((it.number.filter(|&node| node != it.described)?, it)))
     }
@@ -138,7 +138,7 @@ impl Whole<'_> {
         notes
     }
 
-    /// The table.
+    /// Formats the table.
     pub(super) fn table(&self) -> String {
         let cells = self.buses.iter().map(|bus| bus.cells.len()).sum::<usize>();
         let ended = match (self.interrupted, self.dry_run) {
@@ -151,7 +151,7 @@ impl Whole<'_> {
         rows.text()
     }
 
-    /// The result of the program, when all has been shown.
+    /// Result of the program, after all output.
     pub(super) fn end(&self) -> Result<(), Failure> {
         let sum = |part: fn(&BusShown<'_>) -> usize| self.buses.iter().map(part).sum::<usize>();
         let (cells, failed) = (sum(|bus| bus.cells.len()), sum(|bus| bus.failed));

@@ -1,4 +1,4 @@
-//! The files of a capture, and where it begins in its run.
+//! Files of a capture, and its start within the run.
 
 use std::path::{Path, PathBuf};
 
@@ -10,7 +10,7 @@ use protocol::time::Micros;
 use protocol::usage::Failure;
 use trace::capture::{Entry, Reader};
 
-/// The parts of a recording that follow a file, which are called `run-1.mcap`, `run-2.mcap` behind `run.mcap`.
+/// Finds the parts of a recording after the first file: `run-1.mcap`, `run-2.mcap` after `run.mcap`.
 pub(super) fn parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
     if first.is_dir() {
         return Err(Failure::usage(format!(
@@ -37,14 +37,15 @@ pub(super) fn parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
     Ok(files)
 }
 
-/// When a recording began, as it says itself, and which part of it a file is.
+/// Returns the start of a recording, by its metadata, and the number of the part that a file holds.
 fn part(file: &Path) -> Option<(String, u32)> {
     let reader = can_be_read_again(file).then(|| Reader::open(file).ok()).flatten()?;
     let fact = |record, key| reader.extras().fact(record, key).map(str::to_owned);
     Some((fact("program", "began_ns")?, fact("part", "number")?.parse().ok()?))
 }
 
-/// The numbers of the first joints. Captures that began in the middle of a run are read for that, if they can be read twice.
+/// Returns the numbers of the first joints. Captures that start in the middle of a run are read for that, if they can
+/// be read twice.
 pub(super) fn starts(files: &Both<Vec<PathBuf>>, skin: &Skin) -> Result<Both<Option<u64>>, Failure> {
     let unknown = Both { a: None, b: None };
     if ![&files.a, &files.b].iter().all(|files| files.iter().all(|file| can_be_read_again(file))) {
@@ -61,7 +62,7 @@ pub(super) fn starts(files: &Both<Vec<PathBuf>>, skin: &Skin) -> Result<Both<Opt
     Ok(both.map_or(unknown, |(a, b)| compare::starts(&a, &b)))
 }
 
-/// The joints of a capture, or the first of them; what cannot be read is reported when it is compared.
+/// Reads the joints of a capture, or only the first. Errors are reported later, when it is compared.
 fn trace(files: &[PathBuf], skin: &Skin, is_first_enough: bool) -> Option<Trace> {
     let mut reader = super::captures(files, |file| Box::new(file)).ok()?;
     let mut decoder = Decoder::new(None);

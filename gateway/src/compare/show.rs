@@ -1,4 +1,4 @@
-//! The outcome of a comparison as text and as JUnit.
+//! Result of a comparison as text and as JUnit.
 
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
@@ -11,12 +11,12 @@ use protocol::usage::shown;
 use crate::junit::{Case, Outcome, Suite};
 use crate::print::{count, decimals, list, or, some, table};
 
-/// Columns of the tables.
+/// Width of the tables in columns.
 const WIDTH: u16 = 80;
-/// Cells in the table.
+/// Maximum number of cells in the table.
 const CELLS: usize = 8;
 
-/// A capture as it is called.
+/// Names of a capture.
 #[derive(Debug)]
 pub(super) struct About<'a> {
     pub(super) name: &'a str,
@@ -24,17 +24,17 @@ pub(super) struct About<'a> {
     pub(super) files: &'a [PathBuf],
 }
 
-/// The outcome, and what it is of.
+/// Result of a comparison with its inputs.
 #[derive(Debug)]
 pub(super) struct Shown<'a> {
     pub(super) inputs: Both<About<'a>>,
-    /// The file of the option `--skin`.
+    /// File of the option `--skin`.
     pub(super) skin: Option<&'a Path>,
     pub(super) report: &'a Report,
 }
 
 impl Shown<'_> {
-    /// The verdict, tables, and the first difference.
+    /// Formats the verdict, the tables and the first difference.
     pub(super) fn text(&self) -> String {
         let mut text = format!("{}\n", self.verdict());
         for (letter, about) in [("A", &self.inputs.a), ("B", &self.inputs.b)] {
@@ -142,7 +142,7 @@ impl Shown<'_> {
         format!("{table}\n")
     }
 
-    /// Cells that differ, and those of one capture alone.
+    /// Table of cells that differ, and names of cells in only one capture.
     fn cells(&self) -> String {
         let differs = |row: &&CellRow| row.replies.different + row.replies.missing() > 0;
         let mut cells: Vec<_> = self.report.cells.iter().filter(differs).collect();
@@ -176,7 +176,7 @@ impl Shown<'_> {
         text
     }
 
-    /// The first difference, and how to look further.
+    /// Describes the first difference, and names commands that show more.
     fn first(&self, first: &First) -> String {
         let First { what, bus, epoch, number, time_s, words, values, .. } = first;
         let cell = first.cell.map_or_else(String::new, |cell| format!(" of cell {cell}"));
@@ -226,7 +226,7 @@ impl Shown<'_> {
         text
     }
 
-    /// The options that take such a difference for none.
+    /// Options that accept such a difference.
     fn tolerance(&self, first: &First) -> Option<&'static str> {
         match (first.what, first.steps) {
             ("joints", Some(_)) => Some(
@@ -239,7 +239,7 @@ impl Shown<'_> {
         }
     }
 
-    /// The command that shows more of some joints.
+    /// Command that shows more about some joints.
     fn explain(&self, first: &First, which: Which) -> Option<String> {
         let occurrence = (*first.occurrence.of(which))?;
         let about = self.inputs.of(which);
@@ -260,7 +260,7 @@ impl Shown<'_> {
         Some(line)
     }
 
-    /// A JUnit report: a test case for each aspect.
+    /// JUnit report with a test case for each aspect.
     pub(super) fn junit(&self, took: Duration) -> Suite {
         let first = self.report.first.as_ref().map(|first| self.first(first)).unwrap_or_default();
         let cases = ASPECTS.into_iter().map(|aspect| {
@@ -277,7 +277,7 @@ impl Shown<'_> {
         }
     }
 
-    /// An aspect's difference in one line.
+    /// Describes the differences of one aspect in one line.
     fn failed(&self, aspect: &str) -> String {
         let Report { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = self.report;
         let missing = |a, b| format!("{a} missing in A, {b} in B");
@@ -296,7 +296,7 @@ impl Shown<'_> {
     }
 }
 
-/// Equal and different ones.
+/// Counts of equal and different replies.
 fn said(replies: &Replies) -> String {
     let Replies { equal, tolerated, different, open, max_steps, .. } = *replies;
     let mut all = vec![format!("{equal} equal")];

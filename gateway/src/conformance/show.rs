@@ -1,4 +1,4 @@
-//! What came of each requirement, as a table, JSON and JUnit.
+//! Results of the requirements as a table, JSON and JUnit.
 
 use std::fmt::Write;
 use std::time::Duration;
@@ -12,7 +12,7 @@ use serde::Serialize;
 use crate::junit::{Case, Outcome, Suite};
 use crate::print::{count, list, readable, table};
 
-/// All that is printed.
+/// The printed result.
 #[derive(Debug, Serialize)]
 pub(super) struct Whole {
     bus: String,
@@ -20,7 +20,7 @@ pub(super) struct Whole {
     serial: u32,
     format: &'static str,
     seconds: f64,
-    /// Why it ended early.
+    /// Reason of an early end.
     stopped: Option<String>,
     passed: usize,
     failed: usize,
@@ -57,7 +57,7 @@ impl Whole {
         self.failed > 0
     }
 
-    /// A line each, the frames of failures, and what was not tested.
+    /// Formats one line per requirement, the frames of failures, and the requirements that were not tested.
     pub(super) fn text(&self) -> String {
         let rows = self.requirements.iter().map(|it| {
             let (verdict, more) = said(&it.verdict);
@@ -94,7 +94,7 @@ impl Whole {
         text
     }
 
-    /// A JUnit report: a test case for each requirement.
+    /// JUnit report with a test case for each requirement.
     pub(super) fn junit(&self) -> String {
         let case = |Finding { requirement, verdict }: &Finding| {
             let document = serde_json::to_value(requirement.document).unwrap_or_default();
@@ -123,7 +123,7 @@ impl Whole {
     }
 }
 
-/// The verdict in a word, and what more there is to say.
+/// The verdict in words, and further details.
 fn said(verdict: &Verdict) -> (&'static str, String) {
     match verdict {
         Verdict::Passed { checks, but } => {

@@ -1,10 +1,10 @@
-//! Captures that are made of a pipe: what has come is in the file before a tenth of a second has passed, whatever ends the
-//! program, and whether more comes or not.
+//! Captures converted from a pipe: input is in the file within a tenth of a second, however the program ends, and
+//! whether more input comes or not.
 //!
 //! ```text
-//!   pipe ──> convert ──> Shared ──┬──> a log, under its name from the first line on
+//!   pipe ──> convert ──> output ──┬──> a log, under its name from the first line on
 //!                          ▲      └──> OUT.mcap.part, which gets its name at the end
-//!                        keep, every 50 ms
+//!              flush, every 50 ms
 //! ```
 
 use std::fs::File;
@@ -23,12 +23,12 @@ use trace::recording::names::{self, Part};
 
 /// Time after which written entries are in the file.
 const KEEP_INTERVAL: Duration = Duration::from_millis(50);
-/// Bytes that go to a recording together.
+/// Number of bytes written to a recording at once.
 const PIECE: usize = 64 << 10;
-/// Room for the thread that keeps, which calls no deep functions.
+/// Stack size of the writing thread, which calls no deep functions.
 const STACK: usize = 256 << 10;
 
-/// The file that grows.
+/// A file that grows.
 enum Grown {
     Log(LogFile),
     Part(BufWriter<File>),
@@ -37,7 +37,7 @@ enum Grown {
 impl Write for Grown {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         match self {
-            // All of them or none: they are whole lines.
+            // Write all bytes or none: they are whole lines.
             Self::Log(log) => log.append_bytes(bytes).map(|()| bytes.len()),
             Self::Part(file) => file.write(bytes),
         }
@@ -51,12 +51,12 @@ impl Write for Grown {
     }
 }
 
-/// An output, and what became of it since it was kept.
+/// An output and its state since the last flush.
 struct State {
     output: Output<Grown>,
     /// Set by each write, cleared when everything is in the file.
     is_dirty: bool,
-    /// The error of the thread that writes at intervals, for the next call.
+    /// Error of the writing thread, kept for the next call.
     failed: Option<io::Error>,
     is_over: bool,
 }
@@ -64,7 +64,7 @@ struct State {
 #[derive(Default)]
 struct Meeting {
     state: Mutex<Option<State>>,
-    /// Signalled when it is over.
+    /// Signalled at the end.
     over: Condvar,
 }
 
@@ -78,7 +78,7 @@ impl Meeting {
         }
     }
 
-    /// Keeps what was written, until it is over.
+    /// Flushes written entries at intervals until the end.
     fn keep(&self) {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         while let Some(State { output, is_dirty, failed, is_over: false }) = state.as_mut() {
@@ -102,7 +102,7 @@ pub(super) struct Live {
 }
 
 impl Live {
-    /// Begins a file.
+    /// Creates the file and starts the writing thread.
     pub(super) fn create(
         path: &Path,
         force: bool,
@@ -129,18 +129,18 @@ impl Live {
         Ok(Self { meeting, keeper: Some(keeper), path: path.to_owned(), force, part })
     }
 
-    /// Says which file has the entries so far.
+    /// Names the file that holds the entries so far.
     pub(super) fn left(&self) -> String {
         match &self.part {
             Some(_) => {
                 let part = format!("{}.part", self.path.display());
-                format!("what was written before is in {part}: skinbus recover {part}")
+                format!("the part written before is in {part}: `skinbus recover {part}` repairs it")
             }
-            None => format!("{} has what was written before", self.path.display()),
+            None => format!("{} holds the part written before", self.path.display()),
         }
     }
 
-    /// Writes the end, and gives a recording its name.
+    /// Finishes the file, and gives a recording its name.
     pub(super) fn finish(mut self) -> io::Result<()> {
         let ended = self.end(|state| {
             state.output.finish()?;
@@ -155,25 +155,25 @@ impl Live {
         Ok(())
     }
 
-    /// Ends it without its end; what was written is in it.
+    /// Closes the file unfinished; it keeps the entries written so far.
     pub(super) fn close(mut self) {
-        // Why it ends is reported already.
+        // The reason of the end has been reported already.
         let _ = self.end(|state| state.output.keep());
     }
 
-    /// Takes it away: nothing is to be left of it.
+    /// Removes the file.
     pub(super) fn discard(mut self) {
         let is_there = self.part.is_some() || self.meeting.with(|_| Ok(())).is_ok();
         let _ = self.end(|_| Ok(()));
         match &self.part {
             Some((part, _)) => part.remove(),
-            // One that it was to take the place of is there until the first line.
+            // A file to be replaced exists until the first line is written.
             None if is_there && !self.force => _ = std::fs::remove_file(&self.path),
             None => {}
         }
     }
 
-    /// Ends the thread, and then the output.
+    /// Ends the thread, then the output.
     fn end(&mut self, end: impl FnOnce(&mut State) -> io::Result<()>) -> io::Result<()> {
         let ended = self.meeting.with(|state| {
             state.is_over = true;
@@ -182,7 +182,7 @@ impl Live {
         self.meeting.state.lock().unwrap_or_else(PoisonError::into_inner).take();
         self.meeting.over.notify_all();
         if let Some(keeper) = self.keeper.take() {
-            // It does not panic.
+            // The thread does not panic.
             let _ = keeper.join();
         }
         ended
@@ -202,7 +202,7 @@ impl Target for Live {
     }
 }
 
-/// Says what stands in the way of a recording that grows, before its input is waited for.
+/// Checks that a growing recording can be created, before waiting for input.
 pub(super) fn check(path: &Path) -> io::Result<()> {
     let mut part = path.as_os_str().to_owned();
     part.push(".part");
@@ -213,7 +213,7 @@ pub(super) fn check(path: &Path) -> io::Result<()> {
             part.display()
         ))),
         Ok(_) => Err(io::Error::other(format!(
-            "{0} is there, of a program that was killed: `skinbus recover {0}`, then move it away",
+            "{0} was left by a program that was killed: `skinbus recover {0}`, then move it away",
             part.display()
         ))),
         Err(_) => Ok(()),

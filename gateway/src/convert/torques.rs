@@ -1,4 +1,4 @@
-//! The torque of every epoch as CSV.
+//! Torque of every epoch as CSV.
 
 use std::io::Write;
 use std::path::Path;
@@ -11,12 +11,12 @@ use trace::capture::{Reader, seconds_since};
 use crate::input::Missing;
 use crate::print::list;
 
-/// Whether a name is one of a CSV file.
+/// Returns true for the name of a CSV file.
 pub(super) fn is_csv(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "csv")
 }
 
-/// Writes a row for each epoch; how many there were. What the capture lacks is noted.
+/// Writes a row for each epoch. Returns the number of epochs, and what the capture lacks.
 pub(super) fn write(
     reader: &mut Reader,
     skin: &Skin,
@@ -32,14 +32,15 @@ pub(super) fn write(
     Ok((epochs, missing))
 }
 
-/// The buses whose cells answer with sums, which do not contain the torques of single cells; none if there are none.
+/// Names of the buses whose cells answer with sums, which do not contain the torques of single cells; `None` without
+/// such buses.
 pub(super) fn summed(skin: &Skin) -> Option<String> {
     let summed = skin.buses.iter().filter(|bus| bus.reply != Reply::Torque).map(|bus| bus.name.clone());
     let summed: Vec<_> = summed.collect();
     (!summed.is_empty()).then(|| list(summed))
 }
 
-/// Names and units.
+/// Column names with units.
 fn header(skin: &Skin) -> Vec<String> {
     let joints = skin.robot.joints.iter().flat_map(|joint| {
         let (name, unit, torque) = (&joint.name, joint.kind.unit(), joint.kind.torque_unit());
@@ -54,19 +55,19 @@ fn header(skin: &Skin) -> Vec<String> {
     first.chain(joints).chain(["open_cells", "saturated_cells"].map(str::to_owned)).collect()
 }
 
-/// All digits of a number; small ones with an exponent.
+/// All digits of a number; small numbers with an exponent.
 fn digits(value: f64) -> String {
     format!("{value:?}")
 }
 
 struct Rows<W: Write> {
-    /// By joint, whether its torques come in sums.
+    /// True for each joint whose torques come in sums.
     summed: Vec<bool>,
     out: Writer<W>,
 }
 
 impl<W: Write> Rows<W> {
-    /// The numbers are those of `skinbus explain`; seconds count from `zero`, in ns since 1970.
+    /// Writes a row with the numbers of `skinbus explain`. Seconds count from `zero`, in ns since 1970.
     fn write(&mut self, zero: u64, epoch: &EpochTorque) -> Result<(), csv::Error> {
         let EpochTorque { at_ns, epoch, positions, explanation } = epoch;
         let seconds = seconds_since(zero, *at_ns);

@@ -1,4 +1,4 @@
-//! Output for each frame.
+//! Output of `skinbus dump` for each frame.
 
 use std::borrow::Cow;
 use std::fmt::Write as _;
@@ -27,20 +27,20 @@ const DIM: &str = "\x1b[2m";
 const MAGENTA: &str = "\x1b[35m";
 const CYAN: &str = "\x1b[36m";
 
-/// How frames are shown.
+/// Output style of frames.
 #[derive(Debug)]
 pub(super) enum How {
-    /// One line each, in colours or not.
+    /// One line per frame, with or without colours.
     Lines { colour: bool },
-    /// The same without the raw frame: the time since the first one, the bus, and the decoded frame.
+    /// One line per frame without the raw frame: time since the first frame, bus, and decoded frame.
     Brief { colour: bool },
-    /// One JSON object each.
+    /// One JSON object per frame.
     Json,
-    /// None; statistics at the end.
+    /// No lines; statistics at the end.
     Stats(Box<Stats>),
 }
 
-/// A frame that is not settled yet.
+/// A frame whose meaning is not settled yet.
 struct Waiting {
     time: Timestamp,
     bus: Arc<str>,
@@ -49,24 +49,24 @@ struct Waiting {
     direction: Option<Direction>,
 }
 
-/// Decodes, picks and shows frames.
+/// Decodes, filters and shows frames.
 pub(super) struct Show<W> {
     out: W,
     settler: Settler<Waiting>,
-    /// The bus of the last frame, and its units.
+    /// Bus of the last frame, with its units.
     bus: Arc<str>,
     units: Units,
-    /// Those of the buses that a skin describes, and how many joints their chains have.
+    /// Buses that a skin describes, with their units and the numbers of their chains' joints.
     described: Vec<(String, Units, usize)>,
     pick: Pick,
-    /// Only traffic of touches.
+    /// True to show only traffic of touches.
     contact: bool,
     how: How,
-    /// Frames that may still be shown.
+    /// Number of frames that may still be shown.
     left: u64,
-    /// Buses that the filters name, as long as none of their frames came.
+    /// Buses named by the filters from which no frame has come.
     absent: Vec<String>,
-    /// The time that seconds count from; until it is known, or the first frame comes, `None`.
+    /// Time from which seconds count; `None` until it is known or the first frame comes.
     zero: Option<u64>,
     raw: String,
 }
@@ -90,12 +90,12 @@ impl<W: Write> Show<W> {
         }
     }
 
-    /// Counts seconds from this time on; before the first frame.
+    /// Sets the time from which seconds count; call it before the first frame.
     pub(super) const fn count_from(&mut self, zero: u64) {
         self.zero = Some(zero);
     }
 
-    /// Takes the units of the skin's buses; of others they stay the default. Before the first frame.
+    /// Sets the units of the skin's buses; other buses keep the default. Call it before the first frame.
     pub(super) fn describe(&mut self, skin: &Skin) {
         let buses = skin.buses.iter().enumerate();
         let described =
@@ -103,7 +103,7 @@ impl<W: Write> Show<W> {
         self.described = described.collect();
     }
 
-    /// Takes the next frame; it is shown once it is settled, if the filters select it.
+    /// Adds the next frame. It is shown once settled, if the filters select it.
     pub(super) fn frame(&mut self, record: &Record<'_>) -> io::Result<()> {
         let Record { time, interface, frame, direction } = *record;
         if *self.bus != *interface {
@@ -117,19 +117,19 @@ impl<W: Write> Show<W> {
         self.settled()
     }
 
-    /// Time passed without a frame.
+    /// Handles the passing of time without a frame.
     pub(super) fn handle_time(&mut self, now: Micros) -> io::Result<()> {
         self.settler.handle_time(now);
         self.settled()
     }
 
-    /// No more frames follow.
+    /// Settles all waiting frames at the end of the input.
     pub(super) fn finish(&mut self) -> io::Result<()> {
         self.settler.finish();
         self.settled()
     }
 
-    /// Whether frames wait that are not shown yet.
+    /// Returns true if frames wait that are not shown yet.
     pub(super) fn is_waiting(&self) -> bool {
         self.settler.is_waiting()
     }
@@ -147,17 +147,17 @@ impl<W: Write> Show<W> {
         Ok(())
     }
 
-    /// Buses that the options name and of which no frame came, in words.
+    /// Names of the buses that the options name and from which no frame came.
     pub(super) fn absent_buses(&self) -> Option<String> {
         (!self.absent.is_empty() && self.left > 0).then(|| list(&self.absent))
     }
 
-    /// Whether no more frames are to be shown.
+    /// Returns true if no further frames are to be shown.
     pub(super) const fn has_enough(&self) -> bool {
         self.left == 0
     }
 
-    /// Joints of another number than the chain's: the skin is of another robot, and says nothing of this bus.
+    /// Drops the description of a bus whose joints differ in number from the chain's: the skin is for another robot.
     fn check_robot(&mut self, bus: &str, decoded: &Decoded) {
         let Some(Message::Joints { joints, .. }) = decoded.message() else { return };
         let came = usize::from(joints.in_use);
@@ -186,7 +186,7 @@ impl<W: Write> Show<W> {
         match &mut self.how {
             How::Stats(stats) => stats.take(record, decoded),
             How::Json => {
-                // Nothing else in it is free text.
+                // The bus name is the only free text in the line.
                 if let Cow::Borrowed(_) = shown(record.interface) {
                     json::write(&mut self.out, record, decoded, units)?;
                 } else {
@@ -196,7 +196,7 @@ impl<W: Write> Show<W> {
                 }
             }
             How::Brief { colour } => {
-                // Before the run's loop began, and where times run backwards.
+                // Times before the loop's start, or of a capture whose times run backwards, are negative.
                 let (sign, since) = if nanos < zero { ("-", zero - nanos) } else { ("", nanos - zero) };
                 let (seconds, micros) = (since / 1_000_000_000, since / 1_000 % 1_000_000);
                 let (dim, of, plain) = if *colour { (DIM, of(decoded), PLAIN) } else { ("", "", "") };
@@ -209,7 +209,7 @@ impl<W: Write> Show<W> {
                     Some(Direction::Sent) => " T",
                     Some(Direction::Received) => " R",
                 };
-                // A string takes everything.
+                // Writing to a string never fails.
                 let _ = write!(self.raw, "{}{way}", Record { interface, ..*record });
                 let raw = &self.raw;
                 if *colour {
@@ -224,14 +224,14 @@ impl<W: Write> Show<W> {
         Ok(())
     }
 
-    /// Frames were lost before this point.
+    /// Counts frames that were lost before this point.
     pub(super) fn dropped(&mut self, bus: &str, frames: u64) {
         if let How::Stats(stats) = &mut self.how {
             stats.dropped(bus, frames);
         }
     }
 
-    /// The times of the frames are none.
+    /// Notes that the frames have no valid times.
     pub(super) const fn without_times(&mut self) {
         if let How::Stats(stats) = &mut self.how {
             stats.without_times();
@@ -242,7 +242,7 @@ impl<W: Write> Show<W> {
         self.out.flush()
     }
 
-    /// The numbers, where these are shown.
+    /// Returns the statistics, if they are collected.
     pub(super) fn report(&self) -> Option<Report> {
         match &self.how {
             How::Stats(stats) => Some(stats.report()),
@@ -251,7 +251,7 @@ impl<W: Write> Show<W> {
     }
 }
 
-/// The colour of a decoded frame.
+/// Colour of a decoded frame.
 fn of(decoded: &Decoded) -> &'static str {
     match decoded {
         Decoded::Foreign(_) | Decoded::Wire(..) | Decoded::Segment { .. } => DIM,
@@ -272,7 +272,7 @@ mod tests {
     use super::*;
     use protocol::candump;
 
-    /// What is written of a frame on this bus.
+    /// Output for one frame on this bus.
     fn line(bus: &str, how: How) -> String {
         let pick = Pick::default();
         let mut show = Show::new(Vec::new(), None, pick, false, how, 1);

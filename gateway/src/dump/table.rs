@@ -1,4 +1,4 @@
-//! The statistics of a capture as tables.
+//! Statistics of a capture as tables.
 
 use std::collections::BTreeMap;
 
@@ -10,7 +10,7 @@ use trace::capture::{Extras, Topic};
 
 use crate::print::{self, Rows, decimals, filled, list, or, words};
 
-/// All of it: what the capture is, each bus, and each bus' cells.
+/// Formats the whole report: the capture, each bus, and each bus's cells.
 pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extras>) -> String {
     let head = format!("{what}, {:.3} s", report.duration_s);
     let mut rows = Rows::new(name, head, print::count(report.frames, "frame"));
@@ -35,12 +35,12 @@ pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extr
     text
 }
 
-/// A rate, and how long the time is that it is of.
+/// A rate with the time span that it covers.
 fn per_s(rate: Option<f64>, span_s: f64) -> String {
     or(rate.map(|rate| format!("{rate:.1} a second in {} s", span(span_s))), "")
 }
 
-/// Seconds with as many digits as tell them from none.
+/// Formats seconds with enough digits to differ from zero.
 fn span(span_s: f64) -> String {
     if span_s < 1e-3 { format!("{span_s:.9}") } else { format!("{span_s:.3}") }
 }
@@ -74,7 +74,7 @@ fn numbers(rows: &mut Rows, bus: &BusReport, duration_s: f64) {
     rows.row("frames missing", bus.dropped, why);
 }
 
-/// What an MCAP recording has beside frames.
+/// Adds the contents of an MCAP recording besides frames.
 fn beside(rows: &mut Rows, extras: &Extras) {
     if !extras.topics.is_empty() {
         rows.section("other topics", "messages", "");
@@ -90,7 +90,7 @@ fn beside(rows: &mut Rows, extras: &Extras) {
     }
 }
 
-/// How many error frames report what; one may report several things.
+/// Counts error frames by class; one frame may report several classes.
 fn reported(foreign: &ForeignFrames) -> Vec<String> {
     let mut counts = BTreeMap::<&str, u64>::new();
     for id in foreign.identifiers.iter().filter(|id| id.of == FrameType::Error) {
@@ -101,10 +101,10 @@ fn reported(foreign: &ForeignFrames) -> Vec<String> {
     counts.into_iter().map(|(class, count)| format!("{count} {class}")).collect()
 }
 
-/// Foreign identifiers that are shown; --json has all.
+/// Maximum number of foreign identifiers shown; --json has all.
 const FOREIGN: usize = 40;
 
-/// One line a foreign identifier, those with the most frames.
+/// Table with one line per foreign identifier, the most frequent ones first.
 fn foreign(bus: &BusReport) -> Table {
     let head = [
         &format!("{} foreign", shown(&bus.bus)),
@@ -142,10 +142,10 @@ fn foreign(bus: &BusReport) -> Table {
     print::table(head, lines, |column| column < 6)
 }
 
-/// A column: its head, and the text of a cell, if it has any.
+/// A column: its header, and the text of a cell if it has a value.
 type Column<'a> = (&'a str, fn(&CellReport) -> Option<String>);
 
-/// One line a cell. Columns without a value (unanswered, lost, ...) are left out.
+/// Table with one line per cell, without empty columns (unanswered, lost, ...).
 fn cells(bus: &BusReport) -> Table {
     // A zero is left blank.
     fn some(count: u64) -> Option<String> {

@@ -1,4 +1,4 @@
-//! The benches of experiments: this program again, as from a shell.
+//! Benches of experiments: this program, started again as from a shell.
 
 use std::fs;
 use std::io;
@@ -22,19 +22,19 @@ use trace::files::write_whole;
 
 use crate::buses;
 
-/// Where benches are run, and with what.
+/// Settings of the benches.
 #[derive(Debug)]
 pub(super) struct Benches {
-    /// For their skins, scenarios, recordings and summaries.
+    /// Directory for their skins, scenarios, recordings and summaries.
     pub(super) folder: PathBuf,
-    /// Set when it has to end.
+    /// Set to end the bench.
     pub(super) stop: Arc<AtomicBool>,
 }
 
-/// How often it is looked whether a bench has ended.
+/// Interval between checks whether a bench has ended.
 const LOOK: Duration = Duration::from_millis(50);
 
-/// What one run takes and gives.
+/// Files of one run.
 struct Files {
     skin: PathBuf,
     scenario: PathBuf,
@@ -43,7 +43,7 @@ struct Files {
 }
 
 impl Benches {
-    /// Runs `skinbus run` on the arm and reads what it recorded.
+    /// Runs `skinbus run` on the arm and reads the recording.
     pub(super) fn run(&self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
         let name = arm::name(reply);
         let what = format!("the bench of the moving arm ({name})");
@@ -71,13 +71,12 @@ impl Benches {
         Ok(Run { rows, summary, joints })
     }
 
-    /// Runs `skinbus run` on a bench of so many cells, each bus' cells in one process, and reads its summary. One that
-    /// failed or was halted, as the machine cannot do it, has a summary too; one whose cells ended by an error of their own
-    /// measures nothing.
+    /// Runs `skinbus run` on a bench, with each bus's cells in one process, and reads its summary. A bench that failed
+    /// or was halted because the machine cannot run it has a summary too; one whose cells failed measures nothing.
     pub(super) fn scaled(&self, bench: &Bench) -> Result<Value, Failure> {
         let what = format!("the bench of {} cells ({})", bench.cells, bench.name());
         let buses = buses::directory("experiment")?;
-        // What can be generated again is not kept.
+        // Files that can be generated again are not kept.
         let files = Files {
             skin: buses.path().join("skin.toml"),
             scenario: buses.path().join("scenario.toml"),
@@ -120,14 +119,14 @@ impl Benches {
         self.wait(command).map_err(|error| at(what, &own, &error))
     }
 
-    /// Waits for the bench's end, which a signal makes early.
+    /// Waits for the end of the bench; a signal ends it early.
     fn wait(&self, mut command: Command) -> io::Result<Output> {
         let mut child = command.spawn()?;
         let mut stated = false;
         while child.try_wait()?.is_none() {
             if !stated && self.stop.load(Ordering::Relaxed) {
                 stated = true;
-                // If it has just ended, no process gets the signal.
+                // If the bench has just ended, no process gets the signal.
                 let _ = kill_process(Pid::from_child(&child), Signal::INT);
             }
             std::thread::sleep(LOOK);
@@ -144,7 +143,7 @@ fn at(what: &str, path: &Path, error: &dyn std::fmt::Display) -> Failure {
     failed(what, &format_args!("{}: {error}", path.display()))
 }
 
-/// The last that a run said.
+/// Last line that a run printed.
 fn last_words(ended: &Output) -> String {
     let said = String::from_utf8_lossy(&ended.stderr);
     let last = said.trim_end().lines().last().unwrap_or("it printed nothing").to_owned();

@@ -1,4 +1,4 @@
-//! A folder whose files get their names together, when everything is done.
+//! A directory whose files get their names together when everything is done.
 
 use std::fs;
 use std::io;
@@ -9,20 +9,20 @@ use trace::files::{rename, sync_folder, write_whole};
 
 use crate::output::Overwrite;
 
-/// A folder for results of experiments. What is written stands in a hidden folder in it until [`Folder::finish`]; if that
-/// never comes, nothing of it stays.
+/// A directory for results of experiments. Files are written to a hidden directory in it until [`Folder::finish`];
+/// without that call they are removed.
 #[derive(Debug)]
 pub(super) struct Folder {
     path: PathBuf,
     inside: PathBuf,
-    /// Whether it was made for this.
+    /// True if the directory was created for this.
     made: bool,
     overwrite: Overwrite,
 }
 
 impl Folder {
-    /// Makes it where there is none, and makes sure that it can be written. One in which there is something is taken
-    /// with `overwrite` only.
+    /// Creates the directory if it does not exist, and checks that it can be written. A directory that is not empty is
+    /// accepted only with `overwrite`.
     pub(super) fn create(path: &Path, overwrite: Overwrite) -> Result<Self, Failure> {
         let wrong = |error: &dyn std::fmt::Display| {
             Failure::run(format!("-o {}: {error}; name a folder that can be written", path.display()))
@@ -45,7 +45,7 @@ impl Folder {
         Ok(folder)
     }
 
-    /// Where files are until they get their names.
+    /// Directory of the files until they get their names.
     pub(super) fn inside(&self) -> PathBuf {
         self.inside.clone()
     }
@@ -55,12 +55,12 @@ impl Folder {
         write_whole(&self.inside.join(name), text, false).map_err(|error| self.failed(name, &error))
     }
 
-    /// Gives all files their names, in the order of these; files of the same names are replaced with `overwrite` only.
+    /// Gives all files their names, in alphabetical order. Existing files are replaced only with `overwrite`.
     pub(super) fn finish(self) -> Result<(), Failure> {
         self.publish()
     }
 
-    /// Gives the files that have been written so far their names.
+    /// Gives the files written so far their names.
     pub(super) fn publish(&self) -> Result<(), Failure> {
         let listed = fs::read_dir(&self.inside).and_then(Iterator::collect::<io::Result<Vec<_>>>);
         let mut names: Vec<_> =
@@ -72,7 +72,7 @@ impl Folder {
         }
         sync_folder(&self.inside);
         if self.made {
-            // Folders above it may have been made with it.
+            // Directories above it may have been created too.
             self.path.ancestors().for_each(sync_folder);
         }
         Ok(())
@@ -85,7 +85,7 @@ impl Folder {
 
 impl Drop for Folder {
     fn drop(&mut self) {
-        // Nothing more can be done; a folder that has something in it stays.
+        // Errors cannot be handled here; a directory that is not empty stays.
         let _ = fs::remove_dir_all(&self.inside);
         if self.made {
             let _ = fs::remove_dir(&self.path);

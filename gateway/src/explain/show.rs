@@ -11,18 +11,18 @@ use trace::capture::seconds_since;
 
 use crate::print::{self, decimals, or};
 
-/// Which part is shown.
+/// The part that is shown.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum What {
-    /// One line a cell; a single cell in every step.
+    /// One line per cell; all steps of a single cell.
     All,
-    /// These cells in every step.
+    /// All steps of these cells.
     Cells,
     /// One joint, cell by cell.
     Joint,
 }
 
-/// All of it; seconds count from `zero`, in ns since 1970, which is the begin of the run or the first frame.
+/// Formats the explanation. Seconds count from `zero`, in ns since 1970: the start of the run or the first frame.
 pub(super) fn text(
     name: &str,
     epoch: u8,
@@ -64,13 +64,13 @@ pub(super) fn text(
     text
 }
 
-/// Joints that stand beside each other.
+/// Number of joints side by side.
 const BESIDE: usize = 6;
 
-/// The positions that a bus' cells heard.
+/// Positions that the cells of a bus received.
 fn positions(bus: &BusExplained) -> String {
     let unit = if bus.units.contains(&"m") { "rad, m" } else { "rad" };
-    // Of seven the last one would stand alone.
+    // With seven joints, the last would stand alone.
     let beside = if bus.joints.len() == BESIDE + 1 { BESIDE + 1 } else { BESIDE };
     let words = bus.position_words.chunks(beside).zip(bus.position_rad.chunks(beside));
     let tables = bus.joints.chunks(beside).zip(words).map(|(joints, (words, positions))| {
@@ -84,13 +84,13 @@ fn positions(bus: &BusExplained) -> String {
     tables.collect()
 }
 
-/// A table with its columns to the right, but the first and, where that is of words, the last; close together, so
-/// that it fits on 80 columns.
+/// Table with right-aligned columns, except for the first column and, if it holds text, the last. Columns are close, so
+/// that the table fits on 80 columns.
 fn table(head: Vec<String>, rows: impl IntoIterator<Item = Vec<String>>, words_at_the_end: bool) -> String {
     spaced(head, rows, words_at_the_end, 1)
 }
 
-/// The same, with so many more spaces than one before a number.
+/// Formats such a table with `spaces` spaces before a number.
 fn spaced(
     head: Vec<String>,
     rows: impl IntoIterator<Item = Vec<String>>,
@@ -112,7 +112,7 @@ fn millis(nanos: u64) -> String {
     format!("{:.3} ms", nanos as f64 / 1e6)
 }
 
-/// Cells, each in a line; chain by chain, and of chains with many joints in several tables.
+/// Tables with one line per cell: chain by chain, and several tables for chains with many joints.
 fn one_line_each(cells: &[CellExplained], is_finest: bool) -> String {
     let turns = cells.iter().flat_map(|cell| &cell.rows).all(|row| row.unit == "Nm");
     let (unit, steps) =
@@ -125,9 +125,9 @@ fn one_line_each(cells: &[CellExplained], is_finest: bool) -> String {
     )
 }
 
-/// The torques of one chain's cells.
+/// Torques of the cells of one chain.
 fn torques(cells: &[CellExplained]) -> String {
-    // Joints beyond those that move any of them have nothing but zeros, if all is well.
+    // Joints after those that move any of the cells hold only zeros, if all is well.
     let says = |cell: &CellExplained| {
         let moved = cell.rows.iter().position(|row| row.joint == cell.joint);
         let rows = cell.rows.iter().enumerate();
@@ -162,7 +162,7 @@ fn force_of(cell: &CellExplained) -> Option<f64> {
     cell.force.as_ref().map(|force| force.force_n)
 }
 
-/// Names of cells: their node ids, with their bus where there are several.
+/// Names of cells: their node ids, with the bus if there are several.
 struct Names(Option<String>);
 
 impl Names {
@@ -184,9 +184,9 @@ fn name(cell: &CellExplained) -> String {
     format!("{} {}", cell.bus, cell.node)
 }
 
-/// The differences of a cell's words from the nearest steps.
+/// Largest difference of a cell's words from the nearest steps.
 fn steps_off(rows: &[Row]) -> String {
-    // The last of those that are as far off.
+    // The last one of equally large differences.
     let most = rows.iter().filter_map(|row| row.difference_steps).max_by_key(|steps| steps.abs());
     or(most.map(sign), "?")
 }
@@ -195,7 +195,7 @@ fn sign(steps: i32) -> String {
     if steps == 0 { "0".to_owned() } else { format!("{steps:+}") }
 }
 
-/// The rank of a verdict by importance, its word, and an explanation where it needs one.
+/// Rank of a verdict by importance, its name, and an explanation if it needs one.
 fn about(verdict: &Verdict) -> (u8, &'static str, Option<String>) {
     match verdict {
         Verdict::Nearest => (0, "nearest", None),
@@ -217,12 +217,12 @@ fn about(verdict: &Verdict) -> (u8, &'static str, Option<String>) {
     }
 }
 
-/// The most important verdict.
+/// Name of the most important verdict.
 fn worst(rows: &[Row]) -> String {
     or(rows.iter().map(|row| about(&row.verdict)).max().map(|(_, short, _)| short), "")
 }
 
-/// The same with the J that gives the word.
+/// Name of a verdict, with the J that gives the word.
 fn long(verdict: &Verdict) -> String {
     let (_, short, _) = about(verdict);
     match verdict {
@@ -231,7 +231,7 @@ fn long(verdict: &Verdict) -> String {
     }
 }
 
-/// What the words of the last column mean, those that stand there.
+/// Explanations of the verdicts that occur in the last column.
 fn legend(cells: &[CellExplained]) -> String {
     let said = cells.iter().flat_map(|cell| &cell.rows).map(|row| about(&row.verdict));
     let said: BTreeSet<_> = said.collect();
@@ -296,7 +296,7 @@ fn joint(cells: &[CellExplained]) -> String {
     format!("\n{}", rows(cells, true))
 }
 
-/// Joints of cells, each in a line.
+/// Table of the joints of cells, one line each.
 fn rows(cells: &[CellExplained], by_cell: bool) -> String {
     let names = Names::of(cells);
     let first = if by_cell { names.head() } else { "joint".to_owned() };
@@ -321,13 +321,13 @@ fn rows(cells: &[CellExplained], by_cell: bool) -> String {
     table(head, lines.map(|(cell, row)| line(cell, row)), true) + &legend(cells)
 }
 
-/// A joint's number; that of a prismatic one with its unit, as the columns are named for the others.
+/// Number of a joint; with its unit if it is prismatic, because the column names the unit of the others.
 fn joint_name(joint: u8, unit: &str) -> String {
     if unit == "Nm" { joint.to_string() } else { format!("{joint} ({unit})") }
 }
 
 fn totals(total: &[Total], is_finest: bool) -> String {
-    // Words of a coarser format are added up in the steps of the finest one.
+    // Words of a coarser format are added in steps of the finest one.
     let words = if is_finest { "words" } else { "x 2^-12" };
     let head = ["joint", words, "Nm", "products Nm", "central Nm", "difference", "unrounded Nm"];
     let lines = total.iter().map(|it| {

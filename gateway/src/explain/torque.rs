@@ -1,4 +1,4 @@
-//! The torques of a force on a cell, both ways: `skinbus explain SKIN --force`.
+//! Torques of a force on a cell, computed both ways: `skinbus explain SKIN --force`.
 
 use core::f64::consts::TAU;
 use std::path::{Path, PathBuf};
@@ -19,19 +19,20 @@ use crate::columns::{Columns, Table};
 use crate::input::skin_in;
 use crate::print::{count, json_line, table};
 
-/// Bytes of a file of rows.
+/// Maximum size of a file of rows in bytes.
 const BATCH: u64 = 256 << 20;
 
-/// What stands in a line of it.
+/// Columns of a file of rows.
 const COLUMNS: Columns = Columns { needed: &["cell", "force_n", "q"], optional: &[] };
 
-/// A force on a cell, or rows of them.
+/// Options for a force on a cell, or rows of them.
 #[derive(Args, Debug)]
 pub(super) struct Given {
-    /// Compute the torques of a force against the cell's outward normal in N, 0 to 95.997: the range of three contact words
+    /// Compute the torques of a force against the cell's outward normal in N, 0 to 95.997: the range of three contact
+    /// words
     #[arg(long, value_name = "N", requires_all = ["cell", "joints"], conflicts_with_all = ["epoch", "skin"], allow_negative_numbers = true)]
     force: Option<f64>,
-    /// The positions of its chain's joints, rad or m, with spaces between them
+    /// Positions of the chain's joints in rad or m, separated by spaces
     #[arg(long, value_name = "POSITIONS", requires = "force", allow_hyphen_values = true)]
     joints: Option<String>,
     /// Compute the torques of many rows from a file
@@ -39,7 +40,7 @@ pub(super) struct Given {
     batch: Option<PathBuf>,
 }
 
-/// What comes out, in Nm, of prismatic joints in N.
+/// Result of a row in Nm, or N for prismatic joints.
 #[derive(Serialize)]
 struct Row {
     cell: String,
@@ -53,7 +54,7 @@ struct Row {
 }
 
 impl Given {
-    /// Computes the torques for a skin, or for the one in a recording, and prints them.
+    /// Computes the torques for a skin, or the skin in a recording, and prints them.
     pub(super) fn compute(
         &self,
         files: &[PathBuf],
@@ -81,10 +82,10 @@ impl Given {
     }
 }
 
-/// Both computations, for one skin.
+/// Both computations for one skin.
 struct Calculator<'a> {
     skin: &'a Skin,
-    /// By bus.
+    /// Central computation of each bus.
     central: Vec<Central>,
 }
 
@@ -114,13 +115,13 @@ impl<'a> Calculator<'a> {
         Ok(rows)
     }
 
-    /// Both computations of one row, or why there is none; `option` is what names the cell.
+    /// Computes one row both ways, or returns the reason why it cannot; `option` names the option of the cell.
     fn row(&self, named: &CellName, option: &str, force: f64, positions: &str) -> Result<Row, String> {
         let index = cell_of(self.skin, named, option).map_err(|failure| failure.to_string())?;
         self.row_of(index, force, positions).map_err(|why| format!("{option} {named}: {why}"))
     }
 
-    /// The same of the cell with this index.
+    /// Computes one row for the cell with this index.
     fn row_of(&self, index: usize, force: f64, positions: &str) -> Result<Row, String> {
         let skin = self.skin;
         let Some(cell) = skin.cells.get(index) else { return Err("no such cell".to_owned()) };
@@ -149,7 +150,7 @@ impl<'a> Calculator<'a> {
                 ));
             };
             let ([min, max], unit) = (joint.limits, joint.kind.unit());
-            // Angles beyond the limits mean something all the same, but degrees do not.
+            // Angles beyond the limits are still meaningful, but degrees are not.
             let [min, max] = match joint.kind {
                 JointKind::Prismatic => [min, max],
                 JointKind::Revolute => [min.min(-TAU), max.max(TAU)],
@@ -166,11 +167,11 @@ impl<'a> Calculator<'a> {
         let parameters = skin.parameters(cell);
         let reference = Reference::new(&parameters);
         let words = reference.torque_of(&words, force);
-        // The place of the cell on its bus.
+        // Position of the cell on its bus.
         let place = skin.cells_of(cell.bus).position(|other| other.node == cell.node).unwrap_or_default();
         let central =
             self.central.get(cell.bus).map(|central| central.torque(place, &central.frames_at(&q), force));
-        // Without the sign of a zero.
+        // Adding 0.0 removes the sign of a zero.
         let central: Vec<f64> =
             central.into_iter().flatten().take(joints.len()).map(|value| value + 0.0).collect();
         let words = words.get(..joints.len()).unwrap_or_default();

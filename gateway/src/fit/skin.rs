@@ -1,4 +1,4 @@
-//! Whether a skin fits on real buses, in the worst case.
+//! Fit of a skin on real buses in the worst case.
 
 use analysis::fit::{self, BusFit, COMPUTATION_NS, rates};
 use protocol::can::Format;
@@ -11,7 +11,7 @@ use crate::output::note;
 use crate::print::{json, list};
 
 impl Fit {
-    /// Computes it for a skin, and prints it.
+    /// Computes and prints the fit of a skin.
     pub(super) fn of_skin(&self, skin: &Skin) -> Result<(), Failure> {
         let computation_ns = self.computation.unwrap_or(COMPUTATION_NS);
         let chosen = if self.table { None } else { self.rates(skin)? };
@@ -37,7 +37,7 @@ impl Fit {
         })
     }
 
-    /// Format and rates of every bus; `None` when neither the command line nor the description has them for all.
+    /// Format and rates of each bus; `None` if neither the command line nor the skin has them for all.
     fn rates(&self, skin: &Skin) -> Result<Option<Vec<(Format, BitRates)>>, Failure> {
         let formats: Vec<_> = skin.buses.iter().map(|bus| self.format.unwrap_or(bus.format)).collect();
         let Some(nominal) = self.nominal else {
@@ -64,7 +64,7 @@ impl Fit {
     }
 }
 
-/// The rates of a bus in its description.
+/// Rates of a bus in the skin.
 fn described(bus: &Bus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
     let rates = rates::described(bus, format).transpose();
     let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?;

@@ -1,4 +1,4 @@
-//! The tables of `skinbus fit`.
+//! Tables of `skinbus fit` for a skin.
 
 use analysis::fit::case::{Answers, Case};
 use analysis::fit::limits::{Limit, NODES, Need};
@@ -10,7 +10,7 @@ use protocol::usage::shown;
 
 use crate::print::{self, Rows, count, decimals, list, or};
 
-/// The columns of the table over bit rates.
+/// Columns of the table over bit rates.
 const HEAD: [&str; 8] = [
     "bit rates",
     "packet\nµs",
@@ -22,7 +22,7 @@ const HEAD: [&str; 8] = [
     "roots:\nlast ms",
 ];
 
-/// A line for each of several bit rates.
+/// Table with a line for each pair of bit rates.
 pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
     let Some(first) = rows.first() else { return String::new() };
     let lines = rows.iter().map(|row| {
@@ -72,7 +72,7 @@ pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> Str
     for bus in buses {
         section(&mut rows, bus);
     }
-    // With one bus its own section has the same.
+    // With one bus, its own section has the same values.
     if let Some(whole) = whole.filter(|_| buses.len() > 1) {
         rows.section(format!("all {} cells", whole.cells), "", "on buses like the fullest one");
         rows.row("buses needed", needed(&whole.need), each_need(&whole.need));
@@ -156,7 +156,7 @@ fn last(rated: &Rated) -> String {
     }
 }
 
-/// The last answer in ms for a column of numbers.
+/// Last answer in ms for a column of numbers.
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
 fn ms(rated: &Rated) -> String {
     decimals(rated.times.last_ns().map(|ns| ns as f64 / 1e6), 2, "-")
@@ -178,7 +178,7 @@ fn each_need(need: &Need) -> String {
 
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
 fn millis(ns: u64) -> String {
-    // Two decimals at most, and no zeros at the end.
+    // At most two decimals, without trailing zeros.
     format!("{:.2}", ns as f64 / 1e6).trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
@@ -187,7 +187,7 @@ fn micros(ns: u64) -> String {
     format!("{:.1}", ns as f64 / 1e3)
 }
 
-/// A share in %, in a column or a list of them.
+/// A share in %, for a column or a list.
 fn tenths(share: f64) -> String {
     format!("{:.1}", 100.0 * share)
 }

@@ -1,4 +1,4 @@
-//! What became of traffic on real buses.
+//! Traffic on real buses: `skinbus fit` for captures and live buses.
 
 mod show;
 
@@ -22,21 +22,21 @@ use crate::input::{
 use crate::output;
 use crate::print::list;
 
-/// Bytes for frames that wait while others are worked on.
+/// Receive buffer in bytes, for frames that wait while others are processed.
 const RECEIVE_BUFFER: usize = 8 << 20;
 
-/// What was taken in, beside the frames.
+/// Result of reading the traffic.
 struct Taken {
-    /// What it was read from.
+    /// Kind of the source.
     what: &'static str,
-    /// Frames that the recorder lost.
+    /// Number of frames that the recorder lost.
     missing: u64,
-    /// Why there is no more, if not because that was all.
+    /// Error that ended the input early, if any.
     ended: Result<(), Failure>,
 }
 
 impl Fit {
-    /// Computes what became of each frame, and prints it.
+    /// Computes and prints the outcome for each frame.
     pub(super) fn of_traffic(&self) -> Result<(), Failure> {
         let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
         if let (Some(path), Some(skin)) = (&self.skin, &skin) {
@@ -80,7 +80,7 @@ impl Fit {
         taken.ended
     }
 
-    /// Whether the arguments are captures, and not buses.
+    /// Returns true if the sources are captures, false if they are buses.
     fn are_captures(&self, name: &str) -> Result<bool, Failure> {
         match self.sources.iter().filter(|source| is_file(source)).count() {
             0 => return Ok(false),
@@ -102,7 +102,7 @@ impl Fit {
         })
     }
 
-    /// With the rates of the command line, else of the skin, else common ones.
+    /// Creates the model with the bit rates of the command line, else of the skin, else common ones.
     fn shadow(&self, skin: Option<Skin>) -> Result<Shadow, Failure> {
         let requested = Requested { nominal: self.nominal, data: self.data };
         let mut of_bus = self.rates.clone();
@@ -159,7 +159,7 @@ impl Fit {
     }
 }
 
-/// Takes what has come.
+/// Passes waiting frames to the model.
 fn take(receive_end: &mut ReceiveEnd, shadow: &mut Shadow) -> Result<(), BusError> {
     while receive_end.hear(Duration::ZERO)? {
         for received in receive_end.frames() {
@@ -169,7 +169,7 @@ fn take(receive_end: &mut ReceiveEnd, shadow: &mut Shadow) -> Result<(), BusErro
     Ok(())
 }
 
-/// Takes in a capture, and reports what is missing of it.
+/// Passes a capture to the model, and reports what it lacks.
 fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Result<Taken, Failure> {
     let name = reader.name().to_owned();
     let what = input::format(&reader);

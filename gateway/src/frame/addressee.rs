@@ -1,14 +1,14 @@
-//! Whom a packet is for.
+//! Addressee of a packet.
 
 use model::decode::pick::Party;
 use protocol::id::{CellId, Node};
 
-/// The cell that a packet is for; `None` is every cell.
+/// The cell that a packet addresses, or `None` for all cells.
 pub(super) const fn only_cell(addressee: &Party) -> Option<CellId> {
     if let Node::Cell(cell) = addressee.node { Some(cell) } else { None }
 }
 
-/// Parses whom a packet is for, which is never the gateway.
+/// Parses an addressee, which is never the gateway.
 pub(super) fn addressee(text: &str) -> Result<Party, String> {
     let party = text.parse().ok().filter(|party: &Party| party.node != Node::Gateway);
     party.ok_or_else(|| "a node id, 1 to 254, BUS:NODE, or everyone is possible".to_owned())

@@ -1,4 +1,4 @@
-//! Packets by hand: what is asked for, as messages.
+//! Messages of the packets that the user asks for.
 
 use clap::{Args, Subcommand};
 use model::decode::parameter;
@@ -22,7 +22,7 @@ pub(super) enum What {
     /// Leave the halted state
     #[command(after_help = "Example:\n  skinbus frame resume")]
     Resume,
-    /// Answer with a heartbeat when all that the last joints asked is done
+    /// Answer with a heartbeat when all work for the last joints is done
     #[command(after_help = "Example:\n  skinbus frame sync")]
     Sync,
     /// Answer with the pages of counters and sensors
@@ -40,7 +40,7 @@ pub(super) enum What {
   skinbus frame joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0
   skinbus frame joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0")]
 pub(super) struct Positions {
-    /// The number of this broadcast, 0 to 255; cells drop a repetition of the last one
+    /// Number of this broadcast, 0 to 255; cells drop a repetition of the last one
     #[arg(long, value_name = "E")]
     epoch: u8,
     #[command(flatten)]
@@ -50,18 +50,18 @@ pub(super) struct Positions {
 #[derive(Args, Debug)]
 #[group(required = true, multiple = false)]
 struct Angles {
-    /// One position for each joint of the chain, 1 to 14 of them, in rad; wrapped to a turn
+    /// One position for each of the chain's 1 to 14 joints, in rad; wrapped to one turn
     #[arg(long, value_name = "RAD", num_args = 1.., allow_negative_numbers = true)]
     rad: Option<Vec<String>>,
-    /// The same as words: -32768 to 32767 or 0x0 to 0xFFFF, in steps of a turn / 65536
+    /// The positions as words: -32768 to 32767 or 0x0 to 0xFFFF, in steps of a turn / 65536
     #[arg(long, value_name = "WORD", num_args = 1.., allow_negative_numbers = true)]
     words: Option<Vec<String>>,
 }
 
 /// A stimulus: the contact state of a cell in test mode
 ///
-/// The cell must be in test mode: `skinbus frame configure --cell N --write mode 1`. A stimulus takes effect with
-/// the next joints, and holds until another one replaces it; without --force the force is 0.
+/// The cell must be in test mode: `skinbus frame configure --cell N --write mode 1`. A stimulus takes effect with the
+/// next joints and holds until another one replaces it. Without --force the force is 0.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus frame stimulus --cell 12 --force 3.0
@@ -71,16 +71,16 @@ pub(super) struct Stimulus {
     /// The cell, or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee)]
     cell: Party,
-    /// The touch's force in N, shared by the three contact words
+    /// Force of the touch in N, divided among the three contact words
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     force: Option<String>,
-    /// 0, nothing near, to 1
+    /// From 0 (nothing near) to 1
     #[arg(long, value_name = "P", allow_negative_numbers = true)]
     proximity: Option<String>,
     /// The two temperatures in degrees Celsius
     #[arg(long, num_args = 2, value_names = ["T1", "T2"], allow_negative_numbers = true)]
     temperature: Option<Vec<String>>,
-    /// The acceleration in g, instead of what touches the skin
+    /// Acceleration in g, instead of a touch
     #[arg(
         long,
         num_args = 3,
@@ -89,30 +89,30 @@ pub(super) struct Stimulus {
         conflicts_with_all = ["force", "proximity", "temperature"]
     )]
     acceleration: Option<Vec<String>>,
-    /// From the joints of this epoch on; else from the next joints on, whatever their epoch
+    /// Take effect with the joints of this epoch [default: with the next joints]
     #[arg(long, value_name = "E")]
     epoch: Option<u8>,
 }
 
 /// Read or write a parameter of a cell
 ///
-/// A parameter that is written by name takes values in their units:
+/// A parameter written by name takes values in its units:
 ///
 ///   mount JOINT JOINTS
 ///   pose X Y Z NORMAL_X NORMAL_Y NORMAL_Z   (m, in the frame of the joint)
 ///   contact ALPHA_C ALPHA_P CONTACT_THRESHOLD PROXIMITY_THRESHOLD FORCE_THRESHOLD   (N)
 ///   timing PERIOD   (us)
 ///   mode 0|1   (1 obeys stimuli)
-///   reply torque | sum SLOT DEEPEST 0|1   (us; 1 carries what rounding took away)
+///   reply torque | sum SLOT DEEPEST 0|1   (us; 1 carries the remainder of rounding)
 ///   sensing off | continuous PERIOD | event   (ms)
 ///   events CONTACT PROXIMITY TEMPERATURE ACCELERATION HYSTERESIS   (N, °C, g; 0 to 1 of each)
 ///   links_down none | 0+2   (ports that receive nothing, in test mode only)
 ///   baseline off | hold|follow THRESHOLD HYSTERESIS RATE LIMIT SLOPE   (N; 0 to 1 of it; uN/s; N; N/°C)
-///   tare none | tared | forced   (forget the zero, find it unless touched, find it anyhow)
+///   tare none | tared | forced   (forget the zero, find it unless touched, find it in any case)
 ///   row1 to row6  A D ALPHA THETA_OFFSET   (m, m, rad, rad)
 ///   commit HASH   (hexadecimal)
 ///
-/// By number it takes words as they are.
+/// A parameter given by number takes raw words.
 #[derive(Args, Debug)]
 #[command(
     verbatim_doc_comment,
@@ -128,7 +128,7 @@ pub(super) struct Configure {
     cell: Party,
     #[command(flatten)]
     request: Requested,
-    /// Copied into the answer
+    /// Tag, copied into the answer
     #[arg(long, value_name = "T", default_value_t = 0)]
     tag: u8,
 }
@@ -158,7 +158,7 @@ impl What {
         }
     }
 
-    /// Whom it is for; `None` is whoever listens.
+    /// Addressee of the packet, or `None` for all receivers.
     pub(super) const fn to(&self) -> Option<&Party> {
         match self {
             Self::Halt | Self::Resume | Self::Sync | Self::Report | Self::Joints(_) => None,
@@ -225,12 +225,12 @@ impl Configure {
     }
 }
 
-/// A value of an option; the error names the option, the value, and what is allowed.
+/// Reads the value of an option; an error names the option, the value and the allowed values.
 fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<T, String> {
     read(text).map_err(|allowed| format!("{option} {text}: {allowed}"))
 }
 
-/// A value of a field of the sensors.
+/// Reads a value of a sensor field.
 fn contact_state<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
     let layouts =
         packets().iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| &schema.layouts);
@@ -240,7 +240,7 @@ fn contact_state<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q
     Ok(Q::from_bits(word))
 }
 
-/// So many numbers, or zeros when none were given.
+/// Reads `N` numbers, or zeros if none are given.
 fn several<const F: u32, const N: usize>(
     option: &str,
     name: &str,
@@ -253,7 +253,7 @@ fn several<const F: u32, const N: usize>(
     Ok(all)
 }
 
-/// The three contact words of a force.
+/// Divides a force among the three contact words.
 fn contact(text: &str) -> Result<[Q5_10; 3], String> {
     let force = value("--force", text, parameter::real)?;
     let words = contact_words(force);

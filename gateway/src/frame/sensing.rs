@@ -16,9 +16,9 @@ use model::decode::pick::Party;
 
 /// Set when cells send their sensors: never, at a rate, or on changes
 ///
-/// With --bus or --skin it takes effect at once, waits until every cell has confirmed it, and lists those that do not. A
-/// gateway that runs on the bus restores it: it switches a restarted cell to its last mode. Which changes count is
-/// parameter 8, which a skin has under [events]: `skinbus frame configure --write events`.
+/// With --bus or --skin, takes effect at once, waits until all cells have confirmed it, and lists those that have not.
+/// A gateway that runs on the bus overrides it: it switches a restarted cell to its last mode. Parameter 8, [events] in
+/// a skin, sets which changes count: `skinbus frame configure --write events`.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus frame sensing event --bus vcan0
@@ -28,7 +28,7 @@ pub(super) struct Switch {
     /// When cells send their sensors
     #[arg(value_parser = one_of(MODES))]
     mode: When,
-    /// How often, in continuous mode: frames of each cell a second
+    /// Rate in continuous mode: frames per second of each cell
     #[arg(value_name = "HZ", allow_negative_numbers = true)]
     hz: Option<f64>,
     /// The cell, or everyone
@@ -36,7 +36,7 @@ pub(super) struct Switch {
     pub(super) cell: Party,
 }
 
-/// When cells send their sensors.
+/// Mode of the sensor frames.
 #[derive(Clone, Copy, Debug)]
 enum When {
     Off,
@@ -56,7 +56,7 @@ impl Switch {
         Ok(Message::Configure { to: self.cell.node, tag: 0, request })
     }
 
-    /// Switches the cells on a bus, until all have confirmed it.
+    /// Switches the cells on a bus, and waits until all have confirmed.
     pub(super) fn send(&self, bus: Bus, format: Format) -> Result<(), Failure> {
         let mode = self.sensing().map_err(Failure::usage)?;
         let on = format!("{} ({})", bus.name(), bus.kind());

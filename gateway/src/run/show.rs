@@ -1,4 +1,4 @@
-//! The table at the end of a run: the verdict, and what is not usual; all of it if it is verbose.
+//! Table at the end of a run: the verdict and unusual values; all values if verbose.
 
 use std::cmp::Reverse;
 use std::fmt::Display;
@@ -12,23 +12,23 @@ use protocol::usage::shown;
 
 use crate::print::{GREEN, PLAIN, RED, Rows, YELLOW, count, hanging, list, or, quantiles, words};
 
-/// Halts that are listed one by one.
+/// Maximum number of halts listed one by one.
 const HALTS: usize = 10;
-/// Cells of a bus that are listed one by one, because they stand out.
+/// Maximum number of a bus's conspicuous cells listed one by one.
 const CELLS: usize = 5;
-/// Lines of the verdict, unless it is verbose.
+/// Maximum number of lines of the verdict unless verbose.
 const LINES: usize = 6;
-/// Columns for which the names of rows are short enough.
+/// Maximum width of a row's name unless verbose.
 const NAME: usize = 24;
 
-/// How a run is shown.
+/// Display options of a run.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Look {
-    /// Also what is usual.
+    /// True to include usual values.
     pub(super) is_verbose: bool,
-    /// In the colours of a terminal.
+    /// True to use terminal colours.
     pub(super) is_coloured: bool,
-    /// The columns of the terminal; as many as it has, if that is not given.
+    /// Width of the terminal; `None` detects it.
     pub(super) columns: Option<u16>,
 }
 
@@ -164,7 +164,7 @@ fn control(rows: &mut Rows, summary: &Summary, is_verbose: bool) {
     for (name, count, skipped) in counts.into_iter().filter(|(_, _, skipped)| is_verbose || *skipped > 0) {
         rows.row(name, count, format!("{skipped} skipped"));
     }
-    let why = "the bus did not take them, or this machine was busy";
+    let why = "the bus refused them, or this machine was busy";
     rows.any("frames not sent", control.unsent, why);
     rows.any("records of ticks lost", control.records_lost, why);
     for (name, count) in &control.controller {
@@ -251,7 +251,7 @@ fn replies(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
     }
 }
 
-/// Sums, and the tree that they go along.
+/// Rows on sums, and the tree that carries them.
 fn sums_on_the_bus(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
     let Some(sums) = &bus.sums else { return };
     let counts = sums.counts;
@@ -289,7 +289,7 @@ fn unexplained(rows: &mut Rows, name: &str, value: impl Display, reasons: String
     }
 }
 
-/// What was due, and torques that came and were not, which are not compared: by reason.
+/// Rows on replies due, and on torques that were not due and so not compared, by reason.
 fn due(
     rows: &mut Rows,
     name: &str,
@@ -313,30 +313,30 @@ fn due(
     }
 }
 
-/// How late cells hear what stands on the bus.
+/// Row on the age of joints that cells have not received.
 fn hearing(rows: &mut Rows, bus: &BusSummary) {
-    let why = "late here: the machine; lost above: the bus";
-    rows.row("joints not yet taken at heartbeats, µs", quantiles(&bus.joints_not_taken_us), why);
+    let why = "large: busy machine; losses: see the bus";
+    rows.row("joint age at heartbeat, µs", quantiles(&bus.joints_not_taken_us), why);
 }
 
-/// A key of the summary in words.
+/// Formats a key of the summary as words.
 fn spoken(key: &str) -> String {
     key.replace('_', " ")
 }
 
-/// How many there are of each kind.
+/// Formats the count of each kind.
 fn each(kinds: impl IntoIterator<Item = (impl Display, impl Display)>) -> String {
     list(kinds.into_iter().map(|(kind, count)| format!("{count} {kind}")))
 }
 
-/// The reasons that there were, and always how many are unknown.
+/// Formats the reasons that occurred, and always the number of unknown ones.
 fn explained(reasons: &[(u64, impl Display)], unknown: u64) -> String {
     let known = reasons.iter().filter(|(count, _)| *count > 0);
     let known = known.map(|(count, why)| format!("{count} {why}"));
     list(known.chain([format!("{unknown} unknown")]))
 }
 
-/// The cells of a bus that measure, and the worst of those that stand out.
+/// Rows on the measuring cells of a bus, and on its most conspicuous cells.
 fn noteworthy(rows: &mut Rows, bus: &BusSummary, all: &[CellSummary]) {
     let all = || all.iter().filter(|cell| cell.bus == bus.name);
     let measuring: Vec<_> = all().filter(|cell| cell.measures()).map(|cell| cell.node).collect();
@@ -397,7 +397,7 @@ fn frames(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
     }
 }
 
-/// Packets from the cells, by what became of them.
+/// Rows on the packets from the cells, by outcome.
 fn packets(rows: &mut Rows, bus: &BusSummary, lost: u64) {
     let up = &bus.uplink;
     rows.row("packets sent by cells", up.sent, "by their own count");
@@ -419,7 +419,7 @@ fn packets(rows: &mut Rows, bus: &BusSummary, lost: u64) {
 
 fn costs(rows: &mut Rows, summary: &Summary, is_verbose: bool) {
     let Processor { gateway, cells, buses } = summary.processor;
-    // Not -0.0.
+    // Avoid -0.0.
     let [gateway, cells, buses] = [gateway, cells, buses].map(|cores| cores.max(0.0) + 0.0);
     let cores = format!("{:.3}", gateway + cells + buses);
     if is_verbose {

@@ -11,38 +11,38 @@ use robots::{CellOnLink, Chain, Isometry3, Urdf};
 use super::super::print::{count, list};
 use super::super::visuals::{Packages, Visuals};
 
-/// Which links are covered, and how.
+/// Options for the covered links.
 #[derive(Args, Debug)]
 pub(super) struct Covering {
-    /// Cover these links with cells, on the meshes and shapes of their visuals; the other links are in the way
+    /// Cover these links with cells, on the meshes and shapes of their visuals; the other links are obstacles
     #[arg(long, value_name = "LINK,..", value_delimiter = ',', value_parser = link, conflicts_with = "places")]
     pub(super) cover: Vec<String>,
-    /// From one cell's middle to the next one's in m, 0.001 to 1
+    /// Distance between the centers of neighbouring cells in m, 0.001 to 1
     #[arg(long, value_name = "M", requires = "cover", default_value_t = 0.028, value_parser = pitch, allow_negative_numbers = true)]
     pitch: f64,
-    /// Take these links as not there: their visuals are not read, and cells may lie where they are
+    /// Treat these links as absent: their visuals are not read, and cells may lie where they are
     #[arg(long, value_name = "LINK,..", requires = "cover", value_delimiter = ',', value_parser = link)]
     leave_out: Vec<String>,
-    /// A box in a covered link's frame that holds no cell, in m; may be given several times
+    /// A box in the frame of a covered link that holds no cell, in m; may be given several times
     #[arg(long, value_name = "LINK:MINX,MINY,MINZ,MAXX,MAXY,MAXZ", requires = "cover", value_parser = keep_out)]
     keep_out: Vec<KeptOut>,
-    /// Where chance begins: the same seed gives the same cells
+    /// Random seed: the same seed gives the same cells
     #[arg(long, value_name = "N", requires = "cover", default_value_t = 1)]
     seed: u64,
-    /// The most cells of one bus
+    /// Maximum number of cells per bus
     #[arg(long, value_name = "N", requires = "cover", default_value_t = 250, value_parser = clap::value_parser!(u8).range(1..=250))]
     nodes_per_bus: u8,
     #[command(flatten)]
     packages: Packages,
 }
 
-/// A box of a link.
+/// A box in the frame of a link.
 #[derive(Clone, Debug)]
 struct KeptOut {
     link: String,
     min: [f64; 3],
     max: [f64; 3],
-    /// As it was given.
+    /// Original text of the option.
     text: String,
 }
 
@@ -53,7 +53,7 @@ fn pitch(text: &str) -> Result<f64, String> {
     pitch.ok_or_else(|| format!("a length from {MIN_PITCH} to {MAX_PITCH} m"))
 }
 
-/// A link's name, which has no blanks around it.
+/// Name of a link, without surrounding blanks.
 #[expect(clippy::unnecessary_wraps, reason = "a parser of clap's")]
 fn link(text: &str) -> Result<String, String> {
     Ok(text.trim().to_owned())
@@ -75,7 +75,7 @@ fn keep_out(text: &str) -> Result<KeptOut, String> {
     })
 }
 
-/// What came of it.
+/// Result of the covering.
 pub(super) struct Covered {
     pub(super) cells: Vec<CellOnLink>,
     pub(super) figures: Vec<Figures>,
@@ -156,7 +156,7 @@ impl Covering {
         Ok(covered)
     }
 
-    /// The chain of each covered link.
+    /// Chain of each covered link.
     fn owners(&self, urdf: &Urdf, chains: &[Chain]) -> Result<Vec<usize>, Failure> {
         let moved = || {
             let on_path = urdf.links().filter(|link| chains.iter().any(|chain| chain.link(link).is_ok()));
@@ -205,7 +205,7 @@ impl Covering {
         }
     }
 
-    /// The options as they were given.
+    /// The options as given on the command line.
     pub(super) fn words(&self) -> String {
         let Self { cover, pitch, leave_out, keep_out, seed, nodes_per_bus, packages: _ } = self;
         if cover.is_empty() {
@@ -228,7 +228,7 @@ fn has_area(link: &Link) -> bool {
     triangles.into_iter().any(|[a, b, c]| (b - a).cross(&(c - a)).norm() > 0.0)
 }
 
-/// Why a link has no cell, in a line.
+/// Reason why a link has no cell, in one line.
 fn without_cells(Figures { name, outer_area, kept_out, .. }: &Figures, is_flat: bool) -> String {
     let why = if is_flat {
         "its triangles have no area: correct its meshes, or take it out of --cover".to_owned()
@@ -245,7 +245,7 @@ fn without_cells(Figures { name, outer_area, kept_out, .. }: &Figures, is_flat: 
     format!("--cover {name}: {why}")
 }
 
-/// How a link is covered, in a line.
+/// Figures of a covered link, in one line.
 pub(super) fn reported(figures: &Figures) -> String {
     let Figures { name, cells, outer_area, kept_out: _, covered, spacing, tilt } = figures;
     let spacing =

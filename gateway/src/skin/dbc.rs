@@ -14,9 +14,9 @@ use crate::print::list;
 
 /// Describe a bus in a DBC file, for cantools, SavvyCAN and others
 ///
-/// Every identifier of the bus is a message: the commands, and what each cell of the skin sends and is sent. Every
-/// field is a signal with its scale, unit and range; byte 13 multiplexes pages and parameters. Identifiers repeat
-/// from bus to bus, so there is one file for each. Of a recording, that is the bus that it was recorded on.
+/// Each identifier of the bus becomes a message: the commands, and all packets from and to each cell of the skin. Each
+/// field becomes a signal with its scale, unit and range; byte 13 multiplexes pages and parameters. Identifiers repeat
+/// from bus to bus, so there is one file per bus. For a recording, it describes the recorded bus.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus skin dbc gateway/examples/ur5-253.toml -o skin.dbc
@@ -24,16 +24,16 @@ use crate::print::list;
   skinbus skin dbc run.mcap -o run.dbc
   candump -L vcan0 | python3 -m cantools decode -s skin.dbc")]
 pub(super) struct Dbc {
-    /// The skin's description, or a recording of a run, which has it in it
+    /// A skin, or a recording of a run, which contains its skin
     #[arg(value_name = "SKIN|MCAP")]
     file: PathBuf,
-    /// Which bus, when the skin has several
+    /// The bus, if the skin has several
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
-    /// On a classic bus: describe the bytes of the frames of a packet joined, for a program that joins them first
+    /// For a classic bus: describe the joined bytes of a packet's frames, for a program that joins them first
     #[arg(long)]
     joined: bool,
-    /// The file to write, whole or not at all; else standard output
+    /// The file to write, completely or not at all [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]

@@ -14,12 +14,12 @@ use super::super::print::{count, list};
 use super::super::robot_file::{path_from, read_urdf};
 use super::covering::{self, Covered, Covering};
 
-/// Describe a skin on a robot of one's own, from its URDF
+/// Describe a skin on your own robot, from its URDF
 ///
-/// A chain of joints leads from the root to each tip. Its joints become Denavit-Hartenberg rows, and how much these differ
-/// from the URDF's own kinematics is computed and printed: more than 1e-9 m or rad is an error. Chains may share their first
-/// joints, as two arms share a torso. Cells sit where CELLS.csv says, or cover the links that --cover names; else there is
-/// one on each tip, to begin with.
+/// A chain of joints leads from the root to each tip. Its joints become Denavit-Hartenberg rows. Computes and prints
+/// the difference between these and the URDF's own kinematics: more than 1e-9 m or rad is an error. Chains may share
+/// their first joints, as two arms share a torso. Cells sit at the places in CELLS.csv, or cover the links that --cover
+/// names; otherwise each tip gets one cell as a start.
 #[derive(Args, Debug)]
 #[command(
     after_help = "CELLS.csv has a line for each cell: the link, its position and its outward normal in the link's frame, and where
@@ -34,28 +34,28 @@ Examples:
   skinbus run panda.toml --duration 10"
 )]
 pub(super) struct Import {
-    /// The robot's description; of a xacro file, what `xacrodoc FILE -o ROBOT.urdf` writes
+    /// The robot's URDF; for a xacro file, the output of `xacrodoc FILE -o ROBOT.urdf`
     #[arg(value_name = "ROBOT.urdf")]
     urdf: PathBuf,
-    /// The last link of a chain; several chains by several of them
+    /// Last link of a chain; repeat the option for further chains
     #[arg(long, value_name = "LINK", required = true)]
     tip: Vec<String>,
-    /// The first link of all chains; else the robot's root
+    /// First link of all chains [default: the robot's root]
     #[arg(long, value_name = "LINK")]
     root: Option<String>,
-    /// Where the cells sit
+    /// Places of the cells
     #[arg(long, value_name = "CELLS.csv")]
     places: Option<PathBuf>,
     #[command(flatten)]
     covering: Covering,
-    /// The file to write, whole or not at all; else standard output
+    /// The file to write, completely or not at all [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
     overwrite: Overwrite,
 }
 
-/// What stands in a line of the file of cells.
+/// Columns of the file of cells.
 const COLUMNS: Columns =
     Columns { needed: &["link", "px", "py", "pz", "nx", "ny", "nz"], optional: &["bus", "node"] };
 
@@ -78,7 +78,7 @@ impl Import {
             None => self.covering.cells(&urdf, &self.urdf, &chains)?,
         };
         let command = self.command();
-        // A skin cannot name what was read from a pipe.
+        // A skin cannot name a URDF that was read from a pipe.
         let is_named = |path: &&Path| !is_standard_output(path) && self.urdf.is_file();
         let output = self.output.as_deref().filter(is_named);
         let path = output.and_then(|output| path_from(output, &self.urdf));
@@ -110,7 +110,7 @@ impl Import {
         Ok(())
     }
 
-    /// What made the skin, with the files' names alone.
+    /// Command that made the skin, with file names but without directories.
     fn command(&self) -> String {
         let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let mut command = format!("skinbus skin import {}", name(&self.urdf));
@@ -128,7 +128,7 @@ impl Import {
     }
 }
 
-/// A chain in a line.
+/// Describes a chain in one line.
 fn reported(chain: &Chain) -> String {
     let (joints, rows) = (count(chain.joints.len(), "joint"), count(chain.rows.len(), "row"));
     let names = list(chain.joints.iter().map(|joint| &joint.name));
@@ -138,10 +138,10 @@ fn reported(chain: &Chain) -> String {
     )
 }
 
-/// More than this in rad, either way, is rather an angle in degrees.
+/// Limit in rad, either way, above which an angle is probably in degrees.
 const WIDE_RAD: f64 = 8.0 * core::f64::consts::PI;
 
-/// Joints that turn so far that their limits are rather in degrees, in a line each.
+/// Joints whose limits are probably in degrees, one line each.
 fn wide(chain: &Chain) -> impl Iterator<Item = String> {
     let turning = chain.joints.iter().filter(|joint| joint.kind == JointKind::Revolute);
     let wide = turning.filter(|joint| joint.limits.iter().any(|limit| limit.abs() > WIDE_RAD));
@@ -158,7 +158,7 @@ fn text(path: &Path) -> Result<String, Failure> {
     document::text(path).map_err(Failure::usage)
 }
 
-/// The cells of a file.
+/// Reads the cells of a file.
 fn cells(path: &Path) -> Result<Vec<CellOnLink>, Failure> {
     let file = path.display().to_string();
     let text = text(path)?;

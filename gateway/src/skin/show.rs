@@ -14,22 +14,23 @@ use super::super::robot_file::urdf_of;
 use super::super::surface::shells;
 use super::super::visuals::Packages;
 
-/// The most triangles of a robot in a page; more are simplified.
+/// Maximum number of triangles of a robot in a page; larger meshes are simplified.
 const TRIANGLES: usize = 12_000;
 
-/// Draw a skin in 3D, as one HTML page that needs nothing else
+/// Draw a skin in 3D, as one self-contained HTML page
 ///
-/// Each joint stands as near to 0 as its limits allow. If the skin has robot.urdf, the robot's links are drawn by their meshes, as
-/// far as these are found; else tubes lead from frame to frame. FILE.html#vcan1:72 shows node 72 of vcan1.
+/// Each joint stands as near to 0 as its limits allow. If the skin has robot.urdf, the robot's links are drawn by their
+/// meshes, as far as these are found; otherwise tubes lead from frame to frame. FILE.html#vcan1:72 shows node 72 of
+/// vcan1.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  skinbus skin show skin.toml -o skin.html")]
 pub(super) struct Show {
-    /// The skin's description
+    /// The skin
     #[arg(value_name = "SKIN")]
     file: PathBuf,
     #[command(flatten)]
     packages: Packages,
-    /// The file to write, whole or not at all; else standard output
+    /// The file to write, completely or not at all [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]

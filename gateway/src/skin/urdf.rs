@@ -11,16 +11,17 @@ use super::super::output::{Overwrite, apart};
 
 /// Describe a skin's robot as a URDF: its chains, row by row
 ///
-/// It is what recordings carry on /robot_description for a skin without robot.urdf. Each row is a joint with its origin and its
-/// axis, with the limits of the skin; fixed rows are fixed joints, and a link `tip` is behind the last row. A link is drawn as a
-/// cylinder. Two chains that begin with the same rows share links; the controller's max_speed is the joints' velocity.
+/// Recordings carry this URDF on /robot_description for a skin without robot.urdf. Each row becomes a joint with its
+/// origin, its axis and the limits of the skin; fixed rows become fixed joints, and a link `tip` follows the last row.
+/// A link is drawn as a cylinder. Two chains that begin with the same rows share links; the controller's max_speed is
+/// the joints' velocity.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  skinbus skin urdf skin.toml -o robot.urdf")]
 pub(super) struct Urdf {
-    /// The skin's description
+    /// The skin
     #[arg(value_name = "SKIN")]
     file: PathBuf,
-    /// The file to write, whole or not at all; else standard output
+    /// The file to write, completely or not at all [default: standard output]
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]

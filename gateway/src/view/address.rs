@@ -1,4 +1,4 @@
-//! The file with a page's address, for scripts.
+//! File with the address of a page, for scripts.
 
 use std::fs::{self, File, Permissions};
 use std::io::{self, Read, Write};
@@ -8,10 +8,11 @@ use std::path::{Path, PathBuf};
 use protocol::usage::{Failure, print};
 use trace::files::WholeFile;
 
-/// The most bytes of a file that may be an address.
+/// Maximum size in bytes of a file that may be an address.
 const LONGEST: u64 = 4096;
 
-/// A file with the address of a page, which goes with this value. Only its user can read it, since the token is in it.
+/// A file with the address of a page, which is removed on drop. Only its user can read it, because it contains the
+/// token.
 #[derive(Debug)]
 pub(super) struct AddressFile {
     path: PathBuf,
@@ -19,8 +20,8 @@ pub(super) struct AddressFile {
 }
 
 impl AddressFile {
-    /// Writes an address to a new file, in place of one that an earlier page has left; or to a pipe or a terminal, or for `-` to
-    /// standard output, where nothing stays.
+    /// Writes an address to a new file, or in place of the file of an earlier page. Writes to a pipe, a terminal, or
+    /// for `-` to standard output without creating a file.
     pub(super) fn write(path: &Path, url: &str) -> Result<Option<Self>, Failure> {
         let text = format!("{url}\n");
         if path == Path::new("-") {
@@ -33,7 +34,7 @@ impl AddressFile {
             let why = "it exists, and is no page's address: name another file";
             return Err(refused(io::Error::new(io::ErrorKind::AlreadyExists, why)));
         }
-        // Of a symlink the refusal would else name an option that there is not.
+        // For a symlink, the error would otherwise name an option that does not exist.
         let is_there = is_file || path.is_symlink();
         let (whole, mut file) = WholeFile::create(path, is_there).map_err(refused)?;
         let is_stream = whole.is_stream();
@@ -54,14 +55,14 @@ impl AddressFile {
 
 impl Drop for AddressFile {
     fn drop(&mut self) {
-        // It may be another page's by now.
+        // Another page may have replaced the file.
         if start_of(&self.path).is_ok_and(|text| text == self.text) {
             let _ = fs::remove_file(&self.path);
         }
     }
 }
 
-/// Checks that a file is what an earlier page has left.
+/// Returns true if the file was left by an earlier page.
 fn is_address(path: &Path) -> bool {
     start_of(path).is_ok_and(|text| text.starts_with("http://") && text.lines().count() == 1)
 }
@@ -87,7 +88,7 @@ mod tests {
         drop(written);
         assert!(!path.exists());
 
-        // One that was left is replaced, and the newer one is not taken away by the older.
+        // A file that was left is replaced, and the older page does not remove the newer page's file.
         let older = AddressFile::write(&path, "http://127.0.0.1:2/").unwrap();
         let newer = AddressFile::write(&path, "http://127.0.0.1:3/").unwrap();
         drop(older);

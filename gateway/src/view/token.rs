@@ -1,4 +1,4 @@
-//! The token of a page: a file's, the environment's, the command line's, or a random one.
+//! Token of a page: from a file, from the environment, or random.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -11,12 +11,12 @@ use view::Token;
 
 use crate::output::note;
 
-/// The environment's token; a run hands its page's over in it, since only its user can read it there.
+/// Environment variable of the token. A run passes its page's token in it, because only its user can read it there.
 pub(super) const VARIABLE: &str = "SKINBUS_TOKEN";
-/// The most bytes that are read of a token's file.
+/// Maximum number of bytes read from a token file.
 const LONGEST_FILE: u64 = 4096;
 
-/// Returns the token that the user has chosen: of a file, else of the environment.
+/// Returns the token that the user has chosen: from a file, or else from the environment.
 pub(super) fn chosen(file: Option<&Path>) -> Result<Option<Token>, Failure> {
     match file {
         Some(path) => read(path).map(Some),
@@ -24,7 +24,7 @@ pub(super) fn chosen(file: Option<&Path>) -> Result<Option<Token>, Failure> {
     }
 }
 
-/// Returns the token that a page has to have: one that acts, or that others than this machine can reach, is never without.
+/// Returns the token that a page must have: a page that acts, or that other machines can reach, always has one.
 pub(super) fn needed(
     chosen: Option<Token>,
     acts: bool,

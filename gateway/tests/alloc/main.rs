@@ -1,3 +1,3 @@
-//! A loop under an allocator that counts.
+//! Tests of the loop under a counting allocator.
 
 mod tick;

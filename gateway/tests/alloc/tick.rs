@@ -1,6 +1,6 @@
-//! What a tick may not do: allocate, whether its buses take what it sends or not.
+//! A tick must not allocate, whether its buses accept its frames or not.
 //!
-//! That its work does not grow with the cells needs no test: `Cycle::tick` is given sums and no cells.
+//! A test that its cost does not grow with the cells is not needed: `Cycle::tick` gets totals and no cells.
 
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 #![expect(unsafe_code, reason = "an allocator that counts has to be one")]
@@ -28,7 +28,7 @@ use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 use vcan_setup::embedded::Served;
 
-/// Counts what the current thread allocates.
+/// Counts the allocations of the current thread.
 struct Counting;
 
 thread_local! {
@@ -58,13 +58,13 @@ fn skin(cells: usize) -> Skin {
     Skin::parse("skin.toml", &text).unwrap()
 }
 
-/// A loop over one bus, in one mode; its records pile up in a queue that is large enough.
+/// Creates a loop over one bus in one mode; its records fit into a queue that is large enough.
 fn turn(skin: &Skin, mode: Mode) -> (Turn, triple_buffer::Input<model::table::Snapshot>, Table) {
     let (turn, input, table, _) = turn_of(skin, mode);
     (turn, input, table)
 }
 
-/// The same, and how its bus is.
+/// Creates such a loop, and the state of its bus.
 fn turn_of(
     skin: &Skin,
     mode: Mode,
@@ -106,7 +106,7 @@ fn a_tick_allocates_nothing_in_either_mode_also_on_a_bus_that_takes_nothing() {
 fn a_halt_that_a_bus_refused_is_resent_before_its_next_joints_and_then_every_8() {
     let (mut turn, mut snapshots, table) = turn(&skin(4), Mode::Distributed);
     let mut taken = Vec::new();
-    // Nothing is read back, so that the robot is halted within the first 100 ticks.
+    // No broadcast is read back, so the robot is halted within the first 100 ticks.
     for number in 0..200_u64 {
         snapshots.input_buffer_mut().take(table.snapshot(), false);
         snapshots.publish();
@@ -137,7 +137,7 @@ fn a_bus_that_is_back_gets_the_state_of_the_robot_before_its_next_joints() {
         let snapshot = snapshots.input_buffer_mut();
         snapshot.take(table.snapshot(), false);
         snapshot.sums.read_back = number.checked_sub(1).map(|sent| Epoch((sent / 8).to_le_bytes()[0]));
-        // Somebody halts the robot while the bus works for the second time.
+        // Another sender halts the robot while the bus works for the second time.
         snapshot.sums.halts = u32::from(number >= 44);
         snapshots.publish();
         let tick = Tick { number, time: Micros(number * 2_000) };
@@ -198,7 +198,7 @@ struct Run {
     allocations: u64,
 }
 
-/// A thousand ticks that send on a bus, which carries what is sent on it or not.
+/// Runs a thousand ticks that send on a bus, which accepts the frames or not.
 fn ticks(mode: Mode, bus: &Bus, carries: bool) -> Run {
     let (mut turn, mut snapshots, table) = turn(&skin(253), mode);
     let mut run = Run { sent: 0, taken: 0, allocations: 0 };

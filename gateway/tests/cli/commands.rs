@@ -39,14 +39,14 @@ fn text(bytes: &[u8]) -> &str {
     std::str::from_utf8(bytes).unwrap()
 }
 
-/// Standard output of a command that is done well and has nothing to complain of.
+/// Standard output of a command that succeeds without messages.
 fn output(mut command: Command) -> String {
     let Output { status, stdout, stderr } = command.output().unwrap();
     assert_eq!((status.code(), text(&stderr)), (Some(0), ""), "{command:?}");
     text(&stdout).to_owned()
 }
 
-/// The one-line error of a command that ends with this code and prints nothing.
+/// The one-line error of a command that ends with this code and prints nothing else.
 fn refusal(arguments: &str, code: i32) -> String {
     let Output { status, stdout, stderr } = gateway(arguments).output().unwrap();
     let said = text(&stderr);
@@ -101,7 +101,7 @@ fn filters_pick_by_kind_node_and_time() {
     assert_eq!(dump("--kind sync,report --cell gateway"), ["ok      sync", "ok      report"]);
     assert_eq!(dump("--kind torque --cell 13"), [""; 0]);
     assert_eq!(dump("--cell 12,gateway").len(), dump("").len());
-    // Frames come 1 ms apart.
+    // Frames are 1 ms apart.
     assert_eq!(dump("--from 0.002 --to 0.005"), dump("")[2..5]);
     let classic = output(gateway(&format!("dump {} --from 0.0005 -n 2", golden("classic.log"))));
     let pair =
@@ -182,7 +182,7 @@ fn frames_are_those_of_the_document() {
         let there = [1, 5].iter().any(|flags| DOCUMENT.contains(&format!("{id}##{flags}{data}")));
         assert!(there, "{arguments}: {line}is not in the document");
     }
-    // The document writes these with the very flags.
+    // The document writes these frames with exactly these flags.
     let line = output(gateway("frame stimulus --cell 12 --force 3.0"));
     assert!(DOCUMENT.contains(&format!("cansend vcan0 {}", line.trim_end())), "{line}");
 }
@@ -220,7 +220,7 @@ fn frames_mean_what_was_requested() {
     }
 }
 
-/// The packet in one FD frame or two classic ones.
+/// Decodes a packet from one FD frame or two classic ones.
 fn packet(frames: &[Frame], format: Format) -> Packet {
     match (format, frames) {
         (Format::Fd, [frame]) => Packet::from_fd(frame).unwrap(),
@@ -270,8 +270,11 @@ fn wrong_use_is_one_line_and_exit_code_2() {
             "scenario.toml comes after the skin: a scenario is given by --scenario scenario.toml",
         ),
         ("skin chek", "unrecognized subcommand 'chek'; try '--help'"),
-        ("dump nosuch.mcap", "there is no file nosuch.mcap, and no bus of that name: say where the file is"),
-        ("dump a/b.log", "there is no file a/b.log, and no bus of that name: say where the file is"),
+        (
+            "dump nosuch.mcap",
+            "there is no file nosuch.mcap, and no bus of that name: name the path of the file",
+        ),
+        ("dump a/b.log", "there is no file a/b.log, and no bus of that name: name the path of the file"),
     ] {
         assert_eq!(refusal(arguments, 2), format!("skinbus: {expected}"), "{arguments}");
     }
@@ -341,10 +344,10 @@ fn a_check_shows_bit_rates_and_cells_at_one_place() {
     std::fs::write(&file, format!("{text}\n{another}")).unwrap();
     let shown = output(gateway(&format!("check {}", file.display())));
     assert!(shown.contains("bus vcan0 (fd, 500000 bit/s, torque): 2 cells"), "{shown}");
-    assert!(shown.contains("remark: cells 1 on vcan1 and 7 on vcan1 sit at one place"), "{shown}");
+    assert!(shown.contains("remark: cells 1 on vcan1 and 7 on vcan1 sit at the same place"), "{shown}");
 }
 
-/// A scenario's file beside a skin of three cells, and what is said of it.
+/// Checks a scenario file beside a skin of three cells. Returns the output.
 fn checked(scenario: &str, options: &str) -> Output {
     let directory = TempDir::new().unwrap();
     let [skin, file] = ["skin.toml", "s.toml"].map(|name| directory.path().join(name));
@@ -439,7 +442,7 @@ fn names(directory: &Path) -> Vec<String> {
     entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect()
 }
 
-/// The skin's URDF is looked at as a run that records looks at it.
+/// The check reads the skin's URDF as a recording run does.
 #[test]
 fn a_check_refuses_what_a_recorded_run_would_refuse() {
     let folder = TempDir::new().unwrap();

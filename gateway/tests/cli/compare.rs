@@ -1,4 +1,4 @@
-//! `skinbus compare` as a process: recordings against themselves, their logs, changed and damaged ones, and what it refuses.
+//! `skinbus compare` as a process: recordings against themselves, their logs, changed and damaged ones, and refusals.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
 
 use std::fs;
@@ -31,7 +31,7 @@ fn gateway(folder: &Path, arguments: &str) -> (Option<i32>, String, String) {
     (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
 }
 
-/// The one-line error of a command that ends with this code and prints nothing.
+/// The one-line error of a command that ends with this code and prints nothing else.
 fn refusal(folder: &Path, arguments: &str, code: i32) -> String {
     let (ended, text, said) = gateway(folder, arguments);
     assert_eq!((ended, text.as_str()), (Some(code), ""), "{arguments}: {said}");
@@ -44,7 +44,7 @@ fn json(folder: &Path, arguments: &str) -> (Option<i32>, Value) {
     (code, serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error}: {text}{said}")))
 }
 
-/// A folder with the recordings, `fd.log`, and the skin of both, `fd.toml`.
+/// A directory with the recordings, `fd.log`, and the skin of both, `fd.toml`.
 fn folder() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     for entry in fs::read_dir(recordings()).unwrap().map(Result::unwrap).filter(|it| it.path().is_file()) {
@@ -60,7 +60,7 @@ fn folder() -> TempDir {
     folder
 }
 
-/// The frames of a log, changed or left out.
+/// Copies the frames of a log, changed or dropped by `change`.
 fn edit(folder: &Path, (from, to): (&str, &str), mut change: impl FnMut(&mut Record<'_>) -> bool) {
     let mut edited = String::new();
     for line in fs::read_to_string(folder.join(from)).unwrap().lines() {
@@ -73,7 +73,7 @@ fn edit(folder: &Path, (from, to): (&str, &str), mut change: impl FnMut(&mut Rec
     fs::write(folder.join(to), edited).unwrap();
 }
 
-/// Adds one step to the second word of the torque of this place in the log.
+/// Adds one step to the second word of a torque of the log.
 fn torque_off_by_one(folder: &Path, to: &str, place: usize) {
     let mut torques = 0;
     edit(folder, ("fd.log", to), |record| {
@@ -138,7 +138,7 @@ fn a_word_that_is_one_step_off_is_found_with_its_epoch_cell_and_joint() {
     let (epoch, cell) = (&first["epoch"], &first["cell"]);
     assert!(text.starts_with(&format!("different: torques; first at epoch {epoch} (")), "{text}");
     assert!(text.contains("1 step apart"), "{text}");
-    // The commands that it names work.
+    // The commands that the output names work.
     let line = format!("skinbus explain off.log --epoch {epoch} --cell vcan0:{cell} --skin SKIN");
     assert!(text.contains(&line), "{text}");
     let explained = line.replace("SKIN", "fd.toml").replace("skinbus ", "");
@@ -160,13 +160,13 @@ fn parts_are_found_beside_the_first_one_and_a_later_one_is_aligned_by_its_joints
     let first = &object["captures"]["b"]["first"];
     assert_eq!((first, &object["epochs"]["before"]["only_a"]), (&96.into(), &96.into()), "{object}");
     assert_eq!(object["epochs"]["compared"], 54);
-    // Of standard input, which is read once.
+    // Standard input is read once.
     let file = fs::File::open(folder.join("split.mcap")).unwrap();
     let mut child = command(folder, "compare split-1.mcap - --json");
     let Output { status, stdout, .. } = child.stdin(Stdio::from(file)).output().unwrap();
     let object: Value = serde_json::from_slice(&stdout).unwrap();
     assert_eq!((status.code(), &object["epochs"]["compared"]), (Some(1), &0.into()), "{object}");
-    // A part of another recording is none of this one.
+    // A part of another recording does not belong to this one.
     fs::copy(folder.join("fd.mcap"), folder.join("split-1.mcap")).unwrap();
     let (_, object) = json(folder, "split.mcap split.mcap");
     assert_eq!(object["a"], "split.mcap");
@@ -183,7 +183,7 @@ fn standard_input_is_one_of_the_two() {
     let text = String::from_utf8(stdout).unwrap();
     assert_eq!(status.code(), Some(0), "{text}");
     assert!(text.contains("B  standard input (candump log)"), "{text}");
-    // A recording whose skin is known when it has been read.
+    // A recording whose skin is known only after it has been read.
     let file = fs::File::open(folder.join("sums.mcap")).unwrap();
     let mut child = command(folder, "compare fd.log - --skin fd.toml");
     let Output { status, stderr, .. } = child.stdin(Stdio::from(file)).output().unwrap();
@@ -216,7 +216,7 @@ fn two_skins_and_what_is_no_capture_are_refused_in_one_line() {
     for (arguments, code, begin) in [
         ("fd.mcap sums.mcap", 2, "fd.mcap and sums.mcap have two skins: cells 3, in the other 5"),
         ("fd.mcap fd.log --skin sums.toml", 2, "sums.toml and fd.mcap have two skins: "),
-        ("fd.log fd.log --skin moved.toml", 2, "fd.log is of another skin than "),
+        ("fd.log fd.log --skin moved.toml", 2, "fd.log belongs to another skin than "),
         ("fd.log fd.log", 2, "neither fd.log nor fd.log has a skin in it: name one with --skin"),
         ("fd.toml fd.log", 2, "fd.toml is a skin or a scenario, and no candump log or MCAP recording: "),
         ("fd.mcap other.log", 2, "other.log: none of its buses (can7) is one of the skin's (vcan0)"),
@@ -251,7 +251,7 @@ fn what_was_cut_off_lacks_the_rest_and_damage_ends_with_1() {
         said.starts_with("cut.mcap: ") && text.starts_with("different: epochs; first at epoch "),
         "{said}{text}"
     );
-    // With itself it is equal, and said to have no end.
+    // Compared with itself it is equal, and reported as truncated.
     let (code, text, said) = gateway(folder, "compare cut.mcap cut.mcap");
     assert_eq!((code, said.lines().count()), (Some(0), 2), "{said}{text}");
     let mut damaged = object;

@@ -1,4 +1,4 @@
-//! `skinbus convert` as a process: its errors for bad input, and the files on the disk afterwards.
+//! `skinbus convert` as a process: errors for bad input, and the files on disk afterwards.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 mod public;
@@ -14,7 +14,7 @@ use tempfile::TempDir;
 
 const LOG: &str = "(1.000001) can0 123#11\n# why\n(2.000000) can0 22C##5AABB\n";
 
-/// A folder with files in it.
+/// A directory with files.
 struct Folder(TempDir);
 
 impl Folder {
@@ -36,7 +36,7 @@ impl Folder {
         command
     }
 
-    /// The standard error of a command that ends with this code.
+    /// Standard error of a command that ends with this code.
     fn says(&self, arguments: &str, code: i32) -> String {
         let Output { status, stdout, stderr } =
             self.gateway(arguments).stdin(Stdio::null()).output().unwrap();
@@ -45,7 +45,7 @@ impl Folder {
         said
     }
 
-    /// The one line that a command refuses with; everything is as it was.
+    /// The one-line error of a command that changes no file.
     fn refuses(&self, arguments: &str, code: i32) -> String {
         let before = self.all();
         let said = self.says(arguments, code);
@@ -54,7 +54,7 @@ impl Folder {
         said.trim_end().to_owned()
     }
 
-    /// All files and what is in them, hidden ones too.
+    /// All files with their content, including hidden ones.
     fn all(&self) -> Vec<(String, Vec<u8>)> {
         let mut all: Vec<_> = fs::read_dir(self.0.path())
             .unwrap()
@@ -159,7 +159,7 @@ fn what_is_no_capture_is_refused_by_its_name() {
     );
     assert_eq!(
         folder.refuses("convert words.txt run.mcap", 1),
-        "skinbus: words.txt: there is no frame in 3 lines; what candump prints or logs is read: \
+        "skinbus: words.txt: there is no frame in 3 lines; the output of candump is expected: \
          lines like `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`"
     );
     assert!(folder.refuses("convert run.pcapng run.mcap", 2).contains("is a packet capture"));
@@ -206,7 +206,7 @@ fn a_bad_line_is_named_and_kept_and_with_strict_it_is_the_end() {
     assert_eq!(
         folder.says("convert run.log run.mcap", 0),
         "run.log:2: column 4: digits of a second\n\
-         run.log: 1 begins like a frame and is none: not read\n\
+         run.log: 1 line begins like a frame but is not one: not read\n\
          run.log -> run.mcap: 2 frames, 1 notes\n"
     );
     folder.says("convert run.mcap back.log", 0);
@@ -220,7 +220,7 @@ fn of_many_bad_lines_some_are_named_and_all_are_counted() {
     let said = folder.says("convert run.log run.mcap", 0);
     assert_eq!(said.lines().count(), 103, "{said}");
     assert!(said.contains("run.log:100: column 3:") && !said.contains("run.log:101:"), "{said}");
-    assert!(said.contains("run.log: 1000 begin like a frame and are none"), "{said}");
+    assert!(said.contains("run.log: 1000 lines begin like frames but are not"), "{said}");
 }
 
 #[test]
@@ -272,7 +272,7 @@ fn what_makes_no_sense_is_refused() {
     );
 }
 
-/// A recording of some chunks.
+/// A recording of several chunks.
 fn recording(folder: &Folder) -> Vec<u8> {
     let lines = (0..9_000_u64).map(|line| {
         let bits = line.wrapping_mul(0x9E37_79B9_7F4A_7C15);
@@ -301,7 +301,7 @@ fn of_a_recording_without_its_end_all_that_is_there_is_converted_and_that_is_sai
     );
     let strict = folder.refuses("convert cut.mcap strict.log --strict", 1);
     let expected = expected.trim_end();
-    assert_eq!(strict, format!("skinbus: {expected}; without --strict what is there would be written"));
+    assert_eq!(strict, format!("skinbus: {expected}; without --strict the intact part would be written"));
 }
 
 #[test]
@@ -316,7 +316,7 @@ fn a_damaged_recording_is_refused_and_leaves_nothing() {
         said.starts_with("skinbus: bad.mcap is damaged: ") && said.contains(" notes before that were read; "),
         "{said}"
     );
-    // What is before the damage can be had as text.
+    // The part before the damage can be converted to text.
     let Output { status, stdout, .. } = folder.gateway("convert bad.mcap -").output().unwrap();
     assert_eq!(status.code(), Some(1));
     let before = String::from_utf8(stdout).unwrap();
@@ -336,7 +336,7 @@ fn a_full_disk_is_said_and_a_reader_may_leave() {
     assert_eq!((status.code(), String::from_utf8(stderr).unwrap().as_str()), (Some(0), ""));
 }
 
-/// Looks until something is so.
+/// Polls until a condition holds.
 fn until(what: &str, mut so: impl FnMut() -> bool) {
     let begun = Instant::now();
     while !so() {
@@ -345,7 +345,7 @@ fn until(what: &str, mut so: impl FnMut() -> bool) {
     }
 }
 
-/// Whether a process has caught SIGINT for itself, by the kernel's word.
+/// Returns true if a process catches SIGINT, by the kernel's report.
 fn catches_interrupts(pid: u32) -> bool {
     let status =
         fs::read_to_string(Path::new("/proc").join(pid.to_string()).join("status")).unwrap_or_default();

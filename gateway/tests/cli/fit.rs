@@ -21,7 +21,7 @@ fn output(arguments: &str) -> String {
     String::from_utf8(stdout).unwrap()
 }
 
-/// The one-line error of a command that ends with 2 and prints nothing.
+/// The one-line error of a command that ends with 2 and prints nothing else.
 fn refusal(arguments: &str) -> String {
     let Output { status, stdout, stderr } = gateway(arguments);
     let said = String::from_utf8(stderr).unwrap();
@@ -70,7 +70,7 @@ fn rates_are_those_of_the_command_line_or_of_the_description_or_common_ones() {
     assert_eq!(said("plain") + &said("rates"), "");
     let only = json(&format!("fit {} --format classic --json", path("plain")));
     assert_eq!(names(&only, "table"), all[..2]);
-    // A cell that computes longer answers later by that.
+    // A cell that computes longer answers later by the difference.
     let last = |arguments: &str| {
         let json = json(&format!("fit {} {arguments} --json", path("rates")));
         json["buses"][0]["last_answer_us"].as_f64().unwrap()
@@ -109,7 +109,7 @@ fn what_can_does_not_allow_is_refused_in_one_line() {
     }
 }
 
-/// The output with a file as standard input, as a pipe gives it.
+/// The output with a file as standard input through a pipe.
 fn piped(text: &str, arguments: &str) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     command.args(arguments.split_whitespace()).env("NO_COLOR", "1");
@@ -118,7 +118,7 @@ fn piped(text: &str, arguments: &str) -> Output {
     let mut stdin = child.stdin.take().unwrap();
     let writing = std::thread::spawn({
         let text = text.to_owned();
-        // One that is refused early closes it.
+        // A command that fails early closes the pipe.
         move || drop(std::io::Write::write_all(&mut stdin, text.as_bytes()))
     });
     let output = child.wait_with_output().unwrap();
@@ -130,7 +130,7 @@ fn piped(text: &str, arguments: &str) -> Output {
 fn a_pipe_gives_what_a_file_gives() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).display().to_string();
-    // More than a reader takes at once.
+    // More than a reader reads at once.
     let log: String = (0..3_000).map(|at| format!("({at}.000000) can0 123#00\n")).collect();
     let skin = output("skin generate --cells 90");
     let scenario = "duration_s = 4.0\n[[touch]]\nat_s = 1.0\nfor_s = 1.0\ncells = [3]\nforce_n = 1.0\n";

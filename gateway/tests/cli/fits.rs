@@ -1,4 +1,4 @@
-//! One skin and one run of it through `fit`, `shadow`, `report` and `experiment`: the same numbers, in the same words.
+//! One skin and one run of it through `fit`, `report` and `experiment`: the same numbers in the same words.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::fmt::Write as _;
@@ -17,10 +17,10 @@ use serde_json::Value;
 use tempfile::TempDir;
 use trace::recording::file::FileWriter;
 
-/// The paper's arm.
+/// Skin of the paper's arm.
 const ARM: &str = include_str!("../../examples/ur5-253.toml");
 const CELLS: i64 = 253;
-/// How many of them answer.
+/// Number of its cells that answer.
 const ANSWERING: i64 = 120;
 const MS: u64 = 1_000_000;
 
@@ -28,7 +28,7 @@ const MS: u64 = 1_000_000;
 struct Files(TempDir);
 
 impl Files {
-    /// With bit rates in the skin or without.
+    /// Creates the files, with bit rates in the skin or without.
     fn new(rates: &str) -> Self {
         let files = Self(tempfile::tempdir().unwrap());
         let skin = ARM.replace("format = \"fd\"", &format!("format = \"fd\"\n{rates}"));
@@ -71,7 +71,7 @@ impl Files {
     }
 }
 
-/// A page without its marks: one space between what stands in cells and paragraphs.
+/// Text of a page without tags, with one space between cells and paragraphs.
 fn text(page: &Path) -> String {
     let html = fs::read_to_string(page).unwrap().replace('\u{a0}', " ");
     let parts = html.split('<').filter_map(|part| part.split_once('>').map(|(_, text)| text.trim()));
@@ -90,7 +90,8 @@ fn cell(node: i64) -> CellId {
     CellId::new(node).unwrap()
 }
 
-/// Start-up, in which all cells send at once; two seconds of joints that fewer than half answer, with stimuli.
+/// A run: a start-up in which all cells send at once; then two seconds of joints that fewer than half answer, with
+/// stimuli.
 fn run() -> Vec<(u64, Message)> {
     let mut now = 1_700_000_000_000_000_000;
     let mut said = Vec::new();
@@ -164,7 +165,7 @@ fn four_commands_give_the_same_figures_for_one_skin_in_the_same_words() {
         assert!(experiment.contains(words), "{words}: {experiment}");
     }
     assert!(!experiment.contains("does not hold"), "{experiment}");
-    // The whole table: rates, cells a bus has time for, and buses needed.
+    // The whole table: rates, cells that a bus has time for, and buses needed.
     let table: Value = serde_json::from_str(&files.gateway("fit skin.toml --table --json")).unwrap();
     let results: Value = serde_json::from_slice(&fs::read(files.path("laws/results.json")).unwrap()).unwrap();
     let findings = results["experiments"][0]["findings"].as_array().unwrap();
@@ -193,7 +194,7 @@ fn stimuli_and_start_up_are_no_load_of_operation() {
     let start_up = shadow.split_once("start-up").unwrap().1;
     assert!(percent(row(start_up, "most in any 16 ms")[0]) > 95.0, "{start_up}");
     assert!(row(&shadow, "no pause for 16 ms")[0].starts_with("0 times"), "{shadow}");
-    // Without what only a bench sends, the log is the same.
+    // Without bench-only frames, the log is the same.
     let log = fs::read_to_string(files.path("run.log")).unwrap();
     let without: String = log.split_inclusive('\n').filter(|line| !line.contains(" 7")).collect();
     assert!(without.len() < log.len() * 3 / 5);

@@ -1,4 +1,4 @@
-//! Traffic of other people, and damaged traffic of ours, read by `skinbus dump`.
+//! Foreign traffic, and damaged traffic of this protocol, in `skinbus dump`.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 mod traffic;
@@ -21,7 +21,7 @@ use serde_json::Value;
 
 use traffic::{Random, car, others};
 
-/// What every frame is, in order.
+/// Decoded meaning of each frame, in order.
 fn settled(frames: &[(u64, Frame)]) -> Vec<((u64, Frame), Decoded)> {
     let mut settler = Settler::new(None);
     let mut all = Vec::new();
@@ -57,7 +57,7 @@ fn log(frames: &[(u64, Frame)]) -> String {
     text
 }
 
-/// Our traffic on a bus: joints every 16 ms, which cells 1 to 9 answer.
+/// Traffic of this protocol: joints every 16 ms, answered by cells 1 to 9.
 fn ours(format: Format, epochs: u64) -> Vec<(u64, Frame)> {
     let mut frames = Vec::new();
     for epoch in 0..epochs {
@@ -92,7 +92,7 @@ fn a_car_is_foreign_and_chance_makes_one_packet_of_65536_pairs() {
             .unwrap();
     }
     assert!(frames > 160_000, "{frames}");
-    // 2.6 packets are expected; each takes two frames. The seeds are fixed, so this is no matter of luck.
+    // 2.6 packets are expected; each takes two frames. The seeds are fixed, so the result does not vary.
     assert!(chance <= 2 * 8, "{chance} of {frames}");
     assert_eq!(damaged, 0, "a packet by chance makes nothing else ours");
 }
@@ -137,7 +137,7 @@ fn foreign_identifiers_are_counted_with_rate_length_and_times() {
 fn our_packets_are_found_among_foreign_frames_of_the_same_bus() {
     for format in [Format::Fd, Format::Classic] {
         let own = ours(format, 500);
-        // A car that does not use the identifiers of ours that are in use here.
+        // A car that does not use the identifiers of this protocol that are in use here.
         let used: Vec<_> = own.iter().map(|(_, frame)| frame.id()).collect();
         let mut frames = car(7, 8_000);
         frames.extend(others(8, 8_000));
@@ -187,14 +187,14 @@ fn a_frame_waits_no_longer_than_the_reassembly_timeout() {
     settler.push(Micros(1_000_150), "can0", &second, 2);
     let settled = std::iter::from_fn(|| settler.pop()).map(|(item, it)| (item, it.verdict()));
     assert_eq!(settled.collect::<Vec<_>>(), [(1, "segment"), (2, "ok")]);
-    // A live bus on which nothing more comes.
+    // A live bus on which no more frames come.
     settler.push(Micros(2_000_000), "can0", &first, 3);
     settler.handle_time(Micros(2_010_000));
     assert_eq!(settler.pop(), None);
     settler.handle_time(Micros(2_200_000));
     assert_eq!(settler.pop().map(|(item, it)| (item, it.verdict())), Some((3, "foreign")));
     assert!(!settler.is_waiting());
-    // A segment that has timed out is no first segment any more.
+    // A segment that has timed out is no longer a first segment.
     settler.push(Micros(2_200_100), "can0", &second, 4);
     settler.finish();
     assert_eq!(settler.pop().map(|(item, it)| (item, it.verdict())), Some((4, "foreign")));
@@ -206,7 +206,7 @@ fn frames_that_wait_are_bounded_where_times_do_not_move_or_run_backwards() {
         let mut settler = Settler::new(None);
         let (mut out, mut most) = (0_u64, 0_u64);
         let frames = 200_000_u32;
-        // Each under an identifier of its own as far as there are some: no later frame settles an earlier one.
+        // Each frame has an identifier of its own as far as there are enough: no later frame settles an earlier one.
         for number in 0..frames {
             let bus = if number % 2 == 0 { "can0" } else { "can1" };
             let at = Micros(10_000_000_u64.saturating_add_signed(step * i64::from(number)));

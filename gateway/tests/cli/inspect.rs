@@ -1,4 +1,4 @@
-//! `skinbus skin dbc`, `skinbus explain`, and the parts of `skinbus dump` that are not lines, as processes.
+//! `skinbus skin dbc`, `skinbus explain`, and the tables of `skinbus dump`, as processes.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::path::Path;
@@ -12,7 +12,7 @@ fn gateway(folder: &Path, arguments: &str) -> Output {
     command.env("NO_COLOR", "1").env("SKINBUS_DIR", "/nowhere/skinbus").output().unwrap()
 }
 
-/// Standard output of a command that is done well and has nothing to complain of.
+/// Standard output of a command that succeeds without messages.
 fn output(folder: &Path, arguments: &str) -> String {
     let Output { status, stdout, stderr } = gateway(folder, arguments);
     let said = String::from_utf8(stderr).unwrap();
@@ -20,7 +20,7 @@ fn output(folder: &Path, arguments: &str) -> String {
     String::from_utf8(stdout).unwrap()
 }
 
-/// The one-line error of a command that ends with this code and prints nothing.
+/// The one-line error of a command that ends with this code and prints nothing else.
 fn refusal(folder: &Path, arguments: &str, code: i32) -> String {
     let Output { status, stdout, stderr } = gateway(folder, arguments);
     let said = String::from_utf8(stderr).unwrap();
@@ -29,7 +29,7 @@ fn refusal(folder: &Path, arguments: &str, code: i32) -> String {
     said.trim_end().to_owned()
 }
 
-/// A folder with skins in it: `one.toml`, `two.toml` of two buses, `classic.toml`.
+/// A directory with skins: `one.toml`, `two.toml` with two buses, `classic.toml`.
 fn skins() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let skins =
@@ -97,7 +97,7 @@ fn a_classic_bus_is_described_only_as_joined_packets() {
     assert_eq!(said, "skinbus: --joined is for classic buses; on vcan0 a packet is one FD frame");
 }
 
-/// Where a golden log is.
+/// Path of a golden log.
 fn golden(name: &str) -> String {
     format!("{}/../protocol/tests/golden/{name}", env!("CARGO_MANIFEST_DIR"))
 }
@@ -178,7 +178,7 @@ fn with_strict_the_first_line_that_cannot_be_read_is_the_end() {
     assert_eq!((status.code(), std::str::from_utf8(&stdout).unwrap().lines().count()), (Some(0), 1));
 }
 
-/// The cell of the document's whole configuration, and another one without contact.
+/// The cell of the document's complete configuration, and another one without contact.
 const SKIN: &str = r#"version = 1
 name = "document"
 
@@ -237,7 +237,7 @@ const PRESSED: &str = "(1.000000) vcan0 50C##10100000000000000000000000C853231
 (1.200500) vcan0 20C##5CDFB7B0C000000000000000007014157
 ";
 
-/// A folder with `skin.toml` and `run.log`.
+/// A directory with `skin.toml` and `run.log`.
 fn pressed() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("skin.toml"), SKIN).unwrap();
@@ -323,7 +323,7 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain empty.log --skin skin.toml --epoch 7",
             1,
-            "empty.log: there is no frame in 1 line; what candump prints or logs is read: lines like \
+            "empty.log: there is no frame in 1 line; the output of candump is expected: lines like \
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
         ),
         (
@@ -358,7 +358,7 @@ fn a_hint_does_not_lead_to_the_next_refusal() {
     let folder = pressed();
     let folder = folder.path();
     std::fs::write(folder.join("words.txt"), "nothing\n").unwrap();
-    // No skin, sensing or option would help here.
+    // No skin, sensing mode or option would help here.
     let description = "skinbus: skin.toml is a skin or a scenario, and no candump log or MCAP recording: there are no frames in \
                        it: name a capture";
     let nothing = "skinbus: words.txt: there is no frame in 1 line; ";

@@ -1,4 +1,4 @@
-//! The gateway's commands as processes: what they print, what they write, and what they refuse.
+//! The commands as processes: what they print, write and refuse.
 
 mod commands;
 mod compare;

@@ -1,4 +1,4 @@
-//! What a file costs in memory is bounded, whatever stands in it.
+//! Memory use for any file is bounded.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::fmt::Write as _;
@@ -6,7 +6,7 @@ use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};
 
-/// What a command may have mapped in all, bytes; docs/reference/skin.md says 0.5 GB.
+/// Limit of a command's address space in bytes; docs/reference/skin.md promises 0.5 GB.
 const BOUND: &str = "--as=700000000";
 
 fn bounded(folder: &Path, line: &str) -> Output {
@@ -15,7 +15,7 @@ fn bounded(folder: &Path, line: &str) -> Output {
     command.current_dir(folder).output().unwrap()
 }
 
-/// Files of as many keys and tables as are read, in the forms that cost most.
+/// Files with as many keys and tables as are read, in the most expensive forms.
 fn hostile() -> [(&'static str, String); 4] {
     let mut tables = String::new();
     for at in 0..120_000 {

@@ -1,5 +1,5 @@
-//! Recordings that are damaged in every way, by chance and on purpose, through every command that reads one: each ends
-//! with exit code 0, 1 or 2, in bounded memory. `SKINBUS_MUTATIONS=10000` takes so many instead of a few.
+//! Recordings damaged in many ways, by chance and on purpose, through every command that reads one: each command ends
+//! with exit code 0, 1 or 2, in bounded memory. `SKINBUS_MUTATIONS=10000` runs that many files instead of a few.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod mutate;
@@ -16,14 +16,14 @@ use std::time::{Duration, Instant};
 
 use rand_pcg::Pcg64Mcg;
 
-/// Files of the quick tests.
+/// Number of files of the quick tests.
 const QUICK: u64 = 24;
-/// Only a program that hangs takes so long.
+/// A time that only a hanging program needs.
 const HANGS: Duration = Duration::from_secs(120);
-/// Addresses that a command may take, in KiB. What is asked for and not used is none of its memory, and counts here.
+/// Address space of a command in KiB. Reserved but unused memory counts here too.
 const ADDRESSES: &str = "400000";
 
-/// All that read a recording.
+/// All commands that read a recording.
 const COMMANDS: &[&str] = &[
     "dump FILE",
     "dump FILE --stats",
@@ -38,7 +38,7 @@ const COMMANDS: &[&str] = &[
     "recover FILE -o OUT.mcap --overwrite",
 ];
 
-/// Runs a command without a terminal and with few addresses; what became of it, and what it said.
+/// Runs a command without a terminal and with little address space. Returns its status and its messages.
 fn run(folder: &Path, line: &str) -> (ExitStatus, String) {
     let said = File::create(folder.join("said")).unwrap();
     let mut command = Command::new("sh");
@@ -60,7 +60,8 @@ fn run(folder: &Path, line: &str) -> (ExitStatus, String) {
     (status, String::from_utf8_lossy(&fs::read(folder.join("said")).unwrap()).into_owned())
 }
 
-/// With `SKINBUS_MUTATIONS_DIR` files are only written there, to try other programs with them.
+/// Runs the commands on a file. With `SKINBUS_MUTATIONS_DIR`, only writes the files there, to try other programs with
+/// them.
 fn passes(folder: &Path, what: &str, file: &[u8], commands: &[&str]) {
     if let Some(there) = std::env::var_os("SKINBUS_MUTATIONS_DIR") {
         let name: String = what.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
@@ -87,7 +88,7 @@ fn passes(folder: &Path, what: &str, file: &[u8], commands: &[&str]) {
     }
 }
 
-/// Commands that replay wait most of their time.
+/// Number of commands that run at once: replaying commands mostly wait.
 const AT_ONCE: usize = 8;
 
 #[test]

@@ -7,12 +7,12 @@ use std::process::{Command, Output};
 
 use trace::capture::{Reader, SKIN};
 
-/// Where the recordings are.
+/// Directory of the recordings.
 fn recordings() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../tests/recordings")
 }
 
-/// Standard output of a command that has nothing to complain of.
+/// Standard output of a command without messages.
 fn output(arguments: &str) -> String {
     let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     command.args(arguments.split(' ')).current_dir(recordings()).env("NO_COLOR", "1").env("COLUMNS", "100");
@@ -22,7 +22,7 @@ fn output(arguments: &str) -> String {
     String::from_utf8(stdout).unwrap()
 }
 
-/// Compares line by line with `expected/NAME`, or takes the text over on request.
+/// Compares line by line with `expected/NAME`, or replaces that file on request.
 fn is_expected(name: &str, text: &str) {
     let path = recordings().join("expected").join(name);
     if std::env::var_os("SKINBUS_TAKE_OVER").is_some() {
@@ -45,7 +45,7 @@ fn dumps_are_unchanged() {
 
 #[test]
 fn a_log_gives_the_same_text_as_the_recording_of_the_same_run() {
-    // The times of a log have six digits: they are left out.
+    // The times of a log have six digits: ignore them.
     let without_times = |text: &str| -> Vec<String> {
         text.lines().map(|line| line.split_once(' ').unwrap().1.to_owned()).collect()
     };

@@ -1,4 +1,4 @@
-//! Recordings that break off, or are damaged, are made whole: what is whole and right is kept, and the rest is said.
+//! Recordings that are cut off or damaged are repaired: intact content is kept, and the rest is reported.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::collections::BTreeMap;
@@ -16,7 +16,7 @@ use trace::recording::file::{DESCRIBED_EVERY, FileWriter};
 use trace::recording::recover::{RecoverError, Recovered, recover};
 use trace::ros2::standard::JointState;
 
-/// Messages of two topics in five chunks, a file and facts.
+/// A recording with messages of two topics in five chunks, a file and metadata.
 fn recording() -> Vec<u8> {
     let mut writer = FileWriter::new(Vec::new()).unwrap();
     writer.metadata("program", &BTreeMap::from([("a".to_owned(), "b".to_owned())])).unwrap();
@@ -41,7 +41,7 @@ fn recording() -> Vec<u8> {
     writer.into_inner()
 }
 
-/// Topic, time, sequence and bytes of each message of a file that has its end.
+/// Topic, time, sequence and bytes of each message of a finished file.
 fn messages(bytes: &[u8]) -> Vec<(String, u64, u32, Vec<u8>)> {
     let summary = Summary::read(bytes).unwrap().expect("it has its end");
     let messages = MessageStream::new(bytes).unwrap().map(|message| {
@@ -90,7 +90,7 @@ fn a_file_that_breaks_off_anywhere_keeps_what_was_handed_on() {
                 assert!(kept.len() >= most, "{end}: more bytes, fewer messages");
                 assert!(!said.is_sound() && said.damaged == (0, 0) && said.homeless == 0, "{end}: {said:?}");
                 most = kept.len();
-                // What was made whole is whole.
+                // A repaired file needs no repair.
                 let (again, _) = recovered(&copy).unwrap();
                 assert!(again.is_sound() && again.messages == kept.len() as u64, "{end}: {again:?}");
             }
@@ -118,13 +118,13 @@ fn a_damaged_chunk_is_omitted_and_said_and_the_others_are_kept() {
         assert_eq!(messages(&copy), [&all[..lost], &all[lost + 20..]].concat());
         assert!(said.to_string().contains(" damaged bytes are lost"), "{said}");
     }
-    // The first one has the types and topics, which stand outside of chunks too, and in the summary.
+    // The first chunk has the types and topics, which are also outside of chunks and in the summary.
     let mut first = bytes;
     first[usize::try_from(chunks[0].chunk_start_offset + chunks[0].chunk_length - 9).unwrap()] ^= 0x10;
     let (said, copy) = recovered(&first).unwrap();
     assert_eq!((said.messages, said.homeless, said.damaged.0), (100, 0, 1), "{said:?}");
     assert_eq!(messages(&copy), all);
-    // Without an end they are known from what stands outside of chunks.
+    // Without an end they are known from records outside of chunks.
     let end =
         usize::try_from(chunks.last().unwrap().message_index_offsets.values().max().unwrap() + 1).unwrap();
     let (said, copy) = recovered(&first[..end]).unwrap();
@@ -152,7 +152,7 @@ fn types_and_topics_of_a_recording_by_others_are_known_from_its_summary() {
     let lost = summary.chunk_indexes.len();
     assert!(said.messages >= 20 - 2 && said.homeless == 0 && lost > 5, "{said:?}");
     assert!(all.ends_with(&messages(&copy)), "{said}");
-    // Without an end nobody says what the others are.
+    // Without an end the other channels are unknown.
     let end = bytes.windows(9).position(|at| at == [15, 4, 0, 0, 0, 0, 0, 0, 0]).unwrap();
     let (said, _) = recovered(&damaged[..end]).unwrap();
     assert!(said.messages == 0 && said.homeless >= 18 && said.is_little(), "{said:?}");
@@ -204,7 +204,7 @@ fn types_and_topics_are_described_outside_of_chunks_again_and_again() {
     assert_eq!((chunks, described), (count, vec![1, DESCRIBED_EVERY, DESCRIBED_EVERY, DESCRIBED_EVERY]));
 }
 
-/// Whether all messages of chunks that these bytes do not belong to are kept, in their order, and none that was not there.
+/// Checks that all messages of undamaged chunks are kept in order, and that no message was invented.
 fn keeps_what_is_intact(original: &[u8], damaged: &[u8], bytes: std::ops::Range<usize>, what: &str) {
     let all = messages(original);
     let chunks = Summary::read(original).unwrap().unwrap().chunk_indexes;
@@ -223,7 +223,7 @@ fn keeps_what_is_intact(original: &[u8], damaged: &[u8], bytes: std::ops::Range<
         }
     }
     assert!(kept.iter().all(|message| all.contains(message)), "{what}: {said}");
-    // A footer whose checksum is 0 has none.
+    // A footer with a checksum of 0 has none.
     assert!(!said.is_sound() || bytes.end > original.len() - 12, "{what}: {said:?}");
 }
 
@@ -259,7 +259,7 @@ fn a_length_that_leads_over_others_or_beyond_the_end_hides_nothing() {
     let summary = Summary::read(&bytes).unwrap().unwrap();
     let chunk = usize::try_from(summary.chunk_indexes[2].chunk_start_offset).unwrap();
     let attached = usize::try_from(summary.attachment_indexes[0].offset).unwrap();
-    // A chunk's own fields say how long it is, too.
+    // A chunk's own fields give its length too.
     for (at, expected) in [(chunk, [80, 100]), (attached, [100, 100])] {
         for length in [7, 300, 2_000, 1 << 20, u64::MAX] {
             let mut damaged = bytes.clone();
@@ -269,14 +269,14 @@ fn a_length_that_leads_over_others_or_beyond_the_end_hides_nothing() {
             assert!(expected.contains(&said.messages) && said.damaged.0 == 1, "{at} + {length}: {said}");
         }
     }
-    // Of the header: the profile is lost with it.
+    // Damage in the header loses the profile.
     for at in 8..17 {
         let mut damaged = bytes.clone();
         damaged[at] ^= 0x21;
         let (said, _) = recovered(&damaged).unwrap();
         assert!(said.messages == 100 && !said.is_sound(), "{at}: {said}");
     }
-    // What was never written is zeros, as after a power loss.
+    // Blocks that were never written are zeros, as after a power loss.
     let zeros = [&bytes[..chunk], &[0; 300_000]].concat();
     let (said, _) = recovered(&zeros).unwrap();
     assert_eq!((said.messages, said.unfinished, said.damaged.0), (20, 300_000, 0), "{said}");
@@ -300,7 +300,7 @@ fn a_description_is_never_taken_for_a_message() {
     }
 }
 
-/// Adds to the eight bytes of a number in a file.
+/// Adds to an eight-byte number in a file.
 fn add(file: &mut [u8], at: usize, more: u64) {
     let number = u64::from_le_bytes(file[at..at + 8].try_into().unwrap());
     file[at..at + 8].copy_from_slice(&number.wrapping_add(more).to_le_bytes());
@@ -312,7 +312,7 @@ fn a_wrong_length_within_a_chunk_hides_none_behind_it() {
     let chunks = Summary::read(&bytes[..]).unwrap().unwrap().chunk_indexes;
     let [at, next, last] =
         [2, 3, 5].map(|number| usize::try_from(chunks[number].chunk_start_offset).unwrap());
-    // Behind its times, sizes, checksum and the name of its compression.
+    // After its times, sizes, checksum and the name of its compression.
     let packed = at + 9 + 36;
     let wrong = [1, 40, 1 << 10, next - at, last - at, 1 << 40].map(|more| more as u64);
     for more in wrong.into_iter().chain([1, 100].map(u64::wrapping_neg)) {
@@ -330,7 +330,7 @@ fn descriptions_that_moved_into_the_place_of_a_chunk_are_found() {
         let chunk = &summary.chunk_indexes[number];
         usize::try_from(chunk.chunk_start_offset + chunk.chunk_length).unwrap()
     });
-    // The writer was killed: they stand in the first chunk and behind it.
+    // The writer was killed: they are in the first chunk and after it.
     let killed = &bytes[..second];
     for gone in [9, 100, 300] {
         let damaged = [&killed[..first - gone], &killed[first..]].concat();
@@ -415,10 +415,10 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     assert!(says("recover run.mcap.part", 0).starts_with("run-recovered-1.mcap, "));
     assert_eq!(
         says("recover whole.mcap", 0),
-        "whole.mcap is whole, there is nothing to recover: 100 messages"
+        "whole.mcap is intact, there is nothing to recover: 100 messages"
     );
     assert!(!path("whole-recovered.mcap").exists());
-    // Nothing came back, or too little.
+    // No message came back, or too few.
     let begun = usize::try_from(Summary::read(&bytes).unwrap().unwrap().chunk_indexes[1].chunk_start_offset);
     fs::write(path("begun.mcap"), &bytes[..begun.unwrap() + 40]).unwrap();
     let said = says("recover begun.mcap", 1);
@@ -431,7 +431,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     fs::write(path("gap.mcap"), &gap).unwrap();
     let said = says("recover gap.mcap", 1);
     assert!(
-        said.contains("gap.mcap than came back: gap-recovered.mcap, ")
+        said.contains("gap.mcap is lost than was recovered: gap-recovered.mcap, ")
             && said.contains(" 20 of 100 messages"),
         "{said}"
     );

@@ -1,4 +1,4 @@
-//! `skinbus report` as a process: its errors for files that are no recording of a run, and the files on the disk afterwards.
+//! `skinbus report` as a process: errors for files that are not recordings of a run, and the files on disk afterwards.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::fs;
@@ -22,7 +22,7 @@ fn names(folder: &Path) -> Vec<String> {
     names
 }
 
-/// The one line that a report refuses with; nothing is written.
+/// The one-line error of a report that writes no file.
 fn refuses(folder: &TempDir, arguments: &str, code: i32) -> String {
     let before = names(folder.path());
     let Output { status, stdout, stderr } = gateway(folder.path(), &format!("report {arguments}"));
@@ -90,7 +90,7 @@ fn what_would_be_overwritten_or_is_no_bit_rate_is_refused_before_anything_is_rea
     assert_eq!(fs::read_to_string(folder.path().join("run.html")).unwrap(), "mine");
 }
 
-/// A folder with the log and the recording of one run, and its skin.
+/// A directory with the log and the recording of one run, and its skin.
 fn recorded() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let recordings = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/recordings");
@@ -113,7 +113,7 @@ fn page(folder: &TempDir, arguments: &str) -> (String, String) {
     let said = String::from_utf8(stderr).unwrap();
     assert_eq!(status.code(), Some(0), "{said}");
     let page = String::from_utf8(stdout).unwrap();
-    // Options of commands, which do not break.
+    // Remove the marks that keep command options in one line.
     (page.replace("<span>", "").replace("</span>", ""), said)
 }
 
@@ -123,7 +123,7 @@ fn table<'a>(page: &'a str, title: &str) -> &'a str {
     rest.split("</table>").next().unwrap()
 }
 
-/// The cells of the first row of a table that begins with a text.
+/// Cells of the first row that begins with a text.
 fn row<'a>(table: &'a str, first: &str) -> Vec<&'a str> {
     let row = table.split("<tr>").find(|row| row.contains(&format!(">{first}</td>"))).unwrap();
     row.split("</td>").filter_map(|cell| cell.rsplit('>').next()).collect()
@@ -188,7 +188,7 @@ fn a_log_gives_the_accounts_of_the_recording_of_the_same_run_and_names_what_it_l
 fn a_log_without_stimuli_does_not_say_that_nothing_was_touched() {
     let folder = recorded();
     let log = fs::read_to_string(folder.path().join("classic.log")).unwrap();
-    // Kind 7: the stimuli.
+    // Kind 7 is the stimuli.
     let is_stimulus = |line: &&str| line.split(' ').nth(2).is_some_and(|frame| frame.starts_with('7'));
     assert!(log.lines().any(|line| is_stimulus(&line)));
     let rest: String =
@@ -240,12 +240,12 @@ fn a_log_of_something_else_and_another_skin_than_the_recorded_one_are_refused() 
         assert!(refused.starts_with(said), "{arguments}: {refused}");
         assert!(!refused.ends_with("need their --skin"), "it was given: {refused}");
     }
-    // The skin would not help.
+    // A skin would not help.
     write("a.dbc", "VERSION \"1.0\"\n\nNS_:\n\nBS_:\n");
     assert!(refuses(&folder, "a.dbc -o out.html", 2).starts_with("a.dbc is a DBC file, "));
     let missing = refuses(&folder, "classic.log --skin nowhere.toml", 2);
     assert!(missing.starts_with("nowhere.toml: "), "{missing}");
-    // The skin that it has is the same.
+    // The recording has the same skin.
     let (with, _) = page(&folder, "classic.mcap --skin classic.toml");
     let (without, _) = page(&folder, "classic.mcap");
     assert_eq!(with.replace(" --skin classic.toml", ""), without);

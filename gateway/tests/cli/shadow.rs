@@ -1,4 +1,4 @@
-//! `skinbus fit` as a process: whole, cut-off, empty and foreign recordings, and what it refuses.
+//! `skinbus fit` as a process: whole, truncated, empty and foreign recordings, and refusals.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
 
 use std::fmt::Write as _;
@@ -19,7 +19,7 @@ fn gateway(folder: &Path, arguments: &str) -> (Option<i32>, String, String) {
     (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
 }
 
-/// A log of 3000 frames on two buses, a third of a second long, and its frames one by one.
+/// A log of 3000 frames on two buses, a third of a second long.
 fn log() -> String {
     (0..3_000_u64).fold(String::new(), |mut log, line| {
         let micros = 1_700_000_000_000_000 + line * 111;
@@ -56,7 +56,7 @@ fn each_frame_is_an_object_with_the_bits_and_times_of_a_bus() {
         );
         let [time, start, end] = ["time", "start_s", "end_s"].map(|key| object[key].as_f64().unwrap());
         let rates = if record.interface == "can1" { "500k/2M" } else { "1M/5M" };
-        // Doubles since 1970 hold a quarter of a microsecond.
+        // For times since 1970, doubles resolve a quarter of a microsecond.
         assert!((end - start - bits.seconds(rates.parse().unwrap())).abs() < 1e-6, "{object}");
         assert!(start >= time && (time - record.time.nanos as f64 / 1e9).abs() < 1e-6);
     }

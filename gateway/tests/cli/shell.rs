@@ -1,4 +1,4 @@
-//! Completions and man pages, as a shell and `man` take them; former names; standard output in the place of a file.
+//! Completions and man pages, as used by a shell and `man`; former names; standard output in place of a file.
 
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
@@ -100,7 +100,7 @@ fn former_names_are_refused_in_a_line_that_names_the_present_ones() {
     }
 }
 
-/// Each command that writes a file writes it to standard output as well, and nothing else there.
+/// Commands that write a file can write it to standard output, without other output there.
 #[test]
 fn a_dash_is_standard_output_and_standard_input() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,5 +1,5 @@
-//! One signal ends every command, also one that waits for a pipe: to be read, or to be written to. A named pipe is not
-//! waited for.
+//! One signal ends every command, even one that waits for reading from or writing to a pipe. Opening a named pipe does
+//! not block.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::fmt::Write as _;
@@ -15,7 +15,7 @@ use rustix::fs::{CWD, FileType, Mode, mknodat};
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
-/// Only a program that hangs takes so long.
+/// A time that only a hanging program needs.
 const HANGS: Duration = Duration::from_secs(60);
 
 fn place() -> TempDir {
@@ -36,14 +36,14 @@ fn place() -> TempDir {
 }
 
 fn command(folder: &Path, line: &str) -> Command {
-    // A shell starts what it puts in the background with SIGINT ignored, and children inherit that.
+    // A shell starts background processes with SIGINT ignored, and children inherit that.
     let mut command = Command::new("env");
     command.args(["--default-signal=INT,TERM", env!("CARGO_BIN_EXE_skinbus")]).args(line.split(' '));
     command.current_dir(folder).env("SKINBUS_DIR", folder.join("bus")).stdin(Stdio::null());
     command
 }
 
-/// Waits until a program does nothing but wait.
+/// Waits until a program only waits.
 fn until_it_waits(child: &mut Child, line: &str) {
     let (began, mut idle) = (Instant::now(), 0);
     while idle < 10 {

@@ -1,4 +1,4 @@
-//! `skinbus convert RUN.mcap torques.csv`: each row beside `skinbus explain --json` of its epoch.
+//! `skinbus convert RUN.mcap torques.csv`: rows compared with `skinbus explain --json` of their epochs.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 #![allow(clippy::float_cmp, reason = "0, and counts")]
 
@@ -11,7 +11,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 use trace::capture::Reader;
 
-/// Rows between those that are compared.
+/// Number of rows from one compared row to the next.
 const EACH: usize = 9;
 
 fn recordings() -> PathBuf {
@@ -23,7 +23,7 @@ fn gateway(folder: &Path, arguments: &str) -> Output {
     command.args(arguments.split(' ').filter(|word| !word.is_empty())).current_dir(folder).output().unwrap()
 }
 
-/// A folder with recordings and the skin of each.
+/// A directory with recordings and the skin of each.
 fn folder(names: &[&str]) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     for name in names {
@@ -38,7 +38,7 @@ fn folder(names: &[&str]) -> TempDir {
     folder
 }
 
-/// The one line of a command that ends with this code.
+/// The one-line message of a command that ends with this code.
 fn said(folder: &TempDir, arguments: &str, code: i32) -> String {
     let Output { status, stderr, .. } = gateway(folder.path(), arguments);
     let said = String::from_utf8(stderr).unwrap();
@@ -53,13 +53,13 @@ fn rows(folder: &TempDir, name: &str) -> Vec<Row> {
     reader.deserialize().map(|row| row.unwrap()).collect()
 }
 
-/// Whether numbers are the same; serde_json reads some of them a bit of their last digit off.
+/// Returns true if two numbers are equal; serde_json may be off in the last digit.
 fn same(one: f64, other: &Value) -> bool {
     let other = other.as_f64().unwrap();
     (one - other).abs() <= 4e-16 * other.abs()
 }
 
-/// Compares rows with what `skinbus explain` says of their epochs; how many torques were not 0.
+/// Compares rows with `skinbus explain` for their epochs. Returns the number of torques other than 0.
 fn compared(folder: &TempDir, rows: &[Row], capture: &str) -> usize {
     let (mut loaded, mut next) = (0, 0.0);
     for row in rows.iter().step_by(EACH).chain(rows.last()) {
@@ -127,7 +127,7 @@ fn rows_are_what_explain_says_of_their_epochs_in_recordings_logs_and_parts() {
             "{capture}: something was touched"
         );
     }
-    // Parts give what the whole gives, whatever their order.
+    // The parts give the same as the whole, in any order.
     said(&folder, &format!("convert {parts} a.csv"), 0);
     said(&folder, "convert split-2.mcap split.mcap split-1.mcap b.csv", 0);
     assert_eq!(
@@ -187,7 +187,7 @@ fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
     }
     assert!(!folder.path().join("out.csv").exists());
     assert_eq!(fs::read_to_string(folder.path().join("mine.csv")).unwrap(), "mine");
-    // A damaged recording leaves nothing.
+    // A damaged recording leaves no file.
     let bytes = fs::read(folder.path().join("fd.mcap")).unwrap();
     let mut damaged = bytes.clone();
     let middle = damaged.len() / 2;
@@ -196,7 +196,7 @@ fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
     let line = said(&folder, "convert damaged.mcap out.csv --skin fd.toml", 1);
     assert!(line.contains("damaged.mcap is damaged"), "{line}");
     assert!(!folder.path().join("out.csv").exists());
-    // One that was cut off gives what is there.
+    // A truncated recording gives its intact part.
     fs::write(folder.path().join("begun.mcap"), &bytes[..middle]).unwrap();
     let line = said(&folder, "convert begun.mcap strict.csv --strict --skin fd.toml", 1);
     assert!(line.contains("it has no end") && !folder.path().join("strict.csv").exists(), "{line}");

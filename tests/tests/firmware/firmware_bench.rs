@@ -161,9 +161,9 @@ fn what_cannot_be_emulated_is_refused_in_one_line() {
     };
     says("--firmware nowhere.elf --emulate 8", "--firmware nowhere.elf: No such file");
     place.write("text", "no program");
-    says("--firmware text --emulate 8", "no ELF file of a 32-bit ARM microcontroller");
+    says("--firmware text --emulate 8", "not an ELF file of a 32-bit ARM microcontroller");
     says(&format!("--firmware {elf} --emulate 77"), "--emulate 77: the skin has no such cell on vcan0");
-    says(&format!("--firmware {elf} --emulate 8,3,8"), "--emulate 8 is there twice");
+    says(&format!("--firmware {elf} --emulate 8,3,8"), "--emulate 8 is given twice");
     says(&format!("--firmware {elf}"), "--emulate");
     says("--emulate 8", "--firmware");
     says(&format!("--firmware {elf} --emulate 8 --no-spawn"), "--no-spawn");

@@ -159,7 +159,7 @@ fn while_a_bus_is_away_the_others_go_on_and_changes_are_sent_to_it_afterwards() 
     }
     // The robot is halted and resumed while the bus does not receive that.
     place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
-    bench.hears("the robot is halted: somebody sent a halt frame; `skinbus frame resume --bus vcan0 --bus-kind embedded`");
+    bench.hears("the robot is halted: a halt frame was received; `skinbus frame resume --bus vcan0 --bus-kind embedded`");
     let second = serve(&place, "vcan1");
     bench.hears("vcan1 works again");
     (1..=4).for_each(|cell| bench.tells_on("vcan1", cell, "come back"));

@@ -151,7 +151,7 @@ fn a_test_that_is_interrupted_puts_the_cell_back() {
         test.signal(signal);
         let ended = test.end();
         assert_eq!(ended.code(), Some(1), "{ended:#?}");
-        assert_eq!(ended.stderr, "skinbus: interrupted; the cell has been put back\n");
+        assert_eq!(ended.stderr, "skinbus: interrupted; the cell has been restored\n");
         assert!(ended.stdout.contains("not tested"), "{ended:#?}");
         assert_eq!(cell.has(), before);
         assert!(!cell.place.path("conformance-vcan0-5.json").exists());
@@ -170,7 +170,7 @@ fn after_a_kill_the_file_puts_the_cell_back() {
     let refused = cell.conformance("").end();
     assert_eq!(
         refused.refusal(2),
-        "skinbus: conformance-vcan0-5.json is there from an earlier test that did not put the cell back: do that with \
+        "skinbus: conformance-vcan0-5.json is left from an earlier test that did not restore the cell: do that with \
          --restore conformance-vcan0-5.json, or delete it"
     );
     cell.conformance("--restore conformance-vcan0-5.json").end().well();
@@ -188,7 +188,7 @@ fn a_cell_that_dies_is_said_and_its_file_is_kept() {
     process::signal(pid, Signal::KILL);
     let ended = test.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    assert!(ended.stderr.contains("the cell was not put back: the cell fell silent"), "{ended:#?}");
+    assert!(ended.stderr.contains("the cell was not restored: the cell fell silent"), "{ended:#?}");
     assert!(ended.stderr.lines().count() == 1, "{ended:#?}");
     cell.restart();
     cell.conformance("--restore conformance-vcan0-5.json").end().well();

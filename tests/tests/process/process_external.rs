@@ -172,11 +172,11 @@ fn a_run_to_which_no_controller_comes_has_an_outcome_of_its_own() {
     place.write("skin.toml", &place.read("skin.toml").replace("start_s = 0.0", "start_s = 600.0"));
     let ended = place.bench(2.0, "--quiet").end();
     assert_eq!((ended.code(), ended.stderr.lines().count()), (Some(4), 1), "{ended:#?}");
-    assert!(ended.stderr.contains("no external controller said hello on "), "{ended:#?}");
+    assert!(ended.stderr.contains("no external controller sent a hello on "), "{ended:#?}");
     let summary = place.summary();
     let bad = summary.count("/loop/bad_cycles", NOBODY);
     assert_eq!((&summary.0["outcome"], bad), (&"no_controller".into(), summary.number("/loop/ticks")));
-    ends_without_controller(|_| {}, "no external controller said hello on ");
+    ends_without_controller(|_| {}, "no external controller sent a hello on ");
 }
 
 #[test]
@@ -198,6 +198,6 @@ fn a_controller_that_says_hello_and_does_not_answer_is_none() {
         // It stays connected, and reads nothing.
         peer = Some(own);
     };
-    ends_without_controller(control, " said hello and answered no tick in time (");
+    ends_without_controller(control, " sent a hello and answered no tick in time (");
     drop(peer);
 }

@@ -374,7 +374,7 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_resumes_it() {
     let sent = place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     assert_eq!(sent.stderr, "sent on vcan0 (embedded)\n");
     bench.hears(
-        "the robot is halted: somebody sent a halt frame; `skinbus frame resume --bus vcan0 --bus-kind embedded` resumes it",
+        "the robot is halted: a halt frame was received; `skinbus frame resume --bus vcan0 --bus-kind embedded` resumes it",
     );
     place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
@@ -390,11 +390,11 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_resumes_it() {
     place.is_left_clean();
     let summary = place.summary();
     summary.adds_up();
-    assert_eq!(summary.0["halted"], "somebody sent a halt frame");
+    assert_eq!(summary.0["halted"], "a halt frame was received");
     let until: Vec<_> =
         summary.0["halts"].as_array().unwrap().iter().map(|it| it["until_s"].is_null()).collect();
     assert_eq!(until, [false, true], "the first one was resumed");
-    assert!(ended.stdout.contains("somebody sent a halt frame"), "{}", ended.stdout);
+    assert!(ended.stdout.contains("a halt frame was received"), "{}", ended.stdout);
 
     let log = Log::read(&place.read("run.log"), Format::Fd);
     let at = |expected: &Message| log.messages.iter().rposition(|(message, _)| message == expected).unwrap();

@@ -152,7 +152,7 @@ fn a_resumed_halt_is_reported_and_the_run_succeeds() {
     let test_client = place.test_client();
     test_client.waits_for_epoch(10);
     place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
-    bench.hears("the robot is halted: somebody sent a halt frame");
+    bench.hears("the robot is halted: a halt frame was received");
     place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     bench.signal(Signal::TERM);

@@ -183,7 +183,7 @@ fn what_cannot_be_covered_is_said_in_a_line() {
     let with = "--package arm_parts=parts";
     for (words, expected) in [
         (cover("fore", ""), "link plate: mesh package://arm_parts/meshes/plate.stl: "),
-        (cover("fore", ""), "is no file: say where the package is with --package arm_parts=DIR"),
+        (cover("fore", ""), "is no file: name its directory with --package arm_parts=DIR"),
         (cover("fore", "--package arm_parts=nowhere"), "nowhere is no folder: correct --package arm_parts="),
         (cover("fore", ""), "; or take it as not there with --leave-out plate"),
         (cover("fore", "--package arm_parts=."), ". is not the package, or lacks this file"),

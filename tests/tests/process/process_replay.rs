@@ -212,7 +212,9 @@ fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
     let ended = place.replay("run.log", "--expect --spawn --skin other.toml --quiet").end();
     let line = ended.refusal(1);
     assert!(
-        line.starts_with("skinbus: the recording is of another skin: all 8 cells have another "),
+        line.starts_with(
+            "skinbus: the recording is of another skin: the configurations of all 8 cells differ, "
+        ),
         "{line}"
     );
     place.is_left_clean();
@@ -240,7 +242,7 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     place.is_left_clean();
     assert_eq!((ended.code(), &replayed.replies()[1..]), (Some(1), &[1, 0, 0][..]), "{:#}", replayed.0);
     assert!(
-        ended.stderr.contains("skinbus: replies are not as they were recorded: 1 different"),
+        ended.stderr.contains("skinbus: replies differ from the recorded ones: 1 different"),
         "{ended:#?}"
     );
     let text = replayed.text("/expect/first/text");

@@ -224,7 +224,7 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     // A run without touches leaves the cell as it is, and reports that its contact is unknown.
     place.scenario(head);
     let ended = place.bench(1.5, "--no-spawn").end().well();
-    let said = "the contact of these cells is not known, their torques are not compared: 3 on vcan0;";
+    let said = "the contact of these cells is unknown, so their torques are not compared: 3 on vcan0;";
     assert!(ended.stderr.contains(said), "{}", ended.stderr);
     let summary = place.summary();
     let unknown = summary.of_bus("/replies/contact_unknown");

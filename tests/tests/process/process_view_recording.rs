@@ -133,15 +133,12 @@ fn what_cannot_be_shown_is_named() {
     for (words, expected) in [
         (
             "view nothing.mcap",
-            "there is no file nothing.mcap: name a skin, whose buses are listened to, a recording, or a bus and its --skin",
+            "there is no file nothing.mcap: name a skin, to show its buses, a recording, or a bus and its --skin",
         ),
-        (
-            "view /dev/null",
-            "/dev/null is no regular file: name a skin, whose buses are listened to, or a recording",
-        ),
+        ("view /dev/null", "/dev/null is not a regular file: name a skin, to show its buses, or a recording"),
         (
             "view -",
-            "there is no file -: name a skin, whose buses are listened to, a recording, or a bus and its --skin",
+            "there is no file -: name a skin, to show its buses, a recording, or a bus and its --skin",
         ),
         ("view text.log text.log", "text.log is named twice: name it once"),
     ] {

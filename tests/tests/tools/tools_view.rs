@@ -217,7 +217,7 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
     browser.value("document.getElementById('halt').click()");
     browser.until(
         "document.getElementById('halted').textContent === \
-         'The robot is halted: somebody sent a halt frame. Press Resume to continue.'",
+         'The robot is halted: a halt frame was received. Press Resume to continue.'",
     );
     let colour = "getComputedStyle(document.getElementById('resume')).backgroundColor";
     assert_eq!(browser.value(colour), "rgb(98, 181, 242)", "the next step is marked");

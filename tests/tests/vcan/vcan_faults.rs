@@ -195,7 +195,10 @@ fn an_interface_that_is_removed_ends_the_run_with_one_line_and_the_log_is_kept()
     assert_eq!(place.summary().0["failure"], removed);
     let log = Log::read(&place.read("run.log"), Format::Fd);
     assert!(!log.torques().is_empty());
-    assert!(stderr.contains(&format!("{} frames until then are in run.log", log.frames.len())), "{stderr}");
+    assert!(
+        stderr.contains(&format!("{} frames received until then are in run.log", log.frames.len())),
+        "{stderr}"
+    );
 
     // Cells that were started by hand report it themselves.
     let vcan5 = Vcan::make("vcan5");

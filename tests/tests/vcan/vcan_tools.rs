@@ -144,7 +144,7 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
     test_client.waits_for("a torque", torque_of(1, true));
     cansend(&place, "halt");
     bench.hears(
-        "the robot is halted: somebody sent a halt frame; `skinbus frame resume --bus vcan0 --bus-kind socketcan` resumes it",
+        "the robot is halted: a halt frame was received; `skinbus frame resume --bus vcan0 --bus-kind socketcan` resumes it",
     );
     let test_client = place.test_client();
     let joints = Cell::new(0);

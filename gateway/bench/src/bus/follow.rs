@@ -1,18 +1,18 @@
-//! Following a bus: waiting, receiving, counting what was dropped, noticing a loss, opening it again, and keeping the
-//! gateway's ends of the wires to its roots.
+//! Following of a bus: waits, receives, counts dropped frames, notices a loss, reopens the bus, and keeps the gateway's
+//! ends of the wires to the roots.
 //!
-//! | state | event | next | returned |
+//! | state | event | next state | returned |
 //! |---|---|---|---|
-//! | `Works`, `Lost` | frames | `Works` | [`Step::Frames`] |
-//! | `Works`, `Lost` | nothing in time | unchanged | [`Step::Nothing`] |
-//! | `Works` | the bus is down | `Drains` | [`Step::Down`], once |
+//! | `Working`, `Lost` | frames arrive | `Working` | [`Step::Frames`] |
+//! | `Working`, `Lost` | timeout | unchanged | [`Step::Nothing`] |
+//! | `Working` | the bus goes down | `Draining` | [`Step::Down`], once |
 //! | `Lost` | the bus is still down | unchanged, after a pause | [`Step::Nothing`] |
-//! | `Drains` | frames from before the loss | unchanged | [`Step::Leftover`] |
-//! | `Drains` | nothing is left | `Lost` | [`Step::Drained`] |
-//! | any but `Gone` | the bus is gone | `Gone` | [`Step::Gone`], once |
-//! | `Gone` | it opens | `Works` | [`Step::Nothing`] |
-//! | `Gone` | it is absent | unchanged | [`Step::Nothing`] |
-//! | `Gone` | it is there and does not open | unchanged | [`Step::Refused`], once for each reason |
+//! | `Draining` | frames from before the loss | unchanged | [`Step::Leftover`] |
+//! | `Draining` | all leftover frames are read | `Lost` | [`Step::Drained`] |
+//! | any but `Gone` | the bus is removed | `Gone` | [`Step::Gone`], once |
+//! | `Gone` | the bus opens | `Working` | [`Step::Nothing`] |
+//! | `Gone` | the bus is still absent | unchanged | [`Step::Nothing`] |
+//! | `Gone` | the bus exists but does not open | unchanged | [`Step::Refused`], once per reason |
 
 use std::thread;
 use std::time::{Duration, Instant};
@@ -23,24 +23,24 @@ use protocol::id::CellId;
 
 use super::roots::Roots;
 
-/// The pause while an interface is down.
+/// Pause while an interface is down.
 const DOWN_PAUSE: Duration = Duration::from_millis(50);
-/// The interval between attempts to open a bus that is gone.
+/// Interval between attempts to reopen a bus that is gone.
 const REOPEN_INTERVAL: Duration = Duration::from_millis(100);
 
-/// An end of a bus that frames are received from.
+/// A receiving end of a bus.
 pub trait Source {
-    /// The open bus; absent before it was opened for the first time.
+    /// The open bus, or `None` before it was opened for the first time.
     fn bus(&self) -> Option<&Bus>;
 
-    /// Opens it again after it has gone.
+    /// Reopens the bus after it has gone.
     ///
     /// # Errors
-    /// When it does not open yet.
+    /// Returns the [`BusError`] that keeps the bus from opening.
     fn reopen(&mut self) -> Result<(), BusError>;
 }
 
-/// A bus that is opened once: when it is gone, its follower ends.
+/// A bus that is never reopened: its follower ends when the bus is gone.
 #[derive(Debug)]
 pub struct Once<'a>(pub &'a Bus);
 
@@ -57,28 +57,28 @@ impl Source for Once<'_> {
 /// The outcome of one [`Follower::step`].
 #[derive(Debug)]
 pub enum Step {
-    /// Frames came: how many are in the inbox.
+    /// Frames arrived; holds the number of frames in the inbox.
     Frames(usize),
-    /// No frame came in time.
+    /// No frame arrived before the timeout.
     Nothing,
     /// The bus is down for now.
     Down(BusError),
-    /// Frames came that were received before the bus went down: how many are in the inbox.
+    /// Frames from before the loss arrived; holds the number of frames in the inbox.
     Leftover(usize),
-    /// All frames from before the loss are read; the next ones show that the bus works again.
+    /// All frames from before the loss are read: later frames show that the bus works again.
     Drained,
-    /// The bus is gone, and has to be opened again.
+    /// The bus is gone and must be reopened.
     Gone(BusError),
-    /// The bus is there and does not open.
+    /// The bus exists but does not open.
     Refused(BusError),
 }
 
-/// Part of what came with a step.
+/// One item received in a step.
 #[derive(Debug)]
 pub enum Part {
-    /// A frame of a cell, of the gateway or of another program.
+    /// A frame from a cell, from the gateway or from another program.
     Frame(Received),
-    /// A root begins or ceases to feed its sum to the gateway.
+    /// A root starts (true) or stops (false) feeding its sum to the gateway.
     Feeds(CellId, bool),
 }
 
@@ -93,39 +93,40 @@ enum State {
     },
 }
 
-/// Follows a bus: its state, and the frames that came last.
+/// Follows a bus: holds its state and the frames received last.
 #[derive(Debug, Default)]
 pub struct Follower {
-    /// The gateway's ends of the wires to the roots, where cells reply with sums.
+    /// The gateway's ends of the wires to the roots, on buses where cells reply with sums.
     pub roots: Option<Roots>,
-    /// How long frames gather after some came, so that one wake-up reads many.
+    /// Time to wait after frames arrive, so that one wake-up reads many.
     gather: Duration,
     inbox: Inbox,
     state: State,
-    /// Frames dropped on sockets before the present one.
+    /// Frames dropped on earlier sockets of this bus.
     dropped_before: u64,
-    /// The reason reported last for which the bus does not open.
+    /// Last reported reason why the bus does not open.
     refused: String,
 }
 
-/// Waits for frames, at most for `wait`, and reads one batch; returns how many came. Replaces what is in the inbox.
+/// Waits up to `wait` for frames and reads one batch into `inbox`, whose former frames are discarded. Returns the
+/// number of frames.
 ///
 /// # Errors
-/// When the bus is down, gone or closed.
+/// Returns [`BusError`] if the bus is down, gone or closed.
 pub fn fill(bus: &Bus, inbox: &mut Inbox, wait: Duration) -> Result<usize, BusError> {
     inbox.clear();
     if bus.wait(Some(wait))? { bus.receive(inbox) } else { Ok(0) }
 }
 
 impl Follower {
-    /// Follows a bus with these wires to roots; lets frames gather for a time after some came.
+    /// Follows a bus that has these wires to roots. `gather` is the time to wait for more frames after some arrived.
     #[must_use]
     pub fn new(roots: Option<Roots>, gather: Duration) -> Self {
         Self { roots, gather, ..Self::default() }
     }
 
-    /// Sends what the wires to roots need, then receives, or goes on with what a loss needs; waits for at most about
-    /// `wait` beside the time to gather.
+    /// Sends due messages on the wires to the roots, then receives or handles a loss. Returns after about `wait` plus
+    /// the time to gather at the latest.
     pub fn step(&mut self, source: &mut impl Source, wait: Duration) -> Step {
         let bus = match source.bus() {
             Some(bus) if !matches!(self.state, State::Gone { .. }) => bus,
@@ -139,14 +140,15 @@ impl Follower {
         if matches!(self.state, State::Drains) {
             return self.drain(|inbox| bus.receive(inbox));
         }
-        // More is behind a full inbox.
+        // A full inbox has more frames behind it: do not wait.
         if (1..BATCH).contains(&self.inbox.frames().len()) {
             thread::sleep(self.gather);
         }
         self.receive(|inbox| fill(bus, inbox, timeout))
     }
 
-    /// Hands on what came with the last step, in its order; frames of the wires to roots stay here.
+    /// Passes each item of the last step to `each`, in order of arrival. Frames on the wires to the roots are handled
+    /// here.
     pub fn parts(&mut self, mut each: impl FnMut(Part)) {
         for received in self.inbox.frames() {
             if let Some(roots) = &mut self.roots
@@ -159,18 +161,18 @@ impl Follower {
         }
     }
 
-    /// The frames that came with the last step, those of the wires to roots too.
+    /// Frames received in the last step, including those on the wires to the roots.
     pub fn frames(&self) -> impl ExactSizeIterator<Item = Received> + '_ {
         self.inbox.frames()
     }
 
-    /// Counts the frames that all sockets of this bus dropped because they were not read in time.
+    /// Number of frames that all sockets of this bus dropped because they were not read in time.
     #[must_use]
     pub fn dropped(&self) -> u64 {
         self.dropped_before + u64::from(self.inbox.dropped())
     }
 
-    /// Tells whether the bus has failed, and was neither opened again nor has shown by a frame that it works.
+    /// Returns true if the bus has failed and has neither been reopened nor delivered a frame since.
     #[must_use]
     pub const fn is_lost(&self) -> bool {
         !matches!(self.state, State::Works)
@@ -196,16 +198,16 @@ impl Follower {
         }
     }
 
-    /// Reads frames from before a loss, which are no sign that the bus works again.
+    /// Reads frames received before a loss. They do not show that the bus works again.
     fn drain(&mut self, receive: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> Step {
-        // A pause before the first of them: what was on its way is there then.
+        // Pause before the first read, so that frames in flight have arrived.
         if self.inbox.frames().len() == 0 {
             thread::sleep(DOWN_PAUSE);
         }
         self.inbox.clear();
         match receive(&mut self.inbox) {
             Ok(count @ 1..) => Step::Leftover(count),
-            // An interface goes down before it is removed, and each is reported once.
+            // An interface goes down before it is removed; both events are reported once.
             Err(error) if !error.may_pass() => self.gone(error),
             Ok(0) | Err(_) => {
                 self.state = State::Lost;
@@ -248,7 +250,7 @@ impl Follower {
     }
 }
 
-/// Tells a bus that is not there from one that is there and does not open.
+/// Returns true if the error means that the bus does not exist, false if it exists and does not open.
 const fn is_absent(error: &BusError) -> bool {
     matches!(
         error,
@@ -274,7 +276,7 @@ mod tests {
         BusError::Gone("vcan0".to_owned())
     }
 
-    /// A bus that opens as told.
+    /// A source whose `reopen` returns these results, last one first.
     struct Scripted(Vec<Result<(), BusError>>);
 
     impl Source for Scripted {

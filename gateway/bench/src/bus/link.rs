@@ -1,7 +1,7 @@
-//! One bus as the threads of a run share it: it may be lost and reopened, and no thread waits for it.
+//! One bus, shared by the threads of a run: it may be lost and reopened, and senders never wait for that.
 //!
-//! The receiver reopens a bus that is gone. The loop finds the new one in a triple buffer, where it neither waits nor
-//! frees anything; threads that may wait use [`Link::send`].
+//! The receiver reopens a bus that is gone. The control loop gets the new bus through a triple buffer, where it neither
+//! blocks nor frees memory. Threads that may block use [`Link::send`].
 
 use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,38 +15,38 @@ use vcan_setup::hosts::report::Reports;
 use super::follow::Source;
 use control::cycle::turn::BusState;
 
-/// One bus.
+/// A bus shared by the threads of a run.
 #[derive(Debug)]
 pub struct Link {
-    /// Its name.
+    /// Name of the bus.
     pub name: String,
-    /// What carries its frames.
+    /// Transport of the frames.
     pub kind: BusKind,
-    /// How many bytes may wait unread, as they were granted when it was first opened.
+    /// Bytes that may wait unread, as granted when the bus was first opened.
     pub receive_buffer: usize,
-    /// Its state.
+    /// State shared with the control loop.
     pub state: Arc<BusState>,
-    /// How it was opened, and is again.
+    /// Options with which the bus was opened, and is reopened.
     target: Options,
     bus: Mutex<Arc<Bus>>,
     gone: AtomicBool,
 }
 
-/// Where the loop finds the bus.
+/// The control loop's end of the triple buffer that holds the open bus.
 pub type Slot = triple_buffer::Output<Arc<Bus>>;
 
 /// The receiver's end of a link.
 #[derive(Debug)]
 pub struct ReceiveEnd {
-    /// The link.
+    /// The link shared with the other threads.
     pub link: Arc<Link>,
-    /// The bus, as it was opened last.
+    /// The bus as opened last.
     pub bus: Arc<Bus>,
     slot: triple_buffer::Input<Arc<Bus>>,
 }
 
 impl Link {
-    /// The link of a bus that was opened with these options.
+    /// Creates the link of a bus that was opened with these options.
     #[must_use]
     pub fn new(bus: Bus, target: Options) -> (Arc<Self>, ReceiveEnd, Slot) {
         let bus = Arc::new(bus);
@@ -63,44 +63,44 @@ impl Link {
         (Arc::clone(&link), ReceiveEnd { link, bus, slot }, output)
     }
 
-    /// Whether it has to be reopened.
+    /// Returns true if the bus must be reopened.
     #[must_use]
     pub fn is_gone(&self) -> bool {
         self.gone.load(Ordering::Relaxed)
     }
 
-    /// Connects to the program that joins it with buses of other hosts.
+    /// Connects to the program that joins this bus with buses of other hosts.
     ///
     /// # Errors
-    /// When there is none.
+    /// Returns [`io::Error`] if no such program runs.
     pub fn reports(&self) -> io::Result<Reports> {
         Reports::connect(&self.name, self.kind, self.target.directory.as_deref())
     }
 
-    /// Sends frames; not for the loop, for a bus that is being exchanged is waited for.
+    /// Sends frames. Not for the control loop: it waits while the bus is being exchanged.
     ///
     /// # Errors
-    /// The reason, and how many were sent before it.
+    /// Returns [`SendError`] with the reason and the number of frames sent before it.
     pub fn send(&self, frames: &[Frame]) -> Result<(), SendError> {
         let bus = Arc::clone(&self.bus.lock().unwrap_or_else(PoisonError::into_inner));
         bus.send(frames)
     }
 }
 
-/// Whether a bus with this error may be used again, by waiting or by reopening it.
+/// Returns true if a bus with this error may work again, after a wait or a reopening.
 #[must_use]
 pub const fn may_return(error: &BusError) -> bool {
     error.may_pass() || error.is_closed()
 }
 
 impl ReceiveEnd {
-    /// Notes that it does not work; `gone` if it has to be reopened. Whether that is a change.
+    /// Marks the bus as not working, and as gone if it must be reopened. Returns true if that is a change.
     pub fn lose(&self, gone: bool) -> bool {
         let bus_event = gone && !self.link.gone.swap(true, Ordering::Relaxed);
         self.link.state.works.swap(false, Ordering::Relaxed) || bus_event
     }
 
-    /// Notes that it works. Whether that is a change.
+    /// Marks the bus as working. Returns true if that is a change.
     pub fn regain(&self) -> bool {
         !self.link.state.works.swap(true, Ordering::Relaxed)
     }
@@ -111,7 +111,7 @@ impl Source for ReceiveEnd {
         Some(&self.bus)
     }
 
-    /// Reopens a bus that is gone, and hands it to all threads.
+    /// Reopens a bus that is gone, and passes it to all threads.
     fn reopen(&mut self) -> Result<(), BusError> {
         let Link { name, kind, target, .. } = &*self.link;
         self.bus = Arc::new(Bus::open(name, Choice::Only(*kind), target)?);
@@ -122,19 +122,19 @@ impl Source for ReceiveEnd {
     }
 }
 
-/// How often a bus was lost, and for how long.
+/// Number and total duration of the losses of a bus.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Outages {
-    /// How often.
+    /// Number of losses.
     pub times: u64,
-    /// For how long in total, without the present outage.
+    /// Total duration without the present outage.
     lost: Duration,
-    /// Since when it is lost.
+    /// Start of the present outage.
     since: Option<Instant>,
 }
 
 impl Outages {
-    /// It is lost from now on, if it was not.
+    /// Begins an outage unless one lasts.
     pub fn begin(&mut self, now: Instant) {
         if self.since.is_none() {
             self.times += 1;
@@ -142,12 +142,12 @@ impl Outages {
         }
     }
 
-    /// It is there again.
+    /// Ends the present outage.
     pub fn end(&mut self, now: Instant) {
         self.lost += self.since.take().map_or(Duration::ZERO, |since| now.saturating_duration_since(since));
     }
 
-    /// For how long it was lost until now.
+    /// Total lost time up to `now`, including the present outage.
     #[must_use]
     pub fn lost(&self, now: Instant) -> Duration {
         let mut until_now = *self;
@@ -155,7 +155,7 @@ impl Outages {
         until_now.lost
     }
 
-    /// Whether it is lost.
+    /// Returns true during an outage.
     #[must_use]
     pub const fn lasts(&self) -> bool {
         self.since.is_some()

@@ -1,4 +1,4 @@
-//! An open bus on which others send: receives their frames, and sends single packets.
+//! An open bus on which others send: receives their frames and sends single packets.
 
 use std::time::Duration;
 
@@ -11,11 +11,11 @@ use protocol::time::Micros;
 use super::follow::fill;
 use super::realtime::wall;
 
-/// Opens a bus for frames of this format; with `None` for FD frames, or for classic frames alone where its interface
-/// takes no others.
+/// Opens a bus for frames of this format. `None` means FD frames, or classic frames if the interface carries only
+/// those.
 ///
 /// # Errors
-/// When it cannot be opened.
+/// Returns [`BusError`] if the bus cannot be opened.
 pub fn open(name: &str, kind: Choice, format: Option<Format>, options: Options) -> Result<Bus, BusError> {
     let options = Options { fd: format != Some(Format::Classic), ..options };
     match Bus::open(name, kind, &options) {
@@ -26,7 +26,7 @@ pub fn open(name: &str, kind: Choice, format: Option<Format>, options: Options) 
     }
 }
 
-/// The time, on the clock of received frames.
+/// The present time on the clock of received frames.
 #[must_use]
 pub fn now() -> Micros {
     Micros(wall() / 1_000)
@@ -35,13 +35,13 @@ pub fn now() -> Micros {
 /// Sends one packet in frames of this format.
 ///
 /// # Errors
-/// When the bus does not take it.
+/// Returns [`BusError`] if the bus refuses the frames.
 pub fn send(bus: &Bus, message: &Message, format: Format) -> Result<(), BusError> {
     let frames: Vec<Frame> = message.encode().frames(format).collect();
     bus.send(&frames).map_err(BusError::from)
 }
 
-/// What comes on a bus.
+/// Receives and decodes the frames of a bus.
 #[derive(Debug)]
 pub struct Listener {
     bus: Bus,
@@ -50,38 +50,38 @@ pub struct Listener {
 }
 
 impl Listener {
-    /// Receives on a bus whose packets travel in this format; with `None` each frame has its own.
+    /// Receives on a bus whose packets have this format; with `None`, each frame has its own format.
     #[must_use]
     pub fn new(bus: Bus, format: Option<Format>) -> Self {
         Self { bus, inbox: Inbox::new(), decoder: Decoder::new(format) }
     }
 
-    /// The bus.
+    /// The open bus.
     #[must_use]
     pub const fn bus(&self) -> &Bus {
         &self.bus
     }
 
-    /// Frames that came faster than they were read.
+    /// Number of frames that were lost because they arrived faster than they were read.
     #[must_use]
     pub const fn dropped(&self) -> u32 {
         self.inbox.dropped()
     }
 
-    /// Takes the frames that are there, or come within this time; whether there are any.
+    /// Receives the frames that are waiting or arrive within `wait`. Returns true if there are any.
     ///
     /// # Errors
-    /// When the bus is down, gone or closed.
+    /// Returns [`BusError`] if the bus is down, gone or closed.
     pub fn hear(&mut self, wait: Duration) -> Result<bool, BusError> {
         fill(&self.bus, &mut self.inbox, wait).map(|count| count > 0)
     }
 
-    /// The frames that were taken last.
+    /// The frames received last.
     pub fn frames(&self) -> impl Iterator<Item = Received> + '_ {
         self.inbox.frames()
     }
 
-    /// The same, decoded.
+    /// The frames received last, decoded.
     pub fn decoded(&mut self) -> impl Iterator<Item = (Received, Decoded)> + '_ {
         let Self { bus, inbox, decoder } = self;
         inbox.frames().map(|received| {
@@ -91,10 +91,10 @@ impl Listener {
     }
 }
 
-/// Turns the error of a bus that is down or full into `None` after this pause: it may be used again soon.
+/// Turns the error of a bus that is down or full into `None` after `pause`, because the bus may soon be usable again.
 ///
 /// # Errors
-/// The other errors.
+/// Returns all other errors.
 pub fn passing<T>(done: Result<T, BusError>, pause: Duration) -> Result<Option<T>, BusError> {
     match done {
         Ok(done) => Ok(Some(done)),

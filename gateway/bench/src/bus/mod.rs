@@ -1,13 +1,13 @@
-//! Buses as a live bench uses them: opened or served, received from, sent on.
+//! Buses of a live bench: opened or served, received from, sent on.
 //!
 //! | module | what |
 //! |---|---|
-//! | [`follow`] | the one way to follow a bus: waits, receives, counts, reopens, keeps the wires to roots |
-//! | [`listen`] | an open bus on which others send: frames, decoded |
-//! | [`link`] | one bus of a run, shared by its receiver and its senders, and opened again after a loss |
-//! | [`roots`] | the gateway's ends of the wires to the roots of a tree, and the frames that it receives |
-//! | [`served`] | embedded buses that are served from here |
-//! | [`realtime`] | clocks, deadlines and the privileges of threads |
+//! | [`follow`] | follows a bus: waits, receives, counts losses, reopens, keeps the wires to the roots |
+//! | [`listen`] | receives and decodes frames of an open bus |
+//! | [`link`] | one bus of a run, shared by its receiver and its senders, and reopened after a loss |
+//! | [`roots`] | the gateway's ends of the wires to the roots of a tree, and its receive filters |
+//! | [`served`] | embedded buses served by this process |
+//! | [`realtime`] | clocks, deadlines and thread privileges |
 
 pub mod follow;
 pub mod link;

@@ -1,5 +1,4 @@
-//! The clock of the control loop: absolute deadlines, and the privileges that the machine grants its
-//! thread.
+//! Clock of the control loop: absolute deadlines, and the privileges that the machine grants to the loop's thread.
 
 use std::sync::atomic::Ordering;
 use std::thread;
@@ -17,54 +16,54 @@ use control::cycle::Tick;
 use control::cycle::turn::{Shared, Turn};
 use model::quantiles::histogram;
 
-/// The loop's priority: above ordinary threads, below the kernel's own.
+/// Priority of the control loop: above ordinary threads, below the kernel's own.
 const PRIORITY: i32 = 40;
-/// A receiver's: simulated cells that share its processor must not keep it from reading what they send.
+/// Priority of a receiver: above simulated cells on the same processor, so that it reads what they send in time.
 const RECEIVER_PRIORITY: i32 = 30;
 
-/// Wake-ups of the idle machine that are measured.
+/// Number of wake-ups measured on the idle machine.
 const IDLE_WAKEUPS: u32 = 100;
 
-/// What the machine granted.
+/// Privileges that the machine granted.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Granted {
-    /// `SCHED_FIFO`.
+    /// True if the thread runs with `SCHED_FIFO`.
     pub fifo: bool,
-    /// All memory locked.
+    /// True if all memory is locked.
     pub locked: bool,
 }
 
-/// Makes the calling thread as punctual as the machine allows.
+/// Gives the calling thread the most punctual scheduling that the machine grants.
 pub fn prepare() -> Granted {
     let granted = Granted {
         fifo: system_calls::set_fifo(PRIORITY),
-        // Only touched pages are locked, or every thread's whole stack would count.
+        // Lock only touched pages: locking each thread's whole stack would exceed the limit.
         locked: mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT).is_ok(),
     };
     system_calls::set_timer_slack(1);
     granted
 }
 
-/// The same for a receiver's thread, which may be a little late.
+/// Gives a receiver's thread real-time scheduling, below that of the loop.
 pub(crate) fn prepare_receiver() {
     system_calls::set_fifo(RECEIVER_PRIORITY);
 }
 
-/// The monotonic clock in ns.
+/// Monotonic clock in ns.
 #[must_use]
 pub fn now() -> u64 {
     let Timespec { tv_sec, tv_nsec } = clock_gettime(ClockId::Monotonic);
     u64::try_from(tv_sec).unwrap_or(0) * 1_000_000_000 + u64::try_from(tv_nsec).unwrap_or(0)
 }
 
-/// The wall clock in ns since 1970.
+/// Wall clock in ns since 1970.
 #[must_use]
 pub fn wall() -> u64 {
     let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     u64::try_from(wall.as_nanos()).unwrap_or(u64::MAX)
 }
 
-/// Sleeps until the monotonic clock reads `deadline` ns; a signal does not end it early.
+/// Sleeps until the monotonic clock reads `deadline` ns. Signals do not end the sleep.
 pub(crate) fn sleep_until(deadline: u64) {
     let seconds = i64::try_from(deadline / 1_000_000_000).unwrap_or(i64::MAX);
     let nanos = i64::try_from(deadline % 1_000_000_000).unwrap_or(0);
@@ -74,7 +73,7 @@ pub(crate) fn sleep_until(deadline: u64) {
     {}
 }
 
-/// How late this machine wakes a punctual thread that has nothing to do, in ns, at the period of a loop.
+/// Measures how late this machine wakes a punctual, idle thread, in ns, at the period of a loop.
 pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
     let measure = move || {
         prepare();
@@ -82,7 +81,7 @@ pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
         for _ in 0..IDLE_WAKEUPS {
             deadline += period_ns;
             sleep_until(deadline);
-            // It resizes itself, so recording cannot fail.
+            // The histogram resizes itself, so recording cannot fail.
             let _ = histogram.record(now().saturating_sub(deadline));
         }
         histogram
@@ -91,8 +90,7 @@ pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
     measuring.and_then(|measuring| measuring.join().ok()).unwrap_or_else(histogram)
 }
 
-/// Runs ticks until there were `ticks` of them or it is stopped. Whole periods that were missed are
-/// skipped; the phase is never reset.
+/// Runs `ticks` ticks, or fewer if the loop is stopped. Skips whole periods that were missed; never resets the phase.
 pub fn run(
     turn: &mut Turn,
     shared: &Shared,

@@ -1,4 +1,4 @@
-//! A receiver's end of the wires between a bus' roots and the gateway.
+//! The gateway's end of the wires between the roots of a bus and the gateway.
 
 use std::time::{Duration, Instant};
 
@@ -12,36 +12,36 @@ use protocol::time::Micros;
 
 use model::network::Uplinks;
 
-/// The wires of a bus' roots, and the protocol on them.
+/// The wires to the roots of a bus, and the protocol on them.
 #[derive(Debug)]
 pub struct Roots {
     uplinks: Uplinks,
-    /// Each root, with the link on which the gateway sends to it, and whether its sums are for the gateway.
+    /// Each root, the link on which the gateway sends to it, and true if its sums are for the gateway.
     roots: Vec<(CellId, LinkId, bool)>,
     began: Instant,
-    /// Whether the gateway sends: if it begins before all its cells are there, the first ones make a tree that
-    /// is deeper than necessary.
+    /// True once the gateway sends. If it starts before all its cells are present, the first cells build a tree deeper
+    /// than necessary.
     explores: bool,
 }
 
-/// A bus' roots and the links on which the gateway sends to them; none if cells answer with their own torques.
+/// The roots of a bus and the links on which the gateway sends to them. Empty if cells answer with their own torques.
 fn roots(skin: &Skin, bus: usize) -> Vec<(CellId, LinkId)> {
     let sums = skin.buses.get(bus).is_some_and(|bus| bus.reply != Reply::Torque);
     if sums { skin.wires(bus).roots().collect() } else { Vec::new() }
 }
 
-/// What a gateway receives of a bus.
+/// Frames that a gateway receives from a bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct ReceiveFilter {
-    /// What its socket lets pass.
+    /// Filters of the gateway's socket.
     pub filters: Vec<Filter>,
-    /// Whether sums of cells that are no roots pass.
+    /// True if sums of cells that are not roots pass.
     pub all_sums: bool,
 }
 
 impl ReceiveFilter {
-    /// Everything, but of simulated wires only those that lead to the gateway; and unless `everything`, of sums only
-    /// those of roots.
+    /// The filter of a bus: all frames, except that of simulated wires only those to the gateway pass, and of sums only
+    /// those of roots unless `everything` is set.
     #[must_use]
     pub fn of(skin: &Skin, bus: usize, everything: bool) -> Self {
         let roots = roots(skin, bus);
@@ -50,13 +50,13 @@ impl ReceiveFilter {
         }
         let standard = |id, mask| Filter { id, mask: mask | EXTENDED };
         let sums_of_roots = || {
-            // All kinds but that of sums, remote frames of any, and each root's.
+            // All kinds except sums, remote frames of any kind, and each root's sums.
             let kinds = [standard(0x000, 0x700), standard(0x200, 0x600), standard(0x400, 0x400)];
             let remote = Filter { id: REMOTE, mask: EXTENDED | REMOTE };
             let roots = roots.iter().map(|(root, _)| Filter::exact(Id::new(Kind::Sum, Node::Cell(*root))));
             kinds.into_iter().chain([remote]).chain(roots).collect::<Vec<_>>()
         };
-        // Identifiers of 29 bits that are no wire's are foreign, and pass so that they are counted.
+        // 29-bit identifiers that belong to no wire are foreign; they pass so that they are counted.
         let foreign = Filter { id: EXTENDED, mask: EXTENDED | FLAG };
         let wires = roots.iter().map(|(_, link_id)| Filter::link_id(link_id.reversed()));
         let others: Vec<_> = [foreign].into_iter().chain(wires).collect();
@@ -68,12 +68,13 @@ impl ReceiveFilter {
 }
 
 impl Roots {
-    /// Those of a bus; `None` where cells answer with their own torques.
+    /// The roots of a bus, or `None` if its cells answer with their own torques.
     #[must_use]
     pub fn of(skin: &Skin, bus: usize) -> Option<Self> {
         let roots: Vec<_> =
             roots(skin, bus).into_iter().map(|(root, link_id)| (root, link_id, false)).collect();
-        // An earlier gateway counted its walks too, to an unknown count; process ids are often neighbours.
+        // An earlier gateway counted its walks too, up to an unknown number, and process ids are often adjacent: spread
+        // the start.
         let walk = std::process::id().wrapping_mul(37).to_le_bytes()[0];
         (!roots.is_empty()).then(|| Self {
             uplinks: Uplinks::new(roots.len(), walk, Micros(0)),
@@ -83,17 +84,17 @@ impl Roots {
         })
     }
 
-    /// The wire frames that have to pass to receive the roots.
+    /// Filters for the wire frames that come from the roots.
     pub fn filters(&self) -> impl Iterator<Item = Filter> {
         self.roots.iter().map(|(_, link_id, _)| Filter::link_id(link_id.reversed()))
     }
 
-    /// The gateway sends from now on.
+    /// Starts sending on the wires.
     pub const fn explore(&mut self) {
         self.explores = true;
     }
 
-    /// Roots whose sums are for the gateway now and were not, or the other way round, since the last call.
+    /// Roots that started (true) or stopped (false) feeding the gateway since the last call.
     pub fn changes(&mut self) -> impl Iterator<Item = (CellId, bool)> {
         let uplinks = &self.uplinks;
         self.roots.iter_mut().enumerate().filter_map(|(place, (root, _, feeds))| {
@@ -106,7 +107,7 @@ impl Roots {
         Micros::after(self.began.elapsed())
     }
 
-    /// Takes a frame that came from the bus; whether it was one of a wire, which is handled here alone.
+    /// Handles a frame from the bus. Returns true if it was a wire frame, which only this type handles.
     pub fn take(&mut self, frame: &Frame) -> bool {
         let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) else {
             if let Ok(Id { kind: Kind::Network, node }) = packet::data_id(frame)
@@ -126,7 +127,7 @@ impl Roots {
         true
     }
 
-    /// Sends what is due.
+    /// Sends all due messages.
     pub fn speak(&mut self, bus: &Bus) {
         if !self.explores {
             return;
@@ -135,13 +136,13 @@ impl Roots {
         self.uplinks.handle_time(now);
         while let Some((root, message)) = self.uplinks.poll_transmit() {
             if let Some((_, link_id, _)) = self.roots.get(root) {
-                // What the bus does not take is requested again.
+                // A message that the bus refuses is requested again.
                 let _ = bus.offer(&[link_id.frame(message)]);
             }
         }
     }
 
-    /// How long nothing has to be sent, if nothing comes.
+    /// Time until the next message is due if no frame arrives.
     #[must_use]
     pub fn timeout(&self) -> Duration {
         if !self.explores {
@@ -185,7 +186,7 @@ mod tests {
     #[test]
     fn a_gateway_takes_sums_of_roots_and_its_own_wires_and_all_that_is_no_wire() {
         let skin = skin("reply = \"sum\"\nslot_us = 1500");
-        // Wire 0 is between the cells, wire 1 is the root's.
+        // Wire 0 connects the two cells; wire 1 connects the root to the gateway.
         let wire = |wire, back| LinkId { wire, back }.frame(protocol::port::PortMessage::Join);
         for everything in [false, true] {
             let receive_filter = ReceiveFilter::of(&skin, 0, everything);

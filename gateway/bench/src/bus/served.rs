@@ -1,4 +1,4 @@
-//! Embedded buses that this gateway serves itself, each in a process of its own.
+//! Embedded buses that this gateway serves, each in a process of its own.
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -9,8 +9,7 @@ use thiserror::Error;
 
 use crate::processes::{LaunchError, apart, end, program, spawn};
 
-/// An embedded bus in a process of its own, so that it takes its socket away even when the gateway is
-/// killed.
+/// An embedded bus in a process of its own, which removes its socket even if the gateway is killed.
 #[derive(Debug)]
 pub struct ServedBus {
     bus: String,
@@ -18,17 +17,17 @@ pub struct ServedBus {
 }
 
 impl ServedBus {
-    /// Serves a bus and waits until clients can connect; in a directory, if not in the usual one.
+    /// Serves a bus, in `directory` or else in the usual one, and waits until clients can connect.
     ///
     /// # Errors
-    /// When the program does not start or does not say that it serves.
+    /// Returns [`LaunchError`] if the program does not start or does not report that it serves the bus.
     pub fn start(program: &Path, bus: &str, directory: Option<&Path>) -> Result<Self, LaunchError> {
         let mut served = Self::begin(program, bus, directory)?;
         served.wait(program)?;
         Ok(served)
     }
 
-    /// Starts the program, which serves the bus soon.
+    /// Starts the program, which will serve the bus.
     fn begin(program: &Path, bus: &str, directory: Option<&Path>) -> Result<Self, LaunchError> {
         let mut command = Command::new(program);
         command.args(["serve", bus, "--until-eof"]).stdin(Stdio::piped()).stdout(Stdio::piped());
@@ -49,60 +48,60 @@ impl ServedBus {
         Err(LaunchError::Serve { path: program.to_owned(), bus: self.bus.clone() })
     }
 
-    /// Its process.
+    /// Process id of the server.
     #[must_use]
     pub fn pid(&self) -> u32 {
         self.child.id()
     }
 
-    /// The bus.
+    /// Name of the bus.
     #[must_use]
     pub fn bus(&self) -> &str {
         &self.bus
     }
 
-    /// Ends its process, which takes its socket away; clients find a closed connection.
+    /// Ends the server process, which removes its socket; clients find a closed connection.
     pub fn end(&mut self) {
-        // Its standard input ends, and so does it.
+        // The server ends when its standard input does.
         drop(self.child.stdin.take());
         end(&mut [&mut self.child]);
     }
 
-    /// How its process ended, if it did.
+    /// Exit status of the server, or `None` while it runs.
     pub fn ended(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().ok().flatten()
     }
 }
 
-/// A bus that is neither opened nor served.
+/// An error of a bus that can neither be opened nor served.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ServeError {
-    /// It does not open.
+    /// The bus does not open.
     #[error(transparent)]
     Bus(#[from] BusError),
-    /// Its server does not start.
+    /// The server does not start.
     #[error(transparent)]
     Launch(#[from] LaunchError),
 }
 
-/// A bus to be opened: its name, its kind, and how.
+/// A bus to open: its name, its kind and its options.
 pub type Target<'a> = (&'a str, Choice, Options);
 
-/// Whether a bus may be made that is on this machine neither as an interface nor as an embedded bus, where either would do
+/// Handling of a bus that exists neither as an interface nor as an embedded bus, if either kind would do
 /// ([`Choice::Auto`]).
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Absent {
-    /// An embedded bus is made: all cells are started here.
+    /// Create an embedded bus: all its cells are started here.
     Made,
-    /// An error: an empty bus would not be the one that cells are on.
+    /// Return an error: the cells would not be on a new, empty bus.
     Refused,
 }
 
-/// Opens a bus; an embedded one without a server is served.
+/// Opens a bus. Serves an embedded bus that has no server.
 ///
 /// # Errors
-/// When it does not open, or is not served.
+/// Returns [`ServeError`] if the bus does not open or cannot be served.
 pub fn open_or_serve(
     name: &str,
     kind: Choice,
@@ -114,10 +113,10 @@ pub fn open_or_serve(
     Ok((bus, served.pop()))
 }
 
-/// Opens buses, in this order; embedded ones without a server are served, and all their servers start at once.
+/// Opens buses in this order. Serves embedded buses that have no server; all their servers start at once.
 ///
 /// # Errors
-/// When one does not open, or is not served.
+/// Returns [`ServeError`] if a bus does not open or cannot be served.
 pub fn open_or_serve_all(
     buses: &[Target<'_>],
     absent: Absent,
@@ -143,7 +142,7 @@ pub fn open_or_serve_all(
             Err((program, mut served)) => {
                 served.wait(&program)?;
                 all_served.push(served);
-                // Not by the choice: an interface of this name may have come meanwhile.
+                // Not by the user's choice: an interface of this name may have appeared meanwhile.
                 Bus::open(name, Choice::Only(BusKind::Embedded), target)?
             }
         });

@@ -1,4 +1,4 @@
-//! A firmware's file: who a cell is goes into it before it is loaded.
+//! Firmware images: the identity of a cell is written into the image before it is loaded.
 
 use std::path::{Path, PathBuf};
 
@@ -7,59 +7,59 @@ use protocol::factory::{self, Factory};
 use protocol::input;
 use thiserror::Error;
 
-/// Where the flash of the emulated microcontroller is, and how many bytes it has.
+/// Address range of the emulated microcontroller's flash.
 const FLASH: std::ops::Range<u64> = 0..256 << 10;
 
-/// The most bytes that are read of a file; with all debug information a firmware has 4 MB.
+/// Size limit of a firmware file in bytes; a firmware with full debug information has 4 MB.
 const LONGEST: u64 = 64 << 20;
 
-/// Why a file is no firmware of a cell.
+/// An error of a file that is not the firmware of a cell.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum FirmwareError {
-    /// It cannot be read.
-    #[error("--firmware {path}: {source}; docs/how-to/firmware.md says how one is built")]
+    /// The file cannot be read.
+    #[error("--firmware {path}: {source}; docs/how-to/firmware.md explains how to build one")]
     Read {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         source: std::io::Error,
     },
-    /// It is none for this kind of microcontroller.
+    /// The file is not for this kind of microcontroller.
     #[error(
-        "--firmware {path}: no ELF file of a 32-bit ARM microcontroller; docs/how-to/firmware.md builds one"
+        "--firmware {path}: not an ELF file of a 32-bit ARM microcontroller; docs/how-to/firmware.md explains how to build one"
     )]
     NotArm {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
-    /// It has no place for the factory's record.
+    /// The file has no section for the factory's record.
     #[error("--firmware {path}: it has no section {section}, so it is not the firmware of a cell", section = factory::SECTION)]
     NoCell {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
-    /// It is for another board.
+    /// The file is for another board.
     #[error("--firmware {path}: it is for a board without an emulator; build it with `--features microbit`")]
     OtherBoard {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
     },
 }
 
-/// A firmware that was read.
+/// A firmware image in memory.
 #[derive(Clone, Debug)]
 pub struct Firmware {
     bytes: Vec<u8>,
-    /// Where the factory's record is in the file.
+    /// Offset of the factory's record in the image.
     record: usize,
 }
 
 impl Firmware {
-    /// Reads a file.
+    /// Reads a firmware file.
     ///
     /// # Errors
-    /// When it is not there, or not the firmware of a cell for the emulated board.
+    /// Returns [`FirmwareError`] if the file cannot be read or is not the firmware of a cell for the emulated board.
     pub fn read(path: &Path) -> Result<Self, FirmwareError> {
         let path = path.to_owned();
         match input::bytes(&path, LONGEST) {
@@ -87,7 +87,7 @@ impl Firmware {
         }
     }
 
-    /// The file of one cell.
+    /// Returns the image with the factory's record of one cell.
     #[must_use]
     pub fn of(&self, factory: &Factory) -> Vec<u8> {
         let mut bytes = self.bytes.clone();
@@ -110,10 +110,10 @@ mod tests {
     fn what_is_no_firmware_is_named() {
         let missing = Firmware::read(Path::new("/nowhere/cell")).unwrap_err().to_string();
         assert!(missing.starts_with("--firmware /nowhere/cell: No such file"), "{missing}");
-        assert!(error(b"nothing").contains("no ELF file of a 32-bit ARM microcontroller"));
+        assert!(error(b"nothing").contains("not an ELF file of a 32-bit ARM microcontroller"));
         let own = std::fs::read(std::env::current_exe().unwrap()).unwrap();
         assert!(
-            error(&own).contains("no ELF file of a 32-bit ARM microcontroller"),
+            error(&own).contains("not an ELF file of a 32-bit ARM microcontroller"),
             "this test's own program"
         );
     }

@@ -1,4 +1,4 @@
-//! The lines of emulated cells: a thread for each bus, and in it one participant of the bus for each line.
+//! slcan lines of emulated cells: one thread per bus, in which each line is a participant of the bus.
 
 use std::collections::BTreeMap;
 use std::io::{PipeWriter, pipe};
@@ -10,16 +10,16 @@ use vcan_setup::slcan::{Address, Bridge, LineOptions, Settings};
 
 use super::EmulateError;
 
-/// Lines of some buses, until this is dropped.
+/// The lines of some buses; dropping it ends them.
 #[derive(Debug, Default)]
 pub(super) struct Lines {
     buses: Vec<Bus>,
 }
 
-/// The lines of a bus.
+/// The thread that serves the lines of a bus.
 #[derive(Debug)]
 struct Bus {
-    /// Its other end hangs up when this is closed, which ends the thread.
+    /// Closing this end of the pipe ends the thread.
     stop: Option<PipeWriter>,
     thread: Option<JoinHandle<()>>,
 }
@@ -31,16 +31,16 @@ pub(super) struct Planned {
 }
 
 impl Planned {
-    /// Adds a line to a bus: its socket, and what passes to it.
+    /// Adds a line to a bus: its socket and the filters of its cell.
     pub(super) fn add(&mut self, bus: &str, kind: Choice, socket: PathBuf, filters: Vec<Filter>) {
         let line = LineOptions { filters, ..LineOptions::new(Address::Unix(socket)) };
         self.by_bus.entry(bus.to_owned()).or_insert((kind, Vec::new())).1.push(line);
     }
 
-    /// Joins them. Lines that are away, because their emulator is not there yet or again, are waited for.
+    /// Joins the lines to their buses. Waits for lines whose emulator is not running yet.
     ///
     /// # Errors
-    /// When a bus does not open or there is no thread.
+    /// Returns [`EmulateError`] if a bus does not open or a thread cannot be started.
     pub(super) fn join(self, directory: Option<&Path>) -> Result<Lines, EmulateError> {
         let mut lines = Lines::default();
         for (bus, (choice, options)) in self.by_bus {
@@ -48,7 +48,7 @@ impl Planned {
             let (stopped, stop) = pipe().map_err(EmulateError::Lines)?;
             let bridge = Bridge::open(settings, options)?;
             let work = move || {
-                // A line goes away with its emulator, whose end is reported.
+                // A line ends with its emulator, whose exit is reported elsewhere.
                 drop(bridge.run(stopped, |_, _| {}));
             };
             let thread = std::thread::Builder::new().name("slcan".to_owned()).spawn(work);

@@ -1,4 +1,4 @@
-//! Cells that run the machine code of a microcontroller: an emulator each, wired to the bus by slcan.
+//! Emulated cells, which run the machine code of a microcontroller: one emulator each, wired to the bus by slcan.
 //!
 //! ```text
 //!   bus <── client with the cell's filters ── slcan line (UNIX socket) ──> UART of qemu-system-arm -M microbit
@@ -32,35 +32,35 @@ use crate::setup::Timeout;
 pub use firmware::{Firmware, FirmwareError};
 use line::{Lines, Planned};
 
-/// The emulator.
+/// Program name of the emulator.
 const QEMU: &str = "qemu-system-arm";
 
-/// Which cells are emulated.
+/// The cells to emulate.
 #[derive(Clone, Debug)]
 pub struct Emulated {
-    /// The firmware's file.
+    /// Path of the firmware's file.
     pub firmware: PathBuf,
-    /// The cells, as indices into the skin's.
+    /// Indices into the skin's cells.
     pub cells: Vec<usize>,
 }
 
-/// Why cells are not emulated.
+/// An error that keeps cells from being emulated.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum EmulateError {
-    /// The firmware is none.
+    /// The firmware file is not usable.
     #[error(transparent)]
     Firmware(#[from] FirmwareError),
-    /// There is no emulator.
+    /// The emulator is not installed.
     #[error("{QEMU} is not in PATH, and --emulate needs it: apt-get install {QEMU}")]
     NoEmulator,
-    /// There is no room for files.
+    /// Files cannot be written.
     #[error("files of emulated cells: {0}; set TMPDIR to a folder with room")]
     Files(#[source] std::io::Error),
-    /// A path has what the emulator's command line cannot carry.
+    /// The path contains characters that the emulator's command line cannot carry, or is too long.
     #[error("--flash {0}: paths of emulated cells have at most 240 bytes, UTF-8 and no spaces")]
     Path(PathBuf),
-    /// Cells of another run keep their flash there.
+    /// Cells of another run keep their flash in this directory.
     #[error(
         "--flash {0}: emulated cells of another run use it: end that one first, or name another directory"
     )]
@@ -68,10 +68,10 @@ pub enum EmulateError {
     /// A line or a process does not start.
     #[error(transparent)]
     Launch(#[from] LaunchError),
-    /// Lines are not joined to a bus.
+    /// Lines cannot be joined to a bus.
     #[error(transparent)]
     Bridge(#[from] BridgeError),
-    /// The system gives no thread, or no pipe.
+    /// The system grants no thread or no pipe.
     #[error("lines of emulated cells: {0}")]
     Lines(#[source] std::io::Error),
     /// A bus does not open.
@@ -82,10 +82,10 @@ pub enum EmulateError {
     NotCommissioned {
         /// The cell and its bus.
         cell: String,
-        /// Why.
+        /// Cause.
         why: String,
     },
-    /// Commissioning came to no end.
+    /// Commissioning did not finish.
     #[error("emulated cells were not commissioned: {0}")]
     Commission(String),
     /// An emulator ended.
@@ -93,16 +93,16 @@ pub enum EmulateError {
     Ended {
         /// The cell and its bus.
         cells: String,
-        /// How it ended.
+        /// Exit status or reason.
         how: String,
     },
-    /// It was interrupted.
+    /// A signal interrupted the start.
     #[error("interrupted while starting")]
     Interrupted,
 }
 
 impl EmulateError {
-    /// 2 for wrong use or configuration, 1 for cells that failed.
+    /// Exit code: 2 for wrong use or configuration, 1 for cells that failed.
     #[must_use]
     pub const fn exit_code(&self) -> u8 {
         match self {
@@ -131,17 +131,17 @@ pub(crate) struct Emulator<'a> {
     cells: &'a [usize],
 }
 
-/// Emulated cells: their files and lines. Their processes are among the others; end those first.
+/// Files and lines of emulated cells. End their processes, which are among the others, before dropping it.
 #[derive(Debug)]
 pub(crate) struct Emulation {
-    /// The lines hang up before their sockets go away.
+    /// Dropped first: the lines hang up before their sockets are removed.
     _lines: Lines,
     _files: TempDir,
     /// Locked as long as it is open.
     _flash: Option<File>,
 }
 
-/// What emulated cells share.
+/// Settings that all emulated cells share.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Bench<'a> {
     pub(crate) skin: &'a Skin,
@@ -151,10 +151,10 @@ pub(crate) struct Bench<'a> {
 }
 
 impl<'a> Emulator<'a> {
-    /// Reads the firmware and looks for the emulator.
+    /// Reads the firmware and finds the emulator in `PATH`.
     ///
     /// # Errors
-    /// When one of them is not there.
+    /// Returns [`EmulateError`] if either is missing.
     pub(crate) fn new(emulated: &'a Emulated) -> Result<Self, EmulateError> {
         let firmware = Firmware::read(&emulated.firmware)?;
         let path = std::env::var_os("PATH").unwrap_or_default();
@@ -162,10 +162,10 @@ impl<'a> Emulator<'a> {
         Ok(Self { firmware, qemu: qemu.ok_or(EmulateError::NoEmulator)?, cells: &emulated.cells })
     }
 
-    /// Starts the cells, adds their processes to the others, and joins them to their buses, which are there.
+    /// Starts the cells, adds their processes to the others, and joins them to their buses, which must exist.
     ///
     /// # Errors
-    /// When something does not start.
+    /// Returns [`EmulateError`] if something does not start.
     pub(crate) fn start(
         &self,
         bench: &Bench<'_>,
@@ -188,7 +188,7 @@ impl<'a> Emulator<'a> {
         Ok(Emulation { _lines, _files: files, _flash })
     }
 
-    /// Starts an emulator. It waits for its line.
+    /// The command of an emulator, which waits for its line.
     fn command(&self, place: &Place, log: File) -> Command {
         let mut command = Command::new(&self.qemu);
         command.args(["-M", "microbit", "-display", "none", "-monitor", "none", "-serial", "chardev:line"]);
@@ -201,10 +201,10 @@ impl<'a> Emulator<'a> {
         command
     }
 
-    /// Writes the skin's parameters into the cells, as into any others, which are the only ones on their buses yet.
+    /// Commissions the cells as real ones would be. They must be the only cells on their buses.
     ///
     /// # Errors
-    /// When a cell does not take them, or an emulator ends.
+    /// Returns [`EmulateError`] if a cell refuses its parameters or an emulator ends.
     pub(crate) fn commission(
         &self,
         bench: &Bench<'_>,
@@ -214,7 +214,7 @@ impl<'a> Emulator<'a> {
         let began = Instant::now();
         let mut skin = bench.skin.clone();
         skin.cells = self.cells.iter().filter_map(|&cell| bench.skin.cells.get(cell).cloned()).collect();
-        // They have their node ids: no walk over wires assigns them.
+        // The cells already have node ids, so no walk over wires must assign them.
         skin.buses.iter_mut().for_each(|bus| bus.reply = Reply::Torque);
         let mut buses: Vec<_> = skin.cells.iter().map(|cell| cell.bus).collect();
         buses.sort_unstable();
@@ -226,7 +226,7 @@ impl<'a> Emulator<'a> {
         let wish = Wish { dry_run: false, verify: false };
         let done = commission::commission(benches, &skin, wish, &stop, |far| {
             ended = ended.take().or_else(|| processes.ended().into_iter().next());
-            // A cell that starts again and again would be written for ever.
+            // A cell that restarts again and again would be written for ever.
             is_over |= timeout.is_over(far.iter().map(|far| far.found + far.done).sum());
             if ended.is_some() || is_over || signalled.load(Ordering::Relaxed) {
                 stop.store(true, Ordering::Relaxed);
@@ -258,7 +258,7 @@ impl<'a> Emulator<'a> {
     }
 }
 
-/// The files of one cell.
+/// Files of one cell.
 struct Place {
     program: PathBuf,
     socket: PathBuf,
@@ -283,7 +283,7 @@ impl Place {
     }
 }
 
-/// Locks a directory of flash files; where the file system has no locks, it stays without.
+/// Locks a directory of flash files; without a lock if the file system has none.
 fn hold(directory: &Path) -> Result<File, EmulateError> {
     let opened = File::open(directory).map_err(EmulateError::Files)?;
     match flock(&opened, FlockOperation::NonBlockingLockExclusive) {
@@ -292,7 +292,7 @@ fn hold(directory: &Path) -> Result<File, EmulateError> {
     }
 }
 
-/// What the factory would write into a cell.
+/// The record that the factory would write into a cell.
 fn factory(skin: &Skin, cell: &Cell) -> Factory {
     let bus = skin.buses.get(cell.bus);
     let sums = bus.is_some_and(|bus| bus.reply != Reply::Torque);
@@ -305,8 +305,8 @@ fn factory(skin: &Skin, cell: &Cell) -> Factory {
     }
 }
 
-/// What a cell's CAN controller would pass: its own identifiers, what comes over its simulated wires, and the sums of
-/// the cells at their other ends.
+/// The filters of a cell's CAN controller: its own identifiers, frames on its simulated wires, and the sums of the
+/// cells at their other ends.
 fn filters(cell: &Cell, &Factory { link_ids, .. }: &Factory) -> Vec<Filter> {
     let mut filters: Vec<_> = Id::of_cell(cell.node).map(Filter::exact).into();
     if link_ids.iter().any(Option::is_some) {

@@ -1,5 +1,5 @@
-//! Processes of cells that have ended while a run or a replay lasted: noted in groups, and the reasons of those that ended
-//! by an error of their own kept for the summary.
+//! Cell processes that ended during a run or a replay: groups them into notes, and keeps the reasons of those that
+//! failed for the summary.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -7,24 +7,24 @@ use std::time::{Duration, Instant};
 use super::Ended;
 use crate::summary::{CellError, ErrorCells};
 
-/// Processes that end within this time are noted together.
+/// Processes that end within this time share a note.
 const TOGETHER: Duration = Duration::from_millis(50);
-/// Processes that are named in one note.
+/// Maximum number of processes named in one note.
 const NAMED: usize = 6;
 
-/// What is known of processes that have ended.
+/// The processes that ended so far.
 #[derive(Debug, Default)]
 pub(crate) struct EndedProcesses {
-    /// Not noted yet.
+    /// Processes without a note yet.
     new: Vec<Ended>,
-    /// When the last of them was found.
+    /// Time at which the last of them was found.
     found: Option<Instant>,
-    /// The cells of those that ended by an error of their own, by its reason and by bus.
+    /// Cells whose processes failed, by reason and by bus.
     errors: BTreeMap<String, BTreeMap<String, BTreeSet<u8>>>,
 }
 
 impl EndedProcesses {
-    /// Takes processes that have ended, and returns the notes that are due; all of them when it is the `last` time.
+    /// Adds processes that ended and returns the notes that are due; with `last`, all notes.
     pub(crate) fn take(&mut self, ended: Vec<Ended>, last: bool) -> Vec<String> {
         if !ended.is_empty() {
             self.found = Some(Instant::now());
@@ -40,7 +40,7 @@ impl EndedProcesses {
         groups.into_iter().map(|((bus, how), group)| self.note((&bus, &how), &group)).collect()
     }
 
-    /// The note of processes of one bus that have ended in the same way. A reason is given once.
+    /// The note for processes of one bus that ended in the same way. Each reason is given once.
     fn note(&mut self, (bus, how): (&str, &str), group: &[Ended]) -> String {
         let error = group.first().and_then(|ended| Some((ended.status, ended.error()?)));
         let how = error.map_or_else(
@@ -63,7 +63,7 @@ impl EndedProcesses {
         }
     }
 
-    /// The errors by which processes ended, each once.
+    /// The errors that ended processes, each once.
     pub(crate) fn errors(&self) -> Vec<CellError> {
         let cells = |(bus, nodes): (&String, &BTreeSet<u8>)| ErrorCells {
             bus: bus.clone(),

@@ -1,5 +1,5 @@
-//! The processes of a bench: cells here, embedded buses in [`crate::bus::served`]. All of them end with the gateway, however it
-//! ends: each ends at its parent's death by itself, and a [`Processes`] that is dropped ends them.
+//! Processes of a bench: cells here, embedded buses in [`crate::bus::served`]. All of them end with the gateway,
+//! however it ends: each process ends when its parent dies, and dropping a [`Processes`] ends them.
 
 pub(crate) mod ended;
 mod standard_error;
@@ -28,76 +28,76 @@ use crate::remote::{Phase, ProcessState};
 use crate::system_calls::end_with_parent;
 use model::scenario::ProcessAction;
 
-/// Two gateways on one bus notice each other in this time.
+/// Time in which two gateways on one bus detect each other.
 pub const LISTEN: Duration = Duration::from_millis(500);
 /// Timeout of started cells without progress.
 pub const STARTING: Duration = Duration::from_secs(15);
-/// Files that a gateway or a server of a bus has open beside buses and clients.
+/// Open files of a gateway or a bus server, besides its buses and clients.
 const OTHER_FILES: usize = 26;
-/// Files of a gateway for one bus.
+/// Open files of a gateway for each bus.
 const FILES_OF_A_BUS: usize = 4;
-/// How long processes may take to end after SIGTERM.
+/// Time that processes get to end after SIGTERM.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Why a process could not be started.
+/// An error that keeps a process from starting.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum LaunchError {
-    /// There is no such program.
+    /// The program does not exist.
     #[error(
         "{name} is not at {path}: build it with `cargo build --release`, or name its path in {}",
         variable(name)
     )]
     Missing {
-        /// The program.
+        /// Name of the program.
         name: &'static str,
-        /// Where it should be.
+        /// Expected path.
         path: PathBuf,
     },
-    /// It is there and does not start.
+    /// The program exists and does not start.
     #[error("{path} does not start: {source}")]
     Start {
-        /// The program.
+        /// Path of the program.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         source: std::io::Error,
     },
-    /// The ends of processes cannot be noticed.
+    /// SIGCHLD, which reports the ends of processes, cannot be caught.
     #[error("cannot catch SIGCHLD: {0}")]
     Signal(std::io::Error),
-    /// What processes write cannot be read.
-    #[error("a pipe for the messages of cells: {0}")]
+    /// The pipe for the processes' standard error cannot be made.
+    #[error("cannot create a pipe for the messages of cells: {0}")]
     Pipe(std::io::Error),
-    /// Fewer files may be open than buses and cells need.
+    /// The limit of open files is below the number that buses and cells need.
     #[error(
-        "{limit} files may be open at once, and this bench needs {needed}: say `ulimit -n {needed}` before it"
+        "at most {limit} files may be open at once, and this bench needs {needed}: run `ulimit -n {needed}` first"
     )]
     Files {
         /// The limit.
         limit: u64,
-        /// What is needed.
+        /// The number needed.
         needed: u64,
     },
     /// An embedded bus is not served.
     #[error("{path} does not serve {bus}; see its own message above")]
     Serve {
-        /// The program.
+        /// Path of the serving program.
         path: PathBuf,
-        /// The bus.
+        /// Name of the bus.
         bus: String,
     },
 }
 
-/// The system gives no file in memory.
+/// The error of a system that grants no file in memory.
 #[derive(Debug, Error)]
-#[error("a file in memory: {0}")]
+#[error("cannot create a file in memory: {0}")]
 pub struct MemoryError(#[source] std::io::Error);
 
-/// Sees that as many files may be open as the gateway needs for so many buses and as who serves one of them needs for
-/// so many clients; raises the limit as far as that is allowed, for all that are started from here on.
+/// Raises the limit of open files, for this process and all that it starts, to what a gateway needs for `buses` buses
+/// and a bus server for `clients` clients.
 ///
 /// # Errors
-/// When it is not allowed.
+/// Returns [`LaunchError::Files`] if the system forbids it.
 pub fn allow_files(buses: usize, clients: usize) -> Result<(), LaunchError> {
     let needed = (OTHER_FILES + FILES_OF_A_BUS * buses + clients) as u64;
     let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
@@ -106,26 +106,26 @@ pub fn allow_files(buses: usize, clients: usize) -> Result<(), LaunchError> {
         .map_err(|_| LaunchError::Files { limit, needed })
 }
 
-/// The environment variable that has the path of a program of this project.
+/// Name of the environment variable for the path of a program of this project.
 fn variable(name: &str) -> String {
     format!("SKINBUS_{}", name.to_ascii_uppercase().replace('-', "_"))
 }
 
-/// The path of a program of this project: from the environment (`SKINBUS_CELL_NODE`, `SKINBUS_VCAN_SETUP`), else beside this
-/// one.
+/// Path of a program of this project: from the environment (`SKINBUS_CELL_NODE`, `SKINBUS_VCAN_SETUP`), or else beside
+/// this program.
 ///
 /// # Errors
-/// When it is not there.
+/// Returns [`LaunchError::Missing`] if the file does not exist.
 pub fn program(name: &'static str) -> Result<PathBuf, LaunchError> {
     let beside = || std::env::current_exe().ok().and_then(|own| Some(own.parent()?.join(name)));
     let path = path_in(&variable(name)).or_else(beside).unwrap_or_else(|| Path::new(".").join(name));
     if path.is_file() { Ok(path) } else { Err(LaunchError::Missing { name, path }) }
 }
 
-/// A file in memory that is there as long as this program has it open, and how cells name it.
+/// Creates a file in memory, which exists as long as this program holds it open, and the path by which cells open it.
 ///
 /// # Errors
-/// When the system gives none.
+/// Returns [`MemoryError`] if the system grants none.
 pub fn in_memory(bytes: &[u8]) -> Result<(File, PathBuf), MemoryError> {
     let memory = || {
         let mut file = File::from(memfd_create("skin.toml", MemfdFlags::CLOEXEC)?);
@@ -136,48 +136,48 @@ pub fn in_memory(bytes: &[u8]) -> Result<(File, PathBuf), MemoryError> {
     Ok((file, path))
 }
 
-/// The process of one cell or of several.
+/// The process of one or several cells.
 #[derive(Debug)]
 struct Process {
-    /// What started it, and does so again.
+    /// Command that started the process, kept for a restart.
     command: Command,
     bus: usize,
     bus_name: String,
     nodes: (u8, u8),
     child: Child,
     phase: Phase,
-    /// Where an emulator writes its messages.
+    /// File for an emulator's messages.
     log: Option<PathBuf>,
 }
 
-/// A process that ended by itself or was killed; displayed as its cells and their bus.
+/// A process that ended by itself or was killed. Displayed as its cells and their bus.
 #[derive(Clone, Debug)]
 pub struct Ended {
-    /// Its bus.
+    /// Name of the bus.
     pub bus: String,
-    /// The first and last of its cells.
+    /// Node ids of the first and the last cell.
     pub nodes: (u8, u8),
-    /// How it ended.
+    /// Exit status.
     pub status: ExitStatus,
-    /// The last that it said before that.
+    /// Reason that the process gave, if any.
     pub said: Option<String>,
 }
 
 impl Ended {
-    /// Its cells.
+    /// Range of the process's cells.
     #[must_use]
     pub const fn cells(&self) -> CellRange {
         CellRange(self.nodes.0, self.nodes.1)
     }
 
-    /// How it ended, with what it said, if anything.
+    /// Exit status, with the reason that the process gave, if any.
     #[must_use]
     pub fn how(&self) -> String {
         let status = self.status;
         self.said.as_ref().map_or_else(|| status.to_string(), |said| format!("{status}: {said}"))
     }
 
-    /// The reason, if it ended by an error of its own: not by a signal, and not with exit code 0.
+    /// Reason of the error, if the process failed by itself: neither by a signal nor with exit code 0.
     #[must_use]
     pub fn error(&self) -> Option<String> {
         let code = self.status.code().filter(|&code| code != 0)?;
@@ -191,42 +191,42 @@ impl Display for Ended {
     }
 }
 
-/// All cells' processes.
+/// The processes of all cells.
 #[derive(Debug, Default)]
 pub struct Processes {
     all: Vec<Process>,
-    /// Set by SIGCHLD, so that hundreds of processes are polled only when one has changed.
+    /// Set by SIGCHLD, so that hundreds of processes are polled only after one has changed.
     changed: Arc<AtomicBool>,
-    /// What they write; none before one is started.
+    /// Standard error of the processes; `None` before the first start.
     error: Option<StandardError>,
-    /// Ended by themselves, and found so when they were to be started again.
+    /// Processes that had ended by themselves, discovered at their restart.
     found: Vec<Ended>,
 }
 
-/// How to start cells.
+/// Settings for starting cells.
 #[derive(Clone, Copy, Debug)]
 pub struct Plan<'a> {
-    /// The program.
+    /// Path of the program.
     pub program: &'a Path,
-    /// The skin's file.
+    /// Path of the skin's file.
     pub skin_file: &'a Path,
     /// The skin.
     pub skin: &'a Skin,
-    /// Which kind each bus is.
+    /// Kind of each bus.
     pub kinds: &'a Kinds,
-    /// Where embedded buses are, if not where they usually are.
+    /// Directory of embedded buses; `None` for the usual one.
     pub directory: Option<&'a Path>,
-    /// At most so many cells in a process.
+    /// Maximum number of cells per process.
     pub per_process: usize,
-    /// Where cells keep their parameters, if they do.
+    /// Directory for the cells' parameters, if they keep them.
     pub flash: Option<&'a Path>,
 }
 
 impl Processes {
-    /// None yet.
+    /// Creates an empty set.
     ///
     /// # Errors
-    /// When the ends of processes cannot be noticed.
+    /// Returns [`LaunchError`] if the ends of processes cannot be noticed.
     pub fn new() -> Result<Self, LaunchError> {
         let mut processes = Self::default();
         processes.error = Some(StandardError::new().map_err(LaunchError::Pipe)?);
@@ -235,10 +235,10 @@ impl Processes {
         Ok(processes)
     }
 
-    /// Starts all cells of a skin that have no process yet. Call it from a thread that lives as long as the cells must.
+    /// Starts all cells of a skin that have no process yet. The calling thread must live as long as the cells.
     ///
     /// # Errors
-    /// When a process does not start.
+    /// Returns [`LaunchError`] if a process does not start.
     pub fn start(&mut self, plan: &Plan<'_>) -> Result<(), LaunchError> {
         for (bus, described) in plan.skin.buses.iter().enumerate() {
             let mut nodes: Vec<u8> = plan.skin.cells_of(bus).map(|cell| cell.node.get()).collect();
@@ -254,10 +254,11 @@ impl Processes {
         Ok(())
     }
 
-    /// Starts the emulator of a cell on a bus of this name, from the same kind of thread; `log` is the file of its messages.
+    /// Starts the emulator of a cell on this bus; `log` is the file for its messages. The calling thread must live as
+    /// long as the emulator.
     ///
     /// # Errors
-    /// When it does not start.
+    /// Returns [`LaunchError`] if the emulator does not start.
     pub fn emulate(
         &mut self,
         cell: &Cell,
@@ -274,23 +275,23 @@ impl Processes {
         Ok(())
     }
 
-    /// Whether there is a process of this cell.
+    /// Returns true if a process of this cell runs.
     #[must_use]
     pub fn runs(&self, bus: usize, node: u8) -> bool {
         self.all.iter().any(|process| process.state().runs(bus, node))
     }
 
-    /// The process ids.
+    /// Ids of the running processes.
     pub fn pids(&self) -> impl Iterator<Item = u32> {
         self.all.iter().filter(|process| process.lives()).map(|process| process.child.id())
     }
 
-    /// What each does.
+    /// State of each process.
     pub fn states(&self) -> impl Iterator<Item = ProcessState> {
         self.all.iter().map(Process::state)
     }
 
-    /// Processes that have ended since the last call; passes on what others have written to standard error.
+    /// Processes that have ended since the last call. Passes on what others have written to standard error.
     pub fn ended(&mut self) -> Vec<Ended> {
         self.error.iter_mut().for_each(StandardError::read);
         let mut ended = std::mem::take(&mut self.found);
@@ -306,10 +307,10 @@ impl Processes {
         ended
     }
 
-    /// Does something to the process of a cell; returns whether there is one.
+    /// Applies an action to the process of a cell. Returns true if the cell has a process.
     ///
     /// # Errors
-    /// When a process is to be started again and does not start.
+    /// Returns [`LaunchError`] if a restarted process does not start.
     pub fn act(&mut self, bus: usize, node: u8, action: ProcessAction) -> Result<bool, LaunchError> {
         let holds = |process: &&mut Process| process.state().runs(bus, node);
         let Some(process) = self.all.iter_mut().find(holds) else { return Ok(false) };
@@ -320,7 +321,7 @@ impl Processes {
             ProcessAction::Restart => {
                 let lived = process.lives();
                 process.signal(Signal::KILL, Phase::Ended);
-                // One that had ended by itself before is not killed.
+                // Report a process that had ended by itself: only a killed one has a signal status.
                 let status = process.child.wait().ok().filter(|status| lived && status.signal().is_none());
                 self.found.extend(status.map(|status| process.ended(status, self.error.as_mut())));
                 process.child = match &process.log {
@@ -343,12 +344,12 @@ impl Process {
         self.phase != Phase::Ended
     }
 
-    /// What it has left, when it has ended.
+    /// The record of an ended process.
     fn ended(&self, status: ExitStatus, error: Option<&mut StandardError>) -> Ended {
         let said = match (&self.log, error) {
             (Some(log), _) => last_line(log),
             (None, Some(error)) => {
-                // It has written everything by now.
+                // The ended process has written everything by now.
                 error.read();
                 error.of(&self.bus_name, self.nodes)
             }
@@ -357,7 +358,7 @@ impl Process {
         Ended { bus: self.bus_name.clone(), nodes: self.nodes, status, said }
     }
 
-    /// Sends it a signal, after which it is in a phase; one that has ended stays so.
+    /// Sends a signal and enters `phase`. Ended processes are left alone.
     fn signal(&mut self, signal: Signal, phase: Phase) {
         if let Some(pid) = Pid::from_raw(self.child.id().cast_signed()).filter(|_| self.lives()) {
             let _ = kill_process(pid, signal);
@@ -369,7 +370,7 @@ impl Process {
 impl Drop for Processes {
     fn drop(&mut self) {
         for process in &mut self.all {
-            // A stopped process would not handle the other signal.
+            // A stopped process would not handle SIGTERM.
             process.signal(Signal::CONT, Phase::Running);
             process.signal(Signal::TERM, Phase::Running);
         }
@@ -388,7 +389,7 @@ impl Plan<'_> {
         } else {
             command.args(["--nodes", &format!("{first}-{last}")]);
         }
-        // A bus that is lost is served or made again, and the cells on it are the same.
+        // A lost bus is served or made again, and its cells stay the same.
         command.arg("--skin").arg(self.skin_file).arg("--reconnect");
         command.args(["--bus-kind", &self.kinds.of(bus).to_string()]);
         command.args(["--with-parent", &std::process::id().to_string()]);
@@ -405,27 +406,27 @@ pub(crate) fn spawn(command: &mut Command) -> Result<Child, LaunchError> {
     command.spawn().map_err(|source| LaunchError::Start { path: command.get_program().into(), source })
 }
 
-/// Starts a process of cells, whose standard error is read here.
+/// Starts a process of cells with its standard error connected to the pipe.
 fn start(command: &mut Command, error: Option<&StandardError>) -> Result<Child, LaunchError> {
     if let Some(error) = error {
         error.give(command).map_err(LaunchError::Pipe)?;
     }
     let child = spawn(command);
-    // Or each would keep a file open here.
+    // Drop the pipe's end: each command would keep a file open.
     command.stderr(Stdio::inherit());
     child
 }
 
-/// The last of an emulator's messages that is no mere information.
+/// Last message of an emulator that is not mere information.
 fn last_line(log: &Path) -> Option<String> {
     let text = std::fs::read_to_string(log).ok()?;
-    // After a fault come the registers.
+    // Register values follow a fault message.
     let is_message = |line: &&str| line.starts_with("qemu") && !line.contains(": info: ");
     text.lines().rfind(is_message).map(str::to_owned)
 }
 
-/// Ctrl-C on a terminal signals the whole process group, and is meant for the gateway alone: cells and buses
-/// have to outlive it until the final reports. They find embedded buses where it does.
+/// Puts a process into its own group: Ctrl-C on a terminal signals the whole group but is meant for the gateway alone,
+/// because cells and buses must live until the final reports. `directory` is where the process finds embedded buses.
 pub(crate) fn apart(command: &mut Command, directory: Option<&Path>) {
     command.process_group(0);
     if let Some(directory) = directory {
@@ -433,7 +434,7 @@ pub(crate) fn apart(command: &mut Command, directory: Option<&Path>) {
     }
 }
 
-/// Runs of consecutive numbers, at most `size` long.
+/// Groups consecutive numbers into ranges of at most `size`.
 #[must_use]
 pub fn groups(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
     let mut groups: Vec<(u8, u8)> = Vec::new();

@@ -1,6 +1,6 @@
-//! The standard error of the processes of cells: one pipe for all of them, read where their ends are noticed.
+//! Standard error of the cells' processes: one pipe for all of them, read where their ends are noticed.
 //!
-//! A process writes before it ends, so its last words are there when its end is.
+//! A process writes before it ends, so its reason has arrived when its end is noticed.
 
 use std::io::{self, ErrorKind, PipeReader, PipeWriter, Read, pipe};
 use std::process::Command;
@@ -9,51 +9,51 @@ use protocol::last_words::{CellRange, LastWords};
 use protocol::usage::say;
 use rustix::io::ioctl_fionbio;
 
-/// What stands before each line of a cell's process.
+/// Prefix of each line from a cell's process.
 const PROGRAM: &str = "cell-node: ";
 
-/// Bytes of a line that are waited for its end.
+/// Maximum length in bytes of an incomplete line.
 const LONGEST: usize = 1 << 16;
 
-/// The standard error of the processes of cells.
+/// Standard error of the cells' processes.
 #[derive(Debug)]
 pub(super) struct StandardError {
     read: PipeReader,
     write: PipeWriter,
-    /// The begin of a line whose end has not come.
+    /// Beginning of a line whose end has not arrived.
     unread: Vec<u8>,
-    /// Those that nobody has taken.
+    /// Reasons that have not been fetched.
     words: Vec<LastWords>,
 }
 
 impl StandardError {
-    /// Makes the pipe.
+    /// Creates the pipe.
     ///
     /// # Errors
-    /// When the system gives none.
+    /// Returns [`io::Error`] if the system grants no pipe.
     pub(super) fn new() -> io::Result<Self> {
         let (read, write) = pipe()?;
         ioctl_fionbio(&read, true)?;
         Ok(Self { read, write, unread: Vec::new(), words: Vec::new() })
     }
 
-    /// Makes it the standard error of a program that is started next.
+    /// Makes the pipe the standard error of a program to be started.
     ///
     /// # Errors
-    /// When too many files are open.
+    /// Returns [`io::Error`] if too many files are open.
     pub(super) fn give(&self, command: &mut Command) -> io::Result<()> {
         command.stderr(self.write.try_clone()?);
         Ok(())
     }
 
-    /// Reads what has come: last words are kept, other lines are passed on to the standard error of this program.
+    /// Reads all that has arrived. Keeps reasons; passes other lines on to the standard error of this program.
     pub(super) fn read(&mut self) {
         let mut piece = [0; 4_096];
         loop {
             match self.read.read(&mut piece) {
                 Ok(count @ 1..) => self.unread.extend(piece.iter().take(count)),
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                // Nothing is there.
+                // The pipe is empty.
                 Ok(0) | Err(_) => break,
             }
         }
@@ -73,7 +73,7 @@ impl StandardError {
         }
     }
 
-    /// Takes the reason that a process of cells gave.
+    /// Removes and returns the reason that a process of cells gave.
     pub(super) fn of(&mut self, bus: &str, (first, last): (u8, u8)) -> Option<String> {
         let cells = CellRange(first, last);
         let at = self.words.iter().position(|words| words.cells == cells && words.bus == bus)?;

@@ -1,16 +1,16 @@
-//! Frames that the kernel drops between a sender and the sockets, although the sender's call succeeds:
-//! when a processor's queue of arrived packets is full (`net.core.netdev_max_backlog`).
+//! Frames that the kernel drops between a sender and the sockets although the sender's call succeeds: the queue of
+//! arrived packets of a processor was full (`net.core.netdev_max_backlog`).
 //!
-//! The kernel counts them for the whole machine, any network and any interface, not for a bus.
+//! The kernel counts them for the whole machine, over all networks and interfaces.
 
 use std::fs;
 
-/// How many packets the machine has dropped so; none where the kernel does not report it.
+/// Number of packets that the machine has dropped so far, or `None` if the kernel does not report it.
 pub(crate) fn dropped() -> Option<u64> {
     read(&fs::read_to_string("/proc/net/softnet_stat").ok()?)
 }
 
-/// The sum over processors of the second column, hexadecimal, each modulo 2^32.
+/// Sum over the processors of the second column, which is hexadecimal modulo 2^32.
 fn read(text: &str) -> Option<u64> {
     text.lines().map(|line| u64::from_str_radix(line.split_whitespace().nth(1)?, 16).ok()).sum()
 }

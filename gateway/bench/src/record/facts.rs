@@ -1,4 +1,4 @@
-//! The metadata of a recording: the program, the machine, the clocks, the current configuration.
+//! Metadata of a recording: program, machine, clocks and configuration.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,10 +12,10 @@ use rustix::time::{clock_getres, clock_gettime};
 use model::decode::parameter::Words;
 use model::quantiles::Quantiles;
 
-/// Facts by name.
+/// Metadata values by key.
 pub type Facts = BTreeMap<String, String>;
 
-/// The program and how it was called.
+/// Metadata of the program and its command line.
 #[must_use]
 pub fn program(command_line: &[String], began_nanos: u64) -> Facts {
     facts([
@@ -26,7 +26,7 @@ pub fn program(command_line: &[String], began_nanos: u64) -> Facts {
     ])
 }
 
-/// The kernel, the clock that everything is timed by, and how late the machine wakes an idle thread.
+/// Metadata of the kernel, its clock, and the wake-up lateness of an idle thread.
 #[must_use]
 pub fn machine(idle: &Quantiles) -> Facts {
     let about = uname();
@@ -51,7 +51,7 @@ pub fn machine(idle: &Quantiles) -> Facts {
     ])
 }
 
-/// What has to be added to the monotonic clock to make it the wall clock, in ns: the narrowest of some readings.
+/// Offset from the monotonic clock to the wall clock in ns, from the narrowest of three readings.
 #[must_use]
 pub fn realtime_minus_monotonic() -> i64 {
     let nanos = |clock| {
@@ -67,7 +67,7 @@ pub fn realtime_minus_monotonic() -> i64 {
     (0..3).map(reading).min().map_or(0, |(_, offset)| offset)
 }
 
-/// The skin and its effective timing, beside the metadata of the run.
+/// Metadata of the skin and its effective timing, joined with `run`.
 #[must_use]
 pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)>) -> Facts {
     let mut all = facts([
@@ -91,7 +91,7 @@ pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)
     all
 }
 
-/// The hash that each cell's configuration must have, by bus and node id.
+/// Expected configuration hash of each cell, keyed by bus and node id.
 #[must_use]
 pub fn hashes(skin: &Skin) -> Facts {
     let of_cell = |cell: &protocol::skin::Cell| {

@@ -1,5 +1,5 @@
-//! What is handed over to the recorder: bounded queues, one for each producer thread. No producer waits for
-//! room: what does not fit is counted, and the recording notes where it is missing.
+//! Queues to the recorder, one per producer thread. Producers never wait for room: the queue counts items that do not
+//! fit, and the recording notes where they are missing.
 
 use std::sync::{Arc, Mutex};
 
@@ -11,86 +11,86 @@ use model::latched::Seen;
 use model::table::Status;
 use trace::capture::BusNote;
 
-/// Frames of a bus that may wait; of many buses together no more than four times that, so that their memory has a limit,
-/// but of each more than a second of a full bus.
+/// Queue length for the frames of a bus. Many buses together get at most four times this, which limits memory; each
+/// gets at least [`FRAMES_OF_MANY`], more than a second of a full bus.
 const FRAMES: usize = 65_536;
-/// See [`FRAMES`].
+/// Minimum queue length of each of many buses.
 const FRAMES_OF_MANY: usize = 16_384;
 
-/// How many frames of each of so many buses may wait.
+/// Queue length in frames of each of `buses` buses.
 #[must_use]
 pub fn frames(buses: usize) -> usize {
     (4 * FRAMES / buses.max(1)).clamp(FRAMES_OF_MANY, FRAMES)
 }
 
-/// Ticks that may wait: more than a second.
+/// Queue length for ticks: more than a second.
 pub const TICKS: usize = 1_024;
-/// Epochs of a bus that may wait: more than a second.
+/// Queue length for the epochs of a bus: more than a second.
 pub const EPOCHS: usize = 128;
 
-/// What a bus' receiver hands over, in the order in which it came.
+/// An item from the receiver of a bus, in order of arrival.
 #[derive(Clone, Copy, Debug)]
 pub enum Captured {
-    /// A frame.
+    /// A received frame.
     Frame(Seen),
-    /// Frames that the bus dropped because they were not taken in time.
+    /// Frames that the bus dropped because they were not read in time.
     Dropped {
-        /// When this was known, in ns since 1970.
+        /// Time of detection in ns since 1970.
         at_nanos: u64,
-        /// How many.
+        /// Number of frames.
         frames: u64,
     },
     /// Frames that did not fit into this queue.
     Unrecorded {
-        /// When this was reported, in ns since 1970.
+        /// Time of the report in ns since 1970.
         at_nanos: u64,
-        /// How many.
+        /// Number of frames.
         frames: u64,
     },
-    /// The bus was lost, or works again.
+    /// The bus was lost or works again.
     Bus {
-        /// When this was known, in ns since 1970.
+        /// Time of detection in ns since 1970.
         at_nanos: u64,
-        /// Which of the two.
+        /// The event.
         what: BusNote,
     },
 }
 
-/// The contact state of a bus' cells when joints were on it.
+/// Contact states of the cells of a bus at the time of a joint broadcast.
 #[derive(Clone, Debug)]
 pub struct Touched {
-    /// When, in ns since 1970.
+    /// Time in ns since 1970.
     pub at_nanos: u64,
-    /// The joints' epoch.
+    /// Epoch of the joints.
     pub epoch: u8,
-    /// Each cell, in the bus' order.
+    /// Sensor values and status of each cell, in the order of the bus.
     pub cells: Box<[(Option<SkinSensors>, Status)]>,
 }
 
-/// A receiver's end of its queues.
+/// The receiver's end of its queues.
 #[derive(Debug)]
 pub struct Outlet {
     frames: rtrb::Producer<Captured>,
     touched: Option<rtrb::Producer<Touched>>,
-    /// Frames that did not fit, in all.
+    /// Total number of frames that did not fit.
     unrecorded: u64,
-    /// Of these, those that are not reported yet.
+    /// Number of those that have not been reported yet.
     unreported: u64,
-    /// Epochs that did not fit.
+    /// Number of epochs that did not fit.
     untouched: u64,
 }
 
-/// What did not fit into queues.
+/// Items that did not fit into queues.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Unrecorded {
-    /// Frames.
+    /// Number of frames.
     pub frames: u64,
-    /// Contact states of an epoch.
+    /// Number of epochs whose contact states are missing.
     pub epochs: u64,
 }
 
 impl Outlet {
-    /// Hands a frame over.
+    /// Queues a frame.
     pub fn frame(&mut self, seen: Seen) {
         if self.unreported > 0 {
             self.tell(seen.at_nanos);
@@ -101,31 +101,31 @@ impl Outlet {
         }
     }
 
-    /// Frames that fit into the queue now.
+    /// Number of frames that fit into the queue now.
     #[must_use]
     pub fn free(&self) -> usize {
         self.frames.slots()
     }
 
-    /// Reports that the bus dropped frames.
+    /// Queues a report that the bus dropped frames.
     pub fn dropped(&mut self, at_nanos: u64, frames: u64) {
-        // A full queue is reported by itself.
+        // The queue counts frames that do not fit, which is reported separately.
         let _ = self.frames.push(Captured::Dropped { at_nanos, frames });
     }
 
-    /// Reports that the bus was lost, or works again.
+    /// Queues a report that the bus was lost or works again.
     pub fn bus(&mut self, at_nanos: u64, what: BusNote) {
-        // In a full queue frames are lost, which is reported by itself.
+        // A full queue loses frames, which is reported separately.
         let _ = self.frames.push(Captured::Bus { at_nanos, what });
     }
 
-    /// Whether contact states are recorded.
+    /// Returns true if contact states are recorded.
     #[must_use]
     pub const fn wants_touched(&self) -> bool {
         self.touched.is_some()
     }
 
-    /// Hands contact states over.
+    /// Queues contact states.
     pub fn touched(&mut self, touched: Touched) {
         if let Some(queue) = &mut self.touched
             && queue.push(touched).is_err()
@@ -134,7 +134,7 @@ impl Outlet {
         }
     }
 
-    /// Reports what did not fit, if there is room for the report; whether nothing remains to be reported.
+    /// Queues a report of frames that did not fit, if it has room. Returns true if no report remains.
     pub fn tell(&mut self, at_nanos: u64) -> bool {
         let frames = self.unreported;
         if frames > 0 && self.frames.push(Captured::Unrecorded { at_nanos, frames }).is_ok() {
@@ -143,25 +143,25 @@ impl Outlet {
         self.unreported == 0
     }
 
-    /// What did not fit.
+    /// Counts of the items that did not fit.
     #[must_use]
     pub const fn unrecorded(&self) -> Unrecorded {
         Unrecorded { frames: self.unrecorded, epochs: self.untouched }
     }
 }
 
-/// The recorder's end of a bus.
+/// The recorder's end of the queues of a bus.
 #[derive(Debug)]
 pub struct BusFeed {
     pub(super) frames: rtrb::Consumer<Captured>,
     pub(super) touched: Option<rtrb::Consumer<Touched>>,
-    /// The state of its cells.
+    /// State of the bus's cells.
     pub(super) view: Arc<Mutex<View>>,
-    /// The state of the bus.
+    /// State of the bus.
     pub(super) state: Arc<BusState>,
 }
 
-/// The queues of one of so many buses, both ends; `all` if more than frames is recorded.
+/// Creates the queues of one of `buses` buses and returns both ends; `all` if more than frames is recorded.
 #[must_use]
 pub fn bus_feed(buses: usize, all: bool, view: Arc<Mutex<View>>, state: Arc<BusState>) -> (Outlet, BusFeed) {
     let (frames, taken) = rtrb::RingBuffer::new(frames(buses));
@@ -170,12 +170,12 @@ pub fn bus_feed(buses: usize, all: bool, view: Arc<Mutex<View>>, state: Arc<BusS
     (outlet, BusFeed { frames: taken, touched: states, view, state })
 }
 
-/// All input of the recorder.
+/// All inputs of the recorder.
 #[derive(Debug)]
 pub struct Feed {
-    /// Each bus.
+    /// Queues of each bus.
     pub bus_feeds: Vec<BusFeed>,
-    /// The control loop's ticks.
+    /// Ticks of the control loop.
     pub ticks: Option<rtrb::Consumer<Timed>>,
 }
 

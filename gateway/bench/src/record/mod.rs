@@ -1,4 +1,4 @@
-//! What a run records, and the thread that writes it.
+//! Recording of a run, and the thread that writes it.
 //!
 //! ```text
 //!   receiver, one a bus ─ frames, drops, contact states ───┐
@@ -6,8 +6,8 @@
 //!   kernel ───────────── drops of its backlog ─────────────┘   (bounded)            └─> candump log
 //! ```
 //!
-//! No thread waits for the recorder: what does not fit into a queue is counted, and the recording notes where it is
-//! missing. No error of a file ends the run. `docs/reference/recording.md` has the topics.
+//! No thread waits for the recorder: queues count items that do not fit, and the recording notes where they are
+//! missing. File errors do not end the run. `docs/reference/recording.md` describes the topics.
 
 pub(crate) mod backlog;
 pub mod facts;
@@ -36,67 +36,67 @@ use crate::bus::realtime::wall;
 use crate::threads::{ThreadError, spawn};
 use trace::files::check_regular;
 
-/// What is to be recorded where.
+/// Outputs of a recording.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
-    /// Frames as candump text.
+    /// Output of frames as candump text.
     pub candump: Option<Candump>,
-    /// Everything as MCAP.
+    /// Output of all data as MCAP.
     pub mcap: Option<Mcap>,
-    /// Whether a file that exists is overwritten.
+    /// True if existing files are overwritten.
     pub force: bool,
 }
 
-/// Frames as candump text.
+/// An output of frames as candump text.
 #[derive(Clone, Debug)]
 pub struct Candump {
-    /// The file.
+    /// Path of the log.
     pub path: PathBuf,
-    /// Whether it gets a number when one of its name exists.
+    /// True if the name gets a number when the file exists.
     pub numbered: bool,
 }
 
-/// Everything as MCAP.
+/// An output of all data as MCAP.
 #[derive(Clone, Debug)]
 pub struct Mcap {
-    /// The first file.
+    /// Path of the first file.
     pub path: PathBuf,
-    /// When another file is begun.
+    /// Limits at which a new file is started.
     pub split: Split,
-    /// Files in each file.
+    /// Files attached to each file of the recording.
     pub attachments: Vec<Attached>,
-    /// What is known of the robot's links.
+    /// Geometry of the robot's links, if known.
     pub robot: Option<Robot>,
-    /// How the program was called.
+    /// Command line of the program.
     pub command_line: Vec<String>,
 }
 
-/// Why nothing can be recorded there.
+/// An error of an output.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum OutputError {
-    /// A log cannot be written.
+    /// The log cannot be written.
     #[error("--candump {}: {source}", .path.display())]
     Candump {
-        /// The file.
+        /// Path of the log.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         source: io::Error,
     },
-    /// A recording cannot be written.
+    /// The recording cannot be written.
     #[error("--record {}: {source}", .path.display())]
     Mcap {
-        /// The first file.
+        /// Path of the first file.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         source: io::Error,
     },
-    /// A recording has another name.
+    /// The name of the recording does not end in `.mcap`.
     #[error("--record {}: a recording's name ends in .mcap", .0.display())]
     Name(PathBuf),
 }
 
-/// Files that are reserved, and not begun.
+/// Reserved output files, not yet begun.
 #[derive(Debug)]
 pub struct Outputs {
     text: Option<Text>,
@@ -104,12 +104,11 @@ pub struct Outputs {
 }
 
 impl Outputs {
-    /// Opens what will be written, so that what makes that impossible is known before there is anything to write.
-    /// Repairs the unfinished files of killed runs beside it, and reports each. A FIFO is waited for until it has a
-    /// reader, or until `stopped`.
+    /// Opens the outputs, so that errors show up before the run starts. Repairs unfinished files of killed runs beside
+    /// them and reports each repair. Waits for a FIFO's reader, or until `stopped`.
     ///
     /// # Errors
-    /// What cannot be written, and what to do.
+    /// Returns [`OutputError`] with the file that cannot be written.
     pub fn claim(
         options: &Options,
         stopped: &AtomicBool,
@@ -132,28 +131,28 @@ impl Outputs {
         Ok(Self { text, series: series.transpose()? })
     }
 
-    /// Whether nothing is to be recorded.
+    /// Returns true if no output is requested.
     #[must_use]
     pub const fn is_empty(&self) -> bool {
         self.text.is_none() && self.series.is_none()
     }
 
-    /// The candump log, if there is one.
+    /// Path of the candump log, if any.
     #[must_use]
     pub fn log(&self) -> Option<&Path> {
         self.text.as_ref().map(Text::path)
     }
 
-    /// Whether more than frames is recorded.
+    /// Returns true if more than frames is recorded.
     #[must_use]
     pub const fn wants_all(&self) -> bool {
         self.series.is_some()
     }
 
-    /// Begins to record what comes; each file begins with `head`.
+    /// Starts the recorder; each file begins with `head`.
     ///
     /// # Errors
-    /// When there is no thread for it.
+    /// Returns [`ThreadError`] if the system grants no thread.
     pub fn start(self, feed: Feed, layout: Layout, head: Head) -> Result<Recorder, ThreadError> {
         let stop = Arc::new(Stop::default());
         let (tell, said) = mpsc::channel();
@@ -165,16 +164,16 @@ impl Outputs {
     }
 }
 
-/// How a recording is ended.
+/// Requests to end a recording.
 #[derive(Debug, Default)]
 struct Stop {
-    /// Now.
+    /// Ends the recording.
     now: AtomicBool,
-    /// As if there had been no run.
+    /// Discards the recording, as if the run had not happened.
     discard: AtomicBool,
 }
 
-/// The thread that records.
+/// Handle of the recorder's thread.
 #[derive(Debug)]
 pub struct Recorder {
     thread: std::thread::JoinHandle<Recording>,
@@ -189,23 +188,23 @@ impl Recorder {
         self.said.try_iter()
     }
 
-    /// Notes in a recording what is done to the bench now; a log has frames only.
+    /// Adds a note about an intervention to the recording; a candump log holds frames only.
     pub fn note(&self, text: &str) {
-        // Without its thread nothing is recorded any more.
+        // After the thread has ended, notes are lost.
         let _ = self.notes.send((wall(), text.to_owned()));
     }
 
-    /// Ends the recording of a run that never began, and leaves only a log of received frames.
+    /// Ends the recording of a run that never began. Leaves only a log of received frames.
     #[must_use]
     pub fn discard(self) -> Recording {
         self.stop.discard.store(true, Ordering::Relaxed);
         self.stop.now.store(true, Ordering::Release);
-        // At most it leaves a file that the next run removes.
+        // If the thread panicked, it leaves a file that the next run removes.
         self.thread.join().unwrap_or_default()
     }
 
-    /// Records what has been handed over once no thread hands over more, and ends the files. `unrecorded` is what
-    /// did not fit into receivers' queues, `ticks` what did not into the loop's.
+    /// Records all queued items and ends the files. Call it when no thread queues more. `unrecorded` counts items that
+    /// did not fit into the receivers' queues; `ticks` counts ticks that did not fit.
     #[must_use]
     pub fn finish(self, unrecorded: Unrecorded, ticks: u64) -> Recording {
         self.stop.now.store(true, Ordering::Release);

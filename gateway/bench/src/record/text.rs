@@ -1,4 +1,4 @@
-//! The frames of a run as candump text.
+//! Frames of a run as candump text.
 
 use std::fs;
 use std::io;
@@ -13,36 +13,36 @@ use model::latched::Seen;
 use trace::files::LogFile;
 use trace::recording::account::Written;
 
-/// Bytes that are written together.
+/// Number of bytes written at once.
 const PIECE: usize = 64 << 10;
 
-/// Between two looks whether the log still has its name.
+/// Interval between checks that the log still has its name.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// A log that is being written. The first error of writing ends it at its last whole line.
+/// A log that is being written. The first write error ends it after its last whole line.
 #[derive(Debug)]
 pub struct Text {
     log: LogFile,
     failed: bool,
-    /// Whether another program moved or changed it.
+    /// True if another program moved or changed the file.
     moved: bool,
-    /// When that was looked at last.
+    /// Time of the last such check.
     looked: Instant,
-    /// Lines that wait to be written.
+    /// Lines not yet written.
     lines: String,
-    /// Frames in them.
+    /// Number of frames in `lines`.
     waiting: u64,
-    /// Frames in the file.
+    /// Number of frames in the file.
     frames: u64,
-    /// Frames that were not written.
+    /// Number of frames that were not written.
     lost: u64,
 }
 
 impl Text {
-    /// Begins a log. A FIFO is waited for until it has a reader, or until `stopped`.
+    /// Starts a log. Waits for a FIFO's reader, or until `stopped`.
     ///
     /// # Errors
-    /// When it cannot be written.
+    /// Returns [`io::Error`] if the log cannot be written.
     pub fn create(target: &Candump, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
         let log = if target.numbered && !force {
             LogFile::create_numbered(&target.path, stopped)?
@@ -54,16 +54,16 @@ impl Text {
         Ok(Self { log, failed, moved, looked, lines, waiting: 0, frames: 0, lost: 0 })
     }
 
-    /// Its name.
+    /// Path of the log.
     #[must_use]
     pub fn path(&self) -> &Path {
         self.log.path()
     }
 
-    /// A frame.
+    /// Adds a frame.
     ///
     /// # Errors
-    /// When the log cannot be written; reported once.
+    /// Returns [`io::Error`] once if the log cannot be written.
     pub fn frame(&mut self, interface: &str, seen: &Seen) -> io::Result<()> {
         if self.failed {
             self.lost += 1;
@@ -71,16 +71,16 @@ impl Text {
         }
         let time = Timestamp::six_digits(seen.at_nanos);
         let record = Record { time, interface, frame: seen.frame, direction: None };
-        // A string takes everything.
+        // Writing to a string never fails.
         let _ = write_record(&mut self.lines, &record);
         self.waiting += 1;
         self.end_line()
     }
 
-    /// A line that is no frame.
+    /// Adds a line other than a frame.
     ///
     /// # Errors
-    /// When the log cannot be written; reported once.
+    /// Returns [`io::Error`] once if the log cannot be written.
     pub fn note(&mut self, text: &str) -> io::Result<()> {
         if self.failed {
             return Ok(());
@@ -94,16 +94,16 @@ impl Text {
         if self.lines.len() < PIECE { Ok(()) } else { self.flush() }
     }
 
-    /// Whether nothing more is written.
+    /// Returns true if the log has ended after an error.
     #[must_use]
     pub const fn is_over(&self) -> bool {
         self.failed
     }
 
-    /// Hands the lines that wait to the kernel: readers that follow the log see them, and a killed run keeps them.
+    /// Passes waiting lines to the kernel: readers that follow the log see them, and a killed run keeps them.
     ///
     /// # Errors
-    /// When the log cannot be written, or has been moved or changed; reported once.
+    /// Returns [`io::Error`] once if the log cannot be written or was moved or changed.
     pub fn flush(&mut self) -> io::Result<()> {
         self.write()?;
         if self.looked.elapsed() < LOOK {
@@ -135,8 +135,8 @@ impl Text {
         put
     }
 
-    /// Ends the log, also after an error: the file, if it has its name, frames that are not in it, and whether all was
-    /// written.
+    /// Ends the log, also after an error. Returns the file if it still has its name, the number of frames missing in
+    /// it, and the first error.
     pub fn finish(mut self) -> (Option<Written>, u64, io::Result<()>) {
         let (put, looked) = (self.write(), self.look());
         let there = if self.moved { self.log.lines("(").ok().flatten() } else { Some(self.frames) };
@@ -155,9 +155,9 @@ impl Text {
         (file, lost + (written - frames), put.and(looked).and(finished))
     }
 
-    /// Ends the log of a run that never began: the file, or none if nothing was received.
+    /// Ends the log of a run that never began. Returns the file, or `None` if no frame was received.
     pub fn discard(mut self) -> Option<Written> {
-        // The error to report is why the run did not begin.
+        // The reason why the run did not begin is the error to report.
         let _ = self.flush();
         (self.frames > 0).then(|| self.finish().0).flatten()
     }
@@ -204,8 +204,8 @@ mod tests {
         assert_eq!((written.unwrap().frames, lost), (0, 10_000));
     }
 
-    /// What another program does to a log of five frames, after which three more come: which errors are reported, the
-    /// frames in the file that the summary names, if it names one, and how many are lost.
+    /// Lets another program disturb a log of five frames, then adds three. Returns the reported errors, the number of
+    /// frames in the file that the summary names, if any, and the number of lost frames.
     fn disturbed(disturb: impl FnOnce(&Path)) -> (Vec<String>, Option<u64>, u64) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.log");

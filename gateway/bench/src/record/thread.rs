@@ -1,4 +1,4 @@
-//! The recorder's thread: takes what has come, writes and flushes it, and records the state of everything.
+//! The recorder's thread: drains the queues, writes and flushes files, and records diagnostics.
 
 use std::io;
 use std::mem;
@@ -26,53 +26,53 @@ use trace::recording::window::{WINDOW_NS, Window};
 use trace::ros2::skin::ContactState;
 use trace::ros2::standard::{Diagnosis, Level, Point};
 
-/// The thread's rhythm.
+/// Pause between rounds of the thread.
 const LOOK: Duration = Duration::from_millis(10);
-/// Written data is flushed after this time: a killed run may lose that much, and one [`LOOK`].
+/// Interval between flushes: a killed run may lose the data of this time plus one [`LOOK`].
 const FLUSH: Duration = Duration::from_millis(40);
-/// How often the kernel's count of backlog drops is read.
+/// Interval between readings of the kernel's backlog drops.
 const REQUEST: Duration = Duration::from_millis(100);
-/// How often the state of everything is recorded.
+/// Interval between diagnostics messages.
 const DIAGNOSE: Duration = Duration::from_millis(500);
 
-/// One bus, as the recorder sees it.
+/// The recorder's state of a bus.
 #[derive(Default)]
 struct Seen {
     latched: Latched,
-    /// Frames recorded or counted as lost.
+    /// Number of frames recorded or counted as lost.
     frames: u64,
-    /// Dropped by the bus.
+    /// Number of frames dropped by the bus.
     dropped: u64,
-    /// Not fitted into the queue.
+    /// Number of frames that did not fit into the queue.
     unrecorded: u64,
-    /// Not written since the last file ended.
+    /// Number of frames not written since the last file ended.
     missing: u64,
-    /// Epochs.
+    /// Number of epochs recorded.
     epochs: u64,
 }
 
-/// The files, and what went wrong with them.
+/// The output files and their errors.
 struct Files {
     text: Option<Text>,
     series: Option<Series<Topics>>,
     errors: Vec<Said>,
 }
 
-/// What the thread works on.
+/// State of the recorder's thread.
 pub(super) struct Work {
     files: Files,
     feed: Feed,
     layout: Layout,
-    /// What is done to the bench, and when.
+    /// Notes about interventions, with their times.
     noted: Receiver<(u64, String)>,
     tell: Sender<String>,
-    /// How many errors were reported.
+    /// Number of errors already reported.
     reported: usize,
     buses: Vec<Seen>,
     /// Joint positions at the last tick.
     q: Option<[f64; MAX_ROBOT_JOINTS]>,
     backlog: Option<u64>,
-    /// True once the files say when the loop began.
+    /// True once the files contain the start time of the loop.
     has_began: bool,
     ticks: u64,
     ticks_skipped: u64,
@@ -80,7 +80,7 @@ pub(super) struct Work {
     scratch: (Vec<ContactState>, Vec<Point>),
 }
 
-/// Something periodic.
+/// A period and the time at which it last elapsed.
 struct Every(Duration, Instant);
 
 impl Every {
@@ -124,7 +124,7 @@ impl Work {
         }
     }
 
-    /// Records until it is stopped, and what has come until then.
+    /// Records until stopped, including all items queued by then.
     pub(super) fn run(mut self, head: Head, stop: &Stop) -> Recording {
         if let Some(series) = &mut self.files.series {
             let nanos = head.nanos;
@@ -160,7 +160,7 @@ impl Work {
         self.finish()
     }
 
-    /// Writes everything that waits; the most that waited in one queue.
+    /// Writes all queued items. Returns the length of the longest queue.
     fn take(&mut self) -> usize {
         let offset = realtime_minus_monotonic();
         if let Some(series) = &mut self.files.series {
@@ -184,7 +184,7 @@ impl Work {
         else {
             return 0;
         };
-        // What comes meanwhile is left to the next round, so that other queues are served.
+        // Items that arrive meanwhile are left to the next round, so that the other queues are served.
         let waiting = bus_feed.frames.slots();
         let Ok(waiting) = bus_feed.frames.read_chunk(waiting) else { return 0 };
         let taken = waiting.len();
@@ -257,7 +257,7 @@ impl Work {
         }
     }
 
-    /// What the kernel dropped on the way to all sockets; the bus is unknown.
+    /// Records new drops in the kernel's backlog; their bus is unknown.
     fn request_kernel(&mut self) {
         let (Some(total), Some(before)) = (backlog::dropped(), self.backlog) else { return };
         let frames = total.saturating_sub(before);
@@ -304,13 +304,14 @@ impl Work {
     fn flush(&mut self) {
         self.files.text(Text::flush);
         let Some(series) = &mut self.files.series else { return };
-        // Both segments of a packet to the cells belong into one file.
+        // Both segments of a packet to the cells belong in one file.
         let now = wall();
         let holds = self.buses.iter().any(|bus| bus.latched.is_within_a_packet(now));
         if !series.flush(holds) || !series.next(|writer| Topics::new(writer, &self.layout)) {
             return;
         }
-        // So that this file can be understood without the one before. They come first: what waited is in that one.
+        // Each file must be readable without the one before it. These come first: queued items went into the former
+        // file.
         let began = now.saturating_sub(WINDOW_NS);
         robot(series, &self.layout, began);
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
@@ -325,19 +326,19 @@ impl Work {
             let frames = mem::take(&mut seen.missing);
             if frames > 0 {
                 let place = format!("CAN frames on '{name}' while nothing could be written");
-                // The log has them.
+                // The log contains these frames.
                 let line = dropped(frames, &place, frames);
                 self.files.note(wall(), Some((bus, name)), NoteKind::Dropped(frames), &line);
             }
         }
     }
 
-    /// Sends messages for the user.
+    /// Sends new errors to the user.
     fn say(&mut self) {
         let Files { series, errors, .. } = &mut self.files;
         errors.extend(series.iter_mut().flat_map(Series::said));
         for line in errors.get(self.reported..).unwrap_or_default() {
-            // At the end of the run there is no receiver any more.
+            // At the end of the run the receiver is gone.
             let _ = self.tell.send(line.to_string());
         }
         self.reported = errors.len();
@@ -370,7 +371,7 @@ impl Work {
             let (file, unwritten, finished) = text.finish();
             recording.files.extend(file);
             lost = lost.max(unwritten);
-            // What happened during the run was reported before.
+            // Earlier errors have been reported during the run.
             if let Err(error) = finished {
                 self.files.errors.push(Said::Else(format!("{path}: {error}")));
             }
@@ -388,12 +389,12 @@ impl Work {
 }
 
 impl Files {
-    /// Whether one file of a recording has ended and the next has not begun.
+    /// Returns true between the end of one file of a recording and the start of the next.
     fn is_between(&self) -> bool {
         self.series.as_ref().is_some_and(|series| !series.is_open())
     }
 
-    /// Writes to the log, if there is one.
+    /// Writes to the log, if any.
     fn text(&mut self, write: impl FnOnce(&mut Text) -> io::Result<()>) {
         if let Some(text) = &mut self.text
             && let Err(error) = write(text)
@@ -403,21 +404,21 @@ impl Files {
         }
     }
 
-    /// Writes to the recording, if there is one.
+    /// Writes to the recording, if any.
     fn put(&mut self, count: Count, write: impl FnOnce(&mut Window, &mut Topics)) {
         if let Some(series) = &mut self.series {
             series.put(count, write);
         }
     }
 
-    /// Notes in every format that frames of a bus, if it is known, are missing from here on: which, and where.
+    /// Notes in all outputs that frames are missing from here on, and where; `bus` if it is known.
     fn dropped(&mut self, nanos: u64, bus: Option<(usize, &str)>, frames: u64, place: &str, total: u64) {
         let line = dropped(frames, place, total);
         self.text(|text| text.note(&line));
         self.note(nanos, bus, NoteKind::Dropped(frames), &line);
     }
 
-    /// Notes it in the recording alone.
+    /// Adds a note to the recording only.
     fn note(&mut self, nanos: u64, bus: Option<(usize, &str)>, kind: NoteKind, line: &str) {
         let (bus, interface) = bus.unzip();
         let interface = interface.unwrap_or_default();
@@ -426,7 +427,7 @@ impl Files {
     }
 }
 
-/// What each file says of the robot.
+/// Writes the robot's description, once per file.
 fn robot(series: &mut Series<Topics>, layout: &Layout, nanos: u64) {
     if layout.robot.is_some() {
         series.put(Count::others(OF_ROBOT), |window, topics| topics.robot(window, layout, nanos));
@@ -437,7 +438,7 @@ fn dropped(frames: u64, place: &str, total: u64) -> String {
     format!("DROPCOUNT: dropped {frames} {place} (total drops {total})")
 }
 
-/// The state of a bus.
+/// Diagnosis of a bus.
 fn bus(bus_feed: &BusFeed, name: &str, seen: &Seen) -> Diagnosis {
     let works = bus_feed.state.is_there();
     let (mut cells, mut silent) = (0, 0);

@@ -1,4 +1,4 @@
-//! What is recorded on each topic.
+//! Topics of a recording and their messages.
 
 use std::io;
 
@@ -21,7 +21,7 @@ use trace::ros2::robot::{Text, Transforms};
 use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
 
-/// How messages are kept for readers that come later, as bag tools write it: the last one, for ever.
+/// QoS that bag tools write for latched topics: readers that join later get the last message.
 const LATCHED: (&str, &str) = (
     "offered_qos_profiles",
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: 9223372036\n    \
@@ -35,10 +35,10 @@ const TF: &str = "/tf";
 const TF_STATIC: &str = "/tf_static";
 const DESCRIPTION: &str = "/robot_description";
 
-/// Messages of [`Topics::robot`].
+/// Number of messages that [`Topics::robot`] writes.
 pub const OF_ROBOT: u64 = 2;
 
-/// The channels of one file.
+/// Channels of one file.
 #[derive(Debug)]
 pub struct Topics {
     can: Vec<Channel>,
@@ -49,17 +49,17 @@ pub struct Topics {
     torques: Channel,
     timing: Channel,
     diagnostics: Channel,
-    /// Where links are, those that do not move, the description.
+    /// Channels of moving links, fixed links and the description.
     robot: Option<[Channel; 3]>,
-    /// By patch: its state, its points.
+    /// Channels of each patch: its state and its points.
     patches: Vec<[Channel; 2]>,
 }
 
 impl Topics {
-    /// All of them, so that a reader knows all topics from the beginning.
+    /// Creates all channels, so that a reader knows all topics from the beginning.
     ///
     /// # Errors
-    /// When the file cannot be written.
+    /// Returns [`io::Error`] if the file cannot be written.
     pub fn new(writer: &mut Writer, layout: &Layout) -> io::Result<Self> {
         let digits = [("time_digits", "9")];
         let of_arm = ["joint_states", "joint_commands", "torques"];
@@ -95,36 +95,36 @@ impl Topics {
         })
     }
 
-    /// What a file says once of the robot, if it is known.
+    /// Writes the robot's fixed transforms and description, if known.
     pub fn robot(&mut self, window: &mut Window, layout: &Layout, nanos: u64) {
         let (Some(robot), Some([_, still, description])) = (&layout.robot, &mut self.robot) else { return };
         window.write(still, nanos, &Transforms { nanos, transforms: &robot.still() });
         window.write(description, nanos, &Text(&robot.description));
     }
 
-    /// A frame of a bus.
+    /// Writes a frame of a bus.
     pub fn frame(&mut self, window: &mut Window, bus: usize, name: &str, seen: &Seen) {
         if let Some(channel) = self.can.get_mut(bus) {
             window.write(channel, seen.at_nanos, &message(name, seen));
         }
     }
 
-    /// A frame that is latched when the file begins, at `nanos`: its own time may be long before, and viewers would
-    /// begin there.
+    /// Writes a frame that was latched when the file begins, at `nanos`: its own time may be much earlier, and viewers
+    /// would start there.
     pub fn latched(&mut self, window: &mut Window, nanos: u64, (bus, name): (usize, &str), seen: &Seen) {
         if let Some(channel) = self.state.get_mut(bus) {
             window.write_at(channel, nanos, seen.at_nanos, &message(name, seen));
         }
     }
 
-    /// Something between frames; of a bus, behind those that it has heard.
+    /// Writes a note between frames; a note about a bus follows the frames recorded from it.
     pub fn note(&mut self, window: &mut Window, bus: Option<usize>, note: &Note<'_>) {
         let channel = bus.and_then(|bus| self.can.get(bus));
         let heard = channel.map(|channel| window.latest(channel)).filter(|heard| *heard > 0);
         window.write_at(&mut self.notes, heard.unwrap_or(note.nanos), note.nanos, note);
     }
 
-    /// A tick of the loop that should have begun at a time.
+    /// Writes a control tick that was due at `nanos`.
     pub fn tick(&mut self, window: &mut Window, layout: &Layout, nanos: u64, timed: &Timed) {
         let names = &layout.joints;
         fn of(joints: usize, values: &[f64; MAX_ROBOT_JOINTS]) -> &[f64] {
@@ -150,7 +150,7 @@ impl Topics {
         }
     }
 
-    /// The contact states of a patch's cells; with points if the joints' positions are given.
+    /// Writes the contact states of a patch's cells, and their points if the joint positions are given.
     pub fn patch(
         &mut self,
         window: &mut Window,
@@ -189,7 +189,7 @@ impl Topics {
         window.write(points, nanos, &PointCloud { nanos, frame_id: layout.base(), points: cloud });
     }
 
-    /// The state of everything.
+    /// Writes the diagnostics.
     pub fn diagnostics(&mut self, window: &mut Window, nanos: u64, parts: &[Diagnosis]) {
         window.write(&mut self.diagnostics, nanos, &Diagnostics { nanos, parts });
     }

@@ -1,4 +1,4 @@
-//! What has to hold of the cells before a comparison with a recording means anything.
+//! Conditions that the cells must meet before they can be compared with a recording.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,56 +12,56 @@ use super::start::Routes;
 use super::survey::{Bus, Cell, Known, Survey};
 use crate::setup::names;
 
-/// What is replayed, and what has to hold of the cells.
+/// The replayed part, and the conditions on the cells.
 #[derive(Debug)]
 pub(super) struct Checks {
     pub(super) options: Options,
     pub(super) survey: Survey,
     pub(super) routes: Routes,
-    /// What the capture is called.
+    /// Display name of the capture.
     pub(super) name: String,
 }
 
 impl Checks {
-    /// The present name of a bus.
+    /// Present name of a bus.
     pub(super) fn bus_link(&self, bus_link: usize) -> &str {
         self.routes.names.get(bus_link).map_or("", |(_, name)| name)
     }
 
-    /// The name of each bus, and the bus in the capture.
+    /// Present name and recorded state of each bus.
     pub(super) fn bus_links(&self) -> impl Iterator<Item = (&str, &Bus)> {
         let buses = &self.survey.buses;
         self.routes.names.iter().filter_map(|(bus, name)| Some((name.as_str(), buses.get(*bus)?)))
     }
 
-    /// The cells that a bus of the recording has in the part that is replayed.
+    /// Recorded cells of a bus in the replayed part.
     fn cells<'a>(&self, bus: &'a Bus) -> impl Iterator<Item = (CellId, &'a Cell)> + use<'a> {
         bus.cells_in(self.survey.bounds())
     }
 
-    /// The same, by bus.
+    /// Recorded cells of each bus in the replayed part.
     pub(super) fn recorded(&self) -> Vec<BTreeSet<CellId>> {
         self.bus_links().map(|(_, bus)| self.cells(bus).map(|(cell, _)| cell).collect()).collect()
     }
 
-    /// Whether the state where the replay begins needs new parameters: then cells have their recorded configuration
-    /// only after that state is restored.
+    /// Returns true if the state at the start of the replay includes parameters: then the cells have their recorded
+    /// configuration only after that state is restored.
     pub(super) fn configures(&self) -> bool {
         self.bus_links().any(|(_, bus)| bus.state.configures())
     }
 
-    /// Whether cells that were just started are in the state in which the replay begins.
+    /// Returns true if newly started cells already are in the state in which the replay begins.
     pub(super) fn are_fresh(&self) -> bool {
         self.options.spawn.is_some() && self.bus_links().all(|(_, bus)| bus.state.is_fresh())
     }
 
-    /// Cells whose configuration in the recording is not known.
+    /// Number of cells whose recorded configuration is unknown.
     pub(super) fn unchecked(&self) -> u64 {
         let unknown = |bus| self.cells(bus).filter(|(_, cell)| hash(cell).is_none()).count() as u64;
         self.bus_links().map(|(_, bus)| unknown(bus)).sum()
     }
 
-    /// The cells have to be there, with the configuration that they had.
+    /// Checks that the cells are present with their recorded configuration.
     pub(super) fn hashes(&self, comparator: &Comparator) -> Result<(), Mismatch> {
         if self.options.expect.is_none() {
             return Ok(());
@@ -107,7 +107,7 @@ impl Checks {
         if equal == 0 { Err(Mismatch::Unknown) } else { Ok(()) }
     }
 
-    /// The cells on each bus that measure, though in the recording they obeyed stimuli.
+    /// Cells of each bus that measure now, although they obeyed stimuli in the recording.
     pub(super) fn measuring(&self, comparator: &Comparator) -> Vec<Vec<CellId>> {
         let measures = |(bus_link, (_, bus)): (usize, (&str, &Bus))| {
             let obeyed = |cell: &CellId| bus.cells.get(cell).is_some_and(|cell| !cell.measured);
@@ -119,7 +119,7 @@ impl Checks {
     }
 }
 
-/// The hash of a cell's configuration in the recording, if it is known.
+/// Hash of a cell's recorded configuration, if known.
 const fn hash(cell: &Cell) -> Option<u16> {
     if let Known::Yes(hash) = cell.hash { Some(hash) } else { None }
 }

@@ -1,4 +1,4 @@
-//! One reply that is not as it was recorded, for people.
+//! The text of one reply that differs from the recorded one.
 
 use core::fmt::{self, Display, Formatter};
 
@@ -14,69 +14,69 @@ use serde::Serialize;
 use super::comparator::Own;
 use model::decode::Decoded;
 
-/// A reply to joints.
+/// Kind of a reply to joints.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
 pub enum What {
-    /// A torque.
+    /// A torque packet.
     Torque,
-    /// Its sensors, page 0.
+    /// A sensor packet, page 0.
     Skin,
-    /// Its sensors, page 1.
+    /// A sensor packet, page 1.
     Acceleration,
 }
 
-/// How it is not as it was recorded.
+/// Kind of a difference.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum How {
-    /// Other words.
+    /// The words differ.
     Different,
-    /// It did not come.
+    /// The reply did not come.
     Missing,
-    /// It was not recorded.
+    /// The reply was not recorded.
     Extra,
 }
 
-/// What a cell sent.
+/// A value that a cell sent.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Said {
-    /// The words of a reply to joints.
+    /// Words of a reply to joints.
     Words(What, Words),
-    /// A sum, and the remainder without those of the children.
+    /// A sum, with the remainder without the children's sums.
     Sum(Own),
     /// An answer to `configure`, with its tag.
     Answer(u8, Answer),
 }
 
-/// Some joints of a recording.
+/// Position of joints in a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct When {
-    /// Which of the replayed ones on their bus, from 0.
+    /// Number among the replayed joints of the bus, from 0.
     pub joints: u64,
-    /// Their epoch.
+    /// Epoch of the joints.
     pub epoch: u8,
-    /// When they came, in s after the recording's first frame.
+    /// Time in s after the recording's first frame.
     pub at_s: f64,
 }
 
-/// A reply that is not as it was recorded.
+/// A reply that differs from the recorded one.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Difference {
-    /// How.
+    /// Kind of the difference.
     pub how: How,
-    /// The bus, as it is called now.
+    /// Present name of the bus.
     pub bus: String,
-    /// The cell.
+    /// Node id of the cell.
     pub cell: u8,
-    /// The joints that it answers, if it answers joints.
+    /// Joints that the reply answers, if any.
     #[serde(flatten)]
     pub when: Option<When>,
-    /// In several lines, as it is shown.
+    /// Text for people, in several lines.
     pub text: String,
 }
 
 impl Difference {
-    /// Between what a cell sent in the recording, and now.
+    /// Describes the difference between a cell's recorded and present values.
     #[must_use]
     pub fn new(
         how: How,
@@ -113,7 +113,7 @@ impl Difference {
 }
 
 impl Said {
-    /// As the text of a message.
+    /// Formats the value as the text of a message.
     fn text(&self, cell: CellId, epoch: Epoch, units: Units) -> String {
         match self {
             &Self::Words(what, words) => {
@@ -131,7 +131,7 @@ impl Said {
         }
     }
 
-    /// Its torques in steps, none where one is saturated, and their format.
+    /// Torques in steps, `None` for saturated ones, and their format.
     fn steps(&self, units: Units) -> Option<([Option<i32>; MAX_JOINTS], TorqueFormat)> {
         match self {
             Self::Words(What::Torque, words) => {
@@ -143,7 +143,7 @@ impl Said {
     }
 }
 
-/// A sum, its children, and what the cell itself put into it.
+/// Formats a sum, its children, and the cell's own contribution.
 fn summed(cell: CellId, epoch: Epoch, own: &Own, units: Units) -> String {
     let sum = Message::Sum { from: cell, epoch, torque: own.sum, count: own.count };
     let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
@@ -167,13 +167,13 @@ fn summed(cell: CellId, epoch: Epoch, own: &Own, units: Units) -> String {
     format!("{}; {less}:{words} Nm", meaning(sum, units))
 }
 
-/// A message as text, without the verdict.
+/// Formats a message as text, without the verdict.
 fn meaning(message: Message, units: Units) -> String {
     let text = Decoded::Message(message).in_units(units).to_string();
     text.split_once(' ').map_or(String::new(), |(_, text)| text.trim_start().to_owned())
 }
 
-/// By how much torques differ: `joint 1: 2 steps more (0.0005 Nm), joint 3: ...`.
+/// Formats the differences between torques: `joint 1: 2 steps more (0.0005 Nm), joint 3: ...`.
 struct Steps {
     recorded: [Option<i32>; MAX_JOINTS],
     now: [Option<i32>; MAX_JOINTS],

@@ -1,4 +1,4 @@
-//! Why a replay cannot begin, or could not go on.
+//! Errors that keep a replay from starting, or end it.
 
 use std::path::PathBuf;
 use std::process::ExitStatus;
@@ -10,31 +10,31 @@ use crate::error::{RunError, why};
 use model::decode::BUSES;
 use trace::capture::CaptureError;
 
-/// Cells that are not as they were in the recording.
+/// An error of cells that are not as they were in the recording.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 pub enum Mismatch {
-    /// All of them.
+    /// All cells differ.
     #[error(
-        "the recording is of another skin: all {count} cells have another configuration than then, {cells}; {}",
+        "the recording is of another skin: the configurations of all {count} cells differ, {cells}; {}",
         hint(*.spawned)
     )]
     Skin {
-        /// How many there are.
+        /// Number of cells.
         count: usize,
-        /// Which, with their configurations.
+        /// The cells with their configurations.
         cells: String,
-        /// Whether they were started here.
+        /// True if this replay started the cells.
         spawned: bool,
     },
-    /// Some.
+    /// Some cells differ.
     #[error("cells have another configuration than in the recording: {cells}; {}", hint(*.spawned))]
     Cells {
-        /// Which, with their configurations.
+        /// The cells with their configurations.
         cells: String,
-        /// Whether they were started here.
+        /// True if this replay started the cells.
         spawned: bool,
     },
-    /// Some are not there.
+    /// Some cells are absent.
     #[error("cells of the recording are absent: {0}; start them with cell-node, or all with --spawn")]
     Absent(String),
     /// The recording has no heartbeat.
@@ -53,21 +53,21 @@ fn hint(spawned: bool) -> &'static str {
     }
 }
 
-/// Why a replay cannot begin, or could not go on.
+/// An error that keeps a replay from starting, or ends it.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ReplayError {
-    /// As of a run: a skin, a bus, a program, a thread.
+    /// An error that a run can have too: of a skin, a bus, a program or a thread.
     #[error(transparent)]
     Run(RunError),
-    /// Another kind is named for a bus than it can have.
+    /// A bus cannot have the kind that is named for it.
     #[error(transparent)]
     Kinds(#[from] KindsError),
     /// Standard input cannot be read twice.
     #[error("a capture is read twice, which standard input cannot be: write it to a file, and name that")]
     StandardInput,
-    /// Neither can a pipe.
-    #[error("{} is no regular file, and a capture is read twice: write it to a file, and name that", .0.display())]
+    /// A pipe cannot be read twice.
+    #[error("{} is not a regular file, and a capture is read twice: write it to a file, and name that", .0.display())]
     Pipe(PathBuf),
     /// The capture does not open.
     #[error(transparent)]
@@ -81,18 +81,18 @@ pub enum ReplayError {
     /// The capture has too many buses.
     #[error("{0} has frames of more than {BUSES} buses: a replay sends to no more than that")]
     Buses(String),
-    /// There is nothing to be sent.
+    /// The capture has nothing to send.
     #[error("{0}: there is no frame in it")]
     Empty(String),
-    /// The bus whose cells are to answer is not there.
+    /// The bus whose cells are to answer does not exist.
     #[error("{0}; or start fresh cells on an embedded bus with --spawn")]
     NotThere(BusError),
-    /// Nor in the requested part.
+    /// The requested part has nothing to send.
     #[error("nothing remains to be sent: {name} ends at {ends_s:.3} s, and --from and --to leave none of it")]
     NothingLeft {
-        /// What the capture is called.
+        /// Display name of the capture.
         name: String,
-        /// When its last frame came, in s of the run, or after its first frame.
+        /// Time of the last frame, in s of the run, or after its first frame.
         ends_s: f64,
     },
     /// An option names a bus that the capture does not have.
@@ -100,59 +100,59 @@ pub enum ReplayError {
     NoBus {
         /// The option and its value.
         option: String,
-        /// What the capture is called.
+        /// Display name of the capture.
         capture: String,
-        /// The bus.
+        /// Name of the bus.
         bus: String,
-        /// The capture's.
+        /// Names of the capture's buses.
         buses: String,
     },
-    /// A bus would go to two.
+    /// A bus of the capture is mapped to two buses.
     #[error("--map names {0} twice: a bus goes to one other bus")]
     MapTwice(String),
-    /// Two buses would go to one.
+    /// Two buses of the capture are mapped to one.
     #[error(
         "two buses of the capture go to one, so replies cannot be assigned: give each a bus of its own, or leave out --expect, \
          --lockstep and --only inputs"
     )]
     Merged,
-    /// There is no skin for the cells that are to be started.
+    /// The skin of the cells to start is unknown.
     #[error(
         "--spawn: {0} has no skin attached, as recordings of `skinbus run --record` have: name it with --skin SKIN.toml"
     )]
     NoSkin(String),
-    /// The skin does not have a bus.
+    /// The skin does not have a bus of the capture.
     #[error("--spawn: the capture goes to {bus}, and the skin {skin} has {buses}: send it there with --map")]
     NotOfSkin {
-        /// The bus.
+        /// Name of the bus.
         bus: String,
-        /// The skin's name.
+        /// Name of the skin.
         skin: String,
-        /// Its buses.
+        /// Names of the skin's buses.
         buses: String,
     },
-    /// Cells are where some were to be started.
+    /// Other cells are on a bus on which cells were to be started.
     #[error("cells are on {bus} already: {cells}; leave out --spawn to use them, or stop them")]
     CellsThere {
-        /// The bus.
+        /// Name of the bus.
         bus: String,
-        /// Which.
+        /// The cells found.
         cells: String,
     },
     /// A process of cells ended too early.
     #[error("the process of {cells} ended while starting ({status}){}", why(.said.as_deref()))]
     Ended {
-        /// Its cells.
+        /// The cells of the process.
         cells: String,
-        /// How.
+        /// Exit status of the process.
         status: ExitStatus,
-        /// Why, if it said so.
+        /// Reason that the process gave, if any.
         said: Option<String>,
     },
     /// Another gateway is on a bus.
     #[error("another gateway is on {0}: stop it, or send the capture to another bus with --map")]
     OtherGateway(String),
-    /// There is no cell.
+    /// No cell is on the buses.
     #[error("no cell answers on {0}: start them with cell-node, or with --spawn")]
     NoCell(String),
     /// The cells are not as they were.
@@ -161,7 +161,7 @@ pub enum ReplayError {
     /// Cells do not confirm test mode.
     #[error("cells do not go into test mode: {0}")]
     NoTestMode(String),
-    /// Cells measure, and stimuli mean nothing to them.
+    /// Cells measure and ignore stimuli.
     #[error(
         "cells measure and do not obey stimuli, as they did in the recording: {0}; --test-mode lets them obey while the \
          replay lasts"
@@ -169,7 +169,7 @@ pub enum ReplayError {
     Measuring(String),
 }
 
-/// What stops a run stops a replay.
+/// All errors of a run can end a replay.
 impl<E> From<E> for ReplayError
 where
     RunError: From<E>,
@@ -180,7 +180,7 @@ where
 }
 
 impl ReplayError {
-    /// 2 for wrong use or configuration, 1 for a replay that failed.
+    /// Exit code: 2 for wrong use or configuration, 1 for a replay that failed.
     #[must_use]
     pub const fn exit_code(&self) -> u8 {
         match self {

@@ -20,33 +20,34 @@ use super::{Options, ReplayError};
 use crate::bus::realtime;
 use crate::setup::names;
 
-/// How often the stop flag is read.
+/// Interval between readings of the stop flag, in ns.
 const LOOK_NS: u64 = 100_000_000;
-/// How long to wait for the next step, or for an interface that is down.
+/// Pause before the next step.
 const PAUSE: Duration = Duration::from_micros(100);
 const DOWN: Duration = Duration::from_millis(50);
-/// If no cell has answered for so long, cells are asked again, as a frame may have been lost; and given up.
+/// Time without any answer after which cells are queried again, as a frame may have been lost, and after which they are
+/// given up.
 const REMIND: Duration = Duration::from_millis(500);
 const TIMEOUT: Duration = Duration::from_secs(3);
-/// Joints are resent so often when cells were too late for them.
+/// Maximum number of times that joints are resent when cells were too late for them.
 const REQUEST_AGAIN: u32 = 16;
-/// So often after joints for which that did not help: then lateness is hardly the reason.
+/// The same maximum after joints for which resending did not help: lateness is hardly the reason then.
 const REQUEST_AGAIN_IN_VAIN: u32 = 2;
-/// How long the answers to that are waited for the first time, before cells have a heartbeat to send as well.
+/// First wait for answers to resent joints, before cells must send a heartbeat too.
 const ANSWERS: Duration = Duration::from_millis(100);
-/// This factor is the longest wait.
+/// Maximum of the factor on the wait.
 const LONGEST: u32 = 4;
 
-/// The machine's clock, and buses.
+/// The stage of a real replay.
 #[derive(Debug)]
 pub(super) struct Live {
     pub(super) bus_links: Arc<Vec<BusLink>>,
     pub(super) shared_state: Arc<SharedState>,
     /// Messages for the user.
     pub(super) log_sender: Sender<String>,
-    /// Cells that did not answer, and joints that were resent.
+    /// Counts of cells that did not answer, and of joints that were resent.
     pub(super) lockstep: Lockstep,
-    /// The buses on which resending did not help the last time.
+    /// Buses on which resending did not help the last time.
     pub(super) in_vain: BTreeSet<usize>,
     pub(super) down: BTreeSet<usize>,
 }
@@ -95,9 +96,9 @@ impl Stage for Live {
         if let Err(SendError { cause: error @ BusError::Down(_), .. }) = &sent {
             if self.down.insert(index) {
                 self.shared_state.comparator().is_down(index);
-                self.say(format!("{error}; what is due meanwhile is lost, and counted"));
+                self.say(format!("{error}; frames due meanwhile are lost, and counted"));
             }
-            // With a clock something is lost by waiting.
+            // At a timed pace, waiting would lose frames.
             let Options { pace, lockstep, .. } = self.shared_state.checks.options;
             if pace == Pace::Max || lockstep {
                 std::thread::sleep(DOWN);
@@ -115,9 +116,9 @@ impl Stage for Live {
         let Some(round) = open.round.filter(|_| self.shared_state.checks.options.expect.is_some()) else {
             return;
         };
-        // On a slow machine a cell skips joints that it processes more than one period late, and does not answer.
-        // They are resent under the epoch before, and then under their own; and the sync comes later, because on
-        // such a machine the heartbeats of some cells delay others.
+        // On a slow machine a cell skips joints that it processes more than one period late, and does not answer. They
+        // are resent under the epoch before, and then under their own. The sync follows later, because on such a
+        // machine the heartbeats of some cells delay others.
         let tries = if self.in_vain.contains(&bus_link) { REQUEST_AGAIN_IN_VAIN } else { REQUEST_AGAIN };
         for again in 0.. {
             if self.shared_state.is_over() {
@@ -180,7 +181,7 @@ impl Stage for Live {
 }
 
 impl Live {
-    /// Messages that reset the contact state of the cells that are on a bus, and make them obey what comes.
+    /// Messages that reset the contact state of the cells on a bus that are in test mode.
     fn forgetting(&self, bus_link: usize) -> Vec<Message> {
         let comparator = self.shared_state.comparator();
         let obeying = comparator.settled(bus_link).filter(|(_, cell)| cell.claim.says(Flags::TEST_MODE));
@@ -191,12 +192,12 @@ impl Live {
         self.bus_links.get(bus_link).map_or(Ok(()), |bus_link| bus_link.send(messages))
     }
 
-    /// Sends a message for the user; at the end there is no receiver any more.
+    /// Sends a message for the user; at the end of the replay the receiver is gone.
     fn say(&self, text: String) {
         let _ = self.log_sender.send(text);
     }
 
-    /// Waits until the cells of a bus have done all that was sent so far, and this.
+    /// Waits until the cells of a bus have processed all that was sent so far, and `last`.
     fn finish(&mut self, bus_link: usize, last: &[Message]) -> Result<(), BusError> {
         self.shared_state.comparator().announce_again(bus_link);
         self.tell(bus_link, last)?;
@@ -204,7 +205,7 @@ impl Live {
         Ok(())
     }
 
-    /// Requests counters, and waits for them.
+    /// Requests counters and waits for them.
     pub(super) fn report(&mut self, bus_link: usize) -> Result<(), BusError> {
         self.finish(bus_link, &[Message::Report, Message::Sync])
     }
@@ -219,7 +220,7 @@ impl Live {
             }
             if reminded.elapsed() > REMIND {
                 reminded = Instant::now();
-                // A bus that takes nothing is noticed at the next frame.
+                // The next frame reports a bus that refuses messages.
                 let _ = self.tell(bus_link, &[Message::Sync]);
             }
             if progress.elapsed() > TIMEOUT {

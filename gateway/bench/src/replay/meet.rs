@@ -1,4 +1,4 @@
-//! Before anything is sent: the cells are there, their tree is complete, and they are as they have to be.
+//! Checks before the start: the cells are present, their tree is complete, and their state fits the recording.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -17,15 +17,15 @@ use crate::error::RunError;
 use crate::processes::STARTING;
 use crate::setup::{Timeout, names};
 
-/// Cells that were there before send at least a heartbeat within this time.
+/// Time within which cells already present send at least one heartbeat.
 const SHOWING: Duration = Duration::from_secs(1);
-/// If no further cell finds a route to the root for so long, the rest are unreachable: two hellos, and a search.
+/// Time without a newly reachable cell after which the rest counts as unreachable: two hellos and a search.
 const ORGANISING: Duration = Duration::from_secs(2);
-/// The polling period.
+/// Interval between polls.
 const LOOK: Duration = Duration::from_millis(5);
 
 impl Session {
-    /// Queries the cells, and checks that they are as required.
+    /// Queries the cells and checks that they fit the recording.
     pub(super) fn meet(&mut self, skin_override: Option<&SkinOverride>) -> Result<(), ReplayError> {
         let shared_state = Arc::clone(&self.shared_state);
         let (checks, options) = (&shared_state.checks, &shared_state.checks.options);
@@ -74,7 +74,7 @@ impl Session {
         Ok(())
     }
 
-    /// Polls which cells are there, until the check is done.
+    /// Polls until the check returns true.
     fn wait(
         &mut self,
         mut is_last: impl FnMut(&mut Self, &Comparator) -> Result<bool, ReplayError>,
@@ -90,13 +90,13 @@ impl Session {
         self.signalled.load(Ordering::Relaxed)
     }
 
-    /// Waits until the required cells answer, or no further cell does.
+    /// Waits until the required cells have answered, or no further cell does.
     fn wait_for_cells(&mut self, target: &[BTreeSet<CellId>]) -> Result<(), ReplayError> {
         let spawned = self.buses.processes.pids().next().is_some();
         for bus_link in self.buses.bus_links.iter() {
             bus_link.send(&[Message::Sync])?;
         }
-        // Every cell answers: even if none is required, all are known at the first poll.
+        // All cells answer: after the first pause they are known even if none is required.
         thread::sleep(LOOK);
         let all = target.iter().map(BTreeSet::len).sum::<usize>();
         let mut timeout = Timeout::new(if spawned { STARTING } else { SHOWING });
@@ -146,7 +146,7 @@ impl Session {
         })
     }
 
-    /// Puts cells that measure into test mode.
+    /// Puts measuring cells into test mode.
     fn set_test_mode(&mut self, measuring: &[Vec<CellId>]) -> Result<(), ReplayError> {
         self.tell_mode(measuring, true)?;
         let give_up = Instant::now() + SHOWING;
@@ -163,12 +163,12 @@ impl Session {
         })
     }
 
-    /// Restores the cells' former mode.
+    /// Restores the former mode of the cells.
     pub(super) fn leave(&self) -> Result<(), ReplayError> {
         self.tell_mode(&self.measuring, false)
     }
 
-    /// Lets cells obey stimuli and report it at once, or measure.
+    /// Switches cells to obey stimuli and report it at once, or to measure.
     fn tell_mode(&self, cells: &[Vec<CellId>], obey: bool) -> Result<(), ReplayError> {
         for (bus_link, cells) in self.buses.bus_links.iter().zip(cells).filter(|(_, cells)| !cells.is_empty())
         {

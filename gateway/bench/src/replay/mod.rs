@@ -10,8 +10,9 @@
 //!                                                  └─ receiver (one a bus) <──────────┘
 //! ```
 //!
-//! The logic is pure: [`survey`], [`model::latched::state`], [`trace::order`], [`replay_plan`], [`player`] (its clock and
-//! buses are a [`player::Stage`]), [`comparator`] and [`difference`]. The rest is threads, sockets and the clock.
+//! The logic is pure: [`survey`], [`model::latched::state`], [`trace::order`], [`replay_plan`], [`player`] (its clock
+//! and buses are a [`player::Stage`]), [`comparator`] and [`difference`]. The other modules hold threads, sockets and
+//! the clock.
 
 mod checks;
 pub mod comparator;
@@ -56,62 +57,62 @@ use crate::signals::caught;
 use model::decode::BUSES;
 use trace::capture::{CaptureError, Entry, Extras, NoteKind, Reader, seconds_since};
 
-/// The period of wake-ups for which lateness is measured, in ns.
+/// Period in ns of the wake-ups whose lateness is measured.
 const GRID_NS: u64 = 2_000_000;
-/// Lines of a log that cannot be read are named up to so many.
+/// Maximum number of unreadable lines that are named.
 const NAMED_LINES: u64 = 5;
 
-/// Cells that are started for a replay.
+/// Cells to start for a replay.
 #[derive(Clone, Debug)]
 pub struct Spawn {
-    /// Their skin; else the one attached to the recording.
+    /// Path of their skin; `None` for the skin attached to the recording.
     pub skin: Option<PathBuf>,
-    /// At most so many in a process.
+    /// Maximum number of cells per process.
     pub cells_per_process: usize,
 }
 
-/// What a replay needs to know.
+/// Options of a replay.
 #[derive(Clone, Debug)]
 pub struct Options {
     /// The capture: a file, or the parts of a recording.
     pub files: Vec<PathBuf>,
-    /// Which kind of bus.
+    /// Kind of each bus.
     pub kinds: Kinds,
-    /// Whose frames are sent.
+    /// Filter by sender.
     pub only: Only,
-    /// The capture's buses whose frames are sent; all when empty.
+    /// Buses of the capture whose frames are sent; empty for all.
     pub buses: Vec<String>,
-    /// Which bus of the capture goes to which one now.
+    /// Pairs of a bus of the capture and the bus that receives its frames.
     pub map: Vec<(String, String)>,
-    /// Which part of the capture.
+    /// Part of the capture.
     pub part: Part,
-    /// How many passes; without end if none.
+    /// Number of passes, or `None` for no end.
     pub passes: Option<u32>,
-    /// How fast.
+    /// Speed of the replay.
     pub pace: Pace,
-    /// How long before its time a frame is waited for by spinning.
+    /// Time before a frame is due during which the thread spins.
     pub spin: Duration,
-    /// Whether joints wait until all cells have answered the ones before.
+    /// True if joints wait until all cells have answered the joints before.
     pub lockstep: bool,
-    /// Whether replies are compared with recorded ones, and by how many steps torques may differ.
+    /// Tolerance in steps of torques for the comparison with recorded replies, or `None` for no comparison.
     pub expect: Option<u16>,
-    /// Cells to start.
+    /// Cells to start, if any.
     pub spawn: Option<Spawn>,
-    /// Whether cells that measure are put into test mode.
+    /// True if measuring cells are put into test mode.
     pub test_mode: bool,
-    /// How long a full bus is waited for.
+    /// Time to wait for room on a full bus.
     pub timeout: Duration,
-    /// Bytes that may wait in the socket of a bus, as the kernel counts them.
+    /// Size of a socket's receive buffer in bytes, as the kernel counts them.
     pub receive_buffer: usize,
-    /// Whether progress is hidden.
+    /// True if progress is hidden.
     pub quiet: bool,
 }
 
 /// Replays a capture to its end, or until SIGINT or SIGTERM.
 ///
 /// # Errors
-/// When it cannot begin, or could not be read to its end. What went wrong on the buses and in the comparison is in the
-/// summary.
+/// Returns [`ReplayError`] if the replay cannot start or the capture cannot be read to its end. Problems on the buses
+/// and in the comparison are in the summary.
 pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
     let progress = Progress::lines(options.quiet);
     let (survey, extras, name) = look_through(options, &progress)?;
@@ -119,9 +120,9 @@ pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
     let skin_override =
         options.spawn.as_ref().map(|spawn| start::skin_override(spawn, &routes, &extras, &name));
     let skin_override = skin_override.transpose()?;
-    // Until now there was nothing to clean up.
+    // Up to here there is nothing to clean up after a signal.
     let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
-    // In lockstep cells say when a frame is sent, not its time.
+    // In lockstep, frames are sent when cells have answered, not at a time.
     let timed = matches!(options.pace, Pace::Timed(_)) && !options.lockstep;
     let idle = timed.then(|| idle_lateness(GRID_NS));
     let recorded = start::recorded_skin(&extras);
@@ -143,7 +144,7 @@ pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
         .run(idle.as_ref(), skin_override.as_ref())
 }
 
-/// Reads the capture once, from end to end; also what it is called.
+/// Reads the capture once from end to end. Returns its survey, its extras and its display name.
 fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extras, String), ReplayError> {
     if options.files.iter().any(|file| is_standard_input(file)) {
         return Err(ReplayError::StandardInput);
@@ -157,7 +158,7 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
     let mut survey = Survey::new(options.part);
     let few = |buses| if buses > BUSES { Err(ReplayError::Buses(name.clone())) } else { Ok(()) };
     let note = |text: String| progress.note(&format!("{name}: {text}"));
-    // What was latched is stored before the first frame, and is known once it is open.
+    // Latched frames are stored before the first frame, and are known once the capture is open.
     let latched = &reader.extras().latched;
     let buses: BTreeSet<_> = latched.iter().map(|frame| frame.bus.as_str()).collect();
     few(buses.len())?;
@@ -221,7 +222,7 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
     Ok((survey, reader.extras().clone(), name))
 }
 
-/// Cells that are on the bus already will receive their own recorded messages.
+/// Warns that cells which are on the bus already will receive their own recorded messages.
 fn warn_of_doubles(checks: &Checks, heard: &[BTreeSet<CellId>], progress: &Progress) {
     for ((name, bus), heard) in checks.bus_links().zip(heard) {
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();

@@ -1,10 +1,10 @@
-//! Sending what is due, when it is due.
+//! The player, which sends each step when it is due.
 //!
 //! ```text
 //!   steps ──> [ Player ] ──> frames due together, bus by bus ──> stage
 //! ```
 //!
-//! The stage has the clock and the buses; in the tests both are variables.
+//! The stage provides the clock and the buses; tests use variables for both.
 
 use hdrhistogram::Histogram;
 use protocol::bus::batch::BATCH;
@@ -18,93 +18,94 @@ use super::ReplayError;
 use super::replay_plan::{Due, Open, Role, Step};
 use model::quantiles::histogram;
 
-/// From the decision to begin to the first frame, in ns.
+/// Time in ns from the decision to start to the first frame.
 const LEAD_NS: u64 = 1_000_000;
 
-/// The clock, the buses, and the output.
+/// The clock, the buses and the output of a player.
 pub trait Stage {
-    /// A monotonic clock in ns.
+    /// Monotonic clock in ns.
     fn now(&self) -> u64;
     /// Waits until the clock reads `at`, or the replay is stopped.
     fn wait_until(&mut self, at: u64);
-    /// Nothing is there to be sent, and more will come.
+    /// Pauses while the queue is empty and more steps will come.
     fn pause(&mut self);
-    /// Whether the replay was stopped.
+    /// Returns true if the replay was stopped.
     fn is_over(&self) -> bool;
-    /// Joints are about to be sent.
+    /// Notes that joints are about to be sent.
     fn announce(&mut self, bus_link: usize, round: Option<u64>, epoch: Epoch);
-    /// Sends frames, waiting for room for a while.
+    /// Sends frames; waits for room up to the timeout.
     ///
     /// # Errors
-    /// When the bus stays full, is down or has ended.
+    /// Returns [`SendError`] if the bus stays full, is down or has ended.
     fn send(&mut self, bus_link: usize, frames: &[Frame]) -> Result<(), SendError>;
-    /// A bus did not take the joints of a round.
+    /// Notes that a bus refused the joints of a round.
     fn was_not_sent(&mut self, bus_link: usize, round: u64);
     /// Waits until the cells of a bus have answered.
     fn wait_for_answers(&mut self, bus_link: usize, open: &Open);
     /// Restores a state, bus by bus.
     ///
     /// # Errors
-    /// When the cells are then not as they have to be, or a bus has ended.
+    /// Returns [`ReplayError`] if the cells then differ from the recording, or a bus has ended.
     fn restore(&mut self, states: &[(usize, Vec<Message>)]) -> Result<(), ReplayError>;
-    /// Shows where the replay is, in ns after its first frame.
+    /// Shows the position of the replay, in ns after its first frame.
     fn show(&mut self, at: u64);
 }
 
-/// How fast.
+/// Speed of a replay.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Pace {
-    /// At the capture's own times, so many times as fast.
+    /// The capture's own times divided by this factor.
     Timed(f64),
-    /// As fast as the bus takes it.
+    /// As fast as the bus accepts frames.
     Max,
 }
 
-/// The outcome of one bus' frames.
+/// Counts of one bus's frames.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct BusLinkTally {
-    /// Taken by the bus.
+    /// Frames that the bus accepted.
     pub sent: u64,
-    /// Not taken, because it stayed full.
+    /// Frames refused because the bus stayed full.
     pub refused: u64,
-    /// Not taken, because it was down.
+    /// Frames refused because the bus was down.
     pub lost: u64,
-    /// How often it went down.
+    /// Number of times that the bus went down.
     pub outages: u64,
 }
 
-/// What a player has done.
+/// Result of a player.
 #[derive(Debug)]
 pub struct Played {
-    /// Bus by bus.
+    /// Counts of each bus.
     pub bus_links: Vec<BusLinkTally>,
-    /// How late frames were sent, in ns; without those that were to be sent at once.
+    /// Lateness of the frames in ns, without frames that were due at once.
     pub late: Histogram<u64>,
-    /// Whether it was stopped before the end.
+    /// True if the replay was stopped before its end.
     pub was_stopped: bool,
-    /// Why it could not go on.
+    /// Error that ended the replay, if any.
     pub failure: Option<ReplayError>,
 }
 
-/// Sends steps.
+/// Sends the steps of a replay.
 #[derive(Debug)]
 pub struct Player {
     pace: Pace,
-    /// With lockstep, the frames of a sync on each bus.
+    /// Frames of a sync on each bus, in lockstep.
     syncs: Option<Vec<Vec<Frame>>>,
     /// Joints of each bus whose answers are awaited.
     open: Vec<Option<Open>>,
     down: Vec<bool>,
-    /// The clock's and the capture's time of the same moment.
+    /// The clock's time and the capture's time of the same moment.
     origin: Option<(u64, u64)>,
     played: Played,
     batch: Vec<Frame>,
-    /// The rounds of joints in the batch, and where they stand.
+    /// Rounds of joints in the batch, with their positions.
     rounds: Vec<(usize, u64)>,
 }
 
 impl Player {
-    /// For some buses; `syncs` has the frames of a sync on each, when the next joints shall wait for all answers.
+    /// Creates a player for `bus_links` buses. `syncs` holds the frames of a sync on each bus if joints must wait for
+    /// all answers.
     #[must_use]
     pub fn new(bus_links: usize, pace: Pace, syncs: Option<Vec<Vec<Frame>>>) -> Self {
         Self {
@@ -124,14 +125,14 @@ impl Player {
         }
     }
 
-    /// Sends all, or until it is stopped or a bus has ended.
+    /// Sends all steps until the end, a stop, or the end of a bus.
     pub fn play(mut self, steps: &mut rtrb::Consumer<Step>, stage: &mut impl Stage) -> Played {
         while self.played.failure.is_none() {
             if stage.is_over() {
                 self.played.was_stopped = true;
                 break;
             }
-            // Read before the queue, or what is pushed between the two would be lost.
+            // Read before the queue: a step pushed between the two reads would be lost.
             let is_last = steps.is_abandoned();
             match steps.peek() {
                 Err(_) if is_last => break,
@@ -164,7 +165,7 @@ impl Player {
         }
     }
 
-    /// When a frame is due by the clock; at once when there is none.
+    /// Time at which a frame is due by the clock, or `None` to send it at once.
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
@@ -180,7 +181,7 @@ impl Player {
         Some(clock + (due.at.saturating_sub(at) as f64 / speed) as u64)
     }
 
-    /// Sends a frame when it is due, and with it those behind it that are due by then on the same bus.
+    /// Sends a frame when it is due, with the following frames of the same bus that are due by then.
     fn frames_from(&mut self, first: &Due, steps: &mut rtrb::Consumer<Step>, stage: &mut impl Stage) {
         let bus_link = first.bus_link;
         if self.syncs.is_some() && is_joints(first) {
@@ -189,7 +190,7 @@ impl Player {
         self.batch.clear();
         self.rounds.clear();
         let deadline = self.deadline(first, stage.now());
-        // The receiver of the answer has to know the request, and afterwards there is no time for that.
+        // The receiver of the answer must know the request, and later there is no time for that.
         let mut open = self.push(first, stage);
         let _ = steps.pop();
         if let Some(deadline) = deadline {
@@ -198,7 +199,7 @@ impl Player {
         let now = stage.now();
         self.was_late(deadline, now);
         stage.show(first.at);
-        // In lockstep joints end a batch: what comes next has to wait, or belongs to the next ones.
+        // In lockstep, joints end a batch: the next frame must wait, or belongs to the next joints.
         while self.batch.len() < BATCH && !(self.syncs.is_some() && open.is_some()) {
             let Ok(&Step::Frame(next)) = steps.peek() else { break };
             let waits = self.syncs.is_some()
@@ -233,7 +234,7 @@ impl Player {
 
     fn was_late(&mut self, deadline: Option<u64>, now: u64) {
         if let Some(deadline) = deadline {
-            // It resizes itself, so recording cannot fail.
+            // The histogram resizes itself, so recording cannot fail.
             let _ = self.played.late.record(now.saturating_sub(deadline));
         }
     }
@@ -250,7 +251,7 @@ impl Player {
         else {
             return;
         };
-        // A sync may be behind them.
+        // A sync may follow the frames.
         let taken = sent.as_ref().map_or_else(|error| error.sent.min(frames), |()| frames);
         let rest = (frames - taken) as u64;
         tally.sent += taken as u64;

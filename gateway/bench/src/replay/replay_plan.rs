@@ -1,8 +1,8 @@
-//! From the frames of a capture to what is sent, and when.
+//! Replay plan: turns the frames of a capture into steps with their times.
 //!
 //! ```text
-//!   frames ──> take ──> [ order by time ] ──> [ what is it? ] ──> picked? ──> Step, Step, ... ──> player
-//!                                └── joints, replies ──> comparator
+//!   frames ──> add_frame ──> [ order by time ] ──> [ classify ] ──> selected? ──> steps ──> player
+//!                                                       └── joints, replies ──> comparator
 //! ```
 
 use std::collections::{BTreeMap, VecDeque};
@@ -21,109 +21,109 @@ use model::decode::Decoded;
 use model::decode::settle::Settler;
 use trace::order::{Order, Ordered};
 
-/// Recorded replies are taken in for so long after the end of the part, in ns: they answer joints in it.
+/// Time in ns after the end of the part during which recorded replies are still read, because they answer joints in it.
 const LATE_REPLIES_NS: u64 = 1_000_000_000;
-/// The minimum time from one pass to the next, in ns.
+/// Minimum time in ns between two passes.
 const MIN_GAP_NS: u64 = 1_000_000;
 
-/// Whose frames are sent.
+/// Filter of the sent frames by sender.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Only {
-    /// Everybody's, foreign ones too.
+    /// Frames of all senders, including foreign ones.
     #[default]
     All,
     /// Commands, configuration and stimuli.
     Inputs,
-    /// What cells sent.
+    /// Frames from cells.
     Replies,
 }
 
-/// What is sent.
+/// Selection of the frames to send.
 #[derive(Clone, Debug)]
 pub struct Selection {
-    /// The filter by sender.
+    /// Filter by sender.
     pub only: Only,
-    /// By the capture's buses: where a bus' frames go, if they go anywhere.
+    /// Destination of each bus of the capture; `None` for a bus that is not replayed.
     pub bus_links: Vec<Option<usize>>,
-    /// Whether packets are read: joints are numbered, and replies handed on.
+    /// True if packets are decoded: joints are numbered, and replies compared.
     pub reads: bool,
 }
 
-/// What is to be done next.
+/// Next step of a replay.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Step {
-    /// A frame is to be sent.
+    /// Sends a frame.
     Frame(Due),
-    /// A pass begins: the latched state is restored, bus by bus.
+    /// Starts a pass: restores the latched state, bus by bus.
     Restore(Vec<(usize, Vec<Message>)>),
 }
 
-/// A frame and its time.
+/// A frame with its time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Due {
-    /// When, in ns after the first one, by the capture's clock and over all passes.
+    /// Time in ns after the first frame, by the capture's clock and over all passes.
     pub at: u64,
-    /// On which bus.
+    /// Index of the bus.
     pub bus_link: usize,
-    /// What.
+    /// The frame to send.
     pub frame: Frame,
-    /// What it means for the order of things.
+    /// Role of the frame in lockstep and comparison.
     pub role: Role,
-    /// It is older than what was sent before it, and is sent at once.
+    /// True if the frame is older than a frame sent before it, and is sent at once.
     pub is_late: bool,
 }
 
-/// What a frame means for the order of things.
+/// Role of a frame in lockstep and comparison.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Role {
-    /// Nothing.
+    /// A frame without a role.
     Plain,
-    /// The first segment of joints.
+    /// First segment of a joint packet.
     SegmentOfJoints,
-    /// Joints.
+    /// Completes a joint packet.
     Joints(Open),
 }
 
 /// Joints that cells answer.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Open {
-    /// Their epoch.
+    /// Epoch of the joints.
     pub epoch: Epoch,
-    /// Their positions.
+    /// Positions of the joints.
     pub joints: Joints,
-    /// Which ones they are on their bus, if they are compared.
+    /// Number of their round on the bus, if they are compared.
     pub round: Option<u64>,
 }
 
-/// What a replay plan has counted.
+/// Counts of a replay plan.
 #[derive(Clone, Debug, Default)]
 pub struct PlanSummary {
-    /// Frames that were not sent, by reason.
+    /// Number of frames that were not sent, by reason.
     pub skipped: BTreeMap<&'static str, u64>,
-    /// Frames that were older than one sent before them.
+    /// Number of frames that were older than a frame sent before them.
     pub late: u64,
 }
 
-/// One pass over a capture, or several.
+/// Plans one or several passes over a capture.
 #[derive(Debug)]
 pub struct ReplayPlan<'a> {
     survey: &'a Survey,
     selection: &'a Selection,
-    /// Frames that wait for their place, with their buses.
+    /// Frames waiting to be sorted, with their buses.
     order: Order<(usize, Frame)>,
     settler: Settler<Ordered<(usize, Frame)>>,
     steps: VecDeque<Step>,
     plan_summary: PlanSummary,
-    /// When this pass begins, in ns after the first one.
+    /// Start of this pass in ns after the first one.
     offset: u64,
-    /// The times of the first and the last frame of this pass that are sent.
+    /// Times of the first and the last sent frame of this pass.
     sent: Option<(u64, u64)>,
-    /// Frames and joints of this pass that are sent.
+    /// Numbers of sent frames and joints of this pass.
     counts: (u64, u64),
 }
 
 impl<'a> ReplayPlan<'a> {
-    /// Of a capture that has been looked through.
+    /// Creates the plan of a surveyed capture.
     #[must_use]
     pub fn new(survey: &'a Survey, selection: &'a Selection) -> Self {
         Self {
@@ -139,7 +139,7 @@ impl<'a> ReplayPlan<'a> {
         }
     }
 
-    /// Takes the capture's next frame; breaks off when what follows is of no interest.
+    /// Adds the capture's next frame. Breaks once all later frames are past the part.
     pub fn take(&mut self, record: &Record<'_>, comparator: &mut Comparator) -> ControlFlow<()> {
         let Some(bus) = self.survey.bus_named(record.interface) else {
             self.skip(reason::NEW);
@@ -153,19 +153,19 @@ impl<'a> ReplayPlan<'a> {
         ControlFlow::Continue(())
     }
 
-    /// What is to be done next, as far as that is known.
+    /// Next planned step, if any.
     pub fn next_step(&mut self) -> Option<Step> {
         self.steps.pop_front()
     }
 
-    /// Finds out what a frame is.
+    /// Passes a frame to the decoder, which classifies it.
     fn settle(&mut self, next: Ordered<(usize, Frame)>) {
         let (bus, frame) = next.item;
         let name = self.survey.buses.get(bus).map_or("", |bus| bus.name.as_str());
         self.settler.push(Micros(next.nanos / 1_000), name, &frame, next);
     }
 
-    /// Frames whose turn has come, as far as it is known what they are.
+    /// Plans all frames whose order and meaning are settled.
     fn place_settled(&mut self, comparator: &mut Comparator) -> ControlFlow<()> {
         while let Some((next, decoded)) = self.settler.pop() {
             self.place(&next, &decoded, comparator)?;
@@ -173,7 +173,7 @@ impl<'a> ReplayPlan<'a> {
         ControlFlow::Continue(())
     }
 
-    /// Takes in that the capture, or the part of interest, has ended; another pass may follow.
+    /// Notes the end of the capture or of the part. Another pass may follow.
     pub fn end_pass(&mut self, comparator: &mut Comparator) {
         while let Some(next) = self.order.pop_last() {
             self.settle(next);
@@ -191,7 +191,7 @@ impl<'a> ReplayPlan<'a> {
         self.counts = (0, 0);
     }
 
-    /// The messages that restore the state where the part begins.
+    /// The step that restores the state at the start of the part.
     #[must_use]
     pub fn restoring(&self) -> Step {
         let bounds = self.survey.bounds();
@@ -202,18 +202,18 @@ impl<'a> ReplayPlan<'a> {
         Step::Restore(self.survey.buses.iter().zip(&self.selection.bus_links).filter_map(of).collect())
     }
 
-    /// Its counts.
+    /// Returns the counts.
     #[must_use]
     pub fn into_summary(self) -> PlanSummary {
         self.plan_summary
     }
 
-    /// Counts something that is not sent.
+    /// Counts an item that is not sent.
     pub fn skip(&mut self, reason: &'static str) {
         *self.plan_summary.skipped.entry(reason).or_default() += 1;
     }
 
-    /// A frame's turn has come.
+    /// Plans a frame: sends it or counts it as skipped.
     fn place(
         &mut self,
         next: &Ordered<(usize, Frame)>,
@@ -252,12 +252,12 @@ impl<'a> ReplayPlan<'a> {
         ControlFlow::Continue(())
     }
 
-    /// Where a bus' frames go.
+    /// Destination of a bus's frames.
     fn bus_link(&self, bus: usize) -> Option<usize> {
         self.selection.bus_links.get(bus).copied().flatten()
     }
 
-    /// Why a frame of the part is not sent.
+    /// Reason why a frame of the part is not sent, if any.
     fn unwanted(&self, bus: usize, frame: &Frame, decoded: &Decoded) -> Option<&'static str> {
         let picked = self.bus_link(bus).is_some();
         if frame.is_error() {
@@ -277,7 +277,7 @@ impl<'a> ReplayPlan<'a> {
     }
 }
 
-/// Decodes a frame, as far as that is of interest.
+/// Determines the role of a frame, and passes its message to the comparator.
 fn read(
     bus_link: usize,
     nanos: u64,
@@ -311,25 +311,25 @@ fn read(
     }
 }
 
-/// Why frames are not sent.
+/// Reasons why frames are not sent.
 pub mod reason {
-    /// Before `--from`.
+    /// Frame before `--from`.
     pub const BEFORE: &str = "before --from";
-    /// At `--to` or after it.
+    /// Frame at `--to` or after it.
     pub const AFTER: &str = "after --to";
-    /// Left out by `--kind`, `--node` or `--bus`.
+    /// Frame of a bus that is not replayed (`--bus`).
     pub const NOT_PICKED: &str = "not picked";
-    /// No command, configuration or stimulus.
+    /// Frame that is neither a command nor configuration nor a stimulus.
     pub const NO_INPUT: &str = "no input";
-    /// Not sent by a cell.
+    /// Frame that was not sent by a cell.
     pub const NO_REPLY: &str = "no reply";
-    /// An error frame is a message of a driver, and was never on a bus.
+    /// Error frame: a message of a driver, never on a bus.
     pub const ERROR: &str = "error frame";
-    /// Cells send their own messages over their wires now; and wires are on no real bus.
+    /// Frame of a simulated wire: cells send their own wire messages now, and real buses have no wire frames.
     pub const WIRE: &str = "simulated wire";
-    /// Of a bus that the capture did not have when it was first read.
+    /// Frame of a bus that the capture did not have when it was first read.
     pub const NEW: &str = "bus came later";
-    /// What stands between frames.
+    /// Note between frames.
     pub const NOTE: &str = "note";
 }
 

@@ -1,6 +1,6 @@
-//! The result of a replay: the figures of the table at its end, and of `--summary`.
+//! Result of a replay: the figures of the final table and of `--summary`.
 //!
-//! The keys of the JSON are the names of the fields here; `docs/how-to/replay.md` explains them.
+//! The JSON keys are the field names; `docs/how-to/replay.md` explains them.
 
 use std::collections::BTreeMap;
 
@@ -12,121 +12,122 @@ use super::player::BusLinkTally;
 use crate::summary::{CellError, cells_in_error, many};
 use model::quantiles::Quantiles;
 
-/// A whole replay.
+/// Summary of a replay.
 #[derive(Clone, Debug, Serialize)]
 pub struct Summary {
-    /// The capture's file.
+    /// Path of the capture.
     pub file: String,
-    /// How long frames were sent, in s.
+    /// Time in s during which frames were sent.
     pub duration_s: f64,
-    /// Whether it was ended by a signal.
+    /// True if a signal ended the replay.
     pub interrupted: bool,
-    /// Frames that the buses took.
+    /// Number of frames that the buses accepted.
     pub sent: u64,
-    /// Frames that they did not take, because they stayed full.
+    /// Number of frames refused because a bus stayed full.
     pub refused: u64,
-    /// Frames that they did not take, because they were down.
+    /// Number of frames refused because a bus was down.
     pub lost: u64,
-    /// Frames that were not to be sent, by reason.
+    /// Number of frames that were not sent, by reason.
     pub skipped: BTreeMap<&'static str, u64>,
-    /// Frames that were sent at once, because newer ones had been sent before them.
+    /// Number of frames sent at once, because newer ones had been sent before them.
     pub sent_at_once: u64,
-    /// Each bus.
+    /// Summary of each bus.
     pub buses: Vec<BusSummary>,
-    /// How late frames were sent; none of a replay without times, nor of lockstep.
+    /// Lateness of the frames; `None` at full pace and in lockstep.
     pub late_us: Option<Quantiles>,
-    /// How late the same machine wakes a thread when nothing else runs.
+    /// Lateness of the wake-ups of the idle machine.
     pub idle_late_us: Option<Quantiles>,
-    /// How long before its time a frame was waited for by spinning, in µs.
+    /// Time in µs before a frame is due during which the thread spins.
     pub spin_us: f64,
-    /// Whether the machine granted SCHED_FIFO.
+    /// True if the machine granted SCHED_FIFO.
     pub fifo: bool,
-    /// Whether it locked the memory.
+    /// True if the memory was locked.
     pub memory_locked: bool,
-    /// With lockstep, the cells that did not answer.
+    /// Result of lockstep, if used.
     pub lockstep: Option<Lockstep>,
-    /// With a comparison, its result.
+    /// Result of the comparison, if any.
     pub expect: Option<Expect>,
-    /// Errors by which processes of cells ended.
+    /// Errors that ended processes of cells.
     pub cell_errors: Vec<CellError>,
-    /// Why it did not come to its end, if it did not.
+    /// Error that ended the replay early, if any.
     pub failure: Option<String>,
 }
 
-/// One bus.
+/// Summary of one bus.
 #[derive(Clone, Debug, Serialize)]
 pub struct BusSummary {
-    /// Its name in the capture.
+    /// Name in the capture.
     pub capture: String,
-    /// Its name now.
+    /// Present name.
     pub name: String,
-    /// What carries its frames.
+    /// Transport of the frames.
     pub kind: String,
-    /// Its frames.
+    /// Counts of sent and refused frames.
     #[serde(flatten)]
     pub frames: BusLinkTally,
-    /// Replies that came faster than they were read.
+    /// Number of replies lost because they arrived faster than they were read.
     pub unheard: u64,
 }
 
-/// The outcome of lockstep.
+/// Result of lockstep.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Lockstep {
     /// Cells that did not answer in time, as text.
     pub silent_cells: Vec<String>,
-    /// Joints that were resent, because a cell was too late for them.
+    /// Number of joints that were resent because a cell was too late for them.
     pub retried: u64,
 }
 
-/// How replies compare with recorded ones.
+/// Result of the comparison with recorded replies.
 #[derive(Clone, Debug, Serialize)]
 pub struct Expect {
-    /// By how many steps torques may differ.
+    /// Tolerance of torques in steps.
     pub tolerance: u16,
-    /// The counts.
+    /// Counts of the comparison.
     #[serde(flatten)]
     pub tally: Tally,
-    /// Joints that the cells processed too late, by their own counters: replies to them are missing.
+    /// Number of joints that cells processed too late, by their own counters: their replies are missing.
     pub joints_skipped: u64,
-    /// Frames that the recorder reported as lost: inputs among them cannot be sent.
+    /// Number of frames that the recorder reported as lost: inputs among them cannot be sent.
     pub recording_dropped: u64,
-    /// Cells whose configuration in the recording is not known, and was not compared.
+    /// Number of cells whose recorded configuration is unknown and was not compared.
     pub unchecked_cells: u64,
-    /// The first reply that is not as it was recorded.
+    /// First reply that differs from the recorded one.
     pub first: Option<Difference>,
 }
 
 impl Lacking {
-    /// The reasons that occurred, with their counts, as text.
+    /// Reasons that occurred, with their counts.
     #[must_use]
     pub fn reasons(&self) -> Vec<(&'static str, u64)> {
         nonzero([
             ("the cell was silent", self.silent),
-            ("the cell had not taken the joints", self.untaken),
+            ("the cell had not received the joints", self.untaken),
             ("the reply was not recorded", self.unrecorded),
             ("the recording ended", self.ended),
             ("the end of a contact was sent later", self.said_later),
-            ("no counters tell whether the cell took the joints", self.uncounted),
+            ("no counters show whether the cell received the joints", self.uncounted),
             ("the joints were not recorded", self.joints_unrecorded),
             ("the joints came before the replayed part", self.joints_earlier),
             ("the configure came before the replayed part", self.requested_earlier),
             ("the cell measured", self.measured),
             ("unrequested sensors were sent at other joints", self.sensed_otherwise),
-            ("the cell did not come to its slot", self.slot_skipped),
+            ("the cell missed its slot", self.slot_skipped),
             ("a cell was changing its parent", self.parent_changing),
-            ("a cell had not reported where its sums go", self.tree_unknown),
+            ("a cell had not reported its parent", self.tree_unknown),
             ("a sum lacked one of its children's", self.sums_not_taken),
         ])
     }
 }
 
-/// The counts that are not 0, with what they count.
+/// Drops counts of 0.
 fn nonzero<const N: usize>(counts: [(&'static str, u64); N]) -> Vec<(&'static str, u64)> {
     counts.into_iter().filter(|(_, count)| *count > 0).collect()
 }
 
 impl Summary {
-    /// Why it is no success, in one line; none when it is. Reasons of cells' errors are not repeated unless it was `quiet`.
+    /// Reason why the replay failed, in one line, or `None` for success. Reasons of cells' errors are repeated only if
+    /// `quiet`.
     #[must_use]
     pub fn verdict(&self, quiet: bool) -> Option<String> {
         if let Some(failure) = &self.failure {
@@ -149,12 +150,11 @@ impl Summary {
                 } else {
                     String::new()
                 };
-                wrong.push(format!("replies are not as they were recorded: {}{by}", counts.join(", ")));
+                wrong.push(format!("replies differ from the recorded ones: {}{by}", counts.join(", ")));
             }
             if expect.tally.lacks_the_tree() {
                 wrong.push(
-                    "no sum could be compared: cells have not reported where their sums go, then or now"
-                        .to_owned(),
+                    "no sum could be compared: cells have not reported their parents, then or now".to_owned(),
                 );
             }
             if expect.joints_skipped > 0 && self.lockstep.is_none() {
@@ -180,7 +180,7 @@ impl Summary {
         (!wrong.is_empty()).then(|| wrong.join("; "))
     }
 
-    /// Returns the result in one line, and whether all is well: everything was sent, compared and equal.
+    /// Returns the result in one line, and true if everything was sent, compared and equal.
     #[must_use]
     pub fn first_line(&self) -> (bool, String) {
         let until = if self.interrupted { " until it was interrupted" } else { "" };
@@ -228,7 +228,7 @@ impl Summary {
 mod tests {
     use super::*;
 
-    /// A replay of 100 frames whose 40 replies are as recorded.
+    /// Builds the summary of a replay of 100 frames whose 40 replies are as recorded.
     fn well() -> Summary {
         Summary {
             file: "run.log".to_owned(),
@@ -281,7 +281,7 @@ mod tests {
             (|_, expect| expect.tally.equal = 0, "look at: no reply was compared"),
             (
                 |_, expect| expect.tally.different = 3,
-                "look at: replies are not as they were recorded: 3 different",
+                "look at: replies differ from the recorded ones: 3 different",
             ),
             (|it, _| it.refused = 1, "look at: 1 frame was refused"),
             (|it, _| it.failure = Some("no bus".to_owned()), "look at: no bus"),

@@ -1,4 +1,4 @@
-//! A replay from the first message of its cells to its summary.
+//! A replay from the first message to its cells to its summary.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -28,10 +28,10 @@ use crate::progress::Progress;
 use crate::threads::spawn;
 use model::quantiles::Quantiles;
 
-/// The main thread's rhythm.
+/// Interval between rounds of the main thread.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// A replay that is ready.
+/// A replay that is ready to start.
 pub(super) struct Session {
     pub(super) shared_state: Arc<SharedState>,
     pub(super) buses: Buses,
@@ -44,7 +44,8 @@ pub(super) struct Session {
 }
 
 impl Session {
-    /// `idle` is how late the idle machine wakes a thread, `skin_override` the skin of the cells that were started.
+    /// Runs the replay. `idle` is the wake-up lateness of the idle machine; `skin_override` is the skin of the started
+    /// cells.
     pub(super) fn run(
         mut self,
         idle: Option<&Histogram<u64>>,
@@ -77,7 +78,7 @@ impl Session {
         outcome
     }
 
-    /// Sends everything; the summary is still without what the receivers have not read.
+    /// Sends everything. The summary lacks the number of unread frames, which the receivers report later.
     fn play(&mut self, idle: Option<&Histogram<u64>>) -> Result<Summary, ReplayError> {
         let (queue, mut steps) = rtrb::RingBuffer::new(AHEAD);
         let shared_state = Arc::clone(&self.shared_state);
@@ -105,7 +106,7 @@ impl Session {
             let granted = realtime::prepare();
             if hears {
                 for bus_link in 0..live.bus_links.len() {
-                    // Where the counters begin; a bus that is down is noticed at the first frame.
+                    // Starting values of the counters; the first frame reports a bus that is down.
                     let _ = live.report(bus_link);
                 }
                 live.shared_state.comparator().mute(false);
@@ -118,7 +119,7 @@ impl Session {
         let duration_s = began.elapsed().as_secs_f64();
         let plan_summary = reader.join().map_err(|_| RunError::Panicked("reader"))?;
         played.failure = other_gateway.or(played.failure);
-        // A replay ended by a signal is compared as far as it went.
+        // A replay ended by a signal is compared up to that point.
         self.shared_state.over.store(false, Ordering::Relaxed);
         let bus_links = self.shared_state.checks.bus_links().enumerate();
         for (bus_link, (name, _)) in bus_links.filter(|_| hears && played.failure.is_none()) {
@@ -138,7 +139,7 @@ impl Session {
         Ok(self.summary(played, plan_summary, live, duration_s, granted, idle))
     }
 
-    /// Notes the processes of cells that have ended; all that are not noted yet when it is the `last` time.
+    /// Shows notes about processes that have ended; with `last`, all pending notes.
     fn look_at_processes(&mut self, last: bool) {
         let ended = self.buses.processes.ended();
         for note in self.ended.take(ended, last) {
@@ -146,7 +147,7 @@ impl Session {
         }
     }
 
-    /// Shows how it goes, until it is over; whether there is another gateway.
+    /// Shows the progress until the replay is over. Returns an error if another gateway appears.
     fn watch(&mut self, said: &mpsc::Receiver<String>, is_over: impl Fn() -> bool) -> Option<ReplayError> {
         let bar = self.progress.bar(self.length());
         let mut other_gateway = None;
@@ -173,7 +174,7 @@ impl Session {
         other_gateway
     }
 
-    /// How long it is, in ms of the capture; none when it has no end.
+    /// Length in ms of the capture, or `None` if the replay has no end.
     fn length(&self) -> Option<u64> {
         let Checks { survey, options, .. } = &self.shared_state.checks;
         let (from, to) = survey.bounds();

@@ -1,4 +1,4 @@
-//! The state shared by the sending thread and the receivers.
+//! State shared by the sending thread and the receivers.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
@@ -14,23 +14,23 @@ use crate::bus::realtime;
 use crate::bus::roots::Roots;
 use model::decode::{Decoded, Decoder};
 
-/// How often the stop flag is read.
+/// Interval between readings of the stop flag.
 const LOOK: Duration = Duration::from_millis(50);
-/// What all threads of a replay share.
+/// State shared by all threads of a replay.
 #[derive(Debug)]
 pub(super) struct SharedState {
     pub(super) checks: Checks,
     comparator: Mutex<Comparator>,
     heard: Condvar,
-    /// Set once: sending ends.
+    /// Set once, to stop sending.
     pub(super) over: AtomicBool,
-    /// Set when the queue of steps is full for the first time, or all has been read.
+    /// Set when the queue of steps is full for the first time, or everything has been read.
     pub(super) ready: AtomicBool,
-    /// Set once, at the end: receiving ends.
+    /// Set once at the end, to stop receiving.
     pub(super) deaf: AtomicBool,
-    /// Frames sent, for the progress line.
+    /// Number of frames sent, for the progress line.
     pub(super) sent: AtomicU64,
-    /// Where the replay is, in ns after its first frame.
+    /// Position of the replay in ns after its first frame.
     pub(super) at: AtomicU64,
 }
 
@@ -51,7 +51,7 @@ impl SharedState {
     }
 
     pub(super) fn comparator(&self) -> MutexGuard<'_, Comparator> {
-        // A panic here ends the replay anyway.
+        // A panic in another thread ends the replay anyway.
         self.comparator.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -60,7 +60,7 @@ impl SharedState {
         self.heard.notify_all();
     }
 
-    /// Waits until a message was received, or for a moment.
+    /// Waits until a message arrives, at most for `time`.
     pub(super) fn wait<'a>(
         &self,
         comparator: MutexGuard<'a, Comparator>,
@@ -74,18 +74,18 @@ impl SharedState {
         self.over.load(Ordering::Relaxed)
     }
 
-    /// Takes in that a bus is down.
+    /// Marks a bus as down and wakes waiting threads.
     pub(super) fn is_down(&self, bus_link: usize) {
         self.comparator().is_down(bus_link);
         self.has_heard();
     }
 
-    /// Receives on a bus until the end, as the gateway's side of its roots' wires; returns how many frames came faster
-    /// than they were read.
+    /// Receives on a bus until the end, as the gateway's side of the wires to its roots. Returns the number of frames
+    /// lost because they arrived faster than they were read.
     pub(super) fn hear(&self, index: usize, bus_link: &BusLink, mut roots: Option<Roots>) -> u64 {
         realtime::prepare_receiver();
         let mut decoder = Decoder::new(Some(bus_link.format));
-        // Its cells may be there already, and organise themselves as they come.
+        // The cells may be present already, and organise themselves as they start.
         roots.iter_mut().for_each(Roots::explore);
         let (mut follower, mut end) = (Follower::new(roots, Duration::ZERO), Once(&bus_link.bus));
         while !self.deaf.load(Ordering::Relaxed) {

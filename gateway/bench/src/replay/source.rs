@@ -1,4 +1,4 @@
-//! The thread that reads the capture, ahead of what is sent.
+//! The thread that reads the capture ahead of the player.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -8,19 +8,19 @@ use super::replay_plan::{PlanSummary, ReplayPlan, Selection, Step, reason};
 use super::shared_state::SharedState;
 use trace::capture::{CaptureError, Entry, Reader};
 
-/// Steps that are read ahead: some tenths of a second of a full bus.
+/// Number of steps read ahead: some tenths of a second of a full bus.
 pub(super) const AHEAD: usize = 16_384;
-/// How long to wait for room: what is read ahead lasts far longer.
+/// Pause while the queue is full; the steps in it last far longer.
 const PAUSE: Duration = Duration::from_millis(2);
 
-/// Reads a capture, as often as it is replayed, and hands on what is to be done.
+/// Reads a capture once per pass and queues the steps.
 struct Source<'a> {
     shared_state: &'a SharedState,
     replay_plan: ReplayPlan<'a>,
     queue: rtrb::Producer<Step>,
 }
 
-/// Reads to the end, or until the receiver is gone.
+/// Reads to the end, or until the player has ended.
 pub(super) fn read(
     shared_state: &SharedState,
     queue: rtrb::Producer<Step>,

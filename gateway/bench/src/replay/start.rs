@@ -1,4 +1,4 @@
-//! From options to open buses and cells that are as required.
+//! Start of a replay: from options to open buses and started cells.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -24,20 +24,20 @@ use crate::setup::names;
 use model::decode::Decoded;
 use trace::capture::{Extras, SKIN};
 
-/// The polling period.
+/// Interval between polls.
 const LOOK: Duration = Duration::from_millis(5);
 
-/// Where the capture's buses go.
+/// Destinations of the capture's buses.
 #[derive(Clone, Debug)]
 pub(super) struct Routes {
-    /// By the capture's buses: the index of the bus to which its frames are sent, if they are.
+    /// Destination index of each bus of the capture; `None` if it is not replayed.
     pub(super) bus_links: Vec<Option<usize>>,
-    /// By that index: which of the capture's buses it is, and its present name.
+    /// Index in the capture and present name of each destination.
     pub(super) names: Vec<(usize, String)>,
 }
 
 impl Routes {
-    /// By `--bus` and `--map`.
+    /// Evaluates `--bus` and `--map`.
     pub(super) fn new(options: &Options, survey: &Survey, capture: &str) -> Result<Self, ReplayError> {
         let known = |name: &str, option: String| {
             let (capture, buses) = (capture.to_owned(), survey.names());
@@ -77,14 +77,14 @@ impl Routes {
     }
 }
 
-/// One bus.
+/// One open bus of a replay.
 #[derive(Debug)]
 pub(super) struct BusLink {
     pub(super) bus: Bus,
     pub(super) format: Format,
-    /// Whether it was not served before.
+    /// True if this replay serves the bus.
     own: bool,
-    /// Whether its cells reply with sums, over simulated wires.
+    /// True if its cells reply with sums over simulated wires.
     pub(super) wired: bool,
 }
 
@@ -93,34 +93,34 @@ impl BusLink {
         message.encode().frames(self.format)
     }
 
-    /// Sends messages of this replay's own.
+    /// Sends this replay's own messages.
     pub(super) fn send(&self, messages: &[Message]) -> Result<(), BusError> {
         let frames: Vec<_> = messages.iter().flat_map(|message| self.frames(message)).collect();
         Ok(self.bus.send(&frames)?)
     }
 }
 
-/// Buses, and the processes that were started for them.
+/// Buses, and the processes started for them.
 #[derive(Debug)]
 pub(super) struct Buses {
     pub(super) bus_links: Arc<Vec<BusLink>>,
-    /// The gateway's side of the wires to their roots, where there are such; taken by the receiver.
+    /// The gateway's ends of the wires to the roots, until the receiver takes them.
     pub(super) roots: Vec<Option<Roots>>,
-    // In this order they end: the cells before their buses.
+    // Dropped in this order: the cells before their buses.
     pub(super) processes: Processes,
     _served: Vec<ServedBus>,
 }
 
-/// The skin of the cells that are started.
+/// Skin of the cells to start.
 #[derive(Debug)]
 pub(super) struct SkinOverride {
     pub(super) skin: Skin,
     pub(super) file: PathBuf,
-    /// Where an attached one is kept, so that cells can read it.
+    /// Memory file of an attached skin, from which cells read it.
     _memory: Option<std::fs::File>,
 }
 
-/// The skin of the cells that are started: the one that is named, or the one that the recording has.
+/// Returns the skin of the cells to start: the named skin, or the recording's.
 pub(super) fn skin_override(
     spawn: &Spawn,
     routes: &Routes,
@@ -155,12 +155,12 @@ pub(super) fn skin_override(
     Ok(skin_override)
 }
 
-/// The skin that a recording has, if it has one that can be read.
+/// Skin of a recording, if it has a readable one.
 pub(super) fn recorded_skin(extras: &Extras) -> Option<Skin> {
     extras.skin()?.ok()
 }
 
-/// Opens all buses. What is `recorded` is the skin of the cells that are there already, if it is known.
+/// Opens all buses. `recorded` is the skin of cells that are already present, if known.
 pub(super) fn open(
     options: &Options,
     survey: &Survey,
@@ -196,7 +196,7 @@ pub(super) fn open(
                 opened => (opened?, None),
             },
         };
-        // On a real bus the wires are real.
+        // Real buses have real wires.
         let has_wires = options.hears() && (bus.kind() == BusKind::Embedded || bus.is_virtual()?);
         let root = spawned_skin.filter(|_| has_wires).and_then(|(skin, bus)| Roots::of(skin, bus));
         let (own, wired) = (of_ours.is_some(), root.is_some());
@@ -208,7 +208,8 @@ pub(super) fn open(
 }
 
 impl Buses {
-    /// Receives on the buses that were there before, as long as two gateways need to notice each other.
+    /// Receives on the buses that existed before, for as long as two gateways need to detect each other. Returns the
+    /// cells found.
     pub(super) fn listen(&self) -> Result<Vec<BTreeSet<CellId>>, ReplayError> {
         let mut heard = vec![BTreeSet::new(); self.bus_links.len()];
         let filters = vec![Filter::exact(Id::command(Command::Joints)), Filter::kind(Kind::Network)];
@@ -241,7 +242,7 @@ impl Buses {
         Ok(heard)
     }
 
-    /// Starts the cells of a skin on buses where there are none.
+    /// Starts the cells of a skin, on buses without cells.
     pub(super) fn start_cells(
         &mut self,
         spawn: &Spawn,
@@ -269,7 +270,7 @@ impl Buses {
     }
 }
 
-/// The sender, if it is a gateway or a settled cell.
+/// Returns the sender if it is a gateway or a cell.
 const fn speaker(decoded: &Decoded) -> Option<Node> {
     if let Decoded::Message(Message::Network { from, .. }) = decoded {
         Some(*from)
@@ -281,13 +282,13 @@ const fn speaker(decoded: &Decoded) -> Option<Node> {
 }
 
 impl Options {
-    /// Whether messages of cells are received.
+    /// Returns true if messages of cells are received.
     pub(super) fn hears(&self) -> bool {
         self.expect.is_some() || self.lockstep || self.only == Only::Inputs
     }
 }
 
-/// The message that makes a cell obey stimuli, or measure; either way it drops all stimuli.
+/// Returns the message that makes a cell obey stimuli, or measure; in both cases the cell drops all stimuli.
 pub(super) fn mode(cell: CellId, obeys: bool) -> Message {
     let words = core::array::from_fn(|place| i16::from(obeys && place == 0));
     let request = Request::Write { number: Parameter::Mode.number(), words };

@@ -1,5 +1,5 @@
-//! What a capture holds, found in a first reading: its buses and their cells, what it lacks by the cells' own
-//! counters, and the state where the replay begins.
+//! Survey of a capture from a first reading: its buses and their cells, the losses by the cells' own counters, and the
+//! state where the replay begins.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -16,72 +16,72 @@ use model::decode::{Decoded, Decoder};
 use model::latched::State;
 use trace::capture::{BusNote, Latched, Note};
 
-/// A cell that sends nothing for so long is absent, in ns.
+/// Silence in ns after which a cell counts as absent.
 const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
 
-/// A cell that starts hears joints for so long at most before its first heartbeat, in ns.
+/// Maximum time in ns from a starting cell's first joints to its first heartbeat.
 const STARTS_NS: u64 = 100_000_000;
 
-/// A page of counters is on its way for so many joints at most.
+/// Maximum number of joints during which a page of counters is under way.
 const PASSED: usize = 64;
 
-/// A part of a capture, in ns of its run, or after its first frame where there is no run.
+/// A part of a capture, in ns of its run, or after its first frame if there is no run.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Part {
-    /// From here on; else from the beginning.
+    /// Start; `None` for the beginning.
     pub from: Option<u64>,
-    /// Up to, and without, here.
+    /// End, exclusive; `None` for the end of the capture.
     pub to: Option<u64>,
 }
 
-/// A whole capture.
+/// Survey of a whole capture.
 #[derive(Debug)]
 pub struct Survey {
     part: Part,
-    /// When the run began, in ns since 1970, if that is known.
+    /// Start of the run in ns since 1970, if known.
     pub run_began: Option<u64>,
-    /// When the first frame came, in ns since 1970.
+    /// Time of the first frame in ns since 1970.
     pub first: Option<u64>,
-    /// The latest time.
+    /// Latest time in ns since 1970.
     pub last: u64,
-    /// Frames.
+    /// Number of frames.
     pub frames: u64,
-    /// Frames that the recorder reported as lost.
+    /// Number of frames that the recorder reported as lost.
     pub dropped: u64,
-    /// Each bus, in the order of their first frames.
+    /// Buses in the order of their first frames.
     pub buses: Vec<Bus>,
     decoder: Decoder,
 }
 
-/// One bus.
+/// Survey of one bus.
 #[derive(Debug, Default)]
 pub struct Bus {
-    /// Its name in the capture.
+    /// Name in the capture.
     pub name: String,
-    /// Frames on it.
+    /// Number of frames.
     pub frames: u64,
-    /// Whether any of them is CAN FD.
+    /// True if any frame is CAN FD.
     pub has_fd: bool,
-    /// What packets travel in, by the first one.
+    /// Format of the first packet.
     pub format: Option<Format>,
-    /// Joint broadcasts on it.
+    /// Number of joint broadcasts.
     pub joints: u64,
-    /// The newest of them, newest last.
+    /// Latest joint broadcasts, oldest first.
     recent_joints: VecDeque<Broadcast>,
-    /// Whether a cell reported its counters, or something was latched when the capture began: then a part of a
-    /// recording, or a truncated one, may lack what its counters would account for.
+    /// True if a cell reported its counters or a message was latched at the start of the capture: a part of a
+    /// recording, or a truncated one, may lack messages that its counters account for.
     is_accounted: bool,
-    /// The messages from before the capture that are latched at its beginning, as it has them.
+    /// Messages from before the capture that it holds as latched at its start.
     pub latched: Vec<Message>,
-    /// The state where the part begins.
+    /// State where the part begins.
     pub state: State,
-    /// The first joints in the part.
+    /// First joints in the part.
     pub first_joints: Option<(Epoch, Joints)>,
-    /// Sums that cells sent.
+    /// Number of sums that cells sent.
     pub sums: u64,
-    /// Its cells.
+    /// Cells of the bus.
     pub cells: BTreeMap<CellId, Cell>,
-    /// What is known of cells from before the capture.
+    /// Cells by messages from before the capture.
     before: BTreeMap<CellId, Before>,
 }
 
@@ -89,73 +89,73 @@ pub struct Bus {
 #[derive(Clone, Copy, Debug)]
 struct Broadcast {
     epoch: Epoch,
-    /// The joints until then, it among them.
+    /// Number of joints up to this broadcast, including it.
     number: u64,
-    /// When, in ns since 1970.
+    /// Time in ns since 1970.
     nanos: u64,
 }
 
-/// What is known of a cell from before the capture.
+/// State of a cell from before the capture.
 #[derive(Clone, Debug, Default)]
 struct Before {
     tracked: Tracked,
-    /// When it sent last, in ns since 1970.
+    /// Time of its last message in ns since 1970.
     heard: u64,
     hash: Known<u16>,
     measures: bool,
 }
 
-/// One cell.
+/// Survey of one cell.
 #[derive(Clone, Debug)]
 pub struct Cell {
-    /// The hash of its configuration where the part begins, if that can be known.
+    /// Hash of its configuration where the part begins, if known.
     pub hash: Known<u16>,
-    /// Whether it measured in the part: then its torques cannot come back.
+    /// True if it measured in the part: its torques cannot be reproduced.
     pub measured: bool,
-    /// When it sent, in ns since 1970: first and last.
+    /// Times of its first and last message in ns since 1970.
     pub heard: (u64, u64),
-    /// From when to when it sent nothing, when that was long.
+    /// Starts and ends of its long silences in ns since 1970.
     pub silences: Vec<(u64, u64)>,
-    /// Packets that it sent and that are not in the capture.
+    /// Number of packets that it sent and the capture lacks.
     pub unrecorded: u64,
-    /// Joints that it did not take or processed too late.
+    /// Number of joints that it missed or processed too late.
     pub untaken: u64,
-    /// Between which joints its counters account for that: from after one time up to another, in ns since 1970.
+    /// Time ranges in ns since 1970 whose joints its counters account for: start exclusive, end inclusive.
     accounted: Vec<(u64, u64)>,
-    /// Whether counters account for anything in the capture; else everything missing is a difference.
+    /// True if counters account for anything in the capture; otherwise everything missing is a difference.
     is_accounted: bool,
     tracked: Tracked,
-    /// Since when it claims its node id, which it does after each start.
+    /// Time since which it claims its node id, as it does after each start.
     claims: Option<u64>,
-    /// Since when its bus is lost.
+    /// Time since which its bus is lost.
     away: Option<u64>,
-    /// Its counters at the last report, the joints until then, and the time of the last of them.
+    /// Counters of its last report, the number of joints until then, and the time of the last of them.
     report: Option<(Heard, u64, u64)>,
 }
 
-/// Where a frame stands.
+/// Position of a frame relative to the replayed part.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Place {
-    /// Before the part that is replayed.
+    /// Before the part.
     Before,
     In,
     After,
 }
 
-/// Something that may become known too late.
+/// A value that may become known too late.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Known<T> {
-    /// Nothing was reported of it.
+    /// The value has not been reported.
     #[default]
     No,
-    /// It has changed before anything was reported of it.
+    /// The value changed before it was reported.
     TooLate,
-    /// This.
+    /// The value.
     Yes(T),
 }
 
 impl Survey {
-    /// Of a part of a capture that has not been read.
+    /// Creates an empty survey of a part of a capture.
     #[must_use]
     pub const fn new(part: Part) -> Self {
         let decoder = Decoder::new(None);
@@ -171,7 +171,7 @@ impl Survey {
         }
     }
 
-    /// Takes what was latched when the capture began, before its first frame.
+    /// Adds the frames that are latched at the start of the capture; call it before the first frame.
     pub fn begin(&mut self, latched: &[Latched]) {
         let mut decoder = Decoder::new(None);
         for Latched { bus, frame, nanos, .. } in latched {
@@ -185,7 +185,7 @@ impl Survey {
         }
     }
 
-    /// Takes the next frame.
+    /// Adds the next frame.
     pub fn take(&mut self, record: &Record<'_>) {
         let nanos = record.time.nanos;
         self.first.get_or_insert(nanos);
@@ -213,10 +213,10 @@ impl Survey {
         }
     }
 
-    /// Takes in that the capture is at its end.
+    /// Ends the survey.
     pub fn finish(&mut self) {
         let last = self.last;
-        // Of one bus: then a bench recorded it that has counters, and in a part those of another may be missing.
+        // Counters on one bus suffice: the recording bench has counters, and a part may lack those of other buses.
         let is_accounted = self.buses.iter().any(|bus| bus.is_accounted);
         for cell in self.buses.iter_mut().flat_map(|bus| bus.cells.values_mut()) {
             cell.end(last);
@@ -224,12 +224,12 @@ impl Survey {
         }
     }
 
-    /// Takes a note: cells of a bus that was lost are away until they send again. Their last answers may have been lost
-    /// with it.
+    /// Handles a note: the cells of a lost bus are away until they send again. Their last answers may have been lost
+    /// with the bus.
     pub fn note(&mut self, note: &Note<'_>) {
         let Some((name, BusNote::Lost)) = BusNote::of(note) else { return };
         let Some(bus) = self.bus_named(name).and_then(|at| self.buses.get_mut(at)) else { return };
-        // Those that may still be answered.
+        // Joints that may still be answered.
         let recent = bus.recent_joints.iter().rev().take(LATEST + 1);
         let since = recent.map(|joints| joints.nanos).min().unwrap_or(note.nanos);
         for cell in bus.cells.values_mut() {
@@ -237,27 +237,27 @@ impl Survey {
         }
     }
 
-    /// The time that seconds count from, in ns since 1970.
+    /// Time from which seconds count, in ns since 1970.
     #[must_use]
     pub fn zero(&self) -> u64 {
         self.run_began.or(self.first).unwrap_or(0)
     }
 
-    /// The part, in ns since 1970: from, and up to and without. From the beginning on means all, also what is older
-    /// than the first frame.
+    /// Bounds of the part in ns since 1970, end exclusive. Without a start, the part includes frames older than the
+    /// first one.
     #[must_use]
     pub fn bounds(&self) -> (u64, u64) {
         let end = self.part.to.map_or(u64::MAX, |to| self.zero().saturating_add(to));
         (self.part.from.map_or(0, |from| self.zero().saturating_add(from)), end)
     }
 
-    /// Where a bus stands, by its name in the capture.
+    /// Index of a bus, by its name in the capture.
     #[must_use]
     pub fn bus_named(&self, name: &str) -> Option<usize> {
         self.buses.iter().position(|bus| bus.name == name)
     }
 
-    /// The names of the buses, for people.
+    /// Names of the buses, joined for display.
     #[must_use]
     pub fn names(&self) -> String {
         self.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ")
@@ -273,7 +273,7 @@ impl Survey {
 }
 
 impl Bus {
-    /// Takes in messages from before the capture that are latched at its beginning.
+    /// Handles a message from before the capture that is latched at its start.
     fn take_before(&mut self, message: &Message, nanos: u64) {
         if let Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } =
             *message
@@ -321,7 +321,7 @@ impl Bus {
         }
     }
 
-    /// The cells that send in a part of the capture.
+    /// Cells that send in a part of the capture.
     pub fn cells_in(&self, (from, to): (u64, u64)) -> impl Iterator<Item = (CellId, &Cell)> {
         let speaks = move |cell: &Cell| cell.heard.1 >= from && cell.heard.0 < to;
         self.cells.iter().map(|(cell, it)| (*cell, it)).filter(move |(_, cell)| speaks(cell))
@@ -330,11 +330,11 @@ impl Bus {
 
 impl Cell {
     fn new(nanos: u64, before: Option<&Before>) -> Self {
-        // A cell that sent just before the capture was there when it began.
+        // A cell that sent just before the capture was present when it began.
         let first =
             before.map(|before| before.heard).filter(|heard| nanos <= heard.saturating_add(SILENT_NS));
         let mut tracked = before.map(|before| before.tracked.clone()).unwrap_or_default();
-        // What it sent between the two is not known to be lost.
+        // Its messages between the two times are not known to be lost.
         tracked.account = Account::default();
         Self {
             hash: before.map_or(Known::No, |before| before.hash),
@@ -363,7 +363,7 @@ impl Cell {
         }
     }
 
-    /// The capture is at its end.
+    /// Ends the survey of the cell at the end of the capture.
     fn end(&mut self, nanos: u64) {
         self.unrecorded = self.tracked.account.uplink().lost;
         if let Some(away) = self.away {
@@ -375,13 +375,13 @@ impl Cell {
         }
     }
 
-    /// Takes in a message of it, after some joints.
+    /// Handles a message of the cell that followed these joints.
     fn take(&mut self, message: &Message, nanos: u64, place: Place, joints: &VecDeque<Broadcast>) {
         let word = self.tracked.hear(Micros(nanos / 1_000), message, None).word;
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             match word {
                 Some(Word::Claimant | Word::Outsider | Word::Overtaken) | None => return,
-                // After a start its counters begin again, with joints that it took before this heartbeat.
+                // A restart resets its counters, which then include joints from before this heartbeat.
                 Some(Word::Started { .. }) => {
                     let last = joints.back().map(|last| (last.number, last.nanos)).unwrap_or_default();
                     let may_count = |joints: &&Broadcast| nanos <= joints.nanos.saturating_add(STARTS_NS);
@@ -392,7 +392,7 @@ impl Cell {
             }
             self.heartbeat(heartbeat, nanos, place);
         } else if let Message::Network { page: NetworkPage::Heard(heard), epoch, .. } = *message {
-            // The page has the epoch of the last joints that its counters have.
+            // The page carries the epoch of the last joints in its counters.
             let at = joints.iter().rev().find(|joints| joints.epoch == epoch);
             self.report(heard, at.map(|joints| (joints.number, joints.nanos)));
         } else if let Message::Configured { answer: Answer::Value { number, written: true, .. }, .. } =
@@ -409,7 +409,7 @@ impl Cell {
     }
 
     fn heartbeat(&mut self, heartbeat: &Heartbeat, nanos: u64, place: Place) {
-        // While it claims its node id it answers nothing.
+        // A cell that claims its node id answers nothing.
         if heartbeat.state.has(Flags::CLAIMING) {
             self.claims.get_or_insert(nanos);
             return;
@@ -423,7 +423,8 @@ impl Cell {
         self.measured |= place == Place::In && !heartbeat.state.has(Flags::TEST_MODE);
     }
 
-    /// Counters up to some joints. If these were before the capture, it is unknown which joints they account for.
+    /// Handles counters up to some joints. Joints from before the capture leave it unknown which joints the counters
+    /// cover.
     fn report(&mut self, heard: Heard, at: Option<(u64, u64)>) {
         let Some((joints, last)) = at else { return };
         if let Some((before, joints_before, from)) = self.report {
@@ -431,7 +432,7 @@ impl Cell {
             let repeated = heard.joints_repeated.wrapping_sub(before.joints_repeated);
             let known = u64::from(taken) + u64::from(repeated);
             let between = joints.saturating_sub(joints_before);
-            // More than there were are not of one life: what seemed a start was none.
+            // More joints than were broadcast cannot belong to one incarnation: the apparent restart was none.
             if known <= between + PASSED as u64 {
                 self.untaken += between.saturating_sub(known);
                 match self.accounted.last_mut() {
@@ -443,27 +444,27 @@ impl Cell {
         self.report = Some((heard, joints, last));
     }
 
-    /// Whether counters that it reported before and after account for joints of this time, in ns since 1970; if none in
-    /// the capture do, they explain no deviation.
+    /// Returns true if counters reported before and after this time, in ns since 1970, account for its joints, or if no
+    /// counters in the capture account for any: then they explain no deviation.
     #[must_use]
     pub fn is_counted_at(&self, nanos: u64) -> bool {
         !self.is_accounted || self.accounted.iter().any(|&(from, until)| from < nanos && nanos <= until)
     }
 
-    /// Whether it sent nothing for long around a time, in ns since 1970.
+    /// Returns true during a long silence of the cell; `nanos` is in ns since 1970.
     #[must_use]
     pub fn is_silent_at(&self, nanos: u64) -> bool {
         nanos < self.heard.0 || self.silences.iter().any(|&(from, to)| (from..to).contains(&nanos))
     }
 }
 
-/// Whether a frame is of the gateway's side: a command, configuration, a stimulus.
+/// Returns true for frames from the gateway's side: a command, configuration or a stimulus.
 #[must_use]
 pub const fn is_input(id: Id) -> bool {
     !id.kind.is_from_cells()
 }
 
-/// Whether a frame is of a broadcast of joints, or of a segment of one.
+/// Returns true for a broadcast of joints or a segment of one.
 #[must_use]
 pub fn is_joints(id: Id) -> bool {
     id == Id::command(Command::Joints)

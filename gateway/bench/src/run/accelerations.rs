@@ -1,8 +1,8 @@
-//! What the accelerometers of simulated cells measure, as the robot is commanded to move.
+//! Accelerations that simulated cells measure as the robot is commanded to move.
 //!
-//! Of a motion that is known beforehand the stimuli are sent ahead of their epochs, as those of touches are. Of any other
-//! one, and while the robot is halted, they say how the robot moved in the last tick, and cells latch them with the next
-//! joints: they are a broadcast late.
+//! If the motion is known in advance, the stimuli are sent ahead of their epochs, like those of touches. Otherwise, and
+//! while the robot is halted, they hold the motion of the last tick, and cells latch them with the next joints: one
+//! broadcast late.
 
 use model::accelerometer::kinematics::UPRIGHT;
 use model::accelerometer::{Accelerometers, RobotState};
@@ -14,17 +14,17 @@ use protocol::skin::Cell;
 
 use super::Options;
 
-/// How the robot moved in a tick.
+/// Motion of the robot in a tick.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Moved {
-    /// When the tick began, in s since the loop's start.
+    /// Start of the tick in s since the start of the loop.
     pub(super) at_s: f64,
     pub(super) state: RobotState,
     pub(super) is_halted: bool,
 }
 
 impl Moved {
-    /// How it moved a moment before.
+    /// State of the robot up to 0.1 s before, extrapolated.
     fn before(&self, seconds: f64) -> RobotState {
         let mut state = self.state;
         let dt = (seconds - self.at_s).clamp(-0.1, 0.0);
@@ -37,23 +37,23 @@ impl Moved {
     }
 }
 
-/// The accelerometers of a run.
+/// Accelerometers of a run.
 #[derive(Debug)]
 pub(super) struct Accelerations {
     sensors: Accelerometers,
-    /// The broadcasts when the last tick's motion was sent.
+    /// Number of broadcasts when the last tick's motion was sent.
     broadcasts: u64,
 }
 
 impl Accelerations {
-    /// Those of the scenario, if it has any.
+    /// Creates the accelerometers of the scenario, if it has any.
     pub(super) fn new(options: &Options) -> Option<Self> {
         let sheet = options.scenario.sensors.acceleration?;
         let sensors = Accelerometers::new(&options.skin, &sheet, options.scenario.seed, UPRIGHT);
         Some(Self { sensors, broadcasts: 0 })
     }
 
-    /// The stimuli of an epoch to come, `now` s after the loop's start, for each bus; none if the motion is not known.
+    /// Stimuli of a future epoch, `now` s after the start of the loop, for each bus. Empty if the motion is unknown.
     pub(super) fn ahead(
         &self,
         options: &Options,
@@ -75,7 +75,7 @@ impl Accelerations {
         }
     }
 
-    /// The stimuli after the newest of some broadcasts, at `now`, once; none if they were sent ahead.
+    /// Stimuli after the latest broadcast, once per broadcast. Empty if they were sent ahead.
     pub(super) fn latest(
         &mut self,
         options: &Options,

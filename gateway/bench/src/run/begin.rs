@@ -1,4 +1,5 @@
-//! Until the loop begins: the cells start, no other gateway is on their buses, and all are ready, switched and in a tree.
+//! Start of a run up to the first tick: starts the cells, checks that no other gateway is on their buses, and waits
+//! until all cells are ready, switched and in a tree.
 
 use std::sync::atomic::Ordering;
 use std::thread;
@@ -21,12 +22,12 @@ use crate::view::View;
 use model::repeat::Repeats;
 use model::table::{Notice, Switch};
 
-/// How long cells that were there before may take to show up, and all to confirm their switches.
+/// Time that running cells get to show up, and all cells to confirm their switches.
 pub(super) const SHOWING: Duration = Duration::from_secs(2);
-/// The retry period for a cell that does not confirm its switches.
+/// Retry interval for a cell that does not confirm its switches.
 pub(super) const SWITCH_AGAIN: Span = Span::from_millis(250);
 
-/// Cells to which their switches were sent, by bus and node id.
+/// Cells to which switches were sent, by bus and node id.
 pub(super) type Announced = Repeats<(usize, CellId)>;
 
 impl Bench<'_> {
@@ -53,17 +54,17 @@ impl Bench<'_> {
         }
         let cells = options.skin.cells.len();
         self.wait(self.timeout(), |bench, timeout| {
-            // Waiting does not help cells without parameters.
+            // Cells without parameters will not become ready.
             let ready = bench.count(|cell| cell.ready || cell.unconfigured);
             let is_over = timeout.is_over(ready);
-            // After the machine was busy for a moment, ready cells may seem dead: they will send again.
+            // After a busy moment of the machine, ready cells may seem dead: they will send again.
             Ok(Instant::now() >= listened && (ready == cells || is_over))
         })?;
         self.rate_start()?;
         self.wake_up()?;
         self.go_on_after_others();
         self.switch_cells()?;
-        // Their counters, contact states and places in their networks.
+        // Requests their counters, contact states and positions in their networks.
         self.say(&Message::Report)?;
         if self.bus_links.iter().any(|bus_link| bus_link.network.is_some()) {
             self.organise()
@@ -72,7 +73,7 @@ impl Bench<'_> {
         }
     }
 
-    /// Shows what is so from now on.
+    /// Prints the announcements of the run.
     pub(super) fn announce(&self) {
         if self.options.quiet {
             return;
@@ -83,12 +84,12 @@ impl Bench<'_> {
         }
     }
 
-    /// How long cells may make no progress.
+    /// Maximum time without progress of the cells.
     pub(super) const fn timeout(&self) -> Duration {
         if self.options.spawn { STARTING } else { SHOWING }
     }
 
-    /// Polls until the check is done.
+    /// Polls until the check returns true.
     pub(super) fn wait(
         &mut self,
         timeout: Duration,
@@ -102,23 +103,23 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Cells that a gateway before this one has halted go on.
+    /// Resumes cells that an earlier gateway has halted.
     fn wake_up(&mut self) -> Result<(), RunError> {
         self.say(&Message::Resume)?;
         let halted = |bench: &Self| bench.count(|cell| cell.halted);
         if halted(self) == 0 {
             return Ok(());
         }
-        // Their next heartbeats show it.
+        // Their next heartbeats show their state.
         self.say(&Message::Sync)?;
         self.wait(SHOWING, |bench, timeout| Ok(halted(bench) == 0 || timeout.is_over(0)))
     }
 
-    /// A bus that was there before may have a gateway, or cells with the same node ids: listening first disturbs
+    /// Checks that a bus that existed before has neither a gateway nor cells with the same node ids; listening disturbs
     /// neither.
     fn find_alone(&mut self, until: Instant) -> Result<(), RunError> {
         self.wait(LISTEN, |_, _| Ok(Instant::now() >= until))?;
-        // Emulated cells are there already, and ours.
+        // Emulated cells are present already, and belong to this run.
         let others = self.bus_links.iter().enumerate().filter_map(|(bus, bus_link)| {
             let view = bus_link.view.lock().ok()?;
             let heard = view.cells.iter().filter(|cell| cell.heard).map(|cell| cell.node);
@@ -133,7 +134,7 @@ impl Bench<'_> {
         Err(RunError::CellsThere { cells, embedded })
     }
 
-    /// Cells that were there before have received joints of another gateway: its epochs are continued.
+    /// Continues the epochs of a former gateway, whose joints cells that run already have received.
     fn go_on_after_others(&mut self) {
         if self.options.spawn {
             return;
@@ -180,7 +181,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Another gateway, a process that ends or a bus that is gone end the start.
+    /// Ends the start on an error: another gateway, an ended process or a lost bus.
     fn hear_while_starting(&mut self) -> Result<(), RunError> {
         if self.signalled.load(Ordering::Relaxed) {
             return Err(RunError::Interrupted);
@@ -202,13 +203,13 @@ impl Bench<'_> {
         }
     }
 
-    /// Another gateway is on a bus.
+    /// Returns the error of another gateway on a bus.
     pub(super) fn other_gateway(&self, bus: usize) -> RunError {
         let link = self.bus_links.get(bus).map(|bus_link| &bus_link.link);
         RunError::OtherGateway(link.map(|link| (link.name.clone(), link.kind)))
     }
 
-    /// Sends a command on every bus.
+    /// Sends a command on all buses.
     pub(super) fn say(&self, message: &Message) -> Result<(), RunError> {
         for bus_link in &self.bus_links {
             if bus_link.send(message)? {
@@ -218,12 +219,12 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Switches all cells to what they lose at each start, before the first joints.
+    /// Sends all cells, before the first joints, the switches that they lose at each start.
     fn switch_cells(&mut self) -> Result<(), RunError> {
         let mut announced = Announced::new(SWITCH_AGAIN);
         let lacking = self.lacking();
         for (bus, (bus_link, described)) in self.bus_links.iter().zip(&self.options.skin.buses).enumerate() {
-            // Cells that were there before may be in any mode; those that have just started are in none.
+            // Cells that ran before may be in any mode; newly started cells are in the default mode.
             let off = (!self.options.spawn && described.sensing == Sensing::Off)
                 .then(|| (Parameter::Sensing.number(), Sensing::Off.words()));
             let first = lacking.iter().find(|((of, _), _)| *of == bus).map(|(_, switches)| switches.clone());
@@ -239,7 +240,7 @@ impl Bench<'_> {
         })
     }
 
-    /// Switches again the cells that have not confirmed in time: they restarted, or a message was lost.
+    /// Sends the switches again to cells that have not confirmed them in time: they restarted, or a message was lost.
     pub(super) fn switch_again(&self, announced: &mut Announced) -> Result<(), RunError> {
         let lacking = self.lacking();
         let due = announced.due(self.now(), lacking.iter().map(|(cell, _)| *cell));
@@ -252,14 +253,15 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// The cells that can receive and have not confirmed something, and what.
+    /// Reachable cells with unconfirmed switches, and those switches.
     fn lacking(&self) -> Vec<((usize, CellId), Vec<Switch>)> {
         let mut lacking = Vec::new();
         for (bus, bus_link) in
             self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_there())
         {
             let Ok(view) = bus_link.view.lock() else { continue };
-            // Next to never, and thousands of cells would be looked at a hundred times a second.
+            // Check the flag first: cells rarely lack a switch, and this would visit thousands of cells a hundred times
+            // a second.
             for cell in view.cells.iter().filter(|cell| view.lacking && cell.is_lacking()) {
                 lacking.push(((bus, cell.node), cell.lacks.into_iter().flatten().collect()));
             }
@@ -268,8 +270,8 @@ impl Bench<'_> {
     }
 }
 
-/// The epoch after which to begin on cells that have taken these last, if possible the first cell's: joints of the
-/// epoch that a cell has taken last count as repeated. Buses need not have had the same.
+/// Returns the epoch after which to start on cells that received `taken` last, preferably the first cell's: joints of a
+/// cell's last epoch count as repeated. Buses may have had different epochs.
 fn after(taken: &[Epoch]) -> Epoch {
     let mut last = taken.first().copied().unwrap_or_default();
     for _ in 0..u8::MAX {

@@ -18,14 +18,14 @@ use crate::progress::Progress;
 use crate::remote::{BusState, Command, LinkDown, Phase, ProcessState, State};
 use model::scenario::ProcessAction;
 
-/// Commands that are carried out at once, so that stimuli are not late.
+/// Maximum number of commands carried out at once, so that stimuli are not late.
 const AT_ONCE: usize = 4;
-/// From one state to the next.
+/// Interval between states.
 const EVERY: Duration = Duration::from_millis(200);
 
 impl Bench<'_> {
-    /// Carries out the commands that have come, and sends the state when it is time. With its other side a remote ends, and
-    /// buses that it has taken down come back.
+    /// Carries out received commands, and sends the state when due. If the other side has ended, the remote control
+    /// ends, and buses that it has taken down come back.
     pub(super) fn obey(&mut self, measured: &Measured, progress: &Progress) {
         let links = &self.bus_links;
         self.commanded.settle(|bus| {
@@ -35,7 +35,7 @@ impl Bench<'_> {
         let Some(mut remote) = self.remote.take() else { return };
         if remote.lines.has_ended() {
             self.commanded.release(|bus| commands(links, bus));
-            // At the end of the run it may end first.
+            // At the end of the run the other side may end first.
             if !self.signalled.load(Ordering::Relaxed) {
                 progress.error(
                     "--view: the process that served the page has ended; the run goes on without a page",
@@ -65,7 +65,7 @@ impl Bench<'_> {
         self.remote = Some(remote);
     }
 
-    /// A command as text.
+    /// Formats a command as text.
     fn words(&self, command: Command) -> String {
         let switched = |down: bool| if down { "down" } else { "up" };
         match command {
@@ -98,7 +98,7 @@ impl Bench<'_> {
         }
     }
 
-    /// The process of a cell.
+    /// Process of a cell.
     fn process(&self, bus: usize, node: u8) -> Option<ProcessState> {
         self.processes.states().find(|process| process.runs(bus, node))
     }
@@ -169,7 +169,7 @@ impl Bench<'_> {
     }
 }
 
-/// How many commands a bus has taken.
+/// Number of commands sent on a bus.
 fn commands(links: &[BusLink], bus: usize) -> u64 {
     links.get(bus).map_or(0, |bus_link| bus_link.link.state.commands.load(Ordering::Relaxed))
 }
@@ -180,7 +180,7 @@ pub(super) fn serve(options: &Options, bus: &str) -> Result<ServedBus, LaunchErr
     ServedBus::start(&program, bus, options.directory.as_deref())
 }
 
-/// A cell of the skin.
+/// Finds a cell of the skin.
 fn cell(skin: &Skin, bus: usize, node: u8) -> Result<&Cell, Refused> {
     if bus >= skin.buses.len() {
         return Err(Refused::NoBus);

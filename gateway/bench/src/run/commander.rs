@@ -1,4 +1,4 @@
-//! The other process that commands a run, the answers it got, and the buses that its commands have switched.
+//! Remote control of a run by another process: its replies, and the buses that its commands have switched.
 
 use std::collections::BTreeMap;
 use std::io;
@@ -9,48 +9,49 @@ use thiserror::Error;
 use crate::processes::LaunchError;
 use crate::remote::{Answer, Lines, Phase};
 
-/// Answers that are kept.
+/// Maximum number of kept replies.
 const ANSWERS: usize = 8;
 
-/// Who commands a run, and what it was answered.
+/// The remote control of a run and its latest replies.
 #[derive(Debug)]
 pub(super) struct Remote {
     pub(super) lines: Lines,
     pub(super) answers: Vec<Answer>,
-    /// How many answers there were.
+    /// Total number of replies.
     count: u64,
     pub(super) due: Instant,
 }
 
-/// Buses that commands have taken down. They outlive the remote, since only a bus itself shows that it works again.
+/// Buses that commands have taken down. They outlive the remote control, because only a bus itself shows that it works
+/// again.
 #[derive(Debug, Default)]
 pub(super) struct SwitchedBuses(BTreeMap<usize, Switched>);
 
-/// A bus that a command has taken down.
+/// State of a bus that a command has taken down.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Switched {
-    /// It stays down.
+    /// The bus stays down.
     Down,
-    /// It was taken up, or is left to come back, when it had taken so many of this run's commands.
+    /// The bus was taken up, or released, when it had taken this number of the run's commands.
     Up { commands: u64 },
 }
 
 impl SwitchedBuses {
-    /// Whether a bus is to stay down.
+    /// Returns true if a bus is to stay down.
     pub(super) fn is_down(&self, bus: usize) -> bool {
         self.0.get(&bus) == Some(&Switched::Down)
     }
 
-    /// Whether the loss of a bus is due to a command, and no reason to end: it is down, or has not worked since it was
-    /// taken up.
+    /// Returns true if a command caused the loss of a bus, which does not end the run: the bus is down, or has not
+    /// worked since it was taken up.
     pub(super) fn is_expected(&self, bus: usize) -> bool {
         self.0.contains_key(&bus)
     }
 
-    /// Checks that a command may take a bus down, or up.
+    /// Checks that a command may take a bus down, or bring it up.
     ///
     /// # Errors
-    /// When it is so already, or about to be.
+    /// Returns [`Refused`] if the bus is in that state already, or soon will be.
     pub(super) fn check(&self, down: bool, bus: usize) -> Result<(), Refused> {
         match (down, self.0.get(&bus)) {
             (true, Some(Switched::Down)) => Err(Refused::Already("up")),
@@ -60,20 +61,21 @@ impl SwitchedBuses {
         }
     }
 
-    /// Takes in that a bus was switched, when it had taken so many commands.
+    /// Notes that a bus was switched when it had taken this number of commands.
     pub(super) fn switched(&mut self, down: bool, bus: usize, commands: u64) {
         self.0.insert(bus, if down { Switched::Down } else { Switched::Up { commands } });
     }
 
-    /// Leaves the buses that are down to come back, since nobody will take them up; `commands` is how many each has taken.
+    /// Releases the buses that are down, because no other command will take them up. `commands` returns the number that
+    /// each has taken.
     pub(super) fn release(&mut self, commands: impl Fn(usize) -> u64) {
         for (bus, switched) in self.0.iter_mut().filter(|(_, switched)| **switched == Switched::Down) {
             *switched = Switched::Up { commands: commands(*bus) };
         }
     }
 
-    /// Forgets the buses that have come up: which are there, and have taken a command since. Until its receiver has noticed
-    /// that a bus was away, and has opened it again, it takes none.
+    /// Forgets the buses that work again: they exist and have taken a command since. A bus takes none until its
+    /// receiver has noticed the loss and reopened it.
     pub(super) fn settle(&mut self, taken: impl Fn(usize) -> Option<u64>) {
         self.0.retain(|bus, switched| match switched {
             Switched::Down => true,
@@ -82,7 +84,7 @@ impl SwitchedBuses {
     }
 }
 
-/// Why a command is not carried out.
+/// Reason why a command is refused.
 #[derive(Debug, Error)]
 pub(super) enum Refused {
     #[error("the skin has no such bus")]
@@ -103,7 +105,7 @@ pub(super) enum Refused {
     ComesUp,
     #[error("another program serves it: end that one")]
     NotServed,
-    #[error("it is no virtual interface: only vcan, vxcan and embedded buses are taken down here")]
+    #[error("it is not a virtual interface: only vcan, vxcan and embedded buses can be taken down here")]
     NotVirtual,
     #[error("there is no such interface")]
     NoInterface,
@@ -152,7 +154,7 @@ mod tests {
         assert!(matches!(buses.check(true, 0), Err(Refused::Already("up"))));
         buses.settle(|_| Some(105));
         assert!(buses.is_down(0) && buses.is_expected(0), "what works there is of before");
-        // Down and up at once: the receiver has not noticed anything yet.
+        // Down and up at once: the receiver has not noticed the change yet.
         buses.check(false, 0).unwrap();
         buses.switched(false, 0, 105);
         buses.settle(|_| Some(105));
@@ -160,7 +162,7 @@ mod tests {
         assert!(matches!(buses.check(false, 0), Err(Refused::ComesUp)));
         buses.settle(|_| None);
         assert!(buses.is_expected(0), "the receiver has noticed it");
-        // Again, before it has worked.
+        // Taken down again before it has worked.
         buses.check(true, 0).unwrap();
         buses.switched(true, 0, 105);
         buses.switched(false, 0, 105);

@@ -1,4 +1,4 @@
-//! The contact of cells that were there before: a stimulus that came before this run listened may still wait in them.
+//! Contact of cells that were running before: they may still hold a stimulus that came before this run received.
 
 use std::time::Duration;
 
@@ -12,14 +12,14 @@ use super::watch::Script;
 use crate::error::RunError;
 use crate::view::CellView;
 
-/// How long cells may take to report their counters and to clear their contact; they need milliseconds.
+/// Time that cells get to report their counters and to clear their contact; they need milliseconds.
 const ANSWERING: Duration = Duration::from_millis(500);
-/// The value of the mode in which cells obey stimuli.
+/// Value of the mode in which cells obey stimuli.
 const TEST_MODE: i16 = 1;
 
 impl Bench<'_> {
-    /// Waits, not for long, until the contact of all cells in test mode is known: the counters that the report brings show
-    /// whether a cell has taken stimuli before. A scenario that touches the skin begins with cells that nothing touches.
+    /// Waits briefly until the contact of all cells in test mode is known: the reported counters show whether a cell
+    /// has received stimuli before. If the scenario touches the skin, clears the cells' contact.
     pub(super) fn know_contacts(&mut self, script: &mut Script) -> Result<(), RunError> {
         let unreported = |cell: &CellView| cell.unclear && !cell.said.counters;
         self.wait(ANSWERING, |bench, timeout| Ok(bench.count(unreported) == 0 || timeout.is_over(0)))?;
@@ -32,15 +32,15 @@ impl Bench<'_> {
         let unclear = self.names(|cell| cell.unclear);
         if !unclear.is_empty() && !self.options.quiet {
             say(&format!(
-                "the contact of these cells is not known, their torques are not compared: {unclear}; they have taken \
+                "the contact of these cells is unknown, so their torques are not compared: {unclear}; they received \
                  stimuli before this run (`skinbus frame configure --cell N --write mode 1` clears one)"
             ));
         }
         Ok(())
     }
 
-    /// Clears the contact of cells in test mode that may have taken stimuli of others, or lost some of this run, and sends them
-    /// the scenario's stimuli. Only a run that touches the skin does so.
+    /// Clears the contact of cells in test mode that may have received stimuli from others, or missed some of this run,
+    /// and sends them the scenario's stimuli. Does nothing if the scenario does not touch the skin.
     pub(super) fn clear_contacts(&self, script: &mut Script) -> Result<(), RunError> {
         if script.touches.cells().next().is_none() {
             return Ok(());
@@ -58,14 +58,15 @@ impl Bench<'_> {
         self.remind(script, |it| due.contains(&(it.bus, it.node)))
     }
 
-    /// The cells that may have stimuli that did not come here, on buses that work.
+    /// Cells on working buses that may hold stimuli unknown to this run.
     fn unclear(&self) -> Vec<(usize, CellId)> {
         let mut unclear = Vec::new();
         for (bus, bus_link) in
             self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_there())
         {
             let Ok(view) = bus_link.view.lock() else { continue };
-            // Next to never, and thousands of cells would be looked at a hundred times a second.
+            // Check the flag first: cells are rarely unclear, and this would visit thousands of cells a hundred times a
+            // second.
             let cells = view.cells.iter().filter(|cell| view.unclear && cell.unclear);
             unclear.extend(cells.map(|cell| (bus, cell.node)));
         }

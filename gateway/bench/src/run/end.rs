@@ -1,4 +1,4 @@
-//! The end of a bench: final reports of the cells, the recording, the summary.
+//! End of a bench: final reports of the cells, the recording, the summary.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
@@ -22,11 +22,11 @@ use model::quantiles::Quantiles;
 use model::table::{Accuracy, Said};
 use trace::recording::account::Recording;
 
-/// How long the cells may take to send their final reports; an overloaded machine needs it.
+/// Time that cells get to send their final reports; an overloaded machine needs it.
 const LAST_WORDS: Duration = Duration::from_secs(3);
 
 impl Bench<'_> {
-    /// Runs the loop to its end, or as far as it comes.
+    /// Runs the loop to its end or to its failure, and returns the summary.
     pub(super) fn watch(mut self) -> Summary {
         let mut summary = Summary::empty(&self.options.skin);
         let mut measured = Measured::new();
@@ -39,7 +39,7 @@ impl Bench<'_> {
         self.summarise(summary, &measured, &received).rated(failure)
     }
 
-    /// Ends a bench whose loop never began.
+    /// Ends a bench whose loop never started.
     pub(super) fn give_up(mut self, error: RunError) -> Result<Summary, RunError> {
         let mut summary = Summary::empty(&self.options.skin);
         let received = self.stop_receivers();
@@ -51,13 +51,13 @@ impl Bench<'_> {
         Ok(self.summarise(summary, &Measured::new(), &received).rated(Some(error.to_string())))
     }
 
-    /// Reports where the frames received before a failure are.
+    /// Reports the files with the frames received before a failure.
     fn say_what_is_kept(&self, recording: Option<&Recording>) {
         if self.options.quiet {
             return;
         }
         for file in recording.into_iter().flat_map(|recording| &recording.files) {
-            say(&format!("{} frames until then are in {}", file.frames, file.path));
+            say(&format!("{} frames received until then are in {}", file.frames, file.path));
         }
     }
 
@@ -71,14 +71,14 @@ impl Bench<'_> {
         if interrupted {
             self.say(&Message::Halt)?;
         }
-        // Last, so that each cell's own count covers everything else that it has sent.
+        // Sent last, so that each cell's own count covers everything else that it has sent.
         self.say(&Message::Sync)?;
         self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.heartbeat));
         Ok(())
     }
 
-    /// Whether the receivers have read everything that was sent; what came before it they have read too. A lost
-    /// bus is not waited for.
+    /// Returns true if the receivers have read back all commands, and so everything before them. Lost buses do not
+    /// count.
     fn has_caught_up(&self) -> bool {
         self.bus_links.iter().all(|bus_link| {
             let read = bus_link.view.lock().map_or(u64::MAX, |view| view.commands);
@@ -86,7 +86,7 @@ impl Bench<'_> {
         })
     }
 
-    /// Whether all cells that can be expected to have reported it, on buses that work.
+    /// Returns true if all ready cells on working buses have sent the requested report.
     fn all_have(&self, said: impl Fn(&Said) -> bool) -> bool {
         self.bus_links.iter().filter(|bus_link| bus_link.link.state.is_there()).all(|bus_link| {
             let all = |view: &View| view.cells.iter().all(|cell| !cell.ready || said(&cell.said));
@@ -94,7 +94,7 @@ impl Bench<'_> {
         })
     }
 
-    /// Waits for something until the timeout; what is missing then shows in the accounts.
+    /// Waits until a condition holds, up to the timeout; the accounts show what is missing then.
     fn wait_until(&self, done: impl Fn(&Self) -> bool) {
         let give_up = Instant::now() + LAST_WORDS;
         while !done(self) && Instant::now() < give_up {
@@ -102,14 +102,14 @@ impl Bench<'_> {
         }
     }
 
-    /// Ends the receivers and takes their results.
+    /// Stops the receivers and returns their results.
     fn stop_receivers(&mut self) -> Vec<Option<ReceiverResult>> {
         self.shared.stop.store(true, Ordering::Relaxed);
         let end = |bus_link: &mut BusLink| bus_link.receiver.take().and_then(|thread| thread.join().ok());
         self.bus_links.iter_mut().map(end).collect()
     }
 
-    /// Ends the recording once no thread hands over more.
+    /// Ends the recording after all threads have stopped queuing.
     fn finish_recording(&mut self, received: &[Option<ReceiverResult>]) -> Option<Recording> {
         let add = |all: Unrecorded, one: &ReceiverResult| Unrecorded {
             frames: all.frames + one.unrecorded.frames,
@@ -120,7 +120,7 @@ impl Bench<'_> {
         self.recorder.take().map(|recorder| recorder.finish(unrecorded, ticks))
     }
 
-    /// Adds what was measured and received.
+    /// Adds the measured and received figures to the summary.
     fn summarise(
         &self,
         summary: Summary,
@@ -205,7 +205,7 @@ impl Bench<'_> {
         };
         let mut summaries: Vec<_> =
             self.bus_links.iter().zip(received).enumerate().filter_map(summary).collect();
-        // Their bus is unknown, except that it was one of the kernel's.
+        // The dropped packets belong to unknown buses of the kernel.
         let mut backlog = backlog_dropped.unwrap_or(0);
         for summary in summaries.iter_mut().filter(|summary| summary.kind == BusKind::SocketCan.name()) {
             backlog -= summary.uplink.explain_by_backlog(backlog);

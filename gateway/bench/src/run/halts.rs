@@ -1,6 +1,6 @@
-//! When and why the robot was halted, and the ticks before.
+//! Halts of the robot with their reasons, and the ticks before the last one.
 //!
-//! The main thread fills the ring with the records that the loop hands on, so that the loop does nothing for it.
+//! The main thread fills the ring from the loop's records, so that the loop does no extra work.
 
 use std::collections::VecDeque;
 
@@ -12,27 +12,27 @@ use control::cycle::Halt;
 use control::cycle::carried::bit;
 use control::cycle::turn::Timed;
 
-/// Ticks that are kept: 0.4 s at 500 Hz.
+/// Number of kept ticks: 0.4 s at 500 Hz.
 const TICKS: usize = 200;
-/// Halts that are listed one by one.
+/// Maximum number of halts listed one by one.
 const HALTS: usize = 100;
 
-/// What is known of halts.
+/// Halts of a run.
 #[derive(Debug, Default)]
 pub(super) struct Halts {
-    /// The last ticks.
+    /// Latest ticks.
     ring: VecDeque<Timed>,
-    /// The ticks up to the last halt.
+    /// Ticks up to the last halt.
     before: Vec<Timed>,
     halts: Vec<Halted>,
-    /// Halts beyond those that are listed one by one.
+    /// Number of halts beyond those listed one by one.
     pub(super) further: u64,
-    /// The halt that lasts.
+    /// The present halt, if any.
     lasting: Option<Halted>,
 }
 
 impl Halts {
-    /// Takes the next tick.
+    /// Adds the next tick.
     pub(super) fn take(&mut self, timed: &Timed) {
         if self.ring.len() == TICKS {
             self.ring.pop_front();
@@ -67,23 +67,23 @@ impl Halts {
         }
     }
 
-    /// Why the robot is halted, if it is.
+    /// Reason of the present halt, if any.
     pub(super) fn why(&self) -> Option<&str> {
         self.lasting.as_ref().map(|halted| halted.reason.as_str())
     }
 
-    /// Each halt, oldest first; one that lasts is the last and is always there.
+    /// All listed halts, oldest first; a present halt is always included as the last.
     pub(super) fn all(&self) -> Vec<Halted> {
         self.halts.iter().chain(&self.lasting).cloned().collect()
     }
 
-    /// The ticks up to the last halt, oldest first.
+    /// Ticks up to the last halt, oldest first.
     pub(super) fn history(&self, skin: &Skin) -> Vec<TickBefore> {
         self.before.iter().map(|timed| tick(timed, skin)).collect()
     }
 }
 
-/// A tick as it is reported.
+/// Converts a tick for the summary.
 #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
 fn tick(timed: &Timed, skin: &Skin) -> TickBefore {
     let record = &timed.record;
@@ -114,7 +114,7 @@ fn tick(timed: &Timed, skin: &Skin) -> TickBefore {
 fn reason(why: Halt) -> String {
     match why {
         Halt::BadCycles(why) => format!("too many bad cycles in a row: {why}"),
-        Halt::Frame => "somebody sent a halt frame".to_owned(),
+        Halt::Frame => "a halt frame was received".to_owned(),
     }
 }
 
@@ -133,7 +133,7 @@ mod tests {
     use model::testing;
     use protocol::packet::padded;
 
-    /// Moves up to a tick, then has no answer.
+    /// Moves up to a tick, then gives no answer.
     struct Until(u64);
 
     impl Controller for Until {
@@ -207,7 +207,7 @@ mod tests {
         for _ in 0..150 {
             bench.sums.halts += 1;
             bench.ticks(3);
-            assert_eq!(bench.halts.why(), Some("somebody sent a halt frame"));
+            assert_eq!(bench.halts.why(), Some("a halt frame was received"));
             bench.sums.resumes += 1;
             bench.ticks(2);
             assert_eq!(bench.halts.why(), None);

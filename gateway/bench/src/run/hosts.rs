@@ -1,4 +1,5 @@
-//! A bus that `vcan-setup link` joins with those of other hosts: what is lost between the hosts, and which of them are gone.
+//! A bus that `vcan-setup link` joins with buses of other hosts: the losses between the hosts, and the unreachable
+//! hosts.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -10,7 +11,7 @@ use crate::bus::link::{Link, Outages};
 use crate::setup::names;
 use crate::summary::HostSummary;
 
-/// From one look for a link to the next, where there is none.
+/// Interval between attempts to connect to a link.
 const LOOK_AGAIN: Duration = Duration::from_millis(500);
 
 /// The other hosts of a bus, and the connection to its link.
@@ -21,31 +22,31 @@ pub(super) struct Hosts {
     known: Known,
 }
 
-/// What is to be done after a change.
+/// Consequences of a link's reports.
 #[derive(Debug, Default, Eq, PartialEq)]
 pub(super) struct Changes {
-    /// For the user.
+    /// Messages for the user.
     pub(super) notes: Vec<String>,
     /// Cells whose packets, or whose stimuli, may be lost.
     pub(super) in_doubt: BTreeSet<CellId>,
-    /// Of these, the cells of hosts that are reached.
+    /// Cells among these whose hosts are reachable.
     pub(super) reached: BTreeSet<CellId>,
 }
 
-/// What the reports say, over all of a run.
+/// State of the hosts, over all of a run.
 #[derive(Debug, Default)]
 struct Known {
     hosts: BTreeMap<String, Of>,
-    /// Whether a link has reported since the run began.
+    /// True if a link has reported since the start of the run.
     is_linked: bool,
 }
 
-/// What is known of a host.
+/// State of a host.
 #[derive(Debug, Default)]
 struct Of {
     newest: Host,
     outages: Outages,
-    /// Frames that did not get through, from there and to there.
+    /// Numbers of frames lost from the host and to the host.
     lost: [u64; 2],
 }
 
@@ -54,7 +55,7 @@ impl Hosts {
         Self { reports: None, look_at: Instant::now(), known: Known::default() }
     }
 
-    /// Takes what the bus' link has reported. Does not wait.
+    /// Reads the reports of the bus's link without waiting.
     pub(super) fn look(&mut self, link: &Link) -> Changes {
         let (now, mut changes) = (Instant::now(), Changes::default());
         if self.reports.is_none() && self.look_at <= now {
@@ -76,18 +77,18 @@ impl Hosts {
         changes
     }
 
-    /// Whether a cell is on a host that is gone or not reached: what still comes of it was on its way.
+    /// Returns true if a cell is on an unreachable host: its remaining frames were under way.
     pub(super) fn is_away(&self, cell: CellId) -> bool {
         let mut away = self.known.hosts.values().filter(|of| !of.newest.is_there);
         away.any(|of| of.newest.nodes.contains(&cell.get()))
     }
 
-    /// Frames that did not get through between the hosts.
+    /// Number of frames lost between the hosts.
     pub(super) fn lost(&self) -> u64 {
         self.known.hosts.values().flat_map(|of| of.lost).fold(0, u64::saturating_add)
     }
 
-    /// What was known of each host; none where nothing linked the bus.
+    /// Summary of each host; empty if no link joined the bus.
     pub(super) fn summary(&self) -> Vec<HostSummary> {
         let summary = |(name, of): (&String, &Of)| HostSummary {
             name: name.clone(),
@@ -112,7 +113,7 @@ impl Known {
             let missing = |host: &Host| [host.heard.missing(), host.ours.map_or(0, |ours| ours.missing())];
             let (was, is) = (missing(&before), missing(newest));
             if is_first {
-                // What it lost before the run began is not the run's.
+                // Losses from before the run do not belong to the run.
                 known.outages = Outages::default();
             } else {
                 for (lost, (was, is)) in known.lost.iter_mut().zip(was.into_iter().zip(is)) {
@@ -146,7 +147,7 @@ impl Known {
         }
     }
 
-    /// The link here has ended. A next one counts from zero.
+    /// Handles the end of the local link. The next link counts from zero.
     fn end(&mut self, bus: &str, why: &str, now: Instant, changes: &mut Changes) {
         changes.notes.push(format!("the link of {bus} to other hosts has ended ({why})"));
         for known in self.hosts.values_mut() {
@@ -180,7 +181,8 @@ mod tests {
             Self(Hosts::new(), Instant::now(), 0)
         }
 
-        /// A report one second after the last one: the notes, and how many cells are in doubt and reached.
+        /// Handles a report one second after the last one. Returns the notes, and the numbers of cells in doubt and
+        /// reached.
         fn take(&mut self, hosts: &[(&str, bool, u64, u64, u64)]) -> (Vec<String>, usize, usize) {
             self.2 += 1;
             let mut changes = Changes::default();

@@ -1,4 +1,4 @@
-//! The sums of the loop's records.
+//! Totals of the loop's records.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -16,7 +16,7 @@ use model::accelerometer::RobotState;
 use model::quantiles::{Quantiles, histogram};
 use model::scenario::Mode;
 
-/// The sums of the loop's records.
+/// Totals of the loop's records.
 #[derive(Debug)]
 pub(super) struct Measured {
     pub(super) late: Histogram<u64>,
@@ -26,15 +26,15 @@ pub(super) struct Measured {
     pub(super) ticks: u64,
     pub(super) skipped: u64,
     pub(super) bad: BTreeMap<String, u64>,
-    /// Ticks without each bus, as [`control::cycle::Record::missing`] has the buses.
+    /// Number of ticks without each bus, indexed as the bits of [`control::cycle::Record::missing`].
     pub(super) missing: [u64; 32],
     pub(super) halts: Halts,
     last: Option<Timed>,
     before: Option<Timed>,
-    /// Since when ticks are recorded in `recent`, and how late they began.
+    /// Start of the interval that `recent` covers.
     since: Instant,
     recent: Histogram<u64>,
-    /// What is known of lateness, once a second.
+    /// Lateness figures, renewed once a second.
     pub(super) lateness: Lateness,
     pub(super) first_broadcast_s: Option<f64>,
 }
@@ -91,7 +91,7 @@ impl Measured {
         }
     }
 
-    /// How the robot moved in the last tick.
+    /// Motion of the robot in the last tick.
     pub(super) fn moved(&self) -> Option<Moved> {
         let [before, last] = [self.before?, self.last?].map(|timed| timed.record);
         let [began, at_s] = [before, last].map(|record| Span(record.tick.time.0).seconds());
@@ -103,7 +103,7 @@ impl Measured {
         Some(Moved { at_s, state, is_halted: last.halted.is_some() })
     }
 
-    /// Returns the progress, for a line of `width` letters.
+    /// Progress text for a line of `width` columns.
     pub(super) fn line(
         &self,
         elapsed: Duration,

@@ -1,4 +1,4 @@
-//! A bench, live: buses, cells, receivers, the control loop, and the thread that watches over them.
+//! A live bench: buses, cells, receivers, the control loop, and the main thread that supervises them.
 //!
 //! ```text
 //!   main thread ── starts ──> cells, embedded buses (processes)
@@ -43,44 +43,45 @@ use crate::remote::Lines;
 use crate::summary::Summary;
 use model::scenario::Scenario;
 
-/// What a run needs to know.
+/// Options of a run.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// The skin's file, which cells read too.
+    /// Path of the skin's file, which cells read too.
     pub skin_file: PathBuf,
     /// The skin.
     pub skin: Skin,
-    /// What happens.
+    /// The scenario.
     pub scenario: Scenario,
-    /// Which kind each bus is.
+    /// Kind of each bus.
     pub kinds: Kinds,
-    /// Where embedded buses are, if not where they usually are.
+    /// Directory of embedded buses; `None` for the usual one.
     pub directory: Option<PathBuf>,
-    /// Whether cells are started; else they are on the bus already.
+    /// True if the run starts the cells; otherwise they must be on the bus already.
     pub spawn: bool,
-    /// Cells that are emulated, and by which firmware; the others are processes.
+    /// Cells to emulate and their firmware; the other cells are processes.
     pub emulated: Option<Emulated>,
-    /// At most so many cells in a process.
+    /// Maximum number of cells per process.
     pub cells_per_process: usize,
-    /// Where cells keep their parameters, if they do.
+    /// Directory for the cells' parameters, if they keep them.
     pub flash: Option<PathBuf>,
-    /// Bytes that may wait in the gateway's socket of a bus, as the kernel counts them: about 1 KiB a frame.
+    /// Size of the gateway's receive buffer of a bus in bytes, as the kernel counts them: about 1 KiB per frame.
     pub receive_buffer: usize,
-    /// What is recorded where.
+    /// Outputs of the recording.
     pub record: crate::record::Options,
-    /// Whether progress is shown.
+    /// True if progress is hidden.
     pub quiet: bool,
-    /// What moves the robot in place of the scenario.
+    /// Motion of the robot that replaces the scenario's.
     pub planned: Option<Motion>,
-    /// Lines that are true once the loop begins, and are shown then.
+    /// Lines to print when the loop starts.
     pub announced: Vec<String>,
 }
 
-/// Runs a bench to its end, or until SIGINT or SIGTERM. A run that fails has a summary too, with the reason. While the
-/// loop runs, `remote` commands the bench.
+/// Runs a bench to its end, or until SIGINT or SIGTERM. A failed run returns a summary too, with the reason. `remote`
+/// controls the bench while the loop runs.
 ///
 /// # Errors
-/// When it cannot begin because of wrong use or configuration; cells and buses that were started are ended again.
+/// Returns [`RunError`] if the run cannot start because of wrong use or configuration, after ending the cells and buses
+/// that it started.
 pub fn run(options: &Options, remote: Option<Lines>) -> Result<Summary, RunError> {
     let mut bench = match start::start(options) {
         Ok(bench) => bench,

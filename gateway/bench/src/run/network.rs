@@ -1,4 +1,4 @@
-//! The networks of a run's cells, as the main thread sees them: unreachable cells, and cells that need their slots.
+//! Networks of a run's cells, as the main thread sees them: unreachable cells, and cells that need their slots.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -17,9 +17,9 @@ use model::repeat::Repeats;
 
 use crate::view::View;
 
-/// The retry period for a cell that does not answer.
+/// Retry interval for a cell that does not answer.
 const AGAIN: Span = Span::from_millis(200);
-/// Cells have so long to find another route before they are reported.
+/// Time that cells get to find another route before they are reported.
 const GRACE: Span = Span::from_millis(300);
 
 /// The network of one bus.
@@ -31,23 +31,23 @@ pub(super) struct Network {
     period_us: u16,
     /// Cells to which their slots were sent.
     announced: Repeats<CellId>,
-    /// Ports whose links are to be down, a bit each, and cells to which that was sent.
+    /// Ports whose links are to be down, one bit each.
     deaf: BTreeMap<CellId, u8>,
     reported_links_down: Repeats<CellId>,
-    /// Cells that send and are unreachable, and since when.
+    /// Cells that send but are unreachable, with the start of that state.
     without: BTreeMap<CellId, Micros>,
-    /// Cells that were reported as unreachable, and since when they are; until they have a route again.
+    /// Cells reported as unreachable, with the start of that state, until they have a route again.
     said: BTreeMap<CellId, Micros>,
     said_too_deep: bool,
-    /// The longest time that a cell was unreachable.
+    /// Longest time that a cell was unreachable.
     pub(super) longest: Span,
-    /// From the time when all cells were ready until all had a route.
+    /// Time from the moment when all cells were ready until all had a route.
     pub(super) tree_ready: Option<Span>,
     /// Differences from the description at the start.
     pub(super) differences: Vec<Difference>,
 }
 
-/// A tree that is too deep for the time between two joints.
+/// The error of a tree that is too deep for the time between two joint broadcasts.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[error(
     "the tree of {bus} is {deepest} wires deep: {slots} slots of slot_us = {slot_us} do not fit into the {period_us} us \
@@ -57,19 +57,19 @@ pub(super) struct Network {
     slots = .slots
 )]
 pub struct TooDeep {
-    /// The bus.
+    /// Name of the bus.
     pub bus: String,
-    /// The depth of its deepest cell.
+    /// Depth of its deepest cell.
     pub deepest: u8,
-    /// How many slots that needs.
+    /// Number of slots for that depth.
     pub slots: u32,
-    /// How long each is.
+    /// Length of a slot in µs.
     pub slot_us: u32,
-    /// From joints to joints.
+    /// Time between joint broadcasts in µs.
     pub period_us: u32,
 }
 
-/// The result of a check of a network.
+/// Result of a check of a network.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Look {
     /// Messages for cells.
@@ -79,7 +79,7 @@ pub(super) struct Look {
 }
 
 impl Network {
-    /// That of a bus; `None` where cells answer with their own torques.
+    /// Creates the network of a bus, or `None` if its cells answer with their own torques.
     pub(super) fn of(skin: &Skin, bus: usize) -> Option<Self> {
         let described = skin.buses.get(bus)?;
         let Reply::Sum { slot_us, carry } = described.reply else { return None };
@@ -100,17 +100,17 @@ impl Network {
         })
     }
 
-    /// The largest depth for which there is a slot.
+    /// Largest depth that has a slot.
     pub(super) const fn deepest(&self) -> u8 {
         self.slots.deepest
     }
 
-    /// The bus' name.
+    /// Name of the bus.
     pub(super) fn name(&self) -> &str {
         &self.name
     }
 
-    /// Cells that send and are unreachable, at the last check.
+    /// Cells that sent but were unreachable at the last check.
     pub(super) fn unreachable(&self) -> impl Iterator<Item = u8> {
         self.without.keys().map(|cell| cell.get())
     }
@@ -119,7 +119,7 @@ impl Network {
         places(view.network.iter().map(|cell| (cell.node, cell.alive && cell.serial.is_some(), cell.tree)))
     }
 
-    /// How many cells have a route, and whether all that send have one, with pages that agree.
+    /// Number of cells with a route, and true if all that send have one and their pages agree.
     pub(super) fn progress(view: &View) -> (usize, bool) {
         let places = Self::places(view);
         (places.depths.len(), places.unreachable.is_empty() && places.agree)
@@ -130,10 +130,10 @@ impl Network {
         check::differences(&self.wires, &view.network)
     }
 
-    /// Makes slots for the tree as it is.
+    /// Adapts the number of slots to the present tree.
     ///
     /// # Errors
-    /// When they do not fit between two joints, with what would.
+    /// Returns [`TooDeep`] if the slots do not fit between two joint broadcasts; it names values that would.
     pub(super) fn fit(&mut self, view: &View) -> Result<(), TooDeep> {
         let deepest = Self::places(view).deepest().unwrap_or(0);
         let slots = u32::from(deepest) + 1;
@@ -154,13 +154,13 @@ impl Network {
         Message::Configure { to, tag: self.slots.deepest, request }
     }
 
-    /// Announces the depth of the tree to all cells.
+    /// Returns the message that sends the depth of the tree to all cells.
     pub(super) fn announce(&mut self, now: Micros) -> Message {
         self.announced.said_to_all(now);
         self.tell(Node::Everyone)
     }
 
-    /// The cells that do not use the slots of this tree and could.
+    /// Ready cells that have not confirmed the slots of this tree.
     pub(super) fn unconfirmed(&self, view: &View) -> Vec<CellId> {
         let words = Some(self.words());
         let unconfirmed = view.cells.iter().filter(|cell| cell.ready && cell.reply != words);
@@ -173,7 +173,7 @@ impl Network {
         due.into_iter().map(|cell| self.tell(Node::Cell(cell))).collect()
     }
 
-    /// Takes the links from one cell to another down, or up again.
+    /// Takes the links from one cell to another down, or brings them up again.
     pub(super) fn set_link_down(&mut self, link_down: bool, from: CellId, to: CellId) {
         let ends = (0_u8..)
             .zip(0..PORTS)
@@ -184,7 +184,7 @@ impl Network {
         self.reported_links_down.renew(to);
     }
 
-    /// The links that are to be down in one direction or in both, each once: its cells, the smaller node id first.
+    /// Links that are to be down in one or both directions, each once, with the smaller node id first.
     pub(super) fn links_down(&self) -> BTreeSet<[CellId; 2]> {
         let ports = |(&to, &bits): (&CellId, &u8)| {
             let down = (0..PORTS).filter(move |port| bits >> port & 1 == 1);
@@ -290,7 +290,7 @@ mod tests {
         Network::of(&Skin::parse("skin.toml", &text).unwrap(), 0).unwrap()
     }
 
-    /// Cells that report their parents and depths; one that reports nothing is dead.
+    /// Creates a view of cells with these parents and depths; `None` is a dead cell.
     fn view(trees: &[Option<(Option<u8>, u8)>], reply: Option<[i16; WORDS]>) -> View {
         let cells = trees.iter().enumerate().map(|(at, tree)| CellView {
             node: CellId::new(i64::try_from(at + 1).unwrap()).unwrap(),
@@ -343,7 +343,7 @@ mod tests {
         assert_eq!(look.messages.len(), 3, "{look:?}");
         let new = Some(network.words());
         assert_eq!(network.look(at(3), &view(&deep, new)), Look::default());
-        // A restarted cell has lost it.
+        // A restarted cell has lost its slots.
         let look = network.look(at(4), &view(&deep, None));
         assert_eq!(look.messages.len(), 3, "{look:?}");
         // 4 slots of 5 ms are more than 16 ms.
@@ -417,7 +417,7 @@ mod tests {
         );
         assert_eq!(look(&mut network, &link_down), Vec::<String>::new());
         assert_eq!(network.unreachable().collect::<Vec<_>>(), [2, 3]);
-        // One dies, which is reported elsewhere; the other has a route again.
+        // One cell dies, which is reported elsewhere; the other has a route again.
         let partial = [Some((Some(0), 0)), None, Some((Some(1), 1))];
         assert_eq!(
             look(&mut network, &partial),

@@ -1,5 +1,5 @@
-//! Before the loop begins: cells that answer with sums become a tree, the tree is compared with the description, and
-//! all cells get their slots.
+//! Organisation of the trees before the loop starts: cells that answer with sums form a tree, the tree is compared with
+//! the description, and all cells get their slots.
 
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -14,11 +14,11 @@ use super::network::Network;
 use crate::error::RunError;
 use crate::view::View;
 
-/// Differences that last so long are real: a hello and a heartbeat come four times a second.
+/// Time after which a difference counts as real: hellos and heartbeats come four times a second.
 const SETTLING: Duration = Duration::from_millis(1_500);
 
 impl Bench<'_> {
-    /// Waits until cells that answer with sums are a tree, and sends them their slots.
+    /// Waits until the cells that answer with sums form a tree, and sends them their slots.
     pub(super) fn organise(&mut self) -> Result<(), RunError> {
         self.shared.explore.store(true, Ordering::Relaxed);
         let began = self.now();
@@ -52,7 +52,7 @@ impl Bench<'_> {
 
     /// Reports differences from the description.
     fn check_networks(&mut self) -> Result<(), RunError> {
-        // Pages of ports come with heartbeats, unless they are requested.
+        // Without a request, pages of ports come with heartbeats only.
         self.say(&Message::Report)?;
         let mut changes = 0;
         self.wait(SETTLING, |bench, timeout| {
@@ -108,7 +108,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Checks each network with its receiver's view, and sends the resulting messages.
+    /// Passes each network with its receiver's view to `messages`, and sends the messages that it returns.
     fn send_to_networks(
         &mut self,
         mut messages: impl FnMut(&mut Network, Micros, &View) -> Vec<Message>,
@@ -126,7 +126,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Checks all networks while the loop runs: messages for the user.
+    /// Checks all networks while the loop runs. Returns messages for the user.
     pub(super) fn watch_networks(&mut self) -> Result<Vec<String>, RunError> {
         let mut notes = Vec::new();
         self.send_to_networks(|network, now, view| {

@@ -1,4 +1,4 @@
-//! The thread that receives on one bus: it keeps the table, and leaves snapshots for the tick.
+//! The thread that receives on one bus: it maintains the table, and publishes snapshots for the tick.
 
 use std::collections::BTreeSet;
 use std::sync::atomic::Ordering;
@@ -23,93 +23,95 @@ use model::latched::Seen;
 use model::table::{Notice, Snapshot, Table};
 use trace::capture::BusNote;
 
-/// How often timeouts are checked if nothing comes, and the view is renewed.
+/// Interval between checks of timeouts and updates of the view, if no frame arrives.
 const LOOK: Duration = Duration::from_millis(20);
-/// The same of so many cells on all buses together; of more it is proportionally longer, but at most [`LONGEST_LOOK`].
+/// Number of cells on all buses up to which [`LOOK`] holds. With more cells the interval grows proportionally, up to
+/// [`LONGEST_LOOK`].
 const CELLS_A_LOOK: usize = 1_000;
-/// See [`CELLS_A_LOOK`]; a cell is dead after 600 ms.
+/// Maximum of that interval; a cell counts as dead after 600 ms.
 const LONGEST_LOOK: Duration = Duration::from_millis(100);
 
-/// How often the timeouts of a skin of so many cells are checked while the loop runs: all of them cost the same.
+/// Interval between checks of the timeouts of a skin with `cells` cells while the loop runs, so that the checks cost
+/// the same for all skins.
 #[must_use]
 pub fn look_at(cells: usize) -> Duration {
     let times = u32::try_from(cells / CELLS_A_LOOK).unwrap_or(u32::MAX);
     LOOK.saturating_mul(times.max(1)).min(LONGEST_LOOK)
 }
 
-/// What a receiver reports to the main thread at once.
+/// An event that a receiver reports to the main thread immediately.
 #[derive(Debug)]
 pub enum BusEvent {
-    /// Of a cell, or another gateway.
+    /// An event of a cell, or another gateway.
     Notice(Notice),
-    /// The bus does not work for now.
+    /// The bus is down.
     Down(BusError),
-    /// It works again.
+    /// The bus works again.
     Up,
-    /// The bus is gone: it has to be reopened, which its receiver tries.
+    /// The bus is gone; its receiver tries to reopen it.
     Lost(BusError),
-    /// It is there and cannot be opened.
+    /// The bus exists but cannot be opened.
     Refused(BusError),
 }
 
-/// One bus, as its receiver sees it.
+/// The receiver of one bus.
 #[derive(Debug)]
 pub struct Receiver {
-    /// The index of this bus in the skin.
+    /// Index of the bus in the skin.
     pub index: usize,
-    /// The bus.
+    /// The receiver's end of the bus.
     pub receive_end: ReceiveEnd,
-    /// Follows it: frames gather for a tick, as the loop reads no more often.
+    /// Follower of the bus: frames gather for a tick, because the loop reads no more often.
     pub follower: Follower,
-    /// How often timeouts are checked and the view is renewed while the loop runs.
+    /// Interval between checks of timeouts and updates of the view while the loop runs.
     pub look: Duration,
-    /// What is known of it.
+    /// State of the bus and its cells.
     pub table: Table,
-    /// Where snapshots go.
+    /// Snapshots for the control loop.
     pub snapshots: triple_buffer::Input<Snapshot>,
     /// Unrounded positions of the broadcasts.
     pub positions: rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
-    /// Where everything to be recorded goes, if it is recorded.
+    /// Queues to the recorder, if the run is recorded.
     pub outlet: Option<Outlet>,
-    /// What all threads share.
+    /// State shared by all threads.
     pub shared: Arc<Shared>,
-    /// What the main thread sees.
+    /// State shown to the main thread.
     pub view: Arc<Mutex<View>>,
-    /// What is reported to it at once.
+    /// Events for the main thread.
     pub bus_event: Sender<(usize, BusEvent)>,
-    /// Cells that it says were not reached, before it sends them anything again.
+    /// Cells that, as the main thread reports, may have missed messages; sent before it sends them anything again.
     pub in_doubt: mpsc::Receiver<BTreeSet<CellId>>,
 }
 
-/// The result of a receiver.
+/// Result of a receiver.
 #[derive(Debug)]
 pub struct ReceiverResult {
-    /// All that is known of the bus.
+    /// Final state of the bus and its cells.
     pub table: Table,
-    /// Frames that the bus dropped because they were not read in time.
+    /// Number of frames that the bus dropped because they were not read in time.
     pub dropped: u64,
-    /// What did not fit into the recorder's queues.
+    /// Number of items that did not fit into the recorder's queues.
     pub unrecorded: Unrecorded,
-    /// How often the bus was lost, and for how long.
+    /// Number and total duration of the bus's losses.
     pub outages: Outages,
-    /// When it ended: what its cells are is of then, however long a recording takes to be complete.
+    /// End time of the receiver: its cells' states are of this time, however long the recorder takes to finish.
     pub ended: Micros,
 }
 
-/// What was reported of a bus so far.
+/// Reports about a bus so far.
 #[derive(Debug, Default)]
 struct Account {
-    /// Dropped frames that the recorder knows of.
+    /// Number of dropped frames that the recorder knows of.
     announced: u64,
-    /// The newest joints whose contact states the recorder has.
+    /// Latest joints whose contact states the recorder has.
     newest: Option<u64>,
     outages: Outages,
-    /// Commands that the bus took and did not carry, because it was lost.
+    /// Number of commands that the bus accepted but lost when it failed.
     unread: u64,
 }
 
 impl Receiver {
-    /// Receives until it is stopped. A lost bus is waited for, and reopened if it is gone.
+    /// Receives until stopped. Waits for a lost bus, and reopens it if it is gone.
     #[must_use]
     pub fn run(mut self) -> ReceiverResult {
         crate::bus::realtime::prepare_receiver();
@@ -140,12 +142,12 @@ impl Receiver {
         ReceiverResult { table: self.table, dropped, unrecorded, outages: account.outages, ended }
     }
 
-    /// How often to look now: until the loop begins the main thread waits for what cells say.
+    /// Present interval between checks: short until the loop starts, because the main thread waits for the cells.
     fn look_now(&self) -> Duration {
         if self.shared.broadcasts.load(Ordering::Relaxed) == 0 { LOOK } else { self.look }
     }
 
-    /// Notes and reports what a step says of the bus itself.
+    /// Handles the outcome of a step that concerns the bus itself.
     fn take(&mut self, step: Step, account: &mut Account) {
         match step {
             Step::Frames(_) => {
@@ -174,14 +176,14 @@ impl Receiver {
         }
     }
 
-    /// Notes in the recording what has become of the bus.
+    /// Notes a state of the bus in the recording.
     fn note(&mut self, what: BusNote) {
         if let Some(outlet) = &mut self.outlet {
             outlet.bus(wall(), what);
         }
     }
 
-    /// Takes what came.
+    /// Handles the received frames.
     fn hear(&mut self) {
         self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
         let Self { follower, table, positions: queue, outlet, .. } = self;
@@ -199,7 +201,7 @@ impl Receiver {
         });
     }
 
-    /// Hands on what is no frame: what the bus dropped, and once an epoch the contact states.
+    /// Forwards drop counts and, once per epoch, contact states to the recorder.
     fn record(&mut self, account: &mut Account) {
         let Some(outlet) = &mut self.outlet else { return };
         let dropped = self.follower.dropped();
@@ -220,7 +222,7 @@ impl Receiver {
         self.snapshots.publish();
     }
 
-    /// Checks timeouts, and renews the main thread's view.
+    /// Checks timeouts, and updates the main thread's view.
     fn look(&mut self, account: &mut Account) {
         let now = Micros(wall() / 1_000);
         self.table.handle_time(now);
@@ -231,7 +233,7 @@ impl Receiver {
         let cells = self.table.statuses(now).map(|(cell, status)| CellView::of(cell, status));
         let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));
         if !self.receive_end.link.state.is_there() {
-            // What it took and has not carried by now it will not carry.
+            // The lost bus will not carry commands that it has accepted.
             account.unread =
                 self.receive_end.link.state.commands.load(Ordering::Relaxed).saturating_sub(read);
         }
@@ -244,12 +246,12 @@ impl Receiver {
     }
 
     fn tell(&self, bus_event: BusEvent) {
-        // At the end of the run there is no receiver any more.
+        // At the end of the run the main thread is gone.
         let _ = self.bus_event.send((self.index, bus_event));
     }
 }
 
-/// Reports what did not fit; the recorder makes room as long as a receiver runs.
+/// Reports items that did not fit; the recorder makes room as long as a receiver runs.
 fn last_words(outlet: &mut Outlet) -> Unrecorded {
     let give_up = Instant::now() + Duration::from_secs(1);
     while !outlet.tell(wall()) && Instant::now() < give_up {
@@ -258,7 +260,7 @@ fn last_words(outlet: &mut Outlet) -> Unrecorded {
     outlet.unrecorded()
 }
 
-/// The positions of an epoch; those of earlier ones, whose broadcast was not read back, are dropped.
+/// Positions of an epoch. Drops those of earlier epochs, whose broadcast was not read back.
 fn positions_of(
     queue: &mut rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
     epoch: Epoch,

@@ -1,4 +1,4 @@
-//! From a description to buses that are open and received on.
+//! Start of a run: from a description to open buses with receivers.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -45,11 +45,11 @@ use model::table::Table;
 use trace::recording::layout::Layout;
 use trace::recording::series::Head;
 
-/// How long stimuli and commands may wait for a full bus; the loop's own frames never wait.
+/// Time that stimuli and commands may wait for a full bus; the loop's own frames never wait.
 const SEND_TIMEOUT: Duration = Duration::from_millis(10);
-/// Frames gather for a tick, and no longer than this.
+/// Maximum time for which frames gather; otherwise they gather for a tick.
 const GATHER: Duration = Duration::from_millis(10);
-/// Reported when a receive buffer is smaller than it should be.
+/// Remark on a receive buffer that is smaller than requested.
 const LIMITED: &str = ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
 
 /// Claims files and opens buses; [`Bench::begin`] starts the cells.
@@ -58,7 +58,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let emulator = refuse(options)?;
     let skin = &options.skin;
     let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
-    // A file at its size limit is an error like others, not a signal.
+    // A file at its size limit is an ordinary error, not a signal.
     signal_hook::flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false)))
         .map_err(|source| SignalError { signal: SIGXFSZ, source })?;
     let outputs = Outputs::claim(&options.record, &signalled, say).map_err(|refused| {
@@ -66,7 +66,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     })?;
     let numbered = options.record.candump.as_ref().is_some_and(|candump| candump.numbered);
     let log = outputs.log().filter(|_| numbered).map(Path::to_owned);
-    // From now on an external controller can connect, so that it is ready when the loop begins.
+    // From now on an external controller can connect, so that it is ready when the loop starts.
     let controller: Box<dyn Controller> = match &options.planned {
         Some(motion) => {
             let motion = motion.clone();
@@ -79,7 +79,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let idle = realtime::idle_lateness(skin.timing.tick_nanos());
     let backlog_dropped = backlog::dropped();
     let (mut served, mut processes) = (Vec::new(), Processes::new()?);
-    // Before this run itself is on the buses: it takes who commissions for another gateway.
+    // Before this run opens the buses: it would take a commissioning tool for another gateway.
     let emulation =
         emulator.map(|emulator| emulate(options, &emulator, &mut served, &mut processes, &signalled));
     let emulation = emulation.transpose()?;
@@ -134,7 +134,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     })
 }
 
-/// Checks for what a description allows and this program cannot do, and for what is missing.
+/// Checks for valid descriptions that this program cannot run, and for missing programs and directories.
 fn refuse(options: &Options) -> Result<Option<Emulator<'_>>, RunError> {
     if options.spawn {
         program("cell-node")?;
@@ -177,12 +177,12 @@ fn emulate(
     Ok(emulation)
 }
 
-/// Emulated cells are on a bus that others may look at, and cells that are there already are on a bus that is there.
+/// Other programs may use the bus of emulated cells, and cells that are not started here need an existing bus.
 const fn absent(options: &Options) -> Absent {
     if options.spawn && options.emulated.is_none() { Absent::Made } else { Absent::Refused }
 }
 
-/// How a bus is to be opened.
+/// Options for opening a bus.
 fn target_of<'a>(options: &Options, described: &'a skin::Bus, filters: Vec<Filter>) -> Target<'a> {
     let name = &described.name;
     let target = BusOptions {
@@ -197,7 +197,7 @@ fn target_of<'a>(options: &Options, described: &'a skin::Bus, filters: Vec<Filte
     (name, options.kinds.of(name), target)
 }
 
-/// The link of a bus that was opened.
+/// Creates the link of an opened bus.
 fn linked(
     options: &Options,
     described: &skin::Bus,
@@ -221,7 +221,7 @@ fn linked(
     Ok((receive_end, slot))
 }
 
-/// Starts the thread that records, if anything is to be recorded; where the loop's records go to it.
+/// Starts the recorder, if anything is to be recorded. Returns it with the queue for the loop's records.
 fn record(
     options: &Options,
     outputs: Outputs,
@@ -243,7 +243,7 @@ fn record(
     Ok((Some(outputs.start(feed, layout, head)?), recorded))
 }
 
-/// What each file of a recording begins with.
+/// Head of each file of a recording.
 fn head(options: &Options, mcap: &Mcap, bus_links: &[BusLink], idle: &Histogram<u64>) -> Head {
     let nanos = realtime::wall();
     let mut run = vec![
@@ -265,7 +265,7 @@ fn head(options: &Options, mcap: &Mcap, bus_links: &[BusLink], idle: &Histogram<
     Head { nanos, metadata, attachments: mcap.attachments.clone() }
 }
 
-/// Starts a bus' receiver.
+/// Starts the receiver of a bus.
 fn listen(
     options: &Options,
     index: usize,

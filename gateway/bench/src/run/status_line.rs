@@ -1,38 +1,38 @@
-//! The text of the progress line of a run, for a line of any width.
+//! The text of a run's progress line, for any line width.
 
 use protocol::usage::shown;
 
-/// A duration in s from which on a run counts as one without an end.
+/// Duration in s from which a run counts as endless.
 const ENDLESS_S: f64 = 86_400.0;
 
-/// The values of the progress line of a run.
+/// Values of a run's progress line.
 #[derive(Clone, Debug)]
 pub(super) struct StatusLine<'a> {
-    /// Time since the loop began, in s.
+    /// Time since the start of the loop in s.
     pub(super) elapsed_s: f64,
-    /// The run's duration, in s.
+    /// Duration of the run in s.
     pub(super) duration_s: f64,
-    /// Names of the buses that are lost.
+    /// Names of the lost buses.
     pub(super) lost: &'a [&'a str],
-    /// The reason of the halt, while the robot is halted.
+    /// Reason of the present halt, if any.
     pub(super) halted: Option<&'a str>,
-    /// Cells in contact.
+    /// Number of cells in contact.
     pub(super) contributing: u32,
-    /// All cells of the skin.
+    /// Number of cells of the skin.
     pub(super) cells: usize,
-    /// Cells in contact that missed the last epoch.
+    /// Number of cells in contact that missed the last epoch.
     pub(super) stale: u32,
-    /// Cells that have fallen silent.
+    /// Number of dead cells.
     pub(super) dead: u32,
-    /// The 99th percentile of how late ticks began, in µs.
+    /// 99th percentile of the ticks' lateness in µs.
     pub(super) late_us: f64,
-    /// The name of what the gateway computes.
+    /// Name of the gateway's computation mode.
     pub(super) mode: &'static str,
-    /// The torque on each joint, in Nm.
+    /// Torque on each joint in Nm.
     pub(super) torque_nm: &'a [f64],
 }
 
-/// The detail of each part of a line, from 0 for none or the shortest form upwards.
+/// Level of detail of each part of a line: 0 omits the part or selects its shortest form.
 #[derive(Clone, Copy)]
 struct Detail {
     time: u8,
@@ -43,7 +43,7 @@ struct Detail {
     torque: u8,
 }
 
-/// The details of a line, the longest first: what is left out first matters less than what stays.
+/// Details of the lines, longest first. Less important parts are dropped first.
 const DETAILS: [Detail; 12] = [
     Detail { time: 1, alarm: 1, contact: 3, late: 1, mode: 1, torque: 2 },
     Detail { time: 1, alarm: 1, contact: 3, late: 1, mode: 0, torque: 2 },
@@ -60,8 +60,8 @@ const DETAILS: [Detail; 12] = [
 ];
 
 impl StatusLine<'_> {
-    /// Returns the text for a line of `width` letters: the most detailed one that fits, the shortest if none does, and all
-    /// of it without a width. The torque stands in each of them.
+    /// Returns the text for a line of `width` columns: the most detailed text that fits, or the shortest if none fits;
+    /// without a width, the full text. All texts contain the torque.
     pub(super) fn text(&self, width: Option<usize>) -> String {
         let fits = |text: &String| width.is_none_or(|width| text.chars().count() <= width);
         let mut texts = DETAILS.into_iter().map(|detail| self.detailed(detail));
@@ -103,7 +103,7 @@ impl StatusLine<'_> {
         Some(if detail > 0 { format!("HALTED: {}", shown(why)) } else { "HALTED".to_owned() })
     }
 
-    /// Returns the cells in contact; below the full detail the others only where there are some.
+    /// Formats the cells in contact. Stale and dead cells appear at full detail, or if there are any.
     fn contact(&self, detail: u8) -> Option<String> {
         let (contributing, cells) = (self.contributing, self.cells);
         let width = cells.to_string().len();
@@ -182,12 +182,12 @@ mod tests {
 
     #[test]
     fn what_is_wrong_stays_in_a_narrow_line() {
-        let (lost, halted) = (&["vcan1"][..], Some("somebody sent a halt frame"));
+        let (lost, halted) = (&["vcan1"][..], Some("a halt frame was received"));
         let wrong = StatusLine { lost, halted, dead: 3, ..line(6) };
         for (width, text) in [
             (
                 150,
-                "  3.2 of 12.0 s  LOST: vcan1  HALTED: somebody sent a halt frame    4 of 253 in contact, 3 dead  torque  \
+                "  3.2 of 12.0 s  LOST: vcan1  HALTED: a halt frame was received    4 of 253 in contact, 3 dead  torque  \
                  0.00 -12.35  1.00  0.50 -0.25  0.00 Nm",
             ),
             (80, "  3.2 of 12.0 s  LOST: 1  HALTED  torque  0.0 -12.3  1.0  0.5 -0.2  0.0 Nm"),

@@ -1,4 +1,4 @@
-//! What processes cost, as the kernel counts it.
+//! Processor time and memory of processes, as the kernel counts them.
 
 use std::collections::HashMap;
 use std::fs;
@@ -9,23 +9,23 @@ use crate::bus::served::ServedBus;
 use crate::processes::Processes;
 use crate::summary::Processor;
 
-/// Processor time of this process so far, in s.
+/// Processor time of this process so far in s.
 fn own_seconds() -> f64 {
     let time = clock_gettime(ClockId::ProcessCPUTime);
     std::time::Duration::try_from(time).map_or(0.0, |time| time.as_secs_f64())
 }
 
-/// Processor time of another process so far, in s; `None` when it has ended.
+/// Processor time of another process so far in s, or `None` after its end.
 ///
-/// From `schedstat`, which counts ns: the usual figures are sampled a hundred times a second, and miss
-/// cells that all wake up together for some µs.
+/// Reads `schedstat`, which counts in ns: the usual figures are sampled a hundred times a second, and miss cells that
+/// all wake up together for some µs.
 fn processor_seconds(pid: u32) -> Option<f64> {
     let threads = fs::read_dir(format!("/proc/{pid}/task")).ok()?;
     let nanos = threads.flatten().filter_map(|thread| {
         let text = fs::read_to_string(thread.path().join("schedstat")).ok()?;
         text.split_whitespace().next()?.parse::<f64>().ok()
     });
-    // Of a process that has ended and was not waited for there is a folder, and no time in it.
+    // A process that has ended and was not waited for still has a directory, without a time in it.
     nanos.reduce(|all, one| all + one).filter(|nanos| *nanos > 0.0).map(|nanos| nanos * 1e-9)
 }
 
@@ -37,17 +37,17 @@ pub(super) fn private_kib(pid: u32) -> Option<u64> {
     Some(map.lines().filter(|line| line.starts_with("Private_")).filter_map(kib).sum())
 }
 
-/// Processor time so far, in s.
+/// Processor times so far in s.
 pub(super) struct Spent {
     gateway: f64,
-    /// Of each cell's process.
+    /// Time of each cell process.
     cells: HashMap<u32, f64>,
-    /// Of each process that serves a bus.
+    /// Time of each process that serves a bus.
     buses: HashMap<u32, f64>,
 }
 
 impl Spent {
-    /// By this program, cells and buses.
+    /// Reads the times of this program, of cells and of bus servers.
     pub(super) fn by(cells: &Processes, buses: &[ServedBus]) -> Self {
         let of = |pid: u32| Some((pid, processor_seconds(pid)?));
         Self {
@@ -57,12 +57,12 @@ impl Spent {
         }
     }
 
-    /// What was spent since, in cores; of processes that are still there.
+    /// Processor use since `before` in cores, over the processes that still run.
     pub(super) fn since(&self, before: &Self, seconds: f64) -> Processor {
         let since = |now: &HashMap<u32, f64>, before: &HashMap<u32, f64>| {
             // A thread that has ended takes its time with it.
             let one = |(pid, spent): (&u32, &f64)| (spent - before.get(pid).unwrap_or(&0.0)).max(0.0);
-            // Not sum(), which is -0.0 of no processes.
+            // Not `sum()`, which returns -0.0 without processes.
             now.iter().map(one).fold(0.0, |all, one| all + one) / seconds
         };
         Processor {

@@ -1,5 +1,5 @@
-//! The main thread while the loop runs: stimuli ahead of their epochs, faults at their times, events and
-//! progress for the user, frames into the log.
+//! The main thread while the loop runs: sends stimuli ahead of their epochs, injects faults at their times, shows
+//! events and progress, and logs frames.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -33,48 +33,48 @@ use control::external::Absence;
 use model::scenario::{FaultKind, Stimulus, Touches};
 use model::table::Notice;
 
-/// Stimuli are sent so many epochs before the one at which they are latched; cells queue 8.
+/// Number of epochs by which stimuli are sent before the epoch that latches them; cells queue 8.
 const LEAD: u64 = 5;
-/// The main thread's rhythm.
+/// Interval between rounds of the main thread.
 pub(super) const LOOK: Duration = Duration::from_millis(10);
-/// Records that wait for the main thread: more than a second of ticks.
+/// Queue length for the loop's records: more than a second of ticks.
 const RECORDS: usize = 1_024;
 
-/// What the loop's thread leaves.
+/// Result of the loop's thread.
 struct LoopEnd {
-    /// What the machine granted it.
+    /// Privileges that the machine granted to the thread.
     granted: Granted,
-    /// What the controller counted, by name.
+    /// Counts of the controller by name.
     counts: BTreeMap<String, u64>,
-    /// Why the controller counts as absent, if it does.
+    /// Reason why the controller counts as absent, if it does.
     absence: Option<Absence>,
 }
 
-/// Faults and touches that are still to come.
+/// Pending faults and touches of the scenario.
 pub(super) struct Script {
     pub(super) touches: Touches,
     accelerations: Option<Accelerations>,
-    /// The next epoch whose stimuli are to be sent.
+    /// Next epoch whose stimuli are to be sent.
     epoch: u64,
-    /// The next fault.
+    /// Index of the next fault.
     fault: usize,
     /// Cells that were switched again.
     announced: Announced,
     /// Cells whose contact was cleared.
     pub(super) cleared: Announced,
-    /// When the loop began.
+    /// Start of the loop.
     started: Instant,
 }
 
 impl Script {
-    /// Whether no stimulus was sent yet.
+    /// Returns true if no stimulus has been sent.
     pub(super) const fn has_not_begun(&self) -> bool {
         self.epoch == 0
     }
 }
 
 impl Bench<'_> {
-    /// Runs the loop to its end, or as far as it comes; what is known of it then is in the summary.
+    /// Runs the loop to its end or to its failure, and fills in the summary.
     pub(super) fn drive(&mut self, summary: &mut Summary, measured: &mut Measured) -> Result<(), RunError> {
         let options = self.options;
         let (records, mut inlet) = rtrb::RingBuffer::new(RECORDS);
@@ -119,7 +119,7 @@ impl Bench<'_> {
             buses_private_kib: of_buses.reduce(|all, one| all + one),
         };
         if failure.is_some() || ended.is_err() {
-            // The cells get no more commands.
+            // The cells get no further commands.
             let _ = self.say(&Message::Halt);
         }
         let LoopEnd { granted, counts, absence } = ended.map_err(|_| RunError::Panicked("control loop"))?;
@@ -136,7 +136,7 @@ impl Bench<'_> {
         ended
     }
 
-    /// The loop's thread.
+    /// Starts the loop's thread.
     fn start_loop(&self, mut turn: Turn, mut slots: Vec<Slot>) -> Result<JoinHandle<LoopEnd>, ThreadError> {
         let period_ns = self.options.skin.timing.tick_nanos();
         let ticks = self.options.scenario.duration.0 * 1_000 / period_ns;
@@ -152,7 +152,7 @@ impl Bench<'_> {
         })
     }
 
-    /// One poll of everything.
+    /// Runs one round of all checks.
     fn step(
         &mut self,
         script: &mut Script,
@@ -166,7 +166,7 @@ impl Bench<'_> {
             .iter()
             .any(|bus_link| bus_link.receiver.as_ref().is_some_and(JoinHandle::is_finished))
         {
-            // A receiver that loses its bus stays; one that ended without a message must be noticed.
+            // A receiver that loses its bus keeps running; one that has ended without a message must be noticed.
             return Err(RunError::ReceiverEnded);
         }
         self.inject_faults(script, progress)?;
@@ -184,7 +184,7 @@ impl Bench<'_> {
         measured.take(records, self.began);
         match (was_halted, measured.halts.why()) {
             (false, Some(why)) => {
-                // One bus is enough: what is received on it is repeated on the others.
+                // One bus is enough: the loop repeats on the others what is received on it.
                 let bus_link = self
                     .bus_links
                     .iter()
@@ -215,11 +215,11 @@ impl Bench<'_> {
     /// Sends the stimuli of all epochs up to [`LEAD`] ahead.
     fn press(&self, script: &mut Script, moved: Option<Moved>) -> Result<(), RunError> {
         let broadcasts = self.shared.broadcasts.load(Ordering::Acquire);
-        // Broadcasts that were skipped have no epoch, but took their time.
+        // Skipped broadcasts have no epoch, but their time has passed.
         let skipped = self.shared.broadcasts_skipped.load(Ordering::Relaxed);
         let seconds = |touches: &Touches, epoch: u64| Span(touches.time_of(epoch + skipped).0).seconds();
         while script.epoch < broadcasts + LEAD {
-            // Epochs that have passed while this thread was delayed cannot be made up for one by one.
+            // Epochs that passed while this thread was delayed cannot be made up for one by one.
             let epoch = script.epoch.max(broadcasts);
             let numbered = self.first_epoch.plus(epoch.to_le_bytes()[0]);
             for stimulus in script.touches.changes(script.epoch.checked_sub(1), epoch) {
@@ -246,7 +246,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Resends to some cells the stimuli of the scenario; stimuli of others are not its business.
+    /// Resends the scenario's stimuli to the selected cells. Leaves stimuli from other senders alone.
     pub(super) fn remind(&self, script: &Script, target: impl Fn(&Cell) -> bool) -> Result<(), RunError> {
         let touched =
             script.touches.cells().filter_map(|place| Some((place, self.options.skin.cells.get(place)?)));
@@ -260,11 +260,11 @@ impl Bench<'_> {
     fn stimulate(&self, stimulus: &Stimulus, from: From) -> Result<(), RunError> {
         let page = SensorPage::Skin(stimulus.sensors);
         let message = Message::Stimulus { to: Node::Cell(stimulus.node), from, page };
-        // The cells' contact state follows what the bus carried.
+        // The cells' contact state follows the frames that the bus carried.
         self.send_all(&[(stimulus.bus, message)])
     }
 
-    /// Injects the scenario's faults into processes at their times.
+    /// Injects the scenario's process faults at their times.
     fn inject_faults(&mut self, script: &mut Script, progress: &Progress) -> Result<(), RunError> {
         let options = self.options;
         while let Some(fault) = options.scenario.faults.get(script.fault) {
@@ -286,7 +286,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Takes the links between two cells down, or up again; the next check of their network sends it.
+    /// Takes the links between two cells down, or brings them up again; the next check of their network sends it.
     fn switch_link(
         &mut self,
         link_down: bool,
@@ -308,13 +308,13 @@ impl Bench<'_> {
         progress.note(&format!("scenario: {what} {begin} cell {from} {end} cell {to} on {bus}"));
     }
 
-    /// Whether all buses are gone, and none is down, or comes up again, by a command.
+    /// Returns true if all buses are gone, and no command has taken one down or is bringing one up.
     fn has_no_bus(&self) -> bool {
         let mut buses = self.bus_links.iter().enumerate();
         buses.all(|(bus, bus_link)| bus_link.link.is_gone() && !self.commanded.is_expected(bus))
     }
 
-    /// Handles the events of receivers.
+    /// Handles the events of the receivers.
     fn hear(&self, script: &Script, progress: &Progress) -> Result<(), RunError> {
         let bus_event: Vec<_> = self.bus_event.try_iter().collect();
         let mut returned = BTreeSet::new();
@@ -330,12 +330,12 @@ impl Bench<'_> {
                 }
                 BusEvent::Notice(Notice::Restarted(cell)) => {
                     progress.note(&format!("cell {cell} on {} restarted", self.name(bus)));
-                    // It has lost its contact state.
+                    // The restarted cell has lost its contact state.
                     self.remind(script, |it| it.bus == bus && it.node == cell)?;
                 }
                 BusEvent::Notice(Notice::Returned(cell)) => {
-                    // A heartbeat that was on its way when its host was gone is no return: it is told nothing until the
-                    // host is reached.
+                    // A heartbeat that was under way when its host was lost is no return: the cell gets no messages
+                    // until the host is reachable.
                     let is_away = self.bus_links.get(bus).is_some_and(|it| it.hosts.is_away(cell));
                     if !is_away {
                         returned.insert((bus, cell));
@@ -349,7 +349,7 @@ impl Bench<'_> {
                 }
                 BusEvent::Down(why) => progress.note(&why.to_string()),
                 BusEvent::Up => progress.note(&format!("{} works again", self.name(bus))),
-                // Without any bus there is no torque, unless one is to come back.
+                // Without any bus there is no torque, unless a bus is to come back.
                 BusEvent::Lost(why) if self.has_no_bus() => return Err(RunError::Lost(why)),
                 BusEvent::Lost(why) => {
                     progress
@@ -375,7 +375,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Notes the processes of cells that have ended; all that are not noted yet when it is the `last` time.
+    /// Shows notes about cell processes that have ended; with `last`, all pending notes.
     fn look_at_processes(&mut self, progress: &Progress, last: bool) {
         let ended = self.processes.ended();
         for note in self.ended.take(ended, last) {
@@ -383,7 +383,7 @@ impl Bench<'_> {
         }
     }
 
-    /// Takes what links to other hosts report.
+    /// Handles the reports of links to other hosts.
     fn look_at_hosts(&mut self, script: &Script, progress: &Progress) -> Result<(), RunError> {
         let mut reached = BTreeSet::new();
         for (bus, bus_link) in self.bus_links.iter_mut().enumerate() {
@@ -391,7 +391,7 @@ impl Bench<'_> {
             changes.notes.iter().for_each(|note| progress.note(note));
             reached.extend(changes.reached.into_iter().map(|cell| (bus, cell)));
             if !changes.in_doubt.is_empty() {
-                // Before its cells are told anything again.
+                // Before its cells get any further messages.
                 let _ = bus_link.in_doubt.send(changes.in_doubt);
             }
         }
@@ -401,7 +401,7 @@ impl Bench<'_> {
         self.tell_again(script, &reached)
     }
 
-    /// Changes during the absence of these cells have not reached them.
+    /// Resends stimuli and commands to cells that missed changes during their absence.
     fn tell_again(&self, script: &Script, cells: &BTreeSet<(usize, CellId)>) -> Result<(), RunError> {
         self.remind(script, |it| cells.contains(&(it.bus, it.node)))?;
         for bus_link in cells.iter().filter_map(|&(bus, _)| self.bus_links.get(bus)) {
@@ -410,7 +410,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Serves embedded buses again that were ours and whose processes have ended, unless a command has taken them down.
+    /// Restarts the servers of this run's embedded buses that have ended, unless a command has taken them down.
     fn serve_again(&mut self, progress: &Progress) {
         let gone = self.bus_links.iter().enumerate();
         let gone = gone.filter(|&(bus, bus_link)| bus_link.link.is_gone() && !self.commanded.is_down(bus));

@@ -1,4 +1,4 @@
-//! Replies due and come: of each cell, and of a bus' cells together.
+//! Due and received replies of each cell, and of all cells of a bus.
 
 use std::collections::BTreeMap;
 
@@ -11,32 +11,32 @@ use serde::Serialize;
 pub struct RepliesSummary {
     /// Epochs that cells had to answer.
     pub due: u64,
-    /// Answered before the next broadcast.
+    /// Replies before the next broadcast.
     pub in_time: u64,
-    /// Answered after it.
+    /// Replies after the next broadcast.
     pub late: u64,
-    /// Dropped, because they came when their epoch was long over.
+    /// Replies that were dropped because their epoch was long over.
     pub too_late: u64,
-    /// Skipped by the cell, because the joints were older than a period when it took them.
+    /// Replies that the cell skipped because it processed the joints more than one period late.
     pub skipped: u64,
-    /// Not heard by the cell.
+    /// Replies missing because the cell did not receive the joints.
     pub not_heard: u64,
-    /// Sent by the cell and lost or damaged on the way.
+    /// Replies that the cell sent and that were lost or damaged.
     pub lost: u64,
-    /// Of cells that were dead or restarted, or whose bus was lost.
+    /// Missing replies of cells that were dead or restarted, or whose bus was lost.
     pub in_doubt: u64,
-    /// Missing, for no known reason.
+    /// Missing replies without a known reason.
     pub unknown: u64,
-    /// Torques that were not due: ends of contacts, and the next two.
+    /// Torques that were not due: ends of contacts, and the next two kinds.
     pub unasked: u64,
-    /// Of these, torques of cells whose contact was not known.
+    /// Torques of cells whose contact was unknown.
     pub contact_unknown: u64,
-    /// Of these, torques other than zero of cells whose contact was known.
+    /// Torques other than zero of cells whose contact was known.
     pub unexpected: u64,
 }
 
 impl RepliesSummary {
-    /// Adds those of a cell, and explains its missing ones as far as reasons are known.
+    /// Adds the replies of a cell, and explains missing ones as far as reasons are known.
     pub(super) fn add(&mut self, cell: &Cell) {
         let Replies { due, in_time, late, missing, in_doubt, unasked, contact_unknown, unexpected, too_late } =
             cell.replies;
@@ -61,7 +61,7 @@ impl RepliesSummary {
         self.unexpected += unexpected;
     }
 
-    /// The missing ones by reason, those without a known reason last.
+    /// Missing replies by reason; unknown reasons are last.
     #[must_use]
     pub const fn missing(&self) -> [(&'static str, u64); 6] {
         [
@@ -75,35 +75,36 @@ impl RepliesSummary {
     }
 }
 
-/// One cell.
+/// Summary of one cell.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct CellSummary {
-    /// Its node id.
+    /// Node id of the cell.
     pub node: u8,
-    /// Its bus.
+    /// Name of its bus.
     pub bus: String,
-    /// `test` or `measure`, by its last heartbeat; none when it was never heard.
+    /// Mode by its last heartbeat, `test` or `measure`; `None` if none was received.
     pub mode: Option<&'static str>,
-    /// Replies that were due.
+    /// Number of replies due.
     pub due: u64,
-    /// Those that came before the next broadcast.
+    /// Number of replies before the next broadcast.
     pub in_time: u64,
-    /// Those that came after it.
+    /// Number of replies after the next broadcast.
     pub late: u64,
-    /// Those that did not come, by reason; zeros are left out.
+    /// Number of missing replies by reason, without zeros.
     pub missing: BTreeMap<&'static str, u64>,
-    /// Torques that were not due because its contact was not known.
+    /// Number of torques that were not due because the contact was unknown.
     pub contact_unknown: u64,
-    /// Its torques against the central ones, in the joints that move it.
+    /// Errors of its torques against the central ones, in the joints that move it.
     pub error: Errors,
-    /// Equal words in a row, the most of each kind, while it should have sent others; kinds without any are left out.
+    /// Longest run of equal words of each kind while the cell should have sent others; kinds without such a run are
+    /// absent.
     pub stuck: BTreeMap<&'static str, u64>,
-    /// How often it restarted.
+    /// Number of restarts.
     pub restarts: u32,
 }
 
 impl CellSummary {
-    /// A cell of a skin; `known` is what is known of it, if its bus was opened.
+    /// Creates the summary of a cell of the skin; `known` is its table entry if its bus was opened.
     #[must_use]
     pub fn new(skin: &Skin, described: &skin::Cell, known: Option<&Cell>) -> Self {
         let mut replies = RepliesSummary::default();
@@ -124,7 +125,7 @@ impl CellSummary {
         }
     }
 
-    /// Whether stimuli do not touch it.
+    /// Returns true if the cell measures, so that stimuli do not touch it.
     #[must_use]
     pub fn measures(&self) -> bool {
         self.mode == Some("measure")

@@ -1,36 +1,36 @@
-//! How a run ended, and when and why the robot was halted.
+//! Outcome of a run, and the halts of the robot.
 
 use model::listing::ranges;
 use serde::Serialize;
 
-/// Errors of cells that are given one by one.
+/// Maximum number of cell errors given one by one.
 const REASONS: usize = 4;
 
-/// How a run ended. Of several that apply it is the one that is named last here; but a halt counts more than a lost bus.
+/// Outcome of a run. The last variant that applies counts; but a halt takes precedence over a lost bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
-    /// It ran for its whole duration.
+    /// The run lasted its whole duration.
     #[default]
     Done,
-    /// A signal ended it early.
+    /// A signal ended the run early.
     Interrupted,
-    /// Processes of cells ended by an error of their own.
+    /// Processes of cells failed.
     CellError,
-    /// The external controller that the skin requires never answered, or was not there at the end.
+    /// The external controller that the skin requires never answered, or was absent at the end.
     NoController,
-    /// The robot was halted when it ended.
+    /// The robot was halted when the run ended.
     Halted,
-    /// It did not come to its end, a bus was lost at its end, or its recording is incomplete.
+    /// The run ended early, a bus was lost at its end, or its recording is incomplete.
     Failed,
 }
 
 impl Outcome {
-    /// All outcomes.
+    /// All outcomes in ascending order of precedence.
     pub const ALL: [Self; 6] =
         [Self::Done, Self::Interrupted, Self::CellError, Self::NoController, Self::Halted, Self::Failed];
 
-    /// The exit code of a run that ended so; 2 is wrong use.
+    /// Exit code of a run with this outcome; 2 is wrong use.
     #[must_use]
     pub const fn exit_code(self) -> u8 {
         match self {
@@ -56,26 +56,26 @@ impl core::fmt::Display for Outcome {
     }
 }
 
-/// An error by which processes of cells ended.
+/// An error that ended processes of cells.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct CellError {
-    /// The reason that they gave.
+    /// Reason that the processes gave.
     pub reason: String,
-    /// Their cells, by bus.
+    /// Cells of the processes, by bus.
     pub cells: Vec<ErrorCells>,
 }
 
-/// Cells of one bus that ended by an error.
+/// Cells of one bus that ended with an error.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct ErrorCells {
-    /// The bus.
+    /// Name of the bus.
     pub bus: String,
-    /// Their node ids, in order.
+    /// Node ids in ascending order.
     pub nodes: Vec<u8>,
 }
 
 impl CellError {
-    /// How many cells it ended.
+    /// Number of cells that ended with this error.
     #[must_use]
     pub fn count(&self) -> usize {
         self.cells.iter().map(|cells| cells.nodes.len()).sum()
@@ -90,8 +90,8 @@ impl CellError {
     }
 }
 
-/// The cells that ended by errors of their own, in one line; with the first few reasons, if these were not given before.
-/// `None` without any.
+/// Formats the cells that failed in one line, with the first few reasons if `with_reasons`. Returns `None` if no cell
+/// failed.
 #[must_use]
 pub fn cells_in_error(errors: &[CellError], with_reasons: bool) -> Option<String> {
     let each = errors.iter().take(REASONS).map(|error| match with_reasons {
@@ -112,59 +112,59 @@ pub fn cells_in_error(errors: &[CellError], with_reasons: bool) -> Option<String
     Some(format!("{all}: {each}{more}"))
 }
 
-/// One time that the robot was halted.
+/// A halt of the robot.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Halted {
-    /// When, in s since the loop began.
+    /// Time in s since the start of the loop.
     pub at_s: f64,
-    /// The tick.
+    /// Number of the tick.
     pub tick: u64,
-    /// The epoch of the last joints before it.
+    /// Epoch of the last joints before the halt.
     pub epoch: u8,
-    /// Why.
+    /// Reason of the halt.
     pub reason: String,
-    /// When it went on; none: it did not.
+    /// Time of the resumption in s since the start of the loop; `None` if the halt lasted to the end.
     pub until_s: Option<f64>,
 }
 
-/// The record of a tick before a halt.
+/// Record of a tick before a halt.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TickBefore {
-    /// Its number.
+    /// Number of the tick.
     pub tick: u64,
-    /// When it was due, in s since the loop began.
+    /// Due time in s since the start of the loop.
     pub time_s: f64,
-    /// How late it began.
+    /// Lateness in µs.
     pub late_us: f64,
-    /// How long it took.
+    /// Duration in µs.
     pub took_us: f64,
-    /// Ticks skipped just before it.
+    /// Number of ticks skipped just before.
     pub skipped: u64,
-    /// The epoch of the last joints.
+    /// Epoch of the last joints.
     pub epoch: u8,
-    /// Joint positions.
+    /// Joint positions in rad (prismatic joints: m).
     pub q_rad: Vec<f64>,
-    /// Joint velocities.
+    /// Joint velocities in rad/s (prismatic joints: m/s).
     pub qdot_rad_s: Vec<f64>,
-    /// The cells' torque.
+    /// Torque of the cells in Nm (prismatic joints: N).
     pub torque_nm: Vec<f64>,
-    /// Whether the torque could be used.
+    /// True if the torque could be used.
     pub valid: bool,
-    /// Cells in it.
+    /// Number of cells in the torque.
     pub contributing: u32,
-    /// Epochs that the oldest of them has missed.
+    /// Number of epochs that the oldest of them has missed.
     pub age: u32,
-    /// Cells in contact that missed the last epoch.
+    /// Number of cells in contact that missed the last epoch.
     pub stale: u32,
-    /// Cells that have fallen silent.
+    /// Number of dead cells.
     pub dead: u32,
-    /// Buses that were lost.
+    /// Names of the lost buses.
     pub lost_buses: Vec<String>,
-    /// Why the cycle was bad; none: the controller had an answer.
+    /// Reason of a bad cycle; `None` if the controller had an answer.
     pub bad_cycle: Option<String>,
-    /// The commanded joint velocities.
+    /// Commanded joint velocities in rad/s (prismatic joints: m/s).
     pub command_rad_s: Vec<f64>,
-    /// Whether the robot was halted.
+    /// True if the robot was halted.
     pub halted: bool,
 }
 
@@ -178,7 +178,7 @@ mod tests {
         CellError { reason: reason.to_owned(), cells }
     }
 
-    /// A summary of which everything applies that the flags say: absence, errors of cells, a halt, an interruption.
+    /// Creates a summary with the flagged conditions: controller absent, errors of cells, a halt, an interruption.
     fn summary([absent, errors, halted, interrupted]: [bool; 4]) -> Summary {
         let halt = Halted { at_s: 1.0, tick: 500, epoch: 62, reason: "no answer".to_owned(), until_s: None };
         Summary {

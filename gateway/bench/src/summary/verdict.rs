@@ -1,7 +1,7 @@
-//! The verdict on a run: all is well, or what to look at.
+//! Verdict on a run: all is well, or a list of findings.
 //!
-//! A pure function of the other figures of the [`Summary`]. A run is well only if everything that can be checked was
-//! checked: with nothing in contact, or nothing compared, there is something to look at.
+//! The verdict is a pure function of the other figures of the [`Summary`]. A run is well only if everything that can be
+//! checked was checked: a run without contact, or without a comparison, has a finding.
 
 use std::collections::BTreeMap;
 
@@ -11,23 +11,23 @@ use serde::Serialize;
 
 use super::{BusSummary, CellSummary, Outcome, RepliesSummary, Summary, cells_in_error};
 
-/// The mean error of one cell's torques that rounding explains, at most, in Nm: four steps of a torque's word. A correct
-/// cell has about a tenth of it.
+/// Maximum mean error of one cell's torques in Nm that rounding explains: four steps of a torque's word. A correct cell
+/// has about a tenth of it.
 pub const CELL_ERROR_NM: f64 = 4.0 / 4_096.0;
-/// The mean error of sums along a tree that rounding explains, at most, in Nm: four steps of a sum's word.
+/// Maximum mean error of sums along a tree in Nm that rounding explains: four steps of a sum's word.
 const SUM_ERROR_NM: f64 = 4.0 / 256.0;
-/// Events that have a line of their own, by their names in the summary.
+/// Summary names of events with a line of their own.
 const SATURATED: &str = Event::Saturated.name();
 const STALE: &str = Event::StaleTorque.name();
-/// Groups of node ids that are listed; more are counted.
+/// Maximum number of listed groups of node ids; more are counted.
 const RANGES: usize = 12;
 
-/// The verdict on a run.
+/// Verdict on a run.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Verdict {
-    /// Whether the run came to its end, everything was checked, and nothing is wrong.
+    /// True if the run came to its end, everything was checked, and no problem was found.
     pub well: bool,
-    /// What to look at, the most important first; empty if all is well.
+    /// Findings, the most important first; empty if all is well.
     pub look_at: Vec<String>,
 }
 
@@ -60,7 +60,7 @@ impl Verdict {
 }
 
 impl Summary {
-    /// Returns the sums of a run that is well, in one line.
+    /// Returns the totals of a run that is well, in one line.
     #[must_use]
     pub fn sums_of_all(&self) -> String {
         let of = |figure: fn(&BusSummary) -> u64| self.buses.iter().map(figure).sum::<u64>();
@@ -94,7 +94,7 @@ pub(crate) fn many(count: impl TryInto<u64>, one: &str, more: &str) -> String {
     format!("{count} {}", if count == 1 { one } else { more })
 }
 
-/// Formats how often something happened.
+/// Formats the number of times that an event happened.
 fn times(count: u64) -> String {
     if count == 1 { "once".to_owned() } else { format!("{count} times") }
 }
@@ -127,12 +127,12 @@ fn nonzero<'a>(counts: impl IntoIterator<Item = (u64, &'a str)>) -> Vec<String> 
     counts.map(|(count, what)| format!("{count} {what}")).collect()
 }
 
-/// Returns true of a value above a limit, and of one that is not a number.
+/// Returns true if the value is above the limit or is not a number.
 fn is_above(value: f64, limit: f64) -> bool {
     value.is_nan() || value > limit
 }
 
-/// The run did not come to its end, or not as it should.
+/// Finds runs that ended early or badly.
 fn ending(look_at: &mut Vec<String>, summary: &Summary) {
     look_at.extend(summary.failure.as_ref().map(|failure| format!("the run failed: {failure}")));
     if let Some(why) = &summary.halted {
@@ -145,7 +145,7 @@ fn ending(look_at: &mut Vec<String>, summary: &Summary) {
     look_at.extend(cells_in_error(&summary.cell_errors, true));
 }
 
-/// Buses that were lost, and cells that did not speak at the end.
+/// Finds buses that were lost, and cells that were silent at the end.
 fn absent(look_at: &mut Vec<String>, summary: &Summary) {
     for bus in summary.buses.iter().filter(|bus| bus.outages.times > 0) {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
@@ -186,7 +186,7 @@ fn absent(look_at: &mut Vec<String>, summary: &Summary) {
     }
 }
 
-/// What is missing for no known reason.
+/// Finds replies and packets that are missing without a known reason.
 fn unknown(look_at: &mut Vec<String>, bus: &BusSummary) {
     let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
     if replies.unknown > 0 {
@@ -210,7 +210,7 @@ fn unknown(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
 }
 
-/// A tree that is not as described.
+/// Finds trees that differ from the description.
 fn network(look_at: &mut Vec<String>, bus: &BusSummary) {
     let Some(network) = &bus.network else { return };
     if !network.unreachable.is_empty() {
@@ -226,7 +226,7 @@ fn network(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
 }
 
-/// Torques that are not what they should be.
+/// Finds torques that are wrong.
 fn wrong_torques(look_at: &mut Vec<String>, summary: &Summary) {
     let accuracy = &summary.accuracy;
     let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| is_above(mean, CELL_ERROR_NM));
@@ -269,7 +269,7 @@ fn wrong_torques(look_at: &mut Vec<String>, summary: &Summary) {
     }
 }
 
-/// Restarts of cells, and halts that have ended.
+/// Finds restarts of cells, and halts that have ended.
 fn restarts(look_at: &mut Vec<String>, summary: &Summary) {
     for cells in cells_that(summary, |cell| cell.restarts > 0) {
         look_at.push(format!("{cells}: restarted; what was due then is in doubt"));
@@ -296,7 +296,7 @@ fn restarts(look_at: &mut Vec<String>, summary: &Summary) {
 fn recording(look_at: &mut Vec<String>, summary: &Summary) {
     let Some(recording) = &summary.recording else { return };
     let messages = recording.messages_lost.values().sum::<u64>();
-    // A failure names what could not be written.
+    // A failure names the file that could not be written.
     if recording.lost + messages > 0 && summary.failure.is_none() {
         look_at.push(format!(
             "the recording is incomplete, without {} and {}: this machine was busy, or its disk is slow",
@@ -306,7 +306,7 @@ fn recording(look_at: &mut Vec<String>, summary: &Summary) {
     }
 }
 
-/// What was lost for a known reason.
+/// Finds losses with a known reason.
 fn lost(look_at: &mut Vec<String>, bus: &BusSummary) {
     let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
     let reasons = [
@@ -349,7 +349,7 @@ fn control(look_at: &mut Vec<String>, summary: &Summary) {
     }
     if control.unsent > 0 {
         let frames = many(control.unsent, "frame", "frames");
-        look_at.push(format!("{frames} of the gateway not sent: a bus did not take them"));
+        look_at.push(format!("{frames} of the gateway not sent: a bus refused them"));
     }
     if control.records_lost > 0 {
         let records = many(control.records_lost, "record of a tick", "records of ticks");
@@ -358,7 +358,7 @@ fn control(look_at: &mut Vec<String>, summary: &Summary) {
     }
 }
 
-/// Ticks that were skipped.
+/// Finds skipped ticks.
 fn ticks(look_at: &mut Vec<String>, summary: &Summary) {
     let control = &summary.control;
     if control.ticks_skipped > 0 {
@@ -375,11 +375,11 @@ fn ticks(look_at: &mut Vec<String>, summary: &Summary) {
     }
 }
 
-/// Replies that came too late, and those of cells that got the joints too late.
+/// Finds late replies, and replies of cells that received the joints too late.
 fn late(look_at: &mut Vec<String>, bus: &BusSummary) {
     let RepliesSummary { due, late, too_late, skipped, .. } = bus.replies;
     let parts =
-        nonzero([(late + too_late, "late"), (skipped, "skipped by cells that took the joints too late")]);
+        nonzero([(late + too_late, "late"), (skipped, "skipped by cells that received the joints too late")]);
     if !parts.is_empty() {
         look_at.push(format!(
             "{} of {} on {}: this machine was busy, or the cells are slow; -v has the times",
@@ -398,7 +398,7 @@ fn late(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
 }
 
-/// Epochs that are not complete although no reply is late or missing.
+/// Finds incomplete epochs without late or missing replies.
 fn incomplete(look_at: &mut Vec<String>, bus: &BusSummary) {
     let parts = bus.sums.map(|sums| sums.contributions);
     let explained =
@@ -414,7 +414,7 @@ fn incomplete(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
 }
 
-/// Irregular frames, except for those above: saturated torques, and torques that came too late.
+/// Finds irregular frames, except those reported above: saturated torques and torques that came too late.
 fn anomalies(look_at: &mut Vec<String>, bus: &BusSummary) {
     let odd = bus.events.iter().map(|(name, count)| match *name {
         SATURATED => (0, SATURATED),
@@ -427,7 +427,7 @@ fn anomalies(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
 }
 
-/// What the run could not check.
+/// Finds parts that the run could not check.
 fn unchecked(look_at: &mut Vec<String>, summary: &Summary) {
     for cells in cells_that(summary, |cell| cell.contact_unknown > 0 && !cell.measures()) {
         look_at.push(format!(

@@ -1,4 +1,4 @@
-//! A run repairs what runs before it left in its recording's folder, and touches nothing else there.
+//! A run repairs the files that earlier runs left in its recording's folder, and touches no other files.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::fs::{self, File, Permissions};
@@ -14,7 +14,7 @@ use trace::recording::file::FileWriter;
 use trace::recording::names::Part;
 use trace::ros2::standard::JointState;
 
-/// What a writer that is still at it has in its file.
+/// Content of the file of a writer that has not finished.
 fn begun(mut writer: FileWriter<Vec<u8>>) -> Vec<u8> {
     let mut joints = writer.channel::<JointState<'_>>("/arm/joint_states", &[]).unwrap();
     let state = JointState { nanos: 1, names: &[], position: &[1.0], velocity: &[], effort: &[] };
@@ -23,7 +23,7 @@ fn begun(mut writer: FileWriter<Vec<u8>>) -> Vec<u8> {
     writer.into_inner()
 }
 
-/// What a run leaves that is killed while it records to a name.
+/// Leaves the file of a run that was killed while it recorded.
 fn left(folder: &TempDir, name: &str) {
     let (_, mut file) = Part::create(folder.path().join(name)).unwrap();
     let there = usize::try_from(file.metadata().unwrap().len()).unwrap();
@@ -31,7 +31,7 @@ fn left(folder: &TempDir, name: &str) {
     file.write_all(&bytes[there..]).unwrap();
 }
 
-/// The messages of the next run when it claims its files.
+/// Claims the files of the next run. Returns its messages.
 fn claims(folder: &Path, name: &str) -> (Result<Outputs, String>, Vec<String>) {
     let mcap = Mcap {
         path: folder.join(name),
@@ -72,7 +72,7 @@ fn an_original_that_is_damaged_before_its_end_is_kept() {
         left(&folder, "run.mcap");
         let part = folder.path().join("run.mcap.part");
         let mut bytes = fs::read(&part).unwrap();
-        // A bit of the only chunk.
+        // Flips a bit of the only chunk.
         let chunk = bytes.windows(4).position(|at| at == b"zstd").unwrap();
         bytes[chunk + 60] ^= 0x10;
         File::options().write(true).open(&part).unwrap().write_all(&bytes).unwrap();
@@ -106,12 +106,12 @@ fn what_is_not_ours_is_named_and_stays_as_it_is() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     let away = tempfile::tempdir().unwrap();
-    // A recording of ours that another program is just copying, and one of another program.
+    // A recording of this project that another program is copying, and a recording of another program.
     left(&folder, "copy.mcap");
     let ours = fs::read(path("copy.mcap.part")).unwrap();
     fs::rename(path("copy.mcap.part"), away.path().join("original")).unwrap();
     fs::write(path("copy.mcap.part"), &ours).unwrap();
-    // A copy that has got the inode of the one that it was made from, which is gone.
+    // A copy with the inode of its original, which was deleted.
     left(&folder, "again.mcap");
     let mut again = fs::read(path("again.mcap.part")).unwrap();
     let born = again.windows(7).position(|bytes| bytes == b"born_ns").unwrap();
@@ -172,7 +172,7 @@ fn what_is_not_ours_is_named_and_stays_as_it_is() {
     assert_eq!(reason("locked"), "another program is writing it");
     assert_eq!(said.len(), 12);
     assert!(fs::symlink_metadata(path("pipe.mcap.part")).unwrap().file_type().is_fifo());
-    // Under the name of one of them nothing is recorded.
+    // No recording starts under the name of one of them.
     let (claimed, _) = claims(folder.path(), "download.mcap");
     let why = claimed.unwrap_err();
     assert!(why.ends_with("was not left by a killed run: move it away, or record to another name"), "{why}");

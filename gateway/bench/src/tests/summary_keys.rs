@@ -1,4 +1,4 @@
-//! `docs/reference/summary.md` names every key that a summary has, and no other, and its sums are right.
+//! Checks that `docs/reference/summary.md` names exactly the keys of a summary, and that its sums are right.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -31,7 +31,7 @@ fn skin() -> Skin {
     Skin::parse("docs/reference/skin.md", text).unwrap()
 }
 
-/// A run of which everything is known that may be unknown.
+/// A run whose optional figures are all present.
 fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
     let quantiles = Quantiles::of(&histogram(), 1.0);
     Summary {
@@ -45,12 +45,12 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
         failure: Some("lost at the end of the run: vcan0".to_owned()),
         duration_s: 1.0,
         interrupted: false,
-        halted: Some("somebody sent a halt frame".to_owned()),
+        halted: Some("a halt frame was received".to_owned()),
         halts: vec![Halted {
             at_s: 0.5,
             tick: 250,
             epoch: 31,
-            reason: "somebody sent a halt frame".to_owned(),
+            reason: "a halt frame was received".to_owned(),
             until_s: None,
         }],
         further_halts: 0,
@@ -74,7 +74,7 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
             command_rad_s: vec![0.0; 6],
             halted: true,
         }],
-        no_controller: Some("no external controller said hello".to_owned()),
+        no_controller: Some("no external controller sent a hello".to_owned()),
         cell_errors: vec![CellError {
             reason: "cannot send to vcan0".to_owned(),
             cells: vec![ErrorCells { bus: "vcan0".to_owned(), nodes: vec![1] }],
@@ -119,7 +119,7 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
     }
 }
 
-/// Each key of a value with its type: objects that are quantiles or errors and maps are one key.
+/// Collects each key of a value with its type. Quantiles, errors and maps count as one key.
 fn keys(path: &str, value: &Value, maps: &BTreeSet<String>, into: &mut BTreeMap<String, &'static str>) {
     let kind = match value {
         _ if maps.contains(path) => "map",
@@ -144,8 +144,8 @@ fn keys(path: &str, value: &Value, maps: &BTreeSet<String>, into: &mut BTreeMap<
     into.insert(path.to_owned(), kind);
 }
 
-/// The keys of the lists whose items begin with one, each with its type and the heading above it: "- `a`, `b` flag: ..."
-/// has two flags. A key without a type is a number.
+/// Keys of the lists whose items begin with one, with the type and the heading above: "- `a`, `b` flag: ..." names two
+/// flags. A key without a type is a number.
 fn rows() -> impl Iterator<Item = (&'static str, &'static str, &'static str)> {
     let mut heading = "";
     let items = SUMMARY_MD.lines().filter_map(move |line| {
@@ -171,7 +171,7 @@ fn maps() -> BTreeSet<String> {
     rows().filter(|(_, _, kind)| *kind == "map").map(|(_, key, _)| key.to_owned()).collect()
 }
 
-/// The figures of each cell.
+/// Summaries of all cells.
 fn of_each(skin: &Skin, table: &Table) -> Vec<CellSummary> {
     let both = skin.cells.iter().zip(table.cells());
     both.map(|(described, cell)| CellSummary::new(skin, described, Some(cell))).collect()
@@ -243,8 +243,7 @@ fn every_outcome_is_documented_with_its_exit_code() {
     assert_eq!(rows, BTreeMap::from(outcomes));
 }
 
-/// A bus whose two cells are pressed: one answers in time, the other one's replies are lost, refused, late
-/// and repeated.
+/// A bus with two pressed cells: one answers in time; the other's replies are lost, refused, late and repeated.
 fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
     let skin = skin();
     let mut table = Table::new(&skin, 0);
@@ -280,7 +279,7 @@ fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
         let word = heartbeat(&table, place, 0);
         say(&mut table, false, &word, false);
     }
-    // Nothing touches them, whatever was there before.
+    // Nothing touches the cells, whatever touched them before.
     let (number, words) = (Parameter::Mode.number(), [1, 0, 0, 0, 0, 0]);
     let request = Request::Write { number, words };
     say(&mut table, true, &Message::Configure { to: Node::Everyone, tag: 0, request }, false);
@@ -311,7 +310,7 @@ fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
     (bus, of_each(&skin, &table), broadcasts)
 }
 
-/// Joints that move a cell of the skin.
+/// Number of joints that move a cell of the skin.
 fn joints_of(place: usize) -> u64 {
     skin().cells[place].joint.into()
 }
@@ -356,7 +355,7 @@ fn what_the_document_says_adds_up_does() {
     let [first, second] = cells.as_slice() else { panic!("{cells:?}") };
     assert_eq!((first.node, first.due, first.in_time, first.missing.len()), (1, 8, 8, 0));
     assert_eq!((second.node, second.in_time, second.late), (2, 3, 1));
-    // The same torque is right for none of the two, whose joints are compared.
+    // The same torque is wrong for both cells, whose joints are compared.
     assert_eq!((first.error.count(), second.error.count()), (8 * joints_of(0), 4 * joints_of(1)));
     assert!(cells.iter().all(|cell| cell.error.max() > 0.1 && cell.mode == Some("test")), "{cells:?}");
 }

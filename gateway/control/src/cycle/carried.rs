@@ -1,42 +1,42 @@
-//! The part of a bus' torque that counts in a tick.
+//! The part of a bus's torque that counts in a tick.
 //!
-//! The torque of a silent cell decays with the broadcasts that its bus carries. On a bus that carries none it would never
-//! decay, so the loop itself does it, by the same rule: held for some epochs, then decaying to zero.
+//! The torque of a silent cell decays with the broadcasts that its bus carries. On a bus that carries none it would
+//! never decay, so the loop applies the same rule: hold for some epochs, then decay to zero.
 
 use protocol::packet::Epoch;
 use protocol::skin::Safety;
 
 use model::table::Sums;
 
-/// One bus, as input of a tick.
+/// State of one bus as input of a tick.
 #[derive(Clone, Copy, Debug)]
 pub struct Heard<'a> {
-    /// The state of its table.
+    /// Totals of its table.
     pub sums: &'a Sums,
-    /// Whether it works, as its receiver sees it.
+    /// True if the bus works, by its receiver.
     pub works: bool,
 }
 
-/// The bit that stands for a bus in a mask of buses.
+/// The bit of a bus in a mask of buses.
 #[must_use]
 pub fn bit(bus: usize) -> u32 {
     1 << bus.min(31)
 }
 
-/// How many of the broadcasts a bus has carried.
+/// Number of broadcasts that a bus has carried.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Carried {
-    /// The last one that was read back.
+    /// Epoch of the last broadcast that was read back.
     last: Option<Epoch>,
-    /// Its number, from 1.
+    /// Number of that broadcast, from 1.
     number: u64,
 }
 
 impl Carried {
-    /// Broadcasts that should have been read back and were not, when `last` is the last one that was, and `epoch` the
-    /// newest of `broadcasts`. The newest one may still be on its way.
+    /// Number of broadcasts that should have been read back and were not. `last` is the epoch of the last one read
+    /// back; `epoch` is that of the latest of `broadcasts`, which may still be under way.
     pub(super) fn unanswered(&mut self, last: Option<Epoch>, epoch: Epoch, broadcasts: u64) -> u64 {
-        // Epochs wrap around, so they are compared once, when they are new.
+        // Epochs wrap around, so compare each once, when it is new.
         if let Some(read) = last.filter(|_| last != self.last) {
             self.number = broadcasts.saturating_sub(u64::try_from(epoch.since(read)).unwrap_or(0));
             self.last = last;
@@ -45,7 +45,7 @@ impl Carried {
     }
 }
 
-/// The part of the last torque that still counts.
+/// Fraction of the last torque that still counts.
 pub(super) fn part(unanswered: u64, safety: &Safety) -> f64 {
     let hold = u64::from(safety.hold_epochs);
     if unanswered <= hold {
@@ -56,7 +56,7 @@ pub(super) fn part(unanswered: u64, safety: &Safety) -> f64 {
     if left == 0 { 0.0 } else { f64::from(left) / f64::from(safety.decay_epochs) }
 }
 
-/// Whether a bus that has missed so many broadcasts carries nothing any more.
+/// Returns true if a bus that has missed this many broadcasts no longer contributes.
 pub(super) fn is_lost(unanswered: u64, safety: &Safety) -> bool {
     unanswered > u64::from(safety.hold_epochs) + u64::from(safety.decay_epochs)
 }

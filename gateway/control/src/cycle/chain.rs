@@ -1,16 +1,16 @@
-//! The chain of a bus among the joints of the robot.
+//! Chain of a bus among the joints of the robot.
 
 use protocol::fixed::Q1_14;
 use protocol::message::Joints;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{JointKind, MAX_ROBOT_JOINTS, Skin};
 
-/// The joints of a chain, and what was last said of them.
+/// Joints of a chain, with their last broadcast words.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Chain {
-    /// Each joint by its place among those of the robot.
+    /// Index among the robot's joints, and kind, of each joint.
     joints: Vec<(usize, JointKind)>,
-    /// The last words.
+    /// Last broadcast words.
     said: Joints,
 }
 
@@ -21,13 +21,13 @@ impl Chain {
         Self { joints, said: Joints { positions: [Q1_14::ZERO; MAX_JOINTS], in_use } }
     }
 
-    /// What was last said.
+    /// The last broadcast words.
     pub(super) const fn said(&self) -> Joints {
         self.said
     }
 
-    /// The positions of the robot as words. A position that is no number keeps its last word; a robot refuses such
-    /// velocities anyway.
+    /// Converts the robot's positions to words. A position that is not a number keeps its last word; a robot refuses
+    /// velocities that lead there anyway.
     pub(super) fn say(&mut self, q: &[f64; MAX_ROBOT_JOINTS]) {
         for (word, &(joint, kind)) in self.said.positions.iter_mut().zip(&self.joints) {
             if let Some(said) = q.get(joint).and_then(|&q| kind.word(q)) {
@@ -36,7 +36,7 @@ impl Chain {
         }
     }
 
-    /// The positions of the chain's joints, in rad or m.
+    /// Positions of the chain's joints in rad or m.
     pub(super) fn positions(&self, q: &[f64; MAX_ROBOT_JOINTS]) -> [f64; MAX_JOINTS] {
         let mut positions = [0.0; MAX_JOINTS];
         for (position, (joint, _)) in positions.iter_mut().zip(&self.joints) {
@@ -45,7 +45,7 @@ impl Chain {
         positions
     }
 
-    /// Adds a part of the chain's torques to those of the robot: joints that chains share get both.
+    /// Adds a fraction of the chain's torques to the robot's: a joint that chains share gets both.
     pub(super) fn add(&self, part: f64, torque: &[f64; MAX_JOINTS], sum: &mut [f64; MAX_ROBOT_JOINTS]) {
         for ((joint, _), torque) in self.joints.iter().zip(torque) {
             if let Some(sum) = sum.get_mut(*joint) {

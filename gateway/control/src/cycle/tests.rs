@@ -57,7 +57,7 @@ fn bad_cycles_in_a_row_halt_once_and_a_resume_releases() {
     assert_eq!((halted.record.halted, halted.command), (Some(Halt::Frame), Some(Command::Halt)));
 }
 
-/// Misses its answers as often as it is told to, again and again after as many good ones.
+/// Misses the given number of answers, again and again after as many good ones.
 struct Absent {
     misses: Vec<u64>,
     ticks: u64,
@@ -86,7 +86,7 @@ fn another_program_may_take_its_time_to_begin() {
         (halted, records)
     };
     skin.controller.kind = kind(Span::from_millis(4_000));
-    // Nobody comes for 3 s, answers a few times and is away again for longer than is tolerated later.
+    // The controller is absent for 3 s, answers a few times, and is absent again for longer than is tolerated later.
     let late: Vec<_> = (1..=1_500).chain(1_510..=1_800).collect();
     let (halted, records) = halts(&skin, late);
     assert_eq!(halted, None);
@@ -94,7 +94,7 @@ fn another_program_may_take_its_time_to_begin() {
     assert_eq!(records[1_509].command[..6], [0.5; 6], "it goes on as it was, for a while");
     assert_eq!(records[1_700].command, [0.0; MAX_ROBOT_JOINTS], "then it stands");
     assert_eq!(halts(&skin, (1..=3_000).collect()).0, Some(2_000), "the time is over");
-    // Once it has begun it is counted as ever, also within the time.
+    // Once it has started, bad cycles count as usual, even within the start time.
     let begun = (limit + 1..=3_000).collect();
     assert_eq!(halts(&skin, begun).0, Some(2 * limit - 1));
     skin.controller.kind = kind(Span(0));
@@ -115,7 +115,7 @@ fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
     assert_eq!(bad(&mut cycle, &bus, limit * 8 + 9), None, "it works again");
 }
 
-/// Two buses in a loop of eight ticks an epoch; the torque of each is 1 Nm.
+/// Two buses in a loop with eight ticks per epoch; each has a torque of 1 Nm.
 struct Two {
     cycle: Cycle,
     buses: [Sums; 2],
@@ -134,7 +134,7 @@ impl Two {
         Self { cycle, buses: [reference_torque; 2], works: [true; 2], number: 0 }
     }
 
-    /// The ticks of an epoch, of which the last is returned; those buses that carry it read it back.
+    /// Runs the ticks of an epoch and returns the last one; the buses that carry the epoch read it back.
     fn epoch(&mut self, carries: [bool; 2]) -> Record {
         let mut last = None;
         for _ in 0..8 {
@@ -228,7 +228,7 @@ fn a_halted_robot_stands_whatever_is_commanded() {
     assert_eq!(cycle.positions().map(f64::to_bits), moved.map(f64::to_bits));
 }
 
-/// Another program that answers from one tick to another.
+/// A program that answers within a range of ticks.
 struct Present(std::ops::Range<u64>);
 
 impl Controller for Present {
@@ -243,7 +243,7 @@ impl Controller for Present {
     }
 }
 
-/// A loop of so many ticks with a controller that may take a second to begin; why it is absent at the end.
+/// Runs a loop whose controller may take a second to start. Returns the reason of its absence at the end.
 fn absence_after(ticks: u64, present: std::ops::Range<u64>) -> (Option<Absence>, Option<Halt>) {
     let (mut cycle, bus) = cycle(Box::new(Present(present)));
     cycle.starts = Some(Micros(1_000_000));
@@ -258,13 +258,13 @@ fn absence_after(ticks: u64, present: std::ops::Range<u64>) -> (Option<Absence>,
 fn a_run_that_ends_before_its_missing_controller_halts_it_is_without_one() {
     let limit = u64::from(testing::skin().safety.bad_cycles);
     assert!(absence_after(400, 0..0).0.is_some());
-    // It has begun to answer, and is gone before it counts as there.
+    // It has started to answer, and ends before it counts as present.
     assert!(absence_after(400, 100..100 + limit - 1).0.is_some());
     // It came late.
     assert_eq!(absence_after(400, 350..400).0, None);
-    // It is gone for a moment, as it may be at any time.
+    // It is away for a moment, as it may be at any time.
     assert_eq!(absence_after(400, 0..401 - limit).0, None);
-    // The halt says more.
+    // The halt is the more precise outcome.
     let (absence, halted) = absence_after(400, 100..200);
     assert_eq!((absence, halted), (None, Some(Halt::BadCycles(BadCycle::NoPeer))));
     let (absence, halted) = absence_after(600, 0..0);

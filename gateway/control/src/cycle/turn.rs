@@ -1,5 +1,5 @@
-//! What happens in one tick outside the pure cycle: reading the receivers' snapshots, encoding, sending,
-//! and handing a record on. Nothing here allocates, locks, logs or waits.
+//! The part of a tick outside the pure cycle: reads the receivers' snapshots, encodes, sends, and queues a record. It
+//! does not allocate, lock, log or wait.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -16,55 +16,55 @@ use crate::external::Absence;
 use model::scenario::{Mode, Scenario};
 use model::table::Snapshot;
 
-/// While the robot is halted, the halt is resent before every so many joints.
+/// Interval in epochs between repeated halts while the robot is halted.
 const HALT_AGAIN: u8 = 8;
 
-/// What all threads of a run share.
+/// State shared by all threads of a run.
 #[derive(Debug, Default)]
 pub struct Shared {
-    /// Set once: the loop ends.
+    /// Set once, to end the loop.
     pub stop_loop: AtomicBool,
-    /// Set once, after the loop's end: the receivers end.
+    /// Set once after the end of the loop, to end the receivers.
     pub stop: AtomicBool,
-    /// Set once, when all cells are there: the gateway sends to roots.
+    /// Set once when all cells are present: the gateway starts sending to roots.
     pub explore: AtomicBool,
-    /// Whether torques are compared with central ones.
+    /// True while torques are compared with central ones.
     pub comparing: AtomicBool,
-    /// Broadcasts sent so far.
+    /// Number of broadcasts sent so far.
     pub broadcasts: AtomicU64,
-    /// Records that did not fit into their queue.
+    /// Number of records that did not fit into their queue.
     pub records_lost: AtomicU64,
-    /// Records that did not fit into the queue to the recorder.
+    /// Number of records that did not fit into the queue to the recorder.
     pub records_unrecorded: AtomicU64,
-    /// Broadcasts that were skipped with their ticks.
+    /// Number of broadcasts that were skipped with their ticks.
     pub broadcasts_skipped: AtomicU64,
-    /// Frames that a bus did not take.
+    /// Number of frames that a bus refused.
     pub unsent: AtomicU64,
 }
 
-/// A record and its times.
+/// Record of a tick, with its timing.
 #[derive(Clone, Copy, Debug)]
 pub struct Timed {
-    /// The record.
+    /// Record of the tick.
     pub record: Record,
-    /// When it should have begun, in ns of the monotonic clock.
+    /// Nominal start in ns of the monotonic clock.
     pub due_ns: u64,
-    /// How long after that it began, in ns.
+    /// Lateness of the start in ns.
     pub late_ns: u64,
-    /// How long it took, in ns.
+    /// Duration in ns.
     pub took_ns: u64,
-    /// How long the central computation took of that, in ns, and its result.
+    /// Duration of the central computation in ns, and its result, if the tick compared.
     pub central: Option<(u64, Reference)>,
 }
 
-/// The state of a bus, for all threads.
+/// State of a bus, shared by all threads.
 #[derive(Debug)]
 pub struct BusState {
-    /// Whether it works, as its receiver sees it.
+    /// True if the bus works, by its receiver.
     pub works: AtomicBool,
-    /// Commands that it took, joints among them.
+    /// Number of accepted commands, including joints.
     pub commands: AtomicU64,
-    /// Set when cells are back on it after it was lost; the loop then resends whether the robot is halted.
+    /// Set when cells have returned to the bus after a loss; the loop then resends the halt or resume.
     pub returned: AtomicBool,
 }
 
@@ -75,27 +75,27 @@ impl Default for BusState {
 }
 
 impl BusState {
-    /// Whether it works now.
+    /// Returns true if the bus works now.
     #[must_use]
     pub fn is_there(&self) -> bool {
         self.works.load(Ordering::Relaxed)
     }
 }
 
-/// One bus, as a tick sees it.
+/// A tick's access to one bus.
 #[derive(Debug)]
 pub struct Line {
-    /// One FD frame a packet, or two classic ones.
+    /// Format of the packets: one FD frame, or two classic ones.
     pub format: Format,
-    /// The receiver's snapshot.
+    /// Snapshot from the receiver.
     pub snapshot: triple_buffer::Output<Snapshot>,
-    /// Positions in rad of each broadcast, for the receiver to compare with.
+    /// Positions in rad of each broadcast, with which the receiver compares.
     pub positions: rtrb::Producer<(Epoch, [f64; MAX_JOINTS])>,
-    /// Its state.
+    /// State of the bus.
     pub state: Arc<BusState>,
 }
 
-/// The control loop between two readings of the clock.
+/// Driver of the ticks: the control loop between two readings of the clock.
 #[derive(Debug)]
 pub struct Turn {
     cycle: Cycle,
@@ -103,16 +103,16 @@ pub struct Turn {
     scenario: Arc<Scenario>,
     shared: Arc<Shared>,
     records: rtrb::Producer<Timed>,
-    /// The same for the recorder, if there is one.
+    /// Queue of records to the recorder, if any.
     recorded: Option<rtrb::Producer<Timed>>,
-    /// The halt or resume that each bus has not taken yet: its cells have to follow the robot's state.
+    /// Halt or resume that each bus has not accepted yet: its cells must follow the robot's state.
     owed: Vec<Option<Message>>,
-    /// Whether each bus worked in the tick before.
+    /// True for each bus that worked in the tick before.
     worked: Vec<bool>,
 }
 
 impl Turn {
-    /// A loop over some buses that has not begun.
+    /// Creates a loop over some buses that has not started.
     #[must_use]
     pub fn new(
         cycle: Cycle,
@@ -125,27 +125,27 @@ impl Turn {
         Self { cycle, lines, scenario, shared, records, recorded: None, owed, worked }
     }
 
-    /// Hands every tick to a recorder too.
+    /// Also queues all ticks to a recorder.
     #[must_use]
     pub fn recorded(mut self, queue: Option<rtrb::Producer<Timed>>) -> Self {
         self.recorded = queue;
         self
     }
 
-    /// The controller's counters, by name.
+    /// Counters of the controller by name.
     #[must_use]
     pub fn counts(&self) -> Vec<(String, u64)> {
         self.cycle.counts()
     }
 
-    /// Why the controller counts as absent, if it does.
+    /// Reason why the controller counts as absent, if it does.
     #[must_use]
     pub fn absence(&self) -> Option<Absence> {
         self.cycle.absence()
     }
 
-    /// One tick. `now` is a monotonic clock in ns, `due` when the tick should have begun by it; `send`
-    /// puts frames on the bus of an index and returns whether it took them.
+    /// Runs one tick. `now` reads a monotonic clock in ns; `due` is the nominal start of the tick by it. `send` sends
+    /// frames on the bus with an index, and returns true if the bus accepted them.
     pub fn turn(
         &mut self,
         tick: Tick,
@@ -169,17 +169,17 @@ impl Turn {
         let central = (mode == Mode::Compare).then(|| {
             let before = now();
             let reference_torque = self.cycle.central(snapshots());
-            // The result may be unused, and then the compiler could leave out the work.
+            // Without `black_box` the compiler could drop this work if the result is unused.
             (now().saturating_sub(before), std::hint::black_box(reference_torque))
         });
         self.owe_to_returned_buses(outcome.record.halted.is_some());
         if let Some(epoch) = outcome.broadcast {
-            // A cell that restarted, or did not receive it, would go on answering.
+            // A cell that restarted, or missed the halt, would go on answering.
             if outcome.record.halted.is_some() && epoch.0.is_multiple_of(HALT_AGAIN) {
                 self.owed.fill(Some(Message::Halt));
             }
             self.say_what_is_owed(&mut send);
-            // Many buses have the same joints: they are encoded once.
+            // Many buses have the same joints: encode them once.
             let mut said: Option<(usize, Format, Encoded, [f64; MAX_JOINTS])> = None;
             for (bus, line) in self.lines.iter_mut().enumerate() {
                 let chain = self.cycle.chain_of(bus);
@@ -190,7 +190,7 @@ impl Turn {
                     said = Some((chain, line.format, encoded, self.cycle.positions_of(chain)));
                 }
                 let Some((_, _, encoded, positions)) = &said else { continue };
-                // A full queue costs the receiver the unrounded positions, and nothing else.
+                // A full queue costs the receiver only the unrounded positions.
                 let _ = line.positions.push((epoch, *positions));
                 line.give(bus, encoded, &self.shared, &mut send);
             }
@@ -219,12 +219,12 @@ impl Turn {
         }
     }
 
-    /// Cells have not received what a bus took just before it was lost, or before they were back on it: the halt or resume
-    /// is resent once it works, and once more when they send again.
+    /// Requeues the halt or resume for buses that work again, and for buses whose cells send again: cells missed
+    /// commands that the bus accepted just before its loss, or before they returned.
     fn owe_to_returned_buses(&mut self, halted: bool) {
         for ((line, owed), worked) in self.lines.iter().zip(&mut self.owed).zip(&mut self.worked) {
             let works = line.state.is_there();
-            // Looked at first: to exchange it takes the processor's time in every tick, and it is set next to never.
+            // Load before swap: a swap in every tick is costly, and the flag is rarely set.
             let returned = &line.state.returned;
             let returned = returned.load(Ordering::Relaxed) && returned.swap(false, Ordering::Relaxed);
             if (works && !*worked) || returned {
@@ -234,7 +234,7 @@ impl Turn {
         }
     }
 
-    /// Sends a halt or resume on every bus; if one does not take it, it is retried before each of its next joints.
+    /// Sends a halt or resume on all buses. A bus that refuses it gets it again before each of its next joints.
     fn command(&mut self, message: Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
         self.owed.fill(Some(message));
         self.say_what_is_owed(send);
@@ -248,7 +248,7 @@ impl Turn {
 }
 
 impl Line {
-    /// Sends a command on this bus, and counts it; whether the bus took it.
+    /// Sends a command on this bus and counts it. Returns true if the bus accepted it.
     fn say(
         &self,
         bus: usize,
@@ -259,7 +259,7 @@ impl Line {
         self.give(bus, &Encoded::new(&message.encode(), self.format), shared, send)
     }
 
-    /// The same with its frames.
+    /// Sends the frames of a command and counts it. Returns true if the bus accepted them.
     fn give(
         &self,
         bus: usize,
@@ -278,7 +278,7 @@ impl Line {
     }
 }
 
-/// A packet's frames in place: an array, and how many of it are used.
+/// Frames of a packet in an array, with the number in use.
 #[derive(Clone, Copy, Debug)]
 struct Encoded {
     all: [Frame; Length::MAX_SEGMENTS],

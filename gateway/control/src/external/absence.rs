@@ -1,63 +1,63 @@
-//! Why a run ends without the external controller that its skin requires.
+//! Reasons for which a run ends without the external controller that its skin requires.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// What an external controller lacks that counts as absent. Each says what to do.
+/// Reason why an external controller counts as absent. Each message says what to do.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum Absence {
-    /// Nobody said hello.
+    /// No program sent a hello.
     #[error(
-        "no external controller said hello on {}{}: start it before the run or within [controller] start_s; \
+        "no external controller sent a hello on {}{}: start it before the run or within [controller] start_s; \
          docs/how-to/external-controller.md has an example",
         .socket.display(), .others
     )]
     NoHello {
-        /// The gateway's socket.
+        /// Path of the gateway's socket.
         socket: PathBuf,
-        /// What came in its place.
+        /// Datagrams that came instead.
         others: Others,
     },
-    /// It said hello, and nothing else that could be used.
+    /// It sent a hello, but no answer in time.
     #[error(
-        "the external controller on {} said hello and answered no tick in time ({missing} without an answer, {late} \
+        "the external controller on {} sent a hello and answered no tick in time ({missing} without an answer, {late} \
          answered late, {nonsense} datagrams of nonsense): it must answer each state before the next tick, as in \
          docs/how-to/external-controller.md", .socket.display()
     )]
     NoAnswer {
-        /// The gateway's socket.
+        /// Path of the gateway's socket.
         socket: PathBuf,
-        /// Ticks without an answer.
+        /// Number of ticks without an answer.
         missing: u64,
-        /// Answers to ticks that had ended.
+        /// Number of answers to ticks that had ended.
         late: u64,
-        /// Datagrams that were no answers.
+        /// Number of invalid datagrams.
         nonsense: u64,
     },
-    /// It answered, and ended or fell silent.
+    /// It answered, and then ended or fell silent.
     #[error(
         "the external controller on {} answered {answers} ticks and none of the last {ticks}, when the run ended: it \
          must answer until then; see its own messages", .socket.display()
     )]
     Gone {
-        /// The gateway's socket.
+        /// Path of the gateway's socket.
         socket: PathBuf,
-        /// Ticks that it answered.
+        /// Number of answered ticks.
         answers: u64,
-        /// Ticks at the end of the run that it did not.
+        /// Number of unanswered ticks at the end of the run.
         ticks: u32,
     },
 }
 
-/// Datagrams of programs that said no hello.
+/// Datagrams of programs that sent no hello.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Others {
-    /// Of senders with an address.
+    /// Number from senders with an address.
     pub named: u64,
-    /// Of senders without one, who cannot be answered.
+    /// Number from senders without an address, which cannot be answered.
     pub unnamed: u64,
 }
 

@@ -1,4 +1,4 @@
-//! The three datagrams, little endian.
+//! The three datagrams of an external controller, little endian.
 //!
 //! ```text
 //!   all      0 magic "SKBC" | 4 version u16 | 6 kind u16: 1 state, 2 answer, 3 hello
@@ -8,7 +8,8 @@
 //!   hello                                                                                    8 bytes
 //! ```
 //!
-//! n is the robot's joints, but 6 at least: values of joints that it has not are 0 in a state, and ignored in an answer.
+//! n is the number of the robot's joints, but at least 6. Values of joints that the robot does not have are 0 in a
+//! state, and ignored in an answer.
 
 use protocol::skin::MAX_ROBOT_JOINTS;
 use thiserror::Error;
@@ -22,52 +23,52 @@ const ANSWER: u16 = 2;
 const HELLO: u16 = 3;
 
 const HEAD_BYTES: usize = 8;
-/// Bytes of the longest answer.
+/// Size of the longest answer in bytes.
 pub(super) const MAX_ANSWER_BYTES: usize = answer_bytes(MAX_ROBOT_JOINTS);
 
-/// Values of each kind in a datagram.
+/// Number of values of each kind in a datagram.
 const fn values(joints: usize) -> usize {
     if joints < 6 { 6 } else { joints }
 }
 
-/// Bytes of a state.
+/// Size of a state in bytes.
 const fn state_bytes(joints: usize) -> usize {
     40 + 24 * values(joints)
 }
 
-/// Bytes of an answer.
+/// Size of an answer in bytes.
 const fn answer_bytes(joints: usize) -> usize {
     24 + 8 * values(joints)
 }
 
-/// What the gateway sends in every tick.
+/// State that the gateway sends in each tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct State {
-    /// The input of every controller.
+    /// Input that all controllers get.
     pub input: Input,
-    /// Joints of the robot.
+    /// Number of the robot's joints.
     pub joints: u32,
 }
 
-/// What the other program answers.
+/// Answer of the other program.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Answer {
-    /// The tick that it answers.
+    /// Tick that it answers.
     pub tick: u64,
-    /// Its command.
+    /// Command for the robot.
     pub command: Command,
 }
 
-/// The robot's command until the next tick.
+/// Command for the robot until the next tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Command {
     /// 1: joint velocities in rad/s.
     Velocity([f64; MAX_ROBOT_JOINTS]),
-    /// 2: joint positions in rad, to be reached by the next tick as far as the limits of speed allow.
+    /// 2: joint positions in rad, reached by the next tick as far as the speed limits allow.
     Position([f64; MAX_ROBOT_JOINTS]),
 }
 
-/// What the gateway takes.
+/// A datagram that the gateway accepts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "one at a time, on the stack: the loop allocates nothing")]
 pub(super) enum Heard {
@@ -75,29 +76,29 @@ pub(super) enum Heard {
     Answer(Answer),
 }
 
-/// Why a datagram is neither an answer nor a hello.
+/// Reason why a datagram is neither an answer nor a hello.
 #[derive(Clone, Copy, Debug, Eq, Error, Hash, PartialEq)]
 #[non_exhaustive]
 pub enum Nonsense {
-    /// As long as no datagram of this kind is.
+    /// No datagram of this kind has this length.
     #[error("wrong length")]
     Length,
-    /// It does not begin with `SKBC`.
+    /// The datagram does not begin with `SKBC`.
     #[error("wrong magic")]
     Magic,
-    /// A version that this program does not support.
+    /// This program does not support the version.
     #[error("wrong version")]
     Version,
-    /// A kind that the gateway does not take.
+    /// The gateway does not accept this kind.
     #[error("unknown kind")]
     Kind,
-    /// Neither velocities nor positions.
+    /// The command is neither velocities nor positions.
     #[error("unknown command")]
     Command,
-    /// A value is infinite or no number.
+    /// A value is infinite or not a number.
     #[error("not finite")]
     NotFinite,
-    /// It answers a tick that the gateway has not yet sent.
+    /// The datagram answers a tick that the gateway has not sent yet.
     #[error("tick ahead")]
     Ahead,
 }
@@ -108,7 +109,7 @@ impl Nonsense {
         [Self::Length, Self::Magic, Self::Version, Self::Kind, Self::Command, Self::NotFinite, Self::Ahead];
 }
 
-/// Writes values one after the other.
+/// Writes values in sequence.
 struct Writer<'a>(&'a mut [u8]);
 
 impl Writer<'_> {
@@ -132,7 +133,7 @@ impl Writer<'_> {
     }
 }
 
-/// Reads values one after the other; what is not there is zero, so lengths are checked before.
+/// Reads values in sequence; missing values are zero, so callers check lengths first.
 struct Reader<'a>(&'a [u8]);
 
 impl Reader<'_> {
@@ -142,7 +143,7 @@ impl Reader<'_> {
         *head
     }
 
-    /// Values that are not there are 0.
+    /// Missing values are 0.
     fn joints(&mut self, joints: usize) -> [f64; MAX_ROBOT_JOINTS] {
         let mut all = [0.0; MAX_ROBOT_JOINTS];
         for value in all.iter_mut().take(values(joints)) {
@@ -151,7 +152,7 @@ impl Reader<'_> {
         all
     }
 
-    /// The kind, if the head is sound.
+    /// Reads the kind if the header is valid.
     fn head(&mut self) -> Result<u16, Nonsense> {
         if self.0.len() < HEAD_BYTES {
             return Err(Nonsense::Length);
@@ -169,10 +170,10 @@ impl Reader<'_> {
 impl State {
     const VALID: u32 = 1;
     const HALTED: u32 = 1 << 1;
-    /// Bit 16 is the first bus, bit 31 the 16th and all after it.
+    /// Bit 16 is the first bus; bit 31 is the 16th and all after it.
     const MISSING: u32 = 16;
 
-    /// The bytes.
+    /// Encodes the state.
     #[must_use]
     pub fn encode(&self) -> heapless::Vec<u8, { state_bytes(MAX_ROBOT_JOINTS) }> {
         let joints = usize::try_from(self.joints).unwrap_or(usize::MAX).min(MAX_ROBOT_JOINTS);
@@ -202,10 +203,10 @@ impl Answer {
 }
 
 impl Heard {
-    /// Reads what came, for a robot of so many joints. Never panics.
+    /// Decodes a datagram for a robot with `joints` joints. Never panics.
     ///
     /// # Errors
-    /// When it is neither an answer nor a hello.
+    /// Returns [`Nonsense`] if the datagram is neither an answer nor a hello.
     pub(super) fn decode(bytes: &[u8], joints: usize) -> Result<Self, Nonsense> {
         let mut from = Reader(bytes);
         let expected = match from.head()? {
@@ -235,13 +236,13 @@ impl Heard {
     }
 }
 
-/// The same as the other program reads and writes it.
+/// The other program's side of the datagrams, for tests.
 #[cfg(test)]
 mod peer {
     use super::*;
 
     impl State {
-        /// Reads a state. Never panics.
+        /// Decodes a state. Never panics.
         pub(crate) fn decode(bytes: &[u8]) -> Result<Self, Nonsense> {
             let mut from = Reader(bytes);
             if from.head()? != STATE {
@@ -271,7 +272,7 @@ mod peer {
     }
 
     impl Answer {
-        /// The bytes.
+        /// Encodes the answer.
         pub(crate) fn encode(&self, joints: usize) -> Vec<u8> {
             let mut bytes = vec![0; answer_bytes(joints)];
             let mut out = Writer(&mut bytes);

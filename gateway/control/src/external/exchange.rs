@@ -1,4 +1,4 @@
-//! The pending answer, and a tick's handling of received datagrams: no socket, no clock.
+//! Pending answer, and handling of the datagrams received in a tick: without socket and clock.
 
 use std::path::PathBuf;
 
@@ -6,33 +6,33 @@ use super::absence::{Absence, Others};
 use super::datagram::{Command, Heard, Nonsense};
 use crate::controller::{BadCycle, Input, Pace, Step};
 
-/// What happened, each since the start.
+/// Counts of events since the start.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub(super) struct Counts {
     /// Hellos.
     pub(super) hellos: u64,
     /// Answers in time.
     pub(super) answers: u64,
-    /// Ticks that the peer left without an answer.
+    /// Ticks without an answer from the peer.
     pub(super) missing: u64,
     /// Answers to a tick that had ended.
     pub(super) late: u64,
     /// Second answers to the same tick.
     pub(super) repeated: u64,
-    /// Datagrams of others than the peer.
+    /// Datagrams from senders other than the peer.
     pub(super) other_senders: u64,
     /// States that did not fit into the peer's queue.
     pub(super) unsent: u64,
     /// Peers that ended.
     pub(super) gone: u64,
-    /// Datagrams that could not be received, and hellos of unnamed senders.
+    /// Datagrams that could not be received, and hellos from unnamed senders.
     pub(super) failed: u64,
-    /// The peer's nonsense, in the order of [`Nonsense::ALL`].
+    /// Invalid datagrams from the peer, in the order of [`Nonsense::ALL`].
     pub(super) nonsense: [u64; Nonsense::ALL.len()],
 }
 
 impl Counts {
-    /// All of them with their names.
+    /// All counts with their names.
     pub(super) fn each(&self) -> impl Iterator<Item = (String, u64)> {
         let own = [
             ("hellos", self.hellos),
@@ -51,8 +51,8 @@ impl Counts {
             .chain(nonsense.map(|(why, count)| (format!("nonsense: {why}"), count)))
     }
 
-    /// Why the controller counts as absent, if it does: it has never answered, or not in the `silent` last ticks, which are
-    /// as many as halt a robot whose controller had begun.
+    /// Reason why the controller counts as absent, if it does: it never answered, or not in the last `silent` ticks,
+    /// which are enough to halt a robot whose controller had started.
     pub(super) fn absence(&self, socket: PathBuf, silent: Option<u32>) -> Option<Absence> {
         let &Self { hellos, answers, missing, late, other_senders, failed, .. } = self;
         match (hellos, answers, silent) {
@@ -77,14 +77,14 @@ impl Counts {
     }
 }
 
-/// The sender of a datagram.
+/// Sender of a datagram.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Sender {
     Peer,
     Other,
 }
 
-/// The result of sending a state.
+/// Result of sending a state.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Sent {
     Taken,
@@ -92,31 +92,31 @@ pub(super) enum Sent {
     NobodyThere,
 }
 
-/// The exchange with the peer.
+/// Exchange of datagrams with the peer.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Exchange {
     connected: bool,
-    /// The tick whose answer is due.
+    /// Tick whose answer is due.
     due: Option<u64>,
     answer: Option<Command>,
     nonsense: bool,
     pub(super) counts: Counts,
-    /// Joints of the robot.
+    /// Number of the robot's joints.
     joints: usize,
 }
 
 impl Exchange {
-    /// With a robot of so many joints.
+    /// Creates an exchange for a robot with `joints` joints.
     pub(super) fn new(joints: usize) -> Self {
         Self { joints, ..Self::default() }
     }
 
-    /// Takes in a datagram. Whether its sender is the peer from now on.
+    /// Handles a datagram. Returns true if its sender is the peer from now on.
     pub(super) fn handle(&mut self, bytes: &[u8], sender: Sender) -> bool {
         let answer = match (Heard::decode(bytes, self.joints), sender) {
             (Ok(Heard::Hello), _) => {
                 let counts = Counts { hellos: self.counts.hellos + 1, ..core::mem::take(&mut self.counts) };
-                // A second hello of the peer leaves its pending answer.
+                // A second hello of the peer keeps its pending answer.
                 if sender == Sender::Other || !self.connected {
                     *self = Self::new(self.joints);
                 }
@@ -151,7 +151,7 @@ impl Exchange {
         false
     }
 
-    /// The command of the tick, when all datagrams have been taken in.
+    /// Returns the command of the tick; call it after all datagrams have been handled.
     pub(super) fn step(&mut self, input: &Input, pace: &Pace) -> Step {
         let (due, answer) = (self.due.take(), self.answer.take());
         let nonsense = core::mem::take(&mut self.nonsense);
@@ -169,7 +169,7 @@ impl Exchange {
         }
     }
 
-    /// Takes in the result of sending this tick's state.
+    /// Notes the result of sending this tick's state.
     pub(super) fn sent(&mut self, tick: u64, sent: Sent) {
         match sent {
             Sent::Taken => self.due = Some(tick),

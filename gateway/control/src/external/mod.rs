@@ -1,14 +1,13 @@
-//! `kind = "external"`: another program closes the loop, behind a Unix datagram socket.
+//! External controller (`kind = "external"`): another program closes the loop over a Unix datagram socket.
 //!
 //! ```text
 //!   tick n     ── state n ──>                      one datagram a tick from the gateway,
 //!              <── answer n ──   before tick n+1   one back; its command is executed in tick n+1
 //! ```
 //!
-//! The answer to the last tick must be there when the next one begins, else the cycle is bad. The other
-//! program sends a hello first; the sender of the last hello is the peer, and only its answers count. No
-//! datagram can stop a tick: others are counted, by reason. The bytes are in
-//! `docs/how-to/external-controller.md`.
+//! The answer to a tick must have arrived when the next tick starts, or the cycle is bad. The other program sends a
+//! hello first; the sender of the last hello is the peer, and only its answers count. No datagram can stop a tick:
+//! invalid ones are counted by reason. `docs/how-to/external-controller.md` describes the bytes.
 
 mod absence;
 mod datagram;

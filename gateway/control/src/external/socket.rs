@@ -1,4 +1,4 @@
-//! The socket: receives and sends, without any logic.
+//! Socket of an external controller: receives and sends, without any logic.
 
 use std::io::{self, ErrorKind};
 use std::os::linux::net::SocketAddrExt;
@@ -17,7 +17,7 @@ use super::datagram::{MAX_ANSWER_BYTES, State};
 use super::exchange::{Exchange, Sender, Sent};
 use crate::controller::{Controller, Input, Pace, Step};
 
-/// Datagrams taken in one tick: the rest waits, so that no sender can delay the tick.
+/// Maximum number of datagrams received per tick: the rest waits, so that no sender can delay the tick.
 const PER_TICK: usize = 16;
 
 /// A controller in another program.
@@ -25,7 +25,7 @@ const PER_TICK: usize = 16;
 pub struct External {
     socket: UnixDatagram,
     path: PathBuf,
-    /// Device and inode of the socket's file, so that only our own is removed.
+    /// Device and inode of the socket's file, so that only this socket's file is removed.
     file: Option<(u64, u64)>,
     peer: Option<SocketAddr>,
     exchange: Exchange,
@@ -33,45 +33,45 @@ pub struct External {
     joints: u32,
 }
 
-/// Why there is no socket to listen on.
+/// An error that keeps the gateway from listening on its socket.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum SocketError {
-    /// Another program listens there.
+    /// Another program listens on the socket.
     #[error("{}: another program listens on this socket; end it, or name another path", path.display())]
     Live {
-        /// The socket's path.
+        /// Path of the socket.
         path: PathBuf,
     },
-    /// Something else has that name.
+    /// The file is not a socket.
     #[error("{}: exists and is no socket; it is left alone", path.display())]
     NotASocket {
-        /// The socket's path.
+        /// Path of the socket.
         path: PathBuf,
     },
     /// The file system gives the socket other permissions.
     #[error("{}: the socket has mode {mode:04o} and not 0600, so that others may connect; name a path on another file system", path.display())]
     Mode {
-        /// The socket's path.
+        /// Path of the socket.
         path: PathBuf,
-        /// Its permission bits.
+        /// Permission bits of the socket.
         mode: u32,
     },
     /// The system refused.
     #[error("{}: cannot listen on this socket", path.display())]
     System {
-        /// The socket's path.
+        /// Path of the socket.
         path: PathBuf,
-        /// Why.
+        /// Cause.
         source: io::Error,
     },
 }
 
 impl External {
-    /// Listens at a path, and replaces the file of a socket without a listener.
+    /// Listens at a path. Replaces the file of a socket without a listener.
     ///
     /// # Errors
-    /// When another program listens there, something else has that name, or the system refuses.
+    /// Returns [`SocketError`] if another program listens there, the file is not a socket, or the system refuses.
     pub fn listen(path: &Path, skin: &Skin) -> Result<Self, SocketError> {
         Ok(Self {
             socket: bind(path)?,
@@ -85,7 +85,7 @@ impl External {
     }
 
     fn receive(&mut self) {
-        // One byte more than the longest datagram, so that a longer one is seen to be longer.
+        // One byte more than the longest datagram, to detect longer ones.
         let mut bytes = [0; MAX_ANSWER_BYTES + 1];
         for _ in 0..PER_TICK {
             let (length, from) = match self.socket.recv_from(&mut bytes) {
@@ -113,7 +113,7 @@ impl External {
         let state = State { input: *input, joints: self.joints }.encode();
         let sent = match self.socket.send_to_addr(&state, peer) {
             Ok(_) => Sent::Taken,
-            // None of these says that the peer has gone.
+            // None of these errors means that the peer has gone.
             Err(error) if passes(&error) => Sent::QueueFull,
             Err(_) => Sent::NobodyThere,
         };
@@ -144,7 +144,7 @@ impl Controller for External {
 impl Drop for External {
     fn drop(&mut self) {
         if self.file.is_some() && file(&self.path) == self.file {
-            // An error is ignored: the next gateway replaces a dead socket.
+            // Ignore the error: the next gateway replaces a dead socket.
             let _ = std::fs::remove_file(&self.path);
         }
     }
@@ -170,7 +170,7 @@ fn bind(path: &Path) -> Result<UnixDatagram, SocketError> {
     socket.set_nonblocking(true).map_err(system)?;
     let mode = std::fs::symlink_metadata(path).map_err(system)?.mode() & 0o7777;
     if mode & 0o077 != 0 {
-        // Nothing was received from it.
+        // No datagram was received from it.
         let _ = std::fs::remove_file(path);
         return Err(SocketError::Mode { path: path.to_owned(), mode });
     }
@@ -178,7 +178,7 @@ fn bind(path: &Path) -> Result<UnixDatagram, SocketError> {
 }
 
 /// Binds a socket to which only its user may send, whatever the umask is. Linux gives the file the mode of the socket
-/// that is bound, so there is no moment in which others may.
+/// that is bound, so others have no access at any moment.
 fn bind_private(path: &Path) -> io::Result<UnixDatagram> {
     let socket = UnixDatagram::unbound()?;
     fchmod(&socket, Mode::RUSR | Mode::WUSR)?;
@@ -186,7 +186,7 @@ fn bind_private(path: &Path) -> io::Result<UnixDatagram> {
     Ok(socket)
 }
 
-/// Returns whether an error of a socket that does not wait may be gone at the next tick.
+/// Returns true if an error of a non-blocking socket may be gone at the next tick.
 fn passes(error: &io::Error) -> bool {
     let errno = Errno::from_io_error(error);
     matches!(errno, Some(Errno::AGAIN | Errno::INTR | Errno::NOMEM | Errno::NOBUFS))
@@ -197,7 +197,7 @@ fn file(path: &Path) -> Option<(u64, u64)> {
     std::fs::symlink_metadata(path).ok().map(|file| (file.dev(), file.ino()))
 }
 
-/// Whether two addresses, neither of them unnamed, are the same.
+/// Returns true if two named addresses are equal.
 fn same(one: &SocketAddr, other: &SocketAddr) -> bool {
     one.as_pathname() == other.as_pathname() && one.as_abstract_name() == other.as_abstract_name()
 }

@@ -18,7 +18,7 @@ fn listen(path: &Path) -> Result<External, SocketError> {
     External::listen(path, &skin())
 }
 
-/// A folder, the gateway's socket in it, and the gateway.
+/// Creates a directory, the gateway's socket in it, and the gateway.
 fn gateway() -> (TempDir, PathBuf, External) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("controller.sock");
@@ -26,7 +26,7 @@ fn gateway() -> (TempDir, PathBuf, External) {
     (folder, path, gateway)
 }
 
-/// Another program, with the gateway's socket as its peer.
+/// Creates another program, with the gateway's socket as its peer.
 fn program(folder: &TempDir, name: &str) -> UnixDatagram {
     let socket = UnixDatagram::bind(folder.path().join(name)).unwrap();
     socket.connect(folder.path().join("controller.sock")).unwrap();
@@ -278,7 +278,7 @@ fn a_socket_is_replaced_when_dead_refused_when_live_and_removed_at_the_end() {
 
 #[test]
 fn only_its_user_may_connect_whatever_the_umask_is() {
-    // The umask is that of a whole process.
+    // The umask belongs to the whole process.
     const CHILD: &str = "SKINBUS_TEST_OF_THE_UMASK";
     if std::env::var_os(CHILD).is_some() {
         let (_folder, path, _gateway) = gateway();
@@ -325,7 +325,8 @@ proptest! {
     }
 }
 
-/// Checks why a gateway counts its controller as absent, with so many bad cycles at the end; the text names the socket.
+/// Checks the reason why a gateway counts its controller as absent, given the number of bad cycles at the end; the text
+/// names the socket.
 fn absent(gateway: &External, path: &Path, silent: Option<u32>, words: &str) {
     let absence = gateway.absence(silent).unwrap_or_else(|| panic!("not absent: {words}")).to_string();
     assert!(absence.contains(words) && absence.contains(&path.display().to_string()), "{absence}");
@@ -336,7 +337,7 @@ fn absent(gateway: &External, path: &Path, silent: Option<u32>, words: &str) {
 fn a_controller_that_never_says_hello_is_absent_whatever_else_comes() {
     let (folder, path, mut gateway) = gateway();
     gateway.step(&input(0));
-    absent(&gateway, &path, None, "no external controller said hello on ");
+    absent(&gateway, &path, None, "no external controller sent a hello on ");
     let program = program(&folder, "program");
     let of_another_version = [&HELLO[..4], &[2, 0, 3, 0]].concat();
     program.send(&of_another_version).unwrap();
@@ -355,7 +356,7 @@ fn a_controller_that_says_hello_and_never_answers_in_time_is_absent() {
     program.send(HELLO).unwrap();
     gateway.step(&input(0));
     gateway.step(&input(1));
-    // Always a tick behind.
+    // Always one tick behind.
     program.send(&velocity(0, 0.5)).unwrap();
     program.send(b"SKBC").unwrap();
     gateway.step(&input(2));
@@ -374,7 +375,7 @@ fn a_controller_that_answered_is_absent_only_if_it_is_silent_at_the_end() {
     gateway.step(&input(1));
     assert_eq!(gateway.absence(None), None);
     absent(&gateway, &path, Some(40), " answered 1 ticks and none of the last 40");
-    // A second one takes over; the first one's answers count all the same.
+    // A second program takes over; the first one's answers still count.
     let other = program(&folder, "other");
     other.send(HELLO).unwrap();
     gateway.step(&input(2));

@@ -1,4 +1,4 @@
-//! The example in Python closes the loop over the real socket.
+//! The Python example closes the loop over the real socket.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::io::{BufRead, BufReader};
@@ -39,7 +39,7 @@ fn the_example_in_python_makes_the_arm_give_way() {
         let mut line = String::new();
         report.read_line(&mut line).map(|_| line)
     });
-    // Until Python reports, after a second of its own.
+    // Until Python reports, after one second of its own.
     while answers < 100 || !report.is_finished() {
         assert!(start.elapsed() < Duration::from_secs(60), "{answers} answers, and no report from python3");
         let time = Micros(u64::try_from(start.elapsed().as_micros()).unwrap());

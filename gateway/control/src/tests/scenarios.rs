@@ -1,5 +1,4 @@
-//! The ready-made scenarios do what they are there for: played here without a bus, with the central
-//! computation as the skin.
+//! Checks the purposes of the ready-made scenarios: plays them without a bus, with the central computation as the skin.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use crate::controller::{Input, Step};
@@ -14,18 +13,18 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-/// What a run had at its most.
+/// Maxima over a run.
 #[derive(Debug, Default)]
 struct Most {
-    /// Nm, of one cell in one joint.
+    /// Torque of one cell in one joint, in Nm.
     torque: f64,
-    /// Nm, of all cells in one joint.
+    /// Torque of all cells in one joint, in Nm.
     sum: f64,
-    /// Cells at once, in every epoch.
+    /// Number of active cells in each epoch.
     active: Vec<u32>,
-    /// Joints that came to a limit.
+    /// Joints that reached a limit.
     at_limit: u32,
-    /// rad, from the start, of the joint that went farthest.
+    /// Distance in rad from the start, of the joint that went farthest.
     way: f64,
 }
 

@@ -1,4 +1,4 @@
-//! A shadow as JSON lines and as a table.
+//! Result of the model as JSON lines and as a table.
 
 use std::io::{self, Write};
 
@@ -13,7 +13,7 @@ use trace::capture::seconds_since;
 
 use crate::print::{Rows, count, harmless, list, or};
 
-/// Writes the frames that have left the model, one object a line.
+/// Writes the frames that have left the model, one object per line.
 pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {
     let mut line = Vec::with_capacity(192);
     while let Some(frame) = shadow.poll() {
@@ -43,18 +43,18 @@ fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &Shaded) -> io::Res
     Ok(())
 }
 
-/// Seconds with nine digits, which a double could not hold since 1970; many times as quick as by `fmt`.
+/// Writes seconds with nine digits, which a double cannot hold for times since 1970; much faster than `fmt`.
 fn seconds(line: &mut Vec<u8>, nanos: Option<u64>) {
     const NANOS: u64 = 1_000_000_000;
     let Some(nanos) = nanos else { return line.extend_from_slice(b"null") };
     let mut digits = itoa::Buffer::new();
     line.extend_from_slice(digits.format(nanos / NANOS).as_bytes());
     line.push(b'.');
-    // With a one in front none of the nine is left out.
+    // A leading one keeps all nine digits.
     line.extend(digits.format(NANOS + nanos % NANOS).bytes().skip(1));
 }
 
-/// All of it as a table.
+/// Formats the whole result as a table.
 pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> String {
     let head = format!("{what}, {} frames", report.frames);
     let beside = if missing > 0 { format!("{missing} frames are missing in it") } else { String::new() };
@@ -95,7 +95,7 @@ fn one(rows: &mut Rows, bus: &BusShadow, report: &Report) {
     rows.any("never sent", bus.counts.no_room, "4 million frames waited already");
 }
 
-/// Whether it fits, at most and in this run.
+/// Rows on whether the traffic fits, in the worst case and in this run.
 fn fit(rows: &mut Rows, bus: &BusShadow, has_times: bool) {
     match (&bus.worst_case, &bus.answering) {
         (Some(worst), _) => rows.row(worst.case(), worst.value(), worst.cells),
@@ -143,7 +143,7 @@ fn operation(rows: &mut Rows, bus: &BusShadow) {
     }
 }
 
-/// Start-up, which has no limits and is not rated.
+/// Rows on the start-up, which has no limits and no rating.
 fn begin(rows: &mut Rows, bus: &BusShadow, start_up: &StartUp) {
     let beside = format!("{} frames in {:.3} s without joints", start_up.frames, start_up.duration_s);
     load(rows, bus, &start_up.load, ("start-up: average load", &beside));

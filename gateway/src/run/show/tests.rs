@@ -32,7 +32,7 @@ fn bus(name: &str, cells: usize, replies: u64) -> BusSummary {
     }
 }
 
-/// A run that is well, of so many cells on each of these buses.
+/// Creates a run that is well, with `each` cells on each of these buses.
 fn run(skin: &str, buses: &[&str], each: u8, replies: u64) -> Summary {
     let cells = buses.iter().flat_map(|bus| {
         (1..=each).map(|node| CellSummary {
@@ -77,7 +77,7 @@ fn run(skin: &str, buses: &[&str], each: u8, replies: u64) -> Summary {
     summary.rated(None)
 }
 
-/// The demo, with its log.
+/// Creates the run of the demonstration, with its log.
 fn demo() -> Summary {
     let path = "skinbus-demo.log".to_owned();
     let file = Written { path, format: "candump", frames: 34_567, messages: 34_567, bytes: 2_345_678 };
@@ -195,7 +195,7 @@ fn colours_say_how_bad_it_is_and_only_where_they_are_due() {
         let plain = text(&summary, EIGHTY);
         assert!(!plain.contains('\x1b'), "{plain}");
         let coloured = text(&summary, Look { is_coloured: true, ..EIGHTY });
-        // Colours change no letter.
+        // Colours change no text.
         let mut without = String::new();
         let mut letters = coloured.chars();
         while let Some(letter) = letters.next() {

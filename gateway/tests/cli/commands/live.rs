@@ -1,4 +1,4 @@
-//! The same commands on an embedded bus.
+//! The packet commands on an embedded bus.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::PathBuf;
@@ -21,7 +21,7 @@ use vcan_setup::embedded::Served;
 
 use super::*;
 
-/// A bus of its own for a test.
+/// A bus for one test.
 struct Bench {
     parent: TempDir,
     _served: Served,
@@ -44,7 +44,7 @@ impl Bench {
         command
     }
 
-    /// A dump that listens already.
+    /// Starts a dump and waits until it receives.
     fn dump(&self, arguments: &str) -> Child {
         let mut command = self.gateway(&format!("dump vcan0 {arguments}"));
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
@@ -60,7 +60,8 @@ impl Bench {
         assert_eq!(said, (Some(0), "", "sent on vcan0 (embedded)\n"), "{arguments}");
     }
 
-    /// Does something while cell 12 is on the bus: it sends heartbeats, and answers requests for its identity and its mount.
+    /// Runs `work` while cell 12 is on the bus: it sends heartbeats, and answers requests for its identity and its
+    /// mount.
     fn beside<T>(&self, format: Format, work: impl FnOnce() -> T) -> T {
         let (mut cell, over) = (Listener::new(self.open(), Some(format)), AtomicBool::new(false));
         std::thread::scope(|scope| {
@@ -80,7 +81,7 @@ impl Bench {
                             continue;
                         };
                         let answer = match request {
-                            // Without abilities, as the first cells.
+                            // Without abilities, like the first cells.
                             Request::Read { number: 0 } => {
                                 Answer::Value { number: 0, written: false, words: [1, 0, 1, 0, 0x1000, 0] }
                             }
@@ -108,7 +109,7 @@ impl Bench {
     }
 }
 
-/// Ends the cell beside a test, also when the test fails.
+/// Ends the cell beside a test, even if the test fails.
 struct Over<'a>(&'a AtomicBool);
 
 impl Drop for Over<'_> {
@@ -162,8 +163,8 @@ fn a_cell_that_is_requested_answers_and_one_that_is_not_there_is_missed() {
             let nobody = says(&format!("frame stimulus --cell 250 {with}"));
             assert_eq!((nobody.0, nobody.1.as_str()), (Some(1), ""));
             let expected = format!(
-                "skinbus: no cell 250 was heard on vcan0 for 1 s: `skinbus cells vcan0` lists who is there; the bus' \
-                 format may be --format {}\n",
+                "skinbus: no cell 250 sent anything on vcan0 for 1 s: `skinbus cells vcan0` lists the cells; the format \
+                 of the bus may be --format {}\n",
                 format.other().name()
             );
             assert_eq!(nobody.2, expected);
@@ -205,7 +206,7 @@ fn too_few_files_are_refused_before_anything_is_started() {
     command.arg(env!("CARGO_BIN_EXE_skinbus")).arg(&skin).env("SKINBUS_DIR", parent.path().join("skinbus"));
     let Output { status, stderr, .. } = command.output().unwrap();
     let said =
-        "skinbus: 12 files may be open at once, and this bench needs 33: say `ulimit -n 33` before it\n";
+        "skinbus: at most 12 files may be open at once, and this bench needs 33: run `ulimit -n 33` first\n";
     assert_eq!((status.code(), text(&stderr)), (Some(2), said));
 }
 
@@ -214,7 +215,7 @@ fn a_foreign_classic_frame_is_shown_though_nothing_comes_after_it() {
     let bench = Bench::new();
     let mut dump = bench.dump("");
     bench.open().send(&[Frame::classic(0x20C, &[7; 8]).unwrap()]).unwrap();
-    // It may be the first segment of a packet until the reassembly timeout.
+    // The frame may be the first segment of a packet until the reassembly timeout.
     let mut line = String::new();
     BufReader::new(dump.stdout.as_mut().unwrap()).read_line(&mut line).unwrap();
     assert!(line.ends_with("20C#0707070707070707\tforeign no packet: no other segment\n"), "{line}");
@@ -230,7 +231,7 @@ fn cells_on_a_foreign_bus_reports_that_frames_came_and_none_of_a_cell() {
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut sent = 0_u64;
     while child.try_wait().unwrap().is_none() {
-        // A frame that is not taken, because the command has ended, does not matter.
+        // A frame that is refused because the command has ended does not matter.
         let _ = bus.send(&[Frame::classic(0x20C, &sent.to_le_bytes()).unwrap()]);
         sent += 1;
         std::thread::sleep(Duration::from_millis(5));
@@ -238,7 +239,7 @@ fn cells_on_a_foreign_bus_reports_that_frames_came_and_none_of_a_cell() {
     let Output { status, stderr, .. } = child.wait_with_output().unwrap();
     let said = text(&stderr);
     assert_eq!(status.code(), Some(1), "{said}");
-    assert!(said.contains(" frames are of no cell; `skinbus dump` shows them): start them"), "{said}");
+    assert!(said.contains(" frames are not from cells; `skinbus dump` shows them): start them"), "{said}");
 }
 
 #[test]
@@ -254,7 +255,7 @@ fn a_signal_ends_a_dump_cleanly() {
     let mut child = gateway("dump -").stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
     let mut input = child.stdin.take().unwrap();
     input.write_all(b"(1.000000) vcan0 003##500000000000000000000000000004782\n").unwrap();
-    // It is shown at once, though more may come.
+    // The frame is shown at once, although more may come.
     let mut line = String::new();
     let mut shown = BufReader::new(child.stdout.as_mut().unwrap());
     shown.read_line(&mut line).unwrap();
@@ -355,7 +356,7 @@ fn what_the_options_of_a_dump_leave_out_is_said() {
     std::fs::write(&log, "(1.000000) vcan0 003##500000000000000000000000000004782\n").unwrap();
     let log = log.display().to_string();
     for (arguments, expected) in
-        [("--bus vcan3", "no frame is of vcan3"), ("--cell vcan3:1", "no frame is of vcan3")]
+        [("--bus vcan3", "no frame comes from vcan3"), ("--cell vcan3:1", "no frame comes from vcan3")]
     {
         let Output { status, stdout, stderr } = gateway(&format!("dump {log} {arguments}")).output().unwrap();
         let expected = format!("{log}: {expected}\n");
@@ -397,11 +398,11 @@ fn a_dump_reports_lost_frames_though_its_bus_has_ended() {
     let bench = Bench::new();
     let mut dump = bench.dump("");
     let bus = bench.open();
-    // Nobody reads what it shows: the pipe is full, then its socket, then its queue, and the rest is dropped.
+    // The output is not read: the pipe fills, then the socket, then the queue, and the rest is dropped.
     let flood = [Frame::classic(0x123, &[0; 8]).unwrap(); 50];
     (0..FLOOD / 50).for_each(|_| bus.send(&flood).unwrap());
     let mut shown = BufReader::new(dump.stdout.take().unwrap()).lines().map(Result::unwrap);
-    // A frame that is shown after all of them brings how many are missing; it may be dropped as well.
+    // A frame shown after all of them brings the number of missing ones; it may be dropped too.
     let (after, enough) = (Frame::classic(0x7FF, &[]).unwrap(), AtomicBool::new(false));
     let (heard, sent) = std::thread::scope(|scope| {
         let sender = scope.spawn(|| {

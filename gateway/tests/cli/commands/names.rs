@@ -1,4 +1,4 @@
-//! Names of files that are not UTF-8, for each command that takes a file.
+//! File names that are not UTF-8, for each command that takes a file.
 
 use std::ffi::{OsStr, OsString};
 use std::fs;
@@ -15,8 +15,8 @@ use trace::recording::file::FileWriter;
 
 use super::{golden, output, text};
 
-/// Words of a command that takes a file, its exit code, and the files that it writes. `@x` names a file that is not UTF-8, `~`
-/// is a blank in a word. A command with several rows has one for each file that it takes.
+/// Words of a command that takes a file, its exit code, and the files that it writes. `@x` names a file that is not
+/// UTF-8; `~` is a blank in a word. A command has one row for each file that it takes.
 const COMMANDS: &[(&str, i32, &[&str])] = &[
     ("dump @c.log", 0, &[]),
     ("dump @run.mcap --skin @skin.toml -n 3", 0, &[]),
@@ -41,7 +41,7 @@ const COMMANDS: &[(&str, i32, &[&str])] = &[
     ("explain @skin.toml --cell 1 --joints 0~0~0~0~0~0 --force 5", 0, &[]),
     ("explain @skin.toml --batch @rows.csv", 2, &[]),
     ("experiment fig9 --quick -q -o @results", 0, &["results"]),
-    // Without a bus they come as far as their files.
+    // Without a bus, the commands fail only after reading their files.
     ("calibrate @skin.toml --dry-run", 0, &[]),
     ("calibrate @skin.toml --recording @run.mcap -o @found.toml --page @found.html", 2, &[]),
     ("calibrate @skin.toml --recording @run.mcap --data-sheet @sheet.toml", 2, &[]),
@@ -65,7 +65,7 @@ const WITHOUT: &[&str] = &["frame", "sensing", "help"];
 
 /// Names of the commands in a help text.
 fn commands(help: &str) -> Vec<String> {
-    // The program's own are in groups, up to its options.
+    // The program's own commands are in groups, before its options.
     let is_end = |line: &&str| !line.starts_with("Options:");
     let listed = help.lines().skip_while(|line| !line.starts_with("Usage:")).take_while(is_end);
     let is_of_arguments = help.contains("\nArguments:\n");
@@ -76,12 +76,12 @@ fn commands(help: &str) -> Vec<String> {
 
 fn gateway(folder: &Path) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
-    // Whoever is there: no bus can be served or attached to.
+    // On any machine: no bus can be served or attached to.
     command.current_dir(folder).env("NO_COLOR", "1").env("SKINBUS_DIR", "/nowhere/skinbus");
     command
 }
 
-/// A name that is not UTF-8, with the same end.
+/// A name that is not UTF-8, with the same extension.
 fn odd(name: &str) -> OsString {
     let mut whole = OsStr::from_bytes(b"n\xff-").to_owned();
     whole.push(name);
@@ -96,7 +96,7 @@ fn word(word: &str) -> OsString {
 struct Place(TempDir);
 
 impl Place {
-    /// A folder with all files that are read.
+    /// Creates a directory with all files that are read.
     fn new() -> Self {
         let place = Self(tempfile::tempdir().unwrap());
         let skin =
@@ -200,7 +200,7 @@ fn results_have_the_command_as_it_can_be_typed_again() {
     );
 }
 
-/// Where the system starts no thread, commands say so or do without.
+/// If the system starts no thread, commands report it or work without.
 #[test]
 fn without_threads_no_command_panics() {
     let place = Place::new();
@@ -214,7 +214,7 @@ fn without_threads_no_command_panics() {
         "experiment list",
     ] {
         let mut command = gateway(place.0.path());
-        // A stack for which no address space has room.
+        // A stack that does not fit into the address space.
         command.env("RUST_MIN_STACK", (1_u64 << 48).to_string());
         command.args(words.split(' ').map(word));
         let Output { status, stderr, .. } = command.output().unwrap();

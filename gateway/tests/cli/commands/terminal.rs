@@ -1,4 +1,4 @@
-//! What a terminal gets of names that files chose.
+//! Terminal output of names that come from files.
 
 use std::fs::File;
 use std::io::Read;
@@ -7,7 +7,7 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 
 use super::*;
 
-/// Everything that a command writes to a terminal, both of its outputs.
+/// Everything that a command writes to a terminal, on both outputs.
 fn on_terminal(arguments: &str) -> String {
     let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
     grantpt(&master).unwrap();
@@ -20,7 +20,7 @@ fn on_terminal(arguments: &str) -> String {
     // The command holds the terminal too.
     drop(command);
     let mut said = Vec::new();
-    // A terminal that nobody holds any more is an error.
+    // Reading a terminal that no process holds any more is an error.
     let _ = File::from(master).read_to_end(&mut said);
     child.wait().unwrap();
     String::from_utf8(said).unwrap().replace("\r\n", "\n")
@@ -75,12 +75,12 @@ fn no_name_that_a_file_chose_is_obeyed() {
         let said = on_terminal(&arguments);
         assert!(is_harmless(&said) && !said.trim().is_empty(), "{arguments}: {said:?}");
     }
-    // Standard error is read by people wherever it leads, and a name makes no second line of it.
+    // People read standard error wherever it leads; a name must not start a second line.
     let Output { stderr, .. } = gateway(&format!("dump {}", path("empty\n\x1b[2J.log"))).output().unwrap();
     let said = text(&stderr);
     assert!(said.ends_with("empty\\u{a}\\u{1b}[2J.log: it is empty: there is no frame in it\n"), "{said}");
     assert_eq!(said.matches('\n').count(), 1, "{said}");
-    // A pipe leads to a terminal sooner or later.
+    // The output of a pipe may reach a terminal.
     let shown = gateway(&format!("dump {x}")).output().unwrap();
     assert!(text(&shown.stdout).starts_with(r"(1.000000) c\u{1b}[2J"), "{shown:?}");
 }

@@ -1,4 +1,4 @@
-//! Traffic of other people's buses, made from a seed.
+//! Traffic of foreign buses, generated from a seed.
 
 use protocol::can::{ERROR, EXTENDED, Frame};
 
@@ -14,25 +14,25 @@ impl Random {
         z ^ (z >> 31)
     }
 
-    /// Below a bound.
+    /// Returns a number below a bound.
     pub(crate) fn below(&mut self, bound: u64) -> u64 {
         self.word() % bound
     }
 }
 
-/// What the bytes of a message do from one frame to the next.
+/// Behaviour of a message's bytes from frame to frame.
 #[derive(Clone, Copy)]
 enum Bytes {
-    /// Nothing.
+    /// The bytes never change.
     Constant,
-    /// A slow signal, a counter of four bits, and a checksum over them.
+    /// A slow signal, a 4-bit counter, and a checksum over them.
     Signals,
-    /// Noise.
+    /// Random bytes.
     Noise,
 }
 
-/// 11-bit identifiers of a car with their periods in ms: powertrain fast, body slow. Each of our kinds is among them:
-/// commands, sums, torques, sensors, network, configuration, stimuli.
+/// 11-bit identifiers of a car with their periods in ms: powertrain fast, body slow. All kinds of this protocol are
+/// among them: commands, sums, torques, sensors, network, configuration, stimuli.
 const CAR: [(u32, u64, Bytes); 22] = [
     (0x000, 500, Bytes::Constant),
     (0x001, 10, Bytes::Signals),
@@ -58,7 +58,8 @@ const CAR: [(u32, u64, Bytes); 22] = [
     (0x7FF, 1000, Bytes::Constant),
 ];
 
-/// The 11-bit traffic of a car over so many ms: classic frames of 8 bytes, in order of time, each with its time in ns.
+/// Generates the 11-bit traffic of a car over `millis` ms: classic frames of 8 bytes in order of time, each with its
+/// time in ns.
 pub(crate) fn car(seed: u64, millis: u64) -> Vec<(u64, Frame)> {
     let mut random = Random(seed);
     let mut frames = Vec::new();
@@ -78,7 +79,7 @@ pub(crate) fn car(seed: u64, millis: u64) -> Vec<(u64, Frame)> {
                 data[6] = u8::try_from(count % 16).unwrap();
                 data[7] = data[..7].iter().fold(0xFF, |sum, byte| sum ^ byte);
             }
-            // Some jitter, and no two frames of one identifier out of order.
+            // Some jitter, without reordering the frames of one identifier.
             let nanos = due * 1_000_000 + random.below(400_000) + u64::try_from(place).unwrap();
             frames.push((nanos, Frame::classic(id, &data).unwrap()));
         }
@@ -87,7 +88,7 @@ pub(crate) fn car(seed: u64, millis: u64) -> Vec<(u64, Frame)> {
     frames
 }
 
-/// What else there is on other people's buses: CAN FD, J1939, short frames, remote and error frames.
+/// Generates other traffic of foreign buses: CAN FD, J1939, short frames, remote and error frames.
 pub(crate) fn others(seed: u64, millis: u64) -> Vec<(u64, Frame)> {
     let mut random = Random(seed);
     let mut frames = Vec::new();

@@ -1,11 +1,11 @@
-//! Damage: to any byte, and by the structure of a file.
+//! Damage to any byte, and along the structure of a file.
 
 use std::io::Write;
 
 use mcap::records::op;
 use rand::{Rng, RngExt};
 
-/// Numbers that lengths, times and counts go wrong at.
+/// Extreme values for lengths, times and counts.
 const EXTREMES: [u64; 14] = [
     0,
     1,
@@ -23,17 +23,17 @@ const EXTREMES: [u64; 14] = [
     18_446_744_073_709_551_000,
 ];
 
-/// A record: operation code, length, bytes.
+/// Builds a record: operation code, length, bytes.
 pub(crate) fn record(opcode: u8, body: &[u8]) -> Vec<u8> {
     [&[opcode][..], &(body.len() as u64).to_le_bytes(), body].concat()
 }
 
-/// Bytes behind their length.
+/// Builds bytes preceded by their length.
 pub(crate) fn string(text: &[u8]) -> Vec<u8> {
     [&u32::try_from(text.len()).unwrap().to_le_bytes()[..], text].concat()
 }
 
-/// A chunk of these records, whose checksum and lengths are right.
+/// Builds a chunk of these records with correct checksum and lengths.
 pub(crate) fn chunk(compression: &str, records: &[u8]) -> Vec<u8> {
     let packed = match compression {
         "zstd" => zstd::bulk::compress(records, 1).unwrap(),
@@ -50,7 +50,7 @@ pub(crate) fn chunk(compression: &str, records: &[u8]) -> Vec<u8> {
     record(op::CHUNK, &[&numbers[..], &checksum, &string(compression.as_bytes()), &packed].concat())
 }
 
-/// The records of some bytes; what follows the last whole one is left out.
+/// Splits bytes into records; drops an incomplete last one.
 pub(crate) fn records(mut bytes: &[u8]) -> Vec<(u8, Vec<u8>)> {
     let mut found = Vec::new();
     while let Some((&[opcode, ref length @ ..], rest)) = bytes.split_first_chunk::<9>() {
@@ -64,7 +64,7 @@ pub(crate) fn records(mut bytes: &[u8]) -> Vec<(u8, Vec<u8>)> {
     found
 }
 
-/// What a chunk of a sound file unpacks to.
+/// Unpacked content of a chunk of an intact file.
 pub(crate) fn unpacked(body: &[u8]) -> Vec<u8> {
     let number =
         |at: usize| usize::try_from(u64::from_le_bytes(body[at..at + 8].try_into().unwrap())).unwrap();
@@ -121,7 +121,7 @@ fn damage(bytes: &mut [u8], chance: &mut impl Rng) -> &'static str {
     }
 }
 
-/// A damaged file, and how it was damaged.
+/// A damaged file, with a description of the damage.
 pub(crate) fn mutated(seed: &[u8], chance: &mut impl Rng) -> (String, Vec<u8>) {
     let mut file = seed.to_vec();
     let how = match chance.random_range(0..10) {
@@ -179,7 +179,7 @@ pub(crate) fn mutated(seed: &[u8], chance: &mut impl Rng) -> (String, Vec<u8>) {
             file = seed[..8].to_vec();
             for (code, mut body) in all {
                 if code == op::DATA_END {
-                    // A checksum of 0 is none: what follows the damage is read as well.
+                    // A checksum of 0 means none, so that the reader continues after the damage.
                     body.fill(0);
                 }
                 file.extend(record(code, &body));
@@ -193,7 +193,7 @@ pub(crate) fn mutated(seed: &[u8], chance: &mut impl Rng) -> (String, Vec<u8>) {
     (how.to_owned(), file)
 }
 
-/// Makes the length of one of the records from a place on a wrong one: often the last one's.
+/// Changes the length of one of the records from a place on, often the last one's.
 fn wrong_length(bytes: &mut [u8], from: usize, to: usize, chance: &mut impl Rng) {
     let heads = records(&bytes[from..to]).into_iter().scan(from, |place, (_, body)| {
         let head = *place;
@@ -212,7 +212,7 @@ fn wrong_length(bytes: &mut [u8], from: usize, to: usize, chance: &mut impl Rng)
     bytes[head..head + 8].copy_from_slice(&wrong.to_le_bytes());
 }
 
-/// Damages what is in a chunk: one of its records, mostly so that the others stay what they are.
+/// Damages the content of a chunk: one of its records, usually without affecting the others.
 fn inside_out(inside: &mut Vec<u8>, chance: &mut impl Rng) {
     let end = inside.len();
     match chance.random_range(0..5) {
@@ -228,7 +228,7 @@ fn inside_out(inside: &mut Vec<u8>, chance: &mut impl Rng) {
         let place = at(chance, all.len());
         let (code, body) = &mut all[place];
         if *code == op::MESSAGE && chance.random() {
-            // When it was.
+            // Time of the record.
             let number = extreme(chance).to_le_bytes();
             let field = [6, 14, 26][at(chance, 3)];
             body[field..].iter_mut().zip(number).for_each(|(to, from)| *to = from);

@@ -1,5 +1,5 @@
-//! Recordings with one damaged place. What stands in records that were left unchanged comes back, whatever the reader makes
-//! of the place: which these are is known from the making of the file, and not from any reader of ours.
+//! Recordings with one damaged place. The content of unchanged records must come back, whatever the reader makes of the
+//! damage. The making of the file determines these records, not a reader of this project.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -23,15 +23,15 @@ use trace::ros2::standard::JointState;
 use super::mutate::{records, unpacked};
 use super::seeds;
 
-/// Files of the quick test.
+/// Number of files of the quick test.
 const QUICK: u64 = 400;
-/// Of so many files one goes through the commands.
+/// One of this many files goes through the commands.
 const OF_COMMANDS: u64 = 10;
 
 /// A message: topic, sequence, time, bytes.
 type Message = (String, u32, u64, Vec<u8>);
 
-/// A record of a file: where it is, its operation code, its messages, and the descriptions in it by kind and number.
+/// A record of a file: its position, operation code, messages, and the descriptions in it by kind and number.
 struct Part {
     bytes: Range<usize>,
     code: u8,
@@ -39,7 +39,7 @@ struct Part {
     described: BTreeSet<(u8, u16)>,
 }
 
-/// A file that nothing is wrong with.
+/// An intact file.
 struct Seed {
     name: String,
     bytes: Vec<u8>,
@@ -86,13 +86,13 @@ impl Seed {
         Self { name: name.into(), bytes, parts }
     }
 
-    /// The records that no damaged byte belongs to.
+    /// Records without a damaged byte.
     fn intact(&self, damaged: &Range<usize>) -> impl Iterator<Item = &Part> {
         let is_apart = |part: &&Part| damaged.end <= part.bytes.start || part.bytes.end <= damaged.start;
         self.parts.iter().filter(is_apart)
     }
 
-    /// Whether all that its messages need is said in intact records.
+    /// Returns true if intact records contain all descriptions that the record's messages need.
     fn is_described(&self, damaged: &Range<usize>) -> bool {
         let all = |parts: &mut dyn Iterator<Item = &Part>| -> BTreeSet<_> {
             parts.flat_map(|part| part.described.iter().copied()).collect()
@@ -101,7 +101,7 @@ impl Seed {
     }
 }
 
-/// A recording by our own writer, of so many flushes.
+/// A recording by this project's writer with `flushes` flushes.
 fn own(flushes: u64, ends: bool, chance: &mut impl Rng) -> Vec<u8> {
     let mut writer = FileWriter::new(Vec::new()).unwrap();
     writer.metadata("program", &[("a".to_owned(), "b".to_owned())].into()).unwrap();
@@ -142,7 +142,7 @@ fn own(flushes: u64, ends: bool, chance: &mut impl Rng) -> Vec<u8> {
     writer.into_inner()
 }
 
-/// Files of our own writer and of others, with their end and without.
+/// Files of this project's writer and of others, finished and unfinished.
 fn seeds() -> Vec<Seed> {
     let mut chance = Pcg64Mcg::new(36);
     let mut all = Vec::new();
@@ -163,7 +163,7 @@ fn seeds() -> Vec<Seed> {
     all.push(Seed::new("no checksum of the data", seeds::run(&skin, bare.chunk_size(Some(4 << 10)), true)));
     all.push(Seed::new("no chunks", seeds::run(&skin, WriteOptions::new().use_chunks(false), false)));
     all.push(Seed::new("another bridge's", seeds::bridge()));
-    // Their writers were killed.
+    // The writers of these files were killed.
     let cut = all.iter().filter(|seed| seed.bytes.ends_with(mcap::MAGIC)).map(|seed| {
         let end = seed.parts.iter().find(|part| part.code == op::DATA_END).unwrap();
         Seed::new(format!("{}, no end", seed.name), seed.bytes[..end.bytes.start].to_vec())
@@ -174,7 +174,7 @@ fn seeds() -> Vec<Seed> {
     all
 }
 
-/// A file with one damaged place, how, and the bytes of the seed that are not what they were.
+/// A file with one damaged place, a description of the damage, and the range of changed bytes.
 fn damaged(seed: &Seed, chance: &mut impl Rng) -> (&'static str, Vec<u8>, Range<usize>) {
     let mut file = seed.bytes.clone();
     let length = file.len();
@@ -206,7 +206,7 @@ fn damaged(seed: &Seed, chance: &mut impl Rng) -> (&'static str, Vec<u8>, Range<
                     own.wrapping_add(chance.random_range(1..400)),
                     own.saturating_sub(chance.random_range(1..40)),
                 ],
-                // It leads exactly to where another record begins.
+                // The length leads exactly to the start of another record.
                 _ => others.filter(|length| *length < 1 << 40).collect(),
             };
             let wrong = choices[chance.random_range(0..choices.len())];
@@ -240,13 +240,13 @@ fn damaged(seed: &Seed, chance: &mut impl Rng) -> (&'static str, Vec<u8>, Range<
     }
 }
 
-/// Whether all of one are in another, in their order.
+/// Returns true if `all` contains `few` in the same order.
 fn is_within<T: PartialEq>(few: &[T], all: &[T]) -> bool {
     let mut all = all.iter();
     few.iter().all(|it| all.any(|other| other == it))
 }
 
-/// What an independent reader finds in a file that is said to be whole.
+/// Messages that an independent reader finds in a file that is reported as whole.
 fn messages(bytes: &[u8]) -> Vec<Message> {
     let each = MessageStream::new(bytes).unwrap().map(|message| {
         let message = message.unwrap();
@@ -255,7 +255,7 @@ fn messages(bytes: &[u8]) -> Vec<Message> {
     each.collect()
 }
 
-/// Whether damage is in a description that no checksum covers, of a file that says it once.
+/// Returns true if the damage is in a description that no checksum covers and that the file contains once.
 fn is_unsaid(seed: &Seed, place: &Range<usize>) -> bool {
     let has_end = seed.bytes.ends_with(mcap::MAGIC);
     let of_description = |part: &Part| part.code == op::SCHEMA || part.code == op::CHANNEL;
@@ -284,7 +284,7 @@ fn comes_back(seed: &Seed, what: &str, file: &[u8], place: &Range<usize>) {
         "{what}: {} messages are intact: {said}",
         expected.len()
     );
-    // Of a message outside of chunks no checksum tells that it was changed.
+    // Outside of chunks, no checksum shows that a message was changed.
     let all: BTreeSet<_> = seed.parts.iter().flat_map(|part| &part.messages).collect();
     let changed = kept.iter().filter(|message| !all.contains(message)).count();
     let is_bare = seed.parts.iter().any(|part| part.code == op::MESSAGE);
@@ -295,7 +295,7 @@ fn comes_back(seed: &Seed, what: &str, file: &[u8], place: &Range<usize>) {
     );
 }
 
-/// What a command says of a file: exit code, and what it prints.
+/// Result of a command on a file: exit code, output and messages.
 fn run(folder: &Path, words: &str) -> (Option<i32>, Vec<String>, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     command.args(words.split(' ')).current_dir(folder).env("SKINBUS_DIR", folder.join("bus"));
@@ -304,7 +304,7 @@ fn run(folder: &Path, words: &str) -> (Option<i32>, Vec<String>, String) {
     (ended.status.code(), lines, String::from_utf8_lossy(&ended.stderr).into_owned())
 }
 
-/// Each command gives what is intact, or ends with 1 and says why.
+/// Checks that each command returns the intact content, or ends with 1 and a reason.
 fn is_given(folder: &Path, seed: &Seed, what: &str, file: &[u8], place: &Range<usize>) {
     let write = |name: &str, bytes: &[u8]| fs::write(folder.join(name), bytes).unwrap();
     write("seed.mcap", &seed.bytes);
@@ -324,7 +324,7 @@ fn is_given(folder: &Path, seed: &Seed, what: &str, file: &[u8], place: &Range<u
     let frames: usize = seed.intact(place).map(frames).sum();
     let has_end = file.ends_with(mcap::MAGIC);
     let said = |line: &str, code: Option<i32>, stderr: &str| {
-        // What it has given may end where nobody ended it.
+        // The output may end without an end of the recording.
         let tells = has_end || stderr.contains("it has no end: after ");
         assert!(code != Some(0) || tells, "{what}: gateway {line}: {stderr}");
         let refuses = code == Some(1) && !stderr.is_empty();
@@ -364,7 +364,7 @@ fn is_given(folder: &Path, seed: &Seed, what: &str, file: &[u8], place: &Range<u
                 let lines = lines.join("\n").replace("m.mcap", "seed.mcap");
                 assert_eq!(lines, whole.1.join("\n"), "{what}: {line}: {stderr}");
             }
-            // One that is cut off within the epoch says so.
+            // An output that was cut off within the epoch reports it.
             _ => {}
         }
         if whole.0 == Some(0) {

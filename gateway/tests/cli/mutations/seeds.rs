@@ -1,4 +1,4 @@
-//! Recordings to begin with: of several writers, by every compression.
+//! Seed recordings: of several writers, with each compression.
 
 use std::collections::BTreeMap;
 use std::process::Command;
@@ -25,7 +25,7 @@ use protocol::packet::padded;
 
 const BEGAN: u64 = 1_700_000_000_000_000_000;
 
-/// The description of a small skin.
+/// Description of a small skin.
 pub(crate) fn skin() -> String {
     let made = Command::new(env!("CARGO_BIN_EXE_skinbus"))
         .args(["skin", "generate", "--cells", "3"])
@@ -34,7 +34,7 @@ pub(crate) fn skin() -> String {
     String::from_utf8(made.stdout).unwrap()
 }
 
-/// Every kind of recording.
+/// Recordings of every kind.
 pub(crate) fn all(skin: &str) -> Vec<(&'static str, Vec<u8>)> {
     let chunks = |compression| WriteOptions::new().compression(compression).chunk_size(Some(8 << 10));
     let log: String = (0..200)
@@ -171,7 +171,7 @@ fn joints(epoch: u8) -> Packet {
     Packet::Joints { epoch: Epoch(epoch), joints: Joints { positions: padded(&positions), in_use: 6 } }
 }
 
-/// Frames as another bridge records them.
+/// Frames as recorded by another bridge.
 pub(crate) fn bridge() -> Vec<u8> {
     let mut file = begin(WriteOptions::new().compression(None));
     for number in 0..100_u8 {

@@ -1,7 +1,7 @@
-//! What is known of one bus: its cells, the joints sent to them, and their replies.
+//! Comparison state of one bus: its cells, the joints sent to them, and their replies.
 //!
-//! What can be in one of a few states is in [`super::states`], with a table of each: here are the messages that are their
-//! inputs, and the queues between the capture and the bus.
+//! The state machines are in [`super::states`], with a table of each. This module turns messages into their inputs, and
+//! holds the queues between the capture and the bus.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -26,24 +26,24 @@ use crate::replay::survey::Cell as Surveyed;
 use model::latched::State;
 use model::latched::Touched;
 
-/// Unanswered requests of a cell that are remembered.
+/// Maximum number of remembered unanswered requests per cell.
 const ANNOUNCED: usize = 256;
-/// Requests within so many joints of the end may be answered after it.
+/// Number of final joints within which a request may be answered after the end.
 const AT_THE_END: u64 = 8;
 
-/// A cell as it is on the bus now.
+/// A cell on the bus now.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Present {
-    /// Its identity, and its last heartbeat.
+    /// Claim of its node id, with its last heartbeat.
     pub claim: Claim,
-    /// Its counters when they came first, and last.
+    /// First and last counters received from it.
     pub heard: Option<(Heard, Heard)>,
-    /// Its progress with the joints announced last.
+    /// Progress with the joints announced last.
     pub(super) progress: Progress,
 }
 
 impl Present {
-    /// Returns whether the next joints wait for it.
+    /// Returns true if the next joints wait for this cell.
     pub(super) fn is_awaited(&self) -> bool {
         self.claim.is_settled() && matches!(self.progress, Progress::Awaited { .. })
     }
@@ -53,51 +53,51 @@ impl Present {
     }
 }
 
-/// Something of the capture, and the same of now.
+/// A recorded value and its present counterpart.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Both<T> {
     pub(super) recorded: T,
     pub(super) now: T,
 }
 
-/// Joints as they were announced.
+/// Announced joints.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Announced {
     pub(super) announcement: u64,
-    /// Their number among the replayed ones; none for those that only restore a state.
+    /// Number among the replayed joints, or `None` for joints that only restore a state.
     pub(super) round: Option<u64>,
 }
 
-/// Joints of the capture and their replies.
+/// Recorded joints and their replies.
 #[derive(Debug, Default)]
 pub(super) struct Round {
     pub(super) epoch: Epoch,
-    /// When they were recorded, in ns since 1970.
+    /// Recording time in ns since 1970.
     pub(super) nanos: u64,
-    /// Their state on the way back to the bus.
+    /// State of resending the joints.
     pub(super) sending: Sending,
-    /// The words of each reply, recorded and now.
+    /// Words of each reply, recorded and now.
     pub(super) replies: BTreeMap<(CellId, What), Both<Option<Words>>>,
     /// Sums, recorded and now.
     pub(super) sums: Both<Sums>,
-    /// The cells touched at these joints and at the ones before, by the recorded stimuli.
+    /// Cells that the recorded stimuli touch at the joints before, and at these.
     pub(super) touched: [Touched; 2],
-    /// Whether a pass begins with them.
+    /// True if a pass begins with these joints.
     pub(super) is_first: bool,
 }
 
 impl Round {
-    /// Returns whether sums of this epoch are of these joints, and not of an earlier time that they were sent.
+    /// Returns true if sums of this epoch belong to the latest sending of these joints, not to an earlier one.
     pub(super) fn has_sums_of(&self, epoch: Epoch) -> bool {
         self.sending.under().unwrap_or(self.epoch) == epoch
     }
 
-    /// Whether something touches a cell at these joints, if that is known.
+    /// Returns true if a stimulus touches the cell at these joints, or `None` if unknown.
     pub(super) fn is_touched(&self, cell: CellId) -> Option<bool> {
         self.touched.last().and_then(|touched| touched.is(cell))
     }
 
-    /// Whether a cell that takes these joints has a reply: a torque, or the end of its contact.
+    /// Returns true if a cell that receives these joints replies: with a torque, or with the end of its contact.
     pub(super) fn may_answer(&self, cell: CellId) -> bool {
         self.touched.iter().any(|touched| touched.is(cell) == Some(true))
     }
@@ -107,9 +107,9 @@ impl Round {
 #[derive(Debug)]
 pub(super) struct KnownCell {
     pub(super) cell: Surveyed,
-    /// Its recorded contact.
+    /// State of its recorded contact.
     pub(super) contact: Contact,
-    /// Its end now.
+    /// End of its contact in the replay.
     pub(super) end: End,
 }
 
@@ -119,38 +119,38 @@ impl KnownCell {
     }
 }
 
-/// Recorded answers to `configure`, and those that came now, as far as they are not compared yet.
+/// Answers to `configure` that have not been compared: the recorded ones and the present ones.
 #[derive(Debug, Default)]
 pub(super) struct Answers {
-    /// With the number of rounds before it.
+    /// Number of rounds before the answer, its tag, and the answer.
     pub(super) recorded: VecDeque<(u64, u8, Answer)>,
-    /// Recorded requests that are not answered yet.
+    /// Recorded requests without an answer so far.
     announced: VecDeque<Question>,
     pub(super) now: VecDeque<(u8, Answer)>,
 }
 
-/// A recorded `configure`.
+/// A recorded `configure` request.
 #[derive(Clone, Copy, Debug)]
 struct Question {
     tag: u8,
-    /// Rounds before it, and when the last of them was.
+    /// Number of rounds before it, and the time of the last of them.
     round: u64,
     nanos: u64,
 }
 
-/// One pass over the capture, as far as it has been read.
+/// A pass over the capture, as far as it has been read.
 #[derive(Debug, Default)]
 struct Reading {
     pass: Pass,
-    /// What holds at the last recorded joints, and who is touched at them.
+    /// State at the last recorded joints, and the cells touched at them.
     state: State,
     touched: Touched,
-    /// The number of its first round.
+    /// Number of its first round.
     first_round: u64,
 }
 
 impl Reading {
-    /// Takes in what the capture has next; whether that is the first joints of the pass.
+    /// Handles the next item of the capture. Returns true if it is the first joints of the pass.
     const fn next(&mut self, input: pass::Input) -> bool {
         let (next, is_first) = self.pass.next(input);
         self.pass = next;
@@ -158,41 +158,41 @@ impl Reading {
     }
 }
 
-/// One bus.
+/// Comparison state of one bus.
 #[derive(Debug, Default)]
 pub(super) struct BusComparator {
     pub(super) name: String,
-    /// What its torques are worth, as far as a skin tells.
+    /// Units of its torques, as far as a skin gives them.
     pub(super) units: Units,
     pub(super) present: BTreeMap<CellId, Present>,
     pub(super) known: BTreeMap<CellId, KnownCell>,
     pub(super) announcements: u64,
-    /// By epoch.
+    /// Latest announced joints of each epoch.
     pub(super) announced: Vec<Option<Announced>>,
-    /// The same of the capture: the round of its latest joints of each epoch.
+    /// Round of the latest recorded joints of each epoch.
     pub(super) recorded: Vec<Option<u64>>,
-    /// The number of the first of `rounds`.
+    /// Number of the first element of `rounds`.
     pub(super) base: u64,
     pub(super) rounds: VecDeque<Round>,
-    /// Whose children cells are, recorded and now.
+    /// Trees of the cells, recorded and now.
     pub(super) trees: Both<Trees>,
     pub(super) answers: BTreeMap<CellId, Answers>,
-    /// Cells whose last recorded sum was no end of a contact: they have to go on, or send the end.
+    /// Cells whose last recorded sum did not end a contact: they must send another sum or the end.
     pub(super) speaking: BTreeSet<CellId>,
-    /// Whether cells were switched to unrequested sensors frames, which come at times of their own.
+    /// True if cells were configured to send sensor frames without request, which arrive at times of their own.
     pub(super) senses: bool,
-    /// Cells by the joints that they have taken since their start.
+    /// First joints of each cell since its start.
     pub(super) first_joints: Both<PerCell<FirstJoints>>,
     reading: Reading,
-    /// Rounds that were announced.
+    /// Number of announced rounds.
     pub(super) sent: u64,
-    /// The round after which the capture has no more joints.
+    /// Last round with joints in the capture, once known.
     pub(super) last_round: Option<u64>,
     line: Line,
 }
 
 impl BusComparator {
-    /// Its name, and what its torques are worth.
+    /// Its name and the units of its torques.
     pub(super) fn called(&self) -> (&str, Units) {
         (&self.name, self.units)
     }
@@ -208,7 +208,7 @@ impl BusComparator {
         }
     }
 
-    /// Whether there were messages before the first round of this pass.
+    /// Returns true if messages came before the first round of this pass.
     pub(super) const fn begins_later(&self) -> bool {
         self.reading.pass.begins_later()
     }
@@ -217,7 +217,7 @@ impl BusComparator {
         matches!(self.line, Line::Down)
     }
 
-    /// Takes in what happens to the bus.
+    /// Handles an event of the bus.
     pub(super) const fn line(&mut self, input: line::Input) {
         self.line = self.line.next(input);
     }
@@ -227,24 +227,24 @@ impl BusComparator {
         self.rounds.get_mut(usize::try_from(at).ok()?)
     }
 
-    /// The round of the latest recorded joints of an epoch.
+    /// Round of the latest recorded joints of an epoch.
     pub(super) fn recorded_round(&mut self, epoch: Epoch) -> Option<&mut Round> {
         let number = self.recorded.get(usize::from(epoch.0)).copied().flatten()?;
         self.round(number)
     }
 
-    /// The announcement of the latest joints of an epoch.
+    /// Latest announced joints of an epoch.
     fn announced(&self, epoch: Epoch) -> Option<Announced> {
         self.announced.get(usize::from(epoch.0)).copied().flatten()
     }
 
-    /// The round that was sent last under an epoch, and its number.
+    /// Number and state of the round sent last under an epoch.
     pub(super) fn announced_round(&mut self, epoch: Epoch) -> Option<(u64, &mut Round)> {
         let number = self.announced(epoch)?.round?;
         Some((number, self.round(number)?))
     }
 
-    /// Why a torque or sum of the part has no joints in it, if that is counted.
+    /// Counts a torque or sum of the part whose joints are not in it, with the reason.
     pub(super) fn count_without_joints(&self, epoch: Epoch, lacking: &mut Lacking) {
         if self.is_earlier(epoch) {
             lacking.joints_earlier += 1;
@@ -253,14 +253,14 @@ impl BusComparator {
         }
     }
 
-    /// Everything announced so far has to be confirmed by another message of each cell.
+    /// Requires another message of each cell as confirmation of all that was announced so far.
     pub(super) fn announce(&mut self) {
         self.announcements += 1;
         let announced = |progress: Progress| progress.next(progress::Input::Announced);
         self.present.values_mut().for_each(|present| present.progress = announced(present.progress));
     }
 
-    /// Gives up the cells that are waited for; returns them.
+    /// Gives up and returns the cells that have not answered in time.
     pub(super) fn give_up(&mut self) -> Vec<CellId> {
         let mut late = Vec::new();
         for (cell, present) in self.present.iter_mut().filter(|(_, present)| present.is_awaited()) {
@@ -270,18 +270,18 @@ impl BusComparator {
         late
     }
 
-    /// Takes in what becomes of the joints of a round, if that is remembered.
+    /// Handles an event of sending a round's joints, if the round is remembered.
     pub(super) fn send(&mut self, number: u64, input: sending::Input) {
         let Some(round) = self.round(number) else { return };
         round.sending = round.sending.next(input);
         if matches!(input, sending::Input::Sent { .. }) {
-            // When joints are repeated, all cells resend their sums.
+            // Repeated joints make all cells resend their sums.
             round.sums.now.clear();
         }
     }
 
-    /// Drops recorded replies to what was not sent. Whether something was sent after the last joints is unknown, so
-    /// replies to that are not expected.
+    /// Drops recorded replies to messages that were not sent. It is unknown whether messages after the last joints were
+    /// sent, so replies to them are not expected.
     pub(super) fn forget_the_unsent(&mut self) {
         let sent = self.sent;
         for answers in self.answers.values_mut() {
@@ -292,7 +292,7 @@ impl BusComparator {
         }
     }
 
-    /// Takes in that the capture begins again.
+    /// Handles a restart of the capture.
     pub(super) fn begin(&mut self) {
         self.recorded.fill(None);
         let mut reading = Reading { first_round: self.rounds_so_far(), ..Reading::default() };
@@ -304,7 +304,7 @@ impl BusComparator {
         self.base + self.rounds.len() as u64
     }
 
-    /// Takes in that joints were on the bus in the capture; returns the number of their round, if they will be sent.
+    /// Records joints of the capture. Returns the number of their round if they will be sent.
     pub(super) fn record_joints(&mut self, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
         let number = self.rounds_so_far();
         let last = self.reading.state.last_epoch();
@@ -325,7 +325,7 @@ impl BusComparator {
         std::mem::replace(&mut self.reading.touched, self.reading.state.touched())
     }
 
-    /// Takes in the capture's other messages. `is_in_part`: whether it is in the part that is replayed.
+    /// Records any other message of the capture. `is_in_part` is true in the part that is replayed.
     pub(super) fn record_state(&mut self, message: &Message, is_in_part: bool) {
         if !is_in_part {
             self.reading.next(pass::Input::NotSent);
@@ -348,12 +348,13 @@ impl BusComparator {
         }
     }
 
-    /// Whether the cell with a node id in the capture only claims it.
+    /// Returns true if the recorded cell with this node id only claims it.
     pub(super) fn is_claiming(&self, cell: CellId) -> bool {
         self.reading.state.claim(cell).is_some_and(|claim| !claim.is_settled())
     }
 
-    /// Whether a reply of this epoch, which no joints of the part have had yet, answers joints from before it.
+    /// Returns true if a reply of this epoch, which no joints of the part have had yet, answers joints from before the
+    /// part.
     fn is_earlier(&self, epoch: Epoch) -> bool {
         let Reading { pass, state, first_round, .. } = &self.reading;
         let last = pass.earlier(state.last_epoch());
@@ -361,7 +362,7 @@ impl BusComparator {
             && last.is_some_and(|last| (0..100).contains(&last.since(epoch)))
     }
 
-    /// Takes in a recorded answer to `configure`; whether its request is in the part.
+    /// Records an answer to `configure`. Returns true if its request is in the part.
     pub(super) fn record_answer(&mut self, from: CellId, tag: u8, answer: Answer) -> bool {
         let rounds = self.rounds_so_far();
         let answers = self.answers.entry(from).or_default();
@@ -374,15 +375,15 @@ impl BusComparator {
         true
     }
 
-    /// Takes in where a cell's sums go, as it reported in the capture. Its page has the last joints that it has taken:
-    /// from the next ones on they go there.
+    /// Records the parent that a cell reported in the capture. Its page has the epoch of the last joints that it
+    /// received: sums go to that parent from the next joints on.
     pub(super) fn record_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let next = self.base + self.rounds.len() as u64;
         let last = self.recorded.get(usize::from(epoch.0)).copied().flatten();
         self.trees.recorded.say(cell, parent, last.map_or(next, |last| last + 1));
     }
 
-    /// Where its sums go by its present report.
+    /// Notes the parent that a cell reports now.
     fn hear_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let last = self.announced(epoch).and_then(|announced| announced.round);
         self.trees.now.say(cell, parent, last.map_or(self.sent, |last| last + 1));
@@ -416,14 +417,15 @@ impl BusComparator {
         }
     }
 
-    /// The cells that are waited for.
+    /// Cells that the next joints wait for.
     pub(super) fn undone(&self) -> impl Iterator<Item = CellId> {
         self.present.iter().filter(|(_, present)| present.is_awaited()).map(|(cell, _)| *cell)
     }
 }
 
 impl Answers {
-    /// Whether the recording explains why it has the request of this tag and not the answer; `rounds` are all there were.
+    /// Returns true and counts the reason if the recording explains why it has the request of this tag but no answer.
+    /// `rounds` is the total number of rounds.
     pub(super) fn explain_extra(
         &mut self,
         lacking: &mut Lacking,
@@ -432,7 +434,7 @@ impl Answers {
         rounds: u64,
     ) -> bool {
         let Some(KnownCell { cell, .. }) = known_cell else {
-            // A cell that the recording does not have.
+            // The recording does not have this cell.
             lacking.silent += 1;
             return true;
         };
@@ -454,7 +456,7 @@ impl Answers {
     }
 }
 
-/// Takes in what a message shows of whether its cell has taken any joints yet.
+/// Updates the first-joints state of the message's cell.
 pub(super) fn take_first_joints(cells: &mut PerCell<FirstJoints>, message: &Message) {
     let Some((cell, input)) = first_joints::Input::of(message) else { return };
     if let Some(place) = cells.get_mut(cell) {

@@ -1,4 +1,4 @@
-//! Compares what has come with what was recorded, when all of it has come.
+//! Comparison of complete rounds with the recording.
 
 use std::collections::BTreeSet;
 
@@ -44,7 +44,7 @@ impl Comparator {
 }
 
 impl BusComparator {
-    /// Compares a reply to joints with the recorded one; how they differ, unless the recording explains it.
+    /// Compares a reply to joints with the recorded one. Returns the difference, unless the recording explains it.
     fn compare_reply(
         &mut self,
         number: u64,
@@ -82,7 +82,7 @@ impl BusComparator {
             (Some(_), None) if round.sending.is_unsent() => Some(How::Missing),
             (Some(recorded), None) => {
                 let is_end = is_torque && recorded.is_zero();
-                // The cell had not taken the joints at which the contact ended.
+                // The cell had not received the joints at which the contact ended.
                 let was_over = contact.was_over(begins_later, round.may_answer(cell));
                 let is_later = |known_cell: &&mut KnownCell| {
                     let was_over = was_over && !known_cell.cell.is_counted_at(round.nanos);
@@ -93,7 +93,7 @@ impl BusComparator {
                 tally.lacking.said_later += 1;
                 None
             }
-            // Reports may be requested by this replay.
+            // Reports may have been requested by this replay.
             (None, Some(now)) => {
                 let counts = is_torque
                     && !explain_extra(&mut tally.lacking, known_cell, (cell, round), is_last, now.is_zero());
@@ -102,7 +102,7 @@ impl BusComparator {
         }
     }
 
-    /// Compares what each cell itself put into its sums of a round.
+    /// Compares each cell's own contribution to the sums of a round.
     fn close_sums(
         &mut self,
         number: u64,
@@ -153,12 +153,12 @@ impl BusComparator {
                 }
                 Outcome::Different => How::Different,
                 Outcome::Missing => How::Missing,
-                // It had to go on then, or to send the end: it did not come to its slot in time.
+                // The cell had to send again or end its contact then, but missed its slot.
                 Outcome::Extra if self.speaking.contains(&cell) => {
                     lacking.slot_skipped += 1;
                     continue;
                 }
-                // The words only tell whether a contact has ended, which a sum does not show.
+                // Only a torque's words show that a contact has ended; a sum does not.
                 Outcome::Extra if explain_extra(lacking, known_cell, (cell, round), is_last, false) => {
                     continue;
                 }
@@ -177,7 +177,7 @@ impl BusComparator {
         }
     }
 
-    /// Compares the answers to `configure`, in their order.
+    /// Compares the answers to `configure`, in order.
     pub(super) fn close_answers(&mut self, tally: &mut Tally, first: &mut First) {
         for (cell, mut answers) in std::mem::take(&mut self.answers) {
             loop {
@@ -209,7 +209,7 @@ impl BusComparator {
     }
 }
 
-/// Whether the recording explains why it has no such reply.
+/// Returns true and counts the reason if the recording explains why it lacks this reply.
 fn explain_extra(
     lacking: &mut Lacking,
     known_cell: Option<&mut KnownCell>,
@@ -217,10 +217,10 @@ fn explain_extra(
     is_last: bool,
     is_end: bool,
 ) -> bool {
-    // After what seemed a start nothing is known of its contact, and it may go on.
+    // After an apparent restart its contact is unknown, and may last.
     let is_free = round.touched.iter().all(|touched| touched.is(cell) == Some(false));
     let Some(known_cell) = known_cell else {
-        // A cell that the recording does not have.
+        // The recording does not have this cell.
         lacking.silent += 1;
         return true;
     };
@@ -246,7 +246,7 @@ fn explain_extra(
     } else {
         return false;
     }
-    // Counters tell how many are missing, and not which: the end may have been sent later then.
+    // Counters tell how many messages are missing, not which: the end may have been sent later.
     known_cell.end = known_cell.end.next(contact::Round::Extra { is_end });
     true
 }

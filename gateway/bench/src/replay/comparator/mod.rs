@@ -1,14 +1,14 @@
-//! Which cells are on the buses, whether they are done with the last joints, and whether their replies are those of
-//! the capture.
+//! Comparison of the buses with the capture: which cells are present, whether they have processed the last joints, and
+//! whether their replies are those of the capture.
 //!
 //! ```text
-//!   recorded joints, replies ─> record_joints, record ─┐                  ┌─> is_done, unanswered ─> lockstep
-//!          joints to be sent ─> announce ──────────────┼─ [ Comparator ] ─┼─> present, other_gateway
-//!        frames on the buses ─> hear ──────────────────┘                  └─> tally, first difference
+//!   recorded joints, replies ─> expect_joints, expect ─┐                  ┌─> is_done, unanswered ─> lockstep
+//!          joints to be sent ─> sent_joints ───────────┼─ [ Comparator ] ─┼─> present_cells, other_gateway
+//!        frames on the buses ─> observe ───────────────┘                  └─> tally, first difference
 //! ```
 //!
-//! A reply belongs to the joints that it answers: the latest ones of its epoch, in the capture and on the bus
-//! separately. Rounds of joints are compared when 100 more have been sent, or at the end.
+//! A reply belongs to the joints that it answers: the latest joints of its epoch, in the capture and on the bus
+//! separately. A round of joints is compared when 100 more have been sent, or at the end.
 
 mod bus_comparator;
 mod close;
@@ -37,19 +37,19 @@ pub use tally::{Lacking, Steps, Tally};
 use super::difference::{Difference, How, Said, What, When};
 use super::survey::Cell as Surveyed;
 
-/// A reply may come so many joints after those that it answers; far less than the 256 epochs.
+/// Maximum number of joints between those that a reply answers and the reply; far below the 256 epochs.
 const WINDOW: u64 = 100;
 
-/// The first difference.
+/// The first difference found.
 #[derive(Debug)]
 struct First {
-    /// When the capture began, in ns since 1970.
+    /// Start of the capture in ns since 1970.
     nanos: u64,
     difference: Option<Difference>,
 }
 
 impl First {
-    /// Takes in a difference, with the number, the epoch and the time of its joints.
+    /// Keeps the first difference, with the number, the epoch and the time of its joints.
     fn note(
         &mut self,
         how: How,
@@ -70,13 +70,13 @@ impl First {
     }
 }
 
-/// All buses.
+/// Compares the replies on all buses with the capture.
 #[derive(Debug)]
 pub struct Comparator {
     bus_comparators: Vec<BusComparator>,
-    /// By how many steps a torque's words may differ from the recorded ones; none when replies are not compared.
+    /// Tolerance in steps between a torque's words and the recorded ones; `None` if replies are not compared.
     tolerance: Option<u16>,
-    /// While a state is restored, replies are not those of the capture.
+    /// True while a state is restored: replies then differ from the capture's.
     is_muted: bool,
     tally: Tally,
     first: First,
@@ -84,8 +84,8 @@ pub struct Comparator {
 }
 
 impl Comparator {
-    /// For some buses, by their present names and their cells in the capture. Replies are compared if there is
-    /// a tolerance, in steps of torques, once it is no longer muted.
+    /// Compares buses, given by their present names and their cells in the capture. Compares replies within
+    /// `tolerance`, in steps of torques, once unmuted; `None` skips the comparison.
     #[must_use]
     pub fn new(
         buses: impl IntoIterator<Item = (String, BTreeMap<CellId, Surveyed>)>,
@@ -104,7 +104,7 @@ impl Comparator {
         }
     }
 
-    /// The skin's buses of these names have its units.
+    /// Sets the units of the buses that the skin describes, by name.
     pub fn describe(&mut self, skin: &Skin) {
         for bus in &mut self.bus_comparators {
             if let Some(index) = skin.bus_named(&bus.name) {
@@ -113,8 +113,7 @@ impl Comparator {
         }
     }
 
-    /// Takes in that the capture has joints next; returns the number of their round on their bus, if they will be
-    /// sent.
+    /// Records the next joints of the capture. Returns the number of their round on their bus if they will be sent.
     pub fn record_joints(
         &mut self,
         bus_comparator: usize,
@@ -125,7 +124,7 @@ impl Comparator {
         self.bus_comparators.get_mut(bus_comparator)?.record_joints(nanos, epoch, is_sent)
     }
 
-    /// Takes in the capture's other messages. `is_in_part`: whether it is in the part that is replayed.
+    /// Records any other message of the capture. `is_in_part` is true in the part that is replayed.
     pub fn record(&mut self, bus_comparator: usize, message: &Message, is_in_part: bool) {
         let expects = self.tolerance.is_some();
         let (Some(bus_comparator), tally) =
@@ -159,14 +158,14 @@ impl Comparator {
         let Some((cell, epoch, what, words)) = reply(message) else { return };
         let untaken = FirstJoints::Awaited { epoch };
         if what != What::Torque && bus_comparator.first_joints.recorded.get(cell) == Some(&untaken) {
-            // Of no joints, even if joints of that epoch were on the bus by then.
+            // The reply belongs to no joints, even if joints of that epoch were on the bus by then.
             return;
         }
         let measured = bus_comparator.known.get(&cell).is_some_and(|known_cell| known_cell.cell.measured);
         match bus_comparator.recorded_round(epoch) {
             Some(_) if measured => tally.lacking.measured += 1,
             Some(round) => round.replies.entry((cell, what)).or_default().recorded = Some(words),
-            // Before the first joints there are replies of sensors without any.
+            // Before the first joints, sensor replies belong to no joints.
             None if is_in_part && what == What::Torque => {
                 bus_comparator.count_without_joints(epoch, &mut tally.lacking)
             }
@@ -174,12 +173,12 @@ impl Comparator {
         }
     }
 
-    /// Takes in that the capture begins again: replies before its first joints answer none of the last pass.
+    /// Starts a new pass of the capture: replies before its first joints answer joints of no earlier pass.
     pub fn record_begin(&mut self) {
         self.bus_comparators.iter_mut().for_each(BusComparator::begin);
     }
 
-    /// Takes in that the capture has no more joints.
+    /// Notes that the capture has no more joints.
     pub fn record_end(&mut self) {
         for bus_comparator in &mut self.bus_comparators {
             bus_comparator.last_round =
@@ -187,7 +186,7 @@ impl Comparator {
         }
     }
 
-    /// Takes in that joints are about to be sent: those of a round, or others.
+    /// Notes that joints are about to be sent: those of a round, or others.
     pub fn announce(&mut self, bus_comparator: usize, round: Option<u64>, epoch: Epoch) {
         let Some(it) = self.bus_comparators.get_mut(bus_comparator) else { return };
         it.announce();
@@ -207,7 +206,7 @@ impl Comparator {
         }
     }
 
-    /// Takes in that everything sent so far is to be confirmed: a sync without joints.
+    /// Notes a sync without joints: all cells must confirm everything sent so far.
     pub fn announce_again(&mut self, bus_comparator: usize) {
         let Some(it) = self.bus_comparators.get_mut(bus_comparator) else { return };
         it.announce();
@@ -219,14 +218,14 @@ impl Comparator {
         }
     }
 
-    /// Takes in that a bus did not take the joints of a round.
+    /// Notes that a bus refused the joints of a round.
     pub fn was_not_sent(&mut self, bus_comparator: usize, round: u64) {
         if let Some(bus_comparator) = self.bus_comparators.get_mut(bus_comparator) {
             bus_comparator.send(round, sending::Input::Refused);
         }
     }
 
-    /// Takes in a message of another sender on a bus.
+    /// Handles a message of another sender on a bus.
     pub fn hear(&mut self, index: usize, message: &Message) {
         let Some(bus_comparator) = self.bus_comparators.get_mut(index) else { return };
         bus_comparator.line(line::Input::Message);
@@ -259,7 +258,7 @@ impl Comparator {
         let (epoch, nanos) = (round.epoch, round.nanos);
         match pair.now {
             None => pair.now = Some(words),
-            // The same joints may be sent twice, and are then answered twice.
+            // Joints that are sent twice are answered twice.
             Some(before) if before == words => {}
             // The last reply counts, as in the capture.
             Some(_) if what != What::Torque => pair.now = Some(words),
@@ -277,7 +276,7 @@ impl Comparator {
         }
     }
 
-    /// Whether a bus' cells that are waited for are done with the joints announced last.
+    /// Returns true if all awaited cells of a bus have processed the joints announced last.
     #[must_use]
     pub fn is_done(&self, bus_comparator: usize) -> bool {
         self.bus_comparators
@@ -285,7 +284,7 @@ impl Comparator {
             .is_none_or(|bus_comparator| bus_comparator.is_down() || bus_comparator.undone().next().is_none())
     }
 
-    /// Cells that are done with the joints announced last, so that progress can be seen.
+    /// Number of cells that have processed the joints announced last, to show progress.
     #[must_use]
     pub fn done(&self, bus_comparator: usize) -> usize {
         self.bus_comparators.get(bus_comparator).map_or(0, |bus_comparator| {
@@ -293,12 +292,12 @@ impl Comparator {
         })
     }
 
-    /// Gives up the cells that are not done; returns them.
+    /// Gives up and returns the cells that are not done.
     pub fn give_up(&mut self, bus_comparator: usize) -> Vec<CellId> {
         self.bus_comparators.get_mut(bus_comparator).map_or_else(Vec::new, BusComparator::give_up)
     }
 
-    /// How many recorded torques and sums of the joints of a round have not come, of cells that are there.
+    /// Number of recorded torques and sums of a round whose present counterparts have not arrived, of present cells.
     #[must_use]
     pub fn unanswered(&self, bus_comparator: usize, number: u64) -> usize {
         let Some(bus_comparator) = self.bus_comparators.get(bus_comparator) else { return 0 };
@@ -322,14 +321,14 @@ impl Comparator {
         torques + round.sums.recorded.cells().filter(misses).count()
     }
 
-    /// Takes in that a bus is down, so that none of its cells is waited for; the next message ends this.
+    /// Marks a bus as down, so that its cells are not awaited. The next message ends this.
     pub fn is_down(&mut self, bus_comparator: usize) {
         if let Some(bus_comparator) = self.bus_comparators.get_mut(bus_comparator) {
             bus_comparator.line(line::Input::Lost);
         }
     }
 
-    /// From now on replies are not those of the capture, or are again: then to joints that are yet to be sent.
+    /// Ignores replies while muted. After unmuting, compares replies to joints that are yet to be sent.
     pub fn mute(&mut self, is_muted: bool) {
         self.is_muted = is_muted;
         for announced in self
@@ -341,13 +340,13 @@ impl Comparator {
         }
     }
 
-    /// The bus on which another gateway has sent.
+    /// Index of the bus on which another gateway has sent.
     #[must_use]
     pub const fn other_gateway(&self) -> Option<usize> {
         self.other_gateway
     }
 
-    /// The cells that are on a bus now.
+    /// Cells that are on a bus now.
     pub fn present(&self, bus_comparator: usize) -> impl Iterator<Item = (CellId, &Present)> {
         self.bus_comparators
             .get(bus_comparator)
@@ -355,12 +354,12 @@ impl Comparator {
             .flat_map(|bus_comparator| bus_comparator.present.iter().map(|(cell, it)| (*cell, it)))
     }
 
-    /// Those of them that do not only claim their node id.
+    /// Cells on a bus that own their node id.
     pub fn settled(&self, bus_comparator: usize) -> impl Iterator<Item = (CellId, &Present)> {
         self.present(bus_comparator).filter(|(_, present)| present.claim.is_settled())
     }
 
-    /// Cells that have not reported where their sums go, or are unreachable.
+    /// Cells that have not reported a parent for their sums, or are unreachable.
     #[must_use]
     pub fn unreachable(&self, bus_comparator: usize) -> Vec<CellId> {
         let settled = self.settled(bus_comparator);
@@ -368,7 +367,7 @@ impl Comparator {
         settled.map(|(cell, _)| cell).filter(|cell| !bus_comparator.trees.now.is_reachable(*cell)).collect()
     }
 
-    /// Compares all that has been sent, and receives no more; `is_whole`: whether that was all that the capture has.
+    /// Compares all that has been sent; call it once. `is_whole` is true if all of the capture was sent.
     pub fn finish(&mut self, is_whole: bool) {
         self.is_muted = true;
         for bus_comparator in self.bus_comparators.iter_mut().filter(|_| !is_whole) {
@@ -388,25 +387,25 @@ impl Comparator {
         }
     }
 
-    /// The counts so far.
+    /// Counts so far.
     #[must_use]
     pub const fn tally(&self) -> &Tally {
         &self.tally
     }
 
-    /// The first difference, missing or extra reply.
+    /// First difference: a different, missing or extra reply.
     #[must_use]
     pub const fn first(&self) -> Option<&Difference> {
         self.first.difference.as_ref()
     }
 }
 
-/// Whether an answer does not depend on when it is requested: that to `identify` has the cell's state too.
+/// Returns false for the answer to `identify`, which depends on the time of the request through the cell's state.
 fn is_compared(answer: Answer) -> bool {
     !matches!(answer, Answer::Value { number, .. } if number == Parameter::Identity.number())
 }
 
-/// A reply that has the epoch of the joints that it answers, or came after.
+/// Decodes a reply that carries the epoch of the joints that it answers or follows.
 fn reply(message: &Message) -> Option<(CellId, Epoch, What, Words)> {
     let (from, epoch, what) = if let Message::Torque { from, epoch, .. } = *message {
         (from, epoch, What::Torque)

@@ -1,14 +1,14 @@
-//! Sums less their children: what each cell itself put into a sum, whatever the tree was.
+//! Each cell's own contribution to a sum: the sum minus the sums of its children, independent of the tree.
 //!
 //! ```text
 //!   tree pages, joints by joints ──> [Trees] ─┐
-//!                                             ├─> Side: own = sum - sums of the children
+//!                                             ├─> EpochSums: own = sum - sums of the children
 //!   sums of one epoch, the last of each ──────┘        recorded and now: compare
 //! ```
 //!
 //! A sum adds whole steps, so the difference is exact and does not depend on the tree. Two cells in the same contact
-//! state may differ by one step, because rounding carries its remainder into the next value. A cell whose children are
-//! not certain in an epoch is left out, and so is a sum that does not contain all its children's.
+//! state may differ by one step, because rounding carries its remainder into the next value. The comparison omits cells
+//! whose children are uncertain in an epoch, and sums that do not contain the sums of all children.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
@@ -17,20 +17,20 @@ use protocol::id::CellId;
 use protocol::packet::Words;
 use protocol::parameters::MAX_JOINTS;
 
-/// Where each cell's sums go, from round to round.
+/// Parents of the cells from round to round.
 #[derive(Debug, Default)]
 pub(super) struct Trees(BTreeMap<CellId, VecDeque<Step>>);
 
-/// From a round on they go there.
+/// A change of a cell's parent.
 #[derive(Clone, Copy, Debug)]
 struct Step {
     since: u64,
-    /// A cell's node id, 0 for the gateway's side; none if the cell is unreachable.
+    /// Node id of the parent, 0 for the gateway's side, or `None` if the cell is unreachable.
     parent: Option<u8>,
 }
 
 impl Trees {
-    /// Takes in where a cell's sums go from a round on, as it reports.
+    /// Sets the parent that a cell reports from round `since` on.
     pub(super) fn say(&mut self, cell: CellId, parent: Option<u8>, since: u64) {
         let steps = self.0.entry(cell).or_default();
         if steps.back().is_none_or(|last| last.parent != parent) {
@@ -38,20 +38,20 @@ impl Trees {
         }
     }
 
-    /// Whether a cell's sums go anywhere, by its last report.
+    /// Returns true if the cell has a parent by its last report.
     pub(super) fn is_reachable(&self, cell: CellId) -> bool {
         self.0.get(&cell).and_then(VecDeque::back).is_some_and(|step| step.parent.is_some())
     }
 
-    /// Where a cell's sums go in a round; none when that is not known.
+    /// Parent of a cell in a round, or `None` if unknown.
     fn parent(&self, cell: CellId, round: u64) -> Option<Option<u8>> {
         let steps = self.0.get(&cell)?;
         steps.iter().rev().find(|step| step.since <= round).map(|step| step.parent)
     }
 
-    /// Cells that had another parent before a round, or have one after it, with these parents. Their pages have the
-    /// epoch of the last joints, which are the ones before the change or those at it. A cell between two parents
-    /// sends no page; one that has lost its parent for good is not between two.
+    /// Cells whose parent differs between the rounds around this one, with those parents. Their pages carry the epoch
+    /// of the last joints, which may be the joints before the change or those at it. A cell between two parents sends
+    /// no page; a cell that has lost its parent for good is not between two.
     fn affected(&self, round: u64) -> BTreeSet<CellId> {
         let mut all = BTreeSet::new();
         for (cell, steps) in &self.0 {
@@ -70,10 +70,10 @@ impl Trees {
         all
     }
 
-    /// Drops what was before a round.
+    /// Drops changes from before a round.
     pub(super) fn forget_before(&mut self, round: u64) {
         for steps in self.0.values_mut() {
-            // The entry before a change has the former parent.
+            // The entry before a change holds the former parent.
             while steps.get(2).is_some_and(|third| third.since < round) {
                 steps.pop_front();
             }
@@ -81,15 +81,15 @@ impl Trees {
     }
 }
 
-/// One cell's sum.
+/// Sum sent by one cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) struct Sum {
     pub(super) torque: Words,
-    /// Cells in it.
+    /// Number of cells in it.
     pub(super) count: u8,
 }
 
-/// The last sum of each cell for one epoch: the one with the most cells.
+/// Last sum of each cell for one epoch: the sum with the most cells.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Sums(BTreeMap<CellId, Sum>);
 
@@ -113,7 +113,7 @@ impl Sums {
         self.0.contains_key(&cell)
     }
 
-    /// Each cell, and how many are in its sum.
+    /// Each cell and the number of cells in its sum.
     pub(super) fn counts(&self) -> impl Iterator<Item = (CellId, u8)> {
         self.0.iter().map(|(cell, sum)| (*cell, sum.count))
     }
@@ -123,63 +123,65 @@ impl Sums {
     }
 }
 
-/// Two cells that feel the same may differ by so many steps in a sum's word: rounding carries what it took away.
+/// Maximum difference in steps between sum words of two cells in the same contact state: rounding carries its
+/// remainder.
 pub(super) const ROUNDING: u32 = 1;
 
-/// What one cell put into its sum.
+/// A cell's own contribution to its sum.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Own {
-    /// The sum as it was sent.
+    /// The sum as sent.
     pub sum: Words,
-    /// Cells in it.
+    /// Number of cells in it.
     pub count: u8,
-    /// The children whose sums are in it.
+    /// Children whose sums it contains.
     pub children: Vec<CellId>,
-    /// The sum minus theirs, in steps of Q7.8; none where a word is saturated.
+    /// The sum minus the children's sums, in steps of Q7.8; `None` for saturated words.
     pub steps: [Option<i32>; MAX_JOINTS],
-    /// The count minus theirs: 1 of a cell in contact, 0 of one that only forwards its children's sums.
+    /// The count minus the children's counts: 1 for a cell in contact, 0 for a cell that only forwards its children's
+    /// sums.
     pub cells: i32,
 }
 
 impl Own {
-    /// Whether all words are saturated.
+    /// Returns true if all unsaturated words are zero.
     fn is_nothing(&self) -> bool {
         self.steps.iter().flatten().all(|step| *step == 0)
     }
 
-    /// By how many steps its words differ from another one's, where neither is saturated.
+    /// Differences in steps between the words of two terms, where neither word is saturated.
     pub(super) fn differences(&self, other: &Self) -> impl Iterator<Item = u32> {
         let both = self.steps.iter().zip(&other.steps);
         both.filter_map(|(own, it)| Some(own.as_ref()?.abs_diff(*it.as_ref()?)))
     }
 }
 
-/// The sums of one epoch and their tree, recorded or now.
+/// Sums of one epoch and their tree, recorded or now.
 pub(super) struct Side<'a> {
     sums: &'a Sums,
     children: BTreeMap<u8, Vec<CellId>>,
     affected: BTreeSet<CellId>,
-    /// Of cells that changed it: all parents that are remembered.
+    /// All remembered parents of each cell that changed its parent.
     parents: BTreeMap<CellId, BTreeSet<u8>>,
-    /// Whether the parents of all cells are known.
+    /// True if the parents of all cells are known.
     is_known: bool,
 }
 
-/// Why a sum is not compared.
+/// Reason why a sum is not compared.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Why {
-    /// The cell, or one that is or was its child, was changing its parent.
+    /// The cell, or a former or present child, was changing its parent.
     Changing,
-    /// Some cell has not reported where its sums go.
+    /// A cell has not reported its parent.
     Unknown,
-    /// It does not contain all its children's sums, or others than were received.
+    /// The sum does not contain the sums of all children, or contains others than were received.
     NotTaken,
 }
 
-/// How a cell's sums compare.
+/// Result of the comparison of a cell's sums.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Outcome {
-    /// The cell itself contributed nothing then, nor now.
+    /// The cell contributed nothing itself, neither then nor now.
     Nothing,
     Equal,
     Different,
@@ -206,7 +208,7 @@ impl<'a> Side<'a> {
         self.children.get(&cell.get()).map_or(&[], Vec::as_slice)
     }
 
-    /// What a cell put into its sum; none if it sent none.
+    /// A cell's own contribution to its sum, or `None` if it sent no sum.
     pub(super) fn own(&self, cell: CellId) -> Option<Own> {
         let Sum { torque: sum, count } = *self.sums.0.get(&cell)?;
         let below = self.children(cell).iter().filter_map(|child| Some((*child, self.sums.0.get(child)?)));
@@ -222,8 +224,8 @@ impl<'a> Side<'a> {
         Some(Own { sum, count, children, steps, cells })
     }
 
-    /// Whether the remainder of a cell's sum cannot be its own contribution, by whether it was touched: then it had other
-    /// children than their pages report. Where joints were sent again, sums of two times may be mixed too.
+    /// Returns true if the remainder of a cell's sum cannot be its own contribution, given whether it was touched: it
+    /// had other children than their pages report. If joints were resent, sums of two sendings may be mixed too.
     pub(super) fn is_doubtful(&self, cell: CellId, is_touched: Option<bool>, is_mixed: bool) -> bool {
         self.own(cell).is_some_and(|own| {
             let adds = own.cells == 0 && !own.is_nothing();
@@ -231,28 +233,29 @@ impl<'a> Side<'a> {
         })
     }
 
-    /// Whether a cell is in contact itself.
+    /// Returns true if the cell itself is in contact.
     pub(super) fn feels(&self, cell: CellId) -> bool {
         self.own(cell).is_some_and(|own| own.cells > 0)
     }
 
-    /// Whether a cell's sum contains the received sums of all its children: then the remainder is its own contribution.
+    /// Returns true if a cell's sum contains the received sums of all its children, so that the remainder is its own
+    /// contribution.
     fn is_whole(&self, cell: CellId, other: &Self) -> bool {
         let Some(own) = self.own(cell) else { return true };
         let adds_up = match own.cells {
-            // Its own contribution is in it, and that of a child of one cell is not.
+            // It contains the cell's own contribution but lacks the sum of a child of one cell.
             0 => own.is_nothing() || !other.feels(cell),
             1 => true,
             _ => false,
         };
-        // Whether a child that is received on one side only is in this sum is unknown.
+        // A child received on one side only may or may not be in this sum.
         let silent = |child: &CellId| !self.sums.has(*child) && other.feels(*child);
         adds_up && !self.children(cell).iter().any(silent)
     }
 
-    /// Whether a cell's sum contains more than on the other side, and that is the sum of a cell which is or was its
-    /// child, but by its page is not in this epoch: pages come after the change that they report. It may be in no other
-    /// sum then.
+    /// Returns true if a cell's sum exceeds the other side's by the sum of a former or later child, which by its page
+    /// is not a child in this epoch: pages follow the change that they report. That sum must not be in another parent's
+    /// sum.
     fn holds_a_mover(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
         let own_of = |cell| Some((self.own(cell)?, other.own(cell)?));
         let Some((own, its)) = own_of(cell) else { return false };
@@ -275,7 +278,7 @@ impl<'a> Side<'a> {
         })
     }
 
-    /// The cells in a cell's sum, by the tree.
+    /// Cells in a cell's sum, by the tree.
     fn below(&self, cell: CellId) -> BTreeSet<CellId> {
         let (mut all, mut next) = (BTreeSet::new(), vec![cell]);
         while let Some(cell) = next.pop() {
@@ -291,8 +294,9 @@ fn exact(word: i16) -> Option<i32> {
     (!Q7_8::from_bits(word).is_saturated()).then(|| i32::from(word))
 }
 
-/// Compares what a cell put into its sums, where a torque may be so many of its steps off: that may take the rounded
-/// one over one more bound. Children's differences are not in it, so however many cells are in the sum, this is enough.
+/// Compares a cell's own contributions. A torque may differ by `tolerance` of its own steps, which may move the rounded
+/// sum across one more bound. The children's differences cancel, so the tolerance does not depend on the number of
+/// cells in the sum.
 pub(super) fn compare(
     recorded: &Side<'_>,
     now: &Side<'_>,
@@ -312,11 +316,11 @@ pub(super) fn compare(
     let (then, today) = (recorded.own(cell), now.own(cell));
     match (then, today) {
         (Some(then), Some(today)) => {
-            // A word is saturated by the whole subtree: in another tree, by other cells.
+            // The whole subtree saturates a word: in another tree, other cells do.
             let alike = |then: i16, today: i16| {
                 exact(then).is_none() == exact(today).is_none() || recorded.below(cell) != now.below(cell)
             };
-            // Who only passes on what others feel has no torque that could be off.
+            // A cell that only forwards others' sums has no torque that could differ.
             let finer = 1 << (format.fraction() - TorqueFormat::Q7_8.fraction());
             let tolerance = if then.cells > 0 { tolerance.div_ceil(finer) } else { 0 };
             let allowed = ROUNDING + u32::from(tolerance);
@@ -341,7 +345,7 @@ pub(super) fn compare(
         }
         (Some(then), None) if then.cells > 0 => Outcome::Missing,
         (None, Some(today)) if today.cells > 0 => Outcome::Extra,
-        // Whether a cell forwards others' sums depends on the tree; but it adds nothing to them.
+        // The tree decides whether a cell forwards others' sums, but it adds nothing to them.
         (Some(own), None) | (None, Some(own)) if !own.is_nothing() => Outcome::Different,
         (Some(_), None) | (None, Some(_) | None) => Outcome::Nothing,
     }

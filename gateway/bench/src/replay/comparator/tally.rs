@@ -1,4 +1,4 @@
-//! How replies and recorded ones compare, in counts.
+//! Counts of the comparison of replies with recorded ones.
 
 use protocol::packet::Words;
 use serde::Serialize;
@@ -8,39 +8,39 @@ use crate::replay::difference::How;
 /// Counts of compared replies.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Tally {
-    /// Replies that came back as they were recorded.
+    /// Replies equal to the recorded ones.
     pub equal: u64,
-    /// Replies that came back with other words.
+    /// Replies with other words.
     pub different: u64,
-    /// Recorded replies that did not come back.
+    /// Recorded replies that did not come.
     pub missing: u64,
-    /// Replies that were not recorded, and the recording does not explain it.
+    /// Replies that were not recorded, without an explanation in the recording.
     pub extra: u64,
-    /// Recorded replies to joints that a bus did not take from this replay.
+    /// Recorded replies to joints that a bus refused in this replay.
     pub not_requested: u64,
-    /// Among the equal ones, sums less their children.
+    /// Sums, less their children, among the equal replies.
     pub sums: u64,
-    /// Among the equal ones, torques and sums that are so only because differences are tolerated.
+    /// Torques and sums among the equal replies that are equal only within the tolerance.
     pub tolerated: u64,
     /// Words of torques, in steps of Q3.12.
     pub torque_words: Steps,
     /// Words of sums less their children, in steps of Q7.8.
     pub sum_words: Steps,
-    /// What the recording itself lacks.
+    /// Replies that the recording lacks, or whose joints it lacks.
     pub lacking: Lacking,
 }
 
-/// By how many steps words differ from the recorded ones.
+/// Histogram of the differences between words and recorded ones, in steps.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Steps {
-    /// How many differ by 0, by 1, ...; the last by so many or more.
+    /// Number of words that differ by 0, 1, ... steps; the last entry counts all larger differences too.
     pub by_steps: [u64; 9],
-    /// The largest difference.
+    /// Largest difference.
     pub max: u32,
 }
 
 impl Steps {
-    /// Counts the words of one reply; the largest difference among them.
+    /// Counts the words of one reply. Returns the largest difference among them.
     pub(super) fn count(&mut self, differences: impl IntoIterator<Item = u32>) -> u32 {
         let mut max = 0;
         for steps in differences {
@@ -59,18 +59,18 @@ impl Steps {
 /// Replies that were not recorded, or not with their joints, by the reason that the recording shows.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Lacking {
-    /// The cell was silent then: absent, killed, hung, or claiming its node id.
+    /// The cell was silent in the recording: absent, killed, hung, or claiming its node id.
     pub silent: u64,
-    /// The cell did not take so many joints, by its own counters.
+    /// The cell missed this many joints, by its own counters.
     pub untaken: u64,
     /// The cell sent more packets than were recorded, by its own counters.
     pub unrecorded: u64,
-    /// The last joints, or the last `configure`, of the recording: it ended before they were answered.
+    /// The recording ended before its last joints, or its last `configure`, were answered.
     pub ended: u64,
-    /// The end of a contact, sent later because the cell did not take the joints at which it was.
+    /// The end of a contact, sent later because the cell missed the joints at which it ended.
     pub said_later: u64,
-    /// Replies of touched cells, at joints for which no counters tell how many the cell took: in a part of a recording
-    /// before the first report and after the last one.
+    /// Replies of touched cells at joints for which no counters tell how many the cell received: in a part of a
+    /// recording, before the first report and after the last one.
     pub uncounted: u64,
     /// Recorded replies whose joints were not recorded.
     pub joints_unrecorded: u64,
@@ -78,22 +78,22 @@ pub struct Lacking {
     pub joints_earlier: u64,
     /// Recorded answers to `configure` messages from before the part.
     pub requested_earlier: u64,
-    /// Recorded replies of cells that measured: their measured forces were not recorded.
+    /// Recorded replies of cells that measured: the recording has no measured forces.
     pub measured: u64,
-    /// Unrequested sensors frames, sent at another time than now.
+    /// Unrequested sensor frames, sent at another time than now.
     pub sensed_otherwise: u64,
-    /// Sums of cells that had sent one, had not sent the end, and did not come to their slot in time.
+    /// Sums of cells that had started a contact but missed their slot.
     pub slot_skipped: u64,
-    /// Sums of cells that, or whose children, were changing their parent in that epoch, then or now.
+    /// Sums of cells that were changing their parent in that epoch, or whose children were, then or now.
     pub parent_changing: u64,
-    /// Sums of epochs in which a cell had not reported where its sums go, then or now.
+    /// Sums of epochs in which a cell had not reported its parent, then or now.
     pub tree_unknown: u64,
-    /// Sums that do not contain all their children's, then or now.
+    /// Sums that do not contain those of all children, then or now.
     pub sums_not_taken: u64,
 }
 
 impl Tally {
-    /// Counts a reply that is not as it was recorded; one to joints that a bus did not take cannot come.
+    /// Counts a reply that differs from the recorded one. Joints that a bus refused get no reply.
     pub(super) const fn count(&mut self, how: How, is_unsent: bool) {
         let count = match how {
             How::Missing if is_unsent => &mut self.not_requested,
@@ -104,7 +104,7 @@ impl Tally {
         *count += 1;
     }
 
-    /// Compares a torque's words, each within so many steps; whether it is equal.
+    /// Compares a torque's words within `tolerance` steps. Returns true if they are equal.
     pub(super) fn compare_torque(&mut self, recorded: &Words, now: &Words, tolerance: u16) -> bool {
         let steps = recorded
             .as_slice()
@@ -117,13 +117,13 @@ impl Tally {
         is_equal
     }
 
-    /// Whether there are sums, and not one of them could be compared, because nothing tells which children they contain.
+    /// Returns true if no sum could be compared because their trees are unknown.
     #[must_use]
     pub const fn lacks_the_tree(&self) -> bool {
         self.sums == 0 && self.lacking.tree_unknown > 0
     }
 
-    /// Whether all came back, and nothing else.
+    /// Returns true if all replies are equal and no other replies came.
     #[must_use]
     pub const fn is_good(&self) -> bool {
         self.different == 0

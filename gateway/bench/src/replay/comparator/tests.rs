@@ -43,12 +43,12 @@ fn joints(epoch: u8) -> Message {
     Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } }
 }
 
-/// A recording, 1 ms from one message to the next, and the present replies to the same joints.
+/// Compares a recording, with 1 ms between messages, with the present replies to the same joints.
 fn rated(recording: &[Message], now: &[Message]) -> Comparator {
     rated_within(0, recording, now)
 }
 
-/// The same where torques may be so many steps off.
+/// Compares with a tolerance in steps of torques.
 fn rated_within(tolerance: u16, recording: &[Message], now: &[Message]) -> Comparator {
     let mut survey = Survey::new(Part::default());
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(tolerance));
@@ -109,7 +109,7 @@ fn run() -> Vec<Message> {
 #[test]
 fn the_same_again_is_equal_in_any_order_of_cells() {
     assert_eq!(counts(&rated(&run(), &run())), [3, 0, 0, 0]);
-    // Late, but it has the epoch of its joints.
+    // A late reply has the epoch of its joints.
     let mut late = run();
     late.swap(3, 4);
     assert_eq!(counts(&rated(&run(), &late)), [3, 0, 0, 0]);
@@ -137,7 +137,7 @@ fn missing_and_extra_replies_are_distinguished() {
     now.insert(9, torque(1, 4, 9));
     let comparator = rated(&[&run()[..], &[joints(5)]].concat(), &now);
     assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([3, 0, 0, 1], How::Extra));
-    // Twice the same is one answer, as of joints that were asked again; twice otherwise is not.
+    // Two equal replies count as one, as for joints that were resent; two different ones do not.
     let mut now = run();
     now.insert(4, torque(1, 1, 5));
     assert_eq!(counts(&rated(&run(), &now)), [3, 0, 0, 0]);
@@ -147,12 +147,12 @@ fn missing_and_extra_replies_are_distinguished() {
 
 #[test]
 fn what_the_recording_lost_is_not_blamed_on_the_cell() {
-    // By its heartbeats it had sent one packet more.
+    // By its heartbeats the cell had sent one packet more.
     let mut lossy = run();
     lossy.remove(5);
     let comparator = rated(&lossy, &run());
     assert_eq!((counts(&comparator), comparator.tally.lacking.unrecorded), ([2, 0, 0, 0], 1));
-    // But only as many as they count.
+    // The heartbeats explain no more losses than they count.
     lossy.remove(3);
     lossy[7] = heartbeat(1, 4, 13, Flags::TEST_MODE);
     let comparator = rated(&lossy, &run());
@@ -161,7 +161,7 @@ fn what_the_recording_lost_is_not_blamed_on_the_cell() {
 
 #[test]
 fn joints_that_a_cell_did_not_take_then_explain_an_answer_now() {
-    // It did not take joints 3, and so sent the end of the contact one later.
+    // The cell missed joints 3, and so sent the end of the contact one epoch later.
     let recording = [
         joints(0),
         heard(1, 0, 101),
@@ -190,7 +190,7 @@ fn a_cell_that_was_silent_then_may_send_now() {
     recording.extend([joints(5), joints(6)]);
     let now = [&run()[..], &[joints(5), torque(1, 5, 5), torque(2, 5, 1), joints(6)]].concat();
     let comparator = rated(&recording, &now);
-    // Cell 2 is not in the recording at all.
+    // The recording does not have cell 2.
     assert_eq!((counts(&comparator), comparator.tally.lacking.silent), ([3, 0, 0, 0], 2));
 }
 
@@ -250,7 +250,7 @@ fn the_contact_of_a_cell_before_its_first_joints_belongs_to_no_joints() {
         let page = SensorPage::Acceleration([Q3_12::from_bits(4), Q3_12::ZERO, Q3_12::ZERO]);
         Message::Sensors { from: cell(1), epoch: Epoch(epoch), page }
     };
-    // A report that was requested before the first joints, and answered when they were on the bus already.
+    // A report that was requested before the first joints, and answered after they were on the bus.
     let mut recording = run();
     recording.splice(2..2, [heard(1, 0, 0), sensors(0)]);
     assert_eq!(counts(&rated(&recording, &run())), [3, 0, 0, 0]);
@@ -259,11 +259,11 @@ fn the_contact_of_a_cell_before_its_first_joints_belongs_to_no_joints() {
         recording.splice(5..5, said.iter().copied());
         counts(&rated(&recording, &run()))
     };
-    // Its counters, its torque and another epoch show that it has taken joints since.
+    // Its counters, its torque and another epoch show that it has received joints since.
     assert_eq!(late(&[heard(1, 0, 1), sensors(0)]), [3, 0, 1, 0]);
     assert_eq!(late(&[torque(1, 0, 0), sensors(0)]), [3, 0, 2, 0]);
     assert_eq!(late(&[heartbeat(1, 1, 12, Flags::TEST_MODE), sensors(1)]), [3, 0, 1, 0]);
-    // For a cell that had taken joints before, nothing changes.
+    // For a cell that had received joints before, nothing changes.
     let mut recording = run();
     recording.splice(2..2, [heard(1, 0, 7), sensors(0)]);
     assert_eq!(counts(&rated(&recording, &run())), [3, 0, 1, 0]);
@@ -317,7 +317,7 @@ fn epochs_wrap_around_and_old_rounds_are_compared_on_the_way() {
     }
 }
 
-/// Cells 1 to 3 in a row, of which the first and the last are in contact.
+/// Cells 1 to 3 in a row; the first and the last are in contact.
 fn row() -> Vec<Message> {
     let mut all = vec![
         heartbeat(1, 0, 10, Flags::TEST_MODE),
@@ -329,7 +329,7 @@ fn row() -> Vec<Message> {
     ];
     for epoch in 0..6 {
         all.extend([joints(epoch), sum(3, epoch, 30, 1), sum(2, epoch, 30, 1)]);
-        // The first time it did not wait for its children.
+        // The first sum came before the children's sums.
         all.extend([sum(1, epoch, 10, 1), sum(1, epoch, 40, 2)]);
     }
     all
@@ -379,7 +379,7 @@ fn a_cell_that_adds_nothing_any_more_is_missing() {
         |message| !matches!(message, Message::Sum { from, epoch, .. } if from.get() == 3 && epoch.0 == 4),
     );
     let comparator = rated(&row(), &now);
-    // The parent then may have taken it or not: this is unknown.
+    // It is unknown whether the parent received it then.
     assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([11, 0, 1, 0], How::Missing));
 }
 
@@ -390,7 +390,7 @@ fn a_cell_that_stopped_without_the_end_did_not_come_to_its_slot() {
     late.retain(|message| !silent(3)(message));
     let comparator = rated(&late, &row());
     assert_eq!((counts(&comparator), comparator.tally.lacking.slot_skipped), ([17, 0, 0, 0], 1));
-    // One that had sent the end would have had to send the beginning.
+    // A cell that had sent the end would have had to send the beginning.
     let mut ended = row();
     ended.retain(|message| !silent(2)(message) && !silent(3)(message));
     let at = ended.iter().position(|message| *message == joints(3)).unwrap();
@@ -408,7 +408,7 @@ fn a_cell_that_stopped_without_the_end_did_not_come_to_its_slot() {
 fn a_cell_that_changes_its_parent_is_omitted_in_that_epoch_and_counted() {
     let mut now = row();
     let at = now.iter().position(|message| *message == joints(3)).unwrap();
-    // After joints 2: from joints 3 on it is a root.
+    // After joints 2: from joints 3 on, cell 3 is a root.
     now.insert(at, tree(3, 2, Some(0)));
     for message in &mut now[at..] {
         if let Message::Sum { from, epoch, .. } = *message {
@@ -420,7 +420,7 @@ fn a_cell_that_changes_its_parent_is_omitted_in_that_epoch_and_counted() {
         }
     }
     let comparator = rated(&row(), &now);
-    // Cells 2 and 3 in the epoch before the change and in the one after it; later cell 2 has nothing to forward.
+    // Cells 2 and 3 in the epochs before and after the change; later, cell 2 has nothing to forward.
     assert_eq!((comparator.tally.lacking.parent_changing, counts(&comparator)), (4, [6 + 2 + 4, 0, 0, 0]));
     assert!(comparator.tally.is_good());
 }
@@ -471,7 +471,7 @@ fn in_lockstep_a_cell_is_done_when_its_heartbeat_has_the_epoch() {
     comparator.hear(0, &beat(1, 9));
     assert!(comparator.is_done(0), "a cell that claims its node id is not waited for");
     comparator.announce(0, None, Epoch(10));
-    // One that refuses these joints sends its old epoch: once as its periodic heartbeat, once because of the sync.
+    // A cell that refuses these joints sends its old epoch: once in its periodic heartbeat, once because of the sync.
     comparator.hear(0, &beat(1, 9));
     assert!(!comparator.is_done(0));
     comparator.hear(0, &beat(1, 9));

@@ -4,19 +4,19 @@ use super::*;
 use proptest::prelude::*;
 use protocol::message::Joints;
 
-/// A clock and buses that are variables.
+/// A stage whose clock and buses are variables.
 #[derive(Debug, Default)]
 struct Fake {
     clock: u64,
-    /// How long a send takes.
+    /// Duration of a send in ns.
     takes: u64,
-    /// The results of the next sends; then all is taken.
+    /// Results of the next sends; later ones succeed.
     outcomes: Vec<Result<(), SendError>>,
-    /// What was sent, when and where.
+    /// Sent frames with their time and bus.
     sent: Vec<(u64, usize, Vec<Frame>)>,
     announced: Vec<(usize, Option<u64>)>,
     unsent: Vec<(usize, u64)>,
-    /// Where in `sent` answers were waited for, and on which bus.
+    /// Positions in `sent` at which answers were awaited, with the bus.
     waited: Vec<(usize, usize)>,
     restored: usize,
     stops_at: Option<u64>,
@@ -57,13 +57,13 @@ impl Stage for Fake {
     fn show(&mut self, _: u64) {}
 }
 
-/// A bus has taken so many and stayed full.
+/// The error of a bus that stayed full after `sent` frames.
 fn full(sent: usize) -> Result<(), SendError> {
     let cause = BusError::Full { name: "vcan0".to_owned(), waited: Duration::from_millis(100) };
     Err(SendError { sent, target: sent, cause })
 }
 
-/// A bus has taken so many and is down.
+/// The error of a bus that went down after `sent` frames.
 fn down(sent: usize) -> Result<(), SendError> {
     Err(SendError { sent, target: sent, cause: BusError::Down("vcan0".to_owned()) })
 }
@@ -109,7 +109,7 @@ fn a_bus_that_is_slow_delays_what_is_due_and_not_what_comes_after() {
     let mut stage = Fake { takes: 3_000_000, ..Fake::default() };
     let steps = (0..4).map(|n| plain(n * 2_000, 0, u32::try_from(n).unwrap()));
     let played = play(Player::new(1, Pace::Timed(1.0), None), &mut stage, steps);
-    // The second one waits 1 ms for the first, the third and the fourth go together.
+    // The second frame waits 1 ms for the first; the third and the fourth go together.
     assert_eq!(identifiers(&stage), [vec![0], vec![1], vec![2, 3]]);
     assert_eq!(played.late.max() / 1_000, 2_000, "the third one, within three digits");
 }
@@ -138,7 +138,7 @@ fn in_lockstep_joints_wait_for_the_answers_to_those_before_on_their_bus() {
         joints(0, 1, 1),
     ];
     play(Player::new(2, Pace::Max, Some(sync)), &mut stage, steps);
-    // A sync goes with each; what comes after joints does not wait, the next ones do, each for its own bus.
+    // A sync follows each joint packet; later frames do not wait, but the next joints do, on their own bus.
     let expected = [vec![0x70C, 1, 2], vec![1, 2], vec![0x70D, 0x70E], vec![1, 2], vec![1, 2]];
     assert_eq!(identifiers(&stage), expected);
     assert_eq!(stage.waited, [(3, 0), (4, 1), (5, 0), (5, 1)]);

@@ -29,7 +29,7 @@ fn torque(number: i64, epoch: u8) -> Frame {
     frame(&Message::Torque { from: CellId::new(number).unwrap(), epoch: Epoch(epoch), torque: [0; 6].into() })
 }
 
-/// A capture of two buses, 1 ms from one frame to the next.
+/// A capture of two buses with 1 ms between frames.
 fn capture() -> Vec<(u64, &'static str, Frame)> {
     let frames = [
         ("a", press(1)),
@@ -44,12 +44,12 @@ fn capture() -> Vec<(u64, &'static str, Frame)> {
     (5_000_u64..).zip(frames).map(|(at, (bus, frame))| (at * MS, bus, frame)).collect()
 }
 
-/// What a frame is by itself.
+/// Decodes a single frame.
 fn decoded(frame: &Frame) -> Decoded {
     model::decode::Decoder::new(None).decode(Micros(0), "a", frame)
 }
 
-/// All steps of so many passes.
+/// All steps of `passes` passes.
 fn plan_summary(part: Part, selection: impl FnOnce(&mut Selection), passes: u32) -> (Vec<Due>, PlanSummary) {
     share_of(&capture(), part, selection, passes)
 }
@@ -102,7 +102,7 @@ fn all_is_sent_but_what_never_was_on_a_bus() {
     let ids = [(0, 0, 0x701), (1, 0, 1), (2, 1, 1), (3, 0, 0x201), (4, 0, 5), (6, 0, 1), (7, 1, 0x202)];
     assert_eq!(shown(&due), ids);
     assert_eq!(plan_summary.skipped, BTreeMap::from([(reason::ERROR, 1)]));
-    // Joints are numbered, each bus by itself.
+    // Joints are numbered per bus.
     let rounds = due.iter().filter_map(|due| match due.role {
         Role::Joints(Open { round, .. }) => Some((due.bus_link, round)),
         Role::Plain | Role::SegmentOfJoints => None,
@@ -124,7 +124,7 @@ fn inputs_and_replies_are_the_two_sides() {
 
 #[test]
 fn foreign_frames_are_neither_inputs_nor_replies_whatever_their_identifiers_are() {
-    // Foreign frames under identifiers of joints, of a torque and of a stimulus, among segments of ours.
+    // Foreign frames with identifiers of joints, of a torque and of a stimulus, among segments of this protocol.
     let data = |id: u32, byte| Frame::classic(id, &[byte; 8]).unwrap();
     let classic = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
     let page = SensorPage::Skin(SkinSensors::default());
@@ -154,7 +154,7 @@ fn wire_messages_are_never_sent() {
         let replay_plan = ReplayPlan::new(&survey, &selection);
         let frame = port::LinkId { wire: 9, back: false }.frame(port::PortMessage::Join);
         assert_eq!(replay_plan.unwanted(0, &frame, &decoded(&frame)), Some(reason::WIRE));
-        // A damaged one proves nothing, and counts as foreign.
+        // A damaged frame proves nothing, and counts as foreign.
         let other = Frame::classic(frame.raw_id(), &[0; 8]).unwrap();
         assert_ne!(replay_plan.unwanted(0, &other, &decoded(&other)), Some(reason::WIRE));
     }
@@ -173,7 +173,7 @@ fn a_part_begins_and_ends_at_its_times_and_buses_are_mapped() {
 fn passes_follow_each_other_as_joints_do() {
     let (due, _) = plan_summary(Part::default(), |selection| selection.only = Only::Inputs, 3);
     let starts: Vec<_> = due.iter().step_by(4).map(|due| due.at / MS).collect();
-    // A pass lasts 6 ms, and from the first joints to the second it is all of that.
+    // A pass lasts 6 ms, which is also the time from the first joints to the second.
     assert_eq!(starts, [0, 12, 24]);
     let rounds = due.iter().filter_map(|due| match due.role {
         Role::Joints(Open { round, .. }) if due.bus_link == 0 => round,

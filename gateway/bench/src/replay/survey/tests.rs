@@ -10,7 +10,7 @@ fn counters_that_cannot_be_of_one_life_account_for_no_joints() {
         (cell.untaken, cell.accounted.clone())
     };
     assert_eq!(report(0, 100, 10), (0, vec![]));
-    // An old heartbeat seemed a start, and then its own counters came.
+    // An old heartbeat looked like a restart, and then the cell's own counters came.
     assert_eq!(report(2_000, 150, 20), (0, vec![]));
     assert_eq!(report(2_040, 200, 30), (10, vec![(20, 30)]));
     assert_eq!(report(2_090, 250, 40), (10, vec![(20, 40)]));
@@ -37,7 +37,7 @@ fn a_part_has_counters_elsewhere_though_one_of_its_buses_began_lost() {
     assert_eq!(of(&[latched]), [false, false]);
 }
 
-/// A bus on which one cell sends a page of counters after some joints, all 16 ms apart.
+/// A bus on which one cell sends a page of counters after some joints, 16 ms apart.
 struct Counting(Survey, u64);
 
 impl Counting {
@@ -90,6 +90,6 @@ fn a_cell_may_have_taken_joints_before_its_first_heartbeat() {
     bus.joints(11..=20);
     bus.page(20, heartbeat(0, Flags::CLAIMING));
     bus.joints(21..=30);
-    // It began with epoch 15, and took all but three: which of them it did not take is not known.
+    // The cell began with epoch 15 and received all joints but three; which three is unknown.
     assert_eq!(bus.heard(30, 13), 4);
 }

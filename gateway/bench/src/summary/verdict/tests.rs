@@ -1,4 +1,4 @@
-//! Each verdict, and their order.
+//! Verdicts and their order.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::collections::BTreeSet;
@@ -106,18 +106,18 @@ fn nothing_is_well_that_is_not_known() {
     assert!(nan[0].starts_with("mean error of single cells NaN"), "{nan:?}");
 }
 
-/// A change of a run that is well, and the begin of what there is to look at then.
+/// The beginning of the expected finding, and the change of a good run that causes it.
 type Case = (&'static str, fn(&mut Summary));
 
-/// All faults, the most important first.
+/// All findings, the most important first.
 const CASES: &[Case] = &[
     ("the run failed: no memory", |it| it.failure = Some("no memory".to_owned())),
     ("the robot was halted at 1.500 s and not resumed: a halt frame", |it| {
         it.halted = Some("a halt frame".to_owned());
         it.halts.push(halt(1.5, None));
     }),
-    ("no external controller said hello", |it| {
-        it.no_controller = Some("no external controller said hello".to_owned());
+    ("no external controller sent a hello", |it| {
+        it.no_controller = Some("no external controller sent a hello".to_owned());
     }),
     ("2 cells ended by errors of their own: 7, 8 on vcan0 (no memory)", |it| {
         let cells = vec![ErrorCells { bus: "vcan0".to_owned(), nodes: vec![7, 8] }];
@@ -180,7 +180,7 @@ const CASES: &[Case] = &[
         _ = it.control.bad_cycles.insert("the torque is not valid".to_owned(), 2);
     }),
     ("3 frames of the gateway not sent: ", |it| it.control.unsent = 3),
-    ("9 late and 2 skipped by cells that took the joints too late of 17772 replies on vcan0: ", |it| {
+    ("9 late and 2 skipped by cells that received the joints too late of 17772 replies on vcan0: ", |it| {
         let replies = &mut it.buses[0].replies;
         replies.in_time -= 11;
         (replies.late, replies.too_late, replies.skipped) = (8, 1, 2);
@@ -229,7 +229,7 @@ fn the_most_important_fault_comes_first() {
             });
             let place = |begin: &str| found.iter().position(|one| one.starts_with(begin));
             let [first, second] = [begin, after].map(|begin| place(begin));
-            // A failure of the run has the reason of a recording that is not complete.
+            // A failed run already names the reason of an incomplete recording.
             let is_named = second.is_some() || after.starts_with("the recording is incomplete");
             assert!(first == Some(0) && is_named, "{begin}, {after}: {found:?}");
         }
@@ -246,7 +246,7 @@ fn the_error_of_a_file_says_what_to_do_with_it_and_no_other_hint_does() {
         Summary { recording: Some(recording), ..well() }.lost_frames().unwrap()
     };
     let taken = "r.mcap: taken; r.mcap.part is the whole recording: rename it";
-    assert_eq!(failure(0, &[taken]), format!("the recording is not as it should be: {taken}"));
+    assert_eq!(failure(0, &[taken]), format!("the recording has an error: {taken}"));
     let both = failure(2, &["r.mcap: no room", taken]);
     assert_eq!(
         both,

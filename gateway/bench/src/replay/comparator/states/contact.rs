@@ -1,34 +1,34 @@
-//! The end of a cell's contact, in the capture and now.
+//! End of a cell's contact, in the capture and now.
 //!
-//! A cell sends the end of a contact once, at the next joints that it takes. Where it did not take joints then and takes
-//! them now, the end comes earlier now, and the recorded one has no counterpart.
+//! A cell sends the end of a contact once, at the next joints that it receives. If it missed joints in the capture and
+//! receives them now, the end comes earlier now, and the recorded one has no counterpart.
 //!
 //! **The recorded contact**, by the cell's last recorded torque:
 //!
-//! | row | state | input | next | why |
+//! | row | state | input | next | reason |
 //! |---|---|---|---|---|
 //! | `lasts` | all | `Torque` | `Lasts` | the cell is in contact |
-//! | `ends` | all | `End` | `Over` | it has sent the end |
-//! | `pass_begins` | all | `PassBegins` | `Unknown` | the capture begins again: its first torques follow on nothing |
+//! | `ends` | all | `End` | `Over` | the cell has sent the end |
+//! | `pass_begins` | all | `PassBegins` | `Unknown` | the capture starts again: its first torques follow no others |
 //!
 //! **The end now**, by the replies of one round:
 //!
-//! | row | state | input | next | why |
+//! | row | state | input | next | reason |
 //! |---|---|---|---|---|
 //! | `both` | both | `Both` | `AsRecorded` | the cell answered then and now, so both are at the same joints |
-//! | `extra_end` | both | `Extra`, an end | `Earlier` | the recording explains an end that it does not have: it may have it later |
-//! | `extra_torque` | both | `Extra`, no end | `AsRecorded` | the contact goes on now |
-//! | `late_end` | both | `LateEnd` | `AsRecorded` | the recorded end came, and is the last one that can be late |
+//! | `extra_end` | both | `Extra`, an end | `Earlier` | the recording explains the missing end, and may contain it later |
+//! | `extra_torque` | both | `Extra`, no end | `AsRecorded` | the contact lasts now |
+//! | `late_end` | both | `LateEnd` | `AsRecorded` | the recorded end came; no other end can be late |
 
-/// The contact of a cell by its last recorded torque.
+/// Contact of a cell by its last recorded torque.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Contact {
-    /// It has sent none in this pass.
+    /// The cell has sent no torque in this pass.
     #[default]
     Unknown,
-    /// That was no end of a contact.
+    /// The last torque did not end a contact.
     Lasts,
-    /// That was the end.
+    /// The last torque ended the contact.
     Over,
 }
 
@@ -42,23 +42,23 @@ pub(in super::super) enum Recorded {
     PassBegins,
 }
 
-/// The last end of a contact now, compared with the capture.
+/// Present end of a contact compared with the recorded one.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum End {
     #[default]
     AsRecorded,
-    /// Because the cell took joints that it had not taken then.
+    /// Earlier than recorded: the cell received joints that it had missed in the capture.
     Earlier,
 }
 
-/// The torques of a cell in one round.
+/// Torques of a cell in one round.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Round {
-    /// One came in the capture and one now.
+    /// The cell sent one in the capture and one now.
     Both,
-    /// One came only now, which the recording explains.
+    /// The cell sent one only now, which the recording explains.
     Extra { is_end: bool },
-    /// The end came only in the capture, later than now.
+    /// The cell sent the end only in the capture, later than now.
     LateEnd,
 }
 
@@ -72,8 +72,8 @@ impl Contact {
         }
     }
 
-    /// Returns whether the contact was over before a recorded end, which came late: by the recorded stimuli the cell cannot
-    /// have been in contact at these joints or the ones before, or it was in contact before the part that is replayed.
+    /// Returns true if the contact was over before a recorded end that came late: by the recorded stimuli the cell
+    /// cannot have been in contact at these joints or the ones before, or it was in contact before the replayed part.
     pub(in super::super) const fn was_over(self, begins_later: bool, may_answer: bool) -> bool {
         match self {
             Self::Unknown => begins_later,

@@ -1,38 +1,39 @@
-//! The first joints of a cell since its start.
+//! First joints of a cell since its start.
 //!
-//! Until it has, its packets have an epoch that belongs to no joints, and its sensor values are not compared.
+//! Until a cell has received joints, its packets carry an epoch that belongs to no joints, and its sensor values are
+//! not compared.
 //!
-//! | row | state | input | next | why |
+//! | row | state | input | next | reason |
 //! |---|---|---|---|---|
-//! | `counts_none` | both | `CountsNone` | `Awaited`, with the epoch of the page | its counters say so |
-//! | `counts_some` | both | `CountsSome` | `Taken` | its counters say so |
-//! | `torque` | both | `Torque` | `Taken` | a torque is an answer to joints |
-//! | `same_epoch` | `Awaited` | `Sends`, that epoch | the same | it has taken none since |
-//! | `other_epoch` | `Awaited` | `Sends`, another epoch | `Taken` | it has the epoch of joints that it took |
-//! | `known` | `Taken` | `Sends` | the same | only its counters show a start |
+//! | `counts_none` | both | `CountsNone` | `Awaited`, with the epoch of the page | its counters show no joints |
+//! | `counts_some` | both | `CountsSome` | `Taken` | its counters show joints |
+//! | `torque` | both | `Torque` | `Taken` | a torque answers joints |
+//! | `same_epoch` | `Awaited` | `Sends`, that epoch | unchanged | it has received no joints since |
+//! | `other_epoch` | `Awaited` | `Sends`, another epoch | `Taken` | it has the epoch of joints that it received |
+//! | `known` | `Taken` | `Sends` | unchanged | only its counters show a restart |
 
 use protocol::id::{CellId, Node};
 use protocol::message::{Heard, Message, NetworkPage};
 use protocol::packet::Epoch;
 
-/// A cell, by the joints since its start.
+/// State of a cell by the joints since its start.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum FirstJoints {
-    /// It has taken joints, or nothing is known.
+    /// The cell has received joints, or its state is unknown.
     #[default]
     Taken,
-    /// It had taken none when it reported its counters, with this epoch.
+    /// The cell had received no joints when it reported its counters, with this epoch.
     Awaited { epoch: Epoch },
 }
 
-/// A packet of the cell, by what it shows of that.
+/// A packet of the cell, by the evidence that it gives.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
-    /// Its counters: no joints since its start.
+    /// Counters that show no joints since the start.
     CountsNone {
         epoch: Epoch,
     },
-    /// Its counters: some joints.
+    /// Counters that show some joints.
     CountsSome,
     Torque,
     /// Another page of its state, with this epoch.
@@ -42,7 +43,7 @@ pub(in super::super) enum Input {
 }
 
 impl Input {
-    /// Returns a message's cell, and what it shows of that cell's first joints.
+    /// Returns a message's cell and the evidence about that cell's first joints.
     pub(in super::super) const fn of(message: &Message) -> Option<(CellId, Self)> {
         if let Message::Torque { from, .. } = *message {
             return Some((from, Self::Torque));

@@ -1,25 +1,25 @@
-//! The state of a bus.
+//! State of a bus during the comparison.
 //!
-//! | row | state | input | next | why |
+//! | row | state | input | next | reason |
 //! |---|---|---|---|---|
-//! | `lost` | both | `Lost` | `Down` | nothing can come from its cells, so none of them is waited for |
-//! | `back` | both | `Message` | `Up` | something came |
+//! | `lost` | both | `Lost` | `Down` | its cells cannot send, so they are not awaited |
+//! | `back` | both | `Message` | `Up` | a message arrived |
 
-/// A bus by what came last.
+/// State of a bus by its last event.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Line {
     #[default]
     Up,
-    /// Since the last message the bus was lost.
+    /// The bus was lost after the last message.
     Down,
 }
 
 /// An event of a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
-    /// A message of another sender came.
+    /// A message of another sender arrived.
     Message,
-    /// It was lost: it does not take messages, or was closed.
+    /// The bus refused messages or was closed.
     Lost,
 }
 

@@ -1,15 +1,15 @@
-//! The states of a bus in the comparison, each a machine of its own: named states, inputs, and a table of both.
+//! State machines of the comparison: named states, inputs, and a table of both.
 //!
-//! | of | machine | states | what it decides |
+//! | subject | machine | states | decides |
 //! |---|---|---|---|
-//! | a bus | [`line`] | `Up`, `Down` | whether its cells are waited for |
+//! | a bus | [`line`] | `Up`, `Down` | whether its cells are awaited |
 //! | a cell on it now | [`progress`] | `Done`, `Awaited`, `GivenUp` | whether the next joints wait for it |
-//! | a pass over the capture | [`pass`] | `Fresh`, `Before`, `Whole`, `Part` | whether something may answer joints that are not sent again |
+//! | a pass over the capture | [`pass`] | `Fresh`, `Before`, `Whole`, `Part` | whether a reply may answer joints that are not resent |
 //! | a round of joints | [`sending`] | `Recorded`, `Sent`, `Repeated`, `Unsent`, `RepeatedUnsent` | whether and how it is compared |
 //! | a cell of the capture | [`contact`] | `Unknown`, `Lasts`, `Over`; `AsRecorded`, `Earlier` | whether the end of a contact may be missing |
 //! | a cell, then and now | [`first_joints`] | `Taken`, `Awaited` | whether its sensor values belong to joints |
 //!
-//! Each table is a list of rows in the tests of its module, which go through all states and all inputs.
+//! The tests of each module hold its table as a list of rows, and go through all states and inputs.
 
 pub(super) mod contact;
 pub(super) mod first_joints;
@@ -18,11 +18,11 @@ pub(super) mod pass;
 pub(super) mod progress;
 pub(super) mod sending;
 
-/// A row of a table: its name, its states and inputs, and what follows from one of the states.
+/// A row of a table: its name, its states and inputs, and the function from such a state to the next.
 #[cfg(test)]
 type Row<'a, S, I, O> = (&'a str, &'a [S], &'a [I], fn(S) -> O);
 
-/// Checks that each state has one row for each input, and that the machine does what the row says.
+/// Checks that each state has exactly one row for each input, and that the machine follows the row.
 #[cfg(test)]
 fn check_table<S, I, O>((states, inputs): (&[S], &[I]), rows: &[Row<'_, S, I, O>], next: impl Fn(S, I) -> O)
 where

@@ -1,47 +1,47 @@
-//! A pass over the capture, by what came before the joints that are sent again.
+//! A pass over the capture, by the messages before the joints that are resent.
 //!
-//! A reply in the capture may answer joints from before the part that is replayed: then it is counted and not compared.
+//! A recorded reply may answer joints from before the replayed part: it is counted, not compared.
 //!
-//! | row | state | input | next | first | why |
+//! | row | state | input | next | first | reason |
 //! |---|---|---|---|---|---|
-//! | `begins` | all | `Begins` | `Fresh` | - | the capture begins again, with nothing before it |
-//! | `before` | `Fresh`, `Before` | `NotSent` | `Before` | - | replies that come may answer what is not sent again |
-//! | `between` | `Whole`, `Part` | `NotSent` | the same | - | what comes after the first joints of the part is no start |
-//! | `first_of_all` | `Fresh` | `Joints` | `Whole` | yes | nothing was before them |
-//! | `first_of_part` | `Before` | `Joints` | `Part`, with the epoch before them | yes | replies to that epoch, and 99 before it, are of before |
-//! | `further` | `Whole`, `Part` | `Joints` | the same | no | the part has begun |
+//! | `begins` | all | `Begins` | `Fresh` | - | the capture starts again, with no message before it |
+//! | `before` | `Fresh`, `Before` | `NotSent` | `Before` | - | later replies may answer joints that are not resent |
+//! | `between` | `Whole`, `Part` | `NotSent` | unchanged | - | the part has begun |
+//! | `first_of_all` | `Fresh` | `Joints` | `Whole` | yes | no message came before them |
+//! | `first_of_part` | `Before` | `Joints` | `Part`, with the epoch before them | yes | replies to that epoch and the 99 before it answer earlier joints |
+//! | `further` | `Whole`, `Part` | `Joints` | unchanged | no | the part has begun |
 //!
-//! *First*: whether the joints are the first of the pass.
+//! *First*: yes if the joints are the first of the pass.
 
 use protocol::packet::Epoch;
 
 /// A pass over the capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Pass {
-    /// Nothing came yet.
+    /// No message has been read.
     #[default]
     Fresh,
-    /// Messages came that are not sent again, and no joints that are.
+    /// Messages came that are not resent, but no joints that are.
     Before,
-    /// Joints came that are sent again, and nothing before them.
+    /// Joints came that are resent, and nothing before them.
     Whole,
-    /// Joints came that are sent again, and others before them: the last of those had this epoch.
+    /// Joints came that are resent, after others: the last of those had this epoch.
     Part { earlier: Option<Epoch> },
 }
 
-/// The next message of the capture, by what becomes of it.
+/// The next message of the capture, by its handling.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
-    /// It begins again.
+    /// The capture starts again.
     Begins,
-    /// A message that is not sent again: before the part, or left out of it.
+    /// A message that is not resent: before the part, or excluded from it.
     NotSent,
-    /// Joints that are sent again; `last` is the epoch of the ones before them.
+    /// Joints that are resent; `last` is the epoch of the joints before them.
     Joints { last: Option<Epoch> },
 }
 
 impl Pass {
-    /// Returns the state after an input, and whether that was the first joints of the pass.
+    /// Returns the state after an input, and true for the first joints of the pass.
     pub(in super::super) const fn next(self, input: Input) -> (Self, bool) {
         match (self, input) {
             (Self::Fresh | Self::Before | Self::Whole | Self::Part { .. }, Input::Begins) => {
@@ -55,12 +55,13 @@ impl Pass {
         }
     }
 
-    /// Returns whether there were messages before the first joints that are sent again.
+    /// Returns true if messages came before the first joints that are resent.
     pub(in super::super) const fn begins_later(self) -> bool {
         matches!(self, Self::Before | Self::Part { .. })
     }
 
-    /// Returns the epoch of the last joints before those, if replies to it can come; `last` is the epoch of the last joints.
+    /// Returns the epoch of the last joints before the resent ones, if replies to it can come. `last` is the epoch of
+    /// the latest recorded joints.
     pub(in super::super) const fn earlier(self, last: Option<Epoch>) -> Option<Epoch> {
         match self {
             Self::Fresh | Self::Whole => None,

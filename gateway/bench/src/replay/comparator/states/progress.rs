@@ -1,50 +1,50 @@
-//! The progress of a cell with the joints announced last.
+//! Progress of a cell with the joints announced last.
 //!
-//! A heartbeat has the epoch of the last joints that its cell took. A cell that does not take joints, because they are
-//! those of another robot, reports the epoch before: after two heartbeats it has processed them, because one of the two
-//! is the answer to the sync that came after them.
+//! A heartbeat carries the epoch of the last joints that its cell received. A cell that ignores joints, because they
+//! are for another robot, reports the epoch before. It has processed the joints after two heartbeats, because one of
+//! the two answers the sync that followed them.
 //!
-//! | row | state | input | next | why |
+//! | row | state | input | next | reason |
 //! |---|---|---|---|---|
-//! | `announced` | `Done`, `Awaited` | `Announced` | `Awaited`, not heard | all joints have to be confirmed by another heartbeat |
-//! | `announced_to_silence` | `GivenUp` | `Announced` | `GivenUp`, not heard | a cell that did not answer is not waited for again |
-//! | `confirmed` | `Awaited`, `GivenUp` | `ReportsLast` | `Done` | it has taken the last joints |
-//! | `first_other` | `Awaited`, `GivenUp`, not heard | `ReportsOther` | `Awaited`, heard | the heartbeat may have been under way; it is there |
-//! | `second_other` | `Awaited`, `GivenUp`, heard | `ReportsOther` | `Done` | it has processed them, and did not take them |
-//! | `timed_out` | `Awaited` | `TimesOut` | `GivenUp`, heard as before | it is not waited for until it sends a heartbeat |
-//! | `already` | `Done` | `ReportsLast`, `ReportsOther`, `TimesOut` | the same | nothing is waited for |
-//! | `already_given_up` | `GivenUp` | `TimesOut` | the same | nothing is waited for |
+//! | `announced` | `Done`, `Awaited` | `Announced` | `Awaited`, not heard | another heartbeat must confirm all joints |
+//! | `announced_to_silence` | `GivenUp` | `Announced` | `GivenUp`, not heard | a cell that did not answer is not awaited again |
+//! | `confirmed` | `Awaited`, `GivenUp` | `ReportsLast` | `Done` | it has received the last joints |
+//! | `first_other` | `Awaited`, `GivenUp`, not heard | `ReportsOther` | `Awaited`, heard | the cell is present, but the heartbeat may have been under way |
+//! | `second_other` | `Awaited`, `GivenUp`, heard | `ReportsOther` | `Done` | it has processed the joints and ignored them |
+//! | `timed_out` | `Awaited` | `TimesOut` | `GivenUp`, heard as before | it is not awaited until its next heartbeat |
+//! | `already` | `Done` | `ReportsLast`, `ReportsOther`, `TimesOut` | unchanged | it is not awaited |
+//! | `already_given_up` | `GivenUp` | `TimesOut` | unchanged | it is not awaited |
 //!
-//! A cell that is found after an announcement begins as `Awaited`. Cells that only claim their node id go through the same states
-//! and are not waited for: that is in their claim.
+//! A cell found after an announcement starts as `Awaited`. Cells that only claim their node id go through the same
+//! states but are not awaited, which their claim decides.
 
 /// Progress of a cell with the joints announced last.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Progress {
-    /// It has processed them, or there were none.
+    /// The cell has processed the joints, or there were none.
     #[default]
     Done,
-    /// It has not reported them. `heard`: after one heartbeat since they were announced.
+    /// The cell has not reported the joints. `heard` is true after one heartbeat since the announcement.
     Awaited { heard: bool },
-    /// As `Awaited`, and it is not waited for until its next heartbeat, because it did not answer.
+    /// As `Awaited`, but not awaited until its next heartbeat, because it did not answer in time.
     GivenUp { heard: bool },
 }
 
 /// An event of a cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
-    /// Joints were announced, or a sync that they are confirmed with.
+    /// Joints were announced, or a sync that confirms them.
     Announced,
-    /// It sent a heartbeat with the epoch of the joints announced last.
+    /// The cell sent a heartbeat with the epoch of the joints announced last.
     ReportsLast,
-    /// It sent a heartbeat with another epoch.
+    /// The cell sent a heartbeat with another epoch.
     ReportsOther,
-    /// Its time to answer is over.
+    /// The time to answer has passed.
     TimesOut,
 }
 
 impl Progress {
-    /// The state of a cell that is found.
+    /// Returns the initial state of a newly found cell.
     pub(in super::super) const fn found(has_announced: bool) -> Self {
         if has_announced { Self::Awaited { heard: false } } else { Self::Done }
     }

@@ -1,33 +1,33 @@
-//! Recorded joints that are sent again.
+//! Resending of recorded joints.
 //!
-//! | row | state | input | next | why |
+//! | row | state | input | next | reason |
 //! |---|---|---|---|---|
-//! | `sent` | `Recorded` | `Sent` | `Sent` | replies to this epoch are to these joints |
-//! | `sent_again` | all others | `Sent` | `Repeated`, with the new epoch | sums of two times may be mixed from then on; what was not sent is forgotten |
-//! | `refused` | `Sent` | `Refused` | `Unsent` | what is missing was not requested |
-//! | `refused_again` | `Repeated` | `Refused` | `RepeatedUnsent` | the same, and replies to the first time may have come |
-//! | `refused_already` | `Recorded`, `Unsent`, `RepeatedUnsent` | `Refused` | the same | there is nothing to take back |
+//! | `sent` | `Recorded` | `Sent` | `Sent` | replies to this epoch answer these joints |
+//! | `sent_again` | all others | `Sent` | `Repeated`, with the new epoch | sums of two sendings may mix from now on; earlier refusals no longer matter |
+//! | `refused` | `Sent` | `Refused` | `Unsent` | missing replies were not requested |
+//! | `refused_again` | `Repeated` | `Refused` | `RepeatedUnsent` | likewise, but replies to the first sending may have come |
+//! | `refused_already` | `Recorded`, `Unsent`, `RepeatedUnsent` | `Refused` | unchanged | there is no sending to revoke |
 
 use protocol::packet::Epoch;
 
-/// The joints of a round, and the epoch under which they were sent last.
+/// Joints of a round, and the epoch under which they were sent last.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Sending {
-    /// They have not been sent: nothing is compared.
+    /// Not sent: nothing is compared.
     #[default]
     Recorded,
     Sent {
         under: Epoch,
     },
-    /// More than once.
+    /// Sent more than once.
     Repeated {
         under: Epoch,
     },
-    /// They were announced, and the bus did not take them.
+    /// Announced, but refused by the bus.
     Unsent {
         under: Epoch,
     },
-    /// The same, after another time.
+    /// Announced more than once, and refused by the bus the last time.
     RepeatedUnsent {
         under: Epoch,
     },
@@ -36,9 +36,9 @@ pub(in super::super) enum Sending {
 /// An event of joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
-    /// They are sent under this epoch.
+    /// The joints are sent under this epoch.
     Sent { under: Epoch },
-    /// The bus did not take them.
+    /// The bus refused the joints.
     Refused,
 }
 
@@ -57,17 +57,17 @@ impl Sending {
         }
     }
 
-    /// Returns whether they were announced.
+    /// Returns true if the joints were announced.
     pub(in super::super) const fn is_announced(self) -> bool {
         !matches!(self, Self::Recorded)
     }
 
-    /// Returns whether the bus did not take them.
+    /// Returns true if the bus refused the joints.
     pub(in super::super) const fn is_unsent(self) -> bool {
         matches!(self, Self::Unsent { .. } | Self::RepeatedUnsent { .. })
     }
 
-    /// Returns whether they were announced more than once.
+    /// Returns true if the joints were announced more than once.
     pub(in super::super) const fn is_repeated(self) -> bool {
         matches!(self, Self::Repeated { .. } | Self::RepeatedUnsent { .. })
     }

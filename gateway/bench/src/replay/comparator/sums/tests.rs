@@ -5,10 +5,10 @@ fn cell(node: u8) -> CellId {
     CellId::new(node.into()).unwrap()
 }
 
-/// What each cell itself contributes, in steps; cells from 1.
+/// Contribution of each cell in steps; cells are numbered from 1.
 type Contact = Vec<Option<[i16; 6]>>;
 
-/// A tree: the parent of each cell, 0 for the gateway's side. Only cells before it are parents.
+/// Builds the sums of a tree, given the parent of each cell, 0 for the gateway's side. Parents precede their children.
 fn sums(contact: &Contact, parents: &[u8]) -> (Sums, Trees) {
     let (mut sums, mut trees) = (Sums::default(), Trees::default());
     let mut totals = vec![([0_i32; 6], 0_u8); contact.len()];
@@ -45,7 +45,7 @@ fn words(first: i16) -> Option<[i16; 6]> {
 
 #[test]
 fn the_same_contributions_are_equal_in_any_tree() {
-    // 1 - 2 - 3 and 1 - (2, 3); cell 2 only forwards in the first.
+    // Trees 1 - 2 - 3 and 1 - (2, 3); in the first, cell 2 only forwards.
     let contact = vec![words(10), None, words(30)];
     let both = (sums(&contact, &[0, 1, 2]), sums(&contact, &[0, 1, 1]));
     assert_eq!(outcomes(&both.0, &both.1, 3), [Outcome::Equal, Outcome::Nothing, Outcome::Equal]);
@@ -69,7 +69,7 @@ fn a_cell_without_contact_now_is_missing_and_one_without_contact_then_is_extra()
     let then = sums(&vec![words(10), words(20), None], &[0, 0, 0]);
     let today = sums(&vec![words(10), None, words(1)], &[0, 0, 0]);
     assert_eq!(outcomes(&then, &today, 3), [Outcome::Equal, Outcome::Missing, Outcome::Extra]);
-    // One that forwards another's sum sends one all the same: its own count tells.
+    // A cell that only forwards still sends a sum; its own count shows it.
     let then = sums(&vec![words(10), words(20)], &[0, 1]);
     let today = sums(&vec![None, words(20)], &[0, 1]);
     assert_eq!(outcomes(&then, &today, 2), [Outcome::Different, Outcome::Equal]);
@@ -104,7 +104,7 @@ fn a_cell_with_uncertain_children_is_omitted() {
 
 #[test]
 fn a_child_with_a_late_page_is_no_difference_unless_it_is_counted_twice() {
-    // The third goes to the second by its page, and to the first in fact.
+    // By its page the third cell's parent is the second; its sums go to the first.
     let contact = vec![None, words(20), words(30), None];
     let then = sums(&contact, &[0, 1, 1, 0]);
     let mut today = sums(&contact, &[0, 1, 1, 0]);
@@ -158,7 +158,7 @@ fn a_sum_that_lacks_a_childs_is_omitted() {
     today.0.0.insert(cell(1), alone);
     let torn = Outcome::Omitted(Why::NotTaken);
     assert_eq!(outcomes(&then, &today, 2), [torn, Outcome::Equal]);
-    // The child's was lost on the way to the recording, and is in the parent's.
+    // The child's sum was lost on the way to the recording, but is in the parent's.
     let mut then = sums(&vec![None, words(20)], &[0, 1]);
     let today = sums(&vec![None, words(20)], &[0, 1]);
     then.0.0.remove(&cell(2));
@@ -194,7 +194,7 @@ fn saturated_words_are_compared_as_saturated() {
     );
     let other = sums(&contact, &[0, 0]);
     assert_eq!(outcomes(&other, &whole(&contact, &[0, 1]), 2)[0], Outcome::Equal, "others are in it");
-    // The other words are compared as ever.
+    // The other words are compared as usual.
     let contact = vec![Some([10, 9, 0, 0, 0, 0]), words(20)];
     assert_eq!(outcomes(&whole(&contact, &[0, 1]), &then, 2)[0], Outcome::Different);
 }
@@ -211,8 +211,8 @@ fn trees_drop_past_rounds() {
 }
 
 proptest! {
-    /// Any two trees over cells with the same contributions: nothing differs. If one cell contributes something else,
-    /// that cell alone differs.
+    /// Compares any two trees over cells with the same contributions: there is no difference. If one cell contributes
+    /// another value, only that cell differs.
     #[test]
     fn the_tree_leaves_no_trace(
         contact in proptest::collection::vec(proptest::option::of([-60_i16..=60, -60..=60, -60..=60, -60..=60, -60..=60, -60..=60]), 1..40),

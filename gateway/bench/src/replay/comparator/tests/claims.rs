@@ -1,8 +1,8 @@
-//! Another cell claims the node id of one that is there.
+//! Another cell claims the node id of a present cell.
 
 use super::*;
 
-/// The heartbeat of another cell that claims cell 1's node id.
+/// Heartbeat of another cell that claims cell 1's node id.
 fn claim() -> Message {
     let intruder = Heartbeat { serial: 99, state: Flags::CLAIMING, ..Heartbeat::default() };
     Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page: NetworkPage::Heartbeat(intruder) }
@@ -16,7 +16,7 @@ fn a_claim_of_a_taken_node_id_explains_nothing_and_leaves_the_cell_there() {
         said
     };
     for at in 1..run().len() {
-        // An extra reply remains one.
+        // An extra reply stays extra.
         let mut now = run();
         now.insert(9, torque(1, 4, 9));
         let extra = |recorded: &[Message]| rated(&[recorded, &[joints(5)]].concat(), &now).tally;

@@ -1,13 +1,13 @@
-//! Torques that are a few steps off.
+//! Torques that differ by a few steps.
 
 use super::*;
 
-/// How many torque words differ by 0, 1, 2 and 3 steps, and the largest difference.
+/// Number of torque words that differ by 0, 1, 2 and 3 steps, and the largest difference.
 fn steps(steps: &Steps) -> ([u64; 4], u32) {
     (*steps.by_steps.first_chunk().unwrap(), steps.max)
 }
 
-/// [`run`] by a cell whose torques are off by these steps.
+/// Replies of [`run`] with torques off by these steps.
 fn off(by: [i16; 2]) -> Vec<Message> {
     let mut now = run();
     (now[3], now[5]) = (torque(1, 1, 5 + by[0]), torque(1, 2, 6 + by[1]));
@@ -20,7 +20,7 @@ fn torques_within_the_tolerance_are_equal_and_counted() {
     assert_eq!((counts(&comparator), comparator.tally.tolerated), ([3, 0, 0, 0], 2));
     assert_eq!(steps(&comparator.tally.torque_words), ([16, 1, 1, 0], 2));
     assert!(comparator.tally.is_good() && comparator.first().is_none());
-    // The same without a tolerance, with one that is too small, and with nothing to tolerate.
+    // Without a tolerance, with one that is too small, and without a difference.
     for (tolerance, by, equal, tolerated, words) in [
         (0, [1, -2], 1, 0, ([16, 1, 1, 0], 2)),
         (1, [1, -2], 2, 1, ([16, 1, 1, 0], 2)),
@@ -64,7 +64,7 @@ fn a_tolerance_does_not_hide_replies_that_are_missing_extra_or_no_torques() {
 
 #[test]
 fn in_sums_each_cell_that_adds_its_own_may_be_off_and_one_that_passes_on_may_not() {
-    // Cell 2 is pressed, and so is cell 1, to which its sums go, or not.
+    // Cell 2 is pressed; cell 1, its parent, is pressed or not.
     let said = |own: i16, child: i16, count: u8| {
         let trees = [tree(1, 0, Some(0)), tree(2, 0, Some(1))];
         let sums = [joints(1), sum(2, 1, child, 1), sum(1, 1, child + own, count), joints(2)];
