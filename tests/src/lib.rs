@@ -23,6 +23,8 @@ pub mod cell_slot;
 #[cfg(test)]
 mod circles;
 #[cfg(test)]
+mod comments;
+#[cfg(test)]
 mod documents;
 pub mod fault;
 pub mod fuzz;
@@ -33,6 +35,4 @@ pub mod oracle;
 pub mod process;
 pub mod real_bus;
 pub mod skins;
-#[cfg(test)]
-mod words;
 pub mod workshop;

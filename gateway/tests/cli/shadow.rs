@@ -108,7 +108,11 @@ fn what_has_no_frame_and_what_is_no_capture_is_said_in_one_line() {
     fs::write(folder.path().join("run.log"), log()).unwrap();
     for (arguments, code, begin) in [
         ("fit empty.log", 1, "skinbus: empty.log: it is empty: there is no frame in it"),
-        ("fit notes.txt", 1, "skinbus: notes.txt: there is no frame in 1 line; what candump prints"),
+        (
+            "fit notes.txt",
+            1,
+            "skinbus: notes.txt: there is no frame in 1 line; the output of candump is expected",
+        ),
         ("fit x.zip", 2, "skinbus: x.zip is "),
         ("fit .", 2, "skinbus: . is a directory"),
         ("fit nowhere", 2, "skinbus: there is no file nowhere, and as a bus: "),

@@ -171,8 +171,11 @@ fn a_cell_without_a_single_packet_is_named_with_its_mistake() {
         let survey = Survey::take(&mut bus, "vcan0").unwrap();
         let cell = CellId::new(mutants::NODE.into()).unwrap();
         let why = survey.check(cell, "vcan0", None, false).unwrap_err();
-        assert!(why.starts_with("cell 12 on vcan0 fails SEND-1: of "), "{why}");
-        assert!(why.contains("is a valid packet, for example 40C#") && why.contains(mistake), "{mistake}: {why}");
+        assert!(why.starts_with("cell 12 on vcan0 fails SEND-1: none of "), "{why}");
+        assert!(
+            why.contains("is a valid packet, for example 40C#") && why.contains(mistake),
+            "{mistake}: {why}"
+        );
     }
 }
 

@@ -212,7 +212,7 @@ mod tests {
                 "profile = [[1.0, 3.0], [1.0, 2.0]]",
                 "4:25: touch[0].profile[1][0] = 1: times of points increase",
             ),
-            ("profile = [[-1.0, 3.0]]", "4:13: touch[0].profile[0][0] = -1: 0 to 3.2e7 s after the begin"),
+            ("profile = [[-1.0, 3.0]]", "4:13: touch[0].profile[0][0] = -1: 0 to 3.2e7 s after the start of"),
             ("profile = [[nan, 3.0]]", "4:13: touch[0].profile[0][0] = NaN: 0 to 3.2e7 s"),
             ("profile = [[1.0, 96.0]]", "4:18: touch[0].profile[0][1] = 96: 0 to 95.997 N are possible"),
             ("profile = [[1.0, -0.5]]", "4:18: touch[0].profile[0][1] = -0.5: 0 to 95.997 N are possible"),

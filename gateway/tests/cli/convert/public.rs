@@ -272,7 +272,9 @@ fn a_capture_is_shown_and_another_text_is_named_as_dump_names_it() {
     ] {
         let said = folder.refuses(command, 1);
         assert!(
-            said.starts_with("skinbus: words.txt: there is no frame in 1000 lines; what candump prints"),
+            said.starts_with(
+                "skinbus: words.txt: there is no frame in 1000 lines; the output of candump is expected"
+            ),
             "{command}: {said}"
         );
     }

@@ -30,7 +30,11 @@ impl Carrier for Embedded {
     fn open(&self, name: &str, options: &Options) -> Result<(CanFdSocket, usize), BusError> {
         let failed = |errno: Errno| BusError::refused(name, "connect to", errno);
         let gone = |errno| match errno {
-            Errno::PIPE | Errno::CONNRESET => closed(name, options.directory.as_deref()),
+            Errno::PIPE | Errno::CONNRESET => match closed(name, options.directory.as_deref()) {
+                // A busy client's hello comes after the server has turned it away.
+                BusError::HungUp(name) => BusError::TurnedAway(name),
+                error => error,
+            },
             errno => failed(errno),
         };
         let no_answer = || BusError::NoAnswer { name: name.to_owned(), waited: TIMEOUT };
