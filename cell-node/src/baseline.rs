@@ -13,30 +13,30 @@
 
 use protocol::fixed::{Q1_14, Q5_10, Q9_6};
 use protocol::message::{BaselinePage, SkinSensors};
-use protocol::parameters::{Baseline as Rule, Tare, Zeroing};
-use protocol::touch::{Touch, contact};
+use protocol::parameters::{Baseline as Rule, Tare, BaselineSettings};
+use protocol::touch::{Touch, contact_force};
 
 /// Number of joints with a steady reading before the first tare.
-pub const STEADY: u8 = 32;
+pub const STEADY_JOINTS: u8 = 32;
 /// Fraction bits of the zero, in N, beyond those of a contact word.
-const FINER: u32 = 12;
+const EXTRA_FRACTION_BITS: u32 = 12;
 /// Shift of the running mean, which is over 2^`MEAN` joints.
-const MEAN: u32 = 3;
+const MEAN_SHIFT: u32 = 3;
 /// Shift of the zero's approach: at each joints it moves by 2^-`NEARER` of the difference, limited by the
 /// rate.
-const NEARER: u32 = 4;
+const APPROACH_SHIFT: u32 = 4;
 /// Maximum temperature difference that moves the zero: 64 °C.
 const MAX_DEGREES: i32 = 64 << 6;
 /// Temperature change over which the coefficient is learned: 2 °C.
-const LEARNED: i32 = 2 << 6;
+const LEARNING_SPAN: i32 = 2 << 6;
 /// Maximum temperature change for learning; after a faster one, the zero has not caught up.
-const TOO_QUICK: i32 = LEARNED + (LEARNED >> 2);
+const MAX_LEARNING_SPAN: i32 = LEARNING_SPAN + (LEARNING_SPAN >> 2);
 /// Maximum number of joints for learning; over more, the zero may have drifted for another reason.
-const TOO_SLOW: u16 = 1 << 14;
+const MAX_LEARNING_JOINTS: u16 = 1 << 14;
 
 /// The reason of a refused tare.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Refused {
+pub enum TareRefused {
     /// The baseline is off.
     Off,
     /// The cell is touched, or has received no joints.
@@ -70,12 +70,12 @@ pub struct Baseline {
     /// Number of tares and settings; a change is reported.
     changes: u8,
     anchor: Option<Anchor>,
-    pace: Pace,
+    pace: StepLimit,
 }
 
 /// The maximum movement of the zero per joints.
 #[derive(Clone, Copy, Debug, Default)]
-struct Pace {
+struct StepLimit {
     period_us: u16,
     step: i32,
 }
@@ -93,7 +93,7 @@ impl Baseline {
     pub fn set(&mut self, rule: Rule) {
         self.rule = rule;
         self.forget();
-        self.pace = Pace::default();
+        self.pace = StepLimit::default();
     }
 
     /// Returns the rule.
@@ -120,22 +120,22 @@ impl Baseline {
 
     /// Processes the readings at joints; `period_us` is the broadcast period.
     #[inline(never)]
-    pub fn take(&mut self, raw: &SkinSensors, period_us: u16) {
+    pub fn process_joints(&mut self, raw: &SkinSensors, period_us: u16) {
         let Rule::On(rule) = self.rule else { return };
         if self.pace.period_us != period_us {
-            self.pace = Pace { period_us, step: step(rule.rate_un_per_s, period_us) };
+            self.pace = StepLimit { period_us, step: step_per_period(rule.rate_un_per_s, period_us) };
         }
         let [temperature, _] = raw.temperature;
-        let (sum, reading) = (contact(raw), contact(raw) << FINER);
+        let (sum, reading) = (contact_force(raw), contact_force(raw) << EXTRA_FRACTION_BITS);
         let mean = self.mean.unwrap_or(reading);
         self.is_steady = (reading - mean).abs() < rule.threshold.finer() >> 2;
-        let mean = mean + ((reading - mean) >> MEAN);
+        let mean = mean + ((reading - mean) >> MEAN_SHIFT);
         self.mean = Some(mean);
         if !self.is_tared {
             let is_within = mean.abs() <= rule.limit.finer();
             self.steady = if self.is_steady && is_within { self.steady + 1 } else { 0 };
-            if self.steady < STEADY {
-                let net = if is_none(sum, &rule) { 0 } else { sum };
+            if self.steady < STEADY_JOINTS {
+                let net = if is_within_limit(sum, &rule) { 0 } else { sum };
                 self.touch = self.touch.next(net, rule.threshold.to_bits(), rule.hysteresis);
                 return;
             }
@@ -156,17 +156,17 @@ impl Baseline {
 
     /// Returns the readings with the zero subtracted.
     #[must_use]
-    pub fn net(&self, raw: &SkinSensors) -> SkinSensors {
+    pub fn subtract_zero(&self, raw: &SkinSensors) -> SkinSensors {
         let Rule::On(rule) = self.rule else { return *raw };
         if !self.is_tared {
-            let is_none = is_none(contact(raw), &rule);
+            let is_none = is_within_limit(contact_force(raw), &rule);
             return if is_none { SkinSensors { contact: [Q5_10::ZERO; 3], ..*raw } } else { *raw };
         }
         let zero = self.coarse_zero();
         // One third, rounded down; the last word gets the remainder.
         let third = (zero * 21_845) >> 16;
         let [first, second, last] = raw.contact;
-        let contact = [less(first, third), less(second, third), less(last, zero - 2 * third)];
+        let contact = [subtract(first, third), subtract(second, third), subtract(last, zero - 2 * third)];
         SkinSensors { contact, ..*raw }
     }
 
@@ -174,24 +174,24 @@ impl Baseline {
     ///
     /// # Errors
     /// Returns the reason if the tare is refused. Only the count of refused tares changes then.
-    pub fn tare(&mut self, raw: &SkinSensors, how: Tare) -> Result<(), Refused> {
-        let done = self.tared(raw, how);
+    pub fn tare(&mut self, raw: &SkinSensors, how: Tare) -> Result<(), TareRefused> {
+        let done = self.try_tare(raw, how);
         if done.is_err() {
             self.refused = self.refused.wrapping_add(1);
         }
         done
     }
 
-    fn tared(&mut self, raw: &SkinSensors, how: Tare) -> Result<(), Refused> {
+    fn try_tare(&mut self, raw: &SkinSensors, how: Tare) -> Result<(), TareRefused> {
         if how == Tare::Forget {
             self.forget();
             return Ok(());
         }
-        let Rule::On(rule) = self.rule else { return Err(Refused::Off) };
-        let is_free = how == Tare::Anyhow || self.is_steady && self.touch != Touch::Touched;
-        let mean = self.mean.filter(|_| is_free).ok_or(Refused::Touched)?;
+        let Rule::On(rule) = self.rule else { return Err(TareRefused::Off) };
+        let is_free = how == Tare::Forced || self.is_steady && self.touch != Touch::Touched;
+        let mean = self.mean.filter(|_| is_free).ok_or(TareRefused::Touched)?;
         if mean.abs() > rule.limit.finer() {
-            return Err(Refused::Limit);
+            return Err(TareRefused::Limit);
         }
         let [temperature, _] = raw.temperature;
         self.zero_at(mean, temperature);
@@ -202,7 +202,7 @@ impl Baseline {
     #[must_use]
     pub fn page(&self) -> Option<BaselinePage> {
         let page = BaselinePage {
-            zero: Q5_10::from_bits(word(self.coarse_zero())),
+            zero: Q5_10::from_bits(saturate_word(self.coarse_zero())),
             n_per_c: self.n_per_c,
             temperature: self.reference,
             tared: self.is_tared,
@@ -220,7 +220,7 @@ impl Baseline {
 
     /// Returns the state whose changes are worth sending page 3.
     #[must_use]
-    pub fn status(&self) -> Status {
+    pub fn status(&self) -> BaselineStatus {
         (self.is_tared, self.touch == Touch::Touched, self.is_limited, self.refused, self.changes)
     }
 
@@ -240,13 +240,13 @@ impl Baseline {
 
     /// Returns the zero in steps of a contact word.
     const fn coarse_zero(&self) -> i32 {
-        (self.zero + (1 << (FINER - 1))) >> FINER
+        (self.zero + (1 << (EXTRA_FRACTION_BITS - 1))) >> EXTRA_FRACTION_BITS
     }
 
     /// Moves the zero towards the reading of an untouched sensor.
     fn follow(&mut self, reading: i32, shift: i32, limit: i32) {
         let step = self.pace.step;
-        let target = self.zero + ((reading - self.zero) >> NEARER).clamp(-step, step);
+        let target = self.zero + ((reading - self.zero) >> APPROACH_SHIFT).clamp(-step, step);
         self.zero = target.clamp(-limit, limit);
         self.is_limited = self.zero != target;
         self.base = self.zero - shift;
@@ -258,17 +258,17 @@ impl Baseline {
         let anchor = self.anchor.get_or_insert(fresh);
         anchor.joints = anchor.joints.saturating_add(1);
         let degrees = i32::from(temperature.to_bits()) - i32::from(anchor.temperature.to_bits());
-        if degrees.abs() < LEARNED {
+        if degrees.abs() < LEARNING_SPAN {
             return;
         }
-        if degrees.abs() <= TOO_QUICK && anchor.joints <= TOO_SLOW && !self.is_limited {
+        if degrees.abs() <= MAX_LEARNING_SPAN && anchor.joints <= MAX_LEARNING_JOINTS && !self.is_limited {
             // Per 2 °C, with 14 fraction bits. From the second time on only half is applied, to limit the
             // effect of a single error.
-            let lacks = (self.base - anchor.base) >> (FINER + 10 - 14 + 1 + u32::from(self.is_n_per_c_known));
+            let lacks = (self.base - anchor.base) >> (EXTRA_FRACTION_BITS + 10 - 14 + 1 + u32::from(self.is_n_per_c_known));
             self.is_n_per_c_known = true;
             let lacks = if degrees < 0 { -lacks } else { lacks };
             let n_per_c = i32::from(self.n_per_c.to_bits()) + lacks;
-            self.n_per_c = Q1_14::from_bits(word(n_per_c));
+            self.n_per_c = Q1_14::from_bits(saturate_word(n_per_c));
         }
         (self.base, self.reference) = (self.zero, temperature);
         self.anchor = Some(Anchor { temperature, base: self.zero, joints: 0 });
@@ -276,7 +276,7 @@ impl Baseline {
 }
 
 /// The state returned by [`Baseline::status`]: tared, touched, limited, refused tares, changes.
-pub type Status = (bool, bool, bool, u16, u8);
+pub type BaselineStatus = (bool, bool, bool, u16, u8);
 
 /// Conversion to the fraction bits of a zero.
 trait Finer {
@@ -285,29 +285,29 @@ trait Finer {
 
 impl Finer for Q5_10 {
     fn finer(self) -> i32 {
-        i32::from(self.to_bits()) << FINER
+        i32::from(self.to_bits()) << EXTRA_FRACTION_BITS
     }
 }
 
 /// Returns true if a reading of an untared sensor is within the limit and counts as zero.
-fn is_none(sum: i32, rule: &Zeroing) -> bool {
+fn is_within_limit(sum: i32, rule: &BaselineSettings) -> bool {
     sum.abs() <= i32::from(rule.limit.to_bits())
 }
 
 /// Returns the maximum movement of the zero per period, in steps of 2^-22 N, rounded down.
-fn step(rate_un_per_s: u16, period_us: u16) -> i32 {
+fn step_per_period(rate_un_per_s: u16, period_us: u16) -> i32 {
     // 2^22 / 10^12 is 18 014.398 / 2^32.
     let rate = u64::from(u32::from(rate_un_per_s) * u32::from(period_us));
     i32::try_from((rate * 18_014) >> 32).unwrap_or(0)
 }
 
 /// Saturates a value to a word.
-fn word(value: i32) -> i16 {
+fn saturate_word(value: i32) -> i16 {
     i16::try_from(value).unwrap_or(if value < 0 { i16::MIN } else { i16::MAX })
 }
 
-fn less(reading: Q5_10, zero: i32) -> Q5_10 {
-    Q5_10::from_bits(word(i32::from(reading.to_bits()) - zero))
+fn subtract(reading: Q5_10, zero: i32) -> Q5_10 {
+    Q5_10::from_bits(saturate_word(i32::from(reading.to_bits()) - zero))
 }
 
 #[cfg(test)]

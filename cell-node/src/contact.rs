@@ -102,8 +102,8 @@ impl<'a> Torque<'a> {
     /// Like [`Torque::words_by`], into an array; words beyond those of J do not change.
     #[inline]
     pub fn write_words(&self, rounding: &TorqueRounding, words: &mut [i16; MAX_JOINTS]) {
-        if self.force.0 > rounding.fits {
-            return self.write_held_words(rounding.format, words);
+        if self.force.0 > rounding.max_unsaturated_force {
+            return self.write_saturating_words(rounding.format, words);
         }
         match rounding.format {
             TorqueFormat::Q3_12 => self.write_each(words, |row| low_word(self.steps(row, 12))),
@@ -115,7 +115,7 @@ impl<'a> Torque<'a> {
     /// Writes words of which some may saturate.
     #[cold]
     #[inline(never)]
-    fn write_held_words(&self, format: TorqueFormat, words: &mut [i16; MAX_JOINTS]) {
+    fn write_saturating_words(&self, format: TorqueFormat, words: &mut [i16; MAX_JOINTS]) {
         self.write_each(words, |row| {
             let steps = self.steps(row, format.fraction());
             i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX })
@@ -155,7 +155,7 @@ pub const MAX_J: u16 = 1 << 15;
 pub struct TorqueRounding {
     format: TorqueFormat,
     /// The largest force, in steps of 2^-16 N, whose torques all fit a word without saturation.
-    fits: i32,
+    max_unsaturated_force: i32,
 }
 
 impl TorqueRounding {
@@ -165,7 +165,7 @@ impl TorqueRounding {
     pub fn new(format: TorqueFormat, bound: u16) -> Self {
         // J F is at most the largest word, so rounding cannot exceed it.
         let largest = i64::from(i16::MAX) << (14 + 16 - format.fraction());
-        Self { format, fits: i32::try_from(largest / i64::from(bound.max(1))).unwrap_or(i32::MAX) }
+        Self { format, max_unsaturated_force: i32::try_from(largest / i64::from(bound.max(1))).unwrap_or(i32::MAX) }
     }
 }
 
@@ -264,7 +264,7 @@ mod tests {
         {
             let rounding = TorqueRounding::new(format, bound);
             let most = Q1_14::from_bits(bound.wrapping_neg().cast_signed()); // -2 m is the longest
-            for steps in [rounding.fits, rounding.fits.saturating_add(1)] {
+            for steps in [rounding.max_unsaturated_force, rounding.max_unsaturated_force.saturating_add(1)] {
                 let torque = Torque { jacobian: &[most], force: Force(steps) };
                 let mut words = [0; MAX_JOINTS];
                 torque.write_words(&rounding, &mut words);

@@ -28,7 +28,7 @@ pub type Bytes = heapless::Vec<u8, MAX_BYTES>;
 
 /// The node id and parameters kept in flash.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Kept {
+pub struct FlashContent {
     /// The node id, if the cell has one.
     pub number: Option<CellId>,
     /// The parameters, if the cell is configured.
@@ -38,13 +38,13 @@ pub struct Kept {
 /// The contents of flash when the cell started.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "a cell has no heap")]
-pub enum Flash {
+pub enum FlashState {
     /// No image.
     Empty,
     /// An image with a wrong CRC.
     Damaged,
     /// Valid parameters.
-    Sound(Parameters),
+    Valid(Parameters),
 }
 
 /// The error for an image that cannot be used.
@@ -81,14 +81,14 @@ pub enum FlashError {
 
 /// Encodes a flash image.
 #[must_use]
-pub fn encode(serial: u32, kept: &Kept) -> Bytes {
+pub fn encode(serial: u32, kept: &FlashContent) -> Bytes {
     let mut bytes = Bytes::new();
     encode_into(&mut bytes, serial, kept);
     bytes
 }
 
 /// Encodes a flash image into an empty buffer, so that a small stack holds only one copy.
-pub fn encode_into(bytes: &mut Bytes, serial: u32, kept: &Kept) {
+pub fn encode_into(bytes: &mut Bytes, serial: u32, kept: &FlashContent) {
     let number = kept.number.map_or(0, CellId::get);
     let serial = serial.to_le_bytes();
     let head: [&[u8]; 4] = [MAGIC, &[VERSION, number], &serial, &[kept.parameters.is_some().into()]];
@@ -105,7 +105,7 @@ pub fn encode_into(bytes: &mut Bytes, serial: u32, kept: &Kept) {
 /// # Errors
 /// Returns an error if the image has a wrong size, CRC or version, belongs to another cell (by its serial
 /// number, and by its node id if `identity` has one), or its parameters are invalid.
-pub fn decode(identity: Identity, bytes: &[u8]) -> Result<Kept, FlashError> {
+pub fn decode(identity: Identity, bytes: &[u8]) -> Result<FlashContent, FlashError> {
     let size = FlashError::Size { got: bytes.len() };
     let Some((body, crc)) = bytes.split_last_chunk().filter(|_| (BYTES..=MAX_BYTES).contains(&bytes.len()))
     else {
@@ -128,7 +128,7 @@ pub fn decode(identity: Identity, bytes: &[u8]) -> Result<Kept, FlashError> {
         return Err(FlashError::OtherCell { cell, serial });
     }
     let parameters = (configured == 1).then(|| Parameters::from_image(image)).transpose()?;
-    Ok(Kept { number, parameters })
+    Ok(FlashContent { number, parameters })
 }
 
 #[cfg(test)]
@@ -142,8 +142,8 @@ mod tests {
         Identity { cell: CellId::new(12).ok(), serial: 100_012 }
     }
 
-    fn kept() -> Kept {
-        Kept { number: CellId::new(12).ok(), parameters: Some(parameters()) }
+    fn kept() -> FlashContent {
+        FlashContent { number: CellId::new(12).ok(), parameters: Some(parameters()) }
     }
 
     fn parameters() -> Parameters {
@@ -158,9 +158,9 @@ mod tests {
         assert_eq!(&bytes[..11], b"SKIN\x02\x0c\xac\x86\x01\x00\x01");
         assert_eq!(decode(identity(), &bytes), Ok(kept()));
         assert_eq!(decode(Identity { cell: None, ..identity() }, &bytes), Ok(kept()));
-        let bare = Kept { parameters: None, ..kept() };
+        let bare = FlashContent { parameters: None, ..kept() };
         assert_eq!(decode(identity(), &encode(100_012, &bare)), Ok(bare));
-        let nameless = Kept { number: None, ..kept() };
+        let nameless = FlashContent { number: None, ..kept() };
         assert_eq!(decode(identity(), &encode(100_012, &nameless)), Ok(nameless));
         let elsewhere = Identity { cell: CellId::new(13).ok(), ..identity() };
         assert_eq!(decode(elsewhere, &bytes), Err(FlashError::OtherCell { cell: 12, serial: 100_012 }));

@@ -3,7 +3,7 @@
 use protocol::id::{CellId, Id};
 
 /// Number of identifiers that every cell with a node id receives.
-pub const OWN: usize = 10;
+pub const OWN_IDS: usize = 10;
 
 /// The identity of a cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -18,7 +18,7 @@ impl Identity {
     /// Returns the identifiers that this cell receives in every network state ([`Id::of_cell`]). A cell
     /// without a node id receives only at its ports.
     #[must_use]
-    pub fn hears(&self) -> [Option<Id>; OWN] {
-        self.cell.map_or([None; OWN], |cell| Id::of_cell(cell).map(Some))
+    pub fn received_ids(&self) -> [Option<Id>; OWN_IDS] {
+        self.cell.map_or([None; OWN_IDS], |cell| Id::received_by_cell(cell).map(Some))
     }
 }

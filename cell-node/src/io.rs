@@ -9,36 +9,36 @@ mod subscriptions;
 
 use std::time::{Duration, Instant};
 
-use protocol::bus::{BusError, Options, Received};
+use protocol::bus::{BusError, BusOptions, Received};
 use protocol::can::Format;
 use protocol::id::{CellId, Kind};
 use protocol::packet;
 use protocol::port::{LinkId, PORTS};
 use protocol::time::{Micros, Span};
 
-use crate::flash::Flash;
+use crate::flash::FlashState;
 use crate::identity::Identity;
 use crate::node::Node;
 use clock::Clock;
 use outbox::Outbox;
-use sockets::{Arrived, Hearing};
+use sockets::{Arrived, ReceiveFilters};
 use subscriptions::Subscriptions;
 
 pub use flash_file::FlashFile;
-pub use line::Line;
+pub use line::BusPort;
 pub use sockets::Sockets;
 
 /// Retry interval for opening a bus that is not there.
-const AGAIN: Duration = Duration::from_millis(100);
+const RETRY_INTERVAL: Duration = Duration::from_millis(100);
 /// Retry interval while an interface is down.
-const DOWN: Duration = Duration::from_millis(100);
+const DOWN_RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
 /// Maximum age of unsent frames. Epochs count modulo 256, so older torques could be mistaken for newer ones.
-const KEPT: Duration = Duration::from_millis(250);
+const MAX_UNSENT_AGE: Duration = Duration::from_millis(250);
 
 /// Maximum number of cells in a process that may rest. With more, heartbeats wake the process as often as
 /// joints.
-const RESTING: usize = 8;
+const MAX_RESTING_CELLS: usize = 8;
 
 /// The link ids that a cell sends with, by port; the last one is the uplink to the gateway's side.
 pub type LinkIds = [Option<LinkId>; PORTS + 1];
@@ -51,10 +51,10 @@ pub struct Cells {
     clock: Clock,
     subscriptions: Subscriptions,
     /// True if the subscriptions may have changed since the filters were set.
-    hears_changed: bool,
+    subscriptions_changed: bool,
     /// True if pending frames have been received since a timer became due.
-    heard_first: bool,
-    hearing: Hearing,
+    received_first: bool,
+    filters: ReceiveFilters,
     outbox: Outbox,
     /// The time since which the bus has not accepted the outbox.
     unsent_since: Option<Instant>,
@@ -72,12 +72,12 @@ struct HostedCell {
 /// The reason for which cells stop.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
-pub enum Stopped {
+pub enum StopReason {
     /// Another cell has the node id.
     #[error(
         "cell {cell} is on {bus} already, with serial number {serial}: stop that one or give this one another number"
     )]
-    Taken {
+    NodeIdTaken {
         /// The bus.
         bus: String,
         /// The node id.
@@ -108,9 +108,9 @@ impl Cells {
             format,
             clock: Clock::new(),
             subscriptions: Subscriptions::default(),
-            hears_changed: false,
-            heard_first: false,
-            hearing: Hearing::default(),
+            subscriptions_changed: false,
+            received_first: false,
+            filters: ReceiveFilters::default(),
             outbox: Outbox::default(),
             unsent_since: None,
         }
@@ -118,7 +118,7 @@ impl Cells {
 
     /// Starts a cell with the contents of its flash and its wires. A simulated cell has no sensors, so it
     /// uses stimuli.
-    pub fn start(&mut self, identity: Identity, flash: &Flash, file: FlashFile, link_ids: LinkIds) {
+    pub fn start(&mut self, identity: Identity, flash: &FlashState, file: FlashFile, link_ids: LinkIds) {
         let mut wired = 0;
         for (port, link_id) in
             link_ids.iter().enumerate().filter_map(|(port, link_id)| Some((port, (*link_id)?)))
@@ -128,7 +128,7 @@ impl Cells {
         }
         let node = Node::new(identity, self.format, flash, true, self.clock.now()).with_ports(wired);
         self.cells.push(HostedCell { node, file, link_ids });
-        self.hears_changed = true;
+        self.subscriptions_changed = true;
     }
 
     /// Opens the bus of the cells.
@@ -138,26 +138,26 @@ impl Cells {
     ///
     /// # Errors
     /// Returns an error if the bus cannot be used as requested.
-    pub fn open(&mut self, line: &Line) -> Result<Sockets, Stopped> {
-        self.listen();
-        let options = Options {
-            filters: self.hearing.at_once.clone(),
+    pub fn open(&mut self, line: &BusPort) -> Result<Sockets, StopReason> {
+        self.update_subscriptions();
+        let options = BusOptions {
+            filters: self.filters.at_once.clone(),
             fd: self.format == Format::Fd,
             own_frames: line.wires && self.cells.len() > 1,
-            ..Options::default()
+            ..BusOptions::default()
         };
-        Sockets::open(line, &options, &self.hearing.deferred)
+        Sockets::open(line, &options, &self.filters.deferred)
     }
 
     /// Opens the bus as soon as it exists.
     ///
     /// # Errors
     /// Returns an error if the bus cannot be used as requested and waiting would not help.
-    pub fn open_again(&mut self, line: &Line) -> Result<Sockets, Stopped> {
+    pub fn open_again(&mut self, line: &BusPort) -> Result<Sockets, StopReason> {
         loop {
-            std::thread::sleep(AGAIN);
+            std::thread::sleep(RETRY_INTERVAL);
             match self.open(line) {
-                Err(Stopped::Bus(error)) if error.may_open_later() => {}
+                Err(StopReason::Bus(error)) if error.may_open_later() => {}
                 opened => return opened,
             }
         }
@@ -165,30 +165,30 @@ impl Cells {
 
     /// Updates the subscriptions if they may have changed. Returns the previous filters if the filters have
     /// changed.
-    fn listen(&mut self) -> Option<Hearing> {
-        if !core::mem::take(&mut self.hears_changed) {
+    fn update_subscriptions(&mut self) -> Option<ReceiveFilters> {
+        if !core::mem::take(&mut self.subscriptions_changed) {
             return None;
         }
-        let (cells, rest) = (self.cells.iter().enumerate(), self.cells.len() <= RESTING);
-        self.subscriptions.listen(cells.flat_map(|(place, HostedCell { node, link_ids, .. })| {
+        let (cells, rest) = (self.cells.iter().enumerate(), self.cells.len() <= MAX_RESTING_CELLS);
+        self.subscriptions.replace(cells.flat_map(|(place, HostedCell { node, link_ids, .. })| {
             let may_defer = rest || link_ids.iter().any(Option::is_some);
-            node.hears().map(move |id| (place, id, may_defer && node.defers(id)))
+            node.received_ids().map(move |id| (place, id, may_defer && node.defers(id)))
         }));
-        let hearing = self.subscriptions.hearing();
-        (hearing != self.hearing).then(|| core::mem::replace(&mut self.hearing, hearing))
+        let hearing = self.subscriptions.filters();
+        (hearing != self.filters).then(|| core::mem::replace(&mut self.filters, hearing))
     }
 
     /// Runs the cells until the bus fails or another cell has one of their node ids.
     ///
     /// # Errors
     /// Always returns the reason of the end.
-    pub fn run(&mut self, mut sockets: Sockets, line: &Line) -> Result<core::convert::Infallible, Stopped> {
+    pub fn run(&mut self, mut sockets: Sockets, line: &BusPort) -> Result<core::convert::Infallible, StopReason> {
         let mut now = self.clock.now();
         loop {
-            match self.turn(&mut sockets, now) {
+            match self.run_once(&mut sockets, now) {
                 Ok(()) => {}
                 // Frames received before the error have already been processed.
-                Err(Stopped::Bus(error)) => {
+                Err(StopReason::Bus(error)) => {
                     self.recover(error, &mut sockets, line)?;
                     now = self.clock.now();
                     continue;
@@ -201,31 +201,31 @@ impl Cells {
                 // A frame that a resting cell only counts is processed as if it had woken the process. With
                 // sums, its epoch is as old as its joints.
                 let (now, age) = if waited && !line.wires { (now - age, Span(0)) } else { (now, age) };
-                self.take(received, age, sockets.name(), now)?;
+                self.deliver(received, age, sockets.name(), now)?;
             }
         }
     }
 
     /// Waits for a bus that does not work, or opens it again. Unsent frames are sent afterwards; those that
     /// are too old are lost, as on a microcontroller without a bus.
-    fn recover(&mut self, error: BusError, sockets: &mut Sockets, line: &Line) -> Result<(), Stopped> {
+    fn recover(&mut self, error: BusError, sockets: &mut Sockets, line: &BusPort) -> Result<(), StopReason> {
         let since = *self.unsent_since.get_or_insert_with(Instant::now);
         if line.reconnect && error.is_closed() {
             *sockets = self.open_again(line)?;
         } else if matches!(error, BusError::Down(_)) {
-            self.lose_outbox();
-            std::thread::sleep(DOWN);
-        } else if !error.may_pass() {
+            self.drop_outbox();
+            std::thread::sleep(DOWN_RETRY_INTERVAL);
+        } else if !error.is_temporary() {
             return Err(error.into());
         }
-        if since.elapsed() > KEPT {
-            self.lose_outbox();
+        if since.elapsed() > MAX_UNSENT_AGE {
+            self.drop_outbox();
         }
         Ok(())
     }
 
     /// Drops the unsent frames and subtracts them from the cells' counts of sent packets.
-    fn lose_outbox(&mut self) {
+    fn drop_outbox(&mut self) {
         for place in self.outbox.lose() {
             if let Some(hosted_cell) = self.cells.get_mut(place) {
                 hosted_cell.node.handle_unsent();
@@ -234,32 +234,32 @@ impl Cells {
     }
 
     /// Handles due timers, sends, and waits for frames.
-    fn turn(&mut self, sockets: &mut Sockets, now: Micros) -> Result<(), Stopped> {
+    fn run_once(&mut self, sockets: &mut Sockets, now: Micros) -> Result<(), StopReason> {
         let timeouts = self.cells.iter().map(|hosted_cell| hosted_cell.node.poll_timeout());
         let due = timeouts.min().filter(|&due| due <= now);
         // Frames that arrived before a timer became due are processed first, once.
         if let Some(due) = due
-            && !core::mem::replace(&mut self.heard_first, true)
-            && sockets.look(self.clock.wall_nanos(due))?
+            && !core::mem::replace(&mut self.received_first, true)
+            && sockets.receive_pending(self.clock.wall_nanos(due))?
         {
             return Ok(());
         }
-        self.heard_first = false;
+        self.received_first = false;
         let mut next = Micros(u64::MAX);
         for (place, hosted_cell) in self.cells.iter_mut().enumerate() {
             if hosted_cell.node.poll_timeout() <= now {
                 hosted_cell.node.handle_timeout(now);
-                self.hears_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
+                self.subscriptions_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
             }
             next = next.min(hosted_cell.node.poll_timeout());
         }
-        self.clock.keep(now);
+        self.clock.remeasure(now);
         // Set the filters before the answers to the following frames can arrive.
-        if let Some(before) = self.listen()
-            && let Err(error) = sockets.set_filters(&self.hearing, &before)
+        if let Some(before) = self.update_subscriptions()
+            && let Err(error) = sockets.set_filters(&self.filters, &before)
         {
-            self.hearing = before;
-            self.hears_changed = true;
+            self.filters = before;
+            self.subscriptions_changed = true;
             return Err(error.into());
         }
         let frames = self.outbox.frames();
@@ -268,18 +268,18 @@ impl Cells {
         self.outbox.sent(count);
         sent.map_err(|error| error.cause)?;
         self.unsent_since = None;
-        Ok(sockets.wait(Duration::from_micros(next.since(now).0))?)
+        Ok(sockets.wait(Duration::from_micros(next.elapsed_since(now).0))?)
     }
 
     /// Passes a frame to the cells that receive it, and collects their answers at once.
-    fn take(&mut self, received: &Received, age: Span, bus: &str, now: Micros) -> Result<(), Stopped> {
+    fn deliver(&mut self, received: &Received, age: Span, bus: &str, now: Micros) -> Result<(), StopReason> {
         let frame = &received.frame;
         if let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) {
-            if let Some((place, port)) = self.subscriptions.of_link_id(link_id)
-                && let (Some(hosted_cell), Some(message)) = (self.cells.get_mut(place), link_id.read(frame))
+            if let Some((place, port)) = self.subscriptions.port_for_link(link_id)
+                && let (Some(hosted_cell), Some(message)) = (self.cells.get_mut(place), link_id.decode_frame(frame))
             {
                 hosted_cell.node.handle_port(now, age, port, message);
-                self.hears_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
+                self.subscriptions_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
             }
             return Ok(());
         }
@@ -293,14 +293,14 @@ impl Cells {
         if received.own && id.kind != Kind::Sum {
             return Ok(());
         }
-        for &place in self.subscriptions.of_id(id) {
+        for &place in self.subscriptions.cells_for_id(id) {
             let Some(hosted_cell) = self.cells.get_mut(place) else { continue };
             hosted_cell.node.handle_frame(now, age, frame);
-            if let Some(serial) = hosted_cell.node.taken() {
+            if let Some(serial) = hosted_cell.node.other_owner() {
                 let (bus, cell) = (bus.to_owned(), hosted_cell.node.identity().cell.map_or(0, CellId::get));
-                return Err(Stopped::Taken { bus, cell, serial });
+                return Err(StopReason::NodeIdTaken { bus, cell, serial });
             }
-            self.hears_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
+            self.subscriptions_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
         }
         Ok(())
     }
@@ -316,12 +316,12 @@ impl HostedCell {
         while let Some((port, message)) = self.node.poll_port_transmit() {
             let link_id = self.link_ids.get(port).copied().flatten();
             if let Some(link_id) = link_id {
-                outbox.push_uncounted(link_id.frame(message));
+                outbox.push_uncounted(link_id.encode_frame(message));
             }
         }
         while let Some(packet) = self.node.poll_transmit() {
             outbox.push_packet(place, packet.frames(format));
         }
-        self.node.poll_hears()
+        self.node.poll_received_ids()
     }
 }

@@ -4,14 +4,14 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail, ensure};
-use cell_node::flash::{Flash, Kept};
+use cell_node::flash::{FlashState, FlashContent};
 use cell_node::identity::Identity;
-use cell_node::io::{Cells, FlashFile, Line, LinkIds, Sockets, Stopped};
+use cell_node::io::{Cells, FlashFile, BusPort, LinkIds, Sockets, StopReason};
 use clap::Parser;
-use protocol::bus::Choice;
+use protocol::bus::KindChoice;
 use protocol::id::CellId;
-use protocol::last_words::{CellRange, LastWords};
-use protocol::skin::{Reply, Skin, Wires};
+use protocol::last_words::{CellRange, ExitReason};
+use protocol::skin::{SkinReply, Skin, Wires};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
 /// A tactile skin cell: receives joint positions, answers with its joint torques.
@@ -33,7 +33,7 @@ struct Arguments {
     #[arg(long, value_name = "N", required_unless_present = "nodes")]
     node: Option<u8>,
     /// Several cells in one process over one socket: the first and the last node id
-    #[arg(long, value_name = "A-B", conflicts_with = "node", value_parser = range)]
+    #[arg(long, value_name = "A-B", conflicts_with = "node", value_parser = parse_range)]
     nodes: Option<(u8, u8)>,
     /// The skin's description; a cell whose flash is empty takes its parameters from it
     #[arg(long, value_name = "FILE")]
@@ -49,14 +49,14 @@ struct Arguments {
     #[arg(long)]
     reconnect: bool,
     /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
-    bus_kind: Choice,
+    #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto)]
+    bus_kind: KindChoice,
     /// End when this process, the parent, ends
     #[arg(long, value_name = "PID")]
     with_parent: Option<i32>,
 }
 
-fn range(text: &str) -> Result<(u8, u8), String> {
+fn parse_range(text: &str) -> Result<(u8, u8), String> {
     let node_ids =
         text.split_once('-').and_then(|(first, last)| Some((first.parse().ok()?, last.parse().ok()?)));
     node_ids
@@ -72,19 +72,19 @@ impl Arguments {
 
     /// Reports the reason for the end of this process: as a line of [`LastWords`] if another program started
     /// it.
-    fn say_why(&self, why: impl core::fmt::Display) {
+    fn report_exit(&self, why: impl core::fmt::Display) {
         match self.nodes().filter(|_| self.with_parent.is_some()) {
             Some((first, last)) => {
-                say(LastWords { cells: CellRange(first, last), bus: self.bus.clone(), why: why.to_string() });
+                eprint_line(ExitReason { cells: CellRange(first, last), bus: self.bus.clone(), why: why.to_string() });
             }
-            None => say(why),
+            None => eprint_line(why),
         }
     }
 }
 
 /// Writes a line to standard error in one write, because hundreds of cells may share it.
-fn say(text: impl core::fmt::Display) {
-    protocol::usage::say(&format!("cell-node: {text}"));
+fn eprint_line(text: impl core::fmt::Display) {
+    protocol::usage::eprint_line(&format!("cell-node: {text}"));
 }
 
 fn main() -> ExitCode {
@@ -93,30 +93,30 @@ fn main() -> ExitCode {
         // Help and version were requested and are printed unchanged.
         Err(requested) if !requested.use_stderr() => requested.exit(),
         Err(wrong) => {
-            say(protocol::usage::one_line(&wrong.render().to_string()));
+            eprint_line(protocol::usage::one_line_error(&wrong.render().to_string()));
             return ExitCode::from(2);
         }
     };
     // Hundreds of cells wake up at once; each waits for its turn.
-    protocol::bus::never_interrupt();
+    protocol::bus::set_batch_scheduling();
     match prepare(&arguments) {
         Ok((mut cells, sockets, line)) => {
             let Err(stopped) = cells.run(sockets, &line);
             // The program that started hundreds of cells reports once that their bus is gone.
-            let is_gone = matches!(&stopped, Stopped::Bus(error) if error.is_closed());
+            let is_gone = matches!(&stopped, StopReason::Bus(error) if error.is_closed());
             if arguments.with_parent.is_none() || !is_gone {
-                arguments.say_why(stopped);
+                arguments.report_exit(stopped);
             }
             ExitCode::from(1)
         }
         Err(error) => {
-            arguments.say_why(format_args!("{error:#}"));
+            arguments.report_exit(format_args!("{error:#}"));
             ExitCode::from(2)
         }
     }
 }
 
-fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, Line)> {
+fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, BusPort)> {
     if let Some(parent) = arguments.with_parent {
         // A stopped process would not receive SIGTERM before it is continued.
         set_parent_process_death_signal(Some(Signal::KILL))?;
@@ -133,25 +133,25 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, Line)> {
     })?;
     let bus = skin.buses.get(bus_index).context("the bus that was found")?;
     let wires = match bus.reply {
-        Reply::Torque => None,
-        Reply::Sum { .. } => Some(skin.wires(bus_index)),
+        SkinReply::Torque => None,
+        SkinReply::Sum { .. } => Some(skin.wires(bus_index)),
     };
     let (first, last) = arguments.nodes().context("--node or --nodes is needed")?;
     let mut cells = Cells::new(bus.format);
     for number in first..=last {
         start(&mut cells, arguments, &skin, bus_index, wires.as_ref(), CellId::new(number.into())?)?;
     }
-    let line = Line {
+    let line = BusPort {
         name: arguments.bus.clone(),
         choice: arguments.bus_kind,
         wires: wires.is_some(),
         reconnect: arguments.reconnect,
     };
     let sockets = match cells.open(&line) {
-        Err(Stopped::Bus(error)) if line.reconnect && error.may_open_later() => {
+        Err(StopReason::Bus(error)) if line.reconnect && error.may_open_later() => {
             // The program that started hundreds of cells reports it.
             if arguments.with_parent.is_none() {
-                say(format_args!("{error}; waiting for it"));
+                eprint_line(format_args!("{error}; waiting for it"));
             }
             cells.open_again(&line)?
         }
@@ -169,7 +169,7 @@ fn start(
     wires: Option<&Wires>,
     cell: CellId,
 ) -> Result<()> {
-    let described = skin.cells_of(bus_index).find(|described| described.node == cell).with_context(|| {
+    let described = skin.cells_on_bus(bus_index).find(|described| described.node == cell).with_context(|| {
         format!("cell {cell} is not on {} in {}", arguments.bus, arguments.skin.display())
     })?;
     // A cell without wires is never assigned a node id.
@@ -177,23 +177,23 @@ fn start(
     let mut identity = Identity { cell: (!is_nameless).then_some(cell), serial: described.serial };
     let mut file = FlashFile::new(arguments.flash.as_deref(), &arguments.bus, identity);
     let flash = match file.load().with_context(|| file.name())? {
-        Ok(Kept { parameters: None, .. }) if !arguments.fresh => {
+        Ok(FlashContent { parameters: None, .. }) if !arguments.fresh => {
             let parameters = skin.parameters(described);
-            let kept = Kept { number: Some(cell), parameters: Some(parameters) };
+            let kept = FlashContent { number: Some(cell), parameters: Some(parameters) };
             file.store(&kept).with_context(|| file.name())?;
-            Flash::Sound(parameters)
+            FlashState::Valid(parameters)
         }
-        Ok(Kept { number, parameters }) => {
+        Ok(FlashContent { number, parameters }) => {
             identity.cell = identity.cell.or(number);
-            parameters.map_or(Flash::Empty, Flash::Sound)
+            parameters.map_or(FlashState::Empty, FlashState::Valid)
         }
         Err(damage) => {
             let name = file.name();
-            say(format_args!("{name} is not used: {damage}; write it again or delete the file"));
-            Flash::Damaged
+            eprint_line(format_args!("{name} is not used: {damage}; write it again or delete the file"));
+            FlashState::Damaged
         }
     };
-    let link_ids = wires.map_or_else(LinkIds::default, |wires| wires.of_cell(cell));
+    let link_ids = wires.map_or_else(LinkIds::default, |wires| wires.link_ids_of(cell));
     cells.start(identity, &flash, file, link_ids);
     Ok(())
 }

@@ -15,6 +15,6 @@ pub(crate) const fn by_serial(period: Span, serial: u32) -> Span {
 
 /// Returns the next time after `due`. Periods that passed during a hang are skipped, and the phase is kept.
 pub(crate) fn next(due: Micros, period: Span, now: Micros) -> Micros {
-    let skipped = now.since(due).0.checked_div(period.0).unwrap_or(0);
+    let skipped = now.elapsed_since(due).0.checked_div(period.0).unwrap_or(0);
     due + Span((skipped + 1) * period.0)
 }

@@ -18,20 +18,20 @@ use protocol::port::PORTS;
 use protocol::time::{Micros, Span};
 
 /// Number of epochs in which a missing sum is NACKed, because the child's reply may be lost too.
-const MISSING: u8 = 4;
+const NACK_EPOCHS: u8 = 4;
 /// Number of fraction bits that rounding removes.
-const SHORTENED: u32 = 30 - 8;
+const DROPPED_BITS: u32 = 30 - 8;
 
 /// A sum as it is sent on the bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Words {
+pub struct SumWords {
     /// The sums in Nm.
     pub torque: [Q7_8; MAX_JOINTS],
     /// Number of contributing cells.
     pub count: u8,
 }
 
-impl Words {
+impl SumWords {
     /// The sum that ends the lease.
     const END: Self = Self { torque: [Q7_8::ZERO; MAX_JOINTS], count: 0 };
 
@@ -48,11 +48,11 @@ struct Child {
     /// The epoch of the last sum that arrived, while the lease runs.
     last: Option<Epoch>,
     /// True if any sum arrived in the present epoch, of any epoch.
-    heard: bool,
+    received_any: bool,
     /// The sum of the present epoch.
-    taken: Option<Words>,
+    taken: Option<SumWords>,
     /// A sum that arrived before the child's state message.
-    waiting: Option<(Epoch, Words)>,
+    waiting: Option<(Epoch, SumWords)>,
     /// Number of further epochs in which a NACK is sent, unless a sum arrives.
     missing: u8,
 }
@@ -64,7 +64,7 @@ pub struct Sum {
     /// The present epoch.
     pub(crate) epoch: Option<Epoch>,
     /// The start of the present or last epoch.
-    begin: Begin,
+    begin: EpochStart,
     /// The rounded own torque in steps of Q7.8, if it contributes to the sum.
     own: Option<[i32; MAX_JOINTS]>,
     /// True if a sum was sent in the previous epoch: without contributions, the cell then sends one end.
@@ -77,7 +77,7 @@ pub struct Sum {
     /// The time to send the sum.
     due: Option<Micros>,
     /// The last sent sum, and its epoch.
-    said: Option<(Epoch, Words)>,
+    last_sent: Option<(Epoch, SumWords)>,
     /// True if the parent did not accept the last sum: the state is resent with the next one.
     pub(crate) restate: bool,
     /// True if missing sums of this epoch have been checked.
@@ -94,7 +94,7 @@ pub struct Sum {
 
 /// The start of an epoch.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Begin {
+pub struct EpochStart {
     /// The number of the epoch.
     pub epoch: Epoch,
     /// The time at which its joints were on the bus.
@@ -104,7 +104,7 @@ pub struct Begin {
     /// Number of wires to the root; `None` while it is unreachable.
     pub depth: Option<u8>,
     /// True if sums may be sent in this epoch.
-    pub speaks: bool,
+    pub may_send: bool,
     /// Bit p is set if the cell at port p is a child.
     pub children: u8,
 }
@@ -124,7 +124,7 @@ impl Sum {
     }
 
     /// Starts an epoch. `own` is this cell's torque at full width, `None` without contact.
-    pub fn begin(&mut self, begin: &Begin, own: Option<&[Acc<30>; MAX_JOINTS]>) {
+    pub fn begin(&mut self, begin: &EpochStart, own: Option<&[Acc<30>; MAX_JOINTS]>) {
         let Some(slots) = self.slots else { return };
         let before = self.epoch.replace(begin.epoch);
         let follows = before.is_some_and(|before| before.next() == begin.epoch);
@@ -132,7 +132,7 @@ impl Sum {
             let is_child = begin.children >> port & 1 == 1;
             let last = child.last.filter(|_| is_child);
             let waiting = child.waiting.filter(|(epoch, _)| *epoch == begin.epoch);
-            *child = Child { last, heard: false, taken: None, waiting, missing: child.missing };
+            *child = Child { last, received_any: false, taken: None, waiting, missing: child.missing };
         }
         self.begin = *begin;
         self.held = false;
@@ -141,24 +141,24 @@ impl Sum {
         }
         self.own = own.map(|exact| self.round(exact, slots.carry));
         // Send an end, so that the parent does not keep the last sum forever.
-        self.ends = follows && self.said.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
+        self.ends = follows && self.last_sent.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
         self.due = None;
-        self.plan(begin.at);
+        self.schedule(begin.at);
         (self.is_checked, self.check) = (false, None);
         if self.children.iter().any(|child| child.missing > 0) {
-            self.watch();
+            self.schedule_check();
         }
     }
 
     /// Schedules the check for missing sums before the next joints, while there is time to react.
-    pub(crate) fn watch(&mut self) {
+    pub(crate) fn schedule_check(&mut self) {
         if !self.is_checked && self.epoch.is_some() {
-            self.check = Some(self.begin.at + self.settles());
+            self.check = Some(self.begin.at + self.settling_time());
         }
     }
 
     /// Returns the time after joints by which all sums of an epoch have been sent.
-    const fn settles(&self) -> Span {
+    const fn settling_time(&self) -> Span {
         Span(self.begin.period.0 * 7 / 8)
     }
 
@@ -167,28 +167,28 @@ impl Sum {
         let mut words = [0; MAX_JOINTS];
         for ((word, carry), exact) in words.iter_mut().zip(&mut self.carry).zip(exact) {
             let target = exact.steps() + if carries { *carry } else { 0 };
-            let rounded = (target + (1 << (SHORTENED - 1))) >> SHORTENED;
-            *carry = target - (rounded << SHORTENED);
+            let rounded = (target + (1 << (DROPPED_BITS - 1))) >> DROPPED_BITS;
+            *carry = target - (rounded << DROPPED_BITS);
             *word = i32::try_from(rounded).unwrap_or(if rounded < 0 { i32::MIN } else { i32::MAX });
         }
         words
     }
 
     /// Handles a child's state message: its sums from this epoch on are for this cell.
-    pub fn state(&mut self, now: Micros, port: usize, epoch: Epoch) {
+    pub fn handle_state(&mut self, now: Micros, port: usize, epoch: Epoch) {
         let Some(child) = self.children.get_mut(port) else { return };
-        child.last = Some(epoch.before());
+        child.last = Some(epoch.previous());
         if let Some((_, words)) = child.waiting.take_if(|(of, _)| *of == epoch) {
             self.dropped = self.dropped.wrapping_sub(1);
-            self.take(now, port, epoch, words);
+            self.receive(now, port, epoch, words);
         }
     }
 
     /// Handles a child's sum. The one with the largest count is kept.
-    pub fn take(&mut self, now: Micros, port: usize, epoch: Epoch, words: Words) {
+    pub fn receive(&mut self, now: Micros, port: usize, epoch: Epoch, words: SumWords) {
         let present = self.epoch == Some(epoch);
         let Some(child) = self.children.get_mut(port) else { return };
-        child.heard = true;
+        child.received_any = true;
         child.missing = 0;
         let follows = child.last.is_some_and(|last| epoch == last || epoch == last.next());
         child.last = Some(epoch).filter(|_| follows && !words.is_end());
@@ -202,21 +202,21 @@ impl Sum {
         }
         child.taken = Some(words);
         self.taken = self.taken.wrapping_add(1);
-        self.plan(now);
+        self.schedule(now);
     }
 
     /// Schedules sending: at once if the sum of every child has arrived, otherwise in this cell's slot. If a
     /// child that sent in the previous epoch is late, the time is as late as is still useful. Later changes
     /// are sent in the next slot.
-    fn plan(&mut self, now: Micros) {
+    fn schedule(&mut self, now: Micros) {
         let Some(slots) = self.slots else { return };
         if self.count() == 0 && !self.ends {
             return;
         }
         let width = u64::from(slots.slot_us);
         let slot = u64::from(slots.deepest.saturating_sub(self.depth())) * width;
-        if self.said.is_some_and(|(of, _)| Some(of) == self.epoch) {
-            let next = (now.since(self.begin.at).0 / width + 1) * width;
+        if self.last_sent.is_some_and(|(of, _)| Some(of) == self.epoch) {
+            let next = (now.elapsed_since(self.begin.at).0 / width + 1) * width;
             let at = self.begin.at + Span(next.max(slot));
             self.due = Some(self.due.map_or(at, |due| due.min(at)));
             return;
@@ -227,7 +227,7 @@ impl Sum {
         let at = if self.children.iter().enumerate().all(is_in) {
             0
         } else if self.children.iter().any(is_late) {
-            self.late().0.max(slot)
+            self.late_send_time().0.max(slot)
         } else {
             slot
         };
@@ -241,9 +241,9 @@ impl Sum {
 
     /// Returns the time after joints by which a sum that waits for a late child is sent: half a slot earlier
     /// for each wire to the root, so that the sum still reaches the cells above that wait for it.
-    fn late(&self) -> Span {
+    fn late_send_time(&self) -> Span {
         let width = self.slots.map_or(0, |slots| u64::from(slots.slot_us));
-        Span(self.settles().0.saturating_sub(u64::from(self.depth()) * width / 2))
+        Span(self.settling_time().0.saturating_sub(u64::from(self.depth()) * width / 2))
     }
 
     /// Returns true if a child's sum is expected in each epoch: its lease runs.
@@ -253,7 +253,7 @@ impl Sum {
 
     /// Returns the time by which the sum of the next epoch must be sent if a child is late.
     pub(crate) fn late_at_next(&self) -> Micros {
-        self.begin.at + self.begin.period + self.late()
+        self.begin.at + self.begin.period + self.late_send_time()
     }
 
     /// Handles the loss of a child at a port.
@@ -267,8 +267,8 @@ impl Sum {
     }
 
     /// Handles the loss of the parent: sends no more sums in this epoch.
-    pub(crate) const fn fall_silent(&mut self) {
-        self.begin.speaks = false;
+    pub(crate) const fn stop_sending(&mut self) {
+        self.begin.may_send = false;
         self.due = None;
     }
 
@@ -279,19 +279,19 @@ impl Sum {
 
     /// Returns the sum to send if it is due, cumulative over all contributions of this epoch. The last value
     /// is true if a state message must precede it.
-    pub fn say(&mut self, now: Micros) -> Option<(Epoch, Words, bool)> {
+    pub fn poll_sum(&mut self, now: Micros) -> Option<(Epoch, SumWords, bool)> {
         let epoch = self.epoch.filter(|_| !self.held)?;
         self.due.take_if(|due| *due <= now)?;
-        if !self.begin.speaks || self.begin.depth.is_none() {
+        if !self.begin.may_send || self.begin.depth.is_none() {
             return None;
         }
         let words = self.words()?;
-        if self.said == Some((epoch, words)) {
+        if self.last_sent == Some((epoch, words)) {
             return None;
         }
-        let follows = |(of, before): (Epoch, Words)| of == epoch || (of.next() == epoch && !before.is_end());
-        let goes_on = self.said.is_some_and(follows) && !core::mem::take(&mut self.restate);
-        self.said = Some((epoch, words));
+        let follows = |(of, before): (Epoch, SumWords)| of == epoch || (of.next() == epoch && !before.is_end());
+        let goes_on = self.last_sent.is_some_and(follows) && !core::mem::take(&mut self.restate);
+        self.last_sent = Some((epoch, words));
         self.sent = self.sent.wrapping_add(1);
         Some((epoch, words, !goes_on))
     }
@@ -303,10 +303,10 @@ impl Sum {
     }
 
     /// Returns the sum of all contributions of this epoch; `None` if there is nothing to send.
-    fn words(&self) -> Option<Words> {
+    fn words(&self) -> Option<SumWords> {
         let count = self.count();
         if count == 0 {
-            return self.ends.then_some(Words::END);
+            return self.ends.then_some(SumWords::END);
         }
         let mut sums = self.own.unwrap_or_default().map(|own| (i64::from(own), false));
         for words in self.children.iter().filter_map(|child| child.taken) {
@@ -319,22 +319,22 @@ impl Sum {
             let fits = i16::try_from(sum).ok().filter(|_| !saturated);
             Q7_8::from_bits(fits.unwrap_or(if sum < 0 { i16::MIN } else { i16::MAX }))
         });
-        Some(Words { torque, count: u8::try_from(count).unwrap_or(u8::MAX) })
+        Some(SumWords { torque, count: u8::try_from(count).unwrap_or(u8::MAX) })
     }
 
     /// Returns true if the last sum was sent in this epoch.
-    pub(crate) fn said_in(&self, epoch: Epoch) -> bool {
-        self.said.is_some_and(|(of, _)| of == epoch)
+    pub(crate) fn was_sent_in(&self, epoch: Epoch) -> bool {
+        self.last_sent.is_some_and(|(of, _)| of == epoch)
     }
 
     /// Returns true if a sum was sent in this epoch or the previous one, and more will follow.
     pub(crate) fn is_busy(&self) -> bool {
         let recent = |of: Epoch| self.epoch.is_some_and(|epoch| of == epoch || of.next() == epoch);
-        self.said.is_some_and(|(of, words)| recent(of) && !words.is_end())
+        self.last_sent.is_some_and(|(of, words)| recent(of) && !words.is_end())
     }
 
     /// Handles joints that are not answered: all leases end, and the children must send their states again.
-    pub(crate) fn skip(&mut self) {
+    pub(crate) fn skip_epoch(&mut self) {
         self.epoch = None;
         self.children = Default::default();
         (self.due, self.check, self.own) = (None, None, None);
@@ -344,7 +344,7 @@ impl Sum {
 
     /// Records that a frame was received `age` after it was on the bus. If that exceeds a quarter of a
     /// period, the machine itself is slow, and missing sums are not checked in this epoch.
-    pub(crate) const fn heard_after(&mut self, age: Span) {
+    pub(crate) const fn note_delay(&mut self, age: Span) {
         if age.0 * 4 > self.begin.period.0 && self.begin.period.0 > 0 {
             self.is_checked = true;
             self.check = None;
@@ -353,17 +353,17 @@ impl Sum {
 
     /// Returns true if all sums of this epoch have been sent.
     pub(crate) fn is_settled(&self, now: Micros) -> bool {
-        self.epoch.is_none() || now >= self.begin.at + self.settles()
+        self.epoch.is_none() || now >= self.begin.at + self.settling_time()
     }
 
     /// Returns the lateness of the check before the next joints, if it is due.
     pub(crate) fn check(&mut self, now: Micros) -> Option<Span> {
-        self.check.take_if(|check| *check <= now).map(|check| now.since(check))
+        self.check.take_if(|check| *check <= now).map(|check| now.elapsed_since(check))
     }
 
     /// Returns the children whose sums are missing, once per epoch: bit p is set for the child at port p. The
     /// lease of such a child ends.
-    pub(crate) fn missing(&mut self) -> Option<(Epoch, u8)> {
+    pub(crate) fn check_missing(&mut self) -> Option<(Epoch, u8)> {
         if core::mem::replace(&mut self.is_checked, true) {
             return None;
         }
@@ -371,9 +371,9 @@ impl Sum {
         for (port, child) in self.children.iter_mut().enumerate() {
             // No sum arrived, or one without a state message.
             let unsaid = child.waiting.is_some_and(|(of, _)| Some(of) == self.epoch);
-            if unsaid || (child.last.is_some() && !child.heard) {
+            if unsaid || (child.last.is_some() && !child.received_any) {
                 child.last = None;
-                child.missing = MISSING;
+                child.missing = NACK_EPOCHS;
             }
             if child.missing > 0 {
                 child.missing -= 1;

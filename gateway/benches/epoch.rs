@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use criterion::{Criterion, Throughput};
 use model::generate::{Target, generate};
 use model::table::Table;
-use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
+use protocol::bus::{Bus, BusKind, KindChoice, Filter, Inbox, BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q3_12;
 use protocol::id::CellId;
@@ -20,7 +20,7 @@ use protocol::message::{Joints, Message};
 use protocol::packet::Epoch;
 use protocol::skin::Skin;
 use protocol::time::Micros;
-use vcan_setup::embedded::Served;
+use vcan_setup::embedded::ServerThread;
 
 const CELLS: usize = 253;
 /// Identifier of a frame that shows the delivery of all replies before it.
@@ -28,7 +28,7 @@ const AFTER: u32 = 0x7FF;
 
 /// An embedded bus with replies, their sender, and their receiver.
 struct Wire {
-    _served: Served,
+    _served: ServerThread,
     cells: Bus,
     gateway: Bus,
     bell: Bus,
@@ -37,11 +37,11 @@ struct Wire {
 
 impl Wire {
     fn new(directory: PathBuf) -> Self {
-        let served = Served::start_in(&directory, "vcan0").expect("a new directory");
+        let served = ServerThread::start_in(&directory, "vcan0").expect("a new directory");
         let open = |filters| {
             let directory = Some(directory.clone());
-            let options = Options { filters, directory, receive_buffer: 1 << 20, ..Options::default() };
-            Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).expect("it is served")
+            let options = BusOptions { filters, directory, receive_buffer: 1 << 20, ..BusOptions::default() };
+            Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).expect("it is served")
         };
         let gateway = open(vec![Filter { id: 0x200, mask: 0x700 }]);
         let bell = open(vec![Filter { id: AFTER, mask: Filter::EXACT_MASK }]);
@@ -105,7 +105,7 @@ impl Listener {
         epoch
     }
 
-    fn hear(&mut self, frame: &Frame) {
+    fn receive(&mut self, frame: &Frame) {
         let at = Micros((self.number - 1) * 16_000 + 1_000);
         self.table.handle_frame(at, false, frame, &mut |_| None);
     }
@@ -171,7 +171,7 @@ fn main() {
             for _ in 0..epochs {
                 let epoch = listener.open();
                 wire.put(&replies(epoch));
-                took += wire.take(|_, frame| listener.hear(frame));
+                took += wire.take(|_, frame| listener.receive(frame));
                 assert_eq!(listener.table.snapshot().sums.contributing, 253, "every reply counts");
             }
             took

@@ -10,19 +10,19 @@ use std::time::{Duration, Instant};
 
 use bench::bus::realtime;
 use control::controller::Kinesthetic;
-use control::cycle::turn::{Line, Shared, Timed, Turn};
+use control::cycle::turn::{BusPort, Shared, TimedRecord, TickDriver};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
 use criterion::{BenchmarkId, Criterion};
 use model::generate::{Target, generate};
 use model::scenario::{Mode, ModeChange, Scenario};
-use model::table::{Snapshot, Sums};
+use model::table::{Snapshot, BusTotals};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::message::SkinSensors;
 use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{Bus, Skin};
+use protocol::skin::{SkinBus, Skin};
 use protocol::time::{Micros, Span};
 
 /// Maximum number of cells per bus.
@@ -67,7 +67,7 @@ fn skin(cells: usize) -> Skin {
     let mut skin = Skin::parse("skin.toml", &text).expect("a generated skin is sound");
     let first = skin.clone();
     for bus in 1..cells.div_ceil(ON_A_BUS) {
-        let more = first.buses.iter().map(|first| Bus { name: format!("vcan{bus}"), ..first.clone() });
+        let more = first.buses.iter().map(|first| SkinBus { name: format!("vcan{bus}"), ..first.clone() });
         skin.buses.extend(more);
         let room = cells - skin.cells.len();
         skin.cells.extend(first.cells.iter().take(room).cloned().map(|mut cell| {
@@ -87,9 +87,9 @@ struct Receiver {
 
 /// A loop, with the ends that other threads hold in a run.
 struct Bench {
-    turn: Turn,
+    turn: TickDriver,
     buses: Vec<Receiver>,
-    records: rtrb::Consumer<Timed>,
+    records: rtrb::Consumer<TimedRecord>,
     tick: u64,
 }
 
@@ -97,11 +97,11 @@ impl Bench {
     fn new(skin: &Skin, case: Case) -> Self {
         let (mut lines, mut buses) = (Vec::new(), Vec::new());
         for (index, bus) in skin.buses.iter().enumerate() {
-            let sensors = skin.cells_of(index).map(|_| case.sensors()).collect::<Vec<_>>();
-            let snapshot = Snapshot { sums: Sums::default(), sensors };
+            let sensors = skin.cells_on_bus(index).map(|_| case.sensors()).collect::<Vec<_>>();
+            let snapshot = Snapshot { sums: BusTotals::default(), sensors };
             let (snapshots, snapshot) = triple_buffer::triple_buffer(&snapshot);
             let (producer, positions) = rtrb::RingBuffer::new(64);
-            lines.push(Line { format: bus.format, snapshot, positions: producer, state: Arc::default() });
+            lines.push(BusPort { format: bus.format, snapshot, positions: producer, state: Arc::default() });
             buses.push(Receiver { snapshots, positions });
         }
         let mode = if case == Case::Distributed { Mode::Distributed } else { Mode::Compare };
@@ -110,7 +110,7 @@ impl Bench {
         let controller = Box::new(Kinesthetic::new(skin).expect("a generated skin has one"));
         let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, padded(&[0.1; WORDS]))));
         let (producer, records) = rtrb::RingBuffer::new(64);
-        let turn = Turn::new(cycle, lines, Arc::new(scenario), Arc::new(Shared::default()), producer);
+        let turn = TickDriver::new(cycle, lines, Arc::new(scenario), Arc::new(Shared::default()), producer);
         Self { turn, buses, records, tick: 0 }
     }
 

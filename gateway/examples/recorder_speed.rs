@@ -18,11 +18,11 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use bench::record::feed::{self, Feed};
-use bench::record::{Mcap, Options, Outputs};
+use bench::record::{Mcap, RecordOptions, Outputs};
 use model::central::Central;
-use model::latched::Seen;
+use model::latched::ReceivedFrame;
 use protocol::can::Format;
-use protocol::candump::{self, Direction, Line, Record, Timestamp};
+use protocol::candump::{self, Direction, CandumpLine, Record, Timestamp};
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::message::{Joints, Message};
 use protocol::packet::padded;
@@ -30,7 +30,7 @@ use protocol::packet::{Epoch, Length, WORDS, Words};
 use protocol::skin::Skin;
 use trace::recording::file::FileWriter;
 use trace::recording::layout::Layout;
-use trace::recording::series::{Head, Split};
+use trace::recording::series::{FileHead, SplitLimits};
 
 const SKIN: &str = include_str!("ur5-253.toml");
 /// Time for which frames are pushed.
@@ -52,18 +52,18 @@ fn main() -> Result<(), Box<dyn Error>> {
 }
 
 #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
-fn seconds(frames: &[Seen]) -> f64 {
+fn seconds(frames: &[ReceivedFrame]) -> f64 {
     let ends = frames.first().zip(frames.last());
     ends.map_or(0.0, |(first, last)| last.at_nanos.saturating_sub(first.at_nanos) as f64 * 1e-9)
 }
 
 /// Frames of 253 cells that are pressed by 1.5 N each, while each joint swings to and fro.
-fn of_run(skin: &Skin, seconds: u32) -> Vec<Seen> {
+fn of_run(skin: &Skin, seconds: u32) -> Vec<ReceivedFrame> {
     let central = Central::new(skin);
     let (hz, began) = (skin.timing.broadcast_hz(), 1_700_000_000_000_000_000_u64);
     let mut frames = Vec::new();
     let mut say = |at_nanos, own, message: &Message| {
-        frames.extend(message.encode().frames(Format::Fd).map(|frame| Seen { at_nanos, own, frame }));
+        frames.extend(message.encode().frames(Format::Fd).map(|frame| ReceivedFrame { at_nanos, from_gateway: own, frame }));
     };
     let mut number = 0_u32;
     loop {
@@ -95,11 +95,11 @@ fn of_run(skin: &Skin, seconds: u32) -> Vec<Seen> {
     }
 }
 
-fn of_log(text: &str) -> Result<Vec<Seen>, Box<dyn Error>> {
+fn of_log(text: &str) -> Result<Vec<ReceivedFrame>, Box<dyn Error>> {
     let mut frames = Vec::new();
     for line in text.lines() {
-        if let Line::Frame(Record { time, frame, direction, .. }) = candump::parse(line)? {
-            frames.push(Seen { at_nanos: time.nanos, own: direction == Some(Direction::Sent), frame });
+        if let CandumpLine::Frame(Record { time, frame, direction, .. }) = candump::parse(line)? {
+            frames.push(ReceivedFrame { at_nanos: time.nanos, from_gateway: direction == Some(Direction::Sent), frame });
         }
     }
     Ok(frames)
@@ -107,16 +107,16 @@ fn of_log(text: &str) -> Result<Vec<Seen>, Box<dyn Error>> {
 
 /// Pushes frames into the recorder as fast as it accepts them.
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-fn speed(skin: &Skin, folder: &std::path::Path, frames: &[Seen]) -> Result<(), Box<dyn Error>> {
+fn speed(skin: &Skin, folder: &std::path::Path, frames: &[ReceivedFrame]) -> Result<(), Box<dyn Error>> {
     let path = folder.join("recorder_speed.mcap");
-    let split = Split { bytes: u64::MAX / 2, age: Duration::MAX };
+    let split = SplitLimits { bytes: u64::MAX / 2, age: Duration::MAX };
     let mcap =
         Mcap { path: path.clone(), split, attachments: Vec::new(), robot: None, command_line: Vec::new() };
-    let options = Options { mcap: Some(mcap), force: true, ..Options::default() };
+    let options = RecordOptions { mcap: Some(mcap), force: true, ..RecordOptions::default() };
     let outputs = Outputs::claim(&options, &AtomicBool::new(false), |line| println!("{line}"))?;
     let (mut outlet, bus_feed) = feed::bus_feed(1, true, Arc::default(), Arc::default());
     let feed = Feed { bus_feeds: vec![bus_feed], ticks: None };
-    let recorder = outputs.start(feed, Layout::new(skin), Head::default())?;
+    let recorder = outputs.start(feed, Layout::new(skin), FileHead::default())?;
     let began = Instant::now();
     let mut count = 0_u64;
     'pushed: loop {
@@ -165,12 +165,12 @@ impl Write for Counter {
 
 /// Writes only frames, flushed as in a run.
 #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
-fn size(frames: &[Seen]) -> Result<(), Box<dyn Error>> {
+fn size(frames: &[ReceivedFrame]) -> Result<(), Box<dyn Error>> {
     let mut writer = FileWriter::new(Counter::default())?;
     let mut channel = writer.channel::<Record<'_>>("/can/vcan0", &[("time_digits", "9")])?;
     let (mut flushes, mut next) = (0_u64, 0);
     let began = Instant::now();
-    for &Seen { at_nanos, own, frame } in frames {
+    for &ReceivedFrame { at_nanos, from_gateway: own, frame } in frames {
         if at_nanos >= next {
             writer.flush()?;
             next = at_nanos + FLUSH_NANOS;

@@ -8,10 +8,10 @@ use std::fmt::Write as _;
 use std::time::Duration;
 
 use bench::replay::player::Pace;
-use bench::replay::replay_plan::Only;
-use bench::replay::survey::Part;
-use bench::replay::{Options, replay};
-use protocol::bus::{Bus, BusKind, Choice, Inbox, Kinds, Options as BusOptions};
+use bench::replay::replay_plan::SenderFilter;
+use bench::replay::survey::TimeRange;
+use bench::replay::{ReplayOptions, replay};
+use protocol::bus::{Bus, BusKind, KindChoice, Inbox, KindChoices, BusOptions as BusOptions};
 use rustix::time::{ClockId, clock_gettime};
 use vcan_setup::embedded::Server;
 
@@ -22,7 +22,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let server = Server::bind(name)?;
     let (stop, stopped) = std::os::unix::net::UnixStream::pair()?;
     let serving = std::thread::spawn(move || server.run(stopped));
-    let kind = Choice::Only(BusKind::Embedded);
+    let kind = KindChoice::Only(BusKind::Embedded);
     let reader = Bus::open(name, kind, &BusOptions::default())?;
     std::thread::spawn(move || {
         let mut inbox = Inbox::new();
@@ -40,13 +40,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
     println!("spin, us   late 50 % / 90 % / 99 % / maximum, us   idle        processor, cores");
     for spin in [0, 20, 50, 100, 150, 300] {
-        let options = Options {
+        let options = ReplayOptions {
             files: vec![file.clone()],
-            kinds: Kinds::all(kind),
-            only: Only::All,
+            kinds: KindChoices::all(kind),
+            only: SenderFilter::All,
             buses: Vec::new(),
             map: Vec::new(),
-            part: Part::default(),
+            part: TimeRange::default(),
             passes: Some(1),
             pace: Pace::Timed(1.0),
             spin: Duration::from_micros(spin),

@@ -4,23 +4,23 @@ use std::ops::RangeInclusive;
 
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
-use protocol::bus::{Choice, Kinds, OneKind};
+use protocol::bus::{KindChoice, KindChoices, KindOption};
 use protocol::can::Format;
 use protocol::skin::{CellName, Skin};
 use protocol::usage::Failure;
 
-use super::print::list;
+use super::print::comma_separated;
 
 /// A possible value of an option: its word, its help unless the word is plain, and its value.
-pub(crate) type Word<T> = (&'static str, &'static str, T);
+pub(crate) type OptionValue<T> = (&'static str, &'static str, T);
 
 /// Frame formats of a packet.
-pub(crate) const FORMATS: &[Word<Format>] =
+pub(crate) const FORMATS: &[OptionValue<Format>] =
     &[("fd", "One CAN FD frame", Format::Fd), ("classic", "Two to four classic frames", Format::Classic)];
 
 /// Creates a parser that accepts one of these words.
 pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(
-    words: &'static [Word<T>],
+    words: &'static [OptionValue<T>],
 ) -> impl TypedValueParser<Value = T> {
     let allowed = words.iter().map(|(word, about, _)| match *about {
         "" => PossibleValue::new(*word),
@@ -60,23 +60,23 @@ pub(crate) struct BusKinds {
     /// Bus kind: socketcan or embedded. Default: socketcan if an interface has this name, else embedded. For one of
     /// several buses, BUS=KIND; repeat the option for further buses
     #[arg(long, value_name = "[BUS=]KIND")]
-    bus_kind: Vec<OneKind>,
+    bus_kind: Vec<KindOption>,
 }
 
 impl BusKinds {
     /// Kinds of any buses.
-    pub(crate) fn of_any(&self) -> Result<Kinds, Failure> {
-        self.or(Choice::Auto)
+    pub(crate) fn of_any(&self) -> Result<KindChoices, Failure> {
+        self.kinds_or(KindChoice::Auto)
     }
 
     /// Kinds of any buses; `otherwise` is the kind of buses that the option does not name.
-    pub(crate) fn or(&self, otherwise: Choice) -> Result<Kinds, Failure> {
-        Kinds::of_words(&self.bus_kind, otherwise).map_err(Failure::usage)
+    pub(crate) fn kinds_or(&self, otherwise: KindChoice) -> Result<KindChoices, Failure> {
+        KindChoices::from_options(&self.bus_kind, otherwise).map_err(Failure::usage)
     }
 
     /// Kinds of these buses. Fails if the option names another bus.
-    pub(crate) fn of<'a>(&self, buses: impl IntoIterator<Item = &'a str>) -> Result<Kinds, Failure> {
-        self.of_any()?.only(buses).map_err(Failure::usage)
+    pub(crate) fn kinds_of<'a>(&self, buses: impl IntoIterator<Item = &'a str>) -> Result<KindChoices, Failure> {
+        self.of_any()?.restrict_to(buses).map_err(Failure::usage)
     }
 }
 
@@ -111,7 +111,7 @@ pub(crate) fn bus_names(skin: &Skin) -> impl Iterator<Item = &str> {
 /// Finds a bus by name in the skin that `file` describes. Returns its index.
 pub(crate) fn bus_of(skin: &Skin, file: &str, name: &str) -> Result<usize, Failure> {
     skin.bus_named(name).ok_or_else(|| {
-        let names = list(bus_names(skin));
+        let names = comma_separated(bus_names(skin));
         Failure::usage(format!("bus {name} is not in {file}, which has {names}"))
     })
 }
@@ -119,7 +119,7 @@ pub(crate) fn bus_of(skin: &Skin, file: &str, name: &str) -> Result<usize, Failu
 /// Finds the only cell of a name. Returns its index into [`Skin::cells`]; `option` names the option in errors.
 pub(crate) fn cell_of(skin: &Skin, name: &CellName, option: &str) -> Result<usize, Failure> {
     let CellName { bus, node } = name;
-    let names = || list(bus_names(skin));
+    let names = || comma_separated(bus_names(skin));
     if bus.as_ref().is_some_and(|bus| skin.bus_named(bus).is_none()) {
         return Err(Failure::usage(format!("{option} {name}: the skin's buses are {}", names())));
     }
@@ -139,7 +139,7 @@ pub(crate) fn cell_of(skin: &Skin, name: &CellName, option: &str) -> Result<usiz
             bus.clone().unwrap_or_else(names)
         ))),
         buses => {
-            let choices = list(buses.iter().map(|(_, bus)| format!("{}:{node}", bus.name)));
+            let choices = comma_separated(buses.iter().map(|(_, bus)| format!("{}:{node}", bus.name)));
             Err(Failure::usage(format!("{option} {node} is on several buses: choose one of {choices}")))
         }
     }

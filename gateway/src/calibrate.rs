@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::thread;
 
 use bench::record::{self, Mcap};
-use bench::run::{self, Options};
+use bench::run::{self, RunOptions};
 use bench::summary::Outcome;
 use calibration::motion::Motion;
 use calibration::neighbors::Spacing;
@@ -17,19 +17,19 @@ use calibration::write::calibrated;
 use calibration::{Calibration, Settings, calibrate};
 use clap::Args;
 use model::accelerometer::kinematics::UPRIGHT;
-use model::accelerometer::sensor::{DataSheet, Given};
+use model::accelerometer::sensor::{DataSheet, DataSheetInput};
 use model::decode::{Decoded, Decoder};
 use model::scenario::Scenario;
 use protocol::bus::GATEWAY_RECEIVE_BUFFER;
-use protocol::document::{self, Place};
+use protocol::document::{self, KeyPath};
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use protocol::id::CellId;
 use protocol::parameters::{Events, Sensing};
 use protocol::skin::{ControllerKind, Skin};
 use protocol::time::{Micros, Span};
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print_text};
 use trace::capture::{Entry, Reader};
-use trace::recording::series::{Attached, Split};
+use trace::recording::series::{AttachedFile, SplitLimits};
 
 use super::arguments::{BusKinds, bus_names, seconds};
 use super::input::no_frame;
@@ -104,7 +104,7 @@ pub(crate) struct Calibrate {
 
 impl Calibrate {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let text = document::text(&self.skin).map_err(Failure::usage)?;
+        let text = document::read_text(&self.skin).map_err(Failure::usage)?;
         let skin = Skin::parse(&self.skin.display().to_string(), &text).map_err(Failure::usage)?;
         let settings = self.settings(&skin)?;
         let written = [
@@ -120,7 +120,7 @@ impl Calibrate {
             let motion = plan(&skin, &settings.bounds, &settings.sheet, settings.gravity);
             let motion = motion.map_err(Failure::usage)?;
             if self.dry_run {
-                return print(&json(&motion)?);
+                return print_text(&json(&motion)?);
             }
             self.live(&skin, &text, &settings, motion)?
         } else {
@@ -163,8 +163,8 @@ impl Calibrate {
         }
         let sheet = match &self.data_sheet {
             Some(path) => {
-                let text = document::text(path).map_err(Failure::usage)?;
-                let sheet = |given: Given| given.sheet(&Place::root());
+                let text = document::read_text(path).map_err(Failure::usage)?;
+                let sheet = |given: DataSheetInput| given.sheet(&KeyPath::root());
                 document::parse(&path.display().to_string(), &text, sheet).map_err(Failure::usage)?
             }
             None => DataSheet::default(),
@@ -224,10 +224,10 @@ impl Calibrate {
         settings: &Settings,
         motion: Motion,
         path: PathBuf,
-    ) -> Result<Options, Failure> {
+    ) -> Result<RunOptions, Failure> {
         let urdf = skin.robot.urdf.as_deref().map(|urdf| urdf_of(&self.skin, urdf));
         let robot = RobotOfSkin::read(skin, urdf.as_deref())?;
-        let attached = |name: &str, media_type, text: String| Attached {
+        let attached = |name: &str, media_type, text: String| AttachedFile {
             name: name.to_owned(),
             media_type,
             bytes: text.into_bytes(),
@@ -235,7 +235,7 @@ impl Calibrate {
         let mut attachments = vec![attached("skin.toml", "application/toml", text.to_owned())];
         attachments.extend(robot.urdf.map(|text| attached("robot.urdf", "application/xml", text)));
         let command_line = protocol::usage::command_line();
-        let mcap = Mcap { path, split: Split::default(), attachments, robot: robot.robot, command_line };
+        let mcap = Mcap { path, split: SplitLimits::default(), attachments, robot: robot.robot, command_line };
         let length_us = (motion.length_s() * 1e6).round();
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "20 to 3600 s: checked")]
         let mut scenario = Scenario::idle(Span(length_us as u64));
@@ -251,11 +251,11 @@ impl Calibrate {
             acceleration: Q3_12::ZERO,
             ..Events::default()
         };
-        Ok(Options {
+        Ok(RunOptions {
             skin_file: self.skin.clone(),
             skin: sensing,
             scenario,
-            kinds: self.kinds.of(bus_names(skin))?,
+            kinds: self.kinds.kinds_of(bus_names(skin))?,
             directory: None,
             spawn: !self.no_spawn,
             emulated: None,
@@ -263,7 +263,7 @@ impl Calibrate {
             cells_per_process: usize::from(CellId::MAX.get()),
             flash: None,
             receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
-            record: record::Options { candump: None, mcap: Some(mcap), force: self.overwrite.overwrite },
+            record: record::RecordOptions { candump: None, mcap: Some(mcap), force: self.overwrite.overwrite },
             quiet: self.quiet,
             planned: Some(motion),
             announced: Vec::new(),

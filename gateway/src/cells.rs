@@ -7,12 +7,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use bench::cells::Watch;
+use bench::cells::CellWatch;
 use clap::Args;
 use protocol::skin::Skin;
-use protocol::usage::{Failure, print, put, shown_lines, written};
+use protocol::usage::{Failure, print_text, write_stdout, printable_lines, ignore_broken_pipe};
 
-use self::show::{Known, Shown};
+use self::show::{DescribedBus, CellList};
 use super::arguments::{BusKinds, bus_of, seconds};
 use super::input;
 use super::print::{json, json_line};
@@ -55,7 +55,7 @@ pub(crate) struct Cells {
 impl Cells {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let known = self.known()?;
-        let kind = self.kinds.of([self.bus.as_str()])?.of(&self.bus);
+        let kind = self.kinds.kinds_of([self.bus.as_str()])?.kind_of(&self.bus);
         let stopped = input::stopped()?;
         let format = known.as_ref().map(|known| known.format);
         if Path::new(&self.bus).is_file() {
@@ -64,10 +64,10 @@ impl Cells {
                 self.bus
             )));
         }
-        let mut watch = Watch::open(&self.bus, kind, format).map_err(Failure::usage)?;
+        let mut watch = CellWatch::open(&self.bus, kind, format).map_err(Failure::usage)?;
         let seconds = self.duration.or_else(|| (!self.watch).then_some(LISTEN_S));
-        let show = |watch: &Watch| {
-            let shown = Shown::of(watch, known.as_ref());
+        let show = |watch: &CellWatch| {
+            let shown = CellList::of(watch, known.as_ref());
             match (self.json, self.watch) {
                 (false, _) => Ok(shown.table()),
                 (true, false) => json(&shown),
@@ -79,13 +79,13 @@ impl Cells {
         while seconds.is_none_or(|seconds| watch.elapsed().as_secs_f64() < seconds)
             && !stopped.load(Ordering::Relaxed)
         {
-            watch.request(self.watch).and_then(|()| watch.hear(&stopped)).map_err(Failure::run)?;
+            watch.request(self.watch).and_then(|()| watch.receive(&stopped)).map_err(Failure::run)?;
             if self.watch && drawn.elapsed() >= DRAW {
                 drawn = Instant::now();
                 let text = show(&watch)?;
-                let shown = if terminal { put(&show::screen(&shown_lines(&text))) } else { put(&text) };
+                let shown = if terminal { write_stdout(&show::screen(&printable_lines(&text))) } else { write_stdout(&text) };
                 if shown.is_err() {
-                    return written(shown);
+                    return ignore_broken_pipe(shown);
                 }
             }
         }
@@ -102,15 +102,15 @@ impl Cells {
                 "no cell sent anything on {name} for {seconds:.1} s{others}: start them, or switch them on"
             )));
         }
-        print(&show(&watch)?)
+        print_text(&show(&watch)?)
     }
 
     /// Finds this bus in the skin.
-    fn known(&self) -> Result<Option<Known>, Failure> {
+    fn known(&self) -> Result<Option<DescribedBus>, Failure> {
         let Some(path) = &self.skin else { return Ok(None) };
         let skin = Skin::read(path).map_err(Failure::usage)?;
         let file = path.display().to_string();
         let index = bus_of(&skin, &file, &self.bus)?;
-        Ok(Some(Known::of(&skin, index, file)))
+        Ok(Some(DescribedBus::from_skin(&skin, index, file)))
     }
 }

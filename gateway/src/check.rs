@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use protocol::document;
 use protocol::skin::{CellName, Skin};
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print_text};
 
 use self::skin::Listed;
 
@@ -80,7 +80,7 @@ impl Check {
                 }
             };
         }
-        print(&text)?;
+        print_text(&text)?;
         refused.map_or(Ok(()), Err)
     }
 }
@@ -98,7 +98,7 @@ fn described(file: &Path, has_skin: bool) -> Result<Described, Failure> {
     const OF_SKINS: [&str; 8] =
         ["robot", "chain", "bus", "cell", "timing", "controller", "contact", "safety"];
     const OF_SCENARIOS: [&str; 5] = ["motion", "mode", "touch", "fault", "sensors"];
-    let text = document::text(file).map_err(Failure::usage)?;
+    let text = document::read_text(file).map_err(Failure::usage)?;
     let has = |names: &[&str]| {
         let tables = text.lines().filter_map(|line| line.trim_start().strip_prefix('['));
         let name = |line: &str| {

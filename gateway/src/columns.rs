@@ -3,7 +3,7 @@
 use csv::{StringRecord, StringRecordsIntoIter, Trim};
 use protocol::usage::Failure;
 
-use super::print::{count, list};
+use super::print::{count, comma_separated};
 
 /// Maximum number of characters of a first line that an error repeats.
 const REPEATED: usize = 60;
@@ -77,7 +77,7 @@ impl<'a> Table<'a> {
         let byte = values.position().map_or(0, csv::Position::byte);
         let line = self.lines.of(usize::try_from(byte).unwrap_or_default());
         if values.len() != self.names.len() {
-            let (got, names) = (count(values.len(), "value"), list(&self.names));
+            let (got, names) = (count(values.len(), "value"), comma_separated(&self.names));
             return Err(Failure::usage(format!(
                 "{file}: line {line}: {got}: one is needed for each of the columns {names}"
             )));

@@ -6,18 +6,18 @@ use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-use bench::commission::{Done, commission, open};
+use bench::commission::{CommissionedBus, commission, open};
 use bench::progress::Progress as Line;
 use clap::Args;
 use model::commission::node_ids::{NodeIds, renumbered};
-use model::commission::{Outcome, Progress, Wish};
+use model::commission::{Outcome, Progress, CommissionOptions};
 use protocol::document;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 
 use super::arguments::{BusKinds, bus_names, bus_of};
 use super::output::{Overwrite, apart, print_beside};
-use super::print::{list, some};
+use super::print::{comma_separated, abbreviated};
 use super::{input, output};
 
 /// Write a skin's description into its cells, and read it back
@@ -62,7 +62,7 @@ pub(crate) struct Commission {
 
 impl Commission {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let text = document::text(&self.skin).map_err(Failure::usage)?;
+        let text = document::read_text(&self.skin).map_err(Failure::usage)?;
         let file = self.skin.display().to_string();
         let skin = Skin::parse(&file, &text).map_err(Failure::usage)?;
         let target = match &self.bus {
@@ -73,9 +73,9 @@ impl Commission {
         // Opened before cells are written, so that an error of the file is reported first.
         let begun =
             self.node_ids.as_ref().map(|path| self.overwrite.create("--node-ids", path)).transpose()?;
-        let wish = Wish { dry_run: self.dry_run, verify: self.verify };
+        let wish = CommissionOptions { dry_run: self.dry_run, verify: self.verify };
         let stopped = input::stopped()?;
-        let kinds = self.kinds.of(bus_names(&skin))?;
+        let kinds = self.kinds.kinds_of(bus_names(&skin))?;
         // All buses are opened before anything is sent.
         let benches = target.into_iter().map(|bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
         let benches = benches.map_err(Failure::usage)?;
@@ -85,7 +85,7 @@ impl Commission {
         line.clear();
         let interrupted = stopped.load(Ordering::Relaxed);
         check_begun(&file, &done, interrupted)?;
-        let whole = show::Whole {
+        let whole = show::CommissionResult {
             skin: &skin.name,
             file: &file,
             seconds: began.elapsed().as_secs_f64(),
@@ -106,7 +106,7 @@ impl Commission {
                 copy.map_err(|error| Failure::run(format!("--node-ids {}: {error}", file.path().display())))?;
             output::finish("--node-ids", file, out, &copy)?;
         }
-        whole.end()
+        whole.outcome()
     }
 }
 
@@ -116,13 +116,13 @@ fn how_far(all: &[Progress]) -> String {
     let [cells, found] = [sum(|it| it.cells), sum(|it| it.found)];
     let [done, failed] = [sum(|it| it.done), sum(|it| it.failed)];
     // The slowest bus determines the displayed activity.
-    let doing = all.iter().filter(|it| it.doing != "done").map(|it| it.doing).next().unwrap_or("done");
+    let doing = all.iter().filter(|it| it.activity != "done").map(|it| it.activity).next().unwrap_or("done");
     let failed = if failed == 0 { String::new() } else { format!(", {failed} failed") };
     format!("{doing}: {found} of {cells} cells found, {done} done{failed}")
 }
 
 /// Returns an error with the reason if no cell was reached.
-fn check_begun(file: &str, done: &[Done], interrupted: bool) -> Result<(), Failure> {
+fn check_begun(file: &str, done: &[CommissionedBus], interrupted: bool) -> Result<(), Failure> {
     let begun = done.iter().any(|done| {
         let is_well = |outcome| !matches!(outcome, Outcome::Failed(_));
         done.report.requests > 0 || done.report.cells.iter().any(|cell| is_well(cell.outcome))
@@ -141,7 +141,7 @@ fn check_begun(file: &str, done: &[Done], interrupted: bool) -> Result<(), Failu
         return Ok(());
     }
     let unknown_nodes: Vec<_> = done.iter().flat_map(|done| &done.report.unknown_nodes).collect();
-    let buses = list(done.iter().map(|done| &done.name));
+    let buses = comma_separated(done.iter().map(|done| &done.name));
     Err(Failure::run(if unknown_nodes.is_empty() {
         format!("no cells are on {buses}: start them, or switch them on, and run this again")
     } else {
@@ -150,7 +150,7 @@ fn check_begun(file: &str, done: &[Done], interrupted: bool) -> Result<(), Failu
         format!(
             "none of the cells on {buses} is one of {file}: their serial numbers are {}; name the description \
              that has them",
-            some(&serials)
+            abbreviated(&serials)
         )
     }))
 }

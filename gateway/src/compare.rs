@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-use analysis::compare::{Both, Comparison, Options, Report, Which};
+use analysis::compare::{Both, Comparison, Options, Report, CaptureSide};
 use analysis::explain::NotFound;
 use clap::Args;
 use model::decode::Decoder;
@@ -17,7 +17,7 @@ use protocol::stop;
 use protocol::time::Micros;
 use protocol::usage::Failure;
 use serde::Serialize;
-use trace::capture::{Entry, Format, NoteKind, Reader};
+use trace::capture::{Entry, CaptureFormat, NoteKind, Reader};
 
 use self::files::{parts, starts};
 use super::input;
@@ -83,7 +83,7 @@ pub(crate) struct Compare {
 
 /// The printed result.
 #[derive(Serialize)]
-struct Whole<'a> {
+struct CompareOutput<'a> {
     a: &'a str,
     b: &'a str,
     skin: &'a str,
@@ -100,7 +100,7 @@ struct Input {
     name: String,
     reader: Reader,
     decoder: Decoder,
-    missing: input::Missing,
+    missing: input::LossCounts,
     has_frames: bool,
     /// Error that ended it.
     damage: Option<Failure>,
@@ -109,13 +109,13 @@ struct Input {
 impl Input {
     fn open(files: Vec<PathBuf>) -> Result<Self, Failure> {
         let reader = captures(&files, |file| Box::new(file))?;
-        let (name, missing) = (reader.name().to_owned(), input::Missing::default());
+        let (name, missing) = (reader.name().to_owned(), input::LossCounts::default());
         let decoder = Decoder::new(None);
         Ok(Self { files, name, reader, decoder, missing, has_frames: false, damage: None })
     }
 
     /// Passes the frames that are latched at the start of the capture to the comparison.
-    fn begin(&mut self, which: Which, comparison: &mut Comparison<'_>) {
+    fn begin(&mut self, which: CaptureSide, comparison: &mut Comparison<'_>) {
         for before in &self.reader.extras().latched {
             let at = Micros(before.nanos / 1_000);
             if let Some(message) = self.decoder.decode(at, &before.bus, &before.frame).message() {
@@ -125,16 +125,16 @@ impl Input {
     }
 
     /// Passes the next entry to the comparison.
-    fn read(&mut self, which: Which, comparison: &mut Comparison<'_>) {
+    fn read(&mut self, which: CaptureSide, comparison: &mut Comparison<'_>) {
         match self.reader.next() {
             Ok(Some(Entry::Frame(record))) => {
                 self.has_frames = true;
                 let nanos = record.time.nanos;
                 let decoded = self.decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
-                comparison.take(which, nanos, record.interface, decoded.message());
+                comparison.receive(which, nanos, record.interface, decoded.message());
             }
             Ok(Some(Entry::Note(note))) => {
-                self.missing.take(&note);
+                self.missing.count(&note);
                 match note.kind {
                     NoteKind::Dropped(frames) => comparison.dropped(which, frames),
                     NoteKind::Unreadable(why) if self.missing.unreadable() == 1 => {
@@ -173,29 +173,29 @@ impl Compare {
         let mut comparison = Comparison::new(&skin, self.options(), starts(&files, &skin)?);
         let Both { a, b } = files;
         let mut inputs = Both { a: Input::open(a)?, b: Input::open(b)? };
-        for which in [Which::A, Which::B] {
+        for which in [CaptureSide::A, CaptureSide::B] {
             inputs.of_mut(which).begin(which, &mut comparison);
         }
         while let Some(which) = comparison.next() {
             inputs.of_mut(which).read(which, &mut comparison);
         }
-        if stop::flag().load(Ordering::Relaxed) {
+        if stop::stop_flag().load(Ordering::Relaxed) {
             return Err(Failure::run("stopped before all was compared"));
         }
-        for which in [Which::A, Which::B] {
+        for which in [CaptureSide::A, CaptureSide::B] {
             self.check(inputs.of_mut(which), which, &mut comparison, &skin)?;
         }
         let report = comparison.report();
-        for which in [Which::A, Which::B] {
-            let input = inputs.of(which);
-            input.missing.tell(&input.reader, "left out");
+        for which in [CaptureSide::A, CaptureSide::B] {
+            let input = inputs.get(which);
+            input.missing.report(&input.reader, "left out");
         }
-        let shown = show::Shown {
+        let shown = show::ComparisonText {
             inputs: Both { a: about(&inputs.a), b: about(&inputs.b) },
             skin: self.skin.as_deref(),
             report: &report,
         };
-        let whole = Whole {
+        let whole = CompareOutput {
             a: &inputs.a.name,
             b: &inputs.b.name,
             skin: &skin.name,
@@ -213,7 +213,7 @@ impl Compare {
         match inputs.a.damage.or(inputs.b.damage) {
             Some(damage) => Err(damage),
             None if report.equal => Ok(()),
-            None => Err(Failure::said()),
+            None => Err(Failure::already_reported()),
         }
     }
 
@@ -233,7 +233,7 @@ impl Compare {
         for (path, files) in [(&self.a, &files.a), (&self.b, &files.b)] {
             // A log has no skin; that of standard input is compared at the end.
             if !can_be_read_again(path)
-                || Reader::open_all(files).map_err(Failure::usage)?.format() == Format::Candump
+                || Reader::open_all(files).map_err(Failure::usage)?.format() == CaptureFormat::Candump
             {
                 continue;
             }
@@ -263,7 +263,7 @@ impl Compare {
     fn check(
         &self,
         input: &mut Input,
-        which: Which,
+        which: CaptureSide,
         comparison: &mut Comparison<'_>,
         skin: &Skin,
     ) -> Result<(), Failure> {
@@ -305,6 +305,6 @@ fn same_skin(
     )))
 }
 
-fn about(input: &Input) -> show::About<'_> {
-    show::About { name: &input.name, format: format(&input.reader), files: &input.files }
+fn about(input: &Input) -> show::CaptureNames<'_> {
+    show::CaptureNames { name: &input.name, format: format(&input.reader), files: &input.files }
 }

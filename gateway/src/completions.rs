@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Command};
 use clap_complete::Shell;
-use protocol::usage::{Failure, draw, written};
+use protocol::usage::{Failure, print_raw, ignore_broken_pipe};
 
 use super::output::{Overwrite, is_standard_output, note};
 
@@ -24,7 +24,7 @@ impl Completions {
     pub(crate) fn run(self, mut program: Command) -> Result<(), Failure> {
         let mut script = Vec::new();
         clap_complete::generate(self.shell, &mut program, "skinbus", &mut script);
-        draw(&String::from_utf8_lossy(&script))
+        print_raw(&String::from_utf8_lossy(&script))
     }
 }
 
@@ -44,7 +44,7 @@ pub(crate) struct Man {
 impl Man {
     pub(crate) fn run(self, mut program: Command) -> Result<(), Failure> {
         if is_standard_output(&self.folder) {
-            return written(clap_mangen::Man::new(program).render(&mut io::stdout()));
+            return ignore_broken_pipe(clap_mangen::Man::new(program).render(&mut io::stdout()));
         }
         if !self.folder.is_dir() {
             let folder = self.folder.display();

@@ -7,23 +7,23 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::Args;
-use conformance::bus::Stop;
-use conformance::findings::Only;
-use conformance::live::Live;
+use conformance::bus::StopReason;
+use conformance::findings::RequirementFilter;
+use conformance::live::SocketBus;
 use conformance::survey::Survey;
-use conformance::{Saved, Session};
+use conformance::{SavedCell, Session};
 use protocol::can::Format;
 use protocol::skin::CellName;
 use protocol::time::Span;
 use protocol::usage::Failure;
 
-use self::show::Whole;
+use self::show::ConformanceResult;
 use super::arguments::{BusKinds, FORMATS, one_of};
 use super::output::{Overwrite, print_beside};
 use super::{input, output};
 
 /// Maximum duration of a test, besides listening and restoring.
-const LONGEST: Span = Span::from_millis(80_000);
+const MAX_TEST_DURATION: Span = Span::from_millis(80_000);
 
 /// Test one cell of any make against the requirements of the documents
 ///
@@ -76,7 +76,7 @@ pub(crate) struct Conformance {
 
 impl Conformance {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let only = Only::new(&self.requirement).map_err(|word| {
+        let only = RequirementFilter::new(&self.requirement).map_err(|word| {
             Failure::usage(format!(
                 "--requirement {word}: no requirement has this id; CONF-7 and CONF are examples"
             ))
@@ -93,7 +93,7 @@ impl Conformance {
             (Some(bus), _) | (None, Some(bus)) => bus.as_str(),
         };
         let node = self.cell.node;
-        let kind = self.kinds.of([name])?.of(name);
+        let kind = self.kinds.kinds_of([name])?.kind_of(name);
         let path = self.save.clone().unwrap_or_else(|| format!("conformance-{name}-{}.json", node).into());
         if self.restore.is_none() && path.exists() {
             let path = path.display();
@@ -103,12 +103,12 @@ impl Conformance {
             )));
         }
         let junit = self.junit.as_ref().map(|path| self.overwrite.create("--junit", path)).transpose()?;
-        let mut live = Live::open(name, kind, stopped, self.restart.clone()).map_err(Failure::usage)?;
-        let survey = Survey::take(&mut live, name).map_err(Failure::run)?;
+        let mut live = SocketBus::open(name, kind, stopped, self.restart.clone()).map_err(Failure::usage)?;
+        let survey = Survey::listen(&mut live, name).map_err(Failure::run)?;
         let format = survey
             .check(node, name, self.format, self.others_will_stop || self.restore.is_some())
             .map_err(Failure::run)?;
-        let mut session = Session::new(&mut live, name, node, format, LONGEST);
+        let mut session = Session::new(&mut live, name, node, format, MAX_TEST_DURATION);
         if let Some(path) = &self.restore {
             return put_back(&mut session, &read(path)?, path);
         }
@@ -118,7 +118,7 @@ impl Conformance {
         Overwrite { overwrite: false }.write("--save", &path, &super::print::json(&saved)?)?;
         let stopped = conformance::run(&mut session, &only).err();
         let back = put_back(&mut session, &saved, &path);
-        let whole = Whole::new(
+        let whole = ConformanceResult::new(
             &saved,
             format,
             began.elapsed(),
@@ -134,24 +134,24 @@ impl Conformance {
             junit.map_or(Ok(()), |(file, out)| output::finish("--junit", file, out, &whole.junit()));
         back.and(shown).and(reported)?;
         match stopped {
-            Some(Stop::Interrupted) => Err(Failure::run("interrupted; the cell has been restored")),
+            Some(StopReason::Interrupted) => Err(Failure::run("interrupted; the cell has been restored")),
             Some(stopped) => Err(Failure::run(stopped)),
-            None if whole.has_failed() => Err(Failure::said()),
+            None if whole.has_failed() => Err(Failure::already_reported()),
             None => Ok(()),
         }
     }
 }
 
 /// Reads the configuration that an earlier test saved.
-fn read(path: &Path) -> Result<Saved, Failure> {
+fn read(path: &Path) -> Result<SavedCell, Failure> {
     let wrong =
         |error: &dyn std::fmt::Display| Failure::usage(format!("--restore {}: {error}", path.display()));
-    let text = protocol::document::text(path).map_err(Failure::usage)?;
+    let text = protocol::document::read_text(path).map_err(Failure::usage)?;
     serde_json::from_str(&text).map_err(|error| wrong(&error))
 }
 
 /// Restores the cell's configuration, and deletes the file on success.
-fn put_back(session: &mut Session<'_>, saved: &Saved, path: &PathBuf) -> Result<(), Failure> {
+fn put_back(session: &mut Session<'_>, saved: &SavedCell, path: &PathBuf) -> Result<(), Failure> {
     let keep = |why: &dyn std::fmt::Display| {
         let path = path.display();
         Failure::run(format!(

@@ -14,22 +14,22 @@ use analysis::explain::series::SeriesError;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::input::can_be_read_again;
-use protocol::stop::{self, Stoppable};
+use protocol::stop::{self, InterruptibleWriter};
 use protocol::usage::Failure;
-use trace::capture::convert::{ConvertError, Converted, Origin, Output, Shortened, Target, convert};
-use trace::capture::log::{Digits, Style, Wrote};
-use trace::capture::{Entry, Format, NoteKind, Reader};
+use trace::capture::convert::{ConvertError, ConversionCounts, Origin, CaptureWriter, LossCounts, EntrySink, convert};
+use trace::capture::log::{Digits, Style, WriteOutcome};
+use trace::capture::{Entry, CaptureFormat, NoteKind, Reader};
 use trace::files::WholeFile;
 
-use self::live::Live;
-use super::arguments::{Word, one_of};
+use self::live::GrowingCapture;
+use super::arguments::{OptionValue, one_of};
 use super::input::{captures, no_frame, others, place, skin_for};
 use super::output::{Overwrite, apart, is_standard_output, note, refused};
 
 /// Maximum number of unreadable lines that are reported one by one.
 const NAMED: u64 = 100;
 /// Number of bytes written at once.
-const PIECE: usize = 1 << 18;
+const WRITE_BYTES: usize = 1 << 18;
 
 /// Convert a capture between candump log and MCAP recording, or its torques to CSV
 ///
@@ -77,7 +77,7 @@ pub(crate) struct Convert {
 /// Hint for a refused capture that is truncated.
 const WITHOUT_STRICT: &str = "without --strict the intact part would be written";
 
-const DIGITS: &[Word<Digits>] = &[("6", "", Digits::Six), ("9", "", Digits::Nine)];
+const DIGITS: &[OptionValue<Digits>] = &[("6", "", Digits::Six), ("9", "", Digits::Nine)];
 
 impl Convert {
     pub(crate) fn run(self) -> Result<(), Failure> {
@@ -91,7 +91,7 @@ impl Convert {
             )));
         }
         let format = self.format()?;
-        let text = format == Format::Candump;
+        let text = format == CaptureFormat::Candump;
         let options =
             [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
         if let Some((option, _)) = options.iter().find(|(_, given)| *given && !text) {
@@ -111,9 +111,9 @@ impl Convert {
             self.check_frames()?;
         }
         let (mut reader, bar, live) = self.open()?;
-        let stopped = stop::flag();
+        let stopped = stop::stop_flag();
         let name = reader.name().to_owned();
-        let of_log = reader.format() == Format::Candump;
+        let of_log = reader.format() == CaptureFormat::Candump;
         if !text && !of_log && !reader.has_foreign_frames() {
             return Err(Failure::usage(format!("{name} is an MCAP recording already: copy it")));
         }
@@ -123,14 +123,14 @@ impl Convert {
         let mut sink = if live && self.is_new() {
             let refused = |error: io::Error| refused("", &self.to, &error);
             Sink::Live(
-                Live::create(&self.to, self.overwrite.overwrite, (format, style, of_log), stopped)
+                GrowingCapture::create(&self.to, self.overwrite.overwrite, (format, style, of_log), stopped)
                     .map_err(refused)?,
             )
         } else {
             let (whole, out) = self.create(stopped)?;
             let output = match format {
-                Format::Candump => Output::new(out, format, style),
-                Format::Mcap => Output::recording(out, Origin { of_log, file: None }),
+                CaptureFormat::Candump => CaptureWriter::new(out, format, style),
+                CaptureFormat::Mcap => CaptureWriter::recording(out, Origin { of_log, file: None }),
             };
             Sink::Whole(whole, output.map_err(|error| Failure::run(format!("{to}: {error}")))?)
         };
@@ -196,7 +196,7 @@ impl Convert {
                     }
                 }
                 Ok(None)
-                    if !stop::flag().load(Ordering::Relaxed) && (!self.strict || unreadable.is_empty()) =>
+                    if !stop::stop_flag().load(Ordering::Relaxed) && (!self.strict || unreadable.is_empty()) =>
                 {
                     unreadable.iter().for_each(note);
                     return Err(no_frame(&reader));
@@ -229,7 +229,7 @@ impl Convert {
         self.overwrite.check("", &self.to)?;
         let skin = skin_for(&self.from, self.skin.as_deref())?;
         let (mut reader, bar, live) = self.open()?;
-        let stopped = stop::flag();
+        let stopped = stop::stop_flag();
         let name = reader.name().to_owned();
         let (whole, out) = self.create(stopped)?;
         let done = torques::write(&mut reader, &skin, out);
@@ -247,7 +247,7 @@ impl Convert {
         if let Some(whole) = whole {
             whole.finish().map_err(|error| Failure::run(format!("{to}: {error}")))?;
         }
-        missing.tell(&reader, "left out");
+        missing.report(&reader, "left out");
         if let Some(buses) = torques::summed(&skin) {
             note(format_args!("{name}: {buses} answers with sums: distributed torques and errors are empty"));
         }
@@ -268,7 +268,7 @@ impl Convert {
     fn create(
         &self,
         stopped: &AtomicBool,
-    ) -> Result<(Option<WholeFile>, BufWriter<Stoppable<File>>), Failure> {
+    ) -> Result<(Option<WholeFile>, BufWriter<InterruptibleWriter<File>>), Failure> {
         let begun = if is_standard_output(&self.to) {
             io::stdout().as_fd().try_clone_to_owned().map(|file| (None, file.into()))
         } else {
@@ -276,11 +276,11 @@ impl Convert {
                 .map(|(whole, file)| (Some(whole), file))
         };
         let (whole, file) = begun.map_err(|error| refused("", &self.to, &error))?;
-        Ok((whole, BufWriter::with_capacity(PIECE, Stoppable::new(file))))
+        Ok((whole, BufWriter::with_capacity(WRITE_BYTES, InterruptibleWriter::new(file))))
     }
 
     /// Format of OUT, by its name.
-    fn format(&self) -> Result<Format, Failure> {
+    fn format(&self) -> Result<CaptureFormat, Failure> {
         if is_standard_output(&self.to) && io::stdout().is_terminal() {
             let why = "standard output is a terminal, and a log may have anything in it";
             return Err(Failure::usage(format!(
@@ -289,9 +289,9 @@ impl Convert {
         }
         let other = fs::metadata(&self.to).is_ok_and(|there| !there.is_file() && !there.is_dir());
         match self.to.extension().and_then(OsStr::to_str) {
-            Some("mcap") => Ok(Format::Mcap),
-            Some("log" | "txt") => Ok(Format::Candump),
-            _ if is_standard_output(&self.to) || other => Ok(Format::Candump),
+            Some("mcap") => Ok(CaptureFormat::Mcap),
+            Some("log" | "txt") => Ok(CaptureFormat::Candump),
+            _ if is_standard_output(&self.to) || other => Ok(CaptureFormat::Candump),
             _ => Err(Failure::usage(format!(
                 "{}: a name that ends in .mcap is a recording, in .log or .txt a candump log, in .csv its torques, and - is \
                  standard output",
@@ -311,15 +311,15 @@ fn size(from: &[PathBuf]) -> Option<u64> {
 /// `head` does.
 fn written(to: &Path, left: &str, error: io::Error) -> Result<(), Failure> {
     if is_standard_output(to) {
-        return protocol::usage::written(Err(error));
+        return protocol::usage::ignore_broken_pipe(Err(error));
     }
     Err(Failure::run(format!("{}: {error}; {left}", to.display())))
 }
 
 /// Destination of entries: a file that appears when it is complete, or one that grows.
 enum Sink {
-    Whole(Option<WholeFile>, Output<BufWriter<Stoppable<File>>>),
-    Live(Live),
+    Whole(Option<WholeFile>, CaptureWriter<BufWriter<InterruptibleWriter<File>>>),
+    Live(GrowingCapture),
 }
 
 impl Sink {
@@ -364,18 +364,18 @@ impl Sink {
     }
 }
 
-impl Target for Sink {
-    fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote> {
+impl EntrySink for Sink {
+    fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome> {
         match self {
             Self::Whole(_, output) => output.write(entry),
             Self::Live(live) => live.write(entry),
         }
     }
 
-    fn pass_on(&mut self) -> io::Result<()> {
+    fn flush_lines(&mut self) -> io::Result<()> {
         match self {
-            Self::Whole(_, output) => output.pass_on(),
-            Self::Live(live) => live.pass_on(),
+            Self::Whole(_, output) => output.flush_lines(),
+            Self::Live(live) => live.flush_lines(),
         }
     }
 }
@@ -389,10 +389,10 @@ fn bar(size: Option<u64>) -> ProgressBar {
 }
 
 /// Notes on a conversion, one per line.
-fn remarks(reader: &Reader, done: &Converted, style: &Style, text: bool) -> Vec<String> {
+fn remarks(reader: &Reader, done: &ConversionCounts, style: &Style, text: bool) -> Vec<String> {
     let mut lines = reader.remarks();
     let how = if style.plain { "" } else { ", which not every tool reads; --direction writes it" };
-    let Shortened { digits, direction, raw_dlc, name } = done.shortened;
+    let LossCounts { digits, direction, raw_dlc, name } = done.shortened;
     let written = ["frame is written", "frames are written"];
     for (count, [one, more], what) in [
         (

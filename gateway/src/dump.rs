@@ -11,24 +11,24 @@ use std::time::{Duration, Instant};
 use analysis::stats::Report;
 use bench::bus::listen::now;
 use clap::Args;
-use model::decode::pick::{IdMask, Party, Pick, Selector};
-use protocol::bus::Options;
+use model::decode::pick::{IdMask, Party, FrameFilter, Selector};
+use protocol::bus::BusOptions;
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
 use protocol::skin::Skin;
-use protocol::stop::{self, Stoppable};
-use protocol::usage::{Failure, print, written};
+use protocol::stop::{self, InterruptibleWriter};
+use protocol::usage::{Failure, print_text, ignore_broken_pipe};
 use serde::Serialize;
-use trace::capture::{Entry, Extras, NoteKind, Reader, Topic};
+use trace::capture::{Entry, RecordingExtras, NoteKind, Reader, Topic};
 
-use self::show::{How, Show};
-use super::arguments::{BusKinds, Word, nanos, one_of};
+use self::show::{OutputStyle, FrameOutput};
+use super::arguments::{BusKinds, OptionValue, nanos, one_of};
 use super::input::{
-    self, LOOK, Missing, ReceiveEnd, captures, is_file, is_path, no_frame, place, remark_another,
+    self, POLL_TIMEOUT, LossCounts, ReceiveEnd, captures, is_file, is_path, no_frame, place, remark_another,
     skin_beside, stopped,
 };
 use super::output;
-use super::print::{json, list};
+use super::print::{json, comma_separated};
 
 /// Show the traffic of a bus or a capture, decoded beside the raw frames
 ///
@@ -111,7 +111,7 @@ pub(crate) struct Dump {
 /// Frame format of packets, or `None` if unknown in advance.
 type Packets = Option<Format>;
 
-const ANY_FORMAT: &[Word<Packets>] = &[
+const ANY_FORMAT: &[OptionValue<Packets>] = &[
     ("auto", "Both", None),
     ("fd", "One CAN FD frame", Some(Format::Fd)),
     ("classic", "Two to four classic frames", Some(Format::Classic)),
@@ -120,16 +120,16 @@ const ANY_FORMAT: &[Word<Packets>] = &[
 impl Dump {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let is_capture = self.is_capture()?;
-        let mut title = list(self.sources.iter().map(|source| source.display()));
+        let mut title = comma_separated(self.sources.iter().map(|source| source.display()));
         let out = io::stdout();
         let colour = output::is_coloured(&out);
         let how = match (self.stats, self.json, self.brief) {
-            (true, _, _) => How::Stats(Box::default()),
-            (false, true, _) => How::Json,
-            (false, false, true) => How::Brief { colour },
-            (false, false, false) => How::Lines { colour },
+            (true, _, _) => OutputStyle::Stats(Box::default()),
+            (false, true, _) => OutputStyle::Json,
+            (false, false, true) => OutputStyle::Brief { colour },
+            (false, false, false) => OutputStyle::Lines { colour },
         };
-        let pick = Pick {
+        let pick = FrameFilter {
             kinds: self.kind.clone(),
             parties: self.cell.clone(),
             buses: self.bus.clone(),
@@ -141,7 +141,7 @@ impl Dump {
         if !is_capture {
             let names: Vec<_> = self.sources.iter().map(|source| source.display().to_string()).collect();
             if let Some(other) = pick.bus_names().find(|bus| !names.iter().any(|name| name == bus)) {
-                let names = list(&names);
+                let names = comma_separated(&names);
                 return Err(Failure::usage(format!("{other} is not shown: name it beside {names}")));
             }
             if let Some(file) = self.sources.iter().find(|source| self.wait && is_path(source)) {
@@ -152,8 +152,8 @@ impl Dump {
             return Err(Failure::usage(format!("--wait is for buses, and {title} is a file")));
         }
         let max = self.count.unwrap_or(u64::MAX);
-        let to_out = BufWriter::new(Stoppable::new(&out));
-        let mut show = Show::new(to_out, self.format, pick, self.contact, how, max);
+        let to_out = BufWriter::new(InterruptibleWriter::new(&out));
+        let mut show = FrameOutput::new(to_out, self.format, pick, self.contact, how, max);
         if let Some(path) = &self.skin {
             let skin = Skin::read(path).map_err(Failure::usage)?;
             remark_another(&self.sources, path, &skin);
@@ -180,15 +180,15 @@ impl Dump {
             let kinds = self.kinds.of_any()?;
             let until = self.wait.then_some(&*stopped);
             let mut receive_ends =
-                input::receive_ends(&self.sources, &kinds, self.format, &Options::default(), until)?;
+                input::receive_ends(&self.sources, &kinds, self.format, &BusOptions::default(), until)?;
             ("live", None, live(&mut receive_ends, &mut show, self.to, &stopped))
         };
-        written(show.finish().and_then(|()| show.flush()))?;
+        ignore_broken_pipe(show.finish().and_then(|()| show.flush()))?;
         let report = show.report();
         drop(show);
         if let Some(report) = report {
             // The counts are shown however the dump ended.
-            print(&match self.json {
+            print_text(&match self.json {
                 true => as_json(&title, what, &report, extras.as_ref())?,
                 false => table::text(&title, what, &report, extras.as_ref()),
             })?;
@@ -215,7 +215,7 @@ impl Dump {
 }
 
 /// Statistics as JSON.
-fn as_json(source: &str, format: &str, report: &Report, extras: Option<&Extras>) -> Result<String, Failure> {
+fn as_json(source: &str, format: &str, report: &Report, extras: Option<&RecordingExtras>) -> Result<String, Failure> {
     #[derive(Serialize)]
     struct Whole<'a> {
         source: &'a str,
@@ -232,9 +232,9 @@ fn as_json(source: &str, format: &str, report: &Report, extras: Option<&Extras>)
 }
 
 /// Shows a capture.
-fn captured(reader: &mut Reader, show: &mut Show<impl Write>) -> Result<(), Failure> {
+fn captured(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Result<(), Failure> {
     let name = reader.name().to_owned();
-    let (mut frames, mut missing) = (0_u64, Missing::default());
+    let (mut frames, mut missing) = (0_u64, LossCounts::default());
     let done = loop {
         if reader.is_drained()
             && let Err(error) = show.flush()
@@ -253,7 +253,7 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>) -> Result<(), Fail
                 }
             }
             Some(Entry::Note(note)) => {
-                missing.take(&note);
+                missing.count(&note);
                 let place = place(&name, note.line);
                 match note.kind {
                     NoteKind::Text | NoteKind::CanXl => {}
@@ -268,26 +268,26 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>) -> Result<(), Fail
             }
         }
     };
-    written(done)?;
+    ignore_broken_pipe(done)?;
     if !reader.has_times() {
         show.without_times();
     }
     // The missing frames have been reported at their places.
     missing.frames = 0;
-    missing.tell(reader, "not shown");
-    if frames == 0 && !stop::flag().load(Ordering::Relaxed) {
+    missing.report(reader, "not shown");
+    if frames == 0 && !stop::stop_flag().load(Ordering::Relaxed) {
         return Err(no_frame(reader));
     }
     Ok(())
 }
 
 /// Interval between checks of waiting first segments for their timeout.
-const SETTLE: Duration = Duration::from_millis(20);
+const SETTLE_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Shows buses until a signal, or until one is closed.
 fn live(
     receive_ends: &mut [ReceiveEnd],
-    show: &mut Show<impl Write>,
+    show: &mut FrameOutput<impl Write>,
     to: Option<u64>,
     stopped: &AtomicBool,
 ) -> Result<(), Failure> {
@@ -300,7 +300,7 @@ fn live(
             // Frames lost until then are reported all the same.
             Err(failure) => break Err(failure),
             // A reader that has read enough ends the dump without an error.
-            Ok(Err(error)) => break written(Err(error)),
+            Ok(Err(error)) => break ignore_broken_pipe(Err(error)),
             Ok(Ok(true)) => {
                 // The end also comes if no further frames arrive.
                 end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
@@ -323,9 +323,9 @@ fn live(
 /// Waits for frames and shows them. Returns true if there were any, or the error of the output.
 fn received(
     receive_ends: &mut [ReceiveEnd],
-    show: &mut Show<impl Write>,
+    show: &mut FrameOutput<impl Write>,
 ) -> Result<io::Result<bool>, Failure> {
-    let wait = if show.is_waiting() { SETTLE } else { LOOK };
+    let wait = if show.is_waiting() { SETTLE_INTERVAL } else { POLL_TIMEOUT };
     // A single bus is waited for where it is received from: one system call instead of two.
     let is_alone = receive_ends.len() == 1;
     if !is_alone {
@@ -333,7 +333,7 @@ fn received(
     }
     let mut any = false;
     for receive_end in receive_ends {
-        if !receive_end.hear(if is_alone { wait } else { Duration::ZERO }).map_err(Failure::run)? {
+        if !receive_end.receive(if is_alone { wait } else { Duration::ZERO }).map_err(Failure::run)? {
             continue;
         }
         any = true;

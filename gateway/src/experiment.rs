@@ -19,14 +19,14 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use model::quantiles::Quantiles;
 use paper::arm::Reply;
 use paper::moving::Run;
-use paper::scale::Bench;
+use paper::scale::ScaleBench;
 use paper::{Effort, Experiment as Named, Lab, Session, files};
-use protocol::usage::{Failure, print, quoted_os};
+use protocol::usage::{Failure, print_text, shell_quoted_os};
 use serde_json::Value;
 
 use super::input::stopped;
 use super::output::{Overwrite, note};
-use super::print::{Rows, json};
+use super::print::{KeyValueTable, json};
 use benches::Benches;
 use folder::Folder;
 
@@ -47,7 +47,7 @@ use folder::Folder;
 pub(crate) struct Experiment {
     /// Experiments, or all, or list
     #[arg(value_name = "NAME", required = true)]
-    names: Vec<Word>,
+    names: Vec<ExperimentArgument>,
     /// Directory for the results; created if it does not exist
     #[arg(long, short, value_name = "DIR")]
     output: Option<PathBuf>,
@@ -63,13 +63,13 @@ pub(crate) struct Experiment {
 
 /// An argument: an experiment or a keyword.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Word {
+enum ExperimentArgument {
     All,
     List,
     One(Named),
 }
 
-impl FromStr for Word {
+impl FromStr for ExperimentArgument {
     type Err = String;
 
     fn from_str(word: &str) -> Result<Self, String> {
@@ -83,14 +83,14 @@ impl FromStr for Word {
 
 impl Experiment {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        if self.names.contains(&Word::List) {
+        if self.names.contains(&ExperimentArgument::List) {
             return list();
         }
         let Some(output) = &self.output else {
             return Err(Failure::usage("-o DIR is missing: name the folder for report.html and the figures"));
         };
         let target = |named: &Named| {
-            self.names.iter().any(|word| matches!(word, Word::All) || *word == Word::One(*named))
+            self.names.iter().any(|word| matches!(word, ExperimentArgument::All) || *word == ExperimentArgument::One(*named))
         };
         let named: Vec<Named> = Named::ALL.into_iter().filter(target).collect();
         let stop = stopped()?;
@@ -105,7 +105,7 @@ impl Experiment {
                 output.display()
             ))
         })?;
-        if self.quiet { Ok(()) } else { tell(&page, &output.join("report.html")) }
+        if self.quiet { Ok(()) } else { print_findings(&page, &output.join("report.html")) }
     }
 
     fn perform(&self, named: &[Named], folder: &Folder, stop: Arc<AtomicBool>) -> Result<Page, Failure> {
@@ -129,7 +129,7 @@ impl Experiment {
         let words = std::env::args_os().enumerate().map(|(place, word)| {
             // Without the directory of the program.
             let name = Path::new(&word).file_name().filter(|_| place == 0);
-            quoted_os(name.unwrap_or(&word))
+            shell_quoted_os(name.unwrap_or(&word))
         });
         let command = words.collect::<Vec<_>>().join(" ");
         let about = facts::program(std::slice::from_ref(&command), 0);
@@ -181,7 +181,7 @@ impl Lab for Here {
         Ok(run)
     }
 
-    fn scaled(&mut self, bench: &Bench) -> Result<Value, Failure> {
+    fn scaled(&mut self, bench: &ScaleBench) -> Result<Value, Failure> {
         let summary = self.benches.scaled(bench);
         self.go_on()?;
         summary
@@ -213,7 +213,7 @@ fn machine() -> String {
 
 fn list() -> Result<(), Failure> {
     let line = |named: Named| format!("{:12} {}\n", named.name(), named.about());
-    print(&Named::ALL.into_iter().map(line).collect::<String>())
+    print_text(&Named::ALL.into_iter().map(line).collect::<String>())
 }
 
 /// Writes the findings and the data of the figures, and publishes them with the recordings.
@@ -235,8 +235,8 @@ fn draw(page: &Page, folder: Folder) -> Result<(), Failure> {
 }
 
 /// Prints the findings and the path of the page.
-fn tell(page: &Page, report: &Path) -> Result<(), Failure> {
-    let mut rows = Rows::new("", "here", "paper, bar");
+fn print_findings(page: &Page, report: &Path) -> Result<(), Failure> {
+    let mut rows = KeyValueTable::new("", "here", "paper, bar");
     for section in &page.sections {
         rows.section(&section.title, "", "");
         for Finding { what, paper, ours, bar, verdict, .. } in &section.findings {
@@ -256,7 +256,7 @@ fn tell(page: &Page, report: &Path) -> Result<(), Failure> {
     } else {
         format!("worse than the paper's or than required: {worse}\n")
     };
-    print(&format!("{}{worse}{}\n", rows.text(), report.display()))
+    print_text(&format!("{}{worse}{}\n", rows.text(), report.display()))
 }
 
 /// A progress bar on a terminal; elsewhere one line per experiment.

@@ -5,12 +5,12 @@ mod torque;
 
 use std::path::PathBuf;
 
-use analysis::explain::{CellExplained, Explanation, Requested, explain, find};
+use analysis::explain::{CellExplained, Explanation, RequestedJoints, explain, find};
 use clap::Args;
 use protocol::id::CellId;
 use protocol::packet::Epoch;
 use protocol::skin::{CellName, Skin};
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print_text};
 use serde::Serialize;
 use trace::capture::Reader;
 
@@ -73,7 +73,7 @@ pub(crate) struct Explain {
 
 /// The printed JSON object.
 #[derive(Serialize)]
-struct Whole<'a> {
+struct ExplainOutput<'a> {
     source: String,
     epoch: u8,
     #[serde(flatten)]
@@ -98,7 +98,7 @@ impl Explain {
         self.check(&skin)?;
         let mut reader = Reader::open_all(&self.files).map_err(Failure::usage)?;
         let name = reader.name().to_owned();
-        let requested = Requested { epoch: Epoch(epoch), from_ns: self.at, occurrence: self.occurrence };
+        let requested = RequestedJoints { epoch: Epoch(epoch), from_ns: self.at, occurrence: self.occurrence };
         let found = find(&mut reader, &skin, requested).map_err(Failure::run)?;
         for (count, what) in [
             (found.dropped, "frames are missing before this point; contact states may be out of date"),
@@ -133,15 +133,15 @@ impl Explain {
             explanation.total.retain(|total| total.joint == joint);
         }
         if self.json {
-            let whole = Whole { source: name, epoch, explanation: &explanation };
-            return print(&json(&whole)?);
+            let whole = ExplainOutput { source: name, epoch, explanation: &explanation };
+            return print_text(&json(&whole)?);
         }
         let what = match (self.cell.is_some(), self.joint) {
-            (true, _) => show::What::Cells,
-            (false, Some(_)) => show::What::Joint,
-            (false, None) => show::What::All,
+            (true, _) => show::ExplainDetail::Cells,
+            (false, Some(_)) => show::ExplainDetail::Joint,
+            (false, None) => show::ExplainDetail::All,
         };
-        print(&show::text(&name, epoch, (found.zero_ns, found.is_of_run), &explanation, what))
+        print_text(&show::text(&name, epoch, (found.zero_ns, found.is_of_run), &explanation, what))
     }
 
     /// Checks that the skin has the cell and the joint.

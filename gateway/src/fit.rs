@@ -10,12 +10,12 @@ use clap::Args;
 use protocol::can::Format;
 use protocol::input::can_be_read_again;
 use protocol::usage::Failure;
-use protocol::wire_time::{BitRates, bit_rate};
-use trace::capture::{Format as CaptureFormat, Reader};
+use protocol::wire_time::{BitRates, parse_bit_rate};
+use trace::capture::{CaptureFormat as CaptureFormat, Reader};
 
 use super::arguments::{BusKinds, FORMATS, one_of, seconds};
 use super::input::{is_file, read_skin};
-use super::print::list;
+use super::print::comma_separated;
 
 /// Compute whether a skin, or the traffic of a capture or a live bus, fits on real buses
 ///
@@ -42,10 +42,10 @@ pub(crate) struct Fit {
     #[arg(value_name = "SKIN|FILE|BUS", required = true)]
     sources: Vec<PathBuf>,
     /// Bit rate of identifiers, and of classic frames as a whole, in bit/s: 1000000, 500k or 1M
-    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     nominal: Option<u32>,
     /// Bit rate of the data of CAN FD frames that switch rates
-    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     data: Option<u32>,
     /// For a skin: a table over common bit rates, whatever rates the skin has
     #[arg(long, conflicts_with = "nominal")]
@@ -122,7 +122,7 @@ impl Fit {
         let is_skin = is_file(source) && (is_text || given.is_some() || !is_capture(source));
         match given {
             Some(option) if !is_skin => {
-                let names = list(self.sources.iter().map(|source| source.display()));
+                let names = comma_separated(self.sources.iter().map(|source| source.display()));
                 Err(Failure::usage(format!(
                     "{option} is for a skin, and {names} is not a skin: leave it out"
                 )))

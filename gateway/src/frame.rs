@@ -14,21 +14,21 @@ use bench::sensing as switching;
 use clap::Args;
 use model::decode::Decoded;
 use model::decode::pick::Party;
-use protocol::bus::{Bus, BusError, Choice, Kinds, Options};
+use protocol::bus::{Bus, BusError, KindChoice, KindChoices, BusOptions};
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame as CanFrame};
 use protocol::id::CellId;
 use protocol::message::{Answer, Message};
 use protocol::skin::{CellName, Skin};
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print_text};
 
 use super::arguments::{BusKinds, FORMATS, bus_of, cell_of, one_of};
 use super::output;
-use super::print::list;
+use super::print::comma_separated;
 use addressee::only_cell;
-use packets::What;
+use packets::PacketCommand;
 
 /// Time within which present cells send a heartbeat, and answers.
-const ANSWER: Duration = Duration::from_secs(1);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Print a frame for cansend, with the right CRC; or send it
 ///
@@ -44,7 +44,7 @@ const ANSWER: Duration = Duration::from_secs(1);
   skinbus frame sensing continuous 62.5 --bus vcan0")]
 pub(crate) struct Frame {
     #[command(subcommand)]
-    what: What,
+    what: PacketCommand,
     /// Frame format of the packet [default: with --skin the format of each bus, else fd]
     #[arg(long, value_parser = one_of(FORMATS))]
     format: Option<Format>,
@@ -63,11 +63,11 @@ impl Frame {
         let message = self.what.message().map_err(Failure::usage)?;
         let (targets, kinds) = self.targets()?;
         if targets.is_empty() {
-            return print(&text(&message, self.format.unwrap_or(Format::Fd)));
+            return print_text(&text(&message, self.format.unwrap_or(Format::Fd)));
         }
         // All buses are opened before anything is sent.
         let open = |(name, format): &(String, Format)| {
-            self.open(name, kinds.of(name), *format).map_err(Failure::usage)
+            self.open(name, kinds.kind_of(name), *format).map_err(Failure::usage)
         };
         let buses = targets.iter().map(open).collect::<Result<Vec<_>, _>>()?;
         let done =
@@ -78,7 +78,7 @@ impl Frame {
     }
 
     /// Buses on which the frame is sent, with their formats, and their kinds; without buses it is printed.
-    fn targets(&self) -> Result<(Vec<(String, Format)>, Kinds), Failure> {
+    fn targets(&self) -> Result<(Vec<(String, Format)>, KindChoices), Failure> {
         let format = |of_skin: Format| self.format.unwrap_or(of_skin);
         let to = self.what.to();
         let of_cell = to.and_then(|to| to.bus.as_ref());
@@ -105,8 +105,8 @@ impl Frame {
                 self.bus.iter().chain(of_cell).map(|name| (name.clone(), format(Format::Fd))).collect()
             }
         };
-        let names = list(targets.iter().map(|(name, _)| name));
-        let kinds = self.kinds.of(targets.iter().map(|(name, _)| name.as_str()))?;
+        let names = comma_separated(targets.iter().map(|(name, _)| name));
+        let kinds = self.kinds.kinds_of(targets.iter().map(|(name, _)| name.as_str()))?;
         if let Some(Party { bus: Some(bus), node }) = to {
             targets.retain(|(name, _)| name == bus);
             if targets.is_empty() {
@@ -119,12 +119,12 @@ impl Frame {
     }
 
     /// Opens a bus for sending, and for receiving if answers are awaited.
-    fn open(&self, name: &str, kind: Choice, format: Format) -> Result<Bus, BusError> {
+    fn open(&self, name: &str, kind: KindChoice, format: Format) -> Result<Bus, BusError> {
         match self.what.to() {
             // A send-only socket cannot tell whether a cell is present.
             Some(_) => switching::open(name, kind, format),
             None => {
-                let nothing = Options { filters: Vec::new(), ..Options::default() };
+                let nothing = BusOptions { filters: Vec::new(), ..BusOptions::default() };
                 listen::open(name, kind, Some(format), nothing)
             }
         }
@@ -133,7 +133,7 @@ impl Frame {
     /// Sends the frame on a bus, and waits for the cells' answers.
     fn send(&self, bus: Bus, format: Format, message: &Message) -> Result<(), Failure> {
         let (name, only) = (bus.name().to_owned(), self.what.to().and_then(only_cell));
-        if let What::Sensing(switch) = &self.what {
+        if let PacketCommand::Sensing(switch) = &self.what {
             return switch.send(bus, format);
         }
         listen::send(&bus, message, format).map_err(Failure::run)?;
@@ -159,8 +159,8 @@ fn wait(mut listener: Listener, only: Option<CellId>, tag: Option<u8>) -> Result
         (None, Some(_)) => false,
     };
     let began = Instant::now();
-    while began.elapsed() < ANSWER && !are_complete(&answers) {
-        answers.hear(&mut listener)?;
+    while began.elapsed() < ANSWER_TIMEOUT && !are_complete(&answers) {
+        answers.receive(&mut listener)?;
     }
     Ok(answers)
 }
@@ -182,11 +182,11 @@ fn verdict(
             Answer::Refused { .. } => refused.push(line.to_owned()),
         }
     }
-    print(&lines)?;
+    print_text(&lines)?;
     let who = only.map_or_else(|| "cell".to_owned(), |cell| format!("cell {cell}"));
-    let (waited, other) = (ANSWER.as_secs_f64(), format.other().name());
+    let (waited, other) = (ANSWER_TIMEOUT.as_secs_f64(), format.other().name());
     if !refused.is_empty() {
-        return Err(Failure::run(list(&refused)));
+        return Err(Failure::run(comma_separated(&refused)));
     }
     if answers.present().is_empty() {
         return Err(Failure::run(format!(

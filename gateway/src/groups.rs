@@ -52,7 +52,7 @@ pub(crate) fn unknown(program: &Command, name: &str) -> String {
     let best = likely.max_by(|one, other| one.0.total_cmp(&other.0)).filter(|(likeness, _)| *likeness > 0.75);
     match best {
         Some((_, best)) => format!("there is no command {name}; did you mean {best}?"),
-        None => format!("there is no command {name}; there are {}", crate::print::list(names)),
+        None => format!("there is no command {name}; there are {}", crate::print::comma_separated(names)),
     }
 }
 
@@ -118,7 +118,7 @@ mod tests {
             let long = arg.get_long().unwrap_or_default().to_owned();
             let names = arg.get_value_names().unwrap_or_default();
             let takes =
-                if arg.get_action().takes_values() { crate::print::words(names) } else { String::new() };
+                if arg.get_action().takes_values() { crate::print::space_separated(names) } else { String::new() };
             // FILE and DIR both name a path.
             let takes = if takes == "DIR" { "FILE".to_owned() } else { takes };
             meanings.entry(long.clone()).or_default().insert(takes);

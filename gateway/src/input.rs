@@ -8,10 +8,10 @@ use std::sync::{Arc, OnceLock};
 use std::thread;
 use std::time::Duration;
 
-use bench::bus::follow::{Follower, Once, Step};
+use bench::bus::follow::{Follower, OpenedOnce, FollowStep};
 use bench::bus::listen;
 use bench::signals::caught;
-use protocol::bus::{Bus, BusError, Choice, Kinds, Options, Received};
+use protocol::bus::{Bus, BusError, KindChoice, KindChoices, BusOptions, Received};
 use protocol::can::{self, EXTENDED_MASK};
 use protocol::input::{can_be_read_again, is_standard_input};
 use protocol::skin::{Cell, Skin};
@@ -19,16 +19,16 @@ use protocol::stop;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use trace::capture::{CaptureError, DESCRIPTION, Format, Note, NoteKind, ORIGIN, Reader};
+use trace::capture::{CaptureError, SKIN_OR_SCENARIO, CaptureFormat, Note, NoteKind, ORIGIN_METADATA, Reader};
 
 use super::output;
-use super::print::{count, some};
+use super::print::{count, abbreviated};
 
 /// Interval between attempts to open an awaited bus.
-const AGAIN: Duration = Duration::from_millis(20);
+const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Maximum delay of a signal while no frame arrives.
-pub(crate) const LOOK: Duration = Duration::from_millis(200);
+pub(crate) const POLL_TIMEOUT: Duration = Duration::from_millis(200);
 
 /// Catches SIGINT and SIGTERM, and returns the flag that they set.
 pub(crate) fn stopped() -> Result<Arc<AtomicBool>, Failure> {
@@ -116,7 +116,7 @@ pub(crate) fn difference(one: &Skin, other: &Skin) -> Option<(String, String, St
 pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
     // The error for a file that is neither comes from reading it as a skin.
     let is_recording =
-        can_be_read_again(file) && Reader::open(file).is_ok_and(|it| it.format() == Format::Mcap);
+        can_be_read_again(file) && Reader::open(file).is_ok_and(|it| it.format() == CaptureFormat::Mcap);
     if !is_recording {
         return read_skin(file);
     }
@@ -143,7 +143,7 @@ fn as_capture(file: &Path) -> Option<Failure> {
             "{name} is a capture ({}), and a skin is needed: name the skin's own file",
             format(&reader)
         )),
-        false if reader.text_kind().is_some_and(|(kind, _)| kind == DESCRIPTION) => return None,
+        false if reader.text_kind().is_some_and(|(kind, _)| kind == SKIN_OR_SCENARIO) => return None,
         false => no_frame(&reader),
     })
 }
@@ -168,7 +168,7 @@ pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
 fn attached(files: &[PathBuf], hint: &str, check: impl Fn() -> Result<(), Failure>) -> Result<Skin, Failure> {
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
     // The attachment may follow the frames.
-    while reader.format() == Format::Mcap
+    while reader.format() == CaptureFormat::Mcap
         && reader.extras().skin().is_none()
         && reader.next().map_err(Failure::run)?.is_some()
     {}
@@ -201,8 +201,8 @@ pub(crate) fn skin_beside(reader: &Reader, instead: &str) -> Option<Skin> {
 /// Format of a capture.
 pub(crate) fn format(reader: &Reader) -> &'static str {
     match reader.format() {
-        Format::Candump => "candump log",
-        Format::Mcap => "MCAP",
+        CaptureFormat::Candump => "candump log",
+        CaptureFormat::Mcap => "MCAP",
     }
 }
 
@@ -218,13 +218,13 @@ pub(crate) fn no_frame(reader: &Reader) -> Failure {
         return Failure::usage(format!("{name} is {what}, and no candump log or MCAP recording: {hint}"));
     }
     let what = match (reader.format(), reader.lines()) {
-        (Format::Candump, 0) => "it is empty: there is no frame in it".to_owned(),
-        (Format::Candump, lines) => format!(
+        (CaptureFormat::Candump, 0) => "it is empty: there is no frame in it".to_owned(),
+        (CaptureFormat::Candump, lines) => format!(
             "there is no frame in {}; the output of candump is expected: lines like \
              `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
             count(lines, "line")
         ),
-        (Format::Mcap, _) => match others(reader) {
+        (CaptureFormat::Mcap, _) => match others(reader) {
             others if others.is_empty() => "there is no frame in it".to_owned(),
             others => format!("there is no frame in it, only {others}"),
         },
@@ -238,14 +238,14 @@ pub(crate) fn others(reader: &Reader) -> String {
     let topics = extras.topics.iter().filter(|topic| topic.messages > 0);
     let topics = topics.map(|topic| format!("{} ({} messages)", topic.name, topic.messages));
     let attached = extras.attachments.iter().map(|(name, _)| format!("attachment {name}"));
-    let facts = extras.metadata.iter().filter(|(name, _)| name != ORIGIN);
+    let facts = extras.metadata.iter().filter(|(name, _)| name != ORIGIN_METADATA);
     let facts = facts.map(|(name, _)| format!("metadata {name}"));
-    some(&topics.chain(attached).chain(facts).collect::<Vec<_>>())
+    abbreviated(&topics.chain(attached).chain(facts).collect::<Vec<_>>())
 }
 
 /// Counts of what a capture lacks.
 #[derive(Debug, Default)]
-pub(crate) struct Missing {
+pub(crate) struct LossCounts {
     /// Number of unreadable lines.
     pub(crate) lines: u64,
     /// Number of unreadable messages.
@@ -256,9 +256,9 @@ pub(crate) struct Missing {
     can_xl: u64,
 }
 
-impl Missing {
+impl LossCounts {
     /// Counts an entry other than a frame.
-    pub(crate) fn take(&mut self, note: &Note<'_>) {
+    pub(crate) fn count(&mut self, note: &Note<'_>) {
         match note.kind {
             NoteKind::Text => {}
             NoteKind::CanXl => self.can_xl += 1,
@@ -274,7 +274,7 @@ impl Missing {
     }
 
     /// Prints the counts at the end; `can_xl` names the handling of CAN XL frames.
-    pub(crate) fn tell(&self, reader: &Reader, can_xl: &str) {
+    pub(crate) fn report(&self, reader: &Reader, can_xl: &str) {
         let name = reader.name();
         // In a recording, the lines are notes.
         let unread = match reader.lines() {
@@ -307,19 +307,19 @@ pub(crate) struct ReceiveEnd {
 /// Opens buses as [`ReceiveEnd::open`] does. With a flag, waits for absent buses until it is set.
 pub(crate) fn receive_ends(
     sources: &[PathBuf],
-    kinds: &Kinds,
+    kinds: &KindChoices,
     format: Option<can::Format>,
-    options: &Options,
+    options: &BusOptions,
     until: Option<&AtomicBool>,
 ) -> Result<Vec<ReceiveEnd>, Failure> {
     let mut opened = Vec::new();
     for source in sources {
         let name = source.display().to_string();
         loop {
-            match (ReceiveEnd::open(&name, kinds.of(&name), format, options.clone()), until) {
+            match (ReceiveEnd::open(&name, kinds.kind_of(&name), format, options.clone()), until) {
                 (Ok(receive_end), _) => break opened.push(receive_end),
                 (Err(_), Some(stopped)) if stopped.load(Ordering::Relaxed) => return Ok(opened),
-                (Err(error), Some(_)) if error.may_open_later() => thread::sleep(AGAIN),
+                (Err(error), Some(_)) if error.may_open_later() => thread::sleep(RETRY_INTERVAL),
                 (Err(error), _) => return Err(neither(&name, &error)),
             }
         }
@@ -331,11 +331,11 @@ impl ReceiveEnd {
     /// Opens a bus to receive all its frames, and prints its kind; without a format also a classic interface.
     fn open(
         name: &str,
-        kind: Choice,
+        kind: KindChoice,
         format: Option<can::Format>,
-        options: Options,
+        options: BusOptions,
     ) -> Result<Self, BusError> {
-        let bus = listen::open(name, kind, format, Options { error_mask: EXTENDED_MASK, ..options })?;
+        let bus = listen::open(name, kind, format, BusOptions { error_mask: EXTENDED_MASK, ..options })?;
         output::note(format_args!("{} is {}", bus.name(), bus.kind()));
         Ok(Self { bus, follower: Follower::default() })
     }
@@ -344,15 +344,15 @@ impl ReceiveEnd {
     ///
     /// # Errors
     /// Returns [`BusError`] if the bus is gone.
-    pub(crate) fn hear(&mut self, wait: Duration) -> Result<bool, BusError> {
-        match self.follower.step(&mut Once(&self.bus), wait) {
-            Step::Frames(_) | Step::Leftover(_) => Ok(true),
-            Step::Nothing | Step::Drained | Step::Refused(_) => Ok(false),
-            Step::Down(error) => {
+    pub(crate) fn receive(&mut self, wait: Duration) -> Result<bool, BusError> {
+        match self.follower.step(&mut OpenedOnce(&self.bus), wait) {
+            FollowStep::Frames(_) | FollowStep::Leftover(_) => Ok(true),
+            FollowStep::Nothing | FollowStep::Drained | FollowStep::Refused(_) => Ok(false),
+            FollowStep::Down(error) => {
                 output::note(format_args!("skinbus: {error}; waiting"));
                 Ok(false)
             }
-            Step::Gone(error) => Err(error),
+            FollowStep::Gone(error) => Err(error),
         }
     }
 
@@ -397,7 +397,7 @@ pub(crate) fn captures(
     let flag = OnceLock::new();
     let interruptible = move |file| {
         // Once for all parts. If signals cannot be caught, they end the program at once.
-        let caught = || stopped().unwrap_or_else(|_| Arc::clone(stop::flag()));
+        let caught = || stopped().unwrap_or_else(|_| Arc::clone(stop::stop_flag()));
         through(Interruptible { file, stopped: Arc::clone(flag.get_or_init(caught)) })
     };
     Reader::open_through(sources, Box::new(interruptible)).map_err(Failure::usage)
@@ -411,7 +411,7 @@ pub(crate) struct Interruptible {
 
 impl Read for Interruptible {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let timeout = Timespec::try_from(LOOK).ok();
+        let timeout = Timespec::try_from(POLL_TIMEOUT).ok();
         while !self.stopped.load(Ordering::Relaxed) {
             match poll(&mut [PollFd::new(&self.file, PollFlags::IN)], timeout.as_ref()) {
                 Ok(0) | Err(rustix::io::Errno::INTR) => {}

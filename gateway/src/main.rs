@@ -43,7 +43,7 @@ use std::process::ExitCode;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
-use protocol::usage::{Failure, end, one_line};
+use protocol::usage::{Failure, exit_code, one_line_error};
 
 /// A test bench for robot skin on CAN: runs cells, bridges their bus to a control loop, records, replays
 #[derive(Debug, Parser)]
@@ -120,7 +120,7 @@ fn main() -> ExitCode {
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => Err(Failure::usage(refusal(&wrong))),
     };
-    end("skinbus", done)
+    exit_code("skinbus", done)
 }
 
 /// Formats clap's error in one line, with a better text where clap's suggestion would mislead.
@@ -144,8 +144,8 @@ fn refusal(wrong: &clap::Error) -> String {
             format!("{file} comes after the skin: a scenario is given by --scenario {file}")
         }
         Some(option) => {
-            former::option(&words, option).unwrap_or_else(|| one_line(&wrong.render().to_string()))
+            former::option(&words, option).unwrap_or_else(|| one_line_error(&wrong.render().to_string()))
         }
-        None => one_line(&wrong.render().to_string()),
+        None => one_line_error(&wrong.render().to_string()),
     }
 }

@@ -6,7 +6,7 @@ use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use protocol::usage::{Failure, draw, print, say, say_lines, written};
+use protocol::usage::{Failure, print_raw, print_text, eprint_line, eprint_lines, ignore_broken_pipe};
 use trace::files::{STANDARD_OUTPUT, WholeFile, check, folder_of, with_hint};
 
 /// The option that allows existing files to be overwritten.
@@ -46,10 +46,10 @@ pub(crate) fn print_beside<'a>(
     text: &str,
 ) -> Result<(), Failure> {
     if files.into_iter().flatten().any(is_standard_output) {
-        say_lines(text);
+        eprint_lines(text);
         return Ok(());
     }
-    print(text)
+    print_text(text)
 }
 
 /// Prints a table like [`print_beside`], in colours if standard output supports them.
@@ -62,16 +62,16 @@ pub(crate) fn print_table<'a>(
         return print_beside([file], &text(false));
     }
     if !is_coloured(&io::stdout()) {
-        return print(&text(false));
+        return print_text(&text(false));
     }
     // A terminal in place of a file may show colours too. Names in the text are already escaped.
-    draw(&text(true))
+    print_raw(&text(true))
 }
 
 /// Writes the whole content of a created file.
 pub(crate) fn finish(option: &str, whole: WholeFile, mut file: File, text: &str) -> Result<(), Failure> {
     if is_standard_output(whole.path()) {
-        return written(file.write_all(text.as_bytes()));
+        return ignore_broken_pipe(file.write_all(text.as_bytes()));
     }
     let name = named(option, whole.path());
     let written = file.write_all(text.as_bytes()).and_then(|()| whole.finish());
@@ -127,5 +127,5 @@ pub(crate) fn is_coloured(out: &impl IsTerminal) -> bool {
 
 /// Prints a line on standard error, or drops it if that is closed.
 pub(crate) fn note(text: impl Display) {
-    say(&text.to_string());
+    eprint_line(&text.to_string());
 }

@@ -5,7 +5,7 @@ use std::fmt::Display;
 
 use comfy_table::{Cell, CellAlignment, Color, ColumnConstraint, ContentArrangement, Table, Width, presets};
 use model::quantiles::Quantiles;
-use protocol::usage::{Failure, shown, shown_lines};
+use protocol::usage::{Failure, printable, printable_lines};
 use serde::Serialize;
 
 /// Colours of a terminal, and the code that ends them.
@@ -36,10 +36,10 @@ pub(crate) fn json_line(value: &impl Serialize) -> Result<String, Failure> {
 /// Replaces terminal control characters in the strings of a JSON text by escapes such as `\u009b`.
 pub(crate) fn harmless(json: String) -> String {
     // JSON itself has line feeds but no tabs.
-    if matches!(shown_lines(&json), Cow::Borrowed(_)) {
+    if matches!(printable_lines(&json), Cow::Borrowed(_)) {
         return json;
     }
-    let letter = |letter: char| match shown_lines(letter.encode_utf8(&mut [0; 4])) {
+    let letter = |letter: char| match printable_lines(letter.encode_utf8(&mut [0; 4])) {
         Cow::Borrowed(same) => same.to_owned(),
         Cow::Owned(_) => format!("\\u{:04x}", u32::from(letter)),
     };
@@ -47,12 +47,12 @@ pub(crate) fn harmless(json: String) -> String {
 }
 
 /// Joins items with commas.
-pub(crate) fn list(items: impl IntoIterator<Item: Display>) -> String {
+pub(crate) fn comma_separated(items: impl IntoIterator<Item: Display>) -> String {
     joined(", ", items)
 }
 
 /// Joins items with spaces.
-pub(crate) fn words(items: impl IntoIterator<Item: Display>) -> String {
+pub(crate) fn space_separated(items: impl IntoIterator<Item: Display>) -> String {
     joined(" ", items)
 }
 
@@ -61,9 +61,9 @@ fn joined(between: &str, items: impl IntoIterator<Item: Display>) -> String {
 }
 
 /// Lists all names, or the first of many with the total.
-pub(crate) fn some(names: &[String]) -> String {
+pub(crate) fn abbreviated(names: &[String]) -> String {
     let few = names.get(..NAMES).filter(|_| names.len() > NAMES);
-    few.map_or_else(|| list(names), |few| format!("{}, ... ({} in all)", list(few), names.len()))
+    few.map_or_else(|| comma_separated(names), |few| format!("{}, ... ({} in all)", comma_separated(few), names.len()))
 }
 
 /// Formats a count with its noun.
@@ -77,13 +77,13 @@ pub(crate) fn count(count: impl TryInto<u64>, one: &str) -> String {
 }
 
 /// Formats a value, or returns the text for an absent one.
-pub(crate) fn or(value: Option<impl Display>, none: &str) -> String {
+pub(crate) fn or_else_text(value: Option<impl Display>, none: &str) -> String {
     value.map_or_else(|| none.to_owned(), |value| value.to_string())
 }
 
 /// Formats a number with this many decimals, or returns the text for an absent one.
 pub(crate) fn decimals(value: Option<f64>, decimals: usize, none: &str) -> String {
-    or(value.map(|value| format!("{value:.decimals$}")), none)
+    or_else_text(value.map(|value| format!("{value:.decimals$}")), none)
 }
 
 /// Formats 50 %, 90 %, 99 % and the maximum.
@@ -100,9 +100,9 @@ pub(crate) fn table<H: Into<String>>(
 ) -> Table {
     let mut table = Table::new();
     table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
-    table.set_header(head.into_iter().map(|head| shown_lines(&head.into()).into_owned()));
+    table.set_header(head.into_iter().map(|head| printable_lines(&head.into()).into_owned()));
     table.add_rows(
-        rows.into_iter().map(|row| row.iter().map(|text| shown(text).into_owned()).collect::<Vec<_>>()),
+        rows.into_iter().map(|row| row.iter().map(|text| printable(text).into_owned()).collect::<Vec<_>>()),
     );
     for (index, column) in table.column_iter_mut().enumerate() {
         if is_of_numbers(index) {
@@ -120,7 +120,7 @@ pub(crate) fn readable(mut table: Table) -> Table {
 }
 
 /// Returns the columns that have values, and their texts in each row; `nothing` stands for an absent value.
-pub(crate) fn filled<H, T, F: Fn(&T) -> Option<String>>(
+pub(crate) fn drop_empty_columns<H, T, F: Fn(&T) -> Option<String>>(
     columns: impl IntoIterator<Item = (H, F)>,
     rows: &[T],
     nothing: &str,
@@ -132,7 +132,7 @@ pub(crate) fn filled<H, T, F: Fn(&T) -> Option<String>>(
         if column.iter().any(Option::is_some) {
             heads.push(head);
             for (line, text) in lines.iter_mut().zip(column) {
-                line.push(or(text, nothing));
+                line.push(or_else_text(text, nothing));
             }
         }
     }
@@ -140,13 +140,13 @@ pub(crate) fn filled<H, T, F: Fn(&T) -> Option<String>>(
 }
 
 /// A table of names, values and values for comparison.
-pub(crate) struct Rows {
+pub(crate) struct KeyValueTable {
     table: Table,
     /// Width of a name in one line.
     name_width: Option<usize>,
 }
 
-impl Rows {
+impl KeyValueTable {
     /// Creates a [`readable`] table with this header and no rows.
     pub(crate) fn new(name: impl Display, value: impl Display, beside: impl Display) -> Self {
         Self::in_columns(None, name, value, beside)
@@ -246,7 +246,7 @@ impl Rows {
 
 /// Texts of a row, [`shown`].
 fn line(name: impl Display, value: impl Display, beside: impl Display) -> [String; 3] {
-    [name.to_string(), value.to_string(), beside.to_string()].map(|text| shown(&text).into_owned())
+    [name.to_string(), value.to_string(), beside.to_string()].map(|text| printable(&text).into_owned())
 }
 
 /// Breaks a text into lines of `columns` columns. The first line begins with `begin`; the others are indented by its

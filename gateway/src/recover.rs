@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use protocol::input;
-use protocol::usage::{Failure, shown};
+use protocol::usage::{Failure, printable};
 use trace::files::with_hint;
 use trace::recording::recover::RecoverError;
 use trace::recording::{names, repair};
@@ -65,6 +65,6 @@ impl Recover {
         if recovered.is_little() {
             return Err(Failure::run(format!("more of {name} is lost than was recovered: {line}")));
         }
-        print_beside([Some(output.as_path())], &format!("{}\n", shown(&line)))
+        print_beside([Some(output.as_path())], &format!("{}\n", printable(&line)))
     }
 }

@@ -5,16 +5,16 @@ use std::time::Duration;
 
 use bench::replay::comparator::Steps;
 use bench::replay::player::Pace;
-use bench::replay::replay_plan::Only;
+use bench::replay::replay_plan::SenderFilter;
 use bench::replay::report::{Expect, Summary};
-use bench::replay::survey::Part;
-use bench::replay::{Options, ReplayError, Spawn, replay};
+use bench::replay::survey::TimeRange;
+use bench::replay::{ReplayOptions, ReplayError, SpawnOptions, replay};
 use clap::Args;
-use protocol::usage::{Failure, shown, shown_lines};
+use protocol::usage::{Failure, printable, printable_lines};
 
-use super::arguments::{BusKinds, Word, cells_per_process, nanos, of_environment, one_of};
+use super::arguments::{BusKinds, OptionValue, cells_per_process, nanos, of_environment, one_of};
 use super::output::{self, Overwrite, apart, print_table};
-use super::print::{GREEN, PLAIN, Rows, YELLOW, count, hanging, json, list, or, quantiles};
+use super::print::{GREEN, PLAIN, KeyValueTable, YELLOW, count, hanging, json, comma_separated, or_else_text, quantiles};
 
 /// Receive buffer in bytes: all cells may answer a report at once.
 const RECEIVE_BUFFER: u32 = 8 << 20;
@@ -102,7 +102,7 @@ struct Frames {
     /// Send only these frames: inputs are commands, configuration and stimuli. Default: inputs with --expect,
     /// --lockstep or --spawn, else all
     #[arg(long, value_parser = one_of(ONLY))]
-    only: Option<Only>,
+    only: Option<SenderFilter>,
     /// Begin at this second of the run, counted from the first frame if there is no run; with inputs only, in the state
     /// that was latched there
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
@@ -112,10 +112,10 @@ struct Frames {
     to: Option<u64>,
 }
 
-const ONLY: &[Word<Only>] = &[
-    ("inputs", "Commands, configuration, stimuli", Only::Inputs),
-    ("replies", "Frames from cells", Only::Replies),
-    ("all", "Everything", Only::All),
+const ONLY: &[OptionValue<SenderFilter>] = &[
+    ("inputs", "Commands, configuration, stimuli", SenderFilter::Inputs),
+    ("replies", "Frames from cells", SenderFilter::Replies),
+    ("all", "Everything", SenderFilter::All),
 ];
 
 fn route(text: &str) -> Result<(String, String), String> {
@@ -150,7 +150,7 @@ impl Replay {
         summary.verdict(self.shown.quiet).map_or(Ok(()), |why| Err(Failure::run(why)))
     }
 
-    fn options(&self) -> Result<Options, Failure> {
+    fn options(&self) -> Result<ReplayOptions, Failure> {
         let answered = [("--expect", self.expect), ("--lockstep", self.lockstep), ("--spawn", self.spawn)];
         let needs = answered.into_iter().find_map(|(name, given)| given.then_some(name));
         if let Some(skin) = self.skin.as_ref().filter(|_| !self.spawn) {
@@ -160,23 +160,23 @@ impl Replay {
             )));
         }
         let only = match (self.frames.only, needs) {
-            (Some(Only::Replies | Only::All), Some(name)) => {
+            (Some(SenderFilter::Replies | SenderFilter::All), Some(name)) => {
                 return Err(Failure::usage(format!(
                     "{name} lets cells answer, and --only sends recorded answers in their place: leave out one of the \
                      two"
                 )));
             }
-            (None, Some(_)) => Only::Inputs,
-            (only, _) => only.unwrap_or(Only::All),
+            (None, Some(_)) => SenderFilter::Inputs,
+            (only, _) => only.unwrap_or(SenderFilter::All),
         };
         let timeout_ms = of_environment("SKINBUS_SEND_TIMEOUT_MS", 1..=60_000)?;
-        Ok(Options {
+        Ok(ReplayOptions {
             files: self.files.clone(),
             kinds: self.kinds.of_any()?,
             only,
             buses: self.frames.bus.clone(),
             map: self.frames.map.clone(),
-            part: Part { from: self.frames.from, to: self.frames.to },
+            part: TimeRange { from: self.frames.from, to: self.frames.to },
             passes: (self.passes > 0).then_some(self.passes),
             pace: self.speed,
             spin: SPIN,
@@ -184,7 +184,7 @@ impl Replay {
             expect: self.expect.then_some(self.tolerance),
             spawn: self
                 .spawn
-                .then_some(Spawn { skin: self.skin.clone(), cells_per_process: cells_per_process()? }),
+                .then_some(SpawnOptions { skin: self.skin.clone(), cells_per_process: cells_per_process()? }),
             test_mode: self.test_mode,
             timeout: Duration::from_millis(timeout_ms.unwrap_or(SEND_TIMEOUT_MS).into()),
             receive_buffer: RECEIVE_BUFFER as usize,
@@ -200,9 +200,9 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
         (None, true) => "interrupted",
         (None, false) => "done",
     };
-    let mut rows = Rows::new(&summary.file, format!("{:.1} s, {ended}", summary.duration_s), "");
+    let mut rows = KeyValueTable::new(&summary.file, format!("{:.1} s, {ended}", summary.duration_s), "");
     let (is_well, first) = summary.first_line();
-    let first_line = hanging("", &shown(&first), rows.columns());
+    let first_line = hanging("", &printable(&first), rows.columns());
     let first_line = match is_coloured {
         true if is_well => format!("{GREEN}{first_line}{PLAIN}\n"),
         true => format!("{YELLOW}{first_line}{PLAIN}\n"),
@@ -227,7 +227,7 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
         }
     }
     if let Some(lockstep) = &summary.lockstep {
-        let silent = list(&lockstep.silent_cells);
+        let silent = comma_separated(&lockstep.silent_cells);
         let silent = if silent.is_empty() { "all answered".to_owned() } else { format!("silent: {silent}") };
         rows.section("lockstep", silent, format!("{} joints retried", lockstep.retried));
     }
@@ -235,10 +235,10 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
         expectation(&mut rows, expect);
     }
     let first = summary.expect.as_ref().and_then(|expect| expect.first.as_ref());
-    first_line + &rows.text() + &or(first.map(|first| format!("{}\n", shown_lines(&first.text))), "")
+    first_line + &rows.text() + &or_else_text(first.map(|first| format!("{}\n", printable_lines(&first.text))), "")
 }
 
-fn expectation(rows: &mut Rows, expect: &Expect) {
+fn expectation(rows: &mut KeyValueTable, expect: &Expect) {
     let tally = &expect.tally;
     rows.section("replies", "against the recording", "");
     let within = format!("{} of them within the tolerance of {} steps", tally.tolerated, expect.tolerance);
@@ -261,7 +261,7 @@ fn expectation(rows: &mut Rows, expect: &Expect) {
 }
 
 /// Rows on the words that differ by more than `usual` steps, if any: the number of words for each difference.
-fn off(rows: &mut Rows, what: &str, steps: &Steps, usual: usize) {
+fn off(rows: &mut KeyValueTable, what: &str, steps: &Steps, usual: usize) {
     let counts = steps.by_steps.iter().enumerate().skip(1);
     let found: Vec<_> = counts.filter(|(_, count)| **count > 0).collect();
     let Some((worst, _)) = found.last().filter(|(worst, _)| *worst > usual) else { return };

@@ -8,8 +8,8 @@ use analysis::report::run::{self, ReportError};
 use analysis::report::{figure::Page, page, svg};
 use clap::Args;
 use protocol::skin::Skin;
-use protocol::usage::{Failure, command_line, print, shown, written};
-use protocol::wire_time::bit_rate;
+use protocol::usage::{Failure, command_line, print_text, printable, ignore_broken_pipe};
+use protocol::wire_time::parse_bit_rate;
 
 use super::input::{difference, read_skin};
 use super::output::{Overwrite, apart, is_standard_output, note};
@@ -41,10 +41,10 @@ pub(crate) struct Report {
     #[arg(long, value_name = "DIR")]
     svg: Option<PathBuf>,
     /// Bit rate of all buses for their load: 500k, 1M [default: the skin's, else 1M]
-    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     nominal: Option<u32>,
     /// Bit rate of FD data: 2M, 5M [default: the skin's, else 5M]
-    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
+    #[arg(long, value_name = "RATE", value_parser = parse_bit_rate)]
     data: Option<u32>,
     #[command(flatten)]
     overwrite: Overwrite,
@@ -103,7 +103,7 @@ impl Report {
             self.svg.map_or_else(String::new, |folder| format!(", also as files in {}", folder.display()));
         let said = format!("{}: {figures} figures{beside}", output.display());
         if !is_standard_output(&output) {
-            print(&format!("{}\n", shown(&said)))?;
+            print_text(&format!("{}\n", printable(&said)))?;
         }
         match report.missing.filter(|_| report.is_damaged) {
             Some(missing) => Err(Failure::run(format!("{}: {missing}", report.name))),
@@ -163,7 +163,7 @@ fn write(files: &[(&str, PathBuf, String)], overwrite: Overwrite) -> Result<(), 
         let (begun, mut file) = overwrite.create(option, path)?;
         let done = file.write_all(text.as_bytes());
         if is_standard_output(path) {
-            written(done)?;
+            ignore_broken_pipe(done)?;
         } else {
             done.map_err(|error| failed(option, path, error))?;
             whole.push((option, path, begun));

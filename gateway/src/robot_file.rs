@@ -3,20 +3,20 @@
 use std::fmt::Display;
 use std::path::{Component, Path, PathBuf};
 
-use protocol::document::LONGEST;
+use protocol::document::MAX_FILE_BYTES;
 use protocol::input;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 use robots::Urdf;
 use trace::files::folder_of;
-use trace::recording::robot::Robot;
+use trace::recording::robot::RecordedRobot;
 
 use super::output::note;
 
 /// Robot of a skin: its geometry for recordings, and the text of the URDF that the skin names.
 #[derive(Default)]
 pub(crate) struct RobotOfSkin {
-    pub(crate) robot: Option<Robot>,
+    pub(crate) robot: Option<RecordedRobot>,
     pub(crate) urdf: Option<String>,
 }
 
@@ -28,13 +28,13 @@ impl RobotOfSkin {
     /// Returns [`Failure`] if the file cannot be read or is not a URDF.
     pub(crate) fn read(skin: &Skin, file: Option<&Path>) -> Result<Self, Failure> {
         let of_rows = || {
-            Robot::of_rows(skin).map_err(|error| note(format_args!("the robot is not shown: {error}"))).ok()
+            RecordedRobot::of_rows(skin).map_err(|error| note(format_args!("the robot is not shown: {error}"))).ok()
         };
         let Some(path) = file else { return Ok(Self { robot: of_rows(), urdf: None }) };
         let hint = "correct the skin's path, or take the key out";
         let wrong = |error: &dyn Display| Failure::usage(format!("robot.urdf: {error}; {hint}"));
         let (urdf, text) = read_urdf(path).map_err(|error| wrong(&error))?;
-        let robot = Robot::of_urdf(skin, urdf, text.clone());
+        let robot = RecordedRobot::of_urdf(skin, urdf, text.clone());
         let robot = robot.or_else(|error| {
             note(format_args!("robot.urdf: {error}; the robot is shown by the skin's rows"));
             of_rows().ok_or(())
@@ -49,7 +49,7 @@ impl RobotOfSkin {
 /// Returns a one-line text if the file cannot be read or is not a URDF.
 pub(crate) fn read_urdf(path: &Path) -> Result<(Urdf, String), String> {
     let file = path.display().to_string();
-    let bytes = input::bytes(path, LONGEST).map_err(|error| format!("{file}: {error}"))?;
+    let bytes = input::read_bytes(path, MAX_FILE_BYTES).map_err(|error| format!("{file}: {error}"))?;
     let text = robots::text(&file, &bytes).map_err(|error| error.to_string())?.into_owned();
     let urdf = Urdf::parse(&file, &text).map_err(|error| error.to_string())?;
     Ok((urdf, text))

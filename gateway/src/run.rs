@@ -10,18 +10,18 @@ use std::time::Duration;
 use bench::emulate::Emulated;
 use bench::processes::in_memory;
 use bench::record::{self, Candump};
-use bench::remote::Lines;
-use bench::run::{self, Options};
+use bench::remote::JsonPipe;
+use bench::run::{self, RunOptions};
 use bench::summary::Summary;
 use clap::Args;
-use model::scenario::{IDLE, Scenario};
-use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds};
+use model::scenario::{DEFAULT_DURATION, Scenario};
+use protocol::bus::{BusKind, KindChoice, GATEWAY_RECEIVE_BUFFER, KindChoices};
 use protocol::document;
 use protocol::input::can_be_read_again;
 use protocol::skin::{CellName, Skin};
 use protocol::time::Span;
-use protocol::usage::{Failure, command_line, quoted_os};
-use trace::recording::series::{Attached, Split};
+use protocol::usage::{Failure, command_line, shell_quoted_os};
+use trace::recording::series::{AttachedFile, SplitLimits};
 
 use super::arguments::{
     BusKinds, Processes, bus_names, cell_of, cells_per_process, of_environment, seconds, time,
@@ -31,7 +31,7 @@ use super::output::{self, Overwrite, apart, note, print_table};
 use super::print::json;
 use super::robot_file::{RobotOfSkin, urdf_of};
 use super::view::{Page, PageOptions};
-use show::Look;
+use show::TableStyle;
 
 /// Skin and scenario of the demonstration.
 const SKIN: &str = include_str!("../examples/ur5-253.toml");
@@ -111,8 +111,8 @@ fn limit(text: &str) -> Result<Limit, String> {
 
 impl Recording {
     /// Returns the outputs of the recording, with the files attached.
-    fn options(&self, candump: Option<Candump>, files: Files, limits: &[Limit]) -> record::Options {
-        let mut split = Split::default();
+    fn options(&self, candump: Option<Candump>, files: Files, limits: &[Limit]) -> record::RecordOptions {
+        let mut split = SplitLimits::default();
         for &limit in limits {
             match limit {
                 Limit::Bytes(bytes) => split.bytes = bytes,
@@ -120,7 +120,7 @@ impl Recording {
             }
         }
         let mcap = self.record.clone().map(|path| {
-            let file = |name: &str, media_type, text: String| Attached {
+            let file = |name: &str, media_type, text: String| AttachedFile {
                 name: name.to_owned(),
                 media_type,
                 bytes: text.into_bytes(),
@@ -131,7 +131,7 @@ impl Recording {
             let command_line = command_line();
             record::Mcap { path, split, attachments, robot: files.robot.robot, command_line }
         });
-        record::Options { candump, mcap, force: self.overwrite.overwrite }
+        record::RecordOptions { candump, mcap, force: self.overwrite.overwrite }
     }
 }
 
@@ -219,16 +219,16 @@ impl Demo {
         options.cells_per_process = cells_per_process()?;
         options.kinds = self
             .kinds
-            .or(Choice::Only(BusKind::Embedded))?
-            .only(bus_names(&options.skin))
+            .kinds_or(KindChoice::Only(BusKind::Embedded))?
+            .restrict_to(bus_names(&options.skin))
             .map_err(Failure::usage)?;
-        let kind = options.kinds.of("vcan0").resolve("vcan0");
+        let kind = options.kinds.kind_of("vcan0").resolve("vcan0");
         let given = std::env::var_os("SKINBUS_DIR").filter(|given| !given.is_empty()).map(PathBuf::from);
         let own = given.is_none() && kind == BusKind::Embedded;
         let buses = own.then(|| buses::directory("demo")).transpose()?;
         options.directory = buses.as_ref().map(|buses| buses.path().to_owned()).or(given);
         let place = options.directory.as_ref();
-        let place = place.map(|path| format!("SKINBUS_DIR={} ", quoted_os(path.as_os_str())));
+        let place = place.map(|path| format!("SKINBUS_DIR={} ", shell_quoted_os(path.as_os_str())));
         let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
         options.announced.push(format!("its frames in words: {place}skinbus dump vcan0 --bus-kind {kind}"));
         let Common { recording, summary, verbose, view, listen, .. } = self.common;
@@ -249,13 +249,13 @@ impl Demo {
 impl Run {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let name = |path: &Path| path.display().to_string();
-        let skin_text = document::text(&self.skin).map_err(Failure::usage)?;
+        let skin_text = document::read_text(&self.skin).map_err(Failure::usage)?;
         let skin = Skin::parse(&name(&self.skin), &skin_text).map_err(Failure::usage)?;
         let scenario_text =
-            self.scenario.as_deref().map(document::text).transpose().map_err(Failure::usage)?;
+            self.scenario.as_deref().map(document::read_text).transpose().map_err(Failure::usage)?;
         let scenario = match (&self.scenario, &scenario_text) {
             (Some(path), Some(text)) => Scenario::parse(&name(path), text, &skin).map_err(Failure::usage)?,
-            _ => Scenario::idle(IDLE),
+            _ => Scenario::idle(DEFAULT_DURATION),
         };
         let urdf = self.common.recording.record.as_ref().and(skin.robot.urdf.as_deref());
         let urdf = urdf.map(|urdf| urdf_of(&self.skin, urdf));
@@ -277,7 +277,7 @@ impl Run {
         }
         let mut options = self.common.options(skin_file, skin, scenario);
         let Common { recording, summary, verbose, view, listen, .. } = self.common;
-        options.kinds = self.kinds.of(bus_names(&options.skin))?;
+        options.kinds = self.kinds.kinds_of(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| Candump { path, numbered: false });
         let files = Files { skin: skin_text, scenario: scenario_text, robot };
         options.record = recording.options(candump, files, &self.record_split);
@@ -309,23 +309,23 @@ fn emulated(firmware: Option<PathBuf>, named: &[CellName], skin: &Skin) -> Resul
 
 impl Common {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e13: checked")]
-    fn options(&self, skin_file: PathBuf, skin: Skin, mut scenario: Scenario) -> Options {
+    fn options(&self, skin_file: PathBuf, skin: Skin, mut scenario: Scenario) -> RunOptions {
         let until_stopped = self.view.then_some(UNTIL_STOPPED);
         if let Some(seconds) = self.duration.or(until_stopped) {
             scenario.duration = Span((seconds * 1e6) as u64);
         }
-        Options {
+        RunOptions {
             skin_file,
             skin,
             scenario,
-            kinds: Kinds::default(),
+            kinds: KindChoices::default(),
             directory: None,
             spawn: true,
             emulated: None,
             cells_per_process: 1,
             flash: None,
             receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
-            record: record::Options::default(),
+            record: record::RecordOptions::default(),
             quiet: self.quiet,
             planned: None,
             announced: Vec::new(),
@@ -334,11 +334,11 @@ impl Common {
 }
 
 fn bench(
-    options: &Options,
+    options: &RunOptions,
     (summary_file, overwrite): (Option<&Path>, Overwrite),
     is_verbose: bool,
     read: &[PathBuf],
-    page: Option<(Page, Lines)>,
+    page: Option<(Page, JsonPipe)>,
 ) -> Result<(), Failure> {
     let written = [
         ("--candump", options.record.candump.as_ref().map(|candump| candump.path.as_path())),
@@ -363,7 +363,7 @@ fn bench(
         panic::resume_unwind(panic);
     }
     let files = written.map(|(_, path)| path);
-    let table = |is_coloured| show::text(&ended, Look { is_verbose, is_coloured, columns: None });
+    let table = |is_coloured| show::text(&ended, TableStyle { is_verbose, is_coloured, columns: None });
     let printed = if ended.control.ticks > 0 { print_table(files, table) } else { Ok(()) };
     // The last line is the failure's own; each message is one line.
     let mut lines = ended.complaints(options.quiet);

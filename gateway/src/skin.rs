@@ -11,13 +11,13 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 use model::generate::{Reply as Answers, Target, generate};
 use protocol::can::Format;
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print_text};
 
-use super::arguments::{FORMATS, Word, one_of};
+use super::arguments::{FORMATS, OptionValue, one_of};
 use super::output::Overwrite;
 pub(crate) use show::still;
 
-const REPLIES: &[Word<Answers>] =
+const REPLIES: &[OptionValue<Answers>] =
     &[("torque", "Each cell its own torque", Answers::Torque), ("sum", "Sums along the tree", Answers::Sum)];
 
 /// Create and draw skins, and convert them to URDF and DBC
@@ -85,7 +85,7 @@ impl Generate {
         let text = generate(&target).map_err(Failure::usage)?;
         match output {
             Some(path) => overwrite.write("-o", &path, &text),
-            None => print(&text),
+            None => print_text(&text),
         }
     }
 }

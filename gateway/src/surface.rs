@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use cover::Part;
+use cover::LinkMesh;
 use cover::mesh::{Triangle, simplify};
 use protocol::skin::{Chain, ChainRow, Skin};
-use robots::{Isometry3, LinkFrame, Row, Urdf};
-use view::Shell;
+use robots::{Isometry3, LinkFrame, DhRow, Urdf};
+use view::RowMesh;
 
 use super::output::note;
 use super::print::count;
@@ -21,12 +21,12 @@ struct Placed {
     /// Row in whose frame the part is, from 1; 0 is the start of the chain.
     row: usize,
     /// The part; its pose is relative to that frame.
-    part: Part,
+    part: LinkMesh,
 }
 
 /// Returns the drawing of the robot of a skin's file: triangles for each row, simplified to at most `most` in all.
 /// Empty if the skin names no URDF. Prints a note on parts that cannot be drawn.
-pub(crate) fn shells(file: &Path, skin: &Skin, packages: &Packages, most: usize) -> Vec<Shell> {
+pub(crate) fn shells(file: &Path, skin: &Skin, packages: &Packages, most: usize) -> Vec<RowMesh> {
     let Some(path) = skin.robot.urdf.as_deref().map(|urdf| urdf_of(file, urdf)) else { return Vec::new() };
     let parts = read_urdf(&path).and_then(|(urdf, _)| parts(&urdf, &path, skin, packages));
     let parts =
@@ -40,7 +40,7 @@ pub(crate) fn shells(file: &Path, skin: &Skin, packages: &Packages, most: usize)
         triangles.into_iter().map(|triangle| triangle.map(|corner| corner.coords.into())).collect()
     };
     let shells = places.into_iter().zip(simplify(triangles, most));
-    shells.map(|((chain, row), all)| Shell { chain, row, triangles: points(all) }).collect()
+    shells.map(|((chain, row), all)| RowMesh { chain, row, triangles: points(all) }).collect()
 }
 
 fn parts(urdf: &Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<Vec<Placed>, String> {
@@ -60,7 +60,7 @@ fn parts(urdf: &Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<V
             Err(error) => missing.push(error),
             Ok(all) => {
                 let Some((chain, row, frame)) = place(urdf, &chains, link) else { continue };
-                let put = |part: Part| Part { pose: frame * part.pose, ..part };
+                let put = |part: LinkMesh| LinkMesh { pose: frame * part.pose, ..part };
                 parts.extend(all.into_iter().map(|part| Placed { chain, row, part: put(part) }));
             }
         }
@@ -72,11 +72,11 @@ fn parts(urdf: &Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<V
 }
 
 /// Finds the URDF's chain with the same rows as a skin's chain.
-fn chain_of(urdf: &Urdf, chain: &Chain) -> Option<robots::Chain> {
+fn chain_of(urdf: &Urdf, chain: &Chain) -> Option<robots::UrdfChain> {
     // The skin does not name the link at which the chain begins.
     let mut roots = urdf.links().filter_map(|root| urdf.chain(Some(root), &chain.name).ok());
     roots.find(|found| {
-        let same = |(one, other): (&ChainRow, &Row)| {
+        let same = |(one, other): (&ChainRow, &DhRow)| {
             let other = other.with_limits(one.limits);
             let [one, other] = [one, &other].map(|it| (it.kind, it.table));
             let near = |one: f64, other: f64| (one - other).abs() < 1e-9;
@@ -93,7 +93,7 @@ fn chain_of(urdf: &Urdf, chain: &Chain) -> Option<robots::Chain> {
 
 /// Finds the chain and the row to which a link is fixed, and the link's frame relative to the row's. Joints outside all
 /// chains are at rest; links that no chain moves are fixed to the start of the first chain.
-fn place(urdf: &Urdf, chains: &[robots::Chain], link: &str) -> Option<(usize, usize, Isometry3<f64>)> {
+fn place(urdf: &Urdf, chains: &[robots::UrdfChain], link: &str) -> Option<(usize, usize, Isometry3<f64>)> {
     let pose = |link: &str| urdf.pose(link, &|joint| urdf.rest(joint)).ok();
     let at = pose(link)?;
     let mut above = Some(link);

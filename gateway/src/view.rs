@@ -12,13 +12,13 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
 
-use bench::remote::Lines;
+use bench::remote::JsonPipe;
 use bench::run;
 use clap::Args;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
-use trace::capture::{CaptureError, Format, Reader};
-use view::Shell;
+use trace::capture::{CaptureError, CaptureFormat, Reader};
+use view::RowMesh;
 use view::play::{self, play};
 use view::player::PlayError;
 use view::serve::{Options, ServeError, serve};
@@ -35,7 +35,7 @@ use address::AddressFile;
 const TRIANGLES: usize = 20_000;
 
 /// Default address of a page.
-const LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
+const DEFAULT_ADDRESS: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 
 /// Show a skin in a browser, live or recorded, and press its cells with the mouse
 ///
@@ -66,7 +66,7 @@ pub(crate) struct View {
     #[arg(long, value_name = "S", value_parser = nanos)]
     at: Option<u64>,
     /// Address of the page; port 0 is any free port
-    #[arg(long, value_name = "ADDRESS:PORT", default_value_t = LISTEN)]
+    #[arg(long, value_name = "ADDRESS:PORT", default_value_t = DEFAULT_ADDRESS)]
     listen: SocketAddr,
     /// Read the token in the page's address from this file [default: the variable SKINBUS_TOKEN, else random]
     #[arg(long, value_name = "FILE")]
@@ -146,18 +146,18 @@ impl View {
                 return Err(Failure::usage(why));
             }
         };
-        let kinds = self.kinds.of(bus_names(&skin))?;
+        let kinds = self.kinds.kinds_of(bus_names(&skin))?;
         let stop = stopped()?;
         let bench = self.of_run.then(run_of_this).transpose().map_err(|error| failed(&error))?;
         let Served { listener, access, url } = served;
         let options =
-            Options { skin, surface, kinds, directory: None, listener, access, patient: self.wait, bench };
-        serve(options, &stop, || say(url)).map_err(Failure::usage)?;
+            Options { skin, surface, kinds, directory: None, listener, access, waits_for_buses: self.wait, bench };
+        serve(options, &stop, || print_address(url)).map_err(Failure::usage)?;
         Ok(())
     }
 
     /// Part of a skin on the named buses.
-    fn on_buses(&self) -> Result<(Skin, Vec<Shell>), Failure> {
+    fn on_buses(&self) -> Result<(Skin, Vec<RowMesh>), Failure> {
         let Some(file) = &self.skin else {
             let name = self.sources.first().map(|it| it.display().to_string()).unwrap_or_default();
             return Err(Failure::usage(format!(
@@ -172,7 +172,7 @@ impl View {
         let mut buses = self.sources.iter().map(of).collect::<Result<Vec<_>, _>>()?;
         buses.sort_unstable();
         buses.dedup();
-        Ok((skin.on_buses(&buses), surface))
+        Ok((skin.restricted_to_buses(&buses), surface))
     }
 
     /// Serves the page of a recording.
@@ -184,7 +184,7 @@ impl View {
         let warns = |what: &str| note(format_args!("{what}"));
         let Served { listener, access, url } = served;
         let options = play::Options { paths: self.sources, skin, surface, listener, access, at_s };
-        play(options, &stop, || say(url), warns).map_err(|error| match error {
+        play(options, &stop, || print_address(url), warns).map_err(|error| match error {
             ServeError::Play(PlayError::Damaged(_) | PlayError::Capture(CaptureError::Damaged { .. })) => {
                 Failure::run(error)
             }
@@ -196,14 +196,14 @@ impl View {
     }
 
     /// Reads a skin with the meshes of its robot, as far as they are found.
-    fn read(&self, path: &Path) -> Result<(Skin, Vec<Shell>), Failure> {
+    fn read(&self, path: &Path) -> Result<(Skin, Vec<RowMesh>), Failure> {
         let skin = read_skin(path)?;
         let surface = shells(path, &skin, &self.packages, TRIANGLES);
         Ok((skin, surface))
     }
 
     /// Skin of a recording. The skin inside a recording has no URDF beside it.
-    fn recorded_skin(&self) -> Result<(Skin, Vec<Shell>), Failure> {
+    fn recorded_skin(&self) -> Result<(Skin, Vec<RowMesh>), Failure> {
         match &self.skin {
             Some(path) => {
                 let (skin, shells) = self.read(path)?;
@@ -233,7 +233,7 @@ impl View {
             return Err(Failure::usage(format!("{} {what}", first.display())));
         }
         let mut reader = Reader::open(first).map_err(Failure::usage)?;
-        if reader.format() == Format::Mcap || reader.has_frame().map_err(Failure::usage)? {
+        if reader.format() == CaptureFormat::Mcap || reader.has_frame().map_err(Failure::usage)? {
             return Ok(true);
         }
         // A file given with --skin or --at is not a skin.
@@ -260,14 +260,14 @@ fn unbound(listen: SocketAddr, error: &io::Error) -> Failure {
 }
 
 /// Prints the address of the page.
-fn say(url: Option<String>) {
+fn print_address(url: Option<String>) {
     url.iter().for_each(|url| note(format_args!("view: {url}")));
 }
 
 /// Returns the run that has started this program, at the other end of the socket that is its standard output.
-fn run_of_this() -> io::Result<Lines> {
+fn run_of_this() -> io::Result<JsonPipe> {
     let socket = || io::stdout().as_fd().try_clone_to_owned();
-    Lines::new(socket()?, socket()?)
+    JsonPipe::new(socket()?, socket()?)
 }
 
 /// Returns the listener that is this program's standard input.
@@ -289,22 +289,22 @@ pub(crate) struct Page {
 impl Page {
     /// Serves the page of a run, whose buses open later. Returns it with the connection for its commands.
     pub(crate) fn of(
-        run: &run::Options,
+        run: &run::RunOptions,
         listen: Option<SocketAddr>,
         options: &PageOptions,
-    ) -> Result<(Self, Lines), Failure> {
-        let run::Options { skin_file, skin, kinds, directory, .. } = run;
+    ) -> Result<(Self, JsonPipe), Failure> {
+        let run::RunOptions { skin_file, skin, kinds, directory, .. } = run;
         let program = std::env::current_exe().map_err(|error| failed(&error))?;
         let mut command = Command::new(program);
         command.args(["view", "--wait", "--of-run"]).arg(skin_file);
         for bus in &skin.buses {
-            let kind = kinds.of(&bus.name).resolve(&bus.name);
+            let kind = kinds.kind_of(&bus.name).resolve(&bus.name);
             command.arg("--bus-kind").arg(OsString::from(format!("{}={kind}", bus.name)));
         }
         if let Some(directory) = directory {
             command.env("SKINBUS_DIR", directory);
         }
-        let listen = listen.unwrap_or(LISTEN);
+        let listen = listen.unwrap_or(DEFAULT_ADDRESS);
         let token = token::needed(token::chosen(options.token_file.as_deref())?, true, listen)?;
         // Only this user can read the environment of a process; everyone can read its command line.
         match &token {
@@ -318,11 +318,11 @@ impl Page {
         let address_file = address_file.map(|path| AddressFile::write(path, &url)).transpose()?.flatten();
         let (here, there) = UnixStream::pair().map_err(|error| failed(&error))?;
         let lines =
-            here.try_clone().and_then(|input| Lines::new(input, here)).map_err(|error| failed(&error))?;
+            here.try_clone().and_then(|input| JsonPipe::new(input, here)).map_err(|error| failed(&error))?;
         // The page gets no signals of the terminal: the run ends it, also on Ctrl-C.
         command.process_group(0).stdin(OwnedFd::from(listener)).stdout(OwnedFd::from(there));
         let process = command.spawn().map_err(|error| failed(&error))?;
-        say(Some(url));
+        print_address(Some(url));
         Ok((Self { process, _address_file: address_file }, lines))
     }
 }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use cover::Part;
+use cover::LinkMesh;
 use cover::mesh::{Mesh, MeshError, UpAxis};
 use robots::{Geometry, Shape, Urdf};
 use trace::files::folder_of;
@@ -54,19 +54,19 @@ impl<'a> Visuals<'a> {
     }
 
     /// Parts of a link; empty if the URDF has no visual for it.
-    pub(crate) fn parts(&self, link: &str) -> Result<Vec<Part>, String> {
+    pub(crate) fn parts(&self, link: &str) -> Result<Vec<LinkMesh>, String> {
         let shapes = self.urdf.visuals(link).map_err(|error| error.to_string())?;
         let part =
             |shape| self.part(shape).map_err(|error| format!("{}: link {link}: {error}", self.urdf.file));
         shapes.iter().map(part).collect()
     }
 
-    fn part(&self, shape: &Shape) -> Result<Part, String> {
-        let plain = |mesh: Result<Mesh, MeshError>| mesh.map(Part::new).map_err(|error| error.to_string());
+    fn part(&self, shape: &Shape) -> Result<LinkMesh, String> {
+        let plain = |mesh: Result<Mesh, MeshError>| mesh.map(LinkMesh::new).map_err(|error| error.to_string());
         let part = match &shape.geometry {
             Geometry::Mesh { path, scale } => {
                 let mesh = Mesh::load(&self.find(path)?, UpAxis::Ignore);
-                Part { scale: *scale, ..plain(mesh)? }
+                LinkMesh { scale: *scale, ..plain(mesh)? }
             }
             Geometry::Box { size } => plain(Mesh::cuboid(*size))?,
             Geometry::Cylinder { radius, length } => plain(Mesh::cylinder(*radius, *length))?,
@@ -78,7 +78,7 @@ impl<'a> Visuals<'a> {
             }
             other => return Err(format!("visual {other:?} is not known; make it a mesh")),
         };
-        Ok(Part { pose: shape.origin, ..part })
+        Ok(LinkMesh { pose: shape.origin, ..part })
     }
 
     /// Finds the file that a URI or a path of the URDF names.

@@ -15,7 +15,7 @@ use std::hint::black_box;
 use gungraun::{library_benchmark, library_benchmark_group};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id, Kind, Node};
-use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembly, Segment};
+use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembly, Reassembler};
 use protocol::time::Micros;
 use protocol::wire_time::Bits;
 
@@ -49,7 +49,7 @@ fn decode(frame: Frame) -> Packet {
 const SIX: Lengths = Lengths::only(Length::Six);
 
 fn pair(id: Id, frames: [Frame; 2]) -> Packet {
-    let mut segment = Segment::NONE;
+    let mut segment = Reassembler::NONE;
     let [first, second] = black_box(&frames);
     let waiting = segment.push(Micros(0), id, SIX, first.data());
     match (waiting, segment.push(Micros(134), id, SIX, second.data())) {
@@ -81,7 +81,7 @@ fn paired(id: Id, frames: [Frame; 2]) -> Packet {
 #[bench::fd_16_bytes(fd_frame())]
 #[bench::classic_8_bytes(classic_frames()[0])]
 fn bits(frame: Frame) -> Option<Bits> {
-    Bits::of(black_box(&frame))
+    Bits::from_frame(black_box(&frame))
 }
 
 library_benchmark_group!(name = packets; benchmarks = encoded, decoded, paired);
@@ -94,7 +94,7 @@ fn once() {
     assert_eq!(decode(fd_frame()), packet);
     assert_eq!(encode(packet, Format::Classic), classic_frames().map(Some));
     assert_eq!(pair(packet.id, classic_frames()), packet);
-    assert_ne!(Bits::of(&fd_frame()), Bits::of(&classic_frames()[0]));
+    assert_ne!(Bits::from_frame(&fd_frame()), Bits::from_frame(&classic_frames()[0]));
 }
 
 mod all {

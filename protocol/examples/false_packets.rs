@@ -11,7 +11,7 @@
 #![expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
 
 use protocol::id::{Id, Kind};
-use protocol::packet::{Length, Lengths, Reassembly, Segment};
+use protocol::packet::{Length, Lengths, Reassembly, Reassembler};
 use protocol::time::Micros;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -23,7 +23,7 @@ const BETWEEN_US: u64 = 1_000;
 fn row(name: &str, lengths: Lengths, min: usize, frames: u64) {
     let mut dice = Pcg64Mcg::seed_from_u64(1);
     let id = Id { kind: Kind::Torque, node: 12 };
-    let (mut segment, mut packets, mut ambiguous) = (Segment::NONE, 0_u64, 0_u64);
+    let (mut segment, mut packets, mut ambiguous) = (Reassembler::NONE, 0_u64, 0_u64);
     for frame in 0..frames {
         let (bytes, len): ([u8; 8], usize) = (dice.random(), dice.random_range(min..=8));
         let data = bytes.get(..len).unwrap_or(&bytes);

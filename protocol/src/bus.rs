@@ -33,7 +33,7 @@ use rustix::net::sockopt::{self, Timeout};
 use socketcan::CanFdSocket;
 
 use crate::can::{Format, Frame};
-use batch::{BATCH, Batch, SMALL};
+use batch::{BATCH, Batch, SMALL_BATCH};
 use carrier::Carrier;
 
 pub mod batch;
@@ -54,11 +54,11 @@ pub use error::{BusError, SendError};
 pub use filter::Filter;
 pub use inbox::{Inbox, Received};
 pub use kernel::{GATEWAY_RECEIVE_BUFFER, has_socketcan, set_receive_buffer};
-pub use kinds::{BusKind, Choice, Kinds, KindsError, OneKind, UnknownKind};
+pub use kinds::{BusKind, KindChoice, KindChoices, KindsError, KindOption, UnknownKind};
 
 /// Options for opening a bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Options {
+pub struct BusOptions {
     /// Filters for received frames, at most [`Filter::MAX`]. Without filters the socket receives nothing, as
     /// a pure sender wants.
     pub filters: Vec<Filter>,
@@ -76,7 +76,7 @@ pub struct Options {
     pub directory: Option<PathBuf>,
 }
 
-impl Default for Options {
+impl Default for BusOptions {
     /// Receives all data frames, classic and FD, except own ones, with room for four answers from each of 254
     /// cells.
     fn default() -> Self {
@@ -97,7 +97,7 @@ impl Default for Options {
 ///
 /// This is for the processes of a bench that wake each other by the hundreds: cells, and the server of their
 /// bus. A server that is preempted by every cell it sends a frame to switches processes once per frame.
-pub fn never_interrupt() -> bool {
+pub fn set_batch_scheduling() -> bool {
     calls::set_batch()
 }
 
@@ -125,23 +125,23 @@ pub struct Bus {
 
 impl Bus {
     /// The timeouts that [`Bus::wait_and_receive`] sets as `SO_RCVTIMEO`.
-    const WAITS: [Duration; 2] = [Duration::from_millis(25), Duration::from_millis(100)];
+    const SOCKET_TIMEOUTS: [Duration; 2] = [Duration::from_millis(25), Duration::from_millis(100)];
 
     /// Opens a bus. The filters are active when this returns.
     ///
     /// # Errors
     /// Returns an error, with a hint for the user, if the bus cannot be used as requested.
-    pub fn open(name: &str, choice: Choice, options: &Options) -> Result<Self, BusError> {
+    pub fn open(name: &str, choice: KindChoice, options: &BusOptions) -> Result<Self, BusError> {
         check_name(name)?;
-        check_count(name, &options.filters)?;
+        check_filter_count(name, &options.filters)?;
         let kind = choice.resolve(name);
         let (socket, receive_buffer) = match (kind.carrier().open(name, options), choice) {
-            (Err(BusError::NotServed { name, directory }), Choice::Auto) => {
+            (Err(BusError::NotServed { name, directory }), KindChoice::Auto) => {
                 return Err(BusError::Absent { name, directory });
             }
             (opened, _) => opened?,
         };
-        let Options { fd, send_timeout, .. } = *options;
+        let BusOptions { fd, send_timeout, .. } = *options;
         Ok(Self {
             name: name.to_owned(),
             kind,
@@ -232,7 +232,7 @@ impl Bus {
     /// Returns [`BusError::Down`] or [`BusError::Gone`] for an interface, [`BusError::Closed`] or
     /// [`BusError::HungUp`] for an embedded bus. Frames that arrived before the error are returned first.
     pub fn receive(&self, inbox: &mut Inbox) -> Result<usize, BusError> {
-        self.take(inbox, |batch, socket| batch.receive(socket))
+        self.receive_with(inbox, |batch, socket| batch.receive(socket))
     }
 
     /// Like [`Bus::receive`], but waits up to `timeout` for the first frame; may return early without one.
@@ -242,7 +242,7 @@ impl Bus {
     /// # Errors
     /// Returns the errors of [`Bus::wait`] and [`Bus::receive`].
     pub fn wait_and_receive(&self, inbox: &mut Inbox, timeout: Duration) -> Result<usize, BusError> {
-        let Some(wait) = Self::WAITS.into_iter().rfind(|&wait| wait <= timeout) else {
+        let Some(wait) = Self::SOCKET_TIMEOUTS.into_iter().rfind(|&wait| wait <= timeout) else {
             inbox.clear();
             let comes = timeout.is_zero() || self.wait(Some(timeout))?;
             return if comes { self.receive(inbox) } else { Ok(0) };
@@ -257,12 +257,12 @@ impl Bus {
                 .map_err(|errno| self.error("set the timeout of", errno))?;
             self.receive_timeout.store(millis, Ordering::Relaxed);
         }
-        let count = self.take(inbox, |batch, socket| batch.receive_one_patiently(socket))?;
+        let count = self.receive_with(inbox, |batch, socket| batch.receive_one(socket))?;
         self.expired.store(count == 0, Ordering::Relaxed);
         Ok(count)
     }
 
-    fn take(
+    fn receive_with(
         &self,
         inbox: &mut Inbox,
         receive: impl Fn(&mut Batch, &CanFdSocket) -> io::Result<usize>,
@@ -278,17 +278,17 @@ impl Bus {
             match received {
                 Ok(_) => break,
                 // The server ended with unread frames of ours. Its own frames can still be received.
-                Err(error) if is(&error, Errno::CONNRESET) => {}
-                Err(error) if is(&error, Errno::AGAIN) || is(&error, Errno::INTR) => return Ok(0),
-                Err(error) if batch::is_shortage(&error) && is_before(&mut give_up, SHORTAGE) => {
-                    std::thread::sleep(RECHECK);
+                Err(error) if is_errno(&error, Errno::CONNRESET) => {}
+                Err(error) if is_errno(&error, Errno::AGAIN) || is_errno(&error, Errno::INTR) => return Ok(0),
+                Err(error) if batch::is_memory_shortage(&error) && is_before_deadline(&mut give_up, MAX_SHORTAGE) => {
+                    std::thread::sleep(RETRY_INTERVAL);
                 }
                 Err(error) => return Err(self.io_error("receive from", error)),
             }
         }
         inbox.failure = inbox.batch.take_failure();
         self.failed.store(inbox.failure.is_some(), Ordering::Relaxed);
-        let over = inbox.take(self.carrier());
+        let over = inbox.decode(self.carrier());
         match inbox.frames().len() {
             0 if over => Err(self.closed()),
             count => Ok(count),
@@ -303,9 +303,9 @@ impl Bus {
     pub fn send(&self, frames: &[Frame]) -> Result<(), SendError> {
         if !self.carries(frames) {
             let cause = BusError::FdFrame(self.name.clone());
-            return Err(SendError { sent: 0, target: frames.len(), cause });
+            return Err(SendError { sent: 0, total: frames.len(), cause });
         }
-        self.patiently(frames.len(), |sent| self.send_some(frames.get(sent..).unwrap_or_default()))
+        self.send_all(frames.len(), |sent| self.send_batch(frames.get(sent..).unwrap_or_default()))
     }
 
     /// Returns true if the bus was opened for frames of these formats.
@@ -315,7 +315,7 @@ impl Bus {
 
     /// Sends `target` items and waits for room in between. `some` sends from the given index on and returns
     /// the number sent.
-    fn patiently(&self, target: usize, some: impl Fn(usize) -> io::Result<usize>) -> Result<(), SendError> {
+    fn send_all(&self, target: usize, some: impl Fn(usize) -> io::Result<usize>) -> Result<(), SendError> {
         let (mut sent, mut give_up) = (0, None);
         while sent < target {
             let waited = match some(sent) {
@@ -324,10 +324,10 @@ impl Bus {
                     give_up = None;
                     continue;
                 }
-                Err(error) if is(&error, Errno::INTR) => continue,
+                Err(error) if is_errno(&error, Errno::INTR) => continue,
                 Err(error) => self.wait_for_room(error, &mut give_up),
             };
-            waited.map_err(|cause| SendError { sent, target, cause })?;
+            waited.map_err(|cause| SendError { sent, total: target, cause })?;
         }
         Ok(())
     }
@@ -335,8 +335,8 @@ impl Bus {
     /// Waits for room if `error` means that there was none; fails after the send timeout.
     fn wait_for_room(&self, error: io::Error, give_up: &mut Option<Instant>) -> Result<(), BusError> {
         // The transmit queue of the interface is full, or there is no memory for the frame.
-        let interface = batch::is_shortage(&error);
-        if !interface && !is(&error, Errno::AGAIN) {
+        let interface = batch::is_memory_shortage(&error);
+        if !interface && !is_errno(&error, Errno::AGAIN) {
             return Err(self.io_error("send to", error));
         }
         let now = Instant::now();
@@ -346,7 +346,7 @@ impl Bus {
         }
         let waited = if interface {
             // The queue is shared and nothing signals room in it, so retry soon.
-            wait_on(&mut [], Some(left.min(RECHECK)))
+            wait_on(&mut [], Some(left.min(RETRY_INTERVAL)))
         } else {
             self.poll(PollFlags::OUT, Some(left))
         };
@@ -357,12 +357,12 @@ impl Bus {
     /// never allocates, and returns no cause: for a loop with its own deadline. The next [`Bus::receive`]
     /// reports an interface that is down.
     #[must_use]
-    pub fn offer(&self, frames: &[Frame]) -> bool {
+    pub fn try_send_all(&self, frames: &[Frame]) -> bool {
         if !self.carries(frames) {
             return false;
         }
-        let sent = self.send_some(frames);
-        if sent.as_ref().is_err_and(|error| is(error, Errno::NETDOWN)) {
+        let sent = self.send_batch(frames);
+        if sent.as_ref().is_err_and(|error| is_errno(error, Errno::NETDOWN)) {
             self.down.store(true, Ordering::Relaxed);
         }
         sent.is_ok_and(|sent| sent == frames.len())
@@ -374,17 +374,17 @@ impl Bus {
     /// # Errors
     /// Returns an error if there are too many filters, or the bus does not accept them.
     pub fn set_filters(&self, filters: &[Filter]) -> Result<(), BusError> {
-        check_count(&self.name, filters)?;
+        check_filter_count(&self.name, filters)?;
         self.carrier().set_filters(self, filters)
     }
 
-    fn send_some(&self, frames: &[Frame]) -> io::Result<usize> {
+    fn send_batch(&self, frames: &[Frame]) -> io::Result<usize> {
         match frames {
             [frame] => {
                 let (bytes, len) = (frame.to_bytes(), frame.byte_len());
                 batch::send_one(&self.socket, bytes.get(..len).unwrap_or(&bytes))
             }
-            few if few.len() <= SMALL => self.send_up_to::<SMALL>(few),
+            few if few.len() <= SMALL_BATCH => self.send_up_to::<SMALL_BATCH>(few),
             many => self.send_up_to::<BATCH>(many),
         }
     }
@@ -407,7 +407,7 @@ impl Bus {
 
     /// Returns the error for the end of the connection to an embedded bus.
     fn closed(&self) -> BusError {
-        embedded::closed(&self.name, self.directory.as_deref())
+        embedded::closed_error(&self.name, self.directory.as_deref())
     }
 
     fn error(&self, doing: &'static str, errno: Errno) -> BusError {
@@ -416,7 +416,7 @@ impl Bus {
 
     fn io_error(&self, doing: &'static str, source: io::Error) -> BusError {
         let name = self.name.clone();
-        let cause = Errno::from_io_error(&source).and_then(|errno| self.carrier().cause(errno));
+        let cause = Errno::from_io_error(&source).and_then(|errno| self.carrier().bus_error(errno));
         let Some(cause) = cause else { return BusError::Io { name, doing, source } };
         let error = cause(name);
         if matches!(error, BusError::Closed(_)) { self.closed() } else { error }
@@ -430,9 +430,9 @@ impl AsFd for Bus {
 }
 
 /// Retry interval while a transmit queue is full: the duration of a few frames at 1 Mbit/s.
-const RECHECK: Duration = Duration::from_micros(500);
+const RETRY_INTERVAL: Duration = Duration::from_micros(500);
 /// Maximum time for which a shortage of memory is retried.
-const SHORTAGE: Duration = Duration::from_millis(100);
+const MAX_SHORTAGE: Duration = Duration::from_millis(100);
 
 fn wait_on(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, Errno> {
     let timeout = timeout.and_then(|timeout| Timespec::try_from(timeout).ok());
@@ -440,7 +440,7 @@ fn wait_on(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, E
         Ok(ready) => Ok(ready > 0),
         Err(Errno::INTR) => Ok(false),
         Err(Errno::NOMEM | Errno::AGAIN) => {
-            std::thread::sleep(RECHECK);
+            std::thread::sleep(RETRY_INTERVAL);
             Ok(false)
         }
         Err(errno) => Err(errno),
@@ -448,16 +448,16 @@ fn wait_on(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, E
 }
 
 /// Returns true until the deadline, which the first call sets to `after` from now.
-fn is_before(give_up: &mut Option<Instant>, after: Duration) -> bool {
+fn is_before_deadline(give_up: &mut Option<Instant>, after: Duration) -> bool {
     let now = Instant::now();
     now < *give_up.get_or_insert(now + after)
 }
 
-fn is(error: &io::Error, errno: Errno) -> bool {
+fn is_errno(error: &io::Error, errno: Errno) -> bool {
     error.raw_os_error() == Some(errno.raw_os_error())
 }
 
-fn check_count(name: &str, filters: &[Filter]) -> Result<(), BusError> {
+fn check_filter_count(name: &str, filters: &[Filter]) -> Result<(), BusError> {
     let got = filters.len();
     if got <= Filter::MAX { Ok(()) } else { Err(BusError::Filters { name: name.to_owned(), got }) }
 }
@@ -476,7 +476,7 @@ pub fn check_name(name: &str) -> Result<(), BusError> {
 /// Returns true if a name is valid for every kernel interface and needs no quotes in a shell: 1 to 15 ASCII
 /// letters, digits, `-`, `_` and `.`.
 #[must_use]
-pub fn is_plain(name: &str) -> bool {
+pub fn is_plain_name(name: &str) -> bool {
     let plain = |c: char| c.is_ascii_alphanumeric() || "-_.".contains(c);
     (1..=15).contains(&name.len()) && name.chars().all(plain)
 }

@@ -17,12 +17,12 @@ mod wire;
 use std::collections::HashMap;
 
 use bus_model::Attempt;
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use model::scenario::{Scenario, contact_words};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q5_10;
-use protocol::message::{From, Message, SkinSensors};
+use protocol::message::{AppliesFrom, Message, SkinSensors};
 use protocol::packet::{Packet, WORDS};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
@@ -139,7 +139,7 @@ impl Bench {
         };
         for (place, cell) in skin.cells.iter().enumerate() {
             let identity = Identity { cell: Some(cell.node), serial: cell.serial };
-            let cell_slot = bench.add(identity, Flash::Sound(skin.parameters(cell)));
+            let cell_slot = bench.add(identity, FlashState::Valid(skin.parameters(cell)));
             bench.at(start(place), Act::Start(cell_slot));
         }
         bench.agenda.enter(Micros(0), Event::Look);
@@ -166,9 +166,9 @@ impl Bench {
     }
 
     /// Adds a cell, switched off, and returns its slot.
-    pub fn add(&mut self, identity: Identity, flash: Flash) -> usize {
+    pub fn add(&mut self, identity: Identity, flash: FlashState) -> usize {
         let cell_slot = self.cell_slots.len();
-        for id in identity.hears().into_iter().flatten() {
+        for id in identity.received_ids().into_iter().flatten() {
             self.hearers.entry(u32::from(id.to_bits())).or_default().push(cell_slot);
         }
         self.cell_slots.push(CellSlot::new(identity, flash, self.format));
@@ -209,14 +209,14 @@ impl Bench {
     /// # Panics
     /// Panics if the skin does not have the cell.
     pub fn press(&mut self, place: usize, newtons: f64) {
-        self.press_from(place, newtons, From::Next);
+        self.press_from(place, newtons, AppliesFrom::Next);
     }
 
     /// Makes the gateway press a cell from given joints on.
     ///
     /// # Panics
     /// Panics if the skin does not have the cell.
-    pub fn press_from(&mut self, place: usize, newtons: f64, from: From) {
+    pub fn press_from(&mut self, place: usize, newtons: f64, from: AppliesFrom) {
         let message = self.gateway.stimulus(place, from, touch(newtons)).expect("a cell of the skin");
         self.act(Act::Say(message));
     }

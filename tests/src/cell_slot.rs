@@ -1,6 +1,6 @@
 //! The slot of one cell: the real [`Node`], with the behaviour of the process around it.
 
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
 use protocol::can::{Format, Frame};
@@ -22,7 +22,7 @@ pub struct CellSlot {
     /// Its identity.
     pub identity: Identity,
     /// The content of its flash.
-    pub flash: Flash,
+    pub flash: FlashState,
     /// The time from receiving a frame to answering it.
     pub thinks: Span,
     /// The number of starts. Packets of an earlier life do not belong to the present one.
@@ -42,7 +42,7 @@ pub struct CellSlot {
 impl CellSlot {
     /// Creates a cell that is not switched on yet.
     #[must_use]
-    pub const fn new(identity: Identity, flash: Flash, format: Format) -> Self {
+    pub const fn new(identity: Identity, flash: FlashState, format: Format) -> Self {
         let thinks = Span(30);
         Self {
             identity,
@@ -130,8 +130,8 @@ impl CellSlot {
     fn take(&mut self, now: Micros, batch: &[Waiting]) -> Vec<Packet> {
         for &(stood, frame) in batch {
             let Life::Runs(node) = &mut self.life else { break };
-            node.handle_frame(now, now.since(stood), &frame);
-            if let Some(serial) = node.taken() {
+            node.handle_frame(now, now.elapsed_since(stood), &frame);
+            if let Some(serial) = node.other_owner() {
                 (self.life, self.gave_up) = (Life::Off, Some(serial));
             }
         }
@@ -141,7 +141,7 @@ impl CellSlot {
     fn sends(&mut self) -> Vec<Packet> {
         let Life::Runs(node) = &mut self.life else { return Vec::new() };
         if let Some(kept) = node.poll_store() {
-            self.flash = kept.parameters.map_or(Flash::Empty, Flash::Sound);
+            self.flash = kept.parameters.map_or(FlashState::Empty, FlashState::Valid);
             node.handle_stored(true);
         }
         core::iter::from_fn(|| node.poll_transmit()).collect()

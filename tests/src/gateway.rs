@@ -2,15 +2,15 @@
 
 use std::collections::VecDeque;
 
-use control::cycle::carried::Heard;
-use control::cycle::{Cycle, Record, Tick};
+use control::cycle::carried::BusInput;
+use control::cycle::{Cycle, TickRecord, Tick};
 use control::motion::controller_of;
 use control::robot::SimulatedArm;
 use model::scenario::{Scenario, Touches};
 use model::table::{Notice, Snapshot, Table};
 use protocol::can::Frame;
 use protocol::id::{CellId, Command, Node};
-use protocol::message::{From, Message, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, Message, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
@@ -25,7 +25,7 @@ pub struct Gateway {
     /// The state of its bus.
     pub table: Table,
     /// The records of all ticks.
-    pub records: Vec<Record>,
+    pub records: Vec<TickRecord>,
     /// The notices, with their times.
     pub notices: Vec<(Micros, Notice)>,
     /// The state of the bus, as the loop gets it: true if it works.
@@ -93,7 +93,7 @@ impl Gateway {
 
     /// Returns the last tick's record.
     #[must_use]
-    pub fn last(&self) -> Option<&Record> {
+    pub fn last(&self) -> Option<&TickRecord> {
         self.records.last()
     }
 
@@ -104,7 +104,7 @@ impl Gateway {
 
     /// Returns the stimulus with these sensor values for a cell, given by its index in the skin.
     #[must_use]
-    pub fn stimulus(&mut self, place: usize, from: From, sensors: SkinSensors) -> Option<Message> {
+    pub fn stimulus(&mut self, place: usize, from: AppliesFrom, sensors: SkinSensors) -> Option<Message> {
         *self.pressed.get_mut(place)? = sensors;
         let to = Node::Cell(*self.nodes.get(place)?);
         Some(Message::Stimulus { to, from, page: SensorPage::Skin(sensors) })
@@ -132,12 +132,12 @@ impl Gateway {
             return Vec::new();
         }
         let began = *self.began.get_or_insert(now);
-        let time = Micros(now.since(began).0);
+        let time = Micros(now.elapsed_since(began).0);
         let skipped = self.records.last().map_or(0, |last| self.tick - last.tick.number - 1);
-        self.snapshot.take(self.table.snapshot(), true);
+        self.snapshot.copy_from(self.table.snapshot(), true);
         let tick = Tick { number: self.tick, time };
         let outcome =
-            self.cycle.tick(tick, skipped, [Heard { sums: &self.snapshot.sums, works: self.works }]);
+            self.cycle.tick(tick, skipped, [BusInput { sums: &self.snapshot.sums, works: self.works }]);
         self.tick += 1;
         self.records.push(outcome.record);
         self.broadcasts_skipped += outcome.broadcasts_skipped;
@@ -161,7 +161,7 @@ impl Gateway {
         let mut messages = Vec::new();
         let until = self.cycle.broadcasts() + LEAD;
         while self.script_epoch < until {
-            let from = From::Epoch(epoch_of(self.script_epoch));
+            let from = AppliesFrom::Epoch(epoch_of(self.script_epoch));
             for stimulus in self.touches.stimuli_for(self.script_epoch) {
                 let page = SensorPage::Skin(stimulus.sensors);
                 messages.push(Message::Stimulus { to: Node::Cell(stimulus.node), from, page });
@@ -178,7 +178,7 @@ impl Gateway {
             let place = self.nodes.iter().position(|&it| it == node).filter(|_| self.reminds);
             let sensors = place.and_then(|place| self.pressed.get(place).copied());
             if let (Some(place), Some(sensors)) = (place, sensors) {
-                messages.extend(self.stimulus(place, From::Next, sensors));
+                messages.extend(self.stimulus(place, AppliesFrom::Next, sensors));
             }
         }
         messages

@@ -17,14 +17,14 @@ mod survey;
 
 use std::collections::HashMap;
 
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
-use cell_node::sum::Words;
+use cell_node::sum::SumWords;
 use model::network::Uplinks;
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q5_10, Q7_8};
-use protocol::message::{From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
 use protocol::packet::{self, Epoch, WORDS};
 use protocol::parameters::{LinksDown, Parameter, Reply, Slots};
 use protocol::port::{PORTS, PortMessage, UPLINK};
@@ -93,7 +93,7 @@ pub struct Wiring {
     /// The maximum depth for which cells have slots.
     pub deepest: u8,
     uplinks: Uplinks,
-    root_sums: HashMap<usize, (Words, u128)>,
+    root_sums: HashMap<usize, (SumWords, u128)>,
     agenda: Agenda<Event>,
     gateway_newest: Micros,
     epoch: Option<Epoch>,
@@ -192,7 +192,7 @@ impl Wiring {
         let Some(node_id) = place.node_id else { return };
         let deaf = place.deaf.iter().enumerate().map(|(port, deaf)| u8::from(*deaf) << port).sum();
         let request =
-            Request::Write { number: Parameter::LinksDown.number(), words: LinksDown { deaf }.words() };
+            Request::Write { number: Parameter::LinksDown.number(), words: LinksDown { ports: deaf }.words() };
         let message = Message::Configure { to: protocol::id::Node::Cell(node_id), tag: 0, request };
         let frame = message.encode().frames(Format::Fd).next().expect("one frame");
         self.deliver(cell, Inlet::Frame(frame));
@@ -210,7 +210,7 @@ impl Wiring {
         let identity = Identity { cell: place.node_id, serial: place.serial };
         let wired = place.wires.iter().enumerate().filter(|(_, wire)| wire.is_some());
         let wired = wired.map(|(port, _)| 1 << port).sum();
-        let node = Node::new(identity, Format::Fd, &Flash::Sound(place.parameters), true, now);
+        let node = Node::new(identity, Format::Fd, &FlashState::Valid(place.parameters), true, now);
         place.life = Life::Runs(Box::new(node.with_ports(wired)));
         place.wake = None;
         place.deferred.clear();
@@ -297,7 +297,7 @@ impl Wiring {
             let place = &mut self.cells[cell];
             let Life::Runs(node) = &mut place.life else { return };
             let Some((stood, frame)) = place.deferred.pop_front() else { return };
-            node.handle_frame(now, now.since(stood), &frame);
+            node.handle_frame(now, now.elapsed_since(stood), &frame);
             self.after(cell);
         }
     }
@@ -315,7 +315,7 @@ impl Wiring {
         let place = &mut self.cells[cell];
         if let Life::Runs(node) = &mut place.life {
             match inlet {
-                Inlet::Frame(frame) => node.handle_frame(now, now.since(stood), &frame),
+                Inlet::Frame(frame) => node.handle_frame(now, now.elapsed_since(stood), &frame),
                 Inlet::Port(port, _) if place.deaf[port] => {}
                 Inlet::Port(port, message) => node.handle_port(now, Span(0), port, message),
             }
@@ -331,9 +331,9 @@ impl Wiring {
             place.node_id = kept.number;
             node.handle_stored(true);
         }
-        assert_eq!(node.taken(), None, "cell {cell} gave up its node id {:?}", place.node_id);
+        assert_eq!(node.other_owner(), None, "cell {cell} gave up its node id {:?}", place.node_id);
         // Its subscriptions are checked for each frame that arrives.
-        let _ = node.poll_hears();
+        let _ = node.poll_received_ids();
         let mut messages = Vec::new();
         while let Some(message) = node.poll_port_transmit() {
             messages.push(message);
@@ -368,7 +368,7 @@ impl Wiring {
             match message {
                 Message::Sum { from, epoch, torque, count } => {
                     let torque = torque.padded().map(Q7_8::from_bits);
-                    self.hear_sum(cell, from, epoch, Words { torque, count });
+                    self.hear_sum(cell, from, epoch, SumWords { torque, count });
                 }
                 Message::Network { page: NetworkPage::Tree(tree), .. } => self.cells[cell].tree = Some(tree),
                 Message::Network { page: NetworkPage::Ports(ports), .. } => {
@@ -446,6 +446,6 @@ impl Wiring {
         let word = Q5_10::from_bits(i16::try_from(self.cells[cell].force.steps() >> 6).expect("a word"));
         let contact = if pressed { [word, Q5_10::ZERO, Q5_10::ZERO] } else { [Q5_10::ZERO; 3] };
         let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-        self.say(&Message::Stimulus { to: protocol::id::Node::Cell(node_id), from: From::Next, page });
+        self.say(&Message::Stimulus { to: protocol::id::Node::Cell(node_id), from: AppliesFrom::Next, page });
     }
 }

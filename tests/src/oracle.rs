@@ -1,11 +1,11 @@
 //! A second, simpler gateway that knows the truth about every frame: its damage, its sender, and the starts of each
 //! cell. The real gateway's results for the same frames must agree with it, whatever was damaged.
 
-use model::table::{Notice, Sums};
+use model::table::{Notice, BusTotals};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
-use protocol::packet::{Epoch, Packet, Segment, WORDS};
+use protocol::packet::{Epoch, Packet, Reassembler, WORDS};
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Safety, Skin};
 use protocol::time::Micros;
@@ -212,7 +212,7 @@ impl Oracle {
                 self.tally.broadcasts += 1;
                 // After that many broadcasts that were not on the bus, all torques have decayed in the loop.
                 let recent = self.broadcasts.iter().rev().take(LATEST);
-                let passed = recent.map(|&before| epoch.since(before)).min().unwrap_or(1);
+                let passed = recent.map(|&before| epoch.epochs_since(before)).min().unwrap_or(1);
                 if i64::from(passed) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1 {
                     self.mirrors.iter_mut().for_each(Mirror::release);
                 }
@@ -254,7 +254,7 @@ impl Oracle {
         // An equal first segment counts like the packet's own.
         let first = truth.packet.and_then(|packet| packet.frames(self.format).next());
         let in_time =
-            |since| truth.packet.is_some_and(|packet| stood.since(since) <= Segment::within(packet.id));
+            |since| truth.packet.is_some_and(|packet| stood.elapsed_since(since) <= Reassembler::max_gap(packet.id));
         let whole =
             truth.segment == 1 && last.is_some_and(|(waits, since)| Some(waits) == first && in_time(since));
         *last = if whole { None } else { Some((*frame, stood)) };
@@ -271,7 +271,7 @@ impl Oracle {
     }
 
     /// Checks that the sum of a tick equals the oracle's, to the last bit.
-    pub(crate) fn check_sum(&self, now: Micros, snapshot: &Sums) {
+    pub(crate) fn check_sum(&self, now: Micros, snapshot: &BusTotals) {
         if !self.compares {
             return;
         }

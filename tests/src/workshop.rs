@@ -1,10 +1,10 @@
 //! A workshop that commissions cells in virtual time: real [`Node`]s, a bus that loses, repeats and damages frames at
 //! random from a seed, and control over the power of cells and the end of the commissioning.
 
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
-use model::commission::{Commission, Report, Wish};
+use model::commission::{Commission, Report, CommissionOptions};
 use model::decode::{Decoded, Decoder};
 use protocol::can::{Format, Frame};
 use protocol::id::CellId;
@@ -29,9 +29,9 @@ pub struct Piece {
     /// Its identity.
     pub identity: Identity,
     /// The content of its flash.
-    pub flash: Flash,
+    pub flash: FlashState,
     /// All contents that its flash has had, oldest first.
-    pub history: Vec<Flash>,
+    pub history: Vec<FlashState>,
     /// True if its flash cannot be written.
     pub worn: bool,
     node: Option<Node>,
@@ -100,7 +100,7 @@ impl Workshop {
 
     /// Creates a workshop with a skin's cells, switched on now, with the content of flash that `flash` returns.
     #[must_use]
-    pub fn of(skin: &Skin, seed: u64, flash: impl Fn(usize) -> Flash) -> Self {
+    pub fn of(skin: &Skin, seed: u64, flash: impl Fn(usize) -> FlashState) -> Self {
         let mut workshop = Self::new(skin.buses.first().map_or(Format::Fd, |bus| bus.format), seed);
         for (place, cell) in skin.cells.iter().enumerate() {
             workshop.add(Identity { cell: Some(cell.node), serial: cell.serial }, flash(place));
@@ -109,7 +109,7 @@ impl Workshop {
     }
 
     /// Adds a cell, switched on now, and returns its index.
-    pub fn add(&mut self, identity: Identity, flash: Flash) -> usize {
+    pub fn add(&mut self, identity: Identity, flash: FlashState) -> usize {
         let place = self.pieces.len();
         let (history, newest) = (vec![flash], Micros(0));
         self.pieces.push(Piece { identity, flash, history, worn: false, node: None, newest });
@@ -158,7 +158,7 @@ impl Workshop {
     ///
     /// # Panics
     /// Panics if it does not end.
-    pub fn commission(&mut self, skin: &Skin, wish: Wish, killed_after: Option<Span>) -> Report {
+    pub fn commission(&mut self, skin: &Skin, wish: CommissionOptions, killed_after: Option<Span>) -> Report {
         let mut commission = Commission::new(skin, 0, wish, 1_000, self.agenda.now);
         let mut decoder = Decoder::new(Some(self.format));
         let (began, end) = (self.agenda.now, killed_after.map(|span| self.agenda.now + span));
@@ -173,7 +173,7 @@ impl Workshop {
                 self.agenda.now = end;
                 return commission.report();
             }
-            assert!(at.since(began) < TIMEOUT, "it does not end: {commission:#?}");
+            assert!(at.elapsed_since(began) < TIMEOUT, "it does not end: {commission:#?}");
             self.step(at, &mut |now, frame| {
                 if let Decoded::Message(message) = decoder.decode(now, "bus", &frame) {
                     commission.handle_message(now, &message);
@@ -222,13 +222,13 @@ impl Workshop {
         let Some(node) = piece.node.as_mut() else { return };
         if let Some(kept) = node.poll_store() {
             if !piece.worn {
-                piece.flash = kept.parameters.map_or(Flash::Empty, Flash::Sound);
+                piece.flash = kept.parameters.map_or(FlashState::Empty, FlashState::Valid);
                 piece.history.push(piece.flash);
             }
             node.handle_stored(!piece.worn);
         }
         let packets: Vec<_> = core::iter::from_fn(|| node.poll_transmit()).collect();
-        if node.taken().is_some() {
+        if node.other_owner().is_some() {
             piece.node = None;
         }
         let forge = self.forgers.map(|(_, from)| from);
@@ -262,7 +262,7 @@ impl Workshop {
         let id = frame.id();
         let hears = |piece: &Piece| {
             let node = piece.node.as_ref();
-            node.is_some_and(|node| node.hears().any(|heard| u32::from(heard.to_bits()) == id))
+            node.is_some_and(|node| node.received_ids().any(|heard| u32::from(heard.to_bits()) == id))
         };
         let all = self.pieces.iter().enumerate();
         let hearers: Vec<_> = all.filter(|(_, piece)| hears(piece)).map(|(place, _)| place).collect();
@@ -303,7 +303,7 @@ impl Workshop {
     /// Returns the number of cells whose flash holds exactly the expected parameters.
     #[must_use]
     pub fn holding(&self, expected: impl Fn(usize) -> Parameters) -> usize {
-        let holds = |(place, piece): &(usize, &Piece)| piece.flash == Flash::Sound(expected(*place));
+        let holds = |(place, piece): &(usize, &Piece)| piece.flash == FlashState::Valid(expected(*place));
         self.pieces.iter().enumerate().filter(holds).count()
     }
 }

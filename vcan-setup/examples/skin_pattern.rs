@@ -11,7 +11,7 @@ use std::error::Error;
 use std::thread::Builder;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
+use protocol::bus::{Bus, BusKind, KindChoice, Filter, Inbox, BusOptions};
 use protocol::can::{BIT_RATE_SWITCH, Frame};
 use rustix::time::{ClockId, clock_gettime};
 use vcan_setup::embedded::Server;
@@ -33,8 +33,8 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     let exact = |id| vec![Filter { id, mask: Filter::EXACT_MASK }];
     let open = |filters| {
-        let options = Options { filters, directory: Some(directory.clone()), ..Options::default() };
-        Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options)
+        let options = BusOptions { filters, directory: Some(directory.clone()), ..BusOptions::default() };
+        Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options)
     };
     let ids: Vec<_> = (1..=cells).map(|cell| 0x200 + cell).collect();
     for ids in ids.chunks(share.max(1)) {

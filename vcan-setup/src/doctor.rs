@@ -8,23 +8,23 @@
 
 use std::collections::BTreeSet;
 
-use protocol::bus::{BusKind, Choice};
+use protocol::bus::{BusKind, KindChoice};
 use protocol::can::Format;
 use protocol::id::CellId;
 use serde::Serialize;
 
 use crate::kernel::Kernel;
-use crate::plan::Target;
+use crate::plan::InterfaceTarget;
 
 mod facts;
 mod interface;
 
-pub use facts::{Bus, Facts, Heard, Program, User};
+pub use facts::{BusFacts, Facts, ObservedTraffic, Program, User};
 
 /// The space of one frame in a receive buffer as the kernel accounts for it, in bytes.
 const FRAME: usize = 1_024;
 /// The number of answers of every cell that should fit into a receive buffer.
-const TIMES: usize = 4;
+const BUFFERED_ANSWERS: usize = 4;
 
 /// The severity of a finding.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd, Serialize)]
@@ -121,9 +121,9 @@ impl Facts {
     #[must_use]
     pub fn bus_kind(&self) -> BusKind {
         match self.choice {
-            Choice::Only(kind) => kind,
-            Choice::Auto if self.kernel.has_can && self.has_interface() => BusKind::SocketCan,
-            Choice::Auto => BusKind::Embedded,
+            KindChoice::Only(kind) => kind,
+            KindChoice::Auto if self.kernel.has_can && self.has_interface() => BusKind::SocketCan,
+            KindChoice::Auto => BusKind::Embedded,
         }
     }
 
@@ -133,7 +133,7 @@ impl Facts {
     }
 
     /// Returns a command line of this program, to be run as root.
-    fn own(&self, command: &str) -> String {
+    fn own_command(&self, command: &str) -> String {
         self.sudo(&format!("{} {command}", self.program))
     }
 
@@ -142,27 +142,27 @@ impl Facts {
     }
 
     /// Returns the `vcan-setup up` command for a bus, with its skin or its name.
-    fn up(&self, target: &Target) -> String {
+    fn up(&self, target: &InterfaceTarget) -> String {
         let what = target.skin.as_ref().map_or(&target.name, |skin| &skin.file);
-        self.own(&format!("up {what}"))
+        self.own_command(&format!("up {what}"))
     }
 
     fn kind(&self) -> Finding {
         let Kernel { release, has_can, can_raw, .. } = &self.kernel;
         let hints = || self.kernel.hints(*can_raw);
         match (self.choice, has_can) {
-            (Choice::Only(BusKind::Embedded), _) => {
+            (KindChoice::Only(BusKind::Embedded), _) => {
                 Finding::ok("the embedded bus was chosen, which needs nothing of the kernel")
             }
-            (Choice::Auto | Choice::Only(BusKind::SocketCan), true) => {
+            (KindChoice::Auto | KindChoice::Only(BusKind::SocketCan), true) => {
                 Finding::ok(format!("the kernel ({release}) has CAN"))
             }
-            (Choice::Auto, false) => Finding::note(format!(
+            (KindChoice::Auto, false) => Finding::note(format!(
                 "the kernel ({release}) has no CAN, so the bench runs on the embedded bus: no candump, no real cell; \
                  for a kernel with CAN:"
             ))
             .hints(hints()),
-            (Choice::Only(BusKind::SocketCan), false) => {
+            (KindChoice::Only(BusKind::SocketCan), false) => {
                 Finding::fault(format!("the kernel ({release}) has no CAN, and --bus-kind socketcan needs it"))
                     .hints(hints())
                     .hint("# leave out --bus-kind socketcan: the bench then runs on the embedded bus")
@@ -171,9 +171,9 @@ impl Facts {
     }
 
     /// Reports the nodes that are already on a bus.
-    fn traffic(&self, bus: &Bus, on: &str) -> Vec<Finding> {
+    fn traffic(&self, bus: &BusFacts, on: &str) -> Vec<Finding> {
         let name = &bus.target.name;
-        let heard = match &bus.heard {
+        let heard = match &bus.traffic {
             Ok(Some(heard)) => heard,
             Ok(None) => return Vec::new(),
             Err(why) => return vec![Finding::fault(why)],
@@ -216,18 +216,18 @@ impl Facts {
     fn receive_buffer(&self) -> Option<Finding> {
         let granted = self.receive_buffer?;
         let all = usize::from(CellId::MAX.get());
-        let frames = |bus: &Bus| bus.cells.as_ref().map_or(all, BTreeSet::len) * frames_of(&bus.target);
+        let frames = |bus: &BusFacts| bus.cells.as_ref().map_or(all, BTreeSet::len) * frames_of(&bus.target);
         let frames = self.buses.iter().map(frames).max().unwrap_or(all);
-        let needed = TIMES * frames * FRAME;
+        let needed = BUFFERED_ANSWERS * frames * FRAME;
         let (has, wants) = (granted >> 10, needed >> 10);
         let hint = self.sudo(&format!("sysctl -w net.core.rmem_max={needed}"));
         Some(if granted >= needed {
             Finding::ok(format!(
-                "receive buffers of {has} KiB hold all answers, {frames} frames, {TIMES} times over"
+                "receive buffers of {has} KiB hold all answers, {frames} frames, {BUFFERED_ANSWERS} times over"
             ))
         } else if granted >= frames * FRAME {
             Finding::note(format!(
-                "receive buffers are limited to {has} KiB; to hold all answers, {frames} frames, {TIMES} times over \
+                "receive buffers are limited to {has} KiB; to hold all answers, {frames} frames, {BUFFERED_ANSWERS} times over \
                  takes {wants} KiB, and a gateway that is held up loses some"
             ))
             .hint(hint)
@@ -242,7 +242,7 @@ impl Facts {
 
     /// Checks that one answer of every cell fits into the kernel's queue between sender and receiver.
     fn backlog(&self) -> Option<Finding> {
-        let frames = |bus: &Bus| bus.cells.as_ref().map_or(0, BTreeSet::len) * frames_of(&bus.target);
+        let frames = |bus: &BusFacts| bus.cells.as_ref().map_or(0, BTreeSet::len) * frames_of(&bus.target);
         let frames: usize = self.buses.iter().map(frames).sum();
         if frames == 0 {
             return None;
@@ -285,7 +285,7 @@ impl Facts {
 }
 
 /// Returns the number of frames per packet.
-const fn frames_of(target: &Target) -> usize {
+const fn frames_of(target: &InterfaceTarget) -> usize {
     match target.format {
         Format::Fd => 1,
         Format::Classic => 2,

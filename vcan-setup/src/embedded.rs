@@ -18,10 +18,10 @@ mod served;
 pub mod server;
 mod totals;
 
-pub use place::PlaceError;
-pub use served::Served;
+pub use place::BusSocketError;
+pub use served::ServerThread;
 pub use server::{ServeError, Server};
-pub use totals::Totals;
+pub use totals::BusTotals;
 
 #[cfg(test)]
 #[allow(unreachable_pub, reason = "the tests on a real kernel have the same table")]

@@ -7,7 +7,7 @@ use protocol::bus::has_socketcan;
 
 /// The availability of a kernel module.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Module {
+pub enum ModuleState {
     /// The module is built in or loaded.
     There,
     /// The module is on the disk and can be loaded.
@@ -30,17 +30,17 @@ pub struct Kernel {
     /// True if `CAN_RAW` sockets can be opened.
     pub has_can: bool,
     /// The module for `CAN_RAW` sockets.
-    pub can_raw: Module,
+    pub can_raw: ModuleState,
     /// The module for virtual buses.
-    pub vcan: Module,
+    pub vcan: ModuleState,
     /// The module for pairs of virtual interfaces.
-    pub vxcan: Module,
+    pub vxcan: ModuleState,
 }
 
 impl Kernel {
     /// Examines the running kernel.
     #[must_use]
-    pub fn look() -> Self {
+    pub fn detect() -> Self {
         let uname = rustix::system::uname();
         let release = uname.release().to_string_lossy().into_owned();
         let lists = Lists::read(&release);
@@ -61,19 +61,19 @@ impl Kernel {
 
     /// Returns the state of the module for a virtual kind, `vcan` or `vxcan`.
     #[must_use]
-    pub fn module(&self, kind: &str) -> Module {
+    pub fn module(&self, kind: &str) -> ModuleState {
         if kind == "vxcan" { self.vxcan } else { self.vcan }
     }
 
     /// Returns ways to get CAN or `vcan`: one shell command with a comment each, the simplest first.
     #[must_use]
-    pub fn hints(&self, module: Module) -> Vec<String> {
+    pub fn hints(&self, module: ModuleState) -> Vec<String> {
         let modprobe = "sudo modprobe -a can_raw vcan vxcan";
         let here = match module {
-            Module::There => None,
-            Module::Loadable => Some(modprobe.to_owned()),
-            Module::Missing => Some(self.other_kernel(modprobe)),
-            Module::Unknown => {
+            ModuleState::There => None,
+            ModuleState::Loadable => Some(modprobe.to_owned()),
+            ModuleState::Missing => Some(self.other_kernel(modprobe)),
+            ModuleState::Unknown => {
                 Some(format!("{modprobe}  # on the host, if this is a container: its modules are not here"))
             }
         };
@@ -124,22 +124,22 @@ impl Lists {
         Self { built_in: read("modules.builtin"), on_disk: read("modules.dep"), takes_modules }
     }
 
-    fn module(&self, name: &str, works: bool) -> Module {
-        let lists = |list: &Option<String>| list.as_deref().is_some_and(|list| names(list, name));
+    fn module(&self, name: &str, works: bool) -> ModuleState {
+        let lists = |list: &Option<String>| list.as_deref().is_some_and(|list| lists_module(list, name));
         if works || lists(&self.built_in) {
-            Module::There
+            ModuleState::There
         } else if lists(&self.on_disk) {
-            Module::Loadable
+            ModuleState::Loadable
         } else if self.on_disk.is_some() || !self.takes_modules {
-            Module::Missing
+            ModuleState::Missing
         } else {
-            Module::Unknown
+            ModuleState::Unknown
         }
     }
 }
 
 /// Returns true if a list of paths contains the module: `kernel/net/can/can-raw.ko.xz: kernel/net/can/can.ko.xz`.
-fn names(list: &str, module: &str) -> bool {
+fn lists_module(list: &str, module: &str) -> bool {
     list.lines().any(|line| {
         let path = line.split(':').next().unwrap_or_default();
         let file = path.rsplit('/').next().unwrap_or_default();
@@ -165,8 +165,8 @@ mod tests {
 
     #[test]
     fn a_module_is_found_by_its_own_file_and_not_by_what_needs_it() {
-        assert!(names(DEP, "vcan") && names(DEP, "can_raw"));
-        assert!(!names(DEP, "can") && !names(DEP, "can_dev") && !names(DEP, "vxcan"));
+        assert!(lists_module(DEP, "vcan") && lists_module(DEP, "can_raw"));
+        assert!(!lists_module(DEP, "can") && !lists_module(DEP, "can_dev") && !lists_module(DEP, "vxcan"));
     }
 
     #[test]
@@ -176,16 +176,16 @@ mod tests {
             on_disk: Some(DEP.into()),
             takes_modules: true,
         };
-        assert_eq!(lists.module("can", false), Module::There);
-        assert_eq!(lists.module("vcan", false), Module::Loadable);
-        assert_eq!(lists.module("vcan", true), Module::There);
-        assert_eq!(lists.module("vxcan", false), Module::Missing);
+        assert_eq!(lists.module("can", false), ModuleState::There);
+        assert_eq!(lists.module("vcan", false), ModuleState::Loadable);
+        assert_eq!(lists.module("vcan", true), ModuleState::There);
+        assert_eq!(lists.module("vxcan", false), ModuleState::Missing);
         let none = |takes_modules| Lists { built_in: None, on_disk: None, takes_modules };
-        assert_eq!(none(true).module("vcan", false), Module::Unknown);
-        assert_eq!(none(false).module("vcan", false), Module::Missing);
+        assert_eq!(none(true).module("vcan", false), ModuleState::Unknown);
+        assert_eq!(none(false).module("vcan", false), ModuleState::Missing);
     }
 
-    fn first(release: &str, os_release: &str, module: Module) -> String {
+    fn first(release: &str, os_release: &str, module: ModuleState) -> String {
         let kernel = Kernel {
             release: release.into(),
             machine: "x86_64".into(),
@@ -202,19 +202,19 @@ mod tests {
     fn the_hint_fits_the_kernel_and_the_distribution() {
         let debian = "PRETTY_NAME=\"Debian\"\nID=debian\nVERSION_ID=\"12\"\n";
         assert_eq!(
-            first("6.1.0-30-cloud-amd64", debian, Module::Missing),
+            first("6.1.0-30-cloud-amd64", debian, ModuleState::Missing),
             "sudo apt install linux-image-amd64  # a generic kernel, not a cloud one: boot it, then sudo modprobe \
              -a can_raw vcan vxcan"
         );
         let mint = "NAME=\"Linux Mint\"\nID=linuxmint\nID_LIKE=\"ubuntu debian\"\n";
         assert_eq!(
-            first("6.8.0-50-generic", mint, Module::Missing),
+            first("6.8.0-50-generic", mint, ModuleState::Missing),
             "sudo apt install linux-modules-extra-6.8.0-50-generic && sudo modprobe -a can_raw vcan vxcan"
         );
         let strange = "# boot a kernel with CONFIG_CAN_RAW and CONFIG_CAN_VCAN";
-        assert!(first("6.12.1", "ID=arch\n", Module::Missing).starts_with(strange));
-        assert!(first("5.15.0-microsoft-WSL2", debian, Module::Missing).starts_with(strange));
-        assert_eq!(first("6.1.0", debian, Module::Loadable), "sudo modprobe -a can_raw vcan vxcan");
-        assert!(first("6.1.0", debian, Module::There).starts_with("tests/lab/run "));
+        assert!(first("6.12.1", "ID=arch\n", ModuleState::Missing).starts_with(strange));
+        assert!(first("5.15.0-microsoft-WSL2", debian, ModuleState::Missing).starts_with(strange));
+        assert_eq!(first("6.1.0", debian, ModuleState::Loadable), "sudo modprobe -a can_raw vcan vxcan");
+        assert!(first("6.1.0", debian, ModuleState::There).starts_with("tests/lab/run "));
     }
 }

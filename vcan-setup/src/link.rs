@@ -5,7 +5,7 @@ use core::fmt;
 use serde::Serialize;
 
 /// The alias that marks interfaces made by this program; `ip link show` prints it.
-pub const MARK: &str = "skinbus";
+pub const ALIAS_MARK: &str = "skinbus";
 /// The MTU of an interface that carries classic CAN only.
 pub const CLASSIC_MTU: u32 = 16;
 /// The MTU of an interface that carries CAN FD too.
@@ -19,7 +19,7 @@ pub struct Interface {
     /// The name of the interface.
     pub name: String,
     /// The kind of the interface.
-    pub kind: Kind,
+    pub kind: InterfaceKind,
     /// True if this program made the interface: it has the alias [`MARK`].
     pub ours: bool,
     /// True if the interface is up.
@@ -32,7 +32,7 @@ pub struct Interface {
 
 /// The kind of an interface.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub enum Kind {
+pub enum InterfaceKind {
     /// A virtual bus in the kernel.
     Vcan,
     /// One end of a pair, which may lead into another network namespace.
@@ -43,7 +43,7 @@ pub enum Kind {
     Other(String),
 }
 
-impl Kind {
+impl InterfaceKind {
     /// Returns the kind in one word.
     #[must_use]
     pub const fn name(&self) -> &'static str {
@@ -75,7 +75,7 @@ pub struct Hardware {
     /// The driver.
     pub driver: Option<String>,
     /// The error state.
-    pub state: Option<State>,
+    pub state: Option<ControllerState>,
     /// The bit rate in bit/s; `None` if it is not set.
     pub bitrate: Option<u32>,
     /// The bit rate of CAN FD data in bit/s; `None` if it is not set.
@@ -88,7 +88,7 @@ pub struct Hardware {
 
 /// Bit rates of CAN hardware.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Rates {
+pub struct HardwareRates {
     /// The bit rate in bit/s; `None` if it is not set.
     pub bitrate: Option<u32>,
     /// The bit rate of CAN FD data in bit/s; `None` for classic CAN.
@@ -98,12 +98,12 @@ pub struct Rates {
 impl Hardware {
     /// Returns the bit rates in use; a controller in classic mode has no data bit rate.
     #[must_use]
-    pub fn rates(&self) -> Rates {
-        Rates { bitrate: self.bitrate, data_bitrate: self.data_bitrate.filter(|_| self.fd) }
+    pub fn rates(&self) -> HardwareRates {
+        HardwareRates { bitrate: self.bitrate, data_bitrate: self.data_bitrate.filter(|_| self.fd) }
     }
 }
 
-impl Rates {
+impl HardwareRates {
     /// Returns true if the rates are within half a percent of the target's. A rate that the target does not give may
     /// have any value.
     #[must_use]
@@ -119,7 +119,7 @@ impl Rates {
 }
 
 /// Formats rates as `500 kbit/s, data 83333 bit/s`.
-impl fmt::Display for Rates {
+impl fmt::Display for HardwareRates {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let words = |rate: u32| {
             if rate.is_multiple_of(1_000) {
@@ -139,7 +139,7 @@ impl fmt::Display for Rates {
 /// The error state of a controller.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "SCREAMING-KEBAB-CASE")]
-pub enum State {
+pub enum ControllerState {
     /// Normal operation.
     ErrorActive,
     /// More than 96 errors.
@@ -154,7 +154,7 @@ pub enum State {
     Sleeping,
 }
 
-impl State {
+impl ControllerState {
     /// Returns the state for the kernel's number.
     #[must_use]
     pub const fn from_number(number: u32) -> Option<Self> {
@@ -200,36 +200,36 @@ impl Interface {
     /// Returns true if the interface is software only, so that it may be made and removed.
     #[must_use]
     pub const fn is_virtual(&self) -> bool {
-        matches!(self.kind, Kind::Vcan | Kind::Vxcan(_))
+        matches!(self.kind, InterfaceKind::Vcan | InterfaceKind::Vxcan(_))
     }
 
     /// Returns the other end if the interface belongs to a pair.
     #[must_use]
     pub const fn peer(&self) -> Option<&Peer> {
-        if let Kind::Vxcan(Some(peer)) = &self.kind { Some(peer) } else { None }
+        if let InterfaceKind::Vxcan(Some(peer)) = &self.kind { Some(peer) } else { None }
     }
 
     /// Returns the controller if the interface is hardware.
     #[must_use]
     pub const fn hardware(&self) -> Option<&Hardware> {
-        if let Kind::Hardware(hardware) = &self.kind { Some(hardware) } else { None }
+        if let InterfaceKind::Hardware(hardware) = &self.kind { Some(hardware) } else { None }
     }
 
     /// Returns true if the interface carries CAN frames.
     #[must_use]
     pub const fn is_can(&self) -> bool {
-        !matches!(self.kind, Kind::Other(_))
+        !matches!(self.kind, InterfaceKind::Other(_))
     }
 
     /// Describes the interface: `a vcan`, `CAN hardware (kvaser_pci)`, `an ethernet interface`.
     #[must_use]
     pub fn what(&self) -> String {
         match &self.kind {
-            Kind::Vcan => "a vcan".to_owned(),
-            Kind::Vxcan(_) => "a vxcan".to_owned(),
-            Kind::Hardware(Hardware { driver: Some(driver), .. }) => format!("CAN hardware ({driver})"),
-            Kind::Hardware(_) => "CAN hardware".to_owned(),
-            Kind::Other(what) => what.clone(),
+            InterfaceKind::Vcan => "a vcan".to_owned(),
+            InterfaceKind::Vxcan(_) => "a vxcan".to_owned(),
+            InterfaceKind::Hardware(Hardware { driver: Some(driver), .. }) => format!("CAN hardware ({driver})"),
+            InterfaceKind::Hardware(_) => "CAN hardware".to_owned(),
+            InterfaceKind::Other(what) => what.clone(),
         }
     }
 }

@@ -6,42 +6,42 @@ use std::path::{Path, PathBuf};
 use std::thread::{self, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
-use protocol::bus::embedded::{address, open_directory, seqpacket, socket_name, usual_directory};
-use protocol::bus::{self, BusError, BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Inbox, Options};
+use protocol::bus::embedded::{address, open_directory, seqpacket, socket_name, default_directory};
+use protocol::bus::{self, BusError, BusKind, KindChoice, GATEWAY_RECEIVE_BUFFER, Inbox, BusOptions};
 use protocol::can::Format;
 use protocol::id::{CellId, Command, Id, Kind, Node};
-use protocol::usage::quoted_os;
+use protocol::usage::shell_quoted_os;
 use rustix::fs::Access;
 use rustix::net::{AddressFamily, SocketFlags, SocketType};
 use rustix::thread::{CapabilitySet, capabilities};
 use serde::Serialize;
 
-use crate::doctor::{Bus, Facts, Heard, Program, User};
+use crate::doctor::{BusFacts, Facts, ObservedTraffic, Program, User};
 use crate::kernel::Kernel;
 use crate::link::Interface;
-use crate::plan::Target;
+use crate::plan::InterfaceTarget;
 
 /// The time for which a bus is observed. A gateway sends joints much more often, and a cell sends a heartbeat at least
 /// every half second.
-const LISTEN: Duration = Duration::from_millis(600);
+const OBSERVATION_TIME: Duration = Duration::from_millis(600);
 
 /// Collects all facts that affect a bench on these buses.
 #[must_use]
-pub fn facts(mut buses: Vec<Bus>, choice: Choice, no_spawn: bool, present: &[Interface]) -> Facts {
+pub fn facts(mut buses: Vec<BusFacts>, choice: KindChoice, no_spawn: bool, present: &[Interface]) -> Facts {
     for bus in &mut buses {
         bus.interface = present.iter().find(|interface| interface.name == bus.target.name).cloned();
     }
     let all_heard = listen_to_all(&buses, choice);
     for (bus, heard) in buses.iter_mut().zip(all_heard) {
         if let Some(heard) = heard {
-            bus.heard = heard;
+            bus.traffic = heard;
         }
     }
     Facts {
         choice,
         no_spawn,
         program: program(),
-        kernel: Kernel::look(),
+        kernel: Kernel::detect(),
         user: User { root: rustix::process::geteuid().is_root(), admin: is_admin() },
         receive_buffer: receive_buffer().ok(),
         backlog: fs::read_to_string("/proc/sys/net/core/netdev_max_backlog")
@@ -54,22 +54,22 @@ pub fn facts(mut buses: Vec<Bus>, choice: Choice, no_spawn: bool, present: &[Int
     }
 }
 
-fn usable(target: &Target, interface: &Interface) -> bool {
+fn usable(target: &InterfaceTarget, interface: &Interface) -> bool {
     interface.is_can() && interface.up && target.carried_by(interface.mtu)
 }
 
 /// Observes at the same time all buses that can be opened.
-fn listen_to_all(buses: &[Bus], choice: Choice) -> Vec<Option<Result<Option<Heard>, String>>> {
-    let kind_of = |bus: &Bus| match (choice, &bus.interface) {
-        (Choice::Only(kind), _) => kind,
-        (Choice::Auto, Some(_)) => BusKind::SocketCan,
-        (Choice::Auto, None) => BusKind::Embedded,
+fn listen_to_all(buses: &[BusFacts], choice: KindChoice) -> Vec<Option<Result<Option<ObservedTraffic>, String>>> {
+    let kind_of = |bus: &BusFacts| match (choice, &bus.interface) {
+        (KindChoice::Only(kind), _) => kind,
+        (KindChoice::Auto, Some(_)) => BusKind::SocketCan,
+        (KindChoice::Auto, None) => BusKind::Embedded,
     };
-    let is_open = |bus: &&Bus| {
+    let is_open = |bus: &&BusFacts| {
         kind_of(bus) == BusKind::Embedded || bus.interface.as_ref().is_some_and(|it| usable(&bus.target, it))
     };
     thread::scope(|scope| {
-        let begin = |bus: &'_ Bus| {
+        let begin = |bus: &'_ BusFacts| {
             let (target, kind) = (bus.target.clone(), kind_of(bus));
             is_open(&bus).then(|| thread::Builder::new().spawn_scoped(scope, move || listen(&target, kind)))
         };
@@ -84,18 +84,18 @@ fn listen_to_all(buses: &[Bus], choice: Choice) -> Vec<Option<Result<Option<Hear
 }
 
 /// Observes a bus for other gateways and cells. Returns `None` if the bus is not served.
-fn listen(target: &Target, kind: BusKind) -> Result<Option<Heard>, String> {
-    let options = Options { fd: target.format == Format::Fd, ..Options::default() };
-    let until = Instant::now() + LISTEN;
+fn listen(target: &InterfaceTarget, kind: BusKind) -> Result<Option<ObservedTraffic>, String> {
+    let options = BusOptions { fd: target.format == Format::Fd, ..BusOptions::default() };
+    let until = Instant::now() + OBSERVATION_TIME;
     let hear = || {
-        let bus = bus::Bus::open(&target.name, Choice::Only(kind), &options)?;
-        let (mut inbox, mut heard) = (Inbox::new(), Heard::default());
+        let bus = bus::Bus::open(&target.name, KindChoice::Only(kind), &options)?;
+        let (mut inbox, mut heard) = (Inbox::new(), ObservedTraffic::default());
         while let Some(unchanged) = until.checked_duration_since(Instant::now()) {
             if bus.wait(Some(unchanged))? {
                 bus.receive(&mut inbox)?;
                 let data = inbox.frames().filter(|it| !it.frame.is_extended() && !it.frame.is_error());
                 for id in data.filter_map(|it| u16::try_from(it.frame.id()).ok()).map(Id::from_bits) {
-                    heard.take(id);
+                    heard.record(id);
                 }
             }
         }
@@ -108,9 +108,9 @@ fn listen(target: &Target, kind: BusKind) -> Result<Option<Heard>, String> {
     }
 }
 
-impl Heard {
+impl ObservedTraffic {
     /// Records the sender of a frame with this identifier.
-    pub fn take(&mut self, id: Id) {
+    pub fn record(&mut self, id: Id) {
         let node = Node::from_byte(id.node);
         match id.kind {
             // The gateway's other commands may come from a user at a shell.
@@ -143,7 +143,7 @@ pub fn program() -> String {
         return "vcan-setup".to_owned();
     }
     let called = std::env::args_os().next().filter(|called| called.as_encoded_bytes().contains(&b'/'));
-    quoted_os(&called.unwrap_or_else(|| own.into_os_string()))
+    shell_quoted_os(&called.unwrap_or_else(|| own.into_os_string()))
 }
 
 /// Returns true if this process may change interfaces.
@@ -165,7 +165,7 @@ fn cell_node() -> Program {
 
 /// Returns the directory for embedded buses, or the reason why none can be served.
 fn embedded() -> Result<PathBuf, String> {
-    let directory = usual_directory();
+    let directory = default_directory();
     address(&directory, "a23456789012345").map_err(|error| error.to_string())?;
     match open_directory(&directory) {
         Ok(_) => {}
@@ -184,7 +184,7 @@ fn embedded() -> Result<PathBuf, String> {
 
 /// An embedded bus of this user.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
-pub struct Embedded {
+pub struct EmbeddedBus {
     /// The name of the bus.
     pub name: String,
     /// The path of its socket.
@@ -195,8 +195,8 @@ pub struct Embedded {
 
 /// Returns the embedded buses of this user.
 #[must_use]
-pub fn embedded_buses() -> Vec<Embedded> {
-    let directory = usual_directory();
+pub fn embedded_buses() -> Vec<EmbeddedBus> {
+    let directory = default_directory();
     if open_directory(&directory).is_err() {
         return Vec::new();
     }
@@ -205,7 +205,7 @@ pub fn embedded_buses() -> Vec<Embedded> {
         name.strip_suffix(".bus").map(str::to_owned)
     });
     let mut buses: Vec<_> = names
-        .map(|name| Embedded {
+        .map(|name| EmbeddedBus {
             path: directory.join(socket_name(&name)).display().to_string(),
             served: is_served(&directory, &name),
             name,
@@ -229,8 +229,8 @@ mod tests {
     #[test]
     fn a_gateway_is_known_by_what_nobody_types_at_a_shell() {
         let heard = |id| {
-            let mut heard = Heard::default();
-            heard.take(id);
+            let mut heard = ObservedTraffic::default();
+            heard.record(id);
             (heard.gateway, heard.cells.len())
         };
         let cell = Node::Cell(CellId::new(7).unwrap());

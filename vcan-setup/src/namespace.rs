@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use thiserror::Error;
 
 /// The directory in which `ip netns` keeps named namespaces.
-pub const NAMED: &str = "/run/netns";
+pub const NAMESPACE_DIRECTORY: &str = "/run/netns";
 
 /// A network namespace as named by the user.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -28,7 +28,7 @@ pub enum Namespace {
 pub enum NamespaceError {
     /// The name does not exist.
     #[error(
-        "there is no network namespace {name} in {NAMED}: `sudo ip netns add {name}` makes it, `ip netns` lists them; a process' number or a path is taken too"
+        "there is no network namespace {name} in {NAMESPACE_DIRECTORY}: `sudo ip netns add {name}` makes it, `ip netns` lists them; a process' number or a path is taken too"
     )]
     Name {
         /// The name.
@@ -36,7 +36,7 @@ pub enum NamespaceError {
     },
     /// The process does not exist.
     #[error(
-        "there is no network namespace {pid} in {NAMED}, and no process {pid}: is it still running? `ip netns` lists names"
+        "there is no network namespace {pid} in {NAMESPACE_DIRECTORY}, and no process {pid}: is it still running? `ip netns` lists names"
     )]
     Process {
         /// The process id.
@@ -59,10 +59,10 @@ impl Namespace {
     pub fn named(word: &OsStr) -> Self {
         let Some(word) = word.to_str().filter(|word| !word.contains('/')) else {
             let is_path = word.as_encoded_bytes().contains(&b'/');
-            return Self::Path(if is_path { word.into() } else { PathBuf::from(NAMED).join(word) });
+            return Self::Path(if is_path { word.into() } else { PathBuf::from(NAMESPACE_DIRECTORY).join(word) });
         };
         match word.parse() {
-            Ok(pid) if !PathBuf::from(NAMED).join(word).exists() => Self::Process(pid),
+            Ok(pid) if !PathBuf::from(NAMESPACE_DIRECTORY).join(word).exists() => Self::Process(pid),
             Ok(_) | Err(_) => Self::Name(word.to_owned()),
         }
     }
@@ -71,7 +71,7 @@ impl Namespace {
     #[must_use]
     pub fn path(&self) -> PathBuf {
         match self {
-            Self::Name(name) => PathBuf::from(NAMED).join(name),
+            Self::Name(name) => PathBuf::from(NAMESPACE_DIRECTORY).join(name),
             Self::Process(pid) => PathBuf::from(format!("/proc/{pid}/ns/net")),
             Self::Path(path) => path.clone(),
         }

@@ -16,13 +16,13 @@ use netlink_packet_route::link::{
     LinkFlags, LinkHeader, LinkInfo, LinkMessage,
 };
 use netlink_packet_route::nsid::{NsidAttribute, NsidMessage};
-use protocol::bus::netlink::Exchange;
+use protocol::bus::netlink::RtnetlinkSocket;
 use rustix::io::Errno;
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
-use crate::link::{FD_MTU, Hardware, Interface, Kind, MARK, Peer, Rates};
-use crate::namespace::NAMED;
-use crate::plan::{Action, Step};
+use crate::link::{FD_MTU, Hardware, Interface, InterfaceKind, ALIAS_MARK, Peer, HardwareRates};
+use crate::namespace::NAMESPACE_DIRECTORY;
+use crate::plan::{StepAction, Step};
 
 mod reading;
 
@@ -31,12 +31,12 @@ use reading::{driver, interface};
 /// The length of the header before a namespace's attributes, in bytes.
 const NSID_HEADER: usize = 4;
 /// The maximum number of indices that are tried for a new link while other programs create theirs; a pair takes two.
-const TRIES: u32 = 64;
+const MAX_INDEX_ATTEMPTS: u32 = 64;
 
 /// A netlink socket for the interfaces of one network namespace.
 #[derive(Debug)]
 pub struct Netlink {
-    exchange: Exchange,
+    exchange: RtnetlinkSocket,
 }
 
 impl Netlink {
@@ -45,7 +45,7 @@ impl Netlink {
     /// # Errors
     /// Returns an error if the system provides no such socket.
     pub fn open() -> io::Result<Self> {
-        Exchange::open().map(|exchange| Self { exchange })
+        RtnetlinkSocket::open().map(|exchange| Self { exchange })
     }
 
     /// Opens a socket in another namespace. A socket stays in the namespace where it was opened, so a separate thread
@@ -74,17 +74,17 @@ impl Netlink {
         let mut namespaces = None;
         for interface in &mut interfaces {
             match &mut interface.kind {
-                Kind::Vxcan(Some(Peer { index, name, namespace_id: None, .. })) => {
+                InterfaceKind::Vxcan(Some(Peer { index, name, namespace_id: None, .. })) => {
                     *name = names.get(index).cloned();
                 }
-                Kind::Vxcan(Some(Peer { index, name, namespace, namespace_id: Some(id) })) => {
+                InterfaceKind::Vxcan(Some(Peer { index, name, namespace, namespace_id: Some(id) })) => {
                     let known = namespaces.get_or_insert_with(|| self.named_namespaces());
                     *namespace = known.get(id).cloned();
                     // Only a user with access to that namespace gets an answer.
                     *name = self.name_in(*id, *index).ok().flatten();
                 }
-                Kind::Hardware(hardware) => hardware.driver = driver(&interface.name),
-                Kind::Vcan | Kind::Vxcan(None) | Kind::Other(_) => {}
+                InterfaceKind::Hardware(hardware) => hardware.driver = driver(&interface.name),
+                InterfaceKind::Vcan | InterfaceKind::Vxcan(None) | InterfaceKind::Other(_) => {}
             }
         }
         Ok(interfaces)
@@ -115,7 +115,7 @@ impl Netlink {
     /// Returns the namespaces that have both an id here and a name.
     fn named_namespaces(&mut self) -> HashMap<i32, String> {
         let mut names = HashMap::new();
-        for entry in std::fs::read_dir(NAMED).into_iter().flatten().flatten() {
+        for entry in std::fs::read_dir(NAMESPACE_DIRECTORY).into_iter().flatten().flatten() {
             let id = File::open(entry.path()).and_then(|file| self.namespace_id(&file));
             if let Ok(Some(id)) = id {
                 names.insert(id, entry.file_name().to_string_lossy().into_owned());
@@ -200,9 +200,9 @@ impl Netlink {
             match self.exchange.request(RouteNetlinkMessage::NewLink(message), flags) {
                 Ok(_) => return Ok(index),
                 // Another program took the index of the other end meanwhile,
-                Err(error) if is(&error, Errno::BUSY) && number < TRIES => number += 2,
+                Err(error) if is(&error, Errno::BUSY) && number < MAX_INDEX_ATTEMPTS => number += 2,
                 // or that of this end: the kernel returns the same error for a name that is taken.
-                Err(error) if is(&error, Errno::EXIST) && number < TRIES && self.free_index()? > index => {
+                Err(error) if is(&error, Errno::EXIST) && number < MAX_INDEX_ATTEMPTS && self.free_index()? > index => {
                     number += 2;
                 }
                 Err(error) => return Err(error),
@@ -212,7 +212,7 @@ impl Netlink {
 
     fn mark(&mut self, index: u32) -> io::Result<()> {
         // The mark comes first, so that the next command can remove the link if a later step fails.
-        self.change(link(index, [LinkAttribute::IfAlias(MARK.to_owned())]))?;
+        self.change(link(index, [LinkAttribute::IfAlias(ALIAS_MARK.to_owned())]))?;
         self.set_up(index, true)
     }
 
@@ -243,7 +243,7 @@ impl Netlink {
     ///
     /// # Errors
     /// Returns the driver's error.
-    pub fn set_rates(&mut self, index: u32, rates: Rates) -> io::Result<()> {
+    pub fn set_rates(&mut self, index: u32, rates: HardwareRates) -> io::Result<()> {
         let fd = if rates.data_bitrate.is_some() { CanCtrlModeFlags::Fd } else { CanCtrlModeFlags::empty() };
         let mut data = vec![InfoCan::CtrlMode(CanCtrlMode { mask: CanCtrlModeFlags::Fd, flags: fd })];
         data.extend(rates.bitrate.map(|rate| InfoCan::BitTiming(CanBitTiming::new(rate))));
@@ -253,7 +253,7 @@ impl Netlink {
     }
 
     /// Checks that the clock comes close enough to the requested rates, because drivers accept a rate up to 5 % off.
-    fn see_rates(&mut self, index: u32, target: Rates) -> io::Result<()> {
+    fn see_rates(&mut self, index: u32, target: HardwareRates) -> io::Result<()> {
         let nearest = self.query(link(index, []))?.and_then(|it| it.hardware().map(Hardware::rates));
         match nearest.filter(|nearest| !nearest.meet(target)) {
             Some(nearest) => Err(io::Error::other(format!("the nearest that its clock gives is {nearest}"))),
@@ -277,17 +277,17 @@ impl Netlink {
         let restore = |index, mtu, up| Undo::Restore { index, mtu, rates: None, up };
         let Step { name, action } = step;
         match *action {
-            Action::MakeVcan => self.make_vcan(name).map(|index| Some(Undo::Remove { index })),
-            Action::MakePair { ref peer, .. } => {
+            StepAction::MakeVcan => self.make_vcan(name).map(|index| Some(Undo::Remove { index })),
+            StepAction::MakePair { ref peer, .. } => {
                 self.make_pair(name, peer, there).map(|index| Some(Undo::Remove { index }))
             }
-            Action::BringUp { index } => self.set_up(index, true).map(|()| Some(restore(index, None, false))),
-            Action::Widen { index, from, was_up } => {
+            StepAction::BringUp { index } => self.set_up(index, true).map(|()| Some(restore(index, None, false))),
+            StepAction::Widen { index, from, was_up } => {
                 let done = self.set_up(index, false).and_then(|()| self.set_mtu(index, FD_MTU));
                 let done = done.and_then(|()| self.set_up(index, true));
                 self.or_undo(done, restore(index, Some(from), was_up)).map(Some)
             }
-            Action::SetRates { index, rates, before, was_up } => {
+            StepAction::SetRates { index, rates, before, was_up } => {
                 let undo = Undo::Restore { index, mtu: None, rates: Some(before), up: was_up };
                 let down = if was_up { self.set_up(index, false) } else { Ok(()) };
                 let done = down
@@ -296,7 +296,7 @@ impl Netlink {
                     .and_then(|()| self.set_up(index, true));
                 self.or_undo(done, undo).map(Some)
             }
-            Action::Remove { index } => self.remove(index).map(|()| None),
+            StepAction::Remove { index } => self.remove(index).map(|()| None),
         }
     }
 
@@ -321,7 +321,7 @@ impl Netlink {
                     self.set_mtu(index, mtu)?;
                 }
                 // The kernel cannot unset a rate once it was set.
-                if let Some(rates @ Rates { bitrate: Some(_), .. }) = rates {
+                if let Some(rates @ HardwareRates { bitrate: Some(_), .. }) = rates {
                     self.set_rates(index, rates)?;
                 }
                 if up { self.set_up(index, true) } else { Ok(()) }
@@ -345,7 +345,7 @@ pub enum Undo {
         /// The former MTU, if it was changed.
         mtu: Option<u32>,
         /// The former bit rates, if they were changed.
-        rates: Option<Rates>,
+        rates: Option<HardwareRates>,
         /// True if the interface was up.
         up: bool,
     },

@@ -14,9 +14,9 @@ use std::ffi::OsStr;
 
 use protocol::can::Format;
 use protocol::skin::Skin;
-use protocol::usage::quoted_os;
+use protocol::usage::shell_quoted_os;
 
-use crate::link::{FD_MTU, Hardware, Interface, Kind, Rates};
+use crate::link::{FD_MTU, Hardware, Interface, InterfaceKind, HardwareRates};
 use crate::namespace::Namespace;
 
 mod refusal;
@@ -24,11 +24,11 @@ mod step;
 
 pub use refusal::Refusal;
 pub(crate) use step::widen;
-pub use step::{Action, Step};
+pub use step::{StepAction, Step};
 
 /// A requested interface.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Target {
+pub struct InterfaceTarget {
     /// The name.
     pub name: String,
     /// The format of the frames that it must carry.
@@ -43,10 +43,10 @@ pub struct SkinBus {
     /// The skin's file, quoted for a shell.
     pub file: String,
     /// The bit rates that the skin gives.
-    pub rates: Rates,
+    pub rates: HardwareRates,
 }
 
-impl Target {
+impl InterfaceTarget {
     /// Returns the target for an interface that was named, for frames of both formats.
     #[must_use]
     pub fn named(name: &str) -> Self {
@@ -56,12 +56,12 @@ impl Target {
     /// Returns the targets for the buses of a skin.
     #[must_use]
     pub fn of_skin(file: &OsStr, skin: &Skin) -> Vec<Self> {
-        let target = |bus: &protocol::skin::Bus| Self {
+        let target = |bus: &protocol::skin::SkinBus| Self {
             name: bus.name.clone(),
             format: bus.format,
             skin: Some(SkinBus {
-                file: quoted_os(file),
-                rates: Rates { bitrate: bus.bitrate, data_bitrate: bus.data_bitrate },
+                file: shell_quoted_os(file),
+                rates: HardwareRates { bitrate: bus.bitrate, data_bitrate: bus.data_bitrate },
             }),
         };
         skin.buses.iter().map(target).collect()
@@ -105,12 +105,12 @@ pub struct TargetPair<'a> {
     /// The other end.
     pub peer: &'a str,
     /// The namespace of the other end; `None` for this namespace.
-    pub there: Option<&'a There>,
+    pub there: Option<&'a OtherNamespace>,
 }
 
 /// Another network namespace.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct There {
+pub struct OtherNamespace {
     /// The namespace as named by the user.
     pub name: Namespace,
     /// Its id in this namespace, if it has one.
@@ -135,7 +135,7 @@ fn find<'a>(present: &'a [Interface], name: &str) -> Option<&'a Interface> {
 ///
 /// # Errors
 /// Returns [`Refusal`] if that requires a change to an interface that this program did not make.
-pub fn up(target: &[Target], present: &[Interface], set_bit_rates: bool) -> Result<Plan, Refusal> {
+pub fn up(target: &[InterfaceTarget], present: &[Interface], set_bit_rates: bool) -> Result<Plan, Refusal> {
     let mut plan = Plan::default();
     if let Some(refusal) = target.iter().enumerate().find_map(|(at, it)| it.at_odds(target.get(..at)?)) {
         return Err(refusal);
@@ -148,15 +148,15 @@ pub fn up(target: &[Target], present: &[Interface], set_bit_rates: bool) -> Resu
             if let Some(SkinBus { file, .. }) = target.hardware() {
                 return Err(Refusal::Absent { name: target.name.clone(), file: file.clone() });
             }
-            plan.steps.push(Step { name: target.name.clone(), action: Action::MakeVcan });
+            plan.steps.push(Step { name: target.name.clone(), action: StepAction::MakeVcan });
             continue;
         };
         match (&interface.kind, &target.skin) {
-            (Kind::Vcan | Kind::Vxcan(_), _) => plan.fit(target, interface)?,
-            (Kind::Hardware(hardware), Some(skin)) => {
+            (InterfaceKind::Vcan | InterfaceKind::Vxcan(_), _) => plan.fit(target, interface)?,
+            (InterfaceKind::Hardware(hardware), Some(skin)) => {
                 plan.hardware(target, skin, interface, hardware, set_bit_rates)?;
             }
-            (Kind::Hardware(_), None) | (Kind::Other(_), _) => return Err(Refusal::real(interface)),
+            (InterfaceKind::Hardware(_), None) | (InterfaceKind::Other(_), _) => return Err(Refusal::real(interface)),
         }
     }
     Ok(plan)
@@ -177,7 +177,7 @@ pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, R
     let (here, other) = match ends {
         (None, None) => {
             let namespace = there.map(|there| there.name.clone());
-            let action = Action::MakePair { peer: peer.to_owned(), namespace };
+            let action = StepAction::MakePair { peer: peer.to_owned(), namespace };
             plan.steps.push(Step { name: name.to_owned(), action });
             return Ok(plan);
         }
@@ -185,9 +185,9 @@ pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, R
         (Some(in_the_way), _) => return Err(not_a_pair(in_the_way, peer, None)),
         (None, Some(in_the_way)) => return Err(not_a_pair(in_the_way, name, there)),
     };
-    plan.fit(&Target::named(name), here)?;
+    plan.fit(&InterfaceTarget::named(name), here)?;
     let Some(there) = there else {
-        plan.fit(&Target::named(peer), other)?;
+        plan.fit(&InterfaceTarget::named(peer), other)?;
         return Ok(plan);
     };
     // Steps do not change interfaces in the other namespace, except for making a missing pair.
@@ -201,16 +201,16 @@ pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, R
     Err(Refusal::OtherEnd { name: name.to_owned(), end, command })
 }
 
-fn are_a_pair(here: &Interface, other: &Interface, there: Option<&There>) -> bool {
+fn are_a_pair(here: &Interface, other: &Interface, there: Option<&OtherNamespace>) -> bool {
     let Some(peer) = here.peer() else { return false };
     let same_place = match there {
         None => peer.namespace_id.is_none(),
         Some(there) => peer.namespace_id.is_some() && there.id == peer.namespace_id,
     };
-    same_place && peer.index == other.index && matches!(other.kind, Kind::Vxcan(_))
+    same_place && peer.index == other.index && matches!(other.kind, InterfaceKind::Vxcan(_))
 }
 
-fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&There>) -> Refusal {
+fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&OtherNamespace>) -> Refusal {
     let Interface { name, .. } = in_the_way;
     if !in_the_way.is_virtual() {
         return Refusal::real(in_the_way);
@@ -241,7 +241,7 @@ impl Plan {
     }
 
     /// Brings an existing virtual interface into the target state, if this program made it.
-    fn fit(&mut self, target: &Target, interface: &Interface) -> Result<(), Refusal> {
+    fn fit(&mut self, target: &InterfaceTarget, interface: &Interface) -> Result<(), Refusal> {
         let Interface { index, mtu, .. } = *interface;
         let name = interface.name.clone();
         let wide = target.carried_by(mtu);
@@ -253,8 +253,8 @@ impl Plan {
             }
             (false, _, false) => return Err(Refusal::Narrow { name, mtu }),
             (true, false, false) => return Err(Refusal::Down(name)),
-            (false, was_up, true) => Action::Widen { index, from: mtu, was_up },
-            (true, false, true) => Action::BringUp { index },
+            (false, was_up, true) => StepAction::Widen { index, from: mtu, was_up },
+            (true, false, true) => StepAction::BringUp { index },
         };
         self.steps.push(Step { name, action });
         Ok(())
@@ -263,7 +263,7 @@ impl Plan {
     /// Compares hardware with the skin, and sets its rates on request.
     fn hardware(
         &mut self,
-        target: &Target,
+        target: &InterfaceTarget,
         skin: &SkinBus,
         interface: &Interface,
         hardware: &Hardware,
@@ -289,7 +289,7 @@ impl Plan {
                 return Err(Refusal::NoRate { name, key, example, file });
             }
             let (index, was_up) = (interface.index, interface.up);
-            self.steps.push(Step { name, action: Action::SetRates { index, rates, before, was_up } });
+            self.steps.push(Step { name, action: StepAction::SetRates { index, rates, before, was_up } });
             return Ok(());
         }
         if !agrees {
@@ -312,7 +312,7 @@ impl Plan {
 /// # Errors
 /// Returns [`Refusal`] if an interface was named that this program did not make. Buses of a skin are left alone
 /// instead.
-pub fn down(target: &[Target], present: &[Interface]) -> Result<Plan, Refusal> {
+pub fn down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Plan, Refusal> {
     let mut plan = Plan::default();
     for target in target {
         let name = target.name.clone();
@@ -323,7 +323,7 @@ pub fn down(target: &[Target], present: &[Interface]) -> Result<Plan, Refusal> {
             (None, _) => plan.leave(format!("{name} is not there")),
             (Some(interface), _) if interface.ours && interface.is_virtual() => {
                 if !removed_with(&plan, interface, present) {
-                    plan.steps.push(Step { name, action: Action::Remove { index: interface.index } });
+                    plan.steps.push(Step { name, action: StepAction::Remove { index: interface.index } });
                 }
             }
             (Some(interface), Some(_)) => {

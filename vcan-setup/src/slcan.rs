@@ -21,8 +21,8 @@ mod participant;
 pub mod refusals;
 mod settings;
 
-pub use account::Account;
+pub use account::LineAccount;
 pub use bridge::{Bridge, BridgeError};
-pub use event::Event;
+pub use event::LineEvent;
 pub use options::{Address, LineError, LineOptions};
-pub use settings::Settings;
+pub use settings::BridgeSettings;

@@ -4,8 +4,8 @@ use super::*;
 
 const PERIOD: u16 = 16_000;
 
-fn rule() -> Zeroing {
-    Zeroing {
+fn rule() -> BaselineSettings {
+    BaselineSettings {
         threshold: Q5_10::nearest(0.1),
         hysteresis: Q1_14::nearest(0.5),
         rate_un_per_s: 2_000,
@@ -14,7 +14,7 @@ fn rule() -> Zeroing {
     }
 }
 
-fn with(rule: Zeroing) -> Baseline {
+fn with(rule: BaselineSettings) -> Baseline {
     let mut baseline = Baseline::default();
     baseline.set(Rule::On(rule));
     baseline
@@ -29,22 +29,22 @@ fn reads(newtons: f64, degrees: f64) -> SkinSensors {
 }
 
 fn newtons(sensors: &SkinSensors) -> f64 {
-    f64::from(contact(sensors)) / 1_024.0
+    f64::from(contact_force(sensors)) / 1_024.0
 }
 
 impl Baseline {
     fn run(&mut self, joints: usize, raw: &SkinSensors) -> f64 {
         for _ in 0..joints {
-            self.take(raw, PERIOD);
+            self.process_joints(raw, PERIOD);
         }
-        newtons(&self.net(raw))
+        newtons(&self.subtract_zero(raw))
     }
 }
 
 /// Returns the baseline of a sensor that reads 0.3 N without a touch, at 25 °C.
-fn tared(rule: Zeroing) -> Baseline {
+fn tared(rule: BaselineSettings) -> Baseline {
     let mut baseline = with(rule);
-    baseline.run(STEADY.into(), &reads(0.3, 25.0));
+    baseline.run(STEADY_JOINTS.into(), &reads(0.3, 25.0));
     assert!(baseline.is_tared());
     baseline
 }
@@ -54,14 +54,14 @@ fn without_a_baseline_nothing_is_subtracted_and_nothing_told() {
     let mut baseline = Baseline::default();
     let raw = reads(0.3, 25.0);
     baseline.run(100, &raw);
-    assert_eq!((baseline.net(&raw), baseline.page()), (raw, None));
-    assert_eq!(baseline.tare(&raw, Tare::Untouched), Err(Refused::Off));
+    assert_eq!((baseline.subtract_zero(&raw), baseline.page()), (raw, None));
+    assert_eq!(baseline.tare(&raw, Tare::Untouched), Err(TareRefused::Off));
 }
 
 #[test]
 fn a_steady_reading_within_the_limit_is_the_zero_after_a_start() {
     let mut baseline = with(rule());
-    for joints in 0..STEADY {
+    for joints in 0..STEADY_JOINTS {
         assert!(!baseline.is_tared(), "{joints}");
         assert_eq!(baseline.run(1, &reads(0.3, 25.0)), 0.0, "what is within the limit is none");
     }
@@ -84,7 +84,7 @@ fn a_touch_at_the_start_beyond_the_limit_is_a_touch_and_no_zero() {
 }
 
 fn reads_as(newtons: f64) -> f64 {
-    f64::from(contact(&reads(newtons, 0.0))) / 1_024.0
+    f64::from(contact_force(&reads(newtons, 0.0))) / 1_024.0
 }
 
 #[test]
@@ -111,7 +111,7 @@ fn what_changes_slowly_without_a_touch_is_followed_and_what_is_quick_is_a_touch(
 
 #[test]
 fn the_zero_moves_with_the_temperature_in_contact_too() {
-    let mut baseline = tared(Zeroing { n_per_c: Q1_14::nearest(0.02), ..rule() });
+    let mut baseline = tared(BaselineSettings { n_per_c: Q1_14::nearest(0.02), ..rule() });
     for degrees in 25..=30 {
         let degrees = f64::from(degrees);
         let net = baseline.run(500, &reads(1.3 + 0.02 * (degrees - 25.0), degrees));
@@ -123,7 +123,7 @@ fn the_zero_moves_with_the_temperature_in_contact_too() {
 fn the_coefficient_is_learned_from_a_warm_up_without_a_touch() {
     for (slope, start) in [(0.02, 25.0), (-0.015, 25.0), (0.02, 35.0)] {
         let mut baseline = with(rule());
-        baseline.run(STEADY.into(), &reads(0.1, start));
+        baseline.run(STEADY_JOINTS.into(), &reads(0.1, start));
         let up = if start > 30.0 { -1.0 } else { 1.0 };
         // One degree per minute, in steps of 1/64 °C.
         for step in 0..640 {
@@ -152,28 +152,28 @@ fn a_tare_needs_that_nothing_touches_it_unless_it_is_forced() {
     let mut baseline = tared(rule());
     let touched = reads(0.45, 25.0);
     baseline.run(50, &touched);
-    assert_eq!(baseline.tare(&touched, Tare::Untouched), Err(Refused::Touched));
+    assert_eq!(baseline.tare(&touched, Tare::Untouched), Err(TareRefused::Touched));
     let page = baseline.page().unwrap();
     assert_eq!((page.refused, page.zero, page.touched), (1, Q5_10::nearest(0.3), true));
-    assert_eq!(baseline.tare(&touched, Tare::Anyhow), Ok(()));
+    assert_eq!(baseline.tare(&touched, Tare::Forced), Ok(()));
     assert_eq!(baseline.run(1, &touched), 0.0);
     let more = reads(0.95, 25.0);
     baseline.run(50, &more);
-    assert_eq!(baseline.tare(&more, Tare::Anyhow), Err(Refused::Limit), "0.95 N");
+    assert_eq!(baseline.tare(&more, Tare::Forced), Err(TareRefused::Limit), "0.95 N");
     baseline.tare(&more, Tare::Forget).unwrap();
     assert!(!baseline.is_tared());
-    assert_eq!(with(rule()).tare(&more, Tare::Untouched), Err(Refused::Touched), "it has read nothing");
+    assert_eq!(with(rule()).tare(&more, Tare::Untouched), Err(TareRefused::Touched), "it has read nothing");
 }
 
 #[test]
 fn a_zero_is_shared_by_the_three_words_and_adds_up() {
     for zero in -600..600 {
-        let mut baseline = with(Zeroing { limit: Q5_10::from_bits(700), ..rule() });
+        let mut baseline = with(BaselineSettings { limit: Q5_10::from_bits(700), ..rule() });
         let contact_words = [zero, 0, 0].map(Q5_10::from_bits);
         baseline.run(40, &SkinSensors { contact: contact_words, ..SkinSensors::default() });
         let raw = SkinSensors { contact: [400, 500, 600].map(Q5_10::from_bits), ..SkinSensors::default() };
-        assert_eq!(contact(&baseline.net(&raw)), 1_500 - i32::from(zero));
-        let [first, second, _] = baseline.net(&raw).contact.map(Q5_10::to_bits);
+        assert_eq!(contact_force(&baseline.subtract_zero(&raw)), 1_500 - i32::from(zero));
+        let [first, second, _] = baseline.subtract_zero(&raw).contact.map(Q5_10::to_bits);
         assert!((first - (400 - zero / 3)).abs() <= 1 && (second - (500 - zero / 3)).abs() <= 1, "{zero}");
     }
 }
@@ -182,7 +182,7 @@ fn a_zero_is_shared_by_the_three_words_and_adds_up() {
 fn the_pace_is_the_rate_in_a_period_and_never_more() {
     for (rate, period) in [(2_000, 16_000), (1, 65_535), (65_535, 65_535), (50, 1_000), (65_535, 1)] {
         let exact = f64::from(rate) * f64::from(period) * 1e-12 * 4_194_304.0;
-        let got = f64::from(step(rate, period));
+        let got = f64::from(step_per_period(rate, period));
         assert!(got <= exact && got > exact - 1.1, "{rate} {period}: {got} of {exact}");
     }
 }
@@ -195,22 +195,22 @@ proptest! {
         rate in 1_u16..,
         limit in 0_i16..1_000,
     ) {
-        let mut baseline = with(Zeroing { rate_un_per_s: rate, limit: Q5_10::from_bits(limit), ..rule() });
-        let most = step(rate, PERIOD);
+        let mut baseline = with(BaselineSettings { rate_un_per_s: rate, limit: Q5_10::from_bits(limit), ..rule() });
+        let most = step_per_period(rate, PERIOD);
         for (force, noise, joints) in readings {
             for joint in 0..joints {
                 let noise = if joint % 3 == 0 { noise } else { 0 };
                 let contact = [force / 3, force / 3, force / 3 + noise].map(Q5_10::from_bits);
                 let raw = SkinSensors { contact, ..SkinSensors::default() };
                 let before = baseline;
-                baseline.take(&raw, PERIOD);
+                baseline.process_joints(&raw, PERIOD);
                 if before.is_tared {
                     prop_assert!(before.zero.abs_diff(baseline.zero) <= most.unsigned_abs());
                     if baseline.touch == Touch::Touched {
                         prop_assert_eq!(before.zero, baseline.zero);
                     }
                 }
-                prop_assert!(baseline.zero.abs() <= i32::from(limit) << FINER);
+                prop_assert!(baseline.zero.abs() <= i32::from(limit) << EXTRA_FRACTION_BITS);
             }
         }
     }
@@ -230,11 +230,11 @@ proptest! {
                 ..SkinSensors::default()
             };
             for _ in 0..tare {
-                baseline.take(&raw, period);
+                baseline.process_joints(&raw, period);
             }
-            let how = [Tare::Forget, Tare::Untouched, Tare::Anyhow];
+            let how = [Tare::Forget, Tare::Untouched, Tare::Forced];
             let _ = how.get(usize::from(tare)).map(|how| baseline.tare(&raw, *how));
-            let _ = (baseline.net(&raw), baseline.page());
+            let _ = (baseline.subtract_zero(&raw), baseline.page());
         }
     }
 }

@@ -5,7 +5,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use protocol::time::{Micros, Span};
 
 /// Interval between comparisons with the wall clock.
-const MEASURE: Span = Span::from_millis(250);
+const MEASURE_INTERVAL: Span = Span::from_millis(250);
 
 /// A monotonic clock with a known offset to the wall clock.
 #[derive(Debug)]
@@ -26,12 +26,12 @@ impl Clock {
     }
 
     pub(super) fn now(&self) -> Micros {
-        Micros::after(self.start.elapsed())
+        Micros::since_start(self.start.elapsed())
     }
 
     /// Measures the offset to the wall clock if the interval has elapsed.
-    pub(super) fn keep(&mut self, now: Micros) {
-        if now.since(self.measured) >= MEASURE {
+    pub(super) fn remeasure(&mut self, now: Micros) {
+        if now.elapsed_since(self.measured) >= MEASURE_INTERVAL {
             self.set(now);
         }
     }

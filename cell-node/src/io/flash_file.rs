@@ -12,11 +12,11 @@ use protocol::input::{self, folder_of};
 use rustix::fs::{CWD, FlockOperation, RenameFlags, flock, renameat_with};
 use rustix::io::Errno;
 
-use crate::flash::{self, FlashError, Kept};
+use crate::flash::{self, FlashError, FlashContent};
 use crate::identity::Identity;
 
 /// Maximum number of bytes read from a file; a flash image is far smaller.
-const LONGEST: u64 = 64 << 10;
+const MAX_READ_BYTES: u64 = 64 << 10;
 
 /// The flash of a cell: a file, or memory only if there is no directory.
 #[derive(Debug)]
@@ -53,22 +53,22 @@ impl FlashFile {
     ///
     /// # Errors
     /// Returns an error if the file exists but cannot be read, or another process uses it.
-    pub fn load(&mut self) -> io::Result<Result<Kept, FlashError>> {
-        let Some(path) = &self.path else { return Ok(Ok(Kept::default())) };
-        lock(path, &mut self.held)?;
+    pub fn load(&mut self) -> io::Result<Result<FlashContent, FlashError>> {
+        let Some(path) = &self.path else { return Ok(Ok(FlashContent::default())) };
+        lock_current(path, &mut self.held)?;
         if self.held.is_none() {
-            return Ok(Ok(Kept::default()));
+            return Ok(Ok(FlashContent::default()));
         }
-        Ok(flash::decode(self.identity, &input::bytes(path, LONGEST)?))
+        Ok(flash::decode(self.identity, &input::read_bytes(path, MAX_READ_BYTES)?))
     }
 
     /// Writes a node id and parameters. A complete new file replaces the old one, or nothing changes.
     ///
     /// # Errors
     /// Returns an error if writing fails, or another process uses the file.
-    pub fn store(&mut self, kept: &Kept) -> io::Result<()> {
+    pub fn store(&mut self, kept: &FlashContent) -> io::Result<()> {
         let Some(path) = &self.path else { return Ok(()) };
-        lock(path, &mut self.held)?;
+        lock_current(path, &mut self.held)?;
         let part = path.with_extension("flash.part");
         let store = || {
             // Left over from an earlier attempt or another program.
@@ -79,7 +79,7 @@ impl FlashFile {
             let mut file = File::create_new(&part)?;
             file.write_all(&flash::encode(self.identity.serial, kept))?;
             file.sync_all()?;
-            hold(&file)?;
+            lock_file(&file)?;
             if self.held.is_some() {
                 fs::rename(&part, path)?;
             } else {
@@ -100,7 +100,7 @@ impl FlashFile {
 }
 
 /// Sets `held` to the locked file at this path.
-fn lock(path: &Path, held: &mut Option<File>) -> io::Result<()> {
+fn lock_current(path: &Path, held: &mut Option<File>) -> io::Result<()> {
     loop {
         let file = match input::open(path) {
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
@@ -115,7 +115,7 @@ fn lock(path: &Path, held: &mut Option<File>) -> io::Result<()> {
         {
             return Ok(());
         }
-        hold(&file)?;
+        lock_file(&file)?;
         // Another process may have replaced the file before it was locked.
         if fs::metadata(path).is_ok_and(|about| (about.dev(), about.ino()) == is) {
             *held = Some(file);
@@ -125,7 +125,7 @@ fn lock(path: &Path, held: &mut Option<File>) -> io::Result<()> {
 }
 
 /// Locks a file. On a file system without locks, it stays unlocked.
-fn hold(file: &File) -> io::Result<()> {
+fn lock_file(file: &File) -> io::Result<()> {
     match flock(file, FlockOperation::NonBlockingLockExclusive) {
         Err(Errno::WOULDBLOCK) => {
             let who = holder(file).unwrap_or_else(|| "another process".to_owned());
@@ -170,19 +170,19 @@ mod tests {
         let mut first = cell(place.path(), 1);
         let mut second = cell(place.path(), 1);
         assert!(first.load().unwrap().is_ok() && second.load().unwrap().is_ok(), "there is no file yet");
-        first.store(&Kept::default()).unwrap();
-        first.store(&Kept::default()).unwrap();
+        first.store(&FlashContent::default()).unwrap();
+        first.store(&FlashContent::default()).unwrap();
         let name = fs::read_to_string("/proc/self/comm").unwrap();
         let who = format!("process {} ({}) uses it", std::process::id(), name.trim_end());
-        for error in [second.load().map(drop).unwrap_err(), second.store(&Kept::default()).unwrap_err()] {
+        for error in [second.load().map(drop).unwrap_err(), second.store(&FlashContent::default()).unwrap_err()] {
             assert_eq!(error.kind(), io::ErrorKind::ResourceBusy);
             let said = error.to_string();
             assert!(said.starts_with(&who) || said.starts_with("another process"), "{said}");
         }
-        cell(place.path(), 2).store(&Kept::default()).unwrap();
+        cell(place.path(), 2).store(&FlashContent::default()).unwrap();
         drop(first);
         assert!(second.load().unwrap().is_ok());
-        second.store(&Kept::default()).unwrap();
+        second.store(&FlashContent::default()).unwrap();
         assert!(!place.path().join("vcan0-1.flash.part").exists());
     }
 
@@ -191,13 +191,13 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("vcan0-1.flash");
         let mut file = cell(place.path(), 1);
-        file.store(&Kept::default()).unwrap();
+        file.store(&FlashContent::default()).unwrap();
         let image = fs::read(&path).unwrap();
         fs::remove_file(&path).unwrap();
-        file.store(&Kept::default()).unwrap();
+        file.store(&FlashContent::default()).unwrap();
         fs::remove_file(&path).unwrap();
         fs::write(&path, []).unwrap();
-        file.store(&Kept::default()).unwrap();
+        file.store(&FlashContent::default()).unwrap();
         assert_eq!(fs::read(&path).unwrap(), image);
     }
 }

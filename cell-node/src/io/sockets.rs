@@ -4,15 +4,15 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use protocol::bus::batch::BATCH;
-use protocol::bus::{Bus, BusError, Filter, Inbox, Options, Received, SendError};
+use protocol::bus::{Bus, BusError, Filter, Inbox, BusOptions, Received, SendError};
 use protocol::can::Frame;
 
-use super::Line;
-use super::Stopped;
+use super::BusPort;
+use super::StopReason;
 
 /// The receive filters of a process.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
-pub(super) struct Hearing {
+pub(super) struct ReceiveFilters {
     /// Filters of the socket that wakes the process.
     pub(super) at_once: Vec<Filter>,
     /// Filters of the deferred socket, which is read before frames that woke the process.
@@ -20,9 +20,9 @@ pub(super) struct Hearing {
 }
 
 /// Time for which frames may still arrive at the deferred socket after a filter was removed from it.
-const SETTLED: Duration = Duration::from_millis(50);
+const SETTLING_TIME: Duration = Duration::from_millis(50);
 /// Number of batches read from the deferred socket at once: the capacity of its buffer.
-const BATCHES: usize = 16;
+const MAX_DEFERRED_BATCHES: usize = 16;
 
 /// The open bus, and a second socket for deferred frames.
 ///
@@ -36,7 +36,7 @@ pub struct Sockets {
     /// resting cell.
     is_network: bool,
     /// True if the deferred socket has filters.
-    keeps: bool,
+    has_deferred_filters: bool,
     /// Until this time, frames at the deferred socket may belong to the waking socket, because a filter was
     /// moved.
     settled: Option<Instant>,
@@ -46,7 +46,7 @@ pub struct Sockets {
     /// Frames from the waking socket.
     woke: Inbox,
     /// Frames from both sockets, in the order of the kernel's time stamps.
-    came: Vec<Arrived>,
+    arrived: Vec<Arrived>,
 }
 
 /// A received frame.
@@ -62,18 +62,18 @@ impl Sockets {
     ///
     /// # Errors
     /// Returns an error if the bus cannot be used as requested.
-    pub(super) fn open(line: &Line, options: &Options, deferred: &[Filter]) -> Result<Self, Stopped> {
-        let second = Options { filters: deferred.to_vec(), own_frames: false, ..options.clone() };
+    pub(super) fn open(line: &BusPort, options: &BusOptions, deferred: &[Filter]) -> Result<Self, StopReason> {
+        let second = BusOptions { filters: deferred.to_vec(), own_frames: false, ..options.clone() };
         Ok(Self {
             bus: line.open(options)?,
             deferred: line.open(&second)?,
             is_network: line.wires,
-            keeps: !deferred.is_empty(),
+            has_deferred_filters: !deferred.is_empty(),
             settled: None,
             deferred_frames: VecDeque::new(),
             inbox: Inbox::new(),
             woke: Inbox::new(),
-            came: Vec::new(),
+            arrived: Vec::new(),
         })
     }
 
@@ -82,7 +82,7 @@ impl Sockets {
     }
 
     /// Replaces the filters `before` by `hearing`.
-    pub(super) fn set_filters(&mut self, hearing: &Hearing, before: &Hearing) -> Result<(), BusError> {
+    pub(super) fn set_filters(&mut self, hearing: &ReceiveFilters, before: &ReceiveFilters) -> Result<(), BusError> {
         // A filter that moves between the sockets is set on both for a moment, so that no frame is lost.
         let (update, old) =
             (only_in(&hearing.deferred, &before.deferred), only_in(&before.deferred, &hearing.deferred));
@@ -94,9 +94,9 @@ impl Sockets {
         }
         if !old.is_empty() {
             self.deferred.set_filters(&hearing.deferred)?;
-            self.settled = Some(Instant::now() + SETTLED);
+            self.settled = Some(Instant::now() + SETTLING_TIME);
         }
-        self.keeps = !hearing.deferred.is_empty();
+        self.has_deferred_filters = !hearing.deferred.is_empty();
         Ok(())
     }
 
@@ -106,13 +106,13 @@ impl Sockets {
 
     /// Receives pending frames without waiting, before a timer that was due at a wall clock time in ns.
     /// Returns true if there are any.
-    pub(super) fn look(&mut self, due_nanos: u64) -> Result<bool, BusError> {
+    pub(super) fn receive_pending(&mut self, due_nanos: u64) -> Result<bool, BusError> {
         self.clear();
         self.bus.receive(&mut self.woke)?;
         // Includes frames that a slow server delivered after the settling time.
         self.receive_deferred()?;
         self.order(due_nanos);
-        Ok(!self.came.is_empty())
+        Ok(!self.arrived.is_empty())
     }
 
     /// Waits for a frame that wakes the process, and receives it with the deferred ones.
@@ -130,13 +130,13 @@ impl Sockets {
             }
             return Ok(());
         }
-        if self.is_network || !self.keeps {
+        if self.is_network || !self.has_deferred_filters {
             self.bus.wait_and_receive(&mut self.woke, wait)?;
         } else if self.bus.wait(Some(wait))? {
             self.bus.receive(&mut self.woke)?;
         }
         if self.woke.frames().len() > 0 {
-            if self.keeps {
+            if self.has_deferred_filters {
                 self.receive_deferred()?;
             }
             self.order(u64::MAX);
@@ -146,11 +146,11 @@ impl Sockets {
 
     fn clear(&mut self) {
         self.woke.clear();
-        self.came.clear();
+        self.arrived.clear();
     }
 
     fn receive_deferred(&mut self) -> Result<(), BusError> {
-        for _ in 0..BATCHES {
+        for _ in 0..MAX_DEFERRED_BATCHES {
             let count = self.deferred.receive(&mut self.inbox)?;
             self.deferred_frames.extend(self.inbox.frames());
             if count < BATCH {
@@ -171,18 +171,18 @@ impl Sockets {
             }
         };
         for received in self.woke.frames() {
-            earlier(received.at_nanos, &mut self.came);
-            self.came.push(Arrived { received, waited: false });
+            earlier(received.at_nanos, &mut self.arrived);
+            self.arrived.push(Arrived { received, waited: false });
         }
         // If the waking socket has more pending frames, those come first.
         if self.woke.frames().len() < BATCH {
-            earlier(u64::MAX, &mut self.came);
+            earlier(u64::MAX, &mut self.arrived);
         }
     }
 
     /// Returns the frames of the last receive.
     pub(super) fn frames(&self) -> &[Arrived] {
-        &self.came
+        &self.arrived
     }
 }
 

@@ -5,23 +5,23 @@ use std::collections::{BTreeMap, BTreeSet};
 use protocol::bus::Filter;
 use protocol::can::{EXTENDED, REMOTE};
 use protocol::id::Id;
-use protocol::port::{FLAG, LinkId};
+use protocol::port::{WIRE_FLAG, LinkId};
 
-use super::sockets::Hearing;
+use super::sockets::ReceiveFilters;
 
 /// Passes the frames of all simulated wires of a bus.
-const ALL_WIRES: Filter = Filter { id: EXTENDED | FLAG, mask: EXTENDED | REMOTE | FLAG };
+const ALL_WIRES: Filter = Filter { id: EXTENDED | WIRE_FLAG, mask: EXTENDED | REMOTE | WIRE_FLAG };
 
 /// The receiving cells, as indices within the process, by identifier and by link id.
 #[derive(Debug, Default)]
 pub(super) struct Subscriptions {
-    by_id: BTreeMap<Id, Heard>,
+    by_id: BTreeMap<Id, Subscribers>,
     by_link_id: BTreeMap<LinkId, (usize, usize)>,
 }
 
 /// The receivers of an identifier.
 #[derive(Debug, Default)]
-struct Heard {
+struct Subscribers {
     by: Vec<usize>,
     /// True if at least one receiver must be woken for it.
     wakes: bool,
@@ -34,7 +34,7 @@ impl Subscriptions {
     }
 
     /// Replaces all subscriptions to identifiers by these: cell, identifier, and true if it may be deferred.
-    pub(super) fn listen(&mut self, hears: impl Iterator<Item = (usize, Id, bool)>) {
+    pub(super) fn replace(&mut self, hears: impl Iterator<Item = (usize, Id, bool)>) {
         self.by_id.clear();
         for (cell, id, deferred) in hears {
             let heard = self.by_id.entry(id).or_default();
@@ -44,29 +44,29 @@ impl Subscriptions {
     }
 
     /// Returns the cells that receive an identifier.
-    pub(super) fn of_id(&self, id: Id) -> &[usize] {
+    pub(super) fn cells_for_id(&self, id: Id) -> &[usize] {
         self.by_id.get(&id).map_or(&[], |heard| &heard.by)
     }
 
     /// Returns the cell and port that receive a link id.
-    pub(super) fn of_link_id(&self, link_id: LinkId) -> Option<(usize, usize)> {
+    pub(super) fn port_for_link(&self, link_id: LinkId) -> Option<(usize, usize)> {
         self.by_link_id.get(&link_id).copied()
     }
 
     /// Returns an exact filter for each identifier and link id. If these are too many for a socket, returns
     /// one for each kind that is received, and one for all wires.
-    pub(super) fn hearing(&self) -> Hearing {
+    pub(super) fn filters(&self) -> ReceiveFilters {
         let ids = |wakes| self.by_id.iter().filter(move |(_, heard)| heard.wakes == wakes).map(|(id, _)| *id);
         let link_ids = self.by_link_id.keys().copied();
         if self.by_id.len() + link_ids.len() <= Filter::MAX {
-            return Hearing {
-                at_once: ids(true).map(Filter::exact).chain(link_ids.map(Filter::link_id)).collect(),
+            return ReceiveFilters {
+                at_once: ids(true).map(Filter::exact).chain(link_ids.map(Filter::for_link)).collect(),
                 deferred: ids(false).map(Filter::exact).collect(),
             };
         }
         let kinds: BTreeSet<_> = self.by_id.keys().map(|id| id.kind).collect();
         let wires = (link_ids.len() > 0).then_some(ALL_WIRES);
-        Hearing { at_once: kinds.into_iter().map(Filter::kind).chain(wires).collect(), deferred: Vec::new() }
+        ReceiveFilters { at_once: kinds.into_iter().map(Filter::for_kind).chain(wires).collect(), deferred: Vec::new() }
     }
 }
 
@@ -84,7 +84,7 @@ mod tests {
         let id = |kind, cell| Id::new(kind, Node::Cell(cell));
         let cells = || CellId::all().take(cells).enumerate();
         let hears = |(at, cell)| [Kind::Network, Kind::Sum].map(|kind| (at, id(kind, cell), false));
-        subscriptions.listen(cells().flat_map(hears));
+        subscriptions.replace(cells().flat_map(hears));
         for (at, cell) in cells() {
             subscriptions.wire(LinkId { wire: cell.get().into(), back: true }, at, 2);
         }
@@ -94,7 +94,7 @@ mod tests {
     #[test]
     fn each_identifier_and_link_id_has_an_exact_filter_as_long_as_they_fit() {
         let link_id = |wire, back| LinkId { wire, back }.raw_id();
-        let filters = subscriptions(100).hearing().at_once;
+        let filters = subscriptions(100).filters().at_once;
         assert_eq!(filters.len(), 300);
         for id in [0x401, 0x464, 0x101, link_id(1, true), link_id(100, true)] {
             assert!(passes(&filters, id), "{id:X}");
@@ -115,12 +115,12 @@ mod tests {
     #[test]
     fn too_many_become_kinds_and_all_wires() {
         let link_id = |wire, back| LinkId { wire, back }.raw_id();
-        let filters = subscriptions(254).hearing().at_once;
+        let filters = subscriptions(254).filters().at_once;
         assert_eq!(filters.len(), 3);
         for id in [0x401, 0x4FE, 0x101, link_id(1, false), link_id(65_535, true)] {
             assert!(passes(&filters, id), "{id:X}");
         }
-        for id in [0x201, 0x001, link_id(1, true) | REMOTE, 0x401 | EXTENDED, FLAG | 0x101 | REMOTE] {
+        for id in [0x201, 0x001, link_id(1, true) | REMOTE, 0x401 | EXTENDED, WIRE_FLAG | 0x101 | REMOTE] {
             assert!(!passes(&filters, id), "{id:X}");
         }
     }
@@ -129,12 +129,12 @@ mod tests {
     fn subscriptions_to_identifiers_are_replaced_and_those_to_link_ids_stay() {
         let mut subscriptions = subscriptions(3);
         let id = |kind, number| Id::new(kind, Node::Cell(CellId::new(number).unwrap()));
-        assert_eq!(subscriptions.of_id(id(Kind::Sum, 2)), [1]);
-        subscriptions.listen([(0, id(Kind::Sum, 2), false), (2, id(Kind::Sum, 2), true)].into_iter());
-        assert_eq!(subscriptions.of_id(id(Kind::Sum, 2)), [0, 2]);
-        assert_eq!(subscriptions.of_id(id(Kind::Sum, 1)), [0; 0]);
-        assert_eq!(subscriptions.of_link_id(LinkId { wire: 2, back: true }), Some((1, 2)));
-        assert_eq!(subscriptions.of_link_id(LinkId { wire: 2, back: false }), None);
+        assert_eq!(subscriptions.cells_for_id(id(Kind::Sum, 2)), [1]);
+        subscriptions.replace([(0, id(Kind::Sum, 2), false), (2, id(Kind::Sum, 2), true)].into_iter());
+        assert_eq!(subscriptions.cells_for_id(id(Kind::Sum, 2)), [0, 2]);
+        assert_eq!(subscriptions.cells_for_id(id(Kind::Sum, 1)), [0; 0]);
+        assert_eq!(subscriptions.port_for_link(LinkId { wire: 2, back: true }), Some((1, 2)));
+        assert_eq!(subscriptions.port_for_link(LinkId { wire: 2, back: false }), None);
     }
 
     #[test]
@@ -142,10 +142,10 @@ mod tests {
         let mut subscriptions = Subscriptions::default();
         let id = |number| Id::new(Kind::Sum, Node::Cell(CellId::new(number).unwrap()));
         subscriptions
-            .listen([(0, id(1), true), (1, id(2), true), (2, id(2), false), (2, id(3), false)].into_iter());
-        let Hearing { at_once, deferred } = subscriptions.hearing();
+            .replace([(0, id(1), true), (1, id(2), true), (2, id(2), false), (2, id(3), false)].into_iter());
+        let ReceiveFilters { at_once, deferred } = subscriptions.filters();
         assert_eq!(at_once, [id(2), id(3)].map(Filter::exact));
         assert_eq!(deferred, [id(1)].map(Filter::exact));
-        assert_eq!(subscriptions.of_id(id(2)), [1, 2]);
+        assert_eq!(subscriptions.cells_for_id(id(2)), [1, 2]);
     }
 }

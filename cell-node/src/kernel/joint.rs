@@ -31,12 +31,12 @@ impl Joint {
 
     /// Returns the element of this joint.
     #[inline(always)]
-    pub(super) fn of<T>(self, joints: &[T; MAX_JOINTS]) -> Option<&T> {
+    pub(super) fn get<T>(self, joints: &[T; MAX_JOINTS]) -> Option<&T> {
         joints.get(self as usize)
     }
 
     #[inline(always)]
-    pub(super) fn of_mut<T>(self, joints: &mut [T; MAX_JOINTS]) -> Option<&mut T> {
+    pub(super) fn get_mut<T>(self, joints: &mut [T; MAX_JOINTS]) -> Option<&mut T> {
         joints.get_mut(self as usize)
     }
 }

@@ -78,7 +78,7 @@ fn length<N: Number>(word: Q1_14) -> Option<N> {
 /// Marks a branch as unlikely, so that the compiler keeps it out of the main path.
 #[cold]
 #[inline(always)]
-const fn seldom() {}
+const fn cold_path() {}
 
 /// Returns sine and cosine of a constant angle.
 fn settled_turn<N: Number>(angle: Q1_14) -> [N; 2] {

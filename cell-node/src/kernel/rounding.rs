@@ -19,9 +19,9 @@ pub(super) trait Rounding {
 }
 
 /// Rounding with saturation.
-pub(super) enum Held {}
+pub(super) enum Saturating {}
 
-impl Rounding for Held {
+impl Rounding for Saturating {
     #[inline(always)]
     fn sum<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N {
         N::rounded_sum(lhs, rhs)

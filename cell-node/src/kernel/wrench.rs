@@ -26,8 +26,8 @@ use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 use self::fold::fold;
 use self::range::bound;
 use super::joint::Joint;
-use super::rounding::{Bounded, Held, Rounding};
-use super::{Kernel, Number, Scalar, Twist, chain, length, seldom, settled_turn};
+use super::rounding::{Bounded, Saturating, Rounding};
+use super::{Kernel, Number, Scalar, Twist, chain, length, cold_path, settled_turn};
 use crate::contact::{MAX_J, TorqueRounding};
 
 /// The wrench kernel of one cell.
@@ -39,7 +39,7 @@ pub struct Wrench<S: Scalar = Q1_14> {
     /// The joint that moves the cell; 0 if there is none.
     joint: usize,
     /// The contact's wrench, twisted and shifted by the row of joint k.
-    contact: Wrenched<S::Number>,
+    contact: PerComponent<S::Number>,
     /// The links from joint k's row down to the base; the first `rows` are in use.
     links: [Link<S::Number>; MAX_ROWS],
     rows: usize,
@@ -52,13 +52,13 @@ pub struct Wrench<S: Scalar = Q1_14> {
 
 /// A force of one newton and its moment in m (Nm per N); or a property of each of their components.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Wrenched<T> {
+struct PerComponent<T> {
     force: [T; 3],
     moment: [T; 3],
 }
 
 /// The components of a wrench that are used.
-type Live = Wrenched<bool>;
+type Live = PerComponent<bool>;
 
 impl Live {
     const NOTHING: Self = Self { force: [false; 3], moment: [false; 3] };
@@ -134,10 +134,10 @@ impl<S: Scalar> Wrench<S> {
     }
 
     /// Returns a kernel without a cell: every J is zero.
-    pub(crate) fn nothing() -> Self {
+    pub(crate) fn empty() -> Self {
         Self {
             joint: 0,
-            contact: Wrenched { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] },
+            contact: PerComponent { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] },
             links: const { [Link::NOTHING; MAX_ROWS] },
             rows: 0,
             bound: MAX_J,
@@ -156,7 +156,7 @@ impl<S: Scalar> Wrench<S> {
             let joint = if row.moves() { joints.next() } else { joints.peek().copied() };
             link.joint = joint.unwrap_or(Joint::J14);
         }
-        let nothing = Wrenched { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] };
+        let nothing = PerComponent { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] };
         let mut contact = chain.last().map_or(nothing, |last| fold(&parameters.pose, last));
         // Fold fixed rows between the cell and the joint that moves it.
         let mut rows = chain.len();
@@ -169,7 +169,7 @@ impl<S: Scalar> Wrench<S> {
             if let Some(row) = rows.checked_sub(1).and_then(|last| chain.get(last)) {
                 // Without the position of a prismatic joint.
                 let link = Link::new(row, Live::ALL).0;
-                link.twist_and_shift::<Held>(&mut contact, length(row.d));
+                link.twist_and_shift::<Saturating>(&mut contact, length(row.d));
             }
         }
         self.links.get_mut(..rows).unwrap_or_default().reverse();
@@ -184,7 +184,7 @@ impl<S: Scalar> Wrench<S> {
 
 impl<S: Scalar> Kernel<S> for Wrench<S> {
     fn new(parameters: &Parameters) -> Self {
-        let mut kernel = Self::nothing();
+        let mut kernel = Self::empty();
         kernel.prepare(parameters);
         kernel
     }
@@ -197,7 +197,7 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
         } else {
             let moving = jacobian.get_mut(..self.joint).unwrap_or_default().iter_mut().rev();
             let positions = joints.get(..self.joint).unwrap_or_default().iter().rev();
-            seldom();
+            cold_path();
             down(self.contact, links, moving, positions);
         }
     }
@@ -207,7 +207,7 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
 /// in which no number can leave its range.
 #[inline(always)]
 fn down_bounded<S: Scalar>(
-    mut wrench: Wrenched<S::Number>,
+    mut wrench: PerComponent<S::Number>,
     links: &[Link<S::Number>],
     joints: &[Q1_14; MAX_JOINTS],
     jacobian: &mut [S; MAX_JOINTS],
@@ -215,7 +215,7 @@ fn down_bounded<S: Scalar>(
     let mut links = links.iter();
     let Some(mut link) = links.next() else { return };
     loop {
-        let (Some(row), Some(position)) = (link.joint.of_mut(jacobian), link.joint.of(joints)) else {
+        let (Some(row), Some(position)) = (link.joint.get_mut(jacobian), link.joint.get(joints)) else {
             return;
         };
         let [.., moment] = wrench.moment;
@@ -225,8 +225,8 @@ fn down_bounded<S: Scalar>(
         link = next;
         if link.is_due(due::MORE) {
             while link.is_due(due::PASS) {
-                seldom();
-                link.pass(&mut wrench);
+                cold_path();
+                link.apply_fixed(&mut wrench);
                 let Some(next) = links.next() else { return };
                 link = next;
             }
@@ -240,7 +240,7 @@ fn down_bounded<S: Scalar>(
 /// Like [`down_bounded`], for any chain, with saturation.
 #[inline(never)]
 fn down<'a, S: Scalar + 'a>(
-    mut wrench: Wrenched<S::Number>,
+    mut wrench: PerComponent<S::Number>,
     links: &[Link<S::Number>],
     mut moving: impl Iterator<Item = &'a mut S>,
     mut positions: impl Iterator<Item = &'a Q1_14>,
@@ -254,18 +254,18 @@ fn down<'a, S: Scalar + 'a>(
         if index > 0 {
             let d = slide
                 .map_or_else(|| link.own_d(), |slide| Some(S::Number::word(link.d.saturating_add(slide))));
-            link.twist_and_shift::<Held>(&mut wrench, d);
+            link.twist_and_shift::<Saturating>(&mut wrench, d);
         } else if let Some(slide) = slide {
             // The own row is folded without the position of its joint.
             let d = Some(S::Number::word(slide));
-            Link::shift::<Held>(&mut wrench, d, None);
+            Link::shift::<Saturating>(&mut wrench, d, None);
         }
-        let Wrenched { force: [.., force], moment: [.., moment] } = wrench;
+        let PerComponent { force: [.., force], moment: [.., moment] } = wrench;
         if let Some(row) = &mut row {
             **row = S::from_number(if slide.is_some() { force } else { moment });
         }
         match link.kind {
-            RowKind::Revolute if link.is_due(due::TURN) => link.turn::<Held>(&mut wrench, position),
+            RowKind::Revolute if link.is_due(due::TURN) => link.turn::<Saturating>(&mut wrench, position),
             RowKind::Revolute => {}
             RowKind::Prismatic | RowKind::Fixed => link.turn_by_offset(&mut wrench),
         }
@@ -341,15 +341,15 @@ impl<N: Number> Link<N> {
 
     /// Applies `Tz(d) Tx(a) Rx(alpha)`.
     #[inline(always)]
-    fn twist_and_shift<R: Rounding>(&self, wrench: &mut Wrenched<N>, d: Option<N>) {
+    fn twist_and_shift<R: Rounding>(&self, wrench: &mut PerComponent<N>, d: Option<N>) {
         self.twist_by_alpha::<R>(wrench);
         Self::shift::<R>(wrench, d, self.own_a());
     }
 
     /// Applies `Rx(alpha)`.
     #[inline(always)]
-    fn twist_by_alpha<R: Rounding>(&self, wrench: &mut Wrenched<N>) {
-        let Wrenched { force: [_, fy, fz], moment: [_, my, mz] } = wrench;
+    fn twist_by_alpha<R: Rounding>(&self, wrench: &mut PerComponent<N>) {
+        let PerComponent { force: [_, fy, fz], moment: [_, my, mz] } = wrench;
         if self.is_due(due::AHEAD) {
             (*fy, *fz) = (R::negative(*fz), *fy);
             (*my, *mz) = (R::negative(*mz), *my);
@@ -360,18 +360,18 @@ impl<N: Number> Link<N> {
             (*fy, *fz) = (R::negative(*fy), R::negative(*fz));
             (*my, *mz) = (R::negative(*my), R::negative(*mz));
         } else if let Twist::Other { sine, cosine } = self.twist {
-            seldom();
+            cold_path();
             self.twist_by([sine, cosine], wrench);
         }
     }
 
     /// Applies `Rx` with an angle that is not a multiple of quarter turns, computing only what is due.
     #[inline(never)]
-    fn twist_by(&self, [sine, cosine]: [N; 2], wrench: &mut Wrenched<N>) {
-        let Wrenched { force: [_, fy, fz], moment: [_, my, mz] } = *wrench;
+    fn twist_by(&self, [sine, cosine]: [N; 2], wrench: &mut PerComponent<N>) {
+        let PerComponent { force: [_, fy, fz], moment: [_, my, mz] } = *wrench;
         let along = |y: N, z: N| N::rounded_difference(cosine.times(y), sine.times(z));
         let across = |y: N, z: N| N::rounded_sum(sine.times(y), cosine.times(z));
-        let Wrenched { force: [_, new_fy, new_fz], moment: [_, new_my, new_mz] } = wrench;
+        let PerComponent { force: [_, new_fy, new_fz], moment: [_, new_my, new_mz] } = wrench;
         if self.is_due(due::TWISTED_FY) {
             *new_fy = along(fy, fz);
         }
@@ -388,8 +388,8 @@ impl<N: Number> Link<N> {
 
     /// Moves the reference point of the moment by (a, 0, d) towards the base.
     #[inline(always)]
-    fn shift<R: Rounding>(wrench: &mut Wrenched<N>, d: Option<N>, a: Option<N>) {
-        let Wrenched { force: [fx, fy, fz], moment: [mx, my, mz] } = wrench;
+    fn shift<R: Rounding>(wrench: &mut PerComponent<N>, d: Option<N>, a: Option<N>) {
+        let PerComponent { force: [fx, fy, fz], moment: [mx, my, mz] } = wrench;
         match (d, a) {
             (None, None) => {}
             (Some(d), None) => {
@@ -410,8 +410,8 @@ impl<N: Number> Link<N> {
 
     /// Applies `Rz(theta)` of a revolute joint at this position, computing only what is due.
     #[inline(always)]
-    fn turn<R: Rounding>(&self, wrench: &mut Wrenched<N>, position: Q1_14) {
-        let turn = Turn(N::sine_cosine(N::plus_angle(position, self.offset)));
+    fn turn<R: Rounding>(&self, wrench: &mut PerComponent<N>, position: Q1_14) {
+        let turn = Rotation(N::sine_cosine(N::plus_angle(position, self.offset)));
         if self.is_due(due::ALL) {
             turn.all::<R>(wrench);
         } else {
@@ -420,26 +420,26 @@ impl<N: Number> Link<N> {
     }
 
     /// Applies `Rz(theta)` of a row that does not turn.
-    fn turn_by_offset(&self, wrench: &mut Wrenched<N>) {
+    fn turn_by_offset(&self, wrench: &mut PerComponent<N>) {
         if let Some(turn) = self.constant
             && self.is_due(due::TURN)
         {
-            Turn(turn).some::<Held>(wrench, self.due);
+            Rotation(turn).some::<Saturating>(wrench, self.due);
         }
     }
 
     /// Applies a whole row without a joint.
     #[inline(never)]
-    fn pass(&self, wrench: &mut Wrenched<N>) {
-        self.twist_and_shift::<Held>(wrench, self.own_d());
+    fn apply_fixed(&self, wrench: &mut PerComponent<N>) {
+        self.twist_and_shift::<Saturating>(wrench, self.own_d());
         self.turn_by_offset(wrench);
     }
 }
 
 /// `Rz`, given by its sine and cosine.
-struct Turn<N>([N; 2]);
+struct Rotation<N>([N; 2]);
 
-impl<N: Number> Turn<N> {
+impl<N: Number> Rotation<N> {
     #[inline(always)]
     fn x<R: Rounding>(&self, x: N, y: N) -> N {
         let Self([sine, cosine]) = self;
@@ -453,16 +453,16 @@ impl<N: Number> Turn<N> {
     }
 
     #[inline(always)]
-    fn all<R: Rounding>(&self, Wrenched { force: [fx, fy, _], moment: [mx, my, _] }: &mut Wrenched<N>) {
+    fn all<R: Rounding>(&self, PerComponent { force: [fx, fy, _], moment: [mx, my, _] }: &mut PerComponent<N>) {
         (*fx, *fy) = (self.x::<R>(*fx, *fy), self.y::<R>(*fx, *fy));
         (*mx, *my) = (self.x::<R>(*mx, *my), self.y::<R>(*mx, *my));
     }
 
     /// Computes only what is due.
     #[inline(always)]
-    fn some<R: Rounding>(&self, wrench: &mut Wrenched<N>, due: u32) {
-        let Wrenched { force: [fx, fy, _], moment: [mx, my, _] } = *wrench;
-        let Wrenched { force: [new_fx, new_fy, _], moment: [new_mx, new_my, _] } = wrench;
+    fn some<R: Rounding>(&self, wrench: &mut PerComponent<N>, due: u32) {
+        let PerComponent { force: [fx, fy, _], moment: [mx, my, _] } = *wrench;
+        let PerComponent { force: [new_fx, new_fy, _], moment: [new_mx, new_my, _] } = wrench;
         if due & due::FX != 0 {
             *new_fx = self.x::<R>(fx, fy);
         }

@@ -30,21 +30,21 @@ use node_ids::NodeIds;
 use port::Port;
 
 /// Interval of hellos.
-const HELLO: Span = Span::from_millis(250);
+const HELLO_INTERVAL: Span = Span::from_millis(250);
 /// Maximum time to wait for a grant before trying another port.
 const JOIN_TIMEOUT: Span = Span::from_millis(5);
 /// Interval of local repairs: the first, and the maximum.
-const REPAIR: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
+const REPAIR_INTERVALS: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
 /// Interval of leaves to the gateway's side until it acknowledges; it accepts sums until then.
-const AGAIN: Span = Span::from_millis(20);
+const LEAVE_INTERVAL: Span = Span::from_millis(20);
 /// Number of ports, including a root's wire to the gateway's side.
-const ALL: usize = PORTS + 1;
+const ALL_PORTS: usize = PORTS + 1;
 /// Capacity for outgoing messages, which the shell collects after every call.
-const OUTBOX: usize = 32;
+const OUTBOX_CAPACITY: usize = 32;
 
 /// The reason for the loss of a parent, which determines whether the parent may still accept a sum.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(crate) enum Lost {
+pub(crate) enum LossReason {
     /// The parent did not accept the last sums, or refuses this child: it accepts no more.
     Done,
     /// The link is down in one direction, or the parent is unreachable itself: it may accept sums until it
@@ -64,19 +64,19 @@ struct Parent {
 struct FormerParent {
     port: usize,
     /// True after it acknowledged the leave: it accepts no more sums.
-    heard: bool,
+    acknowledged: bool,
     since: Micros,
     /// The time to resend the leave.
-    again: Micros,
+    resend_at: Micros,
 }
 
 impl FormerParent {
     const fn new(port: usize, heard: bool, now: Micros) -> Self {
-        Self { port, heard, since: now, again: Self::next(port, now) }
+        Self { port, acknowledged: heard, since: now, resend_at: Self::next(port, now) }
     }
 
     const fn next(port: usize, now: Micros) -> Micros {
-        Micros(now.0 + if port == UPLINK { AGAIN.0 } else { HELLO.0 })
+        Micros(now.0 + if port == UPLINK { LEAVE_INTERVAL.0 } else { HELLO_INTERVAL.0 })
     }
 }
 
@@ -85,24 +85,24 @@ impl FormerParent {
 pub(crate) struct Network {
     wired: u8,
     /// Ports whose input is ignored (bit mask).
-    pub(crate) deaf: u8,
+    pub(crate) ignored_ports: u8,
     node_ids: NodeIds,
-    ports: [Port; ALL],
+    ports: [Port; ALL_PORTS],
     parent: Option<Parent>,
     /// The best rank that this cell ever had; it follows only better ones.
     best: Option<Rank>,
     /// The last announced rank.
-    offered: Option<Rank>,
+    announced: Option<Rank>,
     joining: Option<(usize, Micros)>,
     /// True while sums are sent: the parent is then not changed without need.
     pub(crate) busy: bool,
     /// True if the parent itself is unreachable.
-    deserted: bool,
+    parent_unreachable: bool,
     /// The time of the next local repair, and the interval after it.
     repair: Option<(Micros, Span)>,
     /// The last forwarded repair: its round, true if it went to all ports instead of the parent only, and its
     /// time.
-    passed_on: Option<(u8, bool, Micros)>,
+    forwarded_repair: Option<(u8, bool, Micros)>,
     /// The last parent that was left.
     former_parent: Option<FormerParent>,
     reported: Option<[PortState; PORTS]>,
@@ -111,7 +111,7 @@ pub(crate) struct Network {
     /// True if the place in the tree has changed since the last read.
     pub(crate) tree_changed: bool,
     next_hello: Micros,
-    outbox: Deque<(usize, PortMessage), OUTBOX>,
+    outbox: Deque<(usize, PortMessage), OUTBOX_CAPACITY>,
 }
 
 impl Network {
@@ -123,7 +123,7 @@ impl Network {
     /// Connects wires to the ports `wired`. The hellos of many cells are spread by serial number.
     pub(crate) fn wire(&mut self, wired: u8, number: Option<CellId>, serial: u32) {
         (self.wired, self.node_ids.own) = (wired, number);
-        self.next_hello = self.next_hello + phase::by_serial(HELLO, serial);
+        self.next_hello = self.next_hello + phase::by_serial(HELLO_INTERVAL, serial);
     }
 
     /// Returns true if the cell has wires.
@@ -132,8 +132,8 @@ impl Network {
     }
 
     /// Returns true if a port receives: it is wired, and its link is not down.
-    pub(crate) const fn hears(&self, port: usize) -> bool {
-        self.wired & !self.deaf & 1 << port != 0
+    pub(crate) const fn receives(&self, port: usize) -> bool {
+        self.wired & !self.ignored_ports & 1 << port != 0
     }
 
     /// Returns the port of the parent.
@@ -181,14 +181,14 @@ impl Network {
 
     /// Returns true if no former parent can accept a sum: it has acknowledged the leave, or does not exist.
     pub(crate) fn is_released(&self) -> bool {
-        self.former_parent.is_none_or(|former_parent| former_parent.heard)
+        self.former_parent.is_none_or(|former_parent| former_parent.acknowledged)
     }
 
     /// Forgets a former parent after an epoch in which this cell sent no sum, so that the former parent
     /// accepts no more. The gateway's side needs longer, because it relies on the messages of the wire.
     pub(crate) fn forget_former_parent(&mut self, now: Micros) {
         self.former_parent
-            .take_if(|former_parent| former_parent.port != UPLINK || now.since(former_parent.since) >= HELLO);
+            .take_if(|former_parent| former_parent.port != UPLINK || now.elapsed_since(former_parent.since) >= HELLO_INTERVAL);
     }
 
     /// Returns the children: bit p is set if the cell at port p is a child.
@@ -218,7 +218,7 @@ impl Network {
     }
 
     /// Returns a node id that a walk assigned to this cell, once.
-    pub(crate) const fn given(&mut self) -> Option<CellId> {
+    pub(crate) const fn take_assigned(&mut self) -> Option<CellId> {
         self.node_ids.given.take()
     }
 
@@ -235,12 +235,12 @@ impl Network {
         let join = self.joining.map(|(_, requested)| requested + JOIN_TIMEOUT);
         let repair = self.repair.map(|(at, _)| at).filter(|_| self.joining.is_none());
         let silent = self.parent.and_then(|parent| self.ports.get(parent.port)?.silent_at());
-        let leave = self.to_be_reported().map(|former_parent| former_parent.again);
+        let leave = self.unacknowledged_former_parent().map(|former_parent| former_parent.resend_at);
         [join, repair, silent, leave].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
 
     /// Sends a message to the cell at a port.
-    pub(crate) fn say(&mut self, port: usize, message: PortMessage) {
+    pub(crate) fn send(&mut self, port: usize, message: PortMessage) {
         if self.wired >> port & 1 != 0 {
             // The shell collects messages after every call; the next hello makes up for one that does not
             // fit.
@@ -254,20 +254,20 @@ impl Network {
             version: VERSION,
             number: self.node_ids.own.map_or(0, CellId::get),
             port: port.to_le_bytes()[0],
-            hears,
-            up: self.up() == Some(port),
+            receives: hears,
+            is_parent: self.up() == Some(port),
             unnumbered: self.is_unnumbered(),
             rank: self.rank(),
         };
         if hello.rank.is_some() {
-            self.ports.get_mut(port).into_iter().for_each(|port| port.sought = false);
+            self.ports.get_mut(port).into_iter().for_each(|port| port.round_requested = false);
         }
-        self.say(port, PortMessage::Hello(hello));
+        self.send(port, PortMessage::Hello(hello));
     }
 
     fn hello_to_all(&mut self, now: Micros) {
-        self.offered = self.rank();
-        for port in 0..ALL {
+        self.announced = self.rank();
+        for port in 0..ALL_PORTS {
             self.hello(now, port);
         }
     }
@@ -275,10 +275,10 @@ impl Network {
     /// Handles a message from a port that receives, except those about sums: `State` and `Nack`.
     pub(crate) fn handle(&mut self, now: Micros, port: usize, message: PortMessage) {
         match message {
-            PortMessage::Hello(hello) => self.take_hello(now, port, hello),
-            PortMessage::Join => self.let_in(now, port),
-            PortMessage::Grant(rank) => self.join(now, port, rank),
-            PortMessage::Refuse if self.up() == Some(port) => self.lose_parent(now, Lost::Done),
+            PortMessage::Hello(hello) => self.handle_hello(now, port, hello),
+            PortMessage::Join => self.handle_join(now, port),
+            PortMessage::Grant(rank) => self.handle_grant(now, port, rank),
+            PortMessage::Refuse if self.up() == Some(port) => self.lose_parent(now, LossReason::Done),
             PortMessage::Refuse if self.joining.is_some_and(|(requested, _)| requested == port) => {
                 self.distrust(now, port);
                 self.joining = None;
@@ -286,47 +286,47 @@ impl Network {
             }
             PortMessage::Leave => {
                 self.ports.get_mut(port).into_iter().for_each(|port| port.child = None);
-                self.say(port, PortMessage::LeaveAck);
+                self.send(port, PortMessage::LeaveAck);
             }
             PortMessage::LeaveAck => self
                 .former_parent
                 .iter_mut()
-                .for_each(|former_parent| former_parent.heard |= former_parent.port == port),
-            PortMessage::Repair(round) => self.pass_on(now, port, round),
+                .for_each(|former_parent| former_parent.acknowledged |= former_parent.port == port),
+            PortMessage::Repair(round) => self.forward_repair(now, port, round),
             PortMessage::Probe => self.hello(now, port),
             PortMessage::NodeId(walk) if self.up() == Some(port) => self.begin_walk(now, walk),
-            PortMessage::Return(walk) => self.go_on_walking(port, walk),
+            PortMessage::Return(walk) => self.continue_walk(port, walk),
             PortMessage::Refuse | PortMessage::NodeId(_) | PortMessage::State(_) | PortMessage::Nack(_) => {}
         }
-        self.tell_unnumbered(now);
+        self.report_unnumbered(now);
     }
 
-    fn take_hello(&mut self, now: Micros, port: usize, hello: Hello) {
+    fn handle_hello(&mut self, now: Micros, port: usize, hello: Hello) {
         let Some(there) = self.ports.get_mut(port) else { return };
         let number = there.number();
-        let restarted = there.take(now, hello);
+        let restarted = there.record_hello(now, hello);
         let is_child = there.is_child();
         self.tree_changed |=
             there.number() != number && (is_child || self.parent.is_some_and(|it| it.port == port));
         if hello.version != VERSION {
             return;
         }
-        if restarted || !hello.hears {
+        if restarted || !hello.receives {
             self.hello(now, port);
         }
-        if hello.up && !is_child {
-            self.say(port, PortMessage::Refuse);
+        if hello.is_parent && !is_child {
+            self.send(port, PortMessage::Refuse);
         }
         match self.parent {
             Some(parent) if parent.port == port => match hello.rank {
-                _ if !hello.hears => self.lose_parent(now, Lost::Unsure),
+                _ if !hello.receives => self.lose_parent(now, LossReason::Unsure),
                 // The parent is as near as before, nearer, or of a later round.
                 Some(rank) if !parent.rank.is_better_than(rank) => self.follow(now, port, rank),
                 // The parent is unreachable and repairs its route. This cell helps, and its sums are NACKed
                 // meanwhile.
-                None => self.pass_on(now, port, parent.rank.round),
+                None => self.forward_repair(now, port, parent.rank.round),
                 // The parent restarted.
-                Some(_) => self.lose_parent(now, Lost::Unsure),
+                Some(_) => self.lose_parent(now, LossReason::Unsure),
             },
             Some(parent) => self.improve(now, port, parent),
             None => self.search(now),
@@ -336,18 +336,18 @@ impl Network {
     /// Sends the hellos that are due by `until`, so that the cell need not wake up for them.
     pub(crate) fn hello_by(&mut self, now: Micros, until: Micros) {
         if self.exists() && until >= self.next_hello {
-            self.next_hello = phase::next(self.next_hello, HELLO, now);
+            self.next_hello = phase::next(self.next_hello, HELLO_INTERVAL, now);
             let before = self.children();
-            self.ports.iter_mut().for_each(|port| port.pass(now));
+            self.ports.iter_mut().for_each(|port| port.expire(now));
             self.tree_changed |= before != self.children();
             self.hello_to_all(now);
         }
     }
 
     /// Returns a former parent that has not acknowledged the leave.
-    fn to_be_reported(&self) -> Option<FormerParent> {
+    fn unacknowledged_former_parent(&self) -> Option<FormerParent> {
         self.former_parent
-            .filter(|former_parent| !former_parent.heard && self.up() != Some(former_parent.port))
+            .filter(|former_parent| !former_parent.acknowledged && self.up() != Some(former_parent.port))
     }
 
     /// Handles timers that are due at `now`. An early call does nothing.
@@ -356,32 +356,32 @@ impl Network {
             return;
         }
         self.hello_by(now, now);
-        if let Some(former_parent) = self.to_be_reported().filter(|former_parent| now >= former_parent.again)
+        if let Some(former_parent) = self.unacknowledged_former_parent().filter(|former_parent| now >= former_parent.resend_at)
         {
             self.former_parent =
-                Some(FormerParent { again: FormerParent::next(former_parent.port, now), ..former_parent });
-            self.say(former_parent.port, PortMessage::Leave);
+                Some(FormerParent { resend_at: FormerParent::next(former_parent.port, now), ..former_parent });
+            self.send(former_parent.port, PortMessage::Leave);
         }
         let silent = |parent: &Parent| self.ports.get(parent.port).is_none_or(|it| it.hello(now).is_none());
         if self.parent.as_ref().is_some_and(silent) {
             if self.up() == Some(UPLINK) {
                 // The gateway's side may notice it later, and accepts sums until then.
-                self.joining = Some((UPLINK, now + HELLO));
+                self.joining = Some((UPLINK, now + HELLO_INTERVAL));
             }
-            self.lose_parent(now, Lost::Unsure);
+            self.lose_parent(now, LossReason::Unsure);
         }
         if self.parent.is_none() {
             self.search(now);
         } else {
-            self.joining.take_if(|(_, requested)| now.since(*requested) >= JOIN_TIMEOUT);
+            self.joining.take_if(|(_, requested)| now.elapsed_since(*requested) >= JOIN_TIMEOUT);
         }
-        self.tell_unnumbered(now);
+        self.report_unnumbered(now);
     }
 
     /// Announces to the parent that the sums from this epoch on are for it.
     pub(crate) fn state(&mut self, epoch: Epoch) {
         if let Some(up) = self.up().filter(|up| *up != UPLINK) {
-            self.say(up, PortMessage::State(epoch));
+            self.send(up, PortMessage::State(epoch));
         }
     }
 }

@@ -43,7 +43,7 @@ impl Network {
         self.walk_from(0, walk);
     }
 
-    pub(super) fn go_on_walking(&mut self, port: usize, walk: Walk) {
+    pub(super) fn continue_walk(&mut self, port: usize, walk: Walk) {
         if self.node_ids.walking.is_some_and(|(of, at)| at == port && of.walk == walk.walk) {
             self.walk_from(port + 1, walk);
         }
@@ -54,13 +54,13 @@ impl Network {
         let next = (first..PORTS).find(wants).filter(|_| walk.first <= walk.last);
         self.node_ids.walking = next.map(|at| (walk, at));
         match (next, self.up()) {
-            (Some(port), _) => self.say(port, PortMessage::NodeId(walk)),
-            (None, Some(up)) => self.say(up, PortMessage::Return(walk)),
+            (Some(port), _) => self.send(port, PortMessage::NodeId(walk)),
+            (None, Some(up)) => self.send(up, PortMessage::Return(walk)),
             (None, None) => {}
         }
     }
 
-    pub(super) fn tell_unnumbered(&mut self, now: Micros) {
+    pub(super) fn report_unnumbered(&mut self, now: Micros) {
         let unnumbered = self.is_unnumbered();
         if core::mem::replace(&mut self.node_ids.was_unnumbered, unnumbered) != unnumbered
             && let Some(up) = self.up()

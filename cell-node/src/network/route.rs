@@ -4,12 +4,12 @@ use protocol::port::{PortMessage, Rank, UPLINK};
 use protocol::time::{Micros, Span};
 
 use super::port::Port;
-use super::{ALL, FormerParent, JOIN_TIMEOUT, Lost, Network, Parent, REPAIR};
+use super::{ALL_PORTS, FormerParent, JOIN_TIMEOUT, LossReason, Network, Parent, REPAIR_INTERVALS};
 
 impl Network {
     /// Returns true if moving loses no sums: none are sent, or the parent is unreachable itself.
     const fn may_move(&self) -> bool {
-        !self.busy || self.deserted
+        !self.busy || self.parent_unreachable
     }
 
     /// Sends a join to a port that is nearer than the parent, if moving loses no sums.
@@ -18,7 +18,7 @@ impl Network {
         let nearer = rank.is_some_and(|rank| rank.is_better_than(parent.rank));
         if nearer && self.may_move() && self.joining.is_none() {
             self.joining = Some((port, now));
-            self.say(port, PortMessage::Join);
+            self.send(port, PortMessage::Join);
         }
     }
 
@@ -31,14 +31,14 @@ impl Network {
         }
         let own = rank.below();
         self.best = Some(own);
-        self.deserted = false;
-        let offered = self.offered.replace(own);
+        self.parent_unreachable = false;
+        let offered = self.announced.replace(own);
         let is_as_deep = offered.is_some_and(|offered| offered.depth == own.depth);
         self.tree_changed |= !is_as_deep || before.is_none_or(|before| before.port != port);
         if !is_as_deep && !self.busy {
             return self.hello_to_all(now);
         }
-        for port in (0..ALL).filter(|_| offered != Some(own)) {
+        for port in (0..ALL_PORTS).filter(|_| offered != Some(own)) {
             if self.ports.get(port).is_some_and(|port| port.needs_round(now)) {
                 self.hello(now, port);
             }
@@ -46,9 +46,9 @@ impl Network {
     }
 
     /// Handles a join: a cell requests to send its sums here.
-    pub(super) fn let_in(&mut self, now: Micros, port: usize) {
+    pub(super) fn handle_join(&mut self, now: Micros, port: usize) {
         let Some(rank) = self.rank().filter(|_| self.up() != Some(port)) else {
-            return self.say(port, PortMessage::Refuse);
+            return self.send(port, PortMessage::Refuse);
         };
         let number = self.number_at(port);
         // Two wires may lead to the same cell, whose sums use one of them.
@@ -60,7 +60,7 @@ impl Network {
             }
         }
         self.tree_changed = true;
-        self.say(port, PortMessage::Grant(rank));
+        self.send(port, PortMessage::Grant(rank));
     }
 
     fn is_good(&self, rank: Rank) -> bool {
@@ -68,17 +68,17 @@ impl Network {
     }
 
     /// Handles a grant of a neighbour.
-    pub(super) fn join(&mut self, now: Micros, port: usize, rank: Rank) {
+    pub(super) fn handle_grant(&mut self, now: Micros, port: usize, rank: Rank) {
         if self.up() == Some(port) {
             return;
         }
         let moves = self.parent.is_none_or(|parent| self.may_move() && rank.is_better_than(parent.rank));
         if !moves || !self.is_good(rank) {
-            return self.say(port, PortMessage::Leave);
+            return self.send(port, PortMessage::Leave);
         }
         if let Some(before) = self.parent {
             self.former_parent = Some(FormerParent::new(before.port, false, now));
-            self.say(before.port, PortMessage::Leave);
+            self.send(before.port, PortMessage::Leave);
         }
         self.joining = None;
         self.repair = None;
@@ -91,12 +91,12 @@ impl Network {
     }
 
     /// Handles the loss of the parent, and searches for another route.
-    pub(crate) fn lose_parent(&mut self, now: Micros, how: Lost) {
+    pub(crate) fn lose_parent(&mut self, now: Micros, how: LossReason) {
         let Some(parent) = self.parent.take() else { return };
         self.tree_changed = true;
-        self.deserted = false;
-        self.former_parent = Some(FormerParent::new(parent.port, how == Lost::Done, now));
-        self.say(parent.port, PortMessage::Leave);
+        self.parent_unreachable = false;
+        self.former_parent = Some(FormerParent::new(parent.port, how == LossReason::Done, now));
+        self.send(parent.port, PortMessage::Leave);
         self.distrust(now, parent.port);
         self.search(now);
     }
@@ -111,7 +111,7 @@ impl Network {
             return;
         }
         if let Some((requested, at)) = self.joining {
-            if now.since(at) < JOIN_TIMEOUT {
+            if now.elapsed_since(at) < JOIN_TIMEOUT {
                 return;
             }
             self.joining = None;
@@ -123,16 +123,16 @@ impl Network {
             good.reduce(|nearest, next| if next.1.is_better_than(nearest.1) { next } else { nearest });
         if let Some((port, _)) = nearest {
             self.joining = Some((port, now));
-            return self.say(port, PortMessage::Join);
+            return self.send(port, PortMessage::Join);
         }
         // A cell that never had a rank accepts any rank, so it waits for the first hello with one.
         let Some(best) = self.best else { return };
-        let (at, wait) = self.repair.unwrap_or((now, REPAIR.0));
+        let (at, wait) = self.repair.unwrap_or((now, REPAIR_INTERVALS.0));
         if now >= at {
-            self.repair = Some((now + wait, Span(wait.0 * 2).min(REPAIR.1)));
+            self.repair = Some((now + wait, Span(wait.0 * 2).min(REPAIR_INTERVALS.1)));
             // If no other port leads to the gateway, or the first repair found no route, it may be through a
             // child or a former parent.
-            let is_first = wait == REPAIR.0;
+            let is_first = wait == REPAIR_INTERVALS.0;
             let leads = self.ports.iter().any(|port| port.rank(now).is_some());
             self.repair_at(now, best.round, None, !(leads && is_first));
         }
@@ -141,36 +141,36 @@ impl Network {
     /// Requests a round later than `round` on the ports that lead to the gateway, or on all working ports,
     /// except `but`.
     fn repair_at(&mut self, now: Micros, round: u8, but: Option<usize>, all: bool) {
-        for port in (0..ALL).filter(|port| Some(*port) != but) {
+        for port in (0..ALL_PORTS).filter(|port| Some(*port) != but) {
             let leads = |port: &Port| port.rank(now).is_some() || (all && port.works(now));
             if self.ports.get(port).is_some_and(leads) {
-                self.say(port, PortMessage::Repair(round));
+                self.send(port, PortMessage::Repair(round));
             }
         }
     }
 
     /// Handles a repair: a neighbour needs a round later than `round`. A child's repair is forwarded to the
     /// parent; a parent's to all other ports, one of which may have another route.
-    pub(super) fn pass_on(&mut self, now: Micros, port: usize, round: u8) {
+    pub(super) fn forward_repair(&mut self, now: Micros, port: usize, round: u8) {
         let Some(parent) = self.parent else { return };
         if parent.rank.round.wrapping_sub(round).cast_signed() > 0 {
             return self.hello(now, port);
         }
-        self.ports.get_mut(port).into_iter().for_each(|port| port.sought = true);
+        self.ports.get_mut(port).into_iter().for_each(|port| port.round_requested = true);
         let is_deserted = parent.port == port;
-        self.deserted |= is_deserted;
+        self.parent_unreachable |= is_deserted;
         // A repair that went to the parent only does not count for a deserted cell: the parent may have two
         // wires to this cell, and repair on both.
         let again =
-            |(of, everywhere, at)| of == round && now.since(at) < REPAIR.0 && (everywhere || !is_deserted);
-        if self.passed_on.is_some_and(again) {
+            |(of, everywhere, at)| of == round && now.elapsed_since(at) < REPAIR_INTERVALS.0 && (everywhere || !is_deserted);
+        if self.forwarded_repair.is_some_and(again) {
             return;
         }
-        self.passed_on = Some((round, is_deserted, now));
+        self.forwarded_repair = Some((round, is_deserted, now));
         if is_deserted {
             self.repair_at(now, round, Some(port), true);
         } else {
-            self.say(parent.port, PortMessage::Repair(round));
+            self.send(parent.port, PortMessage::Repair(round));
         }
     }
 }

@@ -26,7 +26,7 @@ const fn rank(round: u8, depth: u8) -> Rank {
 }
 
 fn neighbour(number: u8, rank: Option<Rank>) -> Hello {
-    Hello { version: VERSION, number, port: 3, hears: true, up: false, unnumbered: false, rank }
+    Hello { version: VERSION, number, port: 3, receives: true, is_parent: false, unnumbered: false, rank }
 }
 
 /// Returns a cell whose parent at port 0 has this rank, at a time in ms.
@@ -51,17 +51,17 @@ fn adopt(network: &mut Network, now: Micros, port: usize, number: u8) {
 #[test]
 fn a_port_receives_when_it_is_wired_and_its_link_is_not_down() {
     let mut network = network(0b0011);
-    network.deaf = 0b0110;
-    assert_eq!([0, 1, 2, 3].map(|port| network.hears(port)), [true, false, false, false]);
+    network.ignored_ports = 0b0110;
+    assert_eq!([0, 1, 2, 3].map(|port| network.receives(port)), [true, false, false, false]);
 }
 
 // HELLO-3
 #[test]
 fn a_port_leads_to_the_cell_whose_hellos_come_there() {
     let mut network = network(0b1111);
-    let hello = Hello { port: 2, hears: false, ..neighbour(7, None) };
+    let hello = Hello { port: 2, receives: false, ..neighbour(7, None) };
     network.handle(Micros(0), 1, PortMessage::Hello(hello));
-    let there = PortState { number: 7, port: 2, hears: true, works: false, other_version: false };
+    let there = PortState { number: 7, port: 2, receives: true, works: false, other_version: false };
     let nothing = PortState::default();
     assert_eq!(network.port_states(Micros(600 * MS)), [nothing, there, nothing, nothing]);
     assert_eq!(network.port_states(Micros(600 * MS + 1)), [nothing; PORTS]);
@@ -157,7 +157,7 @@ fn the_tree_changes_with_the_node_id_of_the_parent_or_a_child() {
     let mut changes = |port, number, up| {
         network.tree_changed = false;
         let rank = Some(rank(1, 1)).filter(|_| port == 0);
-        network.handle(now, port, PortMessage::Hello(Hello { up, ..neighbour(number, rank) }));
+        network.handle(now, port, PortMessage::Hello(Hello { is_parent: up, ..neighbour(number, rank) }));
         network.tree_changed
     };
     assert_eq!([changes(0, 1, false), changes(1, 7, true)], [false; 2], "they are the same");
@@ -169,7 +169,7 @@ fn the_tree_changes_with_the_node_id_of_the_parent_or_a_child() {
 #[test]
 fn a_leave_is_repeated_every_quarter_of_a_second_until_it_is_acknowledged() {
     let mut network = below(100, rank(1, 1));
-    let deaf = Hello { hears: false, ..neighbour(1, Some(rank(1, 1))) };
+    let deaf = Hello { receives: false, ..neighbour(1, Some(rank(1, 1))) };
     network.handle(Micros(100 * MS), 0, PortMessage::Hello(deaf));
     let mut leaves = |now| {
         network.handle_time(Micros(now * MS));
@@ -234,7 +234,7 @@ fn a_walk_goes_to_the_children_below_which_a_cell_has_no_node_id() {
     adopt(&mut network, now, 1, 7);
     adopt(&mut network, now, 2, 8);
     let unnumbered = |network: &mut Network, port, unnumbered| {
-        network.handle(now, port, PortMessage::Hello(Hello { up: true, unnumbered, ..neighbour(8, None) }));
+        network.handle(now, port, PortMessage::Hello(Hello { is_parent: true, unnumbered, ..neighbour(8, None) }));
         let announced = said(network).into_iter().find_map(|said| {
             let (0, PortMessage::Hello(hello)) = said else { return None };
             Some(hello.unnumbered)

@@ -1,6 +1,6 @@
 //! The address claim of a cell: claimed at the start, defended, and stated in each heartbeat.
 
-use protocol::message::{Heartbeat, NetworkPage, Refused, State};
+use protocol::message::{Heartbeat, NetworkPage, RejectedCounts, State};
 use protocol::time::{Micros, Span};
 
 use super::Node;
@@ -8,18 +8,18 @@ use crate::identity::Identity;
 use crate::phase;
 
 /// Interval of heartbeats.
-pub const HEARTBEAT: Span = Span::from_millis(250);
+pub const HEARTBEAT_INTERVAL: Span = Span::from_millis(250);
 /// Minimum time for which a new cell checks for another one with its node id.
-pub const CLAIM: Span = Span::from_millis(250);
+pub const CLAIM_TIME: Span = Span::from_millis(250);
 /// Time over which first heartbeats are spread by serial number. Otherwise two cells with one node id that
 /// are switched on together would send different data with one identifier in the same bit time.
-const FIRST_WORD: Span = Span::from_millis(64);
+const FIRST_HEARTBEAT_SPREAD: Span = Span::from_millis(64);
 /// Minimum interval between two defences of the node id.
-const DEFEND: Span = Span::from_millis(10);
+const DEFENCE_INTERVAL: Span = Span::from_millis(10);
 
 /// The stage of an address claim.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Claim {
+pub(super) enum ClaimStage {
     /// The claim has not been sent yet.
     Unsent,
     /// The claim has been sent; the cell waits for objections of another owner.
@@ -31,65 +31,65 @@ pub(super) enum Claim {
 /// The address claim, and the heartbeats that carry it.
 #[derive(Debug)]
 pub(super) struct AddressClaim {
-    pub(super) stage: Claim,
+    pub(super) stage: ClaimStage,
     pub(super) next_heartbeat: Micros,
     /// True if a sync requested a heartbeat, which waits for the end of the present epoch.
     pub(super) sync_waits: bool,
     /// The time of the last defence of the node id.
     defended: Option<Micros>,
     /// The serial number of another cell that owns the node id.
-    pub(super) taken: Option<u32>,
+    pub(super) other_owner: Option<u32>,
 }
 
 impl AddressClaim {
     /// Starts a claim. Without a node id it never becomes due.
     pub(super) fn new(identity: Identity, now: Micros) -> Self {
-        let wait = phase::by_serial(FIRST_WORD, identity.serial);
+        let wait = phase::by_serial(FIRST_HEARTBEAT_SPREAD, identity.serial);
         let next_heartbeat = identity.cell.map_or(Micros(u64::MAX), |_| now + wait);
-        Self { stage: Claim::Unsent, next_heartbeat, sync_waits: false, defended: None, taken: None }
+        Self { stage: ClaimStage::Unsent, next_heartbeat, sync_waits: false, defended: None, other_owner: None }
     }
 
     /// Returns true if this cell owns the node id.
     pub(super) fn is_settled(&self) -> bool {
-        self.stage == Claim::Settled
+        self.stage == ClaimStage::Settled
     }
 }
 
 impl Node {
     /// Sends the heartbeat if it is due: the first one is the address claim, and with the second the cell
     /// owns the node id.
-    pub(super) fn claim_in_time(&mut self, now: Micros) {
+    pub(super) fn send_due_heartbeat(&mut self, now: Micros) {
         let Some(cell) = self.identity.cell.filter(|_| now >= self.claim.next_heartbeat) else { return };
-        if self.claim.stage == Claim::Unsent {
-            self.claim.stage = Claim::Sent;
-            self.claim.next_heartbeat = now + CLAIM + phase::by_number(HEARTBEAT, cell);
+        if self.claim.stage == ClaimStage::Unsent {
+            self.claim.stage = ClaimStage::Sent;
+            self.claim.next_heartbeat = now + CLAIM_TIME + phase::by_number(HEARTBEAT_INTERVAL, cell);
             return self.push_heartbeat();
         }
-        self.claim.stage = Claim::Settled;
+        self.claim.stage = ClaimStage::Settled;
         self.regular_heartbeat(now);
     }
 
     /// Sends a regular heartbeat with all changed pages, four times a second.
     pub(super) fn regular_heartbeat(&mut self, now: Micros) {
         self.push_heartbeat();
-        self.beat_network(now);
-        let pages = self.sensing.beat(now);
+        self.report_with_heartbeat(now);
+        let pages = self.sensing.heartbeat_pages(now);
         self.push_sensors(pages);
         self.beat_zero();
-        self.claim.next_heartbeat = phase::next(self.claim.next_heartbeat, HEARTBEAT, now);
+        self.claim.next_heartbeat = phase::next(self.claim.next_heartbeat, HEARTBEAT_INTERVAL, now);
     }
 
     /// Handles a frame that another cell sent with our node id. While claiming it, this cell gives way,
     /// unless the other one also claims it and has the larger serial number. Once it owns the node id, it
     /// defends it, but only against claims: two settled cells would answer each other forever.
-    pub(super) fn hear_own_number(&mut self, now: Micros, page: &NetworkPage) {
+    pub(super) fn handle_own_node_id(&mut self, now: Micros, page: &NetworkPage) {
         self.flags = self.flags.with(State::DUPLICATE, true);
         let other = if let NetworkPage::Heartbeat(other) = page { Some(other) } else { None };
         let claims = other.is_some_and(|other| other.state.has(State::CLAIMING));
         let stays = claims && other.is_some_and(|other| other.serial > self.identity.serial);
         if !self.claim.is_settled() && !stays {
-            self.claim.taken = Some(other.map_or(0, |other| other.serial));
-        } else if claims && self.claim.defended.is_none_or(|at| now.since(at) >= DEFEND) {
+            self.claim.other_owner = Some(other.map_or(0, |other| other.serial));
+        } else if claims && self.claim.defended.is_none_or(|at| now.elapsed_since(at) >= DEFENCE_INTERVAL) {
             self.claim.defended = Some(now);
             self.push_heartbeat();
         }
@@ -106,7 +106,7 @@ impl Node {
     }
 
     pub(super) fn push_heartbeat(&mut self) {
-        let Refused { length, crc, foreign, meaning, incomplete, stimuli } = self.receiver.refused;
+        let RejectedCounts { length, crc, foreign, meaning, incomplete, stimuli } = self.receiver.refused;
         let rejected =
             [length, crc, foreign, meaning, incomplete, stimuli].into_iter().fold(0, u16::wrapping_add);
         let heartbeat = Heartbeat {

@@ -35,7 +35,7 @@ impl Configuration {
     #[inline(never)]
     pub(super) fn new() -> Self {
         let parameters = Parameters::default();
-        let in_use = InUse { parameters, kernel: Wrench::nothing(), hash: 0 };
+        let in_use = InUse { parameters, kernel: Wrench::empty(), hash: 0 };
         Self { is_configured: false, in_use, staged: parameters }
     }
 

@@ -24,34 +24,34 @@ use heapless::Deque;
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q7_8;
 use protocol::id::{Command, Id, Kind, Node as Address};
-use protocol::message::{From, Heard, Joints, Message, NetworkPage, SensorPage, State};
+use protocol::message::{AppliesFrom, ReceivedCounts, Joints, Message, NetworkPage, SensorPage, State};
 use protocol::packet::{self, Epoch, Length, Lengths, Packet};
 use protocol::port::{PORTS, PortMessage};
 use protocol::time::{Micros, Span};
 
 use crate::baseline::Baseline;
 use crate::contact::{Force, Torque};
-use crate::flash::{Flash, Kept};
-use crate::identity::{Identity, OWN};
+use crate::flash::{FlashState, FlashContent};
+use crate::identity::{Identity, OWN_IDS};
 use crate::kernel::Kernel;
-use crate::sum::Words;
+use crate::sum::SumWords;
 use claim::AddressClaim;
 use configuration::{Configuration, InUse};
-use parameters::{Storing, Switches};
+use parameters::{PendingStore, Switches};
 use receiver::Receiver;
 use rest::Rest;
 use sensing::{Pages, Sensing};
 use stimuli::{Arrival, Stimuli};
 use summing::Summing;
-use zero::Reported;
+use zero::ReportedBaseline;
 
-pub use claim::{CLAIM, HEARTBEAT};
-pub use stimuli::PENDING;
+pub use claim::{CLAIM_TIME, HEARTBEAT_INTERVAL};
+pub use stimuli::MAX_PENDING;
 
 /// Maximum number of identifiers that a cell receives: its own, and the sums of the cells at its ports.
-pub const HEARD: usize = OWN + PORTS;
+pub const MAX_RECEIVED_IDS: usize = OWN_IDS + PORTS;
 /// Capacity for outgoing packets, which the shell collects after every call.
-const OUTBOX: usize = 16;
+const OUTBOX_CAPACITY: usize = 16;
 
 /// A cell.
 #[derive(Debug)]
@@ -62,19 +62,19 @@ pub struct Node {
     switches: Switches,
     stimuli: Stimuli,
     baseline: Baseline,
-    reported: Reported,
+    reported: ReportedBaseline,
     sensing: Sensing,
     summing: Summing,
     receiver: Receiver,
-    heard: Heard,
+    received: ReceivedCounts,
     /// Stored flags such as halted and duplicate; derived flags are added in each heartbeat.
     flags: State,
     /// The epoch of the last accepted joints.
     epoch: Option<Epoch>,
     active: bool,
     rest: Rest,
-    storing: Option<Storing>,
-    outbox: Deque<Message, OUTBOX>,
+    storing: Option<PendingStore>,
+    outbox: Deque<Message, OUTBOX_CAPACITY>,
     sent: u16,
 }
 
@@ -82,7 +82,7 @@ impl Node {
     /// Starts a cell. Its first heartbeat is its address claim. In `test_mode` it uses stimuli instead of
     /// sensors.
     #[must_use]
-    pub fn new(identity: Identity, format: Format, flash: &Flash, test_mode: bool, now: Micros) -> Self {
+    pub fn new(identity: Identity, format: Format, flash: &FlashState, test_mode: bool, now: Micros) -> Self {
         let mut node = Self::unconfigured(identity, format, test_mode, now);
         node.restore(flash);
         node
@@ -101,11 +101,11 @@ impl Node {
             switches: Switches::default(),
             stimuli: Stimuli::default(),
             baseline: Baseline::default(),
-            reported: Reported::default(),
+            reported: ReportedBaseline::default(),
             sensing: Sensing::default(),
             summing: Summing::new(now),
             receiver: Receiver::new(format),
-            heard: Heard::default(),
+            received: ReceivedCounts::default(),
             flags: State::default().with(State::TEST_MODE, test_mode),
             epoch: None,
             active: false,
@@ -117,9 +117,9 @@ impl Node {
     }
 
     /// Loads the contents of flash.
-    pub fn restore(&mut self, flash: &Flash) {
-        self.flags = self.flags.with(State::FLASH_DAMAGED, *flash == Flash::Damaged);
-        if let Flash::Sound(parameters) = flash {
+    pub fn restore(&mut self, flash: &FlashState) {
+        self.flags = self.flags.with(State::FLASH_DAMAGED, *flash == FlashState::Damaged);
+        if let FlashState::Valid(parameters) = flash {
             self.configuration.start(parameters);
         }
     }
@@ -146,9 +146,9 @@ impl Node {
 
     /// Returns true if the received identifiers, or those that wake the cell, have changed since the last
     /// call.
-    pub fn poll_hears(&mut self) -> bool {
+    pub fn poll_received_ids(&mut self) -> bool {
         let rest = self.rest.poll();
-        self.summing.poll_hears() || rest
+        self.summing.poll_received_ids() || rest
     }
 
     /// Returns its identity.
@@ -159,8 +159,8 @@ impl Node {
 
     /// Returns the serial number of another cell that owns this node id; this cell must then stop sending.
     #[must_use]
-    pub const fn taken(&self) -> Option<u32> {
-        self.claim.taken
+    pub const fn other_owner(&self) -> Option<u32> {
+        self.claim.other_owner
     }
 
     /// Returns the next packet to send.
@@ -170,7 +170,7 @@ impl Node {
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = &mut message {
             heartbeat.sent = self.sent;
         }
-        count(&mut self.sent);
+        increment(&mut self.sent);
         Some(message.encode())
     }
 
@@ -189,17 +189,17 @@ impl Node {
 
     /// Returns the contents to be written to flash. The shell answers with [`Node::handle_stored`].
     #[must_use]
-    pub fn poll_store(&self) -> Option<Kept> {
+    pub fn poll_store(&self) -> Option<FlashContent> {
         let parameters = match self.storing.as_ref()? {
-            Storing::Parameters(parameters, _) => Some(*parameters),
-            Storing::NodeId => self.configuration.in_use().map(|in_use| in_use.parameters),
+            PendingStore::Parameters(parameters, _) => Some(*parameters),
+            PendingStore::NodeId => self.configuration.in_use().map(|in_use| in_use.parameters),
         };
-        Some(Kept { number: self.identity.cell, parameters })
+        Some(FlashContent { number: self.identity.cell, parameters })
     }
 
     /// Returns the identifiers that this cell receives now. The shell reads them again after
     /// [`Node::poll_hears`].
-    pub fn hears(&self) -> impl Iterator<Item = Id> + use<'_> {
+    pub fn received_ids(&self) -> impl Iterator<Item = Id> + use<'_> {
         self.slots().flatten()
     }
 
@@ -212,7 +212,7 @@ impl Node {
         if id == Id::command(Command::Joints) {
             return self.summing.waits_for_children || self.rest.rests();
         }
-        self.summing.heard_parent().is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
+        self.summing.received_parent().is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
     }
 
     /// Returns the packet length of joints, torques and sums, if the cell is configured.
@@ -222,8 +222,8 @@ impl Node {
 
     /// Returns the identifier of each reassembly slot, [`HEARD`] of them.
     fn slots(&self) -> impl Iterator<Item = Option<Id>> + use<'_> {
-        let sums = self.summing.heard.iter().map(|cell| Some(Id::new(Kind::Sum, Address::Cell((*cell)?))));
-        self.identity.hears().into_iter().chain(sums)
+        let sums = self.summing.received.iter().map(|cell| Some(Id::new(Kind::Sum, Address::Cell((*cell)?))));
+        self.identity.received_ids().into_iter().chain(sums)
     }
 
     /// Handles timers that are due at `now`. An early call does nothing.
@@ -232,21 +232,21 @@ impl Node {
         self.after_network(now);
         self.handle_sums(now);
         self.sense_in_time(now);
-        self.claim_in_time(now);
+        self.send_due_heartbeat(now);
     }
 
     /// Handles a frame that arrived `age` ago. Identifiers that this cell does not receive are ignored.
     pub fn handle_frame(&mut self, now: Micros, age: Span, frame: &Frame) {
         let Ok(id) = packet::data_id(frame) else {
-            count(&mut self.receiver.refused.foreign);
+            increment(&mut self.receiver.refused.foreign);
             return;
         };
         let Some(slot) = self.slots().position(|heard| heard == Some(id)) else { return };
-        let lengths = Lengths::of_chain(self.length());
-        let Some(packet) = self.receiver.take(now - age, id, slot, lengths, frame) else { return };
+        let lengths = Lengths::for_chain(self.length());
+        let Some(packet) = self.receiver.receive(now - age, id, slot, lengths, frame) else { return };
         match Message::decode(&packet) {
             Ok(message) => self.handle_message(now, age, message),
-            Err(_) => count(&mut self.receiver.refused.meaning),
+            Err(_) => increment(&mut self.receiver.refused.meaning),
         }
     }
 
@@ -256,33 +256,33 @@ impl Node {
         }
         match message {
             Message::Joints { epoch, joints } => {
-                let taken = self.heard.joints;
-                self.take_joints(now, age, epoch, &joints);
+                let taken = self.received.joints;
+                self.handle_joints(now, age, epoch, &joints);
                 // Stimuli latched at joints that were too old are sent with the next ones.
-                if self.heard.joints != taken {
+                if self.received.joints != taken {
                     self.sense(now);
                     self.report_zero();
                 }
                 self.sense_before_the_next_joints(now);
-                self.speak_before_the_next_joints(now);
+                self.send_before_next_joints(now);
             }
             Message::Halt => {
                 self.flags = self.flags.with(State::HALTED, true);
                 self.active = false;
             }
             Message::Resume => self.flags = self.flags.with(State::HALTED, false),
-            Message::Stimulus { from, page, .. } => self.take_stimulus(from, page),
-            Message::Network { page, .. } => self.hear_own_number(now, &page),
+            Message::Stimulus { from, page, .. } => self.handle_stimulus(from, page),
+            Message::Network { page, .. } => self.handle_own_node_id(now, &page),
             // A cell does not answer until it owns its node id.
             Message::Sync | Message::Report | Message::Configure { .. } if !self.claim.is_settled() => {}
             Message::Sync if self.summing.sum.is_settled(now) => self.push_heartbeat(),
             Message::Sync => {
                 self.claim.sync_waits = true;
-                self.summing.sum.watch();
+                self.summing.sum.schedule_check();
             }
             Message::Report => {
-                self.push_network(NetworkPage::Heard(self.heard));
-                self.push_network(NetworkPage::Refused(self.receiver.refused));
+                self.push_network(NetworkPage::Received(self.received));
+                self.push_network(NetworkPage::Rejected(self.receiver.refused));
                 self.push_sensors(Pages::BOTH);
                 self.push_zero();
                 if self.summing.network.exists() {
@@ -297,11 +297,11 @@ impl Node {
                 self.report_zero();
             }
             Message::Sum { torque, .. } if self.length().is_some_and(|length| torque.length() != length) => {
-                count(&mut self.receiver.refused.meaning);
+                increment(&mut self.receiver.refused.meaning);
             }
             Message::Sum { from, epoch, torque, count } => {
                 let torque = torque.padded().map(Q7_8::from_bits);
-                if self.summing.take(now, age, from, epoch, Words { torque, count }) {
+                if self.summing.handle_sum(now, age, from, epoch, SumWords { torque, count }) {
                     self.handle_sums(now);
                 }
             }
@@ -311,16 +311,16 @@ impl Node {
     }
 
     /// Computes the torques and answers: the paper's Eq. 8 and Algorithm 1.
-    fn take_joints(&mut self, now: Micros, age: Span, epoch: Epoch, joints: &Joints) {
+    fn handle_joints(&mut self, now: Micros, age: Span, epoch: Epoch, joints: &Joints) {
         if self.epoch == Some(epoch) {
-            count(&mut self.heard.joints_repeated);
+            increment(&mut self.received.joints_repeated);
             return;
         }
         // All frames before these joints have been received.
         self.check_missing(now);
         let in_use = self.configuration.in_use();
         if in_use.is_some_and(|in_use| in_use.parameters.joints != joints.in_use) {
-            count(&mut self.receiver.refused.meaning);
+            increment(&mut self.receiver.refused.meaning);
             return;
         }
         // Old joints are not answered, but their stimuli are latched. Otherwise a cell that hung would keep
@@ -328,17 +328,17 @@ impl Node {
         self.epoch = Some(epoch);
         self.stimuli.latch(epoch);
         if let Some(in_use) = in_use {
-            self.baseline.take(&self.stimuli.sensed.skin, in_use.parameters.period_us);
+            self.baseline.process_joints(&self.stimuli.sensed.skin, in_use.parameters.period_us);
         }
         if in_use.is_some_and(|in_use| age > in_use.period()) {
-            count(&mut self.heard.joints_late);
+            increment(&mut self.received.joints_late);
             self.rest.end();
-            return self.summing.sum.skip();
+            return self.summing.sum.skip_epoch();
         }
-        count(&mut self.heard.joints);
+        increment(&mut self.received.joints);
         let answers = self.claim.is_settled() && !self.flags.has(State::HALTED);
-        let Some(in_use) = in_use.filter(|_| answers) else { return self.summing.sum.skip() };
-        let skin = self.baseline.net(&self.stimuli.sensed.skin);
+        let Some(in_use) = in_use.filter(|_| answers) else { return self.summing.sum.skip_epoch() };
+        let skin = self.baseline.subtract_zero(&self.stimuli.sensed.skin);
         let force = Force::fuse(skin.contact, skin.proximity, &in_use.parameters.contact);
         let jacobian;
         let torque = if force.is_active() {
@@ -370,35 +370,35 @@ impl Node {
             None if self.stimuli.are_pending() || self.baseline.is_on() => return,
             // A cell of a network stays awake for its neighbours.
             None if self.summing.network.exists() => return,
-            None => return self.rest.lengthen(),
+            None => return self.rest.count_quiet(),
         };
         let torque = packet::Words::new(in_use.length(), torque);
         self.mark_saturated(torque.is_saturated());
-        count(&mut self.heard.torques);
+        increment(&mut self.received.torques);
         self.push(Message::Torque { from, epoch, torque });
     }
 
     /// Sends hellos and a heartbeat that are due before the next joints now, while the cell is awake.
-    fn speak_before_the_next_joints(&mut self, now: Micros) {
+    fn send_before_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use() else { return };
         let next_joints = now + in_use.period();
         self.summing.network.hello_by(now, next_joints);
-        self.tell_tree(now);
+        self.report_tree(now);
         if self.claim.is_settled() && next_joints > self.claim.next_heartbeat {
             self.regular_heartbeat(now);
         }
     }
 
-    fn take_stimulus(&mut self, from: From, page: SensorPage) {
+    fn handle_stimulus(&mut self, from: AppliesFrom, page: SensorPage) {
         let obeys = self.flags.has(State::TEST_MODE);
         let arrival = if obeys { self.stimuli.push(from, page, self.epoch) } else { Arrival::Refused };
         match arrival {
-            Arrival::InTime => count(&mut self.heard.stimuli),
+            Arrival::InTime => increment(&mut self.received.stimuli),
             Arrival::Late => {
-                count(&mut self.heard.stimuli);
-                count(&mut self.heard.stimuli_late);
+                increment(&mut self.received.stimuli);
+                increment(&mut self.received.stimuli_late);
             }
-            Arrival::Refused => count(&mut self.receiver.refused.stimuli),
+            Arrival::Refused => increment(&mut self.receiver.refused.stimuli),
         }
     }
 
@@ -421,7 +421,7 @@ impl Node {
     }
 }
 
-const fn count(counter: &mut u16) {
+const fn increment(counter: &mut u16) {
     *counter = counter.wrapping_add(1);
 }
 

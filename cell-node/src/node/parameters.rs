@@ -8,7 +8,7 @@ use protocol::parameters::{
 use protocol::time::Micros;
 
 use super::Node;
-use crate::baseline::Refused;
+use crate::baseline::TareRefused;
 
 /// Volatile parameters set at run time: 6 to 9.
 #[derive(Clone, Copy, Debug, Default)]
@@ -26,7 +26,7 @@ pub(super) struct Switches {
 /// The contents being written to flash.
 #[derive(Clone, Copy, Debug)]
 #[expect(clippy::large_enum_variant, reason = "a cell has no heap")]
-pub(super) enum Storing {
+pub(super) enum PendingStore {
     /// Committed parameters, with the request's tag.
     Parameters(Parameters, u8),
     /// The node id that the network assigned.
@@ -46,7 +46,7 @@ impl Node {
             (Some(Parameter::Commit), Request::Write { words, .. }) => {
                 match self.configuration.staged_with(words) {
                     Ok(parameters) => {
-                        self.storing = Some(Storing::Parameters(*parameters, tag));
+                        self.storing = Some(PendingStore::Parameters(*parameters, tag));
                         return;
                     }
                     Err(reason) => Err(reason),
@@ -60,7 +60,7 @@ impl Node {
     /// Handles the result of a write to flash; `written` is true on success.
     pub fn handle_stored(&mut self, written: bool) {
         // A node id that could not be stored is assigned again after the next start.
-        let Some(Storing::Parameters(parameters, tag)) = &self.storing else {
+        let Some(PendingStore::Parameters(parameters, tag)) = &self.storing else {
             self.storing = None;
             return;
         };
@@ -115,7 +115,7 @@ impl Node {
             Parameter::Sensing => Sensing::from_words(words).map(|sensing| switches.sensing = sensing),
             Parameter::Events => Events::from_words(words).map(|events| switches.events = events),
             Parameter::LinksDown => Some(LinksDown::from_words(words))
-                .filter(|links_down| self.flags.has(State::TEST_MODE) && (has_ports || links_down.deaf == 0))
+                .filter(|links_down| self.flags.has(State::TEST_MODE) && (has_ports || links_down.ports == 0))
                 .map(|links_down| switches.links_down = links_down),
             Parameter::Mode => {
                 self.flags = self.flags.with(State::TEST_MODE, words.first() == Some(&1));
@@ -125,12 +125,12 @@ impl Node {
             }
             Parameter::Baseline => Baseline::from_words(words).map(|rule| self.baseline.set(rule)),
             Parameter::Tare => {
-                let how = Tare::from_words(words).ok_or(Answer::CANNOT_BE)?;
+                let how = Tare::from_words(words).ok_or(Answer::INVALID)?;
                 let done = self.baseline.tare(&self.stimuli.sensed.skin, how);
                 return done.map(|()| self.read(parameter)).map_err(|why| match why {
-                    Refused::Off => Answer::CANNOT_BE,
-                    Refused::Touched => Answer::TOUCHED,
-                    Refused::Limit => Answer::BEYOND_LIMIT,
+                    TareRefused::Off => Answer::INVALID,
+                    TareRefused::Touched => Answer::TOUCHED,
+                    TareRefused::Limit => Answer::BEYOND_LIMIT,
                 });
             }
             Parameter::Identity
@@ -141,13 +141,13 @@ impl Node {
             | Parameter::Row(_)
             | Parameter::Commit => return self.configuration.stage(parameter, words),
         };
-        self.summing.network.deaf = switches.links_down.deaf;
+        self.summing.network.ignored_ports = switches.links_down.ports;
         self.summing.sum.set_slots(match switches.reply {
             Reply::Torque => None,
             Reply::Sum(slots) => Some(slots),
         });
         self.after_network(now);
-        set.ok_or(Answer::CANNOT_BE).map(|()| self.read(parameter))
+        set.ok_or(Answer::INVALID).map(|()| self.read(parameter))
     }
 
     fn identity_words(&self) -> [i16; WORDS] {

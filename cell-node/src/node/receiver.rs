@@ -2,31 +2,31 @@
 
 use protocol::can::{Format, Frame};
 use protocol::id::Id;
-use protocol::message::Refused;
-use protocol::packet::{Lengths, Packet, PacketError, Reassembly, Segment};
+use protocol::message::RejectedCounts;
+use protocol::packet::{Lengths, Packet, PacketError, Reassembly, Reassembler};
 use protocol::time::Micros;
 
-use super::{HEARD, count};
+use super::{MAX_RECEIVED_IDS, increment};
 
 /// The reassembly buffers, and the counters of rejected frames.
 #[derive(Debug)]
 pub(super) struct Receiver {
     format: Format,
     /// One buffer per slot of the received identifiers.
-    segments: [Segment; HEARD],
+    segments: [Reassembler; MAX_RECEIVED_IDS],
     /// Counters of rejected frames, by reason.
-    pub(super) refused: Refused,
+    pub(super) refused: RejectedCounts,
 }
 
 impl Receiver {
     #[inline(never)]
     pub(super) fn new(format: Format) -> Self {
-        Self { format, segments: [Segment::NONE; HEARD], refused: Refused::default() }
+        Self { format, segments: [Reassembler::NONE; MAX_RECEIVED_IDS], refused: RejectedCounts::default() }
     }
 
     /// Returns the packet that this frame contains or completes. Joints, torques and sums have one of
     /// `lengths`.
-    pub(super) fn take(
+    pub(super) fn receive(
         &mut self,
         arrived: Micros,
         id: Id,
@@ -42,7 +42,7 @@ impl Receiver {
             Format::Classic => match self.segments.get_mut(slot)?.push(arrived, id, lengths, frame.data()) {
                 Ok(Reassembly::Waiting) => return None,
                 Ok(Reassembly::Incomplete | Reassembly::Ambiguous) => {
-                    count(&mut self.refused.incomplete);
+                    increment(&mut self.refused.incomplete);
                     return None;
                 }
                 Ok(Reassembly::Complete(packet)) => Ok(packet),
@@ -51,9 +51,9 @@ impl Receiver {
         };
         match packet {
             Ok(packet) => return Some(packet),
-            Err(PacketError::Length { .. }) => count(&mut self.refused.length),
-            Err(PacketError::Crc { .. }) => count(&mut self.refused.crc),
-            Err(_) => count(&mut self.refused.foreign),
+            Err(PacketError::Length { .. }) => increment(&mut self.refused.length),
+            Err(PacketError::Crc { .. }) => increment(&mut self.refused.crc),
+            Err(_) => increment(&mut self.refused.foreign),
         }
         None
     }

@@ -2,7 +2,7 @@
 
 /// Number of consecutive joints without an answer before the cell rests, so that a flickering touch does not
 /// change filters.
-const QUIET: u8 = 16;
+const QUIET_JOINTS: u8 = 16;
 
 /// The state of resting.
 #[derive(Debug, Default)]
@@ -15,8 +15,8 @@ pub(super) struct Rest {
 
 impl Rest {
     /// Counts joints that were on time and needed no answer.
-    pub(super) fn lengthen(&mut self) {
-        self.quiet = self.quiet.saturating_add(1).min(QUIET);
+    pub(super) fn count_quiet(&mut self) {
+        self.quiet = self.quiet.saturating_add(1).min(QUIET_JOINTS);
     }
 
     /// Ends the rest: joints wake the cell again.
@@ -31,7 +31,7 @@ impl Rest {
 
     /// Returns true if the state has changed since the last call.
     pub(super) fn poll(&mut self) -> bool {
-        let rests = self.quiet == QUIET;
+        let rests = self.quiet == QUIET_JOINTS;
         core::mem::replace(&mut self.rests, rests) != rests
     }
 }

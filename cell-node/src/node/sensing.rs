@@ -16,9 +16,9 @@ use protocol::id::CellId;
 use protocol::message::{Message, SensorPage, SkinSensors};
 use protocol::parameters::{Events, Sensing as Mode};
 use protocol::time::{Micros, Span};
-use protocol::touch::{Touch, contact};
+use protocol::touch::{Touch, contact_force};
 
-use super::stimuli::Sensed;
+use super::stimuli::SensedValues;
 use super::{Node, Switches};
 use crate::phase;
 
@@ -44,9 +44,9 @@ pub(super) struct Sensing {
     /// The time of the next page in continuous mode.
     due: Option<Micros>,
     /// The last sent values, requested or not.
-    sent: Sensed,
+    sent: SensedValues,
     /// The time of the last page 0 sent without a request.
-    said: Option<Micros>,
+    last_sent_at: Option<Micros>,
     contact: Touch,
     proximity: Touch,
     /// Number of heartbeats since the last one with the acceleration.
@@ -55,7 +55,7 @@ pub(super) struct Sensing {
 
 impl Sensing {
     /// Returns the pages to send after sensor values or the mode may have changed.
-    fn look(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &Sensed) -> Pages {
+    fn update(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &SensedValues) -> Pages {
         let Switches { sensing, events, .. } = switches;
         if *sensing != self.mode {
             return self.switch(now, switches, cell, sensed);
@@ -63,17 +63,17 @@ impl Sensing {
         if *sensing != Mode::Event {
             return Pages::NONE;
         }
-        let Sensed { skin, acceleration } = sensed;
+        let SensedValues { skin, acceleration } = sensed;
         let turned = self.follow(skin, events);
         let pages = Pages {
             skin: *skin != self.sent.skin && (turned || has_moved(skin, &self.sent.skin, events)),
             acceleration: is_far(acceleration, &self.sent.acceleration, events.acceleration),
         };
-        self.says(now, pages)
+        self.mark_sent(now, pages)
     }
 
     /// Switches to another mode, which starts with the present contact state.
-    fn switch(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &Sensed) -> Pages {
+    fn switch(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &SensedValues) -> Pages {
         let mode = switches.sensing;
         *self = Self { mode, sent: self.sent, ..Self::default() };
         match mode {
@@ -86,12 +86,12 @@ impl Sensing {
                 self.follow(&sensed.skin, &switches.events);
             }
         }
-        self.says(now, Pages::BOTH)
+        self.mark_sent(now, Pages::BOTH)
     }
 
     /// Tracks contact and proximity. Returns true for an event: a touch or a release.
     fn follow(&mut self, skin: &SkinSensors, events: &Events) -> bool {
-        let contact = self.contact.next(contact(skin), events.contact.to_bits(), events.hysteresis);
+        let contact = self.contact.next(contact_force(skin), events.contact.to_bits(), events.hysteresis);
         let proximity = i32::from(skin.proximity.to_bits());
         let proximity = self.proximity.next(proximity, events.proximity.to_bits(), events.hysteresis);
         let before = (self.contact, self.proximity);
@@ -100,29 +100,29 @@ impl Sensing {
     }
 
     /// Returns the pages to send with a regular heartbeat. A page sent at this very time is not repeated.
-    pub(super) fn beat(&mut self, now: Micros) -> Pages {
+    pub(super) fn heartbeat_pages(&mut self, now: Micros) -> Pages {
         if self.mode == Mode::Off {
             return Pages::NONE;
         }
         self.beats = (self.beats + 1) % BEATS_PER_ACCELERATION;
-        let skin = self.mode == Mode::Event && self.said != Some(now);
-        self.says(now, Pages { skin, acceleration: self.beats == 0 })
+        let skin = self.mode == Mode::Event && self.last_sent_at != Some(now);
+        self.mark_sent(now, Pages { skin, acceleration: self.beats == 0 })
     }
 
     /// Returns the page that is due before `until`. Overdue periods are skipped; the phase is kept.
-    fn pass(&mut self, now: Micros, until: Micros) -> Pages {
+    fn due_pages(&mut self, now: Micros, until: Micros) -> Pages {
         let (Mode::Continuous { period_ms }, Some(due)) = (self.mode, self.due) else { return Pages::NONE };
         if due >= until {
             return Pages::NONE;
         }
         let period = Span::from_millis(period_ms.into());
         self.due = Some(phase::next(due, period, now));
-        self.says(now, Pages { skin: true, acceleration: false })
+        self.mark_sent(now, Pages { skin: true, acceleration: false })
     }
 
-    const fn says(&mut self, now: Micros, pages: Pages) -> Pages {
+    const fn mark_sent(&mut self, now: Micros, pages: Pages) -> Pages {
         if pages.skin {
-            self.said = Some(now);
+            self.last_sent_at = Some(now);
         }
         pages
     }
@@ -147,7 +147,7 @@ impl Node {
         // Pages are sent only once the cell owns its node id. The comparison with the last sent values
         // ensures that no change is lost.
         let Some(cell) = self.identity.cell.filter(|_| self.claim.is_settled()) else { return };
-        let pages = self.sensing.look(now, &self.switches, cell, &self.net());
+        let pages = self.sensing.update(now, &self.switches, cell, &self.net());
         self.push_sensors(pages);
     }
 
@@ -159,7 +159,7 @@ impl Node {
     /// Sends the page that is due.
     pub(super) fn sense_in_time(&mut self, now: Micros) {
         if self.sensing_due().is_some() {
-            let pages = self.sensing.pass(now, now + Span(1));
+            let pages = self.sensing.due_pages(now, now + Span(1));
             self.push_sensors(pages);
         }
     }
@@ -172,7 +172,7 @@ impl Node {
         if let Mode::Continuous { period_ms } = self.switches.sensing
             && Span::from_millis(period_ms.into()) > joints
         {
-            let pages = self.sensing.pass(now, now + joints);
+            let pages = self.sensing.due_pages(now, now + joints);
             self.push_sensors(pages);
         }
     }

@@ -5,11 +5,11 @@
 
 use heapless::Vec;
 use protocol::fixed::Q3_12;
-use protocol::message::{From, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 
 /// Maximum number of pending stimuli.
-pub const PENDING: usize = 8;
+pub const MAX_PENDING: usize = 8;
 
 /// The result of receiving a stimulus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -24,13 +24,13 @@ pub(super) enum Arrival {
 
 /// All sensor values of a cell: its contact state.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct Sensed {
+pub(super) struct SensedValues {
     pub(super) skin: SkinSensors,
     /// Acceleration in g.
     pub(super) acceleration: [Q3_12; 3],
 }
 
-impl Sensed {
+impl SensedValues {
     /// Sets the values of one page.
     pub(super) const fn set(&mut self, page: &SensorPage) {
         match *page {
@@ -44,17 +44,17 @@ impl Sensed {
 /// The simulated sensors of a cell in test mode.
 #[derive(Debug, Default)]
 pub(super) struct Stimuli {
-    pending: Vec<(From, SensorPage), PENDING>,
+    pending: Vec<(AppliesFrom, SensorPage), MAX_PENDING>,
     /// The present contact state.
-    pub(super) sensed: Sensed,
+    pub(super) sensed: SensedValues,
 }
 
 impl Stimuli {
     /// Queues a stimulus that applies from some joints on; `last` is the epoch of the last accepted joints.
-    pub(super) fn push(&mut self, from: From, page: SensorPage, last: Option<Epoch>) -> Arrival {
+    pub(super) fn push(&mut self, from: AppliesFrom, page: SensorPage, last: Option<Epoch>) -> Arrival {
         let (from, arrival) = match (from, last) {
-            (From::Epoch(first), Some(last)) if last.since(first) >= 0 => (From::Next, Arrival::Late),
-            (from @ (From::Epoch(_) | From::Next), _) => (from, Arrival::InTime),
+            (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0 => (AppliesFrom::Next, Arrival::Late),
+            (from @ (AppliesFrom::Epoch(_) | AppliesFrom::Next), _) => (from, Arrival::InTime),
         };
         if self.pending.push((from, page)).is_ok() { arrival } else { Arrival::Refused }
     }
@@ -62,7 +62,7 @@ impl Stimuli {
     /// Latches all stimuli that apply from `epoch` or earlier, in order of arrival.
     pub(super) fn latch(&mut self, epoch: Epoch) {
         self.pending.retain(|(from, page)| {
-            let waits = matches!(from, From::Epoch(first) if epoch.since(*first) < 0);
+            let waits = matches!(from, AppliesFrom::Epoch(first) if epoch.epochs_since(*first) < 0);
             if !waits {
                 self.sensed.set(page);
             }
@@ -99,8 +99,8 @@ mod tests {
     fn a_stimulus_waits_for_its_epoch_even_around_the_corner() {
         let mut stimuli = Stimuli::default();
         let last = Some(Epoch(253));
-        assert_eq!(stimuli.push(From::Epoch(Epoch(1)), press(2.0), last), Arrival::InTime);
-        assert_eq!(stimuli.push(From::Epoch(Epoch(255)), press(1.0), last), Arrival::InTime);
+        assert_eq!(stimuli.push(AppliesFrom::Epoch(Epoch(1)), press(2.0), last), Arrival::InTime);
+        assert_eq!(stimuli.push(AppliesFrom::Epoch(Epoch(255)), press(1.0), last), Arrival::InTime);
         let course = [254, 255, 0, 1, 2].map(|epoch| {
             stimuli.latch(Epoch(epoch));
             sensed(&stimuli)
@@ -113,7 +113,7 @@ mod tests {
     fn a_late_stimulus_holds_from_the_next_joints() {
         let mut stimuli = Stimuli::default();
         stimuli.latch(Epoch(7));
-        assert_eq!(stimuli.push(From::Epoch(Epoch(7)), press(1.0), Some(Epoch(7))), Arrival::Late);
+        assert_eq!(stimuli.push(AppliesFrom::Epoch(Epoch(7)), press(1.0), Some(Epoch(7))), Arrival::Late);
         assert!(sensed(&stimuli) < 0.5, "not before the next joints");
         stimuli.latch(Epoch(40));
         assert!(sensed(&stimuli) > 0.5);
@@ -123,9 +123,9 @@ mod tests {
     #[test]
     fn the_ninth_waiting_stimulus_is_refused() {
         let mut stimuli = Stimuli::default();
-        for _ in 0..PENDING {
-            assert_eq!(stimuli.push(From::Next, press(1.0), None), Arrival::InTime);
+        for _ in 0..MAX_PENDING {
+            assert_eq!(stimuli.push(AppliesFrom::Next, press(1.0), None), Arrival::InTime);
         }
-        assert_eq!(stimuli.push(From::Next, press(1.0), None), Arrival::Refused);
+        assert_eq!(stimuli.push(AppliesFrom::Next, press(1.0), None), Arrival::Refused);
     }
 }

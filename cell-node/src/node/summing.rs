@@ -7,29 +7,29 @@ use protocol::packet::{self, Epoch};
 use protocol::port::{PORTS, PortMessage, UPLINK};
 use protocol::time::{Micros, Span};
 
-use super::{AddressClaim, Node, Storing};
+use super::{AddressClaim, Node, PendingStore};
 use crate::contact::Torque;
-use crate::network::{Lost, Network};
-use crate::sum::{Begin, Sum, Words};
+use crate::network::{LossReason, Network};
+use crate::sum::{EpochStart, Sum, SumWords};
 
 /// Increase of the tolerance, in sixteenths of an epoch, each time a parent lost for lack of answers
 /// acknowledges the leave, and so was alive all the time.
-const TOLERANCE_STEP: u16 = 2 * FORGETS;
+const TOLERANCE_STEP: u16 = 2 * EPOCHS_PER_DECREASE;
 /// Maximum tolerance, in sixteenths of an epoch.
-const TOLERANCE: u16 = 12 * FORGETS;
+const MAX_TOLERANCE: u16 = 12 * EPOCHS_PER_DECREASE;
 /// Number of epochs with a sum of the parent after which the tolerance decreases by one epoch.
-const FORGETS: u16 = 16;
+const EPOCHS_PER_DECREASE: u16 = 16;
 /// Number of consecutive complete epochs after which the children's sums instead of joints wake the cell.
-const STEADY: u8 = 8;
+const STEADY_EPOCHS: u8 = 8;
 /// Maximum lateness of a check for missing sums. A later check is skipped, because the sums may still wait in
 /// the socket.
-const PUNCTUAL: Span = Span::from_millis(1);
+const MAX_CHECK_LATENESS: Span = Span::from_millis(1);
 /// Minimum interval between reports of the place in the tree.
-const TREE: Span = Span::from_millis(50);
+const TREE_REPORT_INTERVAL: Span = Span::from_millis(50);
 
 /// The parent that receives the sum of an epoch.
 #[derive(Clone, Copy, Debug, Default)]
-enum Parent {
+enum EpochParent {
     /// No parent.
     #[default]
     None,
@@ -56,11 +56,11 @@ pub(super) struct Summing {
     pub(super) network: Network,
     pub(super) sum: Sum,
     /// The cell whose sums are received at each port.
-    pub(super) heard: [Option<CellId>; PORTS],
-    hears_changed: bool,
-    parent: Parent,
+    pub(super) received: [Option<CellId>; PORTS],
+    received_changed: bool,
+    parent: EpochParent,
     /// True if a sum was sent in the previous epoch.
-    said_before: bool,
+    sent_before: bool,
     /// Set while the parent may have missed a sum and is probed until it answers: the number of consecutive
     /// epochs without an answer.
     unanswered: Option<u16>,
@@ -87,16 +87,16 @@ impl Summing {
     }
 
     /// Returns the parent whose sums are received.
-    pub(super) fn heard_parent(&self) -> Option<CellId> {
-        self.heard.get(self.network.up()?).copied().flatten()
+    pub(super) fn received_parent(&self) -> Option<CellId> {
+        self.received.get(self.network.up()?).copied().flatten()
     }
 
     /// Returns true if the received identifiers, or those that wake the cell, have changed since the last
     /// call.
-    pub(super) fn poll_hears(&mut self) -> bool {
-        let waits = self.steady == STEADY && self.unanswered.is_none() && self.sum.awaits_children();
-        self.hears_changed |= core::mem::replace(&mut self.waits_for_children, waits) != waits;
-        core::mem::take(&mut self.hears_changed)
+    pub(super) fn poll_received_ids(&mut self) -> bool {
+        let waits = self.steady == STEADY_EPOCHS && self.unanswered.is_none() && self.sum.awaits_children();
+        self.received_changed |= core::mem::replace(&mut self.waits_for_children, waits) != waits;
+        core::mem::take(&mut self.received_changed)
     }
 
     pub(super) fn poll_timeout(&self) -> Micros {
@@ -115,17 +115,17 @@ impl Summing {
     /// Handles a message from a port that receives.
     fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
         let is_parent = self.network.up() == Some(port);
-        self.sum.heard_after(age);
+        self.sum.note_delay(age);
         self.network.busy = self.sum.is_busy();
         if let PortMessage::State(epoch) = message {
             if self.network.is_child(port) {
-                self.sum.state(now, port, epoch);
+                self.sum.handle_state(now, port, epoch);
             }
             return;
         }
         if let PortMessage::Nack(epoch) = message {
             if is_parent {
-                self.was_nack(epoch);
+                self.handle_nack(epoch);
             }
             return;
         }
@@ -136,7 +136,7 @@ impl Summing {
         if message == PortMessage::LeaveAck
             && self.suspected.take_if(|suspected| *suspected == port).is_some()
         {
-            self.tolerance = (self.tolerance + TOLERANCE_STEP).min(TOLERANCE);
+            self.tolerance = (self.tolerance + TOLERANCE_STEP).min(MAX_TOLERANCE);
         }
         self.network.handle(now, port, message);
     }
@@ -150,10 +150,10 @@ impl Summing {
             self.unanswered = None;
             self.sum.restate = true;
             // The previous parent may have accepted what was sent in this epoch.
-            self.sum.fall_silent();
+            self.sum.stop_sending();
         }
         if self.network.up().is_none() {
-            self.sum.fall_silent();
+            self.sum.stop_sending();
         }
         self.report.due |= core::mem::take(&mut self.network.tree_changed);
         // The sums of the parent and of the children.
@@ -161,7 +161,7 @@ impl Summing {
             let is_ours = self.network.is_child(port) || self.network.up() == Some(port);
             self.network.number_at(port).filter(|_| is_ours && self.sum.is_on())
         });
-        self.hears_changed |= core::mem::replace(&mut self.heard, heard) != heard;
+        self.received_changed |= core::mem::replace(&mut self.received, heard) != heard;
     }
 
     /// Starts an epoch with joints that were on the bus `age` ago. Its sums use the tree as it is now.
@@ -173,28 +173,28 @@ impl Summing {
         own: Option<Torque<'_>>,
     ) {
         let (at, up) = (now - age, self.network.up());
-        self.said_before = self.sum.said_in(epoch.before());
+        self.sent_before = self.sum.was_sent_in(epoch.previous());
         // A former parent accepts no sum from a cell that sent none for an epoch.
-        if !self.said_before {
+        if !self.sent_before {
             self.network.forget_former_parent(at);
         }
         self.parent = match up {
-            None => Parent::None,
-            Some(UPLINK) => Parent::Gateway,
-            Some(port) => Parent::Cell { port, number: self.network.number_at(port), heard: false },
+            None => EpochParent::None,
+            Some(UPLINK) => EpochParent::Gateway,
+            Some(port) => EpochParent::Cell { port, number: self.network.number_at(port), heard: false },
         };
-        let begin = Begin {
+        let begin = EpochStart {
             epoch,
             at,
             period,
             depth: self.network.depth(),
-            speaks: up.is_some() && self.network.is_released(),
+            may_send: up.is_some() && self.network.is_released(),
             children: self.network.children(),
         };
         self.sum.begin(&begin, own.map(|torque| torque.exact()).as_ref());
         // The age of deferred frames does not indicate a slow machine.
         if !self.waits_for_children {
-            self.sum.heard_after(age);
+            self.sum.note_delay(age);
         }
         if let Some(unanswered) = self.unanswered {
             // Without an answer the parent is lost in this epoch, and a sum not sent yet may go to another
@@ -207,61 +207,61 @@ impl Summing {
     }
 
     /// Handles a neighbour's sum. Returns true if it is a child's.
-    pub(super) fn take(&mut self, now: Micros, age: Span, from: CellId, epoch: Epoch, words: Words) -> bool {
-        if let Parent::Cell { port, number, heard } = &mut self.parent
+    pub(super) fn handle_sum(&mut self, now: Micros, age: Span, from: CellId, epoch: Epoch, words: SumWords) -> bool {
+        if let EpochParent::Cell { port, number, heard } = &mut self.parent
             && *number == Some(from)
         {
             // A late sum of an earlier epoch also shows that the parent is alive.
-            *heard |= self.network.hears(*port);
+            *heard |= self.network.receives(*port);
             return false;
         }
-        let Some(port) = self.network.child_with(from).filter(|&port| self.network.hears(port)) else {
+        let Some(port) = self.network.child_with(from).filter(|&port| self.network.receives(port)) else {
             return false;
         };
         // Unlike a parent's sum, a child's is not deferred.
-        self.sum.heard_after(age);
-        self.sum.take(now, port, epoch, words);
+        self.sum.note_delay(age);
+        self.sum.receive(now, port, epoch, words);
         true
     }
 
     /// Sends a NACK to each child whose sum is missing in this epoch, once. Returns true if the parent is
     /// lost.
     fn check_missing(&mut self, now: Micros) -> bool {
-        let Some((epoch, nack)) = self.sum.missing() else { return false };
+        let Some((epoch, nack)) = self.sum.check_missing() else { return false };
         for port in (0..PORTS).filter(|port| nack >> port & 1 == 1) {
-            self.network.say(port, PortMessage::Nack(epoch));
+            self.network.send(port, PortMessage::Nack(epoch));
         }
-        let said = self.sum.said_in(epoch);
+        let said = self.sum.was_sent_in(epoch);
         let tolerated = self.tolerated();
         let mut lost = None;
         match (&mut self.unanswered, self.parent) {
             (Some(unanswered), _) => {
                 *unanswered += 1;
                 // A cell that sent nothing in this epoch has no lease any more.
-                lost = (*unanswered > tolerated).then_some(if said { Lost::Unsure } else { Lost::Done });
+                lost = (*unanswered > tolerated).then_some(if said { LossReason::Unsure } else { LossReason::Done });
             }
-            (None, Parent::Cell { heard: true, .. }) => self.tolerance = self.tolerance.saturating_sub(1),
-            (None, Parent::Cell { heard: false, .. }) => self.unanswered = said.then_some(0),
-            (None, Parent::Gateway | Parent::None) => {}
+            (None, EpochParent::Cell { heard: true, .. }) => self.tolerance = self.tolerance.saturating_sub(1),
+            (None, EpochParent::Cell { heard: false, .. }) => self.unanswered = said.then_some(0),
+            (None, EpochParent::Gateway | EpochParent::None) => {}
         }
         if let Some(how) = lost {
             // The parent did not answer.
             self.unanswered = None;
             self.suspected = self.network.up();
-            self.sum.fall_silent();
+            self.sum.stop_sending();
             self.network.lose_parent(now, how);
             self.follow_network();
         }
         let well = said && nack == 0 && self.unanswered.is_none() && self.sum.awaits_children();
-        self.steady = if well { (self.steady + 1).min(STEADY) } else { 0 };
+        self.steady = if well { (self.steady + 1).min(STEADY_EPOCHS) } else { 0 };
         lost.is_some()
     }
 
     /// Handles a NACK: resends the state, and probes whether the parent receives this cell at all.
-    fn was_nack(&mut self, epoch: Epoch) {
+    fn handle_nack(&mut self, epoch: Epoch) {
         self.sum.restate = true;
         let before = self.sum.epoch.is_some_and(|present| epoch.next() == present);
-        if (self.sum.epoch == Some(epoch) && self.sum.said_in(epoch)) || (before && self.said_before) {
+        if (self.sum.epoch == Some(epoch) && self.sum.was_sent_in(epoch)) || (before && self.sent_before) {
             // The sum was assumed to be accepted.
             self.unanswered = self.unanswered.or(Some(0));
             self.probe_parent();
@@ -270,22 +270,22 @@ impl Summing {
 
     /// Returns the tolerated number of consecutive epochs without an answer.
     const fn tolerated(&self) -> u16 {
-        self.tolerance.div_ceil(FORGETS)
+        self.tolerance.div_ceil(EPOCHS_PER_DECREASE)
     }
 
     /// Probes the parent; the answer is checked before the next joints.
     fn probe_parent(&mut self) {
         if let Some(up) = self.network.up() {
-            self.network.say(up, PortMessage::Probe);
+            self.network.send(up, PortMessage::Probe);
         }
-        self.sum.watch();
+        self.sum.schedule_check();
     }
 }
 
 impl Node {
     /// Handles a message that arrived at a port `age` ago.
     pub fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
-        if self.summing.network.hears(port) {
+        if self.summing.network.receives(port) {
             self.summing.handle_port(now, age, port, message);
             self.after_network(now);
         }
@@ -296,21 +296,21 @@ impl Node {
         if !self.summing.network.exists() {
             return;
         }
-        if let Some(cell) = self.summing.network.given() {
+        if let Some(cell) = self.summing.network.take_assigned() {
             self.identity.cell = Some(cell);
             self.claim = AddressClaim::new(self.identity, now);
-            self.storing = Some(Storing::NodeId);
-            self.summing.hears_changed = true;
+            self.storing = Some(PendingStore::NodeId);
+            self.summing.received_changed = true;
         }
         self.summing.follow_network();
-        self.tell_tree(now);
+        self.report_tree(now);
     }
 
     /// Sends the sum that is due, and checks for missing ones.
     pub(super) fn handle_sums(&mut self, now: Micros) {
         let Some(from) = self.identity.cell else { return };
         let summing = &mut self.summing;
-        if let Some((epoch, Words { torque, count }, restarted)) = summing.sum.say(now) {
+        if let Some((epoch, SumWords { torque, count }, restarted)) = summing.sum.poll_sum(now) {
             if restarted {
                 summing.network.state(epoch);
             }
@@ -321,7 +321,7 @@ impl Node {
         }
         let Some(late) = self.summing.sum.check(now) else { return };
         // A late check is left to the next joints, when all frames before them have been received.
-        if late <= PUNCTUAL {
+        if late <= MAX_CHECK_LATENESS {
             self.check_missing(now);
             if self.summing.unanswered.is_some() {
                 self.summing.probe_parent();
@@ -340,22 +340,22 @@ impl Node {
     }
 
     /// Reports the place in the tree if it has changed, at a limited rate.
-    pub(super) fn tell_tree(&mut self, now: Micros) {
+    pub(super) fn report_tree(&mut self, now: Micros) {
         let report = &mut self.summing.report;
         let may = self.summing.network.exists() && self.claim.is_settled();
         if may && report.due && now >= report.next {
-            (report.due, report.next) = (false, now + TREE);
+            (report.due, report.next) = (false, now + TREE_REPORT_INTERVAL);
             self.push_tree(now);
         }
     }
 
     /// Reports changes of the place in the tree and of the ports, with a regular heartbeat.
-    pub(super) fn beat_network(&mut self, now: Micros) {
+    pub(super) fn report_with_heartbeat(&mut self, now: Micros) {
         let Summing { network, report, .. } = &mut self.summing;
         if network.exists() {
             // A new round alone waits for the heartbeat.
             report.due |= report.round != network.round();
-            self.tell_tree(now);
+            self.report_tree(now);
             if self.summing.network.ports_changed(now) {
                 self.push_ports(now);
             }
@@ -367,13 +367,13 @@ impl Node {
         report.round = network.round();
         let tree = Tree {
             parent: network.parent_node(),
-            up: network.up().map_or(0, |up| up.to_le_bytes()[0]),
+            parent_port: network.up().map_or(0, |up| up.to_le_bytes()[0]),
             depth: network.depth().unwrap_or(0),
             round: report.round,
             children: network.children(),
-            works: network.working(now),
+            working_ports: network.working(now),
             sent: sum.sent,
-            taken: sum.taken,
+            accepted: sum.taken,
             dropped: sum.dropped,
         };
         self.push_network(NetworkPage::Tree(tree));

@@ -3,24 +3,24 @@
 use protocol::message::{Message, SensorPage};
 
 use super::Node;
-use super::stimuli::Sensed;
-use crate::baseline::Status;
+use super::stimuli::SensedValues;
+use crate::baseline::BaselineStatus;
 
 /// Number of heartbeats per page.
-const BEATS: u8 = 4;
+const HEARTBEATS_PER_PAGE: u8 = 4;
 
 /// The last reported state.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Reported {
-    status: Status,
+pub(super) struct ReportedBaseline {
+    status: BaselineStatus,
     beats: u8,
 }
 
 impl Node {
     /// Returns the sensor values with the zero subtracted.
-    pub(super) fn net(&self) -> Sensed {
-        let Sensed { skin, acceleration } = self.stimuli.sensed;
-        Sensed { skin: self.baseline.net(&skin), acceleration }
+    pub(super) fn net(&self) -> SensedValues {
+        let SensedValues { skin, acceleration } = self.stimuli.sensed;
+        SensedValues { skin: self.baseline.subtract_zero(&skin), acceleration }
     }
 
     /// Reports the zero if its state has changed and the cell owns its node id.
@@ -32,7 +32,7 @@ impl Node {
 
     /// Reports the zero with every fourth regular heartbeat.
     pub(super) fn beat_zero(&mut self) {
-        self.reported.beats = (self.reported.beats + 1) % BEATS;
+        self.reported.beats = (self.reported.beats + 1) % HEARTBEATS_PER_PAGE;
         if self.reported.beats == 0 {
             self.push_zero();
         }

@@ -8,9 +8,9 @@ fn sum(carry: bool) -> Sum {
     sum
 }
 
-fn begin(epoch: u8, depth: u8) -> Begin {
+fn begin(epoch: u8, depth: u8) -> EpochStart {
     let at = Micros(u64::from(epoch) * PERIOD.0);
-    Begin { epoch: Epoch(epoch), at, period: PERIOD, depth: Some(depth), speaks: true, children: 0b1111 }
+    EpochStart { epoch: Epoch(epoch), at, period: PERIOD, depth: Some(depth), may_send: true, children: 0b1111 }
 }
 
 /// Returns a torque in thousandths of a step of Q7.8.
@@ -18,8 +18,8 @@ fn own(thousandths: i64) -> [Acc<30>; MAX_JOINTS] {
     [Acc::from_steps(thousandths * (1 << 22) / 1_000); MAX_JOINTS]
 }
 
-fn words(word: i16, count: u8) -> Words {
-    Words { torque: [Q7_8::from_bits(word); MAX_JOINTS], count }
+fn words(word: i16, count: u8) -> SumWords {
+    SumWords { torque: [Q7_8::from_bits(word); MAX_JOINTS], count }
 }
 
 fn at(epoch: u8, micros: u64) -> Micros {
@@ -30,7 +30,7 @@ fn at(epoch: u8, micros: u64) -> Micros {
 fn says(sum: &mut Sum, epoch: u8) -> Vec<(u64, i16, u8, bool)> {
     let mut said = Vec::new();
     for micros in (0..PERIOD.0).step_by(100) {
-        if let Some((of, words, restarted)) = sum.say(at(epoch, micros)) {
+        if let Some((of, words, restarted)) = sum.poll_sum(at(epoch, micros)) {
             assert_eq!(of, Epoch(epoch));
             said.push((micros, words.torque[0].to_bits(), words.count, restarted));
         }
@@ -78,13 +78,13 @@ fn the_rounding_remainder_is_carried_until_the_contact_ends() {
 fn a_late_child_makes_one_more_sum_of_all_in_the_next_slot() {
     let mut sum = sum(false);
     sum.begin(&begin(1, 2), Some(&own(1_000)));
-    sum.state(at(1, 10), 0, Epoch(1));
-    sum.take(at(1, 500), 0, Epoch(1), words(10, 3));
-    assert_eq!(sum.say(at(1, 1_000)), Some((Epoch(1), words(11, 4), true)));
-    sum.take(at(1, 1_700), 0, Epoch(1), words(12, 4));
-    sum.take(at(1, 1_800), 0, Epoch(1), words(9, 2));
-    assert_eq!(sum.say(at(1, 1_900)), None);
-    assert_eq!(sum.say(at(1, 2_000)), Some((Epoch(1), words(13, 5), false)));
+    sum.handle_state(at(1, 10), 0, Epoch(1));
+    sum.receive(at(1, 500), 0, Epoch(1), words(10, 3));
+    assert_eq!(sum.poll_sum(at(1, 1_000)), Some((Epoch(1), words(11, 4), true)));
+    sum.receive(at(1, 1_700), 0, Epoch(1), words(12, 4));
+    sum.receive(at(1, 1_800), 0, Epoch(1), words(9, 2));
+    assert_eq!(sum.poll_sum(at(1, 1_900)), None);
+    assert_eq!(sum.poll_sum(at(1, 2_000)), Some((Epoch(1), words(13, 5), false)));
     assert_eq!((sum.sent, sum.taken, sum.dropped), (2, 2, 0));
 }
 
@@ -93,24 +93,24 @@ fn a_late_child_makes_one_more_sum_of_all_in_the_next_slot() {
 fn a_sum_is_taken_while_its_lease_runs_and_not_after_a_gap() {
     let mut sum = sum(false);
     sum.begin(&begin(1, 2), None);
-    sum.take(at(1, 500), 1, Epoch(1), words(10, 1));
+    sum.receive(at(1, 500), 1, Epoch(1), words(10, 1));
     assert_eq!((sum.taken, sum.dropped), (0, 1), "no state yet");
-    sum.state(at(1, 600), 1, Epoch(1));
+    sum.handle_state(at(1, 600), 1, Epoch(1));
     assert_eq!((sum.taken, sum.dropped), (1, 0), "the state came late");
     sum.begin(&begin(2, 2), None);
-    sum.take(at(2, 500), 1, Epoch(2), words(10, 1));
+    sum.receive(at(2, 500), 1, Epoch(2), words(10, 1));
     assert_eq!(sum.taken, 2);
     sum.begin(&begin(3, 2), None);
-    assert_eq!(sum.missing(), Some((Epoch(3), 0b10)), "it did not come");
+    assert_eq!(sum.check_missing(), Some((Epoch(3), 0b10)), "it did not come");
     sum.begin(&begin(4, 2), None);
     assert_eq!(sum.poll_timeout(), Some(at(4, 14_000)), "checked in time");
     assert_eq!((sum.check(at(4, 13_999)), sum.check(at(4, 14_000))), (None, Some(Span(0))));
-    sum.take(at(4, 500), 1, Epoch(4), words(10, 1));
+    sum.receive(at(4, 500), 1, Epoch(4), words(10, 1));
     assert_eq!(sum.taken, 2, "after a gap");
     sum.disown(1);
     sum.begin(&begin(5, 2), None);
-    sum.state(at(5, 0), 1, Epoch(4));
-    sum.take(at(5, 500), 1, Epoch(5), words(10, 1));
+    sum.handle_state(at(5, 0), 1, Epoch(4));
+    sum.receive(at(5, 500), 1, Epoch(5), words(10, 1));
     assert_eq!(sum.taken, 2, "stated for another epoch");
 }
 
@@ -119,15 +119,15 @@ fn a_sum_is_taken_while_its_lease_runs_and_not_after_a_gap() {
 fn a_sum_that_came_before_its_joints_and_without_a_lease_waits_for_its_state() {
     let mut sum = sum(false);
     sum.begin(&begin(1, 2), None);
-    sum.take(at(1, 15_900), 1, Epoch(2), words(10, 1));
+    sum.receive(at(1, 15_900), 1, Epoch(2), words(10, 1));
     sum.begin(&begin(2, 2), None);
     assert_eq!((sum.taken, sum.dropped), (0, 1), "no state yet");
-    sum.state(at(2, 100), 1, Epoch(2));
+    sum.handle_state(at(2, 100), 1, Epoch(2));
     assert_eq!((sum.taken, sum.dropped), (1, 0));
     sum.disown(1);
-    sum.take(at(2, 15_900), 1, Epoch(3), words(10, 1));
+    sum.receive(at(2, 15_900), 1, Epoch(3), words(10, 1));
     sum.begin(&begin(3, 2), None);
-    assert_eq!(sum.missing(), Some((Epoch(3), 0b10)), "it does not come");
+    assert_eq!(sum.check_missing(), Some((Epoch(3), 0b10)), "it does not come");
 }
 
 // LEASE-2
@@ -135,15 +135,15 @@ fn a_sum_that_came_before_its_joints_and_without_a_lease_waits_for_its_state() {
 fn a_sum_that_comes_late_is_not_in_its_epoch_and_keeps_its_lease() {
     let mut sum = sum(false);
     sum.begin(&begin(1, 2), None);
-    sum.state(at(1, 0), 1, Epoch(1));
-    sum.take(at(1, 100), 1, Epoch(1), words(10, 1));
+    sum.handle_state(at(1, 0), 1, Epoch(1));
+    sum.receive(at(1, 100), 1, Epoch(1), words(10, 1));
     sum.begin(&begin(2, 2), None);
     sum.begin(&begin(3, 2), None);
-    sum.take(at(3, 100), 1, Epoch(2), words(10, 1));
+    sum.receive(at(3, 100), 1, Epoch(2), words(10, 1));
     assert_eq!((sum.taken, sum.dropped), (1, 1));
-    sum.take(at(3, 200), 1, Epoch(3), words(10, 1));
+    sum.receive(at(3, 200), 1, Epoch(3), words(10, 1));
     assert_eq!((sum.taken, sum.dropped), (2, 1));
-    assert_eq!(sum.missing(), Some((Epoch(3), 0)));
+    assert_eq!(sum.check_missing(), Some((Epoch(3), 0)));
 }
 
 // LEASE-3
@@ -151,10 +151,10 @@ fn a_sum_that_comes_late_is_not_in_its_epoch_and_keeps_its_lease() {
 fn an_end_closes_the_lease_without_a_nack() {
     let mut sum = sum(false);
     sum.begin(&begin(1, 2), None);
-    sum.state(at(1, 0), 1, Epoch(1));
-    sum.take(at(1, 100), 1, Epoch(1), Words::END);
+    sum.handle_state(at(1, 0), 1, Epoch(1));
+    sum.receive(at(1, 100), 1, Epoch(1), SumWords::END);
     sum.begin(&begin(2, 2), None);
-    assert_eq!((sum.poll_timeout(), sum.missing()), (None, Some((Epoch(2), 0))), "nothing is missing");
+    assert_eq!((sum.poll_timeout(), sum.check_missing()), (None, Some((Epoch(2), 0))), "nothing is missing");
 }
 
 // SUM-3
@@ -162,18 +162,18 @@ fn an_end_closes_the_lease_without_a_nack() {
 fn saturation_passes_upwards_word_by_word() {
     let mut sum = sum(false);
     sum.begin(&begin(1, 2), Some(&own(-1_000_000)));
-    sum.state(at(1, 0), 0, Epoch(1));
+    sum.handle_state(at(1, 0), 0, Epoch(1));
     let mut saturated = words(5, 2);
     saturated.torque[1] = Q7_8::MAX;
     saturated.torque[2] = Q7_8::MIN;
-    sum.take(at(1, 0), 0, Epoch(1), saturated);
-    let (_, said, _) = sum.say(at(1, 1_000)).unwrap();
+    sum.receive(at(1, 0), 0, Epoch(1), saturated);
+    let (_, said, _) = sum.poll_sum(at(1, 1_000)).unwrap();
     let mut target = [-995; MAX_JOINTS];
     target[1..3].copy_from_slice(&[i16::MAX, i16::MIN]);
     assert_eq!(said.torque.map(Q7_8::to_bits), target);
     sum.begin(&begin(2, 2), Some(&own(i64::from(i16::MAX) * 1_000)));
-    sum.take(at(2, 0), 0, Epoch(2), words(1, 1));
-    let (_, said, _) = sum.say(at(2, 1_000)).unwrap();
+    sum.receive(at(2, 0), 0, Epoch(2), words(1, 1));
+    let (_, said, _) = sum.poll_sum(at(2, 1_000)).unwrap();
     assert_eq!(said.torque, [Q7_8::MAX; MAX_JOINTS]);
 }
 
@@ -183,7 +183,7 @@ fn a_torque_beyond_the_32_bits_that_are_kept_of_it_saturates_at_its_end() {
     for (steps, end) in [(i64::MIN / 2, Q7_8::MIN), (i64::MAX / 2, Q7_8::MAX)] {
         let mut sum = sum(false);
         sum.begin(&begin(1, 2), Some(&[Acc::from_steps(steps); MAX_JOINTS]));
-        let (_, said, _) = sum.say(at(1, 1_000)).unwrap();
+        let (_, said, _) = sum.poll_sum(at(1, 1_000)).unwrap();
         assert_eq!(said.torque, [end; MAX_JOINTS]);
     }
 }
@@ -194,11 +194,11 @@ fn a_machine_that_receives_late_checks_no_missing_sums() {
     for (age, missing) in [(PERIOD.0 / 4, Some((Epoch(2), 0b1))), (PERIOD.0 / 4 + 1, None)] {
         let mut sum = sum(false);
         sum.begin(&begin(1, 1), Some(&own(1_000)));
-        sum.state(at(1, 10), 0, Epoch(1));
-        sum.take(at(1, 500), 0, Epoch(1), words(1, 1));
+        sum.handle_state(at(1, 10), 0, Epoch(1));
+        sum.receive(at(1, 500), 0, Epoch(1), words(1, 1));
         sum.begin(&begin(2, 1), Some(&own(1_000)));
-        sum.watch();
-        sum.heard_after(Span(age));
-        assert_eq!(sum.missing(), missing, "{age} µs");
+        sum.schedule_check();
+        sum.note_delay(Span(age));
+        assert_eq!(sum.check_missing(), missing, "{age} µs");
     }
 }

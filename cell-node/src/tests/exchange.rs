@@ -4,11 +4,11 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use crate::flash::Flash;
+use crate::flash::FlashState;
 use crate::identity::Identity;
 use crate::node::Node;
 use protocol::can::{Format, Frame};
-use protocol::candump::{self, Line};
+use protocol::candump::{self, CandumpLine};
 use protocol::id::CellId;
 use protocol::message::{Message, Request};
 use protocol::packet::Packet;
@@ -36,7 +36,7 @@ impl Cell {
             cell: Some(CellId::new(fields["node"].parse().unwrap()).unwrap()),
             serial: fields["serial"].parse().unwrap(),
         };
-        let flash = if fields["flash"] == "session" { Flash::Sound(configuration()) } else { Flash::Empty };
+        let flash = if fields["flash"] == "session" { FlashState::Valid(configuration()) } else { FlashState::Empty };
         let node = Node::new(identity, format, &flash, fields["test"] == "1", Micros(0));
         Self { node, format, sent: VecDeque::new() }
     }
@@ -52,7 +52,7 @@ impl Cell {
 
     /// Advances the time. A cell that has given way does nothing more.
     fn until(&mut self, at: u64) {
-        while self.node.taken().is_none() && self.node.poll_timeout() <= Micros(at) {
+        while self.node.other_owner().is_none() && self.node.poll_timeout() <= Micros(at) {
             let due = self.node.poll_timeout();
             self.node.handle_timeout(due);
             self.collect(due.0);
@@ -69,7 +69,7 @@ impl Cell {
 fn configuration() -> Parameters {
     let mut parameters = Parameters::default();
     for line in SESSION.lines() {
-        if let Line::Frame(record) = candump::parse(line).unwrap()
+        if let CandumpLine::Frame(record) = candump::parse(line).unwrap()
             && let Ok(message) = Message::decode(&Packet::from_fd(&record.frame).unwrap())
             && let Message::Configure { request: Request::Write { number, words }, .. } = message
             && let Some(parameter) = Parameter::from_number(number).filter(|it| it.is_stored())
@@ -85,7 +85,7 @@ fn the_cell_sends_what_the_log_says_when_the_log_says_it() {
     let mut cell: Option<Cell> = None;
     let (mut comment, mut title, mut frames) = ("", "", 0);
     for line in EXCHANGE.lines() {
-        let Line::Frame(record) = candump::parse(line).unwrap() else {
+        let CandumpLine::Frame(record) = candump::parse(line).unwrap() else {
             title = line.strip_prefix("## ").unwrap_or(title);
             comment = line.strip_prefix("# ").unwrap_or(comment);
             if let Some(fields) = line.strip_prefix("# start ") {
@@ -128,7 +128,7 @@ fn a_cell_that_gave_way_says_so() {
         let (mut comment, mut at) = ("", 0);
         for line in exchange.lines().skip(1) {
             comment = line.strip_prefix("# ").unwrap_or(comment);
-            if let Line::Frame(record) = candump::parse(line).unwrap() {
+            if let CandumpLine::Frame(record) = candump::parse(line).unwrap() {
                 at = record.time.nanos / 1_000 % APART;
                 cell.until(at);
                 if comment.starts_with("bus ") {
@@ -136,7 +136,7 @@ fn a_cell_that_gave_way_says_so() {
                 }
             }
         }
-        assert!(cell.node.taken().is_some(), "{exchange}, at {at} us");
+        assert!(cell.node.other_owner().is_some(), "{exchange}, at {at} us");
         gave_way += 1;
     }
     assert_eq!(gave_way, 3);

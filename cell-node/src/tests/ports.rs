@@ -1,14 +1,14 @@
 //! Tests of cells with and without ports: their messages over wires, and parameter 6.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
-use crate::flash::Flash;
+use crate::flash::FlashState;
 use crate::identity::Identity;
 use crate::node::Node;
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};
-use protocol::message::{Answer, From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
-use protocol::packet::{Epoch, WORDS, words};
+use protocol::message::{Answer, AppliesFrom, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
+use protocol::packet::{Epoch, WORDS, padded_words};
 use protocol::parameters::{Contact, Parameter, Parameters, Pose};
 use protocol::port::{Hello, PortMessage, Rank, UPLINK, Walk};
 use protocol::time::{Micros, Span};
@@ -30,7 +30,7 @@ fn start_with(wired: u8, cell: Option<CellId>) -> Node {
         ..Parameters::default()
     };
     let identity = Identity { cell, serial: 1 };
-    Node::new(identity, Format::Fd, &Flash::Sound(parameters), true, Micros(0)).with_ports(wired)
+    Node::new(identity, Format::Fd, &FlashState::Valid(parameters), true, Micros(0)).with_ports(wired)
 }
 
 /// Advances the time. Returns the messages sent over wires.
@@ -78,8 +78,8 @@ fn a_cell_without_ports_does_not_sum_and_one_with_ports_reads_back_what_it_was_t
             other => panic!("{other:?}"),
         }
     });
-    let refused = Answer::Refused { number: REPLY, reason: Answer::CANNOT_BE };
-    let taken = Answer::Value { number: REPLY, written: true, words: words([1, 1_500, 6, 1]) };
+    let refused = Answer::Refused { number: REPLY, reason: Answer::INVALID };
+    let taken = Answer::Value { number: REPLY, written: true, words: padded_words([1, 1_500, 6, 1]) };
     assert_eq!(answers, [refused, taken]);
 }
 
@@ -93,12 +93,12 @@ fn a_root_sends_its_sums_to_the_gateways_side_without_a_state() {
     tell(&mut node, now, &sum_with([1, 1_500, 0, 1, 0, 0]));
     let contact = [Q5_10::nearest(4.0), Q5_10::ZERO, Q5_10::ZERO];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    tell(&mut node, now, &Message::Stimulus { to: Address::Everyone, from: From::Next, page });
+    tell(&mut node, now, &Message::Stimulus { to: Address::Everyone, from: AppliesFrom::Next, page });
     let joints = Joints { in_use: 1, ..Joints::default() };
     let sent = tell(&mut node, now, &Message::Joints { epoch: Epoch(7), joints });
     assert!(sent.iter().any(|message| matches!(message, Message::Sum { count: 1, .. })), "{sent:?}");
     let said: Vec<_> = core::iter::from_fn(|| node.poll_port_transmit()).collect();
-    let is_up = |message: &PortMessage| matches!(message, PortMessage::Hello(Hello { up: true, .. }));
+    let is_up = |message: &PortMessage| matches!(message, PortMessage::Hello(Hello { is_parent: true, .. }));
     assert!(said.iter().any(|(port, message)| *port == UPLINK && is_up(message)), "{said:?}");
     assert!(!said.iter().any(|(_, message)| matches!(message, PortMessage::State(_))), "{said:?}");
 }
@@ -107,7 +107,7 @@ fn a_root_sends_its_sums_to_the_gateways_side_without_a_state() {
 fn join_gateway(node: &mut Node, now: Micros) {
     let rank = Rank { round: 1, depth: 0 };
     let hello =
-        Hello { version: 1, number: 0, port: 0, hears: true, up: false, unnumbered: false, rank: Some(rank) };
+        Hello { version: 1, number: 0, port: 0, receives: true, is_parent: false, unnumbered: false, rank: Some(rank) };
     node.handle_port(now, Span(0), UPLINK, PortMessage::Hello(hello));
     node.handle_port(now, Span(0), UPLINK, PortMessage::Grant(rank));
 }
@@ -139,10 +139,10 @@ fn the_place_in_the_tree_is_reported_at_most_every_50_ms() {
 #[test]
 fn a_new_node_id_changes_once_what_a_cell_receives() {
     let mut node = start_with(1 << UPLINK, None);
-    assert!(!node.poll_hears());
+    assert!(!node.poll_received_ids());
     join_gateway(&mut node, Micros(1_000));
-    assert!(!node.poll_hears(), "the gateway sends no sums");
+    assert!(!node.poll_received_ids(), "the gateway sends no sums");
     let walk = Walk { walk: 1, first: 3, last: 9 };
     node.handle_port(Micros(2_000), Span(0), UPLINK, PortMessage::NodeId(walk));
-    assert_eq!([node.poll_hears(), node.poll_hears()], [true, false]);
+    assert_eq!([node.poll_received_ids(), node.poll_received_ids()], [true, false]);
 }

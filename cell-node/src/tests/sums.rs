@@ -1,7 +1,7 @@
 //! Tests of late sums of children.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
-use crate::sum::{Begin, Sum, Words};
+use crate::sum::{EpochStart, Sum, SumWords};
 use protocol::fixed::Q7_8;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
@@ -10,24 +10,24 @@ use protocol::time::{Micros, Span};
 
 /// Starts an epoch of a parent without contact, at the root of a tree of two, with its child at port 0.
 fn begin(sum: &mut Sum, epoch: u8, at: u64) {
-    let begin = Begin {
+    let begin = EpochStart {
         epoch: Epoch(epoch),
         at: Micros(at),
         period: Span(16_000),
         depth: Some(0),
-        speaks: true,
+        may_send: true,
         children: 1,
     };
     sum.begin(&begin, None);
 }
 
-fn words(bits: i16) -> Words {
-    Words { torque: [Q7_8::from_bits(bits); MAX_JOINTS], count: 1 }
+fn words(bits: i16) -> SumWords {
+    SumWords { torque: [Q7_8::from_bits(bits); MAX_JOINTS], count: 1 }
 }
 
 /// Returns the sum sent within half a period.
-fn said(sum: &mut Sum, after: u64) -> Option<Words> {
-    sum.say(Micros(after + 8_000)).map(|(_, words, _)| words)
+fn said(sum: &mut Sum, after: u64) -> Option<SumWords> {
+    sum.poll_sum(Micros(after + 8_000)).map(|(_, words, _)| words)
 }
 
 // LEASE-1, LEASE-2
@@ -37,10 +37,10 @@ fn a_sum_that_arrives_after_its_epoch_is_not_taken_for_another_epoch() {
     sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 1, carry: true }));
     begin(&mut sum, 129, 0);
     // A slow machine delivers it late; then the child's state message arrives.
-    sum.take(Micros(100), 0, Epoch(126), words(-154));
-    sum.state(Micros(200), 0, Epoch(129));
+    sum.receive(Micros(100), 0, Epoch(126), words(-154));
+    sum.handle_state(Micros(200), 0, Epoch(129));
     assert_eq!(said(&mut sum, 0), None, "nothing of this epoch has come");
-    sum.take(Micros(9_000), 0, Epoch(129), words(-151));
+    sum.receive(Micros(9_000), 0, Epoch(129), words(-151));
     assert_eq!(said(&mut sum, 9_000), Some(words(-151)));
 }
 
@@ -50,8 +50,8 @@ fn a_sum_that_arrives_before_its_state_is_taken_when_the_state_arrives() {
     let mut sum = Sum::default();
     sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 1, carry: true }));
     begin(&mut sum, 7, 0);
-    sum.take(Micros(100), 0, Epoch(7), words(3));
+    sum.receive(Micros(100), 0, Epoch(7), words(3));
     assert_eq!((said(&mut sum, 0), sum.dropped), (None, 1));
-    sum.state(Micros(200), 0, Epoch(7));
+    sum.handle_state(Micros(200), 0, Epoch(7));
     assert_eq!((said(&mut sum, 200), sum.taken, sum.dropped), (Some(words(3)), 1, 0));
 }

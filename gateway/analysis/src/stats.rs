@@ -7,8 +7,8 @@
 //! The work per frame is bounded. Memory grows with the number of buses, up to [`BUSES`], not with the number of
 //! frames.
 
-use model::decode::{BUSES, Decoded};
-use model::tracker::{Tracked, Word};
+use model::decode::{MAX_BUSES, Decoded};
+use model::tracker::{CellTracker, HeartbeatKind};
 use protocol::candump::Record;
 use protocol::id::CellId;
 use protocol::message::{Message, NetworkPage, State};
@@ -16,7 +16,7 @@ use protocol::packet::{Epoch, PacketError};
 use protocol::time::Micros;
 use serde::Serialize;
 
-use self::foreign::Foreigners;
+use self::foreign::ForeignCounter;
 pub use self::foreign::{ForeignFrames, ForeignId, FrameType};
 
 mod foreign;
@@ -28,13 +28,13 @@ pub struct Stats {
     span: Option<(u64, u64)>,
     /// The figures that grow with each frame.
     counts: Report,
-    bus_stats: Vec<LinkId>,
+    bus_stats: Vec<BusStats>,
     is_untimed: bool,
 }
 
 /// The statistics of one bus.
 #[derive(Debug)]
-struct LinkId {
+struct BusStats {
     /// Time of the previous frame.
     last: u64,
     all: Count,
@@ -42,10 +42,10 @@ struct LinkId {
     counts: BusReport,
     kinds: [Count; NAMES.len()],
     wires: Count,
-    foreign: Foreigners,
+    foreign: ForeignCounter,
     joints: Option<Joints>,
     /// By index of the cell.
-    cells: Vec<Option<Box<Cell>>>,
+    cells: Vec<Option<Box<CellStats>>>,
 }
 
 /// The packet kinds that are counted, in display order.
@@ -103,15 +103,15 @@ struct Joints {
 impl Joints {
     /// Returns the number of the joints of an epoch shortly before these.
     fn of(self, epoch: Epoch) -> Option<u64> {
-        let age = u64::try_from(self.epoch.since(epoch)).ok()?;
+        let age = u64::try_from(self.epoch.epochs_since(epoch)).ok()?;
         self.number.checked_sub(age)
     }
 }
 
 /// The packets of one cell.
 #[derive(Debug, Default)]
-struct Cell {
-    tracked: Tracked,
+struct CellStats {
+    tracked: CellTracker,
     /// The figures that grow with each packet.
     counts: CellReport,
     /// The epoch of the last sum.
@@ -263,7 +263,7 @@ pub struct CellReport {
 
 impl Stats {
     /// Counts a frame.
-    pub fn take(&mut self, record: &Record<'_>, decoded: &Decoded) {
+    pub fn record(&mut self, record: &Record<'_>, decoded: &Decoded) {
         let nanos = record.time.nanos;
         self.counts.frames += 1;
         let (earliest, latest) = self.span.unwrap_or((nanos, nanos));
@@ -289,10 +289,10 @@ impl Stats {
         *dropped = dropped.saturating_add(frames);
     }
 
-    fn bus_stats(&mut self, bus: &str) -> Option<&mut LinkId> {
+    fn bus_stats(&mut self, bus: &str) -> Option<&mut BusStats> {
         let at = self.bus_stats.iter().position(|bus_stats| bus_stats.counts.bus == bus).or_else(|| {
-            (self.bus_stats.len() < BUSES).then(|| {
-                self.bus_stats.push(LinkId::new(bus));
+            (self.bus_stats.len() < MAX_BUSES).then(|| {
+                self.bus_stats.push(BusStats::new(bus));
                 self.bus_stats.len() - 1
             })
         });
@@ -340,7 +340,7 @@ fn rate(count: u64, nanos: u64) -> Option<f64> {
     (count > 0 && nanos > 0).then(|| count as f64 * 1e9 / nanos as f64)
 }
 
-impl LinkId {
+impl BusStats {
     fn new(bus: &str) -> Self {
         Self {
             last: 0,
@@ -348,7 +348,7 @@ impl LinkId {
             counts: BusReport { bus: bus.to_owned(), ..BusReport::default() },
             kinds: [Count::default(); NAMES.len()],
             wires: Count::default(),
-            foreign: Foreigners::default(),
+            foreign: ForeignCounter::default(),
             joints: None,
             cells: (0..CellId::COUNT).map(|_| None).collect(),
         }
@@ -367,7 +367,7 @@ impl LinkId {
             Decoded::Wire(..) | Decoded::Segment { .. } => {}
             Decoded::Message(message) => self.message(nanos, message),
             Decoded::Meaningless { .. } => refused.meaning += 1,
-            Decoded::Foreign(foreign) => self.foreign.take(nanos, &record.frame, *foreign),
+            Decoded::Foreign(foreign) => self.foreign.record(nanos, &record.frame, *foreign),
             Decoded::Damaged { fault, .. } => match fault {
                 PacketError::Length { .. } => refused.length += 1,
                 PacketError::Crc { .. } => refused.crc += 1,
@@ -396,7 +396,7 @@ impl LinkId {
         let epochs = &mut self.counts.epochs;
         epochs.first.get_or_insert(epoch.0);
         epochs.last = Some(epoch.0);
-        let step = self.joints.map_or(1, |last| epoch.since(last.epoch));
+        let step = self.joints.map_or(1, |last| epoch.epochs_since(last.epoch));
         match u64::try_from(step) {
             Ok(0) => epochs.repeated += 1,
             Ok(step) => epochs.missing += step - 1,
@@ -433,10 +433,10 @@ impl LinkId {
     }
 }
 
-impl Cell {
+impl CellStats {
     fn take(&mut self, nanos: u64, message: &Message, joints: Option<Joints>) {
         self.counts.packets += 1;
-        let word = self.tracked.hear(Micros(nanos / 1_000), message, None).word;
+        let word = self.tracked.receive(Micros(nanos / 1_000), message, None).word;
         if let Message::Torque { epoch, torque, .. } = message {
             let still = !torque.is_zero();
             self.counts.saturated += u64::from(torque.is_saturated());
@@ -450,7 +450,7 @@ impl Cell {
             // A report older than the last torque does not end the contact.
             let is_over = !heartbeat.state.has(State::ACTIVE)
                 && joints.and_then(|joints| joints.of(*epoch)) >= self.touching;
-            if matches!(word, Some(Word::Started { .. })) || is_over && word != Some(Word::Claimant) {
+            if matches!(word, Some(HeartbeatKind::Started { .. })) || is_over && word != Some(HeartbeatKind::Claimant) {
                 self.touching = None;
             }
         }

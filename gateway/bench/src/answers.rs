@@ -31,18 +31,18 @@ impl Answers {
     ///
     /// # Errors
     /// Returns [`BusError`] if the bus is down, gone or closed.
-    pub fn hear(&mut self, listener: &mut Listener) -> Result<(), BusError> {
-        listener.hear(Duration::from_millis(20))?;
+    pub fn receive(&mut self, listener: &mut Listener) -> Result<(), BusError> {
+        listener.receive(Duration::from_millis(20))?;
         for (_, decoded) in listener.decoded() {
             if let Decoded::Message(message) = decoded {
-                self.take(&message);
+                self.record(&message);
             }
         }
         Ok(())
     }
 
     /// Records one packet.
-    pub fn take(&mut self, message: &Message) {
+    pub fn record(&mut self, message: &Message) {
         let Some(from) = message.sender().filter(|&from| self.only.is_none_or(|only| only == from)) else {
             return;
         };

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use model::decode::Decoded;
 use model::listing::Listing;
-use protocol::bus::{Bus, BusError, Choice, Filter, GATEWAY_RECEIVE_BUFFER, Options};
+use protocol::bus::{Bus, BusError, KindChoice, Filter, GATEWAY_RECEIVE_BUFFER, BusOptions};
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind};
 use protocol::message::Message;
@@ -16,13 +16,13 @@ use crate::bus::listen::{self, Listener, passing, send};
 /// Time to wait for a heartbeat (sent four times a second), which shows the cells' frame format.
 const FORMAT: Duration = Duration::from_millis(300);
 /// Interval between queries to all cells.
-const REQUEST: Duration = Duration::from_secs(2);
+const QUERY_INTERVAL: Duration = Duration::from_secs(2);
 /// Time that one poll of the bus waits for a frame.
-const LOOK: Duration = Duration::from_millis(50);
+const POLL_TIMEOUT: Duration = Duration::from_millis(50);
 
 /// Reports received from the cells of a bus, and the time of the last query.
 #[derive(Debug)]
-pub struct Watch {
+pub struct CellWatch {
     listener: Listener,
     began: Instant,
     listing: Listing,
@@ -32,18 +32,18 @@ pub struct Watch {
     requested: Option<Instant>,
 }
 
-impl Watch {
+impl CellWatch {
     /// Opens a bus, also a classic interface, to receive from cells and gateways. Queries are sent in this format, or
     /// else in the format of the cells.
     ///
     /// # Errors
     /// Returns [`BusError`] if the bus cannot be opened.
-    pub fn open(name: &str, kind: Choice, format: Option<Format>) -> Result<Self, BusError> {
+    pub fn open(name: &str, kind: KindChoice, format: Option<Format>) -> Result<Self, BusError> {
         let kinds = Kind::ALL.into_iter().filter(|kind| kind.is_from_cells());
-        let mut filters: Vec<_> = kinds.map(Filter::kind).collect();
+        let mut filters: Vec<_> = kinds.map(Filter::for_kind).collect();
         filters.push(Filter::exact(Id::command(Command::Joints)));
         let receive_buffer = GATEWAY_RECEIVE_BUFFER as usize;
-        let options = Options { filters, receive_buffer, ..Options::default() };
+        let options = BusOptions { filters, receive_buffer, ..BusOptions::default() };
         let listener = Listener::new(listen::open(name, kind, None, options)?, None);
         let listing = Listing::new();
         Ok(Self { listener, began: Instant::now(), listing, others: 0, format, requested: None })
@@ -76,7 +76,7 @@ impl Watch {
     /// The present time on the listing's clock.
     #[must_use]
     pub fn now(&self) -> Micros {
-        Micros::after(self.began.elapsed())
+        Micros::since_start(self.began.elapsed())
     }
 
     /// Queries the cells once the format of their frames is known; queries them repeatedly if `again`.
@@ -84,7 +84,7 @@ impl Watch {
     /// # Errors
     /// Returns [`BusError`] if the bus is gone or closed.
     pub fn request(&mut self, again: bool) -> Result<(), BusError> {
-        let due = self.requested.is_none_or(|requested| again && requested.elapsed() >= REQUEST);
+        let due = self.requested.is_none_or(|requested| again && requested.elapsed() >= QUERY_INTERVAL);
         let waited = (self.elapsed() >= FORMAT).then_some(Format::Fd);
         let Some(format) = self.format.or_else(|| self.listing.format()).or(waited).filter(|_| due) else {
             return Ok(());
@@ -103,17 +103,17 @@ impl Watch {
     ///
     /// # Errors
     /// Returns [`BusError`] if the bus is gone or closed.
-    pub fn hear(&mut self, stopped: &AtomicBool) -> Result<(), BusError> {
-        let heard = self.listener.hear(LOOK);
+    pub fn receive(&mut self, stopped: &AtomicBool) -> Result<(), BusError> {
+        let heard = self.listener.receive(POLL_TIMEOUT);
         if stopped.load(Ordering::Relaxed) {
             heard?;
         } else {
-            passing(heard, LOOK)?;
+            passing(heard, POLL_TIMEOUT)?;
         }
         let now = self.now();
         for (received, decoded) in self.listener.decoded() {
             if let Decoded::Message(message) = decoded {
-                self.listing.hear(now, received.frame.format(), &message);
+                self.listing.receive(now, received.frame.format(), &message);
             } else {
                 self.others += 1;
             }

@@ -6,39 +6,39 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
-use model::commission::{Commission, Progress, Report, Wish};
+use model::commission::{Commission, Progress, Report, CommissionOptions};
 use model::decode::Decoded;
-use protocol::bus::{BusError, Filter, GATEWAY_RECEIVE_BUFFER, Kinds, Options};
+use protocol::bus::{BusError, Filter, GATEWAY_RECEIVE_BUFFER, KindChoices, BusOptions};
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
 use crate::bus::listen::{self, Listener, passing, send};
-use crate::bus::roots::Roots;
+use crate::bus::roots::RootWires;
 
 /// Longest time without a check for a signal.
-const LOOK: Duration = Duration::from_millis(50);
+const POLL_TIMEOUT: Duration = Duration::from_millis(50);
 /// Interval between progress reports.
-const TELL: Duration = Duration::from_millis(20);
+const PROGRESS_INTERVAL: Duration = Duration::from_millis(20);
 /// Pause while an interface is down.
-const DOWN: Duration = Duration::from_millis(20);
+const DOWN_PAUSE: Duration = Duration::from_millis(20);
 /// Bytes that the kernel counts in a socket's buffer for each waiting frame.
 const FRAME_BYTES: usize = 1_024;
 
 /// An open bus whose cells are to be commissioned.
 #[derive(Debug)]
-pub struct Bench {
+pub struct BusCommissioner {
     index: usize,
     listener: Listener,
     format: Format,
     /// Wires to the roots of a network, whose cells may have no node ids yet.
-    roots: Option<Roots>,
+    roots: Option<RootWires>,
 }
 
 /// The result of commissioning a bus.
 #[derive(Debug)]
-pub struct Done {
+pub struct CommissionedBus {
     /// Name of the bus.
     pub name: String,
     /// Kind of the bus.
@@ -55,36 +55,36 @@ pub struct Done {
 ///
 /// # Errors
 /// Returns [`BusError`] if the bus cannot be opened.
-pub fn open(skin: &Skin, index: usize, kinds: &Kinds) -> Result<Bench, BusError> {
+pub fn open(skin: &Skin, index: usize, kinds: &KindChoices) -> Result<BusCommissioner, BusError> {
     let described = skin.buses.get(index);
     let (name, format) = described.map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));
-    let mut roots = Roots::of(skin, index);
+    let mut roots = RootWires::for_bus(skin, index);
     // The roots' messages are received from the beginning.
-    roots.iter_mut().for_each(Roots::explore);
-    let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(Filter::kind).to_vec();
+    roots.iter_mut().for_each(RootWires::explore);
+    let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(Filter::for_kind).to_vec();
     filters.push(Filter::exact(Id::command(Command::Joints)));
-    filters.extend(roots.iter().flat_map(Roots::filters));
+    filters.extend(roots.iter().flat_map(RootWires::filters));
     let receive_buffer = GATEWAY_RECEIVE_BUFFER as usize;
-    let options = Options { filters, receive_buffer, ..Options::default() };
-    let bus = listen::open(name, kinds.of(name), Some(format), options)?;
+    let options = BusOptions { filters, receive_buffer, ..BusOptions::default() };
+    let bus = listen::open(name, kinds.kind_of(name), Some(format), options)?;
     if roots.is_some() && !bus.is_virtual()? {
         // Real cells have real wires; do not simulate wires among them.
         roots = None;
     }
-    Ok(Bench { index, listener: Listener::new(bus, Some(format)), format, roots })
+    Ok(BusCommissioner { index, listener: Listener::new(bus, Some(format)), format, roots })
 }
 
 /// Commissions the cells of all buses until done or stopped, and shows the progress.
 pub fn commission(
-    benches: Vec<Bench>,
+    benches: Vec<BusCommissioner>,
     skin: &Skin,
-    wish: Wish,
+    wish: CommissionOptions,
     stopped: &AtomicBool,
     mut show: impl FnMut(&[Progress]),
-) -> Vec<Done> {
+) -> Vec<CommissionedBus> {
     let far = Mutex::new(vec![None; benches.len()]);
     let waiting: Vec<_> = benches.into_iter().map(|bench| Mutex::new(Some(bench))).collect();
-    let work = |(place, bench): (usize, &Mutex<Option<Bench>>)| {
+    let work = |(place, bench): (usize, &Mutex<Option<BusCommissioner>>)| {
         let bench = bench.lock().ok()?.take()?;
         Some(bench.work(skin, wish, stopped, |progress| {
             if let Some(own) = far.lock().ok().as_mut().and_then(|far| far.get_mut(place)) {
@@ -110,22 +110,22 @@ pub fn commission(
             if !now.is_empty() {
                 show(&now);
             }
-            thread::sleep(TELL);
+            thread::sleep(PROGRESS_INTERVAL);
         }
         threads.into_iter().filter_map(|(thread, done)| done.or_else(|| thread?.join().ok()?)).collect()
     })
 }
 
-impl Bench {
+impl BusCommissioner {
     /// Commissions the cells of the bus until done or stopped, and reports the progress.
-    fn work(mut self, skin: &Skin, wish: Wish, stopped: &AtomicBool, tell: impl FnMut(Progress)) -> Done {
+    fn work(mut self, skin: &Skin, wish: CommissionOptions, stopped: &AtomicBool, tell: impl FnMut(Progress)) -> CommissionedBus {
         let frames = match self.format {
             Format::Fd => 1,
             Format::Classic => 2,
         };
         let room = self.listener.bus().receive_buffer().checked_div(FRAME_BYTES * frames).unwrap_or(0);
         let began = Instant::now();
-        let clock = || Micros::after(began.elapsed());
+        let clock = || Micros::since_start(began.elapsed());
         let mut commission = Commission::new(skin, self.index, wish, room, clock());
         let lost = self.converse(&mut commission, &clock, stopped, tell).err();
         if lost.is_some() {
@@ -134,7 +134,7 @@ impl Bench {
         let bus = self.listener.bus();
         let report = commission.report();
         let trouble = report.trouble.map(|trouble| trouble.on(bus.name()));
-        Done {
+        CommissionedBus {
             name: bus.name().to_owned(),
             kind: bus.kind().to_string(),
             report,
@@ -157,19 +157,19 @@ impl Bench {
             }
             commission.handle_time(clock());
             tell(commission.progress());
-            if let Some(roots) = roots.as_mut().filter(|_| commission.speaks()) {
-                roots.speak(listener.bus());
+            if let Some(roots) = roots.as_mut().filter(|_| commission.may_send()) {
+                roots.send_due(listener.bus());
             }
             while let Some(message) = commission.poll_transmit() {
                 // A packet that was not sent gets no answer, and is sent again.
-                passing(send(listener.bus(), &message, *format), DOWN)?;
+                passing(send(listener.bus(), &message, *format), DOWN_PAUSE)?;
             }
             let Some(next) = commission.poll_timeout() else { return Ok(()) };
-            let quiet = roots.as_ref().filter(|_| commission.speaks()).map_or(LOOK, Roots::timeout);
-            let wait = Duration::from_micros(next.since(clock()).0).min(quiet).min(LOOK);
-            passing(listener.hear(wait), DOWN)?;
+            let quiet = roots.as_ref().filter(|_| commission.may_send()).map_or(POLL_TIMEOUT, RootWires::timeout);
+            let wait = Duration::from_micros(next.elapsed_since(clock()).0).min(quiet).min(POLL_TIMEOUT);
+            passing(listener.receive(wait), DOWN_PAUSE)?;
             for (received, decoded) in listener.decoded() {
-                if roots.as_mut().is_some_and(|roots| roots.take(&received.frame)) {
+                if roots.as_mut().is_some_and(|roots| roots.handle_frame(&received.frame)) {
                     continue;
                 }
                 if let Decoded::Message(message) = decoded {

@@ -4,7 +4,7 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use protocol::usage::{say, shown};
+use protocol::usage::{eprint_line, printable};
 use rustix::termios::tcgetwinsize;
 
 /// Interval between updates on a terminal, and elsewhere.
@@ -54,23 +54,23 @@ impl Progress {
         let [here, elsewhere] = PERIODS;
         if self.bar.is_hidden() {
             self.due = now + elsewhere;
-            return say(&text(None));
+            return eprint_line(&text(None));
         }
         self.due = now + here;
-        self.bar.set_message(shown(&text(columns())).into_owned());
+        self.bar.set_message(printable(&text(columns())).into_owned());
         self.bar.tick();
     }
 
     /// Writes a line above the progress line.
     pub fn note(&self, text: &str) {
         if !self.quiet {
-            self.bar.suspend(|| say(text));
+            self.bar.suspend(|| eprint_line(text));
         }
     }
 
     /// Writes an error above the line, even if quiet.
     pub fn error(&self, text: &str) {
-        self.bar.suspend(|| say(text));
+        self.bar.suspend(|| eprint_line(text));
     }
 
     /// Removes the line.

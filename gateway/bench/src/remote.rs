@@ -17,14 +17,14 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// Number of bytes read at once.
-const PIECE: usize = 4_096;
+const READ_BYTES: usize = 4_096;
 /// Maximum length of a line in bytes. The state of 16 buses with one process per cell is shorter.
-const LONGEST: usize = 1 << 20;
+const MAX_LINE_BYTES: usize = 1 << 20;
 
 /// A command to a bench. Buses are indices into the skin's buses.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
 #[serde(tag = "on", rename_all = "lowercase", deny_unknown_fields)]
-pub enum Command {
+pub enum BenchCommand {
     /// Applies an action to the process of a cell, and so to all cells of that process.
     Process {
         /// The action.
@@ -54,7 +54,7 @@ pub enum Command {
 
 /// State of a bench that is under remote control.
 #[derive(Clone, Debug, Default, Deserialize, PartialEq, Serialize)]
-pub struct State {
+pub struct BenchState {
     /// Processes of cells that the run has started.
     pub processes: Vec<ProcessState>,
     /// Links that are down, in one direction or in both.
@@ -67,10 +67,10 @@ pub struct State {
     #[serde(default)]
     pub halted: Option<String>,
     /// Latest answers to commands, oldest first.
-    pub answers: Vec<Answer>,
+    pub answers: Vec<CommandReply>,
 }
 
-impl State {
+impl BenchState {
     /// Returns a copy that contains only the process of one cell, or no process.
     #[must_use]
     pub fn seen_from(&self, cell: Option<(usize, u8)>) -> Self {
@@ -142,7 +142,7 @@ pub struct Lateness {
 
 /// The answer to a command.
 #[derive(Clone, Debug, Deserialize, Eq, PartialEq, Serialize)]
-pub struct Answer {
+pub struct CommandReply {
     /// Number of the command, from 1.
     pub number: u64,
     /// True if the command was carried out, false if it was refused.
@@ -153,7 +153,7 @@ pub struct Answer {
 
 /// One side of two pipes that carry lines of JSON.
 #[derive(Debug)]
-pub struct Lines {
+pub struct JsonPipe {
     input: OwnedFd,
     output: OwnedFd,
     /// Received bytes that have not been parsed.
@@ -163,7 +163,7 @@ pub struct Lines {
     ended: bool,
 }
 
-impl Lines {
+impl JsonPipe {
     /// Reads from one pipe and writes to another. Sets both to non-blocking.
     ///
     /// # Errors
@@ -224,8 +224,8 @@ impl Lines {
 
     /// Reads the bytes that have arrived. Returns true if there were any.
     fn read(&mut self) -> bool {
-        let mut piece = [0; PIECE];
-        if self.received.len() > LONGEST {
+        let mut piece = [0; READ_BYTES];
+        if self.received.len() > MAX_LINE_BYTES {
             self.received.clear();
         }
         match read(&self.input, &mut piece) {
@@ -247,19 +247,19 @@ mod tests {
     use std::io::{Write, pipe};
 
     /// Creates both sides of two pipes.
-    fn pair() -> (Lines, Lines) {
+    fn pair() -> (JsonPipe, JsonPipe) {
         let ((one_in, two_out), (two_in, one_out)) = (pipe().unwrap(), pipe().unwrap());
-        (Lines::new(one_in, one_out).unwrap(), Lines::new(two_in, two_out).unwrap())
+        (JsonPipe::new(one_in, one_out).unwrap(), JsonPipe::new(two_in, two_out).unwrap())
     }
 
     #[test]
     fn commands_are_json_and_nothing_else_is_one() {
-        let read = |text: &str| serde_json::from_str::<Command>(text).ok();
-        let kill = Command::Process { action: ProcessAction::Kill, bus: 0, node: 12 };
+        let read = |text: &str| serde_json::from_str::<BenchCommand>(text).ok();
+        let kill = BenchCommand::Process { action: ProcessAction::Kill, bus: 0, node: 12 };
         assert_eq!(read(r#"{"on":"process","action":"kill","bus":0,"node":12}"#), Some(kill));
-        let link = Command::Link { down: true, bus: 1, nodes: [3, 4] };
+        let link = BenchCommand::Link { down: true, bus: 1, nodes: [3, 4] };
         assert_eq!(read(r#"{"on":"link","down":true,"bus":1,"nodes":[3,4]}"#), Some(link));
-        assert_eq!(read(r#"{"on":"bus","down":false,"bus":0}"#), Some(Command::Bus { down: false, bus: 0 }));
+        assert_eq!(read(r#"{"on":"bus","down":false,"bus":0}"#), Some(BenchCommand::Bus { down: false, bus: 0 }));
         for wrong in [
             r#"{"on":"process","action":"shoot","bus":0,"node":12}"#,
             r#"{"on":"process","action":"kill","bus":0,"node":256}"#,
@@ -276,44 +276,44 @@ mod tests {
     #[test]
     fn values_come_as_they_were_sent_and_other_lines_are_passed_over() {
         let (mut run, mut page) = pair();
-        let command = Command::Bus { down: true, bus: 2 };
-        assert_eq!(run.receive::<Command>(), None);
+        let command = BenchCommand::Bus { down: true, bus: 2 };
+        assert_eq!(run.receive::<BenchCommand>(), None);
         assert!(page.send(&"no command") && page.send(&command) && page.send(&command));
         assert_eq!((run.receive(), run.receive()), (Some(command), Some(command)));
-        assert_eq!((run.receive::<Command>(), run.has_ended()), (None, false));
-        let answers = vec![Answer { number: 1, done: false, text: "\"a\"\nb".to_owned() }];
+        assert_eq!((run.receive::<BenchCommand>(), run.has_ended()), (None, false));
+        let answers = vec![CommandReply { number: 1, done: false, text: "\"a\"\nb".to_owned() }];
         let process = ProcessState { bus: 1, nodes: (1, 63), phase: Phase::Stopped };
-        let state = State { answers, processes: vec![process; 3_000], ..State::default() };
+        let state = BenchState { answers, processes: vec![process; 3_000], ..BenchState::default() };
         // The state is larger than a pipe.
         assert!(run.send(&state) && !run.send(&state));
         let mut received = None;
         while received.is_none() {
-            received = page.receive::<State>();
+            received = page.receive::<BenchState>();
             run.flush();
         }
         assert_eq!(received, Some(state));
         drop(run);
-        assert_eq!((page.receive::<State>(), page.has_ended()), (None, true));
+        assert_eq!((page.receive::<BenchState>(), page.has_ended()), (None, true));
         assert!(!page.send(&command));
     }
 
     #[test]
     fn a_side_that_reads_nothing_or_ends_no_line_holds_nothing_up() {
         let (mut run, page) = pair();
-        let sent = (0..100_000).take_while(|_| run.send(&State::default())).count();
+        let sent = (0..100_000).take_while(|_| run.send(&BenchState::default())).count();
         assert!((100..10_000).contains(&sent), "{sent}: a pipe holds 64 KiB");
         assert!(!run.has_ended());
         drop(page);
-        assert!(!run.send(&State::default()) && run.has_ended());
+        assert!(!run.send(&BenchState::default()) && run.has_ended());
 
         let ((input, mut other), (_reader, output)) = (pipe().unwrap(), pipe().unwrap());
-        let mut lines = Lines::new(input, output).unwrap();
+        let mut lines = JsonPipe::new(input, output).unwrap();
         for _ in 0..40 {
             other.write_all(&[b'x'; 60_000]).unwrap();
-            assert_eq!(lines.receive::<Command>(), None);
+            assert_eq!(lines.receive::<BenchCommand>(), None);
         }
-        assert!(lines.received.len() <= LONGEST + 60_000);
+        assert!(lines.received.len() <= MAX_LINE_BYTES + 60_000);
         other.write_all(b"\n{\"on\":\"bus\",\"down\":true,\"bus\":0}\n").unwrap();
-        assert_eq!(lines.receive(), Some(Command::Bus { down: true, bus: 0 }));
+        assert_eq!(lines.receive(), Some(BenchCommand::Bus { down: true, bus: 0 }));
     }
 }

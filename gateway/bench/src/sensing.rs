@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use model::repeat::Repeats;
-use protocol::bus::{Bus, BusError, Choice, Filter, Options};
+use protocol::bus::{Bus, BusError, KindChoice, Filter, BusOptions};
 use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Answer, Message, Request};
@@ -16,9 +16,9 @@ use crate::answers::Answers;
 use crate::bus::listen::{self, Listener, send};
 
 /// Time to find cells: two heartbeats and a margin.
-const LISTEN: Duration = Duration::from_millis(600);
+const DISCOVERY_TIME: Duration = Duration::from_millis(600);
 /// Retry interval for a cell that does not answer.
-const AGAIN: Span = Span::from_millis(250);
+const RETRY_INTERVAL: Span = Span::from_millis(250);
 /// Timeout of all answers.
 const TIMEOUT: Duration = Duration::from_secs(3);
 /// Tag of the requests, which distinguishes their answers from those to other senders.
@@ -28,9 +28,9 @@ const TAG: u8 = 0x57;
 ///
 /// # Errors
 /// Returns [`BusError`] if the bus cannot be opened.
-pub fn open(name: &str, kind: Choice, format: Format) -> Result<Bus, BusError> {
-    let filters = [Kind::Network, Kind::Configured].map(Filter::kind).to_vec();
-    listen::open(name, kind, Some(format), Options { filters, ..Options::default() })
+pub fn open(name: &str, kind: KindChoice, format: Format) -> Result<Bus, BusError> {
+    let filters = [Kind::Network, Kind::Configured].map(Filter::for_kind).to_vec();
+    listen::open(name, kind, Some(format), BusOptions { filters, ..BusOptions::default() })
 }
 
 /// An error that keeps cells from being switched.
@@ -85,11 +85,11 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
     };
     tell(listener.bus(), only.map_or(Node::Everyone, Node::Cell))?;
     let began = Instant::now();
-    let mut requests = Repeats::new(AGAIN);
-    requests.said_to_all(Micros::after(began.elapsed()));
-    while began.elapsed() < TIMEOUT && !are_complete(&answers, only, began.elapsed() >= LISTEN) {
-        answers.hear(&mut listener)?;
-        for cell in requests.due(Micros::after(began.elapsed()), answers.missing()) {
+    let mut requests = Repeats::new(RETRY_INTERVAL);
+    requests.mark_all_sent(Micros::since_start(began.elapsed()));
+    while began.elapsed() < TIMEOUT && !are_complete(&answers, only, began.elapsed() >= DISCOVERY_TIME) {
+        answers.receive(&mut listener)?;
+        for cell in requests.due(Micros::since_start(began.elapsed()), answers.missing()) {
             tell(listener.bus(), Node::Cell(cell))?;
         }
     }
@@ -172,13 +172,13 @@ mod tests {
         let mut answers = Answers::new(None, Some(TAG));
         assert!(!are_complete(&answers, None, true), "no cell is there yet");
         for message in [beat(1), confirms(1, TAG), confirms(2, TAG), beat(3), confirms(3, TAG ^ 1)] {
-            answers.take(&message);
+            answers.record(&message);
         }
         assert!(!are_complete(&answers, None, true));
         assert_eq!(answers.missing(), [cell(3)].into(), "the answer to another sender does not count");
         let why = "cell 3 on vcan0 did not answer, 2 did: switch them again when they are back";
         assert_eq!(says(&answers, None), Err(why.to_owned()));
-        answers.take(&confirms(3, TAG));
+        answers.record(&confirms(3, TAG));
         assert!(!are_complete(&answers, None, false) && are_complete(&answers, None, true));
         assert_eq!(says(&answers, None), Ok("3 cells".to_owned()));
     }
@@ -187,11 +187,11 @@ mod tests {
     fn one_cell_is_requested_and_waited_for_alone() {
         let only = Some(cell(7));
         let mut answers = Answers::new(only, Some(TAG));
-        answers.take(&confirms(1, TAG));
+        answers.record(&confirms(1, TAG));
         assert_eq!(answers.missing(), [cell(7)].into());
         let why = "no cell 7 answers on vcan0: start it, or name the bus' format with --format classic";
         assert_eq!(says(&answers, only), Err(why.to_owned()));
-        answers.take(&confirms(7, TAG));
+        answers.record(&confirms(7, TAG));
         assert!(are_complete(&answers, only, false));
         assert_eq!(says(&answers, only), Ok("cell 7".to_owned()));
     }
@@ -200,7 +200,7 @@ mod tests {
     fn a_cell_that_refuses_is_named() {
         let mut answers = Answers::new(None, Some(TAG));
         let answer = Answer::Refused { number: 7, reason: Answer::UNKNOWN };
-        answers.take(&Message::Configured { from: cell(9), tag: TAG, answer });
+        answers.record(&Message::Configured { from: cell(9), tag: TAG, answer });
         let why = "cell 9 on vcan0 refused with reason 18: docs/reference/protocol.md explains it";
         assert_eq!(says(&answers, None), Err(why.to_owned()));
     }

@@ -10,12 +10,12 @@ use protocol::time::Micros;
 use serde::Serialize;
 
 pub use self::cells::{CellSummary, RepliesSummary};
-pub use self::outcome::{CellError, ErrorCells, Halted, Outcome, TickBefore, cells_in_error};
+pub use self::outcome::{CellError, ErrorCells, HaltSummary, Outcome, TickBefore, cells_in_error};
 pub(crate) use self::verdict::many;
 pub use self::verdict::{CELL_ERROR_NM, Verdict};
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Contributions, Event, Status, SumCounts, Table};
-pub use trace::recording::account::{Recording, Written};
+pub use trace::recording::account::{RecordingAccount, WrittenFile};
 
 mod cells;
 mod outcome;
@@ -41,7 +41,7 @@ pub struct Summary {
     /// Reason of the halt at the end of the run, if any.
     pub halted: Option<String>,
     /// All halts, oldest first.
-    pub halts: Vec<Halted>,
+    pub halts: Vec<HaltSummary>,
     /// Number of ended halts beyond the first 100.
     pub further_halts: u64,
     /// Ticks up to the last halt, oldest first.
@@ -54,7 +54,7 @@ pub struct Summary {
     pub first_broadcast_s: f64,
     /// Figures of the control loop.
     #[serde(rename = "loop")]
-    pub control: Loop,
+    pub control: LoopSummary,
     /// Distributed torques compared with central ones.
     pub accuracy: Accuracy,
     /// Number of packets that the kernel dropped before a socket because a processor's backlog was full, over the whole
@@ -63,12 +63,12 @@ pub struct Summary {
     /// Summary of each bus.
     pub buses: Vec<BusSummary>,
     /// Processor use during the loop in cores.
-    pub processor: Processor,
+    pub processor: ProcessorUse,
     /// Private memory of the processes.
     #[serde(flatten)]
-    pub memory: Memory,
+    pub memory: PrivateMemory,
     /// Summary of the recording, if any.
-    pub recording: Option<Recording>,
+    pub recording: Option<RecordingAccount>,
 }
 
 impl Summary {
@@ -86,12 +86,12 @@ impl Summary {
     /// Creates the summary of a run that failed before any bus was opened.
     #[must_use]
     pub fn of_no_run(skin: &Skin, why: String) -> Self {
-        Self::empty(skin).rated(Some(why))
+        Self::empty(skin).with_verdict(Some(why))
     }
 
     /// Sets the outcome and the verdict from the other figures; `failure` is the reason of an early end.
     #[must_use]
-    pub fn rated(mut self, failure: Option<String>) -> Self {
+    pub fn with_verdict(mut self, failure: Option<String>) -> Self {
         // A lost bus may have caused the halt, and the halt is the more precise outcome.
         let lost_buses = || self.lost_buses().filter(|_| self.halted.is_none());
         self.failure = failure.or_else(|| self.lost_frames()).or_else(lost_buses);
@@ -103,7 +103,7 @@ impl Summary {
             None if self.interrupted => Outcome::Interrupted,
             None => Outcome::Done,
         };
-        self.verdict = Verdict::of(&self);
+        self.verdict = Verdict::new(&self);
         self
     }
 
@@ -115,7 +115,7 @@ impl Summary {
         let came_to_its_end = self.failure.is_none() || self.failure == self.lost_frames();
         let lost = self.lost_buses().filter(|_| came_to_its_end);
         let halted = self.halts.last().filter(|_| self.halted.is_some()).map(|halted| {
-            let Halted { at_s, epoch, reason, .. } = halted;
+            let HaltSummary { at_s, epoch, reason, .. } = halted;
             format!(
                 "the robot was halted at {at_s:.3} s (epoch {epoch}) and not resumed: {reason}; --summary FILE keeps \
                  the ticks before it"
@@ -135,7 +135,7 @@ impl Summary {
     }
 
     fn lost_frames(&self) -> Option<String> {
-        let Recording { errors, lost_write, files, .. } = self.recording.as_ref()?;
+        let RecordingAccount { errors, lost_write, files, .. } = self.recording.as_ref()?;
         let first = errors.first().map_or("", String::as_str);
         let parts = files.iter().map(|file| &file.path).filter(|path| path.ends_with(".part"));
         // The error of such a file says how to recover it.
@@ -154,7 +154,7 @@ impl Summary {
 
 /// Figures of the control loop.
 #[derive(Clone, Debug, Default, Serialize)]
-pub struct Loop {
+pub struct LoopSummary {
     /// Number of executed ticks.
     pub ticks: u64,
     /// Number of ticks skipped because the machine was late.
@@ -189,7 +189,7 @@ pub struct Loop {
 
 /// Processor use during the loop in cores.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
-pub struct Processor {
+pub struct ProcessorUse {
     /// This program.
     pub gateway: f64,
     /// All cells together.
@@ -200,7 +200,7 @@ pub struct Processor {
 
 /// Private memory in KiB.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
-pub struct Memory {
+pub struct PrivateMemory {
     /// Memory of the largest cell process, if the run started cells.
     pub cell_private_kib: Option<u64>,
     /// Memory of this program at the end of the loop.
@@ -434,9 +434,9 @@ impl BusSummary {
             sent: kinds(&|kind| counters.sent(kind)),
             events: events.filter(|(_, count)| *count > 0).collect(),
             dropped_by_bus: dropped,
-            last_reply_us: Quantiles::of(table.delays().of_last_replies(), 1.0),
-            reply_us: Quantiles::of(table.delays().of_replies(), 1.0),
-            joints_not_taken_us: Quantiles::of(table.delays().of_joints_not_taken(), 1.0),
+            last_reply_us: Quantiles::from_histogram(table.delays().of_last_replies(), 1.0),
+            reply_us: Quantiles::from_histogram(table.delays().of_replies(), 1.0),
+            joints_not_taken_us: Quantiles::from_histogram(table.delays().of_joints_not_taken(), 1.0),
         }
     }
 }

@@ -4,8 +4,8 @@ use protocol::id::CellId;
 use protocol::message::State;
 use protocol::packet::{Epoch, WORDS};
 
-use model::network::check::Seen;
-use model::table::{Cell, SWITCHES, Said, Status, Switch};
+use model::network::check::ObservedCell;
+use model::table::{CellState, SWITCHES, Responded, Status, Switch};
 
 /// State of a bus's cells, updated every 20 ms.
 #[derive(Clone, Debug, Default)]
@@ -19,7 +19,7 @@ pub struct View {
     /// Number of the gateway's commands that were read back from the bus, or were lost with it.
     pub commands: u64,
     /// Cells of the network, including undescribed ones; empty if cells answer with their own torques.
-    pub network: Vec<Seen>,
+    pub network: Vec<ObservedCell>,
 }
 
 /// State of one cell.
@@ -28,7 +28,7 @@ pub struct CellView {
     /// Node id of the cell.
     pub node: CellId,
     /// True if a heartbeat was received from it.
-    pub heard: bool,
+    pub seen: bool,
     /// True if it has fallen silent.
     pub dead: bool,
     /// True if it can be expected to answer, unless it is halted.
@@ -44,7 +44,7 @@ pub struct CellView {
     /// Epoch of the last joints that it received.
     pub last_joints: Epoch,
     /// Reports that it has sent since it was queried.
-    pub said: Said,
+    pub responded: Responded,
     /// Reply mode by its last report, as the words of the parameter.
     pub reply: Option<[i16; WORDS]>,
     /// Ports whose link it holds down, by its last report; one bit each.
@@ -58,7 +58,7 @@ pub struct CellView {
 impl View {
     /// Creates the view of a bus.
     #[must_use]
-    pub fn new(cells: Vec<CellView>, commands: u64, network: Vec<Seen>) -> Self {
+    pub fn new(cells: Vec<CellView>, commands: u64, network: Vec<ObservedCell>) -> Self {
         let lacking = cells.iter().any(CellView::is_lacking);
         let unclear = cells.iter().any(|cell| cell.unclear);
         Self { cells, lacking, unclear, commands, network }
@@ -74,14 +74,14 @@ impl CellView {
 
     /// Creates the view of a cell from its table entry.
     #[must_use]
-    pub fn of(cell: &Cell, status: Status) -> Self {
+    pub fn new(cell: &CellState, status: Status) -> Self {
         let state = cell.heartbeat().map(|heartbeat| heartbeat.state);
         let alive = !matches!(status, Status::Dead | Status::Unknown);
         let settled = state.filter(|state| alive && !state.has(State::CLAIMING));
         let ready = settled.is_some_and(|state| state.has(State::CONFIGURED));
         Self {
             node: cell.node,
-            heard: state.is_some(),
+            seen: state.is_some(),
             dead: status == Status::Dead,
             ready,
             halted: ready && !cell.is_ready(),
@@ -89,10 +89,10 @@ impl CellView {
             measures: ready && cell.measures() == Some(true),
             other: cell.heartbeat().is_some_and(|heartbeat| heartbeat.configuration != cell.configuration),
             last_joints: cell.last_joints,
-            said: cell.said(),
+            responded: cell.responded(),
             reply: cell.reply,
-            deaf: cell.deaf,
-            lacks: cell.lacks(),
+            deaf: cell.ports_down,
+            lacks: cell.unconfirmed_switches(),
             unclear: ready && cell.has_unseen_stimuli(),
         }
     }

@@ -154,7 +154,7 @@ fn name(skin: &Skin, bus: usize) -> String {
 /// Checks that the joints of a recording match the skin, also in their rate.
 fn checked(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
     for (bus, observed) in
-        seen.buses.iter().enumerate().filter(|(bus, _)| skin.cells_of(*bus).next().is_some())
+        seen.buses.iter().enumerate().filter(|(bus, _)| skin.cells_on_bus(*bus).next().is_some())
     {
         if let Some(got) = observed.other_joints {
             let joints = skin.chain(bus).joints.len();
@@ -210,7 +210,7 @@ fn fitting(
 fn each_alone(skin: &Skin, seen: &Observations, settings: &Settings, lags: Vec<Lags>) -> Seen {
     let buses: Vec<_> = (0..skin.buses.len()).collect();
     let tables: Vec<_> = each(buses.len(), settings.threads, |bus| {
-        let is_used = skin.cells_of(bus).next().is_some();
+        let is_used = skin.cells_on_bus(bus).next().is_some();
         let (sheet, gravity) = (&settings.sheet, settings.gravity);
         lags.get(bus)
             .filter(|_| is_used)

@@ -90,7 +90,7 @@ impl Observations {
                 joints: Vec::new(),
                 gaps: Vec::new(),
                 other_joints: None,
-                reference: Central::unquantised(&skin.part_on(bus)),
+                reference: Central::unquantised(&skin.with_cells_of_bus(bus)),
                 revolute: rows
                     .filter(|kind| *kind != RowKind::Fixed)
                     .map(|kind| kind == RowKind::Revolute)
@@ -134,7 +134,7 @@ impl BusObservations {
     fn broadcast(&mut self, epoch: Epoch, at: Micros, words: &[protocol::fixed::Q1_14]) {
         if let Some((last, before)) = self.last {
             let periods = real(at.0.saturating_sub(before.0)) / self.period_us;
-            let steps = epoch.since(last);
+            let steps = epoch.epochs_since(last);
             // Epoch numbers repeat after 256 broadcasts.
             if steps < 1 && periods < f64::from(LATEST) {
                 // A repeated or an old broadcast.

@@ -149,7 +149,7 @@ pub fn plan(skin: &Skin, bounds: &Bounds, sheet: &DataSheet, gravity: [f64; 3]) 
     bounds.check(skin)?;
     let swings = Swings::new(skin, bounds);
     let poses = poses(skin, bounds, &swings);
-    let buses = (0..skin.buses.len()).filter(|&bus| skin.cells_of(bus).next().is_some());
+    let buses = (0..skin.buses.len()).filter(|&bus| skin.cells_on_bus(bus).next().is_some());
     let arms: Vec<_> = buses.map(|bus| (bus, Arm::new(skin, bus, gravity))).collect();
     let supposed = supposed(skin, &arms);
     let mut candidates = Vec::new();

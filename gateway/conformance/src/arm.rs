@@ -13,9 +13,9 @@ use rand_pcg::Pcg64Mcg;
 
 /// A pseudo-random generator with a fixed seed.
 #[derive(Clone, Debug)]
-pub(crate) struct Dice(Pcg64Mcg);
+pub(crate) struct TestRandom(Pcg64Mcg);
 
-impl Dice {
+impl TestRandom {
     pub(crate) fn new(seed: u64) -> Self {
         Self(Pcg64Mcg::seed_from_u64(seed))
     }
@@ -36,7 +36,7 @@ impl Dice {
     }
 
     /// Returns one element of a slice.
-    pub(crate) fn one<T: Copy + Default>(&mut self, of: &[T]) -> T {
+    pub(crate) fn choose<T: Copy + Default>(&mut self, of: &[T]) -> T {
         of.choose(&mut self.0).copied().unwrap_or_default()
     }
 }
@@ -60,7 +60,7 @@ fn row(a: i16, d: i16, alpha: i16, theta_offset: i16) -> Row {
 }
 
 /// Returns the cell of the protocol's complete configuration, on joint k of a UR5, with [`PLAIN`] contact.
-pub(crate) fn document(joint: u8) -> Parameters {
+pub(crate) fn example_parameters(joint: u8) -> Parameters {
     let mut rows = [Row::default(); MAX_ROWS];
     let ur5 = [
         row(0, 0x05B5, 0x4000, 0),
@@ -90,14 +90,14 @@ pub(crate) fn document(joint: u8) -> Parameters {
 }
 
 /// Returns the same at 62.5 joints a second, for checks of times.
-pub(crate) fn in_time(joint: u8) -> Parameters {
-    Parameters { period_us: 16_000, ..document(joint) }
+pub(crate) fn fast_parameters(joint: u8) -> Parameters {
+    Parameters { period_us: 16_000, ..example_parameters(joint) }
 }
 
 /// Returns a configuration as large as the cell accepts, with a different value in each word, so that no word can be
 /// lost in flash unnoticed.
-pub(crate) fn distinct(abilities: Abilities) -> Parameters {
-    let mut all = document(3);
+pub(crate) fn distinct_parameters(abilities: Abilities) -> Parameters {
+    let mut all = example_parameters(3);
     all.period_us = 55_500;
     all.contact = Contact {
         alpha_c: Q3_12::from_bits(4_101),
@@ -137,7 +137,7 @@ pub(crate) fn distinct(abilities: Abilities) -> Parameters {
     let byte = |number: usize| u8::try_from(number).unwrap_or_default();
     (large.joints, large.table_rows, large.row) = (byte(joints), byte(rows), byte(rows));
     large.joint = large.joints;
-    if abilities.lacks(&large).is_none() { large } else { all }
+    if abilities.first_missing(&large).is_none() { large } else { all }
 }
 
 /// Returns the gains and thresholds of the document's example.
@@ -154,14 +154,14 @@ pub(crate) fn document_contact() -> Contact {
 
 /// The dimensions of a chain.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Shape {
+pub(crate) struct ChainShape {
     pub(crate) joints: usize,
     pub(crate) rows: usize,
     pub(crate) prismatic: bool,
 }
 
 /// Returns an arm of a given shape and limited reach, with a cell somewhere on it.
-pub(crate) fn random(dice: &mut Dice, shape: Shape) -> Parameters {
+pub(crate) fn random_parameters(dice: &mut TestRandom, shape: ChainShape) -> Parameters {
     let mut rows = [Row::default(); MAX_ROWS];
     let fixed = shape.rows.saturating_sub(shape.joints);
     // Lengths and slides add up to less than 2 m.
@@ -184,7 +184,7 @@ pub(crate) fn random(dice: &mut Dice, shape: Shape) -> Parameters {
             kind,
             a: Q1_14::nearest(dice.unit() * share),
             d: Q1_14::nearest(dice.unit() * share / if kind == RowKind::Prismatic { 2.0 } else { 1.0 }),
-            alpha: Q1_14::from_bits(dice.one(&twist)),
+            alpha: Q1_14::from_bits(dice.choose(&twist)),
             theta_offset: Q1_14::from_bits(dice.word()),
         };
     }
@@ -211,7 +211,7 @@ pub(crate) fn random(dice: &mut Dice, shape: Shape) -> Parameters {
 }
 
 /// Returns a vector of length 1.
-fn normal(dice: &mut Dice) -> [Q1_14; 3] {
+fn normal(dice: &mut TestRandom) -> [Q1_14; 3] {
     loop {
         let any = [0; 3].map(|_| dice.unit());
         let length = any.iter().map(|x| x * x).sum::<f64>().sqrt();
@@ -222,14 +222,14 @@ fn normal(dice: &mut Dice) -> [Q1_14; 3] {
 }
 
 /// Returns joint positions for a chain; prismatic joints stay near 0.
-pub(crate) fn positions(dice: &mut Dice, parameters: &Parameters) -> [i16; MAX_JOINTS] {
+pub(crate) fn positions(dice: &mut TestRandom, parameters: &Parameters) -> [i16; MAX_JOINTS] {
     let moving: Vec<_> = parameters.table().iter().filter(|row| row.moves()).map(|row| row.kind).collect();
     let share = 16_384 / i16::try_from(parameters.table().len().max(1) * 3).unwrap_or(i16::MAX);
     core::array::from_fn(|index| match moving.get(index) {
         None => 0,
         Some(RowKind::Prismatic) => dice.word() % share,
         Some(RowKind::Revolute | RowKind::Fixed) => match dice.below(8) {
-            0 => dice.one(&[0, 0x4000, -0x4000, i16::MIN, i16::MAX]),
+            0 => dice.choose(&[0, 0x4000, -0x4000, i16::MIN, i16::MAX]),
             _ => dice.word(),
         },
     })
@@ -248,7 +248,7 @@ pub(crate) fn force(contact: &Contact, skin: &SkinSensors) -> i64 {
 }
 
 /// Computes a torque word from a word of J and a force in steps of 2^-16 N.
-pub(crate) fn word(j: i16, force: i64, format: TorqueFormat) -> i16 {
+pub(crate) fn torque_word(j: i16, force: i64, format: TorqueFormat) -> i16 {
     let bits = 30 - i64::from(format.fraction());
     let held = ((i64::from(j) * force + (1 << (bits - 1))) >> bits).clamp(i16::MIN.into(), i16::MAX.into());
     i16::try_from(held).unwrap_or_default()
@@ -263,20 +263,20 @@ pub(crate) fn contact(sum: i32) -> [Q5_10; 3] {
 }
 
 /// Formats words, separated by spaces.
-pub(crate) fn list(words: &[i16]) -> String {
+pub(crate) fn format_words(words: &[i16]) -> String {
     words.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ")
 }
 
 /// Formats the values of a sensors page.
-pub(crate) fn page(page: SensorPage) -> String {
+pub(crate) fn format_page(page: SensorPage) -> String {
     let message = Message::Sensors { from: CellId::MAX, epoch: Epoch(0), page };
     let text = Decoded::Message(message).to_string();
     text.split_once(": ").map_or_else(String::new, |(_, values)| values.to_owned())
 }
 
 /// Formats latched sensor values.
-pub(crate) fn skin(skin: Option<SkinSensors>) -> String {
-    skin.map_or_else(|| "nothing".to_owned(), |skin| page(SensorPage::Skin(skin)))
+pub(crate) fn format_skin(skin: Option<SkinSensors>) -> String {
+    skin.map_or_else(|| "nothing".to_owned(), |skin| format_page(SensorPage::Skin(skin)))
 }
 
 /// Returns a press with this sum of contact words, and no other values.
@@ -296,7 +296,7 @@ pub(crate) fn exact_jacobian(central: &Central, positions: &[i16; MAX_JOINTS]) -
 }
 
 /// Returns the distance of a word of J from the nearest word to the exact value, in steps.
-pub(crate) fn off(j: i16, exact: f64) -> u32 {
+pub(crate) fn steps_off(j: i16, exact: f64) -> u32 {
     let nearest = Q::<14>::nearest(exact).to_bits();
     i32::from(j).abs_diff(nearest.into())
 }

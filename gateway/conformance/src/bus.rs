@@ -6,7 +6,7 @@ use thiserror::Error;
 
 /// A frame seen on the bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Seen {
+pub struct ObservedFrame {
     /// Its time on the clock of [`Bus::now`].
     pub at: Micros,
     /// The frame.
@@ -16,7 +16,7 @@ pub struct Seen {
 }
 
 /// A bus with the cell under test.
-pub trait Bus {
+pub trait TestBus {
     /// Returns the time.
     fn now(&self) -> Micros;
 
@@ -27,13 +27,13 @@ pub trait Bus {
     ///
     /// # Errors
     /// Returns [`Stop`] if the bus does not accept the frames, or if the test is interrupted.
-    fn send(&mut self, frames: &[Frame]) -> Result<(), Stop>;
+    fn send(&mut self, frames: &[Frame]) -> Result<(), StopReason>;
 
     /// Returns the next frame, or `None` if no frame arrives by then.
     ///
     /// # Errors
     /// Returns [`Stop`] if the bus is gone, or if the test is interrupted.
-    fn receive(&mut self, until: Micros) -> Result<Option<Seen>, Stop>;
+    fn receive(&mut self, until: Micros) -> Result<Option<ObservedFrame>, StopReason>;
 
     /// Returns the maximum lateness of the bench itself since the last call; it does not count against the cell.
     fn lateness(&mut self) -> Span;
@@ -48,18 +48,18 @@ pub trait Bus {
     ///
     /// # Errors
     /// Returns [`Stop`] if that is not possible.
-    fn begin_restart(&mut self) -> Result<(), Stop>;
+    fn begin_restart(&mut self) -> Result<(), StopReason>;
 
     /// Returns true while the restart is in progress.
     ///
     /// # Errors
     /// Returns [`Stop`] if the restart failed.
-    fn is_restarting(&mut self) -> Result<bool, Stop>;
+    fn is_restarting(&mut self) -> Result<bool, StopReason>;
 }
 
 /// The reason why a test ends early.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
-pub enum Stop {
+pub enum StopReason {
     /// A signal arrived.
     #[error("interrupted")]
     Interrupted,

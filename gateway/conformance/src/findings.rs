@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::requirements::{REQUIREMENTS, Requirement};
 
 /// The maximum number of frames that are shown for a failure.
-const FRAMES: usize = 24;
+const MAX_FAILURE_FRAMES: usize = 24;
 
 /// The verdict on one requirement.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
@@ -88,7 +88,7 @@ impl Findings {
         tally.failed += 1;
         tally.failure.get_or_insert_with(|| {
             let mut frames = frames();
-            frames.drain(..frames.len().saturating_sub(FRAMES));
+            frames.drain(..frames.len().saturating_sub(MAX_FAILURE_FRAMES));
             (what, frames)
         });
     }
@@ -116,7 +116,7 @@ impl Findings {
     }
 
     /// Retracts the failures of a requirement since `before`.
-    pub(crate) fn forgive(&mut self, id: &'static str, before: &Self) {
+    pub(crate) fn retract(&mut self, id: &'static str, before: &Self) {
         let Tally { failed, failure, .. } = before.0.get(id).cloned().unwrap_or_default();
         let tally = self.tally(id);
         (tally.failed, tally.failure) = (failed, failure);
@@ -140,7 +140,7 @@ impl Findings {
     /// Returns all requested requirements with their verdicts, in the order of the documents. `stopped` is the reason
     /// why the test ended early, if it did.
     #[must_use]
-    pub fn list(&self, only: &Only, stopped: Option<&Stop>) -> Vec<Finding> {
+    pub fn list(&self, only: &RequirementFilter, stopped: Option<&StopReason>) -> Vec<Finding> {
         let why = stopped.map_or_else(|| "there is no check for it".to_owned(), ToString::to_string);
         let asked = REQUIREMENTS.iter().filter(|it| only.has(it.id));
         asked
@@ -151,9 +151,9 @@ impl Findings {
 
 /// The selection of requirements.
 #[derive(Clone, Debug, Default)]
-pub struct Only(Vec<String>);
+pub struct RequirementFilter(Vec<String>);
 
-impl Only {
+impl RequirementFilter {
     /// Selects requirements by id or by kind: `CONF-7`, `CONF`; without words, selects everything.
     ///
     /// # Errors

@@ -22,5 +22,5 @@ mod timing;
 mod timings;
 
 pub use checks::run;
-pub use saved::Saved;
+pub use saved::SavedCell;
 pub use session::Session;

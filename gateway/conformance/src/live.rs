@@ -10,26 +10,26 @@ use std::time::Duration;
 
 use bench::bus::follow::fill;
 use bench::bus::listen;
-use protocol::bus::{Bus as Socket, BusError, Choice, GATEWAY_RECEIVE_BUFFER, Inbox, Options};
+use protocol::bus::{Bus as Socket, BusError, KindChoice, GATEWAY_RECEIVE_BUFFER, Inbox, BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::time::{Micros, Span};
 
-use crate::bus::{Bus, Seen, Stop};
+use crate::bus::{TestBus, ObservedFrame, StopReason};
 use probe::Probe;
 
 /// The interval at which a termination signal is checked.
-const LOOK: Span = Span::from_millis(50);
+const SIGNAL_POLL_INTERVAL: Span = Span::from_millis(50);
 /// The time limit for a restart.
-const RESTART: Span = Span::from_millis(15_000);
+const RESTART_TIMEOUT: Span = Span::from_millis(15_000);
 
 /// An open bus.
 #[derive(Debug)]
-pub struct Live {
+pub struct SocketBus {
     socket: Socket,
     inbox: Inbox,
-    waiting: VecDeque<Seen>,
+    waiting: VecDeque<ObservedFrame>,
     stopped: Arc<AtomicBool>,
-    obeys: bool,
+    obeys_signals: bool,
     late: Span,
     /// Measures this computer's lateness, if the cell may be a process on it.
     probe: Option<Probe>,
@@ -37,19 +37,19 @@ pub struct Live {
     child: Option<(Child, Micros)>,
 }
 
-impl Live {
+impl SocketBus {
     /// Opens a bus. `stopped` interrupts the test; `command` switches the cell off and on.
     ///
     /// # Errors
     /// Returns [`BusError`] if it cannot be used as requested.
     pub fn open(
         name: &str,
-        kind: Choice,
+        kind: KindChoice,
         stopped: Arc<AtomicBool>,
         command: Option<String>,
     ) -> Result<Self, BusError> {
         let receive_buffer = GATEWAY_RECEIVE_BUFFER as usize;
-        let options = Options { own_frames: true, receive_buffer, ..Options::default() };
+        let options = BusOptions { own_frames: true, receive_buffer, ..BusOptions::default() };
         let socket = listen::open(name, kind, None, options)?;
         let (inbox, waiting, late) = (Inbox::new(), VecDeque::new(), Span(0));
         let probe = socket.is_virtual().unwrap_or(false).then(Probe::new).transpose();
@@ -58,19 +58,19 @@ impl Live {
             doing: "start a thread beside",
             source,
         })?;
-        Ok(Self { socket, inbox, waiting, stopped, obeys: true, late, probe, command, child: None })
+        Ok(Self { socket, inbox, waiting, stopped, obeys_signals: true, late, probe, command, child: None })
     }
 
     fn interrupted(&self) -> bool {
-        self.obeys && self.stopped.load(Ordering::Relaxed)
+        self.obeys_signals && self.stopped.load(Ordering::Relaxed)
     }
 }
 
-fn lost(error: impl ToString) -> Stop {
-    Stop::Bus(error.to_string())
+fn lost(error: impl ToString) -> StopReason {
+    StopReason::Bus(error.to_string())
 }
 
-impl Bus for Live {
+impl TestBus for SocketBus {
     fn now(&self) -> Micros {
         listen::now()
     }
@@ -80,29 +80,29 @@ impl Bus for Live {
         format == Format::Classic || self.socket.carries_fd() && self.probe.is_some()
     }
 
-    fn send(&mut self, frames: &[Frame]) -> Result<(), Stop> {
+    fn send(&mut self, frames: &[Frame]) -> Result<(), StopReason> {
         self.socket.send(frames).map_err(lost)
     }
 
-    fn receive(&mut self, until: Micros) -> Result<Option<Seen>, Stop> {
+    fn receive(&mut self, until: Micros) -> Result<Option<ObservedFrame>, StopReason> {
         loop {
             if self.interrupted() {
-                return Err(Stop::Interrupted);
+                return Err(StopReason::Interrupted);
             }
             if let Some(seen) = self.waiting.pop_front() {
                 return Ok(Some(seen));
             }
             let before = self.now();
-            let wait = until.since(before).min(LOOK);
+            let wait = until.elapsed_since(before).min(SIGNAL_POLL_INTERVAL);
             let wait_time = Duration::from_micros(wait.0);
             let count = fill(&self.socket, &mut self.inbox, wait_time).map_err(lost)?;
             let now = self.now();
             if self.inbox.dropped() > 0 {
                 let name = self.socket.name();
-                return Err(Stop::Bus(format!("{name}: frames came faster than they were read")));
+                return Err(StopReason::Bus(format!("{name}: frames came faster than they were read")));
             }
             if count == 0 {
-                self.late = self.late.max(now.since(before + wait));
+                self.late = self.late.max(now.elapsed_since(before + wait));
                 if now >= until {
                     return Ok(None);
                 }
@@ -110,8 +110,8 @@ impl Bus for Live {
             }
             for received in self.inbox.frames() {
                 let at = if received.at_nanos == 0 { now } else { Micros(received.at_nanos / 1_000) };
-                self.late = self.late.max(now.since(at));
-                self.waiting.push_back(Seen { at, frame: received.frame, own: received.own });
+                self.late = self.late.max(now.elapsed_since(at));
+                self.waiting.push_back(ObservedFrame { at, frame: received.frame, own: received.own });
             }
         }
     }
@@ -122,35 +122,35 @@ impl Bus for Live {
     }
 
     fn finish(&mut self) {
-        self.obeys = false;
+        self.obeys_signals = false;
     }
 
     fn can_restart(&self) -> bool {
         self.command.is_some()
     }
 
-    fn begin_restart(&mut self) -> Result<(), Stop> {
-        let Some(command) = &self.command else { return Err(Stop::Restart("no command".to_owned())) };
+    fn begin_restart(&mut self) -> Result<(), StopReason> {
+        let Some(command) = &self.command else { return Err(StopReason::Restart("no command".to_owned())) };
         let child = Command::new("sh")
             .args(["-c", command])
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .spawn()
-            .map_err(|error| Stop::Restart(format!("--restart {command:?}: {error}")))?;
+            .map_err(|error| StopReason::Restart(format!("--restart {command:?}: {error}")))?;
         self.child = Some((child, self.now()));
         Ok(())
     }
 
-    fn is_restarting(&mut self) -> Result<bool, Stop> {
+    fn is_restarting(&mut self) -> Result<bool, StopReason> {
         let now = self.now();
         let Some((child, began)) = &mut self.child else { return Ok(false) };
-        let failed = |why: String| Err(Stop::Restart(format!("the command of --restart {why}")));
+        let failed = |why: String| Err(StopReason::Restart(format!("the command of --restart {why}")));
         match child.try_wait() {
             Ok(Some(status)) => {
                 self.child = None;
                 if status.success() { Ok(false) } else { failed(format!("failed: {status}")) }
             }
-            Ok(None) if now.since(*began) > RESTART => failed("did not end within 15 s".to_owned()),
+            Ok(None) if now.elapsed_since(*began) > RESTART_TIMEOUT => failed("did not end within 15 s".to_owned()),
             Ok(None) => Ok(true),
             Err(error) => failed(error.to_string()),
         }

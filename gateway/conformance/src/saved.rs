@@ -3,16 +3,16 @@
 use std::collections::BTreeMap;
 
 use protocol::message::{Answer, Message, State};
-use protocol::packet::{WORDS, words};
+use protocol::packet::{WORDS, padded_words};
 use protocol::parameters::Parameter;
 use protocol::time::Span;
 use serde::{Deserialize, Serialize};
 
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::{Reply, Session};
 
 /// The time limit for restoring the state.
-const LONGEST: Span = Span::from_millis(8_000);
+const RESTORE_TIMEOUT: Span = Span::from_millis(8_000);
 /// The time after which all answers to the test have come.
 const SETTLE: Span = Span::from_millis(60);
 /// The number of attempts to restore a value.
@@ -30,7 +30,7 @@ const SWITCHES: [Parameter; 6] = [
 
 /// The state of a cell.
 #[derive(Clone, Debug, Deserialize, Eq, PartialEq, Serialize)]
-pub struct Saved {
+pub struct SavedCell {
     /// The name of its bus.
     pub bus: String,
     /// Its node id.
@@ -50,7 +50,7 @@ impl Session<'_> {
     ///
     /// # Errors
     /// Returns [`Stop`] if the bus fails, or if the test is interrupted.
-    pub fn save(&mut self) -> Result<Result<Saved, String>, Stop> {
+    pub fn save(&mut self) -> Result<Result<SavedCell, String>, StopReason> {
         let Reply::Value(identity) = self.read(Parameter::Identity.number())? else {
             return Ok(Err("it does not answer a read of parameter 0 (identity)".to_owned()));
         };
@@ -74,20 +74,20 @@ impl Session<'_> {
         self.about.abilities = abilities;
         let halted = State(state).has(State::HALTED);
         let (bus, node) = (self.bus_name().to_owned(), self.cell.get());
-        Ok(Ok(Saved { bus, node, serial, hash, halted, parameters }))
+        Ok(Ok(SavedCell { bus, node, serial, hash, halted, parameters }))
     }
 
     /// Restores the state of the cell, and returns descriptions of the parts that could not be restored.
     ///
     /// # Errors
     /// Returns [`Stop`] if the bus fails.
-    pub fn restore(&mut self, saved: &Saved) -> Result<Vec<String>, Stop> {
+    pub fn restore(&mut self, saved: &SavedCell) -> Result<Vec<String>, StopReason> {
         let mut left = Vec::new();
-        self.extend(LONGEST);
+        self.extend(RESTORE_TIMEOUT);
         // Lets late answers to the test pass, so that they do not count as answers to this.
         self.idle(SETTLE)?;
-        self.start();
-        self.say(&[Message::Resume])?;
+        self.begin_expected_exchange();
+        self.send_messages(&[Message::Resume])?;
         if saved.hash == 0 {
             left.push("it had no configuration, and cannot be made to forget the test's".to_owned());
         } else if !self.put_back_stored(saved)? {
@@ -110,11 +110,11 @@ impl Session<'_> {
                 left.push(format!("parameter {}", parameter.number()));
             }
         }
-        self.say(&[if saved.halted { Message::Halt } else { Message::Resume }])?;
+        self.send_messages(&[if saved.halted { Message::Halt } else { Message::Resume }])?;
         Ok(left)
     }
 
-    fn put_back_stored(&mut self, saved: &Saved) -> Result<bool, Stop> {
+    fn put_back_stored(&mut self, saved: &SavedCell) -> Result<bool, StopReason> {
         for _ in 0..ATTEMPTS {
             let mut is_well = true;
             for (&number, &words) in &saved.parameters {
@@ -122,7 +122,7 @@ impl Session<'_> {
                     is_well &= self.write(number, words)? == Reply::Value(words);
                 }
             }
-            let hash = words([saved.hash.cast_signed()]);
+            let hash = padded_words([saved.hash.cast_signed()]);
             is_well &= self.write(Parameter::Commit.number(), hash)? == Reply::Value(hash);
             if is_well {
                 return Ok(true);

@@ -18,34 +18,34 @@ use protocol::packet::{Epoch, Words};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
 
-use crate::bus::{Bus, Seen, Stop};
+use crate::bus::{TestBus, ObservedFrame, StopReason};
 use crate::findings::Findings;
 use crate::timings::Timings;
 
 pub(crate) use exchange::Exchange;
-pub(crate) use joints::Step;
-pub(crate) use known::{About, Known};
-use life::Life;
+pub(crate) use joints::JointsResult;
+pub(crate) use known::{CellAbilities, TrackedState};
+use life::CellLife;
 pub(crate) use request::Reply;
 
 /// The time limit for an answer.
-pub(crate) const PATIENT: Span = Span::from_millis(300);
+pub(crate) const ANSWER_TIMEOUT: Span = Span::from_millis(300);
 /// The additional time that answers are awaited after a sync's heartbeat.
-pub(crate) const LINGER: Span = Span::from_millis(5);
+pub(crate) const SYNC_GRACE: Span = Span::from_millis(5);
 /// The time after which a sent frame was on the bus, even on a busy computer.
-const ON_BUS: Span = Span::from_millis(1_200);
+const SEND_TIMEOUT: Span = Span::from_millis(1_200);
 /// A cell that sends nothing for this time has fallen silent.
-const SILENT: Span = Span::from_millis(3_000);
+const SILENCE_TIMEOUT: Span = Span::from_millis(3_000);
 
 /// A packet of the cell.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Heard {
+pub(crate) struct CellPacket {
     /// The time at which it, or its last segment, was on the bus.
     pub(crate) at: Micros,
     pub(crate) message: Message,
 }
 
-impl Heard {
+impl CellPacket {
     /// Returns the heartbeat and its epoch byte, if the packet is one.
     pub(crate) const fn beat(&self) -> Option<(&Heartbeat, Epoch)> {
         if let Message::Network { page: NetworkPage::Heartbeat(beat), epoch, .. } = &self.message {
@@ -91,7 +91,7 @@ struct Clock {
 /// The frames of the cell and of the bench.
 #[derive(Debug, Default)]
 struct Log {
-    frames: Vec<Seen>,
+    frames: Vec<ObservedFrame>,
     /// The start of the present exchange; frames that were sent for it may come before it.
     since: usize,
     /// The end of the last exchange.
@@ -100,33 +100,33 @@ struct Log {
 
 impl Log {
     /// Returns the frames of the present exchange.
-    fn present(&self) -> &[Seen] {
+    fn present(&self) -> &[ObservedFrame] {
         self.frames.get(self.since..).unwrap_or_default()
     }
 }
 
 /// A conversation with one cell.
 pub struct Session<'a> {
-    bus: &'a mut dyn Bus,
+    bus: &'a mut dyn TestBus,
     name: String,
     pub(crate) cell: CellId,
     pub(crate) format: Format,
     log: Log,
     /// The packets of the cell.
-    pub(crate) heard: Vec<Heard>,
+    pub(crate) packets: Vec<CellPacket>,
     /// The index in `heard` at which the present exchange begins.
     pub(crate) from: usize,
     /// The index in `heard` up to which packets were expected.
     consumed: usize,
     /// The number of joints whose answers came so late that the cell may have skipped them.
     pub(crate) skips: u16,
-    life: Life,
+    life: CellLife,
     /// The frames of the cell since a restart began, while it is unknown to which life they belong.
-    held: Option<Vec<(Seen, Id)>>,
+    held: Option<Vec<(ObservedFrame, Id)>>,
     /// The results.
     pub findings: Findings,
-    pub(crate) known: Known,
-    pub(crate) about: About,
+    pub(crate) known: TrackedState,
+    pub(crate) about: CellAbilities,
     tag: u8,
     pub(crate) timings: Timings,
     clock: Clock,
@@ -143,7 +143,7 @@ impl core::fmt::Debug for Session<'_> {
 
 impl<'a> Session<'a> {
     /// Creates a conversation with a cell on a bus of this name and format, with a time limit.
-    pub fn new(bus: &'a mut dyn Bus, name: &str, cell: CellId, format: Format, longest: Span) -> Self {
+    pub fn new(bus: &'a mut dyn TestBus, name: &str, cell: CellId, format: Format, longest: Span) -> Self {
         let now = bus.now();
         Self {
             bus,
@@ -151,15 +151,15 @@ impl<'a> Session<'a> {
             cell,
             format,
             log: Log::default(),
-            heard: Vec::new(),
+            packets: Vec::new(),
             from: 0,
             consumed: 0,
             skips: 0,
-            life: Life::default(),
+            life: CellLife::default(),
             held: None,
             findings: Findings::default(),
-            known: Known::default(),
-            about: About::default(),
+            known: TrackedState::default(),
+            about: CellAbilities::default(),
             tag: 0x50,
             timings: Timings::default(),
             clock: Clock {
@@ -194,8 +194,8 @@ impl<'a> Session<'a> {
     }
 
     /// Returns the remaining time.
-    pub(crate) fn left(&self) -> Span {
-        self.clock.end.since(self.bus.now())
+    pub(crate) fn remaining_time(&self) -> Span {
+        self.clock.end.elapsed_since(self.bus.now())
     }
 
     /// Notes that the cell was allowed to be silent until now.
@@ -217,83 +217,83 @@ impl<'a> Session<'a> {
             self.findings.pass(id);
         } else if !self.clock.skipped {
             let (log, name) = (&self.log, &self.name);
-            self.findings.fail(id, what(), || log.present().iter().map(|seen| line(name, seen)).collect());
+            self.findings.fail(id, what(), || log.present().iter().map(|seen| frame_line(name, seen)).collect());
         }
         is_so
     }
 
     /// Begins a new exchange. Packets since the last one count as unexpected, unless a cell may send them by itself.
-    pub(crate) fn mark(&mut self) {
-        let strays: Vec<_> = self.heard.get(self.consumed..).unwrap_or_default().to_vec();
+    pub(crate) fn begin_exchange(&mut self) {
+        let strays: Vec<_> = self.packets.get(self.consumed..).unwrap_or_default().to_vec();
         for stray in strays {
             if let Some(id) = self.known.unexpected(&stray.message) {
                 let kind = stray.message.id().kind.name();
                 self.check(id, false, || format!("a {kind} packet that nothing asked for"));
             }
         }
-        self.start();
+        self.begin_expected_exchange();
     }
 
     /// Begins a new exchange, and treats the packets since the last one as expected.
-    pub(crate) fn start(&mut self) {
+    pub(crate) fn begin_expected_exchange(&mut self) {
         self.clock.skipped = false;
         self.log.since = self.log.ended;
-        (self.from, self.consumed) = (self.heard.len(), self.heard.len());
+        (self.from, self.consumed) = (self.packets.len(), self.packets.len());
         self.lateness();
         self.clock.late = Span(0);
     }
 
     /// Marks the packets since the exchange began as expected.
     pub(crate) fn consume(&mut self) {
-        self.consumed = self.heard.len();
+        self.consumed = self.packets.len();
         self.log.ended = self.log.frames.len();
     }
 
     /// Returns the packets since the last exchange ended.
-    pub(crate) fn unmarked(&self) -> Vec<Heard> {
-        self.heard.get(self.consumed..).unwrap_or_default().to_vec()
+    pub(crate) fn unmarked(&self) -> Vec<CellPacket> {
+        self.packets.get(self.consumed..).unwrap_or_default().to_vec()
     }
 
     /// Returns the cell's packets since the exchange began.
-    pub(crate) fn answers(&self) -> &[Heard] {
-        self.heard.get(self.from..).unwrap_or_default()
+    pub(crate) fn answers(&self) -> &[CellPacket] {
+        self.packets.get(self.from..).unwrap_or_default()
     }
 
     /// Discards all assumptions about values that were written before.
-    pub(crate) fn forget(&mut self) {
-        self.known = Known {
+    pub(crate) fn forget_state(&mut self) {
+        self.known = TrackedState {
             last_epoch: self.known.last_epoch,
             joints: self.known.joints,
             hash: None,
-            ..Known::default()
+            ..TrackedState::default()
         };
     }
 
     /// Sends frames, and returns the time at which the last one was on the bus.
-    pub(crate) fn send(&mut self, frames: &[Frame]) -> Result<Micros, Stop> {
+    pub(crate) fn send(&mut self, frames: &[Frame]) -> Result<Micros, StopReason> {
         let times = self.send_all(frames)?;
         Ok(times.last().copied().unwrap_or_else(|| self.now()))
     }
 
     /// Sends frames, and returns the time at which each was on the bus.
-    pub(crate) fn send_all(&mut self, frames: &[Frame]) -> Result<Vec<Micros>, Stop> {
+    pub(crate) fn send_all(&mut self, frames: &[Frame]) -> Result<Vec<Micros>, StopReason> {
         let Some(last) = frames.last() else { return Ok(Vec::new()) };
         let before = self.log.frames.len();
         let sent = self.bus.now();
         self.bus.send(frames)?;
-        let give_up = self.bus.now() + ON_BUS;
+        let give_up = self.bus.now() + SEND_TIMEOUT;
         loop {
             let own = self.log.frames.get(before..).unwrap_or_default().iter().filter(|seen| seen.own);
             let own: Vec<_> = own.map(|seen| seen.at).collect();
             if own.len() >= frames.len() {
-                let waited = own.last().map_or(Span(0), |at| at.since(sent));
+                let waited = own.last().map_or(Span(0), |at| at.elapsed_since(sent));
                 self.clock.worst = self.clock.worst.max(waited);
                 return Ok(own);
             }
             if self.bus.now() >= give_up {
-                return Err(Stop::Bus(format!("{}: {last} was sent and was not on the bus", self.name)));
+                return Err(StopReason::Bus(format!("{}: {last} was sent and was not on the bus", self.name)));
             }
-            self.pump(give_up)?;
+            self.process_next_frame(give_up)?;
         }
     }
 
@@ -303,7 +303,7 @@ impl<'a> Session<'a> {
     }
 
     /// Sends packets, and returns the time at which the first one was completely on the bus.
-    pub(crate) fn say(&mut self, messages: &[Message]) -> Result<Micros, Stop> {
+    pub(crate) fn send_messages(&mut self, messages: &[Message]) -> Result<Micros, StopReason> {
         let mut at = None;
         for message in messages {
             let frames = self.frames(message);
@@ -318,8 +318,8 @@ impl<'a> Session<'a> {
     pub(crate) fn wait(
         &mut self,
         until: Micros,
-        mut done: impl FnMut(&[Heard]) -> bool,
-    ) -> Result<bool, Stop> {
+        mut done: impl FnMut(&[CellPacket]) -> bool,
+    ) -> Result<bool, StopReason> {
         loop {
             if done(self.answers()) {
                 return Ok(true);
@@ -327,20 +327,20 @@ impl<'a> Session<'a> {
             if self.bus.now() >= until {
                 return Ok(false);
             }
-            self.pump(until)?;
+            self.process_next_frame(until)?;
         }
     }
 
     /// Receives for a time.
-    pub(crate) fn idle(&mut self, span: Span) -> Result<(), Stop> {
+    pub(crate) fn idle(&mut self, span: Span) -> Result<(), StopReason> {
         let until = self.bus.now() + span;
         self.wait(until, |_| false).map(|_| ())
     }
 
     /// Waits for late packets of the cell.
-    pub(crate) fn settle(&mut self) -> Result<(), Stop> {
+    pub(crate) fn settle(&mut self) -> Result<(), StopReason> {
         self.idle(Span::from_millis(15))?;
-        self.mark();
+        self.begin_exchange();
         Ok(())
     }
 
@@ -359,14 +359,14 @@ impl<'a> Session<'a> {
     }
 
     /// Checks that segments followed each other; in a few packets they may be delayed by a busy processor.
-    pub(crate) fn check_segments(&mut self) -> Result<(), Stop> {
-        const FEW: usize = 3;
+    pub(crate) fn check_segments(&mut self) -> Result<(), StopReason> {
+        const MAX_TORN_PACKETS: usize = 3;
         if self.format == Format::Classic {
             if self.life.is_waiting() {
-                self.idle(Span(PATIENT.0 + 10_000))?;
+                self.idle(Span(ANSWER_TIMEOUT.0 + 10_000))?;
             }
             let torn = self.clock.torn;
-            self.check("SEND-1", torn <= FEW, || {
+            self.check("SEND-1", torn <= MAX_TORN_PACKETS, || {
                 format!("of {torn} packets a segment came too late after the one before")
             });
         }
@@ -374,13 +374,13 @@ impl<'a> Session<'a> {
     }
 
     /// Measures the time for an answer.
-    pub(crate) fn measure(&mut self) -> Result<(), Stop> {
+    pub(crate) fn measure(&mut self) -> Result<(), StopReason> {
         const TIMES: u64 = 8;
         let began = self.now();
         for _ in 0..TIMES {
             self.read(0)?;
         }
-        self.clock.round_trip = Span(self.now().since(began).0 / TIMES);
+        self.clock.round_trip = Span(self.now().elapsed_since(began).0 / TIMES);
         Ok(())
     }
 
@@ -397,7 +397,7 @@ impl<'a> Session<'a> {
     /// Records the time of an answer, unless the bench itself was late.
     pub(crate) fn note_time(&mut self, what: &'static str, asked: Micros, answered: Micros) {
         let late = self.lateness();
-        self.timings.note(what, answered.since(asked), late);
+        self.timings.note(what, answered.elapsed_since(asked), late);
     }
 
     /// Returns joints of the chain in use.
@@ -415,7 +415,7 @@ impl<'a> Session<'a> {
 }
 
 /// Formats a frame in candump's notation, with T for frames of the bench and R for others.
-fn line(name: &str, seen: &Seen) -> String {
+fn frame_line(name: &str, seen: &ObservedFrame) -> String {
     let time = Timestamp::six_digits(seen.at.0 * 1_000);
     let record = Record { time, interface: name, frame: seen.frame, direction: None };
     format!("{record} {}", if seen.own { 'T' } else { 'R' })

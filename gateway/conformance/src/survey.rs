@@ -9,25 +9,25 @@ use protocol::message::{Message, NetworkPage};
 use protocol::packet::{self, Packet};
 use protocol::time::Span;
 
-use crate::bus::{Bus, Stop};
+use crate::bus::{TestBus, StopReason};
 
 /// The listening time: more than two intervals of heartbeats.
-pub const LISTEN: Span = Span::from_millis(600);
+pub const LISTEN_TIME: Span = Span::from_millis(600);
 
 /// The result of a survey.
 #[derive(Clone, Debug, Default)]
 pub struct Survey {
     /// The senders of each node id.
-    pub cells: BTreeMap<CellId, Present>,
+    pub cells: BTreeMap<CellId, NodeSenders>,
     /// A frame that only gateways send.
     pub gateway: Option<String>,
     /// Frames under the identifiers of a node id that are not packets.
-    damaged: BTreeMap<CellId, Damaged>,
+    damaged: BTreeMap<CellId, DamagedFrames>,
 }
 
 /// Frames that are not packets.
 #[derive(Clone, Debug)]
-struct Damaged {
+struct DamagedFrames {
     count: usize,
     /// The identifier of the first one, and the first frames under it.
     id: Id,
@@ -38,7 +38,7 @@ struct Damaged {
 
 /// The senders that use a node id.
 #[derive(Clone, Debug, Default)]
-pub struct Present {
+pub struct NodeSenders {
     /// Serial numbers in heartbeats.
     pub serials: BTreeSet<u32>,
     /// The format of the frames.
@@ -50,8 +50,8 @@ impl Survey {
     ///
     /// # Errors
     /// Returns [`Stop`] if the bus fails, or if the test is interrupted.
-    pub fn take(bus: &mut dyn Bus, name: &str) -> Result<Self, Stop> {
-        let until = bus.now() + LISTEN;
+    pub fn listen(bus: &mut dyn TestBus, name: &str) -> Result<Self, StopReason> {
+        let until = bus.now() + LISTEN_TIME;
         let mut decoder = Decoder::new(None);
         let mut survey = Self::default();
         while bus.now() < until {
@@ -89,13 +89,13 @@ impl Survey {
 
     /// Counts a frame that is not a packet, or a segment that waits for others.
     fn note_damaged(&mut self, id: Id, frame: &Frame, fault: Option<String>) {
-        const KEPT: usize = 4;
+        const MAX_KEPT_FRAMES: usize = 4;
         let Some(cell) = id.sender() else { return };
-        let new = || Damaged { count: 0, id, frames: Vec::new(), fault: None };
+        let new = || DamagedFrames { count: 0, id, frames: Vec::new(), fault: None };
         let damaged = self.damaged.entry(cell).or_insert_with(new);
         damaged.count += 1;
         damaged.fault = damaged.fault.take().or(fault);
-        if damaged.id == id && damaged.frames.len() < KEPT {
+        if damaged.id == id && damaged.frames.len() < MAX_KEPT_FRAMES {
             damaged.frames.push(*frame);
         }
     }
@@ -158,7 +158,7 @@ impl Survey {
     }
 }
 
-impl Damaged {
+impl DamagedFrames {
     /// Returns the usual implementation mistake that explains the frames, if one does.
     fn mistake(&self) -> Option<&'static str> {
         let bytes = |frames: &[&Frame]| -> Vec<u8> {
@@ -190,7 +190,7 @@ impl Damaged {
     }
 }
 
-impl core::fmt::Display for Damaged {
+impl core::fmt::Display for DamagedFrames {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let frames: Vec<_> = self.frames.iter().map(ToString::to_string).collect();
         let fault = self.fault.as_deref().unwrap_or("no other segment came");

@@ -4,14 +4,14 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::time::Span;
 
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::Session;
 use crate::timings::{LIMITS, Times};
 
 impl Session<'_> {
     /// Measures answer times at 62.5 joints a second. Late answers are measured again, because the computer of a
     /// simulated cell may be busy for a while.
-    pub(crate) fn measure_times(&mut self) -> Result<(), Stop> {
+    pub(crate) fn measure_times(&mut self) -> Result<(), StopReason> {
         const ATTEMPTS: usize = 4;
         const ANSWERS: usize = 150;
         const TIME: Span = Span::from_millis(15_000);
@@ -19,13 +19,13 @@ impl Session<'_> {
         for attempt in 0..ATTEMPTS {
             let late = |name| self.timings.0.get(name).is_some_and(|times: &Times| !times.are_right());
             let is_late = MEASURED.iter().any(|name| late(*name));
-            if attempt > 0 && !is_late || self.left() < TIME {
+            if attempt > 0 && !is_late || self.remaining_time() < TIME {
                 break;
             }
             if is_late {
                 self.timings.0.retain(|name, _| !MEASURED.contains(name));
             }
-            self.ready(&arm::in_time(6))?;
+            self.ready(&arm::fast_parameters(6))?;
             for step in 0..self.attempts(ANSWERS) {
                 if self.about.test_mode {
                     self.press(arm::press(4_096))?;
@@ -49,7 +49,7 @@ impl Session<'_> {
                 continue;
             }
             let is_so = times.are_right();
-            self.start();
+            self.begin_expected_exchange();
             self.check("TIME-2", is_so, || {
                 format!(
                     "{name}: {late} of {} answers came after more than {limit} ms, up to {:.1} ms ({blameless} more \

@@ -44,7 +44,7 @@ pub struct Input {
 /// Answer of a controller.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "one at a time, on the stack: the loop allocates nothing")]
-pub enum Step {
+pub enum ControllerOutput {
     /// Joint velocities in rad/s until the next tick; finite, and within the speed limits.
     Move([f64; MAX_ROBOT_JOINTS]),
     /// A bad cycle: the controller has no answer. The caller decides how the robot then moves.
@@ -71,7 +71,7 @@ pub enum BadCycle {
 /// A controller, which turns torques into joint velocities.
 pub trait Controller: Send {
     /// Computes one tick. Must not block, allocate, lock or log.
-    fn step(&mut self, input: &Input) -> Step;
+    fn step(&mut self, input: &Input) -> ControllerOutput;
 
     /// Counters of the controller by name. Call it at the end of a run, not in the tick.
     fn counts(&self) -> Vec<(String, u64)> {
@@ -132,12 +132,12 @@ impl Kinesthetic {
 }
 
 impl Controller for Kinesthetic {
-    fn step(&mut self, input: &Input) -> Step {
+    fn step(&mut self, input: &Input) -> ControllerOutput {
         if input.halted {
-            return Step::Move([0.0; MAX_ROBOT_JOINTS]);
+            return ControllerOutput::Move([0.0; MAX_ROBOT_JOINTS]);
         }
         if !input.valid || !input.torque.iter().chain(&input.qdot).all(|value| value.is_finite()) {
-            return Step::Bad(BadCycle::Torque);
+            return ControllerOutput::Bad(BadCycle::Torque);
         }
         let mut velocity = input.qdot;
         for ((velocity, torque), joint) in velocity.iter_mut().zip(input.torque).zip(&self.joints) {
@@ -146,7 +146,7 @@ impl Controller for Kinesthetic {
             let next = settled + (*velocity - settled) * joint.keep;
             *velocity = next.clamp(-joint.max_speed, joint.max_speed);
         }
-        Step::Move(velocity)
+        ControllerOutput::Move(velocity)
     }
 }
 
@@ -154,7 +154,7 @@ impl Controller for Kinesthetic {
 #[derive(Clone, Copy, Debug)]
 pub struct Planned<F> {
     at: F,
-    pace: Pace,
+    pace: SpeedLimits,
 }
 
 impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS]> Planned<F> {
@@ -162,28 +162,28 @@ impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS]> Planned<F> {
     /// allocate, lock or log.
     #[must_use]
     pub fn new(skin: &Skin, at: F) -> Self {
-        Self { at, pace: Pace::of(skin) }
+        Self { at, pace: SpeedLimits::from_skin(skin) }
     }
 }
 
 impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS] + Send> Controller for Planned<F> {
     /// Aims at the position for the start of the next tick, so that the robot neither lags nor drifts.
-    fn step(&mut self, input: &Input) -> Step {
+    fn step(&mut self, input: &Input) -> ControllerOutput {
         let next = (self.at)(seconds(input.time) + self.pace.tick);
-        Step::Move(self.pace.towards(&next, input))
+        ControllerOutput::Move(self.pace.towards(&next, input))
     }
 }
 
 /// Speed limits of the joints, and the length of a tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Pace {
+pub(crate) struct SpeedLimits {
     /// Length of a tick in s.
     tick: f64,
     max_speed: [f64; MAX_ROBOT_JOINTS],
 }
 
-impl Pace {
-    pub(crate) fn of(skin: &Skin) -> Self {
+impl SpeedLimits {
+    pub(crate) fn from_skin(skin: &Skin) -> Self {
         Self { tick: 1.0 / skin.timing.control_hz, max_speed: padded(&skin.controller.max_speed) }
     }
 
@@ -228,10 +228,10 @@ mod tests {
         Kinesthetic::new(&skin()).unwrap()
     }
 
-    fn moved(step: Step) -> [f64; MAX_ROBOT_JOINTS] {
+    fn moved(step: ControllerOutput) -> [f64; MAX_ROBOT_JOINTS] {
         match step {
-            Step::Move(velocity) => velocity,
-            Step::Bad(why) => panic!("{why}"),
+            ControllerOutput::Move(velocity) => velocity,
+            ControllerOutput::Bad(why) => panic!("{why}"),
         }
     }
 
@@ -275,10 +275,10 @@ mod tests {
     #[test]
     fn a_torque_that_must_not_be_used_is_a_bad_cycle() {
         let mut controller = kinesthetic();
-        assert_eq!(controller.step(&Input::default()), Step::Bad(BadCycle::Torque));
-        assert_eq!(controller.step(&pushed(padded(&[f64::NAN; 6]))), Step::Bad(BadCycle::Torque));
+        assert_eq!(controller.step(&Input::default()), ControllerOutput::Bad(BadCycle::Torque));
+        assert_eq!(controller.step(&pushed(padded(&[f64::NAN; 6]))), ControllerOutput::Bad(BadCycle::Torque));
         let halted = Input { halted: true, qdot: padded(&[1.0; 6]), ..pushed(padded(&[5.0; 6])) };
-        assert_eq!(controller.step(&halted), Step::Move(padded(&[0.0; 6])));
+        assert_eq!(controller.step(&halted), ControllerOutput::Move(padded(&[0.0; 6])));
     }
 
     #[test]
@@ -315,11 +315,11 @@ mod tests {
             let mut controller = kinesthetic();
             let input = Input { qdot: padded(&qdot), ..pushed(padded(&torque)) };
             match controller.step(&input) {
-                Step::Bad(why) => {
+                ControllerOutput::Bad(why) => {
                     prop_assert_eq!(why, BadCycle::Torque);
                     prop_assert!(torque.iter().any(|torque| !torque.is_finite()));
                 }
-                Step::Move(velocity) => {
+                ControllerOutput::Move(velocity) => {
                     for (velocity, limit) in velocity.iter().zip([2.0, 2.0, 2.0, 3.0, 3.0, 3.0]) {
                         prop_assert!(velocity.abs() <= limit, "{}", velocity);
                     }

@@ -24,10 +24,10 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{ControllerKind, LostBus, MAX_ROBOT_JOINTS, Safety, Skin};
 use protocol::time::Micros;
 
-use crate::controller::{BadCycle, Controller, Input, Step};
+use crate::controller::{BadCycle, Controller, Input, ControllerOutput};
 use crate::external::Absence;
-use crate::robot::{Moved, Robot};
-use carried::{Carried, Heard, bit};
+use crate::robot::{StepResult, Robot};
+use carried::{Carried, BusInput, bit};
 use chain::Chain;
 use model::central::Central;
 use model::table::Snapshot;
@@ -52,7 +52,7 @@ pub enum Halt {
 
 /// Record of a tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Record {
+pub struct TickRecord {
     /// Number and time of the tick.
     pub tick: Tick,
     /// Number of ticks skipped just before, because the one before took too long or the machine was busy.
@@ -84,12 +84,12 @@ pub struct Record {
     /// Reason of the halt while the robot is halted.
     pub halted: Option<Halt>,
     /// Joints at their limits, and refused commands.
-    pub moved: Moved,
+    pub moved: StepResult,
 }
 
 /// Torque of the whole skin, computed centrally.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Reference {
+pub struct CentralTorque {
     /// Sum of all cells' torques in Nm or N, by joint of the robot (paper, Eq. 1).
     pub torque: [f64; MAX_ROBOT_JOINTS],
     /// Number of cells with a force above zero.
@@ -98,7 +98,7 @@ pub struct Reference {
 
 /// Outcome of a tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Outcome {
+pub struct TickOutcome {
     /// Epoch of new joints for all buses ([`Cycle::joints`]).
     pub broadcast: Option<Epoch>,
     /// Number of earlier broadcasts that were skipped with their ticks.
@@ -107,7 +107,7 @@ pub struct Outcome {
     /// repeat it on the others.
     pub command: Option<Command>,
     /// Record of the tick.
-    pub record: Record,
+    pub record: TickRecord,
 }
 
 /// State of the control loop.
@@ -161,7 +161,7 @@ impl Cycle {
         Self {
             controller,
             robot,
-            central: (0..skin.buses.len()).map(|bus| Central::new(&skin.part_on(bus))).collect(),
+            central: (0..skin.buses.len()).map(|bus| Central::new(&skin.with_cells_of_bus(bus))).collect(),
             chains,
             chain_of,
             tick_seconds: 1.0 / skin.timing.control_hz,
@@ -223,8 +223,8 @@ impl Cycle {
         &mut self,
         tick: Tick,
         skipped: u64,
-        buses: impl IntoIterator<Item = Heard<'a>>,
-    ) -> Outcome {
+        buses: impl IntoIterator<Item = BusInput<'a>>,
+    ) -> TickOutcome {
         let mut input = Input {
             tick: tick.number,
             time: tick.time,
@@ -236,7 +236,7 @@ impl Cycle {
         let mut some_bus_works = false;
         let chains = self.chain_of.iter().filter_map(|&chain| self.chains.get(chain));
         let chains = self.carried.iter_mut().zip(chains);
-        for (index, (Heard { sums: bus, works }, (carried, chain))) in
+        for (index, (BusInput { sums: bus, works }, (carried, chain))) in
             buses.into_iter().zip(chains).enumerate()
         {
             let unanswered = carried.unanswered(bus.read_back, self.epoch, self.broadcasts);
@@ -259,7 +259,7 @@ impl Cycle {
             (halts, resumes) = (halts + bus.halts, resumes + bus.resumes);
         }
         input.valid = match self.safety.lost_bus {
-            LostBus::GoOn => some_bus_works,
+            LostBus::Continue => some_bus_works,
             LostBus::Halt => input.missing == 0,
         };
         let heard = self.obey(halts, resumes);
@@ -267,20 +267,20 @@ impl Cycle {
 
         let step = self.controller.step(&input);
         let bad = match step {
-            Step::Move(_) => None,
-            Step::Bad(why) => Some(why),
+            ControllerOutput::Move(_) => None,
+            ControllerOutput::Bad(why) => Some(why),
         };
         let command = if self.count(bad, tick.time) { Some(Command::Halt) } else { heard };
         let velocity = match step {
-            Step::Move(velocity) if self.halted.is_none() => velocity,
+            ControllerOutput::Move(velocity) if self.halted.is_none() => velocity,
             // Without an answer, the robot first keeps its velocity for some cycles; then it stands, halted or not.
-            Step::Bad(_) if self.halted.is_none() && self.bad_in_a_row < self.safety.bad_cycles => input.qdot,
-            Step::Move(_) | Step::Bad(_) => [0.0; MAX_ROBOT_JOINTS],
+            ControllerOutput::Bad(_) if self.halted.is_none() && self.bad_in_a_row < self.safety.bad_cycles => input.qdot,
+            ControllerOutput::Move(_) | ControllerOutput::Bad(_) => [0.0; MAX_ROBOT_JOINTS],
         };
         let moved = self.robot.step(&velocity, self.tick_seconds);
         let (broadcast, broadcasts_skipped) = self.broadcast(tick);
         let Input { q, qdot, torque, valid, contributing, age, missing, .. } = input;
-        let record = Record {
+        let record = TickRecord {
             tick,
             skipped,
             q,
@@ -298,17 +298,17 @@ impl Cycle {
             halted: self.halted,
             moved,
         };
-        Outcome { broadcast, broadcasts_skipped, command, record }
+        TickOutcome { broadcast, broadcasts_skipped, command, record }
     }
 
     /// Computes the reference torque centrally, from the words of the last broadcast and the sensor values at it.
     /// Distributed computation takes this work out of the tick. Its cost grows with the number of cells.
     #[must_use]
-    pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> Reference {
-        let mut reference = Reference::default();
+    pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> CentralTorque {
+        let mut reference = CentralTorque::default();
         let chains = self.chain_of.iter().filter_map(|&chain| self.chains.get(chain));
         for ((central, chain), bus) in self.central.iter().zip(chains).zip(buses) {
-            let part = central.total(&central.frames(&chain.said().positions), &bus.sensors);
+            let part = central.total(&central.frames(&chain.broadcast_joints().positions), &bus.sensors);
             chain.add(1.0, &part.torque, &mut reference.torque);
             reference.active += part.active;
         }
@@ -324,7 +324,7 @@ impl Cycle {
     /// Joints of a chain as last broadcast.
     #[must_use]
     pub fn joints(&self, chain: usize) -> Joints {
-        self.chains.get(chain).map_or_else(Joints::default, Chain::said)
+        self.chains.get(chain).map_or_else(Joints::default, Chain::broadcast_joints)
     }
 
     /// Positions of a chain at the latest broadcast, before rounding to words.
@@ -380,7 +380,7 @@ impl Cycle {
         let skipped = self.slot.map_or(slot, |last| slot.saturating_sub(last + 1));
         self.slot = Some(slot);
         let q = self.robot.positions();
-        self.chains.iter_mut().for_each(|chain| chain.say(&q));
+        self.chains.iter_mut().for_each(|chain| chain.set_positions(&q));
         self.epoch = self.epoch.next();
         self.broadcasts += 1;
         (Some(self.epoch), skipped)

@@ -31,7 +31,7 @@ pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>
 #[expect(clippy::float_cmp, reason = "what does not move is exactly where it was")]
 mod tests {
     use super::*;
-    use crate::controller::{Input, Step};
+    use crate::controller::{Input, ControllerOutput};
     use model::testing::skin;
     use protocol::packet::padded;
 
@@ -47,8 +47,8 @@ mod tests {
                 ..Input::default()
             };
             match controller_of(&skin(), &motion).unwrap().step(&input) {
-                Step::Move(velocities) => velocities[0],
-                Step::Bad(why) => panic!("{why}"),
+                ControllerOutput::Move(velocities) => velocities[0],
+                ControllerOutput::Bad(why) => panic!("{why}"),
             }
         };
         assert_eq!(step(MotionKind::Hold, 1.0), 0.0);

@@ -6,7 +6,7 @@ use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 pub trait Robot {
     /// Moves for `seconds` with these joint velocities in rad/s. Called once per tick: must not block, allocate, lock
     /// or log.
-    fn step(&mut self, velocity: &[f64; MAX_ROBOT_JOINTS], seconds: f64) -> Moved;
+    fn step(&mut self, velocity: &[f64; MAX_ROBOT_JOINTS], seconds: f64) -> StepResult;
 
     /// Joint positions in rad, counting full turns: they may exceed half a turn.
     fn positions(&self) -> [f64; MAX_ROBOT_JOINTS];
@@ -17,7 +17,7 @@ pub trait Robot {
 
 /// Result of a step.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Moved {
+pub struct StepResult {
     /// Joints that stand at a limit and were commanded beyond it; one bit each, joint 1 lowest.
     pub at_limit: u32,
     /// True if a velocity was not finite and was taken as zero.
@@ -49,8 +49,8 @@ impl SimulatedArm {
 }
 
 impl Robot for SimulatedArm {
-    fn step(&mut self, velocity: &[f64; MAX_ROBOT_JOINTS], seconds: f64) -> Moved {
-        let mut moved = Moved::default();
+    fn step(&mut self, velocity: &[f64; MAX_ROBOT_JOINTS], seconds: f64) -> StepResult {
+        let mut moved = StepResult::default();
         let joints = self.positions.iter_mut().zip(&mut self.velocities).zip(&self.limits);
         for (joint, (((position, velocity), &[min, max]), &target)) in joints.zip(velocity).enumerate() {
             let finite = target.is_finite();
@@ -87,7 +87,7 @@ mod tests {
     fn positions_follow_velocities_beyond_half_a_turn() {
         let mut arm = SimulatedArm::new(&skin(), padded(&[0.5; 6]));
         for _ in 0..2_000 {
-            assert_eq!(arm.step(&padded(&[1.0, -1.0, 0.0, 0.0, 0.0, 0.0]), 0.002), Moved::default());
+            assert_eq!(arm.step(&padded(&[1.0, -1.0, 0.0, 0.0, 0.0, 0.0]), 0.002), StepResult::default());
         }
         let [q1, q2, q3, ..] = arm.positions();
         assert!((q1 - 4.5).abs() < 1e-9 && (q2 + 3.5).abs() < 1e-9 && q3 == 0.5);
@@ -100,9 +100,9 @@ mod tests {
         skin.robot.joints[2].limits = [-1.0, 0.5];
         let mut arm = SimulatedArm::new(&skin, padded(&[0.0, 0.0, 0.499, 0.0, 0.0, 0.0]));
         let moved = arm.step(&padded(&[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), 0.002);
-        assert_eq!(moved, Moved { at_limit: 0b100, refused: false });
+        assert_eq!(moved, StepResult { at_limit: 0b100, refused: false });
         assert_eq!((arm.positions()[2], arm.velocities()[2]), (0.5, 0.0));
-        assert_eq!(arm.step(&padded(&[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]), 0.002), Moved::default());
+        assert_eq!(arm.step(&padded(&[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]), 0.002), StepResult::default());
         assert!(arm.positions()[2] < 0.5);
     }
 

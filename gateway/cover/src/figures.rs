@@ -1,13 +1,13 @@
 //! Measures how well a link is covered.
 
 use crate::grid::Grid;
-use crate::place::{Spot, spacing};
+use crate::place::{CellPosition, spacing};
 use crate::surface::{Sample, Surface, real};
-use crate::{Figures, Link};
+use crate::{LinkFigures, RobotLink};
 
 /// Computes the figures of a link.
-pub(crate) fn figures(link: &Link, surface: &Surface<'_>, spots: &[Spot], pitch: f64) -> Figures {
-    let grid = Grid::of(pitch, spots.iter().map(|spot| &spot.point));
+pub(crate) fn figures(link: &RobotLink, surface: &Surface<'_>, spots: &[CellPosition], pitch: f64) -> LinkFigures {
+    let grid = Grid::with_points(pitch, spots.iter().map(|spot| &spot.point));
     let covered = |sample: &&Sample| {
         let mut near = grid.around(grid.cube(&sample.point)).filter_map(|index| spots.get(index));
         near.any(|spot| {
@@ -17,7 +17,7 @@ pub(crate) fn figures(link: &Link, surface: &Surface<'_>, spots: &[Spot], pitch:
     };
     let count = surface.samples.len();
     let share = |samples: usize| if count == 0 { 0.0 } else { real(samples) / real(count) };
-    Figures {
+    LinkFigures {
         name: link.name.clone(),
         cells: spots.len(),
         outer_area: real(count) * surface.share,

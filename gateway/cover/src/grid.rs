@@ -18,7 +18,7 @@ impl Grid {
     }
 
     /// Creates a grid of these points, numbered from 0.
-    pub(crate) fn of<'a>(edge: f64, points: impl IntoIterator<Item = &'a Point3<f64>>) -> Self {
+    pub(crate) fn with_points<'a>(edge: f64, points: impl IntoIterator<Item = &'a Point3<f64>>) -> Self {
         let mut grid = Self::new(edge);
         for (index, point) in points.into_iter().enumerate() {
             grid.insert(point, index);
@@ -64,7 +64,7 @@ mod tests {
             points in proptest::collection::vec(proptest::array::uniform3(-2.0..2.0_f64), 1..80),
         ) {
             let points: Vec<_> = points.into_iter().map(Point3::from).collect();
-            let grid = Grid::of(0.7, &points);
+            let grid = Grid::with_points(0.7, &points);
             prop_assert_eq!(grid.cubes().map(|(_, points)| points.len()).sum::<usize>(), points.len());
             for point in &points {
                 let found: Vec<_> = grid.around(grid.cube(point)).collect();

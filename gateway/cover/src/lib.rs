@@ -47,11 +47,11 @@ pub const MAX_LINKS: usize = 1000;
 
 /// A rigid body of a robot.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Link {
+pub struct RobotLink {
     /// The name, for errors.
     pub name: String,
     /// The meshes; inner parts get no cells.
-    pub parts: Vec<Part>,
+    pub parts: Vec<LinkMesh>,
     /// The pose of its frame in a frame that all links share, in m, for the joint configuration at which it is covered.
     /// Surfaces that links hide from each other in this configuration get no cells.
     pub pose: Isometry3<f64>,
@@ -59,7 +59,7 @@ pub struct Link {
 
 /// A mesh of a link.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Part {
+pub struct LinkMesh {
     /// The mesh.
     pub mesh: Mesh,
     /// The pose of the mesh's frame in the link's frame, in m.
@@ -68,7 +68,7 @@ pub struct Part {
     pub scale: [f64; 3],
 }
 
-impl Part {
+impl LinkMesh {
     /// Creates an unscaled part at the origin of the link's frame.
     #[must_use]
     pub fn new(mesh: Mesh) -> Self {
@@ -97,7 +97,7 @@ pub struct KeepOut {
 
 /// Options of the cover.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Options {
+pub struct CoverOptions {
     /// The distance between the centers of neighbouring cells, in m.
     pub pitch: f64,
     /// The seed of the random numbers.
@@ -110,7 +110,7 @@ pub struct Options {
     pub clearance: f64,
 }
 
-impl Default for Options {
+impl Default for CoverOptions {
     fn default() -> Self {
         Self { pitch: 0.028, seed: 1, keep_out: Vec::new(), nodes_per_bus: MAX_NODES, clearance: 0.005 }
     }
@@ -118,7 +118,7 @@ impl Default for Options {
 
 /// A cell of the skin.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Cell {
+pub struct CoverCell {
     /// The index of the covered link.
     pub link: usize,
     /// The center on the mesh, in the link's frame, in m.
@@ -139,7 +139,7 @@ pub struct Cell {
 
 /// The figures of a covered link.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Figures {
+pub struct LinkFigures {
     /// The name of the link.
     pub name: String,
     /// The number of cells.
@@ -159,13 +159,13 @@ pub struct Figures {
 
 /// A skin.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Skin {
+pub struct Cover {
     /// The cells, ordered by bus and node id, and therefore by link.
-    pub cells: Vec<Cell>,
+    pub cells: Vec<CoverCell>,
     /// The number of buses.
     pub buses: usize,
     /// The figures of each covered link.
-    pub links: Vec<Figures>,
+    pub links: Vec<LinkFigures>,
 }
 
 /// The error of links that cannot be covered.
@@ -236,7 +236,7 @@ pub enum CoverError {
 ///
 /// # Errors
 /// Returns [`CoverError`] if an option is out of range, or if a link is too large for the pitch or not finite.
-pub fn cover(links: &[Link], others: &[Link], options: &Options) -> Result<Skin, CoverError> {
+pub fn cover(links: &[RobotLink], others: &[RobotLink], options: &CoverOptions) -> Result<Cover, CoverError> {
     check(links, others, options)?;
     let mut placed = Vec::with_capacity(links.len());
     let mut figures = Vec::with_capacity(links.len());
@@ -247,7 +247,7 @@ pub fn cover(links: &[Link], others: &[Link], options: &Options) -> Result<Skin,
         placed.push(spots);
     }
     let (cells, buses) = wire::wire(&placed, options);
-    Ok(Skin { cells, buses, links: figures })
+    Ok(Cover { cells, buses, links: figures })
 }
 
 /// Formats the smallest sufficient pitch in m; empty if there is none in the allowed range.
@@ -258,7 +258,7 @@ fn raised(pitch: f64, cells: f64, most: usize) -> String {
     if needed <= MAX_PITCH { format!(", or raise the pitch to {needed} m") } else { String::new() }
 }
 
-fn check(links: &[Link], others: &[Link], options: &Options) -> Result<(), CoverError> {
+fn check(links: &[RobotLink], others: &[RobotLink], options: &CoverOptions) -> Result<(), CoverError> {
     if !(MIN_PITCH..=MAX_PITCH).contains(&options.pitch) {
         return Err(CoverError::Pitch(options.pitch));
     }

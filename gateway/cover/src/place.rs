@@ -7,7 +7,7 @@ use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use crate::Options;
+use crate::CoverOptions;
 use crate::grid::Grid;
 use crate::relax::{Field, Site};
 use crate::surface::{Sample, Surface, cell_area, real};
@@ -16,13 +16,13 @@ use crate::surface::{Sample, Surface, cell_area, real};
 const MAX_TILT: f64 = 0.157;
 
 /// The initial distance between sites, in pitches: relaxation makes room for further ones between them.
-const START: f64 = 1.15;
+const INITIAL_SPACING: f64 = 1.15;
 
 /// The maximum number of attempts with other distances, until the spacing is the pitch.
-const TRIES: usize = 4;
+const MAX_ATTEMPTS: usize = 4;
 
 /// The relative difference between the median spacing and the pitch that ends the attempts.
-const NEAR: f64 = 0.015;
+const SPACING_TOLERANCE: f64 = 0.015;
 
 /// The cost of tilt in the choice of a cell's position, per squared pitch and 1 minus the cosine: 9 degrees cost as
 /// much as a fifth of a pitch.
@@ -30,14 +30,14 @@ const TILT_COST: f64 = 3.0;
 
 /// The minimum distance of two cells on the same side, in pitches. Relaxation leaves a few closer ones where a surface
 /// is folded or narrow.
-const CLOSEST: f64 = 0.6;
+const MIN_SPACING: f64 = 0.6;
 
 /// The minimum cosine of the angle between the normals of two cells on the same side.
 const SAME_SIDE: f64 = 0.5;
 
 /// The position of a cell in the link's frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Spot {
+pub(crate) struct CellPosition {
     pub(crate) point: Point3<f64>,
     pub(crate) normal: Vector3<f64>,
     /// The angle between the normal and the mesh's, in rad.
@@ -45,7 +45,7 @@ pub(crate) struct Spot {
 }
 
 /// Returns the positions of a link's cells.
-pub(crate) fn place(surface: &Surface<'_>, options: &Options, link: usize) -> Vec<Spot> {
+pub(crate) fn place(surface: &Surface<'_>, options: &CoverOptions, link: usize) -> Vec<CellPosition> {
     let pitch = options.pitch;
     let field = Field::new(surface.samples.iter().filter(|sample| sample.free).collect(), 1.2 * pitch);
     if real(field.samples.len()) * surface.share < cell_area(pitch) / 4.0 {
@@ -55,9 +55,9 @@ pub(crate) fn place(surface: &Surface<'_>, options: &Options, link: usize) -> Ve
     let mut dice = Pcg64Mcg::seed_from_u64(options.seed ^ stream);
     let mut order: Vec<_> = (0..field.samples.len()).collect();
     order.shuffle(&mut dice);
-    let mut apart = START * pitch;
-    let mut best: Option<(f64, Vec<Spot>)> = None;
-    for _ in 0..TRIES {
+    let mut apart = INITIAL_SPACING * pitch;
+    let mut best: Option<(f64, Vec<CellPosition>)> = None;
+    for _ in 0..MAX_ATTEMPTS {
         let mut sites = field.grow(&order, apart, dice.random_range(0.0..FRAC_PI_3));
         field.relax(&mut sites, apart);
         let spots = thinned(spots(surface, &field, &sites, pitch), pitch);
@@ -68,7 +68,7 @@ pub(crate) fn place(surface: &Surface<'_>, options: &Options, link: usize) -> Ve
         if best.as_ref().is_none_or(|(min, _)| off < *min) {
             best = Some((off, spots));
         }
-        if off < NEAR {
+        if off < SPACING_TOLERANCE {
             break;
         }
         apart *= (pitch / spacing).clamp(0.7, 1.3);
@@ -77,12 +77,12 @@ pub(crate) fn place(surface: &Surface<'_>, options: &Options, link: usize) -> Ve
 }
 
 /// Removes positions that are closer than [`CLOSEST`] to an earlier one on the same side.
-fn thinned(spots: Vec<Spot>, pitch: f64) -> Vec<Spot> {
-    let apart = CLOSEST * pitch;
+fn thinned(spots: Vec<CellPosition>, pitch: f64) -> Vec<CellPosition> {
+    let apart = MIN_SPACING * pitch;
     let mut grid = Grid::new(apart);
-    let mut kept: Vec<Spot> = Vec::new();
+    let mut kept: Vec<CellPosition> = Vec::new();
     for spot in spots {
-        let near = |other: &Spot| {
+        let near = |other: &CellPosition| {
             other.normal.dot(&spot.normal) > SAME_SIDE && (other.point - spot.point).norm() < apart
         };
         let is_crowded = grid.around(grid.cube(&spot.point)).filter_map(|index| kept.get(index)).any(near);
@@ -95,8 +95,8 @@ fn thinned(spots: Vec<Spot>, pitch: f64) -> Vec<Spot> {
 }
 
 /// Returns the median distance from a position to the nearest one that faces about the same way, in m.
-pub(crate) fn spacing(spots: &[Spot], pitch: f64) -> Option<f64> {
-    let nearest = |spot: &Spot| {
+pub(crate) fn spacing(spots: &[CellPosition], pitch: f64) -> Option<f64> {
+    let nearest = |spot: &CellPosition| {
         let same = spots.iter().filter(|other| *other != spot && other.normal.dot(&spot.normal) > 0.0);
         same.map(|other| (other.point - spot.point).norm()).min_by(f64::total_cmp)
     };
@@ -116,7 +116,7 @@ fn median(values: &mut [f64]) -> Option<f64> {
 }
 
 /// Returns the positions on the mesh for relaxed sites.
-fn spots(surface: &Surface<'_>, field: &Field<'_>, sites: &[Site], pitch: f64) -> Vec<Spot> {
+fn spots(surface: &Surface<'_>, field: &Field<'_>, sites: &[Site], pitch: f64) -> Vec<CellPosition> {
     let mut best: Vec<Option<(f64, &Sample)>> = vec![None; sites.len()];
     for (owner, sample) in field.owners(sites).into_iter().zip(&field.samples) {
         let Some((site, best)) = owner.and_then(|owner| Some((sites.get(owner)?, best.get_mut(owner)?)))
@@ -135,7 +135,7 @@ fn spots(surface: &Surface<'_>, field: &Field<'_>, sites: &[Site], pitch: f64) -
         let straight = projected.filter(|(_, face)| face.angle(&sample.smooth) < MAX_TILT);
         let (point, face) = straight.unwrap_or((sample.point, sample.face));
         let normal = limited(&face, &sample.smooth);
-        Some(Spot { point, normal, tilt: normal.angle(&face) })
+        Some(CellPosition { point, normal, tilt: normal.angle(&face) })
     };
     sites.iter().zip(best).filter_map(spot).collect()
 }

@@ -11,10 +11,10 @@ use crate::surface::{Sample, tangents};
 
 /// The minimum cosine between two normals for a sample to belong to a site. It separates the two sides of a thin wall
 /// and the faces at a sharp edge.
-const AGREE: f64 = 0.3;
+const MIN_NORMAL_COSINE: f64 = 0.3;
 
 /// The minimum distance of sites while they grow, in steps. It applies where a honeycomb meets itself behind a tube.
-const CLOSEST: f64 = 0.75;
+const MIN_GROWTH_DISTANCE: f64 = 0.75;
 
 /// The number of rounds in which sites are moved.
 const ROUNDS: usize = 60;
@@ -32,7 +32,7 @@ pub(crate) struct Site {
 impl Site {
     /// Returns the squared distance to a sample, in m², if they face about the same way.
     pub(crate) fn distance(&self, sample: &Sample) -> Option<f64> {
-        (self.normal.dot(&sample.smooth) > AGREE).then(|| (self.point - sample.point).norm_squared())
+        (self.normal.dot(&sample.smooth) > MIN_NORMAL_COSINE).then(|| (self.point - sample.point).norm_squared())
     }
 }
 
@@ -46,13 +46,13 @@ pub(crate) struct Field<'a> {
 
 impl<'a> Field<'a> {
     pub(crate) fn new(samples: Vec<&'a Sample>, reach: f64) -> Self {
-        let grid = Grid::of(reach, samples.iter().map(|sample| &sample.point));
+        let grid = Grid::with_points(reach, samples.iter().map(|sample| &sample.point));
         Self { samples, grid, reach }
     }
 
     /// Adds sites at samples, in the given order, that are `apart` from each other.
     pub(crate) fn apart(&self, order: &[usize], apart: f64, sites: &mut Vec<Site>) {
-        let mut grid = Grid::of(apart, sites.iter().map(|site| &site.point));
+        let mut grid = Grid::with_points(apart, sites.iter().map(|site| &site.point));
         for sample in order.iter().filter_map(|&index| self.samples.get(index)) {
             let near = grid.around(grid.cube(&sample.point)).filter_map(|index| sites.get(index));
             let free =
@@ -72,7 +72,7 @@ impl<'a> Field<'a> {
         let free = |site: &Site, apart: f64, sites: &[Site], grid: &Grid| {
             let mut near = grid.around(grid.cube(&site.point)).filter_map(|index| sites.get(index));
             near.all(|other| {
-                other.normal.dot(&site.normal) <= AGREE || (other.point - site.point).norm() >= apart
+                other.normal.dot(&site.normal) <= MIN_NORMAL_COSINE || (other.point - site.point).norm() >= apart
             })
         };
         for sample in order.iter().filter_map(|&index| self.samples.get(index)) {
@@ -83,7 +83,7 @@ impl<'a> Field<'a> {
             let (s, t) = tangents(&first.normal);
             let mut open = VecDeque::from([(first, s * turn.cos() + t * turn.sin())]);
             while let Some((site, row)) = open.pop_front() {
-                if !free(&site, CLOSEST * step, &sites, &grid) {
+                if !free(&site, MIN_GROWTH_DISTANCE * step, &sites, &grid) {
                     continue;
                 }
                 grid.insert(&site.point, sites.len());
@@ -117,7 +117,7 @@ impl<'a> Field<'a> {
     /// Returns the nearest site of each sample, if one is within reach.
     pub(crate) fn owners(&self, sites: &[Site]) -> Vec<Option<usize>> {
         let mut owners = vec![None; self.samples.len()];
-        let grid = Grid::of(self.reach, sites.iter().map(|site| &site.point));
+        let grid = Grid::with_points(self.reach, sites.iter().map(|site| &site.point));
         for (cube, members) in self.grid.cubes() {
             let near: Vec<_> =
                 grid.around(cube).filter_map(|index| Some((index, sites.get(index)?))).collect();

@@ -6,8 +6,8 @@ use nalgebra::{Isometry3, Matrix3, Point3, Unit, Vector3};
 
 use crate::grid::Grid;
 use crate::mesh::{Affine, MAX_TRIANGLES, Triangle};
-use crate::tree::{Ray, Tree};
-use crate::{CoverError, KeepOut, Link, Options};
+use crate::tree::{Ray, TriangleTree};
+use crate::{CoverError, KeepOut, RobotLink, CoverOptions};
 
 /// The number of samples per cell area.
 const PER_CELL: f64 = 64.0;
@@ -20,31 +20,31 @@ const MIN_SAMPLES: f64 = 2000.0;
 
 /// The number of rays from a side of a sample. If the first [`FEW`] agree, no others are cast.
 const RAYS: u32 = 32;
-const FEW: u32 = 8;
+const FIRST_RAYS: u32 = 8;
 
 /// The minimum share of rays that escape from a side of the outer surface: more than through a screw hole, and less
 /// than from between the arms of a fork.
-const ESCAPING: f64 = 0.3;
+const MIN_ESCAPING_SHARE: f64 = 0.3;
 
 /// The maximum share of rays from inside another link that leave it through gaps of its mesh.
-const LEAKING: f64 = 0.1;
+const MAX_LEAKING_SHARE: f64 = 0.1;
 
 /// The minimum share of rays from a side that leave the robot, past all links. A smaller share comes only through the
 /// gap between two links, where nothing can touch a cell.
-const REACHED: f64 = 0.05;
+const MIN_REACHED_SHARE: f64 = 0.05;
 
 /// The number of rays for that share. If half of the first [`FEW`] leave, no others are cast.
-const REACHING: u32 = 128;
+const REACH_RAYS: u32 = 128;
 
 /// The height above the surface at which rays start, in pitches.
 const ABOVE: f64 = 1e-3;
 
 /// The distance up to which other links hide a surface, in pitches.
-const HIDING: f64 = 2.0;
+const HIDING_DISTANCE: f64 = 2.0;
 
 /// The minimum share of the disc below a cell that is surface facing about the same way. It is about half at a straight
 /// edge, and near zero on the rim of a sheet.
-const SUPPORT: f64 = 0.4;
+const MIN_SUPPORT: f64 = 0.4;
 
 /// A point of the outer surface. Each sample represents the same area.
 #[derive(Clone, Copy, Debug)]
@@ -61,8 +61,8 @@ pub(crate) struct Sample {
 /// The outer surface of a link in its own frame.
 #[derive(Debug)]
 pub(crate) struct Surface<'a> {
-    own: Tree,
-    others: Tree,
+    own: TriangleTree,
+    others: TriangleTree,
     keep_out: Vec<&'a KeepOut>,
     clearance: f64,
     pitch: f64,
@@ -80,9 +80,9 @@ impl<'a> Surface<'a> {
     /// Samples the outer surface of one of the links.
     pub(crate) fn new(
         index: usize,
-        links: &[Link],
-        others: &[Link],
-        options: &'a Options,
+        links: &[RobotLink],
+        others: &[RobotLink],
+        options: &'a CoverOptions,
     ) -> Result<Self, CoverError> {
         let mut own = Vec::new();
         let mut obstacles = Vec::new();
@@ -103,8 +103,8 @@ impl<'a> Surface<'a> {
             return Err(CoverError::TooLarge { link, area, cells, pitch, most: MAX_CELLS });
         }
         let mut surface = Self {
-            own: Tree::new(own),
-            others: Tree::new(obstacles),
+            own: TriangleTree::new(own),
+            others: TriangleTree::new(obstacles),
             keep_out: options.keep_out.iter().filter(|keep_out| keep_out.link == index).collect(),
             clearance: options.clearance,
             pitch,
@@ -151,7 +151,7 @@ impl<'a> Surface<'a> {
         // Both sides of a sheet are outer sides. The more open one is chosen, and the front if they are equal.
         let back = if front < 0.95 { self.escaping(point, &-face) } else { 0.0 };
         let (side, share) = if back > front { (-face, back) } else { (*face, front) };
-        let is_outer = share >= ESCAPING
+        let is_outer = share >= MIN_ESCAPING_SHARE
             && !self.inside_another(&(point + side * (ABOVE * self.pitch)))
             && self.is_reached(point, &side);
         is_outer.then_some(side)
@@ -160,19 +160,19 @@ impl<'a> Surface<'a> {
     /// Returns the share of rays from just above a point that escape, weighted by the cosine to the normal.
     fn escaping(&self, point: &Point3<f64>, side: &Vector3<f64>) -> f64 {
         let rays = self.rays(point, side);
-        share(|ray| self.escapes(&rays(*ray), HIDING * self.pitch))
+        share(|ray| self.escapes(&rays(*ray), HIDING_DISTANCE * self.pitch))
     }
 
     /// Returns true if something can touch the point from this side: enough rays leave the robot.
     fn is_reached(&self, point: &Point3<f64>, side: &Vector3<f64>) -> bool {
         let rays = self.rays(point, side);
         let leaves = |ray: &u32| self.escapes(&rays(*ray), f64::INFINITY);
-        let few = count((0..FEW).filter(leaves));
-        if 2 * few >= FEW {
+        let few = count((0..FIRST_RAYS).filter(leaves));
+        if 2 * few >= FIRST_RAYS {
             return true;
         }
-        let mut needed = (REACHED * f64::from(REACHING)).ceil() - f64::from(few);
-        let left = (FEW..REACHING).filter(leaves).find(|_| {
+        let mut needed = (MIN_REACHED_SHARE * f64::from(REACH_RAYS)).ceil() - f64::from(few);
+        let left = (FIRST_RAYS..REACH_RAYS).filter(leaves).find(|_| {
             needed -= 1.0;
             needed <= 0.0
         });
@@ -206,7 +206,7 @@ impl<'a> Surface<'a> {
             if !self.others.blocks(&ray, f64::INFINITY) {
                 leaking += 1;
             }
-            if f64::from(leaking) > LEAKING * f64::from(RAYS) {
+            if f64::from(leaking) > MAX_LEAKING_SHARE * f64::from(RAYS) {
                 return false;
             }
         }
@@ -230,8 +230,8 @@ impl<'a> Surface<'a> {
     /// Computes the mean normal around each sample, and checks that there is enough surface below a cell.
     fn smooth(&mut self) {
         let radius = self.pitch / 2.0;
-        let grid = Grid::of(radius, self.samples.iter().map(|sample| &sample.point));
-        let min = SUPPORT * PI * radius * radius / self.share;
+        let grid = Grid::with_points(radius, self.samples.iter().map(|sample| &sample.point));
+        let min = MIN_SUPPORT * PI * radius * radius / self.share;
         let mut smoothed = Vec::new();
         for (cube, members) in grid.cubes() {
             let near: Vec<_> = grid.around(cube).filter_map(|index| self.samples.get(index)).collect();
@@ -276,11 +276,11 @@ impl<'a> Surface<'a> {
 
 /// Returns the share of rays that pass, from the first few if those agree.
 fn share(escapes: impl Fn(&u32) -> bool) -> f64 {
-    let few = count((0..FEW).filter(&escapes));
-    if few == 0 || few == FEW {
-        return f64::from(few) / f64::from(FEW);
+    let few = count((0..FIRST_RAYS).filter(&escapes));
+    if few == 0 || few == FIRST_RAYS {
+        return f64::from(few) / f64::from(FIRST_RAYS);
     }
-    f64::from(few + count((FEW..RAYS).filter(&escapes))) / f64::from(RAYS)
+    f64::from(few + count((FIRST_RAYS..RAYS).filter(&escapes))) / f64::from(RAYS)
 }
 
 /// Counts rays.
@@ -315,7 +315,7 @@ pub(crate) fn normal([a, b, c]: &Triangle) -> Option<Vector3<f64>> {
 }
 
 /// Collects the triangles of a link, in a frame in which its own is at `pose`.
-fn collect(link: &Link, pose: &Isometry3<f64>, triangles: &mut Vec<Triangle>) -> Result<(), CoverError> {
+fn collect(link: &RobotLink, pose: &Isometry3<f64>, triangles: &mut Vec<Triangle>) -> Result<(), CoverError> {
     let count = link.parts.iter().map(|part| part.mesh.triangles().len()).sum();
     if count > MAX_TRIANGLES {
         return Err(CoverError::Triangles { link: link.name.clone(), count });

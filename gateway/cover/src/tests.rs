@@ -10,16 +10,16 @@ use crate::mesh::Triangle;
 
 const PITCH: f64 = 0.04;
 
-fn options() -> Options {
-    Options { pitch: PITCH, ..Options::default() }
+fn options() -> CoverOptions {
+    CoverOptions { pitch: PITCH, ..CoverOptions::default() }
 }
 
-fn link(name: &str, parts: Vec<Part>) -> Link {
-    Link { name: name.to_owned(), parts, ..Link::default() }
+fn link(name: &str, parts: Vec<LinkMesh>) -> RobotLink {
+    RobotLink { name: name.to_owned(), parts, ..RobotLink::default() }
 }
 
-fn single(mesh: Mesh) -> Link {
-    link("single", vec![Part::new(mesh)])
+fn single(mesh: Mesh) -> RobotLink {
+    link("single", vec![LinkMesh::new(mesh)])
 }
 
 fn cube(edge: f64) -> Mesh {
@@ -27,19 +27,19 @@ fn cube(edge: f64) -> Mesh {
 }
 
 /// Covers one link, and checks the wiring.
-fn covered(link: Link, options: &Options) -> Skin {
+fn covered(link: RobotLink, options: &CoverOptions) -> Cover {
     let skin = cover(&[link], &[], options).unwrap();
     sound(&skin, options);
     skin
 }
 
-fn vectors(cell: &Cell) -> (Vector3<f64>, Vector3<f64>) {
+fn vectors(cell: &CoverCell) -> (Vector3<f64>, Vector3<f64>) {
     (Vector3::from(cell.position), Vector3::from(cell.normal))
 }
 
 /// Checks the properties of every skin's cells.
-fn sound(skin: &Skin, options: &Options) {
-    let mut buses: BTreeMap<usize, Vec<&Cell>> = BTreeMap::new();
+fn sound(skin: &Cover, options: &CoverOptions) {
+    let mut buses: BTreeMap<usize, Vec<&CoverCell>> = BTreeMap::new();
     for cell in &skin.cells {
         buses.entry(cell.bus).or_default().push(cell);
         assert!((vectors(cell).1.norm() - 1.0).abs() < 1e-9);
@@ -90,7 +90,7 @@ fn sound(skin: &Skin, options: &Options) {
 }
 
 /// Checks the figures of a well covered link.
-fn well(figures: &Figures) {
+fn well(figures: &LinkFigures) {
     let spacing = figures.spacing.unwrap() / PITCH;
     assert!(figures.covered > 0.98, "{figures:?}");
     assert!((0.9..1.1).contains(&spacing), "{figures:?}");
@@ -159,10 +159,10 @@ fn a_sheet_without_thickness_is_covered_on_the_side_of_its_winding() {
 
 #[test]
 fn inner_parts_wear_nothing() {
-    let inner = Part { scale: [0.5; 3], ..Part::new(cube(0.2)) };
+    let inner = LinkMesh { scale: [0.5; 3], ..LinkMesh::new(cube(0.2)) };
     // The third part is a second wall, just below the outer one.
-    let wall = Part { scale: [0.99; 3], ..Part::new(cube(0.2)) };
-    let skin = covered(link("boxes", vec![inner, Part::new(cube(0.2)), wall]), &options());
+    let wall = LinkMesh { scale: [0.99; 3], ..LinkMesh::new(cube(0.2)) };
+    let skin = covered(link("boxes", vec![inner, LinkMesh::new(cube(0.2)), wall]), &options());
     well(&skin.links[0]);
     assert!((skin.links[0].outer_area / 0.24 - 1.0).abs() < 0.02, "{:?}", skin.links);
     assert!(skin.cells.iter().all(|cell| (vectors(cell).0.amax() - 0.1).abs() < 1e-9));
@@ -170,7 +170,7 @@ fn inner_parts_wear_nothing() {
 
 #[test]
 fn winding_and_mirrors_do_not_turn_cells_inward() {
-    let outward = |skin: &Skin, middle: Vector3<f64>| {
+    let outward = |skin: &Cover, middle: Vector3<f64>| {
         well(&skin.links[0]);
         assert!(
             skin.cells.iter().map(vectors).all(|(position, normal)| (position - middle).dot(&normal) > 0.0)
@@ -183,7 +183,7 @@ fn winding_and_mirrors_do_not_turn_cells_inward() {
         triangles.iter().enumerate().map(|(at, &[a, b, c])| if at % 3 == 0 { [c, b, a] } else { [a, b, c] });
     outward(&covered(single(Mesh::new("mixed", mixed.collect()).unwrap()), &options()), Vector3::zeros());
     let pose = Isometry3::from_parts(Translation3::new(0.5, 0.0, 0.0), UnitQuaternion::identity());
-    let mirrored = Part { mesh: cube(0.2), pose, scale: [-1.0, 1.0, 1.5] };
+    let mirrored = LinkMesh { mesh: cube(0.2), pose, scale: [-1.0, 1.0, 1.5] };
     let skin = covered(link("mirrored", vec![mirrored]), &options());
     outward(&skin, Vector3::new(0.5, 0.0, 0.0));
     assert!((skin.links[0].outer_area / 0.32 - 1.0).abs() < 0.01);
@@ -197,10 +197,10 @@ fn other_links_hide_and_keep_cells_away() {
         Translation3::new(0.3, -0.2, 1.0),
         UnitQuaternion::from_axis_angle(&Vector3::x_axis(), 0.7),
     );
-    let clad = Link { pose, ..single(cube(0.2)) };
-    let holding = Link { pose: pose * at(0.2, 0.0, 0.0), ..single(cube(0.4)) };
+    let clad = RobotLink { pose, ..single(cube(0.2)) };
+    let holding = RobotLink { pose: pose * at(0.2, 0.0, 0.0), ..single(cube(0.4)) };
     let plate = single(Mesh::cuboid([0.6, 0.6, 0.01]).unwrap());
-    let plate = Link { pose: pose * at(0.0, 0.0, -0.115), ..plate };
+    let plate = RobotLink { pose: pose * at(0.0, 0.0, -0.115), ..plate };
     let skin = cover(core::slice::from_ref(&clad), &[holding, plate], &options()).unwrap();
     sound(&skin, &options());
     // One whole side and half of three others remain.
@@ -210,7 +210,7 @@ fn other_links_hide_and_keep_cells_away() {
         assert!(cell.position[0] <= -0.005 && cell.position[2] > -0.0999, "{cell:?}");
     }
     // Two links hide each other, and a link inside another gets no cells.
-    let shell = Link { pose, ..single(cube(0.3)) };
+    let shell = RobotLink { pose, ..single(cube(0.3)) };
     let skin = cover(&[clad, shell], &[], &options()).unwrap();
     sound(&skin, &options());
     assert_eq!((skin.links[0].cells, skin.links[0].spacing, skin.links[0].covered), (0, None, 0.0));
@@ -239,11 +239,11 @@ fn directions() -> Vec<Vector3<f64>> {
 }
 
 /// Returns the number of the first link's cells that nothing can touch: every direction from them meets a link.
-fn enclosed(links: &[Link], skin: &Skin) -> usize {
+fn enclosed(links: &[RobotLink], skin: &Cover) -> usize {
     let directions = directions();
     let parts = links.iter().flat_map(|link| link.parts.iter().map(|part| part.triangles(&link.pose)));
-    let tree = tree::Tree::new(parts.flatten().collect());
-    let blocked = |cell: &&Cell| {
+    let tree = tree::TriangleTree::new(parts.flatten().collect());
+    let blocked = |cell: &&CoverCell| {
         let (position, normal) = vectors(cell);
         let from = links[0].pose * Point3::from(position + normal * 1e-4);
         directions.iter().all(|direction| tree.blocks(&tree::Ray::new(from, *direction), f64::INFINITY))
@@ -260,17 +260,17 @@ fn no_cell_is_where_links_together_enclose_it() {
     let tube = |wall: f64, lift: f64| {
         let is_open = |triangle: &&Triangle| triangle.iter().any(|corner| corner.z > -0.1 + 1e-9);
         let open: Vec<_> = closed.triangles().iter().filter(is_open).copied().collect();
-        let inner = Part {
+        let inner = LinkMesh {
             scale: [1.0 - wall, 1.0 - wall, 1.0 - wall / 2.0],
-            ..Part::new(Mesh::new("tube", open.clone()).unwrap())
+            ..LinkMesh::new(Mesh::new("tube", open.clone()).unwrap())
         };
-        let outer = Part::new(Mesh::new("tube", open).unwrap());
+        let outer = LinkMesh::new(Mesh::new("tube", open).unwrap());
         let parts = if wall > 0.0 { vec![outer, inner] } else { vec![outer] };
-        Link { pose: at(0.11 + lift), ..link("tube", parts) }
+        RobotLink { pose: at(0.11 + lift), ..link("tube", parts) }
     };
     for (wall, lift) in [(0.0, 0.002), (0.05, 0.002), (0.0, 0.0005), (0.0, -0.001)] {
         let tube = tube(wall, lift);
-        let below = |cell: &&Cell| cell.normal[2] > 0.9 && vectors(cell).0.xy().norm() < 0.095;
+        let below = |cell: &&CoverCell| cell.normal[2] > 0.9 && vectors(cell).0.xy().norm() < 0.095;
         let links = [plate.clone(), tube];
         let skin = cover(&links[..1], &links[1..], &options()).unwrap();
         sound(&skin, &options());
@@ -294,15 +294,15 @@ fn no_cell_is_where_links_together_enclose_it() {
 #[test]
 fn keep_out_boxes_hold_no_cell() {
     let keep_out = KeepOut { link: 0, min: [-1.0, -1.0, 0.05], max: [1.0, 1.0, 1.0] };
-    let options = Options { keep_out: vec![keep_out], ..options() };
+    let options = CoverOptions { keep_out: vec![keep_out], ..options() };
     let skin = covered(single(cube(0.2)), &options);
     assert!(skin.cells.iter().all(|cell| cell.position[2] < 0.05));
     assert!(skin.links[0].covered < 0.9, "the area in the box counts");
     assert!((0.2..0.5).contains(&skin.links[0].kept_out), "{}", skin.links[0].kept_out);
-    let all = Options { keep_out: vec![KeepOut { min: [-1.0; 3], ..keep_out }], ..options };
+    let all = CoverOptions { keep_out: vec![KeepOut { min: [-1.0; 3], ..keep_out }], ..options };
     let figures = &covered(single(cube(0.2)), &all).links[0];
     assert!(figures.cells == 0 && figures.kept_out >= 1.0, "{figures:?}");
-    let other = Options { keep_out: vec![KeepOut { link: 1, ..keep_out }], ..all };
+    let other = CoverOptions { keep_out: vec![KeepOut { link: 1, ..keep_out }], ..all };
     assert_eq!(
         cover(&[single(cube(0.2))], &[], &other).unwrap_err().to_string(),
         "keep-out box 0: link 1 is none of the 1 covered ones; correct it"
@@ -311,14 +311,14 @@ fn keep_out_boxes_hold_no_cell() {
 
 #[test]
 fn the_same_seed_gives_the_same_cells() {
-    let skin = |seed| covered(single(Mesh::cylinder(0.06, 0.2).unwrap()), &Options { seed, ..options() });
+    let skin = |seed| covered(single(Mesh::cylinder(0.06, 0.2).unwrap()), &CoverOptions { seed, ..options() });
     assert_eq!(skin(7), skin(7));
     assert_ne!(skin(7).cells, skin(8).cells);
 }
 
 #[test]
 fn buses_are_patches_along_a_link_and_nodes_follow_it() {
-    let options = Options { nodes_per_bus: 20, ..options() };
+    let options = CoverOptions { nodes_per_bus: 20, ..options() };
     let skin = covered(single(Mesh::cylinder(0.04, 0.6).unwrap()), &options);
     assert!(skin.buses > 3);
     for pair in skin.cells.windows(2) {
@@ -338,7 +338,7 @@ fn buses_are_patches_along_a_link_and_nodes_follow_it() {
 
 #[test]
 fn what_cannot_be_covered_is_refused_in_one_line() {
-    let refused = |link: Link, options: Options| {
+    let refused = |link: RobotLink, options: CoverOptions| {
         let message = cover(&[link], &[], &options).unwrap_err().to_string();
         assert_eq!(message.lines().count(), 1, "{message}");
         message
@@ -349,19 +349,19 @@ fn what_cannot_be_covered_is_refused_in_one_line() {
     let wide = refused(single(cube(2.0)), options());
     let (_, hint) = wide.rsplit_once("or raise the pitch to ").unwrap();
     let pitch = hint.strip_suffix(" m").unwrap().parse().unwrap();
-    let raised = Options { pitch, ..options() };
+    let raised = CoverOptions { pitch, ..options() };
     assert!(Surface::new(0, &[single(cube(2.0))], &[], &raised).is_ok(), "{wide}");
-    let infinite = link("l", vec![Part { scale: [1.0, f64::INFINITY, 1.0], ..Part::new(cube(1.0)) }]);
+    let infinite = link("l", vec![LinkMesh { scale: [1.0, f64::INFINITY, 1.0], ..LinkMesh::new(cube(1.0)) }]);
     assert!(refused(infinite, options()).starts_with("link l, part 0: coordinates are not finite"));
-    let overflowing = link("l", vec![Part { scale: [1e200; 3], ..Part::new(cube(1.0)) }]);
+    let overflowing = link("l", vec![LinkMesh { scale: [1e200; 3], ..LinkMesh::new(cube(1.0)) }]);
     assert!(refused(overflowing, options()).starts_with("link l: inf m²"));
-    let pitch = refused(single(cube(1.0)), Options { pitch: 0.0, ..options() });
+    let pitch = refused(single(cube(1.0)), CoverOptions { pitch: 0.0, ..options() });
     assert_eq!(pitch, "pitch 0 m: it is 0.001 to 1 m; correct it");
-    assert!(refused(single(cube(1.0)), Options { pitch: f64::NAN, ..options() }).starts_with("pitch NaN m"));
+    assert!(refused(single(cube(1.0)), CoverOptions { pitch: f64::NAN, ..options() }).starts_with("pitch NaN m"));
     assert!(
-        refused(single(cube(1.0)), Options { clearance: -1.0, ..options() }).starts_with("clearance -1 m")
+        refused(single(cube(1.0)), CoverOptions { clearance: -1.0, ..options() }).starts_with("clearance -1 m")
     );
-    assert!(refused(single(cube(1.0)), Options { nodes_per_bus: 251, ..options() }).starts_with("251 nodes"));
+    assert!(refused(single(cube(1.0)), CoverOptions { nodes_per_bus: 251, ..options() }).starts_with("251 nodes"));
 }
 
 #[test]
@@ -394,7 +394,7 @@ proptest! {
 
     #[test]
     fn any_triangles_are_covered_or_refused(soup in soup(), seed in any::<u64>(), nodes in 1..=MAX_NODES) {
-        let options = Options { seed, nodes_per_bus: nodes, pitch: 0.08, ..Options::default() };
+        let options = CoverOptions { seed, nodes_per_bus: nodes, pitch: 0.08, ..CoverOptions::default() };
         let (first, second) = soup.split_at(soup.len() / 2);
         let link = |triangles: &[Triangle]| Mesh::new("soup", triangles.to_vec()).map(single).unwrap_or_default();
         match cover(&[link(first), link(second)], &[], &options) {

@@ -18,7 +18,7 @@ pub(crate) struct Bounds {
 }
 
 impl Bounds {
-    fn of<'a>(points: impl Iterator<Item = &'a Point3<f64>>) -> Self {
+    fn enclosing<'a>(points: impl Iterator<Item = &'a Point3<f64>>) -> Self {
         let empty = Self {
             min: Point3::from(Vector3::repeat(f64::INFINITY)),
             max: Point3::from(Vector3::repeat(f64::NEG_INFINITY)),
@@ -75,7 +75,7 @@ impl Ray {
 }
 
 #[derive(Clone, Copy, Debug)]
-enum Kind {
+enum NodeKind {
     /// The range of triangles.
     Leaf(usize, usize),
     /// The two child nodes.
@@ -84,14 +84,14 @@ enum Kind {
 
 /// Triangles with queries for the first one that a ray meets, and for those near a point.
 #[derive(Clone, Debug)]
-pub(crate) struct Tree {
+pub(crate) struct TriangleTree {
     /// The nodes; the root comes first.
-    nodes: Vec<(Bounds, Kind)>,
+    nodes: Vec<(Bounds, NodeKind)>,
     /// The triangles in the order of the leaves.
     triangles: Vec<Triangle>,
 }
 
-impl Tree {
+impl TriangleTree {
     pub(crate) fn new(mut triangles: Vec<Triangle>) -> Self {
         let count = triangles.len();
         let mut nodes = Vec::new();
@@ -99,11 +99,11 @@ impl Tree {
         let mut open = vec![(0, count, None)];
         while let Some((from, to, place)) = open.pop() {
             let Some(part) = triangles.get_mut(from..to).filter(|part| !part.is_empty()) else { continue };
-            let bounds = Bounds::of(part.iter().flatten());
+            let bounds = Bounds::enclosing(part.iter().flatten());
             let node = nodes.len();
-            nodes.push((bounds, Kind::Leaf(from, to)));
+            nodes.push((bounds, NodeKind::Leaf(from, to)));
             // The parent stores the index of its second child; the first one follows the parent directly.
-            if let Some((_, Kind::Fork(_, second))) = place.and_then(|parent: usize| nodes.get_mut(parent)) {
+            if let Some((_, NodeKind::Fork(_, second))) = place.and_then(|parent: usize| nodes.get_mut(parent)) {
                 *second = node;
             }
             if to - from <= LEAF {
@@ -116,7 +116,7 @@ impl Tree {
             };
             part.select_nth_unstable_by(middle, |a, b| key(a).total_cmp(&key(b)));
             if let Some((_, kind)) = nodes.get_mut(node) {
-                *kind = Kind::Fork(node + 1, node + 1);
+                *kind = NodeKind::Fork(node + 1, node + 1);
             }
             open.push((from + middle, to, Some(node)));
             open.push((from, from + middle, None));
@@ -157,8 +157,8 @@ impl Tree {
                 continue;
             }
             match *kind {
-                Kind::Fork(first, second) => open.extend([second, first]),
-                Kind::Leaf(from, to) => {
+                NodeKind::Fork(first, second) => open.extend([second, first]),
+                NodeKind::Leaf(from, to) => {
                     for (index, triangle) in self.leaf(from, to) {
                         if let Some(at) = ray.meets(triangle).filter(|&at| at <= until) {
                             until = at;
@@ -183,8 +183,8 @@ impl Tree {
                 continue;
             }
             match *kind {
-                Kind::Fork(first, second) => open.extend([first, second]),
-                Kind::Leaf(from, to) => {
+                NodeKind::Fork(first, second) => open.extend([first, second]),
+                NodeKind::Leaf(from, to) => {
                     if self.leaf(from, to).any(|(_, triangle)| distance(point, triangle) < within) {
                         return true;
                     }
@@ -236,7 +236,7 @@ mod tests {
         ) {
             prop_assume!((to - from).norm() > 1e-3);
             let ray = Ray::new(from, (to - from).normalize());
-            let tree = Tree::new(triangles.clone());
+            let tree = TriangleTree::new(triangles.clone());
             prop_assert_eq!(tree.triangles().len(), triangles.len());
             let hits = triangles.iter().filter_map(|triangle| ray.meets(triangle));
             let first = hits.filter(|&at| at <= until).min_by(f64::total_cmp);
@@ -260,7 +260,7 @@ mod tests {
     #[test]
     fn triangles_without_an_area_stop_no_ray() {
         let point = Point3::new(0.0, 0.0, 1.0);
-        let tree = Tree::new(vec![[point; 3]; 10]);
+        let tree = TriangleTree::new(vec![[point; 3]; 10]);
         assert!(!tree.blocks(&Ray::new(Point3::origin(), Vector3::z()), 9.0));
         assert!(tree.near(&Point3::origin(), 1.5));
         assert!(!tree.near(&Point3::origin(), 0.5));

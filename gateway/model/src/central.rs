@@ -18,20 +18,20 @@ use nalgebra::{IsometryMatrix3, Matrix4, Point3, Rotation3, Translation3, Vector
 use protocol::fixed::{Q, Q1_14};
 use protocol::message::SkinSensors;
 use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
-use protocol::skin::{Base, Cell, Chain, Skin};
+use protocol::skin::{ChainBase, Cell, Chain, Skin};
 
 /// The central computation for the cells of one chain. Cells are named by their index in [`Skin::cells`].
 #[derive(Clone, Debug)]
 pub struct Central {
     /// Pose of frame 0 in the robot's base frame.
     base: IsometryMatrix3<f64>,
-    links: Vec<Link>,
-    cells: Vec<Place>,
+    links: Vec<ChainLink>,
+    cells: Vec<CellGeometry>,
 }
 
 /// One row of the chain's table.
 #[derive(Clone, Copy, Debug)]
-struct Link {
+struct ChainLink {
     kind: RowKind,
     /// The part of the transform that does not depend on the joint: `Tz(d) Tx(a) Rx(alpha)`.
     fixed: IsometryMatrix3<f64>,
@@ -43,7 +43,7 @@ struct Link {
 
 /// The pose of a cell in the frame of the row that carries it, and its contact thresholds.
 #[derive(Clone, Copy, Debug)]
-struct Place {
+struct CellGeometry {
     row: usize,
     position: Point3<f64>,
     normal: Vector3<f64>,
@@ -76,10 +76,10 @@ impl Central {
         let cells = skin.cells.iter().map(|cell| {
             let parameters = skin.parameters(cell);
             if links.is_empty() {
-                links.extend(parameters.table().iter().map(Link::of_words));
+                links.extend(parameters.table().iter().map(ChainLink::of_words));
             }
             let pose = parameters.pose;
-            Place::new(cell, pose.position.map(Q::to_f64), pose.normal.map(Q::to_f64))
+            CellGeometry::new(cell, pose.position.map(Q::to_f64), pose.normal.map(Q::to_f64))
         });
         let cells = cells.collect();
         Self { base: base(skin), links, cells }
@@ -92,11 +92,11 @@ impl Central {
             let link = |row: &protocol::skin::ChainRow| {
                 let table = row.table;
                 let word = Q1_14::from_radians(table.theta_offset).unwrap_or_default();
-                Link::new(row.kind, table.a, table.d, table.alpha, word, table.theta_offset)
+                ChainLink::new(row.kind, table.a, table.d, table.alpha, word, table.theta_offset)
             };
             chain.rows.iter().map(link).collect()
         };
-        let cells = skin.cells.iter().map(|cell| Place::new(cell, cell.position, cell.normal));
+        let cells = skin.cells.iter().map(|cell| CellGeometry::new(cell, cell.position, cell.normal));
         let links = skin.cells.first().map_or_else(Vec::new, |cell| rows(skin.chain(cell.bus)));
         Self { base: base(skin), links, cells: cells.collect() }
     }
@@ -107,8 +107,8 @@ impl Central {
         let Parameters { pose, contact, .. } = *parameters;
         let position = pose.position.map(Q::to_f64).into();
         let normal = pose.normal.map(Q::to_f64).into();
-        let place = Place { row: parameters.chain().len(), position, normal, contact };
-        let links = parameters.table().iter().map(Link::of_words).collect();
+        let place = CellGeometry { row: parameters.chain().len(), position, normal, contact };
+        let links = parameters.table().iter().map(ChainLink::of_words).collect();
         Self { base: IsometryMatrix3::identity(), links, cells: vec![place] }
     }
 
@@ -144,7 +144,7 @@ impl Central {
     }
 
     /// Multiplies the transforms of the rows; `place` returns the angle and the displacement of a row.
-    fn chain<T>(&self, joints: &[T], place: impl Fn(&Link, Option<&T>) -> (f64, f64)) -> Frames {
+    fn chain<T>(&self, joints: &[T], place: impl Fn(&ChainLink, Option<&T>) -> (f64, f64)) -> Frames {
         let mut tip = self.base;
         let mut frames = Frames { frames: [tip; MAX_ROWS + 1], kinds: [RowKind::Fixed; MAX_ROWS] };
         let mut joints = joints.iter();
@@ -206,7 +206,7 @@ impl Central {
 
 /// Returns the pose of frame 0 of the cells' chain in the robot's base frame.
 fn base(skin: &Skin) -> IsometryMatrix3<f64> {
-    let base = skin.cells.first().map_or_else(Base::default, |cell| skin.chain(cell.bus).base);
+    let base = skin.cells.first().map_or_else(ChainBase::default, |cell| skin.chain(cell.bus).base);
     let turn = Matrix4::from(base.matrix()).fixed_view::<3, 3>(0, 0).into_owned();
     Translation3::from(base.position) * Rotation3::from_matrix_unchecked(turn)
 }
@@ -220,7 +220,7 @@ impl Frames {
 
     /// Adds the torques about joints 1 to k of a cell at `place` with the force `f_z` on it:
     /// `z_(l-1) x (t - t_(l-1)) . force`, for prismatic joints `z_(l-1) . force`.
-    fn add_torque(&self, place: &Place, f_z: f64, torque: &mut [f64; MAX_JOINTS]) {
+    fn add_torque(&self, place: &CellGeometry, f_z: f64, torque: &mut [f64; MAX_JOINTS]) {
         let Some(limb) = self.frames.get(place.row) else { return };
         let position = limb * place.position;
         let force = limb.rotation * place.normal * -f_z;
@@ -237,7 +237,7 @@ impl Frames {
     }
 }
 
-impl Link {
+impl ChainLink {
     fn of_words(row: &Row) -> Self {
         let (a, d, alpha) = (row.a.to_f64(), row.d.to_f64(), row.alpha.to_radians());
         Self::new(row.kind, a, d, alpha, row.theta_offset, row.theta_offset.to_radians())
@@ -249,7 +249,7 @@ impl Link {
     }
 }
 
-impl Place {
+impl CellGeometry {
     fn new(cell: &Cell, position: [f64; 3], normal: [f64; 3]) -> Self {
         let Cell { row, contact, .. } = *cell;
         Self { row: row.into(), position: position.into(), normal: normal.into(), contact }

@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 
 use protocol::can::Format;
-use protocol::message::{Heard, Heartbeat, Message, NetworkPage, Ports, Refused, Tree};
+use protocol::message::{ReceivedCounts, Heartbeat, Message, NetworkPage, Ports, RejectedCounts, Tree};
 use protocol::time::{Micros, Span};
 
-use crate::tracker::{Claim, Word};
+use crate::tracker::{AddressClaim, HeartbeatKind};
 
 /// Formats sorted node ids as text. Three or more consecutive ids become a range: `1-3`, `5`.
 #[must_use]
@@ -21,36 +21,36 @@ pub fn ranges(nodes: &[u8]) -> Vec<String> {
 
 /// The reports of one cell.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Cell {
+pub struct ListedCell {
     /// Its identity and state.
     pub heartbeat: Option<Heartbeat>,
     /// Counters of what it received.
-    pub heard: Option<Heard>,
+    pub heard: Option<ReceivedCounts>,
     /// Counters of what the cell refused.
-    pub refused: Option<Refused>,
+    pub refused: Option<RejectedCounts>,
     /// Its place in the tree.
     pub tree: Option<Tree>,
     /// The neighbours at its ports.
     pub ports: Option<Ports>,
     /// The serial number of another cell that claims this node id, or held it before.
     pub other: Option<u32>,
-    claim: Claim,
+    claim: AddressClaim,
     /// Arrival time of its last packet.
     last: Micros,
 }
 
-impl Cell {
+impl ListedCell {
     /// Returns the time since its last packet.
     #[must_use]
     pub const fn age(&self, now: Micros) -> Span {
-        now.since(self.last)
+        now.elapsed_since(self.last)
     }
 
-    fn says(&mut self, now: Micros, page: &NetworkPage) {
+    fn record_page(&mut self, now: Micros, page: &NetworkPage) {
         match *page {
             NetworkPage::Heartbeat(heartbeat) => {
                 let before = self.claim.serial();
-                if matches!(self.claim.hear(now, &heartbeat), Word::Claimant | Word::Outsider) {
+                if matches!(self.claim.receive(now, &heartbeat), HeartbeatKind::Claimant | HeartbeatKind::Outsider) {
                     self.other = Some(heartbeat.serial);
                 } else if before.is_some_and(|before| before != heartbeat.serial) {
                     // The reports so far belong to the previous cell: start again.
@@ -58,8 +58,8 @@ impl Cell {
                 }
                 self.heartbeat = self.claim.heartbeat();
             }
-            NetworkPage::Heard(heard) => self.heard = Some(heard),
-            NetworkPage::Refused(refused) => self.refused = Some(refused),
+            NetworkPage::Received(heard) => self.heard = Some(heard),
+            NetworkPage::Rejected(refused) => self.refused = Some(refused),
             NetworkPage::Tree(tree) => self.tree = Some(tree),
             NetworkPage::Ports(ports) => self.ports = Some(ports),
         }
@@ -69,7 +69,7 @@ impl Cell {
 /// All cells that were seen on a bus.
 #[derive(Clone, Debug, Default)]
 pub struct Listing {
-    cells: BTreeMap<u8, Cell>,
+    cells: BTreeMap<u8, ListedCell>,
     gateway: bool,
     format: Option<Format>,
 }
@@ -82,7 +82,7 @@ impl Listing {
     }
 
     /// Records a message that arrived in frames of this format.
-    pub fn hear(&mut self, now: Micros, format: Format, message: &Message) {
+    pub fn receive(&mut self, now: Micros, format: Format, message: &Message) {
         let Some(from) = message.sender() else {
             self.gateway |= matches!(message, Message::Joints { .. } | Message::Network { .. });
             return;
@@ -91,12 +91,12 @@ impl Listing {
         let cell = self.cells.entry(from.get()).or_default();
         cell.last = now;
         if let Message::Network { page, .. } = message {
-            cell.says(now, page);
+            cell.record_page(now, page);
         }
     }
 
     /// Returns the cells by node id.
-    pub fn cells(&self) -> impl ExactSizeIterator<Item = (u8, &Cell)> {
+    pub fn cells(&self) -> impl ExactSizeIterator<Item = (u8, &ListedCell)> {
         self.cells.iter().map(|(&node, cell)| (node, cell))
     }
 
@@ -115,7 +115,7 @@ impl Listing {
     /// Returns the node id of the cell with this serial number, if it is on the bus.
     #[must_use]
     pub fn number_of(&self, serial: u32) -> Option<u8> {
-        let is = |cell: &Cell| cell.claim.serial() == Some(serial);
+        let is = |cell: &ListedCell| cell.claim.serial() == Some(serial);
         self.cells.iter().find(|(_, cell)| is(cell)).map(|(&number, _)| number)
     }
 }
@@ -141,12 +141,12 @@ mod tests {
     fn only_reports_of_a_cell_are_listed() {
         let mut listing = Listing::new();
         let heartbeat = Heartbeat { serial: 7, state: State(0x1101), ..Heartbeat::default() };
-        listing.hear(Micros(10), Format::Classic, &says(3, NetworkPage::Heartbeat(heartbeat)));
-        listing.hear(Micros(20), Format::Classic, &says(4, NetworkPage::Refused(Refused::default())));
+        listing.receive(Micros(10), Format::Classic, &says(3, NetworkPage::Heartbeat(heartbeat)));
+        listing.receive(Micros(20), Format::Classic, &says(4, NetworkPage::Rejected(RejectedCounts::default())));
         let cells: Vec<_> = listing.cells().collect();
         let [(3, third), (4, fourth)] = cells.as_slice() else { panic!("{cells:?}") };
         assert_eq!((third.heartbeat, third.refused, third.tree), (Some(heartbeat), None, None));
-        assert_eq!((fourth.heartbeat, fourth.refused), (None, Some(Refused::default())));
+        assert_eq!((fourth.heartbeat, fourth.refused), (None, Some(RejectedCounts::default())));
         assert_eq!(
             (third.age(Micros(110)), listing.number_of(7), listing.number_of(8)),
             (Span(100), Some(3), None)
@@ -158,8 +158,8 @@ mod tests {
     fn another_cell_with_a_node_id_has_no_reports_of_the_one_before_it() {
         let mut listing = Listing::new();
         let of = |serial| NetworkPage::Heartbeat(Heartbeat { serial, ..Heartbeat::default() });
-        for page in [of(7), NetworkPage::Heard(Heard::default()), of(8)] {
-            listing.hear(Micros(0), Format::Fd, &says(3, page));
+        for page in [of(7), NetworkPage::Received(ReceivedCounts::default()), of(8)] {
+            listing.receive(Micros(0), Format::Fd, &says(3, page));
         }
         let (_, cell) = listing.cells().next().unwrap();
         assert_eq!((cell.other, cell.heard), (Some(7), None));
@@ -169,8 +169,8 @@ mod tests {
     fn a_cell_that_takes_a_node_id_is_as_old_as_its_last_packet() {
         let mut listing = Listing::new();
         let beat = |serial| NetworkPage::Heartbeat(Heartbeat { serial, sent: 9, ..Heartbeat::default() });
-        listing.hear(Micros(10), Format::Fd, &says(3, beat(7)));
-        listing.hear(Micros(900_000), Format::Fd, &says(3, beat(8)));
+        listing.receive(Micros(10), Format::Fd, &says(3, beat(7)));
+        listing.receive(Micros(900_000), Format::Fd, &says(3, beat(8)));
         let (_, cell) = listing.cells().next().unwrap();
         assert_eq!((cell.age(Micros(900_400)), cell.other), (Span(400), Some(7)));
     }

@@ -12,12 +12,12 @@
 use protocol::can::{Format, Frame};
 use protocol::id::{Command, Id};
 use protocol::message::{Message, MessageError};
-use protocol::packet::{Length, Lengths, Packet, PacketError, Reassembly, Segment, data_id};
+use protocol::packet::{Length, Lengths, Packet, PacketError, Reassembly, Reassembler, data_id};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
 /// The number of identifiers of 11 bits.
-const IDS: usize = 1 << 11;
+const IDENTIFIER_COUNT: usize = 1 << 11;
 
 /// The number of joints in joints, torques and sums on a bus, and how it is known.
 #[derive(Clone, Copy, Debug)]
@@ -73,7 +73,7 @@ pub struct PacketReader {
     format: Option<Format>,
     length: ChainLength,
     /// Reassembly state by identifier.
-    segments: Vec<Option<Box<Segment>>>,
+    segments: Vec<Option<Box<Reassembler>>>,
 }
 
 impl Default for PacketReader {
@@ -94,7 +94,7 @@ impl PacketReader {
     pub fn of_skin(skin: &Skin, bus: usize) -> Self {
         Self {
             format: Some(skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format)),
-            length: ChainLength::Described(skin.length_of(bus)),
+            length: ChainLength::Described(skin.packet_length(bus)),
             segments: Vec::new(),
         }
     }
@@ -119,7 +119,7 @@ impl PacketReader {
     fn of_described_length(&self, id: Id, packet: Packet) -> Result<Packet, PacketError> {
         match self.length {
             ChainLength::Described(length)
-                if packet.words.length() != length && Lengths::of(id) == Lengths::ALL =>
+                if packet.words.length() != length && Lengths::for_id(id) == Lengths::ALL =>
             {
                 Err(PacketError::Length { expected: length.bytes(), got: packet.words.length().bytes() })
             }
@@ -132,10 +132,10 @@ impl PacketReader {
             ChainLength::Described(length) => Lengths::only(length),
             // Joints packets contain their own length.
             ChainLength::FromJoints(_) if id == Id::command(Command::Joints) => Lengths::ALL,
-            ChainLength::FromJoints(length) => Lengths::of_chain(length),
+            ChainLength::FromJoints(length) => Lengths::for_chain(length),
         };
         if self.segments.is_empty() {
-            self.segments.resize(IDS, None);
+            self.segments.resize(IDENTIFIER_COUNT, None);
         }
         let segments = self.segments.get_mut(usize::from(id.to_bits())).expect("an identifier has 11 bits");
         let segment = segments.get_or_insert_default();

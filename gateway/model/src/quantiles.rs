@@ -63,7 +63,7 @@ impl Quantiles {
     /// Computes the quantiles of a histogram that counts in units of `unit_us`.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
-    pub fn of(histogram: &Histogram<u64>, unit_us: f64) -> Self {
+    pub fn from_histogram(histogram: &Histogram<u64>, unit_us: f64) -> Self {
         let at = |quantile| histogram.value_at_quantile(quantile) as f64 * unit_us;
         Self {
             p50: at(0.5),

@@ -27,7 +27,7 @@ pub struct Attempt {
 
 /// The action for a request now.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Turn {
+pub enum RetryAction {
     /// Nothing yet.
     Wait,
     /// Send it again.
@@ -56,16 +56,16 @@ impl Attempt {
     }
 
     /// Handles the timeout. [`Turn::Again`] counts as a transmission. Has no effect before the timeout.
-    pub fn turn(&mut self, now: Micros) -> Turn {
+    pub fn turn(&mut self, now: Micros) -> RetryAction {
         if now < self.due {
-            return Turn::Wait;
+            return RetryAction::Wait;
         }
         if self.tries >= self.limits.tries {
-            return Turn::GiveUp;
+            return RetryAction::GiveUp;
         }
         self.tries += 1;
         self.extend(now);
-        Turn::Again
+        RetryAction::Again
     }
 
     /// Restarts the timeout: a cell has answered, so others may still answer.
@@ -94,14 +94,14 @@ impl<K: Copy + Ord> Repeats<K> {
     /// Returns those of the `open` requests that are due now, and counts them as sent.
     pub fn due(&mut self, now: Micros, open: impl IntoIterator<Item = K>) -> Vec<K> {
         let last = |key: &K| self.sent.get(key).copied().max(self.all);
-        let is_due = |key: &K| last(key).is_none_or(|at| now.since(at) >= self.every);
+        let is_due = |key: &K| last(key).is_none_or(|at| now.elapsed_since(at) >= self.every);
         let due: Vec<_> = open.into_iter().filter(is_due).collect();
         self.sent.extend(due.iter().map(|key| (*key, now)));
         due
     }
 
     /// Records that all requests were sent in one message to all cells.
-    pub const fn said_to_all(&mut self, now: Micros) {
+    pub const fn mark_all_sent(&mut self, now: Micros) {
         self.all = Some(now);
     }
 
@@ -121,12 +121,12 @@ mod tests {
     fn an_attempt_waits_twice_as_long_each_time_up_to_a_limit_and_then_gives_up() {
         let mut attempt = Attempt::new(Micros(0), LIMITS);
         for due in [100, 300, 600] {
-            assert_eq!((attempt.due(), attempt.turn(Micros(due - 1))), (Micros(due), Turn::Wait));
-            assert_eq!(attempt.turn(Micros(due)), Turn::Again);
+            assert_eq!((attempt.due(), attempt.turn(Micros(due - 1))), (Micros(due), RetryAction::Wait));
+            assert_eq!(attempt.turn(Micros(due)), RetryAction::Again);
         }
         assert_eq!((attempt.tries(), attempt.due()), (4, Micros(900)));
         attempt.extend(Micros(800));
-        assert_eq!((attempt.turn(Micros(1_099)), attempt.turn(Micros(1_100))), (Turn::Wait, Turn::GiveUp));
+        assert_eq!((attempt.turn(Micros(1_099)), attempt.turn(Micros(1_100))), (RetryAction::Wait, RetryAction::GiveUp));
     }
 
     #[test]
@@ -135,7 +135,7 @@ mod tests {
         assert_eq!(repeats.due(Micros(0), [1, 2]), [1, 2]);
         assert_eq!(repeats.due(Micros(99), [1, 2, 3]), [3]);
         assert_eq!(repeats.due(Micros(100), [2, 3]), [2]);
-        repeats.said_to_all(Micros(200));
+        repeats.mark_all_sent(Micros(200));
         assert!(repeats.due(Micros(299), [1, 2, 3, 4]).is_empty());
         assert_eq!(repeats.due(Micros(300), [1, 4]), [1, 4]);
         repeats.renew(4);

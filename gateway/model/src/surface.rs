@@ -6,7 +6,7 @@ use nalgebra::{Matrix3, Vector3};
 const CYLINDER_CELLS: usize = 6;
 
 /// A cell on a link: its centre in m and its unit normal, in the link's frame.
-pub type Placed = ([f64; 3], [f64; 3]);
+pub type SurfaceCell = ([f64; 3], [f64; 3]);
 
 /// A cylinder in a link's frame; lengths in m.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -27,7 +27,7 @@ impl Cylinder {
     /// for cells that face one way, as on a plate.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "a number of cells")]
-    pub fn fit(cells: &[Placed]) -> Option<Self> {
+    pub fn fit(cells: &[SurfaceCell]) -> Option<Self> {
         if cells.len() < CYLINDER_CELLS {
             return None;
         }
@@ -86,7 +86,7 @@ pub struct Flat {
 /// down.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "a number of cells")]
-pub fn lay_flat(cells: &[Placed], tip: [f64; 3]) -> Flat {
+pub fn lay_flat(cells: &[SurfaceCell], tip: [f64; 3]) -> Flat {
     let tip = Vector3::from(tip);
     if let Some(cylinder) = Cylinder::fit(cells) {
         let axis = Vector3::from(cylinder.axis);
@@ -119,7 +119,7 @@ fn beside(axis: &Vector3<f64>) -> Vector3<f64> {
     (chosen - axis * axis.dot(&chosen)).normalize()
 }
 
-fn vectors((position, normal): &Placed) -> (Vector3<f64>, Vector3<f64>) {
+fn vectors((position, normal): &SurfaceCell) -> (Vector3<f64>, Vector3<f64>) {
     (Vector3::from(*position), Vector3::from(*normal))
 }
 
@@ -129,7 +129,7 @@ mod tests {
     use core::f64::consts::{FRAC_PI_2, TAU};
 
     /// Six rings of twelve cells around the axis through (0.1, 0.2, z).
-    fn ring() -> Vec<Placed> {
+    fn ring() -> Vec<SurfaceCell> {
         let cells = (0..72_u32).map(|at| {
             let (angle, z) = (f64::from(at % 12) / 12.0 * TAU, f64::from(at / 12) * 0.03);
             let normal = [angle.cos(), angle.sin(), 0.0];
@@ -163,7 +163,7 @@ mod tests {
 
     #[test]
     fn a_plate_keeps_its_distances() {
-        let cells: Vec<Placed> =
+        let cells: Vec<SurfaceCell> =
             (0..4).map(|at| ([f64::from(at) * 0.03, 0.5, 0.1], [0.0, 0.0, 1.0])).collect();
         let flat = lay_flat(&cells, [1.0, 0.0, 0.0]);
         assert_eq!(flat.radius, None);

@@ -34,7 +34,7 @@ pub struct SineError {
 impl SineError {
     /// Computes the error over all 65 536 words.
     #[must_use]
-    pub fn of(function: impl Fn(Q1_14) -> Q1_14) -> Self {
+    pub fn of_function(function: impl Fn(Q1_14) -> Q1_14) -> Self {
         let (mut sum, mut max) = (0.0, 0.0_f64);
         let (mut points, mut parts) = (Vec::new(), vec![(0.0, 0.0_f64); 65_536 / PART]);
         for (place, bits) in (i16::MIN..=i16::MAX).enumerate() {
@@ -58,9 +58,9 @@ impl SineError {
 #[must_use]
 pub fn sine_section() -> Section {
     let [fifth, seventh, rounded] = [
-        SineError::of(paper_sine),
-        SineError::of(sine),
-        SineError::of(|angle| Q1_14::nearest(angle.to_radians().sin())),
+        SineError::of_function(paper_sine),
+        SineError::of_function(sine),
+        SineError::of_function(|angle| Q1_14::nearest(angle.to_radians().sin())),
     ];
     let figure = |name: &str, title: &str, error: &str| {
         let angle = Axis::new("angle", "quarter turns").between(-2.0, 2.0);
@@ -98,17 +98,17 @@ pub fn sine_section() -> Section {
 
 /// The operations of a cell's Jacobian on each link of a robot.
 #[derive(Clone, Debug)]
-pub struct Costs {
+pub struct JacobianCosts {
     /// By the wrench kernel, for a cell on link 1, 2, ...
     pub wrench: Vec<Operations>,
     /// By the paper's projections.
     pub projection: Vec<Operations>,
 }
 
-impl Costs {
+impl JacobianCosts {
     /// Counts the operations for a skin's robot by running the kernels on counting numbers.
     #[must_use]
-    pub fn of(skin: &Skin) -> Self {
+    pub fn for_skin(skin: &Skin) -> Self {
         let joints = u8::try_from(skin.robot.joints.len()).unwrap_or(u8::MAX);
         let on = |joint| {
             let cell = skin.cells.first().map(|cell| skin.parameters(cell)).unwrap_or_default();
@@ -142,7 +142,7 @@ const WRENCH: [u32; 4] = [40, 24, 5, 5];
 
 /// Writes the section on the operations of both kernels.
 #[must_use]
-pub fn kernels_section(robot: &str, costs: &Costs) -> Section {
+pub fn kernels_section(robot: &str, costs: &JacobianCosts) -> Section {
     let links = |costs: &[Operations]| (1_u8..).zip(costs.to_vec()).collect::<Vec<_>>();
     let products = |costs: &[Operations]| {
         let of_link =
@@ -195,17 +195,17 @@ mod tests {
         let drawn =
             section.figures.iter().flat_map(|figure| &figure.series).map(|series| series.points.len());
         assert_eq!(drawn.collect::<Vec<_>>(), [65_536 / DRAWN, 256, 256, 256]);
-        let error = SineError::of(sine);
+        let error = SineError::of_function(sine);
         let max = error.parts.iter().map(|(_, error)| *error).fold(0.0, f64::max);
         assert!((max - error.max).abs() < 1e-15 && (error.parts[128].0 - 0.0078).abs() < 1e-4);
         assert!(section.findings[0].ours.value > 1e-4 && section.findings[2].ours.value > 1e-5);
-        let wrong = SineError::of(|angle| sine(angle.wrapping_add(Q1_14::from_bits(100))));
+        let wrong = SineError::of_function(|angle| sine(angle.wrapping_add(Q1_14::from_bits(100))));
         assert!(wrong.mean > 1e-3, "a phase of 100 words is seen");
     }
 
     #[test]
     fn the_kernels_cost_what_they_may_and_more_on_farther_links() {
-        let costs = Costs::of(&ticks::skin(1, 1).unwrap());
+        let costs = JacobianCosts::for_skin(&ticks::skin(1, 1).unwrap());
         let section = kernels_section("UR5", &costs);
         assert!(
             section

@@ -19,7 +19,7 @@ pub const fn name(reply: Reply) -> &'static str {
 /// The number of cells of the paper's arm.
 const CELLS: usize = 253;
 /// The number of cells of a quick run.
-const FEW: usize = 24;
+const QUICK_CELLS: usize = 24;
 /// A scenario with strokes, palms, a grip and a poke; the central computation is off from 5.7 s on.
 const TOUCHES: &str = include_str!("../../examples/demo.toml");
 /// A scenario with a touch of all cells at once; the central computation is off from 1.2 s on.
@@ -55,7 +55,7 @@ profile = \"half-sine\"
 #[must_use]
 pub fn skin(reply: Reply, effort: Effort) -> String {
     let cells = match effort {
-        Effort::Quick => FEW,
+        Effort::Quick => QUICK_CELLS,
         Effort::Full => CELLS,
     };
     generate(&Target { cells, reply, ..Target::default() }).expect("so many cells fit on the arm")

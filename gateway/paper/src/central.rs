@@ -12,7 +12,7 @@ use protocol::skin::Skin;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use super::line::{Line, Weighted, count, quantile};
+use super::line::{LinearFit, WeightedPoint, count, quantile};
 use super::samples;
 use super::ticks::{POSE, nanos, touch};
 use analysis::paper;
@@ -26,7 +26,7 @@ const LOOKS: usize = 5;
 
 /// The extent of the measurements.
 #[derive(Clone, Copy, Debug)]
-pub struct Extent {
+pub struct CentralExtent {
     /// The step between two numbers of cells.
     pub step: usize,
     /// The number of measurements of each number of cells.
@@ -41,7 +41,7 @@ pub struct OverCells {
     /// The number of cells, and the median, 25th and 75th percentile in ns.
     pub points: Vec<[f64; 4]>,
     /// The fit of T_skin in ns over the number of cells.
-    pub line: Line,
+    pub line: LinearFit,
 }
 
 /// T_skin over the number of active cells of a skin.
@@ -50,18 +50,18 @@ pub struct OverActive {
     /// The number of cells of the skin.
     pub cells: usize,
     /// The number of active cells, the median of T_skin in ns, and the number of touches as the weight.
-    pub points: Vec<Weighted>,
+    pub points: Vec<WeightedPoint>,
     /// The fit of T_skin in ns over active cells, weighted by the number of touches.
-    pub line: Line,
+    pub line: LinearFit,
 }
 
 /// Returns the time of one computation, averaged over several in a row, in ns.
-fn timed(central: &Central, reference_torque: &[SkinSensors], now: &impl Fn() -> u64) -> f64 {
+fn timed(central: &Central, sensors: &[SkinSensors], now: &impl Fn() -> u64) -> f64 {
     let joints = POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default());
     let began = now();
     for _ in 0..IN_A_ROW {
         let frames = central.frames(black_box(&joints));
-        black_box(central.total(&frames, black_box(reference_torque)));
+        black_box(central.total(&frames, black_box(sensors)));
     }
     nanos(now().saturating_sub(began)) / f64::from(IN_A_ROW)
 }
@@ -69,51 +69,51 @@ fn timed(central: &Central, reference_torque: &[SkinSensors], now: &impl Fn() ->
 /// Measures T_skin over 0 to all cells of a skin, all inactive. Returns `None` for fewer than three numbers of
 /// cells.
 #[must_use]
-pub fn over_cells(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option<OverCells> {
+pub fn over_cells(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) -> Option<OverCells> {
     let central = Central::new(skin);
-    let reference_torque = vec![SkinSensors::default(); skin.cells.len()];
+    let sensors = vec![SkinSensors::default(); skin.cells.len()];
     let cells: Vec<usize> = (0..=skin.cells.len()).step_by(extent.step.max(1)).collect();
     let measured = samples::interleaved(cells.len(), extent.rounds, 9, |place| {
-        let reference_torque =
-            cells.get(place).and_then(|&cells| reference_torque.get(..cells)).unwrap_or_default();
-        timed(&central, reference_torque, &now)
+        let sensors =
+            cells.get(place).and_then(|&cells| sensors.get(..cells)).unwrap_or_default();
+        timed(&central, sensors, &now)
     });
     let points = cells.iter().zip(&measured).map(|(&cells, values)| {
         let at = |part| quantile(&mut values.clone(), part);
         [count(cells), at(0.5), at(0.25), at(0.75)]
     });
     let points: Vec<_> = points.collect();
-    let line = Line::through_equals(&points.iter().map(|[x, y, ..]| (*x, *y)).collect::<Vec<_>>())?;
+    let line = LinearFit::through_equals(&points.iter().map(|[x, y, ..]| (*x, *y)).collect::<Vec<_>>())?;
     Some(OverCells { points, line })
 }
 
 /// Measures T_skin over the number of active cells of a skin. A touch is a patch of consecutive cells in the skin's
 /// order, which are neighbours. Its first cell and its size are random.
 #[must_use]
-pub fn over_active(skin: &Skin, extent: Extent, now: impl Fn() -> u64) -> Option<OverActive> {
+pub fn over_active(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) -> Option<OverActive> {
     let central = Central::new(skin);
     let cells = skin.cells.len();
     let mut dice = Pcg64Mcg::seed_from_u64(10);
     let mut by_active = vec![Vec::new(); cells + 1];
     for _ in 0..extent.touches {
         let (active, first) = (dice.random_range(0..=cells), dice.random_range(0..cells.max(1)));
-        let mut reference_torque = vec![SkinSensors::default(); cells];
-        reference_torque.iter_mut().take(active).for_each(|reference_torque| *reference_torque = touch());
-        reference_torque.rotate_right(first);
-        let min = (0..LOOKS).map(|_| timed(&central, &reference_torque, &now)).fold(f64::INFINITY, f64::min);
+        let mut sensors = vec![SkinSensors::default(); cells];
+        sensors.iter_mut().take(active).for_each(|reference_torque| *reference_torque = touch());
+        sensors.rotate_right(first);
+        let min = (0..LOOKS).map(|_| timed(&central, &sensors, &now)).fold(f64::INFINITY, f64::min);
         if let Some(values) = by_active.get_mut(active) {
             values.push(min);
         }
     }
     let points = by_active.iter_mut().enumerate().filter(|(_, values)| !values.is_empty());
-    let points: Vec<_> = points.map(|(active, values)| Weighted::median(count(active), values)).collect();
-    Some(OverActive { cells, line: Line::through(&points)?, points })
+    let points: Vec<_> = points.map(|(active, values)| WeightedPoint::median(count(active), values)).collect();
+    Some(OverActive { cells, line: LinearFit::through(&points)?, points })
 }
 
 /// The minimum R² of a law.
 const QUALITY: f64 = 0.99;
 
-fn quality(line: &Line, paper: f64) -> Finding {
+fn quality(line: &LinearFit, paper: f64) -> Finding {
     let finding = Finding::more_is_better("quality of the fit, R²", paper, line.quality);
     finding.must(format!("at least {QUALITY}"), line.quality >= QUALITY)
 }
@@ -157,8 +157,8 @@ fn beside(
 }
 
 /// Returns a law in ns as a line from 0 on, in µs.
-fn law(line: &Line, most: f64) -> Vec<(f64, f64)> {
-    [0.0, most].map(|x| (x, line.at(x) * 1e-3)).into()
+fn law(line: &LinearFit, most: f64) -> Vec<(f64, f64)> {
+    [0.0, most].map(|x| (x, line.value_at(x) * 1e-3)).into()
 }
 
 /// Writes the section on Fig. 9 with Eq. 29.
@@ -219,7 +219,7 @@ pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
         beside(&fig10, "Eq. 30", micros, most, |active| paper::ACTIVE_S * active + paper::NONE_ACTIVE_S);
     let all = Finding::stated(
         format!("T_skin of {of} cells, all active (Eq. 31)"),
-        ((of_cells.at(most) + line.slope * most) * 1e-3, "µs"),
+        ((of_cells.value_at(most) + line.slope * most) * 1e-3, "µs"),
     );
     let all_papers = (paper::CELL_S * most + paper::FIXED_S + paper::ACTIVE_S * most) * 1e6;
     let touches: f64 = points.iter().map(|point| point.weight).sum();
@@ -259,18 +259,18 @@ mod tests {
     use crate::ticks;
     use analysis::report::figure::Verdict;
 
-    fn line(slope: f64, intercept: f64) -> Line {
-        Line { slope, intercept, quality: 0.999, slope_half: 0.1 }
+    fn line(slope: f64, intercept: f64) -> LinearFit {
+        LinearFit { slope, intercept, quality: 0.999, slope_half: 0.1 }
     }
 
     /// The findings for the paper's own law, in ns.
     #[test]
     fn the_papers_own_laws_lead_to_its_limits_and_to_no_verdict_but_the_same() {
         let law = line(paper::CELL_S * 1e9, paper::FIXED_S * 1e9);
-        let points = [0.0, 1500.0, 3000.0].map(|cells| [cells, law.at(cells), law.at(cells), law.at(cells)]);
+        let points = [0.0, 1500.0, 3000.0].map(|cells| [cells, law.value_at(cells), law.value_at(cells), law.value_at(cells)]);
         let cells = OverCells { points: points.to_vec(), line: law };
         let over = line(paper::ACTIVE_S * 1e9, paper::NONE_ACTIVE_S * 1e9);
-        let points = [0.0, 100.0, 253.0].map(|x| Weighted { x, y: over.at(x), weight: 3.0 });
+        let points = [0.0, 100.0, 253.0].map(|x| WeightedPoint { x, y: over.value_at(x), weight: 3.0 });
         let active = OverActive { cells: 253, points: points.to_vec(), line: over };
         let (nine, ten) = (fig9(&cells), fig10(&active, &cells));
         let all = || nine.findings.iter().chain(&ten.findings);
@@ -286,7 +286,7 @@ mod tests {
         let of = |what: &str| all().find(|finding| finding.what.starts_with(what)).unwrap();
         assert_eq!(of("T_skin for each cell").verdict, Verdict::Same);
         assert_eq!(of("quality").verdict, Verdict::Better, "above the bar");
-        let steep = OverCells { line: Line { quality: 0.98, ..line(900.0, 0.0) }, ..cells };
+        let steep = OverCells { line: LinearFit { quality: 0.98, ..line(900.0, 0.0) }, ..cells };
         let worse = fig9(&steep).findings.iter().filter(|finding| finding.verdict == Verdict::Worse).count();
         assert_eq!(worse, 3, "slope, quality and limit");
     }
@@ -300,7 +300,7 @@ mod tests {
             clock.set(clock.get() + 16);
             clock.get()
         };
-        let extent = Extent { step: 10, rounds: 3, touches: 200 };
+        let extent = CentralExtent { step: 10, rounds: 3, touches: 200 };
         let cells = over_cells(&skin, extent, now).unwrap();
         assert_eq!(
             cells.points.iter().map(|point| point[0].to_string()).collect::<Vec<_>>(),
@@ -310,6 +310,6 @@ mod tests {
         let active = over_active(&skin, extent, now).unwrap();
         assert!((active.points.iter().map(|point| point.weight).sum::<f64>() - 200.0).abs() < 1e-9);
         assert!(active.points.iter().all(|point| (point.y - 1.0).abs() < 1e-9 && point.x <= 40.0));
-        assert!(over_cells(&skin, Extent { step: 40, ..extent }, now).is_none(), "two numbers make no law");
+        assert!(over_cells(&skin, CentralExtent { step: 40, ..extent }, now).is_none(), "two numbers make no law");
     }
 }

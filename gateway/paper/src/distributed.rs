@@ -13,7 +13,7 @@ use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use super::line::{Line, count};
+use super::line::{LinearFit, count};
 use super::samples;
 use super::ticks::{BUSES, Ticks, nanos, spread};
 use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, number};
@@ -22,7 +22,7 @@ use model::table::Table;
 
 /// The extent of the measurements.
 #[derive(Clone, Copy, Debug)]
-pub struct Extent {
+pub struct DistributedExtent {
     /// The number of steps of the number of cells after one per bus, and of active cells after 0.
     pub steps: usize,
     /// The number of measurements of each.
@@ -31,16 +31,16 @@ pub struct Extent {
 
 /// Times of ticks over a number of cells, and their fits; all in ns.
 #[derive(Clone, Debug)]
-pub struct Over {
+pub struct TickTimes {
     /// The number, the time of a distributed tick, and that of the central computation in a comparing tick.
     pub points: Vec<[f64; 3]>,
     /// The fit of distributed ticks.
-    pub distributed: Line,
+    pub distributed: LinearFit,
     /// The fit of central computations.
-    pub central: Line,
+    pub central: LinearFit,
 }
 
-impl Over {
+impl TickTimes {
     /// Returns the upper end of the distributed slope's 95 % interval, relative to the central slope.
     #[must_use]
     pub fn share(&self) -> f64 {
@@ -52,11 +52,11 @@ impl Over {
 #[derive(Clone, Debug)]
 pub struct Distributed {
     /// Times over cells, all of them inactive.
-    pub cells: Over,
+    pub cells: TickTimes,
     /// Times over active cells of the whole skin.
-    pub active: Over,
+    pub active: TickTimes,
     /// The fit of distributed ticks over the number of buses, in ns.
-    pub buses: Line,
+    pub buses: LinearFit,
     /// The number of cells of the whole skin.
     pub of: usize,
     /// The time of the receiver's thread for a torque, from the frame to the sum, in ns.
@@ -65,7 +65,7 @@ pub struct Distributed {
 
 /// Measures everything on parts of a skin. Returns `None` for fewer than two steps.
 #[must_use]
-pub fn measure(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Option<Distributed> {
+pub fn measure(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + Copy) -> Option<Distributed> {
     let most = skin.cells.len();
     let step = |step| most * step / extent.steps.max(1);
     // A bus without cells has no robot to compute, so each bus has at least one cell.
@@ -82,7 +82,7 @@ pub fn measure(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Opt
         active,
         buses: over_buses(skin, extent, now)?,
         of: most,
-        receiving: receiving(&skin.part_on(0), extent.rounds, now),
+        receiving: receiving(&skin.with_cells_of_bus(0), extent.rounds, now),
     })
 }
 
@@ -94,7 +94,7 @@ pub(super) fn over(
     seed: u64,
     ticks: impl Fn(usize, Mode) -> Ticks,
     now: impl Fn() -> u64 + Copy,
-) -> Option<Over> {
+) -> Option<TickTimes> {
     let (distributed, central) = (Mode::Distributed, Mode::Compare);
     let things = (0..numbers.len()).flat_map(|place| [(place, distributed), (place, central)]);
     let mut loops: Vec<_> = things.map(|(place, mode)| (ticks(place, mode), mode)).collect();
@@ -109,13 +109,13 @@ pub(super) fn over(
     let pairs = numbers.iter().zip(medians.as_chunks().0);
     let points: Vec<_> = pairs.map(|(&number, &[tick, central])| [count(number), tick, central]).collect();
     let line = |place: fn(&[f64; 3]) -> f64| {
-        Line::through_equals(&points.iter().map(|point| (point[0], place(point))).collect::<Vec<_>>())
+        LinearFit::through_equals(&points.iter().map(|point| (point[0], place(point))).collect::<Vec<_>>())
     };
-    Some(Over { distributed: line(|point| point[1])?, central: line(|point| point[2])?, points })
+    Some(TickTimes { distributed: line(|point| point[1])?, central: line(|point| point[2])?, points })
 }
 
 /// Measures distributed ticks over the first buses of a skin without cells.
-fn over_buses(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Option<Line> {
+fn over_buses(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + Copy) -> Option<LinearFit> {
     let bare = |buses: usize| Skin {
         buses: skin.buses.iter().take(buses).cloned().collect(),
         cells: Vec::new(),
@@ -130,7 +130,7 @@ fn over_buses(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Opti
         ticks.epoch(now).tick
     });
     let medians = samples::medians(&measured);
-    Line::through_equals(&numbers.iter().map(|&buses| count(buses)).zip(medians).collect::<Vec<_>>())
+    LinearFit::through_equals(&numbers.iter().map(|&buses| count(buses)).zip(medians).collect::<Vec<_>>())
 }
 
 /// Returns the time for handling a torque, in ns: its packet is checked and decoded, and its torque replaces the cell's
@@ -166,10 +166,10 @@ fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
 }
 
 /// The maximum distributed slope relative to the central one.
-const SHARE: f64 = 0.01;
+const MAX_SLOPE_RATIO: f64 = 0.01;
 
-pub(super) fn of_share(what: &str, over: &Over) -> [Finding; 3] {
-    let Over { distributed, central, .. } = over;
+pub(super) fn of_share(what: &str, over: &TickTimes) -> [Finding; 3] {
+    let TickTimes { distributed, central, .. } = over;
     [
         Finding::stated(format!("central T_skin for each {what}"), central.slope_in("ns")),
         Finding::stated(format!("distributed tick for each {what}"), distributed.slope_in("ns")).beside(0.0),
@@ -177,7 +177,7 @@ pub(super) fn of_share(what: &str, over: &Over) -> [Finding; 3] {
             format!("distributed slope over {what}s, upper 95 % limit, by the central one"),
             (over.share() * 100.0, "%"),
         )
-        .must(format!("at most {} %", SHARE * 100.0), over.share() <= SHARE),
+        .must(format!("at most {} %", MAX_SLOPE_RATIO * 100.0), over.share() <= MAX_SLOPE_RATIO),
     ]
 }
 
@@ -185,12 +185,12 @@ pub(super) fn of_share(what: &str, over: &Over) -> [Finding; 3] {
 #[must_use]
 pub fn section(measured: &Distributed) -> Section {
     let Distributed { cells, active, buses, of, receiving } = measured;
-    let figure = |name: &str, title: String, what: &str, over: &Over| {
+    let figure = |name: &str, title: String, what: &str, over: &TickTimes| {
         let micros = |place: fn(&[f64; 3]) -> f64| {
             over.points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
         };
         let most = over.points.last().map_or(0.0, |point| point[0]);
-        let law = |line: &Line| [0.0, most].map(|x| (x, line.at(x) * 1e-3)).to_vec();
+        let law = |line: &LinearFit| [0.0, most].map(|x| (x, line.value_at(x) * 1e-3)).to_vec();
         Figure::new(name, title, Axis::new(what, ""), Axis::new("time in a tick", "µs"))
             .draw("central T_skin", Shape::Points, micros(|point| point[2]))
             .draw("distributed: the whole tick", Shape::Points, micros(|point| point[1]))
@@ -246,7 +246,7 @@ mod tests {
             clock.set(clock.get() + 1);
             clock.get()
         };
-        let measured = measure(&skin, Extent { steps: 4, rounds: 3 }, now).unwrap();
+        let measured = measure(&skin, DistributedExtent { steps: 4, rounds: 3 }, now).unwrap();
         for (over, target) in [
             (&measured.cells, ["12", "12", "24", "36", "48"]),
             (&measured.active, ["0", "12", "24", "36", "48"]),
@@ -262,6 +262,6 @@ mod tests {
         assert!((measured.receiving - 0.25).abs() < 1e-9, "four cells between two looks");
         let section = section(&measured);
         assert_eq!(section.figures.len(), 2);
-        assert!(measure(&skin, Extent { steps: 1, rounds: 3 }, now).is_none());
+        assert!(measure(&skin, DistributedExtent { steps: 1, rounds: 3 }, now).is_none());
     }
 }

@@ -187,7 +187,7 @@ pub trait Lab {
     ///
     /// # Errors
     /// Returns an error if the bench did not begin.
-    fn scaled(&mut self, bench: &scale::Bench) -> Result<Value, Self::Error>;
+    fn scaled(&mut self, bench: &scale::ScaleBench) -> Result<Value, Self::Error>;
 
     /// Checks between two measurements that the experiments should continue.
     ///
@@ -239,7 +239,7 @@ impl Session {
             }
             Experiment::Distributed => {
                 let (steps, rounds) = self.pick((4, 10), (30, 200));
-                let extent = distributed::Extent { steps, rounds };
+                let extent = distributed::DistributedExtent { steps, rounds };
                 let now = || lab.now();
                 let measured = distributed::measure(self.large(), extent, now);
                 distributed::section(&measured.expect("more than two numbers of cells"))
@@ -250,14 +250,14 @@ impl Session {
                 let mut errors = Vec::new();
                 for active in sums::numbers(&arm) {
                     lab.go_on()?;
-                    errors.push(sums::errors(&arm, active, sums::Extent { touches, epochs }));
+                    errors.push(sums::errors(&arm, active, sums::SumsExtent { touches, epochs }));
                 }
                 sums::section(&arm, &errors)
             }
             Experiment::Sine => arithmetic::sine_section(),
             Experiment::Kernels => {
                 let arm = self.arm();
-                arithmetic::kernels_section(&arm.robot.name, &arithmetic::Costs::of(&arm))
+                arithmetic::kernels_section(&arm.robot.name, &arithmetic::JacobianCosts::for_skin(&arm))
             }
             Experiment::Load => load::section(),
             Experiment::Scale => scale::section(&scale::measure(lab, self.effort)?),
@@ -271,10 +271,10 @@ impl Session {
         }
     }
 
-    fn extent(&self) -> central::Extent {
+    fn extent(&self) -> central::CentralExtent {
         self.pick(
-            central::Extent { step: 24, rounds: 20, touches: 100 },
-            central::Extent { step: 100, rounds: 1_000, touches: 8_000 },
+            central::CentralExtent { step: 24, rounds: 20, touches: 100 },
+            central::CentralExtent { step: 100, rounds: 1_000, touches: 8_000 },
         )
     }
 
@@ -285,7 +285,7 @@ impl Session {
 
     /// Returns a skin with as many cells as in Fig. 9, or fewer for a quick measurement.
     fn large(&mut self) -> &Skin {
-        let cells = self.pick(240, ticks::MOST_CELLS);
+        let cells = self.pick(240, ticks::MAX_CELLS);
         self.large.get_or_insert_with(|| {
             ticks::skin(cells, ticks::BUSES).expect("so many cells fit on the arm and on so many buses")
         })

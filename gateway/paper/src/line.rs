@@ -4,7 +4,7 @@ use analysis::report::figure::Quantity;
 
 /// A point with a weight.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Weighted {
+pub struct WeightedPoint {
     /// The independent variable.
     pub x: f64,
     /// The dependent variable.
@@ -13,7 +13,7 @@ pub struct Weighted {
     pub weight: f64,
 }
 
-impl Weighted {
+impl WeightedPoint {
     /// Returns the median of the measurements at x.
     #[must_use]
     pub fn median(x: f64, measured: &mut [f64]) -> Self {
@@ -23,7 +23,7 @@ impl Weighted {
 
 /// A line `y = slope x + intercept`.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Line {
+pub struct LinearFit {
     /// The slope, in units of y per unit of x.
     pub slope: f64,
     /// The intercept, in units of y.
@@ -34,7 +34,7 @@ pub struct Line {
     pub slope_half: f64,
 }
 
-impl Line {
+impl LinearFit {
     /// Returns the line with the smallest weighted sum of squared distances along y. Returns `None` for fewer than
     /// three points, or if all have the same x: the line or its interval is then undefined.
     ///
@@ -45,17 +45,17 @@ impl Line {
     ///   interval of the slope: slope ± t(0.975, n - 2) · sqrt(s² / Sxx)
     /// ```
     #[must_use]
-    pub fn through(points: &[Weighted]) -> Option<Self> {
+    pub fn through(points: &[WeightedPoint]) -> Option<Self> {
         if points.len() < 3 {
             return None;
         }
         let total: f64 = points.iter().map(|point| point.weight).sum();
-        let mean = |of: fn(&Weighted) -> f64| {
+        let mean = |of: fn(&WeightedPoint) -> f64| {
             points.iter().map(|point| point.weight * of(point)).sum::<f64>() / total
         };
         let (x_mean, y_mean) = (mean(|point| point.x), mean(|point| point.y));
         let (mut sxx, mut sxy, mut syy) = (0.0, 0.0, 0.0);
-        for Weighted { x, y, weight } in points {
+        for WeightedPoint { x, y, weight } in points {
             let (dx, dy) = (x - x_mean, y - y_mean);
             sxx += weight * dx * dx;
             sxy += weight * dx * dy;
@@ -66,7 +66,7 @@ impl Line {
         }
         let slope = sxy / sxx;
         let intercept = y_mean - slope * x_mean;
-        let left = |point: &Weighted| point.weight * (point.y - slope * point.x - intercept).powi(2);
+        let left = |point: &WeightedPoint| point.weight * (point.y - slope * point.x - intercept).powi(2);
         let residual: f64 = points.iter().map(left).sum();
         // A horizontal line explains no variance, because there is none.
         let quality = if syy > 0.0 { (1.0 - residual / syy).max(0.0) } else { 0.0 };
@@ -78,13 +78,13 @@ impl Line {
     /// Returns the line through points of equal weight.
     #[must_use]
     pub fn through_equals(points: &[(f64, f64)]) -> Option<Self> {
-        let points: Vec<_> = points.iter().map(|&(x, y)| Weighted { x, y, weight: 1.0 }).collect();
+        let points: Vec<_> = points.iter().map(|&(x, y)| WeightedPoint { x, y, weight: 1.0 }).collect();
         Self::through(&points)
     }
 
     /// Returns the value of the line at `x`.
     #[must_use]
-    pub fn at(&self, x: f64) -> f64 {
+    pub fn value_at(&self, x: f64) -> f64 {
         self.slope * x + self.intercept
     }
 
@@ -145,10 +145,10 @@ mod tests {
     #[test]
     fn a_line_is_found_and_explains_everything() {
         let points: Vec<_> = (0..10).map(|x| (f64::from(x), 3.0 * f64::from(x) - 2.0)).collect();
-        let line = Line::through_equals(&points).unwrap();
+        let line = LinearFit::through_equals(&points).unwrap();
         assert!((line.slope - 3.0).abs() < 1e-12 && (line.intercept + 2.0).abs() < 1e-12);
         assert!((line.quality - 1.0).abs() < 1e-12 && line.slope_half < 1e-6);
-        assert!((line.reaches(25.0) - 9.0).abs() < 1e-12 && (line.at(9.0) - 25.0).abs() < 1e-12);
+        assert!((line.reaches(25.0) - 9.0).abs() < 1e-12 && (line.value_at(9.0) - 25.0).abs() < 1e-12);
     }
 
     /// x 1 to 5, y 2, 4, 5, 4, 5: slope 0.6, intercept 2.2, R² 0.6, standard error of the slope 0.2828 (a common
@@ -156,7 +156,7 @@ mod tests {
     #[test]
     fn quality_and_interval_are_those_of_a_textbook() {
         let points = [(1.0, 2.0), (2.0, 4.0), (3.0, 5.0), (4.0, 4.0), (5.0, 5.0)];
-        let line = Line::through_equals(&points).unwrap();
+        let line = LinearFit::through_equals(&points).unwrap();
         assert!((line.slope - 0.6).abs() < 1e-12 && (line.intercept - 2.2).abs() < 1e-12);
         assert!((line.quality - 0.6).abs() < 1e-12);
         assert!((line.slope_half / 0.282_843 - 3.182).abs() < 0.02 * 3.182, "{}", line.slope_half);
@@ -177,8 +177,8 @@ mod tests {
     fn a_weight_of_three_is_three_points() {
         let once = [(0.0, 1.0), (1.0, 2.0), (1.0, 2.0), (1.0, 2.0), (2.0, 5.0)];
         let thrice = [(0.0, 1.0, 1.0), (1.0, 2.0, 3.0), (2.0, 5.0, 1.0)];
-        let thrice = thrice.map(|(x, y, weight)| Weighted { x, y, weight });
-        let (once, thrice) = (Line::through_equals(&once).unwrap(), Line::through(&thrice).unwrap());
+        let thrice = thrice.map(|(x, y, weight)| WeightedPoint { x, y, weight });
+        let (once, thrice) = (LinearFit::through_equals(&once).unwrap(), LinearFit::through(&thrice).unwrap());
         assert!((once.slope - thrice.slope).abs() < 1e-12);
         assert!((once.intercept - thrice.intercept).abs() < 1e-12);
         assert!((once.quality - thrice.quality).abs() < 1e-12);
@@ -186,9 +186,9 @@ mod tests {
 
     #[test]
     fn where_there_is_no_line_there_is_none() {
-        assert_eq!(Line::through_equals(&[(0.0, 1.0), (1.0, 2.0)]), None);
-        assert_eq!(Line::through_equals(&[(1.0, 1.0), (1.0, 2.0), (1.0, 3.0)]), None);
-        let level = Line::through_equals(&[(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)]).unwrap();
+        assert_eq!(LinearFit::through_equals(&[(0.0, 1.0), (1.0, 2.0)]), None);
+        assert_eq!(LinearFit::through_equals(&[(1.0, 1.0), (1.0, 2.0), (1.0, 3.0)]), None);
+        let level = LinearFit::through_equals(&[(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)]).unwrap();
         assert!(level.reaches(5.0).is_nan(), "a line that does not rise has no limit");
     }
 

@@ -3,13 +3,13 @@
 
 use super::arm;
 use super::line::count;
-use analysis::fit::limits::NODES;
+use analysis::fit::limits::MAX_NODES;
 use analysis::fit::verdict::Answer;
 use analysis::fit::{self, COMPUTATION_NS, Row};
 use analysis::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table};
 
 /// The maximum number of cells in the figure.
-const MOST: u32 = 300;
+const MAX_CELLS: u32 = 300;
 
 /// Writes the section on loads over cells.
 #[must_use]
@@ -20,7 +20,7 @@ pub fn section() -> Section {
     let series = |row: &Row| {
         let rated = &row.fullest.rated;
         let load = |cells| (f64::from(cells), 100.0 * rated.case.with_cells(cells).load().total());
-        let points = (0..=MOST).step_by(10).map(load).collect();
+        let points = (0..=MAX_CELLS).step_by(10).map(load).collect();
         Series::new(Answer::worst_case(rated).rates, Shape::Line, points)
     };
     // These rates are defaults and not a choice of the user, so they get no verdict.
@@ -32,12 +32,12 @@ pub fn section() -> Section {
     let figure = Figure::new(
         "load",
         "Load of one bus, every cell in contact, worst case",
-        Axis::new("cells", "").between(0.0, f64::from(MOST)),
+        Axis::new("cells", "").between(0.0, f64::from(MAX_CELLS)),
         Axis::new("load", "%").between(0.0, 200.0),
     );
     let marks = [
         Mark::y(100.0, "full"),
-        Mark::x(f64::from(NODES - 1), "nodes electrically"),
+        Mark::x(f64::from(MAX_NODES - 1), "nodes electrically"),
         Mark::x(count(cells), "the paper's arm"),
     ];
     Section::new("load", "Bus load over the number of cells")
@@ -48,7 +48,7 @@ pub fn section() -> Section {
              numbers of skinbus fit, which shows more about one skin.",
         )
         .text(format!(
-            "The paper asks for time only. Transceivers drive about {NODES} nodes, one of which is the gateway: so the table has \
+            "The paper asks for time only. Transceivers drive about {MAX_NODES} nodes, one of which is the gateway: so the table has \
              the buses that {cells} cells need by time, and how many they need by all limits, with what asks for so many."
         ))
         .figures([figure.series(rows.iter().map(series)).marks(marks)])

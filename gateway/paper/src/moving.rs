@@ -2,8 +2,8 @@
 
 use serde_json::Value;
 
-use super::line::{Line, Weighted, count, quantile};
-use super::recorded::Row;
+use super::line::{LinearFit, WeightedPoint, count, quantile};
+use super::recorded::TickRow;
 use analysis::paper;
 use analysis::report::figure::{
     Axis, Figure, Finding, Mark, Quantity, Section, Series, Shape, Table, number,
@@ -13,7 +13,7 @@ use analysis::report::figure::{
 #[derive(Clone, Debug)]
 pub struct Run {
     /// The ticks, in the order of time.
-    pub rows: Vec<Row>,
+    pub rows: Vec<TickRow>,
     /// The summary.
     pub summary: Value,
     /// The number of joints of the robot.
@@ -44,7 +44,7 @@ impl Run {
         self.rows.get(last + 1).map(|row| row.time_s)
     }
 
-    fn over_time(&self, value: impl Fn(&Row) -> f64) -> Vec<(f64, f64)> {
+    fn over_time(&self, value: impl Fn(&TickRow) -> f64) -> Vec<(f64, f64)> {
         self.rows.iter().map(|row| (row.time_s, value(row))).collect()
     }
 
@@ -69,13 +69,13 @@ impl Run {
 #[must_use]
 pub fn fig6(single: &Run, summed: &Run) -> Section {
     let joint = |joint: usize| {
-        let central = |row: &Row| row.central.map_or(f64::NAN, |torque| at(&torque, joint));
+        let central = |row: &TickRow| row.central.map_or(f64::NAN, |torque| joint_value(&torque, joint));
         let (name, title) = (format!("fig6-joint{}", joint + 1), format!("Joint {}", joint + 1));
         single
             .drawn(name, title, Axis::new("torque", "Nm"))
             .half()
             .draw("central", Shape::Line, single.over_time(central))
-            .draw("distributed", Shape::Dashed, single.over_time(|row| at(&row.distributed, joint)))
+            .draw("distributed", Shape::Dashed, single.over_time(|row| joint_value(&row.distributed, joint)))
     };
     let error = |run: &Run, kind: &str, key: &str| run.figure(&["accuracy", kind, key]);
     let (mean_single, mean_summed) = (error(single, "single", "mean_nm"), error(summed, "sums", "mean_nm"));
@@ -132,7 +132,7 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
 
 /// Names the joints without a torque.
 fn bare(run: &Run) -> String {
-    let bears = |joint: usize| run.rows.iter().any(|row| at(&row.distributed, joint).abs() > 0.0);
+    let bears = |joint: usize| run.rows.iter().any(|row| joint_value(&row.distributed, joint).abs() > 0.0);
     let bare: Vec<_> =
         (0..run.joints).filter(|&joint| !bears(joint)).map(|joint| (joint + 1).to_string()).collect();
     if bare.is_empty() {
@@ -142,7 +142,7 @@ fn bare(run: &Run) -> String {
     }
 }
 
-fn at(values: &[f64], joint: usize) -> f64 {
+fn joint_value(values: &[f64], joint: usize) -> f64 {
     values.get(joint).copied().unwrap_or(f64::NAN)
 }
 
@@ -151,7 +151,7 @@ fn at(values: &[f64], joint: usize) -> f64 {
 pub fn fig7(run: &Run) -> Section {
     let velocity = |joint: usize| {
         let caption = format!("joint {}", joint + 1);
-        Series::new(caption, Shape::Line, run.over_time(|row| at(&row.velocity, joint)))
+        Series::new(caption, Shape::Line, run.over_time(|row| joint_value(&row.velocity, joint)))
     };
     let active = run.rows.iter().map(|row| row.contributing).max().unwrap_or(0);
     let fastest = run.rows.iter().flat_map(|row| row.velocity).map(f64::abs).fold(0.0, f64::max);
@@ -171,10 +171,10 @@ pub fn fig7(run: &Run) -> Section {
 }
 
 /// The number of cycles per drawn median.
-const TOGETHER: usize = 25;
+const CYCLES_PER_MEDIAN: usize = 25;
 
 /// Returns the median of some ticks' times in µs.
-fn median<'a>(rows: impl Iterator<Item = &'a Row>, time: impl Fn(&Row) -> f64) -> f64 {
+fn median<'a>(rows: impl Iterator<Item = &'a TickRow>, time: impl Fn(&TickRow) -> f64) -> f64 {
     quantile(&mut rows.map(time).collect::<Vec<_>>(), 0.5)
 }
 
@@ -202,8 +202,8 @@ pub fn fig8(run: &Run) -> Section {
     let figure = |name: &str, title: &str, top| {
         run.drawn(name, title, Axis::new("time in a cycle", "µs").between(0.0, top))
     };
-    let medians = |time: &dyn Fn(&Row) -> f64| {
-        let pieces = run.rows.chunks(TOGETHER).filter_map(|rows| Some((rows.first()?.time_s, rows)));
+    let medians = |time: &dyn Fn(&TickRow) -> f64| {
+        let pieces = run.rows.chunks(CYCLES_PER_MEDIAN).filter_map(|rows| Some((rows.first()?.time_s, rows)));
         pieces.map(|(at, rows)| (at, median(rows.iter(), time))).collect::<Vec<_>>()
     };
     let per_frame = {
@@ -221,8 +221,8 @@ pub fn fig8(run: &Run) -> Section {
         let slope = Quantity::new(line.slope * 1e3, "ns").plus_minus(line.slope_half * 1e3);
         Finding::stated("T_total after the switch for each active cell", slope)
     });
-    let took = |row: &Row| row.took_us;
-    let central = |row: &Row| row.central_us;
+    let took = |row: &TickRow| row.took_us;
+    let central = |row: &TickRow| row.central_us;
     Section::new("fig8", format!("Fig. 8: cycle times, {cells} cells"))
         .text(
             "T_total is how long a tick took from reading the sums to handing on its record, T_skin the central computation in \
@@ -258,13 +258,13 @@ pub fn fig8(run: &Run) -> Section {
 }
 
 /// Fits the median times of ticks over active cells, weighted by the number of ticks.
-fn over_active<'a>(rows: impl Iterator<Item = &'a Row>) -> Option<Line> {
+fn over_active<'a>(rows: impl Iterator<Item = &'a TickRow>) -> Option<LinearFit> {
     let mut by_active = std::collections::BTreeMap::<u32, Vec<f64>>::new();
     for row in rows {
         by_active.entry(row.contributing).or_default().push(row.took_us);
     }
-    let points = by_active.iter_mut().map(|(&active, times)| Weighted::median(f64::from(active), times));
-    Line::through(&points.collect::<Vec<_>>())
+    let points = by_active.iter_mut().map(|(&active, times)| WeightedPoint::median(f64::from(active), times));
+    LinearFit::through(&points.collect::<Vec<_>>())
 }
 
 #[cfg(test)]
@@ -279,7 +279,7 @@ mod tests {
         let row = |tick: u16| {
             let central = (tick < 250).then_some([1.0; 6]);
             let central_us = if central.is_some() { 3.0 } else { 0.0 };
-            Row {
+            TickRow {
                 time_s: f64::from(tick) * 0.002,
                 velocity: padded(&[0.1, -0.4, 0.0, 0.0, 0.0, 0.0]),
                 distributed: padded(&[1.001; 6]),

@@ -15,7 +15,7 @@ use trace::ros2::standard::JointState;
 
 /// A tick.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Row {
+pub struct TickRow {
     /// The scheduled start, in s since the first tick.
     pub time_s: f64,
     /// Joint velocities in rad/s.
@@ -36,17 +36,17 @@ pub struct Row {
 ///
 /// # Errors
 /// Returns [`CaptureError`] if the recording cannot be read or is damaged.
-pub fn read(path: &Path) -> Result<Vec<Row>, CaptureError> {
+pub fn read(path: &Path) -> Result<Vec<TickRow>, CaptureError> {
     let mut items = Reader::open_with_others(&[path.to_path_buf()])?;
-    let mut rows: BTreeMap<u64, Row> = BTreeMap::new();
+    let mut rows: BTreeMap<u64, TickRow> = BTreeMap::new();
     while let Some(item) = items.next_item()? {
         if let Item::Other(other) = item {
             // Another program may have written an unexpected message, so errors are ignored.
-            let _ = take(&mut rows, other.topic, other.schema, other.nanos, other.message);
+            let _ = store_message(&mut rows, other.topic, other.schema, other.nanos, other.message);
         }
     }
     let first = rows.keys().next().copied().unwrap_or(0);
-    Ok(rows.into_iter().map(|(nanos, row)| Row { time_s: seconds(nanos - first), ..row }).collect())
+    Ok(rows.into_iter().map(|(nanos, row)| TickRow { time_s: seconds(nanos - first), ..row }).collect())
 }
 
 #[expect(clippy::cast_precision_loss, reason = "a run's length, far below 2^53 ns")]
@@ -55,8 +55,8 @@ fn seconds(nanos: u64) -> f64 {
 }
 
 /// Stores a message of a tick in its row; other messages are ignored.
-fn take(
-    rows: &mut BTreeMap<u64, Row>,
+fn store_message(
+    rows: &mut BTreeMap<u64, TickRow>,
     topic: &str,
     schema: &str,
     nanos: u64,
@@ -88,15 +88,15 @@ fn by_joint(numbers: &[f64]) -> [f64; MAX_ROBOT_JOINTS] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use trace::ros2::cdr::{Encode, Writer};
+    use trace::ros2::cdr::{Encode, CdrWriter};
 
     #[test]
     fn the_messages_of_a_tick_make_one_row() {
         let mut rows = BTreeMap::new();
-        let mut say = |topic: &str, schema: &str, nanos, message: &dyn Fn(&mut Writer<'_>)| {
+        let mut say = |topic: &str, schema: &str, nanos, message: &dyn Fn(&mut CdrWriter<'_>)| {
             let mut bytes = Vec::new();
-            message(&mut Writer::new(&mut bytes));
-            take(&mut rows, topic, schema, nanos, &bytes).unwrap();
+            message(&mut CdrWriter::new(&mut bytes));
+            store_message(&mut rows, topic, schema, nanos, &bytes).unwrap();
         };
         let names = ["joint1", "joint2"].map(str::to_owned);
         let states = JointState {

@@ -12,7 +12,7 @@ use std::fmt::Write;
 use protocol::id::CellId;
 use serde_json::Value;
 
-use super::distributed::{Over, over};
+use super::distributed::{TickTimes, over};
 use super::line::count;
 use super::ticks::{self, Ticks, spread};
 use super::{Effort, Lab};
@@ -22,9 +22,9 @@ use model::scenario::Mode;
 pub use section::section;
 
 /// The share of cells that are touched.
-pub const ACTIVE: f64 = 0.05;
+pub const ACTIVE_SHARE: f64 = 0.05;
 /// The share of replies that must be in time.
-pub const HOLDS: f64 = 0.99;
+pub const MIN_IN_TIME_SHARE: f64 = 0.99;
 /// The force on a touched cell, in N.
 const TOUCH_N: f64 = 0.5;
 /// The number of cells of the smallest bench in a full measurement: that of the paper's arm.
@@ -32,7 +32,7 @@ const PAPER: usize = 253;
 
 /// A bench.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Bench {
+pub struct ScaleBench {
     /// The number of cells.
     pub cells: usize,
     /// The number of buses.
@@ -45,7 +45,7 @@ pub struct Bench {
     pub seconds: f64,
 }
 
-impl Bench {
+impl ScaleBench {
     /// Returns the name of its files.
     #[must_use]
     pub fn name(&self) -> String {
@@ -95,7 +95,7 @@ const fn share(cells: usize) -> usize {
 
 /// The figures of a bench's summary.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Figures {
+pub struct BenchFigures {
     /// The time from its start to the first joints, in s.
     pub start_s: f64,
     /// Processor use of the gateway, the buses and the cells, in cores.
@@ -116,10 +116,10 @@ pub struct Figures {
     pub done: bool,
 }
 
-impl Figures {
+impl BenchFigures {
     /// Reads a summary (`bench::summary::Summary` as JSON).
     #[must_use]
-    pub fn of(summary: &Value) -> Self {
+    pub fn from_summary(summary: &Value) -> Self {
         let figure = |keys: &[&str]| {
             let value = keys.iter().try_fold(summary, |value, key| value.get(key));
             value.and_then(Value::as_f64).unwrap_or(f64::NAN)
@@ -151,13 +151,13 @@ impl Figures {
 
     /// Returns true if the rate holds.
     fn holds(&self) -> bool {
-        self.done && self.share() >= HOLDS && self.unknown <= 0.0
+        self.done && self.share() >= MIN_IN_TIME_SHARE && self.unknown <= 0.0
     }
 }
 
 /// The measurements of one number of cells, at the highest rate that holds, or else at the lowest.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Size {
+pub struct SizeFigures {
     /// The number of cells.
     pub cells: usize,
     /// The number of buses.
@@ -167,29 +167,29 @@ pub struct Size {
     /// True if that rate holds.
     pub holds: bool,
     /// The figures without touched cells.
-    pub quiet: Figures,
+    pub quiet: BenchFigures,
     /// The figures with [`ACTIVE`] of the cells touched.
-    pub active: Figures,
+    pub active: BenchFigures,
 }
 
 /// Times of ticks without threads, in ns: of the fewest cells, of the fewest cells on as many buses as the most, and of
 /// the most.
-pub type Beside = [f64; 3];
+pub type ComparedTicks = [f64; 3];
 
 /// All measurements.
 #[derive(Clone, Debug)]
 pub struct Scale {
     /// Ticks over cells, all of them active, on as many buses as the largest number needs.
-    pub sizes: Vec<Size>,
+    pub sizes: Vec<SizeFigures>,
     /// Ticks over cells, all active, on as many buses as the most of them need.
-    pub ticks: Over,
+    pub ticks: TickTimes,
     /// Times of the compared ticks, with all cells active.
-    pub beside: Beside,
+    pub beside: ComparedTicks,
 }
 
 /// The extent of the measurements.
 #[derive(Clone, Copy, Debug)]
-struct Extent {
+struct ScaleExtent {
     /// Numbers of cells, in ascending order.
     cells: &'static [usize],
     /// Rates, in descending order.
@@ -202,7 +202,7 @@ struct Extent {
     rounds: usize,
 }
 
-const FULL: Extent = Extent {
+const FULL: ScaleExtent = ScaleExtent {
     cells: &[PAPER, 2 * PAPER, 4 * PAPER, 10 * PAPER, 20 * PAPER, 10_000],
     rates: &[62.5, 31.25, 15.625],
     seconds: 5.0,
@@ -210,7 +210,7 @@ const FULL: Extent = Extent {
     rounds: 100,
 };
 
-const QUICK: Extent = Extent { cells: &[24, 300], rates: &[62.5], seconds: 1.0, steps: 4, rounds: 5 };
+const QUICK: ScaleExtent = ScaleExtent { cells: &[24, 300], rates: &[62.5], seconds: 1.0, steps: 4, rounds: 5 };
 
 /// Measures everything.
 ///
@@ -235,25 +235,25 @@ pub fn measure<L: Lab>(lab: &mut L, effort: Effort) -> Result<Scale, L::Error> {
 }
 
 /// Finds the highest rate that this number of cells holds, and measures at it.
-fn size<L: Lab>(lab: &mut L, cells: usize, extent: Extent) -> Result<Size, L::Error> {
+fn size<L: Lab>(lab: &mut L, cells: usize, extent: ScaleExtent) -> Result<SizeFigures, L::Error> {
     let buses = cells.div_ceil(CellId::COUNT);
-    let of = |hz, active| Bench { cells, buses, hz, active, seconds: extent.seconds };
-    let (mut hz, mut active) = (f64::NAN, Figures::default());
+    let of = |hz, active| ScaleBench { cells, buses, hz, active, seconds: extent.seconds };
+    let (mut hz, mut active) = (f64::NAN, BenchFigures::default());
     for &rate in extent.rates {
         lab.go_on()?;
         hz = rate;
-        active = Figures::of(&lab.scaled(&of(hz, true))?);
+        active = BenchFigures::from_summary(&lab.scaled(&of(hz, true))?);
         if active.holds() {
             break;
         }
     }
     lab.go_on()?;
-    let quiet = Figures::of(&lab.scaled(&of(hz, false))?);
-    Ok(Size { cells, buses, hz, holds: active.holds(), quiet, active })
+    let quiet = BenchFigures::from_summary(&lab.scaled(&of(hz, false))?);
+    Ok(SizeFigures { cells, buses, hz, holds: active.holds(), quiet, active })
 }
 
 /// Measures ticks without threads: over cells, and three of them for comparison.
-fn loops(fewest: usize, most: usize, extent: Extent, now: impl Fn() -> u64 + Copy) -> (Over, Beside) {
+fn loops(fewest: usize, most: usize, extent: ScaleExtent, now: impl Fn() -> u64 + Copy) -> (TickTimes, ComparedTicks) {
     let skin = |cells, buses| ticks::skin(cells, buses).expect("so many cells fit on the arm");
     let buses = most.div_ceil(CellId::COUNT);
     let large = skin(most, buses);
@@ -279,7 +279,7 @@ fn loops(fewest: usize, most: usize, extent: Extent, now: impl Fn() -> u64 + Cop
 }
 
 /// Returns the number of cells for an axis.
-fn cells_of(size: &Size) -> f64 {
+fn cells_of(size: &SizeFigures) -> f64 {
     count(size.cells)
 }
 

@@ -10,7 +10,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use super::line::count;
-use super::tree::{Came, Tree};
+use super::tree::{EpochResult, SumTree};
 use analysis::paper;
 use analysis::report::figure::{Axis, Figure, Finding, Section, Series, Shape, Table, number};
 
@@ -25,7 +25,7 @@ const MOST_NM: f64 = 127.0;
 
 /// The extent of the measurements.
 #[derive(Clone, Copy, Debug)]
-pub struct Extent {
+pub struct SumsExtent {
     /// The number of touches for each number of active cells.
     pub touches: usize,
     /// The number of epochs of each touch while the arm moves.
@@ -34,7 +34,7 @@ pub struct Extent {
 
 /// Mean absolute errors over loaded joints, in Nm.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Errors {
+pub struct SumErrors {
     /// The number of active cells.
     pub active: usize,
     /// Every cell's torque is truncated.
@@ -53,11 +53,11 @@ pub struct Errors {
 fn touched(dice: &mut Pcg64Mcg, cells: usize, active: usize) -> Vec<(usize, SkinSensors)> {
     let mut places: Vec<usize> = (0..cells).collect();
     places.shuffle(dice);
-    let reference_torque = |place| {
+    let touched_cell = |place| {
         let contact = [0; 3].map(|_| Q5_10::nearest(dice.random_range(0.2..2.0)));
         (place, SkinSensors { contact, ..SkinSensors::default() })
     };
-    places.into_iter().take(active).map(reference_torque).collect()
+    places.into_iter().take(active).map(touched_cell).collect()
 }
 
 /// A mean of absolute errors.
@@ -90,9 +90,9 @@ pub fn numbers(skin: &Skin) -> impl Iterator<Item = usize> + use<> {
 
 /// Measures the errors for a number of active cells. The result is deterministic.
 #[must_use]
-pub fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
+pub fn errors(skin: &Skin, active: usize, extent: SumsExtent) -> SumErrors {
     let mut dice = Pcg64Mcg::seed_from_u64(active as u64);
-    let (mut rounding, mut carrying) = (Tree::new(skin, false), Tree::new(skin, true));
+    let (mut rounding, mut carrying) = (SumTree::new(skin, false), SumTree::new(skin, true));
     let [mut truncated, mut rounded, mut carried] = [Mean::default(); 3];
     let [mut rounded_average, mut carried_average] = [Mean::default(); 2];
     for _ in 0..extent.touches {
@@ -107,13 +107,13 @@ pub fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
         }
         let q = phase.map(|phase| 1.5 * phase.sin());
         // A sum with carry begins without a carried error.
-        let mut fresh = Tree::new(skin, true);
+        let mut fresh = SumTree::new(skin, true);
         for (tree, average) in [(&mut rounding, &mut rounded_average), (&mut fresh, &mut carried_average)] {
             let (mean, last) = averaged(tree, &q, &touch);
             average.add(last.loaded, &mean, &last.central);
         }
     }
-    Errors {
+    SumErrors {
         active,
         truncated: truncated.mean(),
         rounded: rounded.mean(),
@@ -125,11 +125,11 @@ pub fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
 
 /// Returns the average of the sums of a constant touch on an arm at rest.
 fn averaged(
-    tree: &mut Tree,
+    tree: &mut SumTree,
     q: &[f64; MAX_JOINTS],
     touch: &[(usize, SkinSensors)],
-) -> ([f64; MAX_JOINTS], Came) {
-    let (mut mean, mut last) = ([0.0; MAX_JOINTS], Came::default());
+) -> ([f64; MAX_JOINTS], EpochResult) {
+    let (mut mean, mut last) = ([0.0; MAX_JOINTS], EpochResult::default());
     for _ in 0..AVERAGED {
         last = tree.turn(q, touch);
         for (mean, sum) in mean.iter_mut().zip(last.sum) {
@@ -140,10 +140,10 @@ fn averaged(
 }
 
 /// A column of [`Errors`]: its heading, the text of its finding, and its value.
-type Way = (&'static str, &'static str, fn(&Errors) -> f64);
+type SumMethod = (&'static str, &'static str, fn(&SumErrors) -> f64);
 
 /// All methods of summing.
-const WAYS: [Way; 5] = [
+const WAYS: [SumMethod; 5] = [
     ("truncated", "each cut off, mean error", |at| at.truncated),
     ("rounded", "rounded, mean error", |at| at.rounded),
     ("carried", "carried, mean error of single epochs", |at| at.carried),
@@ -153,7 +153,7 @@ const WAYS: [Way; 5] = [
 
 /// Writes the section on errors over the number of active cells.
 #[must_use]
-pub fn section(skin: &Skin, errors: &[Errors]) -> Section {
+pub fn section(skin: &Skin, errors: &[SumErrors]) -> Section {
     let of = skin.cells.len();
     let figure = Figure::new(
         "sums",
@@ -203,13 +203,13 @@ mod tests {
     fn truncated_sums_drift_with_the_cells_rounded_ones_do_not_and_carried_ones_are_right_on_average() {
         let skin = ticks::skin(64, 1).unwrap();
         let measure = || -> Vec<_> {
-            numbers(&skin).map(|active| errors(&skin, active, Extent { touches: 6, epochs: 4 })).collect()
+            numbers(&skin).map(|active| errors(&skin, active, SumsExtent { touches: 6, epochs: 4 })).collect()
         };
         let errors = measure();
         assert_eq!(errors.iter().map(|at| at.active).collect::<Vec<_>>(), [1, 2, 5, 10, 20, 40]);
         let (one, forty) = (errors[0], errors[5]);
         // Each cell that loads a joint contributes half a step of 1/256 Nm; cells near the base load fewer joints.
-        let drift = |at: &Errors| at.truncated / (count(at.active) / 512.0);
+        let drift = |at: &SumErrors| at.truncated / (count(at.active) / 512.0);
         assert!((0.6..1.1).contains(&drift(&one)) && (0.6..1.0).contains(&drift(&forty)), "{errors:?}");
         assert!((25.0..45.0).contains(&(forty.truncated / one.truncated)), "{errors:?}");
         // One cell contributes a quarter of a step; the error grows with the square root.

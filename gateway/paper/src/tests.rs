@@ -21,7 +21,7 @@ impl Lab for Bare {
         Err("there is no bench here")
     }
 
-    fn scaled(&mut self, _: &scale::Bench) -> Result<Value, &'static str> {
+    fn scaled(&mut self, _: &scale::ScaleBench) -> Result<Value, &'static str> {
         Err("there is no bench here")
     }
 

@@ -10,8 +10,8 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, Skin};
 use protocol::time::{Micros, Span};
 
-use control::controller::{Controller, Input, Kinesthetic, Step};
-use control::cycle::turn::{Line, Shared, Timed, Turn};
+use control::controller::{Controller, Input, Kinesthetic, ControllerOutput};
+use control::cycle::turn::{BusPort, Shared, TimedRecord, TickDriver};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
 use model::generate::{GenerateError, Target, generate};
@@ -19,7 +19,7 @@ use model::scenario::{Mode, ModeChange, Scenario, contact_words};
 use model::table::{Snapshot, Table};
 
 /// The maximum number of cells in the paper's Fig. 9.
-pub const MOST_CELLS: usize = 3_000;
+pub const MAX_CELLS: usize = 3_000;
 /// The number of buses for that many cells.
 pub const BUSES: usize = 12;
 /// The position of the arm while times are measured, in rad.
@@ -46,7 +46,7 @@ pub fn skin(cells: usize, buses: usize) -> Result<Skin, GenerateError> {
 pub fn spread(skin: &Skin, cells: usize) -> Skin {
     let buses = skin.buses.len().max(1);
     let share = |bus: usize| cells / buses + usize::from(bus < cells % buses);
-    let of_bus = |bus: usize| skin.cells_of(bus).take(share(bus)).cloned().collect::<Vec<_>>();
+    let of_bus = |bus: usize| skin.cells_on_bus(bus).take(share(bus)).cloned().collect::<Vec<_>>();
     Skin { cells: (0..buses).flat_map(of_bus).collect(), ..skin.clone() }
 }
 
@@ -65,7 +65,7 @@ fn sensors(cells: usize, active: usize) -> Vec<SkinSensors> {
 /// epoch. A real table computes it from real frames.
 fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
     let mut table = Table::new(skin, bus);
-    let cells: Vec<&Cell> = skin.cells_of(bus).collect();
+    let cells: Vec<&Cell> = skin.cells_on_bus(bus).collect();
     let epoch = Epoch(0);
     let mut hear = |own, message: Message| {
         for frame in message.encode().frames(Format::Fd) {
@@ -82,13 +82,13 @@ fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
 
 /// A controller that computes everything that the kinesthetic controller computes, but holds the arm. If the robot
 /// moved to its limits, ticks of few cells would differ from those of many.
-struct Held(Kinesthetic);
+struct HoldingController(Kinesthetic);
 
-impl Controller for Held {
-    fn step(&mut self, input: &Input) -> Step {
+impl Controller for HoldingController {
+    fn step(&mut self, input: &Input) -> ControllerOutput {
         match self.0.step(input) {
-            Step::Move(velocity) => Step::Move(std::hint::black_box(velocity).map(|_| 0.0)),
-            Step::Bad(why) => Step::Bad(why),
+            ControllerOutput::Move(velocity) => ControllerOutput::Move(std::hint::black_box(velocity).map(|_| 0.0)),
+            ControllerOutput::Bad(why) => ControllerOutput::Bad(why),
         }
     }
 }
@@ -96,16 +96,16 @@ impl Controller for Held {
 /// A control loop over buses whose receivers have passed on sums.
 #[derive(Debug)]
 pub struct Ticks {
-    turn: Turn,
-    buses: Vec<Inlet>,
-    records: rtrb::Consumer<Timed>,
+    turn: TickDriver,
+    buses: Vec<ReceiverEnds>,
+    records: rtrb::Consumer<TimedRecord>,
     mode: Mode,
     number: u64,
 }
 
 /// The receiver's ends of the channels to the loop.
 #[derive(Debug)]
-struct Inlet {
+struct ReceiverEnds {
     snapshot: Snapshot,
     to_loop: triple_buffer::Input<Snapshot>,
     positions: rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
@@ -113,7 +113,7 @@ struct Inlet {
 
 /// The average times of an epoch's ticks, in ns.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Took {
+pub struct TickCost {
     /// The time of a whole tick, without the central computation.
     pub tick: f64,
     /// The time of the central computation in it; 0 without one.
@@ -136,30 +136,30 @@ impl Ticks {
             let snapshot = snapshot(skin, bus, share(bus));
             let (to_loop, from_receiver) = triple_buffer::triple_buffer(&snapshot);
             let (positions_in, positions) = rtrb::RingBuffer::new(QUEUE);
-            lines.push(Line {
+            lines.push(BusPort {
                 format: Format::Fd,
                 snapshot: from_receiver,
                 positions: positions_in,
                 state: Arc::default(),
             });
-            inlets.push(Inlet { snapshot, to_loop, positions });
+            inlets.push(ReceiverEnds { snapshot, to_loop, positions });
         }
         let modes = vec![ModeChange { at: Micros(0), mode }];
         let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
-        let controller = Held(Kinesthetic::new(skin).expect("a generated skin moves by itself"));
+        let controller = HoldingController(Kinesthetic::new(skin).expect("a generated skin moves by itself"));
         let cycle = Cycle::new(skin, Box::new(controller), Box::new(SimulatedArm::new(skin, padded(&POSE))));
-        let turn = Turn::new(cycle, lines, Arc::new(scenario), Arc::new(Shared::default()), records_in);
+        let turn = TickDriver::new(cycle, lines, Arc::new(scenario), Arc::new(Shared::default()), records_in);
         Self { turn, buses: inlets, records, mode, number: 0 }
     }
 
     /// Runs the ticks of one epoch, each on a new snapshot.
-    pub fn epoch(&mut self, now: impl Fn() -> u64 + Copy) -> Took {
+    pub fn epoch(&mut self, now: impl Fn() -> u64 + Copy) -> TickCost {
         for _ in 0..TICKS {
-            for Inlet { snapshot, to_loop, positions } in &mut self.buses {
+            for ReceiverEnds { snapshot, to_loop, positions } in &mut self.buses {
                 // The read-back epoch is that of the previous broadcast, as on a working bus.
                 let sent = self.number.checked_sub(1).map(|number| number / TICKS);
                 snapshot.sums.read_back = sent.map(|sent| Epoch(sent.to_le_bytes()[0]));
-                to_loop.input_buffer_mut().take(snapshot, self.mode == Mode::Compare);
+                to_loop.input_buffer_mut().copy_from(snapshot, self.mode == Mode::Compare);
                 to_loop.publish();
                 while positions.pop().is_ok() {}
             }
@@ -168,8 +168,8 @@ impl Ticks {
             self.turn.turn(tick, 0, 0, now, take);
             self.number += 1;
         }
-        let mut took = Took::default();
-        while let Ok(Timed { took_ns, central, .. }) = self.records.pop() {
+        let mut took = TickCost::default();
+        while let Ok(TimedRecord { took_ns, central, .. }) = self.records.pop() {
             let central = central.map_or(0, |(nanos, _)| nanos);
             took.tick += nanos(took_ns.saturating_sub(central)) / 8.0;
             took.central += nanos(central) / 8.0;
@@ -185,10 +185,10 @@ impl Ticks {
         self.turn.turn(tick, 0, 0, now, |_, _| true);
         self.number += 1;
         let timed = self.records.pop().ok();
-        timed.map_or((0, None, true), |Timed { record, central, .. }| {
+        timed.map_or((0, None, true), |TimedRecord { record, central, .. }| {
             (
                 record.contributing,
-                central.map(|(_, reference_torque)| reference_torque.active),
+                central.map(|(_, total)| total.active),
                 record.halted.is_some(),
             )
         })
@@ -210,7 +210,7 @@ mod tests {
         for (cells, active) in [(0, 0), (30, 0), (30, 7), (240, 240)] {
             let part = spread(&whole, cells);
             assert_eq!(part.cells.len(), cells);
-            let counts: Vec<_> = (0..BUSES).map(|bus| part.cells_of(bus).count()).collect();
+            let counts: Vec<_> = (0..BUSES).map(|bus| part.cells_on_bus(bus).count()).collect();
             assert!(counts.iter().max().unwrap() - counts.iter().min().unwrap() <= 1, "{counts:?}");
             let target = u32::try_from(active).unwrap();
             let mut compared = Ticks::new(&part, active, Mode::Compare);
@@ -234,7 +234,7 @@ mod tests {
             clock.get()
         };
         let took = |mode| Ticks::new(&part, 0, mode).epoch(now);
-        assert_eq!(took(Mode::Compare), Took { tick: 2.0, central: 1.0 });
-        assert_eq!(took(Mode::Distributed), Took { tick: 1.0, central: 0.0 });
+        assert_eq!(took(Mode::Compare), TickCost { tick: 2.0, central: 1.0 });
+        assert_eq!(took(Mode::Distributed), TickCost { tick: 1.0, central: 0.0 });
     }
 }

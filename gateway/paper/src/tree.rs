@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 
 use cell_node::contact::{Force, Torque};
 use cell_node::kernel::{Kernel, Wrench};
-use cell_node::sum::{Begin, Sum};
+use cell_node::sum::{EpochStart, Sum};
 use protocol::fixed::{Acc, Q1_14};
 use protocol::id::CellId;
 use protocol::message::SkinSensors;
@@ -32,7 +32,7 @@ struct Branch {
 
 /// A skin on one bus whose cells sum along the shortest routes to the nearest root.
 #[derive(Clone, Debug)]
-pub struct Tree {
+pub struct SumTree {
     skin: Skin,
     central: Central,
     sums: Vec<Sum>,
@@ -44,7 +44,7 @@ pub struct Tree {
 
 /// The result of one epoch, in Nm.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Came {
+pub struct EpochResult {
     /// The torque computed centrally in double precision.
     pub central: [f64; MAX_JOINTS],
     /// The sum along the tree in Q7.8.
@@ -57,7 +57,7 @@ pub struct Came {
     pub count: usize,
 }
 
-impl Tree {
+impl SumTree {
     /// Creates a tree. `carry` is true to carry rounding errors into a cell's next value. Unreachable cells take no
     /// part.
     #[must_use]
@@ -101,20 +101,20 @@ impl Tree {
     }
 
     /// Runs one epoch in which the cells with these indices are in contact while the joints are at `q` (rad).
-    pub fn turn(&mut self, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> Came {
+    pub fn turn(&mut self, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> EpochResult {
         let words = q.map(|q| Q1_14::from_radians(q).unwrap_or_default());
         let frames = self.central.frames(&words);
-        let mut came = Came::default();
+        let mut came = EpochResult::default();
         let mut own = vec![None; self.sums.len()];
-        for (place, reference_torque) in touch {
+        for (place, sensors) in touch {
             let (Some(cell), Some(kernel)) = (self.skin.cells.get(*place), self.kernels.get(*place)) else {
                 continue;
             };
-            let force = self.central.force(*place, reference_torque);
+            let force = self.central.force(*place, sensors);
             add(&mut came.central, self.central.torque(*place, &frames, force));
             let force = Force::fuse(
-                reference_torque.contact,
-                reference_torque.proximity,
+                sensors.contact,
+                sensors.proximity,
                 &self.skin.parameters(cell).contact,
             );
             let exact = Torque::new(&kernel.jacobian(&words), force).exact();
@@ -128,24 +128,24 @@ impl Tree {
         let mut said = vec![None; self.sums.len()];
         for Branch { cell, depth, children } in &self.order {
             let Some(sum) = self.sums.get_mut(*cell) else { continue };
-            let begin = Begin {
+            let begin = EpochStart {
                 epoch: self.epoch,
                 at: Micros(0),
                 period: Span(PERIOD),
                 depth: Some(*depth),
-                speaks: true,
+                may_send: true,
                 children: children.iter().map(|(port, _)| 1 << port).sum(),
             };
             sum.begin(&begin, own.get(*cell).and_then(Option::as_ref));
             for (port, child) in children {
                 if let Some((epoch, words, restarted)) = said.get(*child).copied().flatten() {
                     if restarted {
-                        sum.state(Micros(0), *port, epoch);
+                        sum.handle_state(Micros(0), *port, epoch);
                     }
-                    sum.take(Micros(0), *port, epoch, words);
+                    sum.receive(Micros(0), *port, epoch, words);
                 }
             }
-            let says = sum.say(Micros(PERIOD));
+            let says = sum.poll_sum(Micros(PERIOD));
             if let (0, Some((_, words, _))) = (depth, &says) {
                 add(&mut came.sum, words.torque.map(|word| word.to_f64()));
                 came.count += usize::from(words.count);

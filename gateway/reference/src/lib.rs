@@ -9,13 +9,13 @@ use protocol::parameters::{Contact, MAX_JOINTS, Parameters};
 
 /// A cell with a configuration, reduced to its arithmetic.
 #[derive(Clone, Debug)]
-pub struct Reference {
+pub struct ReferenceCell {
     kernel: Wrench,
     contact: Contact,
     format: TorqueFormat,
 }
 
-impl Reference {
+impl ReferenceCell {
     /// Creates a cell with these parameters.
     #[must_use]
     pub fn new(parameters: &Parameters) -> Self {

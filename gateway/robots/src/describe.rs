@@ -7,7 +7,7 @@
 //! ```
 
 use nalgebra::{Point3, Vector3};
-use protocol::bus::is_plain;
+use protocol::bus::is_plain_name;
 use protocol::can::Format;
 use protocol::document::DocumentError;
 use protocol::parameters::RowKind;
@@ -15,11 +15,11 @@ use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
 use protocol::skin::{JointKind, MAX_ROBOT_JOINTS, REACH, Skin, reach};
 use thiserror::Error;
 
-use crate::chain::{Chain, Joint};
+use crate::chain::{UrdfChain, ChainJoint};
 use crate::error::RobotError;
 
 /// The default number of cells per bus: node ids 1 to 250, which leaves some for cells that are added later.
-pub const CELLS_OF_A_BUS: usize = 250;
+pub const DEFAULT_CELLS_PER_BUS: usize = 250;
 
 /// The maximum speed of a joint if the URDF gives none, in rad/s or m/s.
 const MAX_SPEED: f64 = 2.0;
@@ -47,7 +47,7 @@ pub struct CellOnLink {
 
 /// The input for a skin.
 #[derive(Debug)]
-pub struct Import<'a> {
+pub struct SkinImport<'a> {
     /// The name of the robot.
     pub name: &'a str,
     /// The command that made the skin, for the first line.
@@ -55,7 +55,7 @@ pub struct Import<'a> {
     /// The path of the URDF relative to the skin's file, if it is known.
     pub urdf: Option<&'a str>,
     /// The chains. Those after the first have their own tip, and may share joints with earlier ones.
-    pub chains: &'a [Chain],
+    pub chains: &'a [UrdfChain],
     /// The cells in their order. If there are none, each tip gets one.
     pub cells: &'a [CellOnLink],
 }
@@ -72,7 +72,7 @@ pub enum ImportError {
         count: usize,
     },
     /// The link of a cell cannot carry it.
-    #[error("{}{error}", at(*line))]
+    #[error("{}{error}", line_prefix(*line))]
     Link {
         /// The line of the file of cells.
         line: usize,
@@ -80,7 +80,7 @@ pub enum ImportError {
         error: RobotError,
     },
     /// A normal has no direction.
-    #[error("{}the normal nx,ny,nz = {x},{y},{z} has no direction: it must be longer than 0", at(*line))]
+    #[error("{}the normal nx,ny,nz = {x},{y},{z} has no direction: it must be longer than 0", line_prefix(*line))]
     Normal {
         /// The line of the file of cells.
         line: usize,
@@ -94,7 +94,7 @@ pub enum ImportError {
     /// Cells of two chains are on one bus.
     #[error(
         "{}bus {bus:?} carries chain {first:?} already, and this cell sits on chain {second:?}: name another bus",
-        at(*line)
+        line_prefix(*line)
     )]
     Bus {
         /// The line of the file of cells.
@@ -107,7 +107,7 @@ pub enum ImportError {
         second: String,
     },
     /// A bus has no free node id.
-    #[error("{}bus {bus:?} has no node id left: it has 254", at(*line))]
+    #[error("{}bus {bus:?} has no node id left: it has 254", line_prefix(*line))]
     Full {
         /// The line of the file of cells.
         line: usize,
@@ -115,7 +115,7 @@ pub enum ImportError {
         bus: String,
     },
     /// Two cells have the same node id.
-    #[error("{}node {node} of bus {bus:?} is that of line {first} already: give it another one, or none", at(*line))]
+    #[error("{}node {node} of bus {bus:?} is that of line {first} already: give it another one, or none", line_prefix(*line))]
     Taken {
         /// The line of the file of cells.
         line: usize,
@@ -127,7 +127,7 @@ pub enum ImportError {
         first: usize,
     },
     /// The name of the bus is not possible for an interface.
-    #[error("{}bus {bus:?}: its name has 1 to 15 letters, digits, `-`, `_` or `.`, and does not begin with `.`", at(*line))]
+    #[error("{}bus {bus:?}: its name has 1 to 15 letters, digits, `-`, `_` or `.`, and does not begin with `.`", line_prefix(*line))]
     BusName {
         /// The line of the file of cells.
         line: usize,
@@ -138,7 +138,7 @@ pub enum ImportError {
     #[error(
         "{}position px,py,pz = {x},{y},{z} of link {link:?} can come {reach:.3} m from a frame of the rows below \
          it, if all joints turn freely; less than {REACH} m is possible: correct it, or choose a root nearer to the link",
-        at(*line)
+        line_prefix(*line)
     )]
     Reach {
         /// The line of the file of cells.
@@ -155,7 +155,7 @@ pub enum ImportError {
         reach: f64,
     },
     /// The check of the skin refuses cells or buses.
-    #[error("{}{what}", at(*line))]
+    #[error("{}{what}", line_prefix(*line))]
     Cells {
         /// The line of the file of cells; 0 for the whole file.
         line: usize,
@@ -179,8 +179,8 @@ impl ImportError {
 
     /// Converts an error of the skin's check, and refers it to the lines of the cells, because the user does not see
     /// the text of the skin.
-    fn of_check(error: DocumentError, cells: &[CellOnLink], buses: &[Bus]) -> Self {
-        let DocumentError::Wrong { what, .. } = error else { return Self::Robot { what: error.to_string() } };
+    fn of_check(error: DocumentError, cells: &[CellOnLink], buses: &[BusAssignment]) -> Self {
+        let DocumentError::InvalidValue { what, .. } = error else { return Self::Robot { what: error.to_string() } };
         let lines_of_buses = || buses.iter().map(|bus| bus.line);
         let found =
             numbered(&what, "cell").map(|(index, rest)| (cells.get(index).map(|cell| cell.line), rest));
@@ -201,12 +201,12 @@ fn numbered<'a>(what: &'a str, table: &str) -> Option<(usize, &'a str)> {
 }
 
 /// Formats the line of a cell in an error; empty for cells without a file.
-fn at(line: usize) -> String {
+fn line_prefix(line: usize) -> String {
     if line == 0 { String::new() } else { format!("line {line}: ") }
 }
 
 /// A cell with its position on a chain.
-struct Placed<'a> {
+struct PlacedCell<'a> {
     cell: &'a CellOnLink,
     bus: usize,
     node: u8,
@@ -218,7 +218,7 @@ struct Placed<'a> {
 }
 
 /// A bus while cells are assigned to it.
-struct Bus {
+struct BusAssignment {
     name: String,
     chain: usize,
     /// The line of its first cell.
@@ -229,7 +229,7 @@ struct Bus {
     named: bool,
 }
 
-impl Import<'_> {
+impl SkinImport<'_> {
     /// Returns the text of the skin. The result is deterministic.
     ///
     /// # Errors
@@ -242,7 +242,7 @@ impl Import<'_> {
         }
         let on_tips: Vec<_> = self.chains.iter().map(on_tip).collect();
         let cells = if self.cells.is_empty() { &on_tips } else { self.cells };
-        let mut buses: Vec<Bus> = Vec::new();
+        let mut buses: Vec<BusAssignment> = Vec::new();
         let placed = cells.iter().map(|cell| self.place(cell, &mut buses)).collect::<Result<Vec<_>, _>>()?;
         let text = self.text(&buses, &placed);
         match Skin::parse("imported skin", &text) {
@@ -252,7 +252,7 @@ impl Import<'_> {
     }
 
     /// Assigns a cell to the first chain that moves its link, and to a bus.
-    fn place<'a>(&self, cell: &'a CellOnLink, buses: &mut Vec<Bus>) -> Result<Placed<'a>, ImportError> {
+    fn place<'a>(&self, cell: &'a CellOnLink, buses: &mut Vec<BusAssignment>) -> Result<PlacedCell<'a>, ImportError> {
         let line = cell.line;
         let mut found = None;
         let mut refused = None;
@@ -277,7 +277,7 @@ impl Import<'_> {
             return Err(ImportError::Normal { line, x, y, z });
         };
         let position = frame.frame * Point3::from(cell.position);
-        let rows = self.chains.get(owner).map(Chain::chain_rows).unwrap_or_default();
+        let rows = self.chains.get(owner).map(UrdfChain::chain_rows).unwrap_or_default();
         let reach = reach(rows.get(..frame.row).unwrap_or_default(), position.into());
         if reach.is_nan() || reach >= REACH {
             let ([x, y, z], link) = (cell.position, cell.link.clone());
@@ -298,11 +298,11 @@ impl Import<'_> {
         };
         there.taken.push((node, line));
         let (chain, joint, row) = (owner, frame.joint, frame.row);
-        Ok(Placed { cell, bus, node, chain, joint, row, position: position.into(), normal: normal.into() })
+        Ok(PlacedCell { cell, bus, node, chain, joint, row, position: position.into(), normal: normal.into() })
     }
 
     /// Returns the bus of a cell: the one that it names, or the last one of its chain that has room.
-    fn bus(&self, cell: &CellOnLink, chain: usize, buses: &mut Vec<Bus>) -> Result<usize, ImportError> {
+    fn bus(&self, cell: &CellOnLink, chain: usize, buses: &mut Vec<BusAssignment>) -> Result<usize, ImportError> {
         let name = |chain: usize| self.chains.get(chain).map_or_else(String::new, |chain| chain.tip.clone());
         if let Some(named) = &cell.bus {
             if let Some(index) = buses.iter().position(|bus| bus.name == *named) {
@@ -316,13 +316,13 @@ impl Import<'_> {
                     _ => Ok(index),
                 };
             }
-            if !is_plain(named) || named.starts_with('.') {
+            if !is_plain_name(named) || named.starts_with('.') {
                 return Err(ImportError::BusName { line: cell.line, bus: named.clone() });
             }
-            buses.push(Bus { name: named.clone(), chain, line: cell.line, taken: Vec::new(), named: true });
+            buses.push(BusAssignment { name: named.clone(), chain, line: cell.line, taken: Vec::new(), named: true });
             return Ok(buses.len() - 1);
         }
-        let has_room = |bus: &Bus| bus.chain == chain && !bus.named && bus.taken.len() < CELLS_OF_A_BUS;
+        let has_room = |bus: &BusAssignment| bus.chain == chain && !bus.named && bus.taken.len() < DEFAULT_CELLS_PER_BUS;
         if let Some(index) = buses.iter().rposition(has_room) {
             return Ok(index);
         }
@@ -330,13 +330,13 @@ impl Import<'_> {
             .map(|number| format!("vcan{number}"))
             .find(|name| buses.iter().all(|bus| bus.name != *name));
         let name = free.unwrap_or_default();
-        buses.push(Bus { name, chain, line: cell.line, taken: Vec::new(), named: false });
+        buses.push(BusAssignment { name, chain, line: cell.line, taken: Vec::new(), named: false });
         Ok(buses.len() - 1)
     }
 
     /// Returns the joints of all chains, each once.
-    fn joints(&self) -> Vec<&Joint> {
-        let mut joints: Vec<&Joint> = Vec::new();
+    fn joints(&self) -> Vec<&ChainJoint> {
+        let mut joints: Vec<&ChainJoint> = Vec::new();
         for joint in self.chains.iter().flat_map(|chain| &chain.joints) {
             if joints.iter().all(|known| known.name != joint.name) {
                 joints.push(joint);
@@ -345,12 +345,12 @@ impl Import<'_> {
         joints
     }
 
-    fn text(&self, buses: &[Bus], cells: &[Placed<'_>]) -> String {
+    fn text(&self, buses: &[BusAssignment], cells: &[PlacedCell<'_>]) -> String {
         let joints = self.joints();
         let each =
-            |value: &dyn Fn(&Joint) -> f64| joints.iter().map(|joint| value(joint)).collect::<Vec<_>>();
+            |value: &dyn Fn(&ChainJoint) -> f64| joints.iter().map(|joint| value(joint)).collect::<Vec<_>>();
         let by_kind = |turns: f64, slides: f64| {
-            move |joint: &Joint| if joint.kind == JointKind::Prismatic { slides } else { turns }
+            move |joint: &ChainJoint| if joint.kind == JointKind::Prismatic { slides } else { turns }
         };
         let mut draft = Draft::default();
         draft.comment(self.command);
@@ -368,11 +368,11 @@ impl Import<'_> {
         if let Some(urdf) = self.urdf {
             draft.set("urdf", Value::Text(urdf));
         }
-        for Joint { name, kind, limits, .. } in &joints {
+        for ChainJoint { name, kind, limits, .. } in &joints {
             draft.table("[[robot.joint]]", None);
             draft.set("name", Value::Text(name));
             draft.set("kind", Value::Text(kind.name()));
-            draft.set_remarked("limits", Value::Numbers(limits), 3, kind.unit());
+            draft.set_with_comment("limits", Value::Numbers(limits), 3, kind.unit());
         }
         self.chains.iter().for_each(|chain| add_chain(&mut draft, chain));
         draft.paper(62.5);
@@ -382,10 +382,10 @@ impl Import<'_> {
         }
         draft.table("[controller]", Some("M q'' + D q' = tau, joint by joint"));
         draft.set("kind", Value::Text("kinesthetic"));
-        draft.set_remarked("inertia", Value::Numbers(&each(&by_kind(1.0, 10.0))), 5, "kg m2, or kg");
-        draft.set_remarked("damping", Value::Numbers(&each(&by_kind(4.0, 80.0))), 5, "Nm s/rad, or N s/m");
+        draft.set_with_comment("inertia", Value::Numbers(&each(&by_kind(1.0, 10.0))), 5, "kg m2, or kg");
+        draft.set_with_comment("damping", Value::Numbers(&each(&by_kind(4.0, 80.0))), 5, "Nm s/rad, or N s/m");
         let speed = each(&|joint| joint.max_speed.unwrap_or(MAX_SPEED));
-        draft.set_remarked("max_speed", Value::Numbers(&speed), 3, "rad/s, or m/s");
+        draft.set_with_comment("max_speed", Value::Numbers(&speed), 3, "rad/s, or m/s");
         for cell in cells {
             let bus = buses.get(cell.bus).map_or("", |bus| &bus.name);
             let own = self.chains.get(cell.chain).and_then(|chain| row_of(chain, cell.joint));
@@ -411,7 +411,7 @@ impl Import<'_> {
 }
 
 /// Adds a chain: its base and its rows.
-fn add_chain(draft: &mut Draft, chain: &Chain) {
+fn add_chain(draft: &mut Draft, chain: &UrdfChain) {
     draft.table("[[robot.chain]]", Some("standard Denavit-Hartenberg, base to tip; m, rad"));
     draft.set("name", Value::Text(&chain.tip));
     let base = chain.below * chain.base;
@@ -430,13 +430,13 @@ fn add_chain(draft: &mut Draft, chain: &Chain) {
 }
 
 /// Returns the row of a joint, both from 1.
-fn row_of(chain: &Chain, joint: usize) -> Option<usize> {
+fn row_of(chain: &UrdfChain, joint: usize) -> Option<usize> {
     let moving = chain.rows.iter().enumerate().filter(|(_, row)| row.kind != RowKind::Fixed);
     moving.map(|(index, _)| index + 1).nth(joint.checked_sub(1)?)
 }
 
 /// Returns a cell at the origin of a chain's tip, which faces along z.
-fn on_tip(chain: &Chain) -> CellOnLink {
+fn on_tip(chain: &UrdfChain) -> CellOnLink {
     CellOnLink { link: chain.tip.clone(), normal: [0.0, 0.0, 1.0], ..CellOnLink::default() }
 }
 

@@ -16,12 +16,12 @@ pub struct RobotError {
     /// The line, from 1, if it is known.
     pub line: Option<u32>,
     /// The problem.
-    pub problem: Box<Problem>,
+    pub problem: Box<RobotProblem>,
 }
 
 impl RobotError {
     /// Creates an error in a file.
-    pub(crate) fn new(file: &str, line: Option<u32>, problem: Problem) -> Self {
+    pub(crate) fn new(file: &str, line: Option<u32>, problem: RobotProblem) -> Self {
         Self { file: file.to_owned(), line, problem: Box::new(problem) }
     }
 }
@@ -29,7 +29,7 @@ impl RobotError {
 /// A problem in a robot's file, or in a chain of it.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
-pub enum Problem {
+pub enum RobotProblem {
     /// The file is empty.
     #[error("the file is empty; a URDF has a robot element with links and joints")]
     Empty,

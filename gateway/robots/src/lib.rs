@@ -40,17 +40,17 @@ mod taken;
 mod urdf;
 mod written;
 
-pub use chain::{Chain, Joint, LinkFrame};
-pub use describe::{CELLS_OF_A_BUS, CellOnLink, Import, ImportError};
-pub use error::{Problem, RobotError};
+pub use chain::{UrdfChain, ChainJoint, LinkFrame};
+pub use describe::{DEFAULT_CELLS_PER_BUS, CellOnLink, SkinImport, ImportError};
+pub use error::{RobotProblem, RobotError};
 pub use links::LinkPose;
 pub use nalgebra::Isometry3;
 pub use protocol::parameters::RowKind;
 pub use protocol::skin::JointKind;
-pub use rows::{MAX_LENGTH_M, MAX_RESIDUAL, Row, frames, pose_of};
-pub use taken::{Taken, chain_words, word};
+pub use rows::{MAX_LENGTH_M, MAX_RESIDUAL, DhRow, frames, pose_of};
+pub use taken::{UniqueNames, chain_words, word};
 pub use urdf::{Geometry, Shape, Urdf, text};
-pub use written::{Written, written};
+pub use written::{WrittenUrdf, written};
 
 #[cfg(test)]
 mod tests;

@@ -2,9 +2,9 @@
 
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
-use crate::error::{Problem, RobotError};
+use crate::error::{RobotProblem, RobotError};
 use crate::nearest::nearest;
-use crate::urdf::{Kind, Urdf, UrdfJoint};
+use crate::urdf::{UrdfJointKind, Urdf, UrdfJoint};
 
 /// A link on its parent.
 #[derive(Clone, Debug, PartialEq)]
@@ -15,12 +15,12 @@ pub struct LinkPose {
     pub child: String,
     /// The transform from the parent to the link, with the joint at zero.
     origin: Isometry3<f64>,
-    motion: Option<Motion>,
+    motion: Option<LinkMotion>,
 }
 
 /// The motion of a link on its parent.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Motion {
+struct LinkMotion {
     /// The index of the joint that moves the link.
     joint: usize,
     slides: bool,
@@ -38,8 +38,8 @@ impl LinkPose {
 
     /// Returns the transform from the parent to the link, with the joints at these positions in rad or m.
     #[must_use]
-    pub fn at(&self, positions: &[f64]) -> Isometry3<f64> {
-        let Some(Motion { joint, slides, axis, multiplier, offset }) = self.motion else {
+    pub fn pose(&self, positions: &[f64]) -> Isometry3<f64> {
+        let Some(LinkMotion { joint, slides, axis, multiplier, offset }) = self.motion else {
             return self.origin;
         };
         let position = multiplier * positions.get(joint).copied().unwrap_or_default() + offset;
@@ -67,10 +67,10 @@ impl Urdf {
                 Some(mimic) => (mimic.joint.as_str(), mimic.multiplier, mimic.offset),
                 None => (joint.name.as_str(), 1.0, 0.0),
             };
-            let slides = joint.kind == Kind::Prismatic;
-            let moves = matches!(joint.kind, Kind::Revolute | Kind::Continuous | Kind::Prismatic);
+            let slides = joint.kind == UrdfJointKind::Prismatic;
+            let moves = matches!(joint.kind, UrdfJointKind::Revolute | UrdfJointKind::Continuous | UrdfJointKind::Prismatic);
             let motion = place(of).filter(|_| moves);
-            let motion = motion.map(|of| Motion { joint: of, slides, axis: joint.axis, multiplier, offset });
+            let motion = motion.map(|of| LinkMotion { joint: of, slides, axis: joint.axis, multiplier, offset });
             let origin = match motion {
                 Some(_) => joint.origin,
                 None => joint.transform(multiplier * self.rest(of) + offset),
@@ -91,14 +91,14 @@ impl Urdf {
 
     fn moving(&self, name: &str) -> Result<&UrdfJoint, RobotError> {
         let moves = |joint: &&UrdfJoint| {
-            let kind = matches!(joint.kind, Kind::Revolute | Kind::Continuous | Kind::Prismatic);
+            let kind = matches!(joint.kind, UrdfJointKind::Revolute | UrdfJointKind::Continuous | UrdfJointKind::Prismatic);
             kind && joint.mimic.is_none()
         };
         let found = self.joints().iter().filter(moves).find(|joint| joint.name == name);
         found.ok_or_else(|| {
             let names = self.joints().iter().filter(moves).map(|joint| joint.name.as_str());
             let nearest = nearest(name, names);
-            self.error(Problem::NoSuchJoint { joint: name.to_owned(), nearest })
+            self.error(RobotProblem::NoSuchJoint { joint: name.to_owned(), nearest })
         })
     }
 }

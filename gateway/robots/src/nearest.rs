@@ -1,7 +1,7 @@
 //! Suggestions for mistyped names.
 
 /// The maximum number of suggested names.
-const PROPOSED: usize = 3;
+const MAX_SUGGESTIONS: usize = 3;
 
 /// Lists the names that are most similar to a mistyped one, nearest first, at most three.
 pub(crate) fn nearest<'a>(target: &str, names: impl IntoIterator<Item = &'a str>) -> String {
@@ -9,7 +9,7 @@ pub(crate) fn nearest<'a>(target: &str, names: impl IntoIterator<Item = &'a str>
     let mut found: Vec<_> =
         names.into_iter().map(|name| (edits(&target, &name.to_lowercase()), name)).collect();
     found.sort();
-    let found: Vec<_> = found.into_iter().take(PROPOSED).map(|(_, name)| format!("{name:?}")).collect();
+    let found: Vec<_> = found.into_iter().take(MAX_SUGGESTIONS).map(|(_, name)| format!("{name:?}")).collect();
     match found.as_slice() {
         [] => "none".to_owned(),
         [one] => one.clone(),

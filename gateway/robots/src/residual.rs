@@ -4,8 +4,8 @@ use core::f64::consts::TAU;
 
 use nalgebra::Isometry3;
 
-use crate::chain::Chain;
-use crate::chain::{Hanging, behind};
+use crate::chain::UrdfChain;
+use crate::chain::{CarriedLink, behind};
 use crate::urdf::UrdfJoint;
 use protocol::skin::JointKind;
 
@@ -22,12 +22,12 @@ pub(crate) struct Residual {
 }
 
 /// Compares all links that move with the chain.
-pub(crate) fn residual(chain: &Chain, path: &[&UrdfJoint], hanging: &[Hanging]) -> Residual {
+pub(crate) fn residual(chain: &UrdfChain, path: &[&UrdfJoint], hanging: &[CarriedLink]) -> Residual {
     let mut worst = Residual::default();
     for positions in positions(chain) {
         let frames = chain.frames(&positions);
         let behind = behind(path, &positions);
-        for (Hanging { link, joint, fixed }, (_, found)) in hanging.iter().zip(chain.links()) {
+        for (CarriedLink { link, joint, fixed }, (_, found)) in hanging.iter().zip(chain.links()) {
             let urdf = joint.checked_sub(1).and_then(|index| behind.get(index)).map(|pose| pose * fixed);
             let rows = frames.get(found.row).map(|frame| frame * found.frame);
             let residual = urdf.zip(rows).map_or(f64::INFINITY, |(urdf, rows)| difference(&urdf, &rows));
@@ -49,7 +49,7 @@ pub(crate) fn difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
 }
 
 /// Returns zero, the limits, and reproducible positions between them.
-fn positions(chain: &Chain) -> Vec<Vec<f64>> {
+fn positions(chain: &UrdfChain) -> Vec<Vec<f64>> {
     let limits = chain.joints.iter().map(|joint| match joint.kind {
         JointKind::Revolute => joint.limits.map(|limit| limit.clamp(-TAU, TAU)),
         JointKind::Prismatic => joint.limits,

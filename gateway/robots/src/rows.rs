@@ -4,7 +4,7 @@ use core::f64::consts::{FRAC_PI_2, PI};
 
 use nalgebra::{Isometry3, Matrix4, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use protocol::parameters::RowKind;
-use protocol::skin::{Base, ChainRow, DenavitHartenberg, JointKind};
+use protocol::skin::{ChainBase, ChainRow, DenavitHartenberg, JointKind};
 
 /// The bound of `a` and `d` of a row, in m: at least its negative, and less than it.
 pub const MAX_LENGTH_M: f64 = 2.0;
@@ -39,7 +39,7 @@ const IMPOSSIBLE_M: f64 = 1e3;
 /// One row in standard Denavit-Hartenberg form, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`. It leads from frame l - 1, whose z
 /// axis is that of the row's joint, to frame l.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Row {
+pub struct DhRow {
     /// The kind of motion.
     pub kind: RowKind,
     /// The length along the new x axis in m.
@@ -52,14 +52,14 @@ pub struct Row {
     pub theta_offset: f64,
 }
 
-impl From<&ChainRow> for Row {
+impl From<&ChainRow> for DhRow {
     fn from(row: &ChainRow) -> Self {
         let DenavitHartenberg { a, alpha, d, theta_offset } = row.table;
         Self { kind: row.kind, a, alpha, d, theta_offset }
     }
 }
 
-impl Row {
+impl DhRow {
     /// Returns the transform from frame l - 1 to frame l, with the joint at this position in rad or m. A fixed row
     /// ignores the position.
     #[must_use]
@@ -106,7 +106,7 @@ impl Row {
 /// Returns the frames 0 to `rows.len()` in the coordinates in which `base` is frame 0, with the joints at `positions`
 /// in rad or m. Joints without a position are at zero.
 #[must_use]
-pub fn frames(base: &Isometry3<f64>, rows: &[Row], positions: &[f64]) -> Vec<Isometry3<f64>> {
+pub fn frames(base: &Isometry3<f64>, rows: &[DhRow], positions: &[f64]) -> Vec<Isometry3<f64>> {
     let mut positions = positions.iter();
     let mut frame = *base;
     let mut all = vec![frame];
@@ -131,19 +131,19 @@ pub(crate) struct Axis {
 
 /// A sequence of rows from frame 0 to an axis.
 #[derive(Clone, Debug)]
-struct Way {
-    rows: Vec<Row>,
+struct RowPath {
+    rows: Vec<DhRow>,
     /// The last frame, in the root's coordinates.
     frame: Isometry3<f64>,
     /// The length of the rows plus the cost of fixed rows, in m.
     cost: f64,
 }
 
-impl Way {
+impl RowPath {
     /// Returns the path extended by these rows.
-    fn and(&self, rows: &[Row], row_cost: f64) -> Self {
+    fn and(&self, rows: &[DhRow], row_cost: f64) -> Self {
         let frame = rows.iter().fold(self.frame, |frame, row| frame * row.transform(0.0));
-        let cost = |row: &Row| row.length() + if row.kind == RowKind::Fixed { row_cost } else { 0.0 };
+        let cost = |row: &DhRow| row.length() + if row.kind == RowKind::Fixed { row_cost } else { 0.0 };
         let cost = self.cost + rows.iter().map(cost).sum::<f64>();
         Self { rows: [self.rows.as_slice(), rows].concat(), frame, cost }
     }
@@ -163,20 +163,20 @@ impl Axis {
 /// that lead from frame to frame along common normals or by way of joints, the shortest is chosen, so that rows do not
 /// fold back. The origin of the last row is the point of the last axis that is nearest to `tip`. `row_cost` is the
 /// length in m that a fixed row must save.
-pub(crate) fn chain(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometry3<f64>, Vec<Row>) {
+pub(crate) fn chain(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometry3<f64>, Vec<DhRow>) {
     let Some(first) = axes.first() else { return (Isometry3::identity(), Vec::new()) };
     let base = base(first);
-    let mut ways = vec![Way { rows: Vec::new(), frame: base, cost: 0.0 }];
+    let mut ways = vec![RowPath { rows: Vec::new(), frame: base, cost: 0.0 }];
     for (index, axis) in axes.iter().enumerate() {
         let kind = axis.kind.row();
         let next = axes.get(index + 1);
-        let mut longer: Vec<Way> = Vec::new();
+        let mut longer: Vec<RowPath> = Vec::new();
         for way in &ways {
             let local = |point: &Point3<f64>| way.frame.inverse_transform_point(point).coords;
             let Some(next) = next else {
                 let d = local(tip).z.clamp(-LONG_M, LONG_M);
                 longer.push(
-                    way.and(&[Row { kind, a: 0.0, alpha: 0.0, d, theta_offset: 0.0 }.tidy()], row_cost),
+                    way.and(&[DhRow { kind, a: 0.0, alpha: 0.0, d, theta_offset: 0.0 }.tidy()], row_cost),
                 );
                 continue;
             };
@@ -186,7 +186,7 @@ pub(crate) fn chain(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometr
             for rows in between(kind, &places, &direction) {
                 let way = way.and(&rows, row_cost);
                 // Paths that end in the same frame have the same continuations.
-                let same = |other: &&mut Way| {
+                let same = |other: &&mut RowPath| {
                     let apart = other.frame.translation.vector - way.frame.translation.vector;
                     apart.norm() < SAME_PLACE_M
                 };
@@ -224,7 +224,7 @@ fn base(first: &Axis) -> Isometry3<f64> {
 
 /// Returns the possible rows from a frame whose z axis moves to one whose z axis is the line through the `places` along
 /// `direction`.
-fn between(kind: RowKind, places: &[Vector3<f64>], direction: &Vector3<f64>) -> Vec<Vec<Row>> {
+fn between(kind: RowKind, places: &[Vector3<f64>], direction: &Vector3<f64>) -> Vec<Vec<DhRow>> {
     let Some(point) = places.first() else { return Vec::new() };
     // The point of the axis that is nearest to the frame's origin.
     let nearest = point - direction * direction.dot(point);
@@ -238,22 +238,22 @@ fn between(kind: RowKind, places: &[Vector3<f64>], direction: &Vector3<f64>) -> 
 }
 
 /// Returns the row to an axis parallel or opposite to z: d is free, and leads to the next joint's origin.
-fn parallel(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> Row {
+fn parallel(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> DhRow {
     let meets = point.xy().norm() < LENGTH_TOLERANCE_M;
     let theta_offset = if meets { 0.0 } else { upright(point.y.atan2(point.x)) };
     let alpha = if direction.z > 0.0 { 0.0 } else { PI };
-    Row { kind, a: along_x(point, theta_offset), alpha, d: point.z, theta_offset }.tidy()
+    DhRow { kind, a: along_x(point, theta_offset), alpha, d: point.z, theta_offset }.tidy()
 }
 
 /// Returns the row along the common normal.
-fn common_normal(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> Row {
+fn common_normal(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> DhRow {
     let along = -point.xy().dot(&direction.xy()) / direction.xy().norm_squared();
     let theta_offset = upright(direction.x.atan2(-direction.y));
     // The component of the direction that is perpendicular to the new x axis.
     let (sine, cosine) = theta_offset.sin_cos();
     let alpha = (sine * direction.x - cosine * direction.y).atan2(direction.z);
     let d = point.z + along * direction.z;
-    Row { kind, a: along_x(point, theta_offset), alpha, d, theta_offset }.tidy()
+    DhRow { kind, a: along_x(point, theta_offset), alpha, d, theta_offset }.tidy()
 }
 
 /// Returns the coordinate of a point along the x axis after a rotation by this angle about z. It replaces the length of
@@ -266,7 +266,7 @@ fn along_x(point: &Vector3<f64>, theta: f64) -> f64 {
 
 /// Returns the rows by way of a helper axis, which passes through the point `at` of the next axis and is perpendicular
 /// to both axes. No digits are lost, however small the angle between them is.
-fn helper(kind: RowKind, at: &Vector3<f64>, direction: &Vector3<f64>) -> [Row; 2] {
+fn helper(kind: RowKind, at: &Vector3<f64>, direction: &Vector3<f64>) -> [DhRow; 2] {
     let normal = Vector3::new(-direction.y, direction.x, 0.0).normalize();
     let row = common_normal(kind, at, &normal);
     let frame = row.transform(0.0);
@@ -289,7 +289,7 @@ fn quarter(angle: f64) -> f64 {
 
 /// Returns the base of a skin's chain as a pose.
 #[must_use]
-pub fn pose_of(base: &Base) -> Isometry3<f64> {
+pub fn pose_of(base: &ChainBase) -> Isometry3<f64> {
     let turn = Matrix4::from(base.matrix()).fixed_view::<3, 3>(0, 0).into_owned();
     let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(turn));
     Isometry3::from_parts(base.position.into(), turn)

@@ -6,9 +6,9 @@ use protocol::skin::Skin;
 
 /// A set of used names.
 #[derive(Clone, Debug, Default)]
-pub struct Taken(BTreeSet<String>);
+pub struct UniqueNames(BTreeSet<String>);
 
-impl Taken {
+impl UniqueNames {
     /// Returns unique names for the requested ones, in their order. A name that is already used, also by an earlier one
     /// in the list, gets a number: `name_2`.
     pub fn give(&mut self, requested: Vec<String>) -> Vec<String> {
@@ -47,7 +47,7 @@ pub fn chain_words(skin: &Skin) -> Vec<String> {
     if chains.len() < 2 {
         return vec![String::new(); chains.len()];
     }
-    Taken::default().give(chains.iter().map(|chain| word(&chain.name)).collect())
+    UniqueNames::default().give(chains.iter().map(|chain| word(&chain.name)).collect())
 }
 
 #[cfg(test)]
@@ -56,7 +56,7 @@ mod tests {
 
     #[test]
     fn a_taken_name_gets_a_number_that_is_free() {
-        let mut taken = Taken::default();
+        let mut taken = UniqueNames::default();
         let given = taken.give(["a", "b", "a", "a_2", "a"].map(str::to_owned).to_vec());
         assert_eq!(given, ["a", "b", "a_3", "a_2", "a_4"]);
         assert_eq!([taken.give_one("b".to_owned()), taken.give_one("c".to_owned())], ["b_2", "c"]);

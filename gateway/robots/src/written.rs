@@ -12,7 +12,7 @@ use protocol::parameters::RowKind;
 use protocol::skin::{JointKind, Skin};
 use protocol::xml::escaped;
 
-use crate::rows::{Row, pose_of};
+use crate::rows::{DhRow, pose_of};
 use crate::taken::chain_words;
 
 /// The link that all chains are on.
@@ -26,7 +26,7 @@ const EFFORT: f64 = 1000.0;
 
 /// A URDF and the names of its links.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Written {
+pub struct WrittenUrdf {
     /// The text.
     pub xml: String,
     /// By chain: the link that each of its joints moves.
@@ -42,12 +42,12 @@ struct Origin {
 
 impl Origin {
     /// Returns the constant part of a row.
-    fn of_row(row: &Row) -> Self {
+    fn of_row(row: &DhRow) -> Self {
         let (sine, cosine) = row.theta_offset.sin_cos();
         Self { xyz: [row.a * cosine, row.a * sine, row.d], rpy: [row.alpha, 0.0, row.theta_offset] }
     }
 
-    fn of_base(base: &protocol::skin::Base) -> Self {
+    fn of_base(base: &protocol::skin::ChainBase) -> Self {
         let pose = pose_of(base);
         Self { xyz: pose.translation.vector.into(), rpy: pose.rotation.euler_angles().into() }
     }
@@ -63,7 +63,7 @@ fn three(numbers: [f64; 3]) -> String {
 }
 
 /// A joint and the link that it carries.
-struct Joint {
+struct WrittenJoint {
     parent: String,
     origin: Origin,
     /// The index of the robot's joint, unless it is fixed.
@@ -77,9 +77,9 @@ struct Joint {
 
 /// Writes a URDF for the chains of a skin.
 #[must_use]
-pub fn written(skin: &Skin) -> Written {
+pub fn written(skin: &Skin) -> WrittenUrdf {
     let robot = &skin.robot;
-    let mut joints: Vec<Joint> = Vec::new();
+    let mut joints: Vec<WrittenJoint> = Vec::new();
     let mut links = Vec::new();
     for (chain, word) in robot.chains.iter().zip(chain_words(skin)) {
         let prefix = if word.is_empty() { word } else { word + "_" };
@@ -102,21 +102,21 @@ pub fn written(skin: &Skin) -> Written {
             if moved.is_some() {
                 of_chain.push(link.clone());
             }
-            (parent, origin) = (link, Origin::of_row(&Row::from(row)));
+            (parent, origin) = (link, Origin::of_row(&DhRow::from(row)));
         }
         joints.push(joint(skin, &joints, (parent, origin, None), format!("{prefix}tip")));
         links.push(of_chain);
     }
-    Written { xml: xml(&robot.name, &joints), links }
+    WrittenUrdf { xml: xml(&robot.name, &joints), links }
 }
 
 /// Returns a joint between a link and a new one.
 fn joint(
     skin: &Skin,
-    before: &[Joint],
+    before: &[WrittenJoint],
     (parent, origin, moved): (String, Origin, Option<usize>),
     link: String,
-) -> Joint {
+) -> WrittenJoint {
     let robot = &skin.robot;
     let known = moved.and_then(|index| Some((index, robot.joints.get(index)?)));
     let Some((index, joint)) = known else {
@@ -125,7 +125,7 @@ fn joint(
         while names().any(|it| *it == name) {
             name.push('_');
         }
-        return Joint { parent, origin, moved, link, name, kind: "fixed", inner: String::new() };
+        return WrittenJoint { parent, origin, moved, link, name, kind: "fixed", inner: String::new() };
     };
     let [lower, upper] = joint.limits;
     let speed = skin.controller.max_speed.get(index).copied().unwrap_or(1.0);
@@ -144,10 +144,10 @@ fn joint(
         JointKind::Revolute => "revolute",
         JointKind::Prismatic => "prismatic",
     };
-    Joint { parent, origin, moved, link, name, kind, inner }
+    WrittenJoint { parent, origin, moved, link, name, kind, inner }
 }
 
-fn xml(name: &str, joints: &[Joint]) -> String {
+fn xml(name: &str, joints: &[WrittenJoint]) -> String {
     let name = escaped(if name.is_empty() { "robot" } else { name });
     let mut out = format!(
         "<?xml version=\"1.0\"?>\n<robot name=\"{name}\">\n  <material name=\"grey\"><color rgba=\"0.6 0.6 0.6 1\"/></material>\n"
@@ -160,7 +160,7 @@ fn xml(name: &str, joints: &[Joint]) -> String {
         }
         out.push_str("  </link>\n");
     }
-    for Joint { parent, origin, link, name, kind, inner, .. } in joints {
+    for WrittenJoint { parent, origin, link, name, kind, inner, .. } in joints {
         let name = escaped(name);
         let _ = write!(
             out,

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use calibration::Calibration;
 use protocol::skin::Skin;
-use view::{Moved, Scene};
+use view::{MovedCell, Scene};
 
 use crate::skin::still;
 use crate::visuals::Packages;
@@ -20,12 +20,12 @@ pub(super) fn page(file: &Path, skin: &Skin, calibration: &Calibration) -> Strin
         cell.normal = [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)];
     }
     let mut still = still(file, &found, &Packages::beside());
-    let described = Scene::of(skin, false);
+    let described = Scene::from_skin(skin, false);
     for (index, (old, result)) in described.cells.into_iter().zip(&calibration.cells).enumerate() {
         let chain = described.buses.get(old.bus).map_or(0, |bus| bus.chain);
         if result.found.is_some_and(|_| result.is_written()) {
             let (position, normal) = (old.position, old.normal);
-            still.moved.push(Moved { cell: index, chain, row: old.row, position, normal });
+            still.moved.push(MovedCell { cell: index, chain, row: old.row, position, normal });
         }
         let Some(details) = still.details.get_mut(index) else { continue };
         let mut detail = |name: &str, value: String| details.push((name.to_owned(), value));

@@ -3,21 +3,21 @@
 use std::collections::BTreeMap;
 use std::fmt::Display;
 
-use bench::cells::Watch;
+use bench::cells::CellWatch;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
-use model::listing::Cell;
+use model::listing::ListedCell;
 use protocol::can::Format;
 use protocol::id::CellId;
-use protocol::message::{Heard, Heartbeat, PortState, Refused, State, Tree};
+use protocol::message::{ReceivedCounts, Heartbeat, PortState, RejectedCounts, State, Tree};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use rustix::termios::tcgetwinsize;
 use serde::Serialize;
 
-use crate::print::{filled, some, words};
+use crate::print::{drop_empty_columns, abbreviated, space_separated};
 
 /// A bus in a skin description.
-pub(super) struct Known {
+pub(super) struct DescribedBus {
     file: String,
     pub(super) format: Format,
     /// Node ids and configuration hashes by serial number.
@@ -34,7 +34,7 @@ const COLUMNS: [Column; 10] = [
     ("joint", |it| text(it.joint)),
     ("up", |it| it.tree.as_ref().map(TreeShown::up)),
     ("depth", |it| text(it.tree.as_ref()?.depth)),
-    ("ports", |it| it.ports.as_ref().map(|ports| words(ports.iter().map(PortShown::leads_to)))),
+    ("ports", |it| it.ports.as_ref().map(|ports| space_separated(ports.iter().map(PortShown::leads_to)))),
     ("hash", |it| it.hash.clone()),
     ("skin", |it| it.skin.clone()),
     ("age", |it| Some(format!("{:.2}", it.age_s))),
@@ -62,7 +62,7 @@ fn text(value: Option<impl Display>) -> Option<String> {
 
 /// A bus with the cells that send on it.
 #[derive(Serialize)]
-pub(super) struct Shown<'a> {
+pub(super) struct CellList<'a> {
     bus: &'a str,
     kind: String,
     gateway_heard: bool,
@@ -74,11 +74,11 @@ pub(super) struct Shown<'a> {
     file: &'a str,
 }
 
-impl<'a> Shown<'a> {
+impl<'a> CellList<'a> {
     /// Collects the cells of the bus, compared with a skin.
-    pub(super) fn of(watch: &'a Watch, known: Option<&'a Known>) -> Self {
+    pub(super) fn of(watch: &'a CellWatch, known: Option<&'a DescribedBus>) -> Self {
         let (bus, listing, now) = (watch.bus(), watch.listing(), watch.now());
-        let missing = |known: &Known| {
+        let missing = |known: &DescribedBus| {
             let silent = known.cells.iter().filter(|(serial, _)| listing.number_of(**serial).is_none());
             silent.map(|(_, (cell, _))| cell.get()).collect()
         };
@@ -104,7 +104,7 @@ impl<'a> Shown<'a> {
 
     /// One line per cell, without empty columns.
     fn lines(&self, columns: impl IntoIterator<Item = Column>) -> String {
-        let (heads, lines) = filled(columns, &self.cells, "-");
+        let (heads, lines) = drop_empty_columns(columns, &self.cells, "-");
         let mut table = Table::new();
         table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
         table.set_header(&heads).add_rows(lines);
@@ -134,21 +134,21 @@ impl<'a> Shown<'a> {
         });
         let shared: Vec<_> = shared.collect();
         if !shared.is_empty() {
-            text += &format!("node ids that two cells use: {}\n", some(&shared));
+            text += &format!("node ids that two cells use: {}\n", abbreviated(&shared));
         }
         let missing: Vec<_> = self.missing.iter().flatten().map(u8::to_string).collect();
         if !missing.is_empty() {
-            text += &format!("cells of {} that are missing: {}\n", self.file, some(&missing));
+            text += &format!("cells of {} that are missing: {}\n", self.file, abbreviated(&missing));
         }
         text
     }
 }
 
-impl Known {
+impl DescribedBus {
     /// Selects one bus of a skin that comes from this file.
-    pub(super) fn of(skin: &Skin, bus: usize, file: String) -> Self {
+    pub(super) fn from_skin(skin: &Skin, bus: usize, file: String) -> Self {
         let format = skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format);
-        let cells = skin.cells_of(bus).map(|cell| (cell.serial, (cell.node, skin.parameters(cell).hash())));
+        let cells = skin.cells_on_bus(bus).map(|cell| (cell.serial, (cell.node, skin.parameters(cell).hash())));
         Self { file, format, cells: cells.collect() }
     }
 
@@ -197,8 +197,8 @@ struct CellShown {
     skin: Option<String>,
     sent: Option<u16>,
     refused: Option<u16>,
-    heard: Option<Heard>,
-    refused_by: Option<Refused>,
+    heard: Option<ReceivedCounts>,
+    refused_by: Option<RejectedCounts>,
     tree: Option<TreeShown>,
     ports: Option<Vec<PortShown>>,
     parent_changes: Option<u16>,
@@ -207,7 +207,7 @@ struct CellShown {
 }
 
 impl CellShown {
-    fn of(node: u8, cell: &Cell, known: Option<&Known>, now: Micros) -> Self {
+    fn of(node: u8, cell: &ListedCell, known: Option<&DescribedBus>, now: Micros) -> Self {
         let beat = cell.heartbeat.as_ref();
         let configured = beat.filter(|it| it.state.has(State::CONFIGURED));
         #[expect(clippy::cast_precision_loss, reason = "seconds, to the ms, which is what it is known to")]
@@ -217,7 +217,7 @@ impl CellShown {
             age_s,
             serial: beat.map(|it| it.serial),
             configured: beat.map(|_| configured.is_some()),
-            state: beat.map(|it| it.state.names().collect()),
+            state: beat.map(|it| it.state.flag_names().collect()),
             joint: configured.map(|it| it.state.joint()),
             version: beat.map(|it| it.state.version()),
             hash: configured.map(|it| format!("{:04X}", it.configuration)),
@@ -242,7 +242,7 @@ impl CellShown {
     fn state(&self) -> Option<String> {
         let bare = (self.configured == Some(false)).then_some(&"unconfigured");
         let others = self.state.as_ref()?.iter().filter(|name| **name != "configured");
-        let said = words(bare.into_iter().chain(others));
+        let said = space_separated(bare.into_iter().chain(others));
         Some(if said.is_empty() { "configured".to_owned() } else { said })
     }
 }
@@ -259,7 +259,7 @@ struct TreeShown {
 
 impl TreeShown {
     fn of(it: &Tree) -> Self {
-        let Tree { parent, depth, sent, taken, dropped, .. } = *it;
+        let Tree { parent, depth, sent, accepted: taken, dropped, .. } = *it;
         let depth = parent.map(|_| depth);
         Self { parent, depth, sums_sent: sent, sums_taken: taken, sums_dropped: dropped }
     }
@@ -285,7 +285,7 @@ struct PortShown {
 
 impl PortShown {
     fn of(it: &PortState) -> Self {
-        let PortState { number, port, hears, works, other_version } = *it;
+        let PortState { number, port, receives: hears, works, other_version } = *it;
         Self { node: hears.then_some(number), port: hears.then_some(port), works, other_version }
     }
 
@@ -308,10 +308,10 @@ mod tests {
     fn places_in_the_tree_are_words() {
         let up = |parent| TreeShown::of(&Tree { parent, ..Tree::default() }).up();
         assert_eq!([up(None), up(Some(0)), up(Some(12))], ["none", "gateway", "12"]);
-        let heard = PortState { number: 12, hears: true, ..PortState::default() };
+        let heard = PortState { number: 12, receives: true, ..PortState::default() };
         let works = PortState { works: true, ..heard };
         let other = PortState { other_version: true, ..works };
         let all = [PortState::default(), heard, works, other];
-        assert_eq!(words(all.map(|port| PortShown::of(&port).leads_to())), ". 12? 12 12!");
+        assert_eq!(space_separated(all.map(|port| PortShown::of(&port).leads_to())), ". 12? 12 12!");
     }
 }

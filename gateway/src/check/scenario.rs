@@ -9,11 +9,11 @@ use model::scenario::{
 };
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
-use protocol::usage::{Failure, shown};
+use protocol::usage::{Failure, printable};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-use crate::print::{count, decimals, json as pretty, list, or, table, words};
+use crate::print::{count, decimals, json as pretty, comma_separated, or_else_text, table, space_separated};
 
 /// Maximum number of listed values.
 const LISTED: usize = 8;
@@ -43,7 +43,7 @@ struct Plan {
     #[serde(skip_serializing_if = "Option::is_none")]
     touches_repeat_s: Option<f64>,
     seed: u64,
-    motion: Motion,
+    motion: PlannedMotion,
     events: Vec<Event>,
     /// Errors of the sensors.
     #[serde(skip_serializing_if = "Map::is_empty")]
@@ -53,7 +53,7 @@ struct Plan {
 }
 
 #[derive(Serialize)]
-struct Motion {
+struct PlannedMotion {
     kind: &'static str,
     /// Start position in the units of the joints.
     start: Vec<f64>,
@@ -120,7 +120,7 @@ impl Plan {
         events.sort_by(|a, b| a.at_s.total_cmp(&b.at_s));
         let units = skin.robot.joints.iter().map(|joint| joint.kind.unit()).collect();
         let motion =
-            Motion { kind: scenario.motion.kind.name(), start: each(&scenario.motion.start), units, how };
+            PlannedMotion { kind: scenario.motion.kind.name(), start: each(&scenario.motion.start), units, how };
         let (duration_s, seed) = (scenario.duration.seconds(), scenario.seed);
         let remarks = scenario.remarks(skin);
         let errors = errors(&scenario.sensors.force).into_iter().filter(|(_, error)| *error > 0.0);
@@ -150,18 +150,18 @@ impl Plan {
         let is_mixed = motion.units.iter().any(|unit| *unit != "rad");
         let start = if is_mixed {
             let each = motion.start.iter().zip(&motion.units).map(|(start, unit)| format!("{start} {unit}"));
-            list(each)
+            comma_separated(each)
         } else {
-            format!("{} rad", words(&motion.start))
+            format!("{} rad", space_separated(&motion.start))
         };
-        let (file, skin) = (shown(file), shown(skin));
+        let (file, skin) = (printable(file), printable(skin));
         let head = format!(
             "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start}{how}\n{}{}",
             count(events.len(), "event"),
-            or(touches_repeat_s.map(|period| format!("the touches repeat every {period} s\n")), ""),
+            or_else_text(touches_repeat_s.map(|period| format!("the touches repeat every {period} s\n")), ""),
             if sensors.is_empty() { String::new() } else { format!("sensors: {}\n", described(sensors)) }
         );
-        let remarks: String = remarks.iter().map(|remark| format!("remark: {}\n", shown(remark))).collect();
+        let remarks: String = remarks.iter().map(|remark| format!("remark: {}\n", printable(remark))).collect();
         if events.is_empty() {
             return head + "no touches and no faults\n" + &remarks;
         }
@@ -185,8 +185,8 @@ impl Event {
             decimals(Some(self.at_s), 3, ""),
             decimals(self.for_s, 3, ""),
             self.what.to_owned(),
-            or(self.bus.as_ref(), ""),
-            words(runs),
+            or_else_text(self.bus.as_ref(), ""),
+            space_separated(runs),
             described(&self.how),
         ]
     }
@@ -201,7 +201,7 @@ fn on_cells(
     cells: &[usize],
     how: &Map<String, Value>,
 ) -> Vec<Event> {
-    let of_bus = |(index, bus): (usize, &protocol::skin::Bus)| {
+    let of_bus = |(index, bus): (usize, &protocol::skin::SkinBus)| {
         let cells = cells.iter().filter_map(|&cell| skin.cells.get(cell)).filter(|cell| cell.bus == index);
         let cells: Vec<u8> = cells.map(|cell| cell.node.get()).collect();
         let bus = Some(bus.name.clone());
@@ -273,12 +273,12 @@ fn described(how: &Map<String, Value>) -> String {
             [first, second, .., last] if values.len() > LISTED => {
                 format!("{first} {second} ... {last} ({} in all)", values.len())
             }
-            few => words(few),
+            few => space_separated(few),
         },
         Value::Object(values) => format!("({})", described(values)),
         Value::Null | Value::Bool(_) | Value::Number(_) => value.to_string(),
     };
-    list(how.iter().map(|(key, it)| format!("{key} {}", words_of(it))))
+    comma_separated(how.iter().map(|(key, it)| format!("{key} {}", words_of(it))))
 }
 
 fn map<const N: usize>(pairs: [(&str, Value); N]) -> Map<String, Value> {

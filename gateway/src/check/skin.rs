@@ -6,12 +6,12 @@ use std::path::Path;
 
 use protocol::fixed::TorqueFormat;
 use protocol::packet::crc16;
-use protocol::skin::{Cell, CellName, ControllerKind, Reply, Skin};
-use protocol::usage::{Failure, shown};
+use protocol::skin::{Cell, CellName, ControllerKind, SkinReply, Skin};
+use protocol::usage::{Failure, printable};
 use serde_json::{Value, json};
 
 use crate::arguments::bus_names;
-use crate::print::{count, list, or, words};
+use crate::print::{count, comma_separated, or_else_text, space_separated};
 use crate::robot_file::{RobotOfSkin, urdf_of};
 
 /// Cells listed beside the summary.
@@ -42,7 +42,7 @@ pub(super) fn summary(
     if let Listed::Only(named) = listed
         && cells.is_empty()
     {
-        let (file, buses) = (file.display(), list(bus_names(skin)));
+        let (file, buses) = (file.display(), comma_separated(bus_names(skin)));
         return Err(Failure::usage(format!(
             "--cell {named}: {file} has no such cell on {buses}; --list lists all"
         )));
@@ -61,7 +61,7 @@ fn describe(skin: &Skin) -> String {
         ControllerKind::External { socket, .. } => format!("external controller at {socket}"),
     };
     let every = cells.first().map(|cell| format!(" (every {} us)", skin.parameters(cell).period_us));
-    let (name, robot_name) = (shown(name), shown(&robot.name));
+    let (name, robot_name) = (printable(name), printable(&robot.name));
     let mut text = format!(
         "{name}: {}, {}\nrobot: {}, {}\ntiming: control loop {} Hz, joints {} Hz{}, {controller}\n",
         count(cells.len(), "cell"),
@@ -70,40 +70,40 @@ fn describe(skin: &Skin) -> String {
         count(robot.joints.len(), "joint"),
         timing.control_hz,
         timing.broadcast_hz(),
-        or(every, ""),
+        or_else_text(every, ""),
     );
     for chain in
         robot.chains.iter().filter(|chain| robot.chains.len() > 1 || chain.rows.len() > chain.joints.len())
     {
         let names =
-            words(chain.joints.iter().filter_map(|joint| robot.joints.get(*joint)).map(|joint| &joint.name));
+            space_separated(chain.joints.iter().filter_map(|joint| robot.joints.get(*joint)).map(|joint| &joint.name));
         let (joints, rows) = (count(chain.joints.len(), "joint"), count(chain.rows.len(), "row"));
-        text += &format!("chain {}: {joints} in {rows}: {}\n", shown(&chain.name), shown(&names));
+        text += &format!("chain {}: {joints} in {rows}: {}\n", printable(&chain.name), printable(&names));
     }
     for (index, bus) in buses.iter().enumerate() {
         let format = bus.format.name();
         let reply = match bus.reply {
-            Reply::Torque => "torque".to_owned(),
-            Reply::Sum { slot_us, carry: true } => format!("sum, slots of {slot_us} us"),
-            Reply::Sum { slot_us, carry: false } => format!("sum without carry, slots of {slot_us} us"),
+            SkinReply::Torque => "torque".to_owned(),
+            SkinReply::Sum { slot_us, carry: true } => format!("sum, slots of {slot_us} us"),
+            SkinReply::Sum { slot_us, carry: false } => format!("sum without carry, slots of {slot_us} us"),
         };
         let mut by_joint = BTreeMap::<_, usize>::new();
-        for cell in skin.cells_of(index) {
+        for cell in skin.cells_on_bus(index) {
             *by_joint.entry(cell.joint).or_default() += 1;
         }
         let cells = count(by_joint.values().sum::<usize>(), "cell");
-        let parts = list(by_joint.iter().map(|(joint, cells)| format!("{cells} on joint {joint}")));
-        let roots: Vec<_> = skin.cells_of(index).filter(|cell| cell.root).map(|cell| cell.node).collect();
+        let parts = comma_separated(by_joint.iter().map(|(joint, cells)| format!("{cells} on joint {joint}")));
+        let roots: Vec<_> = skin.cells_on_bus(index).filter(|cell| cell.root).map(|cell| cell.node).collect();
         let roots = match roots.as_slice() {
             [] => "no root".to_owned(),
             [root] => format!("root {root}"),
-            roots => format!("roots {}", words(roots)),
+            roots => format!("roots {}", space_separated(roots)),
         };
         let rates = bus.bitrate.map(|nominal| match bus.data_bitrate {
             Some(data) => format!(", {nominal} and {data} bit/s"),
             None => format!(", {nominal} bit/s"),
         });
-        let rates = or(rates, "");
+        let rates = or_else_text(rates, "");
         let chain = if robot.chains.len() > 1 {
             format!(", chain {}", skin.chain(index).name)
         } else {
@@ -153,11 +153,11 @@ fn bus_name<'a>(skin: &'a Skin, cell: &Cell) -> &'a str {
 fn line(skin: &Skin, cell: &Cell) -> String {
     let on_bus = bus_name(skin, cell);
     let Cell { node, serial, joint, row, position, normal, neighbors, root, .. } = cell;
-    let (position, ports) = (words(position), words(neighbors.map(|port| or(port, "-"))));
-    let normal = words(rounded(normal));
+    let (position, ports) = (space_separated(position), space_separated(neighbors.map(|port| or_else_text(port, "-"))));
+    let normal = space_separated(rounded(normal));
     let root = if *root { " root" } else { "" };
     let row = Some(*row).filter(|row| skin.chain(cell.bus).row_of(*joint) != Some(*row));
-    let row = or(row.map(|row| format!(" row {row}")), "");
+    let row = or_else_text(row.map(|row| format!(" row {row}")), "");
     let hash = skin.parameters(cell).hash();
     format!(
         "{on_bus} {node} joint {joint}{row} at {position} m normal {normal} ports {ports}{root} serial {serial} hash {hash:04X}\n"
@@ -178,14 +178,14 @@ fn hash(skin: &Skin) -> u16 {
 /// The skin as JSON.
 fn values(file: &Path, skin: &Skin, cells: &[&Cell]) -> Value {
     let buses = skin.buses.iter().enumerate().map(|(index, bus)| {
-        let roots = skin.cells_of(index).filter(|cell| cell.root).map(|cell| cell.node.get());
+        let roots = skin.cells_on_bus(index).filter(|cell| cell.root).map(|cell| cell.node.get());
         json!({
             "name": bus.name,
             "format": bus.format.name(),
-            "reply": if bus.reply == Reply::Torque { "torque" } else { "sum" },
+            "reply": if bus.reply == SkinReply::Torque { "torque" } else { "sum" },
             "bitrate": bus.bitrate,
             "data_bitrate": bus.data_bitrate,
-            "cells": skin.cells_of(index).count(),
+            "cells": skin.cells_on_bus(index).count(),
             "roots": roots.collect::<Vec<_>>(),
         })
     });

@@ -2,20 +2,20 @@
 
 use std::collections::BTreeMap;
 
-use bench::commission::Done;
+use bench::commission::CommissionedBus;
 use model::commission::{CellReport, Outcome, Report, UnknownNode};
 use protocol::id::CellId;
 use protocol::usage::Failure;
 use serde::Serialize;
 
-use crate::print::{Rows, count, some};
+use crate::print::{KeyValueTable, count, abbreviated};
 
 /// Maximum number of cells with other node ids that get a line each.
 const LINES: usize = 8;
 
 /// The whole result.
 #[derive(Debug, Serialize)]
-pub(super) struct Whole<'a> {
+pub(super) struct CommissionResult<'a> {
     pub(super) skin: &'a str,
     #[serde(skip)]
     pub(super) file: &'a str,
@@ -45,7 +45,7 @@ pub(super) struct BusShown<'a> {
 }
 
 impl<'a> BusShown<'a> {
-    pub(super) fn of(Done { name, kind, report, failure, dropped }: &'a Done) -> Self {
+    pub(super) fn of(CommissionedBus { name, kind, report, failure, dropped }: &'a CommissionedBus) -> Self {
         let Report { cells, unknown_nodes, requests, repeated, trouble: _ } = report;
         let count = |is: fn(&Outcome) -> bool| cells.iter().filter(|cell| is(&cell.outcome)).count();
         Self {
@@ -70,7 +70,7 @@ impl<'a> BusShown<'a> {
         self.cells.iter().filter_map(|it| Some((it.number.filter(|&node| node != it.described)?, it)))
     }
 
-    fn rows(&self, rows: &mut Rows) {
+    fn rows(&self, rows: &mut KeyValueTable) {
         let cells = format!("{} described", count(self.cells.len(), "cell"));
         let others = match self.unknown_nodes.len() {
             0 => String::new(),
@@ -92,7 +92,7 @@ impl<'a> BusShown<'a> {
             }
         }
         for (why, cells) in reasons {
-            rows.row(format!("  {}", some(&cells)), why, "");
+            rows.row(format!("  {}", abbreviated(&cells)), why, "");
         }
         if let Some(failure) = &self.failure {
             rows.row("ended", failure, "");
@@ -104,7 +104,7 @@ impl<'a> BusShown<'a> {
     }
 }
 
-impl Whole<'_> {
+impl CommissionResult<'_> {
     /// Notes beside the table.
     pub(super) fn notes(&self, has_copy: bool) -> Vec<String> {
         let file = self.file;
@@ -121,7 +121,7 @@ impl Whole<'_> {
                 }
             }
             if !unknown_nodes.is_empty() {
-                let unknown_nodes = some(&unknown_nodes);
+                let unknown_nodes = abbreviated(&unknown_nodes);
                 notes.push(format!("cells on {name} that {file} does not have, left alone: {unknown_nodes}"));
             }
             notes.extend(elsewhere);
@@ -146,13 +146,13 @@ impl Whole<'_> {
             (false, true) => "dry run, nothing was written",
             (false, false) => "done",
         };
-        let mut rows = Rows::new(self.skin, format!("{cells} cells, {:.1} s, {ended}", self.seconds), "");
+        let mut rows = KeyValueTable::new(self.skin, format!("{cells} cells, {:.1} s, {ended}", self.seconds), "");
         self.buses.iter().for_each(|bus| bus.rows(&mut rows));
         rows.text()
     }
 
     /// Result of the program, after all output.
-    pub(super) fn end(&self) -> Result<(), Failure> {
+    pub(super) fn outcome(&self) -> Result<(), Failure> {
         let sum = |part: fn(&BusShown<'_>) -> usize| self.buses.iter().map(part).sum::<usize>();
         let (cells, failed) = (sum(|bus| bus.cells.len()), sum(|bus| bus.failed));
         let are = if failed == 1 { "is" } else { "are" };

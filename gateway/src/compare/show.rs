@@ -4,12 +4,12 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use analysis::compare::{ASPECTS, Both, CellRow, First, Replies, Report, Source, Which};
+use analysis::compare::{ASPECTS, Both, CellRow, FirstDifference, Replies, Report, Source, CaptureSide};
 use model::quantiles::Quantiles;
-use protocol::usage::shown;
+use protocol::usage::printable;
 
 use crate::junit::{Case, Outcome, Suite};
-use crate::print::{count, decimals, list, or, some, table};
+use crate::print::{count, decimals, comma_separated, or_else_text, abbreviated, table};
 
 /// Width of the tables in columns.
 const WIDTH: u16 = 80;
@@ -18,7 +18,7 @@ const CELLS: usize = 8;
 
 /// Names of a capture.
 #[derive(Debug)]
-pub(super) struct About<'a> {
+pub(super) struct CaptureNames<'a> {
     pub(super) name: &'a str,
     pub(super) format: &'static str,
     pub(super) files: &'a [PathBuf],
@@ -26,19 +26,19 @@ pub(super) struct About<'a> {
 
 /// Result of a comparison with its inputs.
 #[derive(Debug)]
-pub(super) struct Shown<'a> {
-    pub(super) inputs: Both<About<'a>>,
+pub(super) struct ComparisonText<'a> {
+    pub(super) inputs: Both<CaptureNames<'a>>,
     /// File of the option `--skin`.
     pub(super) skin: Option<&'a Path>,
     pub(super) report: &'a Report,
 }
 
-impl Shown<'_> {
+impl ComparisonText<'_> {
     /// Formats the verdict, the tables and the first difference.
     pub(super) fn text(&self) -> String {
         let mut text = format!("{}\n", self.verdict());
         for (letter, about) in [("A", &self.inputs.a), ("B", &self.inputs.b)] {
-            let _ = writeln!(text, "{letter}  {} ({})", shown(about.name), about.format);
+            let _ = writeln!(text, "{letter}  {} ({})", printable(about.name), about.format);
         }
         text += &self.table();
         text += &self.cells();
@@ -62,7 +62,7 @@ impl Shown<'_> {
                     .filter(|(count, _)| *count > 0)
                     .map(|(number, name)| count(number, name)),
             );
-            return format!("equal{within}: {}", list(all));
+            return format!("equal{within}: {}", comma_separated(all));
         }
         if epochs.compared == 0 {
             return "different: no epoch is in both".to_owned();
@@ -72,7 +72,7 @@ impl Shown<'_> {
             let time = time.map_or_else(String::new, |time| format!(" ({time:.3} s)"));
             format!("; first at epoch {}{time}", first.epoch)
         });
-        format!("different: {}{}", list(&self.report.differs), or(at, ""))
+        format!("different: {}{}", comma_separated(&self.report.differs), or_else_text(at, ""))
     }
 
     fn table(&self) -> String {
@@ -102,7 +102,7 @@ impl Shown<'_> {
             max_steps: joints.max_steps,
             ..Replies::default()
         };
-        row("joints", none(), none(), said(&only_joints));
+        row("joints", none(), none(), replies_text(&only_joints));
         let touched = [contacts.only.only_a, contacts.only.only_b].map(|only| contacts.both + only);
         let [in_a, in_b] = touched.map(|touched| touched.to_string());
         row("touched, cells x epochs", in_a, in_b, format!("{} in both", contacts.both));
@@ -112,7 +112,7 @@ impl Shown<'_> {
             if a + b == 0 {
                 continue;
             }
-            row(name, a.to_string(), b.to_string(), said(replies));
+            row(name, a.to_string(), b.to_string(), replies_text(replies));
             if replies.missing() > 0 {
                 let [a, b] = [replies.missing_in_a, replies.missing_in_b].map(|it| it.to_string());
                 row("  missing", a, b, "the other has them".to_owned());
@@ -170,25 +170,25 @@ impl Shown<'_> {
             let cells = self.report.extra_cells.iter().filter(|cell| cell.only_in == only_in);
             let names: Vec<_> = cells.map(|cell| format!("{}:{}", cell.bus, cell.node)).collect();
             if !names.is_empty() {
-                let _ = writeln!(text, "only {letter} has {}", shown(&some(&names)));
+                let _ = writeln!(text, "only {letter} has {}", printable(&abbreviated(&names)));
             }
         }
         text
     }
 
     /// Describes the first difference, and names commands that show more.
-    fn first(&self, first: &First) -> String {
-        let First { what, bus, epoch, number, time_s, words, values, .. } = first;
+    fn first(&self, first: &FirstDifference) -> String {
+        let FirstDifference { what, bus, epoch, number, time_s, words, values, .. } = first;
         let cell = first.cell.map_or_else(String::new, |cell| format!(" of cell {cell}"));
         let joint = first.joint.map_or_else(String::new, |joint| format!(", joint {joint}"));
         let mut text = format!(
             "the first difference: {what}{cell} on {}{joint}, epoch {epoch} (number {number})\n",
-            shown(bus)
+            printable(bus)
         );
-        for (letter, which) in [("A", Which::A), ("B", Which::B)] {
+        for (letter, which) in [("A", CaptureSide::A), ("B", CaptureSide::B)] {
             let is_missing = first.how == format!("missing in {}", letter.to_lowercase());
             let unit = first.unit.unwrap_or_default();
-            let has = match (words.of(which), values.of(which)) {
+            let has = match (words.get(which), values.get(which)) {
                 (Some(word), Some(value)) => format!("word {word}, {value:.4} {unit}"),
                 _ if is_missing => "nothing".to_owned(),
                 _ => match *what {
@@ -198,7 +198,7 @@ impl Shown<'_> {
                     _ => "joints".to_owned(),
                 },
             };
-            let time = time_s.of(which).map_or_else(String::new, |time| format!("{time:.3} s  "));
+            let time = time_s.get(which).map_or_else(String::new, |time| format!("{time:.3} s  "));
             let _ = writeln!(text, "  {letter}  {time}{has}");
         }
         if let Some(steps) = first.steps {
@@ -207,10 +207,10 @@ impl Shown<'_> {
         if first.cell.is_some() && *what != "contact" {
             let inputs = match (first.inputs.as_slice(), first.unknown_inputs.as_slice()) {
                 ([], []) => "the inputs are the same: joints, halt, stimulus, configuration".to_owned(),
-                ([], unknown) => format!("no input is known to differ; not known: {}", list(unknown)),
-                (inputs, []) => format!("other inputs: {}", list(inputs)),
+                ([], unknown) => format!("no input is known to differ; not known: {}", comma_separated(unknown)),
+                (inputs, []) => format!("other inputs: {}", comma_separated(inputs)),
                 (inputs, unknown) => {
-                    format!("other inputs: {}; not known: {}", list(inputs), list(unknown))
+                    format!("other inputs: {}; not known: {}", comma_separated(inputs), comma_separated(unknown))
                 }
             };
             let _ = writeln!(text, "  {inputs}");
@@ -218,7 +218,7 @@ impl Shown<'_> {
         if let Some(hint) = self.tolerance(first) {
             let _ = writeln!(text, "  {hint}");
         }
-        for which in [Which::A, Which::B] {
+        for which in [CaptureSide::A, CaptureSide::B] {
             if let Some(line) = self.explain(first, which) {
                 let _ = writeln!(text, "  {line}");
             }
@@ -227,7 +227,7 @@ impl Shown<'_> {
     }
 
     /// Options that accept such a difference.
-    fn tolerance(&self, first: &First) -> Option<&'static str> {
+    fn tolerance(&self, first: &FirstDifference) -> Option<&'static str> {
         match (first.what, first.steps) {
             ("joints", Some(_)) => Some(
                 "a motion depends on when ticks ran: kind = \"hold\" has none, --joints-tolerance and --tolerance allow steps",
@@ -240,20 +240,20 @@ impl Shown<'_> {
     }
 
     /// Command that shows more about some joints.
-    fn explain(&self, first: &First, which: Which) -> Option<String> {
-        let occurrence = (*first.occurrence.of(which))?;
-        let about = self.inputs.of(which);
-        let names = about.files.iter().map(|file| shown(&file.display().to_string()).into_owned());
+    fn explain(&self, first: &FirstDifference, which: CaptureSide) -> Option<String> {
+        let occurrence = (*first.occurrence.get(which))?;
+        let about = self.inputs.get(which);
+        let names = about.files.iter().map(|file| printable(&file.display().to_string()).into_owned());
         let mut line =
             format!("skinbus explain {} --epoch {}", names.collect::<Vec<_>>().join(" "), first.epoch);
         if occurrence > 1 {
             let _ = write!(line, " --occurrence {occurrence}");
         }
         if let Some(cell) = first.cell {
-            let _ = write!(line, " --cell {}:{cell}", shown(&first.bus));
+            let _ = write!(line, " --cell {}:{cell}", printable(&first.bus));
         }
         match self.skin {
-            Some(skin) => _ = write!(line, " --skin {}", shown(&skin.display().to_string())),
+            Some(skin) => _ = write!(line, " --skin {}", printable(&skin.display().to_string())),
             None if about.format != "MCAP" => line += " --skin SKIN",
             None => {}
         }
@@ -290,14 +290,14 @@ impl Shown<'_> {
             "cells" => count(extra_cells.len(), "extra cell"),
             _ => {
                 let replies = if aspect == "sums" { sums } else { torques };
-                format!("{}, {}", said(replies), missing(replies.missing_in_a, replies.missing_in_b))
+                format!("{}, {}", replies_text(replies), missing(replies.missing_in_a, replies.missing_in_b))
             }
         }
     }
 }
 
 /// Counts of equal and different replies.
-fn said(replies: &Replies) -> String {
+fn replies_text(replies: &Replies) -> String {
     let Replies { equal, tolerated, different, open, max_steps, .. } = *replies;
     let mut all = vec![format!("{equal} equal")];
     for (count, what) in [(tolerated, "tolerated"), (different, "different"), (open, "open")] {
@@ -308,5 +308,5 @@ fn said(replies: &Replies) -> String {
     if max_steps > 0 {
         all.push(format!("max {max_steps} off"));
     }
-    list(all)
+    comma_separated(all)
 }

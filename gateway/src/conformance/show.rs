@@ -3,18 +3,18 @@
 use std::fmt::Write;
 use std::time::Duration;
 
-use conformance::Saved;
-use conformance::bus::Stop;
+use conformance::SavedCell;
+use conformance::bus::StopReason;
 use conformance::findings::{Finding, Verdict};
 use protocol::can::Format;
 use serde::Serialize;
 
 use crate::junit::{Case, Outcome, Suite};
-use crate::print::{count, list, readable, table};
+use crate::print::{count, comma_separated, readable, table};
 
 /// The printed result.
 #[derive(Debug, Serialize)]
-pub(super) struct Whole {
+pub(super) struct ConformanceResult {
     bus: String,
     node: u8,
     serial: u32,
@@ -29,13 +29,13 @@ pub(super) struct Whole {
     requirements: Vec<Finding>,
 }
 
-impl Whole {
+impl ConformanceResult {
     pub(super) fn new(
-        saved: &Saved,
+        saved: &SavedCell,
         format: Format,
         took: Duration,
         requirements: Vec<Finding>,
-        stopped: Option<&Stop>,
+        stopped: Option<&StopReason>,
     ) -> Self {
         let count = |is: fn(&Verdict) -> bool| requirements.iter().filter(|it| is(&it.verdict)).count();
         Self {
@@ -60,7 +60,7 @@ impl Whole {
     /// Formats one line per requirement, the frames of failures, and the requirements that were not tested.
     pub(super) fn text(&self) -> String {
         let rows = self.requirements.iter().map(|it| {
-            let (verdict, more) = said(&it.verdict);
+            let (verdict, more) = verdict_text(&it.verdict);
             let title = it.requirement.title;
             let about = if more.is_empty() { title.to_owned() } else { format!("{title}: {more}") };
             vec![it.requirement.id.to_owned(), verdict.to_owned(), about]
@@ -76,7 +76,7 @@ impl Whole {
             }
         }
         let untested = self.requirements.iter().filter(|it| matches!(it.verdict, Verdict::NotTested { .. }));
-        let ids = list(untested.map(|it| it.requirement.id));
+        let ids = comma_separated(untested.map(|it| it.requirement.id));
         let _ = write!(
             text,
             "\ncell {} on {} ({}, serial number {}), {:.1} s: {} passed, {} failed, {} not applicable, {} not tested{}\n",
@@ -124,7 +124,7 @@ impl Whole {
 }
 
 /// The verdict in words, and further details.
-fn said(verdict: &Verdict) -> (&'static str, String) {
+fn verdict_text(verdict: &Verdict) -> (&'static str, String) {
     match verdict {
         Verdict::Passed { checks, but } => {
             let but = but.as_ref().map_or_else(String::new, |but| format!("; not tested: {but}"));

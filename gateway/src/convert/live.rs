@@ -15,16 +15,16 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use trace::capture::convert::{Origin, Output, Target};
-use trace::capture::log::{Style, Wrote};
-use trace::capture::{Entry, Format};
+use trace::capture::convert::{Origin, CaptureWriter, EntrySink};
+use trace::capture::log::{Style, WriteOutcome};
+use trace::capture::{Entry, CaptureFormat};
 use trace::files::LogFile;
-use trace::recording::names::{self, Part};
+use trace::recording::names::{self, PartFile};
 
 /// Time after which written entries are in the file.
 const KEEP_INTERVAL: Duration = Duration::from_millis(50);
 /// Number of bytes written to a recording at once.
-const PIECE: usize = 64 << 10;
+const WRITE_BYTES: usize = 64 << 10;
 /// Stack size of the writing thread, which calls no deep functions.
 const STACK: usize = 256 << 10;
 
@@ -53,7 +53,7 @@ impl Write for Grown {
 
 /// An output and its state since the last flush.
 struct State {
-    output: Output<Grown>,
+    output: CaptureWriter<Grown>,
     /// Set by each write, cleared when everything is in the file.
     is_dirty: bool,
     /// Error of the writing thread, kept for the next call.
@@ -83,7 +83,7 @@ impl Meeting {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         while let Some(State { output, is_dirty, failed, is_over: false }) = state.as_mut() {
             if std::mem::take(is_dirty) && failed.is_none() {
-                *failed = output.keep().err();
+                *failed = output.flush_all().err();
             }
             let waited = self.over.wait_timeout(state, KEEP_INTERVAL);
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
@@ -92,32 +92,32 @@ impl Meeting {
 }
 
 /// A capture that grows.
-pub(super) struct Live {
+pub(super) struct GrowingCapture {
     meeting: Arc<Meeting>,
     keeper: Option<JoinHandle<()>>,
     path: PathBuf,
     force: bool,
     /// Name and file of a recording while it grows.
-    part: Option<(Part, File)>,
+    part: Option<(PartFile, File)>,
 }
 
-impl Live {
+impl GrowingCapture {
     /// Creates the file and starts the writing thread.
     pub(super) fn create(
         path: &Path,
         force: bool,
-        (format, style, of_log): (Format, Style, bool),
+        (format, style, of_log): (CaptureFormat, Style, bool),
         stopped: &AtomicBool,
     ) -> io::Result<Self> {
         let (output, part) = match format {
-            Format::Candump => {
-                (Output::new(Grown::Log(LogFile::create(path, force, stopped)?), format, style)?, None)
+            CaptureFormat::Candump => {
+                (CaptureWriter::new(Grown::Log(LogFile::create(path, force, stopped)?), format, style)?, None)
             }
-            Format::Mcap => {
-                let (part, mut file) = Part::create(path.to_owned())?;
+            CaptureFormat::Mcap => {
+                let (part, mut file) = PartFile::create(path.to_owned())?;
                 let begun = file.rewind().and_then(|()| {
-                    let out = Grown::Part(BufWriter::with_capacity(PIECE, file.try_clone()?));
-                    Output::recording(out, Origin { of_log, file: Some(&file.metadata()?) })
+                    let out = Grown::Part(BufWriter::with_capacity(WRITE_BYTES, file.try_clone()?));
+                    CaptureWriter::recording(out, Origin { of_log, file: Some(&file.metadata()?) })
                 });
                 (begun.inspect_err(|_| part.remove())?, Some((part, file)))
             }
@@ -158,7 +158,7 @@ impl Live {
     /// Closes the file unfinished; it keeps the entries written so far.
     pub(super) fn close(mut self) {
         // The reason of the end has been reported already.
-        let _ = self.end(|state| state.output.keep());
+        let _ = self.end(|state| state.output.flush_all());
     }
 
     /// Removes the file.
@@ -189,16 +189,16 @@ impl Live {
     }
 }
 
-impl Target for Live {
-    fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote> {
+impl EntrySink for GrowingCapture {
+    fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome> {
         self.meeting.with(|state| {
             state.is_dirty = true;
             state.output.write(entry)
         })
     }
 
-    fn pass_on(&mut self) -> io::Result<()> {
-        self.meeting.with(|state| state.output.pass_on())
+    fn flush_lines(&mut self) -> io::Result<()> {
+        self.meeting.with(|state| state.output.flush_lines())
     }
 }
 

@@ -5,11 +5,11 @@ use std::path::Path;
 
 use analysis::explain::series::{EpochTorque, SeriesError, each_epoch, is_summed};
 use csv::{Writer, WriterBuilder};
-use protocol::skin::{Reply, Skin};
+use protocol::skin::{SkinReply, Skin};
 use trace::capture::{Reader, seconds_since};
 
-use crate::input::Missing;
-use crate::print::list;
+use crate::input::LossCounts;
+use crate::print::comma_separated;
 
 /// Returns true for the name of a CSV file.
 pub(super) fn is_csv(path: &Path) -> bool {
@@ -21,12 +21,12 @@ pub(super) fn write(
     reader: &mut Reader,
     skin: &Skin,
     out: impl Write,
-) -> Result<(u64, Missing), SeriesError<csv::Error>> {
+) -> Result<(u64, LossCounts), SeriesError<csv::Error>> {
     let summed = (0..skin.robot.joints.len()).map(|joint| is_summed(skin, joint)).collect();
     let mut rows = Rows { summed, out: WriterBuilder::new().from_writer(out) };
     rows.out.write_record(header(skin)).map_err(SeriesError::Taken)?;
-    let mut missing = Missing::default();
-    let done = each_epoch(reader, skin, |note| missing.take(note), |first, epoch| rows.write(first, epoch));
+    let mut missing = LossCounts::default();
+    let done = each_epoch(reader, skin, |note| missing.count(note), |first, epoch| rows.write(first, epoch));
     let epochs = done?.epochs;
     rows.out.flush().map_err(|error| SeriesError::Taken(error.into()))?;
     Ok((epochs, missing))
@@ -35,9 +35,9 @@ pub(super) fn write(
 /// Names of the buses whose cells answer with sums, which do not contain the torques of single cells; `None` without
 /// such buses.
 pub(super) fn summed(skin: &Skin) -> Option<String> {
-    let summed = skin.buses.iter().filter(|bus| bus.reply != Reply::Torque).map(|bus| bus.name.clone());
+    let summed = skin.buses.iter().filter(|bus| bus.reply != SkinReply::Torque).map(|bus| bus.name.clone());
     let summed: Vec<_> = summed.collect();
-    (!summed.is_empty()).then(|| list(summed))
+    (!summed.is_empty()).then(|| comma_separated(summed))
 }
 
 /// Column names with units.

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use analysis::explain::another_robot;
 use analysis::stats::{Report, Stats};
-use model::decode::pick::Pick;
+use model::decode::pick::FrameFilter;
 use model::decode::settle::Settler;
 use model::decode::{Decoded, json};
 use protocol::can::{Format, Frame};
@@ -17,10 +17,10 @@ use protocol::message::Message;
 use protocol::schema::Units;
 use protocol::skin::Skin;
 use protocol::time::Micros;
-use protocol::usage::shown;
+use protocol::usage::printable;
 
 use crate::output::note;
-use crate::print::{GREEN, PLAIN, RED, YELLOW, harmless, list};
+use crate::print::{GREEN, PLAIN, RED, YELLOW, harmless, comma_separated};
 
 /// Colours of a terminal.
 const DIM: &str = "\x1b[2m";
@@ -29,7 +29,7 @@ const CYAN: &str = "\x1b[36m";
 
 /// Output style of frames.
 #[derive(Debug)]
-pub(super) enum How {
+pub(super) enum OutputStyle {
     /// One line per frame, with or without colours.
     Lines { colour: bool },
     /// One line per frame without the raw frame: time since the first frame, bus, and decoded frame.
@@ -50,7 +50,7 @@ struct Waiting {
 }
 
 /// Decodes, filters and shows frames.
-pub(super) struct Show<W> {
+pub(super) struct FrameOutput<W> {
     out: W,
     settler: Settler<Waiting>,
     /// Bus of the last frame, with its units.
@@ -58,10 +58,10 @@ pub(super) struct Show<W> {
     units: Units,
     /// Buses that a skin describes, with their units and the numbers of their chains' joints.
     described: Vec<(String, Units, usize)>,
-    pick: Pick,
+    pick: FrameFilter,
     /// True to show only traffic of touches.
     contact: bool,
-    how: How,
+    how: OutputStyle,
     /// Number of frames that may still be shown.
     left: u64,
     /// Buses named by the filters from which no frame has come.
@@ -71,8 +71,8 @@ pub(super) struct Show<W> {
     raw: String,
 }
 
-impl<W: Write> Show<W> {
-    pub(super) fn new(out: W, format: Option<Format>, pick: Pick, contact: bool, how: How, max: u64) -> Self {
+impl<W: Write> FrameOutput<W> {
+    pub(super) fn new(out: W, format: Option<Format>, pick: FrameFilter, contact: bool, how: OutputStyle, max: u64) -> Self {
         let absent = pick.bus_names().map(str::to_owned).collect();
         Self {
             out,
@@ -99,7 +99,7 @@ impl<W: Write> Show<W> {
     pub(super) fn describe(&mut self, skin: &Skin) {
         let buses = skin.buses.iter().enumerate();
         let described =
-            buses.map(|(index, bus)| (bus.name.clone(), Units::of(skin, index), skin.joints_of(index).len()));
+            buses.map(|(index, bus)| (bus.name.clone(), Units::for_bus(skin, index), skin.joints_on_bus(index).len()));
         self.described = described.collect();
     }
 
@@ -149,7 +149,7 @@ impl<W: Write> Show<W> {
 
     /// Names of the buses that the options name and from which no frame came.
     pub(super) fn absent_buses(&self) -> Option<String> {
-        (!self.absent.is_empty() && self.left > 0).then(|| list(&self.absent))
+        (!self.absent.is_empty() && self.left > 0).then(|| comma_separated(&self.absent))
     }
 
     /// Returns true if no further frames are to be shown.
@@ -182,12 +182,12 @@ impl<W: Write> Show<W> {
             return Ok(());
         }
         let said = decoded.in_units(units);
-        let interface = &shown(record.interface);
+        let interface = &printable(record.interface);
         match &mut self.how {
-            How::Stats(stats) => stats.take(record, decoded),
-            How::Json => {
+            OutputStyle::Stats(stats) => stats.record(record, decoded),
+            OutputStyle::Json => {
                 // The bus name is the only free text in the line.
-                if let Cow::Borrowed(_) = shown(record.interface) {
+                if let Cow::Borrowed(_) = printable(record.interface) {
                     json::write(&mut self.out, record, decoded, units)?;
                 } else {
                     let mut line = Vec::new();
@@ -195,14 +195,14 @@ impl<W: Write> Show<W> {
                     self.out.write_all(harmless(String::from_utf8_lossy(&line).into_owned()).as_bytes())?;
                 }
             }
-            How::Brief { colour } => {
+            OutputStyle::Brief { colour } => {
                 // Times before the loop's start, or of a capture whose times run backwards, are negative.
                 let (sign, since) = if nanos < zero { ("-", zero - nanos) } else { ("", nanos - zero) };
                 let (seconds, micros) = (since / 1_000_000_000, since / 1_000 % 1_000_000);
                 let (dim, of, plain) = if *colour { (DIM, of(decoded), PLAIN) } else { ("", "", "") };
                 writeln!(self.out, "{dim}{sign}{seconds}.{micros:06} {interface}{plain} {of}{said}{plain}")?;
             }
-            How::Lines { colour } => {
+            OutputStyle::Lines { colour } => {
                 self.raw.clear();
                 let way = match record.direction {
                     None => "",
@@ -226,14 +226,14 @@ impl<W: Write> Show<W> {
 
     /// Counts frames that were lost before this point.
     pub(super) fn dropped(&mut self, bus: &str, frames: u64) {
-        if let How::Stats(stats) = &mut self.how {
+        if let OutputStyle::Stats(stats) = &mut self.how {
             stats.dropped(bus, frames);
         }
     }
 
     /// Notes that the frames have no valid times.
     pub(super) const fn without_times(&mut self) {
-        if let How::Stats(stats) = &mut self.how {
+        if let OutputStyle::Stats(stats) = &mut self.how {
             stats.without_times();
         }
     }
@@ -245,8 +245,8 @@ impl<W: Write> Show<W> {
     /// Returns the statistics, if they are collected.
     pub(super) fn report(&self) -> Option<Report> {
         match &self.how {
-            How::Stats(stats) => Some(stats.report()),
-            How::Lines { .. } | How::Brief { .. } | How::Json => None,
+            OutputStyle::Stats(stats) => Some(stats.report()),
+            OutputStyle::Lines { .. } | OutputStyle::Brief { .. } | OutputStyle::Json => None,
         }
     }
 }
@@ -273,9 +273,9 @@ mod tests {
     use protocol::candump;
 
     /// Output for one frame on this bus.
-    fn line(bus: &str, how: How) -> String {
-        let pick = Pick::default();
-        let mut show = Show::new(Vec::new(), None, pick, false, how, 1);
+    fn line(bus: &str, how: OutputStyle) -> String {
+        let pick = FrameFilter::default();
+        let mut show = FrameOutput::new(Vec::new(), None, pick, false, how, 1);
         let frame = candump::parse_frame("123#00").unwrap();
         let time = Timestamp::six_digits(1_000_000_000);
         show.frame(&Record { time, interface: bus, frame, direction: None }).unwrap();
@@ -286,15 +286,15 @@ mod tests {
     #[test]
     fn the_name_of_a_bus_makes_no_line_and_no_column_and_no_terminal_obeys_it() {
         let forged = "can0 1#\tok\n(2.000000) can1";
-        for how in [How::Lines { colour: false }, How::Brief { colour: false }] {
+        for how in [OutputStyle::Lines { colour: false }, OutputStyle::Brief { colour: false }] {
             let said = line(forged, how);
             assert_eq!(said.matches('\n').count(), 1, "{said}");
             assert!(said.contains(r"can0 1#\u{9}ok\u{a}(2.000000) can1"), "{said}");
         }
         let escapes = "can\x1b[2J\u{9b}\0\r\u{202e}";
-        let said = line(escapes, How::Lines { colour: false });
+        let said = line(escapes, OutputStyle::Lines { colour: false });
         assert!(said.starts_with("(1.000000) can\\u{1b}[2J\\u{9b}\\u{0}\\u{d}\\u{202e} 123#00\t"), "{said}");
-        let said = line(escapes, How::Json);
+        let said = line(escapes, OutputStyle::Json);
         assert!(said.contains(r#""bus":"can\u001b[2J\u009b\u0000\r\u202e""#), "{said}");
     }
 }

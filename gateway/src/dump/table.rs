@@ -5,15 +5,15 @@ use std::collections::BTreeMap;
 use analysis::stats::{BusReport, CellReport, Epochs, ForeignFrames, ForeignId, FrameType, Report};
 use comfy_table::Table;
 use model::decode::error_classes;
-use protocol::usage::shown;
-use trace::capture::{Extras, Topic};
+use protocol::usage::printable;
+use trace::capture::{RecordingExtras, Topic};
 
-use crate::print::{self, Rows, decimals, filled, list, or, words};
+use crate::print::{self, KeyValueTable, decimals, drop_empty_columns, comma_separated, or_else_text, space_separated};
 
 /// Formats the whole report: the capture, each bus, and each bus's cells.
-pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extras>) -> String {
+pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&RecordingExtras>) -> String {
     let head = format!("{what}, {:.3} s", report.duration_s);
-    let mut rows = Rows::new(name, head, print::count(report.frames, "frame"));
+    let mut rows = KeyValueTable::new(name, head, print::count(report.frames, "frame"));
     rows.any("frames before the one before them", report.times_backwards, "times run backwards");
     rows.any("frames missing", report.dropped, "lost by the recorder");
     rows.any("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
@@ -37,7 +37,7 @@ pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extr
 
 /// A rate with the time span that it covers.
 fn per_s(rate: Option<f64>, span_s: f64) -> String {
-    or(rate.map(|rate| format!("{rate:.1} a second in {} s", span(span_s))), "")
+    or_else_text(rate.map(|rate| format!("{rate:.1} a second in {} s", span(span_s))), "")
 }
 
 /// Formats seconds with enough digits to differ from zero.
@@ -45,7 +45,7 @@ fn span(span_s: f64) -> String {
     if span_s < 1e-3 { format!("{span_s:.9}") } else { format!("{span_s:.3}") }
 }
 
-fn numbers(rows: &mut Rows, bus: &BusReport, duration_s: f64) {
+fn numbers(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
     rows.section(&bus.bus, print::count(bus.frames, "frame"), per_s(bus.frames_per_s, duration_s));
     for kind in &bus.kinds {
         rows.row(kind.kind, kind.packets, per_s(kind.packets_per_s, kind.span_s));
@@ -53,19 +53,19 @@ fn numbers(rows: &mut Rows, bus: &BusReport, duration_s: f64) {
     let Epochs { first, last, missing, repeated, jumps } = bus.epochs;
     if let (Some(first), Some(last)) = (first, last) {
         let odd = [(missing, "missing"), (repeated, "repeated"), (jumps, "restarts")];
-        let odd = list(odd.map(|(count, what)| format!("{count} {what}")));
+        let odd = comma_separated(odd.map(|(count, what)| format!("{count} {what}")));
         rows.row("epochs", format!("{first} to {last}"), odd);
     }
     rows.any("wires", bus.wires, format!("{}, on no real bus", per_s(bus.wires_per_s, bus.wires_span_s)));
     let refused: Vec<_> = bus.refused.by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
-    let reasons = list(refused.iter().map(|(reason, count)| format!("{count} {reason}")));
+    let reasons = comma_separated(refused.iter().map(|(reason, count)| format!("{count} {reason}")));
     rows.row("damaged or refused", refused.iter().map(|(_, count)| count).sum::<u64>(), reasons);
     let ForeignFrames { standard, extended, remote, error, packets_by_chance, .. } = bus.foreign;
     rows.row("foreign", bus.foreign.frames, "");
     rows.any("  11-bit identifiers", standard, "");
     rows.any("  29-bit identifiers", extended, "");
     rows.any("  remote frames", remote, "");
-    rows.any("  error frames", error, list(reported(&bus.foreign)));
+    rows.any("  error frames", error, comma_separated(reported(&bus.foreign)));
     if packets_by_chance >= 0.05 {
         let chance = format!("{packets_by_chance:.1}");
         rows.row("  packets by chance", chance, "expected");
@@ -75,7 +75,7 @@ fn numbers(rows: &mut Rows, bus: &BusReport, duration_s: f64) {
 }
 
 /// Adds the contents of an MCAP recording besides frames.
-fn beside(rows: &mut Rows, extras: &Extras) {
+fn beside(rows: &mut KeyValueTable, extras: &RecordingExtras) {
     if !extras.topics.is_empty() {
         rows.section("other topics", "messages", "");
     }
@@ -107,7 +107,7 @@ const FOREIGN: usize = 40;
 /// Table with one line per foreign identifier, the most frequent ones first.
 fn foreign(bus: &BusReport) -> Table {
     let head = [
-        &format!("{} foreign", shown(&bus.bus)),
+        &format!("{} foreign", printable(&bus.bus)),
         "frames",
         "per s",
         "in s",
@@ -152,7 +152,7 @@ fn cells(bus: &BusReport) -> Table {
         (count > 0).then(|| count.to_string())
     }
     const STATE: &str = "last state";
-    let name = shown(&bus.bus);
+    let name = printable(&bus.bus);
     let columns: [Column<'_>; 17] = [
         (&name, |cell| Some(cell.node.to_string())),
         ("torques", |cell| Some(cell.torques.to_string())),
@@ -173,9 +173,9 @@ fn cells(bus: &BusReport) -> Table {
         ("refused", |cell| some(cell.refused?.into())),
         ("lost", |cell| some(cell.lost)),
         ("starts", |cell| some(cell.restarts)),
-        (STATE, |cell| Some(words(&cell.state)).filter(|state| !state.is_empty())),
+        (STATE, |cell| Some(space_separated(&cell.state)).filter(|state| !state.is_empty())),
     ];
-    let (heads, lines) = filled(columns, &bus.cells, "");
+    let (heads, lines) = drop_empty_columns(columns, &bus.cells, "");
     let of_words = heads.iter().rposition(|head| *head == STATE);
     print::table(heads, lines, |column| Some(column) != of_words)
 }

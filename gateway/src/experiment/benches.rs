@@ -11,7 +11,7 @@ use std::time::Duration;
 use bench::summary::Outcome;
 use paper::arm::{self, Reply};
 use paper::moving::Run;
-use paper::scale::Bench;
+use paper::scale::ScaleBench;
 use paper::{Effort, recorded};
 use protocol::id::CellId;
 use protocol::skin::Skin;
@@ -32,7 +32,7 @@ pub(super) struct Benches {
 }
 
 /// Interval between checks whether a bench has ended.
-const LOOK: Duration = Duration::from_millis(50);
+const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Files of one run.
 struct Files {
@@ -73,7 +73,7 @@ impl Benches {
 
     /// Runs `skinbus run` on a bench, with each bus's cells in one process, and reads its summary. A bench that failed
     /// or was halted because the machine cannot run it has a summary too; one whose cells failed measures nothing.
-    pub(super) fn scaled(&self, bench: &Bench) -> Result<Value, Failure> {
+    pub(super) fn scaled(&self, bench: &ScaleBench) -> Result<Value, Failure> {
         let what = format!("the bench of {} cells ({})", bench.cells, bench.name());
         let buses = buses::directory("experiment")?;
         // Files that can be generated again are not kept.
@@ -129,7 +129,7 @@ impl Benches {
                 // If the bench has just ended, no process gets the signal.
                 let _ = kill_process(Pid::from_child(&child), Signal::INT);
             }
-            std::thread::sleep(LOOK);
+            std::thread::sleep(POLL_INTERVAL);
         }
         child.wait_with_output()
     }

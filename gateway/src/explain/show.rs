@@ -6,14 +6,14 @@ use analysis::explain::{
     BusExplained, CellExplained, Explanation, Force, JACOBIAN_STEPS, Origin, Row, Total, Verdict,
 };
 use protocol::fixed::TorqueFormat;
-use protocol::usage::shown;
+use protocol::usage::printable;
 use trace::capture::seconds_since;
 
-use crate::print::{self, decimals, or};
+use crate::print::{self, decimals, or_else_text};
 
 /// The part that is shown.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum What {
+pub(super) enum ExplainDetail {
     /// One line per cell; all steps of a single cell.
     All,
     /// All steps of these cells.
@@ -28,10 +28,10 @@ pub(super) fn text(
     epoch: u8,
     (zero, is_of_run): (u64, bool),
     explanation: &Explanation,
-    what: What,
+    what: ExplainDetail,
 ) -> String {
     let mut text = String::new();
-    let name = shown(name);
+    let name = printable(name);
     for bus in &explanation.buses {
         let at = seconds_since(zero, bus.at_ns);
         let at = if is_of_run { format!("at {at:.6} s") } else { format!("{at:.6} s after the first frame") };
@@ -43,16 +43,16 @@ pub(super) fn text(
     let finest = TorqueFormat::default().name();
     let is_finest = explanation.buses.iter().all(|bus| bus.torque_format == finest);
     match (what, cells.as_slice()) {
-        (What::All | What::Cells, []) => text += "\nno cell was in contact, and none answered\n",
-        (What::Joint, _) => text += &joint(cells),
-        (What::Cells, _) | (What::All, [_]) => {
+        (ExplainDetail::All | ExplainDetail::Cells, []) => text += "\nno cell was in contact, and none answered\n",
+        (ExplainDetail::Joint, _) => text += &joint(cells),
+        (ExplainDetail::Cells, _) | (ExplainDetail::All, [_]) => {
             for cell in cells {
                 text += &every_step(cell, zero);
             }
         }
-        (What::All, _) => text += &one_line_each(cells, is_finest),
+        (ExplainDetail::All, _) => text += &one_line_each(cells, is_finest),
     }
-    if what != What::Cells && !cells.is_empty() {
+    if what != ExplainDetail::Cells && !cells.is_empty() {
         text += &totals(&explanation.total, is_finest);
     }
     if !explanation.missing.is_empty() {
@@ -188,7 +188,7 @@ fn name(cell: &CellExplained) -> String {
 fn steps_off(rows: &[Row]) -> String {
     // The last one of equally large differences.
     let most = rows.iter().filter_map(|row| row.difference_steps).max_by_key(|steps| steps.abs());
-    or(most.map(sign), "?")
+    or_else_text(most.map(sign), "?")
 }
 
 fn sign(steps: i32) -> String {
@@ -219,7 +219,7 @@ fn about(verdict: &Verdict) -> (u8, &'static str, Option<String>) {
 
 /// Name of the most important verdict.
 fn worst(rows: &[Row]) -> String {
-    or(rows.iter().map(|row| about(&row.verdict)).max().map(|(_, short, _)| short), "")
+    or_else_text(rows.iter().map(|row| about(&row.verdict)).max().map(|(_, short, _)| short), "")
 }
 
 /// Name of a verdict, with the J that gives the word.
@@ -309,10 +309,10 @@ fn rows(cells: &[CellExplained], by_cell: bool) -> String {
         line.extend([
             decimals(row.jacobian_m, 6, "?"),
             decimals(row.product_nm, 6, "?"),
-            or(row.nearest_word, "-"),
-            or(row.word, "-"),
+            or_else_text(row.nearest_word, "-"),
+            or_else_text(row.word, "-"),
             decimals(row.word_nm, 6, "-"),
-            or(row.difference_steps.map(sign), "?"),
+            or_else_text(row.difference_steps.map(sign), "?"),
             long(&row.verdict),
         ]);
         line

@@ -10,8 +10,8 @@ use protocol::document;
 use protocol::fixed::{Q1_14, is_saturated};
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{CellName, JointKind, Skin};
-use protocol::usage::{Failure, print};
-use reference::Reference;
+use protocol::usage::{Failure, print_text};
+use reference::ReferenceCell;
 use serde::Serialize;
 
 use crate::arguments::cell_of;
@@ -76,9 +76,9 @@ impl Given {
             (None, None) => Vec::new(),
         };
         if as_json {
-            return rows.iter().try_for_each(|row| print(&json_line(row)?));
+            return rows.iter().try_for_each(|row| print_text(&json_line(row)?));
         }
-        rows.iter().try_for_each(|row| print(&row.text()))
+        rows.iter().try_for_each(|row| print_text(&row.text()))
     }
 }
 
@@ -91,13 +91,13 @@ struct Calculator<'a> {
 
 impl<'a> Calculator<'a> {
     fn new(skin: &'a Skin) -> Self {
-        let central = (0..skin.buses.len()).map(|bus| Central::unquantised(&skin.part_on(bus)));
+        let central = (0..skin.buses.len()).map(|bus| Central::unquantised(&skin.with_cells_of_bus(bus)));
         Self { skin, central: central.collect() }
     }
 
     fn batch(&self, path: &Path) -> Result<Vec<Row>, Failure> {
         let file = path.display().to_string();
-        let text = document::text_within(path, BATCH).map_err(Failure::usage)?;
+        let text = document::read_text_within(path, BATCH).map_err(Failure::usage)?;
         let mut table = Table::new(&file, &text, COLUMNS)?;
         let mut rows = Vec::new();
         while let Some(line) = table.row()? {
@@ -125,7 +125,7 @@ impl<'a> Calculator<'a> {
     fn row_of(&self, index: usize, force: f64, positions: &str) -> Result<Row, String> {
         let skin = self.skin;
         let Some(cell) = skin.cells.get(index) else { return Err("no such cell".to_owned()) };
-        let joints: Vec<_> = skin.joints_of(cell.bus).map(|(_, joint)| joint).collect();
+        let joints: Vec<_> = skin.joints_on_bus(cell.bus).map(|(_, joint)| joint).collect();
         if !(0.0..=MAX_FORCE_N).contains(&force) {
             return Err(format!(
                 "force {force} N: a force presses against the outward normal with 0 to {MAX_FORCE_N:.3} N, the range of \
@@ -165,10 +165,10 @@ impl<'a> Calculator<'a> {
             *word = nearest;
         }
         let parameters = skin.parameters(cell);
-        let reference = Reference::new(&parameters);
+        let reference = ReferenceCell::new(&parameters);
         let words = reference.torque_of(&words, force);
         // Position of the cell on its bus.
-        let place = skin.cells_of(cell.bus).position(|other| other.node == cell.node).unwrap_or_default();
+        let place = skin.cells_on_bus(cell.bus).position(|other| other.node == cell.node).unwrap_or_default();
         let central =
             self.central.get(cell.bus).map(|central| central.torque(place, &central.frames_at(&q), force));
         // Adding 0.0 removes the sign of a zero.

@@ -2,13 +2,13 @@
 
 use analysis::fit::{self, BusFit, COMPUTATION_NS, rates};
 use protocol::can::Format;
-use protocol::skin::{Bus, Skin};
-use protocol::usage::{Failure, print};
+use protocol::skin::{SkinBus, Skin};
+use protocol::usage::{Failure, print_text};
 use protocol::wire_time::BitRates;
 
 use super::{Fit, skin_text};
 use crate::output::note;
-use crate::print::{json, list};
+use crate::print::{json, comma_separated};
 
 impl Fit {
     /// Computes and prints the fit of a skin.
@@ -28,10 +28,10 @@ impl Fit {
         let is_partly_described = !rows.is_empty() && skin.buses.iter().any(|bus| bus.bitrate.is_some());
         if is_partly_described && !self.table && !self.json {
             let without = skin.buses.iter().filter(|bus| bus.bitrate.is_none()).map(|bus| &bus.name);
-            let (without, skin) = (list(without), &skin.name);
+            let (without, skin) = (comma_separated(without), &skin.name);
             note(format_args!("no bitrate of {without}: these are common bit rates, not those of {skin}"));
         }
-        print(&match self.json {
+        print_text(&match self.json {
             true => json(&fit::json(skin, &buses, whole.as_ref(), &rows))?,
             false => skin_text::table(skin, &rows) + &skin_text::buses(skin, &buses, whole.as_ref()),
         })
@@ -65,7 +65,7 @@ impl Fit {
 }
 
 /// Rates of a bus in the skin.
-fn described(bus: &Bus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
+fn described(bus: &SkinBus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
     let rates = rates::described(bus, format).transpose();
     let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?;
     Ok(rates.map(|rates| (format, rates)))

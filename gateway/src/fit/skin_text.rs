@@ -1,14 +1,14 @@
 //! Tables of `skinbus fit` for a skin.
 
 use analysis::fit::case::{Answers, Case};
-use analysis::fit::limits::{Limit, NODES, Need};
+use analysis::fit::limits::{Limit, MAX_NODES, NeededBuses};
 use analysis::fit::verdict::{Answer, percent};
-use analysis::fit::{BusFit, Rated, Row, Spread, Whole, name};
+use analysis::fit::{BusFit, AssessedBus, Row, Spread, SkinFit, name};
 use protocol::parameters::Sensing;
 use protocol::skin::Skin;
-use protocol::usage::shown;
+use protocol::usage::printable;
 
-use crate::print::{self, Rows, count, decimals, list, or};
+use crate::print::{self, KeyValueTable, count, decimals, comma_separated, or_else_text};
 
 /// Columns of the table over bit rates.
 const HEAD: [&str; 8] = [
@@ -35,8 +35,8 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
             ms(rated),
             most.in_time().to_string(),
             row.need.in_short(),
-            or(roots.map(|it| tenths(it.load.total())), ""),
-            or(roots.map(ms), ""),
+            or_else_text(roots.map(|it| tenths(it.load.total())), ""),
+            or_else_text(roots.map(ms), ""),
         ]
     });
     let table = print::table(HEAD, lines, |column| column > 0);
@@ -53,22 +53,22 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
          cells   that a bus has time for; transceivers drive about {}\n\
          buses   for {cells} cells, and what asks for so many: time or nodes\n\
          roots   sums with only the roots on this bus; sums of all cells save no frame\n",
-        shown(&skin.name),
+        printable(&skin.name),
         millis(case.period_ns),
         micros(case.computation_ns),
         what(case),
         sensors(case),
-        NODES - 1,
+        MAX_NODES - 1,
     )
 }
 
 /// Buses at their bit rates: a section for each, and one for all cells of the skin.
-pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> String {
+pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>) -> String {
     let Some(first) = buses.first() else { return String::new() };
     let case = &first.rated.case;
     let period = format!("joints every {} ms", millis(case.period_ns));
     let computation = format!("a cell computes {} µs", micros(case.computation_ns));
-    let mut rows = Rows::new(&skin.name, period, computation).names_in_one_line();
+    let mut rows = KeyValueTable::new(&skin.name, period, computation).names_in_one_line();
     for bus in buses {
         section(&mut rows, bus);
     }
@@ -84,9 +84,9 @@ pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>) -> Str
     rows.text()
 }
 
-fn section(rows: &mut Rows, bus: &BusFit) {
+fn section(rows: &mut KeyValueTable, bus: &BusFit) {
     let BusFit { name: bus_name, rated, most, need, answers, hints } = bus;
-    let Rated { case, load, times, .. } = rated;
+    let AssessedBus { case, load, times, .. } = rated;
     let cells = case.answers.cells();
     let worst = Answer::worst_case(rated);
     rows.section(format!("{bus_name} at {}", worst.rates), format!("{cells} cells, {}", what(case)), "");
@@ -98,12 +98,12 @@ fn section(rows: &mut Rows, bus: &BusFit) {
     ];
     let parts =
         parts.iter().filter(|it| it.1 > 0.0).map(|(what, share)| format!("{what} {}", tenths(*share)));
-    rows.row("  load", percent(load.total()), list(parts));
+    rows.row("  load", percent(load.total()), comma_separated(parts));
     let bounds = [("chain", times.chain_ns), ("analysis", times.response_ns.map(|it| it.worst_ns))];
     let bounds = bounds.iter().filter_map(|(how, ns)| Some(format!("{how} {}", millis((*ns)?))));
     let due = format!("due after {} ms", millis(case.deadline_ns()));
-    rows.row("last answer", last(rated), list([due].into_iter().chain(bounds)));
-    let heartbeat = or(times.heartbeat_ns.map(|ns| format!("{} ms", millis(ns))), "no bound");
+    rows.row("last answer", last(rated), comma_separated([due].into_iter().chain(bounds)));
+    let heartbeat = or_else_text(times.heartbeat_ns.map(|ns| format!("{} ms", millis(ns))), "no bound");
     rows.row("heartbeats late by", heartbeat, "silent for 600 ms is dead");
     let others = format!("bandwidth {}, deadline {}, nodes {}", most.bandwidth, most.deadline, most.nodes);
     rows.row("cells that fit", most.in_time().min(most.nodes), others);
@@ -143,12 +143,12 @@ const fn sensors(case: &Case) -> &'static str {
 }
 
 /// Load and last answer.
-fn figures(rated: &Rated) -> String {
+fn figures(rated: &AssessedBus) -> String {
     format!("{}, {}", percent(rated.load.total()), last(rated))
 }
 
-fn last(rated: &Rated) -> String {
-    let Rated { case, load, times, .. } = rated;
+fn last(rated: &AssessedBus) -> String {
+    let AssessedBus { case, load, times, .. } = rated;
     match times.last_ns() {
         Some(last_ns) => format!("{} ms", millis(last_ns)),
         None if load.total() > 1.0 => "no bound".to_owned(),
@@ -158,12 +158,12 @@ fn last(rated: &Rated) -> String {
 
 /// Last answer in ms for a column of numbers.
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
-fn ms(rated: &Rated) -> String {
+fn ms(rated: &AssessedBus) -> String {
     decimals(rated.times.last_ns().map(|ns| ns as f64 / 1e6), 2, "-")
 }
 
-fn needed(need: &Need) -> String {
-    let why = list(need.binding().into_iter().map(Limit::name));
+fn needed(need: &NeededBuses) -> String {
+    let why = comma_separated(need.binding().into_iter().map(Limit::name));
     match need.buses() {
         None => format!("none: {why}"),
         Some(1) => "1".to_owned(),
@@ -171,9 +171,9 @@ fn needed(need: &Need) -> String {
     }
 }
 
-fn each_need(need: &Need) -> String {
+fn each_need(need: &NeededBuses) -> String {
     let needs = [("bandwidth", need.bandwidth), ("deadline", need.deadline), ("nodes", need.nodes)];
-    list(needs.map(|(name, buses)| format!("{name} {}", or(buses, "no number"))))
+    comma_separated(needs.map(|(name, buses)| format!("{name} {}", or_else_text(buses, "no number"))))
 }
 
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]

@@ -6,21 +6,21 @@ use std::io::{self, BufWriter, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use analysis::fit::rates::Requested;
+use analysis::fit::rates::RequestedRates;
 use analysis::shadow::{self, Shadow};
-use protocol::bus::{BusError, Options};
+use protocol::bus::{BusError, BusOptions};
 use protocol::skin::Skin;
-use protocol::stop::{self, Stoppable};
-use protocol::usage::{Failure, print, written};
+use protocol::stop::{self, InterruptibleWriter};
+use protocol::usage::{Failure, print_text, ignore_broken_pipe};
 use trace::capture::{Entry, NoteKind, Reader};
 
 use self::show::write_frames;
 use super::Fit;
 use crate::input::{
-    self, LOOK, Missing, ReceiveEnd, captures, is_file, no_frame, place, remark_another, skin_beside, stopped,
+    self, POLL_TIMEOUT, LossCounts, ReceiveEnd, captures, is_file, no_frame, place, remark_another, skin_beside, stopped,
 };
 use crate::output;
-use crate::print::list;
+use crate::print::comma_separated;
 
 /// Receive buffer in bytes, for frames that wait while others are processed.
 const RECEIVE_BUFFER: usize = 8 << 20;
@@ -42,8 +42,8 @@ impl Fit {
         if let (Some(path), Some(skin)) = (&self.skin, &skin) {
             remark_another(&self.sources, path, skin);
         }
-        let mut out = BufWriter::new(Stoppable::new(io::stdout()));
-        let name = list(self.sources.iter().map(|source| source.display()));
+        let mut out = BufWriter::new(InterruptibleWriter::new(io::stdout()));
+        let name = comma_separated(self.sources.iter().map(|source| source.display()));
         let mut title = name.clone();
         let mut run_began = None;
         let (mut shadow, taken) = if self.are_captures(&name)? {
@@ -63,7 +63,7 @@ impl Fit {
             (shadow, taken)
         };
         shadow.finish();
-        written(write_frames(&mut shadow, &mut out).and_then(|()| out.flush()))?;
+        ignore_broken_pipe(write_frames(&mut shadow, &mut out).and_then(|()| out.flush()))?;
         drop(out);
         let mut report = shadow.report();
         for bus in &mut report.buses {
@@ -75,7 +75,7 @@ impl Fit {
             }
         }
         if !self.json && report.frames > 0 {
-            print(&show::text(&title, taken.what, taken.missing, &report))?;
+            print_text(&show::text(&title, taken.what, taken.missing, &report))?;
         }
         taken.ended
     }
@@ -104,7 +104,7 @@ impl Fit {
 
     /// Creates the model with the bit rates of the command line, else of the skin, else common ones.
     fn shadow(&self, skin: Option<Skin>) -> Result<Shadow, Failure> {
-        let requested = Requested { nominal: self.nominal, data: self.data };
+        let requested = RequestedRates { nominal: self.nominal, data: self.data };
         let mut of_bus = self.rates.clone();
         for bus in skin.iter().flat_map(|skin| &skin.buses) {
             let rates = requested.of_bus(bus);
@@ -131,21 +131,21 @@ impl Fit {
         stopped: &AtomicBool,
     ) -> Result<Taken, Failure> {
         let kinds = self.kinds.of_any()?;
-        let options = Options { receive_buffer: RECEIVE_BUFFER, ..Options::default() };
+        let options = BusOptions { receive_buffer: RECEIVE_BUFFER, ..BusOptions::default() };
         let mut receive_ends = input::receive_ends(&self.sources, &kinds, None, &options, None)?;
         let length = self.duration.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
         let end = length.map(|length| Instant::now() + length);
         let mut ended = Ok(());
         while ended.is_ok() && !stopped.load(Ordering::Relaxed) && end.is_none_or(|end| Instant::now() < end)
         {
-            input::wait(&receive_ends, LOOK)?;
+            input::wait(&receive_ends, POLL_TIMEOUT)?;
             for receive_end in &mut receive_ends {
                 if let Err(error) = take(receive_end, shadow) {
                     ended = Err(Failure::run(error));
                 }
             }
             if let Err(error) = write_frames(shadow, out).and_then(|()| out.flush()) {
-                written(Err(error))?;
+                ignore_broken_pipe(Err(error))?;
                 break;
             }
         }
@@ -161,7 +161,7 @@ impl Fit {
 
 /// Passes waiting frames to the model.
 fn take(receive_end: &mut ReceiveEnd, shadow: &mut Shadow) -> Result<(), BusError> {
-    while receive_end.hear(Duration::ZERO)? {
+    while receive_end.receive(Duration::ZERO)? {
         for received in receive_end.frames() {
             shadow.frame(receive_end.bus().name(), received.at_nanos, &received.frame);
         }
@@ -173,7 +173,7 @@ fn take(receive_end: &mut ReceiveEnd, shadow: &mut Shadow) -> Result<(), BusErro
 fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Result<Taken, Failure> {
     let name = reader.name().to_owned();
     let what = input::format(&reader);
-    let (mut frames, mut missing) = (0_u64, Missing::default());
+    let (mut frames, mut missing) = (0_u64, LossCounts::default());
     let mut ended = loop {
         match reader.next() {
             Ok(None) => break Ok(()),
@@ -182,12 +182,12 @@ fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Re
                 frames += 1;
                 shadow.frame(record.interface, record.time.nanos, &record.frame);
                 if let Err(error) = write_frames(shadow, out) {
-                    written(Err(error))?;
+                    ignore_broken_pipe(Err(error))?;
                     return Ok(Taken { what, missing: missing.frames, ended: Ok(()) });
                 }
             }
             Ok(Some(Entry::Note(note))) => {
-                missing.take(&note);
+                missing.count(&note);
                 match note.kind {
                     NoteKind::Dropped(lost) if !note.interface.is_empty() => {
                         shadow.missing(note.interface, lost);
@@ -203,8 +203,8 @@ fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Re
     if !reader.has_times() {
         shadow.without_times();
     }
-    missing.tell(&reader, "left out");
-    if stop::flag().load(Ordering::Relaxed) {
+    missing.report(&reader, "left out");
+    if stop::stop_flag().load(Ordering::Relaxed) {
         output::note(format_args!("{name}: stopped after {frames} frames"));
     } else if frames == 0 && ended.is_ok() {
         ended = Err(no_frame(&reader));

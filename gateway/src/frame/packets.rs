@@ -6,7 +6,7 @@ use model::decode::pick::Party;
 use model::scenario::contact_words;
 use protocol::fixed::{Q, Q1_14, Q5_10};
 use protocol::id::Kind;
-use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, Joints, Message, Request, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::schema::packets;
@@ -15,7 +15,7 @@ use super::addressee::addressee;
 use super::sensing;
 
 #[derive(Debug, Subcommand)]
-pub(super) enum What {
+pub(super) enum PacketCommand {
     /// Stop answering until a resume
     #[command(after_help = "Example:\n  skinbus frame halt")]
     Halt,
@@ -31,7 +31,7 @@ pub(super) enum What {
     Joints(Positions),
     Stimulus(Stimulus),
     Configure(Configure),
-    Sensing(sensing::Switch),
+    Sensing(sensing::SensingCommand),
 }
 
 /// The joint positions of an epoch
@@ -144,7 +144,7 @@ struct Requested {
     write: Option<Vec<String>>,
 }
 
-impl What {
+impl PacketCommand {
     pub(super) fn message(&self) -> Result<Message, String> {
         match self {
             Self::Halt => Ok(Message::Halt),
@@ -205,7 +205,7 @@ impl Stimulus {
                 )?,
             }),
         };
-        let from = self.epoch.map_or(From::Next, |epoch| From::Epoch(Epoch(epoch)));
+        let from = self.epoch.map_or(AppliesFrom::Next, |epoch| AppliesFrom::Epoch(Epoch(epoch)));
         Ok(Message::Stimulus { to: self.cell.node, from, page })
     }
 }
@@ -274,7 +274,7 @@ mod tests {
     #[derive(Parser)]
     struct Line {
         #[command(subcommand)]
-        what: What,
+        what: PacketCommand,
     }
 
     fn message(line: &str) -> Result<Message, String> {
@@ -317,7 +317,7 @@ mod tests {
         for (force, steps) in
             [("3.0", 3_072), ("-96", -98_304), ("95.997", 98_301), ("0.0005", 1), ("1", 1_024)]
         {
-            let Ok(Message::Stimulus { page: SensorPage::Skin(skin), from: From::Next, to: Node::Everyone }) =
+            let Ok(Message::Stimulus { page: SensorPage::Skin(skin), from: AppliesFrom::Next, to: Node::Everyone }) =
                 message(&format!("stimulus --cell everyone --force {force}"))
             else {
                 panic!("{force}");

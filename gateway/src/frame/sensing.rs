@@ -2,16 +2,16 @@
 
 use bench::sensing::switch;
 use clap::Args;
-use model::decode::parameter::Words;
+use model::decode::parameter::ParameterWords;
 use protocol::bus::Bus;
 use protocol::can::Format;
 use protocol::message::{Message, Request};
 use protocol::parameters::{Parameter, Sensing};
-use protocol::skin::sensing::continuous;
-use protocol::usage::{Failure, print};
+use protocol::skin::sensing::continuous_sensing;
+use protocol::usage::{Failure, print_text};
 
 use super::addressee::{addressee, only_cell};
-use crate::arguments::{Word, one_of};
+use crate::arguments::{OptionValue, one_of};
 use model::decode::pick::Party;
 
 /// Set when cells send their sensors: never, at a rate, or on changes
@@ -24,10 +24,10 @@ use model::decode::pick::Party;
   skinbus frame sensing event --bus vcan0
   skinbus frame sensing continuous 62.5 --cell 12 --bus vcan0
   skinbus frame sensing off --skin skin.toml")]
-pub(super) struct Switch {
+pub(super) struct SensingCommand {
     /// When cells send their sensors
     #[arg(value_parser = one_of(MODES))]
-    mode: When,
+    mode: SensingMode,
     /// Rate in continuous mode: frames per second of each cell
     #[arg(value_name = "HZ", allow_negative_numbers = true)]
     hz: Option<f64>,
@@ -38,19 +38,19 @@ pub(super) struct Switch {
 
 /// Mode of the sensor frames.
 #[derive(Clone, Copy, Debug)]
-enum When {
+enum SensingMode {
     Off,
     Continuous,
     Event,
 }
 
-const MODES: &[Word<When>] = &[
-    ("off", "Only on a report", When::Off),
-    ("continuous", "At a rate", When::Continuous),
-    ("event", "On changes, and with each heartbeat", When::Event),
+const MODES: &[OptionValue<SensingMode>] = &[
+    ("off", "Only on a report", SensingMode::Off),
+    ("continuous", "At a rate", SensingMode::Continuous),
+    ("event", "On changes, and with each heartbeat", SensingMode::Event),
 ];
 
-impl Switch {
+impl SensingCommand {
     pub(super) fn message(&self) -> Result<Message, String> {
         let request = Request::Write { number: Parameter::Sensing.number(), words: self.sensing()?.words() };
         Ok(Message::Configure { to: self.cell.node, tag: 0, request })
@@ -61,16 +61,16 @@ impl Switch {
         let mode = self.sensing().map_err(Failure::usage)?;
         let on = format!("{} ({})", bus.name(), bus.kind());
         let confirmed = switch(bus, format, only_cell(&self.cell), mode).map_err(Failure::run)?;
-        print(&format!("{confirmed} on {on}: {}\n", Words(Parameter::Sensing.number(), mode.words())))
+        print_text(&format!("{confirmed} on {on}: {}\n", ParameterWords(Parameter::Sensing.number(), mode.words())))
     }
 
     fn sensing(&self) -> Result<Sensing, String> {
         match (self.mode, self.hz) {
-            (When::Off, None) => Ok(Sensing::Off),
-            (When::Event, None) => Ok(Sensing::Event),
-            (When::Continuous, Some(hz)) => continuous(hz).map_err(|why| format!("HZ = {hz}: {why}")),
-            (When::Continuous, None) => Err("continuous needs a rate, such as `continuous 62.5`".to_owned()),
-            (When::Off | When::Event, Some(hz)) => {
+            (SensingMode::Off, None) => Ok(Sensing::Off),
+            (SensingMode::Event, None) => Ok(Sensing::Event),
+            (SensingMode::Continuous, Some(hz)) => continuous_sensing(hz).map_err(|why| format!("HZ = {hz}: {why}")),
+            (SensingMode::Continuous, None) => Err("continuous needs a rate, such as `continuous 62.5`".to_owned()),
+            (SensingMode::Off | SensingMode::Event, Some(hz)) => {
                 Err(format!("HZ = {hz}: only continuous has a rate; leave it out"))
             }
         }

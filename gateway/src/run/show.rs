@@ -4,13 +4,13 @@ use std::cmp::Reverse;
 use std::fmt::Display;
 
 use analysis::paper;
-use bench::summary::{BusSummary, CELL_ERROR_NM, CellSummary, Halted, Outcome, Processor, Summary};
+use bench::summary::{BusSummary, CELL_ERROR_NM, CellSummary, HaltSummary, Outcome, ProcessorUse, Summary};
 use comfy_table::Color;
 use model::listing::ranges;
 use model::table::Errors;
-use protocol::usage::shown;
+use protocol::usage::printable;
 
-use crate::print::{GREEN, PLAIN, RED, Rows, YELLOW, count, hanging, list, or, quantiles, words};
+use crate::print::{GREEN, PLAIN, RED, KeyValueTable, YELLOW, count, hanging, comma_separated, or_else_text, quantiles, space_separated};
 
 /// Maximum number of halts listed one by one.
 const HALTS: usize = 10;
@@ -23,7 +23,7 @@ const NAME: usize = 24;
 
 /// Display options of a run.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Look {
+pub(super) struct TableStyle {
     /// True to include usual values.
     pub(super) is_verbose: bool,
     /// True to use terminal colours.
@@ -33,25 +33,25 @@ pub(super) struct Look {
 }
 
 /// Returns the verdict and the table of a run.
-pub(super) fn text(summary: &Summary, look: Look) -> String {
+pub(super) fn text(summary: &Summary, look: TableStyle) -> String {
     let rows = rows(summary, look);
     verdict(summary, look, rows.columns()) + &rows.text()
 }
 
-fn verdict(summary: &Summary, look: Look, columns: usize) -> String {
+fn verdict(summary: &Summary, look: TableStyle, columns: usize) -> String {
     let look_at = &summary.verdict.look_at;
     let mut lines = Vec::new();
     if summary.verdict.well {
         let is_interrupted = summary.outcome == Outcome::Interrupted;
         let begin = if is_interrupted { "all well until it was interrupted: " } else { "all well: " };
-        lines.push(hanging("", &format!("{begin}{}", shown(&summary.sums_of_all())), columns));
+        lines.push(hanging("", &format!("{begin}{}", printable(&summary.sums_of_all())), columns));
     }
     let many = if look.is_verbose { look_at.len() } else { LINES };
     let more = look_at.len().saturating_sub(many);
     let more = (more > 0).then(|| format!("and {more} more, with --verbose"));
     for (at, item) in look_at.iter().take(many).chain(&more).enumerate() {
         let begin = if at == 0 { "look at: " } else { "         " };
-        lines.push(hanging(begin, &shown(item), columns));
+        lines.push(hanging(begin, &printable(item), columns));
     }
     let text = lines.join("\n");
     let is_unknown = summary.buses.iter().any(|bus| bus.replies.unknown + bus.uplink.unknown > 0);
@@ -63,7 +63,7 @@ fn verdict(summary: &Summary, look: Look, columns: usize) -> String {
     if look.is_coloured { format!("{colour}{text}{PLAIN}\n") } else { format!("{text}\n") }
 }
 
-fn rows(summary: &Summary, look: Look) -> Rows {
+fn rows(summary: &Summary, look: TableStyle) -> KeyValueTable {
     let cells = format!("{}, {:.1} s", count(summary.cells.len(), "cell"), summary.duration_s);
     let (cells, ended) = match summary.halts.last().filter(|_| summary.outcome == Outcome::Halted) {
         Some(halted) => (cells, format!("halted at {:.3} s", halted.at_s)),
@@ -71,9 +71,9 @@ fn rows(summary: &Summary, look: Look) -> Rows {
     };
     let is_verbose = look.is_verbose;
     let mut rows = if is_verbose {
-        Rows::in_columns(look.columns, &summary.skin, cells, ended)
+        KeyValueTable::in_columns(look.columns, &summary.skin, cells, ended)
     } else {
-        Rows::in_columns(look.columns, &summary.skin, cells, ended).names_in(NAME)
+        KeyValueTable::in_columns(look.columns, &summary.skin, cells, ended).names_in(NAME)
     };
     rows = rows.coloured(look.is_coloured);
     halts(&mut rows, summary);
@@ -92,8 +92,8 @@ fn rows(summary: &Summary, look: Look) -> Rows {
     rows
 }
 
-fn halts(rows: &mut Rows, summary: &Summary) {
-    for Halted { at_s, epoch, reason, until_s, .. } in summary.halts.iter().take(HALTS) {
+fn halts(rows: &mut KeyValueTable, summary: &Summary) {
+    for HaltSummary { at_s, epoch, reason, until_s, .. } in summary.halts.iter().take(HALTS) {
         let until = until_s.map_or_else(|| "to the end".to_owned(), |until| format!("to {until:.3} s"));
         rows.section("halted", format!("{at_s:.3} s {until}, epoch {epoch}"), reason);
     }
@@ -103,7 +103,7 @@ fn halts(rows: &mut Rows, summary: &Summary) {
     }
 }
 
-fn accuracy(rows: &mut Rows, summary: &Summary, is_verbose: bool) {
+fn accuracy(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
     let accuracy = &summary.accuracy;
     let [single, sums] = [&accuracy.single, &accuracy.sums].map(|errors| errors.mean().is_some());
     if single || sums {
@@ -139,14 +139,14 @@ fn accuracy(rows: &mut Rows, summary: &Summary, is_verbose: bool) {
 }
 
 fn error(errors: &Errors) -> String {
-    or(errors.mean().map(|mean| format!("{mean:.2e} ({:.1e})", errors.max())), "nothing compared")
+    or_else_text(errors.mean().map(|mean| format!("{mean:.2e} ({:.1e})", errors.max())), "nothing compared")
 }
 
 fn compared(errors: &Errors) -> String {
     count(errors.count(), "torque")
 }
 
-fn control(rows: &mut Rows, summary: &Summary, is_verbose: bool) {
+fn control(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
     let control = &summary.control;
     rows.section("control loop", "median / 90 % / 99 % / max", "µs");
     rows.row("began late", quantiles(&control.late_us), format!("idle {}", quantiles(&control.idle_late_us)));
@@ -180,7 +180,7 @@ fn control(rows: &mut Rows, summary: &Summary, is_verbose: bool) {
     }
 }
 
-fn replies(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
+fn replies(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let replies = &bus.replies;
     rows.section(&bus.name, each(&bus.cells), &bus.kind);
     if bus.outages.times > 0 {
@@ -192,15 +192,15 @@ fn replies(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
     for it in &bus.hosts {
         let gone = (it.gone > 0).then(|| format!("gone {}, {:.1} s", count(it.gone, "time"), it.gone_s));
         let end = (!it.at_end).then(|| "not reached at the end".to_owned());
-        let lost = list(
+        let lost = comma_separated(
             [(it.lost_from, "from there"), (it.lost_to, "to there")]
                 .map(|(n, way)| format!("{} lost {way}", count(n, "frame"))),
         );
         let cells = count(it.cells, "cell");
-        rows.row(format!("host {}", it.name), list([cells].into_iter().chain(gone).chain(end)), lost);
+        rows.row(format!("host {}", it.name), comma_separated([cells].into_iter().chain(gone).chain(end)), lost);
     }
     if !bus.silent_cells.is_empty() {
-        rows.row("silent cells", list(ranges(&bus.silent_cells)), "");
+        rows.row("silent cells", comma_separated(ranges(&bus.silent_cells)), "");
     }
     let complete = format!("{} of {} complete", bus.epochs_complete, count(bus.epochs_due, "epoch"));
     if let Some(sums) = &bus.sums {
@@ -226,7 +226,7 @@ fn replies(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
             rows.row("  in time", replies.in_time, format!("{} late", replies.late));
             let missing = replies.due - replies.in_time - replies.late;
             if is_verbose || missing > 0 {
-                let [reasons @ .., _] = replies.missing().map(|(why, count)| (count, spoken(why)));
+                let [reasons @ .., _] = replies.missing().map(|(why, count)| (count, key_words(why)));
                 unexplained(
                     rows,
                     "  missing",
@@ -244,7 +244,7 @@ fn replies(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
         if bus.sums.is_none() {
             rows.row("  each reply, µs", quantiles(&bus.reply_us), "late ones included");
         }
-        hearing(rows, bus);
+        joint_age_row(rows, bus);
     } else if bus.last_reply_us.count > 0 {
         let name = if bus.sums.is_some() { "last sum, µs" } else { "last reply, µs" };
         rows.row(name, quantiles(&bus.last_reply_us), "after the joints");
@@ -252,7 +252,7 @@ fn replies(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
 }
 
 /// Rows on sums, and the tree that carries them.
-fn sums_on_the_bus(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
+fn sums_on_the_bus(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let Some(sums) = &bus.sums else { return };
     let counts = sums.counts;
     if is_verbose || counts.resent + counts.overheard + counts.stale > 0 {
@@ -268,12 +268,12 @@ fn sums_on_the_bus(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
     }
     let Some(network) = &bus.network else { return };
     if is_verbose || network.tree_ready_s.is_none() {
-        let tree_ready = or(network.tree_ready_s.map(|s| format!("in {s:.2} s")), "never complete");
+        let tree_ready = or_else_text(network.tree_ready_s.map(|s| format!("in {s:.2} s")), "never complete");
         let changes = count(network.parent_changes, "change");
         rows.row("tree, wires deep", network.deepest, format!("{tree_ready}, {changes} of parents"));
     }
     if !network.unreachable.is_empty() {
-        rows.row("unreachable cells", words(&network.unreachable), "no sum contains them");
+        rows.row("unreachable cells", space_separated(&network.unreachable), "no sum contains them");
     }
     for difference in &network.differences {
         rows.row("not as described", difference, "");
@@ -281,7 +281,7 @@ fn sums_on_the_bus(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
 }
 
 /// Adds a row whose last text is red if something is missing for an unknown reason.
-fn unexplained(rows: &mut Rows, name: &str, value: impl Display, reasons: String, unknown: u64) {
+fn unexplained(rows: &mut KeyValueTable, name: &str, value: impl Display, reasons: String, unknown: u64) {
     if unknown > 0 {
         rows.row_in_colour(name, value, reasons, Color::Red);
     } else {
@@ -291,7 +291,7 @@ fn unexplained(rows: &mut Rows, name: &str, value: impl Display, reasons: String
 
 /// Rows on replies due, and on torques that were not due and so not compared, by reason.
 fn due(
-    rows: &mut Rows,
+    rows: &mut KeyValueTable,
     name: &str,
     due: u64,
     is_brief: bool,
@@ -314,43 +314,43 @@ fn due(
 }
 
 /// Row on the age of joints that cells have not received.
-fn hearing(rows: &mut Rows, bus: &BusSummary) {
+fn joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
     let why = "large: busy machine; losses: see the bus";
     rows.row("joint age at heartbeat, µs", quantiles(&bus.joints_not_taken_us), why);
 }
 
 /// Formats a key of the summary as words.
-fn spoken(key: &str) -> String {
+fn key_words(key: &str) -> String {
     key.replace('_', " ")
 }
 
 /// Formats the count of each kind.
 fn each(kinds: impl IntoIterator<Item = (impl Display, impl Display)>) -> String {
-    list(kinds.into_iter().map(|(kind, count)| format!("{count} {kind}")))
+    comma_separated(kinds.into_iter().map(|(kind, count)| format!("{count} {kind}")))
 }
 
 /// Formats the reasons that occurred, and always the number of unknown ones.
 fn explained(reasons: &[(u64, impl Display)], unknown: u64) -> String {
     let known = reasons.iter().filter(|(count, _)| *count > 0);
     let known = known.map(|(count, why)| format!("{count} {why}"));
-    list(known.chain([format!("{unknown} unknown")]))
+    comma_separated(known.chain([format!("{unknown} unknown")]))
 }
 
 /// Rows on the measuring cells of a bus, and on its most conspicuous cells.
-fn noteworthy(rows: &mut Rows, bus: &BusSummary, all: &[CellSummary]) {
+fn noteworthy(rows: &mut KeyValueTable, bus: &BusSummary, all: &[CellSummary]) {
     let all = || all.iter().filter(|cell| cell.bus == bus.name);
     let measuring: Vec<_> = all().filter(|cell| cell.measures()).map(|cell| cell.node).collect();
     if !measuring.is_empty() {
-        rows.row("cells that measure", words(measuring), "not pressed, their torques not compared");
+        rows.row("cells that measure", space_separated(measuring), "not pressed, their torques not compared");
     }
     let unclear: Vec<_> =
         all().filter(|cell| cell.contact_unknown > 0 && !cell.measures()).map(|cell| cell.node).collect();
     if !unclear.is_empty() {
-        rows.row("cells of unknown contact", words(unclear), "stimuli from before this run, or a baseline");
+        rows.row("cells of unknown contact", space_separated(unclear), "stimuli from before this run, or a baseline");
     }
     for cell in all().filter(|cell| !cell.stuck.is_empty()) {
         let kinds = cell.stuck.iter().map(|(kind, count)| format!("{count} times one {kind}"));
-        rows.row(format!("stuck: cell {}", cell.node), list(kinds), "while it should have sent others");
+        rows.row(format!("stuck: cell {}", cell.node), comma_separated(kinds), "while it should have sent others");
     }
     let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| mean > CELL_ERROR_NM);
     let rank =
@@ -360,19 +360,19 @@ fn noteworthy(rows: &mut Rows, bus: &BusSummary, all: &[CellSummary]) {
     for cell in worst.iter().take(CELLS) {
         let CellSummary { due, in_time, late, restarts, .. } = **cell;
         let late = (late > 0).then(|| format!("{late} late"));
-        let missing = cell.missing.iter().map(|(why, count)| format!("{count} {}", spoken(why)));
+        let missing = cell.missing.iter().map(|(why, count)| format!("{count} {}", key_words(why)));
         let restarts = (restarts > 0).then(|| count(restarts, "restart"));
         let error =
             cell.error.mean().filter(|_| is_off(cell)).map(|mean| format!("mean error {mean:.1e} Nm"));
         let why = late.into_iter().chain(missing).chain(restarts).chain(error);
         let in_time = (due > 0).then(|| format!("{in_time} of {due} replies in time"));
-        rows.row(format!("cell {}", cell.node), or(in_time, ""), list(why));
+        rows.row(format!("cell {}", cell.node), or_else_text(in_time, ""), comma_separated(why));
     }
     let more = worst.len().saturating_sub(CELLS);
     rows.any("further cells that stand out", more as u64, "--summary has each cell");
 }
 
-fn frames(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
+fn frames(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let up = &bus.uplink;
     let lost = up.dropped + up.backlog + up.outage + up.hosts + up.unknown;
     let odd = up.rejected + up.surplus + up.outsiders + up.in_doubt + u64::from(up.restarts);
@@ -386,7 +386,7 @@ fn frames(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
     }
     let sensors = &bus.sensors;
     if let (Some(min), Some(mean), Some(max)) = (sensors.min_hz, sensors.mean_hz, sensors.max_hz) {
-        let touches = list([count(sensors.touches, "touch"), count(sensors.releases, "release")]);
+        let touches = comma_separated([count(sensors.touches, "touch"), count(sensors.releases, "release")]);
         rows.row("  sensors of a cell, Hz", format!("{min:.1} / {mean:.1} / {max:.1}"), touches);
     }
     if is_verbose {
@@ -398,7 +398,7 @@ fn frames(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
 }
 
 /// Rows on the packets from the cells, by outcome.
-fn packets(rows: &mut Rows, bus: &BusSummary, lost: u64) {
+fn packets(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
     let up = &bus.uplink;
     rows.row("packets sent by cells", up.sent, "by their own count");
     rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
@@ -417,8 +417,8 @@ fn packets(rows: &mut Rows, bus: &BusSummary, lost: u64) {
     rows.any("  restarts of cells", up.restarts, "what they sent last is in doubt");
 }
 
-fn costs(rows: &mut Rows, summary: &Summary, is_verbose: bool) {
-    let Processor { gateway, cells, buses } = summary.processor;
+fn costs(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
+    let ProcessorUse { gateway, cells, buses } = summary.processor;
     // Avoid -0.0.
     let [gateway, cells, buses] = [gateway, cells, buses].map(|cores| cores.max(0.0) + 0.0);
     let cores = format!("{:.3}", gateway + cells + buses);

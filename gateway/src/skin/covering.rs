@@ -4,11 +4,11 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 
 use clap::Args;
-use cover::{Figures, KeepOut, Link, MAX_NODES, MAX_PITCH, MIN_PITCH, Options, cover};
+use cover::{LinkFigures, KeepOut, RobotLink, MAX_NODES, MAX_PITCH, MIN_PITCH, CoverOptions, cover};
 use protocol::usage::Failure;
-use robots::{CellOnLink, Chain, Isometry3, Urdf};
+use robots::{CellOnLink, UrdfChain, Isometry3, Urdf};
 
-use super::super::print::{count, list};
+use super::super::print::{count, comma_separated};
 use super::super::visuals::{Packages, Visuals};
 
 /// Options for the covered links.
@@ -78,12 +78,12 @@ fn keep_out(text: &str) -> Result<KeptOut, String> {
 /// Result of the covering.
 pub(super) struct Covered {
     pub(super) cells: Vec<CellOnLink>,
-    pub(super) figures: Vec<Figures>,
+    pub(super) figures: Vec<LinkFigures>,
 }
 
 impl Covering {
     /// Covers the links. A link belongs to the first chain that moves it, and each bus to one chain.
-    pub(super) fn cells(&self, urdf: &Urdf, file: &Path, chains: &[Chain]) -> Result<Covered, Failure> {
+    pub(super) fn cells(&self, urdf: &Urdf, file: &Path, chains: &[UrdfChain]) -> Result<Covered, Failure> {
         let owners = self.owners(urdf, chains)?;
         let visuals = Visuals::new(urdf, file, &self.packages);
         let there = urdf.links().filter(|name| !self.leave_out.iter().any(|out| out == name));
@@ -98,7 +98,7 @@ impl Covering {
                 };
                 error + &hint
             })?;
-            Ok(Link { name: name.to_owned(), parts, pose })
+            Ok(RobotLink { name: name.to_owned(), parts, pose })
         });
         let links: Vec<_> = links.collect::<Result<_, String>>().map_err(Failure::usage)?;
         if let Some(bare) = self
@@ -157,10 +157,10 @@ impl Covering {
     }
 
     /// Chain of each covered link.
-    fn owners(&self, urdf: &Urdf, chains: &[Chain]) -> Result<Vec<usize>, Failure> {
+    fn owners(&self, urdf: &Urdf, chains: &[UrdfChain]) -> Result<Vec<usize>, Failure> {
         let moved = || {
             let on_path = urdf.links().filter(|link| chains.iter().any(|chain| chain.link(link).is_ok()));
-            list(on_path)
+            comma_separated(on_path)
         };
         let mut owners = Vec::with_capacity(self.cover.len());
         for (index, name) in self.cover.iter().enumerate() {
@@ -182,7 +182,7 @@ impl Covering {
             }
         }
         if let Some(lost) = self.keep_out.iter().find(|lost| !self.cover.contains(&lost.link)) {
-            let links = list(&self.cover);
+            let links = comma_separated(&self.cover);
             return Err(Failure::usage(format!(
                 "--keep-out {}: {} is not covered: the covered links are {links}",
                 lost.text, lost.link
@@ -191,22 +191,22 @@ impl Covering {
         Ok(owners)
     }
 
-    fn options(&self, links: &[Link]) -> Options {
+    fn options(&self, links: &[RobotLink]) -> CoverOptions {
         let keep_out = self.keep_out.iter().filter_map(|it| {
             let link = links.iter().position(|link| link.name == it.link)?;
             Some(KeepOut { link, min: it.min, max: it.max })
         });
-        Options {
+        CoverOptions {
             pitch: self.pitch,
             seed: self.seed,
             keep_out: keep_out.collect(),
             nodes_per_bus: usize::from(self.nodes_per_bus).min(MAX_NODES),
-            ..Options::default()
+            ..CoverOptions::default()
         }
     }
 
     /// The options as given on the command line.
-    pub(super) fn words(&self) -> String {
+    pub(super) fn command_options(&self) -> String {
         let Self { cover, pitch, leave_out, keep_out, seed, nodes_per_bus, packages: _ } = self;
         if cover.is_empty() {
             return String::new();
@@ -223,13 +223,13 @@ impl Covering {
 }
 
 /// Returns true if a link has a triangle with an area.
-fn has_area(link: &Link) -> bool {
+fn has_area(link: &RobotLink) -> bool {
     let triangles = link.parts.iter().flat_map(|part| part.triangles(&Isometry3::identity()));
     triangles.into_iter().any(|[a, b, c]| (b - a).cross(&(c - a)).norm() > 0.0)
 }
 
 /// Reason why a link has no cell, in one line.
-fn without_cells(Figures { name, outer_area, kept_out, .. }: &Figures, is_flat: bool) -> String {
+fn without_cells(LinkFigures { name, outer_area, kept_out, .. }: &LinkFigures, is_flat: bool) -> String {
     let why = if is_flat {
         "its triangles have no area: correct its meshes, or take it out of --cover".to_owned()
     } else if *outer_area <= 0.0 {
@@ -246,8 +246,8 @@ fn without_cells(Figures { name, outer_area, kept_out, .. }: &Figures, is_flat: 
 }
 
 /// Figures of a covered link, in one line.
-pub(super) fn reported(figures: &Figures) -> String {
-    let Figures { name, cells, outer_area, kept_out: _, covered, spacing, tilt } = figures;
+pub(super) fn reported(figures: &LinkFigures) -> String {
+    let LinkFigures { name, cells, outer_area, kept_out: _, covered, spacing, tilt } = figures;
     let spacing =
         spacing.map_or_else(String::new, |metres| format!("; {:.1} mm from cell to cell", metres * 1e3));
     format!(

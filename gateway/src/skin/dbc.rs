@@ -5,12 +5,12 @@ use std::path::PathBuf;
 use analysis::dbc::dbc;
 use clap::Args;
 use protocol::can::Format;
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print_text};
 
 use crate::arguments::bus_names;
 use crate::input::skin_in;
 use crate::output::{Overwrite, apart};
-use crate::print::list;
+use crate::print::comma_separated;
 
 /// Describe a bus in a DBC file, for cantools, SavvyCAN and others
 ///
@@ -45,7 +45,7 @@ impl Dbc {
         let file = self.file.display();
         apart([("-o", self.output.as_deref())], [self.file.as_path()])?;
         let skin = skin_in(&self.file)?;
-        let names = || list(bus_names(&skin));
+        let names = || comma_separated(bus_names(&skin));
         let bus = match (&self.bus, skin.buses.as_slice()) {
             (Some(name), _) => skin.bus_named(name).ok_or_else(|| {
                 Failure::usage(format!("{file} has no bus {name:?}; its buses are {}", names()))
@@ -79,7 +79,7 @@ impl Dbc {
         let text = dbc(&skin, bus);
         match self.output {
             Some(path) => self.overwrite.write("-o", &path, &text),
-            None => print(&text),
+            None => print_text(&text),
         }
     }
 }

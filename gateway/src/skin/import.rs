@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use protocol::document;
 use protocol::id::CellId;
-use protocol::usage::{Failure, print};
-use robots::{CellOnLink, Chain, Import as Described, ImportError, JointKind};
+use protocol::usage::{Failure, print_text};
+use robots::{CellOnLink, UrdfChain, SkinImport as Described, ImportError, JointKind};
 
 use super::super::columns::{Columns, Table};
 use super::super::output::{Overwrite, apart, is_standard_output, note};
-use super::super::print::{count, list};
+use super::super::print::{count, comma_separated};
 use super::super::robot_file::{path_from, read_urdf};
 use super::covering::{self, Covered, Covering};
 
@@ -96,7 +96,7 @@ impl Import {
         let skin = import.toml().map_err(wrong)?;
         match &self.output {
             Some(path) => self.overwrite.write("-o", path, &skin)?,
-            None => print(&skin)?,
+            None => print_text(&skin)?,
         }
         for chain in &chains {
             note(reported(chain));
@@ -123,15 +123,15 @@ impl Import {
         if let Some(places) = &self.places {
             command += &format!(" --places {}", name(places));
         }
-        command += &self.covering.words();
+        command += &self.covering.command_options();
         command.replace(['\n', '\r'], " ")
     }
 }
 
 /// Describes a chain in one line.
-fn reported(chain: &Chain) -> String {
+fn reported(chain: &UrdfChain) -> String {
     let (joints, rows) = (count(chain.joints.len(), "joint"), count(chain.rows.len(), "row"));
-    let names = list(chain.joints.iter().map(|joint| &joint.name));
+    let names = comma_separated(chain.joints.iter().map(|joint| &joint.name));
     format!(
         "{} to {}: {joints} ({names}) in {rows}; rows and URDF differ by {:.1e} m or rad at most",
         chain.root, chain.tip, chain.residual
@@ -142,7 +142,7 @@ fn reported(chain: &Chain) -> String {
 const WIDE_RAD: f64 = 8.0 * core::f64::consts::PI;
 
 /// Joints whose limits are probably in degrees, one line each.
-fn wide(chain: &Chain) -> impl Iterator<Item = String> {
+fn wide(chain: &UrdfChain) -> impl Iterator<Item = String> {
     let turning = chain.joints.iter().filter(|joint| joint.kind == JointKind::Revolute);
     let wide = turning.filter(|joint| joint.limits.iter().any(|limit| limit.abs() > WIDE_RAD));
     wide.map(|joint| {
@@ -155,7 +155,7 @@ fn wide(chain: &Chain) -> impl Iterator<Item = String> {
 }
 
 fn text(path: &Path) -> Result<String, Failure> {
-    document::text(path).map_err(Failure::usage)
+    document::read_text(path).map_err(Failure::usage)
 }
 
 /// Reads the cells of a file.

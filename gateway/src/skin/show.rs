@@ -5,11 +5,11 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use protocol::parameters::RowKind;
 use protocol::skin::{Cell, Skin};
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print_text};
 use view::{Scene, Still};
 
 use super::super::output::{Overwrite, apart};
-use super::super::print::words;
+use super::super::print::space_separated;
 use super::super::robot_file::urdf_of;
 use super::super::surface::shells;
 use super::super::visuals::Packages;
@@ -49,7 +49,7 @@ impl Show {
         let page = still(&self.file, &skin, &self.packages).page();
         match &self.output {
             Some(path) => self.overwrite.write("-o", path, &page),
-            None => print(&page),
+            None => print_text(&page),
         }
     }
 }
@@ -58,7 +58,7 @@ impl Show {
 pub(crate) fn still(file: &Path, skin: &Skin, packages: &Packages) -> Still {
     let position = |[min, max]: [f64; 2]| 0.0_f64.clamp(min, max);
     Still {
-        scene: Scene::of(skin, false),
+        scene: Scene::from_skin(skin, false),
         surface: shells(file, skin, packages, TRIANGLES),
         positions: skin.robot.joints.iter().map(|joint| position(joint.limits)).collect(),
         details: skin.cells.iter().map(|cell| details(skin, cell)).collect(),
@@ -69,7 +69,7 @@ pub(crate) fn still(file: &Path, skin: &Skin, packages: &Packages) -> Still {
 fn details(skin: &Skin, cell: &Cell) -> Vec<(String, String)> {
     let mut details = Vec::new();
     let mut detail = |name: &str, value: String| details.push((name.to_owned(), value));
-    let joint = skin.joints_of(cell.bus).nth(usize::from(cell.joint).saturating_sub(1));
+    let joint = skin.joints_on_bus(cell.bus).nth(usize::from(cell.joint).saturating_sub(1));
     if let Some((_, joint)) = joint {
         detail("Joint", format!("{}, {}", cell.joint, joint.name));
     }
@@ -79,7 +79,7 @@ fn details(skin: &Skin, cell: &Cell) -> Vec<(String, String)> {
     if skin.chain(cell.bus).rows.iter().any(|row| row.kind == RowKind::Fixed) {
         detail("Row", cell.row.to_string());
     }
-    detail("In its frame", format!("{} m", words(cell.position.map(|it| (it * 1e5).round() / 1e5 + 0.0))));
+    detail("In its frame", format!("{} m", space_separated(cell.position.map(|it| (it * 1e5).round() / 1e5 + 0.0))));
     detail("Serial", cell.serial.to_string());
     detail("Hash", format!("{:04X}", skin.parameters(cell).hash()));
     details

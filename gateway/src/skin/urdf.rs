@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use protocol::skin::Skin;
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print_text};
 use robots::written;
 
 use super::super::output::{Overwrite, apart};
@@ -35,7 +35,7 @@ impl Urdf {
         let text = written(&skin).xml;
         match &self.output {
             Some(path) => self.overwrite.write("-o", path, &text),
-            None => print(&text),
+            None => print_text(&text),
         }
     }
 }

@@ -5,11 +5,11 @@ use std::io::{self, Read, Write};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print_text};
 use trace::files::WholeFile;
 
 /// Maximum size in bytes of a file that may be an address.
-const LONGEST: u64 = 4096;
+const MAX_FILE_BYTES: u64 = 4096;
 
 /// A file with the address of a page, which is removed on drop. Only its user can read it, because it contains the
 /// token.
@@ -25,7 +25,7 @@ impl AddressFile {
     pub(super) fn write(path: &Path, url: &str) -> Result<Option<Self>, Failure> {
         let text = format!("{url}\n");
         if path == Path::new("-") {
-            return print(&text).map(|()| None);
+            return print_text(&text).map(|()| None);
         }
         let refused =
             |error: io::Error| Failure::usage(format!("--address-file {}: {error}", path.display()));
@@ -69,7 +69,7 @@ fn is_address(path: &Path) -> bool {
 
 fn start_of(path: &Path) -> io::Result<String> {
     let mut text = String::new();
-    File::open(path)?.take(LONGEST).read_to_string(&mut text)?;
+    File::open(path)?.take(MAX_FILE_BYTES).read_to_string(&mut text)?;
     Ok(text)
 }
 

@@ -11,22 +11,22 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use bench::bus::follow::Source;
-use bench::bus::link::Link;
+use bench::bus::link::SharedBus;
 use bench::bus::realtime;
 use control::controller::Kinesthetic;
-use control::cycle::turn::{BusState, Line, Shared, Turn};
+use control::cycle::turn::{BusState, BusPort, Shared, TickDriver};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
 use model::generate::{Target, generate};
 use model::scenario::{Mode, ModeChange, Scenario};
 use model::table::Table;
-use protocol::bus::{Bus, BusKind, Choice, Options};
+use protocol::bus::{Bus, BusKind, KindChoice, BusOptions};
 use protocol::can::Frame;
 use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
-use vcan_setup::embedded::Served;
+use vcan_setup::embedded::ServerThread;
 
 /// Counts the allocations of the current thread.
 struct Counting;
@@ -59,7 +59,7 @@ fn skin(cells: usize) -> Skin {
 }
 
 /// Creates a loop over one bus in one mode; its records fit into a queue that is large enough.
-fn turn(skin: &Skin, mode: Mode) -> (Turn, triple_buffer::Input<model::table::Snapshot>, Table) {
+fn turn(skin: &Skin, mode: Mode) -> (TickDriver, triple_buffer::Input<model::table::Snapshot>, Table) {
     let (turn, input, table, _) = turn_of(skin, mode);
     (turn, input, table)
 }
@@ -68,18 +68,18 @@ fn turn(skin: &Skin, mode: Mode) -> (Turn, triple_buffer::Input<model::table::Sn
 fn turn_of(
     skin: &Skin,
     mode: Mode,
-) -> (Turn, triple_buffer::Input<model::table::Snapshot>, Table, Arc<BusState>) {
+) -> (TickDriver, triple_buffer::Input<model::table::Snapshot>, Table, Arc<BusState>) {
     let table = Table::new(skin, 0);
     let (input, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, _) = rtrb::RingBuffer::new(4_096);
     let (records, _) = rtrb::RingBuffer::new(4_096);
     let state = Arc::<BusState>::default();
-    let line = Line { format: protocol::can::Format::Fd, snapshot, positions, state: Arc::clone(&state) };
+    let line = BusPort { format: protocol::can::Format::Fd, snapshot, positions, state: Arc::clone(&state) };
     let modes = vec![ModeChange { at: Micros(0), mode }];
     let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
     let controller = Box::new(Kinesthetic::new(skin).unwrap());
     let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, padded(&[0.1; WORDS]))));
-    let turn = Turn::new(cycle, vec![line], Arc::new(scenario), Arc::new(Shared::default()), records);
+    let turn = TickDriver::new(cycle, vec![line], Arc::new(scenario), Arc::new(Shared::default()), records);
     (turn, input, table, state)
 }
 
@@ -87,9 +87,9 @@ fn turn_of(
 fn a_tick_allocates_nothing_in_either_mode_also_on_a_bus_that_takes_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let directory = directory.path().join("skinbus");
-    let served = Served::start_in(&directory, "vcan0").unwrap();
-    let options = Options { directory: Some(directory), ..Options::default() };
-    let bus = Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap();
+    let served = ServerThread::start_in(&directory, "vcan0").unwrap();
+    let options = BusOptions { directory: Some(directory), ..BusOptions::default() };
+    let bus = Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap();
     for mode in [Mode::Distributed, Mode::Compare] {
         assert_eq!(ticks(mode, &bus, true), Run { sent: 125, taken: 125, allocations: 0 }, "{mode:?}");
     }
@@ -108,7 +108,7 @@ fn a_halt_that_a_bus_refused_is_resent_before_its_next_joints_and_then_every_8()
     let mut taken = Vec::new();
     // No broadcast is read back, so the robot is halted within the first 100 ticks.
     for number in 0..200_u64 {
-        snapshots.input_buffer_mut().take(table.snapshot(), false);
+        snapshots.input_buffer_mut().copy_from(table.snapshot(), false);
         snapshots.publish();
         turn.turn(
             Tick { number, time: Micros(number * 2_000) },
@@ -135,7 +135,7 @@ fn a_bus_that_is_back_gets_the_state_of_the_robot_before_its_next_joints() {
     for number in 0..64_u64 {
         bus.works.store(!(20..30).contains(&number), Ordering::Relaxed);
         let snapshot = snapshots.input_buffer_mut();
-        snapshot.take(table.snapshot(), false);
+        snapshot.copy_from(table.snapshot(), false);
         snapshot.sums.read_back = number.checked_sub(1).map(|sent| Epoch((sent / 8).to_le_bytes()[0]));
         // Another sender halts the robot while the bus works for the second time.
         snapshot.sums.halts = u32::from(number >= 44);
@@ -162,15 +162,15 @@ fn a_bus_that_is_back_gets_the_state_of_the_robot_before_its_next_joints() {
 fn a_bus_that_was_opened_again_is_found_by_the_tick_which_allocates_nothing_for_it() {
     let directory = tempfile::tempdir().unwrap();
     let directory = directory.path().join("skinbus");
-    let serve = || Served::start_in(&directory, "vcan0").unwrap();
-    let options = Options { directory: Some(directory.clone()), ..Options::default() };
+    let serve = || ServerThread::start_in(&directory, "vcan0").unwrap();
+    let options = BusOptions { directory: Some(directory.clone()), ..BusOptions::default() };
     let frames = [Frame::classic(0x001, &[0; 8]).unwrap()];
     let first = serve();
-    let bus = Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap();
-    let (link, mut monitor, mut slot) = Link::new(bus, options);
+    let bus = Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap();
+    let (link, mut monitor, mut slot) = SharedBus::new(bus, options);
     let mut offer = || {
         let before = ALLOCATIONS.with(Cell::get);
-        let taken = slot.read().offer(&frames);
+        let taken = slot.read().try_send_all(&frames);
         (taken, ALLOCATIONS.with(Cell::get) - before)
     };
     assert_eq!(offer(), (true, 0));
@@ -204,13 +204,13 @@ fn ticks(mode: Mode, bus: &Bus, carries: bool) -> Run {
     let mut run = Run { sent: 0, taken: 0, allocations: 0 };
     for number in 0..1_000_u64 {
         let snapshot = snapshots.input_buffer_mut();
-        snapshot.take(table.snapshot(), true);
+        snapshot.copy_from(table.snapshot(), true);
         snapshot.sums.read_back = carries.then(|| Epoch((number / 8).to_le_bytes()[0]));
         snapshots.publish();
         let tick = Tick { number, time: Micros(number * 2_000) };
         let before = ALLOCATIONS.with(Cell::get);
         turn.turn(tick, 0, realtime::now(), realtime::now, |_, frames| {
-            let taken = bus.offer(frames);
+            let taken = bus.try_send_all(frames);
             run.sent += frames.len();
             run.taken += if taken { frames.len() } else { 0 };
             taken

@@ -12,7 +12,7 @@ use std::process::{Command, Output, Stdio};
 use protocol::can::{Format, Frame};
 use protocol::candump;
 use protocol::message::Message;
-use protocol::packet::{Lengths, Packet, Reassembly, Segment, data_id};
+use protocol::packet::{Lengths, Packet, Reassembly, Reassembler, data_id};
 use protocol::time::Micros;
 use tempfile::TempDir;
 
@@ -225,7 +225,7 @@ fn packet(frames: &[Frame], format: Format) -> Packet {
     match (format, frames) {
         (Format::Fd, [frame]) => Packet::from_fd(frame).unwrap(),
         (Format::Classic, [first, second]) => {
-            let mut segment = Segment::NONE;
+            let mut segment = Reassembler::NONE;
             let mut push = |frame: &Frame| {
                 segment.push(Micros(0), data_id(frame).unwrap(), Lengths::ALL, frame.data()).unwrap()
             };

@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
 use protocol::can::Format;
-use protocol::candump::{self, Line, Record};
+use protocol::candump::{self, CandumpLine, Record};
 use protocol::packet::Packet;
 use serde_json::Value;
 use tempfile::TempDir;
-use trace::capture::{Reader, SKIN};
+use trace::capture::{Reader, SKIN_ATTACHMENT};
 
 const NAMES: [&str; 5] = ["fd.mcap", "classic.mcap", "sums.mcap", "two.mcap", "split.mcap"];
 
@@ -54,7 +54,7 @@ fn folder() -> TempDir {
     for name in ["fd", "sums", "two"] {
         let mut reader = Reader::open(&folder.path().join(format!("{name}.mcap"))).unwrap();
         reader.next().unwrap();
-        let (_, skin) = reader.extras().attachments.iter().find(|(name, _)| name == SKIN).unwrap();
+        let (_, skin) = reader.extras().attachments.iter().find(|(name, _)| name == SKIN_ATTACHMENT).unwrap();
         fs::write(folder.path().join(format!("{name}.toml")), skin).unwrap();
     }
     folder
@@ -64,7 +64,7 @@ fn folder() -> TempDir {
 fn edit(folder: &Path, (from, to): (&str, &str), mut change: impl FnMut(&mut Record<'_>) -> bool) {
     let mut edited = String::new();
     for line in fs::read_to_string(folder.join(from)).unwrap().lines() {
-        let Line::Frame(mut record) = candump::parse(line).unwrap() else { continue };
+        let CandumpLine::Frame(mut record) = candump::parse(line).unwrap() else { continue };
         if change(&mut record) {
             candump::write_record(&mut edited, &record).unwrap();
             edited.push('\n');

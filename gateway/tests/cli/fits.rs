@@ -10,7 +10,7 @@ use protocol::can::Format;
 use protocol::candump::{Direction, Record, Timestamp, write_record};
 use protocol::fixed::Q1_14;
 use protocol::id::{CellId, Node};
-use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::message::{AppliesFrom, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use serde_json::Value;
@@ -109,7 +109,7 @@ fn run() -> Vec<(u64, Message)> {
         let epoch = Epoch(epoch);
         for node in 1..=ANSWERING {
             let page = SensorPage::Skin(SkinSensors::default());
-            said.push((now, Message::Stimulus { to: Node::Cell(cell(node)), from: From::Next, page }));
+            said.push((now, Message::Stimulus { to: Node::Cell(cell(node)), from: AppliesFrom::Next, page }));
         }
         let joints = Joints { positions: padded(&[Q1_14::from_bits(0x2345); WORDS]), in_use: 6 };
         said.push((now, Message::Joints { epoch, joints }));

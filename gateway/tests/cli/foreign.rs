@@ -44,7 +44,7 @@ fn record(nanos: u64, frame: Frame) -> Record<'static> {
 fn statistics(frames: &[(u64, Frame)]) -> Report {
     let mut stats = Stats::default();
     for ((nanos, frame), decoded) in settled(frames) {
-        stats.take(&record(nanos, frame), &decoded);
+        stats.record(&record(nanos, frame), &decoded);
     }
     stats.report()
 }

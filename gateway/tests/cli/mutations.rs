@@ -89,7 +89,7 @@ fn passes(folder: &Path, what: &str, file: &[u8], commands: &[&str]) {
 }
 
 /// Number of commands that run at once: replaying commands mostly wait.
-const AT_ONCE: usize = 8;
+const MAX_PARALLEL: usize = 8;
 
 #[test]
 fn whatever_a_recording_is_every_command_ends_and_says_why() {
@@ -105,7 +105,7 @@ fn whatever_a_recording_is_every_command_ends_and_says_why() {
     });
     let files = Mutex::new(whole.chain(damaged));
     thread::scope(|scope| {
-        for _ in 0..AT_ONCE {
+        for _ in 0..MAX_PARALLEL {
             scope.spawn(|| {
                 let folder = tempfile::tempdir().unwrap();
                 fs::write(folder.path().join("skin.toml"), &skin).unwrap();

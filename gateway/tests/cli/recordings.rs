@@ -5,7 +5,7 @@ use std::fs;
 use std::path::PathBuf;
 use std::process::{Command, Output};
 
-use trace::capture::{Reader, SKIN};
+use trace::capture::{Reader, SKIN_ATTACHMENT};
 
 /// Directory of the recordings.
 fn recordings() -> PathBuf {
@@ -85,7 +85,7 @@ fn another_skin_than_the_recorded_one_is_remarked() {
     let mut reader = Reader::open(&recordings().join("fd.mcap")).unwrap();
     reader.next().unwrap();
     let attached = &reader.extras().attachments;
-    let (_, own) = attached.iter().find(|(name, _)| name == SKIN).unwrap();
+    let (_, own) = attached.iter().find(|(name, _)| name == SKIN_ATTACHMENT).unwrap();
     let own = String::from_utf8(own.clone()).unwrap();
     for command in ["dump fd.mcap --brief", "explain fd.mcap --epoch 9", "fit fd.mcap"] {
         let same = said(&own, command);

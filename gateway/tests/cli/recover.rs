@@ -12,8 +12,8 @@ use mcap::records::{MessageHeader, op};
 use mcap::{MessageStream, WriteOptions};
 use protocol::can::Frame;
 use protocol::candump::{Record, Timestamp};
-use trace::recording::file::{DESCRIBED_EVERY, FileWriter};
-use trace::recording::recover::{RecoverError, Recovered, recover};
+use trace::recording::file::{CHUNKS_PER_DESCRIPTION, FileWriter};
+use trace::recording::recover::{RecoverError, RecoveryResult, recover};
 use trace::ros2::standard::JointState;
 
 /// A recording with messages of two topics in five chunks, a file and metadata.
@@ -54,7 +54,7 @@ fn messages(bytes: &[u8]) -> Vec<(String, u64, u32, Vec<u8>)> {
     messages
 }
 
-fn recovered(bytes: &[u8]) -> Result<(Recovered, Vec<u8>), RecoverError> {
+fn recovered(bytes: &[u8]) -> Result<(RecoveryResult, Vec<u8>), RecoverError> {
     let mut out = Vec::new();
     recover(Cursor::new(bytes), &mut out).map(|recovered| (recovered, out))
 }
@@ -88,7 +88,7 @@ fn a_file_that_breaks_off_anywhere_keeps_what_was_handed_on() {
                     "{end}: whole chunks, in order"
                 );
                 assert!(kept.len() >= most, "{end}: more bytes, fewer messages");
-                assert!(!said.is_sound() && said.damaged == (0, 0) && said.homeless == 0, "{end}: {said:?}");
+                assert!(!said.is_sound() && said.damaged == (0, 0) && said.orphaned_messages == 0, "{end}: {said:?}");
                 most = kept.len();
                 // A repaired file needs no repair.
                 let (again, _) = recovered(&copy).unwrap();
@@ -122,13 +122,13 @@ fn a_damaged_chunk_is_omitted_and_said_and_the_others_are_kept() {
     let mut first = bytes;
     first[usize::try_from(chunks[0].chunk_start_offset + chunks[0].chunk_length - 9).unwrap()] ^= 0x10;
     let (said, copy) = recovered(&first).unwrap();
-    assert_eq!((said.messages, said.homeless, said.damaged.0), (100, 0, 1), "{said:?}");
+    assert_eq!((said.messages, said.orphaned_messages, said.damaged.0), (100, 0, 1), "{said:?}");
     assert_eq!(messages(&copy), all);
     // Without an end they are known from records outside of chunks.
     let end =
         usize::try_from(chunks.last().unwrap().message_index_offsets.values().max().unwrap() + 1).unwrap();
     let (said, copy) = recovered(&first[..end]).unwrap();
-    assert_eq!((said.messages, said.homeless, said.stated), (100, 0, None), "{said:?}");
+    assert_eq!((said.messages, said.orphaned_messages, said.stated), (100, 0, None), "{said:?}");
     assert_eq!(messages(&copy), all);
 }
 
@@ -150,12 +150,12 @@ fn types_and_topics_of_a_recording_by_others_are_known_from_its_summary() {
     damaged[usize::try_from(first.chunk_start_offset + first.chunk_length - 9).unwrap()] ^= 1;
     let (said, copy) = recovered(&damaged).unwrap();
     let lost = summary.chunk_indexes.len();
-    assert!(said.messages >= 20 - 2 && said.homeless == 0 && lost > 5, "{said:?}");
+    assert!(said.messages >= 20 - 2 && said.orphaned_messages == 0 && lost > 5, "{said:?}");
     assert!(all.ends_with(&messages(&copy)), "{said}");
     // Without an end the other channels are unknown.
     let end = bytes.windows(9).position(|at| at == [15, 4, 0, 0, 0, 0, 0, 0, 0]).unwrap();
     let (said, _) = recovered(&damaged[..end]).unwrap();
-    assert!(said.messages == 0 && said.homeless >= 18 && said.is_little(), "{said:?}");
+    assert!(said.messages == 0 && said.orphaned_messages >= 18 && said.is_little(), "{said:?}");
 }
 
 #[test]
@@ -184,7 +184,7 @@ fn types_and_topics_are_described_outside_of_chunks_again_and_again() {
     let mut writer = FileWriter::new(Vec::new()).unwrap();
     let mut joints = writer.channel::<JointState<'_>>("/arm/joint_states", &[]).unwrap();
     let state = JointState { nanos: 1, names: &[], position: &[1.0], velocity: &[], effort: &[] };
-    let count = 3 * DESCRIBED_EVERY + 5;
+    let count = 3 * CHUNKS_PER_DESCRIPTION + 5;
     for _ in 0..count {
         writer.write(&mut joints, 1, &state).unwrap();
         writer.flush().unwrap();
@@ -199,9 +199,9 @@ fn types_and_topics_are_described_outside_of_chunks_again_and_again() {
             described.push(since);
             since = 0;
         }
-        assert!(since <= DESCRIBED_EVERY);
+        assert!(since <= CHUNKS_PER_DESCRIPTION);
     }
-    assert_eq!((chunks, described), (count, vec![1, DESCRIBED_EVERY, DESCRIBED_EVERY, DESCRIBED_EVERY]));
+    assert_eq!((chunks, described), (count, vec![1, CHUNKS_PER_DESCRIPTION, CHUNKS_PER_DESCRIPTION, CHUNKS_PER_DESCRIPTION]));
 }
 
 /// Checks that all messages of undamaged chunks are kept in order, and that no message was invented.
@@ -335,7 +335,7 @@ fn descriptions_that_moved_into_the_place_of_a_chunk_are_found() {
     for gone in [9, 100, 300] {
         let damaged = [&killed[..first - gone], &killed[first..]].concat();
         let (said, _) = recovered(&damaged).unwrap();
-        assert_eq!((said.messages, said.homeless), (20, 0), "{gone}: {said}");
+        assert_eq!((said.messages, said.orphaned_messages), (20, 0), "{gone}: {said}");
     }
 }
 

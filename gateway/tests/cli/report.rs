@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use tempfile::TempDir;
-use trace::capture::{Reader, SKIN};
+use trace::capture::{Reader, SKIN_ATTACHMENT};
 
 const LOG: &str = "(1.000001) vcan0 123#11\n(2.000000) vcan0 22C##5AABB\n";
 
@@ -101,7 +101,7 @@ fn recorded() -> TempDir {
         let mut reader = Reader::open(&recordings.join(format!("{name}.mcap"))).unwrap();
         reader.next().unwrap();
         let attached = &reader.extras().attachments;
-        let (_, skin) = attached.iter().find(|(attachment, _)| attachment == SKIN).unwrap();
+        let (_, skin) = attached.iter().find(|(attachment, _)| attachment == SKIN_ATTACHMENT).unwrap();
         fs::write(folder.path().join(format!("{name}.toml")), skin).unwrap();
     }
     folder

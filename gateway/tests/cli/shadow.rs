@@ -6,7 +6,7 @@ use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use protocol::candump::{self, Line};
+use protocol::candump::{self, CandumpLine};
 use protocol::wire_time::Bits;
 use serde_json::Value;
 
@@ -44,10 +44,10 @@ fn each_frame_is_an_object_with_the_bits_and_times_of_a_bus() {
     let objects = objects(&text);
     assert_eq!(objects.len(), 3_000);
     for (object, line) in objects.iter().zip(log().lines()) {
-        let Line::Frame(record) = candump::parse(line).unwrap() else { panic!("{line}") };
+        let CandumpLine::Frame(record) = candump::parse(line).unwrap() else { panic!("{line}") };
         let keys: Vec<_> = object.as_object().unwrap().keys().map(String::as_str).collect();
         assert_eq!(keys.len(), 7, "{keys:?}");
-        let bits = Bits::of(&record.frame).unwrap();
+        let bits = Bits::from_frame(&record.frame).unwrap();
         assert_eq!(object["nominal_bits"], bits.nominal);
         assert_eq!(object["data_bits"], bits.data);
         assert_eq!(
@@ -68,7 +68,7 @@ fn every_line_that_a_capture_can_have_is_taken() {
     fs::write(folder.path().join("corpus.log"), CORPUS).unwrap();
     let (code, text, _) = gateway(folder.path(), "fit corpus.log --json");
     let frames = CORPUS.split(|&byte| byte == b'\n').filter(|line| {
-        std::str::from_utf8(line).is_ok_and(|line| matches!(candump::parse(line), Ok(Line::Frame(_))))
+        std::str::from_utf8(line).is_ok_and(|line| matches!(candump::parse(line), Ok(CandumpLine::Frame(_))))
     });
     assert_eq!((code, objects(&text).len()), (Some(0), frames.count()));
 }

@@ -56,7 +56,7 @@ impl BusNote {
 
     /// Parses a note. Returns the bus and its new state, or `None` if the note is another one.
     #[must_use]
-    pub fn of<'a>(note: &Note<'a>) -> Option<(&'a str, Self)> {
+    pub fn parse<'a>(note: &Note<'a>) -> Option<(&'a str, Self)> {
         let text = core::str::from_utf8(note.text).ok().filter(|_| note.kind == NoteKind::Text)?;
         // In a log the note is a comment.
         let text = text.strip_prefix("# ").unwrap_or(text);
@@ -75,7 +75,7 @@ mod tests {
     fn what_is_noted_of_a_bus_is_read_back() {
         let said = |text: &str| {
             let note = Note { kind: NoteKind::Text, nanos: 0, interface: "", line: 0, text: text.as_bytes() };
-            BusNote::of(&note).map(|(bus, it)| (bus.to_owned(), it))
+            BusNote::parse(&note).map(|(bus, it)| (bus.to_owned(), it))
         };
         for it in BusNote::ALL {
             let found = Some(("can '0".to_owned(), it));

@@ -18,9 +18,9 @@ pub const WINDOW_FRAMES: usize = 8_192;
 
 /// The next frame to be sent.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Ordered<T> {
+pub struct ReleasedFrame<T> {
     /// The time to send it, by the capture's clock; never before that of the frame before it.
-    pub at: u64,
+    pub send_nanos: u64,
     /// The frame's own time.
     pub nanos: u64,
     /// True if a newer frame was released before it; the frame is then sent at once.
@@ -31,7 +31,7 @@ pub struct Ordered<T> {
 
 /// Merges buses by time.
 #[derive(Clone, Debug)]
-pub struct Order<T> {
+pub struct BusMerger<T> {
     /// Waiting frames with their own times. The key is the time, or the latest time before it on the same bus, and the
     /// position in the capture.
     waiting: BTreeMap<(u64, u64), (u64, T)>,
@@ -43,13 +43,13 @@ pub struct Order<T> {
     released: u64,
 }
 
-impl<T> Default for Order<T> {
+impl<T> Default for BusMerger<T> {
     fn default() -> Self {
         Self { waiting: BTreeMap::new(), buses: Vec::new(), places: 0, newest: 0, released: 0 }
     }
 }
 
-impl<T> Order<T> {
+impl<T> BusMerger<T> {
     /// Adds the capture's next frame.
     pub fn push(&mut self, bus: usize, nanos: u64, item: T) {
         if self.buses.len() <= bus {
@@ -65,7 +65,7 @@ impl<T> Order<T> {
     }
 
     /// Returns the next frame, if it need not wait longer.
-    pub fn pop(&mut self) -> Option<Ordered<T>> {
+    pub fn pop(&mut self) -> Option<ReleasedFrame<T>> {
         let (&(key, _), _) = self.waiting.first_key_value()?;
         let waits = self.newest.saturating_sub(key) <= WINDOW_NS && self.waiting.len() <= WINDOW_FRAMES;
         if waits { None } else { self.pop_last() }
@@ -78,11 +78,11 @@ impl<T> Order<T> {
     }
 
     /// Returns the next frame without waiting, at the end of the capture.
-    pub fn pop_last(&mut self) -> Option<Ordered<T>> {
+    pub fn pop_last(&mut self) -> Option<ReleasedFrame<T>> {
         let ((key, _), (nanos, item)) = self.waiting.pop_first()?;
         let is_late = nanos < self.released;
         self.released = self.released.max(key);
-        Some(Ordered { at: self.released, nanos, is_late, item })
+        Some(ReleasedFrame { send_nanos: self.released, nanos, is_late, item })
     }
 }
 
@@ -92,8 +92,8 @@ mod tests {
     use proptest::prelude::*;
 
     /// Returns all released frames with their bus and position.
-    fn merged(frames: &[(usize, u64)]) -> Vec<Ordered<(usize, usize)>> {
-        let mut order = Order::default();
+    fn merged(frames: &[(usize, u64)]) -> Vec<ReleasedFrame<(usize, usize)>> {
+        let mut order = BusMerger::default();
         let mut out = Vec::new();
         for (place, &(bus, nanos)) in frames.iter().enumerate() {
             order.push(bus, nanos, (bus, place));
@@ -116,7 +116,7 @@ mod tests {
     fn the_order_of_one_bus_is_never_changed() {
         let frames = [(0, 20 * MS), (0, 10 * MS), (1, 15 * MS)];
         let out = merged(&frames);
-        let seen: Vec<_> = out.iter().map(|it| (it.item.1, it.at / MS, it.is_late)).collect();
+        let seen: Vec<_> = out.iter().map(|it| (it.item.1, it.send_nanos / MS, it.is_late)).collect();
         assert_eq!(seen, [(2, 15, false), (0, 20, false), (1, 20, true)]);
     }
 
@@ -124,13 +124,13 @@ mod tests {
     fn what_is_older_than_the_window_comes_at_once() {
         let frames = [(0, 1_000 * MS), (0, 5_000 * MS), (1, 500 * MS), (0, 9_000 * MS)];
         let out = merged(&frames);
-        let seen: Vec<_> = out.iter().map(|it| (it.item.1, it.at / MS, it.is_late)).collect();
+        let seen: Vec<_> = out.iter().map(|it| (it.item.1, it.send_nanos / MS, it.is_late)).collect();
         assert_eq!(seen, [(0, 1_000, false), (2, 1_000, true), (1, 5_000, false), (3, 9_000, false)]);
     }
 
     #[test]
     fn no_more_frames_wait_than_are_said_to() {
-        let mut order = Order::default();
+        let mut order = BusMerger::default();
         for place in 0..3 * WINDOW_FRAMES {
             order.push(0, 7, place);
             while order.pop().is_some() {}
@@ -146,7 +146,7 @@ mod tests {
             let frames: Vec<_> = frames.into_iter().map(|(bus, at)| (bus, at * MS)).collect();
             let out = merged(&frames);
             prop_assert_eq!(out.len(), frames.len());
-            prop_assert!(out.is_sorted_by_key(|it| it.at));
+            prop_assert!(out.is_sorted_by_key(|it| it.send_nanos));
             for bus in 0..3 {
                 let places: Vec<_> =
                     out.iter().filter(|it| it.item.0 == bus).map(|it| it.item.1).collect();
@@ -154,7 +154,7 @@ mod tests {
                 prop_assert_eq!(places, expected);
             }
             for it in &out {
-                prop_assert_eq!(it.is_late, it.nanos < it.at, "at once is when it is late, and only then");
+                prop_assert_eq!(it.is_late, it.nanos < it.send_nanos, "at once is when it is late, and only then");
             }
         }
 
@@ -176,7 +176,7 @@ mod tests {
             let frames: Vec<_> = frames.into_iter().map(|(_, bus, at)| (bus, at)).collect();
             let out = merged(&frames);
             prop_assert!(out.is_sorted_by_key(|it| it.nanos));
-            prop_assert!(out.iter().all(|it| !it.is_late && it.at == it.nanos));
+            prop_assert!(out.iter().all(|it| !it.is_late && it.send_nanos == it.nanos));
         }
     }
 }

@@ -24,11 +24,11 @@ pub enum Command {
     /// Resumes all cells.
     Resume,
     /// Requests the details of a cell with each status message.
-    Choose(Chosen),
+    Choose(SelectedCell),
     /// Ends the request for details.
     Unchoose,
     /// A command to the run that the page belongs to.
-    Bench(bench::remote::Command),
+    Bench(bench::remote::BenchCommand),
     /// Plays a recording.
     Play {
         /// Playback speed: seconds of the recording per second.
@@ -58,7 +58,7 @@ pub enum Command {
 /// The cell and the frame that a page shows in detail.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq)]
 #[serde(deny_unknown_fields)]
-pub struct Chosen {
+pub struct SelectedCell {
     /// The cell's bus, as an index into the skin's buses.
     pub bus: usize,
     /// The cell's node id.
@@ -69,13 +69,13 @@ pub struct Chosen {
 }
 
 /// The maximum length of a page's message, in bytes.
-pub const LONGEST: usize = 512;
+pub const MAX_MESSAGE_BYTES: usize = 512;
 
 impl Command {
     /// Parses a message; returns `None` if it is not a command.
     #[must_use]
     pub fn parse(text: &str) -> Option<Self> {
-        if text.len() > LONGEST {
+        if text.len() > MAX_MESSAGE_BYTES {
             return None;
         }
         serde_json::from_str(text).ok()
@@ -83,13 +83,13 @@ impl Command {
 
     /// Returns true if the command changes what cells do.
     #[must_use]
-    pub const fn acts(&self) -> bool {
+    pub const fn affects_cells(&self) -> bool {
         matches!(self, Self::Press { .. } | Self::Release | Self::Halt | Self::Resume | Self::Bench(_))
     }
 
     /// Returns true if the command changes the position in a recording.
     #[must_use]
-    pub const fn plays(&self) -> bool {
+    pub const fn controls_playback(&self) -> bool {
         matches!(
             self,
             Self::Play { .. } | Self::Pause | Self::Seek { .. } | Self::Step { .. } | Self::Jump { .. }
@@ -106,10 +106,10 @@ mod tests {
     fn commands_are_json_and_nothing_else_is_one() {
         let press = Command::Press { bus: 0, node: 12, force_n: 2.5 };
         assert_eq!(Command::parse(r#"{"do":"press","bus":0,"node":12,"force_n":2.5}"#), Some(press.clone()));
-        assert!(press.acts() && !Command::Unchoose.acts());
-        let down = Command::Bench(bench::remote::Command::Bus { down: true, bus: 1 });
+        assert!(press.affects_cells() && !Command::Unchoose.affects_cells());
+        let down = Command::Bench(bench::remote::BenchCommand::Bus { down: true, bus: 1 });
         assert_eq!(Command::parse(r#"{"do":"bench","on":"bus","down":true,"bus":1}"#), Some(down.clone()));
-        assert!(down.acts());
+        assert!(down.affects_cells());
         for wrong in [
             "",
             "null",
@@ -125,7 +125,7 @@ mod tests {
         ] {
             assert_eq!(Command::parse(wrong), None, "{wrong}");
         }
-        assert_eq!(Command::parse(&format!("{}{{\"do\":\"halt\"}}", " ".repeat(LONGEST))), None);
+        assert_eq!(Command::parse(&format!("{}{{\"do\":\"halt\"}}", " ".repeat(MAX_MESSAGE_BYTES))), None);
     }
 
     proptest! {

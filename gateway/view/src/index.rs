@@ -8,13 +8,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 
 use protocol::skin::Skin;
-use trace::capture::{CaptureError, Place, Reader};
+use trace::capture::{CaptureError, SeekPoint, Reader};
 
 use crate::locked;
-use crate::tape::{Event, EventKind, Step, Tape, Watcher};
+use crate::tape::{Event, EventKind, TapeStep, Tape, EventDetector};
 
 /// The approximate memory limit for all kept states, in bytes.
-const BYTES: usize = 256 << 20;
+const MEMORY_LIMIT: usize = 256 << 20;
 /// The approximate size of a kept state per bus and per cell.
 const BUS_BYTES: usize = 1 << 20;
 const CELL_BYTES: usize = 4 << 10;
@@ -23,11 +23,11 @@ const SPACING_NS: u64 = 2_000_000_000;
 
 /// The state of a recording at a position, and the place where reading continues.
 #[derive(Debug)]
-pub struct Kept {
+pub struct Checkpoint {
     /// The state up to this position.
     pub tape: Tape,
     /// The place of the next entry.
-    pub place: Place,
+    pub place: SeekPoint,
 }
 
 /// The index of a recording. One thread builds it while another one reads it.
@@ -36,7 +36,7 @@ pub struct Index(Mutex<Inner>);
 
 #[derive(Debug, Default)]
 struct Inner {
-    kept: Vec<Arc<Kept>>,
+    checkpoints: Vec<Arc<Checkpoint>>,
     events: Vec<Event>,
     at: u64,
     is_over: bool,
@@ -65,49 +65,49 @@ pub struct Progress {
 impl Index {
     /// Indexes a recording from its first frame to its end, or until `stop`. Seconds count from `zero`.
     pub fn build(&self, mut reader: Reader, skin: Skin, (first, zero): (u64, u64), stop: &AtomicBool) {
-        let count = BYTES / (skin.buses.len() * BUS_BYTES + skin.cells.len() * CELL_BYTES).max(1);
+        let count = MEMORY_LIMIT / (skin.buses.len() * BUS_BYTES + skin.cells.len() * CELL_BYTES).max(1);
         let mut spacing = SPACING_NS;
         let mut next = first.saturating_add(spacing);
         let mut tape = Tape::new(skin, zero);
         tape.begin(reader.extras());
-        let mut watcher = Watcher::default();
+        let mut watcher = EventDetector::default();
         while !tape.is_over() && !stop.load(Ordering::Relaxed) {
             match tape.step(u64::MAX) {
-                Step::Hungry => {
+                TapeStep::NeedsEntries => {
                     if let Err(error) = tape.feed(&mut reader) {
                         self.fail(&error);
                     }
                 }
-                Step::Looked => {
-                    let events = watcher.look(tape.at(), tape.live());
-                    let kept = (tape.at() >= next).then(|| {
-                        let mut kept = Kept { tape: tape.clone(), place: reader.place() };
+                TapeStep::Updated => {
+                    let events = watcher.detect(tape.position(), tape.live());
+                    let kept = (tape.position() >= next).then(|| {
+                        let mut kept = Checkpoint { tape: tape.clone(), place: reader.place() };
                         kept.tape.forget_recent();
                         Arc::new(kept)
                     });
                     let mut inner = locked(&self.0);
-                    (inner.at, inner.others) = (tape.at(), tape.others());
+                    (inner.at, inner.others) = (tape.position(), tape.foreign_frames());
                     inner.events.extend(events);
                     if let Some(kept) = kept {
-                        inner.kept.push(kept);
-                        if inner.kept.len() > count.max(4) {
+                        inner.checkpoints.push(kept);
+                        if inner.checkpoints.len() > count.max(4) {
                             let mut number = 0;
-                            inner.kept.retain(|_| {
+                            inner.checkpoints.retain(|_| {
                                 number += 1;
                                 number % 2 == 0
                             });
                             spacing *= 2;
                         }
-                        next = tape.at().saturating_add(spacing);
+                        next = tape.position().saturating_add(spacing);
                     }
                 }
-                Step::Applied { .. } | Step::There | Step::Over => {}
+                TapeStep::Applied { .. } | TapeStep::Reached | TapeStep::Over => {}
             }
         }
         let mut inner = locked(&self.0);
         inner.unfinished.clone_from(&reader.extras().unfinished);
-        (inner.at, inner.others, inner.is_over) = (tape.at(), tape.others(), true);
-        inner.events.extend(watcher.look(tape.at(), tape.live()));
+        (inner.at, inner.others, inner.is_over) = (tape.position(), tape.foreign_frames(), true);
+        inner.events.extend(watcher.detect(tape.position(), tape.live()));
     }
 
     fn fail(&self, error: &CaptureError) {
@@ -125,15 +125,15 @@ impl Index {
 
     /// Returns the last kept state at or before a moment.
     #[must_use]
-    pub fn before(&self, at: u64) -> Option<Arc<Kept>> {
+    pub fn checkpoint_before(&self, at: u64) -> Option<Arc<Checkpoint>> {
         let inner = locked(&self.0);
-        let place = inner.kept.partition_point(|kept| kept.tape.at() <= at).checked_sub(1)?;
-        inner.kept.get(place).cloned()
+        let place = inner.checkpoints.partition_point(|kept| kept.tape.position() <= at).checked_sub(1)?;
+        inner.checkpoints.get(place).cloned()
     }
 
     /// Returns the time of the next event of a kind after a moment, or of the last one before it.
     #[must_use]
-    pub fn event(&self, kind: EventKind, from: u64, forward: bool) -> Option<u64> {
+    pub fn find_event(&self, kind: EventKind, from: u64, forward: bool) -> Option<u64> {
         let inner = locked(&self.0);
         let mut of_kind = inner.events.iter().filter(|event| event.kind == kind).map(|event| event.at);
         if forward { of_kind.find(|at| *at > from) } else { of_kind.rev().find(|at| *at < from) }

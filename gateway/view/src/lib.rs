@@ -36,8 +36,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 pub use live::Live;
 pub use scene::Scene;
-pub use still::{Moved, Still};
-pub use surface::Shell;
+pub use still::{MovedCell, Still};
+pub use surface::RowMesh;
 pub use token::Token;
 
 /// Locks a mutex, also after a thread that held it has panicked.

@@ -11,9 +11,9 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 
 use self::bus::LiveBus;
-pub use self::recent::{FrameSaid, Recent, Why};
-pub use self::said::{Answer, BusSaid, Dead, Detail, Gains, Said, Wires};
-use crate::pressed::{Place, Pressed};
+pub use self::recent::{DecodedFrame, RecentFrames, TorqueExplanation};
+pub use self::said::{TorqueReply, BusStatus, DeadCell, CellDetail, Gains, StatusMessage, TreePlace};
+use crate::pressed::{CellKey, TouchRegistry};
 use protocol::message::SkinSensors;
 
 /// The state of a skin, as seen on its buses.
@@ -28,7 +28,7 @@ pub struct Live {
     began: Option<Micros>,
     /// The bus whose joints count as epochs: the first bus that carries joints.
     clock: Option<usize>,
-    recent: Recent,
+    recent: RecentFrames,
 }
 
 /// The flags of a cell in a snapshot.
@@ -51,13 +51,13 @@ impl Live {
             let place = next.get_mut(cell.bus).map_or(0, |next| std::mem::replace(next, *next + 1));
             (cell.bus, place)
         });
-        let recent = Recent::new(&skin);
+        let recent = RecentFrames::new(&skin);
         Self { places: places.collect(), skin, buses, number: 0, began: None, clock: None, recent }
     }
 
     /// Creates the state before any frame, with times that count from `began`.
     #[must_use]
-    pub fn since(skin: Skin, began: Micros) -> Self {
+    pub fn with_start(skin: Skin, began: Micros) -> Self {
         Self { began: Some(began), ..Self::new(skin) }
     }
 
@@ -68,10 +68,10 @@ impl Live {
     }
 
     /// Applies the frames that were latched when a recording began, each with its bus index. Counters start after them.
-    pub fn begin<'a>(&mut self, at: Micros, latched: impl Iterator<Item = (usize, &'a Frame)>) {
+    pub fn apply_latched<'a>(&mut self, at: Micros, latched: impl Iterator<Item = (usize, &'a Frame)>) {
         for (index, frame) in latched {
             if let Some(bus) = self.buses.get_mut(index) {
-                bus.frame(at, frame);
+                bus.apply_frame(at, frame);
                 self.recent.push(at, index, frame);
             }
         }
@@ -79,10 +79,10 @@ impl Live {
     }
 
     /// Applies a frame of a bus. Returns true if an epoch begins with it.
-    pub fn frame(&mut self, bus: usize, at: Micros, frame: &Frame) -> bool {
+    pub fn apply_frame(&mut self, bus: usize, at: Micros, frame: &Frame) -> bool {
         self.began.get_or_insert(at);
         let Some(of) = self.buses.get_mut(bus) else { return false };
-        let joints = of.frame(at, frame);
+        let joints = of.apply_frame(at, frame);
         self.recent.push(at, bus, frame);
         if joints {
             self.clock = Some(self.clock.map_or(bus, |clock| clock.min(bus)));
@@ -92,7 +92,7 @@ impl Live {
 
     /// Drops the frames of the last seconds.
     pub fn forget_recent(&mut self) {
-        self.recent.forget();
+        self.recent.clear();
     }
 
     /// Returns for each bus the total of all losses so far, and true if the bus is halted.
@@ -117,14 +117,14 @@ impl Live {
     /// N.
     #[must_use]
     pub fn torques(&self) -> Vec<[f64; 2]> {
-        self.rows().into_iter().map(|[_, distributed, central]| [distributed, central]).collect()
+        self.joint_rows().into_iter().map(|[_, distributed, central]| [distributed, central]).collect()
     }
 
     /// Returns the position, the distributed and the central torque of each joint of the robot.
-    fn rows(&self) -> Vec<[f64; 3]> {
+    fn joint_rows(&self) -> Vec<[f64; 3]> {
         let mut rows = vec![[0.0_f64; 3]; self.skin.robot.joints.len()];
         for (index, bus) in self.buses.iter().enumerate() {
-            for ((place, (joint, _)), torque) in self.skin.joints_of(index).enumerate().zip(bus.torques()) {
+            for ((place, (joint, _)), torque) in self.skin.joints_on_bus(index).enumerate().zip(bus.torques()) {
                 let Some([position, distributed, central]) = rows.get_mut(joint) else { continue };
                 *position = bus.position(place).unwrap_or(*position);
                 *distributed += torque.0;
@@ -148,7 +148,7 @@ impl Live {
 
     /// Returns the key of a cell if the skin has it and it may be pressed: it has reported test mode.
     #[must_use]
-    pub fn may_press(&self, bus: usize, node: u8) -> Option<Place> {
+    pub fn pressable_cell(&self, bus: usize, node: u8) -> Option<CellKey> {
         let node = CellId::new(node.into()).ok()?;
         let cell = self.buses.get(bus)?.cell(node)?;
         (cell.measures() == Some(false)).then_some((bus, node))
@@ -156,7 +156,7 @@ impl Live {
 
     /// Returns the sensor words that a cell has latched, as far as the bus shows them.
     #[must_use]
-    pub fn latched(&self, (bus, node): Place, now: Micros) -> Option<SkinSensors> {
+    pub fn latched(&self, (bus, node): CellKey, now: Micros) -> Option<SkinSensors> {
         self.buses.get(bus)?.sensors(node, now)
     }
 
@@ -175,7 +175,7 @@ impl Live {
     /// All values are little-endian. The torques are those of the last completed epoch. Status: 0 never heard, 1 quiet,
     /// 2 active, 3 stale, 4 dead. Flags: 1 without parameters, 2 with parameters other than the skin's, 4 measures,
     /// 8 halted, 16 pressed by a page, 32 stuck.
-    pub fn snapshot(&mut self, now: Micros, pressed: &Pressed) -> Vec<u8> {
+    pub fn snapshot(&mut self, now: Micros, pressed: &TouchRegistry) -> Vec<u8> {
         self.number = self.number.wrapping_add(1);
         let joints = self.skin.robot.joints.len();
         let count = |number: usize| u32::try_from(number).unwrap_or(u32::MAX);
@@ -184,11 +184,11 @@ impl Live {
             bytes.extend(word.to_le_bytes());
         }
         bytes.extend(self.seconds(now).to_le_bytes());
-        for value in self.rows().into_iter().flatten() {
+        for value in self.joint_rows().into_iter().flatten() {
             #[expect(clippy::cast_possible_truncation, reason = "to be drawn")]
             bytes.extend((value as f32).to_le_bytes());
         }
-        let shown: Vec<Vec<_>> = self.buses.iter().map(|bus| bus.shown(now)).collect();
+        let shown: Vec<Vec<_>> = self.buses.iter().map(|bus| bus.encode_cells(now)).collect();
         for (cell, &(bus, place)) in self.skin.cells.iter().zip(&self.places) {
             let Some(mut cell_bytes) = shown.get(bus).and_then(|bus| bus.get(place)).copied() else {
                 continue;

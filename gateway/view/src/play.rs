@@ -12,21 +12,21 @@ use trace::capture::Reader;
 
 use crate::command::Command;
 use crate::index::Progress;
-use crate::live::Said;
+use crate::live::StatusMessage;
 use crate::player::{PlayError, Player};
-use crate::pressed::Pressed;
+use crate::pressed::TouchRegistry;
 use crate::scene::Scene;
 use crate::serve::ServeError;
-use crate::server::{Access, Counts, Server};
-use crate::surface::{Shell, pack};
+use crate::server::{Access, ServerCounts, Server};
+use crate::surface::{RowMesh, pack};
 use crate::tape::EventKind;
 
 /// The interval between snapshots.
-const EVERY: Duration = Duration::from_millis(33);
+const SNAPSHOT_INTERVAL: Duration = Duration::from_millis(33);
 /// The number of snapshots per status message.
-const SAID_EVERY: u64 = 6;
+const SNAPSHOTS_PER_STATUS: u64 = 6;
 /// The number of parts of the time line in which events are marked.
-const PARTS: u16 = 600;
+const TIMELINE_PARTS: u16 = 600;
 
 /// The recording to play, and the server's settings.
 #[derive(Debug)]
@@ -36,7 +36,7 @@ pub struct Options {
     /// The skin that was recorded.
     pub skin: Skin,
     /// The robot's surface, if known.
-    pub surface: Vec<Shell>,
+    pub surface: Vec<RowMesh>,
     /// The socket that pages connect to.
     pub listener: TcpListener,
     /// The pages' rights and token.
@@ -57,12 +57,12 @@ pub fn play(
     stop: &AtomicBool,
     is_served: impl FnOnce(),
     warns: impl Fn(&str) + Sync,
-) -> Result<Counts, ServeError> {
+) -> Result<ServerCounts, ServeError> {
     let Options { paths, skin, surface, listener, access, at_s } = options;
     let mut player = Player::open(&paths, skin.clone())?;
     let reader = Reader::open_all(&paths).map_err(PlayError::from)?;
     let (shells, corners) = pack(&surface);
-    let scene = serde_json::to_string(&Scene { shells, ..Scene::of(&skin, false) }).unwrap_or_default();
+    let scene = serde_json::to_string(&Scene { shells, ..Scene::from_skin(&skin, false) }).unwrap_or_default();
     let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
     is_served();
     let (index, times) = (player.index(), (player.first(), player.zero()));
@@ -88,7 +88,7 @@ pub fn play(
 
 /// Publishes the player's state to the pages, and carries out their commands.
 fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
-    let nobody = Pressed::default();
+    let nobody = TouchRegistry::default();
     let (mut next, mut before) = (Instant::now(), Instant::now());
     let (mut number, mut jumps) = (0_u64, u64::MAX);
     let mut marks = (usize::MAX, BTreeMap::new());
@@ -102,34 +102,34 @@ fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
             if matches!(command, Command::Seek { .. }) && is_passed {
                 continue;
             }
-            failed = obey(player, command).err().or(failed);
+            failed = execute(player, command).err().or(failed);
         }
         let elapsed = std::mem::replace(&mut before, Instant::now()).elapsed();
-        match player.pass(elapsed) {
+        match player.advance_time(elapsed) {
             Ok(changed) => is_changed |= changed,
             Err(error) => failed = Some(error.to_string()),
         }
         if let Some(failed) = failed {
             player.fail(failed);
         }
-        if server.pages() > 0 {
+        if server.page_count() > 0 {
             let now = player.now();
             if jumps != player.jumps() {
                 jumps = player.jumps();
                 server.publish_history(player.history());
             }
-            let said = number.is_multiple_of(SAID_EVERY).then(|| {
-                let playback = player.said();
+            let said = number.is_multiple_of(SNAPSHOTS_PER_STATUS).then(|| {
+                let playback = player.playback();
                 if marks.0 != playback.events {
                     let kinds = [EventKind::Touch, EventKind::Loss, EventKind::Silence, EventKind::Halt];
-                    marks = (playback.events, kinds.map(|kind| (kind, player.marks(kind, PARTS))).into());
+                    marks = (playback.events, kinds.map(|kind| (kind, player.marks(kind, TIMELINE_PARTS))).into());
                 }
                 let live = player.live();
-                let playback = Some(playback.marked(marks.1.clone()));
-                let mut said = Said { playback, ..live.said(now) };
-                let text = |said: &Said| serde_json::to_string(said).unwrap_or_default();
+                let playback = Some(playback.with_marks(marks.1.clone()));
+                let mut said = StatusMessage { playback, ..live.status_message(now) };
+                let text = |said: &StatusMessage| serde_json::to_string(said).unwrap_or_default();
                 let all = text(&said);
-                let own = server.chosen().into_iter().map(|(page, chosen)| {
+                let own = server.selected_cells().into_iter().map(|(page, chosen)| {
                     said.detail = live.detail(chosen, now);
                     (page, text(&said))
                 });
@@ -140,13 +140,13 @@ fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
             }
             number += 1;
         }
-        next = (next + EVERY).max(Instant::now());
+        next = (next + SNAPSHOT_INTERVAL).max(Instant::now());
         thread::sleep(next.saturating_duration_since(Instant::now()).max(Duration::from_millis(1)));
     }
 }
 
 /// Carries out a page's command.
-fn obey(player: &mut Player, command: &Command) -> Result<(), String> {
+fn execute(player: &mut Player, command: &Command) -> Result<(), String> {
     let done = match *command {
         Command::Play { speed } => {
             player.play(speed);

@@ -8,20 +8,20 @@ use std::time::Duration;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
-use trace::capture::{CaptureError, Entry, Place, Places, Reader, seconds_since};
+use trace::capture::{CaptureError, Entry, SeekPoint, SeekIndex, Reader, seconds_since};
 
-use crate::index::{Index, Kept};
+use crate::index::{Index, Checkpoint};
 use crate::live::Live;
-use crate::tape::{EventKind, Step, Tape};
+use crate::tape::{EventKind, TapeStep, Tape};
 
 /// The time before a position for which the plots have values, in ns.
 const HISTORY_NS: u64 = 10_000_000_000;
 /// The same where the index has not reached the position yet.
-const GLANCE_NS: u64 = 3_000_000_000;
+const PREVIEW_NS: u64 = 3_000_000_000;
 /// The interval between two values of a plot, in ns.
 const SAMPLE_NS: u64 = 20_000_000;
 /// The minimum and the maximum speed.
-const SPEEDS: [f64; 2] = [0.01, 100.0];
+const SPEED_RANGE: [f64; 2] = [0.01, 100.0];
 
 /// The time, and the distributed and the central torque of each joint.
 type Sample = (u64, Vec<[f64; 2]>);
@@ -30,7 +30,7 @@ type Sample = (u64, Vec<[f64; 2]>);
 #[derive(Debug)]
 pub struct Player {
     skin: Skin,
-    places: Places,
+    places: SeekIndex,
     index: Arc<Index>,
     reader: Reader,
     tape: Tape,
@@ -85,7 +85,7 @@ pub struct Playback {
 impl Playback {
     /// Returns the same state with these marks.
     #[must_use]
-    pub fn marked(self, marks: BTreeMap<EventKind, Vec<u16>>) -> Self {
+    pub fn with_marks(self, marks: BTreeMap<EventKind, Vec<u16>>) -> Self {
         Self { marks, ..self }
     }
 }
@@ -119,7 +119,7 @@ impl Player {
             }
         };
         let zero = beginning.extras().run_began().unwrap_or(first);
-        let places = Places::of(paths)?;
+        let places = SeekIndex::open(paths)?;
         let reader = Reader::open_all(paths)?;
         let mut tape = Tape::new(skin.clone(), zero);
         tape.begin(reader.extras());
@@ -185,7 +185,7 @@ impl Player {
 
     /// Plays at a speed from now on, clamped to 0.01 to 100; 1 if it is not finite.
     pub fn play(&mut self, speed: f64) {
-        let [min, max] = SPEEDS;
+        let [min, max] = SPEED_RANGE;
         self.speed = if speed.is_finite() { speed.clamp(min, max) } else { 1.0 };
         self.playing = true;
     }
@@ -205,8 +205,8 @@ impl Player {
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the recording cannot be read further.
-    pub fn pass(&mut self, elapsed: Duration) -> Result<bool, CaptureError> {
-        if !self.is_exact && self.index_is_at(self.at) {
+    pub fn advance_time(&mut self, elapsed: Duration) -> Result<bool, CaptureError> {
+        if !self.is_exact && self.is_indexed(self.at) {
             self.go_to(self.at)?;
             return Ok(true);
         }
@@ -243,7 +243,7 @@ impl Player {
         }
         if self.tape.epoch_before(self.at).is_none() {
             // Reads the time before the position, to find its epochs.
-            self.go_back(self.at)?;
+            self.restart_before(self.at)?;
         }
         let before = self.tape.epoch_before(self.at);
         before.map_or(Ok(()), |before| self.go_to(before))
@@ -254,45 +254,45 @@ impl Player {
     /// # Errors
     /// Returns [`CaptureError`] if the recording cannot be read there.
     pub fn jump(&mut self, kind: EventKind, forward: bool) -> Result<bool, CaptureError> {
-        let Some(at) = self.index.event(kind, self.at, forward) else { return Ok(false) };
+        let Some(at) = self.index.find_event(kind, self.at, forward) else { return Ok(false) };
         self.playing = false;
         self.go_to(at)?;
         Ok(true)
     }
 
-    fn index_is_at(&self, at: u64) -> bool {
+    fn is_indexed(&self, at: u64) -> bool {
         let progress = self.index.progress();
         progress.is_over || progress.at >= at
     }
 
     fn go_to(&mut self, at: u64) -> Result<(), CaptureError> {
         let at = at.clamp(self.first, self.last());
-        let near = self.tape.at() <= at && at - self.tape.at() <= HISTORY_NS;
+        let near = self.tape.position() <= at && at - self.tape.position() <= HISTORY_NS;
         if near && self.is_exact {
             return self.advance(at, false);
         }
-        self.go_back(at)
+        self.restart_before(at)
     }
 
     /// Seeks to a position from the last kept state before it.
-    fn go_back(&mut self, at: u64) -> Result<(), CaptureError> {
-        self.is_exact = self.index_is_at(at) || at <= self.first.saturating_add(HISTORY_NS);
-        let kept = self.index.before(at.saturating_sub(HISTORY_NS)).filter(|_| self.is_exact);
+    fn restart_before(&mut self, at: u64) -> Result<(), CaptureError> {
+        self.is_exact = self.is_indexed(at) || at <= self.first.saturating_add(HISTORY_NS);
+        let kept = self.index.checkpoint_before(at.saturating_sub(HISTORY_NS)).filter(|_| self.is_exact);
         let place = match kept.as_deref() {
-            Some(Kept { tape, place }) => {
+            Some(Checkpoint { tape, place }) => {
                 self.tape.clone_from(tape);
                 *place
             }
             None => {
                 self.tape = Tape::new(self.skin.clone(), self.zero);
                 match self.is_exact {
-                    true => Place::default(),
-                    false => self.places.before(at.saturating_sub(GLANCE_NS)),
+                    true => SeekPoint::default(),
+                    false => self.places.before(at.saturating_sub(PREVIEW_NS)),
                 }
             }
         };
         self.reader.go_to(&self.places, place)?;
-        if place == Place::default() {
+        if place == SeekPoint::default() {
             self.tape.begin(self.reader.extras());
         }
         self.history.clear();
@@ -305,22 +305,22 @@ impl Player {
     fn advance(&mut self, until: u64, to_epoch: bool) -> Result<(), CaptureError> {
         loop {
             match self.tape.step(until) {
-                Step::Hungry => self.tape.feed(&mut self.reader)?,
-                Step::Looked => {}
-                Step::Applied { epoch } => {
-                    let at = self.tape.at();
+                TapeStep::NeedsEntries => self.tape.feed(&mut self.reader)?,
+                TapeStep::Updated => {}
+                TapeStep::Applied { epoch } => {
+                    let at = self.tape.position();
                     let is_due = |(last, _): &(u64, _)| at.saturating_sub(*last) >= SAMPLE_NS;
                     if epoch && self.history.back().is_none_or(is_due) {
                         self.history.push_back((at, self.tape.live().torques()));
                     }
-                    if epoch && to_epoch && self.tape.at() > self.at {
+                    if epoch && to_epoch && self.tape.position() > self.at {
                         break;
                     }
                 }
-                Step::There | Step::Over => break,
+                TapeStep::Reached | TapeStep::Over => break,
             }
         }
-        self.at = if to_epoch { self.tape.at().min(until) } else { until };
+        self.at = if to_epoch { self.tape.position().min(until) } else { until };
         let old = self.at.saturating_sub(HISTORY_NS);
         while self.history.front().is_some_and(|(at, _)| *at < old) {
             self.history.pop_front();
@@ -363,7 +363,7 @@ impl Player {
 
     /// Returns the state for the page.
     #[must_use]
-    pub fn said(&self) -> Playback {
+    pub fn playback(&self) -> Playback {
         let progress = self.index.progress();
         let (of, read) = (self.last() - self.first, progress.at.saturating_sub(self.first));
         Playback {

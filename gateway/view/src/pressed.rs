@@ -10,69 +10,69 @@ use protocol::time::Micros;
 /// The maximum force of a touch, in N.
 pub const MAX_FORCE_N: f64 = 90.0;
 /// The time after which a stimulus that the cell has not latched is sent again, in µs.
-const AGAIN_US: u64 = 150_000;
+const RETRY_INTERVAL_US: u64 = 150_000;
 /// The maximum number of attempts to send a release: the cell may be gone.
-const RELEASES: u32 = 20;
+const MAX_RELEASE_ATTEMPTS: u32 = 20;
 
 /// A cell: its bus index and its node id.
-pub type Place = (usize, CellId);
+pub type CellKey = (usize, CellId);
 
 /// The force to apply to a cell.
 #[derive(Clone, Copy, Debug)]
-struct Target {
+struct TargetForce {
     force_n: f64,
     sent: Option<Micros>,
     /// The number of times that it was sent; this limits releases.
-    tries: u32,
+    attempts: u32,
 }
 
 /// The touches of all pages.
 #[derive(Clone, Debug, Default)]
-pub struct Pressed {
+pub struct TouchRegistry {
     /// The cell and the force of each page.
-    pages: BTreeMap<u64, (Place, f64)>,
-    targets: BTreeMap<Place, Target>,
+    pages: BTreeMap<u64, (CellKey, f64)>,
+    targets: BTreeMap<CellKey, TargetForce>,
 }
 
-impl Pressed {
+impl TouchRegistry {
     /// Presses a cell for a page, and releases the cell that the page pressed before. The force is clamped to 0 to
     /// [`MAX_FORCE_N`]; NaN and infinity count as 0.
-    pub fn press(&mut self, page: u64, cell: Place, force_n: f64) {
+    pub fn press(&mut self, page: u64, cell: CellKey, force_n: f64) {
         let force_n = if force_n.is_finite() { force_n.clamp(0.0, MAX_FORCE_N) } else { 0.0 };
         let before = self.pages.insert(page, (cell, force_n));
         if let Some((before, _)) = before.filter(|(before, _)| *before != cell) {
-            self.aim(before);
+            self.update_target(before);
         }
-        self.aim(cell);
+        self.update_target(cell);
     }
 
     /// Releases the cell of a page, also after the page has gone.
     pub fn release(&mut self, page: u64) {
         if let Some((cell, _)) = self.pages.remove(&page) {
-            self.aim(cell);
+            self.update_target(cell);
         }
     }
 
     /// Sets the force on a cell: the sum of the forces of all pages.
-    fn aim(&mut self, cell: Place) {
+    fn update_target(&mut self, cell: CellKey) {
         let pages = self.pages.values().filter(|(of, _)| *of == cell);
         let force_n = pages.map(|(_, force_n)| force_n).sum::<f64>().min(MAX_FORCE_N);
-        self.targets.insert(cell, Target { force_n, sent: None, tries: 0 });
+        self.targets.insert(cell, TargetForce { force_n, sent: None, attempts: 0 });
     }
 
     /// Returns true if a cell is pressed.
     #[must_use]
-    pub fn is_pressed(&self, cell: Place) -> bool {
+    pub fn is_pressed(&self, cell: CellKey) -> bool {
         self.targets.get(&cell).is_some_and(|target| target.force_n > 0.0)
     }
 
     /// Returns the stimuli to send now. `latched` returns the sensor words that a cell has latched, as far as the bus
     /// shows them.
-    pub fn due(
+    pub fn due_stimuli(
         &mut self,
         now: Micros,
-        latched: impl Fn(Place) -> Option<SkinSensors>,
-    ) -> Vec<(Place, SkinSensors)> {
+        latched: impl Fn(CellKey) -> Option<SkinSensors>,
+    ) -> Vec<(CellKey, SkinSensors)> {
         let mut due = Vec::new();
         self.targets.retain(|&cell, target| {
             let sensors =
@@ -82,12 +82,12 @@ impl Pressed {
             if is_latched && target.sent.is_some() {
                 return !released;
             }
-            if target.sent.is_none_or(|sent| now.since(sent).0 >= AGAIN_US) {
+            if target.sent.is_none_or(|sent| now.elapsed_since(sent).0 >= RETRY_INTERVAL_US) {
                 target.sent = Some(now);
-                target.tries += 1;
+                target.attempts += 1;
                 due.push((cell, sensors));
             }
-            !(released && target.tries >= RELEASES)
+            !(released && target.attempts >= MAX_RELEASE_ATTEMPTS)
         });
         due
     }
@@ -98,7 +98,7 @@ impl Pressed {
 mod tests {
     use super::*;
 
-    fn cell(node: u8) -> Place {
+    fn cell(node: u8) -> CellKey {
         (0, CellId::new(node.into()).unwrap())
     }
 
@@ -108,33 +108,33 @@ mod tests {
 
     #[test]
     fn a_touch_is_sent_until_it_is_latched_and_goes_with_its_page() {
-        let mut pressed = Pressed::default();
+        let mut pressed = TouchRegistry::default();
         pressed.press(1, cell(3), 4.5);
-        let first = pressed.due(Micros(0), |_| None);
+        let first = pressed.due_stimuli(Micros(0), |_| None);
         assert_eq!((first.len(), force(&first[0].1), first[0].0), (1, 4.5, cell(3)));
-        assert_eq!(pressed.due(Micros(1_000), |_| None), [], "it may still come");
-        assert_eq!(pressed.due(Micros(200_000), |_| None).len(), 1, "it was lost");
+        assert_eq!(pressed.due_stimuli(Micros(1_000), |_| None), [], "it may still come");
+        assert_eq!(pressed.due_stimuli(Micros(200_000), |_| None).len(), 1, "it was lost");
         let sensors = first[0].1;
-        assert_eq!(pressed.due(Micros(900_000), |_| Some(sensors)), []);
+        assert_eq!(pressed.due_stimuli(Micros(900_000), |_| Some(sensors)), []);
         assert!(pressed.is_pressed(cell(3)));
         // The cell restarts.
-        assert_eq!(pressed.due(Micros(1_900_000), |_| Some(SkinSensors::default())).len(), 1);
+        assert_eq!(pressed.due_stimuli(Micros(1_900_000), |_| Some(SkinSensors::default())).len(), 1);
         pressed.release(1);
-        let last = pressed.due(Micros(2_000_000), |_| Some(sensors));
+        let last = pressed.due_stimuli(Micros(2_000_000), |_| Some(sensors));
         assert_eq!((last.len(), force(&last[0].1)), (1, 0.0));
-        assert_eq!(pressed.due(Micros(2_020_000), |_| Some(SkinSensors::default())), []);
+        assert_eq!(pressed.due_stimuli(Micros(2_020_000), |_| Some(SkinSensors::default())), []);
         assert!(pressed.targets.is_empty() && !pressed.is_pressed(cell(3)));
     }
 
     #[test]
     fn a_page_presses_one_cell_and_forces_of_pages_add_up() {
-        let mut pressed = Pressed::default();
+        let mut pressed = TouchRegistry::default();
         pressed.press(1, cell(3), 1.0);
         pressed.press(2, cell(3), f64::INFINITY);
         pressed.press(2, cell(3), 2.0);
-        assert_eq!(force(&pressed.due(Micros(0), |_| None)[0].1), 3.0);
+        assert_eq!(force(&pressed.due_stimuli(Micros(0), |_| None)[0].1), 3.0);
         pressed.press(1, cell(4), -7.0);
-        let due = pressed.due(Micros(1), |_| None);
+        let due = pressed.due_stimuli(Micros(1), |_| None);
         assert_eq!(
             due.iter().map(|(cell, it)| (cell.1.get(), force(it))).collect::<Vec<_>>(),
             [(3, 2.0), (4, 0.0)]
@@ -144,10 +144,10 @@ mod tests {
 
     #[test]
     fn a_release_that_nobody_takes_ends() {
-        let mut pressed = Pressed::default();
+        let mut pressed = TouchRegistry::default();
         pressed.press(1, cell(3), 1.0);
         pressed.release(1);
-        let sent = (0..100_u64).map(|at| pressed.due(Micros(at * AGAIN_US), |_| None).len()).sum::<usize>();
-        assert_eq!((sent, pressed.targets.len()), (RELEASES as usize, 0));
+        let sent = (0..100_u64).map(|at| pressed.due_stimuli(Micros(at * RETRY_INTERVAL_US), |_| None).len()).sum::<usize>();
+        assert_eq!((sent, pressed.targets.len()), (MAX_RELEASE_ATTEMPTS as usize, 0));
     }
 }

@@ -11,9 +11,9 @@ use serde::Serialize;
 use crate::surface::SceneShell;
 
 /// The pitch is estimated from about this many cells.
-const ASKED: usize = 200;
+const PITCH_SAMPLES: usize = 200;
 /// The pitch of a skin whose cells have no neighbours, in m.
-const PITCH: f64 = 0.028;
+const DEFAULT_PITCH: f64 = 0.028;
 
 /// The scene that the page draws; lengths in m, angles in rad.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -123,7 +123,7 @@ pub struct Tube {
 impl Scene {
     /// Returns the scene of a skin.
     #[must_use]
-    pub fn of(skin: &Skin, may_press: bool) -> Self {
+    pub fn from_skin(skin: &Skin, may_press: bool) -> Self {
         let joints = skin.robot.joints.iter().map(|joint| SceneJoint {
             name: joint.name.clone(),
             unit: joint.kind.unit(),
@@ -177,10 +177,10 @@ fn pitch(cells: &[SceneCell]) -> f64 {
             |other: &SceneCell| (Vector3::from(other.position) - Vector3::from(cell.position)).norm();
         same.map(distance).filter(|distance| *distance > 1e-6).min_by(f64::total_cmp)
     };
-    let each = cells.len().div_ceil(ASKED).max(1);
+    let each = cells.len().div_ceil(PITCH_SAMPLES).max(1);
     let mut all: Vec<_> = cells.iter().step_by(each).filter_map(nearest).collect();
     all.sort_by(f64::total_cmp);
-    all.get(all.len() / 2).copied().unwrap_or(PITCH).min(0.1)
+    all.get(all.len() / 2).copied().unwrap_or(DEFAULT_PITCH).min(0.1)
 }
 
 /// Returns tubes for the links with many cells.
@@ -209,7 +209,7 @@ mod tests {
     #[test]
     fn cells_around_a_link_lie_on_a_tube_and_those_on_a_plate_on_none() {
         let skin = Skin::parse("ur5", include_str!("../../examples/ur5-253.toml")).unwrap();
-        let scene = Scene::of(&skin, true);
+        let scene = Scene::from_skin(&skin, true);
         assert_eq!((scene.cells.len(), scene.joints.len(), scene.chains[0].rows.len()), (253, 6, 6));
         assert!((0.02..0.035).contains(&scene.pitch), "{}", scene.pitch);
         assert_eq!(scene.tubes.len(), 2, "upper arm and forearm");
@@ -231,7 +231,7 @@ mod tests {
     #[test]
     fn each_row_names_the_joint_that_moves_it() {
         let skin = Skin::parse("ur5", include_str!("../../examples/ur5-253.toml")).unwrap();
-        let scene = Scene::of(&skin, false);
+        let scene = Scene::from_skin(&skin, false);
         let joints: Vec<_> = scene.chains[0].rows.iter().map(|row| row.joint).collect();
         assert_eq!(joints, (0..6).map(Some).collect::<Vec<_>>());
     }

@@ -9,34 +9,34 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use bench::bus::follow::{Follower, Part, Source, Step};
+use bench::bus::follow::{Follower, FollowedItem, Source, FollowStep};
 use bench::bus::listen::{now, open, send};
-use bench::remote::{Lines, State};
+use bench::remote::{JsonPipe, BenchState};
 use protocol::bus::batch::BATCH;
-use protocol::bus::{self, Bus, BusError, Kinds};
+use protocol::bus::{self, Bus, BusError, KindChoices};
 use protocol::can::Format;
 use protocol::id::Node;
-use protocol::message::{From, Message, SensorPage};
+use protocol::message::{AppliesFrom, Message, SensorPage};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
 use crate::command::Command;
-use crate::live::{Live, Said};
+use crate::live::{Live, StatusMessage};
 use crate::locked;
 use crate::player::PlayError;
-use crate::pressed::Pressed;
+use crate::pressed::TouchRegistry;
 use crate::scene::Scene;
-use crate::server::{Access, Counts, Server};
-use crate::surface::{Shell, pack};
+use crate::server::{Access, ServerCounts, Server};
+use crate::surface::{RowMesh, pack};
 
 /// The interval between snapshots.
-const EVERY: Duration = Duration::from_millis(33);
+const SNAPSHOT_INTERVAL: Duration = Duration::from_millis(33);
 /// The number of snapshots per status message.
-const SAID_EVERY: u64 = 6;
+const SNAPSHOTS_PER_STATUS: u64 = 6;
 /// The receive timeout.
-const WAIT: Duration = Duration::from_millis(50);
+const RECEIVE_TIMEOUT: Duration = Duration::from_millis(50);
 /// The time that frames gather after the first one, so that one wake-up reads many.
-const GATHER: Duration = Duration::from_millis(8);
+const GATHER_TIME: Duration = Duration::from_millis(8);
 
 /// The value of `read_to` while no frames are waiting.
 const UP_TO_DATE: u64 = u64::MAX;
@@ -47,9 +47,9 @@ pub struct Options {
     /// The skin.
     pub skin: Skin,
     /// The robot's surface, if known.
-    pub surface: Vec<Shell>,
+    pub surface: Vec<RowMesh>,
     /// The kind of each bus.
-    pub kinds: Kinds,
+    pub kinds: KindChoices,
     /// The directory of embedded buses, if not the default one.
     pub directory: Option<PathBuf>,
     /// The socket that pages connect to.
@@ -57,9 +57,9 @@ pub struct Options {
     /// The pages' rights and token.
     pub access: Access,
     /// True to wait for a bus that does not exist at the start.
-    pub patient: bool,
+    pub waits_for_buses: bool,
     /// The run that the pages command; the view ends with it.
-    pub bench: Option<Lines>,
+    pub bench: Option<JsonPipe>,
 }
 
 /// The error for a view that cannot be served.
@@ -81,7 +81,7 @@ pub enum ServeError {
 
 /// A bus, shared by its thread and the main one.
 #[derive(Debug)]
-struct Shared {
+struct SharedBus {
     name: String,
     format: Format,
     bus: Mutex<Option<Arc<Bus>>>,
@@ -94,17 +94,17 @@ struct Shared {
 /// # Errors
 /// Returns [`ServeError`] if a bus cannot be opened at the start and is not waited for, or if the system refuses a
 /// thread.
-pub fn serve(options: Options, stop: &AtomicBool, is_served: impl FnOnce()) -> Result<Counts, ServeError> {
-    let Options { skin, surface, kinds, directory, listener, access, patient, bench } = options;
+pub fn serve(options: Options, stop: &AtomicBool, is_served: impl FnOnce()) -> Result<ServerCounts, ServeError> {
+    let Options { skin, surface, kinds, directory, listener, access, waits_for_buses: patient, bench } = options;
     let may_act = access.may_act;
     let opened = |name: &str, format: Format| {
-        let options = bus::Options {
+        let options = bus::BusOptions {
             own_frames: true,
             directory: directory.clone(),
             receive_buffer: 8 << 20,
-            ..bus::Options::default()
+            ..bus::BusOptions::default()
         };
-        open(name, kinds.of(name), Some(format), options).map(Arc::new)
+        open(name, kinds.kind_of(name), Some(format), options).map(Arc::new)
     };
     let buses = skin.buses.iter().map(|bus| {
         let first = match opened(&bus.name, bus.format) {
@@ -113,11 +113,11 @@ pub fn serve(options: Options, stop: &AtomicBool, is_served: impl FnOnce()) -> R
             Err(error) => return Err(ServeError::Bus(error)),
         };
         let read_to = AtomicU64::new(UP_TO_DATE);
-        Ok(Shared { name: bus.name.clone(), format: bus.format, bus: Mutex::new(first), read_to })
+        Ok(SharedBus { name: bus.name.clone(), format: bus.format, bus: Mutex::new(first), read_to })
     });
     let buses: Vec<_> = buses.collect::<Result<_, _>>()?;
     let (shells, corners) = pack(&surface);
-    let scene = Scene { shells, ..Scene::of(&skin, may_act) };
+    let scene = Scene { shells, ..Scene::from_skin(&skin, may_act) };
     let scene = serde_json::to_string(&scene).unwrap_or_default();
     let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
     is_served();
@@ -138,13 +138,13 @@ pub fn serve(options: Options, stop: &AtomicBool, is_served: impl FnOnce()) -> R
 }
 
 /// A bus that may appear later, and is reopened after it is lost.
-struct Reopened<'a, O> {
-    shared: &'a Shared,
+struct ReopeningBus<'a, O> {
+    shared: &'a SharedBus,
     opened: &'a O,
     bus: Option<Arc<Bus>>,
 }
 
-impl<O: Fn(&str, Format) -> Result<Arc<Bus>, BusError>> Source for Reopened<'_, O> {
+impl<O: Fn(&str, Format) -> Result<Arc<Bus>, BusError>> Source for ReopeningBus<'_, O> {
     fn bus(&self) -> Option<&Bus> {
         self.bus.as_deref()
     }
@@ -160,15 +160,15 @@ impl<O: Fn(&str, Format) -> Result<Arc<Bus>, BusError>> Source for Reopened<'_, 
 /// Receives on a bus until `stop`.
 fn receive(
     index: usize,
-    shared: &Shared,
+    shared: &SharedBus,
     live: &Mutex<Live>,
     stop: &AtomicBool,
     opened: &impl Fn(&str, Format) -> Result<Arc<Bus>, BusError>,
 ) {
-    let mut source = Reopened { shared, opened, bus: locked(&shared.bus).clone() };
-    let mut follower = Follower::new(None, GATHER);
+    let mut source = ReopeningBus { shared, opened, bus: locked(&shared.bus).clone() };
+    let mut follower = Follower::new(None, GATHER_TIME);
     while !stop.load(Ordering::Relaxed) {
-        if let Step::Gone(_) = follower.step(&mut source, WAIT) {
+        if let FollowStep::Gone(_) = follower.step(&mut source, RECEIVE_TIMEOUT) {
             *locked(&shared.bus) = None;
         }
         // After a full batch more frames may be waiting.
@@ -177,8 +177,8 @@ fn receive(
         shared.read_to.store(read_to, Ordering::Relaxed);
         let mut live = locked(live);
         follower.parts(|part| {
-            if let Part::Frame(received) = part {
-                live.frame(index, Micros(received.at_nanos / 1_000), &received.frame);
+            if let FollowedItem::Frame(received) = part {
+                live.apply_frame(index, Micros(received.at_nanos / 1_000), &received.frame);
             }
         });
         live.set_bus(index, !follower.is_lost(), follower.dropped());
@@ -188,49 +188,49 @@ fn receive(
 /// Publishes snapshots to the pages, and passes their commands to the buses and to the run.
 fn publish(
     live: &Mutex<Live>,
-    buses: &[Shared],
+    buses: &[SharedBus],
     server: &Server,
-    mut bench: Option<Lines>,
+    mut bench: Option<JsonPipe>,
     stop: &AtomicBool,
 ) {
-    let mut pressed = Pressed::default();
+    let mut pressed = TouchRegistry::default();
     let mut state = None;
     let mut next = Instant::now();
     let mut number = 0_u64;
     while !stop.load(Ordering::Relaxed) {
         for (page, command) in server.commands() {
             let Command::Bench(command) = command else {
-                obey(page, &command, &locked(live), &mut pressed, buses);
+                execute(page, &command, &locked(live), &mut pressed, buses);
                 continue;
             };
             if !bench.as_mut().is_some_and(|run| run.send(&command)) {
-                server.ignore();
+                server.count_ignored();
             }
         }
         if let Some(run) = &mut bench {
-            state = iter::from_fn(|| run.receive::<State>()).last().or(state);
+            state = iter::from_fn(|| run.receive::<BenchState>()).last().or(state);
             if run.has_ended() {
                 stop.store(true, Ordering::Relaxed);
             }
         }
-        server.gone().into_iter().for_each(|page| pressed.release(page));
+        server.take_gone_pages().into_iter().for_each(|page| pressed.release(page));
         // Unread frames are pending: do not time cells out.
         let read_to = buses.iter().map(|bus| Micros(bus.read_to.load(Ordering::Relaxed))).min();
         let now = read_to.map_or_else(now, |read_to| now().min(read_to));
         let due = {
             let mut live = locked(live);
             live.handle_time(now);
-            let due = pressed.due(now, |cell| live.latched(cell, now));
-            if server.pages() > 0 {
+            let due = pressed.due_stimuli(now, |cell| live.latched(cell, now));
+            if server.page_count() > 0 {
                 let snapshot = live.snapshot(now, &pressed);
-                let said = number.is_multiple_of(SAID_EVERY).then(|| {
-                    let seen = |cell| state.as_ref().map(|state: &State| state.seen_from(cell));
-                    let mut said = Said { bench: seen(None), ..live.said(now) };
-                    let all = text(&said);
-                    let own = server.chosen().into_iter().map(|(page, chosen)| {
+                let said = number.is_multiple_of(SNAPSHOTS_PER_STATUS).then(|| {
+                    let seen = |cell| state.as_ref().map(|state: &BenchState| state.seen_from(cell));
+                    let mut said = StatusMessage { bench: seen(None), ..live.status_message(now) };
+                    let all = to_json(&said);
+                    let own = server.selected_cells().into_iter().map(|(page, chosen)| {
                         said.bench = seen(Some((chosen.bus, chosen.node)));
                         said.detail = live.detail(chosen, now);
-                        (page, text(&said))
+                        (page, to_json(&said))
                     });
                     (all, own.collect::<BTreeMap<_, _>>())
                 });
@@ -242,21 +242,21 @@ fn publish(
         };
         for ((bus, node), sensors) in due {
             let page = SensorPage::Skin(sensors);
-            say(buses.get(bus), &Message::Stimulus { to: Node::Cell(node), from: From::Next, page });
+            send_message(buses.get(bus), &Message::Stimulus { to: Node::Cell(node), from: AppliesFrom::Next, page });
         }
-        next = (next + EVERY).max(Instant::now());
+        next = (next + SNAPSHOT_INTERVAL).max(Instant::now());
         thread::sleep(next.saturating_duration_since(Instant::now()).max(Duration::from_millis(1)));
     }
 }
 
-fn text(said: &Said) -> String {
+fn to_json(said: &StatusMessage) -> String {
     serde_json::to_string(said).unwrap_or_default()
 }
 
-fn obey(page: u64, command: &Command, live: &Live, pressed: &mut Pressed, buses: &[Shared]) {
-    let everywhere = |message: &Message| buses.iter().for_each(|bus| say(Some(bus), message));
+fn execute(page: u64, command: &Command, live: &Live, pressed: &mut TouchRegistry, buses: &[SharedBus]) {
+    let everywhere = |message: &Message| buses.iter().for_each(|bus| send_message(Some(bus), message));
     match *command {
-        Command::Press { bus, node, force_n } => match live.may_press(bus, node) {
+        Command::Press { bus, node, force_n } => match live.pressable_cell(bus, node) {
             Some(cell) => pressed.press(page, cell, force_n),
             None => pressed.release(page),
         },
@@ -276,7 +276,7 @@ fn obey(page: u64, command: &Command, live: &Live, pressed: &mut Pressed, buses:
 }
 
 /// Sends a message. A send error counts as a lost frame.
-fn say(shared: Option<&Shared>, message: &Message) {
+fn send_message(shared: Option<&SharedBus>, message: &Message) {
     let bus = shared.and_then(|shared| Some((locked(&shared.bus).clone()?, shared.format)));
     if let Some((bus, format)) = bus {
         let _ = send(&bus, message, format);

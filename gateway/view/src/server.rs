@@ -19,14 +19,14 @@ use std::thread;
 
 use tungstenite::{Bytes, Utf8Bytes};
 
-use crate::command::{Chosen, Command};
+use crate::command::{SelectedCell, Command};
 use crate::locked;
 use crate::token::Token;
 
 /// The maximum number of pages at the same time.
-const PAGES: usize = 16;
+const MAX_PAGES: usize = 16;
 /// The capacity of the command queue; further commands are counted and dropped.
-const COMMANDS: usize = 256;
+const COMMAND_QUEUE_SIZE: usize = 256;
 
 /// The rights of the pages, and the token that they need.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -41,7 +41,7 @@ pub struct Access {
 
 /// The counters of the server.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Counts {
+pub struct ServerCounts {
     /// Pages that were connected.
     pub clients: u64,
     /// Refused requests: another host or origin, no token, too slow or too many, no such file.
@@ -52,7 +52,7 @@ pub struct Counts {
 
 /// The newest messages to the pages.
 #[derive(Debug, Default)]
-struct Newest {
+struct LatestMessages {
     snapshot: Bytes,
     number: u64,
     /// The torques before the first snapshot after a jump, and the number of jumps.
@@ -73,8 +73,8 @@ struct Shared {
     scene: String,
     /// The bytes served as `/surface`.
     surface: Vec<u8>,
-    newest: Mutex<Newest>,
-    chosen: Mutex<BTreeMap<u64, Chosen>>,
+    newest: Mutex<LatestMessages>,
+    chosen: Mutex<BTreeMap<u64, SelectedCell>>,
     gone: Mutex<Vec<u64>>,
     commands: SyncSender<(u64, Command)>,
     stop: AtomicBool,
@@ -100,7 +100,7 @@ impl Server {
     pub fn start(listener: TcpListener, access: Access, scene: String, surface: Vec<u8>) -> io::Result<Self> {
         listener.set_nonblocking(true)?;
         let address = listener.local_addr()?;
-        let (sender, commands) = sync_channel(COMMANDS);
+        let (sender, commands) = sync_channel(COMMAND_QUEUE_SIZE);
         let shared = Arc::new(Shared {
             access,
             address,
@@ -156,34 +156,34 @@ impl Server {
     }
 
     /// Counts a command that is not carried out.
-    pub fn ignore(&self) {
+    pub fn count_ignored(&self) {
         self.shared.ignored.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Returns the pages that have gone since the last call.
     #[must_use]
-    pub fn gone(&self) -> Vec<u64> {
+    pub fn take_gone_pages(&self) -> Vec<u64> {
         std::mem::take(&mut *locked(&self.shared.gone))
     }
 
     /// Returns the cells that pages have chosen.
     #[must_use]
-    pub fn chosen(&self) -> BTreeMap<u64, Chosen> {
+    pub fn selected_cells(&self) -> BTreeMap<u64, SelectedCell> {
         locked(&self.shared.chosen).clone()
     }
 
     /// Returns the number of pages that are connected now.
     #[must_use]
-    pub fn pages(&self) -> usize {
+    pub fn page_count(&self) -> usize {
         self.shared.pages.load(Ordering::Relaxed)
     }
 
     /// Returns the counters.
     #[must_use]
-    pub fn counts(&self) -> Counts {
+    pub fn counts(&self) -> ServerCounts {
         let count = |count: &AtomicU64| count.load(Ordering::Relaxed);
         let Shared { clients, refused, ignored, .. } = &*self.shared;
-        Counts { clients: count(clients), refused: count(refused), ignored: count(ignored) }
+        ServerCounts { clients: count(clients), refused: count(refused), ignored: count(ignored) }
     }
 }
 

@@ -9,7 +9,7 @@ use protocol::xml::escaped;
 use serde::Serialize;
 
 use crate::scene::Scene;
-use crate::surface::{Shell, pack};
+use crate::surface::{RowMesh, pack};
 use crate::web;
 
 /// A skin, as its page shows it.
@@ -18,18 +18,18 @@ pub struct Still {
     /// The scene to draw.
     pub scene: Scene,
     /// The robot's surface, if known.
-    pub surface: Vec<Shell>,
+    pub surface: Vec<RowMesh>,
     /// The position of each joint of the robot, in rad or m.
     pub positions: Vec<f64>,
     /// Further properties of each cell, as names and values, in the scene's order.
     pub details: Vec<Vec<(String, String)>>,
     /// Cells that were elsewhere before; the page draws a line from the former place to each.
-    pub moved: Vec<Moved>,
+    pub moved: Vec<MovedCell>,
 }
 
 /// The former place of a cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Moved {
+pub struct MovedCell {
     /// The cell, as an index into [`Scene::cells`].
     pub cell: usize,
     /// The chain of the frame.
@@ -44,11 +44,11 @@ pub struct Moved {
 
 /// The data for the page's script.
 #[derive(Serialize)]
-struct Data<'a> {
+struct PageData<'a> {
     scene: &'a Scene,
     positions: &'a [f64],
     details: &'a [Vec<(String, String)>],
-    moved: &'a [Moved],
+    moved: &'a [MovedCell],
     /// The corners of the surface in base64, in the format of [`pack`].
     surface: String,
 }
@@ -58,7 +58,7 @@ impl Still {
     #[must_use]
     pub fn page(&self) -> String {
         let (shells, corners) = pack(&self.surface);
-        let data = Data {
+        let data = PageData {
             scene: &Scene { shells, may_press: false, ..self.scene.clone() },
             positions: &self.positions,
             details: &self.details,
@@ -92,15 +92,15 @@ mod tests {
 
     fn still() -> Still {
         let skin = Skin::parse("ur5", include_str!("../../examples/ur5-253.toml")).unwrap();
-        let mut scene = Scene::of(&skin, true);
+        let mut scene = Scene::from_skin(&skin, true);
         scene.name = "<arm> & @DATA@ 'x'".to_owned();
         let details = vec![vec![("a<b".to_owned(), "</script><b>".to_owned())]; scene.cells.len()];
         let triangles = vec![[[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]];
         let [position, normal] = [[0.0, 0.1, 0.2], [0.0, 0.0, 1.0]];
         Still {
             positions: vec![0.0; scene.joints.len()],
-            moved: vec![Moved { cell: 7, chain: 0, row: 2, position, normal }],
-            surface: vec![Shell { chain: 0, row: 1, triangles }],
+            moved: vec![MovedCell { cell: 7, chain: 0, row: 2, position, normal }],
+            surface: vec![RowMesh { chain: 0, row: 1, triangles }],
             scene,
             details,
         }

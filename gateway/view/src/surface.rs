@@ -6,11 +6,11 @@ use nalgebra::Vector3;
 use serde::Serialize;
 
 /// Edges between faces at a smaller angle than this are smoothed; the cosine of 40 degrees.
-const ROUND: f64 = 0.77;
+const SMOOTH_EDGE_COSINE: f64 = 0.77;
 
 /// A mesh that is fixed to a row of a chain.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Shell {
+pub struct RowMesh {
     /// The chain, as an index into the skin's chains.
     pub chain: usize,
     /// The row in whose frame the mesh is given, from 1; 0 is the base of the chain.
@@ -35,10 +35,10 @@ pub struct SceneShell {
 /// Returns the shells in the page's format, and the bytes of all their corners: for each one position and normal, as 6
 /// little-endian f32.
 #[must_use]
-pub fn pack(shells: &[Shell]) -> (Vec<SceneShell>, Vec<u8>) {
+pub fn pack(shells: &[RowMesh]) -> (Vec<SceneShell>, Vec<u8>) {
     let (mut all, mut bytes) = (Vec::new(), Vec::new());
     let mut first = 0;
-    for Shell { chain, row, triangles } in shells {
+    for RowMesh { chain, row, triangles } in shells {
         let count = 3 * triangles.len();
         if count == 0 {
             continue;
@@ -76,7 +76,7 @@ fn normals(triangles: &[[[f64; 3]; 3]]) -> Vec<Vector3<f64>> {
         let own = unit(*face);
         triangle.map(|corner| {
             let near = around.get(&key(&corner)).into_iter().flatten();
-            unit(near.filter(|other| unit(**other).dot(&own) > ROUND).sum())
+            unit(near.filter(|other| unit(**other).dot(&own) > SMOOTH_EDGE_COSINE).sum())
         })
     };
     triangles.iter().zip(&faces).flat_map(of).collect()
@@ -92,12 +92,12 @@ mod tests {
         // Two faces share an edge: at a right angle, and at 20 degrees.
         for (turn, together) in [(90.0_f64, false), (20.0, true)] {
             let (sine, cosine) = turn.to_radians().sin_cos();
-            let shell = Shell {
+            let shell = RowMesh {
                 chain: 1,
                 row: 2,
                 triangles: vec![[low, high, [0.0, 1.0, 0.0]], [high, low, [0.0, -cosine, sine]]],
             };
-            let nothing = Shell { chain: 0, row: 0, triangles: Vec::new() };
+            let nothing = RowMesh { chain: 0, row: 0, triangles: Vec::new() };
             let (shells, bytes) = pack(&[nothing, shell.clone(), shell]);
             let of = |first| SceneShell { chain: 1, row: 2, first, count: 6 };
             assert_eq!(shells, [of(0), of(6)]);

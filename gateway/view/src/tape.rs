@@ -14,33 +14,33 @@ use std::collections::VecDeque;
 use protocol::can::Frame;
 use protocol::skin::Skin;
 use protocol::time::Micros;
-use trace::capture::{CaptureError, Entry, Extras, NoteKind, Reader};
-use trace::order::{Order, Ordered};
+use trace::capture::{CaptureError, Entry, RecordingExtras, NoteKind, Reader};
+use trace::order::{BusMerger, ReleasedFrame};
 
-pub use self::events::{Event, EventKind, Watcher};
+pub use self::events::{Event, EventKind, EventDetector};
 use crate::live::Live;
 
 /// The interval at which time-dependent state (silent cells, loads) is updated, in ns.
-const LOOK_NS: u64 = 20_000_000;
+const UPDATE_INTERVAL_NS: u64 = 20_000_000;
 /// The part of a pause beyond this time is skipped, in ns.
-const PAUSE_NS: u64 = 60_000_000_000;
+const MAX_PAUSE_NS: u64 = 60_000_000_000;
 /// The number of epochs whose times are kept.
-const EPOCHS: usize = 256;
+const MAX_EPOCHS: usize = 256;
 
 /// The result of a step.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Step {
+pub enum TapeStep {
     /// A frame was applied.
     Applied {
         /// True if an epoch begins with the frame.
         epoch: bool,
     },
     /// Time-dependent state was updated.
-    Looked,
+    Updated,
     /// The tape needs more entries.
-    Hungry,
+    NeedsEntries,
     /// All frames up to the requested time are applied.
-    There,
+    Reached,
     /// The recording is over.
     Over,
 }
@@ -50,27 +50,27 @@ pub enum Step {
 pub struct Tape {
     live: Live,
     names: Vec<String>,
-    order: Order<Item>,
-    next: Option<Ordered<Item>>,
+    order: BusMerger<TapeFrame>,
+    next: Option<ReleasedFrame<TapeFrame>>,
     /// True if the reader has no more entries.
     ended: bool,
     /// The frames that were latched when the recording began; empty after its first frame.
-    latched: Vec<Item>,
+    latched: Vec<TapeFrame>,
     /// The time of the first frame, in ns since 1970.
     first: Option<u64>,
     /// The time up to which all frames are applied.
     at: u64,
     /// The time of the next update of time-dependent state.
-    look: u64,
+    next_update: u64,
     epochs: VecDeque<u64>,
     /// The number of frames that the recorder lost, by bus.
     dropped: Vec<u64>,
     /// The number of frames on buses that the skin does not have.
-    others: u64,
+    foreign_frames: u64,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Item {
+struct TapeFrame {
     bus: usize,
     frame: Frame,
 }
@@ -80,21 +80,21 @@ impl Tape {
     #[must_use]
     pub fn new(skin: Skin, zero: u64) -> Self {
         let names: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
-        let mut live = Live::since(skin, Micros(zero / 1_000));
+        let mut live = Live::with_start(skin, Micros(zero / 1_000));
         (0..names.len()).for_each(|bus| live.set_bus(bus, true, 0));
         Self {
             live,
             dropped: vec![0; names.len()],
             names,
-            order: Order::default(),
+            order: BusMerger::default(),
             next: None,
             ended: false,
             latched: Vec::new(),
             first: None,
             at: 0,
-            look: 0,
+            next_update: 0,
             epochs: VecDeque::new(),
-            others: 0,
+            foreign_frames: 0,
         }
     }
 
@@ -115,10 +115,10 @@ impl Tape {
     }
 
     /// Stores the state that was latched when the recording began; call it before the first entry.
-    pub fn begin(&mut self, extras: &Extras) {
+    pub fn begin(&mut self, extras: &RecordingExtras) {
         let latched = extras.latched.iter();
         self.latched =
-            latched.filter_map(|it| Some(Item { bus: self.bus(&it.bus)?, frame: it.frame })).collect();
+            latched.filter_map(|it| Some(TapeFrame { bus: self.bus(&it.bus)?, frame: it.frame })).collect();
     }
 
     /// Adds the next entry of the capture.
@@ -127,8 +127,8 @@ impl Tape {
             Entry::Frame(record) => {
                 let nanos = record.time.nanos;
                 match self.bus(record.interface) {
-                    Some(bus) => self.order.push(bus, nanos, Item { bus, frame: record.frame }),
-                    None => self.others += 1,
+                    Some(bus) => self.order.push(bus, nanos, TapeFrame { bus, frame: record.frame }),
+                    None => self.foreign_frames += 1,
                 }
             }
             Entry::Note(note) => {
@@ -146,57 +146,57 @@ impl Tape {
     }
 
     /// Advances by one frame or one update of time-dependent state, but not beyond `until`, in ns since 1970.
-    pub fn step(&mut self, until: u64) -> Step {
+    pub fn step(&mut self, until: u64) -> TapeStep {
         if self.next.is_none() {
             self.next = if self.ended { self.order.pop_last() } else { self.order.pop() };
         }
         let Some(next) = self.next else {
             return match self.ended {
-                false => Step::Hungry,
-                true if self.first.is_none() => Step::Over,
-                true => self.look_until(until).unwrap_or(Step::Over),
+                false => TapeStep::NeedsEntries,
+                true if self.first.is_none() => TapeStep::Over,
+                true => self.update_until(until).unwrap_or(TapeStep::Over),
             };
         };
         if self.first.is_none() {
-            self.first = Some(next.at);
-            (self.at, self.look) = (next.at, next.at.saturating_add(LOOK_NS));
+            self.first = Some(next.send_nanos);
+            (self.at, self.next_update) = (next.send_nanos, next.send_nanos.saturating_add(UPDATE_INTERVAL_NS));
             let latched = std::mem::take(&mut self.latched);
-            self.live.begin(Micros(next.at / 1_000), latched.iter().map(|it| (it.bus, &it.frame)));
+            self.live.apply_latched(Micros(next.send_nanos / 1_000), latched.iter().map(|it| (it.bus, &it.frame)));
         }
-        if let Some(looked) = self.look_until(until.min(next.at.saturating_sub(1))) {
+        if let Some(looked) = self.update_until(until.min(next.send_nanos.saturating_sub(1))) {
             return looked;
         }
-        if next.at > until {
+        if next.send_nanos > until {
             self.at = self.at.max(until);
-            return Step::There;
+            return TapeStep::Reached;
         }
         self.next = None;
-        self.at = next.at;
-        let Item { bus, frame } = next.item;
-        let epoch = self.live.frame(bus, Micros(next.at / 1_000), &frame);
+        self.at = next.send_nanos;
+        let TapeFrame { bus, frame } = next.item;
+        let epoch = self.live.apply_frame(bus, Micros(next.send_nanos / 1_000), &frame);
         if epoch {
-            if self.epochs.len() == EPOCHS {
+            if self.epochs.len() == MAX_EPOCHS {
                 self.epochs.pop_front();
             }
-            self.epochs.push_back(next.at);
+            self.epochs.push_back(next.send_nanos);
         }
-        Step::Applied { epoch }
+        TapeStep::Applied { epoch }
     }
 
     /// Updates time-dependent state, if that is due up to this time.
-    fn look_until(&mut self, until: u64) -> Option<Step> {
+    fn update_until(&mut self, until: u64) -> Option<TapeStep> {
         // 64 bits of ns end in 2554: later updates do not exist.
-        if self.look > until || self.look == u64::MAX {
+        if self.next_update > until || self.next_update == u64::MAX {
             return None;
         }
-        self.live.handle_time(Micros(self.look / 1_000));
-        self.at = self.look;
-        self.look = self.look.saturating_add(LOOK_NS);
+        self.live.handle_time(Micros(self.next_update / 1_000));
+        self.at = self.next_update;
+        self.next_update = self.next_update.saturating_add(UPDATE_INTERVAL_NS);
         // Nothing changes during the rest of a long pause.
-        if until.saturating_sub(self.look) > PAUSE_NS {
-            self.look = until - PAUSE_NS;
+        if until.saturating_sub(self.next_update) > MAX_PAUSE_NS {
+            self.next_update = until - MAX_PAUSE_NS;
         }
-        Some(Step::Looked)
+        Some(TapeStep::Updated)
     }
 
     /// Returns the state.
@@ -212,7 +212,7 @@ impl Tape {
 
     /// Returns the time up to which all frames are applied, in ns since 1970.
     #[must_use]
-    pub const fn at(&self) -> u64 {
+    pub const fn position(&self) -> u64 {
         self.at
     }
 
@@ -235,8 +235,8 @@ impl Tape {
 
     /// Returns the number of frames on buses that the skin does not have.
     #[must_use]
-    pub const fn others(&self) -> u64 {
-        self.others
+    pub const fn foreign_frames(&self) -> u64 {
+        self.foreign_frames
     }
 
     fn bus(&self, name: &str) -> Option<usize> {

@@ -5,9 +5,9 @@ use std::hint::black_box;
 use std::io;
 
 /// The minimum length of a token: 16 letters and digits are 95 bits.
-const SHORTEST: usize = 16;
+const MIN_TOKEN_CHARS: usize = 16;
 /// The maximum length of a token: it is a part of a request's first line.
-const LONGEST: usize = 256;
+const MAX_TOKEN_CHARS: usize = 256;
 
 /// A secret that every request has to carry.
 #[derive(Clone, Eq, PartialEq)]
@@ -25,7 +25,7 @@ impl Token {
     /// Returns [`TokenError`] if it is too short or too long, or has other characters than letters and digits.
     pub fn parse(text: &str) -> Result<Self, TokenError> {
         let is_plain = text.bytes().all(|byte| byte.is_ascii_alphanumeric());
-        let fits = (SHORTEST..=LONGEST).contains(&text.len());
+        let fits = (MIN_TOKEN_CHARS..=MAX_TOKEN_CHARS).contains(&text.len());
         if fits && is_plain { Ok(Self(text.to_owned())) } else { Err(TokenError) }
     }
 
@@ -47,7 +47,7 @@ impl Token {
 
     /// Compares the token with that of a request, in a time that does not depend on where they differ.
     #[must_use]
-    pub fn is(&self, given: &str) -> bool {
+    pub fn matches(&self, given: &str) -> bool {
         let pairs = given.bytes().zip(self.0.bytes());
         let differences = pairs.fold(0, |differences, (one, other)| black_box(differences | (one ^ other)));
         given.len() == self.0.len() && differences == 0
@@ -67,9 +67,9 @@ mod tests {
     #[test]
     fn a_token_is_long_plain_and_not_printed_by_accident() {
         let token = Token::parse("abcdef0123456789").unwrap();
-        assert!(token.is("abcdef0123456789"));
+        assert!(token.matches("abcdef0123456789"));
         for wrong in ["", "abcdef012345678", "abcdef0123456788", "abcdef01234567890", "ABCDEF0123456789"] {
-            assert!(!token.is(wrong), "{wrong}");
+            assert!(!token.matches(wrong), "{wrong}");
         }
         assert_eq!(format!("{token:?}"), "Token(..)");
         for wrong in ["", "short", "abcdef 0123456789", "abcdef0123456789\n", &"a".repeat(257)] {

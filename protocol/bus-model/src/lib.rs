@@ -97,8 +97,8 @@ struct Waiting<T> {
 #[derive(Debug)]
 struct Queue<T> {
     /// True if one of its frames takes part in arbitration or is on the wire.
-    is_heard: bool,
-    behind: VecDeque<Waiting<T>>,
+    is_contending: bool,
+    waiting_frames: VecDeque<Waiting<T>>,
 }
 
 impl<T> Ord for Waiting<T> {
@@ -169,9 +169,9 @@ impl<T: Copy> BusModel<T> {
         self.waiting += 1;
         self.most_waiting = self.most_waiting.max(self.waiting);
         match request.queue.map(|queue| self.queue(queue)) {
-            Some(queue) if queue.is_heard => queue.behind.push_back(waiting),
+            Some(queue) if queue.is_contending => queue.waiting_frames.push_back(waiting),
             queue => {
-                queue.into_iter().for_each(|queue| queue.is_heard = true);
+                queue.into_iter().for_each(|queue| queue.is_contending = true);
                 self.contenders.push(waiting);
             }
         }
@@ -236,14 +236,14 @@ impl<T: Copy> BusModel<T> {
 
     /// Returns the maximum number of frames that ever waited at the same time.
     #[must_use]
-    pub const fn most_waiting(&self) -> usize {
+    pub const fn max_waiting(&self) -> usize {
         self.most_waiting
     }
 
     fn queue(&mut self, number: u16) -> &mut Queue<T> {
         let index = usize::from(number);
         if self.queues.len() <= index {
-            let empty = || Queue { is_heard: false, behind: VecDeque::new() };
+            let empty = || Queue { is_contending: false, waiting_frames: VecDeque::new() };
             self.queues.resize_with(index + 1, empty);
         }
         self.queues.get_mut(index).expect("there are as many now")
@@ -252,14 +252,14 @@ impl<T: Copy> BusModel<T> {
     /// Moves the next frame of a queue into arbitration.
     fn next_of_queue(&mut self, queue: Option<u16>) {
         let Some(queue) = queue.map(|queue| self.queue(queue)) else { return };
-        let next = queue.behind.pop_front();
-        queue.is_heard = next.is_some();
+        let next = queue.waiting_frames.pop_front();
+        queue.is_contending = next.is_some();
         self.contenders.extend(next);
     }
 
     fn attempt(&mut self, request: &Request<T>, start: u64) -> Attempt<T> {
         let Request { tag, at, bits, .. } = *request;
-        let spoilt = self.errors.as_mut().and_then(|errors| errors.spoils(bits));
+        let spoilt = self.errors.as_mut().and_then(|errors| errors.damage(bits));
         let took = spoilt.unwrap_or(bits).nanoseconds(self.rates);
         Attempt { tag, at, start, end: start + took, is_damaged: spoilt.is_some() }
     }

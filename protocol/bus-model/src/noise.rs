@@ -26,9 +26,9 @@ pub struct BitErrorsError {
 pub struct BitErrors {
     dice: Pcg64Mcg,
     /// Logarithm of the probability that a bit is undamaged.
-    sound: f64,
+    log_undamaged: f64,
     /// Number of undamaged bits before the next damaged one.
-    good: u64,
+    undamaged_bits: u64,
 }
 
 impl BitErrors {
@@ -43,7 +43,7 @@ impl BitErrors {
         if !(0.0..=Self::MAX).contains(&rate) {
             return Err(BitErrorsError { got: rate });
         }
-        let mut errors = Self { dice: Pcg64Mcg::seed_from_u64(seed), sound: (-rate).ln_1p(), good: 0 };
+        let mut errors = Self { dice: Pcg64Mcg::seed_from_u64(seed), log_undamaged: (-rate).ln_1p(), undamaged_bits: 0 };
         errors.draw();
         Ok(errors)
     }
@@ -57,18 +57,18 @@ impl BitErrors {
     fn draw(&mut self) {
         let uniform: f64 = self.dice.random();
         // `1 - uniform` is in (0, 1]. Without errors the distance is unlimited.
-        self.good = if self.sound < 0.0 { ((1.0 - uniform).ln() / self.sound) as u64 } else { u64::MAX };
+        self.undamaged_bits = if self.log_undamaged < 0.0 { ((1.0 - uniform).ln() / self.log_undamaged) as u64 } else { u64::MAX };
     }
 
     /// Returns the bits that were sent of a damaged frame, including the error frame; `None` if the frame is
     /// undamaged.
-    pub(super) fn spoils(&mut self, bits: Bits) -> Option<Bits> {
+    pub(super) fn damage(&mut self, bits: Bits) -> Option<Bits> {
         let exposed = bits.total().saturating_sub(INTERMISSION);
-        if self.good >= u64::from(exposed) {
-            self.good = self.good.saturating_sub(u64::from(exposed));
+        if self.undamaged_bits >= u64::from(exposed) {
+            self.undamaged_bits = self.undamaged_bits.saturating_sub(u64::from(exposed));
             return None;
         }
-        let sent = u32::try_from(self.good).unwrap_or(exposed) + 1;
+        let sent = u32::try_from(self.undamaged_bits).unwrap_or(exposed) + 1;
         self.draw();
         let head = if bits.data > 0 { bits.nominal.saturating_sub(FD_TAIL) } else { bits.nominal };
         let data = sent.saturating_sub(head).min(bits.data);
@@ -87,7 +87,7 @@ mod tests {
         const FRAMES: u32 = 200_000;
         let rate = 1e-3;
         let mut errors = BitErrors::new(rate, 7).unwrap();
-        let damaged = (0..FRAMES).filter(|_| errors.spoils(FRAME).is_some()).count();
+        let damaged = (0..FRAMES).filter(|_| errors.damage(FRAME).is_some()).count();
         // A frame is damaged if one of its first 197 bits is. Six standard deviations: one failure in 500
         // million seeds.
         let (frames, one) = (f64::from(FRAMES), 1.0 - (1.0 - rate).powi(197));
@@ -100,7 +100,7 @@ mod tests {
         let mut errors = BitErrors::new(0.01, 1).unwrap();
         let mut seen = [false; 3];
         for _ in 0..10_000 {
-            let Some(Bits { nominal, data }) = errors.spoils(FRAME) else { continue };
+            let Some(Bits { nominal, data }) = errors.damage(FRAME) else { continue };
             let sent = nominal - ERROR_FRAME;
             // Head: 18 nominal bits. Tail: 9 bits before the intermission.
             match (sent, data) {
@@ -116,7 +116,7 @@ mod tests {
     #[test]
     fn without_a_rate_nothing_is_damaged_and_no_other_rate_is_taken() {
         let mut errors = BitErrors::new(0.0, 3).unwrap();
-        assert!((0..1_000).all(|_| errors.spoils(FRAME).is_none()));
+        assert!((0..1_000).all(|_| errors.damage(FRAME).is_none()));
         for got in [-1e-9, 0.011, f64::NAN, f64::INFINITY] {
             assert!(BitErrors::new(got, 0).is_err(), "{got}");
         }

@@ -19,7 +19,7 @@ pub struct Priority(u32);
 impl Priority {
     /// Returns the priority of a frame.
     #[must_use]
-    pub const fn of(frame: &Frame) -> Self {
+    pub const fn from_frame(frame: &Frame) -> Self {
         let id = frame.id();
         let remote = matches!(frame.format(), Format::Classic) && frame.is_remote();
         if frame.is_extended() {
@@ -70,7 +70,7 @@ mod tests {
     proptest! {
         #[test]
         fn priority_is_what_the_wire_makes_of_the_bits(one in any_frame(), other in any_frame()) {
-            prop_assert_eq!(Priority::of(&one) < Priority::of(&other), wins(&one, &other));
+            prop_assert_eq!(Priority::from_frame(&one) < Priority::from_frame(&other), wins(&one, &other));
         }
     }
 
@@ -80,7 +80,7 @@ mod tests {
         let requested = Frame::remote(0x123, 0).unwrap();
         let long = Frame::classic(EXTENDED | 0x123 << 18, &[]).unwrap();
         let below = Frame::classic(EXTENDED | 0x122 << 18 | 0x3_FFFF, &[]).unwrap();
-        let order = [below, short, requested, long].map(|frame| Priority::of(&frame));
+        let order = [below, short, requested, long].map(|frame| Priority::from_frame(&frame));
         assert!(order.is_sorted() && order[0] < order[1] && order[2] < order[3]);
     }
 }

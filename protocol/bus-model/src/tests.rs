@@ -10,7 +10,7 @@ fn rates() -> BitRates {
 }
 
 fn request(at: u64, id: u32, nominal: u32, tag: u64) -> Request {
-    let priority = Priority::of(&Frame::classic(id, &[]).unwrap());
+    let priority = Priority::from_frame(&Frame::classic(id, &[]).unwrap());
     Request { at, priority, bits: Bits { nominal, data: 0 }, queue: None, tag }
 }
 
@@ -72,8 +72,8 @@ fn the_frames_of_a_queue_keep_their_order_whatever_their_identifiers() {
 #[test]
 fn data_bits_take_the_data_bit_rate() {
     let frame = Frame::fd(0x201, BIT_RATE_SWITCH, &[0x55; 16]).unwrap();
-    let bits = Bits::of(&frame).unwrap();
-    let request = Request { at: 7, priority: Priority::of(&frame), bits, queue: None, tag: 0 };
+    let bits = Bits::from_frame(&frame).unwrap();
+    let request = Request { at: 7, priority: Priority::from_frame(&frame), bits, queue: None, tag: 0 };
     let [attempt] = all(BusModel::new(rates()), &[request]).try_into().unwrap();
     assert_eq!(attempt.end - attempt.start, u64::from(bits.nominal) * 1_000 + u64::from(bits.data) * 200);
     assert_eq!((attempt.at, attempt.start), (7, 7));
@@ -91,9 +91,9 @@ fn the_most_that_waited_is_known() {
     let mut bus = BusModel::new(rates());
     (0..5).for_each(|tag| bus.request(request(0, 1, 50, tag)));
     bus.run_until(120_000);
-    assert_eq!((bus.waiting(), bus.most_waiting()), (3, 5));
+    assert_eq!((bus.waiting(), bus.max_waiting()), (3, 5));
     bus.finish();
-    assert_eq!((bus.waiting(), bus.most_waiting()), (0, 5));
+    assert_eq!((bus.waiting(), bus.max_waiting()), (0, 5));
 }
 
 #[test]

@@ -18,9 +18,9 @@ pub use super::slot::Notes;
 pub const BATCH: usize = 64;
 /// Number of datagrams of the first receive call. Most calls return one or two, and preparing 64 slots costs
 /// more than receiving a datagram.
-const FEW: usize = 4;
+const FIRST_BATCH: usize = 4;
 /// Capacity of the smaller send call, which suffices for most sends; see [`FEW`].
-pub(super) const SMALL: usize = 8;
+pub(super) const SMALL_BATCH: usize = 8;
 
 /// A receive buffer for up to [`BATCH`] datagrams of at most 72 bytes.
 pub struct Batch {
@@ -45,10 +45,10 @@ impl Batch {
     pub fn receive(&mut self, fd: impl AsFd) -> io::Result<usize> {
         (self.count, self.failure) = (0, None);
         let (fd, slots) = (fd.as_fd(), self.slots.as_mut_slice());
-        let Some((few, rest)) = slots.split_first_chunk_mut::<FEW>() else { return Ok(0) };
-        self.count = uninterrupted(|| calls::receive(fd, few, false))?;
-        if let (FEW, Some(many)) = (self.count, rest.first_chunk_mut::<{ BATCH - FEW }>()) {
-            match uninterrupted(|| calls::receive(fd, many, false)) {
+        let Some((few, rest)) = slots.split_first_chunk_mut::<FIRST_BATCH>() else { return Ok(0) };
+        self.count = retry_on_interrupt(|| calls::receive(fd, few, false))?;
+        if let (FIRST_BATCH, Some(many)) = (self.count, rest.first_chunk_mut::<{ BATCH - FIRST_BATCH }>()) {
+            match retry_on_interrupt(|| calls::receive(fd, many, false)) {
                 Ok(count) => self.count += count,
                 Err(error) => self.failure = Some(error).filter(|it| it.kind() != io::ErrorKind::WouldBlock),
             }
@@ -62,13 +62,13 @@ impl Batch {
     }
 
     #[cfg(test)]
-    pub(super) fn fail_behind(&mut self, error: io::Error) {
+    pub(super) fn fail_after(&mut self, error: io::Error) {
         self.failure = Some(error);
     }
 
     /// Receives one datagram, waiting up to the socket's `SO_RCVTIMEO`. It does not look for a second one,
     /// because a receiver that wakes up for each datagram rarely finds another.
-    pub(super) fn receive_one_patiently(&mut self, fd: impl AsFd) -> io::Result<usize> {
+    pub(super) fn receive_one(&mut self, fd: impl AsFd) -> io::Result<usize> {
         (self.count, self.failure) = (0, None);
         let Some((one, _)) = self.slots.split_first_chunk_mut::<1>() else { return Ok(0) };
         self.count = calls::receive(fd.as_fd(), one, true)?;
@@ -164,8 +164,8 @@ impl<const N: usize> Outgoing<N> {
         match self.count {
             0 => Ok(0),
             1 => send_one(fd, datagrams.next().unwrap_or_default()),
-            2..=SMALL => uninterrupted(|| calls::send::<SMALL>(fd.as_fd(), datagrams.clone())),
-            _ => uninterrupted(|| calls::send::<N>(fd.as_fd(), datagrams.clone())),
+            2..=SMALL_BATCH => retry_on_interrupt(|| calls::send::<SMALL_BATCH>(fd.as_fd(), datagrams.clone())),
+            _ => retry_on_interrupt(|| calls::send::<N>(fd.as_fd(), datagrams.clone())),
         }
     }
 }
@@ -182,13 +182,13 @@ pub fn send_one(fd: impl AsFd, bytes: &[u8]) -> io::Result<usize> {
 
 /// Returns true if an error means a temporary shortage of memory, unrelated to the socket.
 #[must_use]
-pub fn is_shortage(error: &io::Error) -> bool {
+pub fn is_memory_shortage(error: &io::Error) -> bool {
     let errno = error.raw_os_error().map(Errno::from_raw_os_error);
     matches!(errno, Some(Errno::NOMEM | Errno::NOBUFS))
 }
 
 /// Repeats a non-blocking call that a signal interrupted.
-fn uninterrupted(mut call: impl FnMut() -> io::Result<usize>) -> io::Result<usize> {
+fn retry_on_interrupt(mut call: impl FnMut() -> io::Result<usize>) -> io::Result<usize> {
     loop {
         match call() {
             Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
@@ -251,7 +251,7 @@ mod tests {
 
     #[test]
     fn each_number_of_datagrams_is_sent_whole_and_in_order() {
-        sent_whole_and_in_order::<SMALL>();
+        sent_whole_and_in_order::<SMALL_BATCH>();
         sent_whole_and_in_order::<BATCH>();
     }
 

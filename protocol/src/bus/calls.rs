@@ -5,7 +5,7 @@ use std::io;
 use std::mem;
 use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
 
-use super::slot::{Slot, each_passed};
+use super::slot::{Slot, for_each_descriptor};
 
 /// Requests `SCHED_BATCH` for this thread. Returns true if it was granted.
 pub(super) fn set_batch() -> bool {
@@ -63,7 +63,7 @@ pub(super) fn receive<const N: usize>(
         slot.len = header.msg_len as usize;
         slot.control_len = header.msg_hdr.msg_controllen;
         slot.flags = header.msg_hdr.msg_flags;
-        each_passed(slot, |descriptor| {
+        for_each_descriptor(slot, |descriptor| {
             // SAFETY: the kernel has just opened this descriptor for this process, and no other code knows
             // it.
             drop(unsafe { OwnedFd::from_raw_fd(descriptor) });

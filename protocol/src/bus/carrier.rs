@@ -6,13 +6,13 @@ use rustix::io::Errno;
 use socketcan::CanFdSocket;
 
 use super::batch::Datagram;
-use super::{Bus, BusError, Filter, Options};
+use super::{Bus, BusError, Filter, BusOptions};
 
 /// The operations in which the kinds of buses differ; the rest of [`Bus`] is common to all.
 pub(super) trait Carrier {
     /// Opens a bus, with filters and time stamps enabled. Returns the socket, and the size of its receive
     /// buffer as the kernel counts it.
-    fn open(&self, name: &str, options: &Options) -> Result<(CanFdSocket, usize), BusError>;
+    fn open(&self, name: &str, options: &BusOptions) -> Result<(CanFdSocket, usize), BusError>;
 
     /// Replaces the filters.
     fn set_filters(&self, bus: &Bus, filters: &[Filter]) -> Result<(), BusError>;
@@ -27,5 +27,5 @@ pub(super) trait Carrier {
     fn dropped(&self, notice: &[u8]) -> Option<u32>;
 
     /// Returns the bus error that an error of an open socket stands for; `None` if it is not specific.
-    fn cause(&self, errno: Errno) -> Option<fn(String) -> BusError>;
+    fn bus_error(&self, errno: Errno) -> Option<fn(String) -> BusError>;
 }

@@ -8,10 +8,10 @@ use std::os::fd::AsFd;
 use super::{Filter, calls};
 
 pub use client::seqpacket;
-pub(super) use client::{Embedded, closed};
+pub(super) use client::{Embedded, closed_error};
 pub use directory::{
     DirectoryError, MARK, address, make_directory, mark, open_directory, remove_directory, socket_name,
-    usual_directory,
+    default_directory,
 };
 
 mod client;
@@ -22,7 +22,7 @@ pub const VERSION: u8 = 2;
 /// Index of the byte that marks a frame as the receiver's own.
 pub const OWN_BYTE: usize = 6;
 /// Maximum length of a hello in bytes.
-pub const HELLO_MAX: usize = HELLO_HEAD + 8 * Filter::MAX;
+pub const MAX_HELLO_BYTES: usize = HELLO_HEAD + 8 * Filter::MAX;
 
 const MAGIC: &[u8; 7] = b"skinbus";
 const HELLO_HEAD: usize = 23;
@@ -36,7 +36,7 @@ pub fn peer_process(socket: impl AsFd) -> Option<u32> {
 
 /// The request of a connecting client.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Hello {
+pub struct ClientHello {
     /// Filters for received frames.
     pub filters: Vec<Filter>,
     /// True to receive the client's own frames.
@@ -49,7 +49,7 @@ pub struct Hello {
     pub buffer: u64,
 }
 
-impl Hello {
+impl ClientHello {
     /// Encodes the datagram.
     #[must_use]
     pub fn encode(&self) -> Vec<u8> {
@@ -145,7 +145,7 @@ fn decode_filters(bytes: &[u8]) -> Option<Vec<Filter>> {
 
 /// The bus's answer to a hello.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Answer {
+pub enum HelloReply {
     /// The client is connected and its filters are set.
     Welcome {
         /// Size of the client's receive buffer in bytes, as the kernel counts it.
@@ -158,7 +158,7 @@ pub enum Answer {
     },
 }
 
-impl Answer {
+impl HelloReply {
     /// Encodes the datagram.
     #[must_use]
     pub fn encode(self) -> [u8; ANSWER_LEN] {
@@ -210,12 +210,12 @@ mod tests {
     use crate::can::{CLASSIC_BYTES, FD_BYTES};
     use proptest::prelude::*;
 
-    fn any_hello() -> impl Strategy<Value = Hello> {
+    fn any_hello() -> impl Strategy<Value = ClientHello> {
         let filters = proptest::collection::vec(any::<(u32, u32)>(), 0..20);
         (filters, any::<(bool, bool, u32, u64)>()).prop_map(
             |(filters, (own_frames, fd, error_mask, buffer))| {
                 let filters = filters.into_iter().map(|(id, mask)| Filter { id, mask }).collect();
-                Hello { filters, own_frames, fd, error_mask, buffer }
+                ClientHello { filters, own_frames, fd, error_mask, buffer }
             },
         )
     }
@@ -224,7 +224,7 @@ mod tests {
     fn the_bytes_of_a_hello() {
         let filter = Filter { id: 0x001, mask: 0xC000_07FF };
         let hello =
-            Hello { filters: vec![filter], own_frames: true, fd: true, error_mask: 0x1FF, buffer: 0x10_0000 };
+            ClientHello { filters: vec![filter], own_frames: true, fd: true, error_mask: 0x1FF, buffer: 0x10_0000 };
         let expected = b"skinbus\x02\x01\x01\xff\x01\0\0\0\0\x10\0\0\0\0\0\0\x01\0\0\0\xff\x07\0\xc0";
         assert_eq!(hello.encode(), expected);
     }
@@ -237,22 +237,22 @@ mod tests {
                 let filters = vec![Filter::ALL; count];
                 FilterPart::split(&filters).map(|part| part.encode().len()).collect::<Vec<_>>()
             }))
-            .chain([Answer::Refused { version: 1 }.encode().len(), encode_dropped(0).len()]);
+            .chain([HelloReply::Refused { version: 1 }.encode().len(), encode_dropped(0).len()]);
         assert!(lens.into_iter().all(|len| len != CLASSIC_BYTES && len != FD_BYTES && len != 0));
     }
 
     #[test]
     fn a_hello_of_another_version_is_none() {
         let mut bytes =
-            Hello { filters: vec![], own_frames: false, fd: true, error_mask: 0, buffer: 0 }.encode();
+            ClientHello { filters: vec![], own_frames: false, fd: true, error_mask: 0, buffer: 0 }.encode();
         bytes[7] = VERSION + 1;
-        assert_eq!(Hello::decode(&bytes), None);
+        assert_eq!(ClientHello::decode(&bytes), None);
     }
 
     proptest! {
         #[test]
         fn every_hello_comes_back(hello in any_hello()) {
-            prop_assert_eq!(Hello::decode(&hello.encode()), Some(hello));
+            prop_assert_eq!(ClientHello::decode(&hello.encode()), Some(hello));
         }
 
         #[test]
@@ -271,16 +271,16 @@ mod tests {
 
         #[test]
         fn every_answer_comes_back(granted: u64, version: u8, total: u32) {
-            for answer in [Answer::Welcome { granted }, Answer::Refused { version }] {
-                prop_assert_eq!(Answer::decode(&answer.encode()), Some(answer));
+            for answer in [HelloReply::Welcome { granted }, HelloReply::Refused { version }] {
+                prop_assert_eq!(HelloReply::decode(&answer.encode()), Some(answer));
             }
             prop_assert_eq!(decode_dropped(&encode_dropped(total)), Some(total));
         }
 
         #[test]
         fn no_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..80)) {
-            let _ = (Hello::decode(&bytes), FilterPart::decode(&bytes));
-            let _ = (Answer::decode(&bytes), decode_dropped(&bytes));
+            let _ = (ClientHello::decode(&bytes), FilterPart::decode(&bytes));
+            let _ = (HelloReply::decode(&bytes), decode_dropped(&bytes));
         }
     }
 }

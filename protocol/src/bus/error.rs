@@ -124,7 +124,7 @@ pub enum BusError {
         "the embedded bus {0} has no room for another client: its server may have no more files open; end other clients, or \
          raise `ulimit -Hn` where it is started"
     )]
-    TurnedAway(String),
+    NoRoom(String),
     /// The server of the embedded bus has ended. The bus must be opened again.
     #[error("the embedded bus {0} was closed: its server ended")]
     Closed(String),
@@ -162,7 +162,7 @@ pub enum BusError {
 
 impl BusError {
     /// Creates the error for a bus that the system does not open.
-    pub(super) fn refused(name: &str, doing: &'static str, source: impl Into<io::Error>) -> Self {
+    pub(super) fn open_error(name: &str, doing: &'static str, source: impl Into<io::Error>) -> Self {
         let (name, source) = (name.to_owned(), source.into());
         if source.kind() == io::ErrorKind::PermissionDenied {
             return Self::Permission { name, doing, source };
@@ -172,7 +172,7 @@ impl BusError {
 
     /// Returns true if the bus may work again without being opened again: it is down, or its queue is full.
     #[must_use]
-    pub const fn may_pass(&self) -> bool {
+    pub const fn is_temporary(&self) -> bool {
         matches!(self, Self::Down(_) | Self::Full { .. })
     }
 
@@ -184,7 +184,7 @@ impl BusError {
             Self::NotServed { .. }
                 | Self::Absent { .. }
                 | Self::NoAnswer { .. }
-                | Self::TurnedAway(_)
+                | Self::NoRoom(_)
                 | Self::NoInterface(_)
                 | Self::ClassicOnly { .. }
                 | Self::Down(_)
@@ -204,12 +204,12 @@ impl BusError {
 
 /// The error for frames that were not all sent.
 #[derive(Debug, Error)]
-#[error("{cause} ({sent} of {target} frames sent)")]
+#[error("{cause} ({sent} of {total} frames sent)")]
 pub struct SendError {
     /// Number of frames sent before the error.
     pub sent: usize,
     /// Number of frames to send.
-    pub target: usize,
+    pub total: usize,
     /// The cause.
     #[source]
     pub cause: BusError,

@@ -36,13 +36,13 @@ impl Filter {
 
     /// Creates a filter for the data frames of a kind, from or to any node.
     #[must_use]
-    pub const fn kind(kind: Kind) -> Self {
+    pub const fn for_kind(kind: Kind) -> Self {
         Self { id: Id { kind, node: 0 }.to_bits() as u32, mask: Self::EXACT_MASK & !0xFF }
     }
 
     /// Creates a filter for the frames of one direction of a simulated wire.
     #[must_use]
-    pub const fn link_id(link_id: LinkId) -> Self {
+    pub const fn for_link(link_id: LinkId) -> Self {
         Self { id: link_id.raw_id(), mask: EXTENDED_MASK | EXTENDED | REMOTE }
     }
 
@@ -63,8 +63,8 @@ mod tests {
         let filter = Filter::exact(Id::command(Command::Joints));
         assert_eq!(filter, Filter { id: 0x001, mask: 0xC000_07FF });
         assert_eq!(filter.inverted().inverted(), filter);
-        assert_eq!(Filter::kind(Kind::Network), Filter { id: 0x400, mask: 0xC000_0700 });
+        assert_eq!(Filter::for_kind(Kind::Network), Filter { id: 0x400, mask: 0xC000_0700 });
         let link_id = LinkId { wire: 3, back: true };
-        assert_eq!(Filter::link_id(link_id), Filter { id: 0x9000_0007, mask: 0xDFFF_FFFF });
+        assert_eq!(Filter::for_link(link_id), Filter { id: 0x9000_0007, mask: 0xDFFF_FFFF });
     }
 }

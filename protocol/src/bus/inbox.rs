@@ -68,7 +68,7 @@ impl Inbox {
     }
 
     /// Decodes the datagrams of the batch. Returns true if the other end closed the connection after them.
-    pub(super) fn take(&mut self, carrier: &dyn Carrier) -> bool {
+    pub(super) fn decode(&mut self, carrier: &dyn Carrier) -> bool {
         let Self { batch, frames, dropped, unreadable, failure: _ } = self;
         frames.clear();
         for datagram in batch.datagrams() {

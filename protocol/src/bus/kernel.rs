@@ -9,8 +9,8 @@ use socketcan::{CanAddr, CanFdSocket, CanFilter, Socket, SocketOptions};
 
 use super::batch::{Batch, Datagram};
 use super::carrier::Carrier;
-use super::link::Link;
-use super::{Bus, BusError, Filter, Options};
+use super::link::NetworkInterface;
+use super::{Bus, BusError, Filter, BusOptions};
 
 /// The MTU of an interface that carries CAN FD.
 const FD_MTU: u32 = 72;
@@ -29,7 +29,7 @@ pub fn has_socketcan() -> bool {
 /// Returns true if there is an interface of this name, CAN or not. Any error except "no such device" counts
 /// as true.
 pub(super) fn has_interface(name: &str) -> bool {
-    !Link::named(name).is_err_and(|error| matches!(error.raw_os_error(), Some(libc::ENODEV | libc::ENXIO)))
+    !NetworkInterface::query(name).is_err_and(|error| matches!(error.raw_os_error(), Some(libc::ENODEV | libc::ENXIO)))
 }
 
 fn probe() -> Result<OwnedFd, Errno> {
@@ -42,18 +42,18 @@ fn probe() -> Result<OwnedFd, Errno> {
 pub(super) struct SocketCan;
 
 impl Carrier for SocketCan {
-    fn open(&self, name: &str, options: &Options) -> Result<(CanFdSocket, usize), BusError> {
+    fn open(&self, name: &str, options: &BusOptions) -> Result<(CanFdSocket, usize), BusError> {
         let own = || name.to_owned();
         let failed = |source: io::Error| match source.raw_os_error() {
             Some(libc::ENETDOWN) => BusError::Down(own()),
-            _ => BusError::refused(name, "open", source),
+            _ => BusError::open_error(name, "open", source),
         };
         match probe() {
             Ok(_) => {}
             Err(Errno::AFNOSUPPORT | Errno::PROTONOSUPPORT) => return Err(BusError::NoSocketCan(own())),
             Err(errno) => return Err(failed(errno.into())),
         }
-        let link = Link::named(name).map_err(|source| match source.raw_os_error() {
+        let link = NetworkInterface::query(name).map_err(|source| match source.raw_os_error() {
             Some(libc::ENODEV | libc::ENXIO) => BusError::NoInterface(own()),
             _ => failed(source),
         })?;
@@ -77,7 +77,7 @@ impl Carrier for SocketCan {
     }
 
     fn is_virtual(&self, name: &str) -> io::Result<bool> {
-        Link::named(name).map(|link| link.is_virtual)
+        NetworkInterface::query(name).map(|link| link.is_virtual)
     }
 
     fn is_own(&self, frame: Datagram<'_>) -> bool {
@@ -88,7 +88,7 @@ impl Carrier for SocketCan {
         None
     }
 
-    fn cause(&self, errno: Errno) -> Option<fn(String) -> BusError> {
+    fn bus_error(&self, errno: Errno) -> Option<fn(String) -> BusError> {
         match errno {
             Errno::NETDOWN | Errno::NETUNREACH => Some(BusError::Down),
             Errno::NODEV | Errno::NXIO => Some(BusError::Gone),
@@ -98,7 +98,7 @@ impl Carrier for SocketCan {
 }
 
 /// Sets the options of a new socket. Returns the size of its receive buffer.
-fn set_up(socket: &CanFdSocket, options: &Options) -> io::Result<usize> {
+fn set_up(socket: &CanFdSocket, options: &BusOptions) -> io::Result<usize> {
     set_filters(socket, &options.filters)?;
     socket.set_error_filter(options.error_mask)?;
     let fd = libc::c_int::from(options.fd);

@@ -36,7 +36,7 @@ impl BusKind {
 
     /// Returns the name of the kind in sentences.
     #[must_use]
-    pub const fn words(self) -> &'static str {
+    pub const fn display_name(self) -> &'static str {
         match self {
             Self::SocketCan => "SocketCAN",
             Self::Embedded => "the embedded bus",
@@ -61,7 +61,7 @@ impl fmt::Display for BusKind {
 
 /// A requested kind of bus.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
-pub enum Choice {
+pub enum KindChoice {
     /// SocketCAN if there is an interface of the bus's name, else the embedded bus.
     #[default]
     Auto,
@@ -69,7 +69,7 @@ pub enum Choice {
     Only(BusKind),
 }
 
-impl Choice {
+impl KindChoice {
     /// Returns the kind of the bus of this name, which for [`Choice::Auto`] depends on the interfaces that
     /// exist now.
     #[must_use]
@@ -82,7 +82,7 @@ impl Choice {
     }
 }
 
-impl fmt::Display for Choice {
+impl fmt::Display for KindChoice {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Auto => f.pad("auto"),
@@ -99,7 +99,7 @@ pub struct UnknownKind {
     pub got: String,
 }
 
-impl FromStr for Choice {
+impl FromStr for KindChoice {
     type Err = UnknownKind;
 
     fn from_str(word: &str) -> Result<Self, UnknownKind> {
@@ -111,14 +111,14 @@ impl FromStr for Choice {
 
 /// The value of one `--bus-kind`: for one bus, or for all buses that are not named.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct OneKind {
+pub struct KindOption {
     /// The name of the bus; `None` for all others.
     pub bus: Option<String>,
     /// The requested kind.
-    pub kind: Choice,
+    pub kind: KindChoice,
 }
 
-impl FromStr for OneKind {
+impl FromStr for KindOption {
     type Err = UnknownKind;
 
     fn from_str(word: &str) -> Result<Self, UnknownKind> {
@@ -131,9 +131,9 @@ impl FromStr for OneKind {
 
 /// The requested kind of each bus.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
-pub struct Kinds {
-    named: BTreeMap<String, Choice>,
-    others: Choice,
+pub struct KindChoices {
+    named: BTreeMap<String, KindChoice>,
+    others: KindChoice,
 }
 
 /// The error for contradictory values of `--bus-kind`, or for an unknown bus.
@@ -142,13 +142,13 @@ pub struct Kinds {
 pub enum KindsError {
     /// `--bus-kind` is given twice for the same buses.
     #[error("--bus-kind is given twice for {what}: {first} and {second}; leave out one")]
-    Twice {
+    Duplicate {
         /// The bus, or all other buses.
         what: String,
         /// The first kind.
-        first: Choice,
+        first: KindChoice,
         /// The second kind.
-        second: Choice,
+        second: KindChoice,
     },
     /// `--bus-kind` names a bus that does not exist.
     #[error("--bus-kind {bus}={kind}: there is no bus {bus}; the buses are {}", known.join(", "))]
@@ -156,40 +156,40 @@ pub enum KindsError {
         /// The bus.
         bus: String,
         /// Its requested kind.
-        kind: Choice,
+        kind: KindChoice,
         /// The existing buses.
         known: Vec<String>,
     },
 }
 
-impl Kinds {
+impl KindChoices {
     /// Requests the same kind for every bus.
     #[must_use]
-    pub const fn all(kind: Choice) -> Self {
+    pub const fn all(kind: KindChoice) -> Self {
         Self { named: BTreeMap::new(), others: kind }
     }
 
     /// Requests these kinds for these buses, and [`Choice::Auto`] for others.
     #[must_use]
     pub fn exactly<'a>(buses: impl IntoIterator<Item = (&'a str, BusKind)>) -> Self {
-        let named = buses.into_iter().map(|(name, kind)| (name.to_owned(), Choice::Only(kind)));
-        Self { named: named.collect(), others: Choice::Auto }
+        let named = buses.into_iter().map(|(name, kind)| (name.to_owned(), KindChoice::Only(kind)));
+        Self { named: named.collect(), others: KindChoice::Auto }
     }
 
     /// Combines values of `--bus-kind`; `otherwise` applies to buses without a value.
     ///
     /// # Errors
     /// Returns an error if two values are for the same bus, or both for all other buses.
-    pub fn of_words(words: &[OneKind], otherwise: Choice) -> Result<Self, KindsError> {
+    pub fn from_options(words: &[KindOption], otherwise: KindChoice) -> Result<Self, KindsError> {
         let (mut named, mut others) = (BTreeMap::new(), None);
-        for OneKind { bus, kind } in words {
+        for KindOption { bus, kind } in words {
             let first = match bus {
                 Some(bus) => named.insert(bus.clone(), *kind),
                 None => others.replace(*kind),
             };
             if let Some(first) = first {
                 let what = bus.clone().unwrap_or_else(|| "all other buses".to_owned());
-                return Err(KindsError::Twice { what, first, second: *kind });
+                return Err(KindsError::Duplicate { what, first, second: *kind });
             }
         }
         Ok(Self { named, others: others.unwrap_or(otherwise) })
@@ -199,7 +199,7 @@ impl Kinds {
     ///
     /// # Errors
     /// Returns an error if one is not.
-    pub fn only<'a>(self, known: impl IntoIterator<Item = &'a str>) -> Result<Self, KindsError> {
+    pub fn restrict_to<'a>(self, known: impl IntoIterator<Item = &'a str>) -> Result<Self, KindsError> {
         let known: Vec<_> = known.into_iter().map(str::to_owned).collect();
         match self.named.iter().find(|(bus, _)| !known.contains(bus)) {
             Some((bus, &kind)) => Err(KindsError::Unknown { bus: bus.clone(), kind, known }),
@@ -209,7 +209,7 @@ impl Kinds {
 
     /// Returns the requested kind of a bus.
     #[must_use]
-    pub fn of(&self, bus: &str) -> Choice {
+    pub fn kind_of(&self, bus: &str) -> KindChoice {
         self.named.get(bus).copied().unwrap_or(self.others)
     }
 }
@@ -218,37 +218,37 @@ impl Kinds {
 mod tests {
     use super::*;
 
-    const EMBEDDED: Choice = Choice::Only(BusKind::Embedded);
-    const SOCKETCAN: Choice = Choice::Only(BusKind::SocketCan);
+    const EMBEDDED: KindChoice = KindChoice::Only(BusKind::Embedded);
+    const SOCKETCAN: KindChoice = KindChoice::Only(BusKind::SocketCan);
 
-    fn kinds(words: &[&str]) -> Result<Kinds, KindsError> {
+    fn kinds(words: &[&str]) -> Result<KindChoices, KindsError> {
         let words: Vec<_> = words.iter().map(|word| word.parse().unwrap()).collect();
-        Kinds::of_words(&words, Choice::Auto)
+        KindChoices::from_options(&words, KindChoice::Auto)
     }
 
     #[test]
     fn a_choice_is_read_as_it_is_printed() {
         for word in ["auto", "socketcan", "embedded"] {
-            assert_eq!(word.parse::<Choice>().unwrap().to_string(), word);
+            assert_eq!(word.parse::<KindChoice>().unwrap().to_string(), word);
         }
-        let error = "vcan".parse::<Choice>().unwrap_err().to_string();
+        let error = "vcan".parse::<KindChoice>().unwrap_err().to_string();
         assert_eq!(error, "\"vcan\" is not a kind of bus: use auto, socketcan or embedded");
     }
 
     #[test]
     fn a_bus_that_is_named_is_what_is_said_of_it_and_the_others_are_what_is_said_without_a_name() {
         let mixed = kinds(&["vcan1=embedded", "socketcan"]).unwrap();
-        assert_eq!(["vcan0", "vcan1"].map(|bus| mixed.of(bus)), [SOCKETCAN, EMBEDDED]);
+        assert_eq!(["vcan0", "vcan1"].map(|bus| mixed.kind_of(bus)), [SOCKETCAN, EMBEDDED]);
         let rest = kinds(&["vcan1=socketcan"]).unwrap();
-        assert_eq!(["vcan0", "vcan1"].map(|bus| rest.of(bus)), [Choice::Auto, SOCKETCAN]);
-        assert_eq!(Kinds::all(EMBEDDED).of("vcan9"), EMBEDDED);
-        assert_eq!(Kinds::exactly([("can0", BusKind::SocketCan)]).of("can0"), SOCKETCAN);
+        assert_eq!(["vcan0", "vcan1"].map(|bus| rest.kind_of(bus)), [KindChoice::Auto, SOCKETCAN]);
+        assert_eq!(KindChoices::all(EMBEDDED).kind_of("vcan9"), EMBEDDED);
+        assert_eq!(KindChoices::exactly([("can0", BusKind::SocketCan)]).kind_of("can0"), SOCKETCAN);
     }
 
     #[test]
     fn what_cannot_be_is_said_with_what_can() {
         let wrong =
-            |words: &[&str]| kinds(words).and_then(|kinds| kinds.only(["vcan0", "vcan1"])).unwrap_err();
+            |words: &[&str]| kinds(words).and_then(|kinds| kinds.restrict_to(["vcan0", "vcan1"])).unwrap_err();
         assert_eq!(
             wrong(&["vcan1=embedded", "vcan1=auto"]).to_string(),
             "--bus-kind is given twice for vcan1: embedded and auto; leave out one"
@@ -263,7 +263,7 @@ mod tests {
         );
         for word in ["vcan", "vcan1=vcan", "=embedded", "a/b=embedded", "vcan1=embedded=x"] {
             assert!(
-                word.parse::<OneKind>()
+                word.parse::<KindOption>()
                     .unwrap_err()
                     .to_string()
                     .starts_with(&format!("{word:?} is not a kind"))

@@ -5,11 +5,11 @@ use std::io;
 use netlink_packet_route::RouteNetlinkMessage;
 use netlink_packet_route::link::{InfoKind, LinkAttribute, LinkFlags, LinkHeader, LinkInfo, LinkMessage};
 
-use super::netlink::{Exchange, attributes};
+use super::netlink::{RtnetlinkSocket, attributes};
 
 /// A network interface.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Link {
+pub(super) struct NetworkInterface {
     pub(super) index: u32,
     /// MTU in bytes: 16 for classic CAN, 72 for CAN FD.
     pub(super) mtu: u32,
@@ -19,12 +19,12 @@ pub(super) struct Link {
     pub(super) is_virtual: bool,
 }
 
-impl Link {
+impl NetworkInterface {
     /// Queries the interface of this name.
-    pub(super) fn named(name: &str) -> io::Result<Self> {
+    pub(super) fn query(name: &str) -> io::Result<Self> {
         let mut message = LinkMessage::default();
         message.attributes.push(LinkAttribute::IfName(name.to_owned()));
-        let answers = Exchange::open()?.request(RouteNetlinkMessage::GetLink(message), 0)?;
+        let answers = RtnetlinkSocket::open()?.request(RouteNetlinkMessage::GetLink(message), 0)?;
         let answer = answers.first().map_or(&[][..], Vec::as_slice);
         let LinkHeader { index, flags, .. } = LinkHeader::parse(answer).map_err(io::Error::other)?;
         let mut link = Self { index, mtu: 0, up: flags.contains(LinkFlags::Up), is_virtual: false };
@@ -46,8 +46,8 @@ mod tests {
 
     #[test]
     fn the_loopback_interface_is_no_vcan_and_one_that_is_not_there_is_an_error() {
-        assert!(!Link::named("lo").unwrap().is_virtual);
-        let error = Link::named("nosuchcan0").unwrap_err();
+        assert!(!NetworkInterface::query("lo").unwrap().is_virtual);
+        let error = NetworkInterface::query("nosuchcan0").unwrap_err();
         assert_eq!(error.raw_os_error(), Some(libc::ENODEV), "{error}");
     }
 }

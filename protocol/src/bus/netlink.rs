@@ -23,12 +23,12 @@ const HEADER: usize = 16;
 
 /// A netlink socket in the network namespace in which it was opened.
 #[derive(Debug)]
-pub struct Exchange {
+pub struct RtnetlinkSocket {
     socket: OwnedFd,
     sequence: u32,
 }
 
-impl Exchange {
+impl RtnetlinkSocket {
     /// Opens a socket in the calling thread's network namespace.
     ///
     /// # Errors

@@ -68,7 +68,7 @@ impl<'a> Iterator for ControlMessages<'a> {
 }
 
 /// Calls `take` with each file descriptor passed with a datagram (`SCM_RIGHTS`).
-pub(super) fn each_passed(slot: &Slot, mut take: impl FnMut(i32)) {
+pub(super) fn for_each_descriptor(slot: &Slot, mut take: impl FnMut(i32)) {
     let words = slot.control.map(u64::to_ne_bytes);
     let messages = ControlMessages(words.as_flattened().get(..slot.control_len).unwrap_or_default());
     for message in messages.filter(|message| message.kind == libc::SCM_RIGHTS) {

@@ -15,8 +15,8 @@ fn names_are_those_that_an_interface_can_have() {
 
 #[test]
 fn a_bus_that_nobody_serves_says_how_to_serve_it() {
-    let options = Options { directory: Some("/nowhere/skinbus".into()), ..Options::default() };
-    let error = Bus::open("vcan7", Choice::Only(BusKind::Embedded), &options).unwrap_err();
+    let options = BusOptions { directory: Some("/nowhere/skinbus".into()), ..BusOptions::default() };
+    let error = Bus::open("vcan7", KindChoice::Only(BusKind::Embedded), &options).unwrap_err();
     let expected = "no embedded bus vcan7 is served in /nowhere/skinbus: start `vcan-setup serve vcan7`, or \
                     `skinbus run`, which serves it";
     assert_eq!(error.to_string(), expected);
@@ -24,22 +24,22 @@ fn a_bus_that_nobody_serves_says_how_to_serve_it() {
 
 #[test]
 fn a_bus_of_either_kind_that_is_absent_names_both_ways() {
-    let options = Options { directory: Some("/nowhere/skinbus".into()), ..Options::default() };
-    let error = Bus::open("nosuchcan0", Choice::Auto, &options).unwrap_err();
+    let options = BusOptions { directory: Some("/nowhere/skinbus".into()), ..BusOptions::default() };
+    let error = Bus::open("nosuchcan0", KindChoice::Auto, &options).unwrap_err();
     let expected = "there is no interface nosuchcan0, and no embedded bus of this name is served in /nowhere/skinbus: make \
                     the interface with `vcan-setup up nosuchcan0`, or serve the bus with `vcan-setup serve nosuchcan0`";
     assert_eq!(error.to_string(), expected);
     assert!(error.may_open_later());
     // An interface of that name is chosen, whatever its type.
     assert_eq!(
-        [Choice::Auto.resolve("lo"), Choice::Auto.resolve("nosuchcan0")],
+        [KindChoice::Auto.resolve("lo"), KindChoice::Auto.resolve("nosuchcan0")],
         [BusKind::SocketCan, BusKind::Embedded]
     );
 }
 
 #[test]
 fn a_kernel_without_can_says_so_and_one_with_it_names_the_missing_interface() {
-    let error = Bus::open("nosuchcan0", Choice::Only(BusKind::SocketCan), &Options::default()).unwrap_err();
+    let error = Bus::open("nosuchcan0", KindChoice::Only(BusKind::SocketCan), &BusOptions::default()).unwrap_err();
     if has_socketcan() {
         let expected = "there is no interface nosuchcan0: make it with `vcan-setup up nosuchcan0`, or plug \
                         it in if it is hardware";
@@ -51,8 +51,8 @@ fn a_kernel_without_can_says_so_and_one_with_it_names_the_missing_interface() {
 
 #[test]
 fn too_many_filters_are_refused_before_anything_is_opened() {
-    let options = Options { filters: vec![Filter::ALL; 513], ..Options::default() };
-    let error = Bus::open("vcan0", Choice::Auto, &options).unwrap_err();
+    let options = BusOptions { filters: vec![Filter::ALL; 513], ..BusOptions::default() };
+    let error = Bus::open("vcan0", KindChoice::Auto, &options).unwrap_err();
     assert_eq!(error.to_string(), "513 filters are too many for one socket on vcan0: at most 512");
 }
 
@@ -85,7 +85,7 @@ fn errors_that_pass_cost_no_frame() {
         batch::send_one(&far, &frame.to_bytes()[..frame.byte_len()]).unwrap();
         let failures = std::cell::Cell::new(3_u32);
         let mut inbox = Inbox::new();
-        let count = bus.take(&mut inbox, |batch, socket| {
+        let count = bus.receive_with(&mut inbox, |batch, socket| {
             if failures.replace(failures.get().saturating_sub(1)) > 0 {
                 return Err(errno.into());
             }
@@ -99,7 +99,7 @@ fn errors_that_pass_cost_no_frame() {
 #[test]
 fn a_lack_of_memory_that_lasts_is_an_error() {
     let (bus, _far) = pair();
-    let error = bus.take(&mut Inbox::new(), |_, _| Err(Errno::NOMEM.into())).unwrap_err();
+    let error = bus.receive_with(&mut Inbox::new(), |_, _| Err(Errno::NOMEM.into())).unwrap_err();
     assert_eq!(error.to_string(), "cannot receive from vcan0: Cannot allocate memory (os error 12)");
 }
 
@@ -109,9 +109,9 @@ fn an_error_behind_frames_is_reported_by_the_next_receive_for_which_nothing_wait
     let frame = Frame::classic(0x123, &[1]).unwrap();
     batch::send_one(&far, &frame.to_bytes()[..frame.byte_len()]).unwrap();
     let mut inbox = Inbox::new();
-    let count = bus.take(&mut inbox, |batch, socket| {
+    let count = bus.receive_with(&mut inbox, |batch, socket| {
         let count = batch.receive(socket)?;
-        batch.fail_behind(Errno::PIPE.into());
+        batch.fail_after(Errno::PIPE.into());
         Ok(count)
     });
     assert_eq!(count.unwrap(), 1);

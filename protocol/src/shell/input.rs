@@ -14,11 +14,11 @@ use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 pub const STANDARD_INPUT: &str = "-";
 
 /// Descriptors already opened; their data can be read only once.
-static TAKEN: Mutex<Vec<u32>> = Mutex::new(Vec::new());
+static OPENED: Mutex<Vec<u32>> = Mutex::new(Vec::new());
 
 /// Marks a descriptor as opened; fails the second time.
-fn take(descriptor: u32) -> io::Result<()> {
-    let mut taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
+fn claim_descriptor(descriptor: u32) -> io::Result<()> {
+    let mut taken = OPENED.lock().unwrap_or_else(PoisonError::into_inner);
     if taken.contains(&descriptor) {
         return Err(io::Error::other(
             "it can be read only once and was already read: use a file for one of the two",
@@ -48,7 +48,7 @@ pub fn can_be_read_again(path: &Path) -> bool {
 /// it cannot be opened.
 pub fn open(path: &Path) -> io::Result<File> {
     if is_standard_input(path) {
-        take(0)?;
+        claim_descriptor(0)?;
         return Ok(io::stdin().as_fd().try_clone_to_owned()?.into());
     }
     let flags = (OFlags::NONBLOCK | OFlags::NOCTTY).bits().cast_signed();
@@ -60,7 +60,7 @@ pub fn open(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
     let kind = file.metadata()?.file_type();
     if !kind.is_file() {
-        take(own_descriptor(path).ok_or_else(|| refused(kind))?)?;
+        claim_descriptor(own_descriptor(path).ok_or_else(|| refused(kind))?)?;
         fcntl_setfl(&file, fcntl_getfl(&file)? - OFlags::NONBLOCK)?;
     }
     Ok(file)
@@ -81,7 +81,7 @@ fn refused(kind: FileType) -> io::Error {
 ///
 /// # Errors
 /// Returns the errors of [`open`], or an error if there are more than `longest` bytes.
-pub fn bytes(path: &Path, longest: u64) -> io::Result<Vec<u8>> {
+pub fn read_bytes(path: &Path, longest: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(longest.saturating_add(1)).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > longest {
@@ -160,7 +160,7 @@ mod tests {
     fn more_bytes_than_allowed_are_an_error() {
         let own = std::env::current_exe().unwrap();
         let length = fs::metadata(&own).unwrap().len();
-        assert_eq!(bytes(&own, length).unwrap().len() as u64, length);
-        assert!(bytes(&own, length - 1).unwrap_err().to_string().starts_with("it is longer than"));
+        assert_eq!(read_bytes(&own, length).unwrap().len() as u64, length);
+        assert!(read_bytes(&own, length - 1).unwrap_err().to_string().starts_with("it is longer than"));
     }
 }

@@ -27,7 +27,7 @@ impl Display for CellRange {
 /// assert_eq!(LastWords::parse(&line), Some(words));
 /// ```
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct LastWords {
+pub struct ExitReason {
     /// The cells of the process.
     pub cells: CellRange,
     /// The name of their bus.
@@ -36,14 +36,14 @@ pub struct LastWords {
     pub why: String,
 }
 
-impl Display for LastWords {
+impl Display for ExitReason {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let Self { cells: cells @ CellRange(first, last), bus, why } = self;
         write!(f, "{cells} on {bus} {}: {why}", if first == last { "ends" } else { "end" })
     }
 }
 
-impl LastWords {
+impl ExitReason {
     /// Parses the line. Returns `None` for any other line.
     #[must_use]
     pub fn parse(line: &str) -> Option<Self> {
@@ -75,13 +75,13 @@ mod tests {
         fn what_was_written_is_read_back(
             first in 0..=255_u8, last in 0..=255_u8, bus in "[^ /:]{1,15}", why in "\\PC{0,80}",
         ) {
-            let words = LastWords { cells: CellRange(first, last), bus, why };
-            prop_assert_eq!(LastWords::parse(&words.to_string()), Some(words));
+            let words = ExitReason { cells: CellRange(first, last), bus, why };
+            prop_assert_eq!(ExitReason::parse(&words.to_string()), Some(words));
         }
 
         #[test]
         fn no_line_panics_and_what_is_read_is_what_stands_there(line in "(cells? )?\\PC{0,60}") {
-            if let Some(words) = LastWords::parse(&line) {
+            if let Some(words) = ExitReason::parse(&line) {
                 prop_assert_eq!(words.to_string(), line);
             }
         }
@@ -99,7 +99,7 @@ mod tests {
             "cell 03 on vcan0 ends: no",
             "flash of cell 3 (a b) is not used: its CRC is wrong",
         ] {
-            assert_eq!(LastWords::parse(line), None, "{line}");
+            assert_eq!(ExitReason::parse(line), None, "{line}");
         }
     }
 }

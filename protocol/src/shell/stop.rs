@@ -11,15 +11,15 @@ use rustix::fs::{FileType, fstat};
 use rustix::io::Errno;
 
 /// Interval at which a waiting writer checks for a stop request.
-const LOOK: Duration = Duration::from_millis(100);
+const POLL_INTERVAL: Duration = Duration::from_millis(100);
 /// Number of intervals for which a writer still waits after a stop request.
-const LOOKS: u32 = 10;
+const MAX_STOP_POLLS: u32 = 10;
 /// Number of bytes that a writable pipe accepts without blocking (`PIPE_BUF`).
-const PIECE: usize = 4_096;
+const MAX_WRITE: usize = 4_096;
 
 /// Returns the stop flag, which the signal handler sets.
 #[must_use]
-pub fn flag() -> &'static Arc<AtomicBool> {
+pub fn stop_flag() -> &'static Arc<AtomicBool> {
     static FLAG: LazyLock<Arc<AtomicBool>> = LazyLock::new(Arc::default);
     &FLAG
 }
@@ -27,32 +27,32 @@ pub fn flag() -> &'static Arc<AtomicBool> {
 /// A writer for pipes and terminals that does not block a stop. After a stop request it waits one second for
 /// the reader, then returns an error.
 #[derive(Debug)]
-pub struct Stoppable<F> {
+pub struct InterruptibleWriter<F> {
     file: F,
     /// True if a write may block.
     waits: bool,
     /// Number of intervals left after a stop request.
-    looks: u32,
+    polls_left: u32,
 }
 
-impl<F: AsFd> Stoppable<F> {
+impl<F: AsFd> InterruptibleWriter<F> {
     /// Creates a writer for a file of any type.
     pub fn new(file: F) -> Self {
         let waits =
             fstat(&file).is_ok_and(|about| FileType::from_raw_mode(about.st_mode) != FileType::RegularFile);
-        Self { file, waits, looks: LOOKS }
+        Self { file, waits, polls_left: MAX_STOP_POLLS }
     }
 
     /// Waits until the file is writable or has an error.
     fn wait(&mut self) -> io::Result<()> {
-        let timeout = Timespec::try_from(LOOK).ok();
+        let timeout = Timespec::try_from(POLL_INTERVAL).ok();
         loop {
             match poll(&mut [PollFd::new(&self.file, PollFlags::OUT)], timeout.as_ref()) {
-                Ok(0) if flag().load(Ordering::Relaxed) => {
-                    if self.looks == 0 {
+                Ok(0) if stop_flag().load(Ordering::Relaxed) => {
+                    if self.polls_left == 0 {
                         return Err(io::Error::new(io::ErrorKind::TimedOut, "its reader does not read"));
                     }
-                    self.looks -= 1;
+                    self.polls_left -= 1;
                 }
                 Ok(0) | Err(Errno::INTR) => {}
                 Ok(_) => return Ok(()),
@@ -62,12 +62,12 @@ impl<F: AsFd> Stoppable<F> {
     }
 }
 
-impl<F: AsFd> Write for Stoppable<F> {
+impl<F: AsFd> Write for InterruptibleWriter<F> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         if !self.waits {
             return Ok(rustix::io::write(&self.file, bytes)?);
         }
-        let piece = bytes.get(..PIECE).unwrap_or(bytes);
+        let piece = bytes.get(..MAX_WRITE).unwrap_or(bytes);
         loop {
             self.wait()?;
             match rustix::io::write(&self.file, piece) {
@@ -99,14 +99,14 @@ mod tests {
             read.read_to_end(&mut got).unwrap();
             got
         });
-        Stoppable::new(write).write_all(&all).unwrap();
+        InterruptibleWriter::new(write).write_all(&all).unwrap();
         assert_eq!(reader.join().unwrap(), all);
         // This pipe has no reader.
         let (_read, write) = io::pipe().unwrap();
-        flag().store(true, Ordering::Relaxed);
-        let mut out = Stoppable::new(File::from(std::os::fd::OwnedFd::from(write)));
+        stop_flag().store(true, Ordering::Relaxed);
+        let mut out = InterruptibleWriter::new(File::from(std::os::fd::OwnedFd::from(write)));
         let error = out.write_all(&all).unwrap_err();
-        flag().store(false, Ordering::Relaxed);
+        stop_flag().store(false, Ordering::Relaxed);
         assert_eq!(error.kind(), io::ErrorKind::TimedOut);
     }
 }

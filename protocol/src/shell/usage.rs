@@ -8,7 +8,7 @@ use std::io::{self, ErrorKind, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use crate::stop::Stoppable;
+use crate::stop::InterruptibleWriter;
 
 /// An error message with its exit code.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -32,7 +32,7 @@ impl Failure {
 
     /// Creates an error without a message, for a failure that the output already reports: exit code 1.
     #[must_use]
-    pub const fn said() -> Self {
+    pub const fn already_reported() -> Self {
         Self { text: String::new(), code: 1 }
     }
 
@@ -59,59 +59,59 @@ impl Display for Failure {
 /// Returns the exit code of a program. Prints the error, prefixed with the program's name, to standard error
 /// in one write.
 #[must_use]
-pub fn end(program: &str, done: Result<(), Failure>) -> ExitCode {
+pub fn exit_code(program: &str, done: Result<(), Failure>) -> ExitCode {
     let Err(Failure { text, code }) = done else { return ExitCode::SUCCESS };
     if !text.is_empty() {
-        say(&format!("{program}: {text}"));
+        eprint_line(&format!("{program}: {text}"));
     }
     ExitCode::from(code)
 }
 
 /// Writes a line to standard error in one write, made printable by [`shown`]. Errors are ignored.
-pub fn say(line: &str) {
-    let _ = Stoppable::new(io::stderr()).write_all(format!("{}\n", shown(line)).as_bytes());
+pub fn eprint_line(line: &str) {
+    let _ = InterruptibleWriter::new(io::stderr()).write_all(format!("{}\n", printable(line)).as_bytes());
 }
 
 /// Writes lines to standard error in one write, made printable by [`shown_lines`]. Errors are ignored.
-pub fn say_lines(text: &str) {
-    let _ = Stoppable::new(io::stderr()).write_all(shown_lines(text).as_bytes());
+pub fn eprint_lines(text: &str) {
+    let _ = InterruptibleWriter::new(io::stderr()).write_all(printable_lines(text).as_bytes());
 }
 
 /// Writes text to standard output; on a terminal it is made printable by [`shown_lines`].
 ///
 /// # Errors
 /// Returns the errors of [`written`].
-pub fn print(text: &str) -> Result<(), Failure> {
-    if io::stdout().is_terminal() { draw(&shown_lines(text)) } else { draw(text) }
+pub fn print_text(text: &str) -> Result<(), Failure> {
+    if io::stdout().is_terminal() { print_raw(&printable_lines(text)) } else { print_raw(text) }
 }
 
 /// Writes text to standard output unchanged, including terminal control sequences.
 ///
 /// # Errors
 /// Returns the errors of [`written`].
-pub fn draw(text: &str) -> Result<(), Failure> {
-    written(put(text))
+pub fn print_raw(text: &str) -> Result<(), Failure> {
+    ignore_broken_pipe(write_stdout(text))
 }
 
 /// Writes text to standard output unchanged, for callers that stop when the reader leaves.
 ///
 /// # Errors
 /// Returns an error if the text cannot be written, including when its reader has left.
-pub fn put(text: &str) -> io::Result<()> {
-    Stoppable::new(io::stdout()).write_all(text.as_bytes())
+pub fn write_stdout(text: &str) -> io::Result<()> {
+    InterruptibleWriter::new(io::stdout()).write_all(text.as_bytes())
 }
 
 /// Makes a name or line printable: control characters and marks of text direction become escapes like
 /// `\u{1b}`.
 #[must_use]
-pub fn shown(text: &str) -> Cow<'_, str> {
-    with_codes(text, is_unprintable)
+pub fn printable(text: &str) -> Cow<'_, str> {
+    escape_chars(text, is_unprintable)
 }
 
 /// Makes a text of several lines printable, like [`shown`], but keeps line feeds and tabs.
 #[must_use]
-pub fn shown_lines(text: &str) -> Cow<'_, str> {
-    with_codes(text, |letter| is_unprintable(letter) && !matches!(letter, '\n' | '\t'))
+pub fn printable_lines(text: &str) -> Cow<'_, str> {
+    escape_chars(text, |letter| is_unprintable(letter) && !matches!(letter, '\n' | '\t'))
 }
 
 /// Returns true for control characters, marks and overrides of text direction, line separators, invisible
@@ -136,7 +136,7 @@ pub const fn is_unprintable(letter: char) -> bool {
 }
 
 /// Replaces the characters that `is_coded` selects with escapes like `\u{1b}`.
-fn with_codes(text: &str, is_coded: impl Fn(char) -> bool) -> Cow<'_, str> {
+fn escape_chars(text: &str, is_coded: impl Fn(char) -> bool) -> Cow<'_, str> {
     if !text.contains(&is_coded) {
         return Cow::Borrowed(text);
     }
@@ -155,7 +155,7 @@ fn with_codes(text: &str, is_coded: impl Fn(char) -> bool) -> Cow<'_, str> {
 ///
 /// # Errors
 /// Returns an error if the write failed for another reason.
-pub fn written(done: io::Result<()>) -> Result<(), Failure> {
+pub fn ignore_broken_pipe(done: io::Result<()>) -> Result<(), Failure> {
     match done {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
             Err(Failure::run(format!("standard output: {error}")))
@@ -166,7 +166,7 @@ pub fn written(done: io::Result<()>) -> Result<(), Failure> {
 
 /// Shortens clap's error message to one line: the error and its tip, without the usage.
 #[must_use]
-pub fn one_line(text: &str) -> String {
+pub fn one_line_error(text: &str) -> String {
     let text = text.strip_prefix("error: ").unwrap_or(text);
     let wrong = text.split("\n\nUsage:").flat_map(|text| text.split("\n\nFor more information")).next();
     let lines = wrong.unwrap_or(text).lines().map(str::trim).filter(|line| !line.is_empty());
@@ -178,7 +178,7 @@ pub fn one_line(text: &str) -> String {
 
 /// Quotes a word for a shell if necessary.
 #[must_use]
-pub fn quoted(word: &str) -> Cow<'_, str> {
+pub fn shell_quoted(word: &str) -> Cow<'_, str> {
     let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"_-./:=,@%+".contains(&byte);
     if !word.is_empty() && word.bytes().all(plain) {
         return Cow::Borrowed(word);
@@ -189,9 +189,9 @@ pub fn quoted(word: &str) -> Cow<'_, str> {
 
 /// Quotes any word for a shell. A word that is not UTF-8 becomes `$'...'`, which bash and zsh support.
 #[must_use]
-pub fn quoted_os(word: &OsStr) -> String {
+pub fn shell_quoted_os(word: &OsStr) -> String {
     if let Some(word) = word.to_str() {
-        return quoted(word).into_owned();
+        return shell_quoted(word).into_owned();
     }
     let mut whole = "$'".to_owned();
     for chunk in word.as_encoded_bytes().utf8_chunks() {
@@ -207,7 +207,7 @@ pub fn quoted_os(word: &OsStr) -> String {
 /// Returns the path in an environment variable, if it is set. A bare name gets the prefix `./`, because it
 /// would otherwise be searched in `PATH`.
 #[must_use]
-pub fn path_in(variable: &str) -> Option<PathBuf> {
+pub fn path_from_env(variable: &str) -> Option<PathBuf> {
     let path = std::env::var_os(variable).filter(|path| !path.is_empty()).map(PathBuf::from)?;
     Some(if path.components().count() == 1 { Path::new(".").join(path) } else { path })
 }
@@ -226,19 +226,19 @@ mod tests {
 
     #[test]
     fn an_exit_code_goes_with_each_error() {
-        assert_eq!(end("test", Ok(())), ExitCode::SUCCESS);
-        assert_eq!(end("test", Err(Failure::said())), ExitCode::from(1));
+        assert_eq!(exit_code("test", Ok(())), ExitCode::SUCCESS);
+        assert_eq!(exit_code("test", Err(Failure::already_reported())), ExitCode::from(1));
         assert_eq!(Failure::usage("no"), Failure::with_code(2, "no"));
         assert_eq!(Failure::run("no"), Failure::with_code(1, "no"));
-        assert_eq!(end("test", Err(Failure::with_code(3, ""))), ExitCode::from(3));
+        assert_eq!(exit_code("test", Err(Failure::with_code(3, ""))), ExitCode::from(3));
         assert_eq!(Failure::usage("no").and("no again"), Failure::usage("no; and no again"));
     }
     #[test]
     fn a_reader_may_leave_and_a_disk_may_not_be_full() {
-        assert_eq!(written(Ok(())), Ok(()));
-        assert_eq!(written(Err(ErrorKind::BrokenPipe.into())), Ok(()));
+        assert_eq!(ignore_broken_pipe(Ok(())), Ok(()));
+        assert_eq!(ignore_broken_pipe(Err(ErrorKind::BrokenPipe.into())), Ok(()));
         let full = io::Error::from(ErrorKind::StorageFull);
-        assert_eq!(written(Err(full)), Err(Failure::run("standard output: no storage space")));
+        assert_eq!(ignore_broken_pipe(Err(full)), Err(Failure::run("standard output: no storage space")));
     }
     #[test]
     fn what_is_wrong_and_its_tip_remain() {
@@ -246,43 +246,43 @@ mod tests {
                     Usage: cell-node --bus <NAME>\n\nFor more information, try '--help'.\n";
         let expected =
             "unexpected argument '--nod' found ; a similar argument exists: '--node'; try '--help'";
-        assert_eq!(one_line(said), expected.replace(" ; ", "; "));
+        assert_eq!(one_line_error(said), expected.replace(" ; ", "; "));
         let said = "error: invalid value 'x' for '--node'\n\nFor more information, try '--help'.\n";
-        assert_eq!(one_line(said), "invalid value 'x' for '--node'; try '--help'");
+        assert_eq!(one_line_error(said), "invalid value 'x' for '--node'; try '--help'");
         let said = "error: unexpected argument '-1' found\n\n  tip: to pass '-1' as a value, use '-- -1'\n\n\
                     Usage: x [OPTIONS]\n\nFor more information, try '--help'.\n";
-        assert_eq!(one_line(said), "unexpected argument '-1' found; try '--help'");
+        assert_eq!(one_line_error(said), "unexpected argument '-1' found; try '--help'");
     }
     #[test]
     fn a_terminal_is_shown_controls_and_obeys_none() {
-        assert!(matches!(shown("vcan0 µs — 中"), Cow::Borrowed("vcan0 µs — 中")));
-        assert!(matches!(shown_lines("a\tb\n"), Cow::Borrowed("a\tb\n")));
-        assert_eq!(shown("\x1b[2J\0\x7f"), r"\u{1b}[2J\u{0}\u{7f}");
-        assert_eq!(shown("a\r\n\tb"), r"a\u{d}\u{a}\u{9}b");
-        assert_eq!(shown_lines("a\r\n\tb\u{9b}"), "a\\u{d}\n\tb\\u{9b}");
-        assert_eq!(shown("\u{80}\u{9f}\u{a0}"), "\\u{80}\\u{9f}\u{a0}");
-        assert_eq!(shown("\u{202a}\u{202e}\u{2066}\u{2069}"), r"\u{202a}\u{202e}\u{2066}\u{2069}");
-        assert_eq!(shown("\u{200f}\u{feff}\u{fffe}\u{1ffff}"), r"\u{200f}\u{feff}\u{fffe}\u{1ffff}");
-        assert!(matches!(shown("\u{200d}\u{fffd}\u{ffee}\u{10000}"), Cow::Borrowed(_)));
+        assert!(matches!(printable("vcan0 µs — 中"), Cow::Borrowed("vcan0 µs — 中")));
+        assert!(matches!(printable_lines("a\tb\n"), Cow::Borrowed("a\tb\n")));
+        assert_eq!(printable("\x1b[2J\0\x7f"), r"\u{1b}[2J\u{0}\u{7f}");
+        assert_eq!(printable("a\r\n\tb"), r"a\u{d}\u{a}\u{9}b");
+        assert_eq!(printable_lines("a\r\n\tb\u{9b}"), "a\\u{d}\n\tb\\u{9b}");
+        assert_eq!(printable("\u{80}\u{9f}\u{a0}"), "\\u{80}\\u{9f}\u{a0}");
+        assert_eq!(printable("\u{202a}\u{202e}\u{2066}\u{2069}"), r"\u{202a}\u{202e}\u{2066}\u{2069}");
+        assert_eq!(printable("\u{200f}\u{feff}\u{fffe}\u{1ffff}"), r"\u{200f}\u{feff}\u{fffe}\u{1ffff}");
+        assert!(matches!(printable("\u{200d}\u{fffd}\u{ffee}\u{10000}"), Cow::Borrowed(_)));
         // A text that was made printable once does not change again.
-        assert_eq!(shown(&shown("\x1b")), shown("\x1b"));
+        assert_eq!(printable(&printable("\x1b")), printable("\x1b"));
     }
     #[test]
     fn a_word_can_be_typed_again() {
         for plain in ["vcan0", "/tmp/a-b_c.toml", "--peer=x"] {
-            assert_eq!(quoted(plain), plain);
+            assert_eq!(shell_quoted(plain), plain);
         }
-        assert_eq!(quoted("a b.toml"), "'a b.toml'");
-        assert_eq!(quoted("it's $HOME"), r"'it'\''s $HOME'");
-        assert_eq!(quoted(""), "''");
-        assert_eq!(quoted_os(OsStr::new("a b")), "'a b'");
-        assert_eq!(quoted_os(OsStr::from_bytes(b"it's\\\xff\xc3\xa9")), r"$'it\'s\\\xffé'");
+        assert_eq!(shell_quoted("a b.toml"), "'a b.toml'");
+        assert_eq!(shell_quoted("it's $HOME"), r"'it'\''s $HOME'");
+        assert_eq!(shell_quoted(""), "''");
+        assert_eq!(shell_quoted_os(OsStr::new("a b")), "'a b'");
+        assert_eq!(shell_quoted_os(OsStr::from_bytes(b"it's\\\xff\xc3\xa9")), r"$'it\'s\\\xffé'");
     }
     #[test]
     fn the_shell_reads_a_quoted_word_as_it_was() {
         for word in [b"n\xff.mcap".as_slice(), b"\xff\xfe'\\x41 $HOME", b"plain", b"two words"] {
             let word = OsStr::from_bytes(word);
-            let script = format!("printf %s {}", quoted_os(word));
+            let script = format!("printf %s {}", shell_quoted_os(word));
             let read = std::process::Command::new("bash").args(["-c", &script]).output().unwrap();
             assert_eq!(OsStr::from_bytes(&read.stdout), word, "{script}");
         }

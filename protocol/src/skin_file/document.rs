@@ -23,7 +23,7 @@ use crate::time::Span;
 
 /// A step of the path from the root of a file to a value.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Step {
+enum PathStep {
     /// Into a table.
     Key(&'static str),
     /// Into an array, at an index counted from 0.
@@ -32,20 +32,20 @@ enum Step {
 
 /// An invalid value, with its path and the reason.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Fault {
-    path: Vec<Step>,
+pub struct DocumentFault {
+    path: Vec<PathStep>,
     value: String,
     why: String,
 }
 
 /// The result of a check.
-pub type Checked<T> = Result<T, Fault>;
+pub type Checked<T> = Result<T, DocumentFault>;
 
 /// The path of a value or table in a file. Its methods check values and create faults with this path.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Place(Vec<Step>);
+pub struct KeyPath(Vec<PathStep>);
 
-impl Place {
+impl KeyPath {
     /// Returns the path of the file itself.
     #[must_use]
     pub const fn root() -> Self {
@@ -54,33 +54,33 @@ impl Place {
 
     /// Returns the path of a key at the top level.
     #[must_use]
-    pub fn named(key: &'static str) -> Self {
-        Self(vec![Step::Key(key)])
+    pub fn top_level_key(key: &'static str) -> Self {
+        Self(vec![PathStep::Key(key)])
     }
 
     /// Returns the path of a key in the table at this path.
     #[must_use]
     pub fn key(&self, key: &'static str) -> Self {
-        Self([&self.0[..], &[Step::Key(key)]].concat())
+        Self([&self.0[..], &[PathStep::Key(key)]].concat())
     }
 
     /// Returns the path of an element of the array at this path, counted from 0.
     #[must_use]
-    pub fn nth(&self, index: usize) -> Self {
-        Self([&self.0[..], &[Step::Index(index)]].concat())
+    pub fn element(&self, index: usize) -> Self {
+        Self([&self.0[..], &[PathStep::Index(index)]].concat())
     }
 
     /// Creates a fault with this path. An empty value is not printed.
     #[must_use]
-    pub fn fault(&self, value: impl fmt::Display, why: impl fmt::Display) -> Fault {
-        Fault { path: self.0.clone(), value: value.to_string(), why: why.to_string() }
+    pub fn fault(&self, value: impl fmt::Display, why: impl fmt::Display) -> DocumentFault {
+        DocumentFault { path: self.0.clone(), value: value.to_string(), why: why.to_string() }
     }
 
     /// Converts one of a few words to its meaning.
     ///
     /// # Errors
     /// Returns an error if it is not one of them.
-    pub fn word<T: Copy>(&self, got: &str, words: &[(&str, T)]) -> Result<T, Fault> {
+    pub fn choose<T: Copy>(&self, got: &str, words: &[(&str, T)]) -> Result<T, DocumentFault> {
         let found = words.iter().find(|(word, _)| *word == got);
         found.map(|&(_, meaning)| meaning).ok_or_else(|| {
             let mut words = words.iter().map(|(word, _)| format!("{word:?}")).collect::<Vec<_>>();
@@ -93,7 +93,7 @@ impl Place {
     ///
     /// # Errors
     /// Returns an error if it is outside the range.
-    pub fn within(&self, got: i64, range: RangeInclusive<u32>, unit: &str) -> Result<u32, Fault> {
+    pub fn check_range(&self, got: i64, range: RangeInclusive<u32>, unit: &str) -> Result<u32, DocumentFault> {
         u32::try_from(got).ok().filter(|value| range.contains(value)).ok_or_else(|| {
             let (min, max) = range.into_inner();
             self.fault(got, format_args!("{min} to {max}{unit} are possible"))
@@ -104,7 +104,7 @@ impl Place {
     ///
     /// # Errors
     /// Returns an error if it is infinite or NaN.
-    pub fn finite(&self, value: f64) -> Result<f64, Fault> {
+    pub fn check_finite(&self, value: f64) -> Result<f64, DocumentFault> {
         if value.is_finite() { Ok(value) } else { Err(self.fault(value, "a finite number is needed")) }
     }
 
@@ -112,7 +112,7 @@ impl Place {
     ///
     /// # Errors
     /// Returns an error if it is not.
-    pub fn positive(&self, value: f64) -> Result<f64, Fault> {
+    pub fn check_positive(&self, value: f64) -> Result<f64, DocumentFault> {
         let positive = value.is_finite() && value > 0.0;
         if positive { Ok(value) } else { Err(self.fault(value, "must be above 0")) }
     }
@@ -121,7 +121,7 @@ impl Place {
     ///
     /// # Errors
     /// Returns an error if it is outside the range of the word.
-    pub fn fit<const F: u32>(&self, value: f64, fit: Fit<F>) -> Result<Q<F>, Fault> {
+    pub fn to_fixed<const F: u32>(&self, value: f64, fit: RoundingFn<F>) -> Result<Q<F>, DocumentFault> {
         fit(value).map_err(|OutOfRange { min, bound, .. }| {
             self.fault(value, format_args!("the range is [{min}, {bound})"))
         })
@@ -131,27 +131,27 @@ impl Place {
     ///
     /// # Errors
     /// Returns an error if the number is negative, or outside the range of the word.
-    pub fn set<const F: u32>(&self, given: Option<f64>, word: &mut Q<F>, fit: Fit<F>) -> Result<(), Fault> {
+    pub fn set_word<const F: u32>(&self, given: Option<f64>, word: &mut Q<F>, fit: RoundingFn<F>) -> Result<(), DocumentFault> {
         match given {
             None => {}
             Some(value) if value < 0.0 => return Err(self.fault(value, "must not be negative")),
-            Some(value) => *word = self.fit(value, fit)?,
+            Some(value) => *word = self.to_fixed(value, fit)?,
         }
         Ok(())
     }
 }
 
 /// A rounding function from a number to a word.
-pub type Fit<const F: u32> = fn(f64) -> Result<Q<F>, OutOfRange>;
+pub type RoundingFn<const F: u32> = fn(f64) -> Result<Q<F>, OutOfRange>;
 
-impl fmt::Display for Fault {
+impl fmt::Display for DocumentFault {
     /// Formats the fault like `cell[3].joint = 9: the robot has joints 1 to 6`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (index, step) in self.path.iter().enumerate() {
             match step {
-                Step::Key(key) if index == 0 => write!(f, "{key}")?,
-                Step::Key(key) => write!(f, ".{key}")?,
-                Step::Index(at) => write!(f, "[{at}]")?,
+                PathStep::Key(key) if index == 0 => write!(f, "{key}")?,
+                PathStep::Key(key) => write!(f, ".{key}")?,
+                PathStep::Index(at) => write!(f, "[{at}]")?,
             }
         }
         if !self.value.is_empty() {
@@ -175,7 +175,7 @@ pub enum DocumentError {
     },
     /// A value in the file is invalid.
     #[error("{path}:{line}:{column}: {what}")]
-    Wrong {
+    InvalidValue {
         /// The file.
         path: String,
         /// The line, from 1.
@@ -187,7 +187,7 @@ pub enum DocumentError {
     },
     /// The file is of another kind.
     #[error("{path}: {what}")]
-    Mistaken {
+    WrongKind {
         /// The file.
         path: String,
         /// The kind of the file, and its proper use.
@@ -199,26 +199,26 @@ impl DocumentError {
     /// Returns [`DocumentError::Mistaken`] with `what` if the text has one of the keys `has` and none of the
     /// keys `lacks`: it is a file of another kind. Otherwise returns the error unchanged.
     #[must_use]
-    pub fn or_mistaken(self, text: &str, has: &[&str], lacks: &[&str], what: &'static str) -> Self {
-        let Self::Wrong { path, .. } = &self else { return self };
+    pub fn or_wrong_kind(self, text: &str, has: &[&str], lacks: &[&str], what: &'static str) -> Self {
+        let Self::InvalidValue { path, .. } = &self else { return self };
         let Ok(root) = DeTable::parse(text) else { return self };
         let any = |keys: &[&str]| keys.iter().any(|key| root.get_ref().contains_key(*key));
-        if any(has) && !any(lacks) { Self::Mistaken { path: path.clone(), what } } else { self }
+        if any(has) && !any(lacks) { Self::WrongKind { path: path.clone(), what } } else { self }
     }
 }
 
 /// Maximum size of a user-written file in bytes; a skin of 253 cells has 60 KB.
-pub const LONGEST: u64 = 16 << 20;
+pub const MAX_FILE_BYTES: u64 = 16 << 20;
 
 /// Maximum number of keys, values and tables in a TOML file, estimated by their punctuation. A skin of 10 000
 /// cells has 280 000; this many take at most 0.5 GB of memory.
-const MOST_SIGNS: usize = 500_000;
+const MAX_PUNCTUATION: usize = 500_000;
 
 /// Converts seconds to a duration. The caller checks that they are not negative and within the limits of the
 /// file.
 #[must_use]
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "bounded by whoever calls")]
-pub fn span(seconds: f64) -> Span {
+pub fn span_from_seconds(seconds: f64) -> Span {
     Span((seconds * 1e6).round() as u64)
 }
 
@@ -226,17 +226,17 @@ pub fn span(seconds: f64) -> Span {
 ///
 /// # Errors
 /// Returns an error if it is longer, or cannot be read as UTF-8.
-pub fn text(path: &Path) -> Result<String, DocumentError> {
-    text_within(path, LONGEST)
+pub fn read_text(path: &Path) -> Result<String, DocumentError> {
+    read_text_within(path, MAX_FILE_BYTES)
 }
 
 /// Reads a file of at most `longest` bytes.
 ///
 /// # Errors
 /// Returns an error if it is longer, or cannot be read as UTF-8.
-pub fn text_within(path: &Path, longest: u64) -> Result<String, DocumentError> {
+pub fn read_text_within(path: &Path, longest: u64) -> Result<String, DocumentError> {
     let read =
-        || String::from_utf8(input::bytes(path, longest)?).map_err(|_| io::Error::other("it is not UTF-8"));
+        || String::from_utf8(input::read_bytes(path, longest)?).map_err(|_| io::Error::other("it is not UTF-8"));
     read().map_err(|error: io::Error| DocumentError::Unreadable {
         path: path.display().to_string(),
         reason: error.to_string(),
@@ -250,16 +250,16 @@ pub fn text_within(path: &Path, longest: u64) -> Result<String, DocumentError> {
 pub fn parse<Raw: DeserializeOwned, T>(
     path: &str,
     text: &str,
-    check: impl FnOnce(Raw) -> Result<T, Fault>,
+    check: impl FnOnce(Raw) -> Result<T, DocumentFault>,
 ) -> Result<T, DocumentError> {
     let wrong = |at, what| {
         let (line, column) = line_and_column(text, at);
-        DocumentError::Wrong { path: path.to_owned(), line, column, what }
+        DocumentError::InvalidValue { path: path.to_owned(), line, column, what }
     };
     let signs = text.bytes().filter(|byte| b"=.,[{".contains(byte)).count();
-    if signs > MOST_SIGNS {
+    if signs > MAX_PUNCTUATION {
         let reason =
-            format!("it has {signs} of the characters = . , [ {{, and at most {MOST_SIGNS} are allowed");
+            format!("it has {signs} of the characters = . , [ {{, and at most {MAX_PUNCTUATION} are allowed");
         return Err(DocumentError::Unreadable { path: path.to_owned(), reason });
     }
     let raw = deserialize(text).map_err(|(at, what)| wrong(at, what))?;
@@ -270,20 +270,20 @@ pub fn parse<Raw: DeserializeOwned, T>(
 fn deserialize<T: DeserializeOwned>(text: &str) -> Result<T, (usize, String)> {
     toml::from_str(text).map_err(|error| {
         let at = error.span().unwrap_or_default();
-        (at.start, mistakes::explained(text, at, &error.message().lines().collect::<Vec<_>>().join("; ")))
+        (at.start, mistakes::explain(text, at, &error.message().lines().collect::<Vec<_>>().join("; ")))
     })
 }
 
 /// Returns the offset of the value at a path, or of its nearest existing ancestor.
-fn offset_of(text: &str, path: &[Step]) -> usize {
+fn offset_of(text: &str, path: &[PathStep]) -> usize {
     let Ok(root) = DeTable::parse(text) else { return 0 };
     let mut at = root.span().start;
     let mut table = Some(root.get_ref());
     let mut value: Option<&Spanned<DeValue<'_>>> = None;
     for step in path {
         let next = match step {
-            Step::Key(key) => table.and_then(|table| table.get(*key)),
-            Step::Index(index) => value.and_then(|value| value.get_ref().as_array()?.get(*index)),
+            PathStep::Key(key) => table.and_then(|table| table.get(*key)),
+            PathStep::Index(index) => value.and_then(|value| value.get_ref().as_array()?.get(*index)),
         };
         let Some(next) = next else { break };
         at = next.span().start;
@@ -306,13 +306,13 @@ mod tests {
 
     #[test]
     fn seconds_are_spans_and_too_much_is_not_read() {
-        assert_eq!((span(1.5), span(0.000_000_6)), (Span(1_500_000), Span(1)));
+        assert_eq!((span_from_seconds(1.5), span_from_seconds(0.000_000_6)), (Span(1_500_000), Span(1)));
         let of = |signs| {
             let text = format!("#{}", ".".repeat(signs));
             parse("x.toml", &text, |_: toml::Table| Ok(())).map_err(|error| error.to_string())
         };
-        assert_eq!(of(MOST_SIGNS), Ok(()));
-        assert!(of(MOST_SIGNS + 1).unwrap_err().contains("it has 500001 of the characters"));
-        assert!(of(MOST_SIGNS * 2).is_err());
+        assert_eq!(of(MAX_PUNCTUATION), Ok(()));
+        assert!(of(MAX_PUNCTUATION + 1).unwrap_err().contains("it has 500001 of the characters"));
+        assert!(of(MAX_PUNCTUATION * 2).is_err());
     }
 }

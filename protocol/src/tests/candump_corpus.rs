@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 
 use crate::can::{FD_FORMAT, Format, Frame};
-use crate::candump::{self, Direction, Line, Record};
+use crate::candump::{self, Direction, CandumpLine, Record};
 use socketcan::dump::{self, CanDumpRecord, Reader};
 use socketcan::{CanAnyFrame, EmbeddedFrame as _, Frame as _};
 
@@ -95,7 +95,7 @@ fn describe(record: &Record<'_>) -> BTreeMap<&'static str, String> {
 fn every_line_is_what_the_corpus_says() {
     for (expected, line) in corpus() {
         match (expected.what, candump::parse(line)) {
-            ("frame", Ok(Line::Frame(record))) => {
+            ("frame", Ok(CandumpLine::Frame(record))) => {
                 for (key, found) in describe(&record) {
                     assert_eq!(found, expected.get(key), "{key} of {line}");
                 }
@@ -105,10 +105,10 @@ fn every_line_is_what_the_corpus_says() {
                 };
                 assert_eq!(record.to_string(), out, "written again");
                 let again = candump::parse(&out).unwrap();
-                assert_eq!(again, Line::Frame(Record { direction: None, ..record }), "and read again");
+                assert_eq!(again, CandumpLine::Frame(Record { direction: None, ..record }), "and read again");
             }
-            ("xl", Ok(Line::CanXl)) | ("other", Ok(Line::Other)) => {}
-            (what, Ok(Line::Dropped { frames })) => assert_eq!(what, format!("dropped={frames}"), "{line}"),
+            ("xl", Ok(CandumpLine::CanXl)) | ("other", Ok(CandumpLine::Other)) => {}
+            (what, Ok(CandumpLine::Dropped { frames })) => assert_eq!(what, format!("dropped={frames}"), "{line}"),
             ("error", Err(error)) => {
                 assert_eq!(error.column.to_string(), expected.get("column"), "{line}: {error}");
             }
@@ -171,7 +171,7 @@ fn same_frame(frame: &Frame, other: &CanAnyFrame) -> bool {
 fn the_crate_socketcan_agrees_where_it_can_read() {
     let mut agreed = 0;
     for (expected, line) in corpus() {
-        let Ok(Line::Frame(record)) = candump::parse(line) else {
+        let Ok(CandumpLine::Frame(record)) = candump::parse(line) else {
             let reads = matches!(second_opinion(line), Ok(Some(_)));
             assert_eq!(reads, expected.get("2nd") == "reads", "socketcan and {line:?}");
             continue;

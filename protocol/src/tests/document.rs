@@ -13,7 +13,7 @@ use std::path::Path;
 use crate::id::{Command, Kind};
 use crate::message::State;
 use crate::parameters::Parameter;
-use crate::schema::{Field, Format, Layout, PacketSchema, Range, packets, reasons, wires};
+use crate::schema::{Field, FieldFormat, Layout, PacketSchema, FieldRange, packets, reasons, wires};
 
 /// The documents with the requirements.
 const REQUIREMENTS: [&str; 3] = [
@@ -61,10 +61,10 @@ fn kinds() -> String {
         };
         let only = layouts.first().filter(|_| layouts.len() == 1).map_or(&[][..], |layout| &layout.fields);
         let at = |from: usize, to: usize| {
-            let there = end.iter().chain(only).filter(move |field| (from..to).contains(&field.at()));
+            let there = end.iter().chain(only).filter(move |field| (from..to).contains(&field.first_bit()));
             let mut there: Vec<_> = there.collect();
-            there.sort_by_key(|field| field.at());
-            let flag = |field: &Field| if field.at() == 111 { "+ 0x80: " } else { "" };
+            there.sort_by_key(|field| field.first_bit());
+            let flag = |field: &Field| if field.first_bit() == 111 { "+ 0x80: " } else { "" };
             let all: Vec<_> = there
                 .iter()
                 .map(|field| format!("{}{}{}", flag(field), field.meaning, range(field)))
@@ -100,7 +100,7 @@ fn fields(of: &str, layouts: &[Layout]) -> String {
         let name = if note.starts_with(" to") { "" } else { &layout.name };
         let mut title = format!("{} {name}", layout.number).trim_end().to_owned() + note;
         let mut row = |field: &Field, within: bool| {
-            let choices = field.names.iter().filter(|_| field.format == Format::Choice);
+            let choices = field.names.iter().filter(|_| field.format == FieldFormat::Choice);
             let names = choices.map(|(value, name)| format!("{value} {name}"));
             let names = names.collect::<Vec<_>>().join(", ");
             let meaning =
@@ -113,9 +113,9 @@ fn fields(of: &str, layouts: &[Layout]) -> String {
                 .unwrap();
             title.clear();
         };
-        for field in layout.fields.iter().filter(|field| !matches!(field.format, Format::Total(_))) {
+        for field in layout.fields.iter().filter(|field| !matches!(field.format, FieldFormat::Total(_))) {
             row(field, false);
-            if let Format::Group(group) = &field.format {
+            if let FieldFormat::Group(group) = &field.format {
                 group.iter().for_each(|part| row(part, true));
             }
         }
@@ -125,21 +125,21 @@ fn fields(of: &str, layouts: &[Layout]) -> String {
 
 fn range(field: &Field) -> String {
     match field.range {
-        Range::All => String::new(),
-        Range::NotNegative | Range::NotNegativeAtCommit => ", 0 or more".to_owned(),
-        Range::Within(min, max) if min == max => String::new(),
-        Range::Within(min, max) => format!(", {min} to {max}"),
+        FieldRange::All => String::new(),
+        FieldRange::NotNegative | FieldRange::NotNegativeAtCommit => ", 0 or more".to_owned(),
+        FieldRange::Within(min, max) if min == max => String::new(),
+        FieldRange::Within(min, max) => format!(", {min} to {max}"),
     }
 }
 
 /// Returns the unit on the wire, where angles are in quarter turns.
 fn unit(field: &Field) -> &str {
-    if matches!(field.format, Format::Angle | Format::Position) { "quarter turns" } else { &field.unit }
+    if matches!(field.format, FieldFormat::Angle | FieldFormat::Position) { "quarter turns" } else { &field.unit }
 }
 
 /// Formats the position of a field: `0`, `0 to 2`, `2, bits 8 to 15`.
 fn words(field: &Field, within: bool) -> String {
-    let (word, bit, width) = (field.at() / 16, field.at() % 16, usize::from(field.width()));
+    let (word, bit, width) = (field.first_bit() / 16, field.first_bit() % 16, usize::from(field.width()));
     let bits = if width == 1 { format!("bit {bit}") } else { format!("bits {bit} to {}", bit + width - 1) };
     match (width, field.elements()) {
         (32, _) => format!("{word}, {}", word + 1),
@@ -152,22 +152,22 @@ fn words(field: &Field, within: bool) -> String {
 
 fn format_of(field: &Field) -> String {
     match &field.format {
-        Format::Word => "unsigned".to_owned(),
-        Format::Unsigned(bits) | Format::Parameter(bits) | Format::Page(bits) => {
+        FieldFormat::Word => "unsigned".to_owned(),
+        FieldFormat::Unsigned(bits) | FieldFormat::Parameter(bits) | FieldFormat::Page(bits) => {
             format!("unsigned, {bits} bits")
         }
-        Format::Signed | Format::Choice | Format::Reason => "signed".to_owned(),
-        Format::Flag(_) => "0 or 1".to_owned(),
-        Format::Hex => "16 bits".to_owned(),
-        Format::Fixed(bits) | Format::Threshold(bits) | Format::Saturating(bits) | Format::Total(bits) => {
+        FieldFormat::Signed | FieldFormat::Choice | FieldFormat::Reason => "signed".to_owned(),
+        FieldFormat::Flag(_) => "0 or 1".to_owned(),
+        FieldFormat::Hex => "16 bits".to_owned(),
+        FieldFormat::Fixed(bits) | FieldFormat::Threshold(bits) | FieldFormat::Saturating(bits) | FieldFormat::Total(bits) => {
             format!("Q{}.{bits}", 15 - bits)
         }
-        Format::Angle | Format::Position => "Q1.14".to_owned(),
-        Format::Torque => "Q3.12, or the bus' torque format".to_owned(),
-        Format::Port => "unsigned, 8 bits".to_owned(),
-        Format::Ports(..) => "bits".to_owned(),
-        Format::State => "state".to_owned(),
-        Format::Group(_) => "see below".to_owned(),
+        FieldFormat::Angle | FieldFormat::Position => "Q1.14".to_owned(),
+        FieldFormat::Torque => "Q3.12, or the bus' torque format".to_owned(),
+        FieldFormat::Port => "unsigned, 8 bits".to_owned(),
+        FieldFormat::Ports(..) => "bits".to_owned(),
+        FieldFormat::State => "state".to_owned(),
+        FieldFormat::Group(_) => "see below".to_owned(),
     }
 }
 

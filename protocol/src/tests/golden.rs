@@ -12,11 +12,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use meaning::{Error, Meaning};
 
 use crate::can::{FD_FORMAT, Format, Frame};
-use crate::candump::{self, Line};
+use crate::candump::{self, CandumpLine};
 use crate::fixed::{Acc, TorqueFormat};
 use crate::id::{CellId, Id, Kind};
 use crate::message::{Answer, Message, Request};
-use crate::packet::{Epoch, Length, Lengths, Packet, Reassembly, Segment, crc16, data_id};
+use crate::packet::{Epoch, Length, Lengths, Packet, Reassembly, Reassembler, crc16, data_id};
 use crate::parameters::{Baseline, Events, Parameter, ParameterError, Parameters, Reply, Sensing, Tare};
 use crate::port::LinkId;
 use crate::time::Micros;
@@ -44,13 +44,13 @@ fn lines(log: &str) -> Vec<Golden<'_>> {
     let mut comment = None;
     for line in log.lines() {
         match candump::parse(line).expect(line) {
-            Line::Frame(record) => golden.push(Golden {
+            CandumpLine::Frame(record) => golden.push(Golden {
                 comment: comment.take().expect("a comment above each frame"),
                 micros: record.time.nanos / 1_000,
                 text: line.rsplit_once(' ').unwrap().1,
                 frame: record.frame,
             }),
-            Line::Dropped { .. } | Line::CanXl | Line::Other => comment = line.strip_prefix("# "),
+            CandumpLine::Dropped { .. } | CandumpLine::CanXl | CandumpLine::Other => comment = line.strip_prefix("# "),
         }
     }
     assert!(golden.len() > 10, "the log is there");
@@ -158,7 +158,7 @@ fn lengths_of(golden: &Golden<'_>) -> Lengths {
 // COUNT-3
 #[test]
 fn classic_frames_pair_as_the_log_says() {
-    let mut segments = BTreeMap::<u16, Segment>::new();
+    let mut segments = BTreeMap::<u16, Reassembler>::new();
     for golden in lines(CLASSIC) {
         let outcome = data_id(&golden.frame).and_then(|id| {
             let segment = segments.entry(id.to_bits()).or_default();
@@ -266,7 +266,7 @@ fn unsound_parameters_are_refused_with_the_code_of_the_log() {
             Some(Parameter::Baseline) => (*number, cannot_be(Baseline::from_words(*words))),
             Some(Parameter::Tare) => (*number, cannot_be(Tare::from_words(*words))),
             // The cell of the session is not in test mode.
-            Some(Parameter::LinksDown) => (*number, Answer::CANNOT_BE),
+            Some(Parameter::LinksDown) => (*number, Answer::INVALID),
             Some(parameter) => match spoilt.set(parameter, *words) {
                 Err(error) => (*number, error.code()),
                 Ok(()) => (127, spoilt.check().map_err(ParameterError::code).unwrap_err()),
@@ -280,13 +280,13 @@ fn unsound_parameters_are_refused_with_the_code_of_the_log() {
 
 fn cannot_be<T: core::fmt::Debug>(read: Option<T>) -> i16 {
     assert!(read.is_none(), "{read:?} can be");
-    Answer::CANNOT_BE
+    Answer::INVALID
 }
 
 #[test]
 fn wires_bytes_and_meaning_agree_both_ways() {
     let read =
-        |frame: &Frame| LinkId::from_raw_id(frame.raw_id()).map(|link_id| (link_id, link_id.read(frame)));
+        |frame: &Frame| LinkId::from_raw_id(frame.raw_id()).map(|link_id| (link_id, link_id.decode_frame(frame)));
     let mut kinds = BTreeSet::new();
     let mut odd = 0;
     for golden in lines(WIRE) {
@@ -299,7 +299,7 @@ fn wires_bytes_and_meaning_agree_both_ways() {
                 let (link_id, message) = Meaning::new(comment).wire();
                 assert_eq!(read(&golden.frame), Some((link_id, Some(message))), "{}", golden.text);
                 kinds.insert(golden.frame.data()[0]);
-                odd += u32::from(link_id.frame(message).to_string() != golden.text);
+                odd += u32::from(link_id.encode_frame(message).to_string() != golden.text);
             }
         }
     }

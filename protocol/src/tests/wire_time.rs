@@ -31,7 +31,7 @@ fn every_counted_frame_has_its_bits() {
         let flag = if extended == "1" { EXTENDED } else { 0 };
         let frame = frame(format, u32::from_str_radix(id, 16).unwrap() | flag, &data);
         let expected = Bits { nominal: nominal.parse().unwrap(), data: switched.parse().unwrap() };
-        assert_eq!(Bits::of(&frame), Some(expected), "{line}");
+        assert_eq!(Bits::from_frame(&frame), Some(expected), "{line}");
         assert_eq!(oracle::bits(&frame), expected, "{line}");
         count += 1;
     }
@@ -54,7 +54,7 @@ fn the_worst_packet_takes_what_the_documents_say() {
 
 #[test]
 fn a_drivers_error_frame_has_no_bits() {
-    assert_eq!(Bits::of(&Frame::classic(ERROR | 4, &[0; 8]).unwrap()), None);
+    assert_eq!(Bits::from_frame(&Frame::classic(ERROR | 4, &[0; 8]).unwrap()), None);
 }
 
 #[test]
@@ -66,7 +66,7 @@ fn an_fd_length_that_does_not_exist_is_filled_up_with_zeros() {
             [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64].into_iter().find(|&wire| wire >= len);
         full.resize(wire.unwrap(), 0);
         for id in [0x123, EXTENDED | 0x123] {
-            assert_eq!(Bits::of(&frame("fd-brs", id, &data)), Bits::of(&frame("fd-brs", id, &full)), "{len}");
+            assert_eq!(Bits::from_frame(&frame("fd-brs", id, &data)), Bits::from_frame(&frame("fd-brs", id, &full)), "{len}");
         }
     }
 }
@@ -107,12 +107,12 @@ proptest! {
 
     #[test]
     fn bits_are_those_of_a_second_implementation(frame in any_frame()) {
-        prop_assert_eq!(Bits::of(&frame), Some(oracle::bits(&frame)));
+        prop_assert_eq!(Bits::from_frame(&frame), Some(oracle::bits(&frame)));
     }
 
     #[test]
     fn no_frame_is_shorter_than_the_best_or_longer_than_the_worst(frame in any_frame()) {
-        let (bits, shape) = (Bits::of(&frame).unwrap(), Shape::of(&frame));
+        let (bits, shape) = (Bits::from_frame(&frame).unwrap(), Shape::from_frame(&frame));
         let (best, worst) = (shape.best(), shape.worst());
         prop_assert!(best.nominal <= bits.nominal && bits.nominal <= worst.nominal, "{best:?} {bits:?} {worst:?}");
         prop_assert!(best.data <= bits.data && bits.data <= worst.data, "{best:?} {bits:?} {worst:?}");
@@ -120,7 +120,7 @@ proptest! {
 
     #[test]
     fn no_remote_flag_changes_an_fd_frame(id in 0..0x800_u32, data in proptest::collection::vec(any::<u8>(), 0..=64)) {
-        let with = |id| Bits::of(&Frame::with_data(id, Format::Fd, BIT_RATE_SWITCH, &data).unwrap());
+        let with = |id| Bits::from_frame(&Frame::with_data(id, Format::Fd, BIT_RATE_SWITCH, &data).unwrap());
         prop_assert_eq!(with(id | REMOTE), with(id));
     }
 }

@@ -89,7 +89,7 @@ pub struct IdentifierError {
 ///
 /// # Errors
 /// Returns an error if the number has more bits than that.
-pub const fn identifier(number: u32, flags: u32) -> Result<u32, IdentifierError> {
+pub const fn check_identifier(number: u32, flags: u32) -> Result<u32, IdentifierError> {
     let (bits, max) = if flags & (EXTENDED | ERROR) == 0 { (11, STANDARD_MASK) } else { (29, EXTENDED_MASK) };
     if number > max {
         return Err(IdentifierError { got: number, bits, max });
@@ -204,12 +204,12 @@ impl Frame {
         if let Some(bytes) = bytes.get_mut(..data.len()) {
             bytes.copy_from_slice(data);
         }
-        Self::filled(id, format, flags, bytes, data.len())
+        Self::with_buffer(id, format, flags, bytes, data.len())
     }
 
     /// Like [`Frame::with_data`], with the data already in a full-size buffer. Bytes after `len` must be 0.
     #[inline(always)]
-    pub(crate) fn filled(
+    pub(crate) fn with_buffer(
         id: u32,
         format: Format,
         flags: u8,
@@ -412,12 +412,12 @@ mod tests {
             (0x1FFF_FFFF, ERROR, 29, EXTENDED_MASK),
             (0x1FFF_FFFF, EXTENDED | REMOTE, 29, EXTENDED_MASK),
         ] {
-            assert_eq!(identifier(number, flags), Ok(number | flags));
+            assert_eq!(check_identifier(number, flags), Ok(number | flags));
             for got in [number + 1, (number + 1) | EXTENDED, u32::MAX] {
-                assert_eq!(identifier(got, flags), Err(IdentifierError { got, bits, max }));
+                assert_eq!(check_identifier(got, flags), Err(IdentifierError { got, bits, max }));
             }
         }
-        let wrong = identifier(0x18F0_10FE, 0).unwrap_err().to_string();
+        let wrong = check_identifier(0x18F0_10FE, 0).unwrap_err().to_string();
         assert_eq!(wrong, "18F010FE does not fit an identifier of 11 bits: at most 7FF");
     }
 

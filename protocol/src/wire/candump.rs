@@ -83,7 +83,7 @@ pub struct Record<'a> {
 
 /// The content of one line.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Line<'a> {
+pub enum CandumpLine<'a> {
     /// A frame.
     Frame(Record<'a>),
     /// candump's report that it lost frames.
@@ -112,7 +112,7 @@ pub struct LineError {
 /// # Errors
 /// Returns an error if the line begins with a parenthesis, possibly after blanks and quotation marks, but is
 /// not a frame.
-pub fn parse(line: &str) -> Result<Line<'_>, LineError> {
+pub fn parse(line: &str) -> Result<CandumpLine<'_>, LineError> {
     parse_bytes(line.as_bytes())
 }
 
@@ -122,40 +122,40 @@ pub fn parse(line: &str) -> Result<Line<'_>, LineError> {
 /// Returns an error if the line begins with a parenthesis, possibly after blanks and quotation marks, but is
 /// not a frame.
 #[inline]
-pub fn parse_bytes(line: &[u8]) -> Result<Line<'_>, LineError> {
-    portable::record(line).map_or_else(|| parse_widely(line), |record| Ok(Line::Frame(record)))
+pub fn parse_bytes(line: &[u8]) -> Result<CandumpLine<'_>, LineError> {
+    portable::parse_record(line).map_or_else(|| parse_general(line), |record| Ok(CandumpLine::Frame(record)))
 }
 
 /// Parses every accepted variant of a line.
-fn parse_widely(line: &[u8]) -> Result<Line<'_>, LineError> {
+fn parse_general(line: &[u8]) -> Result<CandumpLine<'_>, LineError> {
     let text = trim_end(line);
     // Blanks and quotation marks of e-mails and issue trackers.
     let indent = text.iter().take_while(|byte| matches!(byte, b' ' | b'\t' | b'>' | b'|')).count();
     match text.get(indent..).unwrap_or_default() {
         [b'(', next, ..] if indent > 0 && next.is_ascii_digit() => parse_at(text, indent),
         [b'(', ..] if indent == 0 => parse_at(text, 0),
-        [b'#' | b';' | b'/', ..] => Ok(other(text)),
-        _ => Ok(behind_prefix(text).unwrap_or_else(|| other(text))),
+        [b'#' | b';' | b'/', ..] => Ok(classify_other(text)),
+        _ => Ok(parse_after_prefix(text).unwrap_or_else(|| classify_other(text))),
     }
 }
 
 /// Parses a line whose opening parenthesis is at `at`.
-fn parse_at(text: &[u8], at: usize) -> Result<Line<'_>, LineError> {
+fn parse_at(text: &[u8], at: usize) -> Result<CandumpLine<'_>, LineError> {
     let mut cursor = Cursor::new(text, at + 1);
     let time = cursor.time()?;
     cursor.expect(b')', "`)` after the time")?;
-    cursor.blanks()?;
-    let interface = cursor.word()?;
-    cursor.blanks()?;
+    cursor.skip_blanks()?;
+    let interface = cursor.interface()?;
+    cursor.skip_blanks()?;
     let Some(frame) = cursor.frame()? else {
-        return Ok(Line::CanXl);
+        return Ok(CandumpLine::CanXl);
     };
     let direction = cursor.direction()?;
-    Ok(Line::Frame(Record { time, interface, frame, direction }))
+    Ok(CandumpLine::Frame(Record { time, interface, frame, direction }))
 }
 
 /// Finds a frame after a prefix such as journald's. A candidate that does not parse is part of the prefix.
-fn behind_prefix(text: &[u8]) -> Option<Line<'_>> {
+fn parse_after_prefix(text: &[u8]) -> Option<CandumpLine<'_>> {
     let begins = |pair: &[u8]| matches!(pair, [before, b'('] if is_blank(*before));
     let places = text.windows(2).enumerate().filter(|(_, pair)| begins(pair));
     places.map(|(at, _)| parse_at(text, at + 1)).find_map(Result::ok)
@@ -196,11 +196,11 @@ fn trim_end(line: &[u8]) -> &[u8] {
 
 /// Classifies a line without a frame. Recognises candump's `DROPCOUNT: dropped 12 CAN frames on 'vcan0'
 /// socket ...`.
-fn other(text: &[u8]) -> Line<'_> {
+fn classify_other(text: &[u8]) -> CandumpLine<'_> {
     text.strip_prefix(b"DROPCOUNT: dropped ")
         .and_then(|rest| rest.split(|&byte| byte == b' ').next())
         .and_then(|frames| core::str::from_utf8(frames).ok()?.parse().ok())
-        .map_or(Line::Other, |frames| Line::Dropped { frames })
+        .map_or(CandumpLine::Other, |frames| CandumpLine::Dropped { frames })
 }
 
 #[cfg(test)]
@@ -211,7 +211,7 @@ mod tests {
 
     fn frame_of(line: &str) -> Frame {
         match parse(line) {
-            Ok(Line::Frame(record)) => record.frame,
+            Ok(CandumpLine::Frame(record)) => record.frame,
             other => panic!("{line}: {other:?}"),
         }
     }
@@ -219,14 +219,14 @@ mod tests {
     #[test]
     fn a_line_is_read_in_every_dress() {
         let plain = parse("(1700000000.123456) vcan0 22C##1AABBCC").unwrap();
-        let Line::Frame(record) = plain else { panic!("{plain:?}") };
+        let CandumpLine::Frame(record) = plain else { panic!("{plain:?}") };
         assert_eq!(record.time, Timestamp::six_digits(1_700_000_000_123_456_000));
         assert_eq!((record.interface, record.direction), ("vcan0", None));
         assert_eq!(record.frame.data(), [0xAA, 0xBB, 0xCC]);
         assert_eq!(record.frame.flags(), BIT_RATE_SWITCH);
 
         let dressed = parse("(1700000000.123456789)   vcan0  22C##1AA.BB.cc   T\r\n").unwrap();
-        let Line::Frame(other) = dressed else { panic!("{dressed:?}") };
+        let CandumpLine::Frame(other) = dressed else { panic!("{dressed:?}") };
         assert_eq!(other.frame, record.frame);
         assert_eq!(other.time, Timestamp::nine_digits(1_700_000_000_123_456_789));
         assert_eq!(other.direction, Some(Direction::Sent));
@@ -242,25 +242,25 @@ mod tests {
         assert_eq!(frame_of("(0.000000) can0 123#1122334455667788_E").raw_dlc(), 14);
         assert_eq!(frame_of("(0.000000) can0 123##5AABBCCDDEEFF0011223344").len(), 11, "no padding");
         for xl in ["00242###81000000000011.", "00242#81:00:12345678#", "12345678#80:01:00000000#112233"] {
-            assert_eq!(parse(&format!("(0.000000) can0 {xl}")), Ok(Line::CanXl));
+            assert_eq!(parse(&format!("(0.000000) can0 {xl}")), Ok(CandumpLine::CanXl));
         }
     }
 
     #[test]
     fn text_that_is_no_frame_is_let_through() {
-        assert_eq!(parse(""), Ok(Line::Other));
-        assert_eq!(parse("# a comment"), Ok(Line::Other));
+        assert_eq!(parse(""), Ok(CandumpLine::Other));
+        assert_eq!(parse("# a comment"), Ok(CandumpLine::Other));
         let drop = "DROPCOUNT: dropped 12 CAN frames on 'vcan0' socket (total drops 40)";
-        assert_eq!(parse(drop), Ok(Line::Dropped { frames: 12 }));
+        assert_eq!(parse(drop), Ok(CandumpLine::Dropped { frames: 12 }));
     }
 
     #[test]
     fn bytes_need_not_be_text() {
-        assert_eq!(parse_bytes(b"# \xFF"), Ok(Line::Other));
+        assert_eq!(parse_bytes(b"# \xFF"), Ok(CandumpLine::Other));
         let says = |line| parse_bytes(line).unwrap_err().to_string();
         assert_eq!(says(b"(1.000000) c\xFFn 123#"), "column 12: the name of an interface");
         assert_eq!(says(b"(1.000000) can0 123#\xFF"), "column 21: a space");
-        assert!(matches!(parse_bytes("(1.000000) kän 123# \u{A0}".as_bytes()), Ok(Line::Frame(_))));
+        assert!(matches!(parse_bytes("(1.000000) kän 123# \u{A0}".as_bytes()), Ok(CandumpLine::Frame(_))));
     }
 
     /// Compares lines in many notations with the values in `vectors/candump.tsv`.
@@ -270,7 +270,7 @@ mod tests {
         let mut count = 0;
         for row in vectors.lines().filter(|row| !row.starts_with('#')) {
             let (line, expected) = row.rsplit_once("\t=> ").unwrap();
-            let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}: {:?}", parse(line)) };
+            let Ok(CandumpLine::Frame(record)) = parse(line) else { panic!("{line}: {:?}", parse(line)) };
             let (seconds, nanos) = (record.time.nanos / 1_000_000_000, record.time.nanos % 1_000_000_000);
             let read = format!("{seconds}.{nanos:09} {} {}", record.interface, record.frame);
             assert_eq!(read, expected, "{line}");
@@ -300,7 +300,7 @@ mod tests {
     #[test]
     fn a_fraction_has_any_number_of_digits() {
         let time = |text: &str| match parse(&format!("({text}) can0 123#")) {
-            Ok(Line::Frame(record)) => (record.time.nanos, record.time.nine_digits),
+            Ok(CandumpLine::Frame(record)) => (record.time.nanos, record.time.nine_digits),
             other => panic!("{text}: {other:?}"),
         };
         assert_eq!(time("7"), (7_000_000_000, false));
@@ -320,14 +320,14 @@ mod tests {
             "(1700000000.123456) can0 123#1122   ERRORFRAME",
             "words (2) and (1700000000.123456) can0 123#1122",
         ] {
-            let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}: {:?}", parse(line)) };
+            let Ok(CandumpLine::Frame(record)) = parse(line) else { panic!("{line}: {:?}", parse(line)) };
             assert_eq!(record.to_string(), "(1700000000.123456) can0 123#1122", "{line}");
             assert_eq!(record.direction, None);
         }
-        let Ok(Line::Frame(sent)) = parse("(1.000000) can0 123# T :: words") else { panic!() };
+        let Ok(CandumpLine::Frame(sent)) = parse("(1.000000) can0 123# T :: words") else { panic!() };
         assert_eq!(sent.direction, Some(Direction::Sent));
         for line in ["# (1.000000) can0 123#", "// (1.000000) can0 123#", "rpi: (1.000000) can0 123#1"] {
-            assert_eq!(parse(line), Ok(Line::Other), "{line}");
+            assert_eq!(parse(line), Ok(CandumpLine::Other), "{line}");
         }
     }
 
@@ -370,7 +370,7 @@ mod tests {
             let min_digits = [1, 3, 10].into_iter().nth(pad).filter(is_padded).unwrap_or(1);
             let record = Record { time: Timestamp { nine_digits: nine, min_digits, ..Timestamp::six_digits(nanos) }, interface: "vcan0", frame, direction: None };
             let line = record.to_string();
-            prop_assert_eq!(parse(&line), Ok(Line::Frame(record)));
+            prop_assert_eq!(parse(&line), Ok(CandumpLine::Frame(record)));
             prop_assert_eq!(parse_frame(&frame.to_string()), Ok(frame));
         }
 

@@ -26,7 +26,7 @@ pub struct CellIdOutOfRange {
 /// The error for a text that is not a cell's node id.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[error("a node id is needed, 1 to 254")]
-pub struct NoNodeId;
+pub struct InvalidNodeId;
 
 impl CellId {
     /// The largest node id of a cell.
@@ -64,11 +64,11 @@ impl CellId {
 }
 
 impl core::str::FromStr for CellId {
-    type Err = NoNodeId;
+    type Err = InvalidNodeId;
 
     /// Parses a node id in decimal digits.
-    fn from_str(text: &str) -> Result<Self, NoNodeId> {
-        text.parse().ok().and_then(|number| Self::new(number).ok()).ok_or(NoNodeId)
+    fn from_str(text: &str) -> Result<Self, InvalidNodeId> {
+        text.parse().ok().and_then(|number| Self::new(number).ok()).ok_or(InvalidNodeId)
     }
 }
 
@@ -112,7 +112,7 @@ impl Node {
 
     /// Returns true if `cell` is addressed, alone or with everyone.
     #[must_use]
-    pub fn names(self, cell: CellId) -> bool {
+    pub fn addresses(self, cell: CellId) -> bool {
         self == Self::Cell(cell) || self == Self::Everyone
     }
 }
@@ -272,7 +272,7 @@ impl Id {
     /// sync, resume and report; its own heartbeats (to detect another cell with its node id); configuration
     /// and stimuli, addressed to it or to everyone. A cell also receives the sums of the cells at its ports.
     #[must_use]
-    pub const fn of_cell(cell: CellId) -> [Self; 10] {
+    pub const fn received_by_cell(cell: CellId) -> [Self; 10] {
         let cell = Node::Cell(cell);
         [
             Self::command(Command::Halt),

@@ -27,7 +27,7 @@ mod length;
 mod reassembly;
 
 pub use length::{Length, Lengths, Words};
-pub use reassembly::{Reassembly, Segment};
+pub use reassembly::{Reassembly, Reassembler};
 
 use thiserror::Error;
 
@@ -58,7 +58,7 @@ pub fn crc16(bytes: &[u8]) -> u16 {
 }
 
 /// Like [`crc16`], for bytes in several parts.
-pub(crate) fn crc16_of<const N: usize>(parts: impl Iterator<Item = [u8; N]>) -> u16 {
+pub(crate) fn crc16_of_parts<const N: usize>(parts: impl Iterator<Item = [u8; N]>) -> u16 {
     let mut digest = CRC.digest();
     parts.for_each(|part| digest.update(&part));
     digest.finalize()
@@ -66,7 +66,7 @@ pub(crate) fn crc16_of<const N: usize>(parts: impl Iterator<Item = [u8; N]>) -> 
 
 /// Returns the words of a packet that begins with `first`, padded with zeros.
 #[must_use]
-pub fn words<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
+pub fn padded_words<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
     const { assert!(N <= WORDS, "a packet has no more words") }
     let mut words = [0; WORDS];
     for (word, first) in words.iter_mut().zip(first) {
@@ -89,24 +89,24 @@ impl Epoch {
     /// Returns the next epoch.
     #[must_use]
     pub const fn next(self) -> Self {
-        self.plus(1)
+        self.advanced_by(1)
     }
 
     /// Returns the previous epoch.
     #[must_use]
-    pub const fn before(self) -> Self {
+    pub const fn previous(self) -> Self {
         Self(self.0.wrapping_sub(1))
     }
 
     /// Returns the epoch `steps` later.
     #[must_use]
-    pub const fn plus(self, steps: u8) -> Self {
+    pub const fn advanced_by(self, steps: u8) -> Self {
         Self(self.0.wrapping_add(steps))
     }
 
     /// Returns the number of epochs since `earlier`, in [-128, 127].
     #[must_use]
-    pub const fn since(self, earlier: Self) -> i8 {
+    pub const fn epochs_since(self, earlier: Self) -> i8 {
         self.0.wrapping_sub(earlier.0).cast_signed()
     }
 }
@@ -214,9 +214,9 @@ impl Packet {
     /// # Errors
     /// Returns an error if packets of this kind cannot have that length, or the CRC is wrong.
     pub fn decode(id: Id, bytes: &[u8]) -> Result<Self, PacketError> {
-        let lengths = Lengths::of(id);
+        let lengths = Lengths::for_id(id);
         let wrong = PacketError::Length { expected: lengths.first().bytes(), got: bytes.len() };
-        let length = Length::of_bytes(bytes.len()).filter(|&length| lengths.has(length)).ok_or(wrong)?;
+        let length = Length::from_byte_count(bytes.len()).filter(|&length| lengths.contains(length)).ok_or(wrong)?;
         let (chunks, _) = bytes.as_chunks::<2>();
         let [words @ .., end, crc] = chunks else {
             return Err(wrong);
@@ -295,7 +295,7 @@ mod tests {
         let words = (0_usize..4, any::<[i16; MAX_WORDS]>());
         (0_u16..0x800, words, any::<u8>(), any::<u8>()).prop_map(|(id, (length, words), epoch, count)| {
             let id = Id::from_bits(id);
-            let length = Length::ALL.into_iter().filter(|&it| Lengths::of(id).has(it)).cycle().nth(length);
+            let length = Length::ALL.into_iter().filter(|&it| Lengths::for_id(id).contains(it)).cycle().nth(length);
             Packet { id, words: Words::new(length.unwrap(), words), epoch: Epoch(epoch), count }
         })
     }
@@ -307,8 +307,8 @@ mod tests {
 
     #[test]
     fn epochs_are_compared_around_the_corner() {
-        assert_eq!(Epoch(2).since(Epoch(254)), 4);
-        assert_eq!(Epoch(254).since(Epoch(2)), -4);
+        assert_eq!(Epoch(2).epochs_since(Epoch(254)), 4);
+        assert_eq!(Epoch(254).epochs_since(Epoch(2)), -4);
         assert_eq!(Epoch(255).next(), Epoch(0));
     }
 
@@ -317,7 +317,7 @@ mod tests {
         let id = Id::command(Command::Joints);
         let make = |epoch| Packet { id, words: [7; WORDS].into(), epoch: Epoch(epoch), count: 6 };
         let segments = |epoch| make(epoch).frames(Format::Classic).collect::<Vec<_>>();
-        let mut segment = Segment::NONE;
+        let mut segment = Reassembler::NONE;
         let mut push = |at, frame: &Frame| segment.push(Micros(at), id, SIX, frame.data()).unwrap();
         assert_eq!(push(0, &segments(1)[0]), Reassembly::Waiting);
         // The second segment of epoch 1 is lost.
@@ -337,7 +337,7 @@ mod tests {
         for (id, longest) in longest {
             let packet = Packet { id, words: [7; WORDS].into(), epoch: Epoch(1), count: 1 };
             let came = [longest, longest + 1].map(|apart| {
-                let mut segment = Segment::NONE;
+                let mut segment = Reassembler::NONE;
                 let segments = packet.frames(Format::Classic).zip([0, apart]);
                 segments
                     .map(|(frame, at)| segment.push(Micros(at), id, SIX, frame.data()).unwrap())
@@ -355,7 +355,7 @@ mod tests {
         let segments = |epoch| make(epoch).frames(Format::Classic).collect::<Vec<_>>();
         let damaged = Frame::classic(segments(2)[0].raw_id(), &[9; 8]).unwrap();
         for (first, apart) in [(segments(2)[0], 15_001), (damaged, 100)] {
-            let mut segment = Segment::NONE;
+            let mut segment = Reassembler::NONE;
             let mut push = |at, frame: &Frame| segment.push(Micros(at), id, SIX, frame.data()).unwrap();
             assert_eq!(push(0, &first), Reassembly::Waiting);
             assert_eq!(push(apart, &segments(2)[1]), Reassembly::Incomplete);
@@ -382,7 +382,7 @@ mod tests {
     /// Returns the outcome of each frame, received `apart` µs after the previous one, with the given possible
     /// lengths.
     fn pushed(id: Id, lengths: Lengths, apart: u64, frames: &[Frame]) -> Vec<Reassembly> {
-        let mut segment = Segment::NONE;
+        let mut segment = Reassembler::NONE;
         let times = (0..).map(|index| Micros(index * apart));
         times.zip(frames).map(|(at, frame)| segment.push(at, id, lengths, frame.data()).unwrap()).collect()
     }
@@ -459,7 +459,7 @@ mod tests {
             let fd: Vec<_> = packet.frames(Format::Fd).collect();
             prop_assert_eq!(fd.len(), 1);
             prop_assert_eq!(Packet::from_fd(&fd[0]), Ok(packet));
-            let mut segment = Segment::NONE;
+            let mut segment = Reassembler::NONE;
             let mut last = Reassembly::Waiting;
             for frame in packet.frames(Format::Classic) {
                 last = segment.push(Micros(0), packet.id, Lengths::only(packet.words.length()), frame.data()).unwrap();
@@ -486,7 +486,7 @@ mod tests {
         #[test]
         fn no_bytes_panic(kind in 0_u16..0x800, bytes in proptest::collection::vec(any::<u8>(), 0..70)) {
             let _ = Packet::decode(Id::from_bits(kind), &bytes);
-            let _ = Segment::default().push(Micros(0), Id { kind: Kind::Sum, node: 0 }, Lengths::ALL, &bytes);
+            let _ = Reassembler::default().push(Micros(0), Id { kind: Kind::Sum, node: 0 }, Lengths::ALL, &bytes);
         }
     }
 }

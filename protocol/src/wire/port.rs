@@ -30,9 +30,9 @@ use crate::can::{EXTENDED, EXTENDED_MASK, Frame, REMOTE};
 use crate::packet::{Epoch, crc16};
 
 /// The identifier flag of every simulated wire.
-pub const FLAG: u32 = 0x1000_0000;
+pub const WIRE_FLAG: u32 = 0x1000_0000;
 /// Maximum number of wires that a bus can simulate.
-pub const MAX: usize = 1 << 16;
+pub const MAX_WIRES: usize = 1 << 16;
 /// Number of ports of a cell.
 pub const PORTS: usize = 4;
 /// The index of the uplink, which connects a root to the gateway's side, after the ports.
@@ -88,9 +88,9 @@ pub struct Hello {
     /// The sending port.
     pub port: u8,
     /// True if the sender receives the other end.
-    pub hears: bool,
+    pub receives: bool,
     /// True if the sender sends its sums over this port: the receiver is its parent.
-    pub up: bool,
+    pub is_parent: bool,
     /// True if the sender, or a cell below it, has no node id yet.
     pub unnumbered: bool,
     /// The rank of the sender; `None` while it is unreachable.
@@ -137,7 +137,7 @@ pub struct Walk {
     pub last: u8,
 }
 
-const HEARS: u8 = 1 << 3;
+const RECEIVES: u8 = 1 << 3;
 const UP: u8 = 1 << 4;
 const UNNUMBERED: u8 = 1 << 5;
 const HAS_RANK: u8 = 1 << 6;
@@ -149,8 +149,8 @@ impl PortMessage {
         match self {
             Self::Hello(hello) => {
                 let flag = |set, flag| if set { flag } else { 0 };
-                let flags = flag(hello.hears, HEARS)
-                    | flag(hello.up, UP)
+                let flags = flag(hello.receives, RECEIVES)
+                    | flag(hello.is_parent, UP)
                     | flag(hello.unnumbered, UNNUMBERED)
                     | flag(hello.rank.is_some(), HAS_RANK);
                 let (round, depth) = hello.rank.map_or((0, 0), |rank| (rank.round, rank.depth));
@@ -178,8 +178,8 @@ impl PortMessage {
                 version: a,
                 number: b,
                 port: c & 7,
-                hears: c & HEARS != 0,
-                up: c & UP != 0,
+                receives: c & RECEIVES != 0,
+                is_parent: c & UP != 0,
                 unnumbered: c & UNNUMBERED != 0,
                 rank: if c & HAS_RANK == 0 { None } else { Some(Rank { round: d, depth: e }) },
             }),
@@ -203,14 +203,14 @@ impl LinkId {
     /// Returns the identifier of its frames, with the flag [`EXTENDED`].
     #[must_use]
     pub const fn raw_id(self) -> u32 {
-        EXTENDED | FLAG | ((self.wire as u32) << 1) | self.back as u32
+        EXTENDED | WIRE_FLAG | ((self.wire as u32) << 1) | self.back as u32
     }
 
     /// Returns the link id whose frames have this identifier. `raw_id` includes the flags.
     #[must_use]
     pub const fn from_raw_id(raw_id: u32) -> Option<Self> {
-        let bits = raw_id & EXTENDED_MASK & !FLAG;
-        if raw_id & (EXTENDED | REMOTE | FLAG) != EXTENDED | FLAG || (bits >> 1) as usize >= MAX {
+        let bits = raw_id & EXTENDED_MASK & !WIRE_FLAG;
+        if raw_id & (EXTENDED | REMOTE | WIRE_FLAG) != EXTENDED | WIRE_FLAG || (bits >> 1) as usize >= MAX_WIRES {
             return None;
         }
         let [low, high, ..] = (bits >> 1).to_le_bytes();
@@ -225,7 +225,7 @@ impl LinkId {
 
     /// Encodes a message as a frame.
     #[must_use]
-    pub fn frame(self, message: PortMessage) -> Frame {
+    pub fn encode_frame(self, message: PortMessage) -> Frame {
         let body = message.encode();
         let [a, b, c, d, e, f] = body;
         let [low, high] = self.checksum(body).to_le_bytes();
@@ -235,7 +235,7 @@ impl LinkId {
     /// Decodes the message of a frame. Returns `None` if the frame has another link id, is damaged, or has an
     /// undefined kind.
     #[must_use]
-    pub fn read(self, frame: &Frame) -> Option<PortMessage> {
+    pub fn decode_frame(self, frame: &Frame) -> Option<PortMessage> {
         let &[a, b, c, d, e, f, low, high] = frame.data() else { return None };
         let body = [a, b, c, d, e, f];
         let sound = frame.raw_id() == self.raw_id() && self.checksum(body) == u16::from_le_bytes([low, high]);
@@ -279,9 +279,9 @@ mod tests {
         fn a_message_is_read_on_its_own_link_id_only(wire: u16, back: bool, body: [u8; 6]) {
             let link_id = LinkId { wire, back };
             if let Some(message) = PortMessage::decode(body) {
-                let frame = link_id.frame(message);
-                prop_assert_eq!(link_id.read(&frame), Some(message));
-                prop_assert_eq!(link_id.reversed().read(&frame), None);
+                let frame = link_id.encode_frame(message);
+                prop_assert_eq!(link_id.decode_frame(&frame), Some(message));
+                prop_assert_eq!(link_id.reversed().decode_frame(&frame), None);
             }
         }
 
@@ -289,11 +289,11 @@ mod tests {
         fn one_wrong_bit_is_noticed(bit in 0_usize..64, body: [u8; 5]) {
             let [a, b, c, ..] = body;
             let link_id = LinkId { wire: 7, back: false };
-            let frame = link_id.frame(PortMessage::NodeId(Walk { walk: a, first: b, last: c }));
+            let frame = link_id.encode_frame(PortMessage::NodeId(Walk { walk: a, first: b, last: c }));
             let mut data: [u8; BYTES] = frame.data().try_into().unwrap();
             data[bit / 8] ^= 1 << (bit % 8);
             let damaged = Frame::classic(frame.raw_id(), &data).unwrap();
-            prop_assert_eq!(link_id.read(&damaged), None);
+            prop_assert_eq!(link_id.decode_frame(&damaged), None);
         }
     }
 }

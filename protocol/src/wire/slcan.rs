@@ -30,9 +30,9 @@ mod tests;
 
 use crate::can::{BIT_RATE_SWITCH, Format, Frame, dlc_len, fd_dlc};
 
-pub use decoder::{Decoder, Line, Refusal, Refused};
+pub use decoder::{Decoder, SlcanLine, Refusal, RejectedLines};
 #[cfg(feature = "host")]
-pub use report::{BusState, ErrorCounters, Fault, Report};
+pub use report::{BusState, ErrorCounters, AdapterFault, AdapterReport};
 
 /// Maximum length of a line without its line ending: an FD frame with bit rate switch, 64 bytes, a 29-bit
 /// identifier, 8 digits of time and the state of its sender.
@@ -44,11 +44,11 @@ pub const BEL: u8 = 0x07;
 
 /// An encoded line with its line ending: 1 to [`MAX_LINE`] bytes.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
-pub struct Text {
+pub struct EncodedLine {
     bytes: heapless::Vec<u8, MAX_LINE>,
 }
 
-impl Text {
+impl EncodedLine {
     /// Returns the bytes to send.
     #[must_use]
     pub fn as_bytes(&self) -> &[u8] {
@@ -81,7 +81,7 @@ impl Text {
 /// The data of an FD frame is padded with zeros to a length that CAN FD has. The error state is dropped, and
 /// a raw DLC of 9 to 15 in a classic frame becomes 8.
 #[must_use]
-pub fn encode(frame: &Frame) -> Option<Text> {
+pub fn encode(frame: &Frame) -> Option<EncodedLine> {
     if frame.is_error() {
         return None;
     }
@@ -92,7 +92,7 @@ pub fn encode(frame: &Frame) -> Option<Text> {
         Format::Fd if frame.flags() & BIT_RATE_SWITCH != 0 => (b'b', fd_dlc(data.len())),
         Format::Fd => (b'd', fd_dlc(data.len())),
     };
-    let mut text = Text::default();
+    let mut text = EncodedLine::default();
     if frame.is_extended() {
         text.push(kind.to_ascii_uppercase());
         text.word(frame.id());
@@ -111,7 +111,7 @@ pub fn encode(frame: &Frame) -> Option<Text> {
 /// A command from a host to an adapter, other than sending a frame.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 #[non_exhaustive]
-pub enum Command {
+pub enum SlcanCommand {
     /// `C`: leaves the bus. Bit rates are set before joining it.
     Close,
     /// `O`: joins the bus.
@@ -136,13 +136,13 @@ pub enum Command {
     Mask(u32),
 }
 
-impl Command {
+impl SlcanCommand {
     /// Returns the command that sets this nominal bit rate, in bit/s; `None` if slcan has none.
     ///
     /// `S7` is 800 kbit/s in Lawicel's protocol and 750 kbit/s in CANable's and python-can; it is returned
     /// for both.
     #[must_use]
-    pub const fn nominal(bit_rate: u32) -> Option<Self> {
+    pub const fn nominal_bit_rate(bit_rate: u32) -> Option<Self> {
         Some(Self::BitRate(match bit_rate {
             10_000 => 0,
             20_000 => 1,
@@ -163,7 +163,7 @@ impl Command {
     ///
     /// All CANable firmware supports 2 M and 5 M; the other rates depend on the firmware.
     #[must_use]
-    pub const fn data(bit_rate: u32) -> Option<Self> {
+    pub const fn data_bit_rate(bit_rate: u32) -> Option<Self> {
         Some(Self::DataBitRate(match bit_rate {
             500_000 => 0,
             1_000_000 => 1,
@@ -180,9 +180,9 @@ impl Command {
 
     /// Encodes the command as a line.
     #[must_use]
-    pub fn encode(self) -> Text {
-        let mut text = Text::default();
-        let with_digit = |text: &mut Text, letter, digit: u8| {
+    pub fn encode(self) -> EncodedLine {
+        let mut text = EncodedLine::default();
+        let with_digit = |text: &mut EncodedLine, letter, digit: u8| {
             text.push(letter);
             text.digit(digit);
         };

@@ -32,13 +32,13 @@ impl Span {
 impl Micros {
     /// Returns the point in time `start` after the origin; saturates.
     #[must_use]
-    pub fn after(start: Duration) -> Self {
+    pub fn since_start(start: Duration) -> Self {
         Self(u64::try_from(start.as_micros()).unwrap_or(u64::MAX))
     }
 
     /// Returns the time since `earlier`; zero if `earlier` is in the future.
     #[must_use]
-    pub const fn since(self, earlier: Self) -> Span {
+    pub const fn elapsed_since(self, earlier: Self) -> Span {
         Span(self.0.saturating_sub(earlier.0))
     }
 }

@@ -45,7 +45,7 @@ impl Touch {
 
 /// Returns the contact force of a cell in steps of Q5.10: the sum of its three contact words.
 #[must_use]
-pub fn contact(skin: &SkinSensors) -> i32 {
+pub fn contact_force(skin: &SkinSensors) -> i32 {
     skin.contact.iter().map(|word| i32::from(word.to_bits())).sum()
 }
 

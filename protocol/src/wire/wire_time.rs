@@ -21,7 +21,7 @@ mod rates;
 mod stuffing;
 
 pub use extremes::{Coding, Shape};
-pub use rates::{BitRates, BitRatesError, bit_rate};
+pub use rates::{BitRates, BitRatesError, parse_bit_rate};
 
 use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Format, Frame, fd_dlc};
 use stuffing::Run;
@@ -54,7 +54,7 @@ impl Bits {
     ///
     /// A length that CAN FD does not have is padded with zeros to the next one.
     #[must_use]
-    pub fn of(frame: &Frame) -> Option<Self> {
+    pub fn from_frame(frame: &Frame) -> Option<Self> {
         match frame.format() {
             _ if frame.is_error() => None,
             Format::Classic => Some(Self { nominal: classic(frame), data: 0 }),
@@ -127,13 +127,13 @@ fn fd(frame: &Frame) -> Bits {
         run = run.byte(byte);
     }
     let last = data.last().copied().unwrap_or(dlc);
-    let stuffed = run.stuffed - head.stuffed - u32::from(run.ended_on(last));
-    parts(switched, len + head.stuffed, data.len(), stuffed)
+    let stuffed = run.stuffed - head.stuffed - u32::from(run.ended_with_stuff_bit(last));
+    fd_bits(switched, len + head.stuffed, data.len(), stuffed)
 }
 
 /// Returns the bits of an FD frame with `head` bits up to BRS, `bytes` data bytes and `stuffed` stuff bits
 /// after BRS.
-fn parts(switched: bool, head: u32, bytes: usize, stuffed: u32) -> Bits {
+fn fd_bits(switched: bool, head: u32, bytes: usize, stuffed: u32) -> Bits {
     let check = if bytes > 16 { FD_LONG_CHECK } else { FD_CHECK };
     let data = 5 + 8 * u32::try_from(bytes).unwrap_or(0) + check + stuffed;
     let nominal = head + FD_TAIL;

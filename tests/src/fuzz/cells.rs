@@ -1,10 +1,10 @@
 //! Fuzz targets for a cell, the tracker of a cell, and wired cells, with any order of events.
 
 use arbitrary::{Result, Unstructured};
-use cell_node::flash::{self, Flash};
+use cell_node::flash::{self, FlashState};
 use cell_node::identity::Identity;
 use cell_node::node::Node;
-use model::tracker::Tracked;
+use model::tracker::CellTracker;
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Command, Id};
 use protocol::message::Message;
@@ -30,9 +30,9 @@ fn run_cell(from: &mut Unstructured<'_>) -> Result<()> {
     let own = CellId::new(12).unwrap();
     let identity = Identity { cell: from.arbitrary::<bool>()?.then_some(own), serial: from.arbitrary()? };
     let flash = match from.int_in_range(0..=2)? {
-        0 => Flash::Empty,
-        1 => Flash::Damaged,
-        _ => Flash::Sound(Parameters::default()),
+        0 => FlashState::Empty,
+        1 => FlashState::Damaged,
+        _ => FlashState::Valid(Parameters::default()),
     };
     let mut node = Node::new(identity, format, &flash, from.arbitrary()?, Micros(0));
     if from.arbitrary()? {
@@ -48,7 +48,7 @@ fn run_cell(from: &mut Unstructured<'_>) -> Result<()> {
                 let message = LinkId { wire: 0, back: false };
                 let data = from.bytes(8)?;
                 let frame = Frame::classic(message.raw_id(), data).unwrap();
-                if let Some(message) = message.read(&frame) {
+                if let Some(message) = message.decode_frame(&frame) {
                     let port = from.int_in_range(0..=PORTS)?;
                     node.handle_port(now, Span(0), port, message);
                 }
@@ -74,7 +74,7 @@ fn run_cell(from: &mut Unstructured<'_>) -> Result<()> {
 /// Returns an identifier; mostly one that the cell receives.
 fn heard(from: &mut Unstructured<'_>, own: CellId) -> Result<Id> {
     let commands = [Command::Joints, Command::Halt, Command::Sync, Command::Resume, Command::Report];
-    let ids: Vec<Id> = commands.into_iter().map(Id::command).chain(Id::of_cell(own)).collect();
+    let ids: Vec<Id> = commands.into_iter().map(Id::command).chain(Id::received_by_cell(own)).collect();
     Ok(*from.choose(&ids)?)
 }
 
@@ -90,7 +90,7 @@ fn drain(node: &mut Node, from: &mut Unstructured<'_>) -> Result<()> {
             messages += 1;
             assert!(port <= PORTS && messages < MANY, "{port} {message:?}");
             let link = LinkId { wire: 0, back: true };
-            assert_eq!(link.read(&link.frame(message)), Some(message));
+            assert_eq!(link.decode_frame(&link.encode_frame(message)), Some(message));
             continue;
         }
         let Some(packet) = node.poll_transmit() else { return Ok(()) };
@@ -111,7 +111,7 @@ pub(super) fn tracker(data: &[u8]) {
 }
 
 fn track(from: &mut Unstructured<'_>) -> Result<()> {
-    let mut cell = Tracked::default();
+    let mut cell = CellTracker::default();
     let (mut now, mut came) = (Micros(0), 0_u64);
     let mut before = cell.account.uplink();
     while !from.is_empty() {
@@ -130,7 +130,7 @@ fn track(from: &mut Unstructured<'_>) -> Result<()> {
             _ => {
                 let Ok(message) = Message::decode(&packet(from)?) else { continue };
                 let joints = from.arbitrary::<Option<u16>>()?.map(u64::from);
-                cell.hear(now, &message, joints);
+                cell.receive(now, &message, joints);
                 came += 1;
                 assert!(!cell.is_dead() && cell.last_packet() == Some(now));
             }

@@ -6,7 +6,7 @@ use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
 use std::os::unix::net::UnixDatagram;
 use std::time::Duration;
 
-use control::controller::{Controller as _, Input, Step};
+use control::controller::{Controller as _, Input, ControllerOutput};
 use control::external::External;
 use protocol::skin::Skin;
 use tempfile::TempDir;
@@ -98,7 +98,7 @@ fn step(listening: &mut Listening) {
     let tick = listening.tick;
     listening.tick += 1;
     let input = Input { tick, valid: true, ..Input::default() };
-    if let Step::Move(velocities) = listening.external.step(&input) {
+    if let ControllerOutput::Move(velocities) = listening.external.step(&input) {
         let limits = listening.skin.controller.max_speed.iter().map(Some).chain(std::iter::repeat(None));
         for (velocity, limit) in velocities.iter().zip(limits) {
             let limit = limit.copied().unwrap_or(0.0);

@@ -9,11 +9,11 @@ use cell_node::flash;
 use cell_node::identity::Identity;
 use cover::mesh::{Mesh, UpAxis};
 use model::scenario::Scenario;
-use protocol::candump::{self, Line};
+use protocol::candump::{self, CandumpLine};
 use protocol::id::CellId;
 use protocol::packet::crc16;
 use protocol::skin::Skin;
-use robots::{Import, Urdf};
+use robots::{SkinImport, Urdf};
 use tempfile::NamedTempFile;
 use trace::capture::{Item, Reader};
 use trace::recording::recover::recover as recover_into;
@@ -25,10 +25,10 @@ static SKIN: LazyLock<Skin> =
 /// Parses each line by itself: a frame must be written as a line with the same meaning.
 pub(super) fn candump(data: &[u8]) {
     for line in data.split(|&byte| byte == b'\n') {
-        let Ok(Line::Frame(record)) = candump::parse_bytes(line) else { continue };
+        let Ok(CandumpLine::Frame(record)) = candump::parse_bytes(line) else { continue };
         let mut text = String::new();
         candump::write_record(&mut text, &record).unwrap();
-        let Ok(Line::Frame(again)) = candump::parse(&text) else { panic!("{text}") };
+        let Ok(CandumpLine::Frame(again)) = candump::parse(&text) else { panic!("{text}") };
         assert_eq!(
             (again.time, again.interface, again.frame),
             (record.time, record.interface, record.frame),
@@ -128,7 +128,7 @@ pub(super) fn urdf(data: &[u8]) {
     let leaves: Vec<_> = urdf.leaves().take(4).map(str::to_owned).collect();
     for tip in leaves {
         let Ok(chain) = urdf.chain(None, &tip) else { continue };
-        let import = Import { name: "robot", command: "import", urdf: None, chains: &[chain], cells: &[] };
+        let import = SkinImport { name: "robot", command: "import", urdf: None, chains: &[chain], cells: &[] };
         let Ok(skin) = import.toml() else { continue };
         Skin::parse("skin.toml", &skin).unwrap_or_else(|error| panic!("{error}: {skin}"));
     }

@@ -11,9 +11,9 @@ use protocol::can::{Format, fd_len};
 use protocol::candump::{Record, Timestamp};
 use protocol::id::Id;
 use protocol::message::Message;
-use protocol::packet::{Length, Lengths, Packet, Reassembly, Segment};
+use protocol::packet::{Length, Lengths, Packet, Reassembly, Reassembler};
 use protocol::schema::Units;
-use protocol::slcan::{self, Decoder, Line};
+use protocol::slcan::{self, Decoder, SlcanLine};
 use protocol::time::Micros;
 use protocol::wire_time::BitRates;
 
@@ -49,8 +49,8 @@ pub(super) fn reassembly(data: &[u8]) {
 
 fn reassemble(from: &mut Unstructured<'_>) -> Result<()> {
     let id = Id::from_bits(from.arbitrary::<u16>()? & 0x7FF);
-    let lengths = Lengths::of(id);
-    let (mut segment, mut now) = (Segment::NONE, Micros(0));
+    let lengths = Lengths::for_id(id);
+    let (mut segment, mut now) = (Reassembler::NONE, Micros(0));
     let mut sent = Vec::new();
     while !from.is_empty() {
         now.0 += u64::from(from.arbitrary::<u16>()?);
@@ -88,14 +88,14 @@ pub(super) fn slcan(data: &[u8]) {
     let mut decoder = Decoder::new();
     for &byte in data {
         match decoder.push(byte) {
-            Some(Line::Frame(frame)) => again(&frame),
-            Some(Line::Command(command)) => {
+            Some(SlcanLine::Frame(frame)) => again(&frame),
+            Some(SlcanLine::Command(command)) => {
                 let mut other = Decoder::new();
                 let lines: Vec<_> =
                     command.encode().as_bytes().iter().filter_map(|&byte| other.push(byte)).collect();
-                assert_eq!(lines, [Line::Command(command)]);
+                assert_eq!(lines, [SlcanLine::Command(command)]);
             }
-            Some(Line::Refused(_)) => assert!(decoder.refused().total() > 0),
+            Some(SlcanLine::Refused(_)) => assert!(decoder.refused().total() > 0),
             _ => {}
         }
     }
@@ -119,7 +119,7 @@ pub(super) fn hosts(data: &[u8]) {
             assert_eq!(message::decode(&bytes, &mut again), Ok(head));
             assert_eq!(again, frames);
         }
-        assert_eq!(incoming.take(host, message).is_ok(), message::decode(message, &mut frames).is_ok());
+        assert_eq!(incoming.receive(host, message).is_ok(), message::decode(message, &mut frames).is_ok());
         waiting = waiting.max(incoming.waiting().len());
         if from.arbitrary().unwrap_or(false) {
             incoming.sent(from.int_in_range(0..=9).unwrap_or(0));
@@ -127,7 +127,7 @@ pub(super) fn hosts(data: &[u8]) {
             incoming.refused(from.int_in_range(0..=9).unwrap_or(0));
         }
     }
-    assert!(waiting <= incoming::QUEUE);
+    assert!(waiting <= incoming::MAX_WAITING_FRAMES);
     let left = incoming.waiting().len();
     incoming.sent(left);
     for (_, it, _) in incoming.accounts() {
@@ -143,7 +143,7 @@ fn again(frame: &protocol::can::Frame) {
     let mut decoder = Decoder::new();
     let lines: Vec<_> = text.as_bytes().iter().filter_map(|&byte| decoder.push(byte)).collect();
     assert_eq!(lines.len(), 1, "{text:?}");
-    let [Line::Frame(read)] = lines[..] else { panic!("{lines:?}") };
+    let [SlcanLine::Frame(read)] = lines[..] else { panic!("{lines:?}") };
     let said = |it: &protocol::can::Frame| (it.id(), it.is_extended(), it.is_remote(), it.format());
     // A sender may set bits above those of an identifier, which a line cannot hold.
     assert_eq!(said(&read), said(frame));
@@ -189,7 +189,7 @@ pub(super) fn decoder(data: &[u8]) {
             let mut line = Vec::new();
             json::write(&mut line, &record, &decoded, Units::default()).unwrap();
             let _: serde_json::Value = serde_json::from_slice(&line).unwrap();
-            stats.take(&record, &decoded);
+            stats.record(&record, &decoded);
         }
     };
     let _ = traffic(&mut Unstructured::new(data), |bus, nanos, frame| {

@@ -68,7 +68,7 @@ fn frame(from: &mut Unstructured<'_>) -> Result<Frame> {
 /// Returns any packet with a correct CRC.
 fn packet(from: &mut Unstructured<'_>) -> Result<Packet> {
     let id = Id::from_bits(from.arbitrary::<u16>()? & 0x7FF);
-    let lengths: Vec<_> = Lengths::of(id).iter().collect();
+    let lengths: Vec<_> = Lengths::for_id(id).iter().collect();
     let length = *from.choose(&lengths)?;
     let mut words = [0; MAX_WORDS];
     for word in words.iter_mut().take(length.words()) {

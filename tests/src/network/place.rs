@@ -4,7 +4,7 @@ use std::collections::{HashMap, VecDeque};
 
 use cell_node::contact::{Force, Torque};
 use cell_node::kernel::{Kernel, Wrench};
-use cell_node::sum::Words;
+use cell_node::sum::SumWords;
 use protocol::can::Frame;
 use protocol::fixed::{Q1_14, Q3_12, Q7_8};
 use protocol::id::CellId;
@@ -50,7 +50,7 @@ pub struct Place {
     pub(super) deferred: VecDeque<(Micros, Frame)>,
     pub(super) newest: Micros,
     /// Its sums in each of the last epochs: words, and the cells in them.
-    pub(super) said: HashMap<u8, Vec<(Words, u128)>>,
+    pub(super) said: HashMap<u8, Vec<(SumWords, u128)>>,
 }
 
 impl Place {

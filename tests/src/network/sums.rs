@@ -2,7 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use cell_node::sum::Words;
+use cell_node::sum::SumWords;
 use protocol::can::Format;
 use protocol::fixed::Q7_8;
 use protocol::id::CellId;
@@ -15,12 +15,12 @@ use super::{End, Event, Wiring};
 
 impl Wiring {
     /// Handles a sum of a cell: finds the cells in it, and its receivers.
-    pub(super) fn hear_sum(&mut self, cell: usize, from: CellId, epoch: Epoch, words: Words) {
+    pub(super) fn hear_sum(&mut self, cell: usize, from: CellId, epoch: Epoch, words: SumWords) {
         let cells = self.decode(cell, epoch, words);
         let said = &mut self.cells[cell].said;
         // A cell that hung continues with sums from long before.
         if said.len() > 64 {
-            said.retain(|of, _| Epoch(*of).since(epoch) >= -48);
+            said.retain(|of, _| Epoch(*of).epochs_since(epoch) >= -48);
         }
         said.entry(epoch.0).or_default().push((words, cells));
         let frame = Message::Sum {
@@ -41,7 +41,7 @@ impl Wiring {
             .collect();
         for other in neighbours {
             let node = self.cells[other].life.node();
-            if node.is_some_and(|node| node.hears().any(|id| id == frame_id(from))) {
+            if node.is_some_and(|node| node.received_ids().any(|id| id == frame_id(from))) {
                 let at = self.arrival(Some(other));
                 self.agenda.enter(at, Event::Deliver(other, Inlet::Frame(frame)));
             }
@@ -70,9 +70,9 @@ impl Wiring {
     }
 
     /// Returns the cells in a sum: its own torque or not, and some of its neighbours' sums.
-    fn decode(&self, cell: usize, epoch: Epoch, words: Words) -> u128 {
+    fn decode(&self, cell: usize, epoch: Epoch, words: SumWords) -> u128 {
         let place = &self.cells[cell];
-        let mut heard: Vec<Vec<(Words, u128)>> = Vec::new();
+        let mut heard: Vec<Vec<(SumWords, u128)>> = Vec::new();
         let mut seen = BTreeSet::new();
         for end in place.wires.iter().flatten() {
             if let End::Cell(other, _) = end
@@ -113,7 +113,7 @@ fn frame_id(from: CellId) -> protocol::id::Id {
 
 /// Tries every choice of one sum, or none, of each neighbour.
 fn choose(
-    heard: &[Vec<(Words, u128)>],
+    heard: &[Vec<(SumWords, u128)>],
     sum: [i32; MAX_JOINTS],
     count: u32,
     cells: u128,

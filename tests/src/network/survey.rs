@@ -52,7 +52,7 @@ impl Wiring {
             match tree.parent? {
                 0 => return Some(route),
                 parent => {
-                    let End::Cell(other, _) = self.cells[at].wires[usize::from(tree.up)]? else {
+                    let End::Cell(other, _) = self.cells[at].wires[usize::from(tree.parent_port)]? else {
                         return None;
                     };
                     if self.cells[other].node_id.map(CellId::get) != Some(parent) || route.contains(&other) {
@@ -69,7 +69,7 @@ impl Wiring {
     pub fn routes(&self) -> String {
         let route = |cell: usize| {
             let place = &self.cells[cell];
-            let tree = place.tree.map(|tree| (tree.parent, tree.up, tree.depth, tree.round, tree.children));
+            let tree = place.tree.map(|tree| (tree.parent, tree.parent_port, tree.depth, tree.round, tree.children));
             format!("{cell}={:?} {tree:?} {:?}", place.node_id.map(CellId::get), self.route(cell))
         };
         (0..self.cells.len()).map(route).collect::<Vec<_>>().join("; ")

@@ -1,7 +1,7 @@
 //! Benches with several buses, some of them with CAN FD and some with classic frames.
 
 use protocol::can::Format;
-use protocol::candump::{Line, parse};
+use protocol::candump::{CandumpLine, parse};
 
 /// Returns the skin with classic frames on these buses.
 pub fn mixed_skin(skin: &str, classic: &[&str]) -> String {
@@ -18,7 +18,7 @@ pub fn mixed_skin(skin: &str, classic: &[&str]) -> String {
 /// Returns true if a log has torques of a bus, in frames of its format only.
 pub fn carries(log: &str, bus: &str, format: Format) -> bool {
     let frames = log.lines().filter_map(|line| match parse(line) {
-        Ok(Line::Frame(record)) if record.interface == bus => Some(record.frame),
+        Ok(CandumpLine::Frame(record)) if record.interface == bus => Some(record.frame),
         _ => None,
     });
     let frames: Vec<_> = frames.collect();

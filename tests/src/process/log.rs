@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 
 use protocol::can::{Format, Frame};
-use protocol::candump::{self, Line};
+use protocol::candump::{self, CandumpLine};
 use protocol::fixed::Q;
 use protocol::id::{Kind, Node};
-use protocol::message::{From, Heartbeat, Message, NetworkPage, SensorPage, SkinSensors};
-use protocol::packet::{Epoch, Lengths, Packet, Reassembly, Segment, data_id};
+use protocol::message::{AppliesFrom, Heartbeat, Message, NetworkPage, SensorPage, SkinSensors};
+use protocol::packet::{Epoch, Lengths, Packet, Reassembly, Reassembler, data_id};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
 
@@ -25,7 +25,7 @@ impl Log {
     /// Reads a log of one bus; every line must be a frame, or a comment of the recorder.
     pub fn read(text: &str, format: Format) -> Self {
         let frame = |line: &str| match candump::parse(line) {
-            Ok(Line::Frame(record)) => record.frame,
+            Ok(CandumpLine::Frame(record)) => record.frame,
             other => panic!("{line}: {other:?}"),
         };
         Self::of(text.lines().filter(|line| !line.starts_with("# ")).map(frame).collect(), format)
@@ -38,7 +38,7 @@ impl Log {
             Format::Fd => Packet::from_fd(frame).ok(),
             Format::Classic => {
                 let id = data_id(frame).ok()?;
-                let segment = segments.entry(id).or_insert(Segment::NONE);
+                let segment = segments.entry(id).or_insert(Reassembler::NONE);
                 match segment.push(Micros(0), id, Lengths::ALL, frame.data()) {
                     Ok(Reassembly::Complete(packet)) => Some(packet),
                     _ => None,
@@ -147,21 +147,21 @@ fn words(skin: &SkinSensors) -> [i16; 6] {
 /// The contact state of a cell, by the rules of the protocol document.
 #[derive(Default)]
 struct ContactState {
-    waiting: Vec<(From, SkinSensors)>,
+    waiting: Vec<(AppliesFrom, SkinSensors)>,
     now: SkinSensors,
 }
 
 impl ContactState {
-    fn push(&mut self, from: From, skin: SkinSensors, last: Option<Epoch>) {
-        let late = matches!((from, last), (From::Epoch(first), Some(last)) if last.since(first) >= 0);
-        self.waiting.push((if late { From::Next } else { from }, skin));
+    fn push(&mut self, from: AppliesFrom, skin: SkinSensors, last: Option<Epoch>) {
+        let late = matches!((from, last), (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0);
+        self.waiting.push((if late { AppliesFrom::Next } else { from }, skin));
     }
 
     fn latch(&mut self, epoch: Epoch) {
         for (from, skin) in std::mem::take(&mut self.waiting) {
             match from {
-                From::Epoch(first) if epoch.since(first) < 0 => self.waiting.push((from, skin)),
-                From::Epoch(_) | From::Next => self.now = skin,
+                AppliesFrom::Epoch(first) if epoch.epochs_since(first) < 0 => self.waiting.push((from, skin)),
+                AppliesFrom::Epoch(_) | AppliesFrom::Next => self.now = skin,
             }
         }
     }

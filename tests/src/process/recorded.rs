@@ -13,7 +13,7 @@ use std::path::Path;
 use mcap::read::{Summary, attachment, metadata};
 use mcap::{MessageStream, Schema};
 use model::generate::{Target, generate};
-use protocol::candump::{Line, parse};
+use protocol::candump::{CandumpLine, parse};
 use serde_json::{Map, Value, json};
 
 use crate::process::vcan::{Candump, same_by_sender};
@@ -212,7 +212,7 @@ pub fn has_what_candump_sees(place: &Place, cells: usize, broadcast_hz: f64, mor
     let recorded = Recorded::read(&place.path("run.mcap"));
     assert!(recorded.on("/can/notes").next().is_none());
     let frame = |line: &String| match parse(line) {
-        Ok(Line::Frame(record)) => record.frame,
+        Ok(CandumpLine::Frame(record)) => record.frame,
         other => panic!("{line}: {other:?}"),
     };
     let ours: Vec<_> = recorded.lines("/can/vcan0").iter().map(frame).collect();

@@ -4,10 +4,10 @@ use std::path::Path;
 use std::time::Duration;
 
 use protocol::can::Format;
-use protocol::candump::{self, Line};
+use protocol::candump::{self, CandumpLine};
 use protocol::fixed::{Q3_12, Q5_10};
 use protocol::id::{CellId, Node};
-use protocol::message::{From, Message, Request, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, Message, Request, SensorPage, SkinSensors};
 use protocol::packet::{Packet, WORDS};
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
@@ -71,11 +71,11 @@ pub fn says_everything(test_client: &TestClient, skin: &Path) {
     test_client.sends(&Message::Report);
     test_client.sends(&Message::Sync);
     let page = SensorPage::Acceleration([Q3_12::nearest(0.5), Q3_12::ZERO, Q3_12::nearest(-1.0)]);
-    test_client.sends(&Message::Stimulus { to: Node::Everyone, from: From::Next, page });
+    test_client.sends(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page });
     let skin_page = SkinSensors { contact: [Q5_10::nearest(0.7); 3], ..SkinSensors::default() };
     test_client.sends(&Message::Stimulus {
         to: Node::Cell(cell(6)),
-        from: From::Next,
+        from: AppliesFrom::Next,
         page: SensorPage::Skin(skin_page),
     });
     test_client.waits_for_epoch(20);
@@ -183,7 +183,7 @@ pub fn changed(
 ) -> String {
     let mut left = nth;
     let line = |line: &str| {
-        let Ok(Line::Frame(record)) = candump::parse(line) else { return line.to_owned() };
+        let Ok(CandumpLine::Frame(record)) = candump::parse(line) else { return line.to_owned() };
         let Ok(mut packet) = Packet::from_fd(&record.frame) else { return line.to_owned() };
         if !Message::decode(&packet).is_ok_and(|message| expected(&message)) {
             return line.to_owned();
@@ -206,7 +206,7 @@ pub fn changed(
 /// Returns a log without some of its packets.
 pub fn without(log: &str, mut unwanted: impl FnMut(&Message) -> bool) -> String {
     let keeps = |line: &&str| {
-        let Ok(Line::Frame(record)) = candump::parse(line) else { return true };
+        let Ok(CandumpLine::Frame(record)) = candump::parse(line) else { return true };
         let packet = Packet::from_fd(&record.frame).ok();
         !packet.and_then(|packet| Message::decode(&packet).ok()).is_some_and(|message| unwanted(&message))
     };

@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use protocol::can::Frame;
-use protocol::slcan::{Decoder, Line, encode};
+use protocol::slcan::{Decoder, SlcanLine, encode};
 use rustix::fs::{Mode, OFlags};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
@@ -27,7 +27,7 @@ pub struct Peer {
     decoder: Decoder,
     /// All bytes so far.
     pub bytes: Vec<u8>,
-    lines: Vec<Line>,
+    lines: Vec<SlcanLine>,
 }
 
 /// A pseudoterminal: the end that is opened by its path, and this one.
@@ -98,7 +98,7 @@ impl Peer {
 
     /// Returns the frames so far.
     pub fn frames(&self) -> Vec<Frame> {
-        let frame = |line: &Line| if let Line::Frame(frame) = line { Some(*frame) } else { None };
+        let frame = |line: &SlcanLine| if let SlcanLine::Frame(frame) = line { Some(*frame) } else { None };
         self.lines.iter().filter_map(frame).collect()
     }
 

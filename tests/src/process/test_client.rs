@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
 use model::decode::{Decoded, Decoder};
-use protocol::bus::{Bus, Choice, Inbox, Options};
+use protocol::bus::{Bus, KindChoice, Inbox, BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
@@ -35,12 +35,12 @@ impl Place {
 
 impl TestClient {
     pub fn on(place: &Place, bus: &str, format: Format) -> Self {
-        Self::on_kind(place, bus, format, Choice::Only(place.kind()))
+        Self::on_kind(place, bus, format, KindChoice::Only(place.kind()))
     }
 
-    pub fn on_kind(place: &Place, bus: &str, format: Format, kind: Choice) -> Self {
+    pub fn on_kind(place: &Place, bus: &str, format: Format, kind: KindChoice) -> Self {
         let fd = format == Format::Fd;
-        let options = Options { directory: Some(place.buses()), fd, ..Options::default() };
+        let options = BusOptions { directory: Some(place.buses()), fd, ..BusOptions::default() };
         let bus = until("the bus", || Bus::open(bus, kind, &options).ok());
         Self { bus, format, decoder: RefCell::new(Decoder::new(Some(format))) }
     }

@@ -13,7 +13,7 @@ use std::process::{Child, Command, Output, Stdio};
 use model::generate::{Target, generate};
 use protocol::bus::BusKind;
 use protocol::can::Frame;
-use protocol::candump::{Line, parse, parse_frame};
+use protocol::candump::{CandumpLine, parse, parse_frame};
 use protocol::id::{Id, Kind};
 
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
@@ -252,7 +252,7 @@ fn mark(number: u32) -> String {
 pub fn frames_of(log: &Path) -> Vec<Frame> {
     let text = fs::read_to_string(log).unwrap();
     let frame = |line: &str| match parse(line) {
-        Ok(Line::Frame(record)) => record.frame,
+        Ok(CandumpLine::Frame(record)) => record.frame,
         other => panic!("{}: {line}: {other:?}", log.display()),
     };
     text.lines().map(frame).collect()

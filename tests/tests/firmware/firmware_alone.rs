@@ -19,7 +19,7 @@ use protocol::message::{Answer, Heartbeat, Joints, Message, NetworkPage, Request
 use protocol::packet::{Epoch, Packet};
 use protocol::parameters::{MAX_JOINTS, Parameter, Parameters};
 use protocol::skin::Skin;
-use protocol::slcan::{self, Decoder, Line};
+use protocol::slcan::{self, Decoder, SlcanLine};
 use tempfile::TempDir;
 
 const SERIAL: u32 = 100_012;
@@ -67,7 +67,7 @@ impl Alone {
             hosted: true,
             link_ids: [None; 5],
         };
-        let elf = if named { Firmware::read(&path).unwrap().of(&factory) } else { fs::read(&path).unwrap() };
+        let elf = if named { Firmware::read(&path).unwrap().for_cell(&factory) } else { fs::read(&path).unwrap() };
         fs::write(folder.join("cell.elf"), elf).unwrap();
         let mut command = Command::new("qemu-system-arm");
         command.args([
@@ -108,7 +108,7 @@ impl Alone {
             let Ok(count) = self.line.read(&mut bytes) else { continue };
             for line in bytes[..count].iter().filter_map(|&byte| self.decoder.push(byte)) {
                 // A reset cuts a line.
-                let Line::Frame(frame) = line else { continue };
+                let SlcanLine::Frame(frame) = line else { continue };
                 self.came.push_back(Message::decode(&Packet::from_fd(&frame).unwrap()).unwrap());
             }
         }
@@ -174,7 +174,7 @@ impl Alone {
         self.send(&Message::Joints { epoch: Epoch(epoch), joints });
         self.send(&Message::Report);
         let taken = self.waits("a report", |message| match message {
-            Message::Network { page: NetworkPage::Heard(heard), .. } => Some(heard.joints),
+            Message::Network { page: NetworkPage::Received(heard), .. } => Some(heard.joints),
             _ => None,
         });
         assert!(taken > 0);

@@ -46,7 +46,7 @@ fn conforms(format: Format) {
     let path = std::env::var_os("SKINBUS_FIRMWARE").expect("tests/firmware/run names it");
     let factory =
         Factory { node: CellId::new(12).ok(), serial: 100_012, format, hosted: true, link_ids: [None; 5] };
-    fs::write(place.path("cell.elf"), Firmware::read(Path::new(&path)).unwrap().of(&factory)).unwrap();
+    fs::write(place.path("cell.elf"), Firmware::read(Path::new(&path)).unwrap().for_cell(&factory)).unwrap();
     place.write("restart.sh", RESTART);
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");

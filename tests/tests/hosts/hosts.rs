@@ -18,7 +18,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use process::{Ended, PRESSED, Place, Running, TIMEOUT, program, skin, until};
-use protocol::bus::{Bus, BusKind, Choice, Inbox, Options};
+use protocol::bus::{Bus, BusKind, KindChoice, Inbox, BusOptions};
 use protocol::can::Frame;
 use proxy::Proxy;
 use rustix::process::Signal;
@@ -146,8 +146,8 @@ struct Client(Bus);
 
 impl Client {
     fn on(host: &Host) -> Self {
-        let options = Options { directory: Some(host.place.buses()), ..Options::default() };
-        Self(Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap())
+        let options = BusOptions { directory: Some(host.place.buses()), ..BusOptions::default() };
+        Self(Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap())
     }
 
     /// Returns the received frames.

@@ -21,10 +21,10 @@ use model::generate::{Format as Generated, Target, generate};
 use process::log::{Log, same_torques};
 use process::vcan::{Candump, by_identifier, command, frames_of, refused, tool};
 use process::{Place, Running, Summary, TIMEOUT, until};
-use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
+use protocol::bus::{Bus, BusError, BusKind, KindChoice, Filter, Inbox, BusOptions};
 use protocol::can::{Format, Frame};
-use protocol::candump::{Line, parse};
-use protocol::packet::{Length, Lengths, Reassembly, Segment, data_id};
+use protocol::candump::{CandumpLine, parse};
+use protocol::packet::{Length, Lengths, Reassembly, Reassembler, data_id};
 use protocol::time::Micros;
 use rustix::process::Signal;
 use serde_json::Value;
@@ -120,12 +120,12 @@ fn address(name: &str) -> String {
     link[0]["parentdev"].as_str().unwrap_or_else(|| panic!("{name} is no PCI device: {link}")).to_owned()
 }
 
-fn options(filters: &[Filter]) -> Options {
-    Options { fd: false, filters: filters.to_vec(), receive_buffer: 8 << 20, ..Options::default() }
+fn options(filters: &[Filter]) -> BusOptions {
+    BusOptions { fd: false, filters: filters.to_vec(), receive_buffer: 8 << 20, ..BusOptions::default() }
 }
 
-fn open(name: &str, options: &Options) -> Result<Bus, BusError> {
-    Bus::open(name, Choice::Only(BusKind::SocketCan), options)
+fn open(name: &str, options: &BusOptions) -> Result<Bus, BusError> {
+    Bus::open(name, KindChoice::Only(BusKind::SocketCan), options)
 }
 
 /// Returns a frame that contains its number.
@@ -177,9 +177,9 @@ fn start_bench(place: &Place, kind: BusKind, seconds: f64) -> Running {
 
 /// Counts the packets in a log, without comments of the recorder, and the segments without a matching one in time.
 fn pairs(log: &str) -> (u64, u64) {
-    let (mut segments, mut whole, mut incomplete) = (vec![Segment::NONE; 1 << 11], 0, 0);
+    let (mut segments, mut whole, mut incomplete) = (vec![Reassembler::NONE; 1 << 11], 0, 0);
     for line in log.lines().filter(|line| !line.starts_with("# ")) {
-        let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}") };
+        let Ok(CandumpLine::Frame(record)) = parse(line) else { panic!("{line}") };
         let Ok(id) = data_id(&record.frame) else { continue };
         let segment = &mut segments[usize::from(id.to_bits())];
         match segment.push(
@@ -288,7 +288,7 @@ fn a_full_queue_is_waited_for_and_nothing_is_lost_or_sent_twice() {
     const FRAMES: u32 = 2_000;
     let controllers = Controllers::up();
     let receiver = open("can1", &options(&[Filter::ALL])).unwrap();
-    let sender = open("can0", &Options { send_timeout: TIMEOUT, ..options(&[]) }).unwrap();
+    let sender = open("can0", &BusOptions { send_timeout: TIMEOUT, ..options(&[]) }).unwrap();
     let frames: Vec<_> = (0..FRAMES).map(numbered).collect();
     for (round, part) in frames.chunks(400).enumerate() {
         let before = refused("can0");
@@ -311,8 +311,8 @@ fn a_queue_that_stays_full_is_given_up_in_time_and_used_again() {
     let controllers = Controllers::up();
     let receiver = open("can1", &options(&[Filter::ALL])).unwrap();
     let timeout = Duration::from_millis(50);
-    let patient = open("can0", &Options { send_timeout: timeout, ..options(&[]) }).unwrap();
-    let hasty = open("can0", &Options { send_timeout: Duration::ZERO, ..options(&[]) }).unwrap();
+    let patient = open("can0", &BusOptions { send_timeout: timeout, ..options(&[]) }).unwrap();
+    let hasty = open("can0", &BusOptions { send_timeout: Duration::ZERO, ..options(&[]) }).unwrap();
     let frames: Vec<_> = (0..40).map(numbered).collect();
 
     let hanging = controllers.hang();
@@ -321,8 +321,8 @@ fn a_queue_that_stays_full_is_given_up_in_time_and_used_again() {
     assert!(began.elapsed() >= timeout);
     // Ten frames in the queue, one in the controller, and one between them if an empty queue is bypassed.
     let sent = error.sent;
-    assert!((11..=12).contains(&sent) && error.target == 40, "{error}");
-    assert!(error.cause.may_pass() && matches!(error.cause, BusError::Full { .. }), "{error}");
+    assert!((11..=12).contains(&sent) && error.total == 40, "{error}");
+    assert!(error.cause.is_temporary() && matches!(error.cause, BusError::Full { .. }), "{error}");
     let said = "can0 accepted no frame for 50 ms: its queue is full; send less, or check that another node is on \
                 the bus";
     assert_eq!(error.to_string(), format!("{said} ({sent} of 40 frames sent)"));
@@ -334,7 +334,7 @@ fn a_queue_that_stays_full_is_given_up_in_time_and_used_again() {
     let before = refused("can0");
     let error = hasty.send(&frames[sent..]).unwrap_err();
     assert!(error.sent == 0 && matches!(error.cause, BusError::Full { .. }), "{error}");
-    assert!(!hasty.offer(&frames[sent..=sent]));
+    assert!(!hasty.try_send_all(&frames[sent..=sent]));
     assert_eq!(refused("can0"), before + 2);
 
     drop(hanging);
@@ -400,7 +400,7 @@ fn error_frames_of_the_driver_are_counted() {
     prepare(&place, "can1", "can0");
     let _cells = start_cells(&place, BusKind::SocketCan, "can0");
     let candump = Candump::start("can1", &place.path("candump.log"));
-    let errors = open("can1", &Options { error_mask: u32::MAX, ..options(&[]) }).unwrap();
+    let errors = open("can1", &BusOptions { error_mask: u32::MAX, ..options(&[]) }).unwrap();
     let bench = start_bench(&place, BusKind::SocketCan, 600.0);
     bench.hears_the_loop();
     for _ in 0..2 {
@@ -452,7 +452,7 @@ fn a_controller_that_is_not_ready_is_refused_with_the_hint() {
     tool("ip link set can0 type can bitrate 1000000");
     tool("ip link set can0 up");
     open("can0", &options(&[Filter::ALL])).unwrap();
-    let error = open("can0", &Options { fd: true, ..options(&[]) }).unwrap_err().to_string();
+    let error = open("can0", &BusOptions { fd: true, ..options(&[]) }).unwrap_err().to_string();
     assert!(error.starts_with("can0 has MTU 16 and CAN FD needs 72"), "{error}");
     assert!(error.contains("or use the classic format"), "{error}");
 }

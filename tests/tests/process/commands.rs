@@ -10,7 +10,7 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use protocol::bus::{Bus, BusKind, Choice, Options, has_socketcan};
+use protocol::bus::{Bus, BusKind, KindChoice, BusOptions, has_socketcan};
 use protocol::id::{CellId, Id, Kind, Node};
 use serde_json::Value;
 use served::Served;
@@ -276,8 +276,8 @@ fn the_doctor_rates_the_kernel_by_the_choice() {
 
 /// Runs the doctor while a process sends on the bus continuously.
 fn doctor_hears(folder: &Folder, arguments: &str, ids: &[Id]) -> Said {
-    let options = Options { filters: vec![], directory: Some(folder.buses()), ..Options::default() };
-    let bus = Bus::open("nosuchcan1", Choice::Only(BusKind::Embedded), &options).unwrap();
+    let options = BusOptions { filters: vec![], directory: Some(folder.buses()), ..BusOptions::default() };
+    let bus = Bus::open("nosuchcan1", KindChoice::Only(BusKind::Embedded), &options).unwrap();
     while_somebody_says(&bus, ids, || {
         folder.run(&format!("doctor skin.toml --bus-kind embedded --json {arguments}"))
     })

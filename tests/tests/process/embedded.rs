@@ -8,13 +8,13 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use skinbus_tests::process::until;
 
-use protocol::bus::embedded::{Answer, FilterPart, Hello, VERSION, address};
-use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
+use protocol::bus::embedded::{HelloReply, FilterPart, ClientHello, VERSION, address};
+use protocol::bus::{Bus, BusError, BusKind, KindChoice, Filter, Inbox, BusOptions};
 use protocol::can::{FD_FORMAT, Frame};
 use rustix::net::{AddressFamily, SendFlags, SocketFlags, SocketType};
 use socketcan::{CanAnyFrame, CanFdSocket, EmbeddedFrame, Socket};
 use tempfile::TempDir;
-use vcan_setup::embedded::{Served, Totals};
+use vcan_setup::embedded::{ServerThread, BusTotals};
 
 use skinbus_tests::can_raw as cases;
 mod place;
@@ -30,13 +30,13 @@ const MEANWHILE: u32 = 0x6FF;
 /// A bus of its own for each test, in a directory that does not exist yet.
 struct Bench {
     parent: TempDir,
-    served: Served,
+    served: ServerThread,
 }
 
 impl Bench {
     fn new() -> Self {
         let parent = TempDir::new().unwrap();
-        let served = Served::start_in(&parent.path().join("skinbus"), BUS).unwrap();
+        let served = ServerThread::start_in(&parent.path().join("skinbus"), BUS).unwrap();
         Self { parent, served }
     }
 
@@ -44,16 +44,16 @@ impl Bench {
         self.parent.path().join("skinbus")
     }
 
-    fn options(&self) -> Options {
-        Options { directory: Some(self.directory()), ..Options::default() }
+    fn options(&self) -> BusOptions {
+        BusOptions { directory: Some(self.directory()), ..BusOptions::default() }
     }
 
     fn open(&self, filters: &[Filter]) -> Bus {
-        self.open_with(Options { filters: filters.to_vec(), ..self.options() })
+        self.open_with(BusOptions { filters: filters.to_vec(), ..self.options() })
     }
 
-    fn open_with(&self, options: Options) -> Bus {
-        Bus::open(BUS, Choice::Only(BusKind::Embedded), &options).unwrap()
+    fn open_with(&self, options: BusOptions) -> Bus {
+        Bus::open(BUS, KindChoice::Only(BusKind::Embedded), &options).unwrap()
     }
 
     /// Connects without [`Bus`], and sends nothing yet.
@@ -66,7 +66,7 @@ impl Bench {
     }
 
     /// Stops the bus, and checks that no file is left and every frame is accounted for.
-    fn end(self) -> Totals {
+    fn end(self) -> BusTotals {
         let totals = self.served.stop().unwrap();
         assert_eq!(std::fs::read_dir(self.parent.path()).unwrap().count(), 0, "the directory is removed too");
         assert_eq!(totals.routed, totals.delivered + totals.dropped + totals.abandoned, "{totals:?}");
@@ -149,7 +149,7 @@ fn every_rule_of_can_raw_holds() {
         // The end marker passes the same filters, so the case gets one more filter that accepts it.
         let filters = [&case.filters[..], &[exact(LAST)]].concat();
         let (own_frames, fd, error_mask) = (case.own_frames, case.fd, case.error_mask);
-        let client = bench.open_with(Options { filters, own_frames, fd, error_mask, ..bench.options() });
+        let client = bench.open_with(BusOptions { filters, own_frames, fd, error_mask, ..bench.options() });
         let other = bench.open(&[]);
         if case.from_self { &client } else { &other }.send(&[case.frame]).unwrap();
         if case.from_self {
@@ -177,7 +177,7 @@ fn filters_change_in_order_with_the_frames() {
     let bench = Bench::new();
     let other = bench.open(&[]);
     let client =
-        bench.open_with(Options { own_frames: true, filters: vec![exact(1), exact(2)], ..bench.options() });
+        bench.open_with(BusOptions { own_frames: true, filters: vec![exact(1), exact(2)], ..bench.options() });
     // The order between its own frames and its filters is kept.
     client.send(&[frame(1, 1), frame(3, 1)]).unwrap();
     client.set_filters(&[exact(2), exact(3), exact(LAST)]).unwrap();
@@ -222,7 +222,7 @@ fn filters_that_never_end_are_garbage_and_those_latched_stay() {
 #[test]
 fn own_frames_are_marked_and_stamped_with_the_wall_clock() {
     let bench = Bench::new();
-    let bus = bench.open_with(Options { own_frames: true, ..bench.options() });
+    let bus = bench.open_with(BusOptions { own_frames: true, ..bench.options() });
     let before = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos();
     bus.send(&[Frame::with_data(5, protocol::can::Format::Fd, 1, &[9]).unwrap()]).unwrap();
     bench.open(&[]).send(&[frame(6, 0)]).unwrap();
@@ -246,7 +246,7 @@ fn what_a_client_does_not_read_is_dropped_and_counted_exactly() {
     const SENT: u32 = 20_000;
     let bench = Bench::new();
     let filters = vec![exact(1), exact(2), exact(LAST)];
-    let slow = bench.open_with(Options { filters, receive_buffer: 64 * 1024, ..bench.options() });
+    let slow = bench.open_with(BusOptions { filters, receive_buffer: 64 * 1024, ..bench.options() });
     assert!(slow.receive_buffer() >= 64 * 1024);
     let sender = bench.open(&[]);
     for first in (0..SENT).step_by(50) {
@@ -278,7 +278,7 @@ fn what_a_client_does_not_read_is_dropped_and_counted_exactly() {
 #[test]
 fn a_slow_client_holds_up_nobody() {
     let bench = Bench::new();
-    let _slow = bench.open_with(Options { receive_buffer: 0, ..bench.options() });
+    let _slow = bench.open_with(BusOptions { receive_buffer: 0, ..bench.options() });
     let fast = bench.open(&[Filter::ALL]);
     let sender = bench.open(&[]);
     let mut inbox = Inbox::new();
@@ -312,7 +312,7 @@ fn a_client_that_vanishes_has_said_what_it_said_and_the_rest_go_on() {
 fn garbage_is_counted_and_hurts_nobody() {
     let bench = Bench::new();
     let bus = bench.open(&[Filter::ALL]);
-    let bad = bench.open_with(Options { fd: false, filters: vec![], ..bench.options() });
+    let bad = bench.open_with(BusOptions { fd: false, filters: vec![], ..bench.options() });
     let worse = bench.open(&[]);
     let mut sent = 0;
     for refused in cases::refused() {
@@ -334,14 +334,14 @@ fn garbage_is_counted_and_hurts_nobody() {
 fn who_does_not_say_hello_is_turned_away() {
     let bench = Bench::new();
     let mut other_version =
-        Hello { filters: vec![], own_frames: false, fd: true, error_mask: 0, buffer: 0 }.encode();
+        ClientHello { filters: vec![], own_frames: false, fd: true, error_mask: 0, buffer: 0 }.encode();
     other_version[7] = VERSION + 1;
     for first in [&frame(1, 1).to_bytes()[..], b"hello", &[0; 5000], &other_version] {
         let socket = bench.raw();
         rustix::net::send(&socket, first, SendFlags::empty()).unwrap();
         let mut answer = [0; 64];
         let (len, _) = rustix::net::recv(&socket, &mut answer, rustix::net::RecvFlags::empty()).unwrap();
-        assert_eq!(Answer::decode(&answer[..len]), Some(Answer::Refused { version: VERSION }));
+        assert_eq!(HelloReply::decode(&answer[..len]), Some(HelloReply::Refused { version: VERSION }));
         let (len, _) = rustix::net::recv(&socket, &mut answer, rustix::net::RecvFlags::empty()).unwrap();
         assert_eq!(len, 0, "and then it is closed");
     }
@@ -421,7 +421,7 @@ fn a_server_that_lets_nobody_in_is_given_up_on() {
     // Bound but not running, like a stopped process: it accepts no client.
     let server = vcan_setup::embedded::Server::bind_in(&parent.path().join("skinbus"), BUS).unwrap();
     let directory = Some(parent.path().join("skinbus"));
-    let error = Bus::open(BUS, Choice::Only(BusKind::Embedded), &Options { directory, ..Options::default() });
+    let error = Bus::open(BUS, KindChoice::Only(BusKind::Embedded), &BusOptions { directory, ..BusOptions::default() });
     let error = error.unwrap_err().to_string();
     let expected = "the embedded bus vcan0 did not answer within 2000 ms: is its server stopped, or out of files (`ulimit -n`)?";
     assert_eq!(error, expected);
@@ -431,7 +431,7 @@ fn a_server_that_lets_nobody_in_is_given_up_on() {
 #[test]
 fn one_receives_while_others_send_on_the_same_bus() {
     let bench = Bench::new();
-    let bus = bench.open_with(Options { own_frames: true, ..bench.options() });
+    let bus = bench.open_with(BusOptions { own_frames: true, ..bench.options() });
     std::thread::scope(|scope| {
         for thread in 0..3 {
             let bus = &bus;

@@ -14,7 +14,7 @@ use model::generate::{Format as Wire, Reply, Target, generate};
 use process::buses::{carries, mixed_skin};
 use process::test_client::TestClient;
 use process::{PRESSED, Place, Running, signal, skin_of, until};
-use protocol::bus::embedded::{Answer, HELLO_MAX, address, seqpacket};
+use protocol::bus::embedded::{HelloReply, MAX_HELLO_BYTES, address, seqpacket};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, Request};
@@ -323,13 +323,13 @@ impl PlayedServer {
     fn admits(&self) -> OwnedFd {
         let client = loop {
             let client = rustix::net::accept(&self.listener).unwrap();
-            if rustix::net::recv(&client, &mut [0; HELLO_MAX], RecvFlags::empty())
+            if rustix::net::recv(&client, &mut [0; MAX_HELLO_BYTES], RecvFlags::empty())
                 .is_ok_and(|(len, _)| len > 0)
             {
                 break client;
             }
         };
-        let answer = Answer::Welcome { granted: 1 << 20 }.encode();
+        let answer = HelloReply::Welcome { granted: 1 << 20 }.encode();
         rustix::net::send(&client, &answer, SendFlags::NOSIGNAL).unwrap();
         client
     }

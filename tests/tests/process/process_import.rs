@@ -110,10 +110,10 @@ fn links_are_covered_and_the_skin_runs() {
     assert!(skin.cells.len() > 100 && skin.buses.len() >= 2, "{} cells", skin.cells.len());
     for (index, bus) in skin.buses.iter().enumerate() {
         assert_eq!(bus.name, format!("vcan{index}"));
-        assert!((1..=60).contains(&skin.cells_of(index).count()), "{}", bus.name);
-        assert!(skin.cells_of(index).any(|cell| cell.root), "{} has a root", bus.name);
-        let wired = skin.cells_of(index).filter(|cell| cell.neighbors.iter().any(Option::is_some));
-        assert!(wired.count() > skin.cells_of(index).count() * 9 / 10);
+        assert!((1..=60).contains(&skin.cells_on_bus(index).count()), "{}", bus.name);
+        assert!(skin.cells_on_bus(index).any(|cell| cell.root), "{} has a root", bus.name);
+        let wired = skin.cells_on_bus(index).filter(|cell| cell.neighbors.iter().any(Option::is_some));
+        assert!(wired.count() > skin.cells_on_bus(index).count() * 9 / 10);
     }
     // The command in the first line gives the same again; another seed gives other cells.
     let again = run(&place, &format!("{COVER} --nodes-per-bus 60 -o again.toml")).well();
@@ -172,7 +172,7 @@ fn a_box_holds_no_cell_and_a_bus_has_one_chain() {
     let skin = read(&place, "two.toml");
     let chains: Vec<_> = skin.buses.iter().map(|bus| skin.robot.chains[bus.chain].name.as_str()).collect();
     assert_eq!(chains, ["left_palm", "right_palm"]);
-    let joints = |bus| skin.cells_of(bus).map(|cell| cell.joint).collect::<BTreeSet<_>>();
+    let joints = |bus| skin.cells_on_bus(bus).map(|cell| cell.joint).collect::<BTreeSet<_>>();
     assert!(joints(0).contains(&2) && !joints(1).contains(&2), "the torso belongs to the first chain");
 }
 

@@ -25,7 +25,7 @@ use protocol::can::Frame;
 use protocol::fixed::Q5_10;
 use protocol::id::{CellId, Node};
 use protocol::message::{
-    From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, Tree,
+    AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State, Tree,
 };
 use protocol::packet::Epoch;
 use protocol::parameters::{Parameter, Reply as Answers, Slots};
@@ -113,7 +113,7 @@ impl Side {
         loop {
             self.uplinks.handle_time(self.now());
             while let Some((root, message)) = self.uplinks.poll_transmit() {
-                self.test_client.bus.send(&[self.roots[root].1.frame(message)]).unwrap();
+                self.test_client.bus.send(&[self.roots[root].1.encode_frame(message)]).unwrap();
             }
             let left = end.saturating_duration_since(Instant::now());
             if left.is_zero() {
@@ -131,7 +131,7 @@ impl Side {
         let now = self.now();
         if let Some(link) = LinkId::from_raw_id(frame.raw_id()) {
             let root = self.roots.iter().position(|(_, ours)| ours.reversed() == link);
-            if let (Some(root), Some(message)) = (root, link.read(frame)) {
+            if let (Some(root), Some(message)) = (root, link.decode_frame(frame)) {
                 self.uplinks.handle(now, root, message);
             }
             return;
@@ -244,7 +244,7 @@ fn sums_reach_the_roots_whichever_cells_share_a_process() {
         let touch = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
         side.test_client.sends(&Message::Stimulus {
             to: Node::Everyone,
-            from: From::Next,
+            from: AppliesFrom::Next,
             page: SensorPage::Skin(touch),
         });
         // A parent receives a child's sums from the epoch on that the child has announced.
@@ -325,7 +325,7 @@ fn flash_of_another_node_id_is_not_used() {
     fs::create_dir(place.path("flash")).unwrap();
     let server = server(&place);
     let serial = skin.cells[1].serial;
-    let kept = flash::Kept { number: CellId::new(7).ok(), parameters: None };
+    let kept = flash::FlashContent { number: CellId::new(7).ok(), parameters: None };
     fs::write(place.path("flash/vcan0-2.flash"), flash::encode(serial, &kept)).unwrap();
     let cell = cells(&place, "--node 2", "--flash flash");
     cell.hears(&format!(

@@ -11,9 +11,9 @@ use std::time::Duration;
 use model::generate::{self, Format};
 use process::replay::{FRESH, Replayed, TOUCHED, by_hand, cell, changed, is_torque, without};
 use process::{Place, example, skin_of};
-use protocol::candump::{Line, parse};
+use protocol::candump::{CandumpLine, parse};
 use protocol::id::Node;
-use protocol::message::{From, Message, NetworkPage, Request, SensorPage, SkinSensors, State};
+use protocol::message::{AppliesFrom, Message, NetworkPage, Request, SensorPage, SkinSensors, State};
 use protocol::packet::{Packet, WORDS};
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
@@ -112,7 +112,7 @@ fn two_buses_of_classic_frames_come_back_too() {
 /// Returns the times of the first and the last such message, in s after the first frame of a log.
 fn seconds(log: &str, is: impl Fn(&Message) -> bool) -> [f64; 2] {
     let records =
-        || log.lines().map(|line| if let Ok(Line::Frame(it)) = parse(line) { it } else { panic!("{line}") });
+        || log.lines().map(|line| if let Ok(CandumpLine::Frame(it)) = parse(line) { it } else { panic!("{line}") });
     let first = records().next().unwrap().time.nanos;
     let they = records().filter(|it| {
         let packet = Packet::from_fd(&it.frame).ok();
@@ -172,7 +172,7 @@ fn cells_with_another_history_answer_as_they_did_then() {
             contact: [protocol::fixed::Q5_10::nearest(3.0); 3],
             ..SkinSensors::default()
         });
-        test_client.sends(&Message::Stimulus { to: Node::Everyone, from: From::Next, page });
+        test_client.sends(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page });
         test_client.sends(&Message::Joints {
             epoch: protocol::packet::Epoch(3),
             joints: protocol::message::Joints { in_use: 6, ..Default::default() },
@@ -274,7 +274,7 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
         it && counted.replace(counted.get() + 1) == 5
     });
     // The recording must not have counters that show that it is incomplete.
-    let silent = |message: &Message| matches!(message, Message::Network { page: NetworkPage::Heard(_), .. });
+    let silent = |message: &Message| matches!(message, Message::Network { page: NetworkPage::Received(_), .. });
     let beats = Counter::new(0);
     let heartbeat = |message: &Message| {
         let it = matches!(message, Message::Network { page: NetworkPage::Heartbeat(beat), .. } if !beat.state.has(State::CLAIMING));

@@ -12,9 +12,9 @@ use protocol::bus::{Bus, Inbox};
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q, Q5_10};
 use protocol::id::{CellId, Kind, Node};
-use protocol::message::{Answer, From, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::message::{Answer, AppliesFrom, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::Packet;
-use protocol::touch::contact;
+use protocol::touch::contact_force;
 use rustix::process::Signal;
 use serde_json::json;
 
@@ -82,7 +82,7 @@ fn a_running_bench_is_switched_from_a_shell_for_one_cell_and_for_all() {
     let tells = |cell: u8| {
         test_client.waits_for(&format!("a sensors frame of cell {cell}"), |message| {
             matches!(message, Message::Sensors { from, page: SensorPage::Skin(skin), .. }
-                if from.get() == cell && contact(skin) > 0)
+                if from.get() == cell && contact_force(skin) > 0)
         });
     };
     assert_eq!(switches(&place, "event --cell 3"), "cell 3 on vcan0 (embedded): event\n");
@@ -219,7 +219,7 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     });
     let contact = [Q5_10::nearest(1.0); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    test_client.sends(&Message::Stimulus { to: third, from: From::Next, page });
+    test_client.sends(&Message::Stimulus { to: third, from: AppliesFrom::Next, page });
 
     // A run without touches leaves the cell as it is, and reports that its contact is unknown.
     place.scenario(head);

@@ -10,7 +10,7 @@ use std::os::unix::net::UnixListener;
 use std::time::Duration;
 
 use process::{Place, Running, until};
-use protocol::bus::{Bus, Inbox, Options};
+use protocol::bus::{Bus, Inbox, BusOptions};
 use protocol::can::{ERROR, ERROR_STATE, EXTENDED, EXTENDED_MASK, Frame};
 use rustix::process::Signal;
 use serde_json::Value;
@@ -28,12 +28,12 @@ fn client(place: &Place) -> Bus {
 }
 
 fn client_with(place: &Place, error_mask: u32) -> Bus {
-    let options = Options {
+    let options = BusOptions {
         error_mask,
         directory: Some(place.buses()),
         receive_buffer: 64 << 20,
         send_timeout: Duration::from_secs(60),
-        ..Options::default()
+        ..BusOptions::default()
     };
     until("the bus", || Bus::open("vcan0", "embedded".parse().unwrap(), &options).ok())
 }

@@ -10,10 +10,10 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use protocol::bus::embedded::{Answer, Hello, address, encode_dropped, seqpacket};
-use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
+use protocol::bus::embedded::{HelloReply, ClientHello, address, encode_dropped, seqpacket};
+use protocol::bus::{Bus, BusError, BusKind, KindChoice, Filter, Inbox, BusOptions};
 use protocol::can::{EXTENDED, Frame};
-use protocol::candump::{self, Line};
+use protocol::candump::{self, CandumpLine};
 use rustix::net::sockopt::{self, Timeout};
 use rustix::net::{RecvFlags, SendFlags, SocketFlags};
 use rustix::process::{Pid, Signal, kill_process};
@@ -45,8 +45,8 @@ fn frames_pass_once_the_line_is_printed_and_a_signal_ends_it_well() {
         let parent = TempDir::new().unwrap();
         let directory = parent.path().join("skinbus");
         let child = serve(&directory, &[]);
-        let options = Options { directory: Some(directory), ..Options::default() };
-        let [a, b] = [(); 2].map(|()| Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap());
+        let options = BusOptions { directory: Some(directory), ..BusOptions::default() };
+        let [a, b] = [(); 2].map(|()| Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap());
         let frame = Frame::fd(0x123, 1, &[1; 16]).unwrap();
         a.send(&[frame]).unwrap();
         let mut inbox = Inbox::new();
@@ -107,15 +107,15 @@ fn while_the_server_is_stopped_a_sender_waits_and_then_says_how_many_went_out() 
     let directory = parent.path().join("skinbus");
     let child = serve(&directory, &[]);
     let send_timeout = Duration::from_millis(50);
-    let options = Options { directory: Some(directory), send_timeout, ..Options::default() };
-    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap());
+    let options = BusOptions { directory: Some(directory), send_timeout, ..BusOptions::default() };
+    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap());
     let frames: Vec<_> = (0..5000_u32).map(|n| Frame::classic(1, &n.to_le_bytes()).unwrap()).collect();
 
     signal(&child, Signal::STOP);
     let before = Instant::now();
     let error = a.send(&frames).unwrap_err();
     assert!(before.elapsed() >= send_timeout);
-    assert!(matches!(error.cause, BusError::Full { .. }) && error.cause.may_pass(), "{error}");
+    assert!(matches!(error.cause, BusError::Full { .. }) && error.cause.is_temporary(), "{error}");
     let sent = &frames[..error.sent];
     assert!(sent.len() >= 253, "{error}");
 
@@ -137,8 +137,8 @@ fn a_timeout_of_the_socket_is_set_when_it_is_too_long_or_ran_out() {
     let parent = TempDir::new().unwrap();
     let directory = parent.path().join("skinbus");
     let child = serve(&directory, &[]);
-    let options = Options { directory: Some(directory), ..Options::default() };
-    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap());
+    let options = BusOptions { directory: Some(directory), ..BusOptions::default() };
+    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap());
     let mut inbox = Inbox::new();
     let mut wait = |millis, comes: bool| {
         if comes {
@@ -252,8 +252,8 @@ fn the_documents_programs_send_receive_and_end_with_the_server() {
     for listing in listings(folder.path()) {
         for end in [Signal::TERM, Signal::KILL] {
             let mut server = serve(&directory, &[]);
-            let options = Options { directory: Some(directory.clone()), ..Options::default() };
-            let bus = Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap();
+            let options = BusOptions { directory: Some(directory.clone()), ..BusOptions::default() };
+            let bus = Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap();
             let mut program = attach(&listing, &directory);
             let (mut inbox, mut received) = (Inbox::new(), Vec::new());
             while received.len() < 2 {
@@ -269,7 +269,7 @@ fn the_documents_programs_send_receive_and_end_with_the_server() {
             for frame in frames {
                 let mut line = String::new();
                 output.read_line(&mut line).unwrap();
-                let Ok(Line::Frame(record)) = candump::parse(line.trim_end()) else { panic!("{line}") };
+                let Ok(CandumpLine::Frame(record)) = candump::parse(line.trim_end()) else { panic!("{line}") };
                 assert_eq!((record.interface, record.frame), ("vcan0", frame));
                 assert!((before..=nanos_now()).contains(&record.time.nanos), "{line}");
             }
@@ -284,13 +284,13 @@ fn the_documents_programs_send_receive_and_end_with_the_server() {
 }
 
 /// Plays the server for a program that attaches: answers its hello, and returns the connection.
-fn greeted(listener: &OwnedFd, answer: Answer) -> OwnedFd {
+fn greeted(listener: &OwnedFd, answer: HelloReply) -> OwnedFd {
     let socket = rustix::net::accept(listener).unwrap();
     let mut bytes = [0; 64];
     let (len, _) = rustix::net::recv(&socket, &mut bytes, RecvFlags::empty()).unwrap();
     let filters = vec![Filter::ALL];
-    let hello = Hello { filters, own_frames: false, fd: true, error_mask: 0, buffer: 1 << 20 };
-    assert_eq!(Hello::decode(&bytes[..len]), Some(hello));
+    let hello = ClientHello { filters, own_frames: false, fd: true, error_mask: 0, buffer: 1 << 20 };
+    assert_eq!(ClientHello::decode(&bytes[..len]), Some(hello));
     rustix::net::send(&socket, &answer.encode(), SendFlags::empty()).unwrap();
     socket
 }
@@ -303,7 +303,7 @@ fn the_documents_programs_read_to_the_end_and_say_when_they_are_refused() {
     rustix::net::listen(&listener, 1).unwrap();
     for listing in listings(folder.path()) {
         let program = attach(&listing, folder.path());
-        let socket = greeted(&listener, Answer::Welcome { granted: 1 << 21 });
+        let socket = greeted(&listener, HelloReply::Welcome { granted: 1 << 21 });
         for (frame, flags) in sent_by_listings().iter().zip([RecvFlags::empty(), RecvFlags::PEEK]) {
             let mut bytes = [0; 73];
             let (len, _) = rustix::net::recv(&socket, &mut bytes, flags).unwrap();
@@ -320,7 +320,7 @@ fn the_documents_programs_read_to_the_end_and_say_when_they_are_refused() {
         assert_eq!(frames, ["01234567#010203", "01234567##5010203000000000000000000"]);
 
         let program = attach(&listing, folder.path());
-        drop(greeted(&listener, Answer::Refused { version: 3 }));
+        drop(greeted(&listener, HelloReply::Refused { version: 3 }));
         let output = program.wait_with_output().unwrap();
         let said = String::from_utf8(output.stderr).unwrap();
         assert_eq!((output.status.code(), said.lines().count()), (Some(1), 1), "{said}");
@@ -335,8 +335,8 @@ fn what_was_ignored_is_said_at_the_end() {
     let mut command = Command::new(program("vcan-setup"));
     command.args(["serve", "vcan0"]).env("SKINBUS_DIR", &directory);
     let (mut server, _) = Served::start(command.stderr(Stdio::piped()));
-    let options = Options { directory: Some(directory), ..Options::default() };
-    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap());
+    let options = BusOptions { directory: Some(directory), ..BusOptions::default() };
+    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap());
     rustix::net::send(&a, &[0; 13], SendFlags::empty()).unwrap();
     a.send(&[Frame::classic(1, &[]).unwrap()]).unwrap();
     assert!(b.wait(Some(Duration::from_secs(60))).unwrap(), "what came before has been read");
@@ -373,16 +373,16 @@ fn clients_for_which_there_is_no_file_are_turned_away_and_the_others_go_on() {
     let parent = TempDir::new().unwrap();
     let directory = parent.path().join("skinbus");
     let mut server = serve_with_files(&directory, "-n 64");
-    let options = Options { directory: Some(directory), filters: vec![], ..Options::default() };
-    let open = |options: &Options| Bus::open("vcan0", Choice::Only(BusKind::Embedded), options);
-    let listening = Options { filters: vec![Filter::ALL], ..options.clone() };
+    let options = BusOptions { directory: Some(directory), filters: vec![], ..BusOptions::default() };
+    let open = |options: &BusOptions| Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), options);
+    let listening = BusOptions { filters: vec![Filter::ALL], ..options.clone() };
     let [a, b] = [(); 2].map(|()| open(&listening).unwrap());
     passes(&a, &b);
     let (others, refused): (Vec<_>, Vec<_>) = (0..100).map(|_| open(&options)).partition(Result::is_ok);
     assert!((40..60).contains(&others.len()), "{}", others.len());
     for error in refused {
         let error = error.unwrap_err();
-        assert!(matches!(error, BusError::TurnedAway(_)) && error.may_open_later(), "{error}");
+        assert!(matches!(error, BusError::NoRoom(_)) && error.may_open_later(), "{error}");
         assert!(error.to_string().contains("no room for another client"), "{error}");
     }
     passes(&a, &b);
@@ -410,8 +410,8 @@ fn a_server_that_has_no_files_left_rests_and_ends_by_a_signal() {
     let parent = TempDir::new().unwrap();
     let directory = parent.path().join("skinbus");
     let server = serve_with_files(&directory, "-n 64");
-    let options = Options { directory: Some(directory), filters: vec![], ..Options::default() };
-    let open = || Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options);
+    let options = BusOptions { directory: Some(directory), filters: vec![], ..BusOptions::default() };
+    let open = || Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options);
     let clients: Vec<_> = std::iter::repeat_with(open).map_while(Result::ok).collect();
     let before = processor_ticks(server.id());
     std::thread::sleep(Duration::from_millis(300));
@@ -427,8 +427,8 @@ fn a_server_lets_in_as_many_clients_as_the_system_allows() {
     let parent = TempDir::new().unwrap();
     let directory = parent.path().join("skinbus");
     let server = serve_with_files(&directory, "-Sn 64");
-    let options = Options { directory: Some(directory), ..Options::default() };
-    let open = || Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap();
+    let options = BusOptions { directory: Some(directory), ..BusOptions::default() };
+    let open = || Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap();
     let clients: Vec<_> = (0..100).map(|_| open()).collect();
     passes(&clients[0], &clients[99]);
     signal(&server, Signal::TERM);
@@ -444,8 +444,8 @@ fn descriptors_that_a_client_passes_along_are_closed() {
     let parent = TempDir::new().unwrap();
     let directory = parent.path().join("skinbus");
     let server = serve(&directory, &[]);
-    let options = Options { directory: Some(directory), ..Options::default() };
-    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap());
+    let options = BusOptions { directory: Some(directory), ..BusOptions::default() };
+    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap());
     let (mut read, write) = std::io::pipe().unwrap();
     let frame = Frame::classic(1, &[]).unwrap();
     for count in 1..=100 {

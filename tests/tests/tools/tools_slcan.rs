@@ -13,7 +13,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use process::{Place, TIMEOUT};
-use protocol::bus::{Bus, Inbox, Options};
+use protocol::bus::{Bus, Inbox, BusOptions};
 use protocol::can::{BIT_RATE_SWITCH, EXTENDED, Format, Frame};
 use rustix::process::Signal;
 use serde_json::Value;
@@ -89,7 +89,7 @@ fn check(format: Format, options: &str) {
     let bus = Bus::open(
         "vcan0",
         "embedded".parse().unwrap(),
-        &Options { directory: Some(place.buses()), receive_buffer: 64 << 20, ..Options::default() },
+        &BusOptions { directory: Some(place.buses()), receive_buffer: 64 << 20, ..BusOptions::default() },
     );
     let bus = bus.unwrap();
 

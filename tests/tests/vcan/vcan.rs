@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
+use protocol::bus::{Bus, BusError, BusKind, KindChoice, Filter, Inbox, BusOptions};
 use protocol::can::{FD_FORMAT, Frame};
 
 use skinbus_tests::can_raw as cases;
@@ -14,12 +14,12 @@ use skinbus_tests::process::vcan::own_network;
 
 const LAST: u32 = 0x7FF;
 
-fn open(options: &Options) -> Bus {
-    Bus::open("vcan0", Choice::Only(BusKind::SocketCan), options).unwrap()
+fn open(options: &BusOptions) -> Bus {
+    Bus::open("vcan0", KindChoice::Only(BusKind::SocketCan), options).unwrap()
 }
 
 fn sender() -> Bus {
-    open(&Options { filters: vec![], ..Options::default() })
+    open(&BusOptions { filters: vec![], ..BusOptions::default() })
 }
 
 /// Returns all frames before [`LAST`].
@@ -53,7 +53,7 @@ fn the_kernel_keeps_every_rule() {
         let exact = Filter { id: LAST, mask: Filter::EXACT_MASK };
         let filters = [&case.filters[..], &[exact]].concat();
         let (own_frames, fd, error_mask) = (case.own_frames, case.fd, case.error_mask);
-        let client = open(&Options { filters, own_frames, fd, error_mask, ..Options::default() });
+        let client = open(&BusOptions { filters, own_frames, fd, error_mask, ..BusOptions::default() });
         if case.from_self { &client } else { &other }.send(&[case.frame]).unwrap();
         other.send(&[Frame::classic(LAST, &[]).unwrap()]).unwrap();
         let got = read(&client, &mut Inbox::new());
@@ -69,7 +69,7 @@ fn the_kernel_changes_filters_of_an_open_socket() {
     let exact = |id| Filter { id, mask: Filter::EXACT_MASK };
     let frame = |id| Frame::classic(id, &[1]).unwrap();
     let other = sender();
-    let client = open(&Options { filters: vec![exact(1)], ..Options::default() });
+    let client = open(&BusOptions { filters: vec![exact(1)], ..BusOptions::default() });
     other.send(&[frame(1), frame(2)]).unwrap();
     client.set_filters(&[exact(2), exact(LAST)]).unwrap();
     other.send(&[frame(1), frame(2), frame(LAST)]).unwrap();
@@ -82,7 +82,7 @@ fn the_kernel_changes_filters_of_an_open_socket() {
 #[ignore = "needs vcan"]
 fn the_kernel_refuses_what_the_table_says() {
     own_network();
-    let [fd, classic] = [true, false].map(|fd| open(&Options { fd, ..Options::default() }));
+    let [fd, classic] = [true, false].map(|fd| open(&BusOptions { fd, ..BusOptions::default() }));
     for refused in cases::refused() {
         let socket = if refused.fd { &fd } else { &classic };
         let sent = rustix::net::send(socket, &refused.datagram, rustix::net::SendFlags::empty());
@@ -94,7 +94,7 @@ fn the_kernel_refuses_what_the_table_says() {
 #[ignore = "needs vcan"]
 fn the_kernel_marks_own_frames_and_counts_drops() {
     own_network();
-    let bus = open(&Options { own_frames: true, receive_buffer: 0, ..Options::default() });
+    let bus = open(&BusOptions { own_frames: true, receive_buffer: 0, ..BusOptions::default() });
     let small = bus.receive_buffer();
     for number in 0..100_u32 {
         bus.send(&[Frame::fd(1, 1, &number.to_le_bytes()).unwrap()]).unwrap();
@@ -115,14 +115,14 @@ fn the_kernel_marks_own_frames_and_counts_drops() {
 #[ignore = "needs vcan"]
 fn the_choice_is_socketcan_and_a_missing_interface_is_no_reason_for_another_bus() {
     own_network();
-    let bus = Bus::open("vcan0", Choice::Auto, &Options::default()).unwrap();
+    let bus = Bus::open("vcan0", KindChoice::Auto, &BusOptions::default()).unwrap();
     assert_eq!(bus.kind(), BusKind::SocketCan);
-    assert!(bus.receive_buffer() >= Options::default().receive_buffer, "{}", bus.receive_buffer());
-    let error = Bus::open("vcan77", Choice::Auto, &Options::default()).unwrap_err();
+    assert!(bus.receive_buffer() >= BusOptions::default().receive_buffer, "{}", bus.receive_buffer());
+    let error = Bus::open("vcan77", KindChoice::Auto, &BusOptions::default()).unwrap_err();
     let expected = "there is no interface vcan77: make it with `vcan-setup up vcan77`, or plug it in if \
                     it is hardware";
     assert_eq!(error.to_string(), expected);
-    let error = Bus::open("lo", Choice::Auto, &Options::default()).unwrap_err();
+    let error = Bus::open("lo", KindChoice::Auto, &BusOptions::default()).unwrap_err();
     assert!(matches!(error, BusError::NotCan { .. }), "{error}");
 }
 
@@ -136,14 +136,14 @@ fn an_interface_that_goes_down_and_up_and_away_is_told_apart() {
         assert!(status.success(), "ip {arguments}");
     };
     let frame = Frame::fd(1, 1, &[1; 16]).unwrap();
-    let open = || Bus::open("vcan9", Choice::Auto, &Options::default());
+    let open = || Bus::open("vcan9", KindChoice::Auto, &BusOptions::default());
     ip("link add vcan9 type vcan");
     assert!(matches!(open().unwrap_err(), BusError::Down { .. }), "made, and not up");
     ip("link set vcan9 mtu 16");
     ip("link set vcan9 up");
     let error = open().unwrap_err().to_string();
     assert!(error.starts_with("vcan9 has MTU 16 and CAN FD needs 72"), "{error}");
-    Bus::open("vcan9", Choice::Auto, &Options { fd: false, ..Options::default() }).unwrap();
+    Bus::open("vcan9", KindChoice::Auto, &BusOptions { fd: false, ..BusOptions::default() }).unwrap();
     ip("link set vcan9 down");
     ip("link set vcan9 mtu 72");
     ip("link set vcan9 up");
@@ -153,10 +153,10 @@ fn an_interface_that_goes_down_and_up_and_away_is_told_apart() {
     ip("link set vcan9 down");
     assert!(a.wait(Some(TIMEOUT)).unwrap(), "going down can be waited for");
     let error = a.receive(&mut inbox).unwrap_err();
-    assert!(matches!(error, BusError::Down { .. }) && error.may_pass(), "{error}");
+    assert!(matches!(error, BusError::Down { .. }) && error.is_temporary(), "{error}");
     assert_eq!(a.receive(&mut inbox).unwrap(), 0, "and is told once");
     // A loop that only offers frames consumes the error; a receiver on the same bus still gets it.
-    assert!(!c.offer(&[frame]) && c.wait(Some(Duration::ZERO)).unwrap());
+    assert!(!c.try_send_all(&[frame]) && c.wait(Some(Duration::ZERO)).unwrap());
     assert!(matches!(c.receive(&mut inbox).unwrap_err(), BusError::Down { .. }));
     assert!(!c.wait(Some(Duration::ZERO)).unwrap(), "once for each time that it was said");
     // A pending error of the socket is returned before the requested operation.

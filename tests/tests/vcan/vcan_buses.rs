@@ -11,7 +11,7 @@ use process::page::{Page, watched_skin};
 use process::test_client::TestClient;
 use process::vcan::{Vcan, tool};
 use process::{PRESSED, Place, Running, until};
-use protocol::bus::{BusKind, Choice};
+use protocol::bus::{BusKind, KindChoice};
 use protocol::can::Format;
 use rustix::process::Signal;
 use serde_json::Value;
@@ -45,7 +45,7 @@ fn run(place: &Place) -> Running {
 
 fn answers(place: &Place, bus: usize) {
     let (bus, format, kind) = BUSES[bus];
-    TestClient::on_kind(place, bus, format, Choice::Only(kind)).waits_for_torques(1..=2);
+    TestClient::on_kind(place, bus, format, KindChoice::Only(kind)).waits_for_torques(1..=2);
 }
 
 fn all_answer(place: &Place) {

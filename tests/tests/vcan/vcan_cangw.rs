@@ -187,7 +187,7 @@ fn cells_refuse_damaged_joints_count_them_and_are_not_blamed() {
     let log = Log::of(gateways, Format::Fd);
     for cell in 1..=CELLS {
         let refused = log.messages.iter().rev().find_map(|(message, _)| match message {
-            Message::Network { from: Node::Cell(from), page: NetworkPage::Refused(refused), .. } => {
+            Message::Network { from: Node::Cell(from), page: NetworkPage::Rejected(refused), .. } => {
                 (usize::from(from.get()) == cell).then_some(*refused)
             }
             _ => None,

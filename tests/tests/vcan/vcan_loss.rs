@@ -12,9 +12,9 @@ use std::time::Duration;
 
 use process::vcan::{Candump, backlog_drops, frames_of, own_network, small_skin, tool};
 use process::{PRESSED, Place, TIMEOUT, is_stopped, until};
-use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
+use protocol::bus::{Bus, BusKind, KindChoice, Filter, Inbox, BusOptions};
 use protocol::can::{EXTENDED, Frame};
-use protocol::candump::{Line, parse};
+use protocol::candump::{CandumpLine, parse};
 use recorded::Recorded;
 use rustix::process::Signal;
 
@@ -40,14 +40,14 @@ struct Pair {
 
 impl Pair {
     fn open(kind: BusKind, place: &Place, filters: &[Filter]) -> Self {
-        let options = |filters: &[Filter], receive_buffer| Options {
+        let options = |filters: &[Filter], receive_buffer| BusOptions {
             filters: filters.to_vec(),
             receive_buffer,
             directory: Some(place.buses()),
             send_timeout: TIMEOUT,
-            ..Options::default()
+            ..BusOptions::default()
         };
-        let open = |options: &Options| Bus::open("vcan0", Choice::Only(kind), options).unwrap();
+        let open = |options: &BusOptions| Bus::open("vcan0", KindChoice::Only(kind), options).unwrap();
         let (sender, sleeper) = (open(&options(&[], 0)), open(&options(filters, SMALL)));
         assert!((SMALL..=2 * SMALL).contains(&sleeper.receive_buffer()), "{}", sleeper.receive_buffer());
         Self { kind, sender, sleeper, inbox: Inbox::new(), sent: 0, heard: 0 }
@@ -214,7 +214,7 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     let dropped = summary.of_bus("/dropped_by_bus");
     assert_eq!((theirs.len() - ours.len()) as u64, dropped, "{}", ended.stderr);
     let said = |line: &str| match parse(line) {
-        Ok(Line::Dropped { frames }) => frames,
+        Ok(CandumpLine::Dropped { frames }) => frames,
         other => panic!("{line}: {other:?}"),
     };
     assert_eq!(missing.iter().map(|line| said(line)).sum::<u64>(), dropped, "{missing:?}");

@@ -11,7 +11,7 @@ use model::generate::{Target, generate};
 use process::replay::{Replayed, says_everything};
 use process::vcan::{Candump, Vcan0, refused, tool};
 use process::{Place, until};
-use protocol::candump::{Line, parse};
+use protocol::candump::{CandumpLine, parse};
 
 /// The options for new cells with the recording's skin.
 const FRESH: &str = "--expect --spawn --skin skin.toml";
@@ -116,7 +116,7 @@ fn a_transmit_queue_without_room_refuses_and_is_waited_for() {
 fn lateness(log: &str, period_us: i64) -> [i64; 3] {
     let mut late = Vec::new();
     for line in fs::read_to_string(log).unwrap().lines() {
-        let Ok(Line::Frame(record)) = parse(line) else { continue };
+        let Ok(CandumpLine::Frame(record)) = parse(line) else { continue };
         if record.frame.id() != 0x123 {
             continue;
         }

@@ -12,7 +12,7 @@ use std::os::unix::process::CommandExt;
 use std::process::Command;
 use std::time::Duration;
 
-use protocol::bus::{Bus, BusKind, Choice, Inbox, Options};
+use protocol::bus::{Bus, BusKind, KindChoice, Inbox, BusOptions};
 use protocol::can::Frame;
 use protocol::id::{CellId, Id, Kind, Node};
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
@@ -82,7 +82,7 @@ fn assert_ours(link: &Value, kind: &str) {
 }
 
 fn open(name: &str) -> Bus {
-    Bus::open(name, Choice::Only(BusKind::SocketCan), &Options::default()).unwrap()
+    Bus::open(name, KindChoice::Only(BusKind::SocketCan), &BusOptions::default()).unwrap()
 }
 
 /// Checks that a frame sent on one bus arrives on the other.

@@ -7,7 +7,7 @@ use skinbus_tests::process::slcan;
 
 use process::vcan::tool;
 use process::{Place, until};
-use protocol::bus::{Bus, Inbox, Options};
+use protocol::bus::{Bus, Inbox, BusOptions};
 use protocol::can::{EXTENDED, Frame};
 use rustix::process::Signal;
 use serde_json::Value;
@@ -21,7 +21,7 @@ fn a_line_is_a_participant_of_a_vcan() {
     let words = format!("slcan vcan0 --json {} {},cell=12", all.path.display(), one.path.display());
     let bridge = place.start("vcan-setup", &words);
     bridge.hears("2 lines on vcan0 (socketcan)");
-    let open = || Bus::open("vcan0", "socketcan".parse().unwrap(), &Options::default()).unwrap();
+    let open = || Bus::open("vcan0", "socketcan".parse().unwrap(), &BusOptions::default()).unwrap();
     let bus = open();
     let frames = [
         Frame::fd(0x001, 1, &[1; 16]).unwrap(),

@@ -13,9 +13,9 @@ use process::log::{Cause, Log, same_torques};
 use process::vcan::{Candump, backlog_drops, cansend, frames_of, small_skin, tool};
 use process::{PRESSED, Place, Summary};
 use protocol::can::{Format, Frame};
-use protocol::candump::{Line, parse};
+use protocol::candump::{CandumpLine, parse};
 use protocol::id::{Id, Kind, Node};
-use protocol::message::{Message, NetworkPage, Refused};
+use protocol::message::{Message, NetworkPage, RejectedCounts};
 use protocol::packet::{Packet, PacketError, WORDS, data_id};
 use protocol::skin::Skin;
 use rustix::process::Signal;
@@ -190,7 +190,7 @@ fn replies(log: &Log) -> BTreeSet<Reply> {
 /// Returns the times and frames of a log that cells receive: joints and stimuli.
 fn joints_and_stimuli(log: &Path) -> String {
     let heard = |line: &&str| {
-        let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}") };
+        let Ok(CandumpLine::Frame(record)) = parse(line) else { panic!("{line}") };
         let id = data_id(&record.frame);
         id.is_ok_and(|id| id.kind == Kind::Stimulus || id.to_bits() == 1)
     };
@@ -226,7 +226,7 @@ fn canplayer_brings_back_every_torque_of_a_recording_bit_for_bit() {
     cansend(&place, "report");
     let skipped = RefCell::new(BTreeMap::new());
     test_client.waits_for("what the cells have received", |message| {
-        if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Heard(heard), .. } = message {
+        if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Received(heard), .. } = message {
             skipped.borrow_mut().insert(cell.get(), heard.joints_late);
         }
         skipped.borrow().len() == CELLS
@@ -308,10 +308,10 @@ fn reason(frame: &Frame) -> Option<&'static str> {
 }
 
 /// Returns the counts of these frames that a cell has to refuse.
-fn refused_by(cell: u8, frames: &[Frame]) -> Refused {
+fn refused_by(cell: u8, frames: &[Frame]) -> RejectedCounts {
     let cell = u16::from(cell);
     let heard = [0x000, 0x001, 0x002, 0x003, 0x004, 0x400 + cell, 0x500 + cell, 0x5FF, 0x700 + cell, 0x7FF];
-    let mut refused = Refused::default();
+    let mut refused = RejectedCounts::default();
     let hears = |frame: &&Frame| data_id(frame).is_ok_and(|id| heard.contains(&id.to_bits()));
     for frame in frames.iter().filter(hears) {
         match reason(frame) {
@@ -383,7 +383,7 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     cansend(&place, "report");
     let reported = RefCell::new(BTreeMap::new());
     test_client.waits_for("what the cells have refused", |message| {
-        if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Refused(refused), .. } = message
+        if let Message::Network { from: Node::Cell(cell), page: NetworkPage::Rejected(refused), .. } = message
         {
             reported.borrow_mut().insert(cell.get(), *refused);
         }

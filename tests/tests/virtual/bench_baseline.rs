@@ -13,8 +13,8 @@ use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
 use protocol::message::{Answer, BaselinePage, Message, Request, SensorPage};
-use protocol::packet::{Packet, words};
-use protocol::parameters::{Baseline, Parameter, Zeroing};
+use protocol::packet::{Packet, padded_words};
+use protocol::parameters::{Baseline, Parameter, BaselineSettings};
 use protocol::skin::{Skin, Timing};
 use protocol::time::{Micros, Span};
 use skinbus_tests::accounts;
@@ -36,8 +36,8 @@ fn skin() -> Skin {
     skin
 }
 
-fn rule() -> Zeroing {
-    Zeroing {
+fn rule() -> BaselineSettings {
+    BaselineSettings {
         threshold: Q5_10::nearest(0.1),
         hysteresis: Q1_14::nearest(0.5),
         rate_un_per_s: 2_000,
@@ -150,7 +150,7 @@ fn a_tare_while_touched_is_refused_and_reported() {
     let mut bench = bench(text, Baseline::On(rule()));
     bench.run(Span::from_millis(4_000));
     let third = Node::Cell(bench.skin.cells[2].node);
-    bench.act(write(third, Parameter::Tare, words([1])));
+    bench.act(write(third, Parameter::Tare, padded_words([1])));
     bench.run(Span::from_millis(100));
     let refused = |message| {
         matches!(
@@ -162,7 +162,7 @@ fn a_tare_while_touched_is_refused_and_reported() {
     let page = *zeros(&bench, 2).last().unwrap();
     assert_eq!((page.refused, page.touched, page.tared), (1, true, true));
     bench.run(Span::from_millis(4_000));
-    bench.act(write(third, Parameter::Tare, words([1])));
+    bench.act(write(third, Parameter::Tare, padded_words([1])));
     bench.run(Span::from_millis(100));
     let written = |message| {
         matches!(message, Message::Configured { answer: Answer::Value { number: 12, written: true, .. }, .. })

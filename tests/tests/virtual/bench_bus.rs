@@ -3,11 +3,11 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
 
-use analysis::shadow::{BusShadow, Options, Shaded, Shadow};
+use analysis::shadow::{BusShadow, Options, FrameTiming, Shadow};
 use model::table::Replies;
 use protocol::can::Format;
 use protocol::id::{Command, Id};
-use protocol::message::From;
+use protocol::message::AppliesFrom;
 use protocol::wire_time::BitRates;
 use skinbus_tests::bench::Bench;
 use skinbus_tests::gateway::epoch_of;
@@ -25,7 +25,7 @@ fn pressed(cells: u8, format: Format, rates: BitRates, seed: u64) -> Bench {
     let mut bench = Bench::new(&skins::arm(cells, format), seed).on_a_bus(rates).started();
     // From the same joints on: stimuli have the lowest priority on a bus, and on a full one the last of them never
     // pass.
-    let from = From::Epoch(epoch_of(bench.gateway.broadcasts() + 4));
+    let from = AppliesFrom::Epoch(epoch_of(bench.gateway.broadcasts() + 4));
     for place in 0..usize::from(cells) {
         bench.press_from(place, 1.0 + 0.005 * place as f64, from);
     }
@@ -46,7 +46,7 @@ fn over_epochs(bench: &mut Bench, epochs: u64) -> (u64, u64, u64) {
 }
 
 /// Runs the traffic of a bench, as a capture, through the bus model.
-fn shadow(bench: &Bench, rates: BitRates) -> (Vec<Shaded>, BusShadow) {
+fn shadow(bench: &Bench, rates: BitRates) -> (Vec<FrameTiming>, BusShadow) {
     // This bus carried stimuli too.
     let options = Options { each_frame: true, bench_traffic: true, ..Options::new(rates) };
     let mut shadow = Shadow::new(options).unwrap();
@@ -64,7 +64,7 @@ fn taken_since(bench: &Bench, nanos: u64) -> f64 {
 }
 
 /// Checks that every frame was sent at the time that the bus model computes.
-fn assert_shaded_alike(bench: &Bench, frames: &[Shaded]) {
+fn assert_shaded_alike(bench: &Bench, frames: &[FrameTiming]) {
     assert!(bench.attempts().len() > 1_000);
     for attempt in bench.attempts() {
         let frame = &frames[usize::try_from(attempt.tag).unwrap()];

@@ -2,15 +2,15 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
-use cell_node::node::{CLAIM, HEARTBEAT, PENDING};
+use cell_node::node::{CLAIM_TIME, HEARTBEAT_INTERVAL, MAX_PENDING};
 use model::table::{Event, Notice, Replies, Status};
 use model::tracker::DEAD_AFTER;
 use protocol::can::Format;
 use protocol::id::{Kind, Node};
 use protocol::message::{Message, Request, State};
-use protocol::packet::words;
+use protocol::packet::padded_words;
 use protocol::parameters::{MAX_JOINTS, Parameter};
 use protocol::time::{Micros, Span};
 use skinbus_tests::accounts;
@@ -25,7 +25,7 @@ fn bench(seed: u64) -> Bench {
 }
 
 /// A time longer than a cell needs from its start to its first torque.
-const START: Span = Span(2 * CLAIM.0 + 2 * HEARTBEAT.0);
+const START: Span = Span(2 * CLAIM_TIME.0 + 2 * HEARTBEAT_INTERVAL.0);
 
 fn status(bench: &Bench, place: usize) -> Status {
     bench.gateway.table.statuses(bench.now()).nth(place).unwrap().1
@@ -94,7 +94,7 @@ fn a_heartbeat_of_a_quiet_cell_clears_a_held_torque() {
     let released = bench.now();
     while bench.gateway.table.snapshot().sums.contributing > 0 {
         bench.run(Span::from_millis(1));
-        assert!(bench.now().since(released) <= Span(HEARTBEAT.0 + bench.epoch().0), "held for ever");
+        assert!(bench.now().elapsed_since(released) <= Span(HEARTBEAT_INTERVAL.0 + bench.epoch().0), "held for ever");
     }
     assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; MAX_JOINTS]);
     assert_eq!(status(&bench, CELL), Status::Quiet);
@@ -109,14 +109,14 @@ fn a_killed_cell_is_dead_after_the_documented_time_and_back_when_it_returns() {
         bench.run(Span(100_000 + seed * 7_919));
         bench.act(Act::Kill(CELL));
         let killed = bench.now();
-        bench.run(Span(DEAD_AFTER.0 + HEARTBEAT.0));
+        bench.run(Span(DEAD_AFTER.0 + HEARTBEAT_INTERVAL.0));
         let node = bench.cell_slots[CELL].identity.cell.unwrap();
         let [(dead, Notice::Dead(who))] = bench.gateway.notices[..] else {
             panic!("{:?}", bench.gateway.notices)
         };
         assert_eq!(who, node);
         // It answered every epoch, so its last packet is at most an epoch old.
-        let after = dead.since(killed);
+        let after = dead.elapsed_since(killed);
         assert!((DEAD_AFTER.0 - bench.epoch().0..DEAD_AFTER.0 + 5_000).contains(&after.0), "{after:?}");
         assert_eq!((status(&bench, CELL), bench.gateway.table.snapshot().sums.dead), (Status::Dead, 1));
         assert_eq!(bench.gateway.table.snapshot().sums.contributing, 0);
@@ -177,7 +177,7 @@ fn a_restart_without_its_claim_is_detected_by_the_counter() {
         bench.act(Act::Kill(CELL));
         bench.act(Act::Start(CELL));
         // Its claim is lost; the first received packet comes when the node id is its own.
-        let claim = bench.now()..bench.now() + CLAIM;
+        let claim = bench.now()..bench.now() + CLAIM_TIME;
         bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).from(Party::CellSlot(CELL)).during(claim));
         bench.run(START);
         let node = bench.cell_slots[CELL].identity.cell.unwrap();
@@ -267,7 +267,7 @@ fn a_cell_that_hung_takes_the_stimuli_of_meanwhile_and_refuses_none() {
     let mut bench = bench(6);
     bench.run_epochs(5);
     bench.act(Act::Hang(CELL));
-    for step in 0..2 * PENDING {
+    for step in 0..2 * MAX_PENDING {
         bench.press(CELL, 1.0 + 0.1 * step as f64);
         bench.run_epochs(1);
     }
@@ -288,13 +288,13 @@ fn of_two_cells_with_one_node_id_exactly_one_stays_whenever_they_start() {
             let mut bench = Bench::new(&skin, seed);
             bench.oracle.compares = false;
             let first = bench.cell_slots[0].identity;
-            let flash = Flash::Sound(skin.parameters(&skin.cells[0]));
+            let flash = FlashState::Valid(skin.parameters(&skin.cells[0]));
             let second = bench.add(Identity { serial, ..first }, flash);
             bench.at(Micros(apart), Act::Start(second));
             bench.run(Span::from_millis(2_000));
             let gave_up = [0, second].map(|cell_slot| bench.cell_slots[cell_slot].gave_up().is_some());
             assert_ne!(gave_up[0], gave_up[1], "{apart} us apart, serial {serial}");
-            if apart + 64_000 < CLAIM.0 {
+            if apart + 64_000 < CLAIM_TIME.0 {
                 let greater = usize::from(serial > first.serial);
                 assert!(gave_up[greater], "{apart} us apart both claim, so the lesser serial number stays");
             }
@@ -314,7 +314,7 @@ fn an_address_claim_for_a_settled_cells_node_id_changes_nothing_and_is_noticed()
         bench.run_epochs(60);
         bench.run(Span(21_000 * start as u64));
         let before = replies(&bench, 0);
-        let flash = Flash::Sound(skin.parameters(&skin.cells[0]));
+        let flash = FlashState::Valid(skin.parameters(&skin.cells[0]));
         let newcomer = bench.add(Identity { serial, ..bench.cell_slots[0].identity }, flash);
         bench.act(Act::Start(newcomer));
         for _ in 0..60 {
@@ -332,7 +332,7 @@ fn an_address_claim_for_a_settled_cells_node_id_changes_nothing_and_is_noticed()
         let notices: Vec<_> = bench.gateway.notices.iter().map(|(_, notice)| *notice).collect();
         assert_eq!(notices, if claimed { vec![Notice::Duplicate(node)] } else { vec![] });
         if let (Some(claim), Some((at, _))) = (claim, bench.gateway.notices.first()) {
-            assert!(at.since(claim) < Span::from_millis(6), "a claim is answered at once");
+            assert!(at.elapsed_since(claim) < Span::from_millis(6), "a claim is answered at once");
         }
         assert_eq!(bench.gateway.table.counters().events(Event::Duplicate), u64::from(claimed));
         finish(&mut bench);
@@ -350,7 +350,7 @@ fn a_cell_that_is_replaced_by_another_one_is_taken_for_what_it_is() {
     bench.press(0, 2.0);
     bench.run_epochs(60);
     bench.act(Act::Kill(0));
-    let flash = Flash::Sound(skin.parameters(&skin.cells[0]));
+    let flash = FlashState::Valid(skin.parameters(&skin.cells[0]));
     let other = bench.add(Identity { serial: 77, ..bench.cell_slots[0].identity }, flash);
     bench.act(Act::Start(other));
     bench.run(START);
@@ -365,7 +365,7 @@ fn a_cell_that_is_replaced_by_another_one_is_taken_for_what_it_is() {
 fn a_damaged_flash_is_reported_and_nothing_is_due() {
     let skin = skins::arm(2, Format::Fd);
     let mut bench = Bench::with(&skin, &model::scenario::Scenario::idle(Span(0)), 9, |_| Micros(0));
-    bench.cell_slots[0].flash = Flash::Damaged;
+    bench.cell_slots[0].flash = FlashState::Damaged;
     bench.run(Span::from_millis(1_000));
     bench.begin();
     bench.press(0, 2.0);
@@ -418,7 +418,7 @@ fn a_right_cell_is_not_stuck_whether_pressed_or_not_measuring_or_halted() {
     bench.act(Act::Say(Message::Halt));
     bench.run_epochs(100);
     let (node, number) = (Node::Everyone, Parameter::Mode.number());
-    let request = Request::Write { number, words: words([0]) };
+    let request = Request::Write { number, words: padded_words([0]) };
     bench.act(Act::Say(Message::Configure { to: node, tag: 0, request }));
     bench.run_epochs(100);
     assert_eq!(stuck(&bench), []);

@@ -2,9 +2,9 @@
 //! cells that differ from the skin, and every cell has either its old parameters or its new ones.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
-use model::commission::{Outcome, Reason, Report, Trouble, Wish};
+use model::commission::{Outcome, Reason, Report, AbortReason, CommissionOptions};
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::id::{Kind, Node};
@@ -17,8 +17,8 @@ use skinbus_tests::skins::arm;
 use skinbus_tests::workshop::{Workshop, cell};
 
 const CELLS: u8 = 12;
-const WISH: Wish = Wish { dry_run: false, verify: false };
-const VERIFY: Wish = Wish { dry_run: false, verify: true };
+const WISH: CommissionOptions = CommissionOptions { dry_run: false, verify: false };
+const VERIFY: CommissionOptions = CommissionOptions { dry_run: false, verify: true };
 
 /// Returns the skin, and the old and the new parameters of its cells.
 fn skin() -> (Skin, impl Fn(usize) -> Parameters, impl Fn(usize) -> Parameters) {
@@ -49,10 +49,10 @@ fn all(report: &Report, expected: Outcome) {
 }
 
 /// Checks that the flash of a cell only ever had its old configuration or its new one.
-fn nothing_is_mixed(workshop: &Workshop, old: impl Fn(usize) -> Flash, new: impl Fn(usize) -> Parameters) {
+fn nothing_is_mixed(workshop: &Workshop, old: impl Fn(usize) -> FlashState, new: impl Fn(usize) -> Parameters) {
     for (place, piece) in workshop.pieces.iter().enumerate() {
         for flash in &piece.history {
-            assert!(*flash == old(place) || *flash == Flash::Sound(new(place)), "cell {place}: {flash:?}");
+            assert!(*flash == old(place) || *flash == FlashState::Valid(new(place)), "cell {place}: {flash:?}");
         }
     }
 }
@@ -62,9 +62,9 @@ fn cells_with_other_parameters_without_any_and_with_damaged_flash_all_get_the_sk
     for format in [Format::Fd, Format::Classic] {
         let (skin, old, new) = skin_of(CELLS, format);
         let flash = |place| match place % 3 {
-            0 => Flash::Sound(old(place)),
-            1 => Flash::Empty,
-            _ => Flash::Damaged,
+            0 => FlashState::Valid(old(place)),
+            1 => FlashState::Empty,
+            _ => FlashState::Damaged,
         };
         let mut workshop = Workshop::of(&skin, 1, flash);
         let report = workshop.commission(&skin, WISH, None);
@@ -81,7 +81,7 @@ fn cells_with_other_parameters_without_any_and_with_damaged_flash_all_get_the_sk
 fn a_configured_cell_is_left_alone_and_read_back_only_if_requested() {
     let (skin, old, new) = skin();
     let mut workshop =
-        Workshop::of(&skin, 2, |place| Flash::Sound(if place == 3 { old(place) } else { new(place) }));
+        Workshop::of(&skin, 2, |place| FlashState::Valid(if place == 3 { old(place) } else { new(place) }));
     let report = workshop.commission(&skin, WISH, None);
     let mut expected = vec![Outcome::AlreadySo; CELLS.into()];
     expected[3] = Outcome::Written;
@@ -106,11 +106,11 @@ fn a_configured_cell_is_left_alone_and_read_back_only_if_requested() {
 #[test]
 fn a_dry_run_writes_nothing_and_reports_what_would_be_written() {
     let (skin, old, new) = skin();
-    let flash = |place| Flash::Sound(if place < 5 { new(place) } else { old(place) });
+    let flash = |place| FlashState::Valid(if place < 5 { new(place) } else { old(place) });
     let mut workshop = Workshop::of(&skin, 3, flash);
     workshop.rest(Span::from_millis(1_000));
     let said = workshop.said;
-    let report = workshop.commission(&skin, Wish { dry_run: true, verify: false }, None);
+    let report = workshop.commission(&skin, CommissionOptions { dry_run: true, verify: false }, None);
     let expected = |place| if place < 5 { Outcome::AlreadySo } else { Outcome::WouldWrite };
     assert_eq!(outcomes(&report), (0..CELLS.into()).map(expected).collect::<Vec<_>>());
     assert_eq!(report.requests, 0);
@@ -126,7 +126,7 @@ const SEEDS: u64 = 100;
 fn loss_and_repetition_and_damage_cost_time_and_nothing_else() {
     for seed in 0..SEEDS {
         let (skin, old, new) = skin_of(CELLS, if seed % 2 == 0 { Format::Fd } else { Format::Classic });
-        let flash = |place| if place % 2 == 0 { Flash::Sound(old(place)) } else { Flash::Empty };
+        let flash = |place| if place % 2 == 0 { FlashState::Valid(old(place)) } else { FlashState::Empty };
         let mut workshop = Workshop::of(&skin, seed, flash);
         (workshop.loss, workshop.twice, workshop.damage) = (0.05, 0.05, 0.05);
         let mut report = workshop.commission(&skin, WISH, None);
@@ -152,7 +152,7 @@ fn killed_at_any_moment_and_run_again_it_is_complete_and_nothing_is_mixed() {
     let mut halfway = 0;
     for seed in 0..SEEDS / 4 {
         let (skin, old, new) = skin_of(MANY, if seed % 2 == 0 { Format::Fd } else { Format::Classic });
-        let flash = |place| if place % 4 == 3 { Flash::Empty } else { Flash::Sound(old(place)) };
+        let flash = |place| if place % 4 == 3 { FlashState::Empty } else { FlashState::Valid(old(place)) };
         let mut workshop = Workshop::of(&skin, seed, flash);
         // With lost frames, most of the time is spent waiting for them.
         workshop.loss = if seed % 4 == 0 { 0.02 } else { 0.0 };
@@ -178,7 +178,7 @@ fn cells_that_are_switched_off_and_on_in_the_middle_are_rewritten_or_named() {
     let mut restarted = 0;
     for seed in 0..SEEDS {
         let (skin, old, new) = skin();
-        let flash = |place| Flash::Sound(old(place));
+        let flash = |place| FlashState::Valid(old(place));
         let mut workshop = Workshop::of(&skin, seed, flash);
         workshop.rest(Span::from_millis(700));
         let mut lost = Vec::new();
@@ -198,7 +198,7 @@ fn cells_that_are_switched_off_and_on_in_the_middle_are_rewritten_or_named() {
         for (place, cell) in report.cells.iter().enumerate() {
             match cell.outcome {
                 Outcome::Written => {
-                    assert_eq!(workshop.pieces[place].flash, Flash::Sound(new(place)), "seed {seed}");
+                    assert_eq!(workshop.pieces[place].flash, FlashState::Valid(new(place)), "seed {seed}");
                     restarted += usize::from(!lost.contains(&place));
                 }
                 Outcome::Failed(Reason::Silent { .. } | Reason::Gone | Reason::Hash { .. }) => {
@@ -235,7 +235,7 @@ fn nobody_claims(packet: Packet) -> Packet {
 fn an_undetected_restart_is_found_at_the_commit() {
     for seed in 0..SEEDS / 2 {
         let (skin, old, new) = skin();
-        let flash = |place| Flash::Sound(old(place));
+        let flash = |place| FlashState::Valid(old(place));
         let mut workshop = Workshop::of(&skin, seed, flash);
         workshop.rest(Span::from_millis(700));
         workshop.forgers = Some((|packet| packet, nobody_claims));
@@ -257,7 +257,7 @@ fn cells_are_identified_by_serial_number_with_any_node_id() {
     for (place, described) in skin.cells.iter().enumerate() {
         // Numbers in the reverse order.
         let number = cell(CELLS + 1 - described.node.get());
-        workshop.add(Identity { cell: Some(number), serial: described.serial }, Flash::Sound(old(place)));
+        workshop.add(Identity { cell: Some(number), serial: described.serial }, FlashState::Valid(old(place)));
     }
     let report = workshop.commission(&skin, WISH, None);
     all(&report, Outcome::Written);
@@ -270,9 +270,9 @@ fn cells_are_identified_by_serial_number_with_any_node_id() {
 #[test]
 fn missing_cells_are_named_and_unknown_ones_left_alone() {
     let (skin, old, _) = skin();
-    let mut workshop = Workshop::of(&skin, 5, |place| Flash::Sound(old(place)));
+    let mut workshop = Workshop::of(&skin, 5, |place| FlashState::Valid(old(place)));
     workshop.switch_off_in(Span(0), 4);
-    let unknown_node = workshop.add(Identity { cell: Some(cell(77)), serial: 9 }, Flash::Sound(old(0)));
+    let unknown_node = workshop.add(Identity { cell: Some(cell(77)), serial: 9 }, FlashState::Valid(old(0)));
     let report = workshop.commission(&skin, WISH, None);
     let mut expected = vec![Outcome::Written; CELLS.into()];
     expected[4] = Outcome::Failed(Reason::Missing);
@@ -287,13 +287,13 @@ fn missing_cells_are_named_and_unknown_ones_left_alone() {
     let request = Request::Write { number: Parameter::Commit.number(), words };
     workshop.say(&Message::Configure { to: Node::Cell(cell(77)), tag: 1, request });
     workshop.rest(Span::from_millis(10));
-    assert_eq!(workshop.pieces[unknown_node].history, [Flash::Sound(old(0)); 2]);
+    assert_eq!(workshop.pieces[unknown_node].history, [FlashState::Valid(old(0)); 2]);
 }
 
 #[test]
 fn a_late_cell_is_commissioned_too() {
     let (skin, old, new) = skin();
-    let mut workshop = Workshop::of(&skin, 6, |place| Flash::Sound(old(place)));
+    let mut workshop = Workshop::of(&skin, 6, |place| FlashState::Valid(old(place)));
     for place in 0..3 {
         workshop.switch_off_in(Span(0), place);
         workshop.switch_on_in(Span::from_millis(1_500), place);
@@ -306,9 +306,9 @@ fn a_late_cell_is_commissioned_too() {
 #[test]
 fn two_cells_with_one_serial_number_are_named_and_neither_is_written() {
     let (skin, old, _) = skin();
-    let mut workshop = Workshop::of(&skin, 7, |place| Flash::Sound(old(place)));
+    let mut workshop = Workshop::of(&skin, 7, |place| FlashState::Valid(old(place)));
     let serial = skin.cells[2].serial;
-    let twin = workshop.add(Identity { cell: Some(cell(90)), serial }, Flash::Sound(old(2)));
+    let twin = workshop.add(Identity { cell: Some(cell(90)), serial }, FlashState::Valid(old(2)));
     workshop.rest(Span::from_millis(700));
     let report = workshop.commission(&skin, WISH, None);
     let mut expected = vec![Outcome::Written; CELLS.into()];
@@ -325,10 +325,10 @@ fn joints_or_another_configuration_on_the_bus_end_it_before_it_sends() {
     let joints = Joints { in_use: 6, ..Joints::default() };
     let write = Request::Write { number: Parameter::Pose.number(), words: [1; WORDS] };
     for (message, trouble) in [
-        (Message::Joints { epoch: Epoch(3), joints }, Trouble::OtherGateway),
-        (Message::Configure { to: Node::Cell(cell(3)), tag: 0, request: write }, Trouble::Meddler),
+        (Message::Joints { epoch: Epoch(3), joints }, AbortReason::OtherGateway),
+        (Message::Configure { to: Node::Cell(cell(3)), tag: 0, request: write }, AbortReason::Meddler),
     ] {
-        let mut workshop = Workshop::of(&skin, 8, |place| Flash::Sound(old(place)));
+        let mut workshop = Workshop::of(&skin, 8, |place| FlashState::Valid(old(place)));
         workshop.rest(Span::from_millis(700));
         workshop.overhear(&message);
         let report = workshop.commission(&skin, WISH, None);
@@ -340,14 +340,14 @@ fn joints_or_another_configuration_on_the_bus_end_it_before_it_sends() {
 #[test]
 fn flash_that_cannot_be_written_is_named_and_the_old_remains() {
     let (skin, old, new) = skin();
-    let mut workshop = Workshop::of(&skin, 9, |place| Flash::Sound(old(place)));
+    let mut workshop = Workshop::of(&skin, 9, |place| FlashState::Valid(old(place)));
     workshop.pieces[6].worn = true;
     let report = workshop.commission(&skin, WISH, None);
     let Outcome::Failed(reason) = report.cells[6].outcome else { panic!("{report:#?}") };
     assert_eq!(reason.to_string(), "refuses a commit: flash could not be written");
     assert_eq!(
         (workshop.pieces[6].flash, workshop.holding(new)),
-        (Flash::Sound(old(6)), usize::from(CELLS) - 1)
+        (FlashState::Valid(old(6)), usize::from(CELLS) - 1)
     );
 }
 
@@ -370,7 +370,7 @@ fn pose_back(packet: Packet) -> Packet {
 #[test]
 fn a_pose_that_came_wrong_is_refused_at_the_commit_and_the_old_one_stays() {
     let (skin, old, new) = skin();
-    let mut workshop = Workshop::of(&skin, 10, |place| Flash::Sound(old(place)));
+    let mut workshop = Workshop::of(&skin, 10, |place| FlashState::Valid(old(place)));
     workshop.forgers = Some((other_pose, pose_back));
     let report = workshop.commission(&skin, WISH, None);
     for cell in &report.cells {
@@ -378,7 +378,7 @@ fn a_pose_that_came_wrong_is_refused_at_the_commit_and_the_old_one_stays() {
         assert_eq!(reason.to_string(), "refuses a commit: the hash is not that of the staged copy");
     }
     assert!(
-        workshop.pieces.iter().enumerate().all(|(place, piece)| piece.history == [Flash::Sound(old(place))])
+        workshop.pieces.iter().enumerate().all(|(place, piece)| piece.history == [FlashState::Valid(old(place))])
     );
     workshop.forgers = None;
     all(&workshop.commission(&skin, WISH, None), Outcome::Written);
@@ -388,7 +388,7 @@ fn a_pose_that_came_wrong_is_refused_at_the_commit_and_the_old_one_stays() {
 #[test]
 fn a_pose_whose_crc_is_wrong_is_not_taken_and_the_old_one_stays() {
     let (skin, old, _) = skin();
-    let mut workshop = Workshop::of(&skin, 11, |place| Flash::Sound(old(place)));
+    let mut workshop = Workshop::of(&skin, 11, |place| FlashState::Valid(old(place)));
     workshop.rest(Span::from_millis(700));
     let refused = |workshop: &Workshop| {
         let node = workshop.pieces[0].node().unwrap();
@@ -408,7 +408,7 @@ fn a_pose_whose_crc_is_wrong_is_not_taken_and_the_old_one_stays() {
     let commit = Request::Write { number: Parameter::Commit.number(), words };
     workshop.say(&Message::Configure { to: Node::Cell(cell(1)), tag: 2, request: commit });
     workshop.rest(Span::from_millis(5));
-    assert_eq!(workshop.pieces[0].history, [Flash::Sound(old(0))]);
+    assert_eq!(workshop.pieces[0].history, [FlashState::Valid(old(0))]);
 }
 
 /// Makes a cell report another period than the one that was written.
@@ -423,7 +423,7 @@ fn liar(packet: Packet) -> Packet {
 #[test]
 fn wrong_words_are_written_again_and_named_in_the_end() {
     let (skin, old, _) = skin();
-    let mut workshop = Workshop::of(&skin, 12, |place| Flash::Sound(old(place)));
+    let mut workshop = Workshop::of(&skin, 12, |place| FlashState::Valid(old(place)));
     workshop.forgers = Some((|packet| packet, liar));
     let report = workshop.commission(&skin, WISH, None);
     let Outcome::Failed(reason) = report.cells[4].outcome else { panic!("{report:#?}") };
@@ -444,7 +444,7 @@ fn a_refusal_is_named_in_words() {
         }
     }
     let (skin, old, _) = skin();
-    let mut workshop = Workshop::of(&skin, 13, |place| Flash::Sound(old(place)));
+    let mut workshop = Workshop::of(&skin, 13, |place| FlashState::Valid(old(place)));
     workshop.forgers = Some((|packet| packet, refuses));
     let report = workshop.commission(&skin, WISH, None);
     let Outcome::Failed(reason) = report.cells[4].outcome else { panic!("{report:#?}") };

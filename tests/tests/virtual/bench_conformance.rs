@@ -15,7 +15,7 @@ mod wrong;
 
 use cell::{Mutant, Right, Virtual};
 use conformance::Session;
-use conformance::findings::{Finding, Only, Verdict};
+use conformance::findings::{Finding, RequirementFilter, Verdict};
 use conformance::survey::Survey;
 use protocol::can::{Format, Frame};
 use protocol::id::CellId;
@@ -23,9 +23,9 @@ use protocol::packet::Packet;
 use protocol::time::Span;
 
 /// Returns the findings on a cell and the failed requirements.
-fn test(bus: &mut Virtual, format: Format, number: u8, only: &Only) -> (Vec<Finding>, Vec<&'static str>) {
+fn test(bus: &mut Virtual, format: Format, number: u8, only: &RequirementFilter) -> (Vec<Finding>, Vec<&'static str>) {
     let cell = CellId::new(number.into()).unwrap();
-    let survey = Survey::take(bus, "vcan0").unwrap();
+    let survey = Survey::listen(bus, "vcan0").unwrap();
     assert_eq!(survey.check(cell, "vcan0", None, false), Ok(format));
     let mut session = Session::new(bus, "vcan0", cell, format, Span::from_millis(80_000));
     let saved = session.save().unwrap();
@@ -52,7 +52,7 @@ fn this_projects_cell_passes() {
     for (format, number) in [(Format::Fd, 12), (Format::Classic, 12), (Format::Fd, 254), (Format::Classic, 1)]
     {
         let mut bus = Virtual::new(format, number, Box::new(Right) as Box<dyn Mutant>);
-        let (findings, failed) = test(&mut bus, format, number, &Only::default());
+        let (findings, failed) = test(&mut bus, format, number, &RequirementFilter::default());
         assert_eq!(failed, [""; 0], "{format:?}\n{}", failures(&findings));
         let untested: Vec<_> = findings
             .iter()
@@ -66,7 +66,7 @@ fn this_projects_cell_passes() {
 #[test]
 fn without_a_restart_what_shows_only_at_a_start_is_not_tested() {
     let mut bus = Virtual::new(Format::Fd, 7, Box::new(Right)).without_restart();
-    let (findings, failed) = test(&mut bus, Format::Fd, 7, &Only::default());
+    let (findings, failed) = test(&mut bus, Format::Fd, 7, &RequirementFilter::default());
     assert_eq!(failed, [""; 0], "{}", failures(&findings));
     let untested: Vec<_> = findings
         .iter()
@@ -81,7 +81,7 @@ fn without_a_restart_what_shows_only_at_a_start_is_not_tested() {
 #[test]
 fn a_right_cell_that_is_cut_off_anywhere_passes() {
     let longest = Span(3_000);
-    let only = Only::new(&["SEND-1", "CLAIM", "CONF-8", "ID-3"].map(str::to_owned)).unwrap();
+    let only = RequirementFilter::new(&["SEND-1", "CLAIM", "CONF-8", "ID-3"].map(str::to_owned)).unwrap();
     let runs =
         std::env::var("SKINBUS_RESTARTS").map_or(8, |restarts| restarts.parse::<u64>().unwrap().div_ceil(13));
     let (mut restarts, mut torn) = (0, 0);
@@ -110,7 +110,7 @@ fn a_cell_that_waits_for_a_processor_is_not_blamed() {
     for (seed, format) in (1..=6).zip([Format::Fd, Format::Classic].into_iter().cycle()) {
         for is_seen in [true, false] {
             let mut bus = Virtual::new(format, 12, Box::new(Right)).starved(seed, is_seen);
-            let (findings, failed) = test(&mut bus, format, 12, &Only::default());
+            let (findings, failed) = test(&mut bus, format, 12, &RequirementFilter::default());
             let failed: Vec<_> = failed.into_iter().filter(|id| !timed(id)).collect();
             assert_eq!(failed, [""; 0], "seed {seed}, {format:?}, {is_seen}\n{}", failures(&findings));
             let passed = findings.iter().filter(|it| matches!(it.verdict, Verdict::Passed { .. })).count();
@@ -135,7 +135,7 @@ fn cells_with_less_pass() {
             if measures {
                 bus = bus.measuring();
             }
-            let (findings, failed) = test(&mut bus, format, mutants::NODE, &Only::default());
+            let (findings, failed) = test(&mut bus, format, mutants::NODE, &RequirementFilter::default());
             assert_eq!(failed, [""; 0], "{name}, {format:?}\n{}", failures(&findings));
         }
     }
@@ -168,7 +168,7 @@ fn a_cell_without_a_single_packet_is_named_with_its_mistake() {
         let mut wrong = wrong::Wrong::new(format, mutants::NODE);
         wrong.put = put;
         let mut bus = Virtual::new(format, mutants::NODE, Box::new(wrong));
-        let survey = Survey::take(&mut bus, "vcan0").unwrap();
+        let survey = Survey::listen(&mut bus, "vcan0").unwrap();
         let cell = CellId::new(mutants::NODE.into()).unwrap();
         let why = survey.check(cell, "vcan0", None, false).unwrap_err();
         assert!(why.starts_with("cell 12 on vcan0 fails SEND-1: none of "), "{why}");
@@ -205,7 +205,7 @@ fn are_found(spoilt: &[mutants::Spoilt], format: Format) {
         let mut wrong = wrong::Wrong::new(format, mutants::NODE);
         spoil(&mut wrong);
         let mut bus = Virtual::new(format, mutants::NODE, Box::new(wrong));
-        let (findings, failed) = test(&mut bus, format, mutants::NODE, &Only::default());
+        let (findings, failed) = test(&mut bus, format, mutants::NODE, &RequirementFilter::default());
         let is_found = findings
             .iter()
             .any(|it| it.requirement.id == *id && matches!(it.verdict, Verdict::Failed { .. }));
@@ -300,7 +300,7 @@ fn each_requirement_is_broken_by_a_wrong_cell() {
     let mut passed = std::collections::BTreeSet::new();
     for format in [Format::Fd, Format::Classic] {
         let mut bus = Virtual::new(format, 12, Box::new(Right));
-        let (findings, _) = test(&mut bus, format, 12, &Only::default());
+        let (findings, _) = test(&mut bus, format, 12, &RequirementFilter::default());
         let is_passed = |it: &&Finding| matches!(it.verdict, Verdict::Passed { .. });
         passed.extend(findings.iter().filter(is_passed).map(|it| it.requirement.id));
     }

@@ -3,11 +3,11 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use analysis::explain::{Explanation, Origin, Requested, Verdict, Watch, explain};
+use analysis::explain::{Explanation, Origin, RequestedJoints, Verdict, Watch, explain};
 use model::decode::{Decoded, Decoder};
 use protocol::can::Format;
 use protocol::id::Kind;
-use protocol::message::From;
+use protocol::message::AppliesFrom;
 use protocol::packet::{Epoch, WORDS};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -20,13 +20,13 @@ const EPOCHS: u64 = 60;
 
 /// Explains an epoch from a capture of these frames.
 fn explained(bench: &Bench, wire: &[OnTheWire], epoch: u8) -> Explanation {
-    let requested = Requested { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
+    let requested = RequestedJoints { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
     let bus = &bench.skin.buses[0].name;
     let (mut watch, mut decoder) = (Watch::new(&bench.skin, requested), Decoder::new(None));
     for sent in wire {
         let decoded = decoder.decode(sent.at, bus, &sent.frame);
         let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
-        if watch.take(sent.at.0 * 1_000, bus, message) {
+        if watch.receive(sent.at.0 * 1_000, bus, message) {
             break;
         }
     }
@@ -42,7 +42,7 @@ fn pressed(seed: u64, format: Format) -> Bench {
             (rng.random_range(0..8), [0.0, 0.05, 1.5, 4.0, 8.0, 90.0][rng.random_range(0..6)]);
         // From the next joints on; or ahead, or late.
         let ahead = rng.random_range(0..u8::try_from(EPOCHS).unwrap());
-        let from = if rng.random_range(0..3) == 0 { From::Next } else { From::Epoch(Epoch(ahead)) };
+        let from = if rng.random_range(0..3) == 0 { AppliesFrom::Next } else { AppliesFrom::Epoch(Epoch(ahead)) };
         bench.press_from(place, newtons, from);
         bench.run_epochs(1);
     }

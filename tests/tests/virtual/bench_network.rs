@@ -55,7 +55,7 @@ fn check_tree_ready(wiring: &Wiring, seed: u64) {
                     let there = wiring.cells[other].node_id.map_or(0, CellId::get);
                     assert_eq!((state.number, usize::from(state.port)), (there, at), "seed {seed}");
                 }
-                Some(End::Gateway(_)) | None => assert!(!state.hears, "seed {seed}"),
+                Some(End::Gateway(_)) | None => assert!(!state.receives, "seed {seed}"),
             }
         }
     }
@@ -254,14 +254,14 @@ fn without_a_touch_all_cells_have_a_route_again_within_a_second() {
             // A silent port times out after 600 ms.
             wiring.run(Span::from_millis(600));
             while !whole(&wiring) {
-                let (took, routes) = (wiring.now().since(from), wiring.routes());
+                let (took, routes) = (wiring.now().elapsed_since(from), wiring.routes());
                 assert!(
                     took <= Span::from_millis(1_000) || repairs,
                     "seed {seed}, {what}: {took:?}, {routes}"
                 );
                 wiring.run(Span::from_millis(20));
             }
-            slowest = slowest.max(wiring.now().since(from).0);
+            slowest = slowest.max(wiring.now().elapsed_since(from).0);
             wiring.run(Span::from_millis(400));
         }
     }

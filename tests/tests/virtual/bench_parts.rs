@@ -3,20 +3,20 @@
 //! split, are replayed to cells that were just started: they must answer as recorded.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use analysis::explain::{Requested, Watch};
+use analysis::explain::{RequestedJoints, Watch};
 use bench::replay::comparator::{Comparator, Tally};
-use bench::replay::replay_plan::{Only, ReplayPlan, Role, Selection, Step};
-use bench::replay::survey::{Part, Survey};
-use cell_node::flash::Flash;
+use bench::replay::replay_plan::{SenderFilter, ReplayPlan, FrameRole, Selection, PlayerStep};
+use bench::replay::survey::{TimeRange, Survey};
+use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
 use model::decode::{Decoded, Decoder};
-use model::latched::{Latched, Seen};
+use model::latched::{LatchedPackets, ReceivedFrame};
 use model::table::{Replies, Table};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Direction, Record, Timestamp};
 use protocol::id::{CellId, Node as Address};
-use protocol::message::{From, Message, Request, SensorPage};
+use protocol::message::{AppliesFrom, Message, Request, SensorPage};
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
@@ -43,7 +43,7 @@ enum Trouble {
 }
 
 /// Records a bench in which cells are pressed and released all the time.
-fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
+fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<ReceivedFrame>) {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     let mut bench = Bench::new(&skins::arm(CELLS, format), seed);
     bench.settle();
@@ -55,7 +55,7 @@ fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
         let place = rng.random_range(0..usize::from(CELLS));
         let newtons = [0.0, 0.0, 0.05, 1.5, 4.0, 90.0][rng.random_range(0..6)];
         let ahead = Epoch(u8::try_from((epoch + rng.random_range(0..6)) % 256).unwrap());
-        let from = if rng.random_ratio(1, 3) { From::Next } else { From::Epoch(ahead) };
+        let from = if rng.random_ratio(1, 3) { AppliesFrom::Next } else { AppliesFrom::Epoch(ahead) };
         // Some of the last cells are pressed permanently.
         if place < 5 || epoch % 60 == 7 {
             bench.press_from(place, newtons, from);
@@ -69,7 +69,7 @@ fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
                     let page = SensorPage::Skin(touch(2.0));
                     bench.act(Act::Inject(Message::Stimulus {
                         to: Address::Everyone,
-                        from: From::Next,
+                        from: AppliesFrom::Next,
                         page,
                     }));
                 }
@@ -103,9 +103,9 @@ fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
             || from == Party::UnknownNode
             || !rng.random_ratio(1, 200)
     };
-    let seen = bench.wire.iter().filter(|sent| is_recorded(sent.from, &mut rng)).map(|sent| Seen {
+    let seen = bench.wire.iter().filter(|sent| is_recorded(sent.from, &mut rng)).map(|sent| ReceivedFrame {
         at_nanos: (sent.at.0 + 1_000_000) * 1_000,
-        own: sent.from == Party::Gateway,
+        from_gateway: sent.from == Party::Gateway,
         frame: sent.frame,
     });
     let seen = seen.collect();
@@ -113,30 +113,30 @@ fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
 }
 
 /// Returns the first index from `at` on at which the recorder may begin another file, and the frames latched there.
-fn split(seen: &[Seen], at: usize) -> (usize, Vec<capture::Latched>) {
-    let mut latched_frames = Latched::default();
+fn split(seen: &[ReceivedFrame], at: usize) -> (usize, Vec<capture::LatchedFrame>) {
+    let mut latched_frames = LatchedPackets::default();
     for (place, frame) in seen.iter().enumerate() {
         if place >= at && !latched_frames.is_within_a_packet(frame.at_nanos) {
             return (place, latched(&latched_frames));
         }
-        latched_frames.take(*frame);
+        latched_frames.receive(*frame);
     }
     (seen.len(), latched(&latched_frames))
 }
 
-fn latched(latched_frames: &Latched) -> Vec<capture::Latched> {
+fn latched(latched_frames: &LatchedPackets) -> Vec<capture::LatchedFrame> {
     let frames = latched_frames.frames().into_iter();
-    let kept = |seen: Seen| capture::Latched {
+    let kept = |seen: ReceivedFrame| capture::LatchedFrame {
         bus: BUS.to_owned(),
-        own: seen.own,
+        own: seen.from_gateway,
         frame: seen.frame,
         nanos: seen.at_nanos,
     };
     frames.map(kept).collect()
 }
 
-fn record(seen: &Seen) -> Record<'static> {
-    let direction = Some(if seen.own { Direction::Sent } else { Direction::Received });
+fn record(seen: &ReceivedFrame) -> Record<'static> {
+    let direction = Some(if seen.from_gateway { Direction::Sent } else { Direction::Received });
     let time = Timestamp::nine_digits(seen.at_nanos);
     Record { time, interface: BUS, frame: seen.frame, direction }
 }
@@ -149,7 +149,7 @@ impl Cells {
         let format = skin.buses[0].format;
         let started = |cell: &protocol::skin::Cell| {
             let identity = Identity { cell: Some(cell.node), serial: cell.serial };
-            let mut node = Node::new(identity, format, &Flash::Sound(skin.parameters(cell)), true, Micros(0));
+            let mut node = Node::new(identity, format, &FlashState::Valid(skin.parameters(cell)), true, Micros(0));
             for _ in 0..2 {
                 node.handle_timeout(node.poll_timeout());
                 while node.poll_transmit().is_some() {}
@@ -167,7 +167,7 @@ impl Cells {
                 node.handle_stored(true);
             }
             while let Some(packet) = node.poll_transmit() {
-                comparator.hear(0, &Message::decode(&packet).unwrap());
+                comparator.observe(0, &Message::decode(&packet).unwrap());
             }
         }
     }
@@ -178,39 +178,39 @@ impl Cells {
 }
 
 /// Replays a part in lockstep, and returns the comparator.
-fn replayed(skin: &Skin, before: &[capture::Latched], part: &[Seen]) -> Comparator {
+fn replayed(skin: &Skin, before: &[capture::LatchedFrame], part: &[ReceivedFrame]) -> Comparator {
     let format = skin.buses[0].format;
-    let mut survey = Survey::new(Part::default());
-    survey.begin(before);
-    part.iter().for_each(|seen| survey.take(&record(seen)));
+    let mut survey = Survey::new(TimeRange::default());
+    survey.add_latched(before);
+    part.iter().for_each(|seen| survey.add_frame(&record(seen)));
     survey.finish();
     let bus = &survey.buses[0];
     let mut comparator = Comparator::new([(BUS.to_owned(), bus.cells.clone())], part[0].at_nanos, Some(0));
-    comparator.record_begin();
-    bus.latched.iter().for_each(|message| comparator.record(0, message, false));
-    let selection = Selection { only: Only::Inputs, bus_links: vec![Some(0)], reads: true };
+    comparator.expect_restart();
+    bus.latched.iter().for_each(|message| comparator.expect(0, message, false));
+    let selection = Selection { only: SenderFilter::Inputs, destinations: vec![Some(0)], reads: true };
     let mut replay_plan = ReplayPlan::new(&survey, &selection);
     let mut cells = Cells::of(skin);
     cells.tell(&Message::Report, format, &mut comparator);
     if !bus.state.is_fresh() {
-        let Step::Restore(states) = replay_plan.restoring() else { unreachable!() };
+        let PlayerStep::Restore(states) = replay_plan.restoring() else { unreachable!() };
         for message in &states[0].1 {
             if let Message::Joints { epoch, .. } = message {
-                comparator.announce(0, None, *epoch);
+                comparator.sent_joints(0, None, *epoch);
             }
             cells.tell(message, format, &mut comparator);
         }
     }
     comparator.mute(false);
     for seen in part {
-        let _ = replay_plan.take(&record(seen), &mut comparator);
+        let _ = replay_plan.add_frame(&record(seen), &mut comparator);
     }
     replay_plan.end_pass(&mut comparator);
-    comparator.record_end();
+    comparator.expect_end();
     while let Some(step) = replay_plan.next_step() {
-        let Step::Frame(due) = step else { unreachable!() };
-        if let Role::Joints(open) = due.role {
-            comparator.announce(0, open.round, open.epoch);
+        let PlayerStep::Frame(due) = step else { unreachable!() };
+        if let FrameRole::Joints(open) = due.role {
+            comparator.sent_joints(0, open.round, open.epoch);
         }
         cells.take(&due.frame, &mut comparator);
     }
@@ -219,9 +219,9 @@ fn replayed(skin: &Skin, before: &[capture::Latched], part: &[Seen]) -> Comparat
 }
 
 /// Returns the number of torques in a part.
-fn torques(part: &[Seen]) -> u64 {
+fn torques(part: &[ReceivedFrame]) -> u64 {
     let mut decoder = Decoder::new(None);
-    let is_torque = |seen: &&Seen| {
+    let is_torque = |seen: &&ReceivedFrame| {
         let decoded = decoder.decode(Micros(seen.at_nanos / 1_000), BUS, &seen.frame);
         matches!(decoded, Decoded::Message(Message::Torque { .. }))
     };
@@ -271,7 +271,7 @@ fn where_nothing_was_lost_or_late_nothing_is_explained() {
         for at in (0..seen.len() - 200).step_by(seen.len() / 15) {
             let (from, before) = split(&seen, at);
             // Up to the next joints: all requests before are answered.
-            let is_joints = |seen: &&Seen| seen.frame.raw_id() == 1;
+            let is_joints = |seen: &&ReceivedFrame| seen.frame.raw_id() == 1;
             let last = seen.iter().rposition(|seen| is_joints(&seen)).unwrap();
             let to = if at % 2 == 0 { seen.len() } else { (from + 400).min(last) };
             let comparator = replayed(&skin, &before, &seen[from..to]);
@@ -293,7 +293,7 @@ fn a_word_that_is_another_one_is_found_in_every_part() {
     let (skin, mut seen) = recorded(7, Format::Fd, Trouble::Late);
     let mut found = 0;
     for at in (200..seen.len() - 200).step_by(97) {
-        let is_torque = |seen: &Seen| {
+        let is_torque = |seen: &ReceivedFrame| {
             let packet = protocol::packet::Packet::from_fd(&seen.frame).ok()?;
             let Ok(Message::Torque { torque, .. }) = Message::decode(&packet) else { return None };
             (torque.six()[0] != 0).then_some(packet)
@@ -321,7 +321,7 @@ fn a_word_that_is_another_one_is_found_in_every_part() {
 fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
     for seed in 200..210 {
         let (skin, seen) = recorded(seed, Format::Fd, Trouble::None);
-        let frames_of = |from: usize, before: &[capture::Latched], requested: Requested| {
+        let frames_of = |from: usize, before: &[capture::LatchedFrame], requested: RequestedJoints| {
             let (mut watch, mut decoder) = (Watch::new(&skin, requested), Decoder::new(None));
             for kept in before {
                 if let Decoded::Message(message) =
@@ -333,12 +333,12 @@ fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
             for seen in &seen[from..] {
                 let decoded = decoder.decode(Micros(seen.at_nanos / 1_000), BUS, &seen.frame);
                 let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
-                watch.take(seen.at_nanos, BUS, message);
+                watch.receive(seen.at_nanos, BUS, message);
             }
             watch.moments().unwrap().remove(0).unwrap()
         };
         let (from, before) = split(&seen, seen.len() / 2 + usize::try_from(seed).unwrap());
-        let requested = |epoch| Requested { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
+        let requested = |epoch| RequestedJoints { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
         for epoch in [160, 172, 185] {
             let (whole, part) =
                 (frames_of(0, &[], requested(epoch)), frames_of(from, &before, requested(epoch)));
@@ -359,7 +359,7 @@ fn explain_and_the_accounts_know_of_a_part_what_they_know_of_the_whole() {
         };
         before.iter().for_each(|kept| take(&mut table, kept.own, kept.nanos, &kept.frame));
         table.begin_accounts();
-        seen[from..].iter().for_each(|seen| take(&mut table, seen.own, seen.at_nanos, &seen.frame));
+        seen[from..].iter().for_each(|seen| take(&mut table, seen.from_gateway, seen.at_nanos, &seen.frame));
         table.finish();
         let all = Replies::total(table.cells().iter().map(|cell| cell.replies));
         let lost: u64 = table.cells().iter().map(|cell| cell.uplink().lost).sum();

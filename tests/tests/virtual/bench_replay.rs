@@ -8,7 +8,7 @@
     reason = "a test may stop"
 )]
 
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
 use model::generate::{Target, generate};
@@ -16,7 +16,7 @@ use model::latched::State;
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};
-use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, Joints, Message, Request, SensorPage, SkinSensors};
 use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Parameters};
@@ -36,7 +36,7 @@ fn parameters() -> Parameters {
 /// Returns a cell that has claimed its node id.
 fn started() -> Node {
     let identity = Identity { cell: CellId::new(CELL).ok(), serial: 1 };
-    let mut node = Node::new(identity, Format::Fd, &Flash::Sound(parameters()), true, Micros(0));
+    let mut node = Node::new(identity, Format::Fd, &FlashState::Valid(parameters()), true, Micros(0));
     for _ in 0..2 {
         node.handle_timeout(node.poll_timeout());
         while node.poll_transmit().is_some() {}
@@ -85,8 +85,8 @@ fn script(random: &mut Pcg64, tame: bool) -> Vec<Message> {
                 let newtons = f64::from(random.random_range(-2..2_i8).max(0)) + 0.2;
                 let contact = [Q5_10::nearest(if newtons < 1.0 { 0.0 } else { newtons }); 3];
                 let from = match random.random_range(0..3) {
-                    0 => From::Next,
-                    _ => From::Epoch(epoch.plus(random.random_range(0..6)).plus(u8::MAX)),
+                    0 => AppliesFrom::Next,
+                    _ => AppliesFrom::Epoch(epoch.advanced_by(random.random_range(0..6)).advanced_by(u8::MAX)),
                 };
                 Message::Stimulus {
                     to,
@@ -96,7 +96,7 @@ fn script(random: &mut Pcg64, tame: bool) -> Vec<Message> {
             }
             15 => {
                 let page = SensorPage::Acceleration([Q3_12::from_bits(random.random()); 3]);
-                Message::Stimulus { to, from: From::Next, page }
+                Message::Stimulus { to, from: AppliesFrom::Next, page }
             }
             16 if random.random_ratio(1, 2) => Message::Halt,
             16 | 17 => Message::Resume,
@@ -141,9 +141,9 @@ fn a_cell_with_another_past_answers_the_rest_as_the_recorded_one_did() {
         let (before, after) = script_of_recording.split_at(link_down);
         let (mut recorded, mut state) = (started(), State::default());
         for message in before {
-            state.take(message);
+            state.apply(message);
             for answer in tell(&mut recorded, message) {
-                state.take(&answer);
+                state.apply(&answer);
             }
         }
         let next = after.iter().find_map(|message| match message {

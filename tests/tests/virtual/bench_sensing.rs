@@ -14,11 +14,11 @@ use model::scenario::Scenario;
 use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Message, Request, SensorPage, SkinSensors};
-use protocol::packet::{Lengths, Packet, Reassembly, Segment, data_id};
+use protocol::packet::{Lengths, Packet, Reassembly, Reassembler, data_id};
 use protocol::parameters::{Parameter, Sensing};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
-use protocol::touch::{Touch, contact};
+use protocol::touch::{Touch, contact_force};
 use skinbus_tests::accounts;
 use skinbus_tests::bench::{Act, Bench};
 use skinbus_tests::fault::{Fault, Harm, Party};
@@ -74,7 +74,7 @@ fn sensors_frames(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPa
         Format::Fd => Packet::from_fd(frame).ok(),
         Format::Classic => {
             let id = data_id(frame).ok()?;
-            match segments.entry(id).or_insert(Segment::NONE).push(Micros(0), id, Lengths::ALL, frame.data())
+            match segments.entry(id).or_insert(Reassembler::NONE).push(Micros(0), id, Lengths::ALL, frame.data())
             {
                 Ok(Reassembly::Complete(packet)) => Some(packet),
                 Ok(Reassembly::Waiting | Reassembly::Incomplete | Reassembly::Ambiguous) | Err(_) => None,
@@ -128,7 +128,7 @@ fn every_turn_was_reported(bench: &Bench, since: Micros) -> (usize, usize) {
         let message = Packet::from_fd(&it.frame).ok().and_then(|packet| Message::decode(&packet).ok());
         match message {
             Some(Message::Stimulus { to: Node::Cell(cell), from, page: SensorPage::Skin(skin) }) => {
-                let protocol::message::From::Epoch(first) = from else { continue };
+                let protocol::message::AppliesFrom::Epoch(first) = from else { continue };
                 stimuli.entry(cell).or_default().push((first.0, skin));
             }
             Some(Message::Joints { epoch, .. }) => {
@@ -141,7 +141,7 @@ fn every_turn_was_reported(bench: &Bench, since: Micros) -> (usize, usize) {
                         }
                         !due
                     });
-                    let next = touch.next(contact(now), events.contact.to_bits(), events.hysteresis);
+                    let next = touch.next(contact_force(now), events.contact.to_bits(), events.hysteresis);
                     if next != *touch && it.at + period < since + LOOK {
                         let within = |&&(at, said): &&(Micros, SkinSensors)| {
                             at >= it.at && at < it.at + period && said == *now
@@ -247,7 +247,7 @@ fn one_cell_is_switched_alone_and_all_at_once_while_the_bench_runs() {
         let fifth = bench.skin.cells[4].node;
         let events: Vec<_> = sensors_frames(&bench, from);
         let pressed =
-            |it: &&(Micros, CellId, SensorPage)| matches!(it.2, SensorPage::Skin(skin) if contact(&skin) > 0);
+            |it: &&(Micros, CellId, SensorPage)| matches!(it.2, SensorPage::Skin(skin) if contact_force(&skin) > 0);
         assert!(events.iter().filter(pressed).all(|&(_, cell, _)| cell == fifth), "{events:?}");
         assert!(events.iter().any(|it| pressed(&it)), "{events:?}");
 

@@ -6,7 +6,7 @@
 
 use std::path::Path;
 
-use paper::tree::{Came, Tree};
+use paper::tree::{EpochResult, SumTree};
 use protocol::fixed::Q5_10;
 use protocol::message::SkinSensors;
 use protocol::parameters::MAX_JOINTS;
@@ -21,16 +21,16 @@ const ACTIVE: usize = 20;
 const AVERAGED: usize = 32;
 
 /// Returns the paper's arm, whose cells add up along the shortest ways to the root.
-fn tree(carry: bool) -> Tree {
+fn tree(carry: bool) -> SumTree {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../gateway/examples/ur5-253.toml");
     let skin = Skin::read(&path).unwrap();
-    let tree = Tree::new(&skin, carry);
+    let tree = SumTree::new(&skin, carry);
     assert_eq!(tree.cells(), skin.cells.len(), "one tree");
     tree
 }
 
 /// Runs one epoch, whose sum contains every touched cell.
-fn turn(tree: &mut Tree, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> Came {
+fn turn(tree: &mut SumTree, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> EpochResult {
     let came = tree.turn(q, touch);
     assert_eq!(came.count, touch.len());
     came

@@ -3,10 +3,10 @@
 use std::ffi::OsString;
 
 use clap::Args;
-use protocol::bus::{BusKind, Choice, has_socketcan};
-use protocol::usage::{Failure, print};
+use protocol::bus::{BusKind, KindChoice, has_socketcan};
+use protocol::usage::{Failure, print_text};
 use serde::Serialize;
-use vcan_setup::doctor::{Bus, Facts, Finding, Level, assess, would_run};
+use vcan_setup::doctor::{BusFacts, Facts, Finding, Level, assess, would_run};
 use vcan_setup::look;
 
 use super::{json, named, query};
@@ -27,8 +27,8 @@ pub(crate) struct Doctor {
     #[arg(value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
     /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
-    bus_kind: Choice,
+    #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto)]
+    bus_kind: KindChoice,
     /// Expect cells that run already, or real ones, as `skinbus run --no-spawn` does
     #[arg(long)]
     no_spawn: bool,
@@ -39,15 +39,15 @@ pub(crate) struct Doctor {
 
 impl Doctor {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let mut buses = named(&self.what, Bus::of_skin, Bus::named)?;
+        let mut buses = named(&self.what, BusFacts::of_skin, BusFacts::named)?;
         let present = match (query(), self.bus_kind) {
             (Ok((_, present)), _) => present,
             // The embedded bus needs no interface.
-            (Err(_), Choice::Only(BusKind::Embedded)) => Vec::new(),
-            (Err(_), Choice::Auto) if !has_socketcan() => Vec::new(),
+            (Err(_), KindChoice::Only(BusKind::Embedded)) => Vec::new(),
+            (Err(_), KindChoice::Auto) if !has_socketcan() => Vec::new(),
             (Err(failure), _) => return Err(failure),
         };
-        for Bus { target, .. } in buses.iter_mut().filter(|bus| bus.cells.is_none()) {
+        for BusFacts { target, .. } in buses.iter_mut().filter(|bus| bus.cells.is_none()) {
             target.take_format_of_hardware(&present);
         }
         let facts = look::facts(buses, self.bus_kind, self.no_spawn, &present);
@@ -55,11 +55,11 @@ impl Doctor {
         let runs = would_run(&findings);
         if self.json {
             let bus_kind = facts.bus_kind().name();
-            print(&json(&Report { would_run: runs, bus_kind, findings: &findings })?)?;
+            print_text(&json(&DoctorReport { would_run: runs, bus_kind, findings: &findings })?)?;
         } else {
-            print(&text(&facts, &findings, runs))?;
+            print_text(&text(&facts, &findings, runs))?;
         }
-        if runs { Ok(()) } else { Err(Failure::said()) }
+        if runs { Ok(()) } else { Err(Failure::already_reported()) }
     }
 }
 
@@ -73,14 +73,14 @@ fn text(facts: &Facts, findings: &[Finding], runs: bool) -> String {
     }
     let faults = findings.iter().filter(|finding| finding.level == Level::Fault).count();
     text + &match (runs, faults) {
-        (true, _) => format!("\nA bench would run, on {}.\n", facts.bus_kind().words()),
+        (true, _) => format!("\nA bench would run, on {}.\n", facts.bus_kind().display_name()),
         (false, 1) => "\nNo bench would run: fix the fault first.\n".to_owned(),
         (false, faults) => format!("\nNo bench would run: fix the {faults} faults first.\n"),
     }
 }
 
 #[derive(Serialize)]
-struct Report<'a> {
+struct DoctorReport<'a> {
     would_run: bool,
     bus_kind: &'static str,
     findings: &'a [Finding],

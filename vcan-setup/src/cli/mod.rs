@@ -16,13 +16,13 @@ use clap::error::ErrorKind;
 use clap::{Parser, Subcommand};
 use protocol::bus::{BusError, check_name};
 use protocol::skin::Skin;
-use protocol::usage::{Failure, end, one_line, quoted_os};
+use protocol::usage::{Failure, exit_code, one_line_error, shell_quoted_os};
 use serde::Serialize;
 use vcan_setup::hosts::options::LinkOptions;
 use vcan_setup::hosts::program;
 use vcan_setup::link::Interface;
 use vcan_setup::netlink::Netlink;
-use vcan_setup::plan::Target;
+use vcan_setup::plan::InterfaceTarget;
 
 /// Sets up CAN buses: makes vcan interfaces, checks what a bench still needs, serves embedded buses
 #[derive(Debug, Parser)]
@@ -75,9 +75,9 @@ pub(crate) fn main() -> ExitCode {
         // The user requested help or the version; clap prints them.
         Err(queried) if !queried.use_stderr() => queried.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
-        Err(wrong) => Err(Failure::usage(one_line(&wrong.render().to_string()))),
+        Err(wrong) => Err(Failure::usage(one_line_error(&wrong.render().to_string()))),
     };
-    end("vcan-setup", done)
+    exit_code("vcan-setup", done)
 }
 
 /// Formats the output of `--json`.
@@ -91,21 +91,21 @@ fn bus_name(word: &str) -> Result<String, BusError> {
 }
 
 /// A positional argument: the file of a skin, which ends in `.toml` or contains a `/`, or a name.
-enum Word {
+enum BusArgument {
     File(Box<Skin>),
     Name(String),
 }
 
-fn word(word: &OsStr) -> Result<Word, Failure> {
+fn word(word: &OsStr) -> Result<BusArgument, Failure> {
     let bytes = word.as_encoded_bytes();
     if bytes.ends_with(b".toml") || bytes.contains(&b'/') {
         let skin = Skin::read(Path::new(word)).map_err(Failure::usage)?;
-        return Ok(Word::File(Box::new(skin)));
+        return Ok(BusArgument::File(Box::new(skin)));
     }
     let name = word
         .to_str()
-        .ok_or_else(|| Failure::usage(format!("{} is no bus name: it is not UTF-8", quoted_os(word))))?;
-    bus_name(name).map(Word::Name).map_err(Failure::usage)
+        .ok_or_else(|| Failure::usage(format!("{} is no bus name: it is not UTF-8", shell_quoted_os(word))))?;
+    bus_name(name).map(BusArgument::Name).map_err(Failure::usage)
 }
 
 /// Converts positional arguments into the buses that they name.
@@ -117,16 +117,16 @@ fn named<T>(
     let mut all = Vec::new();
     for given in words {
         match word(given)? {
-            Word::File(skin) => all.extend(of_skin(given, &skin)),
-            Word::Name(name) => all.push(named(&name)),
+            BusArgument::File(skin) => all.extend(of_skin(given, &skin)),
+            BusArgument::Name(name) => all.push(named(&name)),
         }
     }
     Ok(all)
 }
 
 /// Returns the interfaces that positional arguments name.
-fn target(words: &[OsString]) -> Result<Vec<Target>, Failure> {
-    named(words, Target::of_skin, Target::named)
+fn targets(words: &[OsString]) -> Result<Vec<InterfaceTarget>, Failure> {
+    named(words, InterfaceTarget::of_skin, InterfaceTarget::named)
 }
 
 /// Returns the present interfaces, and the socket that listed them.

@@ -8,7 +8,7 @@ use clap::Args;
 use protocol::usage::Failure;
 use rustix::process::{Resource, Rlimit, Signal, getrlimit, setrlimit};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use vcan_setup::embedded::{Server, Totals};
+use vcan_setup::embedded::{Server, BusTotals};
 
 use super::bus_name;
 
@@ -67,16 +67,16 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
     // The kernel forwards frames at once, but a process may wait behind hundreds of cells for its turn. Without the
     // permission to raise its priority the bus is only slower.
     let _ = rustix::process::setpriority_process(None, URGENT);
-    protocol::bus::never_interrupt();
+    protocol::bus::set_batch_scheduling();
     allow_files();
     let server = Server::bind(name)?;
     writeln!(std::io::stdout(), "serving {name} at {}", server.path().display())
         .and_then(|()| std::io::stdout().flush())
         .context("cannot write to standard output")?;
-    let Totals { garbage, refused, turned_away, failed, failure, .. } = server.run(stopped)?;
+    let BusTotals { garbage, refused, turned_away, failed, failure, .. } = server.run(stopped)?;
     // Only the server can report these: a client gets no error for an invalid datagram.
     if garbage > 0 || refused > 0 {
-        say(&format!(
+        print_to_stderr(&format!(
             "{name}: ignored {garbage} datagrams that were neither frames nor filters, and refused {refused} clients: \
              check their program against docs/reference/embedded-bus.md"
         ));
@@ -84,13 +84,13 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
     if turned_away > 0 {
         let limit =
             getrlimit(Resource::Nofile).current.map_or_else(String::new, |limit| format!(" of {limit}"));
-        say(&format!(
+        print_to_stderr(&format!(
             "{name}: turned away {turned_away} clients for which there was no file{limit} or memory: end other clients, or \
              raise `ulimit -Hn`"
         ));
     }
     if let Some(failure) = failure {
-        say(&format!("{name}: gave up {failed} clients whose sockets failed, the last one with: {failure}"));
+        print_to_stderr(&format!("{name}: gave up {failed} clients whose sockets failed, the last one with: {failure}"));
     }
     Ok(())
 }
@@ -103,6 +103,6 @@ fn allow_files() {
 }
 
 /// Prints to standard error. A failure is ignored, because nothing could report it.
-fn say(text: &str) {
+fn print_to_stderr(text: &str) {
     let _ = writeln!(std::io::stderr(), "vcan-setup: {text}");
 }

@@ -4,14 +4,14 @@ use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
 use clap::Args;
-use protocol::bus::Choice;
+use protocol::bus::KindChoice;
 use protocol::id::CellId;
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print_text};
 use protocol::wire_time::BitRates;
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
-use vcan_setup::slcan::options::{SETTLE, settle_time};
-use vcan_setup::slcan::{Account, Bridge, BridgeError, LineOptions, Settings};
+use vcan_setup::slcan::options::{ALLOWED_SETTLE, settle_time};
+use vcan_setup::slcan::{LineAccount, Bridge, BridgeError, LineOptions, BridgeSettings};
 
 use super::{bus_name, json};
 
@@ -55,8 +55,8 @@ pub(crate) struct Slcan {
     #[arg(long)]
     wait: bool,
     /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
-    bus_kind: Choice,
+    #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto)]
+    bus_kind: KindChoice,
     /// Print the counts of all frames as JSON
     #[arg(long)]
     json: bool,
@@ -68,14 +68,14 @@ fn cell(word: &str) -> Result<CellId, String> {
 }
 
 fn settle(word: &str) -> Result<Duration, String> {
-    settle_time(word).ok_or_else(|| SETTLE.to_owned())
+    settle_time(word).ok_or_else(|| ALLOWED_SETTLE.to_owned())
 }
 
 #[derive(Serialize)]
-struct Report<'a> {
+struct SlcanReport<'a> {
     bus: &'a str,
     bus_kind: &'static str,
-    lines: &'a [Account],
+    lines: &'a [LineAccount],
 }
 
 impl Slcan {
@@ -87,7 +87,7 @@ impl Slcan {
             signal_hook::low_level::pipe::register(signal, stop).map_err(no_signals)?;
         }
         let settings =
-            Settings { bus: self.bus.clone(), choice: self.bus_kind, directory: None, wait: self.wait };
+            BridgeSettings { bus: self.bus.clone(), choice: self.bus_kind, directory: None, wait: self.wait };
         let count = lines.len();
         let bridge = Bridge::open(settings, lines).map_err(|error| {
             if matches!(error, BridgeError::Twice(_)) { Failure::usage(error) } else { Failure::run(error) }
@@ -100,16 +100,16 @@ impl Slcan {
         }
         // With `--json`, standard output contains only the JSON.
         if self.json {
-            say(&ready)
+            print_to_stderr(&ready)
         } else {
-            print(&format!("{ready}\n"))?
+            print_text(&format!("{ready}\n"))?
         }
-        let accounts = bridge.run(stopped, |line, event| say(&format!("{line}: {event}")));
+        let accounts = bridge.run(stopped, |line, event| print_to_stderr(&format!("{line}: {event}")));
         let accounts = accounts.map_err(Failure::run)?;
         if self.json {
-            return print(&json(&Report { bus, bus_kind: kind.name(), lines: &accounts })?);
+            return print_text(&json(&SlcanReport { bus, bus_kind: kind.name(), lines: &accounts })?);
         }
-        print(&accounts.iter().map(|account| format!("{account}\n")).collect::<String>())
+        print_text(&accounts.iter().map(|account| format!("{account}\n")).collect::<String>())
     }
 
     /// Returns the lines, each with the options that apply to all.
@@ -142,6 +142,6 @@ fn no_signals(error: std::io::Error) -> Failure {
     Failure::run(format!("cannot catch signals: {error}"))
 }
 
-fn say(text: &str) {
-    protocol::usage::say(&format!("vcan-setup: {text}"));
+fn print_to_stderr(text: &str) {
+    protocol::usage::eprint_line(&format!("vcan-setup: {text}"));
 }

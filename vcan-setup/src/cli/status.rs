@@ -7,16 +7,16 @@ use std::time::Duration;
 use clap::Args;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use protocol::bus::BusKind;
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print_text};
 use serde::Serialize;
 use vcan_setup::hosts::report as hosts;
-use vcan_setup::link::{CLASSIC_MTU, Counters, FD_MTU, Hardware, Interface, Kind, Peer, Rates};
-use vcan_setup::look::{Embedded, embedded_buses};
+use vcan_setup::link::{CLASSIC_MTU, Counters, FD_MTU, Hardware, Interface, InterfaceKind, Peer, HardwareRates};
+use vcan_setup::look::{EmbeddedBus, embedded_buses};
 
-use super::{json, query, target};
+use super::{json, query, targets};
 
 /// The time for which a link may take to answer.
-const ANSWER: Duration = Duration::from_millis(500);
+const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Show the CAN interfaces of this machine, and the embedded buses of this user
 ///
@@ -36,7 +36,7 @@ pub(crate) struct Status {
 
 impl Status {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let target = target(&self.what)?;
+        let target = targets(&self.what)?;
         let (_, present) = query()?;
         let is_requested = |name: &str| target.is_empty() || target.iter().any(|target| target.name == name);
         let named = |interface: &&Interface| {
@@ -50,14 +50,14 @@ impl Status {
         let text = match (self.json, interfaces.is_empty() && embedded.is_empty()) {
             (true, _) => {
                 let interfaces = interfaces.iter().map(|interface| report(interface)).collect();
-                json(&Report { interfaces, embedded: &embedded, links: &links })?
+                json(&StatusReport { interfaces, embedded: &embedded, links: &links })?
             }
             (false, false) => table(&interfaces, &embedded) + &joined(&links),
             (false, true) if target.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
             // Named buses that are missing are reported below.
             (false, true) => String::new(),
         };
-        print(&text)?;
+        print_text(&text)?;
         let there = |name: &str| {
             interfaces.iter().any(|it| it.name == name)
                 || embedded.iter().any(|it| it.name == name && it.served)
@@ -76,21 +76,21 @@ impl Status {
 }
 
 /// Returns the reports of the links of these buses. A stopped link does not answer, and is left out.
-fn links<'a>(buses: impl Iterator<Item = (&'a str, BusKind)>) -> BTreeMap<&'a str, hosts::Report> {
+fn links<'a>(buses: impl Iterator<Item = (&'a str, BusKind)>) -> BTreeMap<&'a str, hosts::LinkReport> {
     let report = |(bus, kind)| {
-        let report = hosts::Reports::connect(bus, kind, None).and_then(|mut it| it.wait(ANSWER));
+        let report = hosts::ReportReader::connect(bus, kind, None).and_then(|mut it| it.wait(ANSWER_TIMEOUT));
         Some((bus, report.ok()?))
     };
     buses.filter_map(report).collect()
 }
 
-fn joined(links: &BTreeMap<&str, hosts::Report>) -> String {
-    let host = |(name, host): (&String, &hosts::Host)| {
+fn joined(links: &BTreeMap<&str, hosts::LinkReport>) -> String {
+    let host = |(name, host): (&String, &hosts::HostReport)| {
         let cells = host.nodes.len();
         let gone = if host.is_there { "" } else { ", not reached" };
         format!("'{name}' ({cells} cell{}{gone})", if cells == 1 { "" } else { "s" })
     };
-    let line = |(bus, report): (&&str, &hosts::Report)| {
+    let line = |(bus, report): (&&str, &hosts::LinkReport)| {
         let hosts: Vec<_> = report.hosts.iter().map(host).collect();
         let with = if hosts.is_empty() { "no host yet".to_owned() } else { hosts.join(", ") };
         format!("{bus} is linked as '{}' with {with}\n", report.host)
@@ -98,7 +98,7 @@ fn joined(links: &BTreeMap<&str, hosts::Report>) -> String {
     links.iter().map(line).collect()
 }
 
-fn table(interfaces: &[&Interface], embedded: &[Embedded]) -> String {
+fn table(interfaces: &[&Interface], embedded: &[EmbeddedBus]) -> String {
     let mut table = Table::new();
     table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
     let right = ["received", "sent", "dropped", "errors"];
@@ -111,7 +111,7 @@ fn table(interfaces: &[&Interface], embedded: &[Embedded]) -> String {
         let counts = [received, sent, dropped, errors].map(|count| count.to_string());
         table.add_row(words.into_iter().chain(counts));
     }
-    for Embedded { name, served, .. } in embedded {
+    for EmbeddedBus { name, served, .. } in embedded {
         let state = if *served { "served" } else { "left by a server that was killed" };
         table.add_row([name.as_str(), "embedded bus", "this user", state, if *served { "FD" } else { "" }]);
     }
@@ -127,7 +127,7 @@ fn table(interfaces: &[&Interface], embedded: &[Embedded]) -> String {
 
 fn kind(interface: &Interface) -> String {
     match &interface.kind {
-        Kind::Vxcan(Some(Peer { index, name, namespace, namespace_id })) => {
+        InterfaceKind::Vxcan(Some(Peer { index, name, namespace, namespace_id })) => {
             let peer = name.clone().unwrap_or_else(|| format!("interface {index}"));
             match (namespace, namespace_id) {
                 (Some(space), _) => format!("vxcan to {peer} in {space}"),
@@ -135,9 +135,9 @@ fn kind(interface: &Interface) -> String {
                 (None, None) => format!("vxcan to {peer}"),
             }
         }
-        Kind::Hardware(Hardware { driver: Some(driver), .. }) => driver.clone(),
-        Kind::Other(what) => format!("no CAN: {what}"),
-        kind @ (Kind::Vcan | Kind::Vxcan(None) | Kind::Hardware(_)) => kind.name().to_owned(),
+        InterfaceKind::Hardware(Hardware { driver: Some(driver), .. }) => driver.clone(),
+        InterfaceKind::Other(what) => format!("no CAN: {what}"),
+        kind @ (InterfaceKind::Vcan | InterfaceKind::Vxcan(None) | InterfaceKind::Hardware(_)) => kind.name().to_owned(),
     }
 }
 
@@ -173,18 +173,18 @@ fn frames(interface: &Interface) -> String {
 
 fn rates(interface: &Interface) -> String {
     match interface.kind {
-        Kind::Hardware(Hardware { bitrate: None, .. }) => "none set".to_owned(),
-        Kind::Hardware(Hardware { bitrate, data_bitrate, .. }) => Rates { bitrate, data_bitrate }.to_string(),
-        Kind::Vcan | Kind::Vxcan(_) | Kind::Other(_) => String::new(),
+        InterfaceKind::Hardware(Hardware { bitrate: None, .. }) => "none set".to_owned(),
+        InterfaceKind::Hardware(Hardware { bitrate, data_bitrate, .. }) => HardwareRates { bitrate, data_bitrate }.to_string(),
+        InterfaceKind::Vcan | InterfaceKind::Vxcan(_) | InterfaceKind::Other(_) => String::new(),
     }
 }
 
 #[derive(Serialize)]
-struct Report<'a> {
+struct StatusReport<'a> {
     interfaces: Vec<InterfaceReport<'a>>,
-    embedded: &'a [Embedded],
+    embedded: &'a [EmbeddedBus],
     /// Reports of buses that are joined with those of other hosts.
-    links: &'a BTreeMap<&'a str, hosts::Report>,
+    links: &'a BTreeMap<&'a str, hosts::LinkReport>,
 }
 
 #[derive(Serialize)]

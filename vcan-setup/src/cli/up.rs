@@ -6,16 +6,16 @@ use std::io;
 use std::os::unix::fs::MetadataExt;
 
 use clap::Args;
-use protocol::bus::is_plain;
-use protocol::usage::{Failure, print, quoted_os};
+use protocol::bus::is_plain_name;
+use protocol::usage::{Failure, print_text, shell_quoted_os};
 use rustix::io::Errno;
-use vcan_setup::kernel::{Kernel, Module};
+use vcan_setup::kernel::{Kernel, ModuleState};
 use vcan_setup::look;
 use vcan_setup::namespace::{Namespace, NamespaceError};
 use vcan_setup::netlink::Netlink;
-use vcan_setup::plan::{self, Action, Plan, Step, TargetPair, There};
+use vcan_setup::plan::{self, StepAction, Plan, Step, TargetPair, OtherNamespace};
 
-use super::{Word, query, target, unreadable, word};
+use super::{BusArgument, query, targets, unreadable, word};
 
 /// Make virtual CAN interfaces, and bring them up
 ///
@@ -70,7 +70,7 @@ impl Up {
         if let Some(peer) = &self.peer {
             return self.pair(peer);
         }
-        let target = target(&self.what)?;
+        let target = targets(&self.what)?;
         for name in target.iter().map(|target| &target.name) {
             plain(name)?;
         }
@@ -83,10 +83,10 @@ impl Up {
         let [given] = self.what.as_slice() else {
             return Err(Failure::usage("--peer makes one pair: give one NAME with it"));
         };
-        let Word::Name(name) = word(given)? else {
+        let BusArgument::Name(name) = word(given)? else {
             return Err(Failure::usage(format!(
                 "--peer goes with the NAME of an interface, and {} is a skin",
-                quoted_os(given)
+                shell_quoted_os(given)
             )));
         };
         plain(&name)?;
@@ -97,7 +97,7 @@ impl Up {
             Some((namespace, file, inside)) => {
                 let id = netlink.namespace_id(file).map_err(unreadable)?;
                 let present = inside.interfaces().map_err(unreadable)?;
-                Some(There { name: namespace.clone(), id, present })
+                Some(OtherNamespace { name: namespace.clone(), id, present })
             }
             None => None,
         };
@@ -109,7 +109,7 @@ impl Up {
 
 impl Down {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let target = target(&self.what)?;
+        let target = targets(&self.what)?;
         let (mut netlink, present) = query()?;
         let plan = plan::down(&target, &present)?;
         Worker { netlink: &mut netlink, there: None }.finish(&plan, self.dry_run)
@@ -119,7 +119,7 @@ impl Down {
 /// Checks that a name is valid for the kernel and needs no quotes in a shell.
 fn plain(name: &str) -> Result<(), Failure> {
     super::bus_name(name).map_err(Failure::usage)?;
-    if !is_plain(name) || name.starts_with(['-', '.']) {
+    if !is_plain_name(name) || name.starts_with(['-', '.']) {
         return Err(Failure::usage(format!(
             "{name:?} is no name for an interface: take letters, digits, '-', '_' and '.', as in vcan0"
         )));
@@ -164,7 +164,7 @@ fn not_allowed(what: &str) -> Failure {
         ));
     }
     let again: Vec<_> = std::iter::once(look::program())
-        .chain(std::env::args_os().skip(1).map(|word| quoted_os(&word)))
+        .chain(std::env::args_os().skip(1).map(|word| shell_quoted_os(&word)))
         .collect();
     let again = again.join(" ");
     Failure::run(format!("not allowed to {what}, which needs root: `sudo {again}`"))
@@ -190,9 +190,9 @@ impl Worker<'_> {
             if plan.steps.is_empty() {
                 text += "nothing would be done\n";
             }
-            return print(&text);
+            return print_text(&text);
         }
-        print(&text)?;
+        print_text(&text)?;
         let mut undo = Vec::new();
         for step in &plan.steps {
             let there = self.there.as_mut().map(|(file, inside)| (*file, &mut **inside));
@@ -210,16 +210,16 @@ impl Worker<'_> {
             }
         }
         // The steps are printed at the end, because a failure undoes the earlier ones.
-        print(&plan.steps.iter().map(|step| format!("{}\n", step.done())).collect::<String>())
+        print_text(&plan.steps.iter().map(|step| format!("{}\n", step.done())).collect::<String>())
     }
 }
 
 /// Explains why a step failed, and how to fix it.
 fn explain(step: &Step, error: &io::Error) -> Failure {
     let kind = match step.action {
-        Action::MakeVcan => Some("vcan"),
-        Action::MakePair { .. } => Some("vxcan"),
-        Action::BringUp { .. } | Action::Widen { .. } | Action::SetRates { .. } | Action::Remove { .. } => {
+        StepAction::MakeVcan => Some("vcan"),
+        StepAction::MakePair { .. } => Some("vxcan"),
+        StepAction::BringUp { .. } | StepAction::Widen { .. } | StepAction::SetRates { .. } | StepAction::Remove { .. } => {
             None
         }
     };
@@ -241,16 +241,16 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
              needs none"
         ))
     };
-    let data = if let Action::SetRates { rates, .. } = step.action { rates.data_bitrate } else { None };
+    let data = if let StepAction::SetRates { rates, .. } = step.action { rates.data_bitrate } else { None };
     match (Errno::from_io_error(error), kind) {
         (Some(Errno::OPNOTSUPP), None) if data.is_some() => Failure::run(format!(
             "cannot {doing}: this hardware has no CAN FD; give the bus format = \"classic\", without data_bitrate"
         )),
-        (Some(Errno::OPNOTSUPP), Some(kind)) => unknown(kind, &Kernel::look()),
+        (Some(Errno::OPNOTSUPP), Some(kind)) => unknown(kind, &Kernel::detect()),
         (Some(Errno::PERM | Errno::ACCESS), kind) => {
             // Even root would get this error.
-            let kernel = Kernel::look();
-            let missing = kind.filter(|kind| kernel.module(kind) == Module::Missing);
+            let kernel = Kernel::detect();
+            let missing = kind.filter(|kind| kernel.module(kind) == ModuleState::Missing);
             missing.map_or_else(|| not_allowed(&doing), |kind| unknown(kind, &kernel))
         }
         (Some(Errno::OPNOTSUPP), None) => {

@@ -4,19 +4,19 @@ use std::collections::BTreeSet;
 use std::ffi::OsStr;
 use std::path::PathBuf;
 
-use protocol::bus::Choice;
+use protocol::bus::KindChoice;
 use protocol::id::CellId;
-use protocol::skin::{Reply, Skin};
+use protocol::skin::{SkinReply, Skin};
 
 use crate::kernel::Kernel;
 use crate::link::Interface;
-use crate::plan::Target;
+use crate::plan::InterfaceTarget;
 
 /// The facts that the doctor assesses.
 #[derive(Clone, Debug)]
 pub struct Facts {
     /// The requested kind of bus.
-    pub choice: Choice,
+    pub choice: KindChoice,
     /// True if the cells are already present, as with `skinbus run --no-spawn`.
     pub no_spawn: bool,
     /// The name of this program under which `sudo` finds it.
@@ -34,7 +34,7 @@ pub struct Facts {
     /// The directory of this user's embedded buses, or the reason why it cannot be used.
     pub embedded: Result<PathBuf, String>,
     /// The named buses.
-    pub buses: Vec<Bus>,
+    pub buses: Vec<BusFacts>,
     /// The present CAN interfaces.
     pub present: Vec<Interface>,
 }
@@ -59,9 +59,9 @@ pub struct Program {
 
 /// A named bus.
 #[derive(Clone, Debug)]
-pub struct Bus {
+pub struct BusFacts {
     /// The requirements.
-    pub target: Target,
+    pub target: InterfaceTarget,
     /// The expected cells; `None` without a skin.
     pub cells: Option<BTreeSet<CellId>>,
     /// True if its cells answer with tree sums.
@@ -69,36 +69,36 @@ pub struct Bus {
     /// The interface of this name.
     pub interface: Option<Interface>,
     /// The observed traffic; `None` if the bus was not opened, or the reason why it could not be.
-    pub heard: Result<Option<Heard>, String>,
+    pub traffic: Result<Option<ObservedTraffic>, String>,
 }
 
-impl Bus {
+impl BusFacts {
     /// Returns the buses of a skin.
     #[must_use]
     pub fn of_skin(file: &OsStr, skin: &Skin) -> Vec<Self> {
-        let of = |(index, target): (usize, Target)| Self {
-            cells: Some(skin.cells_of(index).map(|cell| cell.node).collect()),
-            sums: skin.buses.get(index).is_some_and(|bus| bus.reply != Reply::Torque),
-            ..Self::of(target)
+        let of = |(index, target): (usize, InterfaceTarget)| Self {
+            cells: Some(skin.cells_on_bus(index).map(|cell| cell.node).collect()),
+            sums: skin.buses.get(index).is_some_and(|bus| bus.reply != SkinReply::Torque),
+            ..Self::new(target)
         };
-        Target::of_skin(file, skin).into_iter().enumerate().map(of).collect()
+        InterfaceTarget::of_skin(file, skin).into_iter().enumerate().map(of).collect()
     }
 
     /// Returns the bus of this name.
     #[must_use]
     pub fn named(name: &str) -> Self {
-        Self::of(Target::named(name))
+        Self::new(InterfaceTarget::named(name))
     }
 
     /// Returns a bus that has not been examined yet.
-    const fn of(target: Target) -> Self {
-        Self { target, cells: None, sums: false, interface: None, heard: Ok(None) }
+    const fn new(target: InterfaceTarget) -> Self {
+        Self { target, cells: None, sums: false, interface: None, traffic: Ok(None) }
     }
 }
 
 /// The traffic observed on a bus.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
-pub struct Heard {
+pub struct ObservedTraffic {
     /// True if another gateway sends on the bus.
     pub gateway: bool,
     /// The cells that send on the bus.

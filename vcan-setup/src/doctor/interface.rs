@@ -1,33 +1,33 @@
 //! Assesses interfaces, and suggests how to fix them.
 
-use protocol::bus::Choice;
+use protocol::bus::KindChoice;
 use protocol::can::Format;
 
-use super::{Bus, Facts, Finding, User, would_run};
-use crate::kernel::Module;
-use crate::link::{FD_MTU, Hardware, Interface, Kind, State};
+use super::{BusFacts, Facts, Finding, User, would_run};
+use crate::kernel::ModuleState;
+use crate::link::{FD_MTU, Hardware, Interface, InterfaceKind, ControllerState};
 use crate::plan::widen;
 
 impl Facts {
     /// Reports whether missing interfaces can be created.
     pub(super) fn making(&self) -> Vec<Finding> {
-        let missing = |bus: &&Bus| bus.interface.is_none() && bus.target.hardware().is_none();
+        let missing = |bus: &&BusFacts| bus.interface.is_none() && bus.target.hardware().is_none();
         let mut findings = Vec::new();
         if self.buses.iter().find(missing).is_none() && !(self.buses.is_empty() && self.present.is_empty()) {
             return findings;
         }
         let hints = self.kernel.hints(self.kernel.vcan);
         findings.extend(match self.kernel.vcan {
-            Module::There => None,
-            Module::Unknown => {
+            ModuleState::There => None,
+            ModuleState::Unknown => {
                 let text = "cannot see whether the kernel has vcan; if it has none:";
                 Some(Finding::note(text).hints(hints))
             }
-            Module::Loadable => {
+            ModuleState::Loadable => {
                 let text = "the kernel's module vcan is not loaded; making an interface loads it";
                 Some(Finding::note(text).hint(self.sudo("modprobe vcan")))
             }
-            Module::Missing => {
+            ModuleState::Missing => {
                 let text = format!("the kernel ({}) has CAN and no vcan", self.kernel.release);
                 Some(Finding::fault(text).hints(hints))
             }
@@ -57,17 +57,17 @@ impl Facts {
             Some(Interface { name, mtu, .. }) => {
                 Finding::ok(format!("{name} is up and carries {}", carries(*mtu)))
             }
-            None => Finding::fault("no CAN interface is up").hint(self.own("up vcan0")),
+            None => Finding::fault("no CAN interface is up").hint(self.own_command("up vcan0")),
         })
     }
 
     /// Reports the effect of a missing interface if either kind of bus is acceptable.
-    pub(super) fn absent(&self, bus: &Bus) -> Option<Finding> {
-        if self.choice != Choice::Auto || !self.kernel.has_can {
+    pub(super) fn absent(&self, bus: &BusFacts) -> Option<Finding> {
+        if self.choice != KindChoice::Auto || !self.kernel.has_can {
             return None;
         }
         let (name, up) = (&bus.target.name, self.up(&bus.target));
-        let is_served = !matches!(bus.heard, Ok(None));
+        let is_served = !matches!(bus.traffic, Ok(None));
         Some(match (self.no_spawn, is_served) {
             (false, _) => Finding::note(format!(
                 "there is no interface {name}: a run that starts its cells makes an embedded bus; for SocketCAN:"
@@ -82,7 +82,7 @@ impl Facts {
         })
     }
 
-    pub(super) fn interface(&self, bus: &Bus) -> Vec<Finding> {
+    pub(super) fn interface(&self, bus: &BusFacts) -> Vec<Finding> {
         let name = &bus.target.name;
         let Some(interface) = &bus.interface else {
             if let Some(finding) = self.absent(bus) {
@@ -100,19 +100,19 @@ impl Facts {
             }];
         };
         let mut findings = match &interface.kind {
-            Kind::Other(what) => {
+            InterfaceKind::Other(what) => {
                 let text = format!("{name} is {what}, which carries no CAN");
                 return vec![Finding::fault(text).hint("# name another bus")];
             }
-            Kind::Vcan | Kind::Vxcan(_) => self.virtual_faults(bus, interface),
-            Kind::Hardware(hardware) => self.hardware_faults(bus, interface, hardware),
+            InterfaceKind::Vcan | InterfaceKind::Vxcan(_) => self.virtual_faults(bus, interface),
+            InterfaceKind::Hardware(hardware) => self.hardware_faults(bus, interface, hardware),
         };
         if would_run(&findings) {
             let what = interface.what();
             let text = format!("{name} is {what}, up, and carries {}", carries(interface.mtu));
             findings.insert(0, Finding::ok(text));
             if interface.is_virtual() && bus.target.hardware().is_some() {
-                let command = if interface.ours { self.own("down") } else { self.sudo("ip link del") };
+                let command = if interface.ours { self.own_command("down") } else { self.sudo("ip link del") };
                 let text =
                     format!("{name} is {what} and has no bit rate; the skin gives it one, as hardware has");
                 let hint = format!("{command} {name}  # if hardware is to have this name");
@@ -123,7 +123,7 @@ impl Facts {
         findings
     }
 
-    fn virtual_faults(&self, bus: &Bus, interface: &Interface) -> Vec<Finding> {
+    fn virtual_faults(&self, bus: &BusFacts, interface: &Interface) -> Vec<Finding> {
         let Interface { name, mtu, ours, up, .. } = interface;
         let repair = |command: String| {
             let command = if self.user.admin { command } else { format!("sudo sh -c '{command}'") };
@@ -140,13 +140,13 @@ impl Facts {
         Vec::new()
     }
 
-    fn hardware_faults(&self, bus: &Bus, interface: &Interface, hardware: &Hardware) -> Vec<Finding> {
+    fn hardware_faults(&self, bus: &BusFacts, interface: &Interface, hardware: &Hardware) -> Vec<Finding> {
         let Interface { name, mtu, up, .. } = interface;
         let what = interface.what();
         let skin = bus.target.skin.as_ref();
         // Returns the command that sets the bit rates, or would if they were known.
         let set = || match bus.target.hardware() {
-            Some(skin) => self.own(&format!("up {} --set-bit-rates", skin.file)),
+            Some(skin) => self.own_command(&format!("up {} --set-bit-rates", skin.file)),
             None => {
                 let rates = match bus.target.format {
                     Format::Fd => "bitrate 1000000 dbitrate 5000000 fd on",
@@ -184,21 +184,21 @@ impl Facts {
             findings.push(Finding::fault(text).hint(hint));
         }
         findings.extend(match hardware.state.filter(|_| *up) {
-            Some(State::BusOff) => Some(
+            Some(ControllerState::BusOff) => Some(
                 Finding::fault(format!(
                     "{name} is BUS-OFF: it no longer takes part after too many errors; wiring, termination or bit \
                      rates are wrong"
                 ))
                 .hint(self.sudo(&format!("ip link set {name} type can restart"))),
             ),
-            Some(state @ (State::ErrorPassive | State::ErrorWarning)) => Some(
+            Some(state @ (ControllerState::ErrorPassive | ControllerState::ErrorWarning)) => Some(
                 Finding::note(format!(
                     "{name} is {}: it sees errors; is another node on the bus, terminated, at the same bit rates?",
                     state.name()
                 ))
                 .hint(format!("ip -details -statistics link show {name}")),
             ),
-            Some(State::ErrorActive | State::Stopped | State::Sleeping) | None => None,
+            Some(ControllerState::ErrorActive | ControllerState::Stopped | ControllerState::Sleeping) | None => None,
         });
         if would_run(&findings) {
             findings.push(match skin {

@@ -1,9 +1,9 @@
 use super::*;
-use crate::kernel::Module;
-use crate::link::{CLASSIC_MTU, Counters, FD_MTU, Hardware, Interface, Kind, Rates, State};
+use crate::kernel::ModuleState;
+use crate::link::{CLASSIC_MTU, Counters, FD_MTU, Hardware, Interface, InterfaceKind, HardwareRates, ControllerState};
 use crate::plan::SkinBus;
 
-fn interface(name: &str, kind: Kind) -> Interface {
+fn interface(name: &str, kind: InterfaceKind) -> Interface {
     let counters = Counters::default();
     Interface { index: 2, name: name.to_owned(), kind, ours: true, up: true, mtu: FD_MTU, counters }
 }
@@ -13,14 +13,14 @@ fn cell(node: i64) -> CellId {
 }
 
 /// Returns a bus of a skin with 100 cells.
-fn bus(interface: Option<Interface>) -> Bus {
+fn bus(interface: Option<Interface>) -> BusFacts {
     let name = interface.as_ref().map_or("vcan0", |it| it.name.as_str()).to_owned();
-    let skin = Some(SkinBus { file: "skin.toml".into(), rates: Rates::default() });
-    Bus {
-        target: Target { name, format: Format::Fd, skin },
+    let skin = Some(SkinBus { file: "skin.toml".into(), rates: HardwareRates::default() });
+    BusFacts {
+        target: InterfaceTarget { name, format: Format::Fd, skin },
         cells: Some((1..=100).map(cell).collect()),
         sums: false,
-        heard: Ok(interface.as_ref().map(|_| Heard::default())),
+        traffic: Ok(interface.as_ref().map(|_| ObservedTraffic::default())),
         interface,
     }
 }
@@ -28,7 +28,7 @@ fn bus(interface: Option<Interface>) -> Bus {
 /// Returns the facts of a machine without faults.
 fn good() -> Facts {
     Facts {
-        choice: Choice::Auto,
+        choice: KindChoice::Auto,
         no_spawn: false,
         program: "vcan-setup".into(),
         kernel: Kernel {
@@ -36,24 +36,24 @@ fn good() -> Facts {
             machine: "x86_64".into(),
             distribution: "debian".into(),
             has_can: true,
-            can_raw: Module::There,
-            vcan: Module::There,
-            vxcan: Module::There,
+            can_raw: ModuleState::There,
+            vcan: ModuleState::There,
+            vxcan: ModuleState::There,
         },
         user: User { root: false, admin: false },
         receive_buffer: Some(2 << 20),
         backlog: Some(1_000),
         cell_node: Program { path: "/bin/cell-node".into(), there: true },
         embedded: Ok("/run/skinbus".into()),
-        buses: vec![bus(Some(interface("vcan0", Kind::Vcan)))],
-        present: vec![interface("vcan0", Kind::Vcan)],
+        buses: vec![bus(Some(interface("vcan0", InterfaceKind::Vcan)))],
+        present: vec![interface("vcan0", InterfaceKind::Vcan)],
     }
 }
 
-fn no_can(choice: Choice) -> Facts {
+fn no_can(choice: KindChoice) -> Facts {
     let mut facts = Facts { choice, ..good() };
     facts.kernel.has_can = false;
-    facts.kernel.can_raw = Module::Loadable;
+    facts.kernel.can_raw = ModuleState::Loadable;
     facts.buses = vec![bus(None)];
     facts
 }
@@ -81,7 +81,7 @@ fn about_interface(change: impl FnOnce(&mut Interface)) -> Vec<String> {
 }
 
 fn about_hardware(
-    target: impl FnOnce(&mut Target),
+    target: impl FnOnce(&mut InterfaceTarget),
     change: impl FnOnce(&mut Interface, &mut Hardware),
 ) -> Vec<String> {
     about(|facts| {
@@ -91,30 +91,30 @@ fn about_hardware(
             data_bitrate: Some(5_000_000),
             fd: true,
             listen_only: false,
-            state: Some(State::ErrorActive),
+            state: Some(ControllerState::ErrorActive),
         };
-        let mut can0 = interface("can0", Kind::Vcan);
+        let mut can0 = interface("can0", InterfaceKind::Vcan);
         can0.ours = false;
         change(&mut can0, &mut hardware);
-        can0.kind = Kind::Hardware(hardware);
+        can0.kind = InterfaceKind::Hardware(hardware);
         let mut can0 = bus(Some(can0));
         if let Some(skin) = &mut can0.target.skin {
-            skin.rates = Rates { bitrate: Some(1_000_000), data_bitrate: Some(5_000_000) };
+            skin.rates = HardwareRates { bitrate: Some(1_000_000), data_bitrate: Some(5_000_000) };
         }
         target(&mut can0.target);
         facts.buses = vec![can0];
     })
 }
 
-fn listens(heard: Heard, no_spawn: bool) -> Vec<String> {
+fn listens(heard: ObservedTraffic, no_spawn: bool) -> Vec<String> {
     about(|facts| {
         facts.no_spawn = no_spawn;
-        facts.buses[0].heard = Ok(Some(heard));
+        facts.buses[0].traffic = Ok(Some(heard));
     })
 }
 
-fn cells(nodes: impl IntoIterator<Item = i64>) -> Heard {
-    Heard { gateway: false, cells: nodes.into_iter().map(cell).collect() }
+fn cells(nodes: impl IntoIterator<Item = i64>) -> ObservedTraffic {
+    ObservedTraffic { gateway: false, cells: nodes.into_iter().map(cell).collect() }
 }
 
 #[test]
@@ -126,21 +126,21 @@ fn a_machine_on_which_all_is_well() {
 #[test]
 fn no_can_in_the_kernel_matters_by_what_was_chosen() {
     assert_eq!(
-        complaints(&no_can(Choice::Auto)),
+        complaints(&no_can(KindChoice::Auto)),
         [
             "note: the kernel (6.1.0) has no CAN, so the bench runs on the embedded bus: no candump, no real cell; \
           for a kernel with CAN: | sudo modprobe -a can_raw vcan vxcan | tests/lab/run COMMAND  # in the project's \
           folder: runs it in a machine that has vcan"
         ]
     );
-    assert_eq!(no_can(Choice::Auto).bus_kind(), BusKind::Embedded);
-    assert_eq!(complaints(&no_can(Choice::Only(BusKind::Embedded))), Vec::<String>::new());
-    let only = complaints(&no_can(Choice::Only(BusKind::SocketCan)));
+    assert_eq!(no_can(KindChoice::Auto).bus_kind(), BusKind::Embedded);
+    assert_eq!(complaints(&no_can(KindChoice::Only(BusKind::Embedded))), Vec::<String>::new());
+    let only = complaints(&no_can(KindChoice::Only(BusKind::SocketCan)));
     assert!(
         only[0].starts_with("fault: the kernel (6.1.0) has no CAN, and --bus-kind socketcan needs it | sudo")
     );
     assert_eq!(only.len(), 1, "nothing is said of interfaces: {only:?}");
-    let mut facts = no_can(Choice::Auto);
+    let mut facts = no_can(KindChoice::Auto);
     facts.embedded = Err("/tmp/skinbus-1 has mode 0755".into());
     assert!(complaints(&facts).contains(&"fault: /tmp/skinbus-1 has mode 0755".to_owned()));
     assert!(!would_run(&assess(&facts)));
@@ -163,9 +163,9 @@ fn hardware_of_a_skin_that_is_a_vcan_is_noted() {
 
 #[test]
 fn a_bus_of_either_kind_that_is_absent_is_made_by_a_run_that_starts_its_cells() {
-    let absent = |no_spawn: bool, heard: Option<Heard>| {
+    let absent = |no_spawn: bool, heard: Option<ObservedTraffic>| {
         about(|facts| {
-            facts.buses = vec![Bus { heard: Ok(heard), ..bus(None) }];
+            facts.buses = vec![BusFacts { traffic: Ok(heard), ..bus(None) }];
             facts.no_spawn = no_spawn;
         })
     };
@@ -182,14 +182,14 @@ fn a_bus_of_either_kind_that_is_absent_is_made_by_a_run_that_starts_its_cells() 
             "fault: {text}, and no embedded bus of this name is served | sudo vcan-setup up skin.toml | vcan-setup serve vcan0 &"
         )]
     );
-    assert_eq!(absent(true, Some(Heard::default())).len(), 1, "no cell sends there");
+    assert_eq!(absent(true, Some(ObservedTraffic::default())).len(), 1, "no cell sends there");
 }
 
 #[test]
 fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
-    let missing = |user: User, vcan: Module| {
+    let missing = |user: User, vcan: ModuleState| {
         about(|facts| {
-            facts.choice = Choice::Only(BusKind::SocketCan);
+            facts.choice = KindChoice::Only(BusKind::SocketCan);
             facts.buses = vec![bus(None)];
             facts.user = user;
             facts.kernel.vcan = vcan;
@@ -198,33 +198,33 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     let anybody = User { root: false, admin: false };
     let admin = User { root: true, admin: true };
     assert_eq!(
-        missing(anybody, Module::There),
+        missing(anybody, ModuleState::There),
         [
             "note: this user may not make interfaces, hence the sudo below",
             "fault: there is no interface vcan0 | sudo vcan-setup up skin.toml",
         ]
     );
     assert_eq!(
-        missing(admin, Module::There),
+        missing(admin, ModuleState::There),
         ["fault: there is no interface vcan0 | vcan-setup up skin.toml"]
     );
     let loadable =
         "note: the kernel's module vcan is not loaded; making an interface loads it | modprobe vcan";
-    assert_eq!(missing(admin, Module::Loadable)[0], loadable);
+    assert_eq!(missing(admin, ModuleState::Loadable)[0], loadable);
     assert!(
-        missing(admin, Module::Missing)[0].starts_with("fault: the kernel (6.1.0) has CAN and no vcan | ")
+        missing(admin, ModuleState::Missing)[0].starts_with("fault: the kernel (6.1.0) has CAN and no vcan | ")
     );
-    assert!(missing(admin, Module::Unknown)[0].starts_with("note: cannot see whether the kernel has vcan"));
-    let contained = missing(User { root: true, admin: false }, Module::There);
+    assert!(missing(admin, ModuleState::Unknown)[0].starts_with("note: cannot see whether the kernel has vcan"));
+    let contained = missing(User { root: true, admin: false }, ModuleState::There);
     assert!(contained[0].starts_with("fault: root may not make interfaces here: it has no CAP_NET_ADMIN"));
     let named = about(|facts| {
-        facts.choice = Choice::Only(BusKind::SocketCan);
-        facts.buses = vec![Bus { target: Target::named("vcan9"), cells: None, ..bus(None) }];
+        facts.choice = KindChoice::Only(BusKind::SocketCan);
+        facts.buses = vec![BusFacts { target: InterfaceTarget::named("vcan9"), cells: None, ..bus(None) }];
         facts.user = admin;
     });
     assert_eq!(named, ["fault: there is no interface vcan9 | vcan-setup up vcan9"]);
     let hardware = about(|facts| {
-        facts.choice = Choice::Only(BusKind::SocketCan);
+        facts.choice = KindChoice::Only(BusKind::SocketCan);
         facts.buses = vec![bus(None)];
         facts.buses[0].target.skin.as_mut().unwrap().rates.bitrate = Some(500_000);
         facts.user = admin;
@@ -248,7 +248,7 @@ fn an_interface_that_does_not_fit_is_repaired_by_who_made_it() {
         ["fault: vcan0 is down | sudo sh -c 'ip link set vcan0 up'"]
     );
     assert_eq!(
-        about_interface(|it| it.kind = Kind::Other("a network interface (ether)".into())),
+        about_interface(|it| it.kind = InterfaceKind::Other("a network interface (ether)".into())),
         ["fault: vcan0 is a network interface (ether), which carries no CAN | # name another bus"]
     );
     let classic = about(|facts| {
@@ -260,7 +260,7 @@ fn an_interface_that_does_not_fit_is_repaired_by_who_made_it() {
 
 #[test]
 fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
-    let same = |_: &mut Target| ();
+    let same = |_: &mut InterfaceTarget| ();
     let fine = |_: &mut Interface, _: &mut Hardware| ();
     assert_eq!(about_hardware(same, fine), Vec::<String>::new());
     let set = "sudo vcan-setup up skin.toml --set-bit-rates";
@@ -275,9 +275,9 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
         about_hardware(same, |can0, _| can0.up = false),
         [format!("fault: can0 is CAN hardware (kvaser_pci), and down | {set}")]
     );
-    let open = |target: &mut Target| {
+    let open = |target: &mut InterfaceTarget| {
         let skin = target.skin.as_mut().unwrap();
-        skin.rates = Rates::default();
+        skin.rates = HardwareRates::default();
     };
     let unsaid = about_hardware(open, fine);
     assert_eq!(unsaid.len(), 1);
@@ -287,12 +287,12 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
         narrow[0].starts_with("fault: can0 is CAN hardware (kvaser_pci) with MTU 16, and CAN FD needs 72")
     );
     let state = |state| about_hardware(same, move |_, hardware| hardware.state = Some(state));
-    let bus_off = state(State::BusOff);
+    let bus_off = state(ControllerState::BusOff);
     assert!(
         bus_off[0].starts_with("fault: can0 is BUS-OFF")
             && bus_off[0].contains("sudo ip link set can0 type can restart")
     );
-    assert!(state(State::ErrorPassive)[0].starts_with("note: can0 is ERROR-PASSIVE: it sees errors"));
+    assert!(state(ControllerState::ErrorPassive)[0].starts_with("note: can0 is ERROR-PASSIVE: it sees errors"));
     let deaf = about_hardware(same, |_, hardware| hardware.listen_only = true);
     assert!(deaf[0].starts_with("fault: can0 only listens"));
 }
@@ -300,7 +300,7 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
 #[test]
 fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
     assert_eq!(
-        listens(Heard { gateway: true, ..Heard::default() }, false),
+        listens(ObservedTraffic { gateway: true, ..ObservedTraffic::default() }, false),
         [
             "fault: another gateway sends joints on vcan0 | pgrep -a skinbus  # and stop it, or take another bus"
         ]
@@ -316,12 +316,12 @@ fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
     );
     assert!(listens(cells([]), true)[0].starts_with("fault: no cell sends on vcan0"));
     let embedded = |heard| {
-        let mut facts = no_can(Choice::Auto);
-        facts.buses[0].heard = Ok(heard);
+        let mut facts = no_can(KindChoice::Auto);
+        facts.buses[0].traffic = Ok(heard);
         complaints(&facts).split_off(1)
     };
     assert_eq!(embedded(None), Vec::<String>::new(), "the gateway will serve it");
-    let other_gateway = Some(Heard { gateway: true, ..Heard::default() });
+    let other_gateway = Some(ObservedTraffic { gateway: true, ..ObservedTraffic::default() });
     assert!(
         embedded(other_gateway)[0]
             .starts_with("fault: another gateway sends joints on the embedded bus vcan0")
@@ -330,7 +330,7 @@ fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
 
 #[test]
 fn a_bus_that_does_not_open_says_why() {
-    let said = about(|facts| facts.buses[0].heard = Err("not allowed to open vcan0".into()));
+    let said = about(|facts| facts.buses[0].traffic = Err("not allowed to open vcan0".into()));
     assert_eq!(said, ["fault: not allowed to open vcan0"]);
 }
 
@@ -378,7 +378,7 @@ fn the_backlog_holds_an_answer_of_every_cell_of_every_bus() {
     assert!(backlog(None)[0].starts_with("note: the kernel's backlog cannot be seen"));
     let two = about(|facts| {
         facts.backlog = Some(150);
-        facts.buses.push(bus(Some(interface("vcan1", Kind::Vcan))));
+        facts.buses.push(bus(Some(interface("vcan1", InterfaceKind::Vcan))));
     });
     assert!(two[0].starts_with("fault: the kernel's backlog of 150"), "{two:?}");
 }
@@ -388,8 +388,8 @@ fn without_a_skin_some_interface_has_to_be_of_use() {
     let machine = |present: Vec<Interface>| {
         about(|facts| (facts.buses, facts.present, facts.user.admin) = (Vec::new(), present, true))
     };
-    assert_eq!(machine(vec![interface("vcan3", Kind::Vcan)]), Vec::<String>::new());
-    let down = Interface { up: false, ..interface("vcan3", Kind::Vcan) };
+    assert_eq!(machine(vec![interface("vcan3", InterfaceKind::Vcan)]), Vec::<String>::new());
+    let down = Interface { up: false, ..interface("vcan3", InterfaceKind::Vcan) };
     let expected = "fault: no CAN interface is up | vcan-setup up vcan0";
     for present in [vec![], vec![down]] {
         assert_eq!(machine(present)[0], expected);
@@ -401,7 +401,7 @@ fn the_cells_program_is_needed_unless_the_cells_are_there() {
     let without = |no_spawn| {
         about(|facts| {
             (facts.cell_node.there, facts.no_spawn) = (false, no_spawn);
-            facts.buses[0].heard = Ok(Some(cells(1..=100)));
+            facts.buses[0].traffic = Ok(Some(cells(1..=100)));
         })
     };
     assert!(without(false)[1].starts_with("fault: cell-node is not at /bin/cell-node"));
@@ -414,7 +414,7 @@ fn sums_run_wherever_nothing_real_is() {
     assert_eq!(about(sums), Vec::<String>::new());
     let said = about(|facts| {
         let hardware = Hardware { bitrate: Some(1_000_000), ..Hardware::default() };
-        facts.buses = vec![bus(Some(interface("can0", Kind::Hardware(hardware))))];
+        facts.buses = vec![bus(Some(interface("can0", InterfaceKind::Hardware(hardware))))];
         sums(facts);
     });
     let expected = "fault: can0 is CAN hardware, and the wires between cells that answer with sums are simulated by \

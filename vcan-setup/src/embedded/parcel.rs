@@ -8,13 +8,13 @@ const FLAGS_BYTE: usize = 5;
 
 /// A `struct can_frame` or `struct canfd_frame`, as the bus forwards it.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Parcel {
+pub struct FrameDatagram {
     bytes: [u8; FD_BYTES],
     id: u32,
     format: Format,
 }
 
-impl Parcel {
+impl FrameDatagram {
     /// Checks a client's datagram; returns `None` if it is not a frame that `CAN_RAW` would send.
     ///
     /// The size must be that of one of the structs, and the length at most the data that it holds. CAN FD requires that
@@ -78,7 +78,7 @@ mod tests {
     #[test]
     fn what_can_raw_refuses_to_send_is_refused() {
         for case in cases::refused() {
-            assert_eq!(Parcel::accept(&case.datagram, case.fd), None, "{}", case.what);
+            assert_eq!(FrameDatagram::accept(&case.datagram, case.fd), None, "{}", case.what);
         }
     }
 
@@ -86,7 +86,7 @@ mod tests {
     fn the_fdf_flag_is_set_and_the_own_mark_cannot_be_forged() {
         let mut bytes = Frame::with_data(0x201, Format::Fd, 1, &[7]).unwrap().to_bytes();
         bytes[OWN_BYTE] = 1;
-        let parcel = Parcel::accept(&bytes, true).unwrap();
+        let parcel = FrameDatagram::accept(&bytes, true).unwrap();
         assert_eq!(parcel.bytes()[4..9], [1, 1 | FD_FORMAT, 0, 0, 7]);
         assert_eq!(parcel.marked(true).bytes()[OWN_BYTE], 1);
         assert_eq!(parcel.marked(true).marked(false), parcel);
@@ -96,14 +96,14 @@ mod tests {
         #[test]
         fn a_frame_passes_unchanged(id: u32, fd: bool, data in proptest::collection::vec(any::<u8>(), 0..=8)) {
             let frame = if fd { Frame::fd(id, 1, &data) } else { Frame::classic(id, &data) }.unwrap();
-            let parcel = Parcel::accept(&frame.to_bytes()[..frame.byte_len()], true).unwrap();
+            let parcel = FrameDatagram::accept(&frame.to_bytes()[..frame.byte_len()], true).unwrap();
             prop_assert_eq!(&parcel.bytes()[..parcel.byte_len()], &frame.to_bytes()[..frame.byte_len()]);
             prop_assert_eq!((parcel.raw_id(), parcel.format()), (frame.raw_id(), frame.format()));
         }
 
         #[test]
         fn no_datagram_panics(bytes in proptest::collection::vec(any::<u8>(), 0..80), fd: bool) {
-            let _ = Parcel::accept(&bytes, fd);
+            let _ = FrameDatagram::accept(&bytes, fd);
         }
     }
 }

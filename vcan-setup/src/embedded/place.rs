@@ -20,7 +20,7 @@ use thiserror::Error;
 /// The error of a bus that cannot be served under a name.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum PlaceError {
+pub enum BusSocketError {
     /// The name is not allowed.
     #[error(transparent)]
     Name(BusError),
@@ -53,7 +53,7 @@ pub enum PlaceError {
 /// A listening socket in its directory. Dropping it removes the socket, and the directory if a server created it and it
 /// is empty.
 #[derive(Debug)]
-pub(super) struct Place {
+pub(super) struct BusSocket {
     pub(super) listener: OwnedFd,
     pub(super) path: PathBuf,
     directory: PathBuf,
@@ -65,26 +65,26 @@ pub(super) struct Place {
 /// The maximum number of clients waiting to be accepted; the kernel's own limit is often lower.
 const BACKLOG: i32 = 4096;
 
-impl Place {
-    pub(super) fn take(directory: &Path, name: &str) -> Result<Self, PlaceError> {
-        protocol::bus::check_name(name).map_err(PlaceError::Name)?;
+impl BusSocket {
+    pub(super) fn bind(directory: &Path, name: &str) -> Result<Self, BusSocketError> {
+        protocol::bus::check_name(name).map_err(BusSocketError::Name)?;
         let file = socket_name(name);
         let path = directory.join(&file);
         let address = address(directory, name)?;
         let failed = |doing| {
             let path = path.clone();
-            move |errno: Errno| PlaceError::Io { path, doing, source: errno.into() }
+            move |errno: Errno| BusSocketError::Io { path, doing, source: errno.into() }
         };
         let lock = lock(directory)?;
         match rustix::fs::statat(&lock, &file, AtFlags::SYMLINK_NOFOLLOW) {
             Ok(stat) if FileType::from_raw_mode(stat.st_mode) != FileType::Socket => {
-                return Err(PlaceError::InTheWay(path));
+                return Err(BusSocketError::InTheWay(path));
             }
             Ok(_) => {
                 let probe = seqpacket(SocketFlags::NONBLOCK).map_err(failed("ask for"))?;
                 // Only a socket without a listener refuses; a full backlog does not.
                 if rustix::net::connect(&probe, &address) != Err(Errno::CONNREFUSED) {
-                    return Err(PlaceError::Served { name: name.to_owned(), path });
+                    return Err(BusSocketError::Served { name: name.to_owned(), path });
                 }
                 rustix::fs::unlinkat(&lock, &file, AtFlags::empty()).map_err(failed("remove"))?;
             }
@@ -111,7 +111,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for BusSocket {
     fn drop(&mut self) {
         // Nothing more can be done if another program removed the socket, or if the directory holds other buses or
         // belongs to the user.
@@ -123,8 +123,8 @@ impl Drop for Place {
 const MOST_ABSENT: u32 = 1_000;
 
 /// Creates the directory if necessary, and locks it.
-fn lock(path: &Path) -> Result<OwnedFd, PlaceError> {
-    let failed = |errno: Errno| PlaceError::Io { path: path.to_owned(), doing: "lock", source: errno.into() };
+fn lock(path: &Path) -> Result<OwnedFd, BusSocketError> {
+    let failed = |errno: Errno| BusSocketError::Io { path: path.to_owned(), doing: "lock", source: errno.into() };
     let mut absent = 0;
     loop {
         let directory = match make_directory(path) {
@@ -157,7 +157,7 @@ mod tests {
 
     #[test]
     fn a_directory_that_cannot_be_made_is_refused_and_not_tried_forever() {
-        let error = Place::take(Path::new("/proc/skinbus"), "vcan0").unwrap_err().to_string();
+        let error = BusSocket::bind(Path::new("/proc/skinbus"), "vcan0").unwrap_err().to_string();
         assert!(error.ends_with("; set SKINBUS_DIR to a directory of your own"), "{error}");
     }
 }

@@ -2,13 +2,13 @@
 
 use std::collections::VecDeque;
 
-use super::parcel::Parcel;
+use super::parcel::FrameDatagram;
 
 /// An entry of the queue.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Entry {
+pub enum QueueEntry {
     /// A frame.
-    Frame(Parcel),
+    Frame(FrameDatagram),
     /// The number of frames dropped so far.
     Dropped(u32),
 }
@@ -16,15 +16,15 @@ pub enum Entry {
 /// A bounded queue. When it is full the newest frame is dropped, as in a socket's receive buffer, and the client gets
 /// the total before its next frame.
 #[derive(Debug)]
-pub struct Queue {
-    entries: VecDeque<Entry>,
+pub struct ClientQueue {
+    entries: VecDeque<QueueEntry>,
     frames: usize,
     limit: usize,
     dropped: u32,
     reported: u32,
 }
 
-impl Queue {
+impl ClientQueue {
     /// Creates an empty queue for at most `limit` frames.
     #[must_use]
     pub const fn new(limit: usize) -> Self {
@@ -32,13 +32,13 @@ impl Queue {
     }
 
     /// Appends a frame. Returns false if there was no room; the frame is then dropped and counted.
-    pub fn push(&mut self, parcel: Parcel) -> bool {
+    pub fn push(&mut self, parcel: FrameDatagram) -> bool {
         if self.frames >= self.limit {
             self.dropped = self.dropped.wrapping_add(1);
             return false;
         }
         self.report_dropped();
-        self.entries.push_back(Entry::Frame(parcel));
+        self.entries.push_back(QueueEntry::Frame(parcel));
         self.frames += 1;
         true
     }
@@ -47,20 +47,20 @@ impl Queue {
     /// empty, so that the report has the correct position in the sequence.
     pub fn report_dropped(&mut self) {
         if self.reported != self.dropped {
-            self.entries.push_back(Entry::Dropped(self.dropped));
+            self.entries.push_back(QueueEntry::Dropped(self.dropped));
             self.reported = self.dropped;
         }
     }
 
     /// Returns the entries, oldest first.
-    pub fn iter(&self) -> impl Iterator<Item = &Entry> {
+    pub fn iter(&self) -> impl Iterator<Item = &QueueEntry> {
         self.entries.iter()
     }
 
     /// Removes the oldest `count` entries, which were sent. Returns the number of frames among them.
     pub fn sent(&mut self, count: usize) -> usize {
         let sent = self.entries.drain(..count.min(self.entries.len()));
-        let frames = sent.filter(|entry| matches!(entry, Entry::Frame(_))).count();
+        let frames = sent.filter(|entry| matches!(entry, QueueEntry::Frame(_))).count();
         self.frames -= frames;
         frames
     }
@@ -84,29 +84,29 @@ mod tests {
     use proptest::prelude::*;
     use protocol::can::Frame;
 
-    fn parcel(id: u32) -> Parcel {
-        Parcel::accept(&Frame::classic(id, &[]).unwrap().to_bytes()[..16], true).unwrap()
+    fn parcel(id: u32) -> FrameDatagram {
+        FrameDatagram::accept(&Frame::classic(id, &[]).unwrap().to_bytes()[..16], true).unwrap()
     }
 
     #[test]
     fn what_does_not_fit_is_dropped_and_reported_before_the_next_frame() {
-        let mut queue = Queue::new(2);
+        let mut queue = ClientQueue::new(2);
         let kept: Vec<_> = (0..5).map(|id| queue.push(parcel(id))).collect();
         assert_eq!(kept, [true, true, false, false, false]);
         assert_eq!(queue.sent(2), 2);
         assert!(queue.push(parcel(5)));
-        assert_eq!(queue.iter().copied().collect::<Vec<_>>(), [Entry::Dropped(3), Entry::Frame(parcel(5))]);
+        assert_eq!(queue.iter().copied().collect::<Vec<_>>(), [QueueEntry::Dropped(3), QueueEntry::Frame(parcel(5))]);
     }
 
     #[test]
     fn a_total_is_reported_once() {
-        let mut queue = Queue::new(0);
+        let mut queue = ClientQueue::new(0);
         queue.report_dropped();
         assert!(queue.is_empty());
         queue.push(parcel(0));
         queue.report_dropped();
         queue.report_dropped();
-        assert_eq!(queue.iter().copied().collect::<Vec<_>>(), [Entry::Dropped(1)]);
+        assert_eq!(queue.iter().copied().collect::<Vec<_>>(), [QueueEntry::Dropped(1)]);
         assert_eq!(queue.sent(1), 0);
     }
 
@@ -114,12 +114,12 @@ mod tests {
         /// `true` pushes the next frame, `false` sends the oldest entry.
         #[test]
         fn a_reader_knows_at_every_frame_how_many_are_missing(limit in 0_usize..6, steps in proptest::collection::vec(any::<bool>(), 0..60)) {
-            let mut queue = Queue::new(limit);
+            let mut queue = ClientQueue::new(limit);
             let (mut pushed, mut heard, mut missing) = (0_u32, 0_u32, 0_u32);
-            let mut hear = |queue: &mut Queue| {
+            let mut hear = |queue: &mut ClientQueue| {
                 match queue.iter().next().copied() {
-                    Some(Entry::Dropped(total)) => missing = total,
-                    Some(Entry::Frame(parcel)) => {
+                    Some(QueueEntry::Dropped(total)) => missing = total,
+                    Some(QueueEntry::Frame(parcel)) => {
                         assert_eq!(parcel.raw_id(), heard + missing);
                         heard += 1;
                     }

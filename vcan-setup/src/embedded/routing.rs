@@ -7,7 +7,7 @@ use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 
 use protocol::bus::Filter;
-use protocol::bus::embedded::Hello;
+use protocol::bus::embedded::ClientHello;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, REMOTE, STANDARD_MASK};
 
 /// The index of a client in the server's table.
@@ -27,7 +27,7 @@ enum Class {
 
 impl Class {
     /// Classifies a filter as the kernel's `can_rcv_list_find` does.
-    fn of(filter: Filter) -> Self {
+    fn from_filter(filter: Filter) -> Self {
         let Filter { id, mut mask } = filter;
         if mask & ERROR != 0 {
             return Self::Errors(mask & EXTENDED_MASK);
@@ -55,7 +55,7 @@ impl Class {
 }
 
 #[derive(Clone, Debug)]
-struct Wants {
+struct Subscription {
     /// The filters for which it is listed.
     filters: Vec<Filter>,
     own_frames: bool,
@@ -65,17 +65,17 @@ struct Wants {
     last: u64,
 }
 
-impl Wants {
+impl Subscription {
     fn classes(&self) -> impl Iterator<Item = Class> + use<'_> {
         let errors = (self.error_mask != 0).then_some(Class::Errors(self.error_mask & EXTENDED_MASK));
-        self.filters.iter().copied().map(Class::of).chain(errors)
+        self.filters.iter().copied().map(Class::from_filter).chain(errors)
     }
 }
 
 /// The subscriptions of all clients.
 #[derive(Debug, Default)]
 pub struct Router {
-    clients: Vec<Option<Wants>>,
+    clients: Vec<Option<Subscription>>,
     /// The clients that subscribe to exactly one data frame identifier.
     exact: HashMap<u32, Vec<ClientId>>,
     /// The filters that are compared with every frame.
@@ -91,13 +91,13 @@ impl Router {
     }
 
     /// Replaces a client's subscription.
-    pub fn insert(&mut self, client: ClientId, hello: &Hello) {
+    pub fn insert(&mut self, client: ClientId, hello: &ClientHello) {
         self.remove(client);
         if self.clients.len() <= client.0 {
             self.clients.resize_with(client.0 + 1, || None);
         }
-        let Hello { ref filters, own_frames, fd, error_mask, buffer: _ } = *hello;
-        let wants = Wants { filters: filters.clone(), own_frames, fd, error_mask, last: 0 };
+        let ClientHello { ref filters, own_frames, fd, error_mask, buffer: _ } = *hello;
+        let wants = Subscription { filters: filters.clone(), own_frames, fd, error_mask, last: 0 };
         self.list(client, &wants);
         if let Some(slot) = self.clients.get_mut(client.0) {
             *slot = Some(wants);
@@ -115,7 +115,7 @@ impl Router {
         }
     }
 
-    fn list(&mut self, client: ClientId, wants: &Wants) {
+    fn list(&mut self, client: ClientId, wants: &Subscription) {
         for class in wants.classes() {
             match class {
                 Class::Exact(id) => self.exact.entry(id).or_default().push(client),
@@ -133,7 +133,7 @@ impl Router {
 
     /// Searches only the lists that contain the client: hundreds of clients change their filters while frames are
     /// waiting.
-    fn unlist(&mut self, client: ClientId, wants: &Wants) {
+    fn unlist(&mut self, client: ClientId, wants: &Subscription) {
         for class in wants.classes() {
             match class {
                 Class::Exact(id) => {
@@ -182,8 +182,8 @@ mod tests {
     use crate::embedded::cases;
     use proptest::prelude::*;
 
-    fn hello(filters: &[Filter]) -> Hello {
-        Hello { filters: filters.to_vec(), own_frames: false, fd: true, error_mask: 0, buffer: 0 }
+    fn hello(filters: &[Filter]) -> ClientHello {
+        ClientHello { filters: filters.to_vec(), own_frames: false, fd: true, error_mask: 0, buffer: 0 }
     }
 
     /// Returns the receivers of a frame, in order of their numbers.
@@ -198,7 +198,7 @@ mod tests {
     fn every_case_comes_out_as_can_raw_has_it() {
         for case in cases::cases() {
             let mut router = Router::new();
-            let hello = Hello {
+            let hello = ClientHello {
                 filters: case.filters.clone(),
                 own_frames: case.own_frames,
                 fd: case.fd,
@@ -279,7 +279,7 @@ mod tests {
         fn filters_that_were_changed_are_as_if_they_had_been_the_first(before in proptest::collection::vec(filter(), 0..5), after in proptest::collection::vec(filter(), 0..5), error_mask in 0..8_u32, id in word()) {
             let id = sound(id);
             let mut router = Router::new();
-            router.insert(ClientId(1), &Hello { error_mask, own_frames: true, ..hello(&before) });
+            router.insert(ClientId(1), &ClientHello { error_mask, own_frames: true, ..hello(&before) });
             router.set_filters(ClientId(1), after.clone());
             let expected = if passes(&after, error_mask, id) { vec![(1, true)] } else { vec![] };
             prop_assert_eq!(receivers(&mut router, 1, id, Format::Classic), expected);
@@ -291,7 +291,7 @@ mod tests {
         fn classes_change_nothing(filters in proptest::collection::vec(filter(), 0..5), error_mask in prop_oneof![Just(0_u32), 0..8_u32], id in word()) {
             let id = sound(id);
             let mut router = Router::new();
-            router.insert(ClientId(1), &Hello { error_mask, ..hello(&filters) });
+            router.insert(ClientId(1), &ClientHello { error_mask, ..hello(&filters) });
             let got = receivers(&mut router, 0, id, Format::Classic);
             let expected = if passes(&filters, error_mask, id) { vec![(1, false)] } else { vec![] };
             prop_assert_eq!(got, expected);

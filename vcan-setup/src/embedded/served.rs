@@ -4,25 +4,25 @@ use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::thread::JoinHandle;
 
-use protocol::bus::embedded::usual_directory;
+use protocol::bus::embedded::default_directory;
 
-use super::{ServeError, Server, Totals};
+use super::{ServeError, Server, BusTotals};
 
 /// A bus that a thread of this process serves until this is dropped.
 #[derive(Debug)]
-pub struct Served {
+pub struct ServerThread {
     path: PathBuf,
     stop: Option<UnixStream>,
-    thread: Option<JoinHandle<Result<Totals, ServeError>>>,
+    thread: Option<JoinHandle<Result<BusTotals, ServeError>>>,
 }
 
-impl Served {
+impl ServerThread {
     /// Serves a bus in the usual directory.
     ///
     /// # Errors
     /// Returns [`ServeError`] as [`Server::bind`] does.
     pub fn start(name: &str) -> Result<Self, ServeError> {
-        Self::start_in(&usual_directory(), name)
+        Self::start_in(&default_directory(), name)
     }
 
     /// Serves a bus in another directory.
@@ -54,14 +54,14 @@ impl Served {
     ///
     /// # Panics
     /// If the thread of the server panicked.
-    pub fn stop(mut self) -> Result<Totals, ServeError> {
+    pub fn stop(mut self) -> Result<BusTotals, ServeError> {
         drop(self.stop.take());
         let thread = self.thread.take().expect("stopped once");
         thread.join().expect("the bus's thread does not panic")
     }
 }
 
-impl Drop for Served {
+impl Drop for ServerThread {
     fn drop(&mut self) {
         drop(self.stop.take());
         if let Some(thread) = self.thread.take() {

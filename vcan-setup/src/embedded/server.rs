@@ -7,8 +7,8 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use protocol::bus::Filter;
-use protocol::bus::batch::{BATCH, Batch, Datagram, is_shortage};
-use protocol::bus::embedded::{FilterPart, usual_directory};
+use protocol::bus::batch::{BATCH, Batch, Datagram, is_memory_shortage};
+use protocol::bus::embedded::{FilterPart, default_directory};
 use rustix::buffer::spare_capacity;
 use rustix::event::epoll::{self, EventData, EventFlags};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -16,23 +16,23 @@ use rustix::io::Errno;
 use rustix::net::{Shutdown, shutdown};
 use thiserror::Error;
 
-use super::client::{Client, Post, Sent};
-use super::parcel::Parcel;
-use super::place::{Place, PlaceError};
+use super::client::{Client, SendContext, SendOutcome};
+use super::parcel::FrameDatagram;
+use super::place::{BusSocket, BusSocketError};
 use super::routing::{ClientId, Router};
 
-pub use super::totals::Totals;
+pub use super::totals::BusTotals;
 
 mod admission;
 #[cfg(test)]
 mod tests;
 
 /// The maximum number of batches read from one client before the next one's turn: more than its send buffer holds.
-const DRAIN: usize = 16;
+const MAX_BATCHES_PER_CLIENT: usize = 16;
 /// The time for which a socket is left alone after an error that may last, such as a lack of memory or files.
 const PAUSE: Duration = Duration::from_millis(1);
 /// The number of failed receptions in a row after which a client is given up; this takes a second.
-const FAILURES: u32 = 1_000;
+const MAX_FAILURES: u32 = 1_000;
 const LISTENER: u64 = u64::MAX;
 const STOP: u64 = u64::MAX - 1;
 
@@ -42,7 +42,7 @@ const STOP: u64 = u64::MAX - 1;
 pub enum ServeError {
     /// The server could not begin.
     #[error(transparent)]
-    Place(#[from] PlaceError),
+    Place(#[from] BusSocketError),
     /// A system call failed.
     #[error("cannot {doing} while serving {name}: {source}")]
     Io {
@@ -59,7 +59,7 @@ pub enum ServeError {
 #[derive(Debug)]
 pub struct Server {
     name: String,
-    place: Place,
+    place: BusSocket,
     /// A reserved file descriptor, which is released for a moment to turn a client away when no others are left.
     spare: Option<OwnedFd>,
     /// A client that is turned away and has not sent its hello.
@@ -68,7 +68,7 @@ pub struct Server {
     /// Clients with something to send at the end of the round.
     dirty: VecDeque<ClientId>,
     router: Router,
-    post: Post,
+    post: SendContext,
     /// Tokens of sockets that are left alone until `resume_at`.
     paused: Vec<u64>,
     resume_at: Option<Instant>,
@@ -98,7 +98,7 @@ impl Server {
     /// # Errors
     /// Returns [`ServeError`] if the name is already served, or if the directory is accessible to other users.
     pub fn bind(name: &str) -> Result<Self, ServeError> {
-        Self::bind_in(&usual_directory(), name)
+        Self::bind_in(&default_directory(), name)
     }
 
     /// Binds a name in another directory.
@@ -108,7 +108,7 @@ impl Server {
     pub fn bind_in(directory: &Path, name: &str) -> Result<Self, ServeError> {
         let failed =
             |doing| move |errno: Errno| ServeError::Io { name: name.to_owned(), doing, source: errno.into() };
-        let place = Place::take(directory, name)?;
+        let place = BusSocket::bind(directory, name)?;
         let epoll = epoll::create(epoll::CreateFlags::CLOEXEC).map_err(failed("make an epoll"))?;
         epoll::add(&epoll, &place.listener, EventData::new_u64(LISTENER), EventFlags::IN)
             .map_err(failed("listen"))?;
@@ -120,7 +120,7 @@ impl Server {
             clients: Vec::new(),
             dirty: VecDeque::new(),
             router: Router::new(),
-            post: Post { epoll, outgoing: Box::default(), totals: Totals::default() },
+            post: SendContext { epoll, outgoing: Box::default(), totals: BusTotals::default() },
             paused: Vec::new(),
             resume_at: None,
         })
@@ -142,11 +142,11 @@ impl Server {
     ///
     /// # Errors
     /// Returns [`ServeError`] if a system call fails, which no client can cause.
-    pub fn run(self, stop: impl AsFd) -> Result<Totals, ServeError> {
+    pub fn run(self, stop: impl AsFd) -> Result<BusTotals, ServeError> {
         self.run_with(stop, Batch::new())
     }
 
-    fn run_with(mut self, stop: impl AsFd, mut batch: impl Receive) -> Result<Totals, ServeError> {
+    fn run_with(mut self, stop: impl AsFd, mut batch: impl Receive) -> Result<BusTotals, ServeError> {
         let name = self.name.clone();
         let failed = |doing, errno: Errno| ServeError::Io { name: name.clone(), doing, source: errno.into() };
         epoll::add(&self.post.epoll, &stop, EventData::new_u64(STOP), EventFlags::IN)
@@ -158,7 +158,7 @@ impl Server {
             let timeout = pause.and_then(|pause| Timespec::try_from(pause).ok());
             match epoll::wait(&self.post.epoll, spare_capacity(&mut events), timeout.as_ref()) {
                 Ok(_) | Err(Errno::INTR) => {}
-                Err(errno) if is_shortage(&errno.into()) => std::thread::sleep(PAUSE),
+                Err(errno) if is_memory_shortage(&errno.into()) => std::thread::sleep(PAUSE),
                 Err(errno) => return Err(failed("wait", errno)),
             }
             for &epoll::Event { flags, data } in &events {
@@ -224,7 +224,7 @@ impl Server {
         }
     }
 
-    fn end(&mut self) -> Totals {
+    fn end(&mut self) -> BusTotals {
         for index in 0..self.clients.len() {
             self.forget(ClientId(index));
         }
@@ -251,7 +251,7 @@ impl Server {
     /// Routes the datagrams of a client. All data that a client can have in flight is read at once, so that it comes
     /// before data that another client sent later. More data waits, so that no client delays the others.
     fn drain(&mut self, id: ClientId, batch: &mut impl Receive) {
-        for _ in 0..DRAIN {
+        for _ in 0..MAX_BATCHES_PER_CLIENT {
             let Some(client) = self.client(id) else { return };
             let fd = client.fd;
             match batch.receive(&client.socket) {
@@ -278,7 +278,7 @@ impl Server {
                         Err(errno) => failure = Some(errno),
                     }
                 }
-                match bytes.and_then(|bytes| Parcel::accept(bytes, fd)) {
+                match bytes.and_then(|bytes| FrameDatagram::accept(bytes, fd)) {
                     Some(parcel) => self.route(id, parcel),
                     None if bytes.is_some_and(|bytes| self.refilter(id, bytes)) => {}
                     None => self.post.totals.garbage += 1,
@@ -322,7 +322,7 @@ impl Server {
     fn fails(&mut self, id: ClientId, errno: Errno) {
         let Some(client) = self.client(id) else { return };
         client.failures += 1;
-        if client.failures < FAILURES {
+        if client.failures < MAX_FAILURES {
             return self.pause(id.0 as u64);
         }
         self.give_up(id, errno);
@@ -337,7 +337,7 @@ impl Server {
         }
     }
 
-    fn route(&mut self, from: ClientId, parcel: Parcel) {
+    fn route(&mut self, from: ClientId, parcel: FrameDatagram) {
         let Self { router, clients, dirty, post, .. } = self;
         post.totals.frames += 1;
         router.route(from, parcel.raw_id(), parcel.format(), |to, own| {
@@ -348,7 +348,7 @@ impl Server {
                 sibling.send_early(post);
             }
             let Some(client) = clients.get_mut(to.0).and_then(Option::as_mut) else { return };
-            if client.take(parcel.marked(own), post) {
+            if client.enqueue(parcel.marked(own), post) {
                 dirty.push_back(to);
             }
         });
@@ -358,10 +358,10 @@ impl Server {
         let Self { clients, post, .. } = self;
         let Some(client) = client(clients, id.0) else { return };
         match client.flush(post) {
-            Sent::Done => {}
-            Sent::Shortage => self.pause(id.0 as u64),
-            Sent::Gone => self.release(id),
-            Sent::Failed(errno) => {
+            SendOutcome::Done => {}
+            SendOutcome::Shortage => self.pause(id.0 as u64),
+            SendOutcome::Gone => self.release(id),
+            SendOutcome::Failed(errno) => {
                 self.give_up(id, errno);
                 self.release(id);
             }

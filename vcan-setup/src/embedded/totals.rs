@@ -5,7 +5,7 @@ use rustix::io::Errno;
 /// The counts of a bus. `routed` equals `delivered + dropped + abandoned` when no frames wait.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 #[non_exhaustive]
-pub struct Totals {
+pub struct BusTotals {
     /// Accepted clients.
     pub clients: u64,
     /// Refused connections: no hello, or one of another version.

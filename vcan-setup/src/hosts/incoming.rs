@@ -6,17 +6,17 @@ use protocol::can::Frame;
 use protocol::id::{CellId, Id};
 use serde::{Deserialize, Serialize};
 
-use super::message::{Head, MessageError, Stamped, decode};
+use super::message::{MessageHeader, MessageError, Stamped, decode};
 
 /// The maximum number of frames that wait for the bus.
-pub const QUEUE: usize = 8_192;
+pub const MAX_WAITING_FRAMES: usize = 8_192;
 /// The maximum number of sources. Without a limit, a host that changes its name each time would fill the memory.
-pub const SOURCES: usize = 256;
+pub const MAX_SOURCES: usize = 256;
 
 /// The account of the frames of one source. `numbered` equals `before + dropped_there + lost + taken`; `taken` equals
 /// `sent + copies + dropped_here + refused` plus the frames that wait.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
-pub struct Heard {
+pub struct SourceAccount {
     /// Numbers that the source has assigned, over all its starts.
     pub numbered: u64,
     /// Numbers from before this link first received from the source, or before a restart of the source.
@@ -48,7 +48,7 @@ pub struct Heard {
     pub shared: u64,
 }
 
-impl Heard {
+impl SourceAccount {
     /// Returns the number of frames that did not get through, wherever they were lost.
     #[must_use]
     pub fn missing(&self) -> u64 {
@@ -60,10 +60,10 @@ impl Heard {
 
 /// The node ids of the cells whose frames came from a host.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Nodes([u64; 4]);
+pub struct NodeSet([u64; 4]);
 
-impl Nodes {
-    fn take(&mut self, frame: &Frame) {
+impl NodeSet {
+    fn add_sender(&mut self, frame: &Frame) {
         let id = u16::try_from(frame.id()).ok().filter(|_| !frame.is_extended() && !frame.is_error());
         let Some(cell) = id.and_then(|id| Id::from_bits(id).sender()) else { return };
         let (word, bit) = (cell.get() / 64, cell.get() % 64);
@@ -88,18 +88,18 @@ const fn add(counter: &mut u64, more: u64) {
 
 #[derive(Debug, Default)]
 struct Source {
-    head: Head,
+    head: MessageHeader,
     /// The number of its next frame.
     next: u64,
     /// The random number of its previous start.
     before: Option<u64>,
-    account: Heard,
-    nodes: Nodes,
+    account: SourceAccount,
+    nodes: NodeSet,
 }
 
 impl Source {
     /// Accounts for the numbers of a message. Returns the number of its frames that were received before.
-    fn take(&mut self, head: &Head, count: u64) -> u64 {
+    fn account_for(&mut self, head: &MessageHeader, count: u64) -> u64 {
         let account = &mut self.account;
         if account.lives == 0 || self.head.life != head.life {
             account.lives += 1;
@@ -134,7 +134,7 @@ pub struct Incoming {
     sources: BTreeMap<String, Source>,
     waiting: VecDeque<Frame>,
     /// The hosts of the waiting frames, in runs.
-    of: VecDeque<(String, usize)>,
+    runs: VecDeque<(String, usize)>,
     /// Messages of hosts beyond [`SOURCES`].
     unknown_hosts: u64,
     frames: Vec<Stamped>,
@@ -145,9 +145,9 @@ impl Incoming {
     ///
     /// # Errors
     /// Returns [`MessageError`] if the message is invalid; it is counted.
-    pub fn take(&mut self, host: &str, bytes: &[u8]) -> Result<(), MessageError> {
+    pub fn receive(&mut self, host: &str, bytes: &[u8]) -> Result<(), MessageError> {
         if !self.sources.contains_key(host) {
-            if self.sources.len() >= SOURCES {
+            if self.sources.len() >= MAX_SOURCES {
                 self.unknown_hosts += 1;
                 return Ok(());
             }
@@ -156,17 +156,17 @@ impl Incoming {
         let Some(source) = self.sources.get_mut(host) else { return Ok(()) };
         self.frames.clear();
         let head = decode(bytes, &mut self.frames).inspect_err(|_| source.account.garbage += 1)?;
-        let again = source.take(&head, self.frames.len() as u64);
+        let again = source.account_for(&head, self.frames.len() as u64);
         let new = self.frames.iter().skip(usize::try_from(again).unwrap_or(usize::MAX));
-        new.clone().for_each(|stamped| source.nodes.take(&stamped.frame));
-        let room = QUEUE.saturating_sub(self.waiting.len());
+        new.clone().for_each(|stamped| source.nodes.add_sender(&stamped.frame));
+        let room = MAX_WAITING_FRAMES.saturating_sub(self.waiting.len());
         let before = self.waiting.len();
         self.waiting.extend(new.clone().take(room).map(|stamped| stamped.frame));
         let added = self.waiting.len() - before;
         source.account.dropped_here += (new.len() - added) as u64;
-        match self.of.back_mut() {
+        match self.runs.back_mut() {
             Some((last, count)) if last == host => *count += added,
-            _ if added > 0 => self.of.push_back((host.to_owned(), added)),
+            _ if added > 0 => self.runs.push_back((host.to_owned(), added)),
             _ => {}
         }
         Ok(())
@@ -193,24 +193,24 @@ impl Incoming {
         self.gone(count, |account, count| account.refused += count);
     }
 
-    fn gone(&mut self, count: usize, note: impl Fn(&mut Heard, u64)) {
+    fn gone(&mut self, count: usize, note: impl Fn(&mut SourceAccount, u64)) {
         let mut left = count.min(self.waiting.len());
         self.waiting.drain(..left);
         while left > 0 {
-            let Some((host, waiting)) = self.of.front_mut() else { return };
+            let Some((host, waiting)) = self.runs.front_mut() else { return };
             let of_it = left.min(*waiting);
             (*waiting, left) = (*waiting - of_it, left - of_it);
             if let Some(source) = self.sources.get_mut(host.as_str()) {
                 note(&mut source.account, of_it as u64);
             }
             if *waiting == 0 {
-                self.of.pop_front();
+                self.runs.pop_front();
             }
         }
     }
 
     /// Returns the account of each host's frames, and the cells that sent them.
-    pub fn accounts(&self) -> impl Iterator<Item = (&str, Heard, Nodes)> {
+    pub fn accounts(&self) -> impl Iterator<Item = (&str, SourceAccount, NodeSet)> {
         self.sources.iter().map(|(host, source)| (host.as_str(), source.account, source.nodes))
     }
 
@@ -233,7 +233,7 @@ mod tests {
     use proptest::prelude::*;
     use protocol::id::{Kind, Node};
 
-    fn message(head: Head, count: u64) -> Vec<u8> {
+    fn message(head: MessageHeader, count: u64) -> Vec<u8> {
         let frame = |at: u64| Frame::classic(0x201, &(head.first + at).to_le_bytes()).unwrap();
         let frames: Vec<_> = (0..count).map(|at| Stamped { at_nanos: at, frame: frame(at) }).collect();
         let mut bytes = Vec::new();
@@ -241,7 +241,7 @@ mod tests {
         bytes
     }
 
-    fn heard(incoming: &Incoming) -> Heard {
+    fn heard(incoming: &Incoming) -> SourceAccount {
         incoming.accounts().next().unwrap().1
     }
 
@@ -249,7 +249,7 @@ mod tests {
     fn each_missing_frame_has_its_place() {
         let mut incoming = Incoming::default();
         let mut take = |life, first, dropped, missed, count| {
-            incoming.take("b", &message(Head { life, first, dropped, missed }, count)).unwrap();
+            incoming.receive("b", &message(MessageHeader { life, first, dropped, missed }, count)).unwrap();
         };
         take(1, 100, 3, 9, 10); // 100 were before
         take(1, 110, 3, 9, 10);
@@ -258,7 +258,7 @@ mod tests {
         take(1, 130, 5, 11, 10); // half of it again
         take(2, 4, 0, 0, 1); // it has restarted
         let account = heard(&incoming);
-        let expected = Heard {
+        let expected = SourceAccount {
             numbered: 145,
             before: 104,
             dropped_there: 2,
@@ -267,7 +267,7 @@ mod tests {
             repeated: 15,
             missed_there: 2,
             lives: 2,
-            ..Heard::default()
+            ..SourceAccount::default()
         };
         assert_eq!(account, expected);
         assert_eq!(incoming.waiting().len(), 36);
@@ -281,7 +281,7 @@ mod tests {
     fn two_hosts_of_one_name_are_noticed() {
         let mut incoming = Incoming::default();
         for life in [1, 2, 3, 2, 3] {
-            incoming.take("b", &message(Head { life, ..Head::default() }, 1)).unwrap();
+            incoming.receive("b", &message(MessageHeader { life, ..MessageHeader::default() }, 1)).unwrap();
         }
         assert_eq!((heard(&incoming).lives, heard(&incoming).shared), (5, 2));
     }
@@ -289,18 +289,18 @@ mod tests {
     #[test]
     fn what_the_bus_does_not_take_is_counted_for_its_host() {
         let mut incoming = Incoming::default();
-        let head = |first| Head { life: 1, first, ..Head::default() };
-        for first in (0..QUEUE as u64).step_by(256) {
-            incoming.take(if first % 512 == 0 { "b" } else { "c" }, &message(head(first), 256)).unwrap();
+        let head = |first| MessageHeader { life: 1, first, ..MessageHeader::default() };
+        for first in (0..MAX_WAITING_FRAMES as u64).step_by(256) {
+            incoming.receive(if first % 512 == 0 { "b" } else { "c" }, &message(head(first), 256)).unwrap();
         }
-        incoming.take("d", &message(head(0), 5)).unwrap();
+        incoming.receive("d", &message(head(0), 5)).unwrap();
         let of: Vec<_> = incoming.accounts().map(|(host, it, _)| (host, it.taken, it.dropped_here)).collect();
-        let half = QUEUE as u64 / 2;
+        let half = MAX_WAITING_FRAMES as u64 / 2;
         assert_eq!(of, [("b", half, 0), ("c", half, 0), ("d", 5, 5)]);
         incoming.sent(300);
         let sent: Vec<_> = incoming.accounts().map(|(_, it, _)| it.sent).collect();
         assert_eq!(sent, [256, 44, 0]);
-        assert!(incoming.take("b", &[9]).is_err());
+        assert!(incoming.receive("b", &[9]).is_err());
         assert_eq!(heard(&incoming).garbage, 1);
     }
 
@@ -316,8 +316,8 @@ mod tests {
             sent(of(Kind::Stimulus, 9)),
             sent(of(Kind::Torque, 7) | protocol::can::EXTENDED),
         ];
-        encode(&Head::default(), &frames, &mut bytes);
-        incoming.take("b", &bytes).unwrap();
+        encode(&MessageHeader::default(), &frames, &mut bytes);
+        incoming.receive("b", &bytes).unwrap();
         let nodes: Vec<_> = incoming.accounts().next().unwrap().2.iter().map(CellId::get).collect();
         assert_eq!(nodes, [7, 126]);
     }
@@ -325,20 +325,20 @@ mod tests {
     #[test]
     fn hosts_without_end_fill_nothing() {
         let mut incoming = Incoming::default();
-        for host in 0..SOURCES + 3 {
-            incoming.take(&host.to_string(), &message(Head::default(), 1)).unwrap();
+        for host in 0..MAX_SOURCES + 3 {
+            incoming.receive(&host.to_string(), &message(MessageHeader::default(), 1)).unwrap();
         }
-        assert_eq!((incoming.accounts().count(), incoming.unknown_hosts()), (SOURCES, 3));
+        assert_eq!((incoming.accounts().count(), incoming.unknown_hosts()), (MAX_SOURCES, 3));
     }
 
     #[test]
     fn a_host_that_says_impossible_numbers_is_counted_up_to_the_end() {
         let mut incoming = Incoming::default();
         for life in 0..4 {
-            let head = Head { life, first: u64::MAX / 2, dropped: u64::MAX / 2, missed: u64::MAX };
-            incoming.take("b", &message(head, 1)).unwrap();
-            let head = Head { first: u64::MAX - 5_000, dropped: u64::MAX - 5_000, ..head };
-            incoming.take("b", &message(head, 1)).unwrap();
+            let head = MessageHeader { life, first: u64::MAX / 2, dropped: u64::MAX / 2, missed: u64::MAX };
+            incoming.receive("b", &message(head, 1)).unwrap();
+            let head = MessageHeader { first: u64::MAX - 5_000, dropped: u64::MAX - 5_000, ..head };
+            incoming.receive("b", &message(head, 1)).unwrap();
         }
         let [(_, heard, _)] = incoming.accounts().collect::<Vec<_>>()[..] else { panic!("one host") };
         assert_eq!((heard.numbered, heard.taken, heard.missing()), (u64::MAX, 8, u64::MAX));
@@ -349,8 +349,8 @@ mod tests {
         fn accounts_add_up_whatever_comes(messages in proptest::collection::vec((0..3_u64, 0..400_u64, 0..30_u64, 0..9_u64, 0..20_u64, 0..30_usize), 0..60)) {
             let mut incoming = Incoming::default();
             for (life, first, dropped, missed, count, gone) in messages {
-                let head = Head { life, first, dropped: dropped.min(first), missed };
-                incoming.take("b", &message(head, count)).unwrap();
+                let head = MessageHeader { life, first, dropped: dropped.min(first), missed };
+                incoming.receive("b", &message(head, count)).unwrap();
                 match gone % 3 {
                     0 => incoming.sent(gone),
                     1 => incoming.copies(gone),

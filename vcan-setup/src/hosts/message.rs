@@ -19,9 +19,9 @@ use thiserror::Error;
 /// The only version.
 pub const VERSION: u8 = 1;
 /// The maximum number of frames in a message.
-pub const FRAMES: usize = 256;
+pub const MAX_FRAMES: usize = 256;
 /// The length of the header in bytes.
-const HEAD: usize = 42;
+const HEADER_BYTES: usize = 42;
 /// The length of a frame before its data, in bytes.
 const FRAME_HEAD: usize = 16;
 
@@ -36,7 +36,7 @@ pub struct Stamped {
 
 /// The header of a message.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Head {
+pub struct MessageHeader {
     /// A random number that identifies this start of the source.
     pub life: u64,
     /// The number of the first frame.
@@ -78,7 +78,7 @@ pub enum MessageError {
 }
 
 /// Encodes a message of at most [`FRAMES`] frames; further ones are left out.
-pub fn encode<'a>(head: &Head, frames: impl IntoIterator<Item = &'a Stamped>, bytes: &mut Vec<u8>) {
+pub fn encode<'a>(head: &MessageHeader, frames: impl IntoIterator<Item = &'a Stamped>, bytes: &mut Vec<u8>) {
     bytes.clear();
     bytes.extend([VERSION, 0, 0, 0, 0, 0, 0, 0]);
     for word in [head.life, head.first, head.dropped, head.missed] {
@@ -86,7 +86,7 @@ pub fn encode<'a>(head: &Head, frames: impl IntoIterator<Item = &'a Stamped>, by
     }
     bytes.extend([0, 0]);
     let mut count = 0_u16;
-    for Stamped { at_nanos, frame } in frames.into_iter().take(FRAMES) {
+    for Stamped { at_nanos, frame } in frames.into_iter().take(MAX_FRAMES) {
         let is_fd = frame.format() == Format::Fd;
         bytes.extend(at_nanos.to_le_bytes());
         bytes.extend(frame.raw_id().to_le_bytes());
@@ -95,7 +95,7 @@ pub fn encode<'a>(head: &Head, frames: impl IntoIterator<Item = &'a Stamped>, by
         bytes.extend(frame.data());
         count += 1;
     }
-    if let Some(place) = bytes.get_mut(HEAD - 2..HEAD) {
+    if let Some(place) = bytes.get_mut(HEADER_BYTES - 2..HEADER_BYTES) {
         place.copy_from_slice(&count.to_le_bytes());
     }
 }
@@ -104,7 +104,7 @@ pub fn encode<'a>(head: &Head, frames: impl IntoIterator<Item = &'a Stamped>, by
 ///
 /// # Errors
 /// Returns [`MessageError`] if the message has another version, is incomplete, or contains an invalid frame.
-pub fn decode(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<Head, MessageError> {
+pub fn decode(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<MessageHeader, MessageError> {
     let before = frames.len();
     let read = read(bytes, frames);
     if read.is_err() {
@@ -113,13 +113,13 @@ pub fn decode(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<Head, MessageEr
     read
 }
 
-fn read(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<Head, MessageError> {
+fn read(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<MessageHeader, MessageError> {
     let wrong = MessageError::Length(bytes.len());
     let &version = bytes.first().ok_or(wrong)?;
     if version != VERSION {
         return Err(MessageError::Version(version));
     }
-    let (head, mut rest) = bytes.split_first_chunk::<HEAD>().ok_or(wrong)?;
+    let (head, mut rest) = bytes.split_first_chunk::<HEADER_BYTES>().ok_or(wrong)?;
     let word = |at: usize| head.get(at..at + 8).and_then(|word| word.try_into().ok()).map(u64::from_le_bytes);
     let (Some(life), Some(first), Some(dropped), Some(missed)) = (word(8), word(16), word(24), word(32))
     else {
@@ -127,10 +127,10 @@ fn read(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<Head, MessageError> {
     };
     let [.., low, high] = *head;
     let count = usize::from(u16::from_le_bytes([low, high]));
-    if count > FRAMES {
+    if count > MAX_FRAMES {
         return Err(wrong);
     }
-    if dropped > first || first.checked_add(FRAMES as u64).is_none() {
+    if dropped > first || first.checked_add(MAX_FRAMES as u64).is_none() {
         return Err(MessageError::Numbers { first, dropped });
     }
     for index in 0..count {
@@ -152,7 +152,7 @@ fn read(bytes: &[u8], frames: &mut Vec<Stamped>) -> Result<Head, MessageError> {
         frames.push(Stamped { at_nanos, frame });
         rest = tail;
     }
-    if rest.is_empty() { Ok(Head { life, first, dropped, missed }) } else { Err(wrong) }
+    if rest.is_empty() { Ok(MessageHeader { life, first, dropped, missed }) } else { Err(wrong) }
 }
 
 #[cfg(test)]
@@ -160,7 +160,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const HEAD_OF: Head = Head { life: 0x0102_0304_0506_0708, first: 9, dropped: 2, missed: 1 };
+    const HEAD_OF: MessageHeader = MessageHeader { life: 0x0102_0304_0506_0708, first: 9, dropped: 2, missed: 1 };
 
     fn stamped(at_nanos: u64, frame: Frame) -> Stamped {
         Stamped { at_nanos, frame }

@@ -4,14 +4,14 @@ use std::collections::VecDeque;
 
 use serde::{Deserialize, Serialize};
 
-use super::message::{FRAMES, Head, Stamped, encode};
+use super::message::{MAX_FRAMES, MessageHeader, Stamped, encode};
 
 /// The maximum number of waiting frames: 100 ms of a full bus.
-pub const QUEUE: usize = 4_096;
+pub const MAX_WAITING_FRAMES: usize = 4_096;
 
 /// The account of the frames of a bus. `taken` equals `sent + dropped` plus the frames that wait.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
-pub struct Sent {
+pub struct BusAccount {
     /// Frames received from the bus.
     pub taken: u64,
     /// Frames passed to the transport.
@@ -32,22 +32,22 @@ pub struct Outgoing {
     waiting: VecDeque<(u64, Stamped)>,
     /// The number of the next frame.
     next: u64,
-    account: Sent,
+    account: BusAccount,
 }
 
 impl Outgoing {
     /// Creates an empty queue; `life` is a random number that identifies this start.
     #[must_use]
     pub fn new(life: u64) -> Self {
-        Self { life, waiting: VecDeque::with_capacity(QUEUE), next: 0, account: Sent::default() }
+        Self { life, waiting: VecDeque::with_capacity(MAX_WAITING_FRAMES), next: 0, account: BusAccount::default() }
     }
 
     /// Queues a frame of the bus, or drops it if the queue is full.
-    pub fn take(&mut self, stamped: Stamped) {
+    pub fn push(&mut self, stamped: Stamped) {
         let number = self.next;
         self.next += 1;
         self.account.taken += 1;
-        if self.waiting.len() < QUEUE {
+        if self.waiting.len() < MAX_WAITING_FRAMES {
             self.waiting.push_back((number, stamped));
         } else {
             self.account.dropped += 1;
@@ -63,11 +63,11 @@ impl Outgoing {
     /// or [`Outgoing::refused`].
     pub fn message(&self, bytes: &mut Vec<u8>) -> usize {
         let Some(&(first, _)) = self.waiting.front() else { return 0 };
-        let run = self.waiting.iter().zip(first..).take(FRAMES);
+        let run = self.waiting.iter().zip(first..).take(MAX_FRAMES);
         let count = run.take_while(|((number, _), expected)| number == expected).count();
         // All earlier frames were sent or dropped.
         let dropped = first - self.account.sent;
-        let head = Head { life: self.life, first, dropped, missed: self.account.missed };
+        let head = MessageHeader { life: self.life, first, dropped, missed: self.account.missed };
         encode(&head, self.waiting.iter().take(count).map(|(_, stamped)| stamped), bytes);
         count
     }
@@ -86,7 +86,7 @@ impl Outgoing {
 
     /// Returns the account of the frames so far.
     #[must_use]
-    pub const fn account(&self) -> Sent {
+    pub const fn account(&self) -> BusAccount {
         self.account
     }
 
@@ -124,7 +124,7 @@ mod tests {
     fn frames_go_out_in_order_and_in_batches() {
         let mut outgoing = Outgoing::new(1);
         assert_eq!(next(&mut outgoing), None);
-        (0..300).for_each(|at| outgoing.take(frame(at)));
+        (0..300).for_each(|at| outgoing.push(frame(at)));
         assert_eq!(next(&mut outgoing), Some((0, 0, (0..256).collect())));
         assert_eq!(next(&mut outgoing), Some((256, 0, (256..300).collect())));
         assert_eq!((outgoing.account().sent, outgoing.account().messages, outgoing.waiting()), (300, 2, 0));
@@ -133,11 +133,11 @@ mod tests {
     #[test]
     fn what_is_dropped_has_a_number_and_is_told() {
         let mut outgoing = Outgoing::new(1);
-        let all = QUEUE as u64;
-        (0..all + 7).for_each(|at| outgoing.take(frame(at)));
-        assert_eq!((outgoing.account().dropped, outgoing.waiting()), (7, QUEUE));
+        let all = MAX_WAITING_FRAMES as u64;
+        (0..all + 7).for_each(|at| outgoing.push(frame(at)));
+        assert_eq!((outgoing.account().dropped, outgoing.waiting()), (7, MAX_WAITING_FRAMES));
         assert_eq!(next(&mut outgoing).unwrap().0, 0);
-        outgoing.take(frame(9_000));
+        outgoing.push(frame(9_000));
         outgoing.refused(256); // frames 256 to 511
         let mut last = None;
         while let Some(message) = next(&mut outgoing) {
@@ -145,7 +145,7 @@ mod tests {
             last = Some(message);
         }
         assert_eq!(last, Some((all + 7, 7 + 256, vec![9_000])));
-        let Sent { taken, sent, dropped, .. } = outgoing.account();
+        let BusAccount { taken, sent, dropped, .. } = outgoing.account();
         assert_eq!((taken, sent, dropped), (all + 8, all + 8 - 263, 263));
     }
 }

@@ -11,7 +11,7 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use protocol::usage::{path_in, quoted_os};
+use protocol::usage::{path_from_env, shell_quoted_os};
 use rustix::fs::{Access, access};
 use thiserror::Error;
 
@@ -35,7 +35,7 @@ pub enum ProgramError {
     )]
     Missing,
     /// The system cannot run the file that [`VARIABLE`] names.
-    #[error("cannot run {}: {source}; {VARIABLE} names it", quoted_os(path.as_os_str()))]
+    #[error("cannot run {}: {source}; {VARIABLE} names it", shell_quoted_os(path.as_os_str()))]
     Named {
         /// The file.
         path: PathBuf,
@@ -43,7 +43,7 @@ pub enum ProgramError {
         source: io::Error,
     },
     /// The system cannot run the file that was found.
-    #[error("cannot run {}: {source}", quoted_os(path.as_os_str()))]
+    #[error("cannot run {}: {source}", shell_quoted_os(path.as_os_str()))]
     Found {
         /// The file.
         path: PathBuf,
@@ -62,7 +62,7 @@ pub enum ProgramError {
 /// Returns only on failure.
 pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ProgramError {
     let start = |path: &Path| Command::new(path).args(arguments).env(CALLER, VERSION).exec();
-    if let Some(path) = path_in(VARIABLE) {
+    if let Some(path) = path_from_env(VARIABLE) {
         let source = start(&path);
         return ProgramError::Named { path, source };
     }

@@ -11,26 +11,26 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use protocol::bus::BusKind;
-use protocol::bus::embedded::usual_directory;
+use protocol::bus::embedded::default_directory;
 use serde::{Deserialize, Serialize};
 
-use super::incoming::Heard;
-use super::outgoing::Sent;
+use super::incoming::SourceAccount;
+use super::outgoing::BusAccount;
 
 /// The maximum length of a line in bytes. A report of 256 hosts is shorter.
-const LONGEST: usize = 1 << 20;
+const MAX_LINE_BYTES: usize = 1 << 20;
 /// The maximum length of an abstract address, in bytes.
 const NAME: usize = 107;
 
 /// The state of a link.
 #[derive(Clone, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
-pub struct Report {
+pub struct LinkReport {
     /// The name of this host.
     pub host: String,
     /// The account of frames from this bus to the other hosts.
-    pub sent: Sent,
+    pub sent: BusAccount,
     /// The other hosts by name.
-    pub hosts: BTreeMap<String, Host>,
+    pub hosts: BTreeMap<String, HostReport>,
     /// Frames that came back from this bus or repeated in a circle, and were not sent again.
     pub returned: u64,
     /// Messages of hosts beyond the limit.
@@ -39,21 +39,21 @@ pub struct Report {
 
 /// The state of another host.
 #[derive(Clone, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
-pub struct Host {
+pub struct HostReport {
     /// True if the host is reachable.
     pub is_there: bool,
     /// The node ids of the cells whose frames came from the host.
     pub nodes: Vec<u8>,
     /// The account of the host's frames here.
-    pub heard: Heard,
+    pub heard: SourceAccount,
     /// The host's account of this host's frames; null until it has sent one.
-    pub ours: Option<Heard>,
+    pub ours: Option<SourceAccount>,
 }
 
 /// Returns the address of the link of a bus. `directory` is that of embedded buses, `None` the usual one.
 fn address(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<SocketAddr> {
     let place = match kind {
-        BusKind::Embedded => directory.map_or_else(usual_directory, Path::to_owned),
+        BusKind::Embedded => directory.map_or_else(default_directory, Path::to_owned),
         _ => PathBuf::new(),
     };
     let mut name = format!("skinbus-link {bus} {}", place.display()).into_bytes();
@@ -75,12 +75,12 @@ pub fn listen(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<
 
 /// A program's connection to the link of a bus.
 #[derive(Debug)]
-pub struct Reports {
+pub struct ReportReader {
     stream: UnixStream,
     buffer: Vec<u8>,
 }
 
-impl Reports {
+impl ReportReader {
     /// Connects to the link of a bus.
     ///
     /// # Errors
@@ -95,7 +95,7 @@ impl Reports {
     ///
     /// # Errors
     /// Returns an error if none arrives in time, or if the link has ended.
-    pub fn wait(&mut self, timeout: Duration) -> io::Result<Report> {
+    pub fn wait(&mut self, timeout: Duration) -> io::Result<LinkReport> {
         let until = Instant::now() + timeout;
         loop {
             if let Some(report) = self.take()?.pop() {
@@ -112,7 +112,7 @@ impl Reports {
     ///
     /// # Errors
     /// Returns an error if the link has ended, or if it sends anything but reports.
-    pub fn take(&mut self) -> io::Result<Vec<Report>> {
+    pub fn take(&mut self) -> io::Result<Vec<LinkReport>> {
         let mut piece = [0; 4_096];
         loop {
             match self.stream.read(&mut piece) {
@@ -122,12 +122,12 @@ impl Reports {
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
                 Err(error) => return Err(error),
             }
-            if self.buffer.len() > LONGEST {
+            if self.buffer.len() > MAX_LINE_BYTES {
                 break;
             }
         }
         let Some(end) = self.buffer.iter().rposition(|&byte| byte == b'\n') else {
-            let is_endless = self.buffer.len() > LONGEST;
+            let is_endless = self.buffer.len() > MAX_LINE_BYTES;
             return if is_endless { Err(ErrorKind::InvalidData.into()) } else { Ok(Vec::new()) };
         };
         let rest = self.buffer.split_off(end + 1);
@@ -150,14 +150,14 @@ mod tests {
         let listener = of("/one").unwrap();
         assert_eq!(of("/one").unwrap_err().kind(), ErrorKind::AddrInUse);
         assert!(of("/two").is_ok(), "another directory, another bus");
-        let connect = |directory| Reports::connect(&bus, BusKind::Embedded, Some(Path::new(directory)));
+        let connect = |directory| ReportReader::connect(&bus, BusKind::Embedded, Some(Path::new(directory)));
         assert_eq!(connect("/two").unwrap_err().kind(), ErrorKind::ConnectionRefused);
         let mut reports = connect("/one").unwrap();
         let (mut stream, _) = listener.accept().unwrap();
         assert!(reports.take().unwrap().is_empty());
         let report = |host: &str| {
-            let hosts = [("b".to_owned(), Host { nodes: vec![1, 9], ..Host::default() })].into();
-            Report { host: host.to_owned(), hosts, ..Report::default() }
+            let hosts = [("b".to_owned(), HostReport { nodes: vec![1, 9], ..HostReport::default() })].into();
+            LinkReport { host: host.to_owned(), hosts, ..LinkReport::default() }
         };
         let line = |host| format!("{}\n", serde_json::to_string(&report(host)).unwrap());
         let (whole, cut) = (line("x"), line("y"));
@@ -178,7 +178,7 @@ mod tests {
         let (mut stream, other) = UnixStream::pair().unwrap();
         other.set_nonblocking(true).unwrap();
         stream.set_nonblocking(true).unwrap();
-        let mut reports = Reports { stream: other, buffer: Vec::new() };
+        let mut reports = ReportReader { stream: other, buffer: Vec::new() };
         let ended = (0..1_000).find_map(|_| {
             let _ = stream.write(&[b'x'; 65_536]);
             reports.take().err()

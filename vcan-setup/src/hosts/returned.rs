@@ -11,7 +11,7 @@ use std::hash::{BuildHasher, RandomState};
 use protocol::can::Frame;
 
 /// The time after a frame has passed during which the same frame counts as returned, in ns.
-pub const WITHIN_NS: u64 = 100_000_000;
+pub const RETURN_WINDOW_NS: u64 = 100_000_000;
 /// The time after a frame of this link has returned during which a circle is assumed, in ns.
 const CIRCLE_NS: u64 = 1_000_000_000;
 /// The maximum number of frames that are remembered in each direction.
@@ -19,7 +19,7 @@ const REMEMBERED: usize = 16_384;
 
 /// The frames that passed recently.
 #[derive(Debug, Default)]
-pub struct Returned {
+pub struct CircleDetector {
     hasher: RandomState,
     put: Recent,
     /// Frames received from the bus. Recorded only while a circle is assumed.
@@ -29,7 +29,7 @@ pub struct Returned {
     count: u64,
 }
 
-impl Returned {
+impl CircleDetector {
     /// Records a frame that was put on the bus, at a time of a monotonic clock.
     pub fn put(&mut self, now: u64, frame: &Frame) {
         let hash = self.hash(frame);
@@ -107,7 +107,7 @@ impl Recent {
     }
 
     fn forget(&mut self, now: u64) {
-        while self.order.front().is_some_and(|&(at, _)| now.saturating_sub(at) > WITHIN_NS) {
+        while self.order.front().is_some_and(|&(at, _)| now.saturating_sub(at) > RETURN_WINDOW_NS) {
             self.forget_one();
         }
     }
@@ -135,7 +135,7 @@ mod tests {
 
     #[test]
     fn a_frame_that_was_put_there_comes_back_and_others_do_not() {
-        let mut returned = Returned::default();
+        let mut returned = CircleDetector::default();
         let it = frame(0x201, &[1, 2]);
         assert!(!returned.is_returned(0, &it));
         returned.put(MS, &it);
@@ -151,7 +151,7 @@ mod tests {
 
     #[test]
     fn no_more_is_remembered_than_may() {
-        let mut returned = Returned::default();
+        let mut returned = CircleDetector::default();
         for number in 0..2 * REMEMBERED as u64 {
             returned.put(0, &frame(0x201, &(number / 3).to_le_bytes()));
         }
@@ -165,7 +165,7 @@ mod tests {
     #[test]
     fn in_a_circle_that_was_noticed_a_frame_passes_once_in_100_ms() {
         let (it, other) = (frame(0x201, &[1]), frame(0x202, &[2]));
-        let mut first = Returned::default();
+        let mut first = CircleDetector::default();
         for at in 0..50 {
             assert!(!first.is_returned(at * MS, &it), "it could be sent again and again");
         }
@@ -175,7 +175,7 @@ mod tests {
         assert!(first.is_returned(53 * MS, &it) && first.is_returned(152 * MS, &it));
         assert!(!first.is_returned(153 * MS, &it), "whoever sends it means it");
 
-        let mut second = Returned::default();
+        let mut second = CircleDetector::default();
         second.put(0, &it);
         assert!(!second.is_copy(MS, &it), "no circle");
         assert!(second.is_returned(2 * MS, &it));

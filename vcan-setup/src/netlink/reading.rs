@@ -8,7 +8,7 @@ use netlink_packet_route::link::{
 };
 use protocol::bus::netlink::attributes;
 
-use crate::link::{Counters, Hardware, Interface, Kind, MARK, Peer, State};
+use crate::link::{Counters, Hardware, Interface, InterfaceKind, ALIAS_MARK, Peer, ControllerState};
 
 /// Parses the kernel's description of one interface.
 pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
@@ -17,7 +17,7 @@ pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
     let mut interface = Interface {
         index: header.index,
         name: String::new(),
-        kind: Kind::Other(words(header.link_layer_type, None)),
+        kind: InterfaceKind::Other(description(header.link_layer_type, None)),
         ours: false,
         up: header.flags.contains(LinkFlags::Up),
         mtu: 0,
@@ -28,7 +28,7 @@ pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
         if let LinkAttribute::IfName(name) = attribute {
             interface.name = name;
         } else if let LinkAttribute::IfAlias(alias) = attribute {
-            interface.ours = alias == MARK;
+            interface.ours = alias == ALIAS_MARK;
         } else if let LinkAttribute::Mtu(mtu) = attribute {
             interface.mtu = mtu;
         } else if let LinkAttribute::Link(index) = attribute {
@@ -49,9 +49,9 @@ pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
     let kind = info.iter().find_map(|it| if let LinkInfo::Kind(kind) = it { Some(kind) } else { None });
     let data = info.iter().find_map(|it| if let LinkInfo::Data(data) = it { Some(data) } else { None });
     interface.kind = match (is_can, kind) {
-        (false, kind) => Kind::Other(words(header.link_layer_type, kind)),
-        (true, Some(InfoKind::Vcan)) => Kind::Vcan,
-        (true, Some(InfoKind::Vxcan)) => Kind::Vxcan(peer.map(|index| Peer {
+        (false, kind) => InterfaceKind::Other(description(header.link_layer_type, kind)),
+        (true, Some(InfoKind::Vcan)) => InterfaceKind::Vcan,
+        (true, Some(InfoKind::Vxcan)) => InterfaceKind::Vxcan(peer.map(|index| Peer {
             index,
             name: None,
             namespace: None,
@@ -59,7 +59,7 @@ pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
         })),
         (true, _) => {
             let data = if let Some(InfoData::Can(data)) = data { data.as_slice() } else { &[] };
-            Kind::Hardware(hardware(data))
+            InterfaceKind::Hardware(hardware(data))
         }
     };
     Some(interface)
@@ -74,7 +74,7 @@ fn hardware(data: &[InfoCan]) -> Hardware {
         } else if let InfoCan::DataBitTiming(timing) = attribute {
             hardware.data_bitrate = set(timing);
         } else if let InfoCan::State(state) = attribute {
-            hardware.state = State::from_number(*state);
+            hardware.state = ControllerState::from_number(*state);
         } else if let InfoCan::CtrlMode(mode) = attribute {
             hardware.fd = mode.flags.contains(CanCtrlModeFlags::Fd);
             hardware.listen_only = mode.flags.contains(CanCtrlModeFlags::ListenOnly);
@@ -84,7 +84,7 @@ fn hardware(data: &[InfoCan]) -> Hardware {
 }
 
 /// Describes an interface without CAN.
-fn words(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
+fn description(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
     if layer == LinkLayerType::Loopback {
         return "the loopback interface".to_owned();
     }

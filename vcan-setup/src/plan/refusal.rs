@@ -4,7 +4,7 @@ use protocol::usage::Failure;
 use thiserror::Error;
 
 use super::widen;
-use crate::link::{FD_MTU, Interface, Rates};
+use crate::link::{FD_MTU, Interface, HardwareRates};
 
 /// The reason why a plan is refused: one line, with the command that fixes it.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
@@ -101,9 +101,9 @@ pub enum Refusal {
         /// The name.
         name: String,
         /// The present rates.
-        has: Rates,
+        has: HardwareRates,
         /// The rates of the skin.
-        wants: Rates,
+        wants: HardwareRates,
         /// The skin's file.
         file: String,
     },

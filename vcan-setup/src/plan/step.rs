@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use crate::link::{FD_MTU, MARK, Rates};
+use crate::link::{FD_MTU, ALIAS_MARK, HardwareRates};
 use crate::namespace::Namespace;
 
 /// One step.
@@ -11,12 +11,12 @@ pub struct Step {
     /// The name of the interface.
     pub name: String,
     /// The action.
-    pub action: Action,
+    pub action: StepAction,
 }
 
 /// An action on an interface.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub enum Action {
+pub enum StepAction {
     /// Makes a vcan with MTU 72, marks it, and brings it up.
     MakeVcan,
     /// Makes a pair with MTU 72, marks both ends, and brings them up.
@@ -45,9 +45,9 @@ pub enum Action {
         /// The index of the interface.
         index: u32,
         /// The rates to be set.
-        rates: Rates,
+        rates: HardwareRates,
         /// The former rates.
-        before: Rates,
+        before: HardwareRates,
         /// True if the interface was up.
         was_up: bool,
     },
@@ -64,12 +64,12 @@ impl Step {
     pub fn doing(&self) -> String {
         let name = &self.name;
         match &self.action {
-            Action::MakeVcan => format!("make {name}"),
-            Action::MakePair { peer, .. } => format!("make {name} and its other end {peer}"),
-            Action::BringUp { .. } => format!("bring {name} up"),
-            Action::Widen { .. } => format!("change the MTU of {name}"),
-            Action::SetRates { rates, .. } => format!("set {name} to {rates}"),
-            Action::Remove { .. } => format!("remove {name}"),
+            StepAction::MakeVcan => format!("make {name}"),
+            StepAction::MakePair { peer, .. } => format!("make {name} and its other end {peer}"),
+            StepAction::BringUp { .. } => format!("bring {name} up"),
+            StepAction::Widen { .. } => format!("change the MTU of {name}"),
+            StepAction::SetRates { rates, .. } => format!("set {name} to {rates}"),
+            StepAction::Remove { .. } => format!("remove {name}"),
         }
     }
 
@@ -78,17 +78,17 @@ impl Step {
     pub fn done(&self) -> String {
         let name = &self.name;
         match &self.action {
-            Action::MakeVcan => format!("{name} is made, a vcan with MTU {FD_MTU}, and up"),
-            Action::MakePair { peer, namespace } => {
+            StepAction::MakeVcan => format!("{name} is made, a vcan with MTU {FD_MTU}, and up"),
+            StepAction::MakePair { peer, namespace } => {
                 let at = namespace.as_ref().map(|namespace| format!(" in {namespace}")).unwrap_or_default();
                 format!(
                     "{name} is made, and its other end {peer}{at}, a vxcan pair with MTU {FD_MTU}, both up"
                 )
             }
-            Action::BringUp { .. } => format!("{name} is up"),
-            Action::Widen { .. } => format!("{name} has MTU {FD_MTU}, and is up"),
-            Action::SetRates { rates, .. } => format!("{name} is at {rates}, and up"),
-            Action::Remove { .. } => format!("{name} is removed"),
+            StepAction::BringUp { .. } => format!("{name} is up"),
+            StepAction::Widen { .. } => format!("{name} has MTU {FD_MTU}, and is up"),
+            StepAction::SetRates { rates, .. } => format!("{name} is at {rates}, and up"),
+            StepAction::Remove { .. } => format!("{name} is removed"),
         }
     }
 
@@ -97,22 +97,22 @@ impl Step {
     pub fn command(&self) -> String {
         let name = &self.name;
         match &self.action {
-            Action::MakeVcan => {
-                format!("ip link add {name} mtu {FD_MTU} type vcan && ip link set {name} alias {MARK} up")
+            StepAction::MakeVcan => {
+                format!("ip link add {name} mtu {FD_MTU} type vcan && ip link set {name} alias {ALIAS_MARK} up")
             }
-            Action::MakePair { peer, namespace } => {
+            StepAction::MakePair { peer, namespace } => {
                 let (netns, ip) = match namespace {
                     Some(namespace) => (format!(" netns {namespace}"), namespace.ip()),
                     None => (String::new(), "ip".to_owned()),
                 };
                 format!(
                     "ip link add {name} mtu {FD_MTU} type vxcan peer name {peer} mtu {FD_MTU}{netns} && ip link set \
-                     {name} alias {MARK} up && {ip} link set {peer} alias {MARK} up"
+                     {name} alias {ALIAS_MARK} up && {ip} link set {peer} alias {ALIAS_MARK} up"
                 )
             }
-            Action::BringUp { .. } => format!("ip link set {name} up"),
-            Action::Widen { .. } => widen("ip", name),
-            Action::SetRates { rates: Rates { bitrate, data_bitrate }, was_up, .. } => {
+            StepAction::BringUp { .. } => format!("ip link set {name} up"),
+            StepAction::Widen { .. } => widen("ip", name),
+            StepAction::SetRates { rates: HardwareRates { bitrate, data_bitrate }, was_up, .. } => {
                 let down = if *was_up { format!("ip link set {name} down && ") } else { String::new() };
                 let bitrate = bitrate.unwrap_or(0);
                 let fd = match data_bitrate {
@@ -121,7 +121,7 @@ impl Step {
                 };
                 format!("{down}ip link set {name} type can bitrate {bitrate} {fd} && ip link set {name} up")
             }
-            Action::Remove { .. } => format!("ip link del {name}"),
+            StepAction::Remove { .. } => format!("ip link del {name}"),
         }
     }
 }
@@ -135,26 +135,26 @@ impl fmt::Display for Step {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let name = &self.name;
         match &self.action {
-            Action::MakeVcan => write!(f, "make {name}, a vcan with MTU {FD_MTU}, and bring it up"),
-            Action::MakePair { peer, namespace } => {
+            StepAction::MakeVcan => write!(f, "make {name}, a vcan with MTU {FD_MTU}, and bring it up"),
+            StepAction::MakePair { peer, namespace } => {
                 write!(f, "make {name} and its other end {peer}")?;
                 if let Some(namespace) = namespace {
                     write!(f, " in the network namespace {namespace}")?;
                 }
                 write!(f, ", a vxcan pair with MTU {FD_MTU}, and bring both up")
             }
-            Action::BringUp { .. } => write!(f, "bring {name} up"),
-            Action::Widen { from, .. } => {
+            StepAction::BringUp { .. } => write!(f, "bring {name} up"),
+            StepAction::Widen { from, .. } => {
                 write!(f, "take {name} down, give it MTU {FD_MTU} instead of {from}, and bring it up")
             }
-            Action::SetRates { rates, before, .. } if rates == before => {
+            StepAction::SetRates { rates, before, .. } if rates == before => {
                 write!(f, "bring {name} up, at {rates}")
             }
-            Action::SetRates { rates, before, was_up, .. } => {
+            StepAction::SetRates { rates, before, was_up, .. } => {
                 let down = if *was_up { format!("take {name} down, ") } else { String::new() };
                 write!(f, "{down}set {name} to {rates} instead of {before}, and bring it up")
             }
-            Action::Remove { .. } => write!(f, "remove {name}"),
+            StepAction::Remove { .. } => write!(f, "remove {name}"),
         }
     }
 }

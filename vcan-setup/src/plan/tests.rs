@@ -5,14 +5,14 @@ mod world;
 
 use world::{THERE, World};
 
-fn interface(name: &str, index: u32, kind: Kind) -> Interface {
-    let mtu = if matches!(kind, Kind::Other(_)) { 1_500 } else { FD_MTU };
+fn interface(name: &str, index: u32, kind: InterfaceKind) -> Interface {
+    let mtu = if matches!(kind, InterfaceKind::Other(_)) { 1_500 } else { FD_MTU };
     let (ours, up) = (false, true);
     Interface { index, name: name.to_owned(), kind, ours, up, mtu, counters: Counters::default() }
 }
 
 fn ours(name: &str, index: u32) -> Interface {
-    Interface { ours: true, ..interface(name, index, Kind::Vcan) }
+    Interface { ours: true, ..interface(name, index, InterfaceKind::Vcan) }
 }
 
 fn kvaser(bitrate: Option<u32>, data_bitrate: Option<u32>) -> Hardware {
@@ -22,25 +22,25 @@ fn kvaser(bitrate: Option<u32>, data_bitrate: Option<u32>) -> Hardware {
 
 fn can0(hardware: Hardware, up: bool) -> Interface {
     let mtu = if hardware.fd { FD_MTU } else { CLASSIC_MTU };
-    Interface { up, mtu, ..interface("can0", 4, Kind::Hardware(hardware)) }
+    Interface { up, mtu, ..interface("can0", 4, InterfaceKind::Hardware(hardware)) }
 }
 
-fn in_skin(name: &str, format: Format, bitrate: Option<u32>, data_bitrate: Option<u32>) -> Target {
-    let rates = Rates { bitrate, data_bitrate };
+fn in_skin(name: &str, format: Format, bitrate: Option<u32>, data_bitrate: Option<u32>) -> InterfaceTarget {
+    let rates = HardwareRates { bitrate, data_bitrate };
     let skin = Some(SkinBus { file: "skin.toml".to_owned(), rates });
-    Target { name: name.to_owned(), format, skin }
+    InterfaceTarget { name: name.to_owned(), format, skin }
 }
 
-fn refused(target: &Target, present: &[Interface]) -> String {
+fn refused(target: &InterfaceTarget, present: &[Interface]) -> String {
     up(std::slice::from_ref(target), present, false).unwrap_err().to_string()
 }
 
 #[test]
 fn what_is_missing_is_made_and_a_second_run_has_nothing_to_do() {
-    let target = ["vcan0", "vcan1"].map(Target::named);
-    let world = World::of(vec![interface("vcan0", 2, Kind::Vcan)]);
+    let target = ["vcan0", "vcan1"].map(InterfaceTarget::named);
+    let world = World::of(vec![interface("vcan0", 2, InterfaceKind::Vcan)]);
     let plan = up(&target, &world.here, false).unwrap();
-    assert_eq!(plan.steps, [Step { name: "vcan1".into(), action: Action::MakeVcan }]);
+    assert_eq!(plan.steps, [Step { name: "vcan1".into(), action: StepAction::MakeVcan }]);
     assert_eq!(plan.unchanged, ["vcan0 is there already, and fits (a vcan, made by another program)"]);
     let again = up(&target, &world.carry_out_all(&plan).here, false).unwrap();
     assert_eq!(again.steps, []);
@@ -50,7 +50,7 @@ fn what_is_missing_is_made_and_a_second_run_has_nothing_to_do() {
 fn what_is_ours_is_repaired() {
     let narrow = Interface { mtu: CLASSIC_MTU, ..ours("vcan0", 2) };
     let down = Interface { up: false, ..ours("vcan1", 3) };
-    let target = ["vcan0", "vcan1"].map(Target::named);
+    let target = ["vcan0", "vcan1"].map(InterfaceTarget::named);
     let plan = up(&target, &[narrow.clone(), down], false).unwrap();
     let said: Vec<_> = plan.steps.iter().map(ToString::to_string).collect();
     let expected = ["take vcan0 down, give it MTU 72 instead of 16, and bring it up", "bring vcan1 up"];
@@ -64,39 +64,39 @@ fn what_is_ours_is_repaired() {
 fn a_real_bus_is_never_touched_because_it_was_named() {
     let present = [
         can0(kvaser(Some(500_000), None), false),
-        interface("eth0", 2, Kind::Other("a network interface (ether)".into())),
+        interface("eth0", 2, InterfaceKind::Other("a network interface (ether)".into())),
     ];
     assert_eq!(
-        refused(&Target::named("can0"), &present),
+        refused(&InterfaceTarget::named("can0"), &present),
         "can0 is real, CAN hardware (kvaser_pci), and is left alone: to check its bit rates put it into a \
          skin and run `vcan-setup up SKIN.toml`, to see it `vcan-setup status can0`"
     );
     assert_eq!(
-        refused(&Target::named("eth0"), &present),
+        refused(&InterfaceTarget::named("eth0"), &present),
         "eth0 is real, a network interface (ether), and is left alone: choose another name, as `vcan-setup \
          up vcan0` does"
     );
-    assert!(up(&[Target::named("can0")], &present, true).is_err(), "whatever else was asked for");
+    assert!(up(&[InterfaceTarget::named("can0")], &present, true).is_err(), "whatever else was asked for");
 }
 
 #[test]
 fn what_somebody_else_made_is_left_alone_and_the_hint_is_told() {
-    let foreign = |mtu, up| Interface { mtu, up, ..interface("vcan0", 2, Kind::Vcan) };
+    let foreign = |mtu, up| Interface { mtu, up, ..interface("vcan0", 2, InterfaceKind::Vcan) };
     assert_eq!(
-        refused(&Target::named("vcan0"), &[foreign(16, true)]),
+        refused(&InterfaceTarget::named("vcan0"), &[foreign(16, true)]),
         "vcan0 has MTU 16 and CAN FD needs 72; vcan-setup has not made it and leaves it alone: `sudo sh -c \
          'ip link set vcan0 down && ip link set vcan0 mtu 72 up'` fixes it"
     );
     assert_eq!(
-        refused(&Target::named("vcan0"), &[foreign(72, false)]),
+        refused(&InterfaceTarget::named("vcan0"), &[foreign(72, false)]),
         "vcan0 is down; vcan-setup has not made it and leaves it alone: `sudo ip link set vcan0 up` fixes it"
     );
 }
 
 #[test]
 fn one_bus_that_cannot_be_had_keeps_the_others_from_being_made() {
-    let present = [interface("lo", 1, Kind::Other("the loopback interface".into()))];
-    let target = ["vcan0", "lo", "vcan1"].map(Target::named);
+    let present = [interface("lo", 1, InterfaceKind::Other("the loopback interface".into()))];
+    let target = ["vcan0", "lo", "vcan1"].map(InterfaceTarget::named);
     assert!(matches!(up(&target, &present, false), Err(Refusal::NotCan { .. })));
 }
 
@@ -199,7 +199,7 @@ fn two_skins_that_give_a_bus_two_bit_rates_are_refused() {
 #[test]
 fn a_clock_may_miss_a_bit_rate_by_half_a_percent() {
     let met = |has, target| {
-        let rates = |bitrate| Rates { bitrate, data_bitrate: None };
+        let rates = |bitrate| HardwareRates { bitrate, data_bitrate: None };
         rates(has).meet(rates(target))
     };
     assert!(met(Some(10_000), Some(10_001)) && met(Some(83_333), Some(83_000)));
@@ -222,7 +222,7 @@ fn a_bus_with_a_bit_rate_is_never_made_of_software() {
 fn a_pair_is_made_once_and_told_from_other_pairs() {
     let mut world = World::of(vec![ours("vcan0", 2)]);
     let named =
-        |there: &World, id| There { name: Namespace::Name("blue".into()), id, present: there.there.clone() };
+        |there: &World, id| OtherNamespace { name: Namespace::Name("blue".into()), id, present: there.there.clone() };
     let there = named(&world, None);
     let target = TargetPair { name: "vcan1", peer: "vcan1", there: Some(&there) };
     let plan = up_pair(&target, &world.here).unwrap();
@@ -265,11 +265,11 @@ fn a_pair_is_made_once_and_told_from_other_pairs() {
 
 #[test]
 fn only_what_is_ours_is_removed() {
-    let present = [ours("vcan0", 2), interface("vcan1", 3, Kind::Vcan), can0(kvaser(None, None), true)];
+    let present = [ours("vcan0", 2), interface("vcan1", 3, InterfaceKind::Vcan), can0(kvaser(None, None), true)];
     let names = ["vcan0", "vcan1", "can0", "vcan9"];
     let skin = names.map(|name| in_skin(name, Format::Fd, None, None));
     let plan = down(&skin, &present).unwrap();
-    assert_eq!(plan.steps, [Step { name: "vcan0".into(), action: Action::Remove { index: 2 } }]);
+    assert_eq!(plan.steps, [Step { name: "vcan0".into(), action: StepAction::Remove { index: 2 } }]);
     assert_eq!(
         plan.unchanged,
         [
@@ -278,7 +278,7 @@ fn only_what_is_ours_is_removed() {
             "vcan9 is not there",
         ]
     );
-    let named = |name| down(&[Target::named(name)], &present);
+    let named = |name| down(&[InterfaceTarget::named(name)], &present);
     assert_eq!(
         named("vcan1").unwrap_err().to_string(),
         "vcan1 is a vcan that vcan-setup has not made, and is left alone: if it is yours, `sudo ip link del \
@@ -295,11 +295,11 @@ fn only_what_is_ours_is_removed() {
 fn the_mark_on_something_real_is_not_believed() {
     let mut present = [
         can0(kvaser(None, None), true),
-        interface("eth0", 2, Kind::Other("a network interface (ether)".into())),
+        interface("eth0", 2, InterfaceKind::Other("a network interface (ether)".into())),
     ];
     present.iter_mut().for_each(|it| it.ours = true);
     for name in ["can0", "eth0"] {
-        assert!(up(&[Target::named(name)], &present, true).is_err(), "{name}");
-        assert!(down(&[Target::named(name)], &present).is_err(), "{name}");
+        assert!(up(&[InterfaceTarget::named(name)], &present, true).is_err(), "{name}");
+        assert!(down(&[InterfaceTarget::named(name)], &present).is_err(), "{name}");
     }
 }

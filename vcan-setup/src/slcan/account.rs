@@ -3,12 +3,12 @@
 use std::collections::BTreeMap;
 use std::fmt;
 
-use protocol::slcan::Refused;
+use protocol::slcan::RejectedLines;
 use serde::Serialize;
 
 /// Counts of frames from the bus to the line. `received` equals `sent` plus the sum of `dropped` if no frames wait.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct ToLine {
+pub struct ToLineCounts {
     /// Frames received from the bus.
     pub received: u64,
     /// Frames written to the line completely.
@@ -38,7 +38,7 @@ pub struct ToLineDropped {
 
 /// Counts of frames from the line to the bus. `received` equals `sent` plus the sum of `dropped` if no frames wait.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct ToBus {
+pub struct ToBusCounts {
     /// Frames received from the line, and error frames made of the adapter's faults.
     pub received: u64,
     /// Frames sent to the bus.
@@ -81,16 +81,16 @@ pub struct RefusedLines {
     pub identifier: u32,
 }
 
-impl From<Refused> for RefusedLines {
-    fn from(refused: Refused) -> Self {
-        let Refused { garbage, long, short, dlc, identifier } = refused;
+impl From<RejectedLines> for RefusedLines {
+    fn from(refused: RejectedLines) -> Self {
+        let RejectedLines { garbage, long, short, dlc, identifier } = refused;
         Self { garbage, long, short, dlc, identifier }
     }
 }
 
 /// The account of a line.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Account {
+pub struct LineAccount {
     /// The address of the line.
     pub line: String,
     /// The number of times the line was opened.
@@ -100,9 +100,9 @@ pub struct Account {
     /// The number of times the adapter was reopened because it refused frames.
     pub reopened: u64,
     /// Frames from the bus to the line.
-    pub to_line: ToLine,
+    pub to_line: ToLineCounts,
     /// Frames from the line to the bus.
-    pub to_bus: ToBus,
+    pub to_bus: ToBusCounts,
     /// Faults and states that the adapter reported, by name.
     pub faults: Faults,
 }
@@ -174,7 +174,7 @@ impl RefusedLines {
     }
 }
 
-impl ToLine {
+impl ToLineCounts {
     /// Formats losses as `, 3 dropped (2 line too slow, 1 line away)`; empty if there are none.
     pub(super) fn losses(&self) -> String {
         losses("dropped", &self.dropped.named())
@@ -182,7 +182,7 @@ impl ToLine {
     }
 }
 
-impl ToBus {
+impl ToBusCounts {
     /// Formats the losses on the way to the bus.
     pub(super) fn losses(&self) -> String {
         losses("dropped", &self.dropped.named()) + &losses("lines refused", &self.refused.named())
@@ -207,7 +207,7 @@ fn times(count: u64) -> String {
     }
 }
 
-impl fmt::Display for Account {
+impl fmt::Display for LineAccount {
     /// Writes three lines, or four if the adapter reported faults, without a line feed at the end.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { line, opened, lost, reopened, to_line, to_bus, faults } = self;
@@ -240,12 +240,12 @@ mod tests {
     #[test]
     fn an_account_names_every_loss_and_only_those() {
         let mut account =
-            Account { line: "/dev/ttyACM0".to_owned(), opened: 2, lost: 1, ..Account::default() };
+            LineAccount { line: "/dev/ttyACM0".to_owned(), opened: 2, lost: 1, ..LineAccount::default() };
         assert_eq!(
             account.to_string(),
             "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 0 received, 0 sent\n  to the bus:  0 received, 0 sent"
         );
-        account.to_line = ToLine {
+        account.to_line = ToLineCounts {
             received: 23,
             sent: 1,
             dropped: ToLineDropped {
@@ -258,7 +258,7 @@ mod tests {
             },
             dropped_by_bus: 6,
         };
-        account.to_bus = ToBus {
+        account.to_bus = ToBusCounts {
             received: 11,
             sent: 1,
             dropped: ToBusDropped { queue_full: 1, bus_away: 2, not_classic: 3, ended: 4 },

@@ -9,16 +9,16 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use thiserror::Error;
 
-use super::account::Account;
-use super::event::Event;
+use super::account::LineAccount;
+use super::event::LineEvent;
 use super::options::LineOptions;
 use super::participant::{Participant, Ready};
-use super::settings::{Settings, open};
+use super::settings::{BridgeSettings, open};
 
 /// The time at the end for finishing a line that was begun and for closing its adapter.
 const CLOSING: Duration = Duration::from_millis(500);
 /// The interval between two attempts at the start.
-const AGAIN: Duration = Duration::from_millis(20);
+const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
 /// The error of lines that cannot be joined to a bus.
 #[derive(Debug, Error)]
@@ -48,7 +48,7 @@ pub enum BridgeError {
 /// The lines of a bus.
 #[derive(Debug)]
 pub struct Bridge {
-    settings: Settings,
+    settings: BridgeSettings,
     kind: BusKind,
     participants: Vec<Participant>,
 }
@@ -58,7 +58,7 @@ impl Bridge {
     ///
     /// # Errors
     /// Returns [`BridgeError`] if the bus or a line cannot be opened.
-    pub fn open(settings: Settings, lines: Vec<LineOptions>) -> Result<Self, BridgeError> {
+    pub fn open(settings: BridgeSettings, lines: Vec<LineOptions>) -> Result<Self, BridgeError> {
         let kind = settings.choice.resolve(&settings.bus);
         let mut participants: Vec<Participant> = Vec::new();
         for line in lines {
@@ -81,7 +81,7 @@ impl Bridge {
                     return Err(refused(participant.name(), error));
                 }
                 // A TCP connection reports in time whether it is established.
-                std::thread::sleep(AGAIN);
+                std::thread::sleep(RETRY_INTERVAL);
             }
         }
         Ok(bridge)
@@ -112,8 +112,8 @@ impl Bridge {
     pub fn run(
         mut self,
         stop: impl AsFd,
-        mut report: impl FnMut(&str, Event),
-    ) -> Result<Vec<Account>, BridgeError> {
+        mut report: impl FnMut(&str, LineEvent),
+    ) -> Result<Vec<LineAccount>, BridgeError> {
         loop {
             let ready = self.wait(Some(stop.as_fd()), None).map_err(BridgeError::Wait)?;
             let Some(ready) = ready else { return self.close(&mut report) };
@@ -124,7 +124,7 @@ impl Bridge {
         }
     }
 
-    fn close(mut self, report: &mut impl FnMut(&str, Event)) -> Result<Vec<Account>, BridgeError> {
+    fn close(mut self, report: &mut impl FnMut(&str, LineEvent)) -> Result<Vec<LineAccount>, BridgeError> {
         let until = Instant::now() + CLOSING;
         self.participants.iter_mut().for_each(Participant::end);
         loop {
@@ -137,7 +137,7 @@ impl Bridge {
         }
         for participant in &mut self.participants {
             if !participant.give_up() {
-                report(&participant.name(), Event::NotClosed);
+                report(&participant.name(), LineEvent::NotClosed);
             }
         }
         Ok(self.participants.iter().map(Participant::account).collect())
@@ -170,7 +170,7 @@ impl Bridge {
         match poll(&mut polled, timeout.as_ref()) {
             Ok(_) | Err(Errno::INTR) => {}
             // The kernel lacks memory for a moment: treat all ends as ready.
-            Err(Errno::NOMEM | Errno::AGAIN) => std::thread::sleep(AGAIN),
+            Err(Errno::NOMEM | Errno::AGAIN) => std::thread::sleep(RETRY_INTERVAL),
             Err(errno) => return Err(errno.into()),
         }
         let mut came = polled.iter().map(|polled| !polled.revents().is_empty());

@@ -2,11 +2,11 @@
 
 use std::fmt;
 
-use super::account::Account;
+use super::account::LineAccount;
 
 /// An event of a line.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub enum Event {
+pub enum LineEvent {
     /// The line is open.
     LineUp,
     /// The line was lost or cannot be opened, with the reason; it is retried.
@@ -22,7 +22,7 @@ pub enum Event {
         /// Frames from the line, and invalid lines.
         to_bus: u64,
         /// The account so far.
-        account: Box<Account>,
+        account: Box<LineAccount>,
     },
     /// The adapter refused some of these commands during its setup.
     SettingRefused(String),
@@ -34,7 +34,7 @@ pub enum Event {
     NotClosed,
 }
 
-impl fmt::Display for Event {
+impl fmt::Display for LineEvent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::LineUp => f.write_str("open"),

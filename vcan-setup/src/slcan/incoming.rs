@@ -3,12 +3,12 @@
 use std::collections::VecDeque;
 
 use protocol::can::{Format, Frame};
-use protocol::slcan::{BusState, Decoder, Fault, Line, Report};
+use protocol::slcan::{BusState, Decoder, AdapterFault, SlcanLine, AdapterReport};
 
-use super::account::{Faults, ToBus};
+use super::account::{Faults, ToBusCounts};
 
 /// The maximum number of frames that wait for the bus.
-pub const QUEUE: usize = 1_024;
+pub const MAX_WAITING_FRAMES: usize = 1_024;
 
 /// The path of frames from a line to the bus.
 #[derive(Debug, Default)]
@@ -20,7 +20,7 @@ pub struct Incoming {
     /// True if the bus is virtual. Hardware would send an error frame as a data frame.
     is_virtual: bool,
     frames: VecDeque<Frame>,
-    account: ToBus,
+    account: ToBusCounts,
     replies: Replies,
     /// The adapter's state, as last reported.
     state: BusState,
@@ -64,21 +64,21 @@ impl Incoming {
     }
 
     /// Decodes bytes of the line.
-    pub fn take(&mut self, bytes: &[u8]) {
+    pub fn receive(&mut self, bytes: &[u8]) {
         for &byte in bytes {
             match self.decoder.push(byte) {
-                Some(Line::Frame(frame)) => {
+                Some(SlcanLine::Frame(frame)) => {
                     self.replies = Replies::ACCEPTED;
                     self.push(frame);
                 }
-                Some(Line::Failed) => {
+                Some(SlcanLine::Failed) => {
                     self.account.bells += 1;
                     self.replies.refusals += 1;
                 }
-                Some(Line::Done | Line::Sent) => self.replies = Replies::ACCEPTED,
-                Some(Line::Reported(report)) => self.report(report),
-                Some(Line::Other | Line::Command(_)) => self.account.other_lines += 1,
-                None | Some(Line::Refused(_)) => {}
+                Some(SlcanLine::Done | SlcanLine::Sent) => self.replies = Replies::ACCEPTED,
+                Some(SlcanLine::Reported(report)) => self.report(report),
+                Some(SlcanLine::Other | SlcanLine::Command(_)) => self.account.other_lines += 1,
+                None | Some(SlcanLine::Refused(_)) => {}
             }
         }
     }
@@ -96,12 +96,12 @@ impl Incoming {
     }
 
     /// Counts the faults of a report, and forwards them as an error frame.
-    fn report(&mut self, report: Report) {
+    fn report(&mut self, report: AdapterReport) {
         let before = self.state;
         self.state = report.state().unwrap_or(before);
         let changed = (self.state != before).then_some(self.state.name());
         let mut is_empty = true;
-        for name in report.faults().map(Fault::name).chain(changed) {
+        for name in report.faults().map(AdapterFault::name).chain(changed) {
             *self.faults.entry(name).or_default() += 1;
             is_empty = false;
         }
@@ -134,8 +134,8 @@ impl Incoming {
 
     /// Returns the counts of the frames.
     #[must_use]
-    pub fn account(&self) -> ToBus {
-        ToBus { refused: self.decoder.refused().into(), ..self.account }
+    pub fn account(&self) -> ToBusCounts {
+        ToBusCounts { refused: self.decoder.refused().into(), ..self.account }
     }
 
     fn push(&mut self, frame: Frame) {
@@ -145,7 +145,7 @@ impl Incoming {
             &mut dropped.bus_away
         } else if self.classic && frame.format() == Format::Fd {
             &mut dropped.not_classic
-        } else if self.frames.len() >= QUEUE {
+        } else if self.frames.len() >= MAX_WAITING_FRAMES {
             &mut dropped.queue_full
         } else {
             self.frames.push_back(frame);
@@ -167,15 +167,15 @@ mod tests {
     #[test]
     fn frames_wait_in_order_and_the_rest_is_counted() {
         let mut incoming = Incoming::new();
-        incoming.take(b"t1230\r");
+        incoming.receive(b"t1230\r");
         incoming.up(true, true);
-        incoming.take(b"\rz\r\x07V1013\rt1240\rb1250\rt1239\rS8\rt12");
-        incoming.take(b"60\r");
+        incoming.receive(b"\rz\r\x07V1013\rt1240\rb1250\rt1239\rS8\rt12");
+        incoming.receive(b"60\r");
         assert_eq!(incoming.waiting().iter().map(Frame::id).collect::<Vec<_>>(), [0x124, 0x126]);
         incoming.sent(1);
-        incoming.take(b"t12");
+        incoming.receive(b"t12");
         incoming.line_lost();
-        incoming.take(b"t1270\r");
+        incoming.receive(b"t1270\r");
         assert_eq!(incoming.waiting().iter().map(Frame::id).collect::<Vec<_>>(), [0x126, 0x127]);
         incoming.down();
         let account = incoming.account();
@@ -189,9 +189,9 @@ mod tests {
         for (is_virtual, expected) in [(true, vec![0xA8, 0x40, 0x88, 0x204]), (false, vec![])] {
             let mut incoming = Incoming::new();
             incoming.up(true, is_virtual);
-            incoming.take(b"e1a\rsb256256\rsb256256\rF80\rF00\r");
+            incoming.receive(b"e1a\rsb256256\rsb256256\rF80\rF00\r");
             incoming.opened();
-            incoming.take(b"sp128000\r");
+            incoming.receive(b"sp128000\r");
             let frames: Vec<_> = incoming.waiting().iter().map(Frame::id).collect();
             assert_eq!(frames, expected);
             assert!(incoming.waiting().iter().all(Frame::is_error));
@@ -206,7 +206,7 @@ mod tests {
     fn refusals_in_succession_are_counted_from_the_last_acceptance() {
         let mut incoming = Incoming::new();
         let mut after = |bytes: &[u8]| {
-            incoming.take(bytes);
+            incoming.receive(bytes);
             let Replies { accepted, refusals } = incoming.replies();
             (accepted, refusals)
         };
@@ -230,10 +230,10 @@ mod tests {
                     0 => incoming.up(amount % 2 == 0, amount % 3 == 0),
                     1 => incoming.down(),
                     2 => incoming.sent(amount),
-                    _ => (0..amount).for_each(|_| incoming.take(b"t1230\rb1230\re1a\rsp128000\r")),
+                    _ => (0..amount).for_each(|_| incoming.receive(b"t1230\rb1230\re1a\rsp128000\r")),
                 }
                 let waiting = incoming.waiting().len();
-                prop_assert!(waiting <= QUEUE);
+                prop_assert!(waiting <= MAX_WAITING_FRAMES);
                 let account = incoming.account();
                 prop_assert_eq!(account.received, account.sent + account.dropped.total() + waiting as u64);
             }

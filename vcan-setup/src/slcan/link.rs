@@ -15,11 +15,11 @@ use rustix::termios::{self, ControlModes, InputModes, OptionalActions, QueueSele
 use super::options::{Address, LineOptions};
 
 /// The time for which a TCP connection may take.
-const CONNECT: Duration = Duration::from_secs(3);
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
 /// The send buffer of a socket in bytes. A larger one would only delay frames, and hide that the peer is too slow.
 const SEND_BUFFER: usize = 16 << 10;
 /// The time after which a silent TCP peer is probed, three times a second apart.
-const SILENT: Duration = Duration::from_secs(5);
+const KEEPALIVE_IDLE: Duration = Duration::from_secs(5);
 
 /// An open line.
 #[derive(Debug)]
@@ -76,7 +76,7 @@ impl Opener {
                 let port = connect(family, |fd| rustix::net::connect(fd, &host))?;
                 sockopt::set_tcp_nodelay(&port, true)?;
                 sockopt::set_socket_keepalive(&port, true)?;
-                sockopt::set_tcp_keepidle(&port, SILENT)?;
+                sockopt::set_tcp_keepidle(&port, KEEPALIVE_IDLE)?;
                 sockopt::set_tcp_keepintvl(&port, Duration::from_secs(1))?;
                 sockopt::set_tcp_keepcnt(&port, 3)?;
                 Ok(port)
@@ -149,7 +149,7 @@ fn connect(
     sockopt::set_socket_send_buffer_size(&fd, SEND_BUFFER)?;
     let connecting = match connect(&fd) {
         Ok(()) if family == AddressFamily::UNIX => None,
-        Ok(()) | Err(Errno::INPROGRESS) => Some(Instant::now() + CONNECT),
+        Ok(()) | Err(Errno::INPROGRESS) => Some(Instant::now() + CONNECT_TIMEOUT),
         Err(errno) => return Err(errno.into()),
     };
     Ok(Port { fd, is_tty: false, connecting })

@@ -8,7 +8,7 @@ use std::time::Duration;
 use protocol::bus::Filter;
 use protocol::can::{EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK};
 use protocol::id::{CellId, Id};
-use protocol::slcan::Command;
+use protocol::slcan::SlcanCommand;
 use protocol::wire_time::BitRates;
 use thiserror::Error;
 
@@ -91,12 +91,12 @@ pub struct OpeningStep {
     /// The time until the next command.
     pub gap: Duration,
     /// The stage of the adapter after the command.
-    pub stage: Stage,
+    pub stage: OpeningStage,
 }
 
 /// The stage of opening an adapter.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub enum Stage {
+pub enum OpeningStage {
     /// No command was sent yet.
     #[default]
     Away,
@@ -113,7 +113,7 @@ const RATES: &str = "slcan has the bit rates 10k, 20k, 50k, 83.3k, 100k, 125k, 2
                      for data 500k and whole Mbit/s up to 8M";
 
 /// The allowed values of [`LineOptions::settle`], for an error.
-pub const SETTLE: &str = "seconds from 0 to 60, such as 2 or 0.5";
+pub const ALLOWED_SETTLE: &str = "seconds from 0 to 60, such as 2 or 0.5";
 
 /// Parses [`LineOptions::settle`].
 #[must_use]
@@ -139,7 +139,7 @@ impl LineOptions {
     /// Adds the filters for the frames that a cell receives. The line gets only these frames, besides those that match
     /// its other filters.
     pub fn add_cell(&mut self, cell: CellId) {
-        for filter in Id::of_cell(cell).map(Filter::exact) {
+        for filter in Id::received_by_cell(cell).map(Filter::exact) {
             if !self.filters.contains(&filter) {
                 self.filters.push(filter);
             }
@@ -152,8 +152,8 @@ impl LineOptions {
     /// Returns an error text if slcan has no command for one of the rates.
     pub fn set_bit_rates(&mut self, rates: BitRates) -> Result<(), String> {
         let data = rates.data();
-        if Command::nominal(rates.nominal()).is_none()
-            || (data != rates.nominal() && Command::data(data).is_none())
+        if SlcanCommand::nominal_bit_rate(rates.nominal()).is_none()
+            || (data != rates.nominal() && SlcanCommand::data_bit_rate(data).is_none())
         {
             return Err(RATES.to_owned());
         }
@@ -166,18 +166,18 @@ impl LineOptions {
     #[must_use]
     pub fn opening(&self) -> Vec<OpeningStep> {
         let rates = self.bit_rates;
-        let data = rates.filter(|_| !self.classic).map(BitRates::data).and_then(Command::data);
-        let line = |command: Command| command.encode().as_bytes().to_vec();
-        let settings = [rates.and_then(|rates| Command::nominal(rates.nominal())), data];
+        let data = rates.filter(|_| !self.classic).map(BitRates::data).and_then(SlcanCommand::data_bit_rate);
+        let line = |command: SlcanCommand| command.encode().as_bytes().to_vec();
+        let settings = [rates.and_then(|rates| SlcanCommand::nominal_bit_rate(rates.nominal())), data];
         let settings =
-            settings.into_iter().flatten().map(|command| (line(command), COMMAND_GAP, Stage::Setting));
+            settings.into_iter().flatten().map(|command| (line(command), COMMAND_GAP, OpeningStage::Setting));
         [
-            (vec![protocol::slcan::CR], COMMAND_GAP, Stage::Away),
-            (line(Command::Close), CLOSE_GAP, Stage::Closed),
+            (vec![protocol::slcan::CR], COMMAND_GAP, OpeningStage::Away),
+            (line(SlcanCommand::Close), CLOSE_GAP, OpeningStage::Closed),
         ]
         .into_iter()
         .chain(settings)
-        .chain([(line(Command::Open), COMMAND_GAP, Stage::Open)])
+        .chain([(line(SlcanCommand::Open), COMMAND_GAP, OpeningStage::Open)])
         .map(|(bytes, gap, stage)| OpeningStep { bytes, gap, stage })
         .collect()
     }
@@ -189,7 +189,7 @@ impl LineOptions {
         self.bit_rates.is_none_or(|rates| rates.data() != rates.nominal())
     }
 
-    fn take(&mut self, option: &str) -> Result<(), LineError> {
+    fn apply(&mut self, option: &str) -> Result<(), LineError> {
         let line = self.address.to_string();
         let wrong = |expected: &dyn fmt::Display| LineError::Value {
             line: line.clone(),
@@ -234,7 +234,7 @@ impl LineOptions {
                 self.baud = Some(baud.ok_or_else(|| wrong(&"bits in a second: baud=115200"))?);
             }
             "settle" => {
-                self.settle = settle_time(value).ok_or_else(|| wrong(&SETTLE))?;
+                self.settle = settle_time(value).ok_or_else(|| wrong(&ALLOWED_SETTLE))?;
             }
             "classic" if option == "classic" => self.classic = true,
             _ => {
@@ -267,7 +267,7 @@ impl FromStr for LineOptions {
         let mut words = text.split(',');
         let mut options = Self::new(words.next().unwrap_or_default().parse()?);
         for word in words {
-            options.take(word)?;
+            options.apply(word)?;
         }
         Ok(options)
     }

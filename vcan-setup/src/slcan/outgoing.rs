@@ -8,13 +8,13 @@ use protocol::can::{BIT_RATE_SWITCH, Format, Frame};
 use protocol::slcan::{CR, encode};
 use protocol::wire_time::{BitRates, Bits};
 
-use super::account::ToLine;
-use super::options::{LineOptions, OpeningStep, Stage};
+use super::account::ToLineCounts;
+use super::options::{LineOptions, OpeningStep, OpeningStage};
 
 /// The maximum number of waiting frames: a tenth of a second of a line at 1 Mbaud.
-pub const QUEUE: usize = 256;
+pub const MAX_WAITING_FRAMES: usize = 256;
 /// The time by which the line may be ahead of its bus or its wire, which is what an adapter buffers.
-pub const AHEAD: Duration = Duration::from_millis(2);
+pub const MAX_AHEAD: Duration = Duration::from_millis(2);
 
 /// The rates from which the duration of a frame on the line is computed.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -28,12 +28,12 @@ pub struct Pace {
 impl Pace {
     /// Returns the pace of a line and of the bus behind it.
     #[must_use]
-    pub const fn of(options: &LineOptions) -> Self {
+    pub const fn from_options(options: &LineOptions) -> Self {
         Self { bit_rates: options.bit_rates, baud: options.baud }
     }
 
     fn cost(self, frame: &Frame, bytes: usize) -> Duration {
-        let bus = self.bit_rates.zip(Bits::of(frame)).map_or(0, |(rates, bits)| bits.nanoseconds(rates));
+        let bus = self.bit_rates.zip(Bits::from_frame(frame)).map_or(0, |(rates, bits)| bits.nanoseconds(rates));
         let wire = self.baud.map_or(0, |baud| bytes as u64 * 10_000_000_000 / u64::from(baud.max(1)));
         Duration::from_nanos(bus.max(wire))
     }
@@ -44,20 +44,20 @@ impl Pace {
 struct Entry {
     bytes: usize,
     cost: Duration,
-    kind: Kind,
+    kind: EntryKind,
 }
 
 /// The kind of a text.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Kind {
+enum EntryKind {
     Frame,
     /// A command, which is not counted. Once it is written the adapter is in this stage.
-    Command(Stage),
+    Command(OpeningStage),
 }
 
 impl Entry {
     fn is_frame(&self) -> bool {
-        self.kind == Kind::Frame
+        self.kind == EntryKind::Frame
     }
 }
 
@@ -78,11 +78,11 @@ pub struct Outgoing {
     released_bytes: usize,
     busy_until: Duration,
     is_up: bool,
-    stage: Stage,
+    stage: OpeningStage,
     /// Frames sent since the adapter was opened, without those that it refused.
     since_open: u64,
     /// The counts of the frames.
-    pub account: ToLine,
+    pub account: ToLineCounts,
 }
 
 impl Outgoing {
@@ -94,9 +94,9 @@ impl Outgoing {
 
     /// Creates the path to a line with these options.
     #[must_use]
-    pub fn of(options: &LineOptions) -> Self {
+    pub fn from_options(options: &LineOptions) -> Self {
         let one_rate = !options.switches_bit_rate();
-        Self { one_rate, ..Self::new(options.classic, Pace::of(options)) }
+        Self { one_rate, ..Self::new(options.classic, Pace::from_options(options)) }
     }
 
     /// Records that the line is open. `opening` is written first.
@@ -113,7 +113,7 @@ impl Outgoing {
         let text = self.text.split_off(rest);
         let entries = self.entries.split_off(begun);
         (self.released, self.released_bytes) = (begun, rest);
-        self.stage = Stage::Away;
+        self.stage = OpeningStage::Away;
         opening.iter().for_each(|step| self.push_step(step));
         self.text.extend(text);
         self.entries.extend(entries);
@@ -121,7 +121,7 @@ impl Outgoing {
 
     /// Returns the stage of opening the adapter.
     #[must_use]
-    pub const fn stage(&self) -> Stage {
+    pub const fn stage(&self) -> OpeningStage {
         self.stage
     }
 
@@ -141,7 +141,7 @@ impl Outgoing {
     }
 
     /// Queues a frame of the bus, or drops it.
-    pub fn take(&mut self, frame: &Frame) {
+    pub fn push_frame(&mut self, frame: &Frame) {
         self.account.received += 1;
         let dropped = &mut self.account.dropped;
         let one_rate = frame.flags() & BIT_RATE_SWITCH != 0 && self.one_rate;
@@ -155,10 +155,10 @@ impl Outgoing {
             &mut dropped.not_classic
         } else if !self.is_up {
             &mut dropped.line_away
-        } else if self.entries.len() >= QUEUE {
+        } else if self.entries.len() >= MAX_WAITING_FRAMES {
             &mut dropped.queue_full
         } else {
-            self.push(text.as_bytes(), self.pace.cost(frame, text.as_bytes().len()), Kind::Frame);
+            self.push(text.as_bytes(), self.pace.cost(frame, text.as_bytes().len()), EntryKind::Frame);
             return;
         };
         *reason += 1;
@@ -167,14 +167,14 @@ impl Outgoing {
     /// Returns the bytes that may be written now, and the time at which more may be written if entries wait.
     pub fn ready(&mut self, now: Duration) -> (&[u8], Option<Duration>) {
         while let Some(entry) = self.entries.get(self.released) {
-            if self.busy_until > now + AHEAD {
+            if self.busy_until > now + MAX_AHEAD {
                 break;
             }
             self.busy_until = self.busy_until.max(now) + entry.cost;
             self.released += 1;
             self.released_bytes += entry.bytes;
         }
-        let again = (self.released < self.entries.len()).then(|| self.busy_until.saturating_sub(AHEAD));
+        let again = (self.released < self.entries.len()).then(|| self.busy_until.saturating_sub(MAX_AHEAD));
         let (text, _) = self.text.as_slices();
         (text.get(..self.released_bytes.min(text.len())).unwrap_or_default(), again)
     }
@@ -188,12 +188,12 @@ impl Outgoing {
         while let Some(entry) = self.entries.front().filter(|entry| entry.bytes <= self.written) {
             self.written -= entry.bytes;
             match entry.kind {
-                Kind::Frame => {
+                EntryKind::Frame => {
                     self.account.sent += 1;
                     self.since_open += 1;
                 }
-                Kind::Command(stage) => {
-                    if stage == Stage::Open {
+                EntryKind::Command(stage) => {
+                    if stage == OpeningStage::Open {
                         self.since_open = 0;
                     }
                     self.stage = stage;
@@ -216,7 +216,7 @@ impl Outgoing {
         self.released_bytes = rest;
         self.busy_until = Duration::ZERO;
         if self.is_up {
-            self.push(closing, Duration::ZERO, Kind::Command(Stage::Closed));
+            self.push(closing, Duration::ZERO, EntryKind::Command(OpeningStage::Closed));
         }
     }
 
@@ -234,10 +234,10 @@ impl Outgoing {
 
     fn push_step(&mut self, step: &OpeningStep) {
         // Writing ahead of time must not shorten a gap.
-        self.push(&step.bytes, step.gap + AHEAD, Kind::Command(step.stage));
+        self.push(&step.bytes, step.gap + MAX_AHEAD, EntryKind::Command(step.stage));
     }
 
-    fn push(&mut self, text: &[u8], cost: Duration, kind: Kind) {
+    fn push(&mut self, text: &[u8], cost: Duration, kind: EntryKind) {
         self.text.extend(text);
         self.entries.push_back(Entry { bytes: text.len(), cost, kind });
     }
@@ -260,7 +260,7 @@ fn unswitched(frame: &Frame) -> Option<Frame> {
 /// Returns the command that closes an adapter.
 #[must_use]
 pub fn closing() -> Vec<u8> {
-    let close = protocol::slcan::Command::Close.encode();
+    let close = protocol::slcan::SlcanCommand::Close.encode();
     debug_assert!(close.as_bytes().ends_with(&[CR]));
     close.as_bytes().to_vec()
 }
@@ -279,7 +279,7 @@ mod tests {
 
     /// Returns an opening that may be written at once.
     fn opening(text: &[u8]) -> Vec<OpeningStep> {
-        vec![OpeningStep { bytes: text.to_vec(), gap: Duration::ZERO, stage: Stage::Open }]
+        vec![OpeningStep { bytes: text.to_vec(), gap: Duration::ZERO, stage: OpeningStage::Open }]
     }
 
     /// Writes until the queue is empty or has to wait.
@@ -299,13 +299,13 @@ mod tests {
     #[test]
     fn frames_follow_the_opening_in_order() {
         let mut outgoing = Outgoing::new(false, Pace::default());
-        outgoing.take(&frame(0));
+        outgoing.push_frame(&frame(0));
         outgoing.up(&opening(b"\rC\rO\r"));
-        outgoing.take(&frame(1));
-        outgoing.take(&Frame::fd(1, 1, &[2]).unwrap());
-        outgoing.take(&Frame::classic(ERROR | 4, &[0; 8]).unwrap());
+        outgoing.push_frame(&frame(1));
+        outgoing.push_frame(&Frame::fd(1, 1, &[2]).unwrap());
+        outgoing.push_frame(&Frame::classic(ERROR | 4, &[0; 8]).unwrap());
         assert_eq!(drain(&mut outgoing, NOW), b"\rC\rO\rt123101\rb001102\r");
-        let ToLine { received, sent, dropped, .. } = outgoing.account;
+        let ToLineCounts { received, sent, dropped, .. } = outgoing.account;
         assert_eq!((received, sent, dropped.line_away, dropped.error_frame), (4, 2, 1, 1));
         assert_eq!(dropped.total(), 2);
     }
@@ -313,9 +313,9 @@ mod tests {
     #[test]
     fn the_commands_of_an_opening_leave_one_by_one() {
         let options: LineOptions = "/dev/x,rates=1M/5M".parse().unwrap();
-        let mut outgoing = Outgoing::of(&options);
+        let mut outgoing = Outgoing::from_options(&options);
         outgoing.up(&options.opening());
-        outgoing.take(&frame(1));
+        outgoing.push_frame(&frame(1));
         let (mut now, mut written) = (NOW, Vec::new());
         loop {
             let text = drain(&mut outgoing, now);
@@ -327,14 +327,14 @@ mod tests {
         }
         let millis = |at: u64| Duration::from_millis(at);
         let expected = [
-            (b"\r".to_vec(), millis(0), Stage::Away),
-            (b"C\r".to_vec(), millis(10), Stage::Closed),
-            (b"S8\r".to_vec(), millis(40), Stage::Setting),
-            (b"Y5\r".to_vec(), millis(50), Stage::Setting),
-            (b"O\r".to_vec(), millis(60), Stage::Open),
-            (b"t123101\r".to_vec(), millis(70), Stage::Open),
+            (b"\r".to_vec(), millis(0), OpeningStage::Away),
+            (b"C\r".to_vec(), millis(10), OpeningStage::Closed),
+            (b"S8\r".to_vec(), millis(40), OpeningStage::Setting),
+            (b"Y5\r".to_vec(), millis(50), OpeningStage::Setting),
+            (b"O\r".to_vec(), millis(60), OpeningStage::Open),
+            (b"t123101\r".to_vec(), millis(70), OpeningStage::Open),
         ];
-        let at = |(text, at, stage): (Vec<u8>, Duration, Stage)| (text, at.as_millis() / 10, stage);
+        let at = |(text, at, stage): (Vec<u8>, Duration, OpeningStage)| (text, at.as_millis() / 10, stage);
         assert_eq!(written.into_iter().map(at).collect::<Vec<_>>(), expected.map(at));
     }
 
@@ -347,10 +347,10 @@ mod tests {
             (",rates=1M/1M", "d123102\rd123102\rt123103\r"),
             (",rates=250k", "d123102\rd123102\rt123103\r"),
         ] {
-            let mut outgoing = Outgoing::of(&format!("/dev/x{rates}").parse().unwrap());
+            let mut outgoing = Outgoing::from_options(&format!("/dev/x{rates}").parse().unwrap());
             for _ in 0..2 {
                 outgoing.up(&[]);
-                frames.iter().for_each(|frame| outgoing.take(frame));
+                frames.iter().for_each(|frame| outgoing.push_frame(frame));
                 assert_eq!(drain(&mut outgoing, NOW), expected.as_bytes(), "{rates}");
             }
         }
@@ -360,21 +360,21 @@ mod tests {
     fn a_frame_that_the_adapter_refused_was_not_sent() {
         let mut outgoing = Outgoing::new(false, Pace::default());
         outgoing.up(&opening(b"O\r"));
-        (0..5).for_each(|number| outgoing.take(&frame(number)));
+        (0..5).for_each(|number| outgoing.push_frame(&frame(number)));
         drain(&mut outgoing, NOW);
         outgoing.refused(2);
         assert_eq!((outgoing.account.sent, outgoing.account.dropped.refused), (3, 2));
         // A line that was begun is finished before the adapter is reopened, and waiting frames follow.
-        (5..7).for_each(|number| outgoing.take(&frame(number)));
+        (5..7).for_each(|number| outgoing.push_frame(&frame(number)));
         outgoing.ready(NOW);
         outgoing.wrote(3);
         outgoing.reopen(&opening(b"C\rO\r"));
-        assert_eq!(outgoing.stage(), Stage::Away);
-        assert_eq!(drain(&mut outgoing, NOW + AHEAD), b"3105\rC\rO\rt123106\r");
-        assert_eq!(outgoing.stage(), Stage::Open);
+        assert_eq!(outgoing.stage(), OpeningStage::Away);
+        assert_eq!(drain(&mut outgoing, NOW + MAX_AHEAD), b"3105\rC\rO\rt123106\r");
+        assert_eq!(outgoing.stage(), OpeningStage::Open);
         // Refusals beyond the frames since then are of commands.
         outgoing.refused(9);
-        let ToLine { received, sent, dropped, .. } = outgoing.account;
+        let ToLineCounts { received, sent, dropped, .. } = outgoing.account;
         assert_eq!((received, sent, dropped.refused, dropped.total()), (7, 4, 3, 3));
     }
 
@@ -382,8 +382,8 @@ mod tests {
     fn a_classic_line_gets_no_fd_frames() {
         let mut outgoing = Outgoing::new(true, Pace::default());
         outgoing.up(&[]);
-        outgoing.take(&Frame::fd(1, 1, &[2]).unwrap());
-        outgoing.take(&frame(1));
+        outgoing.push_frame(&Frame::fd(1, 1, &[2]).unwrap());
+        outgoing.push_frame(&frame(1));
         assert_eq!(drain(&mut outgoing, NOW), b"t123101\r");
         assert_eq!(outgoing.account.dropped.not_classic, 1);
     }
@@ -393,7 +393,7 @@ mod tests {
         let mut outgoing = Outgoing::new(false, Pace::default());
         outgoing.up(&opening(b"O\r"));
         for number in 0..3 {
-            outgoing.take(&frame(number));
+            outgoing.push_frame(&frame(number));
         }
         outgoing.ready(NOW);
         outgoing.wrote(2 + 8 + 3);
@@ -401,7 +401,7 @@ mod tests {
         outgoing.down();
         assert_eq!(outgoing.account.dropped.line_away, 2);
         outgoing.up(&opening(b"\rO\r"));
-        outgoing.take(&frame(9));
+        outgoing.push_frame(&frame(9));
         assert_eq!(drain(&mut outgoing, NOW), b"\rO\rt123109\r");
     }
 
@@ -409,8 +409,8 @@ mod tests {
     fn the_end_finishes_the_line_that_was_begun_and_closes() {
         let mut outgoing = Outgoing::new(false, Pace::default());
         outgoing.up(&[]);
-        outgoing.take(&frame(1));
-        outgoing.take(&frame(2));
+        outgoing.push_frame(&frame(1));
+        outgoing.push_frame(&frame(2));
         outgoing.ready(NOW);
         outgoing.wrote(3);
         outgoing.end(&closing());
@@ -419,7 +419,7 @@ mod tests {
         // A frame that was never written completely is not sent.
         let mut stuck = Outgoing::new(false, Pace::default());
         stuck.up(&[]);
-        stuck.take(&frame(1));
+        stuck.push_frame(&frame(1));
         stuck.ready(NOW);
         stuck.wrote(3);
         stuck.end(&closing());
@@ -437,16 +437,16 @@ mod tests {
         let mut outgoing = Outgoing::new(true, pace);
         outgoing.up(&[]);
         // The frame has 34 + 8 + 13 bits, and stuff bits.
-        let cost = Duration::from_nanos(Bits::of(&frame(0xAA)).unwrap().nanoseconds("125k".parse().unwrap()));
+        let cost = Duration::from_nanos(Bits::from_frame(&frame(0xAA)).unwrap().nanoseconds("125k".parse().unwrap()));
         let (mut now, mut sent) = (NOW, 0);
         while now < NOW + Duration::from_secs(1) {
-            outgoing.take(&frame(0xAA));
+            outgoing.push_frame(&frame(0xAA));
             sent += drain(&mut outgoing, now).len() / 8;
             now += Duration::from_micros(100);
         }
-        let carried = usize::try_from((Duration::from_secs(1) + AHEAD).as_nanos() / cost.as_nanos()).unwrap();
+        let carried = usize::try_from((Duration::from_secs(1) + MAX_AHEAD).as_nanos() / cost.as_nanos()).unwrap();
         assert!((carried..=carried + 1).contains(&sent), "{sent} of {carried}");
-        let ToLine { received, sent, dropped, .. } = outgoing.account;
+        let ToLineCounts { received, sent, dropped, .. } = outgoing.account;
         assert_eq!(received, sent + dropped.queue_full + outgoing.entries.len() as u64);
         assert!(dropped.queue_full > 5_000);
         let (_, again) = outgoing.ready(now);
@@ -477,19 +477,19 @@ mod tests {
                         let bytes = outgoing.ready(now).0.len().min(amount);
                         outgoing.wrote(bytes);
                     }
-                    _ => (0..amount).for_each(|_| outgoing.take(&frame(1))),
+                    _ => (0..amount).for_each(|_| outgoing.push_frame(&frame(1))),
                 }
                 let waiting = outgoing.entries.iter().filter(|entry| entry.is_frame()).count() as u64;
-                let ToLine { received, sent, dropped, .. } = outgoing.account;
+                let ToLineCounts { received, sent, dropped, .. } = outgoing.account;
                 prop_assert_eq!(received, sent + dropped.total() + waiting);
                 let text: usize = outgoing.entries.iter().map(|entry| entry.bytes).sum();
                 prop_assert_eq!(text, outgoing.text.len() + outgoing.written);
-                prop_assert!(waiting <= QUEUE as u64);
+                prop_assert!(waiting <= MAX_WAITING_FRAMES as u64);
             }
             outgoing.end(b"C\r");
             let rest = drain(&mut outgoing, now);
             prop_assert!(rest.is_empty() || rest.ends_with(b"C\r"));
-            let ToLine { received, sent, dropped, .. } = outgoing.account;
+            let ToLineCounts { received, sent, dropped, .. } = outgoing.account;
             prop_assert_eq!(received, sent + dropped.total());
         }
     }

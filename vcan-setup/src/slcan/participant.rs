@@ -6,23 +6,23 @@ use std::time::{Duration, Instant};
 use protocol::bus::{Bus, BusError, Inbox};
 use rustix::event::PollFlags;
 
-use super::account::{Account, Faults, faults_since};
-use super::event::Event;
+use super::account::{LineAccount, Faults, faults_since};
+use super::event::LineEvent;
 use super::incoming::Incoming;
 use super::link::{Opener, Port};
-use super::options::{LineOptions, Stage};
+use super::options::{LineOptions, OpeningStage};
 use super::outgoing::{Outgoing, closing};
-use super::refusals::{Action, Refusals};
-use super::settings::{Settings, open};
+use super::refusals::{RefusalAction, Refusals};
+use super::settings::{BridgeSettings, open};
 
 /// The interval between two attempts to open an unavailable line or bus.
-const AGAIN: Duration = Duration::from_millis(100);
+const REOPEN_INTERVAL: Duration = Duration::from_millis(100);
 /// The interval between two attempts to send to a full bus.
-const RETRY: Duration = Duration::from_millis(1);
+const SEND_RETRY_INTERVAL: Duration = Duration::from_millis(1);
 /// The minimum interval between two loss reports of a line.
 const REPORT: Duration = Duration::from_secs(1);
 /// The maximum number of batches read from a bus or from a line before the next line's turn.
-const TURNS: usize = 4;
+const MAX_BATCHES: usize = 4;
 
 /// The readable ends.
 #[derive(Clone, Copy, Debug)]
@@ -39,14 +39,14 @@ pub(super) struct Interest {
 
 /// The state of a line.
 #[derive(Debug)]
-enum Line {
+enum LineState {
     Away(Instant),
     Open(Port),
 }
 
 /// The state of the line's client.
 #[derive(Debug)]
-enum Client {
+enum ClientState {
     Away(Instant),
     Open(Box<Bus>),
 }
@@ -55,8 +55,8 @@ enum Client {
 #[derive(Debug)]
 pub(super) struct Participant {
     opener: Opener,
-    line: Line,
-    client: Client,
+    line: LineState,
+    client: ClientState,
     inbox: Inbox,
     outgoing: Outgoing,
     incoming: Incoming,
@@ -76,14 +76,14 @@ pub(super) struct Participant {
 
 impl Participant {
     pub(super) fn new(options: LineOptions, bus: Bus) -> io::Result<Self> {
-        let outgoing = Outgoing::of(&options);
+        let outgoing = Outgoing::from_options(&options);
         let mut incoming = Incoming::new();
         incoming.up(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
         let now = Instant::now();
         Ok(Self {
             opener: Opener::new(options)?,
-            line: Line::Away(now),
-            client: Client::Open(Box::new(bus)),
+            line: LineState::Away(now),
+            client: ClientState::Open(Box::new(bus)),
             inbox: Inbox::new(),
             outgoing,
             incoming,
@@ -105,14 +105,14 @@ impl Participant {
     }
 
     pub(super) const fn is_up(&self) -> bool {
-        matches!(&self.line, Line::Open(port) if !port.is_connecting())
+        matches!(&self.line, LineState::Open(port) if !port.is_connecting())
     }
 
-    pub(super) fn account(&self) -> Account {
+    pub(super) fn account(&self) -> LineAccount {
         let mut to_line = self.outgoing.account;
         to_line.dropped_by_bus = self.dropped_before + u64::from(self.inbox.dropped());
         let to_bus = self.incoming.account();
-        Account {
+        LineAccount {
             line: self.name(),
             opened: self.opened,
             lost: self.lost,
@@ -127,10 +127,10 @@ impl Participant {
     pub(super) fn interest(&mut self) -> Interest {
         let now = self.began.elapsed();
         let line = match &self.line {
-            Line::Away(_) => None,
-            Line::Open(port) if port.is_connecting() => Some(PollFlags::OUT),
-            Line::Open(_) if self.outgoing.ready(now).0.is_empty() => Some(PollFlags::IN),
-            Line::Open(_) => Some(PollFlags::IN | PollFlags::OUT),
+            LineState::Away(_) => None,
+            LineState::Open(port) if port.is_connecting() => Some(PollFlags::OUT),
+            LineState::Open(_) if self.outgoing.ready(now).0.is_empty() => Some(PollFlags::IN),
+            LineState::Open(_) => Some(PollFlags::IN | PollFlags::OUT),
         };
         Interest { line }
     }
@@ -138,12 +138,12 @@ impl Participant {
     /// Returns the line and the client to poll.
     pub(super) const fn ends(&self) -> (Option<&Port>, Option<&Bus>) {
         let port = match &self.line {
-            Line::Open(port) => Some(port),
-            Line::Away(_) => None,
+            LineState::Open(port) => Some(port),
+            LineState::Away(_) => None,
         };
         match &self.client {
-            Client::Open(bus) => (port, Some(bus)),
-            Client::Away(_) => (port, None),
+            ClientState::Open(bus) => (port, Some(bus)),
+            ClientState::Away(_) => (port, None),
         }
     }
 
@@ -151,27 +151,27 @@ impl Participant {
     pub(super) fn timeout(&mut self, now: Instant) -> Option<Instant> {
         let elapsed = now - self.began;
         let line = match &self.line {
-            Line::Away(at) => Some(*at),
-            Line::Open(port) if port.is_connecting() => Some(now + AGAIN),
-            Line::Open(_) => self.outgoing.ready(elapsed).1.map(|at| self.began + at),
+            LineState::Away(at) => Some(*at),
+            LineState::Open(port) if port.is_connecting() => Some(now + REOPEN_INTERVAL),
+            LineState::Open(_) => self.outgoing.ready(elapsed).1.map(|at| self.began + at),
         };
         let client = match &self.client {
-            Client::Away(at) => Some(*at),
-            Client::Open(_) if !self.incoming.waiting().is_empty() => Some(now + RETRY),
-            Client::Open(_) => None,
+            ClientState::Away(at) => Some(*at),
+            ClientState::Open(_) if !self.incoming.waiting().is_empty() => Some(now + SEND_RETRY_INTERVAL),
+            ClientState::Open(_) => None,
         };
         let report = self.has_more_to_report().then_some(self.report_at);
         [line, client, report, self.settled_at].into_iter().flatten().min()
     }
 
     /// Forwards all available data.
-    pub(super) fn work(&mut self, settings: &Settings, ready: Ready, report: &mut impl FnMut(Event)) {
+    pub(super) fn work(&mut self, settings: &BridgeSettings, ready: Ready, report: &mut impl FnMut(LineEvent)) {
         let now = Instant::now();
         self.open_line(now, report);
         if self.settled_at.is_some_and(|at| at <= now) {
             self.set_adapter();
         }
-        if matches!(self.client, Client::Away(at) if at <= now) {
+        if matches!(self.client, ClientState::Away(at) if at <= now) {
             self.open_client(settings, now, report);
         }
         if ready.line {
@@ -199,25 +199,25 @@ impl Participant {
     }
 
     /// Reports losses and faults since the last report.
-    fn report(&mut self, report: &mut impl FnMut(Event)) {
+    fn report(&mut self, report: &mut impl FnMut(LineEvent)) {
         let faults = faults_since(&self.reported_faults, self.incoming.faults());
         if !faults.is_empty() {
             self.reported_faults = self.incoming.faults().clone();
-            report(Event::Reported(faults));
+            report(LineEvent::Reported(faults));
         }
         let losses = self.losses();
         if losses != self.reported {
             let (to_line, to_bus) = (losses.0 - self.reported.0, losses.1 - self.reported.1);
-            report(Event::Lost { to_line, to_bus, account: Box::new(self.account()) });
+            report(LineEvent::Lost { to_line, to_bus, account: Box::new(self.account()) });
             self.reported = losses;
         }
     }
 
     /// Opens the line if it is time, and reports the reason if it cannot be opened.
-    pub(super) fn open_line(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
+    pub(super) fn open_line(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         let opened = match &mut self.line {
-            Line::Away(at) if *at <= now => self.opener.open(),
-            Line::Open(port) if port.is_connecting() => match port.connected() {
+            LineState::Away(at) if *at <= now => self.opener.open(),
+            LineState::Open(port) if port.is_connecting() => match port.connected() {
                 Ok(false) => return,
                 Ok(true) => {
                     self.line_is_up(now, report);
@@ -225,18 +225,18 @@ impl Participant {
                 }
                 Err(error) => Err(error),
             },
-            Line::Away(_) | Line::Open(_) => return,
+            LineState::Away(_) | LineState::Open(_) => return,
         };
         match opened {
             Ok(port) => {
                 let up = !port.is_connecting();
-                self.line = Line::Open(port);
+                self.line = LineState::Open(port);
                 if up {
                     self.line_is_up(now, report);
                 }
             }
             Err(error) => {
-                self.line = Line::Away(now + AGAIN);
+                self.line = LineState::Away(now + REOPEN_INTERVAL);
                 self.report_away(error, report);
             }
         }
@@ -252,7 +252,7 @@ impl Participant {
         self.reason.take()
     }
 
-    fn line_is_up(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
+    fn line_is_up(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         self.opened += 1;
         self.reason = None;
         let settle = self.opener.options().settle;
@@ -261,7 +261,7 @@ impl Participant {
         } else {
             self.settled_at = Some(now + settle);
         }
-        report(Event::LineUp);
+        report(LineEvent::LineUp);
     }
 
     /// Opens the adapter, and lets frames follow.
@@ -271,52 +271,52 @@ impl Participant {
     }
 
     /// Reacts to an adapter's refusals.
-    fn heed_refusals(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
+    fn heed_refusals(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         let (bells, replies) = (self.incoming.account().bells, self.incoming.replies());
-        match self.refusals.take(now - self.began, self.outgoing.stage(), bells, replies) {
-            Action::Nothing => {}
-            Action::Count(lines) => self.outgoing.refused(lines),
-            Action::ReportSettings => {
+        match self.refusals.evaluate(now - self.began, self.outgoing.stage(), bells, replies) {
+            RefusalAction::Nothing => {}
+            RefusalAction::Count(lines) => self.outgoing.refused(lines),
+            RefusalAction::ReportSettings => {
                 let opening = self.opener.options().opening();
-                let settings = opening.iter().filter(|step| step.stage == Stage::Setting);
+                let settings = opening.iter().filter(|step| step.stage == OpeningStage::Setting);
                 let names = settings.map(|step| String::from_utf8_lossy(&step.bytes).trim_end().to_owned());
-                report(Event::SettingRefused(names.collect::<Vec<_>>().join(", ")));
+                report(LineEvent::SettingRefused(names.collect::<Vec<_>>().join(", ")));
             }
-            Action::Reopen(lines) => {
+            RefusalAction::Reopen(lines) => {
                 self.outgoing.refused(lines);
                 self.outgoing.reopen(&self.opener.options().opening());
-                report(Event::Reopened);
+                report(LineEvent::Reopened);
             }
         }
     }
 
-    fn line_lost(&mut self, error: io::Error, now: Instant, report: &mut impl FnMut(Event)) {
+    fn line_lost(&mut self, error: io::Error, now: Instant, report: &mut impl FnMut(LineEvent)) {
         self.outgoing.down();
         self.incoming.line_lost();
         self.settled_at = None;
-        self.line = Line::Away(now + AGAIN);
+        self.line = LineState::Away(now + REOPEN_INTERVAL);
         self.lost += 1;
         self.report_away(error, report);
     }
 
-    fn report_away(&mut self, error: io::Error, report: &mut impl FnMut(Event)) {
+    fn report_away(&mut self, error: io::Error, report: &mut impl FnMut(LineEvent)) {
         let why = error.to_string();
         if self.reason.as_ref().is_none_or(|before| before.to_string() != why) {
-            report(Event::LineAway(why));
+            report(LineEvent::LineAway(why));
         }
         self.reason = Some(error);
     }
 
-    fn read_line(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
+    fn read_line(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         if !self.is_up() {
             return;
         }
         let mut buffer = [0; 4_096];
-        for _ in 0..TURNS {
-            let Line::Open(port) = &self.line else { return };
+        for _ in 0..MAX_BATCHES {
+            let LineState::Open(port) = &self.line else { return };
             match port.read(&mut buffer) {
                 Ok(0) => return,
-                Ok(count) => self.incoming.take(buffer.get(..count).unwrap_or_default()),
+                Ok(count) => self.incoming.receive(buffer.get(..count).unwrap_or_default()),
                 Err(error) => return self.line_lost(error, now, report),
             }
             self.heed_refusals(now, report);
@@ -324,12 +324,12 @@ impl Participant {
         }
     }
 
-    fn write_line(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
+    fn write_line(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         if !self.is_up() {
             return;
         }
         loop {
-            let Line::Open(port) = &self.line else { return };
+            let LineState::Open(port) = &self.line else { return };
             let (bytes, _) = self.outgoing.ready(now - self.began);
             if bytes.is_empty() {
                 return;
@@ -339,7 +339,7 @@ impl Participant {
                 Ok(count) => {
                     let before = self.outgoing.stage();
                     self.outgoing.wrote(count);
-                    if before != Stage::Open && self.outgoing.stage() == Stage::Open {
+                    if before != OpeningStage::Open && self.outgoing.stage() == OpeningStage::Open {
                         self.incoming.opened();
                     }
                 }
@@ -348,14 +348,14 @@ impl Participant {
         }
     }
 
-    fn read_bus(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
-        for _ in 0..TURNS {
-            let Client::Open(bus) = &self.client else { return };
+    fn read_bus(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
+        for _ in 0..MAX_BATCHES {
+            let ClientState::Open(bus) = &self.client else { return };
             match bus.receive(&mut self.inbox) {
                 Ok(0) => return,
                 Ok(_) => {
                     for received in self.inbox.frames() {
-                        self.outgoing.take(&received.frame);
+                        self.outgoing.push_frame(&received.frame);
                     }
                 }
                 Err(error) => return self.bus_failed(&error, now, report),
@@ -364,8 +364,8 @@ impl Participant {
         }
     }
 
-    fn write_bus(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
-        let Client::Open(bus) = &self.client else { return };
+    fn write_bus(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
+        let ClientState::Open(bus) = &self.client else { return };
         let waiting = self.incoming.waiting();
         if waiting.is_empty() {
             return;
@@ -385,22 +385,22 @@ impl Participant {
     }
 
     /// Handles an interface that went down or a bus that ended: frames waiting for it are lost.
-    fn bus_failed(&mut self, error: &BusError, now: Instant, report: &mut impl FnMut(Event)) {
+    fn bus_failed(&mut self, error: &BusError, now: Instant, report: &mut impl FnMut(LineEvent)) {
         self.incoming.down();
         self.dropped_before += u64::from(self.inbox.dropped());
         self.inbox = Inbox::new();
-        self.client = Client::Away(now + AGAIN);
-        report(Event::BusAway(error.to_string()));
+        self.client = ClientState::Away(now + REOPEN_INTERVAL);
+        report(LineEvent::BusAway(error.to_string()));
     }
 
-    fn open_client(&mut self, settings: &Settings, now: Instant, report: &mut impl FnMut(Event)) {
+    fn open_client(&mut self, settings: &BridgeSettings, now: Instant, report: &mut impl FnMut(LineEvent)) {
         match open(settings, self.opener.options()) {
             Ok(bus) => {
                 self.incoming.up(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
-                self.client = Client::Open(Box::new(bus));
-                report(Event::BusUp);
+                self.client = ClientState::Open(Box::new(bus));
+                report(LineEvent::BusUp);
             }
-            Err(_) => self.client = Client::Away(now + AGAIN),
+            Err(_) => self.client = ClientState::Away(now + REOPEN_INTERVAL),
         }
     }
 
@@ -417,7 +417,7 @@ impl Participant {
         self.read_line(now, &mut |_| {});
         self.write_bus(now, &mut |_| {});
         self.read_bus(now, &mut |_| {});
-        self.client = Client::Away(Instant::now());
+        self.client = ClientState::Away(Instant::now());
         self.incoming.end();
         self.outgoing.end(&closing());
     }
@@ -431,7 +431,7 @@ impl Participant {
     /// Gives up at the timeout. Returns true if the adapter was closed.
     pub(super) fn give_up(&mut self) -> bool {
         let closed = self.finish();
-        if let Line::Open(port) = &self.line
+        if let LineState::Open(port) = &self.line
             && !closed
         {
             port.discard();

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::incoming::Replies;
-use super::options::Stage;
+use super::options::OpeningStage;
 
 /// The minimum time between two reopenings, which take the adapter off its bus for a moment.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
@@ -11,11 +11,11 @@ const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
 /// The number of refusals in a row after which an adapter that accepted lines before is reopened: its queue may be full
 /// for a moment.
-const MANY: u64 = 8;
+const REFUSAL_THRESHOLD: u64 = 8;
 
 /// The reaction to refused lines.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Action {
+pub enum RefusalAction {
     /// Ignore them: there are none, or they are expected.
     Nothing,
     /// Report that the adapter does not support a setting.
@@ -49,24 +49,24 @@ impl Refusals {
     }
 
     /// Evaluates the refusals so far, for an adapter in this stage with these replies since it was opened.
-    pub fn take(&mut self, now: Duration, stage: Stage, bells: u64, replies: Replies) -> Action {
+    pub fn evaluate(&mut self, now: Duration, stage: OpeningStage, bells: u64, replies: Replies) -> RefusalAction {
         let more = bells - std::mem::replace(&mut self.seen, bells);
         if replies.accepted && replies.refusals == 0 {
             self.pause = FIRST_PAUSE;
         }
         match stage {
-            _ if more == 0 => Action::Nothing,
+            _ if more == 0 => RefusalAction::Nothing,
             // These refusals are of frames before a reopening, or of an incomplete line or of closing a closed adapter.
-            Stage::Away | Stage::Closed => Action::Count(more),
-            Stage::Setting => Action::ReportSettings,
-            Stage::Open if now < self.next || (replies.accepted && replies.refusals < MANY) => {
-                Action::Count(more)
+            OpeningStage::Away | OpeningStage::Closed => RefusalAction::Count(more),
+            OpeningStage::Setting => RefusalAction::ReportSettings,
+            OpeningStage::Open if now < self.next || (replies.accepted && replies.refusals < REFUSAL_THRESHOLD) => {
+                RefusalAction::Count(more)
             }
-            Stage::Open => {
+            OpeningStage::Open => {
                 self.next = now + self.pause;
                 self.pause = LONGEST_PAUSE.min(2 * self.pause);
                 self.reopened += 1;
-                Action::Reopen(more)
+                RefusalAction::Reopen(more)
             }
         }
     }
@@ -92,40 +92,40 @@ mod tests {
         let replies = |refusals| Replies { accepted: false, refusals };
         let mut times = Vec::new();
         for number in 1..=100_000 {
-            if let Action::Reopen(1) = refusals.take(at(number), Stage::Open, number, replies(number)) {
+            if let RefusalAction::Reopen(1) = refusals.evaluate(at(number), OpeningStage::Open, number, replies(number)) {
                 times.push(number);
             }
         }
         assert_eq!(times, [1, 1_001, 3_001, 7_001, 15_001, 31_001, 61_001, 91_001]);
         assert_eq!(refusals.reopened(), 8);
         // Once the adapter has accepted a line, the history starts anew.
-        refusals.take(at(200_000), Stage::Open, 100_000, Replies { accepted: true, refusals: 0 });
+        refusals.evaluate(at(200_000), OpeningStage::Open, 100_000, Replies { accepted: true, refusals: 0 });
         for (now, expected) in [(200_001, true), (200_900, false), (201_001, true)] {
-            let action = refusals.take(at(now), Stage::Open, 100_000 + now, replies(1));
-            assert_eq!(matches!(action, Action::Reopen(_)), expected, "{now}");
+            let action = refusals.evaluate(at(now), OpeningStage::Open, 100_000 + now, replies(1));
+            assert_eq!(matches!(action, RefusalAction::Reopen(_)), expected, "{now}");
         }
     }
 
     #[test]
     fn an_adapter_that_accepts_lines_is_not_opened_for_a_few_refusals() {
         let mut refusals = Refusals::new();
-        for refused in 1..=MANY {
+        for refused in 1..=REFUSAL_THRESHOLD {
             let replies = Replies { accepted: true, refusals: refused };
-            let expected = if refused < MANY { Action::Count(1) } else { Action::Reopen(1) };
-            assert_eq!(refusals.take(at(refused), Stage::Open, refused, replies), expected);
+            let expected = if refused < REFUSAL_THRESHOLD { RefusalAction::Count(1) } else { RefusalAction::Reopen(1) };
+            assert_eq!(refusals.evaluate(at(refused), OpeningStage::Open, refused, replies), expected);
         }
         let accepted = Replies { accepted: true, refusals: 0 };
-        assert_eq!(refusals.take(at(9), Stage::Open, MANY, accepted), Action::Nothing);
+        assert_eq!(refusals.evaluate(at(9), OpeningStage::Open, REFUSAL_THRESHOLD, accepted), RefusalAction::Nothing);
     }
 
     #[test]
     fn refusals_while_it_is_opened_are_no_reason_to_open_it() {
         let mut refusals = Refusals::new();
         let replies = Replies { accepted: false, refusals: 1 };
-        assert_eq!(refusals.take(at(1), Stage::Away, 1, replies), Action::Count(1));
-        assert_eq!(refusals.take(at(2), Stage::Closed, 2, replies), Action::Count(1));
-        assert_eq!(refusals.take(at(3), Stage::Setting, 3, replies), Action::ReportSettings);
-        assert_eq!(refusals.take(at(4), Stage::Setting, 3, replies), Action::Nothing);
+        assert_eq!(refusals.evaluate(at(1), OpeningStage::Away, 1, replies), RefusalAction::Count(1));
+        assert_eq!(refusals.evaluate(at(2), OpeningStage::Closed, 2, replies), RefusalAction::Count(1));
+        assert_eq!(refusals.evaluate(at(3), OpeningStage::Setting, 3, replies), RefusalAction::ReportSettings);
+        assert_eq!(refusals.evaluate(at(4), OpeningStage::Setting, 3, replies), RefusalAction::Nothing);
         assert_eq!(refusals.reopened(), 0);
     }
 }

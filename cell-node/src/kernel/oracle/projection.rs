@@ -23,12 +23,12 @@ mod sums;
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
-use self::axes::{Axis, Frame, Height, Level, Mix, ToBase, Turn, Vector, negate};
+use self::axes::{Axis, Frame, Height, Level, Mix, ToBase, Rotation, Vector, negate};
 use self::range::is_bounded;
 use self::sums::Sums;
 use crate::kernel::joint::Joint;
-use crate::kernel::rounding::{Bounded, Held};
-use crate::kernel::{Kernel, Number, Scalar, Twist, chain, seldom};
+use crate::kernel::rounding::{Bounded, Saturating};
+use crate::kernel::{Kernel, Number, Scalar, Twist, chain, cold_path};
 use crate::sine::QUARTER;
 
 /// The projection kernel of one cell.
@@ -88,11 +88,11 @@ mod due {
     /// The row has a revolute joint.
     pub(super) const TURNS: u32 = 32;
     /// The row continues a group of parallel axes, and turns from the axes before the group.
-    pub(super) const GOES_ON: u32 = 64;
+    pub(super) const CONTINUES: u32 = 64;
 }
 
 /// The axes that the steps down need: z_(l-1) of each group of parallel axes, then x_l of its rows.
-type Kept<N> = heapless::Vec<Vector<N>, { 2 * MAX_ROWS }>;
+type KeptAxes<N> = heapless::Vec<Vector<N>, { 2 * MAX_ROWS }>;
 
 impl<S: Scalar> Kernel<S> for Projection<S> {
     fn new(parameters: &Parameters) -> Self {
@@ -104,7 +104,7 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
             let joint = if row.moves() { joints.next() } else { None }.unwrap_or(Joint::J1);
             *link = Link::new(row, joint, frame, index + 1 == chain.len());
             if goes_on {
-                link.due |= due::GOES_ON;
+                link.due |= due::CONTINUES;
             }
             if index == 0 && row.kind != RowKind::Prismatic {
                 (link.due, link.d) = (link.due & !due::D, Q1_14::ZERO);
@@ -131,14 +131,14 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
 
     #[inline(always)]
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
-        let mut kept = Kept::new();
+        let mut kept = KeptAxes::new();
         let [zero, one] = [S::Number::zero(), S::Number::word(QUARTER)];
         let mut axes = [[one, zero, zero], [zero, one, zero], [zero, zero, one]];
         let axes = self.axes(joints, axes.each_mut(), &mut kept);
         if self.bounded {
             self.down::<Bounded>(axes, &kept, None, jacobian);
         } else {
-            seldom();
+            cold_path();
             self.down_held(axes, &kept, joints, jacobian);
         }
     }
@@ -157,7 +157,7 @@ impl<S: Scalar> Projection<S> {
         &self,
         joints: &[Q1_14; MAX_JOINTS],
         [x, mut y, mut z]: [&'a mut Vector<S::Number>; 3],
-        kept: &mut Kept<S::Number>,
+        kept: &mut KeptAxes<S::Number>,
     ) -> [&'a Vector<S::Number>; 3] {
         let mut group = Q1_14::ZERO;
         for link in self.links() {
@@ -165,7 +165,7 @@ impl<S: Scalar> Projection<S> {
             if !link.is_due(due::X) {
                 continue;
             }
-            let turn = Turn(S::Number::sine_cosine(group));
+            let turn = Rotation(S::Number::sine_cosine(group));
             let [mix, _] = link.mixes;
             // The capacity is two vectors per row.
             if !link.is_due(due::ENDS) {
@@ -190,7 +190,7 @@ impl<S: Scalar> Projection<S> {
     fn down<R: Sums>(
         &self,
         axes: [&Vector<S::Number>; 3],
-        kept: &Kept<S::Number>,
+        kept: &KeptAxes<S::Number>,
         slides: Option<&[Q1_14; MAX_JOINTS]>,
         jacobian: &mut [S; MAX_JOINTS],
     ) {
@@ -203,7 +203,7 @@ impl<S: Scalar> Projection<S> {
                 z = axis;
             }
             let slides = slides.filter(|_| link.kind == RowKind::Prismatic);
-            let d = match slides.and_then(|joints| link.joint.of(joints)) {
+            let d = match slides.and_then(|joints| link.joint.get(joints)) {
                 Some(position) => Some(S::Number::word(link.d.saturating_add(*position))),
                 None => link.is_due(due::D).then(|| S::Number::word(link.d)),
             };
@@ -213,7 +213,7 @@ impl<S: Scalar> Projection<S> {
                 None if slides.is_some() => link.along::<R>(z, &force),
                 None => continue,
             };
-            if let Some(row) = link.joint.of_mut(jacobian) {
+            if let Some(row) = link.joint.get_mut(jacobian) {
                 *row = S::from_number(entry);
             }
         }
@@ -224,11 +224,11 @@ impl<S: Scalar> Projection<S> {
     fn down_held(
         &self,
         axes: [&Vector<S::Number>; 3],
-        kept: &Kept<S::Number>,
+        kept: &KeptAxes<S::Number>,
         joints: &[Q1_14; MAX_JOINTS],
         jacobian: &mut [S; MAX_JOINTS],
     ) {
-        self.down::<Held>(axes, kept, Some(joints), jacobian);
+        self.down::<Saturating>(axes, kept, Some(joints), jacobian);
     }
 
     /// Transforms the force and the cell's position to the base frame.
@@ -300,11 +300,11 @@ impl<N: Number> Link<N> {
     fn angle(&self, group: Q1_14, joints: &[Q1_14; MAX_JOINTS]) -> Q1_14 {
         let mut angle = self.offset;
         if self.is_due(due::TURNS)
-            && let Some(position) = self.joint.of(joints)
+            && let Some(position) = self.joint.get(joints)
         {
             angle = N::plus_angle(*position, angle);
         }
-        if self.is_due(due::GOES_ON) { N::plus_angle(group, angle) } else { angle }
+        if self.is_due(due::CONTINUES) { N::plus_angle(group, angle) } else { angle }
     }
 
     /// Computes y_l and z_l from v_l and the previous z, in place; y and z are swapped if necessary.
@@ -325,8 +325,8 @@ impl<N: Number> Link<N> {
                 core::mem::swap(y, z);
             }
             Twist::Other { sine, cosine } => {
-                seldom();
-                twist_by(Turn([sine, cosine]), self.mixes, y, z);
+                cold_path();
+                twist_by(Rotation([sine, cosine]), self.mixes, y, z);
             }
         }
     }
@@ -426,6 +426,6 @@ fn shift<R: Sums, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N
 
 /// Applies a twist that is not a multiple of quarter turns.
 #[inline(never)]
-fn twist_by<N: Number>(turn: Turn<N>, [_, mix]: [Mix; 2], y: &mut Vector<N>, z: &mut Vector<N>) {
+fn twist_by<N: Number>(turn: Rotation<N>, [_, mix]: [Mix; 2], y: &mut Vector<N>, z: &mut Vector<N>) {
     turn.both(mix, y, z);
 }

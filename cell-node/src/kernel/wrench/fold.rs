@@ -4,10 +4,10 @@ use core::ops::{Add, Mul, Neg, Sub};
 
 use protocol::parameters::{Pose, Row};
 
-use super::{Number, Wrenched};
+use super::{Number, PerComponent};
 
 /// Returns the contact's wrench, twisted and shifted by joint k's row, rounded once.
-pub(super) fn fold<N: Number>(pose: &Pose, row: &Row) -> Wrenched<N> {
+pub(super) fn fold<N: Number>(pose: &Pose, row: &Row) -> PerComponent<N> {
     let (force, moment) = folded(
         pose.normal.map(N::fine),
         pose.position.map(N::fine),
@@ -15,7 +15,7 @@ pub(super) fn fold<N: Number>(pose: &Pose, row: &Row) -> Wrenched<N> {
         (N::fine(row.a), N::fine(row.d)),
     );
     // 14 fraction bits of a word and 28 of the twist; for the moment 14 more of a length.
-    Wrenched { force: force.map(N::settle::<42>), moment: moment.map(N::settle::<56>) }
+    PerComponent { force: force.map(N::settle::<42>), moment: moment.map(N::settle::<56>) }
 }
 
 /// Returns the wrench before rounding. Words of 16 bits give no number above 2^61.

@@ -2,7 +2,7 @@
 
 use protocol::parameters::Row;
 
-use super::Wrenched;
+use super::PerComponent;
 use crate::contact::MAX_J;
 use crate::kernel::Number;
 
@@ -13,7 +13,7 @@ use crate::kernel::Number;
 /// With |f| and |m| at most F and M: a twist or a turn with words for sine and cosine, each at most 5e-4 off,
 /// lengthens a vector by a factor of at most 1 + 2^-10, and rounding its components adds less than one step.
 /// A shift adds at most |(a, d)| F to M, and its rounding less than one step.
-pub(super) fn bound<N: Number>(contact: &Wrenched<N>, rows: &[Row]) -> Option<u16> {
+pub(super) fn bound<N: Number>(contact: &PerComponent<N>, rows: &[Row]) -> Option<u16> {
     let turned = |norm: u32| norm + (norm >> 10) + 2;
     let (mut force, mut moment) = (turned(N::norm(contact.force)?), turned(N::norm(contact.moment)?));
     for row in rows.iter().rev() {

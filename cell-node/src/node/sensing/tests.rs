@@ -1,15 +1,15 @@
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use protocol::id::{CellId, Kind, Node as Address};
-use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, Joints, Message, Request, SensorPage, SkinSensors};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Contact, Events, Parameter, Parameters, Pose, Sensing as Mode};
 use protocol::time::{Micros, Span};
 
-use crate::flash::Flash;
+use crate::flash::FlashState;
 use crate::identity::Identity;
-use crate::node::claim::Claim;
-use crate::node::{HEARTBEAT, Node};
+use crate::node::claim::ClaimStage;
+use crate::node::{HEARTBEAT_INTERVAL, Node};
 
 const NODE: u8 = 51;
 /// The period; node 51 sends after one fifth of it.
@@ -43,7 +43,7 @@ impl Cell {
             ..Parameters::default()
         };
         let identity = Identity { cell: Some(CellId::new(NODE.into()).unwrap()), serial: 0 };
-        let node = Node::new(identity, format, &Flash::Sound(parameters), true, Micros(0));
+        let node = Node::new(identity, format, &FlashState::Valid(parameters), true, Micros(0));
         let mut cell = Self { node, format, now: Micros(0), epoch: Epoch(0) };
         cell.waits();
         cell.waits();
@@ -94,7 +94,7 @@ impl Cell {
     /// Applies a stimulus with the next joints, and sends them.
     fn feels(&mut self, page: SensorPage) -> Vec<SensorPage> {
         let to = Address::Everyone;
-        assert_eq!(self.hears(&Message::Stimulus { to, from: From::Next, page }, Span(0)), []);
+        assert_eq!(self.hears(&Message::Stimulus { to, from: AppliesFrom::Next, page }, Span(0)), []);
         self.joints()
     }
 
@@ -240,7 +240,7 @@ fn a_heartbeat_in_event_mode_carries_the_present_state_and_every_fourth_the_acce
         let both = [pressed(60), NOTHING];
         assert_eq!(pages.as_slice(), &both[..if beat % 4 == 3 { 2 } else { 1 }], "{beat}");
     }
-    assert!(beats.windows(2).all(|pair| pair[1].0.since(pair[0].0) == HEARTBEAT));
+    assert!(beats.windows(2).all(|pair| pair[1].0.elapsed_since(pair[0].0) == HEARTBEAT_INTERVAL));
     // A page counts as sent for whatever reason it was sent.
     assert!(!cell.says(60) && cell.says(160));
 }
@@ -251,7 +251,7 @@ fn a_heartbeat_with_an_event_does_not_send_it_twice() {
     let mut cell = eventful();
     cell.now = cell.node.poll_timeout() - Span(1_000);
     let to = Address::Everyone;
-    cell.hears(&Message::Stimulus { to, from: From::Next, page: pressed(500) }, Span(0));
+    cell.hears(&Message::Stimulus { to, from: AppliesFrom::Next, page: pressed(500) }, Span(0));
     cell.epoch = cell.epoch.next();
     let joints = Joints { in_use: 1, ..Joints::default() };
     for frame in (Message::Joints { epoch: cell.epoch, joints }).encode().frames(Format::Fd) {
@@ -297,7 +297,7 @@ fn what_is_sensed_during_a_hang_is_sent_with_the_next_joints() {
     let mut cell = eventful();
     let to = Address::Everyone;
     for bits in [500, 700, 900] {
-        cell.hears(&Message::Stimulus { to, from: From::Next, page: pressed(bits) }, Span(0));
+        cell.hears(&Message::Stimulus { to, from: AppliesFrom::Next, page: pressed(bits) }, Span(0));
         assert_eq!(cell.joints_aged(Span(16_001)), [], "too old");
     }
     assert_eq!(cell.joints(), [pressed(900)]);
@@ -357,13 +357,13 @@ fn a_threshold_of_zero_makes_every_change_an_event() {
 #[test]
 fn nothing_is_sent_before_the_address_claim_is_settled() {
     let mut cell = eventful();
-    cell.node.claim.stage = Claim::Sent;
+    cell.node.claim.stage = ClaimStage::Sent;
     assert!(!cell.says(500));
-    cell.node.claim.stage = Claim::Settled;
+    cell.node.claim.stage = ClaimStage::Settled;
     assert_eq!(cell.joints(), [pressed(500)]);
 
     let mut cell = Cell::new(Mode::Continuous { period_ms: 10 });
-    cell.node.claim.stage = Claim::Sent;
+    cell.node.claim.stage = ClaimStage::Sent;
     let heartbeat = cell.node.claim.next_heartbeat;
     assert_eq!(cell.node.poll_timeout(), heartbeat, "it is not woken for it");
     cell.now = heartbeat - Span(1);

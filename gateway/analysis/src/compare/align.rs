@@ -11,11 +11,11 @@ use super::Both;
 use super::numbering::Numbering;
 
 /// Maximum number of joints that are kept, from the start; at 62.5 Hz a day has 5.4 million.
-const MOST: usize = 6_000_000;
+const MAX_JOINTS_KEPT: usize = 6_000_000;
 /// Number of joints that are compared for each alignment.
-const SAMPLES: usize = 512;
+const MAX_SAMPLES: usize = 512;
 /// Minimum number of common epochs of two captures that are aligned by their joints.
-const COMMON: usize = 8;
+const MIN_COMMON_EPOCHS: usize = 8;
 
 /// The joints of a capture, each as a hash.
 #[derive(Debug)]
@@ -55,7 +55,7 @@ impl Trace {
         let last = self.numbering.newest();
         let Some(key) = self.numbering.take(nanos, *epoch, last).filter(|key| key.run == 0) else { return };
         self.first.get_or_insert(*epoch);
-        let Some(at) = usize::try_from(key.number).ok().filter(|at| *at < MOST) else { return };
+        let Some(at) = usize::try_from(key.number).ok().filter(|at| *at < MAX_JOINTS_KEPT) else { return };
         if at >= self.joints.len() {
             self.joints.resize(at + 1, None);
         }
@@ -96,10 +96,10 @@ fn share(a: &Trace, b: &Trace, start_a: u64, start_b: u64) -> Option<f64> {
         [start_a, start_b].map(|start| usize::try_from(begin - start).unwrap_or(usize::MAX));
     let (a, b) = (a.joints.get(skip_a..)?, b.joints.get(skip_b..)?);
     let common = a.len().min(b.len());
-    if common < COMMON {
+    if common < MIN_COMMON_EPOCHS {
         return None;
     }
-    let step = common.div_ceil(SAMPLES);
+    let step = common.div_ceil(MAX_SAMPLES);
     let pairs = a.iter().zip(b).take(common).step_by(step).filter(|(a, b)| a.is_some() && b.is_some());
     let (equal, all) =
         pairs.fold((0_u32, 0_u32), |(equal, all), (a, b)| (equal + u32::from(a == b), all + 1));

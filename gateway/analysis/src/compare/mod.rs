@@ -22,25 +22,25 @@ use protocol::skin::Skin;
 use serde::Serialize;
 
 use self::numbering::Key;
-use self::pair::{Firsts, Found, Tally, compare};
+use self::pair::{FirstDifferences, FoundDifference, Tally, compare};
 use self::side::{Moment, Side};
 use crate::explain::NotFound;
 
 pub use self::align::{Trace, starts};
 pub use self::report::{
-    ASPECTS, CellRow, Contacts, Epochs, ExtraCell, First, Joints, Losses, Only, Replies, Report, Source,
+    ASPECTS, CellRow, Contacts, Epochs, ExtraCell, FirstDifference, Joints, Losses, UnpairedCounts, Replies, Report, Source,
 };
 
 /// One of the two captures.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Which {
+pub enum CaptureSide {
     /// The first one.
     A,
     /// The second one.
     B,
 }
 
-impl Which {
+impl CaptureSide {
     const fn other(self) -> Self {
         if matches!(self, Self::A) { Self::B } else { Self::A }
     }
@@ -58,18 +58,18 @@ pub struct Both<T> {
 impl<T> Both<T> {
     /// Returns the value of one capture.
     #[must_use]
-    pub const fn of(&self, which: Which) -> &T {
+    pub const fn get(&self, which: CaptureSide) -> &T {
         match which {
-            Which::A => &self.a,
-            Which::B => &self.b,
+            CaptureSide::A => &self.a,
+            CaptureSide::B => &self.b,
         }
     }
 
     /// Returns the mutable value of one capture.
-    pub const fn of_mut(&mut self, which: Which) -> &mut T {
+    pub const fn of_mut(&mut self, which: CaptureSide) -> &mut T {
         match which {
-            Which::A => &mut self.a,
-            Which::B => &mut self.b,
+            CaptureSide::A => &mut self.a,
+            CaptureSide::B => &mut self.b,
         }
     }
 }
@@ -94,8 +94,8 @@ pub struct Comparison<'a> {
     tallies: Vec<Tally>,
     epochs: Epochs,
     /// The first difference that always counts, and the first missing item; with joints and bus.
-    first: Option<(Key, usize, First)>,
-    first_missing: Option<(Key, usize, First)>,
+    first: Option<(Key, usize, FirstDifference)>,
+    first_missing: Option<(Key, usize, FirstDifference)>,
 }
 
 /// Returns the period of epochs, in ns.
@@ -123,41 +123,41 @@ impl<'a> Comparison<'a> {
 
     /// Returns the capture to read from next, which is the one behind; `None` when both have ended.
     #[must_use]
-    pub fn next(&self) -> Option<Which> {
+    pub fn next(&self) -> Option<CaptureSide> {
         let Both { a, b } = &self.sides;
         match (a.is_ended, b.is_ended) {
             (true, true) => None,
-            (true, false) => Some(Which::B),
-            (false, true) => Some(Which::A),
-            (false, false) => Some(if a.newest() <= b.newest() { Which::A } else { Which::B }),
+            (true, false) => Some(CaptureSide::B),
+            (false, true) => Some(CaptureSide::A),
+            (false, false) => Some(if a.newest() <= b.newest() { CaptureSide::A } else { CaptureSide::B }),
         }
     }
 
     /// Handles a frame that was latched before the start of a capture.
-    pub fn begin(&mut self, which: Which, nanos: u64, bus: &str, message: &Message) {
+    pub fn begin(&mut self, which: CaptureSide, nanos: u64, bus: &str, message: &Message) {
         self.sides.of_mut(which).begin(nanos, bus, message);
     }
 
     /// Handles the next frame of a capture; `message` is its meaning, if it has one.
-    pub fn take(&mut self, which: Which, nanos: u64, bus: &str, message: Option<&Message>) {
+    pub fn receive(&mut self, which: CaptureSide, nanos: u64, bus: &str, message: Option<&Message>) {
         if self.sides.of_mut(which).take(nanos, bus, message) {
             self.pair();
         }
     }
 
     /// Counts frames that the recorder of a capture lost.
-    pub fn dropped(&mut self, which: Which, frames: u64) {
+    pub fn dropped(&mut self, which: CaptureSide, frames: u64) {
         let dropped = &mut self.sides.of_mut(which).counts.dropped;
         *dropped = dropped.saturating_add(frames);
     }
 
     /// Declares that the times of a capture are meaningless.
-    pub fn without_times(&mut self, which: Which) {
+    pub fn without_times(&mut self, which: CaptureSide) {
         self.sides.of_mut(which).has_times = false;
     }
 
     /// Declares the end of a capture; `is_unfinished` if it was cut off.
-    pub fn end(&mut self, which: Which, is_unfinished: bool) {
+    pub fn end(&mut self, which: CaptureSide, is_unfinished: bool) {
         let side = self.sides.of_mut(which);
         side.counts.unfinished = is_unfinished;
         side.end();
@@ -165,16 +165,16 @@ impl<'a> Comparison<'a> {
     }
 
     /// Returns the reason why a complete capture has no joints of the skin; `None` if it has some.
-    pub fn not_found(&mut self, which: Which) -> Option<NotFound> {
+    pub fn not_found(&mut self, which: CaptureSide) -> Option<NotFound> {
         self.sides.of_mut(which).not_found()
     }
 
     /// Returns the number of cells that reported a configuration, and of those among them with the skin's, if these are
     /// fewer than half.
     #[must_use]
-    pub fn other_configurations(&self, which: Which) -> Option<(usize, usize)> {
+    pub fn other_configurations(&self, which: CaptureSide) -> Option<(usize, usize)> {
         let hash = |bus: usize, node| {
-            let cell = self.sides.of(which).buses.get(bus)?.cells.get(node)?;
+            let cell = self.sides.get(which).buses.get(bus)?.cells.get(node)?;
             cell.tracked.claim().heartbeat().map(|it| it.configuration).filter(|hash| *hash != 0)
         };
         let reported = self.skin.cells.iter().filter_map(|cell| Some((cell, hash(cell.bus, cell.node)?)));
@@ -198,19 +198,19 @@ impl<'a> Comparison<'a> {
         let which = match both {
             (Some(a), Some(b)) if a == b => {
                 let mut take = |which| self.sides.of_mut(which).buses.get_mut(bus)?.ready.pop_front();
-                let (a, b) = (take(Which::A)?, take(Which::B)?);
+                let (a, b) = (take(CaptureSide::A)?, take(CaptureSide::B)?);
                 self.same(bus, &a, &b);
                 return Some(());
             }
             (Some(a), Some(b)) => {
                 if a < b {
-                    Which::A
+                    CaptureSide::A
                 } else {
-                    Which::B
+                    CaptureSide::B
                 }
             }
-            (Some(a), None) if self.sides.b.is_past(bus, a) => Which::A,
-            (None, Some(b)) if self.sides.a.is_past(bus, b) => Which::B,
+            (Some(a), None) if self.sides.b.is_past(bus, a) => CaptureSide::A,
+            (None, Some(b)) if self.sides.a.is_past(bus, b) => CaptureSide::B,
             _ => return None,
         };
         let moment = self.sides.of_mut(which).buses.get_mut(bus)?.ready.pop_front()?;
@@ -226,9 +226,9 @@ impl<'a> Comparison<'a> {
     }
 
     /// Counts joints that only one capture has.
-    fn alone(&mut self, bus: usize, which: Which, moment: &Moment) {
-        let other = self.sides.of(which.other());
-        let is_a = which == Which::A;
+    fn alone(&mut self, bus: usize, which: CaptureSide, moment: &Moment) {
+        let other = self.sides.get(which.other());
+        let is_a = which == CaptureSide::A;
         match (other.first, other.newest()) {
             (Some((first, _)), _) if moment.key < first => self.epochs.before.count(is_a),
             (None, _) => self.epochs.before.count(is_a),
@@ -240,18 +240,18 @@ impl<'a> Comparison<'a> {
                     if is_a { &mut self.epochs.missing_in_b } else { &mut self.epochs.missing_in_a };
                 *missing += 1;
                 let moments = match which {
-                    Which::A => Both { a: Some(moment), b: None },
-                    Which::B => Both { a: None, b: Some(moment) },
+                    CaptureSide::A => Both { a: Some(moment), b: None },
+                    CaptureSide::B => Both { a: None, b: Some(moment) },
                 };
-                self.note(bus, moments, Found::missing_epoch(!is_a));
+                self.note(bus, moments, FoundDifference::missing_epoch(!is_a));
             }
         }
     }
 
     /// Keeps differences if they are the earliest so far: buses are not compared in order of time.
-    fn note(&mut self, bus: usize, moments: Both<Option<&Moment>>, firsts: Firsts) {
+    fn note(&mut self, bus: usize, moments: Both<Option<&Moment>>, firsts: FirstDifferences) {
         let Some(key) = moments.a.or(moments.b).map(|moment| moment.key) else { return };
-        let is_first = |kept: &Option<(Key, usize, First)>| {
+        let is_first = |kept: &Option<(Key, usize, FirstDifference)>| {
             kept.as_ref().is_none_or(|(first, on, _)| (*first, *on) > (key, bus))
         };
         if let Some(found) = firsts.other.filter(|_| is_first(&self.first)) {
@@ -262,9 +262,9 @@ impl<'a> Comparison<'a> {
         }
     }
 
-    fn describe(&self, bus: usize, moments: &Both<Option<&Moment>>, mut found: Found) -> Option<First> {
+    fn describe(&self, bus: usize, moments: &Both<Option<&Moment>>, mut found: FoundDifference) -> Option<FirstDifference> {
         if let Some(cell) = found.cell()
-            && self.restarts(bus, cell, Which::A) != self.restarts(bus, cell, Which::B)
+            && self.restarts(bus, cell, CaptureSide::A) != self.restarts(bus, cell, CaptureSide::B)
         {
             found.inputs.push("restart");
         }
@@ -276,8 +276,8 @@ impl<'a> Comparison<'a> {
         found.describe((self.skin, bus), moments, time_s)
     }
 
-    fn restarts(&self, bus: usize, cell: CellId, which: Which) -> u32 {
-        let cell = self.sides.of(which).buses.get(bus).and_then(|bus| bus.cells.get(cell));
+    fn restarts(&self, bus: usize, cell: CellId, which: CaptureSide) -> u32 {
+        let cell = self.sides.get(which).buses.get(bus).and_then(|bus| bus.cells.get(cell));
         cell.map_or(0, |cell| cell.tracked.account.uplink().restarts)
     }
 

@@ -16,9 +16,9 @@ pub(super) struct Key {
 }
 
 /// Maximum number of epochs by which one bus may lag another.
-const BEHIND: u64 = 16;
+const MAX_BUS_LAG: u64 = 16;
 /// Tolerance for the elapsed time, in epochs.
-const SLACK: u64 = 4;
+const ELAPSED_TOLERANCE: u64 = 4;
 
 /// Numbers the joints of all buses of a capture, which share one counter.
 #[derive(Debug)]
@@ -58,7 +58,7 @@ impl Numbering {
         let elapsed = nanos.saturating_sub(newest.nanos) / self.period_ns;
         // The joints of another bus, or out of order.
         let back = u64::from(newest.epoch.0.wrapping_sub(epoch.0));
-        if back <= BEHIND && elapsed <= BEHIND {
+        if back <= MAX_BUS_LAG && elapsed <= MAX_BUS_LAG {
             let number = newest.key.number.checked_sub(back)?;
             let key = Key { number, ..newest.key };
             return last.is_none_or(|last| last < key).then_some(key);
@@ -77,7 +77,7 @@ impl Numbering {
         let modulo = u64::from(epoch.0.wrapping_sub(newest.epoch.0));
         let laps = (elapsed + 128).saturating_sub(modulo) / 256;
         let steps = modulo + 256 * laps;
-        let fits = steps.abs_diff(elapsed) <= SLACK + elapsed / 1_000;
+        let fits = steps.abs_diff(elapsed) <= ELAPSED_TOLERANCE + elapsed / 1_000;
         match modulo {
             // A step of one after a pause is common, 257 lost joints in a row are rare.
             1 if elapsed < 252 => Some(1),

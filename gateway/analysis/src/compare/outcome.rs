@@ -5,8 +5,8 @@ use protocol::id::CellId;
 
 use super::numbering::Key;
 use super::report::{CellRow, ExtraCell, Losses, Replies, Report, Source};
-use super::side::{Cell, Side};
-use super::{ASPECTS, Both, Comparison, Which};
+use super::side::{ComparedCell, Side};
+use super::{ASPECTS, Both, Comparison, CaptureSide};
 
 impl Comparison<'_> {
     /// Returns the outcome, once both captures have ended.
@@ -58,7 +58,7 @@ impl Comparison<'_> {
         for (at, (bus, tally)) in self.skin.buses.iter().zip(&self.tallies).enumerate() {
             for (node, replies) in tally.cells.iter() {
                 let of = |which| self.cell(which, at, node).map(losses).unwrap_or_default();
-                let losses = Both { a: of(Which::A), b: of(Which::B) };
+                let losses = Both { a: of(CaptureSide::A), b: of(CaptureSide::B) };
                 let is_quiet = losses == Both::default()
                     && replies.different + replies.tolerated + replies.missing() == 0;
                 if !is_quiet {
@@ -69,23 +69,23 @@ impl Comparison<'_> {
         rows
     }
 
-    fn cell(&self, which: Which, bus: usize, node: CellId) -> Option<&Cell> {
-        self.sides.of(which).buses.get(bus)?.cells.get(node)
+    fn cell(&self, which: CaptureSide, bus: usize, node: CellId) -> Option<&ComparedCell> {
+        self.sides.get(which).buses.get(bus)?.cells.get(node)
     }
 
     /// Returns the cells that occur in one capture only, within the common time.
     fn extra_cells(&self) -> Vec<ExtraCell> {
         let range = |which| {
-            let side = self.sides.of(which);
+            let side = self.sides.get(which);
             side.first.map(|(first, _)| first).zip(side.newest())
         };
-        let (Some(a), Some(b)) = (range(Which::A), range(Which::B)) else { return Vec::new() };
+        let (Some(a), Some(b)) = (range(CaptureSide::A), range(CaptureSide::B)) else { return Vec::new() };
         let common: (Key, Key) = (a.0.max(b.0), a.1.min(b.1));
         let mut extra = Vec::new();
         for (at, bus) in self.skin.buses.iter().enumerate() {
             for node in CellId::all() {
-                let heard = |which| self.cell(which, at, node).and_then(|cell| cell.heard);
-                let (span, only_in) = match (heard(Which::A), heard(Which::B)) {
+                let heard = |which| self.cell(which, at, node).and_then(|cell| cell.active_range);
+                let (span, only_in) = match (heard(CaptureSide::A), heard(CaptureSide::B)) {
                     (Some(span), None) => (span, "a"),
                     (None, Some(span)) => (span, "b"),
                     _ => continue,
@@ -115,7 +115,7 @@ fn differs(report: &Report, lost: u64, are_missing: bool) -> Vec<&'static str> {
     ASPECTS.into_iter().zip(differs).filter_map(|(name, differs)| differs.then_some(name)).collect()
 }
 
-fn losses(cell: &Cell) -> Losses {
+fn losses(cell: &ComparedCell) -> Losses {
     let uplink = cell.tracked.account.uplink();
     Losses { late: cell.late, too_late: cell.too_late, lost: uplink.lost, restarts: uplink.restarts.into() }
 }
@@ -132,6 +132,6 @@ fn source(side: &Side<'_>) -> Source {
         source.restarts += cell.restarts;
     }
     let histogram = side.reply().histogram();
-    source.reply_us = (side.has_times && !histogram.is_empty()).then(|| Quantiles::of(histogram, 1e-3));
+    source.reply_us = (side.has_times && !histogram.is_empty()).then(|| Quantiles::from_histogram(histogram, 1e-3));
     source
 }

@@ -8,7 +8,7 @@ use protocol::packet::Words;
 use protocol::schema::Units;
 use protocol::skin::{JointKind, Skin};
 
-use super::report::{Contacts, First, Joints, Only, Replies};
+use super::report::{Contacts, FirstDifference, Joints, UnpairedCounts, Replies};
 use super::side::Moment;
 use super::{Both, Options};
 use crate::explain::CellMoment;
@@ -17,7 +17,7 @@ use crate::explain::CellMoment;
 #[derive(Debug, Default)]
 pub(super) struct Tally {
     pub(super) joints: Joints,
-    pub(super) halts: Only,
+    pub(super) halts: UnpairedCounts,
     pub(super) contacts: Contacts,
     pub(super) torques: Replies,
     pub(super) sums: Replies,
@@ -26,7 +26,7 @@ pub(super) struct Tally {
 
 /// A difference, before it is described.
 #[derive(Debug, Default)]
-pub(super) struct Found {
+pub(super) struct FoundDifference {
     what: &'static str,
     how: &'static str,
     cell: Option<CellId>,
@@ -38,13 +38,13 @@ pub(super) struct Found {
 
 /// The first differences at an epoch. Missing items may be within the tolerance, so they are kept apart.
 #[derive(Debug, Default)]
-pub(super) struct Firsts {
-    pub(super) missing: Option<Found>,
-    pub(super) other: Option<Found>,
+pub(super) struct FirstDifferences {
+    pub(super) missing: Option<FoundDifference>,
+    pub(super) other: Option<FoundDifference>,
 }
 
-impl Firsts {
-    fn note(&mut self, found: Found) {
+impl FirstDifferences {
+    fn note(&mut self, found: FoundDifference) {
         let is_missing = found.how != "different" && matches!(found.what, "epoch" | "torque" | "sum");
         (if is_missing { &mut self.missing } else { &mut self.other }).get_or_insert(found);
     }
@@ -59,10 +59,10 @@ struct Differing {
     unit: &'static str,
 }
 
-impl Found {
-    pub(super) fn missing_epoch(in_a: bool) -> Firsts {
+impl FoundDifference {
+    pub(super) fn missing_epoch(in_a: bool) -> FirstDifferences {
         let found = Self { what: "epoch", how: missing(in_a), ..Self::default() };
-        Firsts { missing: Some(found), other: None }
+        FirstDifferences { missing: Some(found), other: None }
     }
 
     /// Returns the cell, if the difference belongs to one.
@@ -76,15 +76,15 @@ impl Found {
         (skin, bus): (&Skin, usize),
         moments: &Both<Option<&Moment>>,
         time_s: Both<Option<f64>>,
-    ) -> Option<First> {
+    ) -> Option<FirstDifference> {
         let moment = moments.a.or(moments.b)?;
         let words = self.word.as_ref();
         let place = words.map(|word| word.place);
-        let joint = place.and_then(|place| skin.joints_of(bus).nth(place));
+        let joint = place.and_then(|place| skin.joints_on_bus(bus).nth(place));
         let pair = |of: fn(&Differing) -> [i16; 2]| words.map(of);
         let [word_a, word_b] = pair(|word| word.words).map_or([None; 2], |words| words.map(Some));
         let [value_a, value_b] = words.map_or([None; 2], |word| word.values.map(Some));
-        Some(First {
+        Some(FirstDifference {
             what: self.what,
             how: self.how,
             bus: skin.buses.get(bus).map(|bus| bus.name.clone()).unwrap_or_default(),
@@ -117,9 +117,9 @@ pub(super) fn compare(
     (skin, bus): (&Skin, usize),
     moments: Both<&Moment>,
     options: &Options,
-) -> Firsts {
+) -> FirstDifferences {
     let Both { a, b } = moments;
-    let mut first = Firsts::default();
+    let mut first = FirstDifferences::default();
     let joints = joints(skin, bus, moments);
     let steps = joints.as_ref().map_or(0, |joints| joints.steps);
     tally.joints.max_steps = tally.joints.max_steps.max(steps);
@@ -130,11 +130,11 @@ pub(super) fn compare(
         tally.joints.tolerated += 1;
     } else {
         tally.joints.different += 1;
-        first.note(Found { what: "joints", how: "different", word: joints, ..Found::default() });
+        first.note(FoundDifference { what: "joints", how: "different", word: joints, ..FoundDifference::default() });
     }
     if a.watched.halted != b.watched.halted {
         tally.halts.count(a.watched.halted);
-        first.note(Found { what: "halt", how: missing(!a.watched.halted), ..Found::default() });
+        first.note(FoundDifference { what: "halt", how: missing(!a.watched.halted), ..FoundDifference::default() });
     }
     for ((cell, in_a), in_b) in CellId::all().zip(&a.watched.cells).zip(&b.watched.cells) {
         contact(&mut tally.contacts, cell, (in_a, in_b), &mut first);
@@ -150,7 +150,7 @@ pub(super) fn compare(
         };
         let inputs = || inputs(moments, same_joints, (in_a, in_b));
         let all = (&mut tally.torques, tally.cells.get_mut(cell));
-        reply.compare(all, moments, (Units::of(skin, bus), options.tolerance), inputs, &mut first);
+        reply.compare(all, moments, (Units::for_bus(skin, bus), options.tolerance), inputs, &mut first);
     }
     sums(tally, (skin, bus), moments, (options.tolerance, same_joints), &mut first);
     first
@@ -162,7 +162,7 @@ fn sums(
     (skin, bus): (&Skin, usize),
     moments: Both<&Moment>,
     (tolerance, same_joints): (u32, bool),
-    first: &mut Firsts,
+    first: &mut FirstDifferences,
 ) {
     let Both { a, b } = moments;
     let of = |moment: &Moment, root: CellId| {
@@ -198,7 +198,7 @@ fn sums(
             all
         };
         let all = (&mut tally.sums, tally.cells.get_mut(*root));
-        reply.compare(all, moments, (Units::of(skin, bus), tolerance), inputs, first);
+        reply.compare(all, moments, (Units::for_bus(skin, bus), tolerance), inputs, first);
     }
 }
 
@@ -219,7 +219,7 @@ impl Reply {
         moments: Both<&Moment>,
         (units, tolerance): (Units, u32),
         inputs: impl Fn() -> (Vec<&'static str>, Vec<&'static str>),
-        first: &mut Firsts,
+        first: &mut FirstDifferences,
     ) {
         let mut once = Replies::default();
         let mut how = None;
@@ -256,7 +256,7 @@ impl Reply {
                 differ.push("cells");
             }
             let (what, cell) = (self.what, Some(self.cell));
-            first.note(Found { what, how, cell, word, inputs: differ, unknown });
+            first.note(FoundDifference { what, how, cell, word, inputs: differ, unknown });
         }
         for counts in [Some(all), of_cell].into_iter().flatten() {
             counts.add(&once);
@@ -300,7 +300,7 @@ impl Replies {
 fn joints(skin: &Skin, bus: usize, moments: Both<&Moment>) -> Option<Differing> {
     let Both { a, b } = moments;
     let pairs = a.watched.joints.positions.iter().zip(&b.watched.joints.positions);
-    let kinds = skin.joints_of(bus).map(|(_, joint)| joint.kind);
+    let kinds = skin.joints_on_bus(bus).map(|(_, joint)| joint.kind);
     let differing = pairs.zip(kinds).enumerate().map(|(place, ((a, b), kind))| {
         let words = [a.to_bits(), b.to_bits()];
         let [one, other] = words;
@@ -325,7 +325,7 @@ fn contact(
     contacts: &mut Contacts,
     cell: CellId,
     (in_a, in_b): (&CellMoment, &CellMoment),
-    first: &mut Firsts,
+    first: &mut FirstDifferences,
 ) {
     let both = match (&in_a.contact_state, &in_b.contact_state) {
         (Some((a, _)), Some((b, _))) => Some((is_touched(a), is_touched(b))),
@@ -336,11 +336,11 @@ fn contact(
         Some((true, true)) => contacts.both += 1,
         Some((is_in_a, is_in_b)) if is_in_a != is_in_b => {
             contacts.only.count(is_in_a);
-            first.note(Found {
+            first.note(FoundDifference {
                 what: "contact",
                 how: missing(is_in_b),
                 cell: Some(cell),
-                ..Found::default()
+                ..FoundDifference::default()
             });
         }
         Some(_) | None => {}

@@ -19,7 +19,7 @@ pub struct Report {
     /// Words of joints.
     pub joints: Joints,
     /// Epochs at which only one run was halted.
-    pub halts: Only,
+    pub halts: UnpairedCounts,
     /// Touches, by cell and epoch.
     pub contacts: Contacts,
     /// Torques of single cells.
@@ -31,7 +31,7 @@ pub struct Report {
     /// Cells without packets in one of the captures.
     pub extra_cells: Vec<ExtraCell>,
     /// The first difference.
-    pub first: Option<First>,
+    pub first: Option<FirstDifference>,
 }
 
 /// The compared aspects.
@@ -84,21 +84,21 @@ pub struct Epochs {
     /// Joints missing from B, but in A within the common time.
     pub missing_in_b: u64,
     /// Joints in one capture before the start of the other.
-    pub before: Only,
+    pub before: UnpairedCounts,
     /// Joints in one capture after the end of the other.
-    pub after: Only,
+    pub after: UnpairedCounts,
 }
 
 /// Counts of items that only one capture has.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Only {
+pub struct UnpairedCounts {
     /// Items in A only.
     pub only_a: u64,
     /// Items in B only.
     pub only_b: u64,
 }
 
-impl Only {
+impl UnpairedCounts {
     pub(super) const fn count(&mut self, is_a: bool) {
         *(if is_a { &mut self.only_a } else { &mut self.only_b }) += 1;
     }
@@ -130,7 +130,7 @@ pub struct Contacts {
     pub both: u64,
     /// Touches in one capture only.
     #[serde(flatten)]
-    pub only: Only,
+    pub only: UnpairedCounts,
 }
 
 /// Replies in epochs that both captures have.
@@ -202,7 +202,7 @@ pub struct ExtraCell {
 
 /// The first difference.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct First {
+pub struct FirstDifference {
     /// The item: `epoch`, `joints`, `halt`, `contact`, `torque` or `sum`.
     pub what: &'static str,
     /// The difference: `different`, `missing in a` or `missing in b`.

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use model::quantiles::Times;
-use model::tracker::{LATEST, PerCell, Tracked};
+use model::tracker::{MAX_LATE_EPOCHS, PerCell, CellTracker};
 use protocol::id::CellId;
 use protocol::message::{Joints, Message};
 use protocol::packet::{Epoch, Words};
@@ -15,7 +15,7 @@ use super::report::Source;
 use crate::explain::{self, NotFound, Watch};
 
 /// Number of epochs by which other buses must be ahead before a silent bus is skipped.
-const PASSED: u64 = 64;
+const SILENT_BUS_EPOCHS: u64 = 64;
 
 /// A joints packet of one bus, and its answers.
 #[derive(Debug)]
@@ -54,13 +54,13 @@ struct Pending {
 
 /// A cell of one capture.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Cell {
-    pub(super) tracked: Tracked,
+pub(super) struct ComparedCell {
+    pub(super) tracked: CellTracker,
     /// Answers after the next joints, and those of them that were too late to be used.
     pub(super) late: u64,
     pub(super) too_late: u64,
     /// The keys of the joints before its first and its last packet.
-    pub(super) heard: Option<(Key, Key)>,
+    pub(super) active_range: Option<(Key, Key)>,
 }
 
 #[derive(Debug, Default)]
@@ -75,12 +75,12 @@ pub(super) struct BusSide {
     pending: VecDeque<Pending>,
     /// Joints with complete answers.
     pub(super) ready: VecDeque<Moment>,
-    pub(super) cells: PerCell<Cell>,
+    pub(super) cells: PerCell<ComparedCell>,
 }
 
 /// Returns true if joints are so far behind that no more of their bus can arrive before the newest ones.
 const fn is_far(newest: Key, key: Key) -> bool {
-    newest.run > key.run || newest.run == key.run && newest.number > key.number + PASSED
+    newest.run > key.run || newest.run == key.run && newest.number > key.number + SILENT_BUS_EPOCHS
 }
 
 /// Reads one capture.
@@ -105,8 +105,8 @@ pub(super) struct Side<'a> {
 impl<'a> Side<'a> {
     pub(super) fn new(skin: &'a Skin, period_ns: u64, start: Option<u64>) -> Self {
         let bus_side = |bus| BusSide {
-            chain: skin.joints_of(bus).len(),
-            roots: skin.cells_of(bus).filter(|cell| cell.root).map(|cell| cell.node).collect(),
+            chain: skin.joints_on_bus(bus).len(),
+            roots: skin.cells_on_bus(bus).filter(|cell| cell.root).map(|cell| cell.node).collect(),
             occurrences: vec![0; 256],
             ..BusSide::default()
         };
@@ -152,7 +152,7 @@ impl<'a> Side<'a> {
                 self.packet(at, nanos, from, message);
             }
         }
-        self.watch.take(nanos, bus, message);
+        self.watch.receive(nanos, bus, message);
         if is_new {
             self.collect(false);
         }
@@ -192,9 +192,9 @@ impl<'a> Side<'a> {
         let newest = self.numbering.newest().unwrap_or_default();
         let Some(bus) = self.buses.get_mut(at) else { return };
         let Some(cell) = bus.cells.get_mut(from) else { return };
-        cell.tracked.hear(Micros(nanos / 1_000), message, None);
-        let (first, _) = cell.heard.unwrap_or((newest, newest));
-        cell.heard = Some((first, newest));
+        cell.tracked.receive(Micros(nanos / 1_000), message, None);
+        let (first, _) = cell.active_range.unwrap_or((newest, newest));
+        cell.active_range = Some((first, newest));
         let (epoch, sum) = if let Message::Torque { epoch, .. } = *message {
             (epoch, None)
         } else if let Message::Sum { epoch, torque, count, .. } = *message
@@ -207,8 +207,8 @@ impl<'a> Side<'a> {
         let newer = bus.pending.iter().rev().position(|pending| pending.epoch == epoch);
         let Some(age) = newer else { return };
         cell.late += u64::from(age > 0);
-        cell.too_late += u64::from(age > LATEST);
-        let Some(sum) = sum.filter(|_| age <= LATEST) else { return };
+        cell.too_late += u64::from(age > MAX_LATE_EPOCHS);
+        let Some(sum) = sum.filter(|_| age <= MAX_LATE_EPOCHS) else { return };
         let Some(pending) = bus.pending.iter_mut().rev().nth(age) else { return };
         match pending.sums.iter_mut().find(|(cell, _)| *cell == from) {
             Some((_, last)) if last.count < sum.count => *last = sum,
@@ -246,7 +246,7 @@ impl<'a> Side<'a> {
                     occurrence: pending.occurrence,
                     watched,
                     sums: pending.sums,
-                    is_settled: is_far || followed > LATEST as u64,
+                    is_settled: is_far || followed > MAX_LATE_EPOCHS as u64,
                 });
             }
         }

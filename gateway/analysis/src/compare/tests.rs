@@ -4,8 +4,8 @@ use super::*;
 use model::testing::SKIN;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
-use protocol::message::{From, Heartbeat, NetworkPage, SensorPage, SkinSensors, State};
-use protocol::packet::{Epoch, padded, words};
+use protocol::message::{AppliesFrom, Heartbeat, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::packet::{Epoch, padded, padded_words};
 
 mod property;
 
@@ -48,7 +48,7 @@ pub(super) fn joints(number: u64) -> Message {
 }
 
 pub(super) fn torque(node: i64, number: u64, word: i16) -> Message {
-    Message::Torque { from: cell(node), epoch: epoch(number), torque: words([3, word]).into() }
+    Message::Torque { from: cell(node), epoch: epoch(number), torque: padded_words([3, word]).into() }
 }
 
 fn heartbeat(skin: &Skin, sent: u16) -> Message {
@@ -58,7 +58,7 @@ fn heartbeat(skin: &Skin, sent: u16) -> Message {
     Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page }
 }
 
-fn press(from: From, newtons: f64) -> Message {
+fn press(from: AppliesFrom, newtons: f64) -> Message {
     let contact = [Q5_10::nearest(newtons); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
     Message::Stimulus { to: Node::Cell(cell(1)), from, page }
@@ -71,7 +71,7 @@ fn run(skin: &Skin, numbers: std::ops::Range<u64>) -> Frames {
     let mut frames = vec![(at(numbers.start) - 20_000_000, "vcan0", heartbeat(skin, sent))];
     for number in numbers {
         if number == 5 {
-            frames.push((at(5) - 1_000_000, "vcan0", press(From::Epoch(Epoch(5)), 1.0)));
+            frames.push((at(5) - 1_000_000, "vcan0", press(AppliesFrom::Epoch(Epoch(5)), 1.0)));
         }
         frames.push((at(number), "vcan0", joints(number)));
         if number >= 5 {
@@ -93,7 +93,7 @@ pub(super) fn read<'a>(
     let mut held = 0;
     while let Some(which) = comparison.next() {
         match frames.of_mut(which).next() {
-            Some((nanos, bus, message)) => comparison.take(which, *nanos, bus, Some(message)),
+            Some((nanos, bus, message)) => comparison.receive(which, *nanos, bus, Some(message)),
             None => comparison.end(which, false),
         }
         held = held.max(comparison.held());
@@ -182,16 +182,16 @@ fn an_input_that_differs_is_named() {
     let skin = skin();
     let a = run(&skin, 0..40);
     // Another force, and so another torque.
-    let b = changed(&a, |it| matches!(it, Message::Stimulus { .. }), Some(press(From::Epoch(Epoch(5)), 2.0)));
+    let b = changed(&a, |it| matches!(it, Message::Stimulus { .. }), Some(press(AppliesFrom::Epoch(Epoch(5)), 2.0)));
     let b = changed(&b, is_torque_of(5), Some(torque(1, 5, 200)));
     let first = equal(&skin, &a, &b).first.unwrap();
     assert_eq!((first.number, first.inputs.as_slice()), (5, &["stimulus"][..]));
     // The touch arrives an epoch later: a contact that only A has, and its torque.
-    let b = changed(&a, |it| matches!(it, Message::Stimulus { .. }), Some(press(From::Epoch(Epoch(6)), 1.0)));
+    let b = changed(&a, |it| matches!(it, Message::Stimulus { .. }), Some(press(AppliesFrom::Epoch(Epoch(6)), 1.0)));
     let b = changed(&b, is_torque_of(5), None);
     let report = equal(&skin, &a, &b);
     assert_eq!(report.differs, ["contacts", "torques"]);
-    assert_eq!((report.contacts.both, report.contacts.only), (34, Only { only_a: 1, only_b: 0 }));
+    assert_eq!((report.contacts.both, report.contacts.only), (34, UnpairedCounts { only_a: 1, only_b: 0 }));
     let first = report.first.unwrap();
     assert_eq!((first.what, first.how, first.number), ("contact", "missing in b", 5));
     // Other joints.
@@ -251,7 +251,7 @@ fn what_one_has_before_and_after_the_other_is_no_difference_but_a_missing_epoch_
     let b = run(&skin, 100..500);
     let report = equal(&skin, &a, &b);
     assert!(report.equal, "{report:?}");
-    let (before, after) = (Only { only_a: 100, only_b: 0 }, Only { only_a: 100, only_b: 0 });
+    let (before, after) = (UnpairedCounts { only_a: 100, only_b: 0 }, UnpairedCounts { only_a: 100, only_b: 0 });
     assert_eq!((report.epochs.before, report.epochs.after, report.epochs.compared), (before, after, 400));
     let b = changed(&b, |it| *it == joints(256), None);
     let report = equal(&skin, &a, &b);
@@ -261,11 +261,11 @@ fn what_one_has_before_and_after_the_other_is_no_difference_but_a_missing_epoch_
     assert_eq!(first.time_s.b, None);
     // A recording that was cut off lacks joints that the other one has.
     let mut comparison = Comparison::new(&skin, Options::default(), Both::default());
-    for (which, frames) in [(Which::A, &a), (Which::B, &run(&skin, 0..300))] {
-        frames.iter().for_each(|(nanos, bus, message)| comparison.take(which, *nanos, bus, Some(message)));
+    for (which, frames) in [(CaptureSide::A, &a), (CaptureSide::B, &run(&skin, 0..300))] {
+        frames.iter().for_each(|(nanos, bus, message)| comparison.receive(which, *nanos, bus, Some(message)));
     }
-    comparison.end(Which::B, true);
-    comparison.end(Which::A, false);
+    comparison.end(CaptureSide::B, true);
+    comparison.end(CaptureSide::A, false);
     let report = comparison.report();
     assert_eq!((report.differs.as_slice(), report.epochs.missing_in_b), (&["epochs"][..], 300));
 }
@@ -306,7 +306,7 @@ fn buses_are_compared_each_and_sums_by_their_roots() {
     let sum = |number, word: i16, count| Message::Sum {
         from: cell(1),
         epoch: epoch(number),
-        torque: words([word]).into(),
+        torque: padded_words([word]).into(),
         count,
     };
     let mut a = Frames::new();
@@ -409,7 +409,7 @@ fn a_capture_of_another_skin_is_known_by_its_buses_joints_and_configurations() {
     let skin = skin();
     let a = run(&skin, 0..10);
     let not_found =
-        |b: &Frames| read(&skin, (Options::default(), Both::default()), &a, b).0.not_found(Which::B);
+        |b: &Frames| read(&skin, (Options::default(), Both::default()), &a, b).0.not_found(CaptureSide::B);
     assert_eq!(not_found(&a), None);
     let elsewhere: Frames = a.iter().map(|(nanos, _, message)| (*nanos, "can9", *message)).collect();
     assert!(matches!(not_found(&elsewhere), Some(NotFound::Buses { .. })));
@@ -429,6 +429,6 @@ fn a_capture_of_another_skin_is_known_by_its_buses_joints_and_configurations() {
         (at(0) - 5, "vcan0", Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page }),
     );
     let comparison = read(&skin, (Options::default(), Both::default()), &a, &configured).0;
-    assert_eq!(comparison.other_configurations(Which::A), None);
-    assert_eq!(comparison.other_configurations(Which::B), Some((1, 0)));
+    assert_eq!(comparison.other_configurations(CaptureSide::A), None);
+    assert_eq!(comparison.other_configurations(CaptureSide::B), Some((1, 0)));
 }

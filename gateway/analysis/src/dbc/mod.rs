@@ -23,7 +23,7 @@ use protocol::can::Format;
 use protocol::id::{Command, Id, Kind, Node};
 use protocol::packet::{Length, Lengths};
 use protocol::schema::{PacketSchema, Units, packets};
-use protocol::skin::{Bus, Skin};
+use protocol::skin::{SkinBus, Skin};
 
 use signal::Signal;
 
@@ -46,7 +46,7 @@ pub fn dbc(skin: &Skin, bus: usize) -> String {
 
 /// A sender or receiver.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Party {
+enum DbcNode {
     Gateway,
     Cell(u8),
     /// All cells of the bus.
@@ -57,7 +57,7 @@ enum Party {
 
 /// The send schedule of a message.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Rhythm {
+enum SendSchedule {
     /// On events.
     Seldom,
     /// Periodic, with the period in ms.
@@ -71,9 +71,9 @@ enum Rhythm {
 struct Message {
     id: Id,
     name: String,
-    from: Party,
-    to: Party,
-    rhythm: Rhythm,
+    from: DbcNode,
+    to: DbcNode,
+    rhythm: SendSchedule,
     comment: &'static str,
     /// Its length.
     length: Length,
@@ -82,23 +82,23 @@ struct Message {
 
 /// Returns all messages of a bus, by identifier.
 fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
-    let mut nodes: Vec<_> = skin.cells_of(bus).map(|cell| Node::Cell(cell.node)).collect();
+    let mut nodes: Vec<_> = skin.cells_on_bus(bus).map(|cell| Node::Cell(cell.node)).collect();
     nodes.sort_unstable_by_key(|node| node.to_byte());
-    let (units, rows) = (Units::of(skin, bus), skin.chain(bus).rows.len());
-    let chain = signal::Chain { length: skin.length_of(bus), units, rows };
+    let (units, rows) = (Units::for_bus(skin, bus), skin.chain(bus).rows.len());
+    let chain = signal::Chain { length: skin.packet_length(bus), units, rows };
     let of = |schema: &'static PacketSchema| {
         let said = |node| message(schema, node, period_ms(skin), &chain);
         let each = nodes.iter().map(|node| said(*node));
         match schema.kind {
             Kind::Command => vec![said(Node::Everyone)],
             Kind::Network => {
-                let (from, to, rhythm) = (Party::Gateway, Party::Unnamed, Rhythm::Seldom);
+                let (from, to, rhythm) = (DbcNode::Gateway, DbcNode::Unnamed, SendSchedule::Seldom);
                 let comment = "For several gateways on one bus: sending it is optional; receiving it shows that there is another gateway.";
                 let other = Message { from, to, rhythm, comment, ..said(Node::Gateway) };
                 iter::once(other).chain(each).collect()
             }
             Kind::Configure | Kind::Stimulus => {
-                each.chain([Message { to: Party::Cells, ..said(Node::Everyone) }]).collect()
+                each.chain([Message { to: DbcNode::Cells, ..said(Node::Everyone) }]).collect()
             }
             Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => each.collect(),
         }
@@ -109,21 +109,21 @@ fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
 /// Returns the message of this kind from a cell or to it, or a command.
 fn message(schema: &'static PacketSchema, node: Node, period_ms: u32, chain: &signal::Chain) -> Message {
     let PacketSchema { kind, command, meaning, .. } = schema;
-    let cell = if command.is_some() { Party::Cells } else { Party::Cell(node.to_byte()) };
-    let (from, to) = if kind.is_from_cells() { (cell, Party::Gateway) } else { (Party::Gateway, cell) };
+    let cell = if command.is_some() { DbcNode::Cells } else { DbcNode::Cell(node.to_byte()) };
+    let (from, to) = if kind.is_from_cells() { (cell, DbcNode::Gateway) } else { (DbcNode::Gateway, cell) };
     let rhythm = match kind {
-        Kind::Command if *command == Some(Command::Joints) => Rhythm::Every(period_ms),
-        Kind::Torque => Rhythm::WhileActive(period_ms),
-        Kind::Network => Rhythm::Every(HEARTBEAT_MS),
+        Kind::Command if *command == Some(Command::Joints) => SendSchedule::Every(period_ms),
+        Kind::Torque => SendSchedule::WhileActive(period_ms),
+        Kind::Network => SendSchedule::Every(HEARTBEAT_MS),
         Kind::Command | Kind::Sum | Kind::Sensors | Kind::Configure | Kind::Configured | Kind::Stimulus => {
-            Rhythm::Seldom
+            SendSchedule::Seldom
         }
     };
     let (id, name) = match command {
         Some(command) => (Id::command(*command), command.name().to_owned()),
         None => (Id::new(*kind, node), format!("{}_{node}", kind.name())),
     };
-    let grows = Lengths::of(id) == Lengths::ALL;
+    let grows = Lengths::for_id(id) == Lengths::ALL;
     let length = if grows { chain.length } else { Length::Six };
     Message {
         id,
@@ -149,7 +149,7 @@ fn period_ms(skin: &Skin) -> u32 {
 
 /// Returns true if the DBC of a bus describes packets that are joined from several frames, false if it describes single
 /// frames.
-const fn are_packets(bus: &Bus) -> bool {
+const fn are_packets(bus: &SkinBus) -> bool {
     matches!(bus.format, Format::Classic)
 }
 

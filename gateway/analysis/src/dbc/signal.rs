@@ -6,7 +6,7 @@ use protocol::id::Kind;
 use protocol::message::State;
 use protocol::packet::{Length, WORDS};
 use protocol::parameters::Parameter;
-use protocol::schema::{Field, Format, Layout, PacketSchema, Range, Units, parameters, reasons};
+use protocol::schema::{Field, FieldFormat, Layout, PacketSchema, FieldRange, Units, parameters, reasons};
 
 /// The end of the words in a packet of six words, in bits.
 const END: usize = WORDS * 16;
@@ -76,9 +76,9 @@ pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) 
             .fields
             .iter()
             .flat_map(move |field| {
-                let count = if field.grows() { length.words() } else { usize::MAX };
+                let count = if field.varies_with_chain() { length.words() } else { usize::MAX };
                 let signals = of(field, &layout.prefix, chain.units).into_iter().take(count);
-                let further = if field.at() < END { 0 } else { further };
+                let further = if field.first_bit() < END { 0 } else { further };
                 signals.map(move |signal| Signal { start: signal.start + further, ..signal })
             })
             .map(move |it| Signal { page, ..it })
@@ -86,7 +86,7 @@ pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) 
     let layouts: Vec<_> = schema.layouts.iter().filter(|layout| chain.has(schema.kind, layout)).collect();
     let mut signals: Vec<_> = layouts.iter().copied().flat_map(of_layout).collect();
     for field in &schema.end {
-        let is_number = matches!(field.format, Format::Page(_) | Format::Parameter(_));
+        let is_number = matches!(field.format, FieldFormat::Page(_) | FieldFormat::Parameter(_));
         let numbered =
             |signal| Signal { page: Page::Number, names: numbers(layouts.iter().copied()), ..signal };
         let signals_of = of(field, "", chain.units).into_iter();
@@ -123,19 +123,19 @@ fn bits(name: String, start: usize, bits: u8) -> Signal {
 
 /// Returns the signals of one field: one per element, and one per bit with its own meaning.
 fn of(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
-    let at = field.at();
+    let at = field.first_bit();
     let named = |label: &str| field.signal_name(prefix, label);
-    if matches!(field.format, Format::Total(_)) {
+    if matches!(field.format, FieldFormat::Total(_)) {
         return Vec::new();
     }
-    if field.format == Format::State {
+    if field.format == FieldFormat::State {
         let bit = |(bit, name): (State, &str)| {
             bits(format!("state_{}", name.replace('-', "_")), at + bit.0.trailing_zeros() as usize, 1)
         };
         let parts = [bits("state_joint".to_owned(), at + 8, 4), bits("state_version".to_owned(), at + 12, 4)];
         return State::NAMES.into_iter().map(bit).chain(parts).collect();
     }
-    if let Format::Ports(_, ports) = field.format {
+    if let FieldFormat::Ports(_, ports) = field.format {
         return (0..usize::from(ports)).map(|port| bits(named(&port.to_string()), at + port, 1)).collect();
     }
     if field.labels.is_empty() {
@@ -143,7 +143,7 @@ fn of(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
     }
     let element = |(word, label): (usize, &String)| {
         let parts =
-            if let Format::Group(parts) = &field.format { &parts[..] } else { slice::from_ref(field) };
+            if let FieldFormat::Group(parts) = &field.format { &parts[..] } else { slice::from_ref(field) };
         let label = label.clone();
         let signal = move |part: &'static Field| {
             let signal = one(part, word, units, part.signal_name(prefix, &label));
@@ -156,21 +156,21 @@ fn of(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
 
 /// Returns the signal of one element of a field.
 fn one(field: &'static Field, element: usize, units: Units, name: String) -> Signal {
-    let unscaled = bits(name, field.at(), field.width());
+    let unscaled = bits(name, field.first_bit(), field.width());
     let factor = field.step_in(element, units);
     let signed = [i16::MIN, i16::MAX].map(|end| f64::from(end) * factor);
     let [min, max] = if field.is_signed() { signed } else { unscaled.range };
     let range = match field.range {
-        Range::All => [min, max],
-        Range::NotNegative | Range::NotNegativeAtCommit => [0.0, max],
-        Range::Within(min, max) => [min, max].map(f64::from),
+        FieldRange::All => [min, max],
+        FieldRange::NotNegative | FieldRange::NotNegativeAtCommit => [0.0, max],
+        FieldRange::Within(min, max) => [min, max].map(f64::from),
     };
     let named = |(value, name): &'static (i16, String)| (i64::from(*value), name.as_str());
-    let names = if let Format::Parameter(_) = field.format {
+    let names = if let FieldFormat::Parameter(_) = field.format {
         numbers(parameters())
     } else if field.is_saturating() {
         [i16::MAX, i16::MIN].map(|end| (i64::from(end), "saturated")).to_vec()
-    } else if field.format == Format::Reason {
+    } else if field.format == FieldFormat::Reason {
         reasons().iter().map(named).collect()
     } else {
         field.names.iter().map(named).collect()

@@ -268,7 +268,7 @@ fn each_bus_has_its_own_cells_and_one_that_is_not_has_no_text() {
     let target = Target { cells: 20, buses: 2, ..Target::default() };
     let skin = Skin::parse("two.toml", &generate::generate(&target).unwrap()).unwrap();
     for bus in 0..2 {
-        let cells: BTreeSet<_> = skin.cells_of(bus).map(|cell| format!("cell_{}", cell.node)).collect();
+        let cells: BTreeSet<_> = skin.cells_on_bus(bus).map(|cell| format!("cell_{}", cell.node)).collect();
         let nodes: BTreeSet<_> = parsed(&skin, bus).nodes.into_iter().skip(1).map(|node| node.0).collect();
         assert_eq!(nodes, cells);
     }

@@ -3,10 +3,10 @@
 use core::fmt::{self, Write};
 
 use protocol::message::VERSION;
-use protocol::skin::{Bus, Skin};
+use protocol::skin::{SkinBus, Skin};
 
 use super::signal::{Page, Signal};
-use super::{Message, Party, Rhythm, are_packets};
+use super::{Message, DbcNode, SendSchedule, are_packets};
 
 /// The format's placeholder for an unnamed sender or receiver.
 const UNNAMED: &str = "Vector__XXX";
@@ -39,7 +39,7 @@ pub(super) fn write(
     out: &mut impl Write,
     skin: &Skin,
     index: usize,
-    bus: &Bus,
+    bus: &SkinBus,
     messages: &[Message],
 ) -> fmt::Result {
     writeln!(out, "VERSION \"{VERSION}\"\n\nNS_ :")?;
@@ -47,7 +47,7 @@ pub(super) fn write(
         writeln!(out, "\t{section}")?;
     }
     write!(out, "\nBS_:\n\nBU_: gateway")?;
-    let mut cells: Vec<_> = skin.cells_of(index).collect();
+    let mut cells: Vec<_> = skin.cells_on_bus(index).collect();
     cells.sort_unstable_by_key(|cell| cell.node);
     for cell in &cells {
         write!(out, " cell_{}", cell.node)?;
@@ -102,13 +102,13 @@ fn frame(out: &mut impl Write, message: &Message, everyone: &[u8]) -> fmt::Resul
     writeln!(out)
 }
 
-fn parties(out: &mut impl Write, party: Party, everyone: &[u8]) -> fmt::Result {
+fn parties(out: &mut impl Write, party: DbcNode, everyone: &[u8]) -> fmt::Result {
     match party {
-        Party::Gateway => write!(out, "gateway"),
-        Party::Cell(node) => write!(out, "cell_{node}"),
-        Party::Unnamed => write!(out, "{UNNAMED}"),
-        Party::Cells if everyone.is_empty() => write!(out, "{UNNAMED}"),
-        Party::Cells => {
+        DbcNode::Gateway => write!(out, "gateway"),
+        DbcNode::Cell(node) => write!(out, "cell_{node}"),
+        DbcNode::Unnamed => write!(out, "{UNNAMED}"),
+        DbcNode::Cells if everyone.is_empty() => write!(out, "{UNNAMED}"),
+        DbcNode::Cells => {
             for (index, node) in everyone.iter().enumerate() {
                 write!(out, "{}cell_{node}", if index == 0 { "" } else { "," })?;
             }
@@ -118,7 +118,7 @@ fn parties(out: &mut impl Write, party: Party, everyone: &[u8]) -> fmt::Result {
 }
 
 /// Writes the comment about the whole file.
-fn about(out: &mut impl Write, skin: &Skin, bus: &Bus) -> fmt::Result {
+fn about(out: &mut impl Write, skin: &Skin, bus: &SkinBus) -> fmt::Result {
     // A quotation mark would end the comment.
     let [skin, bus_name] = [&skin.name, &bus.name].map(|name| name.replace('"', "'"));
     let travels = if are_packets(bus) {
@@ -134,7 +134,7 @@ fn about(out: &mut impl Write, skin: &Skin, bus: &Bus) -> fmt::Result {
     )
 }
 
-fn attributes(out: &mut impl Write, bus: &Bus, messages: &[Message]) -> fmt::Result {
+fn attributes(out: &mut impl Write, bus: &SkinBus, messages: &[Message]) -> fmt::Result {
     let choices =
         |names: &[&str]| names.iter().map(|name| format!("\"{name}\"")).collect::<Vec<_>>().join(",");
     writeln!(out, "BA_DEF_ \"BusType\" STRING ;")?;
@@ -167,9 +167,9 @@ fn attributes(out: &mut impl Write, bus: &Bus, messages: &[Message]) -> fmt::Res
         writeln!(out, "BA_ \"VFrameFormat\" BO_ {id} {STANDARD_CAN_FD};")?;
         writeln!(out, "BA_ \"CANFD_BRS\" BO_ {id} 1;")?;
         let (kind, ms) = match message.rhythm {
-            Rhythm::Seldom => continue,
-            Rhythm::Every(ms) => (1, ms),
-            Rhythm::WhileActive(ms) => (2, ms),
+            SendSchedule::Seldom => continue,
+            SendSchedule::Every(ms) => (1, ms),
+            SendSchedule::WhileActive(ms) => (2, ms),
         };
         writeln!(out, "BA_ \"GenMsgSendType\" BO_ {id} {kind};")?;
         writeln!(out, "BA_ \"GenMsgCycleTime\" BO_ {id} {ms};")?;

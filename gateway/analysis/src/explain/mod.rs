@@ -17,14 +17,14 @@ pub mod series;
 mod watch;
 
 pub use not_found::{NotFound, another_robot};
-pub use read::{Found, find};
+pub use read::{FoundJoints, find};
 pub use row::{JACOBIAN_STEPS, Row, Verdict};
-pub use watch::{CellMoment, Moment, Origin, Requested, Watch};
+pub use watch::{CellMoment, Moment, Origin, RequestedJoints, Watch};
 
 use protocol::fixed::{Q, is_saturated};
 use protocol::message::{SkinSensors, State};
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{Cell, MAX_ROBOT_JOINTS, Reply, Skin};
+use protocol::skin::{Cell, MAX_ROBOT_JOINTS, SkinReply, Skin};
 use serde::Serialize;
 
 use self::row::{jacobian_steps, number, row};
@@ -154,7 +154,7 @@ impl<'a> Explainer<'a> {
     #[must_use]
     pub fn new(skin: &'a Skin) -> Self {
         let parts = (0..skin.buses.len()).map(|bus| {
-            let part = skin.part_on(bus);
+            let part = skin.with_cells_of_bus(bus);
             let both = [Central::new(&part), Central::unquantised(&part)];
             (part, both)
         });
@@ -175,14 +175,14 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
     for (index, ((bus, (part, both)), moment)) in skin.buses.iter().zip(parts).zip(moments).enumerate() {
         let name = &bus.name;
         let Some(moment) = moment else {
-            if skin.cells_of(index).next().is_some() {
+            if skin.cells_on_bus(index).next().is_some() {
                 explanation.missing.push(format!(
                     "{name}: these joints are not in the capture; the total does not include them"
                 ));
             }
             continue;
         };
-        if bus.reply != Reply::Torque {
+        if bus.reply != SkinReply::Torque {
             explanation
                 .missing
                 .push(format!("{name} answers with sums, which do not contain the torques of single cells"));
@@ -190,7 +190,7 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
         let positions = moment.joints.positions;
         let [central, _] = both;
         let frames = both.each_ref().map(|central| central.frames(&positions));
-        let chain: Vec<_> = skin.joints_of(index).collect();
+        let chain: Vec<_> = skin.joints_on_bus(index).collect();
         explanation.buses.push(BusExplained {
             bus: name.clone(),
             at_ns: moment.at_ns,

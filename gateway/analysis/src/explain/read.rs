@@ -6,11 +6,11 @@ use protocol::time::Micros;
 use trace::capture::{CaptureError, Entry, NoteKind, Reader};
 
 use super::NotFound;
-use super::watch::{Moment, Requested, Watch};
+use super::watch::{Moment, RequestedJoints, Watch};
 
 /// The content of a capture up to the requested joints.
 #[derive(Debug)]
-pub struct Found {
+pub struct FoundJoints {
     /// The joints and answers on each bus.
     pub moments: Result<Vec<Option<Moment>>, NotFound>,
     /// The origin of times in s, in ns since 1970.
@@ -29,7 +29,7 @@ pub struct Found {
 ///
 /// # Errors
 /// Returns [`CaptureError`] if the capture cannot be read, or is damaged.
-pub fn find(reader: &mut Reader, skin: &Skin, requested: Requested) -> Result<Found, CaptureError> {
+pub fn find(reader: &mut Reader, skin: &Skin, requested: RequestedJoints) -> Result<FoundJoints, CaptureError> {
     let mut watch = Watch::new(skin, requested);
     let mut decoder = Decoder::new(None);
     for before in &reader.extras().latched {
@@ -50,7 +50,7 @@ pub fn find(reader: &mut Reader, skin: &Skin, requested: Requested) -> Result<Fo
                 is_empty = false;
                 let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
                 let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
-                if watch.take(nanos, record.interface, message) {
+                if watch.receive(nanos, record.interface, message) {
                     break;
                 }
             }
@@ -61,7 +61,7 @@ pub fn find(reader: &mut Reader, skin: &Skin, requested: Requested) -> Result<Fo
             },
         }
     }
-    Ok(Found {
+    Ok(FoundJoints {
         moments: watch.moments(),
         is_empty,
         zero_ns: zero.unwrap_or_default(),

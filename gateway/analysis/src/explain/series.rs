@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 
 use model::decode::{Decoded, Decoder};
 use protocol::packet::Epoch;
-use protocol::skin::{Reply, Skin};
+use protocol::skin::{SkinReply, Skin};
 use protocol::time::Micros;
 use thiserror::Error;
 use trace::capture::{CaptureError, Entry, Note, Reader};
@@ -16,7 +16,7 @@ use super::watch::{Moment, Watch};
 use super::{Explainer, Explanation, NotFound};
 
 /// Maximum number of epochs that a bus may lag before it is no longer waited for.
-const BEHIND: i64 = 64;
+const MAX_BUS_LAG: i64 = 64;
 
 /// The torques of one epoch.
 #[derive(Clone, Debug, PartialEq)]
@@ -52,7 +52,7 @@ pub enum SeriesError<E> {
 
 /// The totals of a series.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Counted {
+pub struct SeriesTotals {
     /// Number of epochs.
     pub epochs: u64,
     /// The origin of times in s, in ns since 1970: the first tick of the run, or else the first frame.
@@ -69,7 +69,7 @@ pub fn each_epoch<E>(
     skin: &Skin,
     mut note: impl FnMut(&Note<'_>),
     mut take: impl FnMut(u64, &EpochTorque) -> Result<(), E>,
-) -> Result<Counted, SeriesError<E>> {
+) -> Result<SeriesTotals, SeriesError<E>> {
     let mut series = Series::new(skin);
     let mut decoder = Decoder::new(None);
     for before in &reader.extras().latched {
@@ -78,7 +78,7 @@ pub fn each_epoch<E>(
             series.watch.begin(before.nanos, &before.bus, &message);
         }
     }
-    let mut counted = Counted::default();
+    let mut counted = SeriesTotals::default();
     let mut zero = reader.extras().run_began();
     while let Some(entry) = reader.next()? {
         let record = match entry {
@@ -92,7 +92,7 @@ pub fn each_epoch<E>(
         counted.zero_ns = *zero.get_or_insert(nanos);
         let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
         let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
-        series.watch.take(nanos, record.interface, message);
+        series.watch.receive(nanos, record.interface, message);
         series.collect(false);
         while let Some(epoch) = series.next(false) {
             counted.epochs += 1;
@@ -116,7 +116,7 @@ pub fn each_epoch<E>(
 #[must_use]
 pub fn is_summed(skin: &Skin, joint: usize) -> bool {
     let mut buses = skin.buses.iter().enumerate();
-    buses.any(|(at, bus)| bus.reply != Reply::Torque && skin.joints_of(at).any(|(of_bus, _)| of_bus == joint))
+    buses.any(|(at, bus)| bus.reply != SkinReply::Torque && skin.joints_on_bus(at).any(|(of_bus, _)| of_bus == joint))
 }
 
 /// Joins the joints of several buses into epochs.
@@ -133,7 +133,7 @@ struct Series<'a> {
 
 impl<'a> Series<'a> {
     fn new(skin: &'a Skin) -> Self {
-        let with_cells = (0..skin.buses.len()).filter(|bus| skin.cells_of(*bus).next().is_some());
+        let with_cells = (0..skin.buses.len()).filter(|bus| skin.cells_on_bus(*bus).next().is_some());
         Self {
             skin,
             watch: Watch::all(skin),
@@ -149,7 +149,7 @@ impl<'a> Series<'a> {
         for (bus, last) in &mut self.last {
             while let Some((epoch, moment)) = self.watch.pop(*bus, is_end) {
                 let (newest, of_newest) = self.newest.unwrap_or((0, epoch));
-                let mut number = newest + i64::from(epoch.since(of_newest));
+                let mut number = newest + i64::from(epoch.epochs_since(of_newest));
                 while last.is_some_and(|last| number <= last) {
                     number += 256;
                 }
@@ -171,7 +171,7 @@ impl<'a> Series<'a> {
         let (number, _) = self.waiting.first_key_value()?;
         let newest = self.newest.map_or(*number, |(newest, _)| newest);
         let is_passed = self.last.iter().all(|(_, last)| last.is_some_and(|last| last >= *number));
-        if !is_end && !is_passed && newest - number <= BEHIND {
+        if !is_end && !is_passed && newest - number <= MAX_BUS_LAG {
             return None;
         }
         let (_, (epoch, moments)) = self.waiting.pop_first()?;

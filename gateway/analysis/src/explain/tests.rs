@@ -3,7 +3,7 @@
 use super::*;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node};
-use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, State};
+use protocol::message::{AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, State};
 use protocol::packet::padded;
 use protocol::packet::{self, Epoch};
 use protocol::parameters::Parameter;
@@ -33,14 +33,14 @@ fn joints(epoch: u8) -> Message {
     Message::Joints { epoch: Epoch(epoch), joints: Joints { positions: padded(&positions), in_use: 6 } }
 }
 
-fn press(from: From, newtons: f64) -> Message {
+fn press(from: AppliesFrom, newtons: f64) -> Message {
     let page =
         SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() });
     Message::Stimulus { to: Node::Cell(cell()), from, page }
 }
 
 fn torque(epoch: u8, words: [i16; 2]) -> Message {
-    Message::Torque { from: cell(), epoch: Epoch(epoch), torque: packet::words(words).into() }
+    Message::Torque { from: cell(), epoch: Epoch(epoch), torque: packet::padded_words(words).into() }
 }
 
 fn heartbeat(configuration: u16) -> Message {
@@ -50,24 +50,24 @@ fn heartbeat(configuration: u16) -> Message {
 }
 
 /// Explains these messages, which are a millisecond apart.
-fn explained(skin: &Skin, messages: &[Message], requested: Requested) -> Result<Explanation, NotFound> {
+fn explained(skin: &Skin, messages: &[Message], requested: RequestedJoints) -> Result<Explanation, NotFound> {
     let mut watch = Watch::new(skin, requested);
     for (at, message) in (1..).zip(messages) {
-        if watch.take(at * 1_000_000, "vcan0", Some(message)) {
+        if watch.receive(at * 1_000_000, "vcan0", Some(message)) {
             break;
         }
     }
     watch.moments().map(|moments| explain(skin, &moments))
 }
 
-fn first(epoch: u8) -> Requested {
-    Requested { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 }
+fn first(epoch: u8) -> RequestedJoints {
+    RequestedJoints { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 }
 }
 
 #[test]
 fn the_worked_example_of_the_document_is_explained_step_by_step() {
     let skin = skin();
-    let said = [heartbeat(0x266D), press(From::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
+    let said = [heartbeat(0x266D), press(AppliesFrom::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
     assert_eq!(explanation.missing, Vec::<String>::new());
     let [cell] = explanation.cells.as_slice() else { panic!("{explanation:?}") };
@@ -91,7 +91,7 @@ fn the_worked_example_of_the_document_is_explained_step_by_step() {
 fn a_word_that_no_jacobian_near_makes_is_not_explained() {
     let skin = skin();
     let verdicts = |words| {
-        let said = [heartbeat(0x266D), press(From::Next, 1.0), joints(7), torque(7, words)];
+        let said = [heartbeat(0x266D), press(AppliesFrom::Next, 1.0), joints(7), torque(7, words)];
         let explanation = explained(&skin, &said, first(7)).unwrap();
         [0, 1].map(|at| explanation.cells[0].rows[at].verdict)
     };
@@ -108,7 +108,7 @@ fn a_torque_in_a_joint_that_does_not_move_the_cell_is_not_explained() {
     if let Message::Torque { torque, .. } = &mut wrong {
         *torque = [-1075, 3195, 1, 0, 0, 0].into();
     }
-    let said = [heartbeat(0x266D), press(From::Next, 1.0), joints(7), wrong];
+    let said = [heartbeat(0x266D), press(AppliesFrom::Next, 1.0), joints(7), wrong];
     let explanation = explained(&skin, &said, first(7)).unwrap();
     assert_eq!(explanation.cells[0].rows[2].verdict, Verdict::Unexplained);
 }
@@ -117,7 +117,7 @@ fn a_torque_in_a_joint_that_does_not_move_the_cell_is_not_explained() {
 fn beyond_the_word_saturated_is_right_and_anything_else_is_not() {
     let skin = skin();
     let verdict = |word| {
-        let said = [heartbeat(0x266D), press(From::Next, 30.0), joints(7), torque(7, [-32_250, word])];
+        let said = [heartbeat(0x266D), press(AppliesFrom::Next, 30.0), joints(7), torque(7, [-32_250, word])];
         explained(&skin, &said, first(7)).unwrap().cells[0].rows[1].verdict
     };
     assert_eq!(verdict(i16::MAX), Verdict::Saturated);
@@ -127,7 +127,7 @@ fn beyond_the_word_saturated_is_right_and_anything_else_is_not() {
 #[test]
 fn another_configuration_is_named_and_nothing_computed() {
     let skin = skin();
-    let said = [heartbeat(0x1234), press(From::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
+    let said = [heartbeat(0x1234), press(AppliesFrom::Next, 1.0), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
     let expected = "vcan0 12: it computes with configuration 1234, the skin has 266D: its force and its torque cannot \
                     be computed from this skin";
@@ -135,7 +135,7 @@ fn another_configuration_is_named_and_nothing_computed() {
     assert!(explanation.cells[0].force.is_none());
     assert_eq!((explanation.total[0].open, explanation.total[0].word_steps), (1, -1075));
     // Its first report follows the torque; its configuration was the same before.
-    let said = [press(From::Next, 1.0), joints(7), torque(7, [-1075, 3195]), heartbeat(0x1234)];
+    let said = [press(AppliesFrom::Next, 1.0), joints(7), torque(7, [-1075, 3195]), heartbeat(0x1234)];
     assert_eq!(explained(&skin, &said, first(7)).unwrap().missing, [expected]);
     let without = explained(&skin, &said[..3], first(7)).unwrap();
     let expected = "vcan0 12: it did not report its configuration; assumed to be the skin's, 266D";
@@ -160,7 +160,7 @@ fn a_measuring_cell_is_known_by_its_own_page_of_that_epoch_only() {
         Message::Sensors { from: cell(), epoch: Epoch(epoch), page: SensorPage::Skin(skin) }
     };
     // A measuring cell refuses a stimulus.
-    let said = [measuring, press(From::Next, 9.0), page(6), joints(7), torque(7, [-1075, 3195])];
+    let said = [measuring, press(AppliesFrom::Next, 9.0), page(6), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
     let expected = "vcan0 12: its contact state is not in the capture: it measures, and sent no sensors page in this epoch";
     assert_eq!(explanation.missing, [expected]);
@@ -174,13 +174,13 @@ fn a_measuring_cell_is_known_by_its_own_page_of_that_epoch_only() {
 fn joints_are_found_by_epoch_time_and_occurrence() {
     let skin = skin();
     let said: Vec<_> = (0..=255).chain(0..=20).map(joints).collect();
-    let at = |requested: Requested| {
+    let at = |requested: RequestedJoints| {
         explained(&skin, &said, requested).map(|explanation| explanation.buses[0].at_ns / 1_000_000)
     };
     assert_eq!(at(first(7)), Ok(8));
-    assert_eq!(at(Requested { occurrence: 2, ..first(7) }), Ok(264));
-    assert_eq!(at(Requested { from_ns: 100_000_000, ..first(7) }), Ok(264));
-    let error = at(Requested { occurrence: 2, ..first(21) }).unwrap_err().to_string();
+    assert_eq!(at(RequestedJoints { occurrence: 2, ..first(7) }), Ok(264));
+    assert_eq!(at(RequestedJoints { from_ns: 100_000_000, ..first(7) }), Ok(264));
+    let error = at(RequestedJoints { occurrence: 2, ..first(21) }).unwrap_err().to_string();
     let expected = "there are no joints of epoch 21 (occurrence 2); there are 277 joints in a row, from epoch 0 at \
                     0.000 s to epoch 20 at 0.276 s";
     assert_eq!(error, expected);
@@ -197,12 +197,12 @@ fn what_is_not_there_is_named_with_what_is() {
     let error = explained(&skin, &[heartbeat(0)], first(5)).unwrap_err().to_string();
     assert_eq!(error, "there are no joints on vcan0, and cells answer only joints");
     let mut watch = Watch::new(&skin, first(5));
-    watch.take(0, "can7", None);
+    watch.receive(0, "can7", None);
     let error = watch.moments().unwrap_err().to_string();
     assert_eq!(error, "none of its buses (can7) is one of the skin's (vcan0)");
     // Memory is bounded for any input.
     let said: Vec<_> = (0..200).map(|epoch: u8| joints(epoch.wrapping_mul(3))).collect();
-    let error = explained(&skin, &said, Requested { occurrence: 9, ..first(5) }).unwrap_err().to_string();
+    let error = explained(&skin, &said, RequestedJoints { occurrence: 9, ..first(5) }).unwrap_err().to_string();
     assert!(error.ends_with("; 192 further runs"), "{error}");
 }
 
@@ -210,7 +210,7 @@ fn what_is_not_there_is_named_with_what_is() {
 fn joints_that_a_cell_drops_are_none() {
     let skin = skin();
     let again = [joints(7), joints(7), joints(8), joints(7)];
-    let explanation = explained(&skin, &again, Requested { occurrence: 2, ..first(7) }).unwrap();
+    let explanation = explained(&skin, &again, RequestedJoints { occurrence: 2, ..first(7) }).unwrap();
     assert_eq!(explanation.buses[0].at_ns, 4_000_000, "the second of them was repeated");
 }
 
@@ -218,7 +218,7 @@ fn joints_that_a_cell_drops_are_none() {
 fn a_torque_after_four_more_joints_is_named_and_not_used() {
     let skin = skin();
     let said = |more: u8| {
-        let mut said = vec![heartbeat(0x266D), press(From::Next, 1.0), joints(7)];
+        let mut said = vec![heartbeat(0x266D), press(AppliesFrom::Next, 1.0), joints(7)];
         said.extend((8..8 + more).map(joints));
         said.push(torque(7, [-1075, 3195]));
         said
@@ -240,7 +240,7 @@ fn a_claim_of_an_owned_node_id_changes_nothing() {
         Message::Network { from: Node::Cell(cell()), epoch: Epoch(0), page }
     };
     let mut said =
-        vec![heartbeat(0x266D), press(From::Next, 1.0), joints(6), joints(7), torque(7, [-1075, 3195])];
+        vec![heartbeat(0x266D), press(AppliesFrom::Next, 1.0), joints(6), joints(7), torque(7, [-1075, 3195])];
     let without = explained(&skin, &said, first(7)).unwrap();
     // The claim replaces other joints, so that the times are equal.
     said[2] = claim;
@@ -252,7 +252,7 @@ fn a_claim_of_an_owned_node_id_changes_nothing() {
 #[test]
 fn a_late_stimulus_is_called_late_and_a_written_mode_forgets_it() {
     let skin = skin();
-    let said = [heartbeat(0x266D), joints(6), press(From::Epoch(Epoch(6)), 1.0), joints(7)];
+    let said = [heartbeat(0x266D), joints(6), press(AppliesFrom::Epoch(Epoch(6)), 1.0), joints(7)];
     let origin = |said: &[Message]| {
         let force =
             explained(&skin, &[said, &[torque(7, [0, 0])]].concat(), first(7)).unwrap().cells[0].force;

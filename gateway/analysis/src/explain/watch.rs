@@ -2,10 +2,10 @@
 
 use std::collections::VecDeque;
 
-use model::tracker::{Claim, Contact, LATEST, PerCell, Word, is_late};
+use model::tracker::{AddressClaim, Contact, MAX_LATE_EPOCHS, PerCell, HeartbeatKind, is_late};
 use protocol::id::{CellId, Node};
 use protocol::message::{
-    Answer, From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
+    Answer, AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
 };
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::Parameter;
@@ -17,9 +17,9 @@ use trace::capture::seconds_since;
 use super::not_found::NotFound;
 
 /// Number of joints to wait after them for late torques and for the configurations of cells.
-const TIMEOUT: u32 = 32;
+const MAX_WAIT_EPOCHS: u32 = 32;
 /// Maximum number of runs of epochs in an error.
-const RUNS: usize = 8;
+const MAX_LISTED_RUNS: usize = 8;
 
 /// The source of a cell's known contact state.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -53,7 +53,7 @@ pub enum Origin {
 
 /// The requested joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Requested {
+pub struct RequestedJoints {
     /// Their epoch.
     pub epoch: Epoch,
     /// Earliest time of the joints in ns, from the origin of times.
@@ -99,19 +99,19 @@ pub struct CellMoment {
 pub struct Watch<'a> {
     skin: &'a Skin,
     /// The requested joints; `None` for all joints.
-    requested: Option<Requested>,
+    requested: Option<RequestedJoints>,
     /// The origin of times in s; the first frame if not set.
     zero: Option<u64>,
     /// By index of the bus in the skin.
-    bus_watches: Vec<LinkId>,
+    bus_watches: Vec<BusWatch>,
     /// Buses that are not in the skin.
     others: Vec<String>,
 }
 
 #[derive(Debug, Default)]
-struct LinkId {
+struct BusWatch {
     /// True if the capture has the bus.
-    there: bool,
+    is_in_capture: bool,
     /// True if the skin has cells on the bus.
     cells_here: bool,
     last: Option<Epoch>,
@@ -119,8 +119,8 @@ struct LinkId {
     /// Number of occurrences of the requested joints so far.
     occurrences: u32,
     /// Joints with incomplete answers, oldest first.
-    open: VecDeque<Open>,
-    cells: PerCell<Cell>,
+    open: VecDeque<OpenJoints>,
+    cells: PerCell<WatchedCell>,
     runs: Vec<Run>,
     /// The number of joints in packets that do not fit the chain.
     other_joints: Option<usize>,
@@ -130,7 +130,7 @@ struct LinkId {
 
 /// Joints that may still be answered.
 #[derive(Debug)]
-struct Open {
+struct OpenJoints {
     epoch: Epoch,
     moment: Moment,
     /// Number of joints since then.
@@ -138,8 +138,8 @@ struct Open {
 }
 
 #[derive(Clone, Debug, Default)]
-struct Cell {
-    claim: Claim,
+struct WatchedCell {
+    claim: AddressClaim,
     contact: Contact<Origin>,
     hash: Option<u16>,
 }
@@ -155,7 +155,7 @@ struct Run {
 impl<'a> Watch<'a> {
     /// Starts before the first frame.
     #[must_use]
-    pub fn new(skin: &'a Skin, requested: Requested) -> Self {
+    pub fn new(skin: &'a Skin, requested: RequestedJoints) -> Self {
         Self::of(skin, Some(requested))
     }
 
@@ -165,8 +165,8 @@ impl<'a> Watch<'a> {
         Self::of(skin, None)
     }
 
-    fn of(skin: &'a Skin, requested: Option<Requested>) -> Self {
-        let bus_watch = |bus| LinkId { cells_here: skin.cells_of(bus).next().is_some(), ..LinkId::default() };
+    fn of(skin: &'a Skin, requested: Option<RequestedJoints>) -> Self {
+        let bus_watch = |bus| BusWatch { cells_here: skin.cells_on_bus(bus).next().is_some(), ..BusWatch::default() };
         let bus_watches = (0..skin.buses.len()).map(bus_watch).collect();
         Self { skin, requested, zero: None, bus_watches, others: Vec::new() }
     }
@@ -179,7 +179,7 @@ impl<'a> Watch<'a> {
     /// Handles a frame that was latched before the start of the capture.
     pub fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
         let at = self.skin.bus_named(bus);
-        let joints = at.map_or(0, |at| self.skin.joints_of(at).len());
+        let joints = at.map_or(0, |at| self.skin.joints_on_bus(at).len());
         if let Some(bus_watch) = at.and_then(|at| self.bus_watches.get_mut(at)) {
             if let Message::Joints { epoch, joints: Joints { in_use, .. } } = *message {
                 if usize::from(in_use) == joints && bus_watch.last != Some(epoch) {
@@ -192,23 +192,23 @@ impl<'a> Watch<'a> {
     }
 
     /// Handles the next frame; `message` is its meaning, if it has one. Returns true if everything requested is known.
-    pub fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
+    pub fn receive(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         let zero = *self.zero.get_or_insert(nanos);
         let at = self.skin.bus_named(bus);
         let Some(bus_watch) = at.and_then(|at| self.bus_watches.get_mut(at)) else {
-            if self.others.len() < RUNS && !self.others.iter().any(|other| other == bus) {
+            if self.others.len() < MAX_LISTED_RUNS && !self.others.iter().any(|other| other == bus) {
                 self.others.push(bus.to_owned());
             }
             return false;
         };
-        bus_watch.there = true;
+        bus_watch.is_in_capture = true;
         if let Some(message) = message {
             bus_watch.take(
                 nanos,
                 nanos.saturating_sub(zero),
                 message,
                 self.requested,
-                at.map_or(0, |at| self.skin.joints_of(at).len()),
+                at.map_or(0, |at| self.skin.joints_on_bus(at).len()),
             );
         }
         self.is_complete()
@@ -223,7 +223,7 @@ impl<'a> Watch<'a> {
 
     /// Returns true if everything requested is known.
     fn is_complete(&self) -> bool {
-        self.bus_watches.iter().filter(|bus_watch| bus_watch.cells_here).all(LinkId::is_complete)
+        self.bus_watches.iter().filter(|bus_watch| bus_watch.cells_here).all(BusWatch::is_complete)
     }
 
     /// Returns the requested joints on each of the skin's buses; `None` for a bus that does not have them. Call it at
@@ -238,10 +238,10 @@ impl<'a> Watch<'a> {
                 .buses
                 .iter()
                 .zip(&self.bus_watches)
-                .filter(|(_, bus_watch)| bus_watch.there || !there);
+                .filter(|(_, bus_watch)| bus_watch.is_in_capture || !there);
             buses.map(|(bus, _)| bus.name.as_str()).collect::<Vec<_>>().join(", ")
         };
-        if !self.bus_watches.iter().any(|bus_watch| bus_watch.there) {
+        if !self.bus_watches.iter().any(|bus_watch| bus_watch.is_in_capture) {
             let capture = if self.others.is_empty() { "none".to_owned() } else { self.others.join(", ") };
             return Err(NotFound::Buses { capture, skin: names(false) });
         }
@@ -250,13 +250,13 @@ impl<'a> Watch<'a> {
             let Some(bus_watch) = self.bus_watches.iter().find(|bus_watch| !bus_watch.runs.is_empty()) else {
                 for (index, (bus, watch)) in self.skin.buses.iter().zip(&self.bus_watches).enumerate() {
                     if let Some(came) = watch.other_joints {
-                        let chain = self.skin.joints_of(index).len();
+                        let chain = self.skin.joints_on_bus(index).len();
                         return Err(NotFound::Robot { bus: bus.name.clone(), came, chain });
                     }
                 }
                 return Err(NotFound::Joints { buses: names(true) });
             };
-            let Some(Requested { epoch, from_ns, occurrence }) = self.requested else {
+            let Some(RequestedJoints { epoch, from_ns, occurrence }) = self.requested else {
                 return Err(NotFound::Joints { buses: names(true) });
             };
             let mut requested = format!("of epoch {epoch}");
@@ -272,7 +272,7 @@ impl<'a> Watch<'a> {
             }
             return Err(NotFound::Epoch { requested, runs: runs.join("; ") });
         }
-        let moment = |bus_watch: LinkId| bus_watch.open.into_iter().next().map(|open| open.moment);
+        let moment = |bus_watch: BusWatch| bus_watch.open.into_iter().next().map(|open| open.moment);
         Ok(self.bus_watches.into_iter().map(moment).collect())
     }
 }
@@ -294,7 +294,7 @@ impl Run {
     }
 }
 
-impl Open {
+impl OpenJoints {
     fn is_complete(&self) -> bool {
         // A cell that answered has reported its configuration, and a cell in contact has answered.
         let settled = |cell: &CellMoment| match cell.answer {
@@ -304,19 +304,19 @@ impl Open {
                     || cell.contact_state.is_none_or(|(skin, _)| skin == SkinSensors::default())
             }
         };
-        self.since >= TIMEOUT || self.is_too_late() && self.moment.cells.iter().all(settled)
+        self.since >= MAX_WAIT_EPOCHS || self.is_too_late() && self.moment.cells.iter().all(settled)
     }
 
     /// Returns true if enough joints have followed that answers are too late to be used.
     const fn is_too_late(&self) -> bool {
-        self.since as usize > LATEST
+        self.since as usize > MAX_LATE_EPOCHS
     }
 }
 
-impl LinkId {
+impl BusWatch {
     /// Returns true if everything about the requested joints is known.
     fn is_complete(&self) -> bool {
-        self.open.front().is_some_and(Open::is_complete)
+        self.open.front().is_some_and(OpenJoints::is_complete)
     }
 
     fn take(
@@ -324,7 +324,7 @@ impl LinkId {
         nanos: u64,
         after: u64,
         message: &Message,
-        requested: Option<Requested>,
+        requested: Option<RequestedJoints>,
         robot: usize,
     ) {
         let last = self.last;
@@ -341,7 +341,7 @@ impl LinkId {
                 }
             }
             Message::Stimulus { to, from, page } => {
-                let from_epoch = if let From::Epoch(epoch) = from { Some(epoch.0) } else { None };
+                let from_epoch = if let AppliesFrom::Epoch(epoch) = from { Some(epoch.0) } else { None };
                 let origin = Origin::Stimulus { at_ns: nanos, from_epoch, late: is_late(from, last) };
                 self.cells.named(to).iter_mut().for_each(|cell| cell.contact.push(from, page, origin, last));
             }
@@ -361,14 +361,14 @@ impl LinkId {
                 if let Some(cell) = self.cells.get_mut(from) {
                     cell.hash = Some(hash);
                 }
-                self.learn(from, hash);
+                self.apply_hash(from, hash);
             }
             Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } => {
                 if self.cells.get_mut(from).is_some_and(|cell| cell.heartbeat(nanos, &heartbeat)) {
-                    self.learn(from, heartbeat.configuration);
+                    self.apply_hash(from, heartbeat.configuration);
                 }
             }
-            Message::Network { from: Node::Cell(from), page: NetworkPage::Heard(heard), .. } => {
+            Message::Network { from: Node::Cell(from), page: NetworkPage::Received(heard), .. } => {
                 let cell = self.cells.get_mut(from).filter(|cell| cell.contact.obeys() != Some(false));
                 cell.into_iter()
                     .for_each(|cell| cell.contact.count(heard.stimuli, Origin::Said { at_ns: nanos }));
@@ -377,7 +377,7 @@ impl LinkId {
                 let origin = Origin::Said { at_ns: nanos };
                 let cell = self.cells.get_mut(from).filter(|cell| cell.contact.obeys() != Some(false));
                 if let Some(cell) = cell.filter(|_| last.is_none_or(|last| last == epoch)) {
-                    cell.contact.learn(page, origin);
+                    cell.contact.apply_reported_page(page, origin);
                 }
                 // A measuring cell has read its sensors at these very joints.
                 if let Some((cell, _)) = self.answering(from, epoch) {
@@ -405,7 +405,7 @@ impl LinkId {
         }
     }
 
-    fn joints(&mut self, nanos: u64, after: u64, epoch: Epoch, joints: Joints, requested: Option<Requested>) {
+    fn joints(&mut self, nanos: u64, after: u64, epoch: Epoch, joints: Joints, requested: Option<RequestedJoints>) {
         self.run(nanos, epoch);
         self.latch(epoch);
         for open in &mut self.open {
@@ -417,7 +417,7 @@ impl LinkId {
             is_one && self.occurrences == requested.occurrence
         });
         if opens {
-            let cells = self.cells.iter().map(|(_, Cell { claim, contact, hash })| CellMoment {
+            let cells = self.cells.iter().map(|(_, WatchedCell { claim, contact, hash })| CellMoment {
                 contact_state: contact.skin().copied(),
                 test_mode: contact.obeys(),
                 state: claim.heartbeat().map(|heartbeat| heartbeat.state),
@@ -425,7 +425,7 @@ impl LinkId {
                 ..CellMoment::default()
             });
             let moment = Moment { at_ns: nanos, joints, halted: self.halted, cells: cells.collect() };
-            self.open.push_back(Open { epoch, moment, since: 0 });
+            self.open.push_back(OpenJoints { epoch, moment, since: 0 });
         }
     }
 
@@ -437,7 +437,7 @@ impl LinkId {
     /// Records the epoch in the list of runs.
     fn run(&mut self, nanos: u64, epoch: Epoch) {
         let follows = !self.runs.is_empty() && self.last.is_some_and(|last| last.next() == epoch);
-        if !follows && self.runs.len() == RUNS {
+        if !follows && self.runs.len() == MAX_LISTED_RUNS {
             self.further_runs += 1;
         } else if !follows {
             self.runs.push(Run { first: (epoch, nanos), last: (epoch, nanos), joints: 1 });
@@ -455,7 +455,7 @@ impl LinkId {
     }
 
     /// Applies a configuration that was reported after the joints; it was the same then.
-    fn learn(&mut self, from: CellId, hash: u16) {
+    fn apply_hash(&mut self, from: CellId, hash: u16) {
         for open in &mut self.open {
             if let Some(cell) = open.moment.cells.get_mut(from.index()) {
                 cell.hash.get_or_insert(hash);
@@ -464,17 +464,17 @@ impl LinkId {
     }
 }
 
-impl Cell {
+impl WatchedCell {
     /// Handles a heartbeat with the cell's node id; returns true if it is from the cell.
     fn heartbeat(&mut self, at_ns: u64, heartbeat: &Heartbeat) -> bool {
         let obeys = heartbeat.state.has(State::TEST_MODE);
-        match self.claim.hear(Micros(at_ns / 1_000), heartbeat) {
-            Word::Claimant | Word::Outsider | Word::Overtaken => return false,
-            Word::Started { .. } => self.mode(obeys, Origin::Start { at_ns }),
+        match self.claim.receive(Micros(at_ns / 1_000), heartbeat) {
+            HeartbeatKind::Claimant | HeartbeatKind::Outsider | HeartbeatKind::Overtaken => return false,
+            HeartbeatKind::Started { .. } => self.mode(obeys, Origin::Start { at_ns }),
             // The apparent start was none, and the contact state before it was not kept.
-            Word::Shared => self.contact.reset(),
-            Word::First | Word::Known if !obeys => self.contact.reset(),
-            Word::First | Word::Known => {}
+            HeartbeatKind::Shared => self.contact.reset(),
+            HeartbeatKind::First | HeartbeatKind::Known if !obeys => self.contact.reset(),
+            HeartbeatKind::First | HeartbeatKind::Known => {}
         }
         self.contact.set_obeys(obeys);
         self.hash = Some(heartbeat.configuration);

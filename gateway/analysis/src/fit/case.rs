@@ -3,7 +3,7 @@
 use protocol::can::Format;
 use protocol::packet::Length;
 use protocol::parameters::Sensing;
-use protocol::skin::{Reply, Skin};
+use protocol::skin::{SkinReply, Skin};
 use protocol::wire_time::{BitRates, Coding, Shape};
 
 use super::response::{Response, Stream, response};
@@ -130,16 +130,16 @@ impl Times {
 impl Case {
     /// Returns the case of one bus of a skin as described, at these rates.
     #[must_use]
-    pub fn of(skin: &Skin, bus: usize, format: Format, rates: BitRates, computation_ns: u64) -> Option<Self> {
+    pub fn from_skin(skin: &Skin, bus: usize, format: Format, rates: BitRates, computation_ns: u64) -> Option<Self> {
         let described = skin.buses.get(bus)?;
         let period_ns = u64::from(skin.timing.ticks_per_broadcast) * skin.timing.tick_nanos();
         let answers = match described.reply {
-            Reply::Torque => torques(skin, bus),
-            Reply::Sum { slot_us, .. } => sums(skin, bus, period_ns, Some(slot_us), true)?,
+            SkinReply::Torque => torques(skin, bus),
+            SkinReply::Sum { slot_us, .. } => sums(skin, bus, period_ns, Some(slot_us), true)?,
         };
         Some(Self {
             format,
-            length: skin.length_of(bus),
+            length: skin.packet_length(bus),
             rates,
             period_ns,
             computation_ns,
@@ -313,7 +313,7 @@ impl Case {
 }
 
 fn torques(skin: &Skin, bus: usize) -> Answers {
-    Answers::Torques { cells: u32::try_from(skin.cells_of(bus).count()).unwrap_or(u32::MAX) }
+    Answers::Torques { cells: u32::try_from(skin.cells_on_bus(bus).count()).unwrap_or(u32::MAX) }
 }
 
 /// Returns the sums of the tree that the wires of a bus allow; `None` if a cell is unreachable. Without a described
@@ -327,7 +327,7 @@ pub(super) fn sums(
 ) -> Option<Answers> {
     let depths = skin.wires(bus).depths();
     let mut by_depth = Vec::new();
-    for cell in skin.cells_of(bus) {
+    for cell in skin.cells_on_bus(bus) {
         let depth = usize::from((*depths.get(cell.node.index())?)?);
         if by_depth.len() <= depth {
             by_depth.resize(depth + 1, 0);

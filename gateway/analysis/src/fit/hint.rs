@@ -2,15 +2,15 @@
 
 use protocol::can::Format;
 use protocol::parameters::Sensing;
-use protocol::skin::{Reply, Skin};
+use protocol::skin::{SkinReply, Skin};
 use serde::Serialize;
 
 use super::case::{self, Answers, Case};
-use super::limits::{Limit, Most, Need, exceeded};
-use super::{COMMON, Rated};
+use super::limits::{Limit, MaxCells, NeededBuses, exceeded};
+use super::{COMMON_RATES, AssessedBus};
 
 /// The longest period of joints that the wire protocol can express, in ns.
-const LONGEST_NS: u64 = 65_535_000;
+const MAX_PERIOD_NS: u64 = 65_535_000;
 
 /// A change and the bus after it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -19,7 +19,7 @@ pub struct Hint {
     pub change: String,
     /// The result; for several buses, that of the fullest.
     #[serde(flatten)]
-    pub after: Rated,
+    pub after: AssessedBus,
 }
 
 /// Returns the hints for a bus; empty if it keeps all limits.
@@ -40,13 +40,13 @@ pub fn hints(skin: &Skin, case: &Case) -> Vec<Hint> {
 }
 
 fn hint(change: String, case: &Case) -> Hint {
-    Hint { change, after: Rated::of(case) }
+    Hint { change, after: AssessedBus::assess(case) }
 }
 
 /// Returns the numbers of buses that are needed for timing, and for transceivers.
 fn more_buses(case: &Case) -> Vec<Hint> {
     let cells = case.answers.cells();
-    let need = Need::of(&Most::of(case), cells);
+    let need = NeededBuses::for_cells(&MaxCells::for_case(case), cells);
     let mut numbers: Vec<_> =
         [need.in_time(), need.buses()].into_iter().flatten().filter(|&it| it > 1).collect();
     numbers.dedup();
@@ -60,7 +60,7 @@ fn more_buses(case: &Case) -> Vec<Hint> {
 /// Returns the slowest common rates that are in time: in the same format, and in CAN FD instead of classic CAN.
 fn faster(case: &Case) -> Vec<Hint> {
     let at = |format: Format| {
-        let rates = COMMON.iter().filter(|it| it.0 == format).filter_map(|it| it.rates());
+        let rates = COMMON_RATES.iter().filter(|it| it.0 == format).filter_map(|it| it.rates());
         let others = rates.map(|rates| Case { format, rates, ..case.clone() }).filter(is_in_time);
         // Of equally slow rates, keep the first.
         others.reduce(|slowest, other| if slowest.frame_ns() < other.frame_ns() { other } else { slowest })
@@ -80,7 +80,7 @@ fn is_in_time(case: &Case) -> bool {
 /// Returns the shortest period of whole ticks that is in time.
 fn slower_joints(skin: &Skin, case: &Case) -> Option<Hint> {
     let tick_ns = skin.timing.tick_nanos();
-    let periods = (1_u64..).map(|ticks| case.period_ns + ticks * tick_ns).take_while(|&it| it <= LONGEST_NS);
+    let periods = (1_u64..).map(|ticks| case.period_ns + ticks * tick_ns).take_while(|&it| it <= MAX_PERIOD_NS);
     let slower = periods.map(|period_ns| Case { period_ns, ..case.clone() }).find(is_in_time)?;
     Some(hint(format!("joint_broadcast_hz = {}", hertz(slower.period_ns)), &slower))
 }
@@ -104,10 +104,10 @@ fn events(case: &Case) -> Option<Hint> {
 /// Returns the alternatives to the answers of a bus: torques, sums with all cells on the bus, and sums with only the
 /// roots on it; sums only if the wires reach all cells.
 #[must_use]
-pub fn answers(skin: &Skin, bus: usize, case: &Case) -> Vec<Hint> {
+pub fn other_answers(skin: &Skin, bus: usize, case: &Case) -> Vec<Hint> {
     let slot_us = match skin.buses.get(bus).map(|it| it.reply) {
-        Some(Reply::Sum { slot_us, .. }) => Some(slot_us),
-        Some(Reply::Torque) | None => None,
+        Some(SkinReply::Sum { slot_us, .. }) => Some(slot_us),
+        Some(SkinReply::Torque) | None => None,
     };
     let sums = |shared| case::sums(skin, bus, case.period_ns, slot_us, shared);
     let torques = Answers::Torques { cells: case.answers.cells() };

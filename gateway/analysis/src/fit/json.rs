@@ -6,8 +6,8 @@ use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
 
 use super::case::{Answers, Load};
-use super::limits::Need;
-use super::{BusFit, Rated, Row, Whole, name};
+use super::limits::NeededBuses;
+use super::{BusFit, AssessedBus, Row, SkinFit, name};
 
 #[derive(Serialize)]
 struct Document<'a> {
@@ -16,7 +16,7 @@ struct Document<'a> {
     #[serde(skip_serializing_if = "<[_]>::is_empty")]
     buses: &'a [BusFit],
     #[serde(skip_serializing_if = "Option::is_none")]
-    whole: Option<&'a Whole>,
+    whole: Option<&'a SkinFit>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     table: Vec<BusFit>,
 }
@@ -24,7 +24,7 @@ struct Document<'a> {
 /// Returns the results of single buses and all of them together, or for common rates; times in µs, loads as shares of
 /// 1, and null for missing bounds.
 #[must_use]
-pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>, table: &[Row]) -> Value {
+pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>, table: &[Row]) -> Value {
     // The number of buses in a row is that for all cells of the skin.
     let table = table.iter().map(|row| BusFit { need: row.need, ..row.fullest.clone() });
     let cells = skin.cells.len();
@@ -32,8 +32,8 @@ pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>, table: &[Row])
 }
 
 /// Serialises the number of buses, and the limits that require it.
-pub(super) fn needed<S: Serializer>(need: &Need, serializer: S) -> Result<S::Ok, S::Error> {
-    let Need { bandwidth, deadline, nodes } = need;
+pub(super) fn needed<S: Serializer>(need: &NeededBuses, serializer: S) -> Result<S::Ok, S::Error> {
+    let NeededBuses { bandwidth, deadline, nodes } = need;
     json!({
         "bandwidth": bandwidth,
         "deadline": deadline,
@@ -44,7 +44,7 @@ pub(super) fn needed<S: Serializer>(need: &Need, serializer: S) -> Result<S::Ok,
     .serialize(serializer)
 }
 
-impl Serialize for Rated {
+impl Serialize for AssessedBus {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let Self { case, load, times, exceeded } = self;
         let answers = match case.answers {

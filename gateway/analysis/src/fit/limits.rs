@@ -5,10 +5,10 @@ use serde::Serialize;
 use super::case::Case;
 
 /// The approximate number of nodes that common transceivers can drive on one bus, including the gateway.
-pub const NODES: u32 = 110;
+pub const MAX_NODES: u32 = 110;
 
 /// Maximum number of cells in the search.
-const ENDLESS: u32 = 1 << 20;
+const MAX_SEARCHED_CELLS: u32 = 1 << 20;
 
 /// A limit on the number of cells on a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
@@ -63,16 +63,16 @@ impl ByLimit<bool> {
 }
 
 /// The maximum number of cells on one bus by each limit; for nodes, [`NODES`] minus the gateway.
-pub type Most = ByLimit<u32>;
+pub type MaxCells = ByLimit<u32>;
 
-impl Most {
+impl MaxCells {
     /// Computes the maxima for a bus like this one.
     #[must_use]
-    pub fn of(case: &Case) -> Self {
+    pub fn for_case(case: &Case) -> Self {
         Self {
             bandwidth: max(|cells| has_room(&case.with_cells(cells))),
             deadline: max(|cells| case.with_cells(cells).is_in_time()),
-            nodes: NODES - 1,
+            nodes: MAX_NODES - 1,
         }
     }
 
@@ -94,7 +94,7 @@ pub fn exceeded(case: &Case) -> Vec<Limit> {
     let holds = ByLimit {
         bandwidth: has_room(case),
         deadline: case.is_in_time(),
-        nodes: case.answers.cells() < NODES,
+        nodes: case.answers.cells() < MAX_NODES,
     };
     holds.broken()
 }
@@ -102,7 +102,7 @@ pub fn exceeded(case: &Case) -> Vec<Limit> {
 /// Returns the largest number up to which a condition holds; 0 if it does not hold for 1.
 fn max(holds: impl Fn(u32) -> bool) -> u32 {
     let mut beyond = 1;
-    while beyond < ENDLESS && holds(beyond) {
+    while beyond < MAX_SEARCHED_CELLS && holds(beyond) {
         beyond *= 2;
     }
     let mut min = beyond / 2;
@@ -118,12 +118,12 @@ fn max(holds: impl Fn(u32) -> bool) -> u32 {
 }
 
 /// The number of buses that cells need, by each limit; `None` if not even one cell fits.
-pub type Need = ByLimit<Option<u32>>;
+pub type NeededBuses = ByLimit<Option<u32>>;
 
-impl Need {
+impl NeededBuses {
     /// Computes the number of buses for cells that are spread evenly.
     #[must_use]
-    pub fn of(most: &Most, cells: u32) -> Self {
+    pub fn for_cells(most: &MaxCells, cells: u32) -> Self {
         let buses = |most: u32| (most > 0).then(|| cells.div_ceil(most));
         Self { bandwidth: buses(most.bandwidth), deadline: buses(most.deadline), nodes: buses(most.nodes) }
     }
@@ -197,11 +197,11 @@ mod tests {
         for limit in [0, 1, 2, 3, 4, 5, 63, 64, 65, 253, 1_000] {
             assert_eq!(max(|number| number <= limit), limit);
         }
-        assert!(max(|_| true) >= ENDLESS / 2);
+        assert!(max(|_| true) >= MAX_SEARCHED_CELLS / 2);
     }
     #[test]
     fn the_larger_need_binds_and_equal_ones_both() {
-        let need = |bandwidth, deadline| Need::of(&Most { bandwidth, deadline, nodes: 109 }, 253);
+        let need = |bandwidth, deadline| NeededBuses::for_cells(&MaxCells { bandwidth, deadline, nodes: 109 }, 253);
         assert_eq!((need(212, 223).buses(), need(212, 223).binding()), (Some(3), vec![Limit::Nodes]));
         assert_eq!(need(212, 223).in_time(), Some(2));
         assert_eq!(

@@ -31,14 +31,14 @@ pub use json::json;
 
 use case::{Case, Load, Times};
 use hint::Hint;
-use limits::{Limit, Most, Need, exceeded};
+use limits::{Limit, MaxCells, NeededBuses, exceeded};
 use verdict::Verdict;
 
 /// Computation time of the paper's cell, 68.5 µs: 1096 instructions at 16 MIPS.
 pub const COMPUTATION_NS: u64 = 68_500;
 
 /// Common bit rates, in bit/s: nominal and data.
-pub const COMMON: [Common; 7] = [
+pub const COMMON_RATES: [Common; 7] = [
     Common(Format::Classic, 500_000, 500_000),
     Common(Format::Classic, 1_000_000, 1_000_000),
     Common(Format::Fd, 500_000, 2_000_000),
@@ -71,7 +71,7 @@ pub fn name(format: Format, rates: BitRates) -> String {
 
 /// A bus with rates and cells, and its assessment.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Rated {
+pub struct AssessedBus {
     /// The assessed case.
     pub case: Case,
     /// Shares of its time.
@@ -82,17 +82,17 @@ pub struct Rated {
     pub exceeded: Vec<Limit>,
 }
 
-impl Rated {
+impl AssessedBus {
     /// Assesses a bus.
     #[must_use]
-    pub fn of(case: &Case) -> Self {
+    pub fn assess(case: &Case) -> Self {
         Self { case: case.clone(), load: case.load(), times: case.times(), exceeded: exceeded(case) }
     }
 
     /// Returns the verdict.
     #[must_use]
     pub fn verdict(&self) -> Verdict {
-        Verdict::of(&self.exceeded, self.case.answers.cells())
+        Verdict::from_limits(&self.exceeded, self.case.answers.cells())
     }
 }
 
@@ -104,13 +104,13 @@ pub struct BusFit {
     pub name: String,
     /// The bus as described.
     #[serde(flatten)]
-    pub rated: Rated,
+    pub rated: AssessedBus,
     /// The maximum number of cells on it.
     #[serde(rename = "most_cells")]
-    pub most: Most,
+    pub most: MaxCells,
     /// The number of buses that its cells need.
     #[serde(rename = "buses_needed", serialize_with = "json::needed")]
-    pub need: Need,
+    pub need: NeededBuses,
     /// Alternatives to the answers of its cells.
     #[serde(rename = "other_answers")]
     pub answers: Vec<Hint>,
@@ -129,14 +129,14 @@ pub fn bus(
     computation_ns: u64,
 ) -> Option<BusFit> {
     let name = skin.buses.get(index)?.name.clone();
-    let case = Case::of(skin, index, format, rates, computation_ns)?;
-    let most = Most::of(&case);
+    let case = Case::from_skin(skin, index, format, rates, computation_ns)?;
+    let most = MaxCells::for_case(&case);
     Some(BusFit {
         name,
-        rated: Rated::of(&case),
+        rated: AssessedBus::assess(&case),
         most,
-        need: Need::of(&most, case.answers.cells()),
-        answers: hint::answers(skin, index, &case),
+        need: NeededBuses::for_cells(&most, case.answers.cells()),
+        answers: hint::other_answers(skin, index, &case),
         hints: hint::hints(skin, &case),
     })
 }
@@ -144,23 +144,23 @@ pub fn bus(
 /// Assesses one bus of a skin as described, at these rates, with all cells answering; `None` if a cell that answers
 /// with sums is unreachable.
 #[must_use]
-pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Rated> {
+pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<AssessedBus> {
     let format = skin.buses.get(index)?.format;
     let rates = match format {
         Format::Fd => rates,
         Format::Classic => BitRates::classic(rates.nominal()).ok()?,
     };
-    Some(Rated::of(&Case::of(skin, index, format, rates, COMPUTATION_NS)?))
+    Some(AssessedBus::assess(&Case::from_skin(skin, index, format, rates, COMPUTATION_NS)?))
 }
 
 /// All cells of a skin, spread evenly over several buses.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Whole {
+pub struct SkinFit {
     /// Number of cells.
     pub cells: u32,
     /// The number of buses that they need.
     #[serde(rename = "buses_needed", serialize_with = "json::needed")]
-    pub need: Need,
+    pub need: NeededBuses,
     /// The results for increasing numbers of buses.
     pub spread: Vec<Spread>,
 }
@@ -171,13 +171,13 @@ pub struct Spread {
     /// Number of buses.
     pub buses: u32,
     /// The fullest one.
-    pub fullest: Rated,
+    pub fullest: AssessedBus,
 }
 
 /// Spreads all cells of a skin over increasing numbers of buses like its fullest one. For several chains, only the
 /// number of buses is computed. Returns `None` without a bus.
 #[must_use]
-pub fn whole(skin: &Skin, buses: &[BusFit]) -> Option<Whole> {
+pub fn whole(skin: &Skin, buses: &[BusFit]) -> Option<SkinFit> {
     let cells = u32::try_from(skin.cells.len()).unwrap_or(u32::MAX);
     let fullest = fullest(buses.iter())?;
     let need = need(skin, buses);
@@ -189,8 +189,8 @@ pub fn whole(skin: &Skin, buses: &[BusFit]) -> Option<Whole> {
     let spread = numbers
         .filter(is_shown)
         .map(|buses| (buses, fullest.rated.case.with_cells(cells.div_ceil(buses))))
-        .map(|(buses, case)| Spread { buses, fullest: Rated::of(&case) });
-    Some(Whole { cells, need, spread: spread.collect() })
+        .map(|(buses, case)| Spread { buses, fullest: AssessedBus::assess(&case) });
+    Some(SkinFit { cells, need, spread: spread.collect() })
 }
 
 /// Returns the chains with cells, each with its number of cells.
@@ -205,17 +205,17 @@ fn carried(skin: &Skin) -> impl Iterator<Item = (usize, u32)> {
 
 /// Returns the number of buses that all cells of a skin need. Each chain needs its own, like its fullest bus, because a
 /// bus carries one chain.
-fn need(skin: &Skin, buses: &[BusFit]) -> Need {
+fn need(skin: &Skin, buses: &[BusFit]) -> NeededBuses {
     let of_chain = |(chain, cells)| {
         let chain_of = |bus: &&BusFit| {
             let index = skin.bus_named(&bus.name)?;
             skin.buses.get(index).map(|bus| bus.chain)
         };
         let fullest = fullest(buses.iter().filter(|bus| chain_of(bus) == Some(chain)))?;
-        Some(Need::of(&fullest.most, cells))
+        Some(NeededBuses::for_cells(&fullest.most, cells))
     };
-    let none = Need { bandwidth: Some(0), deadline: Some(0), nodes: Some(0) };
-    carried(skin).filter_map(of_chain).reduce(Need::with).unwrap_or(none)
+    let none = NeededBuses { bandwidth: Some(0), deadline: Some(0), nodes: Some(0) };
+    carried(skin).filter_map(of_chain).reduce(NeededBuses::with).unwrap_or(none)
 }
 
 /// The skin with one format and its rates.
@@ -224,13 +224,13 @@ pub struct Row {
     /// The fullest bus as described.
     pub fullest: BusFit,
     /// The number of buses that all cells of the skin need.
-    pub need: Need,
+    pub need: NeededBuses,
 }
 
 /// Assesses the fullest bus of a skin at all common rates, or those of one format.
 #[must_use]
 pub fn table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<Row> {
-    let rows = COMMON.iter().filter(|it| format.is_none_or(|format| format == it.0));
+    let rows = COMMON_RATES.iter().filter(|it| format.is_none_or(|format| format == it.0));
     let row = |common: &Common| {
         let rates = common.rates()?;
         let buses = (0..skin.buses.len()).map(|index| bus(skin, index, common.0, rates, computation_ns));

@@ -1,7 +1,7 @@
 //! The bit rates of a bus: the requested ones, or else the skin's, or else common ones.
 
 use protocol::can::Format;
-use protocol::skin::Bus;
+use protocol::skin::SkinBus;
 use protocol::wire_time::{BitRates, BitRatesError};
 
 /// The default nominal bit rate, in bit/s.
@@ -11,7 +11,7 @@ const DATA: u32 = 5_000_000;
 
 /// Requested bit rates, for all buses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Requested {
+pub struct RequestedRates {
     /// Rate of the arbitration phase, and of all of a classic frame.
     pub nominal: Option<u32>,
     /// Rate of the data phase of FD frames.
@@ -20,14 +20,14 @@ pub struct Requested {
 
 /// The rates of a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Chosen {
+pub struct ChosenRates {
     /// The rates.
     pub rates: BitRates,
     /// True if the skin or the caller gave the rates, false for defaults.
     pub is_chosen: bool,
 }
 
-impl Requested {
+impl RequestedRates {
     /// Returns the rates of a bus that is not in a skin.
     ///
     /// # Errors
@@ -41,7 +41,7 @@ impl Requested {
     ///
     /// # Errors
     /// Returns [`BitRatesError`] if CAN does not allow these rates.
-    pub fn of_bus(&self, bus: &Bus) -> Result<Chosen, BitRatesError> {
+    pub fn of_bus(&self, bus: &SkinBus) -> Result<ChosenRates, BitRatesError> {
         let is_chosen = self.nominal.is_some() || self.data.is_some() || bus.bitrate.is_some();
         let rates = match (self.nominal, self.data, described(bus, bus.format)) {
             (None, None, Some(described)) => described?,
@@ -54,13 +54,13 @@ impl Requested {
                 }
             }
         };
-        Ok(Chosen { rates, is_chosen })
+        Ok(ChosenRates { rates, is_chosen })
     }
 }
 
 /// Returns the described rates of a bus in a format; the data bit rate defaults to the nominal one.
 #[must_use]
-pub fn described(bus: &Bus, format: Format) -> Option<Result<BitRates, BitRatesError>> {
+pub fn described(bus: &SkinBus, format: Format) -> Option<Result<BitRates, BitRatesError>> {
     let nominal = bus.bitrate?;
     Some(match format {
         Format::Fd => BitRates::new(nominal, bus.data_bitrate.unwrap_or(nominal)),
@@ -77,7 +77,7 @@ mod tests {
         let text = model::generate::generate(&model::generate::Target::default()).unwrap();
         let text = text.replace("format = \"fd\"", described);
         let skin = Skin::parse("skin.toml", &text).unwrap();
-        let chosen = Requested { nominal, data }.of_bus(&skin.buses[0]).unwrap();
+        let chosen = RequestedRates { nominal, data }.of_bus(&skin.buses[0]).unwrap();
         (chosen.rates.to_string(), chosen.is_chosen)
     }
 

@@ -7,7 +7,7 @@ use protocol::skin::Skin;
 use protocol::wire_time::BitRates;
 
 use super::case::{Answers, Case};
-use super::limits::{Limit, Most};
+use super::limits::{Limit, MaxCells};
 use super::verdict::Verdict;
 use super::{BusFit, COMPUTATION_NS, bus, fullest, json, table, whole};
 use model::generate::{Reply, Target, generate};
@@ -58,7 +58,7 @@ fn the_whole_arm_is_too_much_for_one_bus_at_1m_5m_and_three_are_needed_electrica
     assert_eq!(fit.rated.times.last_ns(), None);
     assert_eq!(fit.rated.times.heartbeat_ns, None);
     // 212 * 70.4 * 1.064 + 70.4 = 15 950 of 16 000 us; 223 * 70.4 + 3 * 70.4 + 68.5 = 15 979 us.
-    assert_eq!(fit.most, Most { bandwidth: 212, deadline: 223, nodes: 109 });
+    assert_eq!(fit.most, MaxCells { bandwidth: 212, deadline: 223, nodes: 109 });
     assert_eq!((fit.need.in_time(), fit.need.buses()), (Some(2), Some(3)));
     assert_eq!(fit.need.binding(), [Limit::Nodes]);
 }
@@ -173,7 +173,7 @@ fn a_skin_of_sums_is_taken_as_it_is_and_compared_with_torques() {
     assert_eq!((by_depth.iter().sum::<u32>(), by_depth.len()), (60, usize::from(deepest) + 1));
     assert!(*shared && by_depth[0] == 1);
     assert!(
-        matches!(skin.buses[0].reply, protocol::skin::Reply::Sum { slot_us, .. } if u64::from(slot_us) * 1_000 == *slot_ns)
+        matches!(skin.buses[0].reply, protocol::skin::SkinReply::Sum { slot_us, .. } if u64::from(slot_us) * 1_000 == *slot_ns)
     );
     // One computation, and one frame of another node, for every wire on the route to the root.
     let chain_ns = 70_400 * 62 + (u64::from(deepest) + 1) * (68_500 + 70_400);

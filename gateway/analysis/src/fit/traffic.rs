@@ -15,7 +15,7 @@ use model::packets::{Content, PacketReader};
 
 /// The kinds of frames that only a bench sends.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Bench {
+pub enum BenchFrame {
     /// Stimuli.
     Stimulus,
     /// Sync, and the heartbeats that answer it.
@@ -41,12 +41,12 @@ pub struct BenchFrames {
 
 impl BenchFrames {
     /// Adds frames of a kind.
-    pub const fn count(&mut self, what: Bench, frames: u64) {
+    pub const fn count(&mut self, what: BenchFrame, frames: u64) {
         match what {
-            Bench::Stimulus => self.stimuli += frames,
-            Bench::Sync => self.syncs += frames,
-            Bench::Report => self.reports += frames,
-            Bench::Wire => self.wires += frames,
+            BenchFrame::Stimulus => self.stimuli += frames,
+            BenchFrame::Sync => self.syncs += frames,
+            BenchFrame::Report => self.reports += frames,
+            BenchFrame::Wire => self.wires += frames,
         }
     }
 
@@ -59,7 +59,7 @@ impl BenchFrames {
 
 /// The meaning of a frame for the course of a run.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Says {
+pub enum RunEvent {
     /// No effect.
     Other,
     /// Joints.
@@ -76,19 +76,19 @@ pub enum Says {
 
 /// A classified frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Sorted {
+pub struct ClassifiedFrame {
     /// Its meaning.
-    pub says: Says,
+    pub says: RunEvent,
     /// The kind, if only a bench sends it.
-    pub bench: Option<Bench>,
+    pub bench: Option<BenchFrame>,
     /// The sending cell, if the frame ends a packet.
     pub from: Option<CellId>,
     /// True if it ends a packet of classic frames: the previous frame with its identifier belongs to the same class.
     pub ends_pair: bool,
 }
 
-impl Sorted {
-    const OTHER: Self = Self { says: Says::Other, bench: None, from: None, ends_pair: false };
+impl ClassifiedFrame {
+    const OTHER: Self = Self { says: RunEvent::Other, bench: None, from: None, ends_pair: false };
 }
 
 /// Classifies the frames of one bus in order, with bounded memory.
@@ -99,11 +99,11 @@ pub struct Traffic {
     others: u64,
     packets: PacketReader,
     /// Outstanding replies to the bench, by cell.
-    owed: Vec<Owed>,
+    owed: Vec<PendingReplies>,
 }
 
 /// Outstanding replies of a cell to sync and report: a heartbeat; sensors 0, sensors 1, the tree.
-type Owed = [bool; 4];
+type PendingReplies = [bool; 4];
 /// The index of the tree page.
 const TREE: usize = 3;
 
@@ -116,17 +116,17 @@ impl Traffic {
     }
 
     /// Classifies the next frame. On a bus of another protocol no frame counts as the bench's. Never panics.
-    pub fn sort(&mut self, nanos: u64, frame: &Frame) -> Sorted {
+    pub fn sort(&mut self, nanos: u64, frame: &Frame) -> ClassifiedFrame {
         let received = self.packets.read(Micros(nanos / 1_000), frame);
         let (id, packet) = match received.content {
             Content::NotData => {
-                let bench = wired(frame).map(|_| Bench::Wire);
-                return Sorted { bench, ..Sorted::OTHER };
+                let bench = wired(frame).map(|_| BenchFrame::Wire);
+                return ClassifiedFrame { bench, ..ClassifiedFrame::OTHER };
             }
-            Content::Segment(_) => return Sorted::OTHER,
+            Content::Segment(_) => return ClassifiedFrame::OTHER,
             Content::AfterLost(_) | Content::Damaged(..) => {
                 self.others += 1;
-                return Sorted::OTHER;
+                return ClassifiedFrame::OTHER;
             }
             Content::Message(id, packet, _) | Content::Meaningless(id, packet, _) => (id, packet),
         };
@@ -134,49 +134,49 @@ impl Traffic {
         self.ours += if is_classic { packet.words.length().segments() as u64 } else { 1 };
         match received.message() {
             Some(message) if self.is_ours() => {
-                Sorted { ends_pair: is_classic, from: id.sender(), ..self.message(message) }
+                ClassifiedFrame { ends_pair: is_classic, from: id.sender(), ..self.message(message) }
             }
-            _ => Sorted::OTHER,
+            _ => ClassifiedFrame::OTHER,
         }
     }
 
-    fn message(&mut self, message: &Message) -> Sorted {
-        let says = |says| Sorted { says, ..Sorted::OTHER };
-        let bench = |bench| Sorted { bench: Some(bench), ..Sorted::OTHER };
+    fn message(&mut self, message: &Message) -> ClassifiedFrame {
+        let says = |says| ClassifiedFrame { says, ..ClassifiedFrame::OTHER };
+        let bench = |bench| ClassifiedFrame { bench: Some(bench), ..ClassifiedFrame::OTHER };
         match message {
-            Message::Joints { epoch, .. } => says(Says::Joints(*epoch)),
-            Message::Torque { epoch, .. } | Message::Sum { epoch, .. } => says(Says::Answer(*epoch)),
-            Message::Halt => says(Says::Halt),
-            Message::Resume => says(Says::Resume),
-            Message::Configure { .. } | Message::Configured { .. } => says(Says::Preparation),
-            Message::Stimulus { .. } => bench(Bench::Stimulus),
+            Message::Joints { epoch, .. } => says(RunEvent::Joints(*epoch)),
+            Message::Torque { epoch, .. } | Message::Sum { epoch, .. } => says(RunEvent::Answer(*epoch)),
+            Message::Halt => says(RunEvent::Halt),
+            Message::Resume => says(RunEvent::Resume),
+            Message::Configure { .. } | Message::Configured { .. } => says(RunEvent::Preparation),
+            Message::Stimulus { .. } => bench(BenchFrame::Stimulus),
             Message::Sync => {
                 self.cells().iter_mut().for_each(|[heartbeat, ..]| *heartbeat = true);
-                bench(Bench::Sync)
+                bench(BenchFrame::Sync)
             }
-            Message::Report => Sorted { says: Says::Preparation, ..bench(Bench::Report) },
+            Message::Report => ClassifiedFrame { says: RunEvent::Preparation, ..bench(BenchFrame::Report) },
             Message::Sensors { from, page: SensorPage::Skin(_), .. } => self.page(*from, 1),
             Message::Sensors { from, page: SensorPage::Acceleration(_), .. } => self.page(*from, 2),
-            Message::Sensors { page: SensorPage::Baseline(_), .. } => Sorted::OTHER,
+            Message::Sensors { page: SensorPage::Baseline(_), .. } => ClassifiedFrame::OTHER,
             Message::Network { from, page, .. } => {
-                let Node::Cell(from) = from else { return Sorted::OTHER };
+                let Node::Cell(from) = from else { return ClassifiedFrame::OTHER };
                 match page {
                     NetworkPage::Heartbeat(heartbeat) if heartbeat.state.has(State::CLAIMING) => {
                         // A starting cell leaves sync and report unanswered.
                         self.take(*from);
-                        says(Says::Preparation)
+                        says(RunEvent::Preparation)
                     }
                     NetworkPage::Heartbeat(_) => {
                         let [heartbeat, ..] = self.take(*from);
-                        if heartbeat { bench(Bench::Sync) } else { Sorted::OTHER }
+                        if heartbeat { bench(BenchFrame::Sync) } else { ClassifiedFrame::OTHER }
                     }
                     // A cell sends these pages only on a report command; the other pages follow.
-                    NetworkPage::Heard(_) | NetworkPage::Refused(_) => {
+                    NetworkPage::Received(_) | NetworkPage::Rejected(_) => {
                         let owed = self.cells().get_mut(from.index());
                         owed.into_iter().for_each(|[_, pages @ ..]| *pages = [true; 3]);
-                        bench(Bench::Report)
+                        bench(BenchFrame::Report)
                     }
-                    NetworkPage::Ports(_) => bench(Bench::Report),
+                    NetworkPage::Ports(_) => bench(BenchFrame::Report),
                     NetworkPage::Tree(_) => self.page(*from, TREE),
                 }
             }
@@ -184,19 +184,19 @@ impl Traffic {
     }
 
     /// Classifies a page that a cell sends on a report command and also at other times.
-    fn page(&mut self, from: CellId, page: usize) -> Sorted {
+    fn page(&mut self, from: CellId, page: usize) -> ClassifiedFrame {
         let owed = self.cells().get_mut(from.index()).and_then(|owed| owed.get_mut(page));
         let owed = owed.map(std::mem::take).unwrap_or(false);
-        Sorted { bench: owed.then_some(Bench::Report), ..Sorted::OTHER }
+        ClassifiedFrame { bench: owed.then_some(BenchFrame::Report), ..ClassifiedFrame::OTHER }
     }
 
     /// Removes and returns the outstanding replies of a cell.
-    fn take(&mut self, from: CellId) -> Owed {
+    fn take(&mut self, from: CellId) -> PendingReplies {
         self.cells().get_mut(from.index()).map(std::mem::take).unwrap_or_default()
     }
 
-    fn cells(&mut self) -> &mut [Owed] {
-        self.owed.resize(CellId::COUNT, Owed::default());
+    fn cells(&mut self) -> &mut [PendingReplies] {
+        self.owed.resize(CellId::COUNT, PendingReplies::default());
         &mut self.owed
     }
 }
@@ -205,9 +205,9 @@ impl Traffic {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-    use protocol::message::{Heard, Heartbeat, Refused, SkinSensors, Tree};
+    use protocol::message::{ReceivedCounts, Heartbeat, RejectedCounts, SkinSensors, Tree};
 
-    fn said(traffic: &mut Traffic, format: Format, message: &Message) -> Vec<Option<Bench>> {
+    fn said(traffic: &mut Traffic, format: Format, message: &Message) -> Vec<Option<BenchFrame>> {
         message.encode().frames(format).map(|frame| traffic.sort(0, &frame).bench).collect()
     }
 
@@ -232,21 +232,21 @@ mod tests {
             let (alive, tree) =
                 (heartbeat(1, State::CONFIGURED), page(1, NetworkPage::Tree(Tree::default())));
             assert_eq!([last(&alive), last(&skin(1)), last(&tree)], [None; 3]);
-            assert_eq!(last(&Message::Sync), Some(Bench::Sync));
+            assert_eq!(last(&Message::Sync), Some(BenchFrame::Sync));
             assert_eq!(last(&heartbeat(2, State::CLAIMING)), None, "it leaves sync unanswered");
-            assert_eq!([last(&alive), last(&alive)], [Some(Bench::Sync), None]);
+            assert_eq!([last(&alive), last(&alive)], [Some(BenchFrame::Sync), None]);
             assert_eq!(last(&heartbeat(2, State::CONFIGURED)), None);
-            assert_eq!(last(&Message::Report), Some(Bench::Report));
+            assert_eq!(last(&Message::Report), Some(BenchFrame::Report));
             assert_eq!(last(&skin(1)), None, "before the answers begin");
             for page_of_one in
-                [NetworkPage::Heard(Heard::default()), NetworkPage::Refused(Refused::default())]
+                [NetworkPage::Received(ReceivedCounts::default()), NetworkPage::Rejected(RejectedCounts::default())]
             {
-                assert_eq!(last(&page(1, page_of_one)), Some(Bench::Report));
+                assert_eq!(last(&page(1, page_of_one)), Some(BenchFrame::Report));
             }
-            assert_eq!([last(&skin(1)), last(&skin(1)), last(&skin(2))], [Some(Bench::Report), None, None]);
-            assert_eq!([last(&tree), last(&tree)], [Some(Bench::Report), None]);
+            assert_eq!([last(&skin(1)), last(&skin(1)), last(&skin(2))], [Some(BenchFrame::Report), None, None]);
+            assert_eq!([last(&tree), last(&tree)], [Some(BenchFrame::Report), None]);
             // A cell without ports sends no tree; its next one is unrequested.
-            last(&page(1, NetworkPage::Refused(Refused::default())));
+            last(&page(1, NetworkPage::Rejected(RejectedCounts::default())));
             assert_eq!([last(&alive), last(&tree)], [None; 2]);
         }
     }
@@ -256,10 +256,10 @@ mod tests {
         let mut traffic = Traffic::default();
         let stimulus = Message::Stimulus {
             to: Node::Everyone,
-            from: protocol::message::From::Next,
+            from: protocol::message::AppliesFrom::Next,
             page: SensorPage::Skin(SkinSensors::default()),
         };
-        assert_eq!(said(&mut traffic, Format::Classic, &stimulus), [None, Some(Bench::Stimulus)]);
+        assert_eq!(said(&mut traffic, Format::Classic, &stimulus), [None, Some(BenchFrame::Stimulus)]);
         let torque = skin(9).encode();
         let sorted: Vec<_> = torque.frames(Format::Classic).map(|frame| traffic.sort(0, &frame)).collect();
         assert_eq!((sorted[0].from, sorted[0].ends_pair), (None, false));
@@ -272,7 +272,7 @@ mod tests {
             let mut traffic = Traffic::default();
             // The first frame alone would be accepted with probability 1/65 536.
             let unknown_node = Frame::classic(0x700, &[1]).unwrap();
-            (0..4).for_each(|_| assert_eq!(traffic.sort(0, &unknown_node), Sorted::OTHER));
+            (0..4).for_each(|_| assert_eq!(traffic.sort(0, &unknown_node), ClassifiedFrame::OTHER));
             for (id, data, is_fd) in frames {
                 let frame = if is_fd {
                     Frame::with_data(id, Format::Fd, protocol::can::FD_FORMAT, &data)

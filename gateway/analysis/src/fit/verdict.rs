@@ -4,8 +4,8 @@ use std::fmt::{self, Display, Formatter};
 
 use serde::{Serialize, Serializer};
 
-use super::Rated;
-use super::limits::{ByLimit, Limit, NODES};
+use super::AssessedBus;
+use super::limits::{ByLimit, Limit, MAX_NODES};
 
 /// The verdict on a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -23,7 +23,7 @@ pub enum Verdict {
 impl Verdict {
     /// Returns the verdict from the exceeded limits of a bus with this number of cells, see [`ByLimit::broken`].
     #[must_use]
-    pub fn of(exceeded: &[Limit], cells: u32) -> Self {
+    pub fn from_limits(exceeded: &[Limit], cells: u32) -> Self {
         match exceeded.first() {
             Some(Limit::Bandwidth) => Self::Bandwidth,
             Some(Limit::Deadline) => Self::Deadline,
@@ -132,7 +132,7 @@ pub struct Answer {
 impl Answer {
     /// Returns the assessment of a bus with all cells answering.
     #[must_use]
-    pub fn worst_case(rated: &Rated) -> Self {
+    pub fn worst_case(rated: &AssessedBus) -> Self {
         Self {
             load: rated.load.total(),
             rates: super::name(rated.case.format, rated.case.rates),
@@ -146,8 +146,8 @@ impl Answer {
     #[must_use]
     pub fn this_run(load: f64, late: u64, rates: String, cells: Cells) -> Self {
         let on_the_bus = cells.on_the_bus();
-        let holds = ByLimit { bandwidth: load <= 1.0, deadline: late == 0, nodes: on_the_bus < NODES };
-        Self { load, rates, cells, verdict: Verdict::of(&holds.broken(), on_the_bus) }
+        let holds = ByLimit { bandwidth: load <= 1.0, deadline: late == 0, nodes: on_the_bus < MAX_NODES };
+        Self { load, rates, cells, verdict: Verdict::from_limits(&holds.broken(), on_the_bus) }
     }
 
     /// Returns the name of the case.

@@ -101,12 +101,12 @@ pub struct Figure {
     /// Marked positions.
     pub marks: Vec<Mark>,
     /// A second diagram below it, with the same horizontal axis.
-    pub below: Option<Below>,
+    pub below: Option<LowerDiagram>,
 }
 
 /// A lower diagram, for series with a scale of their own.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct Below {
+pub struct LowerDiagram {
     /// The vertical axis.
     pub y: Axis,
     /// The series, as in a [`Figure`].
@@ -155,7 +155,7 @@ impl Figure {
 
     /// Adds a diagram below.
     #[must_use]
-    pub fn below(mut self, below: Below) -> Self {
+    pub fn below(mut self, below: LowerDiagram) -> Self {
         self.below = Some(below);
         self
     }
@@ -265,7 +265,7 @@ pub enum Shape {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Mark {
     /// The axis of `at`.
-    pub on: On,
+    pub on: MarkAxis,
     /// The position.
     pub at: f64,
     /// The text.
@@ -276,19 +276,19 @@ impl Mark {
     /// Creates a vertical line.
     #[must_use]
     pub fn x(at: f64, caption: impl Into<String>) -> Self {
-        Self { on: On::X, at, caption: caption.into() }
+        Self { on: MarkAxis::X, at, caption: caption.into() }
     }
 
     /// Creates a horizontal line.
     #[must_use]
     pub fn y(at: f64, caption: impl Into<String>) -> Self {
-        Self { on: On::Y, at, caption: caption.into() }
+        Self { on: MarkAxis::Y, at, caption: caption.into() }
     }
 }
 
 /// An axis.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
-pub enum On {
+pub enum MarkAxis {
     /// The horizontal axis: the line is vertical.
     X,
     /// The vertical axis: the line is horizontal.

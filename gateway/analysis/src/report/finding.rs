@@ -80,7 +80,7 @@ impl Finding {
 
     /// Sets the command that shows the details, if any.
     #[must_use]
-    pub fn look(mut self, command: Option<String>) -> Self {
+    pub fn with_command(mut self, command: Option<String>) -> Self {
         self.command = command;
         self
     }

@@ -113,7 +113,7 @@ pub struct Legend {
 impl Legend {
     /// Creates a legend from 0 to the largest of some values.
     #[must_use]
-    pub fn of(caption: &str, unit: &str, values: impl Iterator<Item = f64>) -> Self {
+    pub fn for_values(caption: &str, unit: &str, values: impl Iterator<Item = f64>) -> Self {
         Self { caption: caption.to_owned(), unit: unit.to_owned(), max: values.fold(0.0, f64::max) }
     }
 }

@@ -20,7 +20,7 @@ use plotters::style::{Color, IntoFont, RGBColor, ShapeStyle, TextStyle};
 use plotters_svg::SVGBackend;
 use protocol::xml::escaped;
 
-use super::figure::{Axis, Figure, Mark, On, Series, Shape, Size};
+use super::figure::{Axis, Figure, Mark, MarkAxis, Series, Shape, Size};
 use super::scale::Span;
 use super::thin::thinned;
 
@@ -164,11 +164,11 @@ impl<'a> Diagram<'a> {
         let marks =
             |marks: &'a [Mark], on| marks.iter().filter(move |mark| mark.on == on).map(|mark| mark.at);
         let across = points().filter(|point| point.1.is_finite()).map(|point| point.0);
-        let x = Span::new(&figure.x, across.chain(marks(&figure.marks, On::X)), 0.0);
+        let x = Span::new(&figure.x, across.chain(marks(&figure.marks, MarkAxis::X)), 0.0);
         let count = drawn().count();
         let diagrams = drawn().enumerate().map(|(at, (axis, series, of_marks))| {
             let up = series.iter().flat_map(|series| &series.points).map(|point| point.1);
-            let y = Span::new(axis, up.chain(marks(of_marks, On::Y)), 0.06);
+            let y = Span::new(axis, up.chain(marks(of_marks, MarkAxis::Y)), 0.06);
             Self { axes: (&figure.x, axis), x, y, series, marks: of_marks, is_lowest: at + 1 == count }
         });
         diagrams.collect()
@@ -359,23 +359,23 @@ fn clipped(points: &[(f64, f64)]) -> Vec<Vec<(f64, f64)>> {
 }
 
 fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Drawn {
-    let place = if mark.on == On::X { x.place(mark.at) } else { y.place(mark.at) };
+    let place = if mark.on == MarkAxis::X { x.place(mark.at) } else { y.place(mark.at) };
     if !(0.0..=1.0).contains(&place) {
         return Ok(());
     }
-    let ends = if mark.on == On::X { [(place, 0.0), (place, 1.0)] } else { [(0.0, place), (1.0, place)] };
+    let ends = if mark.on == MarkAxis::X { [(place, 0.0), (place, 1.0)] } else { [(0.0, place), (1.0, place)] };
     let line = ends.map(|(across, up)| (x.value(across), y.value(up)));
     chart.draw_series([PathElement::new(line.to_vec(), FAINT.stroke_width(DOTTED))])?;
     // Put the text on the side with room.
     let (across, up, side, end) = match mark.on {
-        On::X if place > 0.6 => (place, 1.0, HPos::Right, VPos::Top),
-        On::X => (place, 1.0, HPos::Left, VPos::Top),
-        On::Y if place > 0.9 => (1.0, place, HPos::Right, VPos::Top),
-        On::Y => (1.0, place, HPos::Right, VPos::Bottom),
+        MarkAxis::X if place > 0.6 => (place, 1.0, HPos::Right, VPos::Top),
+        MarkAxis::X => (place, 1.0, HPos::Left, VPos::Top),
+        MarkAxis::Y if place > 0.9 => (1.0, place, HPos::Right, VPos::Top),
+        MarkAxis::Y => (1.0, place, HPos::Right, VPos::Bottom),
     };
     let gap = if matches!(side, HPos::Left) { 0.006 } else { -0.006 };
     let style = letters(&FAINT, LETTERS - 1.0).pos(Pos::new(side, end));
-    let at = (x.value(across + gap), y.value(up - if mark.on == On::X { 0.02 } else { 0.0 }));
+    let at = (x.value(across + gap), y.value(up - if mark.on == MarkAxis::X { 0.02 } else { 0.0 }));
     chart.draw_series([Text::new(mark.caption.clone(), at, style)])?;
     Ok(())
 }

@@ -37,7 +37,7 @@ impl Column {
 /// A line of any length in bounded memory. Points arrive by increasing x; when there are too many columns, pairs of
 /// columns are merged.
 #[derive(Clone, Debug)]
-pub struct Thinned {
+pub struct ThinnedLine {
     most: usize,
     /// Width of a column; it doubles with each merge.
     width: f64,
@@ -51,14 +51,14 @@ pub struct Thinned {
     gap: bool,
 }
 
-impl Default for Thinned {
+impl Default for ThinnedLine {
     /// Creates a line with the number of columns of a page, 2 ms wide at first.
     fn default() -> Self {
         Self::new(1_000, 0.002)
     }
 }
 
-impl Thinned {
+impl ThinnedLine {
     /// Creates an empty line with at most `most` columns (at least 2), which are at least `width` wide.
     #[must_use]
     pub fn new(most: usize, width: f64) -> Self {
@@ -155,21 +155,21 @@ pub fn thinned(points: &[(f64, f64)], columns: u32) -> Vec<(f64, f64)> {
 
 /// Sums over equal bins in bounded memory; when there are too many bins, pairs are merged.
 #[derive(Clone, Debug)]
-pub struct Binned {
+pub struct BinnedSums {
     most: usize,
     width: f64,
     from: Option<f64>,
     bins: Vec<f64>,
 }
 
-impl Default for Binned {
+impl Default for BinnedSums {
     /// Creates 600 bins, 0.1 s wide at first.
     fn default() -> Self {
         Self::new(600, 0.1)
     }
 }
 
-impl Binned {
+impl BinnedSums {
     /// Creates at most `most` empty bins (at least 2), `width` wide at first.
     #[must_use]
     pub fn new(most: usize, width: f64) -> Self {
@@ -230,7 +230,7 @@ mod tests {
 
     #[test]
     fn a_peak_of_one_point_in_a_million_stays_where_it_was() {
-        let mut line = Thinned::new(500, 0.002);
+        let mut line = ThinnedLine::new(500, 0.002);
         for n in 0..1_000_000_u32 {
             let y = if n == 654_321 { 99.0 } else { f64::from(n % 7) };
             line.push(f64::from(n) * 0.002, y);
@@ -246,7 +246,7 @@ mod tests {
 
     #[test]
     fn a_gap_stays_a_gap_when_columns_become_wider() {
-        let mut line = Thinned::new(16, 1.0);
+        let mut line = ThinnedLine::new(16, 1.0);
         for n in 0..1_000_u32 {
             line.push(n.into(), if (300..700).contains(&n) { f64::NAN } else { 1.0 });
         }
@@ -260,7 +260,7 @@ mod tests {
 
     #[test]
     fn what_is_added_to_bins_is_all_there_when_they_become_wider() {
-        let mut bins = Binned::new(10, 0.1);
+        let mut bins = BinnedSums::new(10, 0.1);
         for n in 0..1_000_u32 {
             bins.add(5.0 + f64::from(n) * 0.01, 2.0);
         }
@@ -294,7 +294,7 @@ mod tests {
 
         #[test]
         fn a_stream_keeps_its_ends_and_stays_small(ys in proptest::collection::vec(-100..100_i32, 1..4_000), most in 2_usize..60) {
-            let mut line = Thinned::new(most, 0.5);
+            let mut line = ThinnedLine::new(most, 0.5);
             let mut all = Vec::new();
             for (n, y) in ys.iter().enumerate() {
                 let point = (n as f64 * 0.3, f64::from(*y));

@@ -7,12 +7,12 @@ use protocol::packet::Epoch;
 use protocol::wire_time::{BitRates, Bits};
 
 use super::epochs::Epochs;
-use super::phase::{Each, Figures, Phase, Phases};
-use super::report::{BusShadow, Counts, Delays, Loads, Most, Stretches};
-use super::reported::Reported;
+use super::phase::{ByPhase, Figures, Phase, Phases};
+use super::report::{BusShadow, Counts, Delays, Loads, Peak, Stretches};
+use super::reported::FrameTimings;
 use super::{SATURATED_NS, WINDOW_FRAMES, WINDOW_NS};
 use crate::fit;
-use crate::fit::traffic::{Says, Sorted, Traffic};
+use crate::fit::traffic::{RunEvent, ClassifiedFrame, Traffic};
 use crate::fit::verdict::{Answer, Cells};
 use bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 
@@ -20,7 +20,7 @@ use bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 /// transmit queue.
 pub const MAX_QUEUE: usize = 1 << 22;
 /// The number of identifiers of 11 bits.
-const IDS: usize = 0x800;
+const IDENTIFIER_COUNT: usize = 0x800;
 
 /// The data of a frame in the model.
 #[derive(Clone, Copy, Debug)]
@@ -43,12 +43,12 @@ struct Pending {
     place: u64,
     /// `None` for a 29-bit identifier.
     id: Option<u16>,
-    sorted: Sorted,
+    sorted: ClassifiedFrame,
 }
 
 /// The given properties of a bus.
 #[derive(Clone, Debug)]
-pub(super) struct Known {
+pub(super) struct BusProperties {
     pub(super) rates: BitRates,
     /// Number of the skin's cells on it.
     pub(super) cells: Option<u32>,
@@ -60,10 +60,10 @@ pub(super) struct Known {
 
 /// The model and the figures of one bus.
 #[derive(Debug)]
-pub(super) struct LinkId {
+pub(super) struct BusTiming {
     pub(super) name: String,
     pub(super) counts: Counts,
-    known: Known,
+    known: BusProperties,
     model: BusModel<Tag>,
     pending: VecDeque<Pending>,
     frames: u64,
@@ -76,13 +76,13 @@ pub(super) struct LinkId {
     traffic: Traffic,
     has_fd: bool,
     phases: Phases,
-    figures: Each<Figures>,
+    figures: ByPhase<Figures>,
     epochs: Epochs,
     queued: Vec<u32>,
 }
 
-impl LinkId {
-    pub(super) fn new(name: &str, known: Known, errors: Option<BitErrors>) -> Self {
+impl BusTiming {
+    pub(super) fn new(name: &str, known: BusProperties, errors: Option<BitErrors>) -> Self {
         let model = BusModel::new(known.rates);
         Self {
             name: name.to_owned(),
@@ -97,18 +97,18 @@ impl LinkId {
             traffic: Traffic::default(),
             has_fd: false,
             phases: Phases::default(),
-            figures: Each::default(),
+            figures: ByPhase::default(),
             epochs: Epochs::default(),
-            queued: vec![0; IDS],
+            queued: vec![0; IDENTIFIER_COUNT],
         }
     }
 
     /// Handles a frame that was latched before the start of the capture.
     pub(super) fn latched(&mut self, nanos: u64, frame: &Frame) {
         match self.traffic.sort(nanos, frame).says {
-            Says::Joints(_) => self.phases.beginning.in_the_middle = true,
-            says @ (Says::Halt | Says::Resume) => _ = self.epochs.hear(nanos, says, None),
-            Says::Answer(_) | Says::Preparation | Says::Other => {}
+            RunEvent::Joints(_) => self.phases.beginning.in_the_middle = true,
+            says @ (RunEvent::Halt | RunEvent::Resume) => _ = self.epochs.receive(nanos, says, None),
+            RunEvent::Answer(_) | RunEvent::Preparation | RunEvent::Other => {}
         }
     }
 
@@ -126,7 +126,7 @@ impl LinkId {
         frame: &Frame,
         bits: Bits,
         place: u64,
-        reported: Option<&mut Reported>,
+        reported: Option<&mut FrameTimings>,
     ) {
         let id = (!frame.is_extended()).then(|| u16::try_from(frame.id()).unwrap_or(0));
         let sorted = self.traffic.sort(nanos, frame);
@@ -136,8 +136,8 @@ impl LinkId {
             let first = self.pending.iter_mut().rev().find(|it| it.id == id);
             first.into_iter().for_each(|first| first.sorted.bench = sorted.bench);
         }
-        self.phases.beginning.see(nanos, sorted.says);
-        let pending = Pending { at: nanos, priority: Priority::of(frame), bits, place, id, sorted };
+        self.phases.beginning.record(nanos, sorted.says);
+        let pending = Pending { at: nanos, priority: Priority::from_frame(frame), bits, place, id, sorted };
         match self.pending.back() {
             Some(last) if last.at > nanos => {
                 self.counts.out_of_order += 1;
@@ -161,7 +161,7 @@ impl LinkId {
     }
 
     /// Ends the input.
-    pub(super) fn finish(&mut self, mut reported: Option<&mut Reported>) {
+    pub(super) fn finish(&mut self, mut reported: Option<&mut FrameTimings>) {
         while let Some(first) = self.pending.pop_front() {
             self.enter(first, reported.as_deref_mut());
         }
@@ -170,9 +170,9 @@ impl LinkId {
     }
 
     /// Requests the transmission of the next frame in order of time.
-    fn enter(&mut self, pending: Pending, mut reported: Option<&mut Reported>) {
+    fn enter(&mut self, pending: Pending, mut reported: Option<&mut FrameTimings>) {
         let Pending { at, priority, bits, place, id, sorted } = pending;
-        let Sorted { says, bench, from, .. } = sorted;
+        let ClassifiedFrame { says, bench, from, .. } = sorted;
         if let Some(bench) = bench {
             self.counts.bench.count(bench, 1);
             if !self.known.bench_traffic {
@@ -186,7 +186,7 @@ impl LinkId {
         self.model.run_until(at);
         self.drain(reported.as_deref_mut());
         let phase = self.phases.at(at, says, self.traffic.is_ours());
-        let answer = self.epochs.hear(at, says, from);
+        let answer = self.epochs.receive(at, says, from);
         let took = bits.nanoseconds(self.model.rates());
         let figures = self.figures.of(phase);
         figures.request(at, took);
@@ -206,11 +206,11 @@ impl LinkId {
     }
 
     /// Handles completed transmissions.
-    fn drain(&mut self, mut reported: Option<&mut Reported>) {
+    fn drain(&mut self, mut reported: Option<&mut FrameTimings>) {
         while let Some(attempt) = self.model.poll() {
             let Attempt { tag: Tag { place, id, phase, answer }, at, start, end, is_damaged } = attempt;
             self.wire_end = end;
-            self.figures.of(self.phases.now()).busy.take(start, end, SATURATED_NS);
+            self.figures.of(self.phases.now()).busy.record(start, end, SATURATED_NS);
             if is_damaged {
                 self.counts.damaged += 1;
                 continue;
@@ -220,7 +220,7 @@ impl LinkId {
             let queued = id.and_then(|id| self.queued.get_mut(usize::from(id)));
             queued.into_iter().for_each(|queued| *queued -= 1);
             if let Some((epoch, was_late)) = answer {
-                self.epochs.answered(epoch, was_late, (at, end));
+                self.epochs.record_answer(epoch, was_late, (at, end));
             }
             if let Some(reported) = &mut reported {
                 reported.sent(place, Some((start, end)));
@@ -255,15 +255,15 @@ impl LinkId {
             delay_us: Delays::default(),
             kinds: Vec::new(),
             replies: None,
-            queue: Most::default(),
-            queue_of_one: Most::default(),
+            queue: Peak::default(),
+            queue_of_one: Peak::default(),
             queue_of_one_id: 0,
             ..timed
         }
     }
 
     fn timed(&self, first: u64, last: u64) -> BusShadow {
-        let Each { start_up, operation } = &self.figures;
+        let ByPhase { start_up, operation } = &self.figures;
         let span = self.phases.spans.operation;
         let overrun = self.wire_end.saturating_sub(self.released);
         let load = operation.loads(span, overrun);
@@ -291,7 +291,7 @@ impl LinkId {
             counts: self.counts,
             load,
             stretches: operation.busy.stretches(SATURATED_NS),
-            delay_us: Delays::of(&operation.all),
+            delay_us: Delays::from_times(&operation.all),
             kinds: if is_ours { operation.kinds() } else { Vec::new() },
             replies: Some(replies).filter(|replies| is_ours && replies.count > 0),
             queue: operation.queue,

@@ -5,7 +5,7 @@ use protocol::id::CellId;
 use protocol::packet::Epoch;
 
 use super::report::{Answering, Delays, Replies};
-use crate::fit::traffic::Says;
+use crate::fit::traffic::RunEvent;
 
 /// A set of cells of a bus.
 #[derive(Clone, Copy, Debug, Default)]
@@ -24,7 +24,7 @@ impl Set {
 
 /// The joints of one epoch.
 #[derive(Clone, Copy, Debug, Default)]
-struct Numbered {
+struct EpochAnswers {
     /// The time at which they were to be sent.
     at: u64,
     /// The cells that answered them, if they were sent while cells were not halted.
@@ -34,9 +34,9 @@ struct Numbered {
 /// Follows joints and their answers, in bounded memory.
 #[derive(Debug, Default)]
 pub(super) struct Epochs {
-    heard: Set,
+    senders: Set,
     /// By epoch.
-    numbered: Vec<Numbered>,
+    numbered: Vec<EpochAnswers>,
     newest: Option<Epoch>,
     halted: bool,
     closed: Counts,
@@ -63,18 +63,18 @@ impl Counts {
 
 impl Epochs {
     /// Handles a frame's meaning for joints and answers. Returns the joints that it answers, and whether it is late.
-    pub(super) fn hear(&mut self, at: u64, says: Says, from: Option<CellId>) -> Option<(Epoch, bool)> {
-        from.into_iter().for_each(|cell| self.heard.insert(cell));
+    pub(super) fn receive(&mut self, at: u64, says: RunEvent, from: Option<CellId>) -> Option<(Epoch, bool)> {
+        from.into_iter().for_each(|cell| self.senders.insert(cell));
         match says {
-            Says::Joints(epoch) => self.joints(at, epoch),
-            Says::Answer(epoch) => {
+            RunEvent::Joints(epoch) => self.joints(at, epoch),
+            RunEvent::Answer(epoch) => {
                 let answered = &mut self.numbered(epoch).answered;
                 from.into_iter().zip(answered).for_each(|(cell, answered)| answered.insert(cell));
                 return Some((epoch, self.newest.is_some_and(|newest| newest != epoch)));
             }
-            Says::Halt => self.halted = true,
-            Says::Resume => self.halted = false,
-            Says::Preparation | Says::Other => {}
+            RunEvent::Halt => self.halted = true,
+            RunEvent::Resume => self.halted = false,
+            RunEvent::Preparation | RunEvent::Other => {}
         }
         None
     }
@@ -93,13 +93,13 @@ impl Epochs {
         self.epochs_halted += u64::from(halted);
     }
 
-    fn numbered(&mut self, epoch: Epoch) -> &mut Numbered {
-        self.numbered.resize(256, Numbered::default());
+    fn numbered(&mut self, epoch: Epoch) -> &mut EpochAnswers {
+        self.numbered.resize(256, EpochAnswers::default());
         self.numbered.get_mut(usize::from(epoch.0)).expect("an epoch is one byte")
     }
 
     /// Records the end of an answer that was to be sent at `at`.
-    pub(super) fn answered(&mut self, epoch: Epoch, was_late: bool, (at, end): (u64, u64)) {
+    pub(super) fn record_answer(&mut self, epoch: Epoch, was_late: bool, (at, end): (u64, u64)) {
         let Some(newest) = self.newest else { return };
         self.replies.count += 1;
         if was_late {
@@ -119,7 +119,7 @@ impl Epochs {
 
     /// Returns the answers to joints, by their times.
     pub(super) fn replies(&self) -> Replies {
-        Replies { after_joints_us: Delays::of(&self.after_joints), ..self.replies }
+        Replies { after_joints_us: Delays::from_times(&self.after_joints), ..self.replies }
     }
 
     /// Returns the figures of answering cells; the number of cells is the skin's if known.
@@ -131,7 +131,7 @@ impl Epochs {
             epochs_halted: self.epochs_halted,
             mean: (all.epochs > 0).then(|| all.answers as f64 / all.epochs as f64),
             most: all.most,
-            cells: described.unwrap_or_else(|| self.heard.len()),
+            cells: described.unwrap_or_else(|| self.senders.len()),
             described: described.is_some(),
         }
     }
@@ -149,9 +149,9 @@ mod tests {
     fn each_cell_counts_once_an_epoch_however_late_and_halted_epochs_not_at_all() {
         let mut epochs = Epochs::default();
         let answer = |epochs: &mut Epochs, node, epoch| {
-            epochs.hear(0, Says::Answer(Epoch(epoch)), Some(cell(node)));
+            epochs.receive(0, RunEvent::Answer(Epoch(epoch)), Some(cell(node)));
         };
-        let joints = |epochs: &mut Epochs, epoch| epochs.hear(0, Says::Joints(Epoch(epoch)), None);
+        let joints = |epochs: &mut Epochs, epoch| epochs.receive(0, RunEvent::Joints(Epoch(epoch)), None);
         answer(&mut epochs, 9, 255);
         for epoch in 0..=255 {
             joints(&mut epochs, epoch);
@@ -163,7 +163,7 @@ mod tests {
         answer(&mut epochs, 3, 254);
         joints(&mut epochs, 0);
         answer(&mut epochs, 1, 0);
-        epochs.hear(0, Says::Halt, None);
+        epochs.receive(0, RunEvent::Halt, None);
         joints(&mut epochs, 1);
         answer(&mut epochs, 1, 1);
         let report = epochs.answering(None);

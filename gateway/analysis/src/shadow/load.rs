@@ -2,10 +2,10 @@
 
 use std::collections::VecDeque;
 
-use super::report::{Most, Stretches};
+use super::report::{Peak, Stretches};
 
 /// Maximum number of distinct times within a window; further ones count to the last.
-const MOMENTS: usize = 1 << 16;
+const MAX_WINDOW_TIMES: usize = 1 << 16;
 
 /// The highest load within any window of `SPAN` ns, with any start.
 #[derive(Debug, Default)]
@@ -14,7 +14,7 @@ pub(super) struct Window<const SPAN: u64> {
     requested: VecDeque<(u64, u64)>,
     sum: u64,
     /// The highest share of a window, and its start.
-    pub(super) most: Most,
+    pub(super) most: Peak,
 }
 
 impl<const SPAN: u64> Window<SPAN> {
@@ -25,7 +25,7 @@ impl<const SPAN: u64> Window<SPAN> {
             self.sum -= gone;
             debug_assert!(then <= at, "time runs forwards");
         }
-        let is_full = self.requested.len() >= MOMENTS;
+        let is_full = self.requested.len() >= MAX_WINDOW_TIMES;
         match self.requested.back_mut() {
             Some((then, sum)) if *then == at || is_full => *sum += nanos,
             _ => self.requested.push_back((at, nanos)),
@@ -48,7 +48,7 @@ pub(super) struct Busy {
 
 impl Busy {
     /// Records a transmission, in order of time.
-    pub(super) fn take(&mut self, start: u64, end: u64, saturated: u64) {
+    pub(super) fn record(&mut self, start: u64, end: u64, saturated: u64) {
         self.total += end - start;
         if start > self.end {
             self.close(saturated);
@@ -97,7 +97,7 @@ mod tests {
     fn stretches_end_where_the_wire_is_free() {
         let mut busy = Busy::default();
         for (start, end) in [(10, 20), (20, 45), (50, 55), (60, 90), (90, 100)] {
-            busy.take(start, end, 30);
+            busy.record(start, end, 30);
         }
         let stretches = busy.stretches(30);
         assert_eq!((busy.total, stretches.count, stretches.longest_s.at_ns), (80, 2, 60));

@@ -28,15 +28,15 @@ use protocol::wire_time::{BitRates, Bits};
 use crate::fit;
 use crate::fit::verdict::Answer;
 use bus_model::{BitErrors, BitErrorsError};
-use bus_timing::{Known, LinkId};
-use reported::Reported;
+use bus_timing::{BusProperties, BusTiming};
+use reported::FrameTimings;
 
 pub use bus_timing::MAX_QUEUE;
 pub use phase::PAUSE_NS;
 pub use report::{
-    Answering, BusShadow, Counts, Delays, KindDelays, Loads, Most, Replies, Report, StartUp, Stretches,
+    Answering, BusShadow, Counts, Delays, KindDelays, Loads, Peak, Replies, Report, StartUp, Stretches,
 };
-pub use reported::Shaded;
+pub use reported::FrameTiming;
 pub use trace::order::{WINDOW_FRAMES, WINDOW_NS};
 
 /// Duration without a pause, in ns, from which a bus counts as saturated: the most common period of joints.
@@ -45,7 +45,7 @@ pub const SATURATED_NS: u64 = 16_000_000;
 const SECOND_NS: u64 = 1_000_000_000;
 
 /// Maximum number of modelled buses.
-pub const BUSES: usize = 64;
+pub const MAX_BUSES: usize = 64;
 
 /// Properties of the buses.
 #[derive(Clone, Debug)]
@@ -82,27 +82,27 @@ impl Options {
     }
 
     /// Returns the properties of a bus.
-    fn of(&self, bus: &str) -> Known {
+    fn of(&self, bus: &str) -> BusProperties {
         let named = self.of_bus.iter().find(|(name, _)| name == bus);
         let rates = named.map_or(self.rates, |(_, rates)| *rates);
         let described = self.skin.as_ref().and_then(|skin| Some((skin, skin.bus_named(bus)?)));
         let cells =
-            described.map(|(skin, bus)| u32::try_from(skin.cells_of(bus).count()).unwrap_or(u32::MAX));
+            described.map(|(skin, bus)| u32::try_from(skin.cells_on_bus(bus).count()).unwrap_or(u32::MAX));
         let worst_case = described.and_then(|(skin, bus)| fit::worst_case(skin, bus, rates));
         let worst_case = worst_case.as_ref().map(Answer::worst_case);
-        Known { rates, cells, worst_case, bench_traffic: self.bench_traffic }
+        BusProperties { rates, cells, worst_case, bench_traffic: self.bench_traffic }
     }
 }
 
 /// The latest time of a frame, in ns since 1970.
-const LATEST: u64 = u64::MAX / 2;
+const MAX_TIME_NS: u64 = u64::MAX / 2;
 
 /// The model of the buses' traffic.
 #[derive(Debug)]
 pub struct Shadow {
     options: Options,
-    bus_timings: Vec<LinkId>,
-    reported: Option<Reported>,
+    bus_timings: Vec<BusTiming>,
+    reported: Option<FrameTimings>,
     frames: u64,
     further: u64,
     has_times: bool,
@@ -115,22 +115,22 @@ impl Shadow {
     /// Returns [`BitErrorsError`] if the bit-error rate is outside its range.
     pub fn new(options: Options) -> Result<Self, BitErrorsError> {
         BitErrors::new(options.bit_errors, options.seed)?;
-        let reported = options.each_frame.then(Reported::default);
+        let reported = options.each_frame.then(FrameTimings::default);
         Ok(Self { options, bus_timings: Vec::new(), reported, frames: 0, further: 0, has_times: true })
     }
 
     /// Handles the next frame of a bus, with its time in ns. Times after the year 2262 are set to its end, because the
     /// transmission comes even later and must fit, too.
     pub fn frame(&mut self, bus: &str, nanos: u64, frame: &Frame) {
-        let nanos = nanos.min(LATEST);
+        let nanos = nanos.min(MAX_TIME_NS);
         let place = self.frames;
         self.frames += 1;
         let bus_timing = self.bus_timing(bus);
-        let bits = bus_timing.and_then(|_| Bits::of(frame));
+        let bits = bus_timing.and_then(|_| Bits::from_frame(frame));
         if let Some(reported) = &mut self.reported {
             let (id, extended) =
                 (frame.id() | frame.raw_id() & ERROR, frame.is_extended() || frame.is_error());
-            reported.enter(Shaded { nanos, bus: bus_timing, id, extended, bits, sent: None });
+            reported.enter(FrameTiming { nanos, bus: bus_timing, id, extended, bits, sent: None });
         }
         let Some(bus_timing) = bus_timing.and_then(|bus_timing| self.bus_timings.get_mut(bus_timing)) else {
             self.further += 1;
@@ -166,11 +166,11 @@ impl Shadow {
     /// Ends the input: all waiting frames are sent.
     pub fn finish(&mut self) {
         self.bus_timings.iter_mut().for_each(|bus_timing| bus_timing.finish(self.reported.as_mut()));
-        self.reported.iter_mut().for_each(Reported::finish);
+        self.reported.iter_mut().for_each(FrameTimings::finish);
     }
 
     /// Returns the next frame in input order, once its transmission is known.
-    pub fn poll(&mut self) -> Option<Shaded> {
+    pub fn poll(&mut self) -> Option<FrameTiming> {
         self.reported.as_mut()?.poll()
     }
 
@@ -195,14 +195,14 @@ impl Shadow {
     fn bus_timing(&mut self, bus: &str) -> Option<usize> {
         // Usually the bus of the previous frame, or one of a few.
         let known = self.bus_timings.iter().position(|bus_timing| bus_timing.name == bus);
-        if known.is_some() || self.bus_timings.len() >= BUSES {
+        if known.is_some() || self.bus_timings.len() >= MAX_BUSES {
             return known;
         }
         let index = self.bus_timings.len();
         let seed = self.options.seed.wrapping_add(u64::try_from(index).unwrap_or(0));
         let errors = BitErrors::new(self.options.bit_errors, seed).ok();
         let errors = errors.filter(|_| self.options.bit_errors > 0.0);
-        self.bus_timings.push(LinkId::new(bus, self.options.of(bus), errors));
+        self.bus_timings.push(BusTiming::new(bus, self.options.of(bus), errors));
         Some(index)
     }
 }

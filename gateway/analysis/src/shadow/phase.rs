@@ -4,15 +4,15 @@ use model::quantiles::Times;
 use protocol::id::{Id, Kind};
 
 use super::load::{Busy, Window};
-use super::report::{Delays, KindDelays, Loads, Most, StartUp};
+use super::report::{Delays, KindDelays, Loads, Peak, StartUp};
 use super::{SATURATED_NS, SECOND_NS};
-use crate::fit::traffic::Says;
+use crate::fit::traffic::RunEvent;
 
 /// Time without joints, in ns, after which operation ends.
 pub const PAUSE_NS: u64 = SECOND_NS;
 /// Maximum time, in ns, to the first joints in a capture that begins in the middle of a run: some periods, and less
 /// than a start takes.
-const SOON_NS: u64 = 100_000_000;
+const MAX_FIRST_JOINTS_NS: u64 = 100_000_000;
 
 /// The phase of a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -26,12 +26,12 @@ pub(super) enum Phase {
 
 /// A value for each phase.
 #[derive(Debug, Default)]
-pub(super) struct Each<T> {
+pub(super) struct ByPhase<T> {
     pub(super) start_up: T,
     pub(super) operation: T,
 }
 
-impl<T> Each<T> {
+impl<T> ByPhase<T> {
     pub(super) const fn of(&mut self, phase: Phase) -> &mut T {
         match phase {
             Phase::StartUp => &mut self.start_up,
@@ -42,7 +42,7 @@ impl<T> Each<T> {
 
 /// The start of a capture: observations before the first frame enters the model.
 #[derive(Debug, Default)]
-pub(super) struct Beginning {
+pub(super) struct CaptureStart {
     first: Option<u64>,
     joints: Option<u64>,
     is_prepared: bool,
@@ -51,23 +51,23 @@ pub(super) struct Beginning {
     pub(super) in_the_middle: bool,
 }
 
-impl Beginning {
-    pub(super) fn see(&mut self, at: u64, says: Says) {
+impl CaptureStart {
+    pub(super) fn record(&mut self, at: u64, says: RunEvent) {
         let first = self.first.unwrap_or(at).min(at);
         self.first = Some(first);
         if self.joints.is_some() {
             return;
         }
         match says {
-            Says::Joints(_) => self.joints = Some(at),
-            Says::Answer(_) => self.is_answered = true,
-            Says::Preparation | Says::Resume => self.is_prepared = true,
-            Says::Halt | Says::Other => {}
+            RunEvent::Joints(_) => self.joints = Some(at),
+            RunEvent::Answer(_) => self.is_answered = true,
+            RunEvent::Preparation | RunEvent::Resume => self.is_prepared = true,
+            RunEvent::Halt | RunEvent::Other => {}
         }
     }
 
     fn phase(&self, is_ours: bool) -> Phase {
-        let soon = self.joints.zip(self.first).is_some_and(|(joints, first)| joints - first < SOON_NS);
+        let soon = self.joints.zip(self.first).is_some_and(|(joints, first)| joints - first < MAX_FIRST_JOINTS_NS);
         let in_the_middle = self.in_the_middle || self.is_answered || soon && !self.is_prepared;
         if in_the_middle || !is_ours { Phase::Operation } else { Phase::StartUp }
     }
@@ -76,18 +76,18 @@ impl Beginning {
 /// The current phase, and the durations of both.
 #[derive(Debug, Default)]
 pub(super) struct Phases {
-    pub(super) beginning: Beginning,
+    pub(super) beginning: CaptureStart,
     now: Option<Phase>,
     /// The time up to which durations are counted, in ns.
     until: u64,
     joints: Option<u64>,
     /// Durations in ns.
-    pub(super) spans: Each<u64>,
+    pub(super) spans: ByPhase<u64>,
 }
 
 impl Phases {
     /// Returns the phase of a frame at a time; times never decrease.
-    pub(super) fn at(&mut self, at: u64, says: Says, is_ours: bool) -> Phase {
+    pub(super) fn at(&mut self, at: u64, says: RunEvent, is_ours: bool) -> Phase {
         let mut now = *self.now.get_or_insert_with(|| {
             self.until = at;
             self.beginning.phase(is_ours)
@@ -98,7 +98,7 @@ impl Phases {
             now = Phase::StartUp;
         }
         self.count(now, at);
-        if matches!(says, Says::Joints(_)) {
+        if matches!(says, RunEvent::Joints(_)) {
             now = Phase::Operation;
             self.joints = Some(at);
         }
@@ -127,8 +127,8 @@ pub(super) struct Figures {
     pub(super) all: Times,
     kinds: [Times; 8],
     /// The largest number of waiting frames, of all identifiers and of one.
-    pub(super) queue: Most,
-    pub(super) queue_of_one: Most,
+    pub(super) queue: Peak,
+    pub(super) queue_of_one: Peak,
     pub(super) queue_of_one_id: u16,
 }
 
@@ -160,7 +160,7 @@ impl Figures {
 
     pub(super) fn kinds(&self) -> Vec<KindDelays> {
         let kinds = Kind::ALL.into_iter().zip(&self.kinds).filter(|(_, delay)| !delay.histogram().is_empty());
-        kinds.map(|(kind, delay)| KindDelays { kind: kind.name(), delay_us: Delays::of(delay) }).collect()
+        kinds.map(|(kind, delay)| KindDelays { kind: kind.name(), delay_us: Delays::from_times(delay) }).collect()
     }
 
     /// Returns the load of a phase with this duration, and with transmissions beyond its end.
@@ -172,7 +172,7 @@ impl Figures {
             // high load.
             0..SECOND_NS => {
                 let all = self.requested as f64 / span.max(SATURATED_NS) as f64;
-                Most { value: worst_1_s.value.max(all), ..worst_1_s }
+                Peak { value: worst_1_s.value.max(all), ..worst_1_s }
             }
             _ => worst_1_s,
         };
@@ -188,7 +188,7 @@ impl Figures {
             duration_s: span as f64 / 1e9,
             load: self.loads(span, 0),
             stretches: self.busy.stretches(SATURATED_NS),
-            delay_us: Delays::of(&self.all),
+            delay_us: Delays::from_times(&self.all),
         })
     }
 }

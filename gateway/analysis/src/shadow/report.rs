@@ -65,9 +65,9 @@ pub struct BusShadow {
     /// Answers to joints, if the bus carries this project's protocol.
     pub replies: Option<Replies>,
     /// The largest number of waiting frames.
-    pub queue: Most,
+    pub queue: Peak,
     /// The largest number of waiting frames of one 11-bit identifier.
-    pub queue_of_one: Most,
+    pub queue_of_one: Peak,
     /// That identifier.
     pub queue_of_one_id: u32,
 }
@@ -117,23 +117,23 @@ pub struct Loads {
     /// Mean over the whole time; `None` with fewer than two different times.
     pub mean: Option<f64>,
     /// The highest load within any 16 ms.
-    pub worst_16_ms: Most,
+    pub worst_16_ms: Peak,
     /// The highest load within any second, or within the whole time if that is shorter.
-    pub worst_1_s: Most,
+    pub worst_1_s: Peak,
     /// The share of time in which the bus was busy.
     pub busy: Option<f64>,
 }
 
 /// The maximum of a quantity, and its time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Most {
+pub struct Peak {
     /// The maximum.
     pub value: f64,
     /// The time or the start of the maximum, in ns of the capture's clock.
     pub at_ns: u64,
 }
 
-impl Most {
+impl Peak {
     /// Records a value if it exceeds the maximum.
     pub(super) fn raise(&mut self, value: f64, at_ns: u64) {
         if value > self.value {
@@ -150,7 +150,7 @@ pub struct Stretches {
     /// Their total duration.
     pub total_s: f64,
     /// The longest stretch of all.
-    pub longest_s: Most,
+    pub longest_s: Peak,
 }
 
 /// Quantiles of a duration, in µs.
@@ -216,7 +216,7 @@ pub struct Replies {
 }
 
 impl Delays {
-    pub(super) fn of(times: &Times) -> Self {
+    pub(super) fn from_times(times: &Times) -> Self {
         let (histogram, most) = (times.histogram(), times.longest());
         let micros = |nanos: u64| nanos as f64 / 1e3;
         let quantile = |share| micros(histogram.value_at_quantile(share).min(most));

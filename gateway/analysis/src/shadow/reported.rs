@@ -6,7 +6,7 @@ use protocol::wire_time::Bits;
 
 /// The transmission of a frame on a real bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Shaded {
+pub struct FrameTiming {
     /// Its time in the capture, in ns.
     pub nanos: u64,
     /// Its bus, for [`super::Shadow::bus`]; `None` for buses that are not modelled.
@@ -25,21 +25,21 @@ pub struct Shaded {
 
 #[derive(Clone, Copy, Debug)]
 struct Entry {
-    shaded: Shaded,
+    shaded: FrameTiming,
     is_open: bool,
 }
 
 /// Frames that wait for earlier ones.
 #[derive(Debug, Default)]
-pub(super) struct Reported {
+pub(super) struct FrameTimings {
     entries: VecDeque<Entry>,
     /// The index of the first entry.
     first: u64,
 }
 
-impl Reported {
+impl FrameTimings {
     /// Adds a frame; with bits, its transmission is still unknown.
-    pub(super) fn enter(&mut self, shaded: Shaded) {
+    pub(super) fn enter(&mut self, shaded: FrameTiming) {
         self.entries.push_back(Entry { shaded, is_open: shaded.bits.is_some() });
     }
 
@@ -53,7 +53,7 @@ impl Reported {
         self.settle(place, |shaded| shaded.sent = sent);
     }
 
-    fn settle(&mut self, place: u64, change: impl FnOnce(&mut Shaded)) {
+    fn settle(&mut self, place: u64, change: impl FnOnce(&mut FrameTiming)) {
         let index = usize::try_from(place - self.first).ok();
         if let Some(entry) = index.and_then(|index| self.entries.get_mut(index)) {
             change(&mut entry.shaded);
@@ -65,7 +65,7 @@ impl Reported {
         self.entries.iter_mut().for_each(|entry| entry.is_open = false);
     }
 
-    pub(super) fn poll(&mut self) -> Option<Shaded> {
+    pub(super) fn poll(&mut self) -> Option<FrameTiming> {
         let shaded = self.entries.front().filter(|entry| !entry.is_open)?.shaded;
         self.entries.pop_front();
         self.first += 1;

@@ -27,8 +27,8 @@ pub enum FrameType {
 
 /// Counts the foreign frames of a bus.
 #[derive(Debug, Default)]
-pub(super) struct Foreigners {
-    identifiers: BTreeMap<(FrameType, u32), Seen>,
+pub(super) struct ForeignCounter {
+    identifiers: BTreeMap<(FrameType, u32), IdentifierCounts>,
     /// Number of frames with identifiers beyond those that are counted separately.
     others: u64,
     /// Number of groups of frames with a checked CRC: a single frame, or one with those before it that complete a
@@ -37,7 +37,7 @@ pub(super) struct Foreigners {
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Seen {
+struct IdentifierCounts {
     count: Count,
     bytes: (u8, u8),
     wrong_crc: u64,
@@ -90,8 +90,8 @@ pub struct ForeignId {
     pub wrong_crc: u64,
 }
 
-impl Foreigners {
-    pub(super) fn take(&mut self, nanos: u64, frame: &Frame, why: Foreign) {
+impl ForeignCounter {
+    pub(super) fn record(&mut self, nanos: u64, frame: &Frame, why: Foreign) {
         let of = match why {
             Foreign::Error(_) => FrameType::Error,
             Foreign::Remote => FrameType::Remote,
@@ -109,7 +109,7 @@ impl Foreigners {
             return;
         }
         let len = frame.len();
-        let seen = self.identifiers.entry(key).or_insert_with(|| Seen {
+        let seen = self.identifiers.entry(key).or_insert_with(|| IdentifierCounts {
             count: Count::default(),
             bytes: (len, len),
             wrong_crc: 0,
@@ -147,10 +147,10 @@ impl Foreigners {
 /// Returns the number of packet lengths that a classic frame can complete.
 fn groups(frame: &Frame) -> u64 {
     let ends = |length: &Length| length.last_segment() == frame.data().len();
-    data_id(frame).map_or(0, |id| Lengths::of(id).iter().filter(ends).count() as u64)
+    data_id(frame).map_or(0, |id| Lengths::for_id(id).iter().filter(ends).count() as u64)
 }
 
-impl Seen {
+impl IdentifierCounts {
     fn report(&self, of: FrameType, raw_id: u32, earliest: u64) -> ForeignId {
         let Self { count, bytes, wrong_crc } = *self;
         let since = |nanos: u64| seconds(nanos.saturating_sub(earliest));

@@ -23,7 +23,7 @@ impl Tape {
         settler.finish();
         while let Some(((nanos, bus, frame), decoded)) = settler.pop() {
             let time = Timestamp::six_digits(nanos);
-            self.stats.take(&Record { time, interface: &bus, frame, direction: None }, &decoded);
+            self.stats.record(&Record { time, interface: &bus, frame, direction: None }, &decoded);
         }
     }
 
@@ -182,8 +182,8 @@ fn wires_are_counted_apart_and_are_no_frames_of_the_bus() {
     let mut tape = Tape::default();
     let bus_stats = port::LinkId { wire: 3, back: false };
     tape.joints(0);
-    tape.frame("vcan0", bus_stats.frame(port::PortMessage::Join));
-    tape.frame("vcan0", bus_stats.frame(port::PortMessage::Leave));
+    tape.frame("vcan0", bus_stats.encode_frame(port::PortMessage::Join));
+    tape.frame("vcan0", bus_stats.encode_frame(port::PortMessage::Leave));
     tape.joints(1);
     let bus = tape.bus();
     assert_eq!((bus.frames, bus.wires, bus.wires_per_s), (2, 2, Some(1_000.0)));
@@ -221,7 +221,7 @@ fn memory_is_bounded_whatever_buses_a_capture_names() {
         tape.frame(&format!("can{bus}"), frame);
     }
     let report = tape.stats.report();
-    assert_eq!((report.buses.len(), report.frames_of_other_buses, report.frames), (BUSES, 936, 1_000));
+    assert_eq!((report.buses.len(), report.frames_of_other_buses, report.frames), (MAX_BUSES, 936, 1_000));
 }
 
 #[test]
@@ -234,7 +234,7 @@ fn a_rate_needs_two_times_of_its_own_bus() {
         settler.finish();
         let ((), decoded) = settler.pop().unwrap();
         let time = Timestamp::nine_digits(nanos);
-        stats.take(&Record { time, interface: bus, frame, direction: None }, &decoded);
+        stats.record(&Record { time, interface: bus, frame, direction: None }, &decoded);
     }
     let rates = |stats: &Stats| {
         let rate =

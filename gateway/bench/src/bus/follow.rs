@@ -21,7 +21,7 @@ use protocol::bus::batch::BATCH;
 use protocol::bus::{Bus, BusError, Inbox, Received};
 use protocol::id::CellId;
 
-use super::roots::Roots;
+use super::roots::RootWires;
 
 /// Pause while an interface is down.
 const DOWN_PAUSE: Duration = Duration::from_millis(50);
@@ -42,9 +42,9 @@ pub trait Source {
 
 /// A bus that is never reopened: its follower ends when the bus is gone.
 #[derive(Debug)]
-pub struct Once<'a>(pub &'a Bus);
+pub struct OpenedOnce<'a>(pub &'a Bus);
 
-impl Source for Once<'_> {
+impl Source for OpenedOnce<'_> {
     fn bus(&self) -> Option<&Bus> {
         Some(self.0)
     }
@@ -56,7 +56,7 @@ impl Source for Once<'_> {
 
 /// The outcome of one [`Follower::step`].
 #[derive(Debug)]
-pub enum Step {
+pub enum FollowStep {
     /// Frames arrived; holds the number of frames in the inbox.
     Frames(usize),
     /// No frame arrived before the timeout.
@@ -75,7 +75,7 @@ pub enum Step {
 
 /// One item received in a step.
 #[derive(Debug)]
-pub enum Part {
+pub enum FollowedItem {
     /// A frame from a cell, from the gateway or from another program.
     Frame(Received),
     /// A root starts (true) or stops (false) feeding its sum to the gateway.
@@ -83,10 +83,10 @@ pub enum Part {
 }
 
 #[derive(Debug, Default)]
-enum State {
+enum FollowState {
     #[default]
-    Works,
-    Drains,
+    Working,
+    Draining,
     Lost,
     Gone {
         retry: Option<Instant>,
@@ -97,11 +97,11 @@ enum State {
 #[derive(Debug, Default)]
 pub struct Follower {
     /// The gateway's ends of the wires to the roots, on buses where cells reply with sums.
-    pub roots: Option<Roots>,
+    pub roots: Option<RootWires>,
     /// Time to wait after frames arrive, so that one wake-up reads many.
     gather: Duration,
     inbox: Inbox,
-    state: State,
+    state: FollowState,
     /// Frames dropped on earlier sockets of this bus.
     dropped_before: u64,
     /// Last reported reason why the bus does not open.
@@ -121,23 +121,23 @@ pub fn fill(bus: &Bus, inbox: &mut Inbox, wait: Duration) -> Result<usize, BusEr
 impl Follower {
     /// Follows a bus that has these wires to roots. `gather` is the time to wait for more frames after some arrived.
     #[must_use]
-    pub fn new(roots: Option<Roots>, gather: Duration) -> Self {
+    pub fn new(roots: Option<RootWires>, gather: Duration) -> Self {
         Self { roots, gather, ..Self::default() }
     }
 
     /// Sends due messages on the wires to the roots, then receives or handles a loss. Returns after about `wait` plus
     /// the time to gather at the latest.
-    pub fn step(&mut self, source: &mut impl Source, wait: Duration) -> Step {
+    pub fn step(&mut self, source: &mut impl Source, wait: Duration) -> FollowStep {
         let bus = match source.bus() {
-            Some(bus) if !matches!(self.state, State::Gone { .. }) => bus,
+            Some(bus) if !matches!(self.state, FollowState::Gone { .. }) => bus,
             Some(_) | None => return self.reopen(source, wait),
         };
         let mut timeout = wait;
         if let Some(roots) = &mut self.roots {
-            roots.speak(bus);
+            roots.send_due(bus);
             timeout = wait.min(roots.timeout());
         }
-        if matches!(self.state, State::Drains) {
+        if matches!(self.state, FollowState::Draining) {
             return self.drain(|inbox| bus.receive(inbox));
         }
         // A full inbox has more frames behind it: do not wait.
@@ -149,15 +149,15 @@ impl Follower {
 
     /// Passes each item of the last step to `each`, in order of arrival. Frames on the wires to the roots are handled
     /// here.
-    pub fn parts(&mut self, mut each: impl FnMut(Part)) {
+    pub fn parts(&mut self, mut each: impl FnMut(FollowedItem)) {
         for received in self.inbox.frames() {
             if let Some(roots) = &mut self.roots
-                && roots.take(&received.frame)
+                && roots.handle_frame(&received.frame)
             {
-                roots.changes().for_each(|(root, feeds)| each(Part::Feeds(root, feeds)));
+                roots.changes().for_each(|(root, feeds)| each(FollowedItem::Feeds(root, feeds)));
                 continue;
             }
-            each(Part::Frame(received));
+            each(FollowedItem::Frame(received));
         }
     }
 
@@ -175,76 +175,76 @@ impl Follower {
     /// Returns true if the bus has failed and has neither been reopened nor delivered a frame since.
     #[must_use]
     pub const fn is_lost(&self) -> bool {
-        !matches!(self.state, State::Works)
+        !matches!(self.state, FollowState::Working)
     }
 
-    fn receive(&mut self, fill: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> Step {
+    fn receive(&mut self, fill: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> FollowStep {
         match fill(&mut self.inbox) {
-            Ok(0) => Step::Nothing,
+            Ok(0) => FollowStep::Nothing,
             Ok(count) => {
-                self.state = State::Works;
-                Step::Frames(count)
+                self.state = FollowState::Working;
+                FollowStep::Frames(count)
             }
-            Err(error) if !error.may_pass() => self.gone(error),
-            Err(_) if matches!(self.state, State::Lost) => {
+            Err(error) if !error.is_temporary() => self.gone(error),
+            Err(_) if matches!(self.state, FollowState::Lost) => {
                 thread::sleep(DOWN_PAUSE);
-                Step::Nothing
+                FollowStep::Nothing
             }
             Err(error) => {
                 self.inbox.clear();
-                self.state = State::Drains;
-                Step::Down(error)
+                self.state = FollowState::Draining;
+                FollowStep::Down(error)
             }
         }
     }
 
     /// Reads frames received before a loss. They do not show that the bus works again.
-    fn drain(&mut self, receive: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> Step {
+    fn drain(&mut self, receive: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> FollowStep {
         // Pause before the first read, so that frames in flight have arrived.
         if self.inbox.frames().len() == 0 {
             thread::sleep(DOWN_PAUSE);
         }
         self.inbox.clear();
         match receive(&mut self.inbox) {
-            Ok(count @ 1..) => Step::Leftover(count),
+            Ok(count @ 1..) => FollowStep::Leftover(count),
             // An interface goes down before it is removed; both events are reported once.
-            Err(error) if !error.may_pass() => self.gone(error),
+            Err(error) if !error.is_temporary() => self.gone(error),
             Ok(0) | Err(_) => {
-                self.state = State::Lost;
-                Step::Drained
+                self.state = FollowState::Lost;
+                FollowStep::Drained
             }
         }
     }
 
-    fn gone(&mut self, error: BusError) -> Step {
+    fn gone(&mut self, error: BusError) -> FollowStep {
         self.inbox.clear();
         self.refused.clear();
-        self.state = State::Gone { retry: None };
-        Step::Gone(error)
+        self.state = FollowState::Gone { retry: None };
+        FollowStep::Gone(error)
     }
 
-    fn reopen(&mut self, source: &mut impl Source, wait: Duration) -> Step {
+    fn reopen(&mut self, source: &mut impl Source, wait: Duration) -> FollowStep {
         self.inbox.clear();
         let now = Instant::now();
-        if let State::Gone { retry: Some(retry) } = self.state
+        if let FollowState::Gone { retry: Some(retry) } = self.state
             && now < retry
         {
             thread::sleep(wait.min(retry - now));
-            return Step::Nothing;
+            return FollowStep::Nothing;
         }
         match source.reopen() {
             Ok(()) => {
                 self.dropped_before += u64::from(self.inbox.dropped());
                 self.inbox = Inbox::new();
-                self.state = State::Works;
-                Step::Nothing
+                self.state = FollowState::Working;
+                FollowStep::Nothing
             }
             Err(error) => {
-                self.state = State::Gone { retry: Some(now + REOPEN_INTERVAL) };
+                self.state = FollowState::Gone { retry: Some(now + REOPEN_INTERVAL) };
                 let why = error.to_string();
                 let is_new = !is_absent(&error) && self.refused != why;
                 self.refused = why;
-                if is_new { Step::Refused(error) } else { Step::Nothing }
+                if is_new { FollowStep::Refused(error) } else { FollowStep::Nothing }
             }
         }
     }
@@ -292,30 +292,30 @@ mod tests {
     #[test]
     fn a_loss_is_reported_once_and_frames_from_before_do_not_end_it() {
         let mut follower = Follower::default();
-        assert!(matches!(follower.receive(|_| Ok(0)), Step::Nothing));
-        assert!(matches!(follower.receive(|_| Ok(3)), Step::Frames(3)));
+        assert!(matches!(follower.receive(|_| Ok(0)), FollowStep::Nothing));
+        assert!(matches!(follower.receive(|_| Ok(3)), FollowStep::Frames(3)));
         assert!(!follower.is_lost());
-        assert!(matches!(follower.receive(|_| Err(down())), Step::Down(_)));
-        assert!(matches!(follower.drain(|_| Ok(2)), Step::Leftover(2)));
+        assert!(matches!(follower.receive(|_| Err(down())), FollowStep::Down(_)));
+        assert!(matches!(follower.drain(|_| Ok(2)), FollowStep::Leftover(2)));
         assert!(follower.is_lost());
-        assert!(matches!(follower.drain(|_| Ok(0)), Step::Drained));
-        assert!(matches!(follower.receive(|_| Err(down())), Step::Nothing), "it was reported");
-        assert!(matches!(follower.receive(|_| Ok(0)), Step::Nothing));
+        assert!(matches!(follower.drain(|_| Ok(0)), FollowStep::Drained));
+        assert!(matches!(follower.receive(|_| Err(down())), FollowStep::Nothing), "it was reported");
+        assert!(matches!(follower.receive(|_| Ok(0)), FollowStep::Nothing));
         assert!(follower.is_lost(), "silence is no sign that it works");
-        assert!(matches!(follower.receive(|_| Ok(1)), Step::Frames(1)));
+        assert!(matches!(follower.receive(|_| Ok(1)), FollowStep::Frames(1)));
         assert!(!follower.is_lost());
-        assert!(matches!(follower.receive(|_| Err(down())), Step::Down(_)), "another loss");
+        assert!(matches!(follower.receive(|_| Err(down())), FollowStep::Down(_)), "another loss");
     }
 
     #[test]
     fn an_interface_that_is_removed_goes_down_before() {
         let mut follower = Follower::default();
-        assert!(matches!(follower.receive(|_| Err(down())), Step::Down(_)));
-        assert!(matches!(follower.drain(|_| Err(gone())), Step::Gone(_)));
+        assert!(matches!(follower.receive(|_| Err(down())), FollowStep::Down(_)));
+        assert!(matches!(follower.drain(|_| Err(gone())), FollowStep::Gone(_)));
         let mut follower = Follower::default();
-        assert!(matches!(follower.receive(|_| Err(down())), Step::Down(_)));
-        assert!(matches!(follower.drain(|_| Err(down())), Step::Drained));
-        assert!(matches!(follower.receive(|_| Err(gone())), Step::Gone(_)), "after it is down as well");
+        assert!(matches!(follower.receive(|_| Err(down())), FollowStep::Down(_)));
+        assert!(matches!(follower.drain(|_| Err(down())), FollowStep::Drained));
+        assert!(matches!(follower.receive(|_| Err(gone())), FollowStep::Gone(_)), "after it is down as well");
     }
 
     #[test]
@@ -328,12 +328,12 @@ mod tests {
         let mut follower = Follower::default();
         let mut steps = Vec::new();
         let began = Instant::now();
-        assert!(matches!(follower.receive(|_| Err(gone())), Step::Gone(_)));
+        assert!(matches!(follower.receive(|_| Err(gone())), FollowStep::Gone(_)));
         while follower.is_lost() {
             match follower.step(&mut source, Duration::from_millis(30)) {
-                Step::Nothing => {}
-                Step::Refused(error) => steps.push(error.to_string()),
-                Step::Frames(_) | Step::Down(_) | Step::Leftover(_) | Step::Drained | Step::Gone(_) => {
+                FollowStep::Nothing => {}
+                FollowStep::Refused(error) => steps.push(error.to_string()),
+                FollowStep::Frames(_) | FollowStep::Down(_) | FollowStep::Leftover(_) | FollowStep::Drained | FollowStep::Gone(_) => {
                     panic!("a bus that is gone has neither frames nor a loss")
                 }
             }
@@ -342,6 +342,6 @@ mod tests {
         let reasons: Vec<_> = steps.iter().map(|step| step.contains("another")).collect();
         assert_eq!(reasons, [false, false, true], "an absence in between makes a reason new");
         assert_eq!(source.0.len(), 0);
-        assert!(matches!(follower.receive(|_| Err(gone())), Step::Gone(_)), "it may be lost again");
+        assert!(matches!(follower.receive(|_| Err(gone())), FollowStep::Gone(_)), "it may be lost again");
     }
 }

@@ -8,16 +8,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError, BusKind, Choice, Options, SendError};
+use protocol::bus::{Bus, BusError, BusKind, KindChoice, BusOptions, SendError};
 use protocol::can::Frame;
-use vcan_setup::hosts::report::Reports;
+use vcan_setup::hosts::report::ReportReader;
 
 use super::follow::Source;
 use control::cycle::turn::BusState;
 
 /// A bus shared by the threads of a run.
 #[derive(Debug)]
-pub struct Link {
+pub struct SharedBus {
     /// Name of the bus.
     pub name: String,
     /// Transport of the frames.
@@ -27,7 +27,7 @@ pub struct Link {
     /// State shared with the control loop.
     pub state: Arc<BusState>,
     /// Options with which the bus was opened, and is reopened.
-    target: Options,
+    target: BusOptions,
     bus: Mutex<Arc<Bus>>,
     gone: AtomicBool,
 }
@@ -39,16 +39,16 @@ pub type Slot = triple_buffer::Output<Arc<Bus>>;
 #[derive(Debug)]
 pub struct ReceiveEnd {
     /// The link shared with the other threads.
-    pub link: Arc<Link>,
+    pub link: Arc<SharedBus>,
     /// The bus as opened last.
     pub bus: Arc<Bus>,
     slot: triple_buffer::Input<Arc<Bus>>,
 }
 
-impl Link {
+impl SharedBus {
     /// Creates the link of a bus that was opened with these options.
     #[must_use]
-    pub fn new(bus: Bus, target: Options) -> (Arc<Self>, ReceiveEnd, Slot) {
+    pub fn new(bus: Bus, target: BusOptions) -> (Arc<Self>, ReceiveEnd, Slot) {
         let bus = Arc::new(bus);
         let link = Arc::new(Self {
             name: bus.name().to_owned(),
@@ -73,8 +73,8 @@ impl Link {
     ///
     /// # Errors
     /// Returns [`io::Error`] if no such program runs.
-    pub fn reports(&self) -> io::Result<Reports> {
-        Reports::connect(&self.name, self.kind, self.target.directory.as_deref())
+    pub fn reports(&self) -> io::Result<ReportReader> {
+        ReportReader::connect(&self.name, self.kind, self.target.directory.as_deref())
     }
 
     /// Sends frames. Not for the control loop: it waits while the bus is being exchanged.
@@ -90,7 +90,7 @@ impl Link {
 /// Returns true if a bus with this error may work again, after a wait or a reopening.
 #[must_use]
 pub const fn may_return(error: &BusError) -> bool {
-    error.may_pass() || error.is_closed()
+    error.is_temporary() || error.is_closed()
 }
 
 impl ReceiveEnd {
@@ -113,8 +113,8 @@ impl Source for ReceiveEnd {
 
     /// Reopens a bus that is gone, and passes it to all threads.
     fn reopen(&mut self) -> Result<(), BusError> {
-        let Link { name, kind, target, .. } = &*self.link;
-        self.bus = Arc::new(Bus::open(name, Choice::Only(*kind), target)?);
+        let SharedBus { name, kind, target, .. } = &*self.link;
+        self.bus = Arc::new(Bus::open(name, KindChoice::Only(*kind), target)?);
         *self.link.bus.lock().unwrap_or_else(PoisonError::into_inner) = Arc::clone(&self.bus);
         self.slot.write(Arc::clone(&self.bus));
         self.link.gone.store(false, Ordering::Relaxed);

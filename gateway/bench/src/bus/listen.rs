@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use model::decode::{Decoded, Decoder};
-use protocol::bus::{Bus, BusError, Choice, Inbox, Options, Received};
+use protocol::bus::{Bus, BusError, KindChoice, Inbox, BusOptions, Received};
 use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::time::Micros;
@@ -16,11 +16,11 @@ use super::realtime::wall;
 ///
 /// # Errors
 /// Returns [`BusError`] if the bus cannot be opened.
-pub fn open(name: &str, kind: Choice, format: Option<Format>, options: Options) -> Result<Bus, BusError> {
-    let options = Options { fd: format != Some(Format::Classic), ..options };
+pub fn open(name: &str, kind: KindChoice, format: Option<Format>, options: BusOptions) -> Result<Bus, BusError> {
+    let options = BusOptions { fd: format != Some(Format::Classic), ..options };
     match Bus::open(name, kind, &options) {
         Err(BusError::ClassicOnly { .. }) if format.is_none() => {
-            Bus::open(name, kind, &Options { fd: false, ..options })
+            Bus::open(name, kind, &BusOptions { fd: false, ..options })
         }
         opened => opened,
     }
@@ -72,7 +72,7 @@ impl Listener {
     ///
     /// # Errors
     /// Returns [`BusError`] if the bus is down, gone or closed.
-    pub fn hear(&mut self, wait: Duration) -> Result<bool, BusError> {
+    pub fn receive(&mut self, wait: Duration) -> Result<bool, BusError> {
         fill(&self.bus, &mut self.inbox, wait).map(|count| count > 0)
     }
 
@@ -98,7 +98,7 @@ impl Listener {
 pub fn passing<T>(done: Result<T, BusError>, pause: Duration) -> Result<Option<T>, BusError> {
     match done {
         Ok(done) => Ok(Some(done)),
-        Err(error) if error.may_pass() => {
+        Err(error) if error.is_temporary() => {
             std::thread::sleep(pause);
             Ok(None)
         }

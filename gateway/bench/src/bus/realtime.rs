@@ -13,7 +13,7 @@ use rustix::time::{Timespec, clock_gettime};
 
 use crate::system_calls;
 use control::cycle::Tick;
-use control::cycle::turn::{Shared, Turn};
+use control::cycle::turn::{Shared, TickDriver};
 use model::quantiles::histogram;
 
 /// Priority of the control loop: above ordinary threads, below the kernel's own.
@@ -92,7 +92,7 @@ pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
 
 /// Runs `ticks` ticks, or fewer if the loop is stopped. Skips whole periods that were missed; never resets the phase.
 pub fn run(
-    turn: &mut Turn,
+    turn: &mut TickDriver,
     shared: &Shared,
     period_ns: u64,
     ticks: u64,

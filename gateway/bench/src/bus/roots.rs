@@ -6,15 +6,15 @@ use protocol::bus::{Bus, Filter};
 use protocol::can::{EXTENDED, Frame, REMOTE};
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::packet;
-use protocol::port::{FLAG, LinkId};
-use protocol::skin::{Reply, Skin};
+use protocol::port::{WIRE_FLAG, LinkId};
+use protocol::skin::{SkinReply, Skin};
 use protocol::time::Micros;
 
 use model::network::Uplinks;
 
 /// The wires to the roots of a bus, and the protocol on them.
 #[derive(Debug)]
-pub struct Roots {
+pub struct RootWires {
     uplinks: Uplinks,
     /// Each root, the link on which the gateway sends to it, and true if its sums are for the gateway.
     roots: Vec<(CellId, LinkId, bool)>,
@@ -25,8 +25,8 @@ pub struct Roots {
 }
 
 /// The roots of a bus and the links on which the gateway sends to them. Empty if cells answer with their own torques.
-fn roots(skin: &Skin, bus: usize) -> Vec<(CellId, LinkId)> {
-    let sums = skin.buses.get(bus).is_some_and(|bus| bus.reply != Reply::Torque);
+fn root_links(skin: &Skin, bus: usize) -> Vec<(CellId, LinkId)> {
+    let sums = skin.buses.get(bus).is_some_and(|bus| bus.reply != SkinReply::Torque);
     if sums { skin.wires(bus).roots().collect() } else { Vec::new() }
 }
 
@@ -43,8 +43,8 @@ impl ReceiveFilter {
     /// The filter of a bus: all frames, except that of simulated wires only those to the gateway pass, and of sums only
     /// those of roots unless `everything` is set.
     #[must_use]
-    pub fn of(skin: &Skin, bus: usize, everything: bool) -> Self {
-        let roots = roots(skin, bus);
+    pub fn for_bus(skin: &Skin, bus: usize, everything: bool) -> Self {
+        let roots = root_links(skin, bus);
         if roots.is_empty() {
             return Self { filters: vec![Filter::ALL], all_sums: true };
         }
@@ -57,8 +57,8 @@ impl ReceiveFilter {
             kinds.into_iter().chain([remote]).chain(roots).collect::<Vec<_>>()
         };
         // 29-bit identifiers that belong to no wire are foreign; they pass so that they are counted.
-        let foreign = Filter { id: EXTENDED, mask: EXTENDED | FLAG };
-        let wires = roots.iter().map(|(_, link_id)| Filter::link_id(link_id.reversed()));
+        let foreign = Filter { id: EXTENDED, mask: EXTENDED | WIRE_FLAG };
+        let wires = roots.iter().map(|(_, link_id)| Filter::for_link(link_id.reversed()));
         let others: Vec<_> = [foreign].into_iter().chain(wires).collect();
         let few = sums_of_roots();
         let all_sums = everything || few.len() + others.len() > Filter::MAX;
@@ -67,12 +67,12 @@ impl ReceiveFilter {
     }
 }
 
-impl Roots {
+impl RootWires {
     /// The roots of a bus, or `None` if its cells answer with their own torques.
     #[must_use]
-    pub fn of(skin: &Skin, bus: usize) -> Option<Self> {
+    pub fn for_bus(skin: &Skin, bus: usize) -> Option<Self> {
         let roots: Vec<_> =
-            roots(skin, bus).into_iter().map(|(root, link_id)| (root, link_id, false)).collect();
+            root_links(skin, bus).into_iter().map(|(root, link_id)| (root, link_id, false)).collect();
         // An earlier gateway counted its walks too, up to an unknown number, and process ids are often adjacent: spread
         // the start.
         let walk = std::process::id().wrapping_mul(37).to_le_bytes()[0];
@@ -86,7 +86,7 @@ impl Roots {
 
     /// Filters for the wire frames that come from the roots.
     pub fn filters(&self) -> impl Iterator<Item = Filter> {
-        self.roots.iter().map(|(_, link_id, _)| Filter::link_id(link_id.reversed()))
+        self.roots.iter().map(|(_, link_id, _)| Filter::for_link(link_id.reversed()))
     }
 
     /// Starts sending on the wires.
@@ -104,11 +104,11 @@ impl Roots {
     }
 
     fn now(&self) -> Micros {
-        Micros::after(self.began.elapsed())
+        Micros::since_start(self.began.elapsed())
     }
 
     /// Handles a frame from the bus. Returns true if it was a wire frame, which only this type handles.
-    pub fn take(&mut self, frame: &Frame) -> bool {
+    pub fn handle_frame(&mut self, frame: &Frame) -> bool {
         let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) else {
             if let Ok(Id { kind: Kind::Network, node }) = packet::data_id(frame)
                 && let Node::Cell(cell) = Node::from_byte(node)
@@ -119,7 +119,7 @@ impl Roots {
         };
         let root = self.roots.iter().position(|(_, own, _)| own.reversed() == link_id);
         if let Some((root, message)) =
-            root.filter(|_| self.explores).and_then(|root| Some((root, link_id.read(frame)?)))
+            root.filter(|_| self.explores).and_then(|root| Some((root, link_id.decode_frame(frame)?)))
         {
             let now = self.now();
             self.uplinks.handle(now, root, message);
@@ -128,7 +128,7 @@ impl Roots {
     }
 
     /// Sends all due messages.
-    pub fn speak(&mut self, bus: &Bus) {
+    pub fn send_due(&mut self, bus: &Bus) {
         if !self.explores {
             return;
         }
@@ -137,7 +137,7 @@ impl Roots {
         while let Some((root, message)) = self.uplinks.poll_transmit() {
             if let Some((_, link_id, _)) = self.roots.get(root) {
                 // A message that the bus refuses is requested again.
-                let _ = bus.offer(&[link_id.frame(message)]);
+                let _ = bus.try_send_all(&[link_id.encode_frame(message)]);
             }
         }
     }
@@ -148,7 +148,7 @@ impl Roots {
         if !self.explores {
             return Duration::MAX;
         }
-        Duration::from_micros(self.uplinks.poll_timeout().since(self.now()).0)
+        Duration::from_micros(self.uplinks.poll_timeout().elapsed_since(self.now()).0)
     }
 }
 
@@ -187,9 +187,9 @@ mod tests {
     fn a_gateway_takes_sums_of_roots_and_its_own_wires_and_all_that_is_no_wire() {
         let skin = skin("reply = \"sum\"\nslot_us = 1500");
         // Wire 0 connects the two cells; wire 1 connects the root to the gateway.
-        let wire = |wire, back| LinkId { wire, back }.frame(protocol::port::PortMessage::Join);
+        let wire = |wire, back| LinkId { wire, back }.encode_frame(protocol::port::PortMessage::Join);
         for everything in [false, true] {
-            let receive_filter = ReceiveFilter::of(&skin, 0, everything);
+            let receive_filter = ReceiveFilter::for_bus(&skin, 0, everything);
             assert_eq!(receive_filter.all_sums, everything);
             assert!(passes(&receive_filter, &sum(1)) && passes(&receive_filter, &wire(1, false)));
             assert_eq!(passes(&receive_filter, &sum(2)), everything);
@@ -209,21 +209,21 @@ mod tests {
                 assert!(passes(&receive_filter, &frame), "{foreign:08X}");
             }
         }
-        let torque = ReceiveFilter::of(&self::skin("reply = \"torque\""), 0, false);
+        let torque = ReceiveFilter::for_bus(&self::skin("reply = \"torque\""), 0, false);
         assert_eq!(torque, ReceiveFilter { filters: vec![Filter::ALL], all_sums: true });
     }
 
     #[test]
     fn a_roots_request_is_answered_and_wire_frames_are_kept_from_the_table() {
         let skin = skin("reply = \"sum\"\nslot_us = 1500");
-        let mut roots = Roots::of(&skin, 0).unwrap();
-        let leave = LinkId { wire: 1, back: false }.frame(protocol::port::PortMessage::Leave);
-        assert!(roots.take(&leave));
+        let mut roots = RootWires::for_bus(&skin, 0).unwrap();
+        let leave = LinkId { wire: 1, back: false }.encode_frame(protocol::port::PortMessage::Leave);
+        assert!(roots.handle_frame(&leave));
         assert_eq!(roots.uplinks.poll_transmit(), None, "it does not send yet");
         roots.explore();
-        assert!(roots.take(&LinkId { wire: 0, back: false }.frame(protocol::port::PortMessage::Join)));
+        assert!(roots.handle_frame(&LinkId { wire: 0, back: false }.encode_frame(protocol::port::PortMessage::Join)));
         assert_eq!(roots.uplinks.poll_transmit(), None);
-        assert!(roots.take(&LinkId { wire: 1, back: false }.frame(protocol::port::PortMessage::Join)));
+        assert!(roots.handle_frame(&LinkId { wire: 1, back: false }.encode_frame(protocol::port::PortMessage::Join)));
         let answer = roots.uplinks.poll_transmit();
         assert!(matches!(answer, Some((0, protocol::port::PortMessage::Grant(_)))), "{answer:?}");
         let root = CellId::new(1).unwrap();
@@ -232,19 +232,19 @@ mod tests {
             version: VERSION,
             number: 1,
             port: 4,
-            hears: true,
-            up: true,
+            receives: true,
+            is_parent: true,
             unnumbered: false,
             rank: Some(Rank { round: 1, depth: 1 }),
         };
         assert!(
-            roots.take(&LinkId { wire: 1, back: false }.frame(protocol::port::PortMessage::Hello(hello)))
+            roots.handle_frame(&LinkId { wire: 1, back: false }.encode_frame(protocol::port::PortMessage::Hello(hello)))
         );
         assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, true)]);
         assert_eq!(roots.changes().collect::<Vec<_>>(), []);
-        assert!(roots.take(&leave));
+        assert!(roots.handle_frame(&leave));
         assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, false)]);
-        assert!(!roots.take(&sum(1)));
-        assert!(Roots::of(&self::skin("reply = \"torque\""), 0).is_none());
+        assert!(!roots.handle_frame(&sum(1)));
+        assert!(RootWires::for_bus(&self::skin("reply = \"torque\""), 0).is_none());
     }
 }

@@ -4,10 +4,10 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 
-use protocol::bus::{Bus, BusError, BusKind, Choice, Options};
+use protocol::bus::{Bus, BusError, BusKind, KindChoice, BusOptions};
 use thiserror::Error;
 
-use crate::processes::{LaunchError, apart, end, program, spawn};
+use crate::processes::{LaunchError, apart, wait_or_kill, program, spawn};
 
 /// An embedded bus in a process of its own, which removes its socket even if the gateway is killed.
 #[derive(Debug)]
@@ -61,14 +61,14 @@ impl ServedBus {
     }
 
     /// Ends the server process, which removes its socket; clients find a closed connection.
-    pub fn end(&mut self) {
+    pub fn stop(&mut self) {
         // The server ends when its standard input does.
         drop(self.child.stdin.take());
-        end(&mut [&mut self.child]);
+        wait_or_kill(&mut [&mut self.child]);
     }
 
     /// Exit status of the server, or `None` while it runs.
-    pub fn ended(&mut self) -> Option<ExitStatus> {
+    pub fn exit_status(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().ok().flatten()
     }
 }
@@ -86,12 +86,12 @@ pub enum ServeError {
 }
 
 /// A bus to open: its name, its kind and its options.
-pub type Target<'a> = (&'a str, Choice, Options);
+pub type BusTarget<'a> = (&'a str, KindChoice, BusOptions);
 
 /// Handling of a bus that exists neither as an interface nor as an embedded bus, if either kind would do
 /// ([`Choice::Auto`]).
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Absent {
+pub enum IfAbsent {
     /// Create an embedded bus: all its cells are started here.
     Made,
     /// Return an error: the cells would not be on a new, empty bus.
@@ -104,9 +104,9 @@ pub enum Absent {
 /// Returns [`ServeError`] if the bus does not open or cannot be served.
 pub fn open_or_serve(
     name: &str,
-    kind: Choice,
-    target: &Options,
-    absent: Absent,
+    kind: KindChoice,
+    target: &BusOptions,
+    absent: IfAbsent,
 ) -> Result<(Bus, Option<ServedBus>), ServeError> {
     let (opened, mut served) = open_or_serve_all(&[(name, kind, target.clone())], absent)?;
     let bus = opened.into_iter().next().ok_or_else(|| BusError::Name(name.to_owned()))?;
@@ -118,14 +118,14 @@ pub fn open_or_serve(
 /// # Errors
 /// Returns [`ServeError`] if a bus does not open or cannot be served.
 pub fn open_or_serve_all(
-    buses: &[Target<'_>],
-    absent: Absent,
+    buses: &[BusTarget<'_>],
+    absent: IfAbsent,
 ) -> Result<(Vec<Bus>, Vec<ServedBus>), ServeError> {
     let mut begun = Vec::with_capacity(buses.len());
     for (name, kind, target) in buses {
         let opened = Bus::open(name, *kind, target);
         let is_served = matches!(opened, Err(BusError::NotServed { .. }))
-            || (absent == Absent::Made && matches!(opened, Err(BusError::Absent { .. })));
+            || (absent == IfAbsent::Made && matches!(opened, Err(BusError::Absent { .. })));
         begun.push(match opened {
             Err(_) if is_served => {
                 let program = program("vcan-setup")?;
@@ -143,7 +143,7 @@ pub fn open_or_serve_all(
                 served.wait(&program)?;
                 all_served.push(served);
                 // Not by the user's choice: an interface of this name may have appeared meanwhile.
-                Bus::open(name, Choice::Only(BusKind::Embedded), target)?
+                Bus::open(name, KindChoice::Only(BusKind::Embedded), target)?
             }
         });
     }
@@ -152,6 +152,6 @@ pub fn open_or_serve_all(
 
 impl Drop for ServedBus {
     fn drop(&mut self) {
-        self.end();
+        self.stop();
     }
 }

@@ -11,7 +11,7 @@ use thiserror::Error;
 const FLASH: std::ops::Range<u64> = 0..256 << 10;
 
 /// Size limit of a firmware file in bytes; a firmware with full debug information has 4 MB.
-const LONGEST: u64 = 64 << 20;
+const MAX_FILE_BYTES: u64 = 64 << 20;
 
 /// An error of a file that is not the firmware of a cell.
 #[derive(Debug, Error)]
@@ -62,7 +62,7 @@ impl Firmware {
     /// Returns [`FirmwareError`] if the file cannot be read or is not the firmware of a cell for the emulated board.
     pub fn read(path: &Path) -> Result<Self, FirmwareError> {
         let path = path.to_owned();
-        match input::bytes(&path, LONGEST) {
+        match input::read_bytes(&path, MAX_FILE_BYTES) {
             Ok(bytes) => Self::parse(path, bytes),
             Err(source) => Err(FirmwareError::Read { path, source }),
         }
@@ -89,7 +89,7 @@ impl Firmware {
 
     /// Returns the image with the factory's record of one cell.
     #[must_use]
-    pub fn of(&self, factory: &Factory) -> Vec<u8> {
+    pub fn for_cell(&self, factory: &Factory) -> Vec<u8> {
         let mut bytes = self.bytes.clone();
         if let Some(record) = bytes.get_mut(self.record..self.record + factory::BYTES) {
             record.copy_from_slice(&factory.encode());

@@ -5,20 +5,20 @@ use std::io::{PipeWriter, pipe};
 use std::path::{Path, PathBuf};
 use std::thread::JoinHandle;
 
-use protocol::bus::{Choice, Filter};
-use vcan_setup::slcan::{Address, Bridge, LineOptions, Settings};
+use protocol::bus::{KindChoice, Filter};
+use vcan_setup::slcan::{Address, Bridge, LineOptions, BridgeSettings};
 
 use super::EmulateError;
 
 /// The lines of some buses; dropping it ends them.
 #[derive(Debug, Default)]
-pub(super) struct Lines {
-    buses: Vec<Bus>,
+pub(super) struct SlcanLines {
+    buses: Vec<LineThread>,
 }
 
 /// The thread that serves the lines of a bus.
 #[derive(Debug)]
-struct Bus {
+struct LineThread {
     /// Closing this end of the pipe ends the thread.
     stop: Option<PipeWriter>,
     thread: Option<JoinHandle<()>>,
@@ -26,13 +26,13 @@ struct Bus {
 
 /// Lines to be joined to buses.
 #[derive(Debug, Default)]
-pub(super) struct Planned {
-    by_bus: BTreeMap<String, (Choice, Vec<LineOptions>)>,
+pub(super) struct PlannedLines {
+    by_bus: BTreeMap<String, (KindChoice, Vec<LineOptions>)>,
 }
 
-impl Planned {
+impl PlannedLines {
     /// Adds a line to a bus: its socket and the filters of its cell.
-    pub(super) fn add(&mut self, bus: &str, kind: Choice, socket: PathBuf, filters: Vec<Filter>) {
+    pub(super) fn add(&mut self, bus: &str, kind: KindChoice, socket: PathBuf, filters: Vec<Filter>) {
         let line = LineOptions { filters, ..LineOptions::new(Address::Unix(socket)) };
         self.by_bus.entry(bus.to_owned()).or_insert((kind, Vec::new())).1.push(line);
     }
@@ -41,10 +41,10 @@ impl Planned {
     ///
     /// # Errors
     /// Returns [`EmulateError`] if a bus does not open or a thread cannot be started.
-    pub(super) fn join(self, directory: Option<&Path>) -> Result<Lines, EmulateError> {
-        let mut lines = Lines::default();
+    pub(super) fn join(self, directory: Option<&Path>) -> Result<SlcanLines, EmulateError> {
+        let mut lines = SlcanLines::default();
         for (bus, (choice, options)) in self.by_bus {
-            let settings = Settings { bus, choice, directory: directory.map(Path::to_owned), wait: true };
+            let settings = BridgeSettings { bus, choice, directory: directory.map(Path::to_owned), wait: true };
             let (stopped, stop) = pipe().map_err(EmulateError::Lines)?;
             let bridge = Bridge::open(settings, options)?;
             let work = move || {
@@ -53,13 +53,13 @@ impl Planned {
             };
             let thread = std::thread::Builder::new().name("slcan".to_owned()).spawn(work);
             let thread = Some(thread.map_err(EmulateError::Lines)?);
-            lines.buses.push(Bus { stop: Some(stop), thread });
+            lines.buses.push(LineThread { stop: Some(stop), thread });
         }
         Ok(lines)
     }
 }
 
-impl Drop for Bus {
+impl Drop for LineThread {
     fn drop(&mut self) {
         drop(self.stop.take());
         if let Some(thread) = self.thread.take() {

@@ -14,11 +14,11 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use model::commission::{Outcome, Wish};
-use protocol::bus::{Filter, Kinds};
+use model::commission::{Outcome, CommissionOptions};
+use protocol::bus::{Filter, KindChoices};
 use protocol::factory::Factory;
 use protocol::id::{Id, Kind, Node};
-use protocol::skin::{Cell, Reply, Skin};
+use protocol::skin::{Cell, SkinReply, Skin};
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
 use tempfile::TempDir;
@@ -30,7 +30,7 @@ use crate::processes::{LaunchError, Processes, STARTING};
 use crate::setup::Timeout;
 
 pub use firmware::{Firmware, FirmwareError};
-use line::{Lines, Planned};
+use line::{SlcanLines, PlannedLines};
 
 /// Program name of the emulator.
 const QEMU: &str = "qemu-system-arm";
@@ -135,7 +135,7 @@ pub(crate) struct Emulator<'a> {
 #[derive(Debug)]
 pub(crate) struct Emulation {
     /// Dropped first: the lines hang up before their sockets are removed.
-    _lines: Lines,
+    _lines: SlcanLines,
     _files: TempDir,
     /// Locked as long as it is open.
     _flash: Option<File>,
@@ -143,9 +143,9 @@ pub(crate) struct Emulation {
 
 /// Settings that all emulated cells share.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Bench<'a> {
+pub(crate) struct EmulationSetup<'a> {
     pub(crate) skin: &'a Skin,
-    pub(crate) kinds: &'a Kinds,
+    pub(crate) kinds: &'a KindChoices,
     pub(crate) directory: Option<&'a Path>,
     pub(crate) flash: Option<&'a Path>,
 }
@@ -168,28 +168,28 @@ impl<'a> Emulator<'a> {
     /// Returns [`EmulateError`] if something does not start.
     pub(crate) fn start(
         &self,
-        bench: &Bench<'_>,
+        bench: &EmulationSetup<'_>,
         processes: &mut Processes,
     ) -> Result<Emulation, EmulateError> {
         let files =
             tempfile::Builder::new().prefix("skinbus-cells-").tempdir().map_err(EmulateError::Files)?;
         let _flash = bench.flash.map(hold).transpose()?;
-        let mut planned = Planned::default();
+        let mut planned = PlannedLines::default();
         for cell in self.cells.iter().filter_map(|&cell| bench.skin.cells.get(cell)) {
-            let place = Place::of(bench, files.path(), cell)?;
+            let place = CellFiles::of(bench, files.path(), cell)?;
             let factory = factory(bench.skin, cell);
-            fs::write(&place.program, self.firmware.of(&factory)).map_err(EmulateError::Files)?;
+            fs::write(&place.program, self.firmware.for_cell(&factory)).map_err(EmulateError::Files)?;
             let log = File::create(&place.log).map_err(EmulateError::Files)?;
             let name = bench.skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
             processes.emulate(cell, name, self.command(&place, log), &place.log)?;
-            planned.add(name, bench.kinds.of(name), place.socket, filters(cell, &factory));
+            planned.add(name, bench.kinds.kind_of(name), place.socket, filters(cell, &factory));
         }
         let _lines = planned.join(bench.directory)?;
         Ok(Emulation { _lines, _files: files, _flash })
     }
 
     /// The command of an emulator, which waits for its line.
-    fn command(&self, place: &Place, log: File) -> Command {
+    fn command(&self, place: &CellFiles, log: File) -> Command {
         let mut command = Command::new(&self.qemu);
         command.args(["-M", "microbit", "-display", "none", "-monitor", "none", "-serial", "chardev:line"]);
         let socket = place.socket.display();
@@ -207,7 +207,7 @@ impl<'a> Emulator<'a> {
     /// Returns [`EmulateError`] if a cell refuses its parameters or an emulator ends.
     pub(crate) fn commission(
         &self,
-        bench: &Bench<'_>,
+        bench: &EmulationSetup<'_>,
         processes: &mut Processes,
         signalled: &AtomicBool,
     ) -> Result<String, EmulateError> {
@@ -215,7 +215,7 @@ impl<'a> Emulator<'a> {
         let mut skin = bench.skin.clone();
         skin.cells = self.cells.iter().filter_map(|&cell| bench.skin.cells.get(cell).cloned()).collect();
         // The cells already have node ids, so no walk over wires must assign them.
-        skin.buses.iter_mut().for_each(|bus| bus.reply = Reply::Torque);
+        skin.buses.iter_mut().for_each(|bus| bus.reply = SkinReply::Torque);
         let mut buses: Vec<_> = skin.cells.iter().map(|cell| cell.bus).collect();
         buses.sort_unstable();
         buses.dedup();
@@ -223,7 +223,7 @@ impl<'a> Emulator<'a> {
         let benches = benches.collect::<Result<Vec<_>, _>>()?;
         let stop = AtomicBool::new(false);
         let (mut ended, mut timeout, mut is_over) = (None, Timeout::new(STARTING), false);
-        let wish = Wish { dry_run: false, verify: false };
+        let wish = CommissionOptions { dry_run: false, verify: false };
         let done = commission::commission(benches, &skin, wish, &stop, |far| {
             ended = ended.take().or_else(|| processes.ended().into_iter().next());
             // A cell that restarts again and again would be written for ever.
@@ -259,15 +259,15 @@ impl<'a> Emulator<'a> {
 }
 
 /// Files of one cell.
-struct Place {
+struct CellFiles {
     program: PathBuf,
     socket: PathBuf,
     log: PathBuf,
     flash: String,
 }
 
-impl Place {
-    fn of(bench: &Bench<'_>, files: &Path, cell: &Cell) -> Result<Self, EmulateError> {
+impl CellFiles {
+    fn of(bench: &EmulationSetup<'_>, files: &Path, cell: &Cell) -> Result<Self, EmulateError> {
         let bus = bench.skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
         let name = format!("{bus}-{}", cell.node);
         let flash = bench.flash.unwrap_or(files);
@@ -295,22 +295,22 @@ fn hold(directory: &Path) -> Result<File, EmulateError> {
 /// The record that the factory would write into a cell.
 fn factory(skin: &Skin, cell: &Cell) -> Factory {
     let bus = skin.buses.get(cell.bus);
-    let sums = bus.is_some_and(|bus| bus.reply != Reply::Torque);
+    let sums = bus.is_some_and(|bus| bus.reply != SkinReply::Torque);
     Factory {
         node: Some(cell.node),
         serial: cell.serial,
         format: bus.map_or(protocol::can::Format::Fd, |bus| bus.format),
         hosted: true,
-        link_ids: if sums { skin.wires(cell.bus).of_cell(cell.node) } else { Default::default() },
+        link_ids: if sums { skin.wires(cell.bus).link_ids_of(cell.node) } else { Default::default() },
     }
 }
 
 /// The filters of a cell's CAN controller: its own identifiers, frames on its simulated wires, and the sums of the
 /// cells at their other ends.
 fn filters(cell: &Cell, &Factory { link_ids, .. }: &Factory) -> Vec<Filter> {
-    let mut filters: Vec<_> = Id::of_cell(cell.node).map(Filter::exact).into();
+    let mut filters: Vec<_> = Id::received_by_cell(cell.node).map(Filter::exact).into();
     if link_ids.iter().any(Option::is_some) {
-        filters.extend(link_ids.into_iter().flatten().map(|link_id| Filter::link_id(link_id.reversed())));
+        filters.extend(link_ids.into_iter().flatten().map(|link_id| Filter::for_link(link_id.reversed())));
         let sums = cell.neighbors.iter().flatten().map(|neighbor| Id::new(Kind::Sum, Node::Cell(*neighbor)));
         filters.extend(sums.map(Filter::exact));
     }

@@ -25,7 +25,7 @@ pub(crate) struct EndedProcesses {
 
 impl EndedProcesses {
     /// Adds processes that ended and returns the notes that are due; with `last`, all notes.
-    pub(crate) fn take(&mut self, ended: Vec<Ended>, last: bool) -> Vec<String> {
+    pub(crate) fn add_ended(&mut self, ended: Vec<Ended>, last: bool) -> Vec<String> {
         if !ended.is_empty() {
             self.found = Some(Instant::now());
             self.new.extend(ended);
@@ -84,7 +84,7 @@ mod tests {
 
     fn ended(nodes: (u8, u8), raw_status: i32, said: Option<&str>) -> Ended {
         let said = said.map(str::to_owned);
-        Ended { bus: "vcan0".to_owned(), nodes, status: ExitStatus::from_raw(raw_status), said }
+        Ended { bus: "vcan0".to_owned(), nodes, status: ExitStatus::from_raw(raw_status), reason: said }
     }
 
     #[test]
@@ -92,9 +92,9 @@ mod tests {
         let nodes: Vec<u8> = (1..=252).collect();
         let mut processes = EndedProcesses::default();
         let all = || nodes.iter().map(|&node| ended((node, node), 1 << 8, Some("cannot send"))).collect();
-        let [note] = processes.take(all(), true).try_into().unwrap();
+        let [note] = processes.add_ended(all(), true).try_into().unwrap();
         assert_eq!(note.matches("cannot send").count(), 1, "{note}");
-        let [again] = processes.take(all(), true).try_into().unwrap();
+        let [again] = processes.add_ended(all(), true).try_into().unwrap();
         assert!(!again.contains("cannot send"), "{again}");
         let [error] = processes.errors().try_into().unwrap();
         assert_eq!((error.reason.as_str(), &error.cells[0].nodes), ("cannot send", &nodes));
@@ -103,14 +103,14 @@ mod tests {
     #[test]
     fn signals_are_no_errors_and_a_process_without_a_reason_has_its_exit_code() {
         let mut processes = EndedProcesses::default();
-        let notes = processes.take(vec![ended((1, 1), 9, None), ended((2, 2), 0, None)], true);
+        let notes = processes.add_ended(vec![ended((1, 1), 9, None), ended((2, 2), 0, None)], true);
         assert_eq!(notes.len(), 2);
         assert!(
             notes.contains(&"the process of cell 1 on vcan0 ended (signal: 9 (SIGKILL))".to_owned()),
             "{notes:?}"
         );
         assert!(processes.errors().is_empty());
-        let [note] = processes.take(vec![ended((1, 1), 101 << 8, None)], true).try_into().unwrap();
+        let [note] = processes.add_ended(vec![ended((1, 1), 101 << 8, None)], true).try_into().unwrap();
         assert_eq!(note, "the process of cell 1 on vcan0 ended (exit status: 101)");
         let [error] = processes.errors().try_into().unwrap();
         assert_eq!(error.reason, "exit code 101, and no reason was given");
@@ -119,13 +119,13 @@ mod tests {
     #[test]
     fn those_that_end_together_wait_for_each_other() {
         let mut processes = EndedProcesses::default();
-        assert!(processes.take(vec![ended((1, 1), 9, None)], false).is_empty());
-        assert!(processes.take(vec![ended((2, 2), 9, None)], false).is_empty());
-        let [note] = processes.take(Vec::new(), true).try_into().unwrap();
+        assert!(processes.add_ended(vec![ended((1, 1), 9, None)], false).is_empty());
+        assert!(processes.add_ended(vec![ended((2, 2), 9, None)], false).is_empty());
+        let [note] = processes.add_ended(Vec::new(), true).try_into().unwrap();
         assert!(
             note.starts_with("2 processes of cells on vcan0 ended (signal: 9 (SIGKILL)): cell 1, cell 2"),
             "{note}"
         );
-        assert!(processes.take(Vec::new(), true).is_empty());
+        assert!(processes.add_ended(Vec::new(), true).is_empty());
     }
 }

@@ -15,10 +15,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use protocol::bus::Kinds;
+use protocol::bus::KindChoices;
 use protocol::last_words::CellRange;
 use protocol::skin::{Cell, Skin};
-use protocol::usage::path_in;
+use protocol::usage::path_from_env;
 use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, setrlimit};
 use thiserror::Error;
@@ -29,7 +29,7 @@ use crate::system_calls::end_with_parent;
 use model::scenario::ProcessAction;
 
 /// Time in which two gateways on one bus detect each other.
-pub const LISTEN: Duration = Duration::from_millis(500);
+pub const GATEWAY_DETECTION_TIME: Duration = Duration::from_millis(500);
 /// Timeout of started cells without progress.
 pub const STARTING: Duration = Duration::from_secs(15);
 /// Open files of a gateway or a bus server, besides its buses and clients.
@@ -118,7 +118,7 @@ fn variable(name: &str) -> String {
 /// Returns [`LaunchError::Missing`] if the file does not exist.
 pub fn program(name: &'static str) -> Result<PathBuf, LaunchError> {
     let beside = || std::env::current_exe().ok().and_then(|own| Some(own.parent()?.join(name)));
-    let path = path_in(&variable(name)).or_else(beside).unwrap_or_else(|| Path::new(".").join(name));
+    let path = path_from_env(&variable(name)).or_else(beside).unwrap_or_else(|| Path::new(".").join(name));
     if path.is_file() { Ok(path) } else { Err(LaunchError::Missing { name, path }) }
 }
 
@@ -160,7 +160,7 @@ pub struct Ended {
     /// Exit status.
     pub status: ExitStatus,
     /// Reason that the process gave, if any.
-    pub said: Option<String>,
+    pub reason: Option<String>,
 }
 
 impl Ended {
@@ -174,14 +174,14 @@ impl Ended {
     #[must_use]
     pub fn how(&self) -> String {
         let status = self.status;
-        self.said.as_ref().map_or_else(|| status.to_string(), |said| format!("{status}: {said}"))
+        self.reason.as_ref().map_or_else(|| status.to_string(), |said| format!("{status}: {said}"))
     }
 
     /// Reason of the error, if the process failed by itself: neither by a signal nor with exit code 0.
     #[must_use]
     pub fn error(&self) -> Option<String> {
         let code = self.status.code().filter(|&code| code != 0)?;
-        Some(self.said.clone().unwrap_or_else(|| format!("exit code {code}, and no reason was given")))
+        Some(self.reason.clone().unwrap_or_else(|| format!("exit code {code}, and no reason was given")))
     }
 }
 
@@ -205,7 +205,7 @@ pub struct Processes {
 
 /// Settings for starting cells.
 #[derive(Clone, Copy, Debug)]
-pub struct Plan<'a> {
+pub struct CellLaunch<'a> {
     /// Path of the program.
     pub program: &'a Path,
     /// Path of the skin's file.
@@ -213,7 +213,7 @@ pub struct Plan<'a> {
     /// The skin.
     pub skin: &'a Skin,
     /// Kind of each bus.
-    pub kinds: &'a Kinds,
+    pub kinds: &'a KindChoices,
     /// Directory of embedded buses; `None` for the usual one.
     pub directory: Option<&'a Path>,
     /// Maximum number of cells per process.
@@ -239,9 +239,9 @@ impl Processes {
     ///
     /// # Errors
     /// Returns [`LaunchError`] if a process does not start.
-    pub fn start(&mut self, plan: &Plan<'_>) -> Result<(), LaunchError> {
+    pub fn start(&mut self, plan: &CellLaunch<'_>) -> Result<(), LaunchError> {
         for (bus, described) in plan.skin.buses.iter().enumerate() {
-            let mut nodes: Vec<u8> = plan.skin.cells_of(bus).map(|cell| cell.node.get()).collect();
+            let mut nodes: Vec<u8> = plan.skin.cells_on_bus(bus).map(|cell| cell.node.get()).collect();
             nodes.retain(|&node| !self.runs(bus, node));
             nodes.sort_unstable();
             for nodes in groups(&nodes, plan.per_process) {
@@ -351,11 +351,11 @@ impl Process {
             (None, Some(error)) => {
                 // The ended process has written everything by now.
                 error.read();
-                error.of(&self.bus_name, self.nodes)
+                error.take_reason(&self.bus_name, self.nodes)
             }
             (None, None) => None,
         };
-        Ended { bus: self.bus_name.clone(), nodes: self.nodes, status, said }
+        Ended { bus: self.bus_name.clone(), nodes: self.nodes, status, reason: said }
     }
 
     /// Sends a signal and enters `phase`. Ended processes are left alone.
@@ -376,11 +376,11 @@ impl Drop for Processes {
         }
         let mut children: Vec<_> =
             self.all.iter_mut().filter(|process| process.lives()).map(|process| &mut process.child).collect();
-        end(&mut children);
+        wait_or_kill(&mut children);
     }
 }
 
-impl Plan<'_> {
+impl CellLaunch<'_> {
     fn of(&self, bus: &str, (first, last): (u8, u8)) -> Command {
         let mut command = Command::new(self.program);
         command.args(["--bus", bus]);
@@ -391,7 +391,7 @@ impl Plan<'_> {
         }
         // A lost bus is served or made again, and its cells stay the same.
         command.arg("--skin").arg(self.skin_file).arg("--reconnect");
-        command.args(["--bus-kind", &self.kinds.of(bus).to_string()]);
+        command.args(["--bus-kind", &self.kinds.kind_of(bus).to_string()]);
         command.args(["--with-parent", &std::process::id().to_string()]);
         if let Some(flash) = self.flash {
             command.arg("--flash").arg(flash);
@@ -448,7 +448,7 @@ pub fn groups(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
 }
 
 /// Waits for processes that were asked to end, and kills those that do not.
-pub(crate) fn end(children: &mut [&mut Child]) {
+pub(crate) fn wait_or_kill(children: &mut [&mut Child]) {
     let give_up = Instant::now() + TIMEOUT;
     loop {
         let running = children

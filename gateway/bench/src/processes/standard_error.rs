@@ -5,15 +5,15 @@
 use std::io::{self, ErrorKind, PipeReader, PipeWriter, Read, pipe};
 use std::process::Command;
 
-use protocol::last_words::{CellRange, LastWords};
-use protocol::usage::say;
+use protocol::last_words::{CellRange, ExitReason};
+use protocol::usage::eprint_line;
 use rustix::io::ioctl_fionbio;
 
 /// Prefix of each line from a cell's process.
 const PROGRAM: &str = "cell-node: ";
 
 /// Maximum length in bytes of an incomplete line.
-const LONGEST: usize = 1 << 16;
+const MAX_LINE_BYTES: usize = 1 << 16;
 
 /// Standard error of the cells' processes.
 #[derive(Debug)]
@@ -23,7 +23,7 @@ pub(super) struct StandardError {
     /// Beginning of a line whose end has not arrived.
     unread: Vec<u8>,
     /// Reasons that have not been fetched.
-    words: Vec<LastWords>,
+    words: Vec<ExitReason>,
 }
 
 impl StandardError {
@@ -61,20 +61,20 @@ impl StandardError {
             let line: Vec<_> = self.unread.drain(..=end).collect();
             self.take(&String::from_utf8_lossy(line.strip_suffix(b"\n").unwrap_or(&line)));
         }
-        if self.unread.len() > LONGEST {
-            say(&String::from_utf8_lossy(&core::mem::take(&mut self.unread)));
+        if self.unread.len() > MAX_LINE_BYTES {
+            eprint_line(&String::from_utf8_lossy(&core::mem::take(&mut self.unread)));
         }
     }
 
     fn take(&mut self, line: &str) {
-        match line.strip_prefix(PROGRAM).and_then(LastWords::parse) {
+        match line.strip_prefix(PROGRAM).and_then(ExitReason::parse) {
             Some(words) => self.words.push(words),
-            None => say(line),
+            None => eprint_line(line),
         }
     }
 
     /// Removes and returns the reason that a process of cells gave.
-    pub(super) fn of(&mut self, bus: &str, (first, last): (u8, u8)) -> Option<String> {
+    pub(super) fn take_reason(&mut self, bus: &str, (first, last): (u8, u8)) -> Option<String> {
         let cells = CellRange(first, last);
         let at = self.words.iter().position(|words| words.cells == cells && words.bus == bus)?;
         Some(self.words.remove(at).why)
@@ -85,7 +85,7 @@ impl Drop for StandardError {
     fn drop(&mut self) {
         self.read();
         if !self.unread.is_empty() {
-            say(&String::from_utf8_lossy(&self.unread));
+            eprint_line(&String::from_utf8_lossy(&self.unread));
         }
     }
 }
@@ -100,14 +100,14 @@ mod tests {
         let mut error = StandardError::new().unwrap();
         error.write.write_all(b"cell-node: cell 3 on vcan0 ends: no ").unwrap();
         error.read();
-        assert_eq!(error.of("vcan0", (3, 3)), None);
+        assert_eq!(error.take_reason("vcan0", (3, 3)), None);
         error.write.write_all(b"memory\ncell-node: cells 1 to 4 on vcan1 end: other\n").unwrap();
         error.write.write_all(b"cell-node: cell 3 on vcan0 ends: again\n").unwrap();
         error.read();
-        assert_eq!(error.of("vcan1", (3, 3)), None);
-        let two = [error.of("vcan0", (3, 3)), error.of("vcan0", (3, 3))];
+        assert_eq!(error.take_reason("vcan1", (3, 3)), None);
+        let two = [error.take_reason("vcan0", (3, 3)), error.take_reason("vcan0", (3, 3))];
         assert_eq!(two, [Some("no memory".to_owned()), Some("again".to_owned())]);
-        assert_eq!(error.of("vcan1", (1, 4)), Some("other".to_owned()));
+        assert_eq!(error.take_reason("vcan1", (1, 4)), Some("other".to_owned()));
         assert!(error.words.is_empty() && error.unread.is_empty());
     }
 }

@@ -9,15 +9,15 @@ use rustix::system::uname;
 use rustix::thread::ClockId;
 use rustix::time::{clock_getres, clock_gettime};
 
-use model::decode::parameter::Words;
+use model::decode::parameter::ParameterWords;
 use model::quantiles::Quantiles;
 
 /// Metadata values by key.
-pub type Facts = BTreeMap<String, String>;
+pub type Metadata = BTreeMap<String, String>;
 
 /// Metadata of the program and its command line.
 #[must_use]
-pub fn program(command_line: &[String], began_nanos: u64) -> Facts {
+pub fn program(command_line: &[String], began_nanos: u64) -> Metadata {
     facts([
         ("program", format!("skinbus {}", env!("CARGO_PKG_VERSION"))),
         ("git_revision", env!("SKINBUS_GIT_REVISION").to_owned()),
@@ -28,7 +28,7 @@ pub fn program(command_line: &[String], began_nanos: u64) -> Facts {
 
 /// Metadata of the kernel, its clock, and the wake-up lateness of an idle thread.
 #[must_use]
-pub fn machine(idle: &Quantiles) -> Facts {
+pub fn machine(idle: &Quantiles) -> Metadata {
     let about = uname();
     let text = |text: &std::ffi::CStr| text.to_string_lossy().into_owned();
     let clocks = "/sys/devices/system/clocksource/clocksource0/";
@@ -69,7 +69,7 @@ pub fn realtime_minus_monotonic() -> i64 {
 
 /// Metadata of the skin and its effective timing, joined with `run`.
 #[must_use]
-pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)>) -> Facts {
+pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)>) -> Metadata {
     let mut all = facts([
         ("skin", skin.name.clone()),
         ("robot", skin.robot.name.clone()),
@@ -81,10 +81,10 @@ pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)
         ("decay_epochs", skin.safety.decay_epochs.to_string()),
         ("bad_cycles", skin.safety.bad_cycles.to_string()),
         ("lost_bus", skin.safety.lost_bus.name().to_owned()),
-        ("events", Words(Parameter::Events.number(), skin.events.words()).to_string()),
+        ("events", ParameterWords(Parameter::Events.number(), skin.events.words()).to_string()),
     ]);
     for bus in &skin.buses {
-        let sensing = Words(Parameter::Sensing.number(), bus.sensing.words());
+        let sensing = ParameterWords(Parameter::Sensing.number(), bus.sensing.words());
         all.insert(format!("sensing/{}", bus.name), sensing.to_string());
     }
     all.extend(run);
@@ -93,7 +93,7 @@ pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)
 
 /// Expected configuration hash of each cell, keyed by bus and node id.
 #[must_use]
-pub fn hashes(skin: &Skin) -> Facts {
+pub fn hashes(skin: &Skin) -> Metadata {
     let of_cell = |cell: &protocol::skin::Cell| {
         let bus = skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
         (format!("{bus}/{}", cell.node), format!("{:04X}", skin.parameters(cell).hash()))
@@ -101,6 +101,6 @@ pub fn hashes(skin: &Skin) -> Facts {
     skin.cells.iter().map(of_cell).collect()
 }
 
-fn facts<const N: usize>(facts: [(&str, String); N]) -> Facts {
+fn facts<const N: usize>(facts: [(&str, String); N]) -> Metadata {
     facts.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }

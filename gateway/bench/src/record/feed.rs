@@ -6,8 +6,8 @@ use std::sync::{Arc, Mutex};
 use protocol::message::SkinSensors;
 
 use crate::view::View;
-use control::cycle::turn::{BusState, Timed};
-use model::latched::Seen;
+use control::cycle::turn::{BusState, TimedRecord};
+use model::latched::ReceivedFrame;
 use model::table::Status;
 use trace::capture::BusNote;
 
@@ -32,7 +32,7 @@ pub const EPOCHS: usize = 128;
 #[derive(Clone, Copy, Debug)]
 pub enum Captured {
     /// A received frame.
-    Frame(Seen),
+    Frame(ReceivedFrame),
     /// Frames that the bus dropped because they were not read in time.
     Dropped {
         /// Time of detection in ns since 1970.
@@ -58,7 +58,7 @@ pub enum Captured {
 
 /// Contact states of the cells of a bus at the time of a joint broadcast.
 #[derive(Clone, Debug)]
-pub struct Touched {
+pub struct EpochContacts {
     /// Time in ns since 1970.
     pub at_nanos: u64,
     /// Epoch of the joints.
@@ -71,7 +71,7 @@ pub struct Touched {
 #[derive(Debug)]
 pub struct Outlet {
     frames: rtrb::Producer<Captured>,
-    touched: Option<rtrb::Producer<Touched>>,
+    touched: Option<rtrb::Producer<EpochContacts>>,
     /// Total number of frames that did not fit.
     unrecorded: u64,
     /// Number of those that have not been reported yet.
@@ -91,9 +91,9 @@ pub struct Unrecorded {
 
 impl Outlet {
     /// Queues a frame.
-    pub fn frame(&mut self, seen: Seen) {
+    pub fn frame(&mut self, seen: ReceivedFrame) {
         if self.unreported > 0 {
-            self.tell(seen.at_nanos);
+            self.report_unrecorded(seen.at_nanos);
         }
         if self.unreported > 0 || self.frames.push(Captured::Frame(seen)).is_err() {
             self.unrecorded += 1;
@@ -126,7 +126,7 @@ impl Outlet {
     }
 
     /// Queues contact states.
-    pub fn touched(&mut self, touched: Touched) {
+    pub fn touched(&mut self, touched: EpochContacts) {
         if let Some(queue) = &mut self.touched
             && queue.push(touched).is_err()
         {
@@ -135,7 +135,7 @@ impl Outlet {
     }
 
     /// Queues a report of frames that did not fit, if it has room. Returns true if no report remains.
-    pub fn tell(&mut self, at_nanos: u64) -> bool {
+    pub fn report_unrecorded(&mut self, at_nanos: u64) -> bool {
         let frames = self.unreported;
         if frames > 0 && self.frames.push(Captured::Unrecorded { at_nanos, frames }).is_ok() {
             self.unreported = 0;
@@ -154,7 +154,7 @@ impl Outlet {
 #[derive(Debug)]
 pub struct BusFeed {
     pub(super) frames: rtrb::Consumer<Captured>,
-    pub(super) touched: Option<rtrb::Consumer<Touched>>,
+    pub(super) touched: Option<rtrb::Consumer<EpochContacts>>,
     /// State of the bus's cells.
     pub(super) view: Arc<Mutex<View>>,
     /// State of the bus.
@@ -176,7 +176,7 @@ pub struct Feed {
     /// Queues of each bus.
     pub bus_feeds: Vec<BusFeed>,
     /// Ticks of the control loop.
-    pub ticks: Option<rtrb::Consumer<Timed>>,
+    pub ticks: Option<rtrb::Consumer<TimedRecord>>,
 }
 
 #[cfg(test)]
@@ -192,7 +192,7 @@ mod tests {
     #[test]
     fn what_does_not_fit_is_reported_where_it_is_missing() {
         let (mut outlet, mut bus_feed) = bus_feed(1, false, Arc::default(), Arc::default());
-        let frame = |at_nanos| Seen { at_nanos, own: false, frame: Frame::EMPTY };
+        let frame = |at_nanos| ReceivedFrame { at_nanos, from_gateway: false, frame: Frame::EMPTY };
         let all = FRAMES as u64;
         (0..all + 7).for_each(|at| outlet.frame(frame(at)));
         assert_eq!(outlet.unrecorded(), Unrecorded { frames: 7, epochs: 0 });

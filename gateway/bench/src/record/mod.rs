@@ -26,11 +26,11 @@ use feed::{Feed, Unrecorded};
 use text::Text;
 use thiserror::Error;
 use topics::Topics;
-use trace::recording::account::Recording;
+use trace::recording::account::RecordingAccount;
 use trace::recording::layout::Layout;
 use trace::recording::repair;
-use trace::recording::robot::Robot;
-use trace::recording::series::{Attached, Head, Series, Split};
+use trace::recording::robot::RecordedRobot;
+use trace::recording::series::{AttachedFile, FileHead, SplitRecording, SplitLimits};
 
 use crate::bus::realtime::wall;
 use crate::threads::{ThreadError, spawn};
@@ -38,7 +38,7 @@ use trace::files::check_regular;
 
 /// Outputs of a recording.
 #[derive(Clone, Debug, Default)]
-pub struct Options {
+pub struct RecordOptions {
     /// Output of frames as candump text.
     pub candump: Option<Candump>,
     /// Output of all data as MCAP.
@@ -62,11 +62,11 @@ pub struct Mcap {
     /// Path of the first file.
     pub path: PathBuf,
     /// Limits at which a new file is started.
-    pub split: Split,
+    pub split: SplitLimits,
     /// Files attached to each file of the recording.
-    pub attachments: Vec<Attached>,
+    pub attachments: Vec<AttachedFile>,
     /// Geometry of the robot's links, if known.
-    pub robot: Option<Robot>,
+    pub robot: Option<RecordedRobot>,
     /// Command line of the program.
     pub command_line: Vec<String>,
 }
@@ -100,7 +100,7 @@ pub enum OutputError {
 #[derive(Debug)]
 pub struct Outputs {
     text: Option<Text>,
-    series: Option<Series<Topics>>,
+    series: Option<SplitRecording<Topics>>,
 }
 
 impl Outputs {
@@ -110,7 +110,7 @@ impl Outputs {
     /// # Errors
     /// Returns [`OutputError`] with the file that cannot be written.
     pub fn claim(
-        options: &Options,
+        options: &RecordOptions,
         stopped: &AtomicBool,
         say: impl FnMut(&str),
     ) -> Result<Self, OutputError> {
@@ -126,7 +126,7 @@ impl Outputs {
             }
             check_regular(path, options.force).map_err(failed)?;
             repair::orphans(path, say);
-            Series::claim(path, options.force, *split).map_err(failed)
+            SplitRecording::claim(path, options.force, *split).map_err(failed)
         });
         Ok(Self { text, series: series.transpose()? })
     }
@@ -153,11 +153,11 @@ impl Outputs {
     ///
     /// # Errors
     /// Returns [`ThreadError`] if the system grants no thread.
-    pub fn start(self, feed: Feed, layout: Layout, head: Head) -> Result<Recorder, ThreadError> {
+    pub fn start(self, feed: Feed, layout: Layout, head: FileHead) -> Result<Recorder, ThreadError> {
         let stop = Arc::new(Stop::default());
         let (tell, said) = mpsc::channel();
         let (notes, noted) = mpsc::channel();
-        let work = thread::Work::new(self, feed, layout, (noted, tell));
+        let work = thread::RecorderThread::new(self, feed, layout, (noted, tell));
         let ended = Arc::clone(&stop);
         let thread = spawn("recorder", move || work.run(head, &ended))?;
         Ok(Recorder { thread, stop, notes, said })
@@ -176,7 +176,7 @@ struct Stop {
 /// Handle of the recorder's thread.
 #[derive(Debug)]
 pub struct Recorder {
-    thread: std::thread::JoinHandle<Recording>,
+    thread: std::thread::JoinHandle<RecordingAccount>,
     stop: Arc<Stop>,
     notes: mpsc::Sender<(u64, String)>,
     said: mpsc::Receiver<String>,
@@ -184,7 +184,7 @@ pub struct Recorder {
 
 impl Recorder {
     /// Messages for the user since the last call.
-    pub fn said(&self) -> impl Iterator<Item = String> + '_ {
+    pub fn messages(&self) -> impl Iterator<Item = String> + '_ {
         self.said.try_iter()
     }
 
@@ -196,7 +196,7 @@ impl Recorder {
 
     /// Ends the recording of a run that never began. Leaves only a log of received frames.
     #[must_use]
-    pub fn discard(self) -> Recording {
+    pub fn discard(self) -> RecordingAccount {
         self.stop.discard.store(true, Ordering::Relaxed);
         self.stop.now.store(true, Ordering::Release);
         // If the thread panicked, it leaves a file that the next run removes.
@@ -206,12 +206,12 @@ impl Recorder {
     /// Records all queued items and ends the files. Call it when no thread queues more. `unrecorded` counts items that
     /// did not fit into the receivers' queues; `ticks` counts ticks that did not fit.
     #[must_use]
-    pub fn finish(self, unrecorded: Unrecorded, ticks: u64) -> Recording {
+    pub fn finish(self, unrecorded: Unrecorded, ticks: u64) -> RecordingAccount {
         self.stop.now.store(true, Ordering::Release);
         let mut recording = self.thread.join().unwrap_or_else(|_| {
             let errors =
                 vec!["the recorder panicked: what it had written is recovered by the next run".to_owned()];
-            Recording { errors, ..Recording::default() }
+            RecordingAccount { errors, ..RecordingAccount::default() }
         });
         recording.lost_queue = unrecorded.frames;
         recording.lost += unrecorded.frames;

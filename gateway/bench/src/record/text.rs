@@ -9,15 +9,15 @@ use std::time::{Duration, Instant};
 use protocol::candump::{Record, Timestamp, write_record};
 
 use super::Candump;
-use model::latched::Seen;
+use model::latched::ReceivedFrame;
 use trace::files::LogFile;
-use trace::recording::account::Written;
+use trace::recording::account::WrittenFile;
 
 /// Number of bytes written at once.
-const PIECE: usize = 64 << 10;
+const WRITE_BYTES: usize = 64 << 10;
 
 /// Interval between checks that the log still has its name.
-const LOOK: Duration = Duration::from_secs(1);
+const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A log that is being written. The first write error ends it after its last whole line.
 #[derive(Debug)]
@@ -49,7 +49,7 @@ impl Text {
         } else {
             LogFile::create(&target.path, force, stopped)?
         };
-        let lines = String::with_capacity(PIECE + 256);
+        let lines = String::with_capacity(WRITE_BYTES + 256);
         let (failed, moved, looked) = (false, false, Instant::now());
         Ok(Self { log, failed, moved, looked, lines, waiting: 0, frames: 0, lost: 0 })
     }
@@ -64,7 +64,7 @@ impl Text {
     ///
     /// # Errors
     /// Returns [`io::Error`] once if the log cannot be written.
-    pub fn frame(&mut self, interface: &str, seen: &Seen) -> io::Result<()> {
+    pub fn frame(&mut self, interface: &str, seen: &ReceivedFrame) -> io::Result<()> {
         if self.failed {
             self.lost += 1;
             return Ok(());
@@ -91,7 +91,7 @@ impl Text {
 
     fn end_line(&mut self) -> io::Result<()> {
         self.lines.push('\n');
-        if self.lines.len() < PIECE { Ok(()) } else { self.flush() }
+        if self.lines.len() < WRITE_BYTES { Ok(()) } else { self.flush() }
     }
 
     /// Returns true if the log has ended after an error.
@@ -106,18 +106,18 @@ impl Text {
     /// Returns [`io::Error`] once if the log cannot be written or was moved or changed.
     pub fn flush(&mut self) -> io::Result<()> {
         self.write()?;
-        if self.looked.elapsed() < LOOK {
+        if self.looked.elapsed() < CHECK_INTERVAL {
             return Ok(());
         }
         self.looked = Instant::now();
-        self.look()
+        self.check_name()
     }
 
-    fn look(&mut self) -> io::Result<()> {
+    fn check_name(&mut self) -> io::Result<()> {
         if self.moved || self.failed {
             return Ok(());
         }
-        let looked = self.log.look();
+        let looked = self.log.check();
         self.moved = looked.is_err();
         looked
     }
@@ -137,8 +137,8 @@ impl Text {
 
     /// Ends the log, also after an error. Returns the file if it still has its name, the number of frames missing in
     /// it, and the first error.
-    pub fn finish(mut self) -> (Option<Written>, u64, io::Result<()>) {
-        let (put, looked) = (self.write(), self.look());
+    pub fn finish(mut self) -> (Option<WrittenFile>, u64, io::Result<()>) {
+        let (put, looked) = (self.write(), self.check_name());
         let there = if self.moved { self.log.lines("(").ok().flatten() } else { Some(self.frames) };
         let Self { log, frames: written, lost, .. } = self;
         let frames = there.unwrap_or(0).min(written);
@@ -149,14 +149,14 @@ impl Text {
             } else {
                 log.bytes()
             };
-            Written { path, format: "candump", frames, messages: frames, bytes }
+            WrittenFile { path, format: "candump", frames, messages: frames, bytes }
         });
         let finished = log.finish();
         (file, lost + (written - frames), put.and(looked).and(finished))
     }
 
     /// Ends the log of a run that never began. Returns the file, or `None` if no frame was received.
-    pub fn discard(mut self) -> Option<Written> {
+    pub fn discard(mut self) -> Option<WrittenFile> {
         // The reason why the run did not begin is the error to report.
         let _ = self.flush();
         (self.frames > 0).then(|| self.finish().0).flatten()
@@ -173,9 +173,9 @@ mod tests {
         Text::create(&target, false, &AtomicBool::new(false)).unwrap()
     }
 
-    fn seen(at: u64) -> Seen {
+    fn seen(at: u64) -> ReceivedFrame {
         let frame = Frame::classic(0x123, &[1, 2, 3]).unwrap();
-        Seen { at_nanos: at * 1_000, own: false, frame }
+        ReceivedFrame { at_nanos: at * 1_000, from_gateway: false, frame }
     }
 
     #[test]
@@ -214,7 +214,7 @@ mod tests {
         let mut frames = |log: &mut Text, count| {
             for at in 0..count {
                 log.frame("vcan0", &seen(at)).unwrap();
-                log.looked = Instant::now().checked_sub(LOOK).unwrap();
+                log.looked = Instant::now().checked_sub(CHECK_INTERVAL).unwrap();
                 said.extend(log.flush().err());
             }
         };

@@ -17,28 +17,28 @@ use super::text::Text;
 use super::topics::{OF_ROBOT, Topics};
 use super::{Outputs, Stop};
 use crate::bus::realtime::wall;
-use model::latched::Latched;
-use trace::capture::{Note, NoteKind, RUN, facts_of_run};
-use trace::recording::account::{Count, Recording};
+use model::latched::LatchedPackets;
+use trace::capture::{Note, NoteKind, RUN_METADATA, facts_of_run};
+use trace::recording::account::{MessageCount, RecordingAccount};
 use trace::recording::layout::Layout;
-use trace::recording::series::{Head, Said, Series};
-use trace::recording::window::{WINDOW_NS, Window};
+use trace::recording::series::{FileHead, RecordingEvent, SplitRecording};
+use trace::recording::window::{WINDOW_NS, ReorderWindow};
 use trace::ros2::skin::ContactState;
 use trace::ros2::standard::{Diagnosis, Level, Point};
 
 /// Pause between rounds of the thread.
-const LOOK: Duration = Duration::from_millis(10);
+const ROUND_PAUSE: Duration = Duration::from_millis(10);
 /// Interval between flushes: a killed run may lose the data of this time plus one [`LOOK`].
 const FLUSH: Duration = Duration::from_millis(40);
 /// Interval between readings of the kernel's backlog drops.
-const REQUEST: Duration = Duration::from_millis(100);
+const BACKLOG_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval between diagnostics messages.
 const DIAGNOSE: Duration = Duration::from_millis(500);
 
 /// The recorder's state of a bus.
 #[derive(Default)]
 struct Seen {
-    latched: Latched,
+    latched: LatchedPackets,
     /// Number of frames recorded or counted as lost.
     frames: u64,
     /// Number of frames dropped by the bus.
@@ -54,12 +54,12 @@ struct Seen {
 /// The output files and their errors.
 struct Files {
     text: Option<Text>,
-    series: Option<Series<Topics>>,
-    errors: Vec<Said>,
+    series: Option<SplitRecording<Topics>>,
+    errors: Vec<RecordingEvent>,
 }
 
 /// State of the recorder's thread.
-pub(super) struct Work {
+pub(super) struct RecorderThread {
     files: Files,
     feed: Feed,
     layout: Layout,
@@ -97,7 +97,7 @@ impl Every {
     }
 }
 
-impl Work {
+impl RecorderThread {
     pub(super) fn new(
         outputs: Outputs,
         feed: Feed,
@@ -125,14 +125,14 @@ impl Work {
     }
 
     /// Records until stopped, including all items queued by then.
-    pub(super) fn run(mut self, head: Head, stop: &Stop) -> Recording {
+    pub(super) fn run(mut self, head: FileHead, stop: &Stop) -> RecordingAccount {
         if let Some(series) = &mut self.files.series {
             let nanos = head.nanos;
             series.begin(head, |writer| Topics::new(writer, &self.layout));
             robot(series, &self.layout, nanos);
         }
         let (mut flush, mut request, mut diagnose) =
-            (Every::new(FLUSH), Every::new(REQUEST), Every::new(DIAGNOSE));
+            (Every::new(FLUSH), Every::new(BACKLOG_INTERVAL), Every::new(DIAGNOSE));
         let many = frames(self.feed.bus_feeds.len()) / 8;
         loop {
             let ended = stop.now.load(Ordering::Acquire);
@@ -149,12 +149,12 @@ impl Work {
             if flush.is_due() {
                 self.flush();
             }
-            self.say();
+            self.send_messages();
             if ended {
                 break;
             }
             if taken < many {
-                thread::sleep(LOOK);
+                thread::sleep(ROUND_PAUSE);
             }
         }
         self.finish()
@@ -164,7 +164,7 @@ impl Work {
     fn take(&mut self) -> usize {
         let offset = realtime_minus_monotonic();
         if let Some(series) = &mut self.files.series {
-            series.look(wall());
+            series.set_time(wall());
         }
         let mut most = 0;
         self.take_ticks(offset);
@@ -192,10 +192,10 @@ impl Work {
             match captured {
                 Captured::Frame(frame) => {
                     seen.frames += 1;
-                    seen.latched.take(frame);
+                    seen.latched.receive(frame);
                     seen.missing += u64::from(self.files.is_between());
                     self.files.text(|text| text.frame(name, &frame));
-                    self.files.put(Count::FRAME, |window, topics| topics.frame(window, bus, name, &frame));
+                    self.files.put(MessageCount::FRAME, |window, topics| topics.frame(window, bus, name, &frame));
                 }
                 Captured::Dropped { at_nanos, frames } => {
                     seen.dropped += frames;
@@ -230,11 +230,11 @@ impl Work {
                 && let Some(series) = &mut self.files.series
             {
                 let since = timed.record.tick.number.saturating_mul(layout.tick_ns);
-                series.add(RUN, facts_of_run(nanos.saturating_sub(since)));
+                series.add(RUN_METADATA, facts_of_run(nanos.saturating_sub(since)));
             }
             let messages = 4 + u64::from(layout.poses_at(timed.record.tick.number));
             self.files
-                .put(Count::others(messages), |window, topics| topics.tick(window, layout, nanos, &timed));
+                .put(MessageCount::others(messages), |window, topics| topics.tick(window, layout, nanos, &timed));
         }
     }
 
@@ -250,7 +250,7 @@ impl Work {
             let patches = self.layout.patches.iter().enumerate().filter(|(_, patch)| patch.bus == bus);
             for (place, _) in patches {
                 let messages = if q.is_some() { 2 } else { 1 };
-                self.files.put(Count::others(messages), |window, topics| {
+                self.files.put(MessageCount::others(messages), |window, topics| {
                     topics.patch(window, &self.layout, place, &touched, q, &mut self.scratch)
                 });
             }
@@ -298,7 +298,7 @@ impl Work {
             ],
         });
         let now = wall();
-        series.put(Count::others(1), |window, topics| topics.diagnostics(window, now, &parts));
+        series.put(MessageCount::others(1), |window, topics| topics.diagnostics(window, now, &parts));
     }
 
     fn flush(&mut self) {
@@ -316,7 +316,7 @@ impl Work {
         robot(series, &self.layout, began);
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
             for frame in seen.latched.frames() {
-                series.put(Count::others(1), |window, topics| {
+                series.put(MessageCount::others(1), |window, topics| {
                     topics.latched(window, began, (bus, name), &frame);
                 });
             }
@@ -334,9 +334,9 @@ impl Work {
     }
 
     /// Sends new errors to the user.
-    fn say(&mut self) {
+    fn send_messages(&mut self) {
         let Files { series, errors, .. } = &mut self.files;
-        errors.extend(series.iter_mut().flat_map(Series::said));
+        errors.extend(series.iter_mut().flat_map(SplitRecording::drain_events));
         for line in errors.get(self.reported..).unwrap_or_default() {
             // At the end of the run the receiver is gone.
             let _ = self.tell.send(line.to_string());
@@ -345,16 +345,16 @@ impl Work {
     }
 
     /// Leaves only a log of received frames.
-    fn discard(mut self) -> Recording {
+    fn discard(mut self) -> RecordingAccount {
         if let Some(series) = &mut self.files.series {
             series.discard();
         }
         let files: Vec<_> = self.files.text.and_then(Text::discard).into_iter().collect();
-        Recording { frames: files.iter().map(|file| file.frames).sum(), files, ..Recording::default() }
+        RecordingAccount { frames: files.iter().map(|file| file.frames).sum(), files, ..RecordingAccount::default() }
     }
 
-    fn finish(mut self) -> Recording {
-        let mut recording = Recording::default();
+    fn finish(mut self) -> RecordingAccount {
+        let mut recording = RecordingAccount::default();
         let mut lost = 0;
         if let Some(mut series) = self.files.series.take() {
             let (files, unwritten) = series.finish();
@@ -364,7 +364,7 @@ impl Work {
             if unwritten.others > 0 {
                 recording.messages_lost.insert("unwritten", unwritten.others);
             }
-            self.files.errors.extend(series.said());
+            self.files.errors.extend(series.drain_events());
         }
         if let Some(text) = self.files.text.take() {
             let path = text.path().display().to_string();
@@ -373,10 +373,10 @@ impl Work {
             lost = lost.max(unwritten);
             // Earlier errors have been reported during the run.
             if let Err(error) = finished {
-                self.files.errors.push(Said::Else(format!("{path}: {error}")));
+                self.files.errors.push(RecordingEvent::Else(format!("{path}: {error}")));
             }
         }
-        self.say();
+        self.send_messages();
         let offered: u64 = self.buses.iter().map(|bus| bus.frames).sum();
         recording.frames = offered.saturating_sub(lost);
         recording.lost_write = lost;
@@ -400,12 +400,12 @@ impl Files {
             && let Err(error) = write(text)
         {
             let what = format!("{}: {error}", text.path().display());
-            self.errors.push(if text.is_over() { Said::BrokeOff(what) } else { Said::Else(what) });
+            self.errors.push(if text.is_over() { RecordingEvent::BrokeOff(what) } else { RecordingEvent::Else(what) });
         }
     }
 
     /// Writes to the recording, if any.
-    fn put(&mut self, count: Count, write: impl FnOnce(&mut Window, &mut Topics)) {
+    fn put(&mut self, count: MessageCount, write: impl FnOnce(&mut ReorderWindow, &mut Topics)) {
         if let Some(series) = &mut self.series {
             series.put(count, write);
         }
@@ -423,14 +423,14 @@ impl Files {
         let (bus, interface) = bus.unzip();
         let interface = interface.unwrap_or_default();
         let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
-        self.put(Count::others(1), |window, topics| topics.note(window, bus, &note));
+        self.put(MessageCount::others(1), |window, topics| topics.note(window, bus, &note));
     }
 }
 
 /// Writes the robot's description, once per file.
-fn robot(series: &mut Series<Topics>, layout: &Layout, nanos: u64) {
+fn robot(series: &mut SplitRecording<Topics>, layout: &Layout, nanos: u64) {
     if layout.robot.is_some() {
-        series.put(Count::others(OF_ROBOT), |window, topics| topics.robot(window, layout, nanos));
+        series.put(MessageCount::others(OF_ROBOT), |window, topics| topics.robot(window, layout, nanos));
     }
 }
 
@@ -444,7 +444,7 @@ fn bus(bus_feed: &BusFeed, name: &str, seen: &Seen) -> Diagnosis {
     let (mut cells, mut silent) = (0, 0);
     if let Ok(view) = bus_feed.view.lock() {
         cells = view.cells.len();
-        silent = view.cells.iter().filter(|cell| !cell.heard || cell.dead).count();
+        silent = view.cells.iter().filter(|cell| !cell.seen || cell.dead).count();
     }
     let (level, message) = match (works, silent, seen.dropped) {
         (false, _, _) => (Level::Error, "the bus does not work"),

@@ -5,18 +5,18 @@ use std::io;
 use protocol::candump::{Direction, Record, Timestamp};
 use protocol::skin::MAX_ROBOT_JOINTS;
 
-use super::feed::Touched;
+use super::feed::EpochContacts;
 use control::controller::BadCycle;
 use control::cycle::Halt;
-use control::cycle::turn::Timed;
-use model::latched::Seen;
+use control::cycle::turn::TimedRecord;
+use model::latched::ReceivedFrame;
 use model::table::Status;
 use trace::capture::Note;
-use trace::recording::NOTES;
+use trace::recording::NOTES_TOPIC;
 use trace::recording::file::Channel;
 use trace::recording::layout::{Layout, Patch};
 use trace::recording::series::Writer;
-use trace::recording::window::Window;
+use trace::recording::window::ReorderWindow;
 use trace::ros2::robot::{Text, Transforms};
 use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
@@ -64,7 +64,7 @@ impl Topics {
         let digits = [("time_digits", "9")];
         let of_arm = ["joint_states", "joint_commands", "torques"];
         let of_arm = of_arm.map(|topic| format!("/{}/{topic}", layout.arm));
-        let fixed = [NOTES, TIMING, DIAGNOSTICS, TF, TF_STATIC, DESCRIPTION].map(str::to_owned);
+        let fixed = [NOTES_TOPIC, TIMING, DIAGNOSTICS, TF, TF_STATIC, DESCRIPTION].map(str::to_owned);
         let others = fixed.into_iter().chain(of_arm.iter().cloned());
         let [can, state] = layout.bus_topics(others).map(|topics| -> io::Result<Vec<Channel>> {
             topics.iter().map(|topic| writer.channel::<Record<'_>>(topic, &digits)).collect()
@@ -84,7 +84,7 @@ impl Topics {
         Ok(Self {
             can,
             state,
-            notes: writer.channel::<Note<'_>>(NOTES, &[])?,
+            notes: writer.channel::<Note<'_>>(NOTES_TOPIC, &[])?,
             joint_states: writer.channel::<JointState<'_>>(states, &[])?,
             joint_commands: writer.channel::<JointState<'_>>(commands, &[])?,
             torques: writer.channel::<Torques<'_>>(torques, &[])?,
@@ -96,14 +96,14 @@ impl Topics {
     }
 
     /// Writes the robot's fixed transforms and description, if known.
-    pub fn robot(&mut self, window: &mut Window, layout: &Layout, nanos: u64) {
+    pub fn robot(&mut self, window: &mut ReorderWindow, layout: &Layout, nanos: u64) {
         let (Some(robot), Some([_, still, description])) = (&layout.robot, &mut self.robot) else { return };
         window.write(still, nanos, &Transforms { nanos, transforms: &robot.still() });
         window.write(description, nanos, &Text(&robot.description));
     }
 
     /// Writes a frame of a bus.
-    pub fn frame(&mut self, window: &mut Window, bus: usize, name: &str, seen: &Seen) {
+    pub fn frame(&mut self, window: &mut ReorderWindow, bus: usize, name: &str, seen: &ReceivedFrame) {
         if let Some(channel) = self.can.get_mut(bus) {
             window.write(channel, seen.at_nanos, &message(name, seen));
         }
@@ -111,21 +111,21 @@ impl Topics {
 
     /// Writes a frame that was latched when the file begins, at `nanos`: its own time may be much earlier, and viewers
     /// would start there.
-    pub fn latched(&mut self, window: &mut Window, nanos: u64, (bus, name): (usize, &str), seen: &Seen) {
+    pub fn latched(&mut self, window: &mut ReorderWindow, nanos: u64, (bus, name): (usize, &str), seen: &ReceivedFrame) {
         if let Some(channel) = self.state.get_mut(bus) {
             window.write_at(channel, nanos, seen.at_nanos, &message(name, seen));
         }
     }
 
     /// Writes a note between frames; a note about a bus follows the frames recorded from it.
-    pub fn note(&mut self, window: &mut Window, bus: Option<usize>, note: &Note<'_>) {
+    pub fn note(&mut self, window: &mut ReorderWindow, bus: Option<usize>, note: &Note<'_>) {
         let channel = bus.and_then(|bus| self.can.get(bus));
         let heard = channel.map(|channel| window.latest(channel)).filter(|heard| *heard > 0);
         window.write_at(&mut self.notes, heard.unwrap_or(note.nanos), note.nanos, note);
     }
 
     /// Writes a control tick that was due at `nanos`.
-    pub fn tick(&mut self, window: &mut Window, layout: &Layout, nanos: u64, timed: &Timed) {
+    pub fn tick(&mut self, window: &mut ReorderWindow, layout: &Layout, nanos: u64, timed: &TimedRecord) {
         let names = &layout.joints;
         fn of(joints: usize, values: &[f64; MAX_ROBOT_JOINTS]) -> &[f64] {
             values.get(..joints).unwrap_or_default()
@@ -153,10 +153,10 @@ impl Topics {
     /// Writes the contact states of a patch's cells, and their points if the joint positions are given.
     pub fn patch(
         &mut self,
-        window: &mut Window,
+        window: &mut ReorderWindow,
         layout: &Layout,
         place: usize,
-        touched: &Touched,
+        touched: &EpochContacts,
         q: Option<&[f64; MAX_ROBOT_JOINTS]>,
         scratch: &mut (Vec<ContactState>, Vec<Point>),
     ) {
@@ -190,18 +190,18 @@ impl Topics {
     }
 
     /// Writes the diagnostics.
-    pub fn diagnostics(&mut self, window: &mut Window, nanos: u64, parts: &[Diagnosis]) {
+    pub fn diagnostics(&mut self, window: &mut ReorderWindow, nanos: u64, parts: &[Diagnosis]) {
         window.write(&mut self.diagnostics, nanos, &Diagnostics { nanos, parts });
     }
 }
 
-fn message<'a>(interface: &'a str, seen: &Seen) -> Record<'a> {
+fn message<'a>(interface: &'a str, seen: &ReceivedFrame) -> Record<'a> {
     let time = Timestamp::nine_digits(seen.at_nanos);
-    let direction = Some(if seen.own { Direction::Sent } else { Direction::Received });
+    let direction = Some(if seen.from_gateway { Direction::Sent } else { Direction::Received });
     Record { time, interface, frame: seen.frame, direction }
 }
 
-fn timing(nanos: u64, timed: &Timed) -> LoopTiming {
+fn timing(nanos: u64, timed: &TimedRecord) -> LoopTiming {
     let record = &timed.record;
     #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
     let micros = |nanos: u64| nanos as f64 * 1e-3;

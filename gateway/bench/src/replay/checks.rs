@@ -5,17 +5,17 @@ use std::collections::{BTreeMap, BTreeSet};
 use protocol::id::CellId;
 use protocol::message::State;
 
-use super::Options;
+use super::ReplayOptions;
 use super::comparator::Comparator;
 use super::error::Mismatch;
 use super::start::Routes;
-use super::survey::{Bus, Cell, Known, Survey};
+use super::survey::{SurveyedBus, SurveyedCell, KnownValue, Survey};
 use crate::setup::names;
 
 /// The replayed part, and the conditions on the cells.
 #[derive(Debug)]
 pub(super) struct Checks {
-    pub(super) options: Options,
+    pub(super) options: ReplayOptions,
     pub(super) survey: Survey,
     pub(super) routes: Routes,
     /// Display name of the capture.
@@ -29,13 +29,13 @@ impl Checks {
     }
 
     /// Present name and recorded state of each bus.
-    pub(super) fn bus_links(&self) -> impl Iterator<Item = (&str, &Bus)> {
+    pub(super) fn bus_links(&self) -> impl Iterator<Item = (&str, &SurveyedBus)> {
         let buses = &self.survey.buses;
         self.routes.names.iter().filter_map(|(bus, name)| Some((name.as_str(), buses.get(*bus)?)))
     }
 
     /// Recorded cells of a bus in the replayed part.
-    fn cells<'a>(&self, bus: &'a Bus) -> impl Iterator<Item = (CellId, &'a Cell)> + use<'a> {
+    fn cells<'a>(&self, bus: &'a SurveyedBus) -> impl Iterator<Item = (CellId, &'a SurveyedCell)> + use<'a> {
         bus.cells_in(self.survey.bounds())
     }
 
@@ -70,7 +70,7 @@ impl Checks {
         let (mut equal, mut others, mut count) = (0_usize, 0_usize, 0_usize);
         for (bus_link, (name, bus)) in self.bus_links().enumerate() {
             let there: BTreeMap<_, _> = comparator
-                .settled(bus_link)
+                .settled_cells(bus_link)
                 .filter_map(|(cell, present)| Some((cell, present.claim.heartbeat()?.configuration)))
                 .collect();
             let (mut missing, mut differing) = (Vec::new(), Vec::new());
@@ -109,10 +109,10 @@ impl Checks {
 
     /// Cells of each bus that measure now, although they obeyed stimuli in the recording.
     pub(super) fn measuring(&self, comparator: &Comparator) -> Vec<Vec<CellId>> {
-        let measures = |(bus_link, (_, bus)): (usize, (&str, &Bus))| {
+        let measures = |(bus_link, (_, bus)): (usize, (&str, &SurveyedBus))| {
             let obeyed = |cell: &CellId| bus.cells.get(cell).is_some_and(|cell| !cell.measured);
             let now =
-                comparator.settled(bus_link).filter(|(_, present)| !present.claim.says(State::TEST_MODE));
+                comparator.settled_cells(bus_link).filter(|(_, present)| !present.claim.has_state(State::TEST_MODE));
             now.map(|(cell, _)| cell).filter(obeyed).collect()
         };
         self.bus_links().enumerate().map(measures).collect()
@@ -120,6 +120,6 @@ impl Checks {
 }
 
 /// Hash of a cell's recorded configuration, if known.
-const fn hash(cell: &Cell) -> Option<u16> {
-    if let Known::Yes(hash) = cell.hash { Some(hash) } else { None }
+const fn hash(cell: &SurveyedCell) -> Option<u16> {
+    if let KnownValue::Yes(hash) = cell.hash { Some(hash) } else { None }
 }

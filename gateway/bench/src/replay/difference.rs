@@ -11,12 +11,12 @@ use protocol::schema::Units;
 use protocol::skin::JointKind;
 use serde::Serialize;
 
-use super::comparator::Own;
+use super::comparator::OwnTerm;
 use model::decode::Decoded;
 
 /// Kind of a reply to joints.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
-pub enum What {
+pub enum ReplyKind {
     /// A torque packet.
     Torque,
     /// A sensor packet, page 0.
@@ -28,7 +28,7 @@ pub enum What {
 /// Kind of a difference.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "lowercase")]
-pub enum How {
+pub enum DifferenceKind {
     /// The words differ.
     Different,
     /// The reply did not come.
@@ -39,18 +39,18 @@ pub enum How {
 
 /// A value that a cell sent.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Said {
+pub enum SentValue {
     /// Words of a reply to joints.
-    Words(What, Words),
+    Words(ReplyKind, Words),
     /// A sum, with the remainder without the children's sums.
-    Sum(Own),
+    Sum(OwnTerm),
     /// An answer to `configure`, with its tag.
     Answer(u8, Answer),
 }
 
 /// Position of joints in a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct When {
+pub struct Position {
     /// Number among the replayed joints of the bus, from 0.
     pub joints: u64,
     /// Epoch of the joints.
@@ -63,14 +63,14 @@ pub struct When {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Difference {
     /// Kind of the difference.
-    pub how: How,
+    pub how: DifferenceKind,
     /// Present name of the bus.
     pub bus: String,
     /// Node id of the cell.
     pub cell: u8,
     /// Joints that the reply answers, if any.
     #[serde(flatten)]
-    pub when: Option<When>,
+    pub when: Option<Position>,
     /// Text for people, in several lines.
     pub text: String,
 }
@@ -79,23 +79,23 @@ impl Difference {
     /// Describes the difference between a cell's recorded and present values.
     #[must_use]
     pub fn new(
-        how: How,
+        how: DifferenceKind,
         (bus, units): (&str, Units),
         cell: CellId,
-        when: Option<When>,
-        recorded: Option<&Said>,
-        now: Option<&Said>,
+        when: Option<Position>,
+        recorded: Option<&SentValue>,
+        now: Option<&SentValue>,
     ) -> Self {
         let what = match how {
-            How::Different => "difference",
-            How::Missing => "missing reply",
-            How::Extra => "extra reply",
+            DifferenceKind::Different => "difference",
+            DifferenceKind::Missing => "missing reply",
+            DifferenceKind::Extra => "extra reply",
         };
-        let joints = when.map_or_else(String::new, |When { joints, epoch, at_s }| {
+        let joints = when.map_or_else(String::new, |Position { joints, epoch, at_s }| {
             format!(", joints {joints} (epoch {epoch}, {at_s:.3} s into the recording)")
         });
         let epoch = Epoch(when.map_or(0, |when| when.epoch));
-        let shown = |said: Option<&Said>| {
+        let shown = |said: Option<&SentValue>| {
             said.map_or_else(|| "nothing".to_owned(), |said| said.text(cell, epoch, units))
         };
         let mut text = format!(
@@ -112,15 +112,15 @@ impl Difference {
     }
 }
 
-impl Said {
+impl SentValue {
     /// Formats the value as the text of a message.
     fn text(&self, cell: CellId, epoch: Epoch, units: Units) -> String {
         match self {
             &Self::Words(what, words) => {
                 let (kind, count) = match what {
-                    What::Torque => (Kind::Torque, 1),
-                    What::Skin => (Kind::Sensors, 0),
-                    What::Acceleration => (Kind::Sensors, 1),
+                    ReplyKind::Torque => (Kind::Torque, 1),
+                    ReplyKind::Skin => (Kind::Sensors, 0),
+                    ReplyKind::Acceleration => (Kind::Sensors, 1),
                 };
                 let packet = Packet { id: Id::new(kind, Node::Cell(cell)), words, epoch, count };
                 Message::decode(&packet)
@@ -134,17 +134,17 @@ impl Said {
     /// Torques in steps, `None` for saturated ones, and their format.
     fn steps(&self, units: Units) -> Option<([Option<i32>; MAX_JOINTS], TorqueFormat)> {
         match self {
-            Self::Words(What::Torque, words) => {
+            Self::Words(ReplyKind::Torque, words) => {
                 Some((words.padded().map(|word| Some(word.into())), units.torque_format()))
             }
             Self::Sum(own) => Some((own.steps, TorqueFormat::Q7_8)),
-            Self::Words(What::Skin | What::Acceleration, ..) | Self::Answer(..) => None,
+            Self::Words(ReplyKind::Skin | ReplyKind::Acceleration, ..) | Self::Answer(..) => None,
         }
     }
 }
 
 /// Formats a sum, its children, and the cell's own contribution.
-fn summed(cell: CellId, epoch: Epoch, own: &Own, units: Units) -> String {
+fn summed(cell: CellId, epoch: Epoch, own: &OwnTerm, units: Units) -> String {
     let sum = Message::Sum { from: cell, epoch, torque: own.sum, count: own.count };
     let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
     let less = match children.as_slice() {
@@ -210,12 +210,12 @@ mod tests {
 
     #[test]
     fn a_different_torque_is_shown_word_by_word() {
-        let torque = |words: [i16; 6]| Said::Words(What::Torque, words.into());
+        let torque = |words: [i16; 6]| SentValue::Words(ReplyKind::Torque, words.into());
         let (recorded, now) = (torque([-1075, 3195, 0, 0, 0, 0]), torque([-1074, 3193, 0, 0, 0, 0]));
-        let when = Some(When { joints: 37, epoch: 7, at_s: 2.3842 });
+        let when = Some(Position { joints: 37, epoch: 7, at_s: 2.3842 });
         let cell = CellId::new(12).unwrap();
         let difference = Difference::new(
-            How::Different,
+            DifferenceKind::Different,
             ("vcan0", Units::default()),
             cell,
             when,
@@ -232,10 +232,10 @@ mod tests {
 
     #[test]
     fn a_reply_that_was_not_sent_is_nothing() {
-        let refused = Said::Answer(9, Answer::Refused { number: 127, reason: Answer::WRONG_HASH });
+        let refused = SentValue::Answer(9, Answer::Refused { number: 127, reason: Answer::WRONG_HASH });
         let cell = CellId::new(3).unwrap();
         let text =
-            Difference::new(How::Missing, ("can1", Units::default()), cell, None, Some(&refused), None).text;
+            Difference::new(DifferenceKind::Missing, ("can1", Units::default()), cell, None, Some(&refused), None).text;
         let lines: Vec<_> = text.lines().collect();
         assert_eq!(lines.len(), 3, "{text}");
         assert_eq!(lines[0], "the first missing reply: cell 3 on can1");

@@ -7,7 +7,7 @@ use protocol::bus::{BusError, KindsError};
 use thiserror::Error;
 
 use crate::error::{RunError, why};
-use model::decode::BUSES;
+use model::decode::MAX_BUSES;
 use trace::capture::CaptureError;
 
 /// An error of cells that are not as they were in the recording.
@@ -79,7 +79,7 @@ pub enum ReplayError {
     #[error("{0}")]
     Line(String),
     /// The capture has too many buses.
-    #[error("{0} has frames of more than {BUSES} buses: a replay sends to no more than that")]
+    #[error("{0} has frames of more than {MAX_BUSES} buses: a replay sends to no more than that")]
     Buses(String),
     /// The capture has nothing to send.
     #[error("{0}: there is no frame in it")]

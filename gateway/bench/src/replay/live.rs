@@ -12,19 +12,19 @@ use protocol::message::{Message, State as Flags};
 use protocol::packet::Epoch;
 
 use super::player::{Pace, Stage};
-use super::replay_plan::Open;
+use super::replay_plan::OpenJoints;
 use super::report::Lockstep;
 use super::shared_state::SharedState;
-use super::start::{BusLink, mode};
-use super::{Options, ReplayError};
+use super::start::{ReplayBus, mode};
+use super::{ReplayOptions, ReplayError};
 use crate::bus::realtime;
 use crate::setup::names;
 
 /// Interval between readings of the stop flag, in ns.
 const LOOK_NS: u64 = 100_000_000;
 /// Pause before the next step.
-const PAUSE: Duration = Duration::from_micros(100);
-const DOWN: Duration = Duration::from_millis(50);
+const STEP_PAUSE: Duration = Duration::from_micros(100);
+const DOWN_PAUSE: Duration = Duration::from_millis(50);
 /// Time without any answer after which cells are queried again, as a frame may have been lost, and after which they are
 /// given up.
 const REMIND: Duration = Duration::from_millis(500);
@@ -34,14 +34,14 @@ const REQUEST_AGAIN: u32 = 16;
 /// The same maximum after joints for which resending did not help: lateness is hardly the reason then.
 const REQUEST_AGAIN_IN_VAIN: u32 = 2;
 /// First wait for answers to resent joints, before cells must send a heartbeat too.
-const ANSWERS: Duration = Duration::from_millis(100);
+const FIRST_ANSWER_WAIT: Duration = Duration::from_millis(100);
 /// Maximum of the factor on the wait.
-const LONGEST: u32 = 4;
+const MAX_WAIT_FACTOR: u32 = 4;
 
 /// The stage of a real replay.
 #[derive(Debug)]
-pub(super) struct Live {
-    pub(super) bus_links: Arc<Vec<BusLink>>,
+pub(super) struct LiveStage {
+    pub(super) bus_links: Arc<Vec<ReplayBus>>,
     pub(super) shared_state: Arc<SharedState>,
     /// Messages for the user.
     pub(super) log_sender: Sender<String>,
@@ -52,7 +52,7 @@ pub(super) struct Live {
     pub(super) down: BTreeSet<usize>,
 }
 
-impl Stage for Live {
+impl Stage for LiveStage {
     fn now(&self) -> u64 {
         realtime::now()
     }
@@ -74,15 +74,15 @@ impl Stage for Live {
     }
 
     fn pause(&mut self) {
-        std::thread::sleep(PAUSE);
+        std::thread::sleep(STEP_PAUSE);
     }
 
     fn is_over(&self) -> bool {
         self.shared_state.is_over()
     }
 
-    fn announce(&mut self, bus_link: usize, round: Option<u64>, epoch: Epoch) {
-        self.shared_state.comparator().announce(bus_link, round, epoch);
+    fn announce(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch) {
+        self.shared_state.comparator().sent_joints(bus_index, round, epoch);
     }
 
     fn send(&mut self, index: usize, frames: &[Frame]) -> Result<(), SendError> {
@@ -91,69 +91,69 @@ impl Stage for Live {
         let taken = sent.as_ref().map_or_else(|error| error.sent, |()| frames.len());
         self.shared_state.sent.fetch_add(taken as u64, Ordering::Relaxed);
         if taken > 0 && self.down.remove(&index) {
-            self.say(format!("{} works again", bus_link.bus.name()));
+            self.notify(format!("{} works again", bus_link.bus.name()));
         }
         if let Err(SendError { cause: error @ BusError::Down(_), .. }) = &sent {
             if self.down.insert(index) {
-                self.shared_state.comparator().is_down(index);
-                self.say(format!("{error}; frames due meanwhile are lost, and counted"));
+                self.shared_state.comparator().mark_down(index);
+                self.notify(format!("{error}; frames due meanwhile are lost, and counted"));
             }
             // At a timed pace, waiting would lose frames.
-            let Options { pace, lockstep, .. } = self.shared_state.checks.options;
+            let ReplayOptions { pace, lockstep, .. } = self.shared_state.checks.options;
             if pace == Pace::Max || lockstep {
-                std::thread::sleep(DOWN);
+                std::thread::sleep(DOWN_PAUSE);
             }
         }
         sent
     }
 
-    fn was_not_sent(&mut self, bus_link: usize, round: u64) {
-        self.shared_state.comparator().was_not_sent(bus_link, round);
+    fn mark_unsent(&mut self, bus_index: usize, round: u64) {
+        self.shared_state.comparator().mark_unsent(bus_index, round);
     }
 
-    fn wait_for_answers(&mut self, bus_link: usize, open: &Open) {
-        self.wait_until_done(bus_link);
+    fn wait_for_answers(&mut self, bus_index: usize, open: &OpenJoints) {
+        self.wait_until_done(bus_index);
         let Some(round) = open.round.filter(|_| self.shared_state.checks.options.expect.is_some()) else {
             return;
         };
         // On a slow machine a cell skips joints that it processes more than one period late, and does not answer. They
         // are resent under the epoch before, and then under their own. The sync follows later, because on such a
         // machine the heartbeats of some cells delay others.
-        let tries = if self.in_vain.contains(&bus_link) { REQUEST_AGAIN_IN_VAIN } else { REQUEST_AGAIN };
+        let tries = if self.in_vain.contains(&bus_index) { REQUEST_AGAIN_IN_VAIN } else { REQUEST_AGAIN };
         for again in 0.. {
             if self.shared_state.is_over() {
                 return;
             }
-            if self.shared_state.comparator().unanswered(bus_link, round) == 0 {
+            if self.shared_state.comparator().unanswered(bus_index, round) == 0 {
                 if again > 0 {
-                    self.in_vain.remove(&bus_link);
+                    self.in_vain.remove(&bus_index);
                 }
                 return;
             }
             if again == tries {
-                self.in_vain.insert(bus_link);
+                self.in_vain.insert(bus_index);
                 return;
             }
-            let epoch = if again % 2 == 0 { open.epoch.plus(u8::MAX) } else { open.epoch };
+            let epoch = if again % 2 == 0 { open.epoch.advanced_by(u8::MAX) } else { open.epoch };
             self.lockstep.retried += 1;
-            self.shared_state.comparator().announce(bus_link, Some(round), epoch);
+            self.shared_state.comparator().sent_joints(bus_index, Some(round), epoch);
             let joints = Message::Joints { epoch, joints: open.joints };
-            if self.tell(bus_link, &[joints]).is_err() {
+            if self.send_messages(bus_index, &[joints]).is_err() {
                 return;
             }
-            let give_up = Instant::now() + ANSWERS * (again + 1).min(LONGEST);
+            let give_up = Instant::now() + FIRST_ANSWER_WAIT * (again + 1).min(MAX_WAIT_FACTOR);
             let mut comparator = self.shared_state.comparator();
-            while comparator.unanswered(bus_link, round) > 0
+            while comparator.unanswered(bus_index, round) > 0
                 && Instant::now() < give_up
                 && !self.shared_state.is_over()
             {
                 comparator = self.shared_state.wait(comparator, Duration::from_millis(5));
             }
             drop(comparator);
-            if self.tell(bus_link, &[Message::Sync]).is_err() {
+            if self.send_messages(bus_index, &[Message::Sync]).is_err() {
                 return;
             }
-            self.wait_until_done(bus_link);
+            self.wait_until_done(bus_index);
         }
     }
 
@@ -165,9 +165,9 @@ impl Stage for Live {
             all.extend_from_slice(messages);
             for message in &all {
                 if let Message::Joints { epoch, .. } = *message {
-                    self.shared_state.comparator().announce(*bus_link, None, epoch);
+                    self.shared_state.comparator().sent_joints(*bus_link, None, epoch);
                 }
-                self.tell(*bus_link, core::slice::from_ref(message))?;
+                self.send_messages(*bus_link, core::slice::from_ref(message))?;
             }
             self.finish(*bus_link, &[Message::Sync])?;
             self.shared_state.comparator().mute(false);
@@ -180,55 +180,55 @@ impl Stage for Live {
     }
 }
 
-impl Live {
+impl LiveStage {
     /// Messages that reset the contact state of the cells on a bus that are in test mode.
-    fn forgetting(&self, bus_link: usize) -> Vec<Message> {
+    fn forgetting(&self, bus_index: usize) -> Vec<Message> {
         let comparator = self.shared_state.comparator();
-        let obeying = comparator.settled(bus_link).filter(|(_, cell)| cell.claim.says(Flags::TEST_MODE));
+        let obeying = comparator.settled_cells(bus_index).filter(|(_, cell)| cell.claim.has_state(Flags::TEST_MODE));
         obeying.map(|(cell, _)| mode(cell, true)).collect()
     }
 
-    fn tell(&self, bus_link: usize, messages: &[Message]) -> Result<(), BusError> {
-        self.bus_links.get(bus_link).map_or(Ok(()), |bus_link| bus_link.send(messages))
+    fn send_messages(&self, bus_index: usize, messages: &[Message]) -> Result<(), BusError> {
+        self.bus_links.get(bus_index).map_or(Ok(()), |bus_link| bus_link.send(messages))
     }
 
     /// Sends a message for the user; at the end of the replay the receiver is gone.
-    fn say(&self, text: String) {
+    fn notify(&self, text: String) {
         let _ = self.log_sender.send(text);
     }
 
     /// Waits until the cells of a bus have processed all that was sent so far, and `last`.
-    fn finish(&mut self, bus_link: usize, last: &[Message]) -> Result<(), BusError> {
-        self.shared_state.comparator().announce_again(bus_link);
-        self.tell(bus_link, last)?;
-        self.wait_until_done(bus_link);
+    fn finish(&mut self, bus_index: usize, last: &[Message]) -> Result<(), BusError> {
+        self.shared_state.comparator().announce_sync(bus_index);
+        self.send_messages(bus_index, last)?;
+        self.wait_until_done(bus_index);
         Ok(())
     }
 
     /// Requests counters and waits for them.
-    pub(super) fn report(&mut self, bus_link: usize) -> Result<(), BusError> {
-        self.finish(bus_link, &[Message::Report, Message::Sync])
+    pub(super) fn report(&mut self, bus_index: usize) -> Result<(), BusError> {
+        self.finish(bus_index, &[Message::Report, Message::Sync])
     }
 
-    fn wait_until_done(&mut self, bus_link: usize) {
+    fn wait_until_done(&mut self, bus_index: usize) {
         let (mut done, mut progress, mut reminded) = (0, Instant::now(), Instant::now());
         let mut comparator = self.shared_state.comparator();
-        while !comparator.is_done(bus_link) && !self.shared_state.is_over() {
-            let now = comparator.done(bus_link);
+        while !comparator.is_done(bus_index) && !self.shared_state.is_over() {
+            let now = comparator.done(bus_index);
             if now != done {
                 (done, progress, reminded) = (now, Instant::now(), Instant::now());
             }
             if reminded.elapsed() > REMIND {
                 reminded = Instant::now();
                 // The next frame reports a bus that refuses messages.
-                let _ = self.tell(bus_link, &[Message::Sync]);
+                let _ = self.send_messages(bus_index, &[Message::Sync]);
             }
             if progress.elapsed() > TIMEOUT {
-                let late = comparator.give_up(bus_link);
-                let name = self.shared_state.checks.bus_link(bus_link);
+                let late = comparator.give_up(bus_index);
+                let name = self.shared_state.checks.bus_link(bus_index);
                 self.lockstep.silent_cells.extend(late.iter().map(|cell| format!("{cell} on {name}")));
                 let (plural, verb) = if late.len() == 1 { ("", "does") } else { ("s", "do") };
-                self.say(format!(
+                self.notify(format!(
                     "cell{plural} {} on {name} {verb} not answer within {} s: the replay goes on without",
                     names(&late, ""),
                     TIMEOUT.as_secs()

@@ -18,15 +18,15 @@ use crate::processes::STARTING;
 use crate::setup::{Timeout, names};
 
 /// Time within which cells already present send at least one heartbeat.
-const SHOWING: Duration = Duration::from_secs(1);
+const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(1);
 /// Time without a newly reachable cell after which the rest counts as unreachable: two hellos and a search.
 const ORGANISING: Duration = Duration::from_secs(2);
 /// Interval between polls.
-const LOOK: Duration = Duration::from_millis(5);
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 impl Session {
     /// Queries the cells and checks that they fit the recording.
-    pub(super) fn meet(&mut self, skin_override: Option<&SkinOverride>) -> Result<(), ReplayError> {
+    pub(super) fn check_cells(&mut self, skin_override: Option<&SkinOverride>) -> Result<(), ReplayError> {
         let shared_state = Arc::clone(&self.shared_state);
         let (checks, options) = (&shared_state.checks, &shared_state.checks.options);
         if !options.hears() {
@@ -34,7 +34,7 @@ impl Session {
         }
         let spawned_skin = |skin: &protocol::skin::Skin, name: &str| -> BTreeSet<CellId> {
             let bus = skin.bus_named(name);
-            bus.into_iter().flat_map(|bus| skin.cells_of(bus)).map(|cell| cell.node).collect()
+            bus.into_iter().flat_map(|bus| skin.cells_on_bus(bus)).map(|cell| cell.node).collect()
         };
         let target = match skin_override {
             None => checks.recorded(),
@@ -47,7 +47,7 @@ impl Session {
         self.wait_for_tree()?;
         let comparator = shared_state.comparator();
         let nobody =
-            (0..self.buses.bus_links.len()).all(|bus_link| comparator.settled(bus_link).next().is_none());
+            (0..self.buses.bus_links.len()).all(|bus_link| comparator.settled_cells(bus_link).next().is_none());
         if nobody && (options.expect.is_some() || options.lockstep || skin_override.is_some()) {
             let names: Vec<_> = checks.bus_links().map(|(name, _)| name).collect();
             return Err(ReplayError::NoCell(names.join(", ")));
@@ -81,7 +81,7 @@ impl Session {
     ) -> Result<(), ReplayError> {
         let shared_state = Arc::clone(&self.shared_state);
         while !is_last(self, &shared_state.comparator())? {
-            thread::sleep(LOOK);
+            thread::sleep(POLL_INTERVAL);
         }
         Ok(())
     }
@@ -97,16 +97,16 @@ impl Session {
             bus_link.send(&[Message::Sync])?;
         }
         // All cells answer: after the first pause they are known even if none is required.
-        thread::sleep(LOOK);
+        thread::sleep(POLL_INTERVAL);
         let all = target.iter().map(BTreeSet::len).sum::<usize>();
-        let mut timeout = Timeout::new(if spawned { STARTING } else { SHOWING });
+        let mut timeout = Timeout::new(if spawned { STARTING } else { DISCOVERY_TIMEOUT });
         self.wait(|session, comparator| {
             if session.is_interrupted() {
                 return Err(RunError::Interrupted.into());
             }
             if let Some(ended) = session.buses.processes.ended().into_iter().next() {
                 let cells = ended.to_string();
-                return Err(ReplayError::Ended { cells, status: ended.status, said: ended.said });
+                return Err(ReplayError::Ended { cells, status: ended.status, said: ended.reason });
             }
             if let Some(bus_link) = comparator.other_gateway() {
                 return Err(ReplayError::OtherGateway(
@@ -114,7 +114,7 @@ impl Session {
                 ));
             }
             let there = |(bus_link, cells): (usize, &BTreeSet<CellId>)| {
-                comparator.settled(bus_link).filter(|(cell, _)| cells.contains(cell)).count()
+                comparator.settled_cells(bus_link).filter(|(cell, _)| cells.contains(cell)).count()
             };
             let there = target.iter().enumerate().map(there).sum();
             Ok(there == all || timeout.is_over(there))
@@ -149,10 +149,10 @@ impl Session {
     /// Puts measuring cells into test mode.
     fn set_test_mode(&mut self, measuring: &[Vec<CellId>]) -> Result<(), ReplayError> {
         self.tell_mode(measuring, true)?;
-        let give_up = Instant::now() + SHOWING;
+        let give_up = Instant::now() + DISCOVERY_TIMEOUT;
         self.wait(|_, comparator| {
             let obeys = |(bus_link, cells): (usize, &Vec<CellId>)| {
-                let obeying = comparator.present(bus_link).filter(|(_, it)| it.claim.says(State::TEST_MODE));
+                let obeying = comparator.present_cells(bus_link).filter(|(_, it)| it.claim.has_state(State::TEST_MODE));
                 obeying.filter(|(cell, _)| cells.contains(cell)).count() == cells.len()
             };
             let all_obey = measuring.iter().enumerate().all(obeys);

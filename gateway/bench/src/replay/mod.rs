@@ -34,7 +34,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use protocol::bus::Kinds;
+use protocol::bus::KindChoices;
 use protocol::id::CellId;
 use protocol::input::is_standard_input;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
@@ -43,19 +43,19 @@ use self::checks::Checks;
 pub use self::error::Mismatch;
 pub use self::error::ReplayError;
 use self::player::Pace;
-use self::replay_plan::Only;
+use self::replay_plan::SenderFilter;
 use self::report::Summary;
 use self::session::Session;
 use self::shared_state::SharedState;
 use self::start::Routes;
-use self::survey::{Part, Survey};
+use self::survey::{TimeRange, Survey};
 use crate::bus::realtime::idle_lateness;
 use crate::processes::ended::EndedProcesses;
 use crate::progress::Progress;
 use crate::setup::names;
 use crate::signals::caught;
-use model::decode::BUSES;
-use trace::capture::{CaptureError, Entry, Extras, NoteKind, Reader, seconds_since};
+use model::decode::MAX_BUSES;
+use trace::capture::{CaptureError, Entry, RecordingExtras, NoteKind, Reader, seconds_since};
 
 /// Period in ns of the wake-ups whose lateness is measured.
 const GRID_NS: u64 = 2_000_000;
@@ -64,7 +64,7 @@ const NAMED_LINES: u64 = 5;
 
 /// Cells to start for a replay.
 #[derive(Clone, Debug)]
-pub struct Spawn {
+pub struct SpawnOptions {
     /// Path of their skin; `None` for the skin attached to the recording.
     pub skin: Option<PathBuf>,
     /// Maximum number of cells per process.
@@ -73,19 +73,19 @@ pub struct Spawn {
 
 /// Options of a replay.
 #[derive(Clone, Debug)]
-pub struct Options {
+pub struct ReplayOptions {
     /// The capture: a file, or the parts of a recording.
     pub files: Vec<PathBuf>,
     /// Kind of each bus.
-    pub kinds: Kinds,
+    pub kinds: KindChoices,
     /// Filter by sender.
-    pub only: Only,
+    pub only: SenderFilter,
     /// Buses of the capture whose frames are sent; empty for all.
     pub buses: Vec<String>,
     /// Pairs of a bus of the capture and the bus that receives its frames.
     pub map: Vec<(String, String)>,
     /// Part of the capture.
-    pub part: Part,
+    pub part: TimeRange,
     /// Number of passes, or `None` for no end.
     pub passes: Option<u32>,
     /// Speed of the replay.
@@ -97,7 +97,7 @@ pub struct Options {
     /// Tolerance in steps of torques for the comparison with recorded replies, or `None` for no comparison.
     pub expect: Option<u16>,
     /// Cells to start, if any.
-    pub spawn: Option<Spawn>,
+    pub spawn: Option<SpawnOptions>,
     /// True if measuring cells are put into test mode.
     pub test_mode: bool,
     /// Time to wait for room on a full bus.
@@ -113,7 +113,7 @@ pub struct Options {
 /// # Errors
 /// Returns [`ReplayError`] if the replay cannot start or the capture cannot be read to its end. Problems on the buses
 /// and in the comparison are in the summary.
-pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
+pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     let progress = Progress::lines(options.quiet);
     let (survey, extras, name) = look_through(options, &progress)?;
     let routes = Routes::new(options, &survey, &name)?;
@@ -130,12 +130,12 @@ pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
     for bus_link in buses.bus_links.iter() {
         progress.note(&format!("{} is {}", bus_link.bus.name(), bus_link.bus.kind()));
     }
-    let speaks = options.only != Only::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
+    let speaks = options.only != SenderFilter::Replies && survey.buses.iter().any(|bus| bus.joints > 0);
     let heard = if speaks { buses.listen()? } else { Vec::new() };
     let checks = Checks { options: options.clone(), survey, routes, name };
     if let (Some(spawn), Some(skin_override)) = (&options.spawn, &skin_override) {
         buses.start_cells(spawn, skin_override, &heard)?;
-    } else if options.only == Only::All {
+    } else if options.only == SenderFilter::All {
         warn_of_doubles(&checks, &heard, &progress);
     }
     let shared_state = Arc::new(SharedState::new(checks));
@@ -145,7 +145,7 @@ pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
 }
 
 /// Reads the capture once from end to end. Returns its survey, its extras and its display name.
-fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extras, String), ReplayError> {
+fn look_through(options: &ReplayOptions, progress: &Progress) -> Result<(Survey, RecordingExtras, String), ReplayError> {
     if options.files.iter().any(|file| is_standard_input(file)) {
         return Err(ReplayError::StandardInput);
     }
@@ -156,13 +156,13 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
     let mut reader = Reader::open_all(&options.files).map_err(ReplayError::Open)?;
     let name = reader.name().to_owned();
     let mut survey = Survey::new(options.part);
-    let few = |buses| if buses > BUSES { Err(ReplayError::Buses(name.clone())) } else { Ok(()) };
+    let few = |buses| if buses > MAX_BUSES { Err(ReplayError::Buses(name.clone())) } else { Ok(()) };
     let note = |text: String| progress.note(&format!("{name}: {text}"));
     // Latched frames are stored before the first frame, and are known once the capture is open.
     let latched = &reader.extras().latched;
     let buses: BTreeSet<_> = latched.iter().map(|frame| frame.bus.as_str()).collect();
     few(buses.len())?;
-    survey.begin(latched);
+    survey.add_latched(latched);
     survey.run_began = reader.extras().run_began();
     let (mut unreadable, mut backwards) = (0_u64, None);
     while let Some(entry) = reader.next().map_err(ReplayError::Read)? {
@@ -171,7 +171,7 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
                 if record.time.nanos < survey.last && backwards.is_none() {
                     backwards = Some((survey.frames + 1, survey.last - record.time.nanos));
                 }
-                survey.take(&record);
+                survey.add_frame(&record);
                 few(survey.buses.len())?;
             }
             Entry::Note(note) => match note.kind {

@@ -15,7 +15,7 @@ use protocol::packet::Epoch;
 use serde::Serialize;
 
 use super::ReplayError;
-use super::replay_plan::{Due, Open, Role, Step};
+use super::replay_plan::{DueFrame, OpenJoints, FrameRole, PlayerStep};
 use model::quantiles::histogram;
 
 /// Time in ns from the decision to start to the first frame.
@@ -32,16 +32,16 @@ pub trait Stage {
     /// Returns true if the replay was stopped.
     fn is_over(&self) -> bool;
     /// Notes that joints are about to be sent.
-    fn announce(&mut self, bus_link: usize, round: Option<u64>, epoch: Epoch);
+    fn announce(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch);
     /// Sends frames; waits for room up to the timeout.
     ///
     /// # Errors
     /// Returns [`SendError`] if the bus stays full, is down or has ended.
-    fn send(&mut self, bus_link: usize, frames: &[Frame]) -> Result<(), SendError>;
+    fn send(&mut self, bus_index: usize, frames: &[Frame]) -> Result<(), SendError>;
     /// Notes that a bus refused the joints of a round.
-    fn was_not_sent(&mut self, bus_link: usize, round: u64);
+    fn mark_unsent(&mut self, bus_index: usize, round: u64);
     /// Waits until the cells of a bus have answered.
-    fn wait_for_answers(&mut self, bus_link: usize, open: &Open);
+    fn wait_for_answers(&mut self, bus_link: usize, open: &OpenJoints);
     /// Restores a state, bus by bus.
     ///
     /// # Errors
@@ -75,7 +75,7 @@ pub struct BusLinkTally {
 
 /// Result of a player.
 #[derive(Debug)]
-pub struct Played {
+pub struct PlayerResult {
     /// Counts of each bus.
     pub bus_links: Vec<BusLinkTally>,
     /// Lateness of the frames in ns, without frames that were due at once.
@@ -93,11 +93,11 @@ pub struct Player {
     /// Frames of a sync on each bus, in lockstep.
     syncs: Option<Vec<Vec<Frame>>>,
     /// Joints of each bus whose answers are awaited.
-    open: Vec<Option<Open>>,
+    open: Vec<Option<OpenJoints>>,
     down: Vec<bool>,
     /// The clock's time and the capture's time of the same moment.
     origin: Option<(u64, u64)>,
-    played: Played,
+    played: PlayerResult,
     batch: Vec<Frame>,
     /// Rounds of joints in the batch, with their positions.
     rounds: Vec<(usize, u64)>,
@@ -114,7 +114,7 @@ impl Player {
             open: vec![None; bus_links],
             down: vec![false; bus_links],
             origin: None,
-            played: Played {
+            played: PlayerResult {
                 bus_links: vec![BusLinkTally::default(); bus_links],
                 late: histogram(),
                 was_stopped: false,
@@ -126,7 +126,7 @@ impl Player {
     }
 
     /// Sends all steps until the end, a stop, or the end of a bus.
-    pub fn play(mut self, steps: &mut rtrb::Consumer<Step>, stage: &mut impl Stage) -> Played {
+    pub fn play(mut self, steps: &mut rtrb::Consumer<PlayerStep>, stage: &mut impl Stage) -> PlayerResult {
         while self.played.failure.is_none() {
             if stage.is_over() {
                 self.played.was_stopped = true;
@@ -137,14 +137,14 @@ impl Player {
             match steps.peek() {
                 Err(_) if is_last => break,
                 Err(_) => stage.pause(),
-                Ok(Step::Restore(_)) => {
+                Ok(PlayerStep::Restore(_)) => {
                     self.wait_for_all(stage);
-                    if let Ok(Step::Restore(states)) = steps.pop() {
+                    if let Ok(PlayerStep::Restore(states)) = steps.pop() {
                         self.played.failure = stage.restore(&states).err();
                         self.origin = None;
                     }
                 }
-                Ok(&Step::Frame(due)) => self.frames_from(&due, steps, stage),
+                Ok(&PlayerStep::Frame(due)) => self.frames_from(&due, steps, stage),
             }
         }
         if self.played.failure.is_none() && !self.played.was_stopped {
@@ -172,7 +172,7 @@ impl Player {
         clippy::cast_precision_loss,
         reason = "times far below 2^53 ns"
     )]
-    fn deadline(&mut self, due: &Due, now: u64) -> Option<u64> {
+    fn deadline(&mut self, due: &DueFrame, now: u64) -> Option<u64> {
         let Pace::Timed(speed) = self.pace else { return None };
         if due.is_late {
             return None;
@@ -182,8 +182,8 @@ impl Player {
     }
 
     /// Sends a frame when it is due, with the following frames of the same bus that are due by then.
-    fn frames_from(&mut self, first: &Due, steps: &mut rtrb::Consumer<Step>, stage: &mut impl Stage) {
-        let bus_link = first.bus_link;
+    fn frames_from(&mut self, first: &DueFrame, steps: &mut rtrb::Consumer<PlayerStep>, stage: &mut impl Stage) {
+        let bus_link = first.bus_index;
         if self.syncs.is_some() && is_joints(first) {
             self.wait_for_answers(bus_link, stage);
         }
@@ -201,12 +201,12 @@ impl Player {
         stage.show(first.at);
         // In lockstep, joints end a batch: the next frame must wait, or belongs to the next joints.
         while self.batch.len() < BATCH && !(self.syncs.is_some() && open.is_some()) {
-            let Ok(&Step::Frame(next)) = steps.peek() else { break };
+            let Ok(&PlayerStep::Frame(next)) = steps.peek() else { break };
             let waits = self.syncs.is_some()
                 && is_joints(&next)
                 && self.open.get(bus_link).is_some_and(Option::is_some);
             let deadline = self.deadline(&next, now);
-            if next.bus_link != bus_link || waits || deadline.is_some_and(|deadline| deadline > now) {
+            if next.bus_index != bus_link || waits || deadline.is_some_and(|deadline| deadline > now) {
                 break;
             }
             self.was_late(deadline, now);
@@ -224,10 +224,10 @@ impl Player {
         }
     }
 
-    fn push(&mut self, due: &Due, stage: &mut impl Stage) -> Option<Open> {
+    fn push(&mut self, due: &DueFrame, stage: &mut impl Stage) -> Option<OpenJoints> {
         self.batch.push(due.frame);
-        let Role::Joints(open) = due.role else { return None };
-        stage.announce(due.bus_link, open.round, open.epoch);
+        let FrameRole::Joints(open) = due.role else { return None };
+        stage.announce(due.bus_index, open.round, open.epoch);
         self.rounds.extend(open.round.map(|round| (self.batch.len(), round)));
         Some(open)
     }
@@ -241,13 +241,13 @@ impl Player {
 
     fn account(
         &mut self,
-        bus_link: usize,
+        bus_index: usize,
         frames: usize,
         sent: Result<(), SendError>,
         stage: &mut impl Stage,
     ) {
         let (Some(tally), Some(down)) =
-            (self.played.bus_links.get_mut(bus_link), self.down.get_mut(bus_link))
+            (self.played.bus_links.get_mut(bus_index), self.down.get_mut(bus_index))
         else {
             return;
         };
@@ -266,15 +266,15 @@ impl Player {
         *down = is_down;
         for (behind, round) in &self.rounds {
             if *behind > taken {
-                stage.was_not_sent(bus_link, *round);
+                stage.mark_unsent(bus_index, *round);
             }
         }
-        self.played.failure = cause.filter(|cause| !cause.may_pass()).map(ReplayError::from);
+        self.played.failure = cause.filter(|cause| !cause.is_temporary()).map(ReplayError::from);
     }
 }
 
-const fn is_joints(due: &Due) -> bool {
-    matches!(due.role, Role::Joints(_) | Role::SegmentOfJoints)
+const fn is_joints(due: &DueFrame) -> bool {
+    matches!(due.role, FrameRole::Joints(_) | FrameRole::SegmentOfJoints)
 }
 
 #[cfg(test)]

@@ -19,7 +19,7 @@ use super::comparator::Comparator;
 use super::survey::{Survey, is_input, is_joints};
 use model::decode::Decoded;
 use model::decode::settle::Settler;
-use trace::order::{Order, Ordered};
+use trace::order::{BusMerger, ReleasedFrame};
 
 /// Time in ns after the end of the part during which recorded replies are still read, because they answer joints in it.
 const LATE_REPLIES_NS: u64 = 1_000_000_000;
@@ -28,7 +28,7 @@ const MIN_GAP_NS: u64 = 1_000_000;
 
 /// Filter of the sent frames by sender.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub enum Only {
+pub enum SenderFilter {
     /// Frames of all senders, including foreign ones.
     #[default]
     All,
@@ -42,51 +42,51 @@ pub enum Only {
 #[derive(Clone, Debug)]
 pub struct Selection {
     /// Filter by sender.
-    pub only: Only,
+    pub only: SenderFilter,
     /// Destination of each bus of the capture; `None` for a bus that is not replayed.
-    pub bus_links: Vec<Option<usize>>,
+    pub destinations: Vec<Option<usize>>,
     /// True if packets are decoded: joints are numbered, and replies compared.
     pub reads: bool,
 }
 
 /// Next step of a replay.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Step {
+pub enum PlayerStep {
     /// Sends a frame.
-    Frame(Due),
+    Frame(DueFrame),
     /// Starts a pass: restores the latched state, bus by bus.
     Restore(Vec<(usize, Vec<Message>)>),
 }
 
 /// A frame with its time.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Due {
+pub struct DueFrame {
     /// Time in ns after the first frame, by the capture's clock and over all passes.
     pub at: u64,
     /// Index of the bus.
-    pub bus_link: usize,
+    pub bus_index: usize,
     /// The frame to send.
     pub frame: Frame,
     /// Role of the frame in lockstep and comparison.
-    pub role: Role,
+    pub role: FrameRole,
     /// True if the frame is older than a frame sent before it, and is sent at once.
     pub is_late: bool,
 }
 
 /// Role of a frame in lockstep and comparison.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Role {
+pub enum FrameRole {
     /// A frame without a role.
     Plain,
     /// First segment of a joint packet.
     SegmentOfJoints,
     /// Completes a joint packet.
-    Joints(Open),
+    Joints(OpenJoints),
 }
 
 /// Joints that cells answer.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Open {
+pub struct OpenJoints {
     /// Epoch of the joints.
     pub epoch: Epoch,
     /// Positions of the joints.
@@ -110,9 +110,9 @@ pub struct ReplayPlan<'a> {
     survey: &'a Survey,
     selection: &'a Selection,
     /// Frames waiting to be sorted, with their buses.
-    order: Order<(usize, Frame)>,
-    settler: Settler<Ordered<(usize, Frame)>>,
-    steps: VecDeque<Step>,
+    order: BusMerger<(usize, Frame)>,
+    settler: Settler<ReleasedFrame<(usize, Frame)>>,
+    steps: VecDeque<PlayerStep>,
     plan_summary: PlanSummary,
     /// Start of this pass in ns after the first one.
     offset: u64,
@@ -129,7 +129,7 @@ impl<'a> ReplayPlan<'a> {
         Self {
             survey,
             selection,
-            order: Order::default(),
+            order: BusMerger::default(),
             settler: Settler::new(None),
             steps: VecDeque::new(),
             plan_summary: PlanSummary::default(),
@@ -140,7 +140,7 @@ impl<'a> ReplayPlan<'a> {
     }
 
     /// Adds the capture's next frame. Breaks once all later frames are past the part.
-    pub fn take(&mut self, record: &Record<'_>, comparator: &mut Comparator) -> ControlFlow<()> {
+    pub fn add_frame(&mut self, record: &Record<'_>, comparator: &mut Comparator) -> ControlFlow<()> {
         let Some(bus) = self.survey.bus_named(record.interface) else {
             self.skip(reason::NEW);
             return ControlFlow::Continue(());
@@ -154,12 +154,12 @@ impl<'a> ReplayPlan<'a> {
     }
 
     /// Next planned step, if any.
-    pub fn next_step(&mut self) -> Option<Step> {
+    pub fn next_step(&mut self) -> Option<PlayerStep> {
         self.steps.pop_front()
     }
 
     /// Passes a frame to the decoder, which classifies it.
-    fn settle(&mut self, next: Ordered<(usize, Frame)>) {
+    fn settle(&mut self, next: ReleasedFrame<(usize, Frame)>) {
         let (bus, frame) = next.item;
         let name = self.survey.buses.get(bus).map_or("", |bus| bus.name.as_str());
         self.settler.push(Micros(next.nanos / 1_000), name, &frame, next);
@@ -180,7 +180,7 @@ impl<'a> ReplayPlan<'a> {
         }
         self.settler.finish();
         let _ = self.place_settled(comparator);
-        self.order = Order::default();
+        self.order = BusMerger::default();
         self.settler = Settler::new(None);
         if let Some((first, last)) = self.sent.take() {
             let (frames, joints) = self.counts;
@@ -193,13 +193,13 @@ impl<'a> ReplayPlan<'a> {
 
     /// The step that restores the state at the start of the part.
     #[must_use]
-    pub fn restoring(&self) -> Step {
+    pub fn restoring(&self) -> PlayerStep {
         let bounds = self.survey.bounds();
-        let of = |(bus, bus_link): (&super::survey::Bus, &Option<usize>)| {
+        let of = |(bus, bus_link): (&super::survey::SurveyedBus, &Option<usize>)| {
             let there: Vec<_> = bus.cells_in(bounds).map(|(cell, _)| cell).collect();
             Some(((*bus_link)?, bus.state.restoring(|cell| there.contains(&cell), bus.first_joints)))
         };
-        Step::Restore(self.survey.buses.iter().zip(&self.selection.bus_links).filter_map(of).collect())
+        PlayerStep::Restore(self.survey.buses.iter().zip(&self.selection.destinations).filter_map(of).collect())
     }
 
     /// Returns the counts.
@@ -216,12 +216,12 @@ impl<'a> ReplayPlan<'a> {
     /// Plans a frame: sends it or counts it as skipped.
     fn place(
         &mut self,
-        next: &Ordered<(usize, Frame)>,
+        next: &ReleasedFrame<(usize, Frame)>,
         decoded: &Decoded,
         comparator: &mut Comparator,
     ) -> ControlFlow<()> {
         let (from, to) = self.survey.bounds();
-        if next.at >= to.saturating_add(LATE_REPLIES_NS) {
+        if next.send_nanos >= to.saturating_add(LATE_REPLIES_NS) {
             return ControlFlow::Break(());
         }
         let (bus, frame) = next.item;
@@ -233,9 +233,9 @@ impl<'a> ReplayPlan<'a> {
             self.unwanted(bus, &frame, decoded)
         };
         let bus_link = self.bus_link(bus);
-        let role = bus_link.filter(|_| self.selection.reads).map_or(Role::Plain, |bus_link| {
+        let role = bus_link.filter(|_| self.selection.reads).map_or(FrameRole::Plain, |bus_link| {
             let is_in_part = (from..to).contains(&next.nanos);
-            read(bus_link, next.nanos, decoded, unwanted.is_none(), is_in_part, comparator)
+            classify(bus_link, next.nanos, decoded, unwanted.is_none(), is_in_part, comparator)
         });
         if let Some(reason) = unwanted {
             self.skip(reason);
@@ -243,18 +243,18 @@ impl<'a> ReplayPlan<'a> {
         }
         let Some(bus_link) = bus_link else { return ControlFlow::Continue(()) };
         self.plan_summary.late += u64::from(next.is_late);
-        let (first, last) = self.sent.get_or_insert((next.at, next.at));
-        *last = next.at;
-        let at = self.offset + (next.at - *first);
+        let (first, last) = self.sent.get_or_insert((next.send_nanos, next.send_nanos));
+        *last = next.send_nanos;
+        let at = self.offset + (next.send_nanos - *first);
         self.counts.0 += 1;
-        self.counts.1 += u64::from(matches!(role, Role::Joints(_)) && bus_link == 0);
-        self.steps.push_back(Step::Frame(Due { at, bus_link, frame, role, is_late: next.is_late }));
+        self.counts.1 += u64::from(matches!(role, FrameRole::Joints(_)) && bus_link == 0);
+        self.steps.push_back(PlayerStep::Frame(DueFrame { at, bus_index: bus_link, frame, role, is_late: next.is_late }));
         ControlFlow::Continue(())
     }
 
     /// Destination of a bus's frames.
     fn bus_link(&self, bus: usize) -> Option<usize> {
-        self.selection.bus_links.get(bus).copied().flatten()
+        self.selection.destinations.get(bus).copied().flatten()
     }
 
     /// Reason why a frame of the part is not sent, if any.
@@ -270,44 +270,44 @@ impl<'a> ReplayPlan<'a> {
         let id = data_id(frame).ok().filter(|_| !matches!(decoded, Decoded::Foreign(_)));
         match self.selection.only {
             _ if !picked => Some(reason::NOT_PICKED),
-            Only::Inputs if !id.is_some_and(is_input) => Some(reason::NO_INPUT),
-            Only::Replies if id.and_then(Id::sender).is_none() => Some(reason::NO_REPLY),
-            Only::All | Only::Inputs | Only::Replies => None,
+            SenderFilter::Inputs if !id.is_some_and(is_input) => Some(reason::NO_INPUT),
+            SenderFilter::Replies if id.and_then(Id::sender).is_none() => Some(reason::NO_REPLY),
+            SenderFilter::All | SenderFilter::Inputs | SenderFilter::Replies => None,
         }
     }
 }
 
 /// Determines the role of a frame, and passes its message to the comparator.
-fn read(
-    bus_link: usize,
+fn classify(
+    bus_index: usize,
     nanos: u64,
     decoded: &Decoded,
     is_sent: bool,
     is_in_part: bool,
     comparator: &mut Comparator,
-) -> Role {
+) -> FrameRole {
     if let Decoded::Message(Message::Joints { epoch, joints }) = *decoded {
-        return Role::Joints(Open {
+        return FrameRole::Joints(OpenJoints {
             epoch,
             joints,
-            round: comparator.record_joints(bus_link, nanos, epoch, is_sent),
+            round: comparator.expect_joints(bus_index, nanos, epoch, is_sent),
         });
     }
     if let Decoded::Message(message) = decoded {
-        comparator.record(bus_link, message, is_in_part);
+        comparator.expect(bus_index, message, is_in_part);
     }
     match *decoded {
         Decoded::Segment { id } | Decoded::Damaged { id, fault: PacketError::Incomplete }
             if is_joints(id) =>
         {
-            Role::SegmentOfJoints
+            FrameRole::SegmentOfJoints
         }
         Decoded::Segment { .. }
         | Decoded::Message(_)
         | Decoded::Foreign(_)
         | Decoded::Wire(..)
         | Decoded::Damaged { .. }
-        | Decoded::Meaningless { .. } => Role::Plain,
+        | Decoded::Meaningless { .. } => FrameRole::Plain,
     }
 }
 

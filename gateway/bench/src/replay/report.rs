@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::comparator::{Lacking, Tally};
+use super::comparator::{Uncompared, Tally};
 use super::difference::Difference;
 use super::player::BusLinkTally;
 use crate::summary::{CellError, cells_in_error, many};
@@ -96,7 +96,7 @@ pub struct Expect {
     pub first: Option<Difference>,
 }
 
-impl Lacking {
+impl Uncompared {
     /// Reasons that occurred, with their counts.
     #[must_use]
     pub fn reasons(&self) -> Vec<(&'static str, u64)> {
@@ -298,7 +298,7 @@ mod tests {
 
     #[test]
     fn every_reason_has_a_text() {
-        let all = Lacking {
+        let all = Uncompared {
             silent: 1,
             untaken: 1,
             unrecorded: 1,
@@ -315,6 +315,6 @@ mod tests {
             tree_unknown: 1,
             sums_not_taken: 1,
         };
-        assert_eq!(all.reasons().len(), size_of::<Lacking>() / size_of::<u64>());
+        assert_eq!(all.reasons().len(), size_of::<Uncompared>() / size_of::<u64>());
     }
 }

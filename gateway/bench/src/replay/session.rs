@@ -13,14 +13,14 @@ use protocol::message::Message;
 
 use super::ReplayError;
 use super::checks::Checks;
-use super::live::Live;
-use super::player::{BusLinkTally, Played, Player};
+use super::live::LiveStage;
+use super::player::{BusLinkTally, PlayerResult, Player};
 use super::replay_plan::PlanSummary;
 use super::report::{BusSummary, Expect, Lockstep, Summary};
 use super::shared_state::SharedState;
 use super::source::{self, AHEAD};
 use super::start::{Buses, SkinOverride};
-use super::survey::Bus;
+use super::survey::SurveyedBus;
 use crate::bus::realtime::{self, Granted};
 use crate::error::RunError;
 use crate::processes::ended::EndedProcesses;
@@ -29,7 +29,7 @@ use crate::threads::spawn;
 use model::quantiles::Quantiles;
 
 /// Interval between rounds of the main thread.
-const LOOK: Duration = Duration::from_millis(20);
+const ROUND_PAUSE: Duration = Duration::from_millis(20);
 
 /// A replay that is ready to start.
 pub(super) struct Session {
@@ -58,12 +58,12 @@ impl Session {
                 let (bus_links, shared_state) =
                     (Arc::clone(&self.buses.bus_links), Arc::clone(&self.shared_state));
                 let hear = move || {
-                    bus_links.get(index).map_or(0, |bus_link| shared_state.hear(index, bus_link, roots))
+                    bus_links.get(index).map_or(0, |bus_link| shared_state.receive(index, bus_link, roots))
                 };
                 receivers.push(spawn(&format!("rx {}", bus_link.bus.name()), hear)?);
             }
         }
-        let mut outcome = self.meet(skin_override).and_then(|()| self.play(idle));
+        let mut outcome = self.check_cells(skin_override).and_then(|()| self.play(idle));
         if let Err(error) = self.leave() {
             self.progress.note(&error.to_string());
         }
@@ -82,7 +82,7 @@ impl Session {
     fn play(&mut self, idle: Option<&Histogram<u64>>) -> Result<Summary, ReplayError> {
         let (queue, mut steps) = rtrb::RingBuffer::new(AHEAD);
         let shared_state = Arc::clone(&self.shared_state);
-        let reader = spawn("reader", move || source::read(&shared_state, queue))?;
+        let reader = spawn("reader", move || source::read_capture(&shared_state, queue))?;
         while !self.shared_state.ready.load(Ordering::Relaxed) && !reader.is_finished() {
             thread::sleep(Duration::from_millis(1));
         }
@@ -93,7 +93,7 @@ impl Session {
         let bus_links = Arc::clone(&self.buses.bus_links);
         let sync = || bus_links.iter().map(|bus_link| bus_link.frames(&Message::Sync).collect()).collect();
         let player = Player::new(bus_links.len(), options.pace, options.lockstep.then(sync));
-        let mut live = Live {
+        let mut live = LiveStage {
             shared_state: Arc::clone(&self.shared_state),
             log_sender,
             lockstep: Lockstep::default(),
@@ -142,7 +142,7 @@ impl Session {
     /// Shows notes about processes that have ended; with `last`, all pending notes.
     fn look_at_processes(&mut self, last: bool) {
         let ended = self.buses.processes.ended();
-        for note in self.ended.take(ended, last) {
+        for note in self.ended.add_ended(ended, last) {
             self.progress.note(&note);
         }
     }
@@ -152,7 +152,7 @@ impl Session {
         let bar = self.progress.bar(self.length());
         let mut other_gateway = None;
         while !is_over() {
-            thread::sleep(LOOK);
+            thread::sleep(ROUND_PAUSE);
             bar.set_position(self.shared_state.at.load(Ordering::Relaxed) / 1_000_000);
             bar.set_message(self.shared_state.sent.load(Ordering::Relaxed).to_string());
             for line in said.try_iter() {
@@ -185,9 +185,9 @@ impl Session {
 
     fn summary(
         &self,
-        played: Played,
+        played: PlayerResult,
         plan_summary: PlanSummary,
-        live: Live,
+        live: LiveStage,
         duration_s: f64,
         granted: Granted,
         idle: Option<&Histogram<u64>>,
@@ -195,7 +195,7 @@ impl Session {
         let checks = &self.shared_state.checks;
         let options = &checks.options;
         let total = |of: fn(&BusLinkTally) -> u64| played.bus_links.iter().map(of).sum();
-        let bus = |(index, (name, bus)): (usize, (&str, &Bus))| {
+        let bus = |(index, (name, bus)): (usize, (&str, &SurveyedBus))| {
             Some(BusSummary {
                 capture: bus.name.clone(),
                 name: name.to_owned(),
@@ -216,8 +216,8 @@ impl Session {
             skipped: plan_summary.skipped,
             sent_at_once: plan_summary.late,
             buses: checks.bus_links().enumerate().filter_map(bus).collect(),
-            late_us: idle.map(|_| Quantiles::of(&played.late, 1e-3)),
-            idle_late_us: idle.map(|idle| Quantiles::of(idle, 1e-3)),
+            late_us: idle.map(|_| Quantiles::from_histogram(&played.late, 1e-3)),
+            idle_late_us: idle.map(|idle| Quantiles::from_histogram(idle, 1e-3)),
             spin_us: options.spin.as_secs_f64() * 1e6,
             fifo: granted.fifo,
             memory_locked: granted.locked,
@@ -230,9 +230,9 @@ impl Session {
 
     fn expectation(&self, tolerance: u16) -> Expect {
         let (comparator, checks) = (self.shared_state.comparator(), &self.shared_state.checks);
-        let present = (0..self.buses.bus_links.len()).flat_map(|bus_link| comparator.present(bus_link));
+        let present = (0..self.buses.bus_links.len()).flat_map(|bus_link| comparator.present_cells(bus_link));
         let late = present.filter_map(|(_, cell)| {
-            let (first, last) = cell.heard?;
+            let (first, last) = cell.counters?;
             Some(u64::from(last.joints_late.wrapping_sub(first.joints_late)))
         });
         Expect {

@@ -8,14 +8,14 @@ use protocol::time::Micros;
 
 use super::checks::Checks;
 use super::comparator::Comparator;
-use super::start::BusLink;
-use crate::bus::follow::{Follower, Once, Part, Step};
+use super::start::ReplayBus;
+use crate::bus::follow::{Follower, OpenedOnce, FollowedItem, FollowStep};
 use crate::bus::realtime;
-use crate::bus::roots::Roots;
+use crate::bus::roots::RootWires;
 use model::decode::{Decoded, Decoder};
 
 /// Interval between readings of the stop flag.
-const LOOK: Duration = Duration::from_millis(50);
+const POLL_INTERVAL: Duration = Duration::from_millis(50);
 /// State shared by all threads of a replay.
 #[derive(Debug)]
 pub(super) struct SharedState {
@@ -36,8 +36,8 @@ pub(super) struct SharedState {
 
 impl SharedState {
     pub(super) fn new(checks: Checks) -> Self {
-        let rated = checks.bus_links().map(|(name, bus)| (name.to_owned(), bus.cells.clone()));
-        let comparator = Comparator::new(rated, checks.survey.first.unwrap_or(0), checks.options.expect);
+        let named_cells = checks.bus_links().map(|(name, bus)| (name.to_owned(), bus.cells.clone()));
+        let comparator = Comparator::new(named_cells, checks.survey.first.unwrap_or(0), checks.options.expect);
         Self {
             checks,
             comparator: Mutex::new(comparator),
@@ -75,42 +75,42 @@ impl SharedState {
     }
 
     /// Marks a bus as down and wakes waiting threads.
-    pub(super) fn is_down(&self, bus_link: usize) {
-        self.comparator().is_down(bus_link);
+    pub(super) fn mark_down(&self, bus_index: usize) {
+        self.comparator().mark_down(bus_index);
         self.has_heard();
     }
 
     /// Receives on a bus until the end, as the gateway's side of the wires to its roots. Returns the number of frames
     /// lost because they arrived faster than they were read.
-    pub(super) fn hear(&self, index: usize, bus_link: &BusLink, mut roots: Option<Roots>) -> u64 {
+    pub(super) fn receive(&self, index: usize, bus_link: &ReplayBus, mut roots: Option<RootWires>) -> u64 {
         realtime::prepare_receiver();
         let mut decoder = Decoder::new(Some(bus_link.format));
         // The cells may be present already, and organise themselves as they start.
-        roots.iter_mut().for_each(Roots::explore);
-        let (mut follower, mut end) = (Follower::new(roots, Duration::ZERO), Once(&bus_link.bus));
+        roots.iter_mut().for_each(RootWires::explore);
+        let (mut follower, mut end) = (Follower::new(roots, Duration::ZERO), OpenedOnce(&bus_link.bus));
         while !self.deaf.load(Ordering::Relaxed) {
-            match follower.step(&mut end, LOOK) {
-                Step::Nothing | Step::Drained | Step::Refused(_) => continue,
-                Step::Frames(_) | Step::Leftover(_) => {}
-                Step::Down(_) => {
-                    self.is_down(index);
+            match follower.step(&mut end, POLL_INTERVAL) {
+                FollowStep::Nothing | FollowStep::Drained | FollowStep::Refused(_) => continue,
+                FollowStep::Frames(_) | FollowStep::Leftover(_) => {}
+                FollowStep::Down(_) => {
+                    self.mark_down(index);
                     continue;
                 }
-                Step::Gone(_) => {
-                    self.is_down(index);
+                FollowStep::Gone(_) => {
+                    self.mark_down(index);
                     // The next sender gets the same error, and reports it.
                     break;
                 }
             }
             let mut comparator = self.comparator();
             follower.parts(|part| {
-                let Part::Frame(received) = part else { return };
+                let FollowedItem::Frame(received) = part else { return };
                 let at = Micros(received.at_nanos / 1_000);
                 if !received.own
                     && let Decoded::Message(message) =
                         decoder.decode(at, bus_link.bus.name(), &received.frame)
                 {
-                    comparator.hear(index, &message);
+                    comparator.observe(index, &message);
                 }
             });
             drop(comparator);

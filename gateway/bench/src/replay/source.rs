@@ -4,30 +4,30 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use super::checks::Checks;
-use super::replay_plan::{PlanSummary, ReplayPlan, Selection, Step, reason};
+use super::replay_plan::{PlanSummary, ReplayPlan, Selection, PlayerStep, reason};
 use super::shared_state::SharedState;
 use trace::capture::{CaptureError, Entry, Reader};
 
 /// Number of steps read ahead: some tenths of a second of a full bus.
 pub(super) const AHEAD: usize = 16_384;
 /// Pause while the queue is full; the steps in it last far longer.
-const PAUSE: Duration = Duration::from_millis(2);
+const FULL_QUEUE_PAUSE: Duration = Duration::from_millis(2);
 
 /// Reads a capture once per pass and queues the steps.
 struct Source<'a> {
     shared_state: &'a SharedState,
     replay_plan: ReplayPlan<'a>,
-    queue: rtrb::Producer<Step>,
+    queue: rtrb::Producer<PlayerStep>,
 }
 
 /// Reads to the end, or until the player has ended.
-pub(super) fn read(
+pub(super) fn read_capture(
     shared_state: &SharedState,
-    queue: rtrb::Producer<Step>,
+    queue: rtrb::Producer<PlayerStep>,
 ) -> Result<PlanSummary, CaptureError> {
     let Checks { options, survey, routes, .. } = &shared_state.checks;
     let (bus_links, hears) = (routes.bus_links.clone(), options.hears());
-    let selection = Selection { only: options.only, bus_links, reads: hears };
+    let selection = Selection { only: options.only, destinations: bus_links, reads: hears };
     let mut source = Source { shared_state, replay_plan: ReplayPlan::new(survey, &selection), queue };
     let mut pass = 0_u32;
     while options.passes.is_none_or(|passes| pass < passes) && !source.is_over() {
@@ -35,16 +35,16 @@ pub(super) fn read(
             source.push(source.replay_plan.restoring());
         }
         let mut comparator = shared_state.comparator();
-        comparator.record_begin();
+        comparator.expect_restart();
         for (bus, bus_link) in survey.buses.iter().zip(&routes.bus_links) {
             let Some(bus_link) = *bus_link else { continue };
-            bus.latched.iter().for_each(|message| comparator.record(bus_link, message, false));
+            bus.latched.iter().for_each(|message| comparator.expect(bus_link, message, false));
         }
         drop(comparator);
         source.pass()?;
         pass = pass.saturating_add(1);
     }
-    shared_state.comparator().record_end();
+    shared_state.comparator().expect_end();
     shared_state.ready.store(true, Ordering::Relaxed);
     Ok(source.replay_plan.into_summary())
 }
@@ -57,7 +57,7 @@ impl Source<'_> {
                 self.replay_plan.skip(reason::NOTE);
                 continue;
             };
-            let flow = self.replay_plan.take(&record, &mut self.shared_state.comparator());
+            let flow = self.replay_plan.add_frame(&record, &mut self.shared_state.comparator());
             self.push_steps();
             if flow.is_break() || self.is_over() {
                 break;
@@ -74,14 +74,14 @@ impl Source<'_> {
         }
     }
 
-    fn push(&mut self, mut step: Step) {
+    fn push(&mut self, mut step: PlayerStep) {
         while let Err(rtrb::PushError::Full(back)) = self.queue.push(step) {
             self.shared_state.ready.store(true, Ordering::Relaxed);
             if self.is_over() {
                 return;
             }
             step = back;
-            std::thread::sleep(PAUSE);
+            std::thread::sleep(FULL_QUEUE_PAUSE);
         }
     }
 

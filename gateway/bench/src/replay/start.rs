@@ -6,26 +6,26 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Kinds, Options as BusOptions};
+use protocol::bus::{Bus, BusError, BusKind, KindChoice, Filter, KindChoices, BusOptions as BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Message, Request};
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 
-use super::replay_plan::Only;
+use super::replay_plan::SenderFilter;
 use super::survey::Survey;
-use super::{Options, ReplayError, Spawn};
+use super::{ReplayOptions, ReplayError, SpawnOptions};
 use crate::bus::listen::{self, Listener};
-use crate::bus::roots::{ReceiveFilter, Roots};
-use crate::bus::served::{Absent, ServedBus, open_or_serve};
-use crate::processes::{LISTEN, Plan, Processes, in_memory, program};
+use crate::bus::roots::{ReceiveFilter, RootWires};
+use crate::bus::served::{IfAbsent, ServedBus, open_or_serve};
+use crate::processes::{GATEWAY_DETECTION_TIME, CellLaunch, Processes, in_memory, program};
 use crate::setup::names;
 use model::decode::Decoded;
-use trace::capture::{Extras, SKIN};
+use trace::capture::{RecordingExtras, SKIN_ATTACHMENT};
 
 /// Interval between polls.
-const LOOK: Duration = Duration::from_millis(5);
+const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Destinations of the capture's buses.
 #[derive(Clone, Debug)]
@@ -38,7 +38,7 @@ pub(super) struct Routes {
 
 impl Routes {
     /// Evaluates `--bus` and `--map`.
-    pub(super) fn new(options: &Options, survey: &Survey, capture: &str) -> Result<Self, ReplayError> {
+    pub(super) fn new(options: &ReplayOptions, survey: &Survey, capture: &str) -> Result<Self, ReplayError> {
         let known = |name: &str, option: String| {
             let (capture, buses) = (capture.to_owned(), survey.names());
             let bus = name.to_owned();
@@ -68,7 +68,7 @@ impl Routes {
             }
         }
         let names = routes.names.iter().map(|(_, name)| name.as_str());
-        options.kinds.clone().only(names)?;
+        options.kinds.clone().restrict_to(names)?;
         let distinct: BTreeSet<_> = routes.names.iter().map(|(_, name)| name).collect();
         if options.hears() && distinct.len() < routes.names.len() {
             return Err(ReplayError::Merged);
@@ -79,7 +79,7 @@ impl Routes {
 
 /// One open bus of a replay.
 #[derive(Debug)]
-pub(super) struct BusLink {
+pub(super) struct ReplayBus {
     pub(super) bus: Bus,
     pub(super) format: Format,
     /// True if this replay serves the bus.
@@ -88,7 +88,7 @@ pub(super) struct BusLink {
     pub(super) wired: bool,
 }
 
-impl BusLink {
+impl ReplayBus {
     pub(super) fn frames(&self, message: &Message) -> impl Iterator<Item = Frame> + use<> {
         message.encode().frames(self.format)
     }
@@ -103,9 +103,9 @@ impl BusLink {
 /// Buses, and the processes started for them.
 #[derive(Debug)]
 pub(super) struct Buses {
-    pub(super) bus_links: Arc<Vec<BusLink>>,
+    pub(super) bus_links: Arc<Vec<ReplayBus>>,
     /// The gateway's ends of the wires to the roots, until the receiver takes them.
-    pub(super) roots: Vec<Option<Roots>>,
+    pub(super) roots: Vec<Option<RootWires>>,
     // Dropped in this order: the cells before their buses.
     pub(super) processes: Processes,
     _served: Vec<ServedBus>,
@@ -122,15 +122,15 @@ pub(super) struct SkinOverride {
 
 /// Returns the skin of the cells to start: the named skin, or the recording's.
 pub(super) fn skin_override(
-    spawn: &Spawn,
+    spawn: &SpawnOptions,
     routes: &Routes,
-    extras: &Extras,
+    extras: &RecordingExtras,
     file: &str,
 ) -> Result<SkinOverride, ReplayError> {
     let mut skin_override = if let Some(path) = &spawn.skin {
         SkinOverride { skin: Skin::read(path)?, file: path.clone(), _memory: None }
     } else {
-        let attached = extras.attachments.iter().find(|(name, _)| name == SKIN);
+        let attached = extras.attachments.iter().find(|(name, _)| name == SKIN_ATTACHMENT);
         let Some((_, bytes)) = attached else {
             return Err(ReplayError::NoSkin(file.to_owned()));
         };
@@ -156,13 +156,13 @@ pub(super) fn skin_override(
 }
 
 /// Skin of a recording, if it has a readable one.
-pub(super) fn recorded_skin(extras: &Extras) -> Option<Skin> {
+pub(super) fn recorded_skin(extras: &RecordingExtras) -> Option<Skin> {
     extras.skin()?.ok()
 }
 
 /// Opens all buses. `recorded` is the skin of cells that are already present, if known.
 pub(super) fn open(
-    options: &Options,
+    options: &ReplayOptions,
     survey: &Survey,
     routes: &Routes,
     skin_override: Option<&SkinOverride>,
@@ -174,12 +174,12 @@ pub(super) fn open(
         let described = skin_override
             .and_then(|skin_override| skin_override.skin.buses.iter().find(|bus| bus.name == *name));
         let format = described.map(|bus| bus.format).or(surveyed.format);
-        let spawned_skin = skin_override
+        let bus_skin = skin_override
             .map(|skin_override| (&skin_override.skin, name))
             .or_else(|| Some((recorded?, &surveyed.name)));
-        let spawned_skin = spawned_skin.and_then(|(skin, name)| Some((skin, skin.bus_named(name)?)));
+        let spawned_skin = bus_skin.and_then(|(skin, name)| Some((skin, skin.bus_named(name)?)));
         let receive_filter = spawned_skin
-            .map_or_else(|| vec![Filter::ALL], |(skin, bus)| ReceiveFilter::of(skin, bus, true).filters);
+            .map_or_else(|| vec![Filter::ALL], |(skin, bus)| ReceiveFilter::for_bus(skin, bus, true).filters);
         let bus_options = BusOptions {
             fd: surveyed.has_fd || format == Some(Format::Fd),
             filters: if options.hears() { receive_filter } else { Vec::new() },
@@ -188,8 +188,8 @@ pub(super) fn open(
             ..BusOptions::default()
         };
         let (bus, of_ours) = match skin_override {
-            Some(_) => open_or_serve(name, options.kinds.of(name), &bus_options, Absent::Made)?,
-            None => match Bus::open(name, options.kinds.of(name), &bus_options) {
+            Some(_) => open_or_serve(name, options.kinds.kind_of(name), &bus_options, IfAbsent::Made)?,
+            None => match Bus::open(name, options.kinds.kind_of(name), &bus_options) {
                 Err(error) if options.expect.is_some() && error.may_open_later() => {
                     return Err(ReplayError::NotThere(error));
                 }
@@ -198,11 +198,11 @@ pub(super) fn open(
         };
         // Real buses have real wires.
         let has_wires = options.hears() && (bus.kind() == BusKind::Embedded || bus.is_virtual()?);
-        let root = spawned_skin.filter(|_| has_wires).and_then(|(skin, bus)| Roots::of(skin, bus));
+        let root = spawned_skin.filter(|_| has_wires).and_then(|(skin, bus)| RootWires::for_bus(skin, bus));
         let (own, wired) = (of_ours.is_some(), root.is_some());
         roots.push(root);
         served.extend(of_ours);
-        bus_links.push(BusLink { bus, format: format.unwrap_or(Format::Fd), own, wired });
+        bus_links.push(ReplayBus { bus, format: format.unwrap_or(Format::Fd), own, wired });
     }
     Ok(Buses { bus_links: Arc::new(bus_links), roots, processes: Processes::default(), _served: served })
 }
@@ -212,20 +212,20 @@ impl Buses {
     /// cells found.
     pub(super) fn listen(&self) -> Result<Vec<BTreeSet<CellId>>, ReplayError> {
         let mut heard = vec![BTreeSet::new(); self.bus_links.len()];
-        let filters = vec![Filter::exact(Id::command(Command::Joints)), Filter::kind(Kind::Network)];
-        let again = |(index, bus_link): (usize, &BusLink)| {
+        let filters = vec![Filter::exact(Id::command(Command::Joints)), Filter::for_kind(Kind::Network)];
+        let again = |(index, bus_link): (usize, &ReplayBus)| {
             let options = BusOptions { filters: filters.clone(), ..BusOptions::default() };
-            let kind = Choice::Only(bus_link.bus.kind());
+            let kind = KindChoice::Only(bus_link.bus.kind());
             let bus = listen::open(bus_link.bus.name(), kind, Some(bus_link.format), options)?;
             Ok((index, Listener::new(bus, None)))
         };
         let others = self.bus_links.iter().enumerate().filter(|(_, bus_link)| !bus_link.own);
         let mut open = others.map(again).collect::<Result<Vec<_>, BusError>>()?;
-        let until = Instant::now() + LISTEN;
+        let until = Instant::now() + GATEWAY_DETECTION_TIME;
         while !open.is_empty() && Instant::now() < until {
-            thread::sleep(LOOK);
+            thread::sleep(POLL_INTERVAL);
             for (index, listener) in &mut open {
-                listener.hear(Duration::ZERO)?;
+                listener.receive(Duration::ZERO)?;
                 let speakers: Vec<_> =
                     listener.decoded().filter_map(|(_, decoded)| speaker(&decoded)).collect();
                 for speaker in speakers {
@@ -245,7 +245,7 @@ impl Buses {
     /// Starts the cells of a skin, on buses without cells.
     pub(super) fn start_cells(
         &mut self,
-        spawn: &Spawn,
+        spawn: &SpawnOptions,
         skin_override: &SkinOverride,
         heard: &[BTreeSet<CellId>],
     ) -> Result<(), ReplayError> {
@@ -255,9 +255,9 @@ impl Buses {
             return Err(ReplayError::CellsThere { bus: bus_link.bus.name().to_owned(), cells });
         }
         let kinds =
-            Kinds::exactly(self.bus_links.iter().map(|bus_link| (bus_link.bus.name(), bus_link.bus.kind())));
+            KindChoices::exactly(self.bus_links.iter().map(|bus_link| (bus_link.bus.name(), bus_link.bus.kind())));
         self.processes = Processes::new()?;
-        self.processes.start(&Plan {
+        self.processes.start(&CellLaunch {
             directory: None,
             program: &program("cell-node")?,
             skin_file: &skin_override.file,
@@ -281,10 +281,10 @@ const fn speaker(decoded: &Decoded) -> Option<Node> {
     }
 }
 
-impl Options {
+impl ReplayOptions {
     /// Returns true if messages of cells are received.
     pub(super) fn hears(&self) -> bool {
-        self.expect.is_some() || self.lockstep || self.only == Only::Inputs
+        self.expect.is_some() || self.lockstep || self.only == SenderFilter::Inputs
     }
 }
 

@@ -3,18 +3,18 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use model::tracker::{Account, DEAD_AFTER, LATEST, Tracked, Word};
+use model::tracker::{Account, DEAD_AFTER, MAX_LATE_EPOCHS, CellTracker, HeartbeatKind};
 use protocol::can::Format;
 use protocol::candump::Record;
 use protocol::id::{CellId, Command, Id, Node};
-use protocol::message::{Answer, Heard, Heartbeat, Joints, Message, NetworkPage, Request, State as Flags};
+use protocol::message::{Answer, ReceivedCounts, Heartbeat, Joints, Message, NetworkPage, Request, State as Flags};
 use protocol::packet::{Epoch, data_id};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use model::decode::{Decoded, Decoder};
 use model::latched::State;
-use trace::capture::{BusNote, Latched, Note};
+use trace::capture::{BusNote, LatchedFrame, Note};
 
 /// Silence in ns after which a cell counts as absent.
 const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
@@ -27,7 +27,7 @@ const PASSED: usize = 64;
 
 /// A part of a capture, in ns of its run, or after its first frame if there is no run.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Part {
+pub struct TimeRange {
     /// Start; `None` for the beginning.
     pub from: Option<u64>,
     /// End, exclusive; `None` for the end of the capture.
@@ -37,7 +37,7 @@ pub struct Part {
 /// Survey of a whole capture.
 #[derive(Debug)]
 pub struct Survey {
-    part: Part,
+    part: TimeRange,
     /// Start of the run in ns since 1970, if known.
     pub run_began: Option<u64>,
     /// Time of the first frame in ns since 1970.
@@ -49,13 +49,13 @@ pub struct Survey {
     /// Number of frames that the recorder reported as lost.
     pub dropped: u64,
     /// Buses in the order of their first frames.
-    pub buses: Vec<Bus>,
+    pub buses: Vec<SurveyedBus>,
     decoder: Decoder,
 }
 
 /// Survey of one bus.
 #[derive(Debug, Default)]
-pub struct Bus {
+pub struct SurveyedBus {
     /// Name in the capture.
     pub name: String,
     /// Number of frames.
@@ -80,7 +80,7 @@ pub struct Bus {
     /// Number of sums that cells sent.
     pub sums: u64,
     /// Cells of the bus.
-    pub cells: BTreeMap<CellId, Cell>,
+    pub cells: BTreeMap<CellId, SurveyedCell>,
     /// Cells by messages from before the capture.
     before: BTreeMap<CellId, Before>,
 }
@@ -98,22 +98,22 @@ struct Broadcast {
 /// State of a cell from before the capture.
 #[derive(Clone, Debug, Default)]
 struct Before {
-    tracked: Tracked,
+    tracked: CellTracker,
     /// Time of its last message in ns since 1970.
     heard: u64,
-    hash: Known<u16>,
+    hash: KnownValue<u16>,
     measures: bool,
 }
 
 /// Survey of one cell.
 #[derive(Clone, Debug)]
-pub struct Cell {
+pub struct SurveyedCell {
     /// Hash of its configuration where the part begins, if known.
-    pub hash: Known<u16>,
+    pub hash: KnownValue<u16>,
     /// True if it measured in the part: its torques cannot be reproduced.
     pub measured: bool,
     /// Times of its first and last message in ns since 1970.
-    pub heard: (u64, u64),
+    pub active: (u64, u64),
     /// Starts and ends of its long silences in ns since 1970.
     pub silences: Vec<(u64, u64)>,
     /// Number of packets that it sent and the capture lacks.
@@ -124,18 +124,18 @@ pub struct Cell {
     accounted: Vec<(u64, u64)>,
     /// True if counters account for anything in the capture; otherwise everything missing is a difference.
     is_accounted: bool,
-    tracked: Tracked,
+    tracked: CellTracker,
     /// Time since which it claims its node id, as it does after each start.
     claims: Option<u64>,
     /// Time since which its bus is lost.
     away: Option<u64>,
     /// Counters of its last report, the number of joints until then, and the time of the last of them.
-    report: Option<(Heard, u64, u64)>,
+    report: Option<(ReceivedCounts, u64, u64)>,
 }
 
 /// Position of a frame relative to the replayed part.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Place {
+enum PartPosition {
     /// Before the part.
     Before,
     In,
@@ -144,7 +144,7 @@ enum Place {
 
 /// A value that may become known too late.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub enum Known<T> {
+pub enum KnownValue<T> {
     /// The value has not been reported.
     #[default]
     No,
@@ -157,7 +157,7 @@ pub enum Known<T> {
 impl Survey {
     /// Creates an empty survey of a part of a capture.
     #[must_use]
-    pub const fn new(part: Part) -> Self {
+    pub const fn new(part: TimeRange) -> Self {
         let decoder = Decoder::new(None);
         Self {
             part,
@@ -172,13 +172,13 @@ impl Survey {
     }
 
     /// Adds the frames that are latched at the start of the capture; call it before the first frame.
-    pub fn begin(&mut self, latched: &[Latched]) {
+    pub fn add_latched(&mut self, latched: &[LatchedFrame]) {
         let mut decoder = Decoder::new(None);
-        for Latched { bus, frame, nanos, .. } in latched {
+        for LatchedFrame { bus, frame, nanos, .. } in latched {
             if let Decoded::Message(message) = decoder.decode(Micros(nanos / 1_000), bus, frame) {
                 let bus = self.bus(bus);
                 bus.is_accounted = true;
-                bus.state.take(&message);
+                bus.state.apply(&message);
                 bus.take_before(&message, *nanos);
                 bus.latched.push(message);
             }
@@ -186,7 +186,7 @@ impl Survey {
     }
 
     /// Adds the next frame.
-    pub fn take(&mut self, record: &Record<'_>) {
+    pub fn add_frame(&mut self, record: &Record<'_>) {
         let nanos = record.time.nanos;
         self.first.get_or_insert(nanos);
         self.last = self.last.max(nanos);
@@ -198,16 +198,16 @@ impl Survey {
         bus.has_fd |= record.frame.format() == Format::Fd;
         let from = data_id(&record.frame).ok().and_then(Id::sender);
         if let (Some(cell), Decoded::Message(_) | Decoded::Meaningless { .. }) = (from, &decoded) {
-            bus.heard(cell, nanos);
+            bus.mark_seen(cell, nanos);
         }
         if let Decoded::Message(message) = decoded {
             bus.format.get_or_insert_with(|| record.frame.format());
             let place = if nanos < begins {
-                Place::Before
+                PartPosition::Before
             } else if nanos < ends {
-                Place::In
+                PartPosition::In
             } else {
-                Place::After
+                PartPosition::After
             };
             bus.take(&message, from, nanos, place);
         }
@@ -227,10 +227,10 @@ impl Survey {
     /// Handles a note: the cells of a lost bus are away until they send again. Their last answers may have been lost
     /// with the bus.
     pub fn note(&mut self, note: &Note<'_>) {
-        let Some((name, BusNote::Lost)) = BusNote::of(note) else { return };
+        let Some((name, BusNote::Lost)) = BusNote::parse(note) else { return };
         let Some(bus) = self.bus_named(name).and_then(|at| self.buses.get_mut(at)) else { return };
         // Joints that may still be answered.
-        let recent = bus.recent_joints.iter().rev().take(LATEST + 1);
+        let recent = bus.recent_joints.iter().rev().take(MAX_LATE_EPOCHS + 1);
         let since = recent.map(|joints| joints.nanos).min().unwrap_or(note.nanos);
         for cell in bus.cells.values_mut() {
             cell.away.get_or_insert(since);
@@ -263,16 +263,16 @@ impl Survey {
         self.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ")
     }
 
-    fn bus(&mut self, name: &str) -> &mut Bus {
+    fn bus(&mut self, name: &str) -> &mut SurveyedBus {
         let at = self.bus_named(name).unwrap_or_else(|| {
-            self.buses.push(Bus { name: name.to_owned(), ..Bus::default() });
+            self.buses.push(SurveyedBus { name: name.to_owned(), ..SurveyedBus::default() });
             self.buses.len() - 1
         });
         self.buses.get_mut(at).expect("found, or just made")
     }
 }
 
-impl Bus {
+impl SurveyedBus {
     /// Handles a message from before the capture that is latched at its start.
     fn take_before(&mut self, message: &Message, nanos: u64) {
         if let Message::Network { from: Node::Cell(from), page: NetworkPage::Heartbeat(heartbeat), .. } =
@@ -280,32 +280,32 @@ impl Bus {
         {
             let is_settled = !heartbeat.state.has(Flags::CLAIMING);
             let before = self.before.entry(from).or_default();
-            if before.tracked.hear(Micros(nanos / 1_000), message, None).word != Some(Word::Claimant) {
+            if before.tracked.receive(Micros(nanos / 1_000), message, None).word != Some(HeartbeatKind::Claimant) {
                 before.heard = nanos;
                 before.measures = is_settled && !heartbeat.state.has(Flags::TEST_MODE);
-                before.hash = if is_settled { Known::Yes(heartbeat.configuration) } else { Known::No };
+                before.hash = if is_settled { KnownValue::Yes(heartbeat.configuration) } else { KnownValue::No };
             }
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
-            for (_, before) in self.before.iter_mut().filter(|(cell, _)| to.names(**cell)) {
+            for (_, before) in self.before.iter_mut().filter(|(cell, _)| to.addresses(**cell)) {
                 if number == Parameter::Mode.number() {
                     before.measures = words.first() != Some(&1);
                 } else if number == Parameter::Commit.number() {
-                    before.hash = Known::No;
+                    before.hash = KnownValue::No;
                 }
             }
         }
     }
 
-    fn heard(&mut self, cell: CellId, nanos: u64) {
+    fn mark_seen(&mut self, cell: CellId, nanos: u64) {
         let before = self.before.get(&cell);
-        self.cells.entry(cell).or_insert_with(|| Cell::new(nanos, before)).hear(nanos);
+        self.cells.entry(cell).or_insert_with(|| SurveyedCell::new(nanos, before)).mark_seen(nanos);
     }
 
-    fn take(&mut self, message: &Message, from: Option<CellId>, nanos: u64, place: Place) {
-        if place == Place::Before {
-            self.state.take(message);
+    fn take(&mut self, message: &Message, from: Option<CellId>, nanos: u64, place: PartPosition) {
+        if place == PartPosition::Before {
+            self.state.apply(message);
         }
-        self.is_accounted |= matches!(message, Message::Network { page: NetworkPage::Heard(_), .. });
+        self.is_accounted |= matches!(message, Message::Network { page: NetworkPage::Received(_), .. });
         self.sums += u64::from(matches!(message, Message::Sum { .. }));
         if let Some(cell) = from.and_then(|from| self.cells.get_mut(&from)) {
             cell.take(message, nanos, place, &self.recent_joints);
@@ -315,20 +315,20 @@ impl Bus {
             if self.recent_joints.len() > PASSED {
                 self.recent_joints.pop_front();
             }
-            if place == Place::In {
+            if place == PartPosition::In {
                 self.first_joints.get_or_insert((epoch, joints));
             }
         }
     }
 
     /// Cells that send in a part of the capture.
-    pub fn cells_in(&self, (from, to): (u64, u64)) -> impl Iterator<Item = (CellId, &Cell)> {
-        let speaks = move |cell: &Cell| cell.heard.1 >= from && cell.heard.0 < to;
+    pub fn cells_in(&self, (from, to): (u64, u64)) -> impl Iterator<Item = (CellId, &SurveyedCell)> {
+        let speaks = move |cell: &SurveyedCell| cell.active.1 >= from && cell.active.0 < to;
         self.cells.iter().map(|(cell, it)| (*cell, it)).filter(move |(_, cell)| speaks(cell))
     }
 }
 
-impl Cell {
+impl SurveyedCell {
     fn new(nanos: u64, before: Option<&Before>) -> Self {
         // A cell that sent just before the capture was present when it began.
         let first =
@@ -337,9 +337,9 @@ impl Cell {
         // Its messages between the two times are not known to be lost.
         tracked.account = Account::default();
         Self {
-            hash: before.map_or(Known::No, |before| before.hash),
+            hash: before.map_or(KnownValue::No, |before| before.hash),
             measured: before.is_some_and(|before| before.measures),
-            heard: (first.map_or(nanos, |heard| heard.min(nanos)), nanos),
+            active: (first.map_or(nanos, |heard| heard.min(nanos)), nanos),
             silences: Vec::new(),
             unrecorded: 0,
             untaken: 0,
@@ -352,12 +352,12 @@ impl Cell {
         }
     }
 
-    fn hear(&mut self, nanos: u64) {
-        let last = self.heard.1;
+    fn mark_seen(&mut self, nanos: u64) {
+        let last = self.active.1;
         if nanos > last.saturating_add(SILENT_NS) {
             self.silences.push((last, nanos));
         }
-        self.heard.1 = last.max(nanos);
+        self.active.1 = last.max(nanos);
         if let Some(away) = self.away.take() {
             self.silences.push((away, nanos));
         }
@@ -369,29 +369,29 @@ impl Cell {
         if let Some(away) = self.away {
             self.silences.push((away, u64::MAX));
         }
-        let from = self.claims.unwrap_or(self.heard.1);
+        let from = self.claims.unwrap_or(self.active.1);
         if nanos > from.saturating_add(SILENT_NS) || self.claims.is_some() {
             self.silences.push((from, u64::MAX));
         }
     }
 
     /// Handles a message of the cell that followed these joints.
-    fn take(&mut self, message: &Message, nanos: u64, place: Place, joints: &VecDeque<Broadcast>) {
-        let word = self.tracked.hear(Micros(nanos / 1_000), message, None).word;
+    fn take(&mut self, message: &Message, nanos: u64, place: PartPosition, joints: &VecDeque<Broadcast>) {
+        let word = self.tracked.receive(Micros(nanos / 1_000), message, None).word;
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             match word {
-                Some(Word::Claimant | Word::Outsider | Word::Overtaken) | None => return,
+                Some(HeartbeatKind::Claimant | HeartbeatKind::Outsider | HeartbeatKind::Overtaken) | None => return,
                 // A restart resets its counters, which then include joints from before this heartbeat.
-                Some(Word::Started { .. }) => {
+                Some(HeartbeatKind::Started { .. }) => {
                     let last = joints.back().map(|last| (last.number, last.nanos)).unwrap_or_default();
                     let may_count = |joints: &&Broadcast| nanos <= joints.nanos.saturating_add(STARTS_NS);
                     let early = joints.iter().rev().take_while(may_count).count() as u64;
-                    self.report = Some((Heard::default(), last.0.saturating_sub(early), last.1));
+                    self.report = Some((ReceivedCounts::default(), last.0.saturating_sub(early), last.1));
                 }
-                Some(Word::First | Word::Known | Word::Shared) => {}
+                Some(HeartbeatKind::First | HeartbeatKind::Known | HeartbeatKind::Shared) => {}
             }
             self.heartbeat(heartbeat, nanos, place);
-        } else if let Message::Network { page: NetworkPage::Heard(heard), epoch, .. } = *message {
+        } else if let Message::Network { page: NetworkPage::Received(heard), epoch, .. } = *message {
             // The page carries the epoch of the last joints in its counters.
             let at = joints.iter().rev().find(|joints| joints.epoch == epoch);
             self.report(heard, at.map(|joints| (joints.number, joints.nanos)));
@@ -401,14 +401,14 @@ impl Cell {
         {
             // Configured again before its first heartbeat: its former configuration is unknown.
             self.hash = match self.hash {
-                _ if place == Place::Before => Known::No,
-                Known::No => Known::TooLate,
-                known @ (Known::TooLate | Known::Yes(_)) => known,
+                _ if place == PartPosition::Before => KnownValue::No,
+                KnownValue::No => KnownValue::TooLate,
+                known @ (KnownValue::TooLate | KnownValue::Yes(_)) => known,
             };
         }
     }
 
-    fn heartbeat(&mut self, heartbeat: &Heartbeat, nanos: u64, place: Place) {
+    fn heartbeat(&mut self, heartbeat: &Heartbeat, nanos: u64, place: PartPosition) {
         // A cell that claims its node id answers nothing.
         if heartbeat.state.has(Flags::CLAIMING) {
             self.claims.get_or_insert(nanos);
@@ -417,15 +417,15 @@ impl Cell {
         if let Some(since) = self.claims.take() {
             self.silences.push((since, nanos));
         }
-        if place == Place::Before || self.hash == Known::No {
-            self.hash = Known::Yes(heartbeat.configuration);
+        if place == PartPosition::Before || self.hash == KnownValue::No {
+            self.hash = KnownValue::Yes(heartbeat.configuration);
         }
-        self.measured |= place == Place::In && !heartbeat.state.has(Flags::TEST_MODE);
+        self.measured |= place == PartPosition::In && !heartbeat.state.has(Flags::TEST_MODE);
     }
 
     /// Handles counters up to some joints. Joints from before the capture leave it unknown which joints the counters
     /// cover.
-    fn report(&mut self, heard: Heard, at: Option<(u64, u64)>) {
+    fn report(&mut self, heard: ReceivedCounts, at: Option<(u64, u64)>) {
         let Some((joints, last)) = at else { return };
         if let Some((before, joints_before, from)) = self.report {
             let taken = heard.joints.wrapping_sub(before.joints);
@@ -454,7 +454,7 @@ impl Cell {
     /// Returns true during a long silence of the cell; `nanos` is in ns since 1970.
     #[must_use]
     pub fn is_silent_at(&self, nanos: u64) -> bool {
-        nanos < self.heard.0 || self.silences.iter().any(|&(from, to)| (from..to).contains(&nanos))
+        nanos < self.active.0 || self.silences.iter().any(|&(from, to)| (from..to).contains(&nanos))
     }
 }
 

@@ -8,11 +8,11 @@ use model::accelerometer::kinematics::UPRIGHT;
 use model::accelerometer::{Accelerometers, RobotState};
 use protocol::fixed::Q3_12;
 use protocol::id::Node;
-use protocol::message::{From, Message, SensorPage};
+use protocol::message::{AppliesFrom, Message, SensorPage};
 use protocol::packet::Epoch;
 use protocol::skin::Cell;
 
-use super::Options;
+use super::RunOptions;
 
 /// Motion of the robot in a tick.
 #[derive(Clone, Copy, Debug)]
@@ -47,7 +47,7 @@ pub(super) struct Accelerations {
 
 impl Accelerations {
     /// Creates the accelerometers of the scenario, if it has any.
-    pub(super) fn new(options: &Options) -> Option<Self> {
+    pub(super) fn new(options: &RunOptions) -> Option<Self> {
         let sheet = options.scenario.sensors.acceleration?;
         let sensors = Accelerometers::new(&options.skin, &sheet, options.scenario.seed, UPRIGHT);
         Some(Self { sensors, broadcasts: 0 })
@@ -56,7 +56,7 @@ impl Accelerations {
     /// Stimuli of a future epoch, `now` s after the start of the loop, for each bus. Empty if the motion is unknown.
     pub(super) fn ahead(
         &self,
-        options: &Options,
+        options: &RunOptions,
         moved: Option<Moved>,
         (epoch, now): (Epoch, f64),
     ) -> Vec<(usize, Message)> {
@@ -65,11 +65,11 @@ impl Accelerations {
         }
         match (&options.planned, options.scenario.motion) {
             (Some(planned), _) => {
-                self.stimuli(options, |seconds| planned.at(seconds), now, From::Epoch(epoch))
+                self.stimuli(options, |seconds| planned.at(seconds), now, AppliesFrom::Epoch(epoch))
             }
             (None, motion) if motion.state_at(now).is_some() => {
                 let state = |seconds| motion.state_at(seconds).unwrap_or_default();
-                self.stimuli(options, state, now, From::Epoch(epoch))
+                self.stimuli(options, state, now, AppliesFrom::Epoch(epoch))
             }
             (None, _) => Vec::new(),
         }
@@ -78,7 +78,7 @@ impl Accelerations {
     /// Stimuli after the latest broadcast, once per broadcast. Empty if they were sent ahead.
     pub(super) fn latest(
         &mut self,
-        options: &Options,
+        options: &RunOptions,
         moved: Option<Moved>,
         (broadcasts, now): (u64, f64),
     ) -> Vec<(usize, Message)> {
@@ -86,7 +86,7 @@ impl Accelerations {
         match moved {
             Some(moved) if self.broadcasts != broadcasts && (moved.is_halted || !is_known) => {
                 self.broadcasts = broadcasts;
-                self.stimuli(options, |seconds| moved.before(seconds), now, From::Next)
+                self.stimuli(options, |seconds| moved.before(seconds), now, AppliesFrom::Next)
             }
             _ => Vec::new(),
         }
@@ -94,10 +94,10 @@ impl Accelerations {
 
     fn stimuli(
         &self,
-        options: &Options,
+        options: &RunOptions,
         state: impl Fn(f64) -> RobotState,
         now: f64,
-        from: From,
+        from: AppliesFrom,
     ) -> Vec<(usize, Message)> {
         let readings = self.sensors.readings(&options.skin, state, now, |_, force| *force);
         let cells = options.skin.cells.iter().zip(readings);

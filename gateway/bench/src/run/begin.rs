@@ -5,25 +5,25 @@ use std::sync::atomic::Ordering;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{BusKind, Kinds};
+use protocol::bus::{BusKind, KindChoices};
 use protocol::id::{CellId, Node};
 use protocol::message::Message;
 use protocol::packet::Epoch;
 use protocol::parameters::{Parameter, Sensing};
 use protocol::time::Span;
-use protocol::usage::say;
+use protocol::usage::eprint_line;
 
-use super::bench::{Bench, LOOK};
+use super::bench::{Bench, POLL_INTERVAL};
 use super::receiver::BusEvent;
 use crate::error::RunError;
-use crate::processes::{LISTEN, Plan, STARTING, program};
+use crate::processes::{GATEWAY_DETECTION_TIME, CellLaunch, STARTING, program};
 use crate::setup::{Timeout, names};
 use crate::view::View;
 use model::repeat::Repeats;
 use model::table::{Notice, Switch};
 
 /// Time that running cells get to show up, and all cells to confirm their switches.
-pub(super) const SHOWING: Duration = Duration::from_secs(2);
+pub(super) const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(2);
 /// Retry interval for a cell that does not confirm its switches.
 pub(super) const SWITCH_AGAIN: Span = Span::from_millis(250);
 
@@ -34,17 +34,17 @@ impl Bench<'_> {
     /// Starts the cells, listens for another gateway, and waits until all cells are ready.
     pub(super) fn begin(&mut self) -> Result<(), RunError> {
         let options = self.options;
-        let listened = Instant::now() + LISTEN;
+        let listened = Instant::now() + GATEWAY_DETECTION_TIME;
         if options.spawn {
             if self.served.len() < self.bus_links.len() {
                 self.find_alone(listened)?;
             }
             let program = program("cell-node")?;
-            self.processes.start(&Plan {
+            self.processes.start(&CellLaunch {
                 program: &program,
                 skin_file: &options.skin_file,
                 skin: &options.skin,
-                kinds: &Kinds::exactly(
+                kinds: &KindChoices::exactly(
                     self.bus_links.iter().map(|bus_link| (bus_link.link.name.as_str(), bus_link.link.kind)),
                 ),
                 directory: options.directory.as_deref(),
@@ -60,12 +60,12 @@ impl Bench<'_> {
             // After a busy moment of the machine, ready cells may seem dead: they will send again.
             Ok(Instant::now() >= listened && (ready == cells || is_over))
         })?;
-        self.rate_start()?;
+        self.check_cells()?;
         self.wake_up()?;
         self.go_on_after_others();
         self.switch_cells()?;
         // Requests their counters, contact states and positions in their networks.
-        self.say(&Message::Report)?;
+        self.send_to_all(&Message::Report)?;
         if self.bus_links.iter().any(|bus_link| bus_link.network.is_some()) {
             self.organise()
         } else {
@@ -78,15 +78,15 @@ impl Bench<'_> {
         if self.options.quiet {
             return;
         }
-        self.options.announced.iter().for_each(|line| say(line));
+        self.options.announced.iter().for_each(|line| eprint_line(line));
         if let Some(log) = &self.log {
-            say(&format!("frames are recorded in {}", log.display()));
+            eprint_line(&format!("frames are recorded in {}", log.display()));
         }
     }
 
     /// Maximum time without progress of the cells.
     pub(super) const fn timeout(&self) -> Duration {
-        if self.options.spawn { STARTING } else { SHOWING }
+        if self.options.spawn { STARTING } else { DISCOVERY_TIMEOUT }
     }
 
     /// Polls until the check returns true.
@@ -97,7 +97,7 @@ impl Bench<'_> {
     ) -> Result<(), RunError> {
         let mut timeout = Timeout::new(timeout);
         while !is_last(self, &mut timeout)? {
-            thread::sleep(LOOK);
+            thread::sleep(POLL_INTERVAL);
             self.hear_while_starting()?;
         }
         Ok(())
@@ -105,24 +105,24 @@ impl Bench<'_> {
 
     /// Resumes cells that an earlier gateway has halted.
     fn wake_up(&mut self) -> Result<(), RunError> {
-        self.say(&Message::Resume)?;
+        self.send_to_all(&Message::Resume)?;
         let halted = |bench: &Self| bench.count(|cell| cell.halted);
         if halted(self) == 0 {
             return Ok(());
         }
         // Their next heartbeats show their state.
-        self.say(&Message::Sync)?;
-        self.wait(SHOWING, |bench, timeout| Ok(halted(bench) == 0 || timeout.is_over(0)))
+        self.send_to_all(&Message::Sync)?;
+        self.wait(DISCOVERY_TIMEOUT, |bench, timeout| Ok(halted(bench) == 0 || timeout.is_over(0)))
     }
 
     /// Checks that a bus that existed before has neither a gateway nor cells with the same node ids; listening disturbs
     /// neither.
     fn find_alone(&mut self, until: Instant) -> Result<(), RunError> {
-        self.wait(LISTEN, |_, _| Ok(Instant::now() >= until))?;
+        self.wait(GATEWAY_DETECTION_TIME, |_, _| Ok(Instant::now() >= until))?;
         // Emulated cells are present already, and belong to this run.
         let others = self.bus_links.iter().enumerate().filter_map(|(bus, bus_link)| {
             let view = bus_link.view.lock().ok()?;
-            let heard = view.cells.iter().filter(|cell| cell.heard).map(|cell| cell.node);
+            let heard = view.cells.iter().filter(|cell| cell.seen).map(|cell| cell.node);
             let others: Vec<_> = heard.filter(|node| !self.processes.runs(bus, node.get())).collect();
             (!others.is_empty()).then(|| names(&others, &format!(" on {}", bus_link.link.name)))
         });
@@ -149,7 +149,7 @@ impl Bench<'_> {
         }
     }
 
-    fn rate_start(&self) -> Result<(), RunError> {
+    fn check_cells(&self) -> Result<(), RunError> {
         let spawned = self.options.spawn;
         let silent = self.names(|cell| !cell.ready && !cell.unconfigured);
         let unconfigured = self.names(|cell| cell.unconfigured);
@@ -175,7 +175,7 @@ impl Bench<'_> {
             ),
         ] {
             if !who.is_empty() && !self.options.quiet {
-                say(&format!("cells that {what}: {who}"));
+                eprint_line(&format!("cells that {what}: {who}"));
             }
         }
         Ok(())
@@ -198,7 +198,7 @@ impl Bench<'_> {
         match self.processes.ended().into_iter().next() {
             None => Ok(()),
             Some(ended) => {
-                Err(RunError::Ended { cells: ended.to_string(), status: ended.status, said: ended.said })
+                Err(RunError::Ended { cells: ended.to_string(), status: ended.status, said: ended.reason })
             }
         }
     }
@@ -210,7 +210,7 @@ impl Bench<'_> {
     }
 
     /// Sends a command on all buses.
-    pub(super) fn say(&self, message: &Message) -> Result<(), RunError> {
+    pub(super) fn send_to_all(&self, message: &Message) -> Result<(), RunError> {
         for bus_link in &self.bus_links {
             if bus_link.send(message)? {
                 bus_link.link.state.commands.fetch_add(1, Ordering::Relaxed);
@@ -232,8 +232,8 @@ impl Bench<'_> {
                 bus_link.switch(Node::Everyone, switch)?;
             }
         }
-        announced.said_to_all(self.now());
-        self.wait(SHOWING, |bench, timeout| {
+        announced.mark_all_sent(self.now());
+        self.wait(DISCOVERY_TIMEOUT, |bench, timeout| {
             bench.switch_again(&mut announced)?;
             // Cells that have not answered by then are switched later.
             Ok(bench.lacking().is_empty() || timeout.is_over(0))

@@ -16,12 +16,12 @@ use protocol::message::{Message, Request};
 use protocol::packet::Epoch;
 use protocol::time::Micros;
 
-use super::Options;
-use super::commander::{Remote, SwitchedBuses};
+use super::RunOptions;
+use super::commander::{RemoteControl, SwitchedBuses};
 use super::hosts::Hosts;
 use super::network::Network;
 use super::receiver::{BusEvent, ReceiverResult};
-use crate::bus::link::{Link, Slot, may_return};
+use crate::bus::link::{SharedBus, Slot, may_return};
 use crate::bus::served::ServedBus;
 use crate::emulate::Emulation;
 use crate::processes::Processes;
@@ -30,22 +30,22 @@ use crate::record::Recorder;
 use crate::setup::names;
 use crate::view::{CellView, View};
 use control::cycle::Cycle;
-use control::cycle::turn::{Line, Shared, Timed};
+use control::cycle::turn::{BusPort, Shared, TimedRecord};
 use model::table::Switch;
 
 /// Interval between polls until the loop starts.
-pub(super) const LOOK: Duration = Duration::from_millis(5);
+pub(super) const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
 /// Tag of requests that switch cells.
 const SWITCH: u8 = 0x5E;
 
 /// One bus of a bench.
 #[derive(Debug)]
-pub(super) struct BusLink {
-    pub(super) link: Arc<Link>,
+pub(super) struct RunBus {
+    pub(super) link: Arc<SharedBus>,
     pub(super) format: Format,
     /// The loop's end of the bus, until the loop starts.
-    pub(super) line: Option<(Line, Slot)>,
+    pub(super) line: Option<(BusPort, Slot)>,
     pub(super) view: Arc<Mutex<View>>,
     pub(super) receiver: Option<JoinHandle<ReceiverResult>>,
     /// Sends the receiver the cells that may have missed a message.
@@ -57,7 +57,7 @@ pub(super) struct BusLink {
     pub(super) shared: Arc<Shared>,
 }
 
-impl BusLink {
+impl RunBus {
     /// Sends a message. A lost bus refuses it, which is counted and does not end the run.
     pub(super) fn send(&self, message: &Message) -> Result<bool, BusError> {
         let frames: Vec<Frame> = message.encode().frames(self.format).collect();
@@ -79,13 +79,13 @@ impl BusLink {
 /// A bench whose cells are ready and whose loop has not started.
 #[derive(Debug)]
 pub(super) struct Bench<'a> {
-    pub(super) options: &'a Options,
+    pub(super) options: &'a RunOptions,
     pub(super) began: Instant,
     pub(super) idle: Histogram<u64>,
     /// Number of packets that the kernel's backlog had dropped before the first bus was opened.
     pub(super) backlog_dropped: Option<u64>,
     pub(super) shared: Arc<Shared>,
-    pub(super) bus_links: Vec<BusLink>,
+    pub(super) bus_links: Vec<RunBus>,
     pub(super) bus_event: Inlet<(usize, BusEvent)>,
     pub(super) signalled: Arc<AtomicBool>,
     pub(super) cycle: Option<Cycle>,
@@ -93,9 +93,9 @@ pub(super) struct Bench<'a> {
     pub(super) first_epoch: Epoch,
     pub(super) recorder: Option<Recorder>,
     /// Queue of loop records to the recorder.
-    pub(super) recorded: Option<rtrb::Producer<Timed>>,
+    pub(super) recorded: Option<rtrb::Producer<TimedRecord>>,
     /// Remote control, if any.
-    pub(super) remote: Option<Remote>,
+    pub(super) remote: Option<RemoteControl>,
     /// Buses that a command has taken down and not yet brought back.
     pub(super) commanded: SwitchedBuses,
     /// Processes of cells that have ended.
@@ -112,7 +112,7 @@ pub(super) struct Bench<'a> {
 impl Bench<'_> {
     /// Time since the start of the bench.
     pub(super) fn now(&self) -> Micros {
-        Micros::after(self.began.elapsed())
+        Micros::since_start(self.began.elapsed())
     }
 
     /// Name of a bus of the skin.
@@ -121,7 +121,7 @@ impl Bench<'_> {
     }
 
     /// View of each receiver.
-    pub(super) fn views(&self) -> impl Iterator<Item = (&BusLink, MutexGuard<'_, View>)> {
+    pub(super) fn views(&self) -> impl Iterator<Item = (&RunBus, MutexGuard<'_, View>)> {
         self.bus_links.iter().filter_map(|bus_link| Some((bus_link, bus_link.view.lock().ok()?)))
     }
 
@@ -129,7 +129,7 @@ impl Bench<'_> {
     pub(super) fn networks(&mut self) -> impl Iterator<Item = (&mut Network, MutexGuard<'_, View>)> {
         self.bus_links
             .iter_mut()
-            .filter_map(|BusLink { network, view, .. }| Some((network.as_mut()?, view.lock().ok()?)))
+            .filter_map(|RunBus { network, view, .. }| Some((network.as_mut()?, view.lock().ok()?)))
     }
 
     /// Number of cells that satisfy a predicate.

@@ -5,28 +5,28 @@ use std::time::{Duration, Instant};
 
 use protocol::bus::BusKind;
 use protocol::skin::{Cell, Skin};
-use vcan_setup::link::Kind;
+use vcan_setup::link::InterfaceKind;
 use vcan_setup::netlink::Netlink;
 
-use super::Options;
-use super::bench::{Bench, BusLink};
-use super::commander::{Refused, Remote};
-use super::measured::Measured;
+use super::RunOptions;
+use super::bench::{Bench, RunBus};
+use super::commander::{CommandError, RemoteControl};
+use super::measured::LoopTotals;
 use crate::bus::served::ServedBus;
 use crate::processes::{LaunchError, program};
 use crate::progress::Progress;
-use crate::remote::{BusState, Command, LinkDown, Phase, ProcessState, State};
+use crate::remote::{BusState, BenchCommand, LinkDown, Phase, ProcessState, BenchState};
 use model::scenario::ProcessAction;
 
 /// Maximum number of commands carried out at once, so that stimuli are not late.
-const AT_ONCE: usize = 4;
+const MAX_COMMANDS_PER_ROUND: usize = 4;
 /// Interval between states.
-const EVERY: Duration = Duration::from_millis(200);
+const STATE_INTERVAL: Duration = Duration::from_millis(200);
 
 impl Bench<'_> {
     /// Carries out received commands, and sends the state when due. If the other side has ended, the remote control
     /// ends, and buses that it has taken down come back.
-    pub(super) fn obey(&mut self, measured: &Measured, progress: &Progress) {
+    pub(super) fn obey(&mut self, measured: &LoopTotals, progress: &Progress) {
         let links = &self.bus_links;
         self.commanded.settle(|bus| {
             let link = &links.get(bus)?.link;
@@ -43,9 +43,9 @@ impl Bench<'_> {
             }
             return;
         }
-        for _ in 0..AT_ONCE {
+        for _ in 0..MAX_COMMANDS_PER_ROUND {
             let Some(command) = remote.lines.receive() else { break };
-            let what = self.words(command);
+            let what = self.command_text(command);
             match self.carry_out(command) {
                 Ok(()) => {
                     let note = format!("view: {what}");
@@ -58,7 +58,7 @@ impl Bench<'_> {
         }
         let now = Instant::now();
         if now >= remote.due {
-            remote.due = now + EVERY;
+            remote.due = now + STATE_INTERVAL;
             let state = self.state(&remote, measured);
             remote.lines.send(&state);
         }
@@ -66,10 +66,10 @@ impl Bench<'_> {
     }
 
     /// Formats a command as text.
-    fn words(&self, command: Command) -> String {
+    fn command_text(&self, command: BenchCommand) -> String {
         let switched = |down: bool| if down { "down" } else { "up" };
         match command {
-            Command::Process { action, bus, node } => {
+            BenchCommand::Process { action, bus, node } => {
                 let (action, name) = (action.name(), self.name(bus));
                 match self.process(bus, node).map(|process| process.nodes) {
                     Some((first, last)) if first != last => {
@@ -78,18 +78,18 @@ impl Bench<'_> {
                     Some(_) | None => format!("{action} cell {node} on {name}"),
                 }
             }
-            Command::Link { down, bus, nodes: [one, other] } => {
+            BenchCommand::Link { down, bus, nodes: [one, other] } => {
                 format!("link {} between cell {one} and cell {other} on {}", switched(down), self.name(bus))
             }
-            Command::Bus { down, bus } => format!("bus {} {}", self.name(bus), switched(down)),
+            BenchCommand::Bus { down, bus } => format!("bus {} {}", self.name(bus), switched(down)),
         }
     }
 
-    fn carry_out(&mut self, command: Command) -> Result<(), Refused> {
+    fn carry_out(&mut self, command: BenchCommand) -> Result<(), CommandError> {
         match command {
-            Command::Process { action, bus, node } => self.act(action, bus, node),
-            Command::Link { down, bus, nodes } => self.command_link(down, bus, nodes),
-            Command::Bus { down, bus } => {
+            BenchCommand::Process { action, bus, node } => self.act(action, bus, node),
+            BenchCommand::Link { down, bus, nodes } => self.command_link(down, bus, nodes),
+            BenchCommand::Bus { down, bus } => {
                 self.commanded.check(down, bus)?;
                 self.switch_bus(down, bus)?;
                 self.commanded.switched(down, bus, commands(&self.bus_links, bus));
@@ -103,41 +103,41 @@ impl Bench<'_> {
         self.processes.states().find(|process| process.runs(bus, node))
     }
 
-    fn act(&mut self, action: ProcessAction, bus: usize, node: u8) -> Result<(), Refused> {
+    fn act(&mut self, action: ProcessAction, bus: usize, node: u8) -> Result<(), CommandError> {
         cell(&self.options.skin, bus, node)?;
-        let phase = self.process(bus, node).ok_or(Refused::NoProcess)?.phase;
+        let phase = self.process(bus, node).ok_or(CommandError::NoProcess)?.phase;
         match (action, phase) {
             (ProcessAction::Restart, _)
             | (ProcessAction::Kill, Phase::Running | Phase::Stopped)
             | (ProcessAction::Stop, Phase::Running)
             | (ProcessAction::Continue, Phase::Stopped) => {}
-            (_, phase) => return Err(Refused::Phase(phase)),
+            (_, phase) => return Err(CommandError::Phase(phase)),
         }
         self.processes.act(bus, node, action)?;
         Ok(())
     }
 
-    fn command_link(&mut self, down: bool, bus: usize, [one, other]: [u8; 2]) -> Result<(), Refused> {
+    fn command_link(&mut self, down: bool, bus: usize, [one, other]: [u8; 2]) -> Result<(), CommandError> {
         let skin = &self.options.skin;
         let (one, other) = (cell(skin, bus, one)?, cell(skin, bus, other)?);
         if !one.neighbors.contains(&Some(other.node)) {
-            return Err(Refused::NoWire);
+            return Err(CommandError::NoWire);
         }
         let network = self.bus_links.get_mut(bus).and_then(|bus_link| bus_link.network.as_mut());
-        let network = network.ok_or(Refused::NoLinks)?;
+        let network = network.ok_or(CommandError::NoLinks)?;
         network.set_link_down(down, one.node, other.node);
         network.set_link_down(down, other.node, one.node);
         Ok(())
     }
 
-    fn switch_bus(&mut self, down: bool, bus: usize) -> Result<(), Refused> {
-        let link = &self.bus_links.get(bus).ok_or(Refused::NoBus)?.link;
+    fn switch_bus(&mut self, down: bool, bus: usize) -> Result<(), CommandError> {
+        let link = &self.bus_links.get(bus).ok_or(CommandError::NoBus)?.link;
         match link.kind {
             BusKind::Embedded => {
                 let served = self.served.iter_mut().find(|served| served.bus() == link.name);
-                let served = served.ok_or(Refused::NotServed)?;
+                let served = served.ok_or(CommandError::NotServed)?;
                 if down {
-                    served.end();
+                    served.stop();
                 } else {
                     *served = serve(self.options, &link.name)?;
                 }
@@ -147,7 +147,7 @@ impl Bench<'_> {
         }
     }
 
-    fn state(&self, remote: &Remote, measured: &Measured) -> State {
+    fn state(&self, remote: &RemoteControl, measured: &LoopTotals) -> BenchState {
         let networks = self.bus_links.iter().enumerate();
         let networks = networks.filter_map(|(bus, bus_link)| Some((bus, bus_link.network.as_ref()?)));
         let links_down = networks.flat_map(|(bus, network)| {
@@ -158,7 +158,7 @@ impl Bench<'_> {
             down: self.commanded.is_expected(bus),
             links: bus_link.network.is_some(),
         });
-        State {
+        BenchState {
             processes: self.processes.states().collect(),
             links_down: links_down.collect(),
             buses: buses.collect(),
@@ -170,35 +170,35 @@ impl Bench<'_> {
 }
 
 /// Number of commands sent on a bus.
-fn commands(links: &[BusLink], bus: usize) -> u64 {
+fn commands(links: &[RunBus], bus: usize) -> u64 {
     links.get(bus).map_or(0, |bus_link| bus_link.link.state.commands.load(Ordering::Relaxed))
 }
 
 /// Serves an embedded bus.
-pub(super) fn serve(options: &Options, bus: &str) -> Result<ServedBus, LaunchError> {
+pub(super) fn serve(options: &RunOptions, bus: &str) -> Result<ServedBus, LaunchError> {
     let program = program("vcan-setup")?;
     ServedBus::start(&program, bus, options.directory.as_deref())
 }
 
 /// Finds a cell of the skin.
-fn cell(skin: &Skin, bus: usize, node: u8) -> Result<&Cell, Refused> {
+fn cell(skin: &Skin, bus: usize, node: u8) -> Result<&Cell, CommandError> {
     if bus >= skin.buses.len() {
-        return Err(Refused::NoBus);
+        return Err(CommandError::NoBus);
     }
-    skin.cells.iter().find(|cell| cell.bus == bus && cell.node.get() == node).ok_or(Refused::NoCell)
+    skin.cells.iter().find(|cell| cell.bus == bus && cell.node.get() == node).ok_or(CommandError::NoCell)
 }
 
 /// Brings an interface of the kernel down, or up again.
-fn switch_interface(name: &str, down: bool) -> Result<(), Refused> {
+fn switch_interface(name: &str, down: bool) -> Result<(), CommandError> {
     let state = if down { "down" } else { "up" };
-    let failed = |source| Refused::Interface { name: name.to_owned(), state, source };
+    let failed = |source| CommandError::Interface { name: name.to_owned(), state, source };
     let mut netlink = Netlink::open().map_err(failed)?;
     let interfaces = netlink.interfaces().map_err(failed)?;
     let interface = interfaces.into_iter().find(|interface| interface.name == name);
-    let interface = interface.ok_or(Refused::NoInterface)?;
+    let interface = interface.ok_or(CommandError::NoInterface)?;
     match interface.kind {
-        Kind::Vcan | Kind::Vxcan(_) => netlink.set_up(interface.index, !down).map_err(failed),
-        Kind::Hardware(_) | Kind::Other(_) => Err(Refused::NotVirtual),
+        InterfaceKind::Vcan | InterfaceKind::Vxcan(_) => netlink.set_up(interface.index, !down).map_err(failed),
+        InterfaceKind::Hardware(_) | InterfaceKind::Other(_) => Err(CommandError::NotVirtual),
     }
 }
 
@@ -208,15 +208,15 @@ mod tests {
 
     #[test]
     fn only_virtual_interfaces_are_taken_down() {
-        assert!(matches!(switch_interface("lo", true), Err(Refused::NotVirtual)));
-        assert!(matches!(switch_interface("no-such-one", true), Err(Refused::NoInterface)));
+        assert!(matches!(switch_interface("lo", true), Err(CommandError::NotVirtual)));
+        assert!(matches!(switch_interface("no-such-one", true), Err(CommandError::NoInterface)));
     }
 
     #[test]
     fn cells_are_those_of_the_skin() {
         let skin = Skin::parse("skin.toml", model::testing::SKIN).unwrap();
         assert_eq!(cell(&skin, 0, 1).unwrap().node.get(), 1);
-        assert!(matches!(cell(&skin, 0, 200), Err(Refused::NoCell)));
-        assert!(matches!(cell(&skin, usize::MAX, 1), Err(Refused::NoBus)));
+        assert!(matches!(cell(&skin, 0, 200), Err(CommandError::NoCell)));
+        assert!(matches!(cell(&skin, usize::MAX, 1), Err(CommandError::NoBus)));
     }
 }

@@ -7,16 +7,16 @@ use std::time::Instant;
 use thiserror::Error;
 
 use crate::processes::LaunchError;
-use crate::remote::{Answer, Lines, Phase};
+use crate::remote::{CommandReply, JsonPipe, Phase};
 
 /// Maximum number of kept replies.
-const ANSWERS: usize = 8;
+const MAX_REPLIES: usize = 8;
 
 /// The remote control of a run and its latest replies.
 #[derive(Debug)]
-pub(super) struct Remote {
-    pub(super) lines: Lines,
-    pub(super) answers: Vec<Answer>,
+pub(super) struct RemoteControl {
+    pub(super) lines: JsonPipe,
+    pub(super) answers: Vec<CommandReply>,
     /// Total number of replies.
     count: u64,
     pub(super) due: Instant,
@@ -52,11 +52,11 @@ impl SwitchedBuses {
     ///
     /// # Errors
     /// Returns [`Refused`] if the bus is in that state already, or soon will be.
-    pub(super) fn check(&self, down: bool, bus: usize) -> Result<(), Refused> {
+    pub(super) fn check(&self, down: bool, bus: usize) -> Result<(), CommandError> {
         match (down, self.0.get(&bus)) {
-            (true, Some(Switched::Down)) => Err(Refused::Already("up")),
-            (false, Some(Switched::Up { .. })) => Err(Refused::ComesUp),
-            (false, None) => Err(Refused::Already("down")),
+            (true, Some(Switched::Down)) => Err(CommandError::Already("up")),
+            (false, Some(Switched::Up { .. })) => Err(CommandError::ComesUp),
+            (false, None) => Err(CommandError::Already("down")),
             (true, Some(Switched::Up { .. }) | None) | (false, Some(Switched::Down)) => Ok(()),
         }
     }
@@ -86,7 +86,7 @@ impl SwitchedBuses {
 
 /// Reason why a command is refused.
 #[derive(Debug, Error)]
-pub(super) enum Refused {
+pub(super) enum CommandError {
     #[error("the skin has no such bus")]
     NoBus,
     #[error("the skin has no such cell")]
@@ -117,17 +117,17 @@ pub(super) enum Refused {
     Launch(#[from] LaunchError),
 }
 
-impl Remote {
-    pub(super) fn new(lines: Lines) -> Self {
+impl RemoteControl {
+    pub(super) fn new(lines: JsonPipe) -> Self {
         Self { lines, answers: Vec::new(), count: 0, due: Instant::now() }
     }
 
     pub(super) fn answer(&mut self, done: bool, text: String) {
         self.count += 1;
-        if self.answers.len() >= ANSWERS {
+        if self.answers.len() >= MAX_REPLIES {
             self.answers.remove(0);
         }
-        self.answers.push(Answer { number: self.count, done, text });
+        self.answers.push(CommandReply { number: self.count, done, text });
         self.due = Instant::now();
     }
 }
@@ -139,7 +139,7 @@ mod tests {
     #[test]
     fn a_refusal_says_why_in_one_line() {
         let source = io::Error::from_raw_os_error(1);
-        let refused = Refused::Interface { name: "vcan0".to_owned(), state: "down", source };
+        let refused = CommandError::Interface { name: "vcan0".to_owned(), state: "down", source };
         let why = "Operation not permitted (os error 1); a run that may not do it needs CAP_NET_ADMIN, or `sudo ip \
                    link set vcan0 down` does it";
         assert_eq!(refused.to_string(), why);
@@ -148,10 +148,10 @@ mod tests {
     #[test]
     fn a_bus_that_was_taken_up_is_expected_until_it_has_worked() {
         let mut buses = SwitchedBuses::default();
-        assert!(matches!(buses.check(false, 0), Err(Refused::Already("down"))));
+        assert!(matches!(buses.check(false, 0), Err(CommandError::Already("down"))));
         buses.check(true, 0).unwrap();
         buses.switched(true, 0, 100);
-        assert!(matches!(buses.check(true, 0), Err(Refused::Already("up"))));
+        assert!(matches!(buses.check(true, 0), Err(CommandError::Already("up"))));
         buses.settle(|_| Some(105));
         assert!(buses.is_down(0) && buses.is_expected(0), "what works there is of before");
         // Down and up at once: the receiver has not noticed the change yet.
@@ -159,7 +159,7 @@ mod tests {
         buses.switched(false, 0, 105);
         buses.settle(|_| Some(105));
         assert!(!buses.is_down(0) && buses.is_expected(0));
-        assert!(matches!(buses.check(false, 0), Err(Refused::ComesUp)));
+        assert!(matches!(buses.check(false, 0), Err(CommandError::ComesUp)));
         buses.settle(|_| None);
         assert!(buses.is_expected(0), "the receiver has noticed it");
         // Taken down again before it has worked.

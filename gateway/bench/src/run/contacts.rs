@@ -4,9 +4,9 @@ use std::time::Duration;
 
 use protocol::id::{CellId, Node};
 use protocol::parameters::Parameter;
-use protocol::usage::say;
+use protocol::usage::eprint_line;
 
-use super::begin::SHOWING;
+use super::begin::DISCOVERY_TIMEOUT;
 use super::bench::Bench;
 use super::watch::Script;
 use crate::error::RunError;
@@ -21,17 +21,17 @@ impl Bench<'_> {
     /// Waits briefly until the contact of all cells in test mode is known: the reported counters show whether a cell
     /// has received stimuli before. If the scenario touches the skin, clears the cells' contact.
     pub(super) fn know_contacts(&mut self, script: &mut Script) -> Result<(), RunError> {
-        let unreported = |cell: &CellView| cell.unclear && !cell.said.counters;
+        let unreported = |cell: &CellView| cell.unclear && !cell.responded.counters;
         self.wait(ANSWERING, |bench, timeout| Ok(bench.count(unreported) == 0 || timeout.is_over(0)))?;
         if script.touches.cells().next().is_some() {
-            self.wait(SHOWING, |bench, timeout| {
+            self.wait(DISCOVERY_TIMEOUT, |bench, timeout| {
                 bench.clear_contacts(script)?;
                 Ok(bench.count(|cell| cell.unclear) == 0 || timeout.is_over(0))
             })?;
         }
         let unclear = self.names(|cell| cell.unclear);
         if !unclear.is_empty() && !self.options.quiet {
-            say(&format!(
+            eprint_line(&format!(
                 "the contact of these cells is unknown, so their torques are not compared: {unclear}; they received \
                  stimuli before this run (`skinbus frame configure --cell N --write mode 1` clears one)"
             ));

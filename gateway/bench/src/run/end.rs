@@ -7,36 +7,36 @@ use std::time::{Duration, Instant};
 use protocol::bus::BusKind;
 use protocol::message::Message;
 use protocol::skin::Cell;
-use protocol::usage::say;
+use protocol::usage::eprint_line;
 
-use super::bench::{Bench, BusLink};
-use super::measured::Measured;
+use super::bench::{Bench, RunBus};
+use super::measured::LoopTotals;
 use super::receiver::ReceiverResult;
-use super::watch::LOOK;
+use super::watch::ROUND_PAUSE;
 use crate::error::RunError;
 use crate::record::feed::Unrecorded;
 use crate::record::{Recorder, backlog};
-use crate::summary::{BusSummary, CellSummary, Loop, NetworkSummary, OutagesSummary, Summary};
+use crate::summary::{BusSummary, CellSummary, LoopSummary, NetworkSummary, OutagesSummary, Summary};
 use crate::view::View;
 use model::quantiles::Quantiles;
-use model::table::{Accuracy, Said};
-use trace::recording::account::Recording;
+use model::table::{Accuracy, Responded};
+use trace::recording::account::RecordingAccount;
 
 /// Time that cells get to send their final reports; an overloaded machine needs it.
-const LAST_WORDS: Duration = Duration::from_secs(3);
+const FINAL_REPORT_TIMEOUT: Duration = Duration::from_secs(3);
 
 impl Bench<'_> {
     /// Runs the loop to its end or to its failure, and returns the summary.
     pub(super) fn watch(mut self) -> Summary {
         let mut summary = Summary::empty(&self.options.skin);
-        let mut measured = Measured::new();
+        let mut measured = LoopTotals::new();
         let failure = self.drive(&mut summary, &mut measured).err().map(|error| error.to_string());
         let received = self.stop_receivers();
         summary.recording = self.finish_recording(&received);
         if failure.is_some() {
             self.say_what_is_kept(summary.recording.as_ref());
         }
-        self.summarise(summary, &measured, &received).rated(failure)
+        self.summarise(summary, &measured, &received).with_verdict(failure)
     }
 
     /// Ends a bench whose loop never started.
@@ -48,16 +48,16 @@ impl Bench<'_> {
         if error.exit_code() != 1 {
             return Err(error);
         }
-        Ok(self.summarise(summary, &Measured::new(), &received).rated(Some(error.to_string())))
+        Ok(self.summarise(summary, &LoopTotals::new(), &received).with_verdict(Some(error.to_string())))
     }
 
     /// Reports the files with the frames received before a failure.
-    fn say_what_is_kept(&self, recording: Option<&Recording>) {
+    fn say_what_is_kept(&self, recording: Option<&RecordingAccount>) {
         if self.options.quiet {
             return;
         }
         for file in recording.into_iter().flat_map(|recording| &recording.files) {
-            say(&format!("{} frames received until then are in {}", file.frames, file.path));
+            eprint_line(&format!("{} frames received until then are in {}", file.frames, file.path));
         }
     }
 
@@ -66,13 +66,13 @@ impl Bench<'_> {
         let two_periods = Duration::try_from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz());
         thread::sleep(two_periods.unwrap_or_default());
         self.wait_until(Self::has_caught_up);
-        self.say(&Message::Report)?;
+        self.send_to_all(&Message::Report)?;
         self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.counters));
         if interrupted {
-            self.say(&Message::Halt)?;
+            self.send_to_all(&Message::Halt)?;
         }
         // Sent last, so that each cell's own count covers everything else that it has sent.
-        self.say(&Message::Sync)?;
+        self.send_to_all(&Message::Sync)?;
         self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.heartbeat));
         Ok(())
     }
@@ -87,30 +87,30 @@ impl Bench<'_> {
     }
 
     /// Returns true if all ready cells on working buses have sent the requested report.
-    fn all_have(&self, said: impl Fn(&Said) -> bool) -> bool {
+    fn all_have(&self, said: impl Fn(&Responded) -> bool) -> bool {
         self.bus_links.iter().filter(|bus_link| bus_link.link.state.is_there()).all(|bus_link| {
-            let all = |view: &View| view.cells.iter().all(|cell| !cell.ready || said(&cell.said));
+            let all = |view: &View| view.cells.iter().all(|cell| !cell.ready || said(&cell.responded));
             bus_link.view.lock().map_or(true, |view| all(&view))
         })
     }
 
     /// Waits until a condition holds, up to the timeout; the accounts show what is missing then.
     fn wait_until(&self, done: impl Fn(&Self) -> bool) {
-        let give_up = Instant::now() + LAST_WORDS;
+        let give_up = Instant::now() + FINAL_REPORT_TIMEOUT;
         while !done(self) && Instant::now() < give_up {
-            thread::sleep(LOOK);
+            thread::sleep(ROUND_PAUSE);
         }
     }
 
     /// Stops the receivers and returns their results.
     fn stop_receivers(&mut self) -> Vec<Option<ReceiverResult>> {
         self.shared.stop.store(true, Ordering::Relaxed);
-        let end = |bus_link: &mut BusLink| bus_link.receiver.take().and_then(|thread| thread.join().ok());
+        let end = |bus_link: &mut RunBus| bus_link.receiver.take().and_then(|thread| thread.join().ok());
         self.bus_links.iter_mut().map(end).collect()
     }
 
     /// Ends the recording after all threads have stopped queuing.
-    fn finish_recording(&mut self, received: &[Option<ReceiverResult>]) -> Option<Recording> {
+    fn finish_recording(&mut self, received: &[Option<ReceiverResult>]) -> Option<RecordingAccount> {
         let add = |all: Unrecorded, one: &ReceiverResult| Unrecorded {
             frames: all.frames + one.unrecorded.frames,
             epochs: all.epochs + one.unrecorded.epochs,
@@ -124,7 +124,7 @@ impl Bench<'_> {
     fn summarise(
         &self,
         summary: Summary,
-        measured: &Measured,
+        measured: &LoopTotals,
         received: &[Option<ReceiverResult>],
     ) -> Summary {
         let backlog_dropped =
@@ -146,19 +146,19 @@ impl Bench<'_> {
         }
     }
 
-    fn loop_summary(&self, measured: &Measured, summary: Loop) -> Loop {
+    fn loop_summary(&self, measured: &LoopTotals, summary: LoopSummary) -> LoopSummary {
         let count = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
-        Loop {
+        LoopSummary {
             ticks: measured.ticks,
             ticks_skipped: measured.skipped,
             broadcasts: count(&self.shared.broadcasts),
             broadcasts_skipped: count(&self.shared.broadcasts_skipped),
             bad_cycles: measured.bad.clone(),
-            late_us: Quantiles::of(&measured.late, 1e-3),
-            idle_late_us: Quantiles::of(&self.idle, 1e-3),
-            took_us: Quantiles::of(&measured.took, 1e-3),
-            central_us: Quantiles::of(&measured.central, 1e-3),
-            took_distributed_us: Quantiles::of(&measured.took_distributed, 1e-3),
+            late_us: Quantiles::from_histogram(&measured.late, 1e-3),
+            idle_late_us: Quantiles::from_histogram(&self.idle, 1e-3),
+            took_us: Quantiles::from_histogram(&measured.took, 1e-3),
+            central_us: Quantiles::from_histogram(&measured.central, 1e-3),
+            took_distributed_us: Quantiles::from_histogram(&measured.took_distributed, 1e-3),
             records_lost: count(&self.shared.records_lost),
             unsent: count(&self.shared.unsent),
             ..summary
@@ -178,9 +178,9 @@ impl Bench<'_> {
         &self,
         received: &[Option<ReceiverResult>],
         backlog_dropped: Option<u64>,
-        measured: &Measured,
+        measured: &LoopTotals,
     ) -> Vec<BusSummary> {
-        let summary = |(index, (bus_link, received)): (usize, (&BusLink, &Option<ReceiverResult>))| {
+        let summary = |(index, (bus_link, received)): (usize, (&RunBus, &Option<ReceiverResult>))| {
             let &ReceiverResult { ref table, ref outages, dropped, ended, .. } = received.as_ref()?;
             let link = &bus_link.link;
             let network = bus_link.network.as_ref().map(|network| NetworkSummary {

@@ -7,10 +7,10 @@ use std::collections::VecDeque;
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
-use crate::summary::{Halted, TickBefore};
+use crate::summary::{HaltSummary, TickBefore};
 use control::cycle::Halt;
 use control::cycle::carried::bit;
-use control::cycle::turn::Timed;
+use control::cycle::turn::TimedRecord;
 
 /// Number of kept ticks: 0.4 s at 500 Hz.
 const TICKS: usize = 200;
@@ -21,19 +21,19 @@ const HALTS: usize = 100;
 #[derive(Debug, Default)]
 pub(super) struct Halts {
     /// Latest ticks.
-    ring: VecDeque<Timed>,
+    ring: VecDeque<TimedRecord>,
     /// Ticks up to the last halt.
-    before: Vec<Timed>,
-    halts: Vec<Halted>,
+    before: Vec<TimedRecord>,
+    halts: Vec<HaltSummary>,
     /// Number of halts beyond those listed one by one.
     pub(super) further: u64,
     /// The present halt, if any.
-    lasting: Option<Halted>,
+    lasting: Option<HaltSummary>,
 }
 
 impl Halts {
     /// Adds the next tick.
-    pub(super) fn take(&mut self, timed: &Timed) {
+    pub(super) fn add_tick(&mut self, timed: &TimedRecord) {
         if self.ring.len() == TICKS {
             self.ring.pop_front();
         }
@@ -42,7 +42,7 @@ impl Halts {
         match (record.halted, &mut self.lasting) {
             (Some(why), None) => {
                 self.before = self.ring.iter().copied().collect();
-                self.lasting = Some(Halted {
+                self.lasting = Some(HaltSummary {
                     at_s: seconds(record.tick.time),
                     tick: record.tick.number,
                     epoch: record.epoch.0,
@@ -73,7 +73,7 @@ impl Halts {
     }
 
     /// All listed halts, oldest first; a present halt is always included as the last.
-    pub(super) fn all(&self) -> Vec<Halted> {
+    pub(super) fn all(&self) -> Vec<HaltSummary> {
         self.halts.iter().chain(&self.lasting).cloned().collect()
     }
 
@@ -85,7 +85,7 @@ impl Halts {
 
 /// Converts a tick for the summary.
 #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
-fn tick(timed: &Timed, skin: &Skin) -> TickBefore {
+fn tick(timed: &TimedRecord, skin: &Skin) -> TickBefore {
     let record = &timed.record;
     let joints = |all: &[f64]| all.iter().copied().take(skin.robot.joints.len()).collect();
     let lost = skin.buses.iter().enumerate().filter(|(index, _)| record.missing & bit(*index) != 0);
@@ -125,11 +125,11 @@ fn seconds(time: Micros) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use control::controller::{BadCycle, Controller, Input, Step};
-    use control::cycle::carried::Heard;
+    use control::controller::{BadCycle, Controller, Input, ControllerOutput};
+    use control::cycle::carried::BusInput;
     use control::cycle::{Cycle, Tick};
     use control::robot::SimulatedArm;
-    use model::table::Sums;
+    use model::table::BusTotals;
     use model::testing;
     use protocol::packet::padded;
 
@@ -137,15 +137,15 @@ mod tests {
     struct Until(u64);
 
     impl Controller for Until {
-        fn step(&mut self, input: &Input) -> Step {
-            if input.tick < self.0 { Step::Move(padded(&[0.25; 6])) } else { Step::Bad(BadCycle::NoAnswer) }
+        fn step(&mut self, input: &Input) -> ControllerOutput {
+            if input.tick < self.0 { ControllerOutput::Move(padded(&[0.25; 6])) } else { ControllerOutput::Bad(BadCycle::NoAnswer) }
         }
     }
 
     /// A loop without a machine, whose records go to the tested code.
     struct Bench {
         cycle: Cycle,
-        sums: Sums,
+        sums: BusTotals,
         halts: Halts,
         tick: u64,
     }
@@ -155,19 +155,19 @@ mod tests {
             let skin = testing::skin();
             let robot = SimulatedArm::new(&skin, padded(&[0.0; 6]));
             let cycle = Cycle::new(&skin, Box::new(Until(answers)), Box::new(robot));
-            Self { cycle, sums: Sums::default(), halts: Halts::default(), tick: 0 }
+            Self { cycle, sums: BusTotals::default(), halts: Halts::default(), tick: 0 }
         }
 
         fn ticks(&mut self, ticks: u64) {
             for _ in 0..ticks {
                 let tick = Tick { number: self.tick, time: Micros(self.tick * 2_000) };
-                let heard = Heard { sums: &self.sums, works: true };
+                let heard = BusInput { sums: &self.sums, works: true };
                 let outcome = self.cycle.tick(tick, 0, [heard]);
                 if let Some(epoch) = outcome.broadcast {
                     self.sums.read_back = Some(epoch);
                 }
                 let record = outcome.record;
-                self.halts.take(&Timed { record, due_ns: 0, late_ns: 1_500, took_ns: 2_500, central: None });
+                self.halts.add_tick(&TimedRecord { record, due_ns: 0, late_ns: 1_500, took_ns: 2_500, central: None });
                 self.tick += 1;
             }
         }

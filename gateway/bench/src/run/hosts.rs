@@ -5,9 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use protocol::id::CellId;
-use vcan_setup::hosts::report::{Host, Report, Reports};
+use vcan_setup::hosts::report::{HostReport, LinkReport, ReportReader};
 
-use crate::bus::link::{Link, Outages};
+use crate::bus::link::{SharedBus, Outages};
 use crate::setup::names;
 use crate::summary::HostSummary;
 
@@ -17,14 +17,14 @@ const LOOK_AGAIN: Duration = Duration::from_millis(500);
 /// The other hosts of a bus, and the connection to its link.
 #[derive(Debug)]
 pub(super) struct Hosts {
-    reports: Option<Reports>,
+    reports: Option<ReportReader>,
     look_at: Instant,
-    known: Known,
+    known: KnownHosts,
 }
 
 /// Consequences of a link's reports.
 #[derive(Debug, Default, Eq, PartialEq)]
-pub(super) struct Changes {
+pub(super) struct HostChanges {
     /// Messages for the user.
     pub(super) notes: Vec<String>,
     /// Cells whose packets, or whose stimuli, may be lost.
@@ -35,16 +35,16 @@ pub(super) struct Changes {
 
 /// State of the hosts, over all of a run.
 #[derive(Debug, Default)]
-struct Known {
-    hosts: BTreeMap<String, Of>,
+struct KnownHosts {
+    hosts: BTreeMap<String, HostState>,
     /// True if a link has reported since the start of the run.
     is_linked: bool,
 }
 
 /// State of a host.
 #[derive(Debug, Default)]
-struct Of {
-    newest: Host,
+struct HostState {
+    newest: HostReport,
     outages: Outages,
     /// Numbers of frames lost from the host and to the host.
     lost: [u64; 2],
@@ -52,17 +52,17 @@ struct Of {
 
 impl Hosts {
     pub(super) fn new() -> Self {
-        Self { reports: None, look_at: Instant::now(), known: Known::default() }
+        Self { reports: None, look_at: Instant::now(), known: KnownHosts::default() }
     }
 
     /// Reads the reports of the bus's link without waiting.
-    pub(super) fn look(&mut self, link: &Link) -> Changes {
-        let (now, mut changes) = (Instant::now(), Changes::default());
+    pub(super) fn read_reports(&mut self, link: &SharedBus) -> HostChanges {
+        let (now, mut changes) = (Instant::now(), HostChanges::default());
         if self.reports.is_none() && self.look_at <= now {
             self.look_at = now + LOOK_AGAIN;
             self.reports = link.reports().ok();
         }
-        match self.reports.as_mut().map(Reports::take) {
+        match self.reports.as_mut().map(ReportReader::take) {
             Some(Ok(reports)) => {
                 for report in reports {
                     self.known.take(&link.name, report, now, &mut changes);
@@ -90,7 +90,7 @@ impl Hosts {
 
     /// Summary of each host; empty if no link joined the bus.
     pub(super) fn summary(&self) -> Vec<HostSummary> {
-        let summary = |(name, of): (&String, &Of)| HostSummary {
+        let summary = |(name, of): (&String, &HostState)| HostSummary {
             name: name.clone(),
             cells: of.newest.nodes.len(),
             gone: of.outages.times,
@@ -103,14 +103,14 @@ impl Hosts {
     }
 }
 
-impl Known {
-    fn take(&mut self, bus: &str, report: Report, now: Instant, changes: &mut Changes) {
+impl KnownHosts {
+    fn take(&mut self, bus: &str, report: LinkReport, now: Instant, changes: &mut HostChanges) {
         let is_first = !std::mem::replace(&mut self.is_linked, true);
         for (host, newest) in report.hosts {
             let known = self.hosts.entry(host.clone()).or_default();
             let before = std::mem::replace(&mut known.newest, newest);
             let newest = &known.newest;
-            let missing = |host: &Host| [host.heard.missing(), host.ours.map_or(0, |ours| ours.missing())];
+            let missing = |host: &HostReport| [host.heard.missing(), host.ours.map_or(0, |ours| ours.missing())];
             let (was, is) = (missing(&before), missing(newest));
             if is_first {
                 // Losses from before the run do not belong to the run.
@@ -148,7 +148,7 @@ impl Known {
     }
 
     /// Handles the end of the local link. The next link counts from zero.
-    fn end(&mut self, bus: &str, why: &str, now: Instant, changes: &mut Changes) {
+    fn end(&mut self, bus: &str, why: &str, now: Instant, changes: &mut HostChanges) {
         changes.notes.push(format!("the link of {bus} to other hosts has ended ({why})"));
         for known in self.hosts.values_mut() {
             let nodes = std::mem::take(&mut known.newest).nodes;
@@ -161,17 +161,17 @@ impl Known {
 
 #[cfg(test)]
 mod tests {
-    use vcan_setup::hosts::incoming::Heard;
+    use vcan_setup::hosts::incoming::SourceAccount;
 
     use super::*;
 
-    fn report(hosts: &[(&str, bool, u64, u64, u64)]) -> Report {
+    fn report(hosts: &[(&str, bool, u64, u64, u64)]) -> LinkReport {
         let host = |&(name, is_there, lives, from, to): &(&str, bool, u64, u64, u64)| {
-            let heard = Heard { lives, lost: from, ..Heard::default() };
-            let ours = Some(Heard { dropped_here: to, ..Heard::default() });
-            (name.to_owned(), Host { is_there, nodes: vec![7, 9], heard, ours })
+            let heard = SourceAccount { lives, lost: from, ..SourceAccount::default() };
+            let ours = Some(SourceAccount { dropped_here: to, ..SourceAccount::default() });
+            (name.to_owned(), HostReport { is_there, nodes: vec![7, 9], heard, ours })
         };
-        Report { host: "a".to_owned(), hosts: hosts.iter().map(host).collect(), ..Report::default() }
+        LinkReport { host: "a".to_owned(), hosts: hosts.iter().map(host).collect(), ..LinkReport::default() }
     }
 
     struct Fixture(Hosts, Instant, u64);
@@ -185,7 +185,7 @@ mod tests {
         /// reached.
         fn take(&mut self, hosts: &[(&str, bool, u64, u64, u64)]) -> (Vec<String>, usize, usize) {
             self.2 += 1;
-            let mut changes = Changes::default();
+            let mut changes = HostChanges::default();
             self.0.known.take("vcan0", report(hosts), self.1 + Duration::from_secs(self.2), &mut changes);
             (changes.notes, changes.in_doubt.len(), changes.reached.len())
         }
@@ -228,7 +228,7 @@ mod tests {
         let mut of = Fixture::new();
         of.take(&[("b", true, 1, 10, 0)]);
         of.take(&[("b", true, 1, 15, 0)]);
-        let mut changes = Changes::default();
+        let mut changes = HostChanges::default();
         of.0.known.end("vcan0", "end of file", of.1 + Duration::from_secs(3), &mut changes);
         assert_eq!((changes.in_doubt.len(), changes.reached.len()), (2, 0));
         assert!(of.0.is_away(CellId::new(9).unwrap()), "its heartbeats may still be on their way");

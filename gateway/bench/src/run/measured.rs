@@ -11,14 +11,14 @@ use super::accelerations::Moved;
 use super::halts::Halts;
 use super::status_line::StatusLine;
 use crate::remote::Lateness;
-use control::cycle::turn::Timed;
+use control::cycle::turn::TimedRecord;
 use model::accelerometer::RobotState;
 use model::quantiles::{Quantiles, histogram};
 use model::scenario::Mode;
 
 /// Totals of the loop's records.
 #[derive(Debug)]
-pub(super) struct Measured {
+pub(super) struct LoopTotals {
     pub(super) late: Histogram<u64>,
     pub(super) took: Histogram<u64>,
     pub(super) took_distributed: Histogram<u64>,
@@ -29,8 +29,8 @@ pub(super) struct Measured {
     /// Number of ticks without each bus, indexed as the bits of [`control::cycle::Record::missing`].
     pub(super) missing: [u64; 32],
     pub(super) halts: Halts,
-    last: Option<Timed>,
-    before: Option<Timed>,
+    last: Option<TimedRecord>,
+    before: Option<TimedRecord>,
     /// Start of the interval that `recent` covers.
     since: Instant,
     recent: Histogram<u64>,
@@ -39,7 +39,7 @@ pub(super) struct Measured {
     pub(super) first_broadcast_s: Option<f64>,
 }
 
-impl Measured {
+impl LoopTotals {
     pub(super) fn new() -> Self {
         Self {
             late: histogram(),
@@ -60,7 +60,7 @@ impl Measured {
         }
     }
 
-    pub(super) fn take(&mut self, records: &mut rtrb::Consumer<Timed>, began: Instant) {
+    pub(super) fn add_records(&mut self, records: &mut rtrb::Consumer<TimedRecord>, began: Instant) {
         while let Ok(timed) = records.pop() {
             if self.first_broadcast_s.is_none() {
                 self.first_broadcast_s = Some(began.elapsed().as_secs_f64());
@@ -80,11 +80,11 @@ impl Measured {
             if let Some(bad) = timed.record.bad {
                 *self.bad.entry(bad.to_string()).or_default() += 1;
             }
-            self.halts.take(&timed);
+            self.halts.add_tick(&timed);
             self.before = self.last.replace(timed);
         }
         if self.since.elapsed() >= Duration::from_secs(1) {
-            let [second, all] = [&self.recent, &self.late].map(|late| Quantiles::of(late, 1e-3));
+            let [second, all] = [&self.recent, &self.late].map(|late| Quantiles::from_histogram(late, 1e-3));
             self.lateness = Lateness { second, all, skipped: self.skipped };
             self.since = Instant::now();
             self.recent.reset();
@@ -112,7 +112,7 @@ impl Measured {
         lost: &[&str],
         width: Option<usize>,
     ) -> String {
-        let Some(Timed { record, .. }) = self.last else { return "starting".to_owned() };
+        let Some(TimedRecord { record, .. }) = self.last else { return "starting".to_owned() };
         let line = StatusLine {
             elapsed_s: elapsed.as_secs_f64(),
             duration_s: duration.seconds(),
@@ -122,7 +122,7 @@ impl Measured {
             cells: skin.cells.len(),
             stale: record.stale,
             dead: record.dead,
-            late_us: Quantiles::of(&self.late, 1e-3).p99,
+            late_us: Quantiles::from_histogram(&self.late, 1e-3).p99,
             mode: if comparing { Mode::Compare } else { Mode::Distributed }.name(),
             torque_nm: record.torque.get(..skin.robot.joints.len()).unwrap_or(&record.torque),
         };

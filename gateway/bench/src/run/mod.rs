@@ -32,20 +32,20 @@ mod watch;
 use std::path::PathBuf;
 
 use calibration::motion::Motion;
-use protocol::bus::Kinds;
+use protocol::bus::KindChoices;
 use protocol::skin::Skin;
 
-use self::commander::Remote;
+use self::commander::RemoteControl;
 pub use self::network::TooDeep;
 use crate::emulate::Emulated;
 pub use crate::error::RunError;
-use crate::remote::Lines;
+use crate::remote::JsonPipe;
 use crate::summary::Summary;
 use model::scenario::Scenario;
 
 /// Options of a run.
 #[derive(Clone, Debug)]
-pub struct Options {
+pub struct RunOptions {
     /// Path of the skin's file, which cells read too.
     pub skin_file: PathBuf,
     /// The skin.
@@ -53,7 +53,7 @@ pub struct Options {
     /// The scenario.
     pub scenario: Scenario,
     /// Kind of each bus.
-    pub kinds: Kinds,
+    pub kinds: KindChoices,
     /// Directory of embedded buses; `None` for the usual one.
     pub directory: Option<PathBuf>,
     /// True if the run starts the cells; otherwise they must be on the bus already.
@@ -67,7 +67,7 @@ pub struct Options {
     /// Size of the gateway's receive buffer of a bus in bytes, as the kernel counts them: about 1 KiB per frame.
     pub receive_buffer: usize,
     /// Outputs of the recording.
-    pub record: crate::record::Options,
+    pub record: crate::record::RecordOptions,
     /// True if progress is hidden.
     pub quiet: bool,
     /// Motion of the robot that replaces the scenario's.
@@ -82,7 +82,7 @@ pub struct Options {
 /// # Errors
 /// Returns [`RunError`] if the run cannot start because of wrong use or configuration, after ending the cells and buses
 /// that it started.
-pub fn run(options: &Options, remote: Option<Lines>) -> Result<Summary, RunError> {
+pub fn run(options: &RunOptions, remote: Option<JsonPipe>) -> Result<Summary, RunError> {
     let mut bench = match start::start(options) {
         Ok(bench) => bench,
         Err(error) if error.exit_code() == 1 => {
@@ -90,7 +90,7 @@ pub fn run(options: &Options, remote: Option<Lines>) -> Result<Summary, RunError
         }
         Err(error) => return Err(error),
     };
-    bench.remote = remote.map(Remote::new);
+    bench.remote = remote.map(RemoteControl::new);
     match bench.begin() {
         Ok(()) => {
             bench.announce();

@@ -7,20 +7,20 @@ use protocol::message::{Message, Request};
 use protocol::packet::WORDS;
 use protocol::parameters::{LinksDown, Parameter, Reply as Words, Slots};
 use protocol::port::PORTS;
-use protocol::skin::{Reply, Skin, Wires};
+use protocol::skin::{SkinReply, Skin, Wires};
 use protocol::time::{Micros, Span};
 use thiserror::Error;
 
 use model::network::check::{self, Difference};
-use model::network::tree::{Places, places};
+use model::network::tree::{TreePlaces, places};
 use model::repeat::Repeats;
 
 use crate::view::View;
 
 /// Retry interval for a cell that does not answer.
-const AGAIN: Span = Span::from_millis(200);
+const RETRY_INTERVAL: Span = Span::from_millis(200);
 /// Time that cells get to find another route before they are reported.
-const GRACE: Span = Span::from_millis(300);
+const REROUTE_TIMEOUT: Span = Span::from_millis(300);
 
 /// The network of one bus.
 #[derive(Debug)]
@@ -37,7 +37,7 @@ pub(super) struct Network {
     /// Cells that send but are unreachable, with the start of that state.
     without: BTreeMap<CellId, Micros>,
     /// Cells reported as unreachable, with the start of that state, until they have a route again.
-    said: BTreeMap<CellId, Micros>,
+    reported: BTreeMap<CellId, Micros>,
     said_too_deep: bool,
     /// Longest time that a cell was unreachable.
     pub(super) longest: Span,
@@ -71,7 +71,7 @@ pub struct TooDeep {
 
 /// Result of a check of a network.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct Look {
+pub(super) struct NetworkCheck {
     /// Messages for cells.
     pub(super) messages: Vec<Message>,
     /// Messages for the user.
@@ -80,19 +80,19 @@ pub(super) struct Look {
 
 impl Network {
     /// Creates the network of a bus, or `None` if its cells answer with their own torques.
-    pub(super) fn of(skin: &Skin, bus: usize) -> Option<Self> {
+    pub(super) fn for_bus(skin: &Skin, bus: usize) -> Option<Self> {
         let described = skin.buses.get(bus)?;
-        let Reply::Sum { slot_us, carry } = described.reply else { return None };
+        let SkinReply::Sum { slot_us, carry } = described.reply else { return None };
         Some(Self {
             name: described.name.clone(),
             wires: skin.wires(bus),
             slots: Slots { slot_us: u16::try_from(slot_us).unwrap_or(u16::MAX), deepest: 0, carry },
             period_us: skin.period_us().unwrap_or(u16::MAX),
-            announced: Repeats::new(AGAIN),
+            announced: Repeats::new(RETRY_INTERVAL),
             deaf: BTreeMap::new(),
-            reported_links_down: Repeats::new(AGAIN),
+            reported_links_down: Repeats::new(RETRY_INTERVAL),
             without: BTreeMap::new(),
-            said: BTreeMap::new(),
+            reported: BTreeMap::new(),
             said_too_deep: false,
             longest: Span(0),
             tree_ready: None,
@@ -115,7 +115,7 @@ impl Network {
         self.without.keys().map(|cell| cell.get())
     }
 
-    fn places(view: &View) -> Places {
+    fn places(view: &View) -> TreePlaces {
         places(view.network.iter().map(|cell| (cell.node, cell.alive && cell.serial.is_some(), cell.tree)))
     }
 
@@ -145,24 +145,24 @@ impl Network {
         Ok(())
     }
 
-    fn words(&self) -> [i16; WORDS] {
+    fn reply_words(&self) -> [i16; WORDS] {
         Words::Sum(self.slots).words()
     }
 
-    fn tell(&self, to: Node) -> Message {
-        let request = Request::Write { number: Parameter::Reply.number(), words: self.words() };
+    fn reply_message(&self, to: Node) -> Message {
+        let request = Request::Write { number: Parameter::Reply.number(), words: self.reply_words() };
         Message::Configure { to, tag: self.slots.deepest, request }
     }
 
     /// Returns the message that sends the depth of the tree to all cells.
     pub(super) fn announce(&mut self, now: Micros) -> Message {
-        self.announced.said_to_all(now);
-        self.tell(Node::Everyone)
+        self.announced.mark_all_sent(now);
+        self.reply_message(Node::Everyone)
     }
 
     /// Ready cells that have not confirmed the slots of this tree.
     pub(super) fn unconfirmed(&self, view: &View) -> Vec<CellId> {
-        let words = Some(self.words());
+        let words = Some(self.reply_words());
         let unconfirmed = view.cells.iter().filter(|cell| cell.ready && cell.reply != words);
         unconfirmed.map(|cell| cell.node).collect()
     }
@@ -170,7 +170,7 @@ impl Network {
     /// Messages for cells that have not answered in time.
     pub(super) fn tell_again(&mut self, now: Micros, view: &View) -> Vec<Message> {
         let due = self.announced.due(now, self.unconfirmed(view));
-        due.into_iter().map(|cell| self.tell(Node::Cell(cell))).collect()
+        due.into_iter().map(|cell| self.reply_message(Node::Cell(cell))).collect()
     }
 
     /// Takes the links from one cell to another down, or brings them up again.
@@ -202,15 +202,15 @@ impl Network {
         let message = |cell: CellId| {
             let deaf = target(&cell)?;
             let request =
-                Request::Write { number: Parameter::LinksDown.number(), words: LinksDown { deaf }.words() };
+                Request::Write { number: Parameter::LinksDown.number(), words: LinksDown { ports: deaf }.words() };
             Some(Message::Configure { to: Node::Cell(cell), tag: deaf, request })
         };
         due.into_iter().filter_map(message).collect()
     }
 
     /// Checks the network while the loop runs.
-    pub(super) fn look(&mut self, now: Micros, view: &View) -> Look {
-        let mut look = Look::default();
+    pub(super) fn check_running(&mut self, now: Micros, view: &View) -> NetworkCheck {
+        let mut look = NetworkCheck::default();
         let places = Self::places(view);
         if places.deepest().is_some_and(|deepest| deepest > self.slots.deepest) {
             match self.fit(view) {
@@ -226,14 +226,14 @@ impl Network {
         look.messages.extend(self.report_links_down(now, view));
         let without: BTreeSet<_> = places.unreachable.into_iter().collect();
         self.without.retain(|cell, since| {
-            self.longest = self.longest.max(now.since(*since));
+            self.longest = self.longest.max(now.elapsed_since(*since));
             without.contains(cell)
         });
         let mut back = Vec::new();
-        self.said.retain(|cell, since| {
+        self.reported.retain(|cell, since| {
             let has_one = places.depths.contains_key(cell);
             if has_one {
-                back.push((*cell, now.since(*since)));
+                back.push((*cell, now.elapsed_since(*since)));
             }
             !has_one
         });
@@ -241,11 +241,11 @@ impl Network {
             self.without.entry(cell).or_insert(now);
         }
         let bus_event = |(cell, since): (&CellId, &Micros)| {
-            (now.since(*since) >= GRACE && !self.said.contains_key(cell)).then_some((*cell, *since))
+            (now.elapsed_since(*since) >= REROUTE_TIMEOUT && !self.reported.contains_key(cell)).then_some((*cell, *since))
         };
         let bus_event: Vec<_> = self.without.iter().filter_map(bus_event).collect();
-        if let Some(oldest) = bus_event.iter().map(|(_, since)| now.since(*since)).max() {
-            self.said.extend(bus_event.iter().copied());
+        if let Some(oldest) = bus_event.iter().map(|(_, since)| now.elapsed_since(*since)).max() {
+            self.reported.extend(bus_event.iter().copied());
             let cells: Vec<_> = bus_event.into_iter().map(|(cell, _)| cell).collect();
             let is = if cells.len() == 1 { "is" } else { "are" };
             look.notes.push(format!(
@@ -273,8 +273,8 @@ impl Network {
 mod tests {
     use super::*;
     use crate::view::CellView;
-    use model::network::check::Seen;
-    use model::table::{SWITCHES, Said};
+    use model::network::check::ObservedCell;
+    use model::table::{SWITCHES, Responded};
     use protocol::message::Tree;
     use protocol::packet::Epoch;
 
@@ -287,14 +287,14 @@ mod tests {
         let cells =
             [cell(1, true, "[2, 3, 0, 0]"), cell(2, false, "[1, 3, 0, 0]"), cell(3, false, "[1, 2, 0, 0]")];
         let text = format!("{head}{}", cells.concat());
-        Network::of(&Skin::parse("skin.toml", &text).unwrap(), 0).unwrap()
+        Network::for_bus(&Skin::parse("skin.toml", &text).unwrap(), 0).unwrap()
     }
 
     /// Creates a view of cells with these parents and depths; `None` is a dead cell.
     fn view(trees: &[Option<(Option<u8>, u8)>], reply: Option<[i16; WORDS]>) -> View {
         let cells = trees.iter().enumerate().map(|(at, tree)| CellView {
             node: CellId::new(i64::try_from(at + 1).unwrap()).unwrap(),
-            heard: true,
+            seen: true,
             dead: tree.is_none(),
             ready: tree.is_some(),
             halted: false,
@@ -302,13 +302,13 @@ mod tests {
             measures: false,
             other: false,
             last_joints: Epoch(0),
-            said: Said::default(),
+            responded: Responded::default(),
             reply,
             deaf: 0,
             lacks: [None; SWITCHES],
             unclear: false,
         });
-        let network = trees.iter().enumerate().map(|(at, tree)| Seen {
+        let network = trees.iter().enumerate().map(|(at, tree)| ObservedCell {
             node: CellId::new(i64::try_from(at + 1).unwrap()).unwrap(),
             serial: Some(1),
             configuration: 0,
@@ -316,7 +316,7 @@ mod tests {
             alive: tree.is_some(),
             tree: tree.map(|(parent, depth)| {
                 let up = if parent == Some(0) { 4 } else { 0 };
-                Tree { parent, up, depth, ..Tree::default() }
+                Tree { parent, parent_port: up, depth, ..Tree::default() }
             }),
             ports: None,
         });
@@ -328,27 +328,27 @@ mod tests {
         let mut network = network();
         let flat = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(1), 1))];
         network.fit(&view(&flat, None)).unwrap();
-        let at = |rounds: u64| Micros(rounds * AGAIN.0);
+        let at = |rounds: u64| Micros(rounds * RETRY_INTERVAL.0);
         let now = at(1);
-        let words = Some(network.words());
-        assert_eq!(network.look(now, &view(&flat, words)), Look::default());
+        let words = Some(network.reply_words());
+        assert_eq!(network.check_running(now, &view(&flat, words)), NetworkCheck::default());
         let deep = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
-        let look = network.look(now, &view(&deep, words));
+        let look = network.check_running(now, &view(&deep, words));
         let everyone = |message: &Message| matches!(message, Message::Configure { to: Node::Everyone, .. });
         assert!(look.messages.iter().all(everyone) && look.messages.len() == 1, "{look:?}");
         assert_eq!(network.deepest(), 2);
         // A cell that has not answered is notified alone, and not at once.
-        assert_eq!(network.look(now, &view(&deep, words)), Look::default());
-        let look = network.look(at(2), &view(&deep, words));
+        assert_eq!(network.check_running(now, &view(&deep, words)), NetworkCheck::default());
+        let look = network.check_running(at(2), &view(&deep, words));
         assert_eq!(look.messages.len(), 3, "{look:?}");
-        let new = Some(network.words());
-        assert_eq!(network.look(at(3), &view(&deep, new)), Look::default());
+        let new = Some(network.reply_words());
+        assert_eq!(network.check_running(at(3), &view(&deep, new)), NetworkCheck::default());
         // A restarted cell has lost its slots.
-        let look = network.look(at(4), &view(&deep, None));
+        let look = network.check_running(at(4), &view(&deep, None));
         assert_eq!(look.messages.len(), 3, "{look:?}");
         // 4 slots of 5 ms are more than 16 ms.
         let deeper = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2)), Some((Some(3), 3))];
-        let look = network.look(at(4), &view(&deeper, new));
+        let look = network.check_running(at(4), &view(&deeper, new));
         let [note] = look.notes.as_slice() else { panic!("{look:?}") };
         assert!(note.contains("slot_us = 4000 would") && note.contains("deeper than 2"), "{note}");
     }
@@ -358,11 +358,11 @@ mod tests {
         let mut network = network();
         let trees = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
         network.fit(&view(&trees, None)).unwrap();
-        let words = Some(network.words());
+        let words = Some(network.reply_words());
         let cell = |node| CellId::new(node).unwrap();
         let mut now = Micros(0);
         let mut look = |network: &mut Network, deaf| {
-            now = now + AGAIN;
+            now = now + RETRY_INTERVAL;
             let mut view = view(&trees, words);
             view.cells[1].deaf = deaf;
             let announced = |message: &Message| {
@@ -374,9 +374,9 @@ mod tests {
                 else {
                     panic!("{message:?}")
                 };
-                (to.get(), LinksDown::from_words(words).deaf)
+                (to.get(), LinksDown::from_words(words).ports)
             };
-            network.look(now, &view).messages.iter().map(announced).collect::<Vec<_>>()
+            network.check_running(now, &view).messages.iter().map(announced).collect::<Vec<_>>()
         };
         network.set_link_down(true, cell(3), cell(2));
         assert_eq!(look(&mut network, 0), [(2, 0b10)]);
@@ -401,11 +401,11 @@ mod tests {
         let mut network = network();
         let whole = [Some((Some(0), 0)), Some((Some(1), 1)), Some((Some(2), 2))];
         network.fit(&view(&whole, None)).unwrap();
-        let words = Some(network.words());
+        let words = Some(network.reply_words());
         let mut at = Micros(0);
         let mut look = |network: &mut Network, trees: &[_]| {
             at = at + Span::from_millis(200);
-            network.look(at, &view(trees, words)).notes
+            network.check_running(at, &view(trees, words)).notes
         };
         assert_eq!(look(&mut network, &whole), Vec::<String>::new());
         let link_down = [Some((Some(0), 0)), Some((None, 0)), Some((Some(2), 1))];

@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use protocol::message::Message;
 use protocol::time::Micros;
-use protocol::usage::say;
+use protocol::usage::eprint_line;
 
-use super::begin::SHOWING;
+use super::begin::DISCOVERY_TIMEOUT;
 use super::bench::Bench;
 use super::network::Network;
 use crate::error::RunError;
@@ -28,7 +28,7 @@ impl Bench<'_> {
                 let (count, all) = Network::progress(&view);
                 have_ways += count;
                 whole &= all;
-                network.tree_ready = all.then(|| network.tree_ready.unwrap_or_else(|| now.since(began)));
+                network.tree_ready = all.then(|| network.tree_ready.unwrap_or_else(|| now.elapsed_since(began)));
             }
             Ok(whole || timeout.is_over(have_ways))
         })?;
@@ -45,7 +45,7 @@ impl Bench<'_> {
         {
             let (name, deepest) = (network.name(), network.deepest());
             let tree_ready = network.tree_ready.unwrap_or_default().seconds();
-            say(&format!("the cells of {name} are a tree of depth {deepest} after {tree_ready:.2} s"));
+            eprint_line(&format!("the cells of {name} are a tree of depth {deepest} after {tree_ready:.2} s"));
         }
         Ok(())
     }
@@ -53,7 +53,7 @@ impl Bench<'_> {
     /// Reports differences from the description.
     fn check_networks(&mut self) -> Result<(), RunError> {
         // Without a request, pages of ports come with heartbeats only.
-        self.say(&Message::Report)?;
+        self.send_to_all(&Message::Report)?;
         let mut changes = 0;
         self.wait(SETTLING, |bench, timeout| {
             let mut none = true;
@@ -70,7 +70,7 @@ impl Bench<'_> {
             for difference in &network.differences {
                 let line = format!("{}: {difference}", network.name());
                 if !self.options.quiet {
-                    say(&line);
+                    eprint_line(&line);
                 }
                 if difference.breaks_the_tree() {
                     broken.get_or_insert(line);
@@ -84,7 +84,7 @@ impl Bench<'_> {
     fn tell_networks(&mut self) -> Result<(), RunError> {
         self.send_to_networks(|network, now, _| vec![network.announce(now)])?;
         let mut unconfirmed = Vec::new();
-        self.wait(SHOWING, |bench, timeout| {
+        self.wait(DISCOVERY_TIMEOUT, |bench, timeout| {
             unconfirmed.clear();
             for (network, view) in bench.networks() {
                 unconfirmed.extend(
@@ -104,7 +104,7 @@ impl Bench<'_> {
         if self.options.spawn {
             return Err(error);
         }
-        say(&error.to_string());
+        eprint_line(&error.to_string());
         Ok(())
     }
 
@@ -130,7 +130,7 @@ impl Bench<'_> {
     pub(super) fn watch_networks(&mut self) -> Result<Vec<String>, RunError> {
         let mut notes = Vec::new();
         self.send_to_networks(|network, now, view| {
-            let look = network.look(now, view);
+            let look = network.check_running(now, view);
             notes.extend(look.notes);
             look.messages
         })?;

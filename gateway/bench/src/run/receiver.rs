@@ -12,19 +12,19 @@ use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
 
-use crate::bus::follow::{Follower, Part, Step};
+use crate::bus::follow::{Follower, FollowedItem, FollowStep};
 use crate::bus::link::{Outages, ReceiveEnd};
 use crate::bus::realtime::wall;
-use crate::bus::roots::Roots;
-use crate::record::feed::{Outlet, Touched, Unrecorded};
+use crate::bus::roots::RootWires;
+use crate::record::feed::{Outlet, EpochContacts, Unrecorded};
 use crate::view::{CellView, View};
 use control::cycle::turn::Shared;
-use model::latched::Seen;
+use model::latched::ReceivedFrame;
 use model::table::{Notice, Snapshot, Table};
 use trace::capture::BusNote;
 
 /// Interval between checks of timeouts and updates of the view, if no frame arrives.
-const LOOK: Duration = Duration::from_millis(20);
+const CHECK_INTERVAL: Duration = Duration::from_millis(20);
 /// Number of cells on all buses up to which [`LOOK`] holds. With more cells the interval grows proportionally, up to
 /// [`LONGEST_LOOK`].
 const CELLS_A_LOOK: usize = 1_000;
@@ -36,7 +36,7 @@ const LONGEST_LOOK: Duration = Duration::from_millis(100);
 #[must_use]
 pub fn look_at(cells: usize) -> Duration {
     let times = u32::try_from(cells / CELLS_A_LOOK).unwrap_or(u32::MAX);
-    LOOK.saturating_mul(times.max(1)).min(LONGEST_LOOK)
+    CHECK_INTERVAL.saturating_mul(times.max(1)).min(LONGEST_LOOK)
 }
 
 /// An event that a receiver reports to the main thread immediately.
@@ -64,7 +64,7 @@ pub struct Receiver {
     /// Follower of the bus: frames gather for a tick, because the loop reads no more often.
     pub follower: Follower,
     /// Interval between checks of timeouts and updates of the view while the loop runs.
-    pub look: Duration,
+    pub check_interval: Duration,
     /// State of the bus and its cells.
     pub table: Table,
     /// Snapshots for the control loop.
@@ -100,7 +100,7 @@ pub struct ReceiverResult {
 
 /// Reports about a bus so far.
 #[derive(Debug, Default)]
-struct Account {
+struct ReportedState {
     /// Number of dropped frames that the recorder knows of.
     announced: u64,
     /// Latest joints whose contact states the recorder has.
@@ -115,7 +115,7 @@ impl Receiver {
     #[must_use]
     pub fn run(mut self) -> ReceiverResult {
         crate::bus::realtime::prepare_receiver();
-        let mut account = Account::default();
+        let mut account = ReportedState::default();
         let mut looked = Instant::now();
         while !self.shared.stop.load(Ordering::Relaxed) {
             let wait = self.look_now();
@@ -124,14 +124,14 @@ impl Receiver {
             for cells in self.in_doubt.try_iter() {
                 self.table.interrupt_cells(|cell| cells.contains(&cell));
             }
-            self.hear();
+            self.handle_frames();
             if self.shared.explore.load(Ordering::Relaxed) {
-                self.follower.roots.iter_mut().for_each(Roots::explore);
+                self.follower.roots.iter_mut().for_each(RootWires::explore);
             }
             self.record(&mut account);
             if looked.elapsed() >= self.look_now() {
                 looked = Instant::now();
-                self.look(&mut account);
+                self.refresh_view(&mut account);
             }
             self.publish();
         }
@@ -144,35 +144,35 @@ impl Receiver {
 
     /// Present interval between checks: short until the loop starts, because the main thread waits for the cells.
     fn look_now(&self) -> Duration {
-        if self.shared.broadcasts.load(Ordering::Relaxed) == 0 { LOOK } else { self.look }
+        if self.shared.broadcasts.load(Ordering::Relaxed) == 0 { CHECK_INTERVAL } else { self.check_interval }
     }
 
     /// Handles the outcome of a step that concerns the bus itself.
-    fn take(&mut self, step: Step, account: &mut Account) {
+    fn take(&mut self, step: FollowStep, account: &mut ReportedState) {
         match step {
-            Step::Frames(_) => {
+            FollowStep::Frames(_) => {
                 if self.receive_end.regain() {
                     account.outages.end(Instant::now());
                     self.note(BusNote::Back);
-                    self.tell(BusEvent::Up);
+                    self.send_event(BusEvent::Up);
                 }
             }
-            Step::Nothing | Step::Leftover(_) => {}
-            Step::Down(error) => self.lose(false, BusEvent::Down(error), account),
-            Step::Drained => self.table.interrupt(),
-            Step::Gone(error) => {
+            FollowStep::Nothing | FollowStep::Leftover(_) => {}
+            FollowStep::Down(error) => self.lose(false, BusEvent::Down(error), account),
+            FollowStep::Drained => self.table.interrupt(),
+            FollowStep::Gone(error) => {
                 self.lose(true, BusEvent::Lost(error), account);
                 self.table.interrupt();
             }
-            Step::Refused(error) => self.tell(BusEvent::Refused(error)),
+            FollowStep::Refused(error) => self.send_event(BusEvent::Refused(error)),
         }
     }
 
-    fn lose(&mut self, gone: bool, bus_event: BusEvent, account: &mut Account) {
+    fn lose(&mut self, gone: bool, bus_event: BusEvent, account: &mut ReportedState) {
         if self.receive_end.lose(gone) {
             account.outages.begin(Instant::now());
             self.note(BusNote::Lost);
-            self.tell(bus_event);
+            self.send_event(bus_event);
         }
     }
 
@@ -184,25 +184,25 @@ impl Receiver {
     }
 
     /// Handles the received frames.
-    fn hear(&mut self) {
+    fn handle_frames(&mut self) {
         self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
         let Self { follower, table, positions: queue, outlet, .. } = self;
         follower.parts(|part| match part {
-            Part::Feeds(root, feeds) => table.set_feeds(root, feeds),
-            Part::Frame(received) => {
+            FollowedItem::Feeds(root, feeds) => table.set_feeds(root, feeds),
+            FollowedItem::Frame(received) => {
                 let at = Micros(received.at_nanos / 1_000);
                 let mut positions = |epoch| positions_of(queue, epoch);
                 table.handle_frame(at, received.own, &received.frame, &mut positions);
                 if let Some(outlet) = outlet {
                     let Received { frame, at_nanos, own } = received;
-                    outlet.frame(Seen { at_nanos, own, frame });
+                    outlet.frame(ReceivedFrame { at_nanos, from_gateway: own, frame });
                 }
             }
         });
     }
 
     /// Forwards drop counts and, once per epoch, contact states to the recorder.
-    fn record(&mut self, account: &mut Account) {
+    fn record(&mut self, account: &mut ReportedState) {
         let Some(outlet) = &mut self.outlet else { return };
         let dropped = self.follower.dropped();
         if dropped > account.announced {
@@ -212,25 +212,25 @@ impl Receiver {
         let Some((number, epoch, at)) = self.table.newest() else { return };
         if outlet.wants_touched() && account.newest.replace(number) != Some(number) {
             let cells = self.table.sensors(at).collect();
-            outlet.touched(Touched { at_nanos: at.0 * 1_000, epoch: epoch.0, cells });
+            outlet.touched(EpochContacts { at_nanos: at.0 * 1_000, epoch: epoch.0, cells });
         }
     }
 
     fn publish(&mut self) {
         let comparing = self.shared.comparing.load(Ordering::Relaxed);
-        self.snapshots.input_buffer_mut().take(self.table.snapshot(), comparing);
+        self.snapshots.input_buffer_mut().copy_from(self.table.snapshot(), comparing);
         self.snapshots.publish();
     }
 
     /// Checks timeouts, and updates the main thread's view.
-    fn look(&mut self, account: &mut Account) {
+    fn refresh_view(&mut self, account: &mut ReportedState) {
         let now = Micros(wall() / 1_000);
         self.table.handle_time(now);
         let notices: Vec<_> = self.table.notices().collect();
         for notice in notices {
-            self.tell(BusEvent::Notice(notice));
+            self.send_event(BusEvent::Notice(notice));
         }
-        let cells = self.table.statuses(now).map(|(cell, status)| CellView::of(cell, status));
+        let cells = self.table.statuses(now).map(|(cell, status)| CellView::new(cell, status));
         let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));
         if !self.receive_end.link.state.is_there() {
             // The lost bus will not carry commands that it has accepted.
@@ -245,7 +245,7 @@ impl Receiver {
         }
     }
 
-    fn tell(&self, bus_event: BusEvent) {
+    fn send_event(&self, bus_event: BusEvent) {
         // At the end of the run the main thread is gone.
         let _ = self.bus_event.send((self.index, bus_event));
     }
@@ -254,7 +254,7 @@ impl Receiver {
 /// Reports items that did not fit; the recorder makes room as long as a receiver runs.
 fn last_words(outlet: &mut Outlet) -> Unrecorded {
     let give_up = Instant::now() + Duration::from_secs(1);
-    while !outlet.tell(wall()) && Instant::now() < give_up {
+    while !outlet.report_unrecorded(wall()) && Instant::now() < give_up {
         std::thread::sleep(Duration::from_millis(1));
     }
     outlet.unrecorded()

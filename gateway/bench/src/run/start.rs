@@ -7,25 +7,25 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
-use protocol::bus::{Bus, BusKind, Choice, Filter, Options as BusOptions};
+use protocol::bus::{Bus, BusKind, KindChoice, Filter, BusOptions as BusOptions};
 use protocol::can::Format;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{self, Reply};
-use protocol::usage::say;
+use protocol::skin::{self, SkinReply};
+use protocol::usage::eprint_line;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
-use super::Options;
-use super::bench::{Bench, BusLink};
+use super::RunOptions;
+use super::bench::{Bench, RunBus};
 use super::commander::SwitchedBuses;
 use super::hosts::Hosts;
 use super::network::Network;
 use super::receiver::{BusEvent, Receiver, look_at};
 use crate::bus::follow::Follower;
-use crate::bus::link::{Link, ReceiveEnd, Slot};
+use crate::bus::link::{SharedBus, ReceiveEnd, Slot};
 use crate::bus::realtime;
-use crate::bus::roots::{ReceiveFilter, Roots};
-use crate::bus::served::{Absent, ServedBus, Target, open_or_serve, open_or_serve_all};
+use crate::bus::roots::{ReceiveFilter, RootWires};
+use crate::bus::served::{IfAbsent, ServedBus, BusTarget, open_or_serve, open_or_serve_all};
 use crate::emulate::{self, Emulation, Emulator};
 use crate::error::RunError;
 use crate::processes::ended::EndedProcesses;
@@ -37,13 +37,13 @@ use crate::threads::spawn;
 use crate::view::View;
 use control::controller::{Controller, Planned};
 use control::cycle::Cycle;
-use control::cycle::turn::{Line, Shared, Timed};
+use control::cycle::turn::{BusPort, Shared, TimedRecord};
 use control::motion::controller_of;
 use control::robot::SimulatedArm;
 use model::quantiles::Quantiles;
 use model::table::Table;
 use trace::recording::layout::Layout;
-use trace::recording::series::Head;
+use trace::recording::series::FileHead;
 
 /// Time that stimuli and commands may wait for a full bus; the loop's own frames never wait.
 const SEND_TIMEOUT: Duration = Duration::from_millis(10);
@@ -53,7 +53,7 @@ const GATHER: Duration = Duration::from_millis(10);
 const LIMITED: &str = ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
 
 /// Claims files and opens buses; [`Bench::begin`] starts the cells.
-pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
+pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     let began = Instant::now();
     let emulator = refuse(options)?;
     let skin = &options.skin;
@@ -61,7 +61,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     // A file at its size limit is an ordinary error, not a signal.
     signal_hook::flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false)))
         .map_err(|source| SignalError { signal: SIGXFSZ, source })?;
-    let outputs = Outputs::claim(&options.record, &signalled, say).map_err(|refused| {
+    let outputs = Outputs::claim(&options.record, &signalled, eprint_line).map_err(|refused| {
         if signalled.load(Ordering::Relaxed) { RunError::Interrupted } else { refused.into() }
     })?;
     let numbered = options.record.candump.as_ref().is_some_and(|candump| candump.numbered);
@@ -84,7 +84,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         emulator.map(|emulator| emulate(options, &emulator, &mut served, &mut processes, &signalled));
     let emulation = emulation.transpose()?;
     let targets = skin.buses.iter().enumerate().map(|(index, bus)| {
-        let receive_filter = ReceiveFilter::of(skin, index, !outputs.is_empty());
+        let receive_filter = ReceiveFilter::for_bus(skin, index, !outputs.is_empty());
         target_of(options, bus, receive_filter.filters)
     });
     let targets: Vec<_> = targets.collect();
@@ -135,7 +135,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
 }
 
 /// Checks for valid descriptions that this program cannot run, and for missing programs and directories.
-fn refuse(options: &Options) -> Result<Option<Emulator<'_>>, RunError> {
+fn refuse(options: &RunOptions) -> Result<Option<Emulator<'_>>, RunError> {
     if options.spawn {
         program("cell-node")?;
     }
@@ -147,43 +147,43 @@ fn refuse(options: &Options) -> Result<Option<Emulator<'_>>, RunError> {
     }
     let buses = options.skin.buses.len();
     let clients =
-        (0..buses).map(|bus| options.skin.cells_of(bus).count().div_ceil(options.cells_per_process));
+        (0..buses).map(|bus| options.skin.cells_on_bus(bus).count().div_ceil(options.cells_per_process));
     allow_files(buses, clients.max().unwrap_or(0))?;
     Ok(options.emulated.as_ref().map(Emulator::new).transpose()?)
 }
 
 /// Starts the emulated cells and commissions them, on buses that are served for that.
 fn emulate(
-    options: &Options,
+    options: &RunOptions,
     emulator: &Emulator<'_>,
     served: &mut Vec<ServedBus>,
     processes: &mut Processes,
     signalled: &AtomicBool,
 ) -> Result<Emulation, RunError> {
-    let Options { skin, kinds, directory, flash, .. } = options;
+    let RunOptions { skin, kinds, directory, flash, .. } = options;
     for bus in &skin.buses {
         let target =
             BusOptions { filters: Vec::new(), directory: directory.clone(), ..BusOptions::default() };
         let target = BusOptions { fd: bus.format == Format::Fd, ..target };
-        let (_, own) = open_or_serve(&bus.name, kinds.of(&bus.name), &target, absent(options))?;
+        let (_, own) = open_or_serve(&bus.name, kinds.kind_of(&bus.name), &target, absent(options))?;
         served.extend(own);
     }
-    let bench = emulate::Bench { skin, kinds, directory: directory.as_deref(), flash: flash.as_deref() };
+    let bench = emulate::EmulationSetup { skin, kinds, directory: directory.as_deref(), flash: flash.as_deref() };
     let emulation = emulator.start(&bench, processes)?;
     let said = emulator.commission(&bench, processes, signalled)?;
     if !options.quiet {
-        say(&said);
+        eprint_line(&said);
     }
     Ok(emulation)
 }
 
 /// Other programs may use the bus of emulated cells, and cells that are not started here need an existing bus.
-const fn absent(options: &Options) -> Absent {
-    if options.spawn && options.emulated.is_none() { Absent::Made } else { Absent::Refused }
+const fn absent(options: &RunOptions) -> IfAbsent {
+    if options.spawn && options.emulated.is_none() { IfAbsent::Made } else { IfAbsent::Refused }
 }
 
 /// Options for opening a bus.
-fn target_of<'a>(options: &Options, described: &'a skin::Bus, filters: Vec<Filter>) -> Target<'a> {
+fn target_of<'a>(options: &RunOptions, described: &'a skin::SkinBus, filters: Vec<Filter>) -> BusTarget<'a> {
     let name = &described.name;
     let target = BusOptions {
         fd: described.format == Format::Fd,
@@ -194,41 +194,41 @@ fn target_of<'a>(options: &Options, described: &'a skin::Bus, filters: Vec<Filte
         send_timeout: SEND_TIMEOUT,
         directory: options.directory.clone(),
     };
-    (name, options.kinds.of(name), target)
+    (name, options.kinds.kind_of(name), target)
 }
 
 /// Creates the link of an opened bus.
 fn linked(
-    options: &Options,
-    described: &skin::Bus,
+    options: &RunOptions,
+    described: &skin::SkinBus,
     target: BusOptions,
     bus: Bus,
 ) -> Result<(ReceiveEnd, Slot), RunError> {
     let name = &described.name;
-    if described.reply != Reply::Torque && bus.kind() == BusKind::SocketCan && !bus.is_virtual()? {
+    if described.reply != SkinReply::Torque && bus.kind() == BusKind::SocketCan && !bus.is_virtual()? {
         return Err(RunError::RealWires(name.clone()));
     }
     if !options.quiet {
         let (kind, bytes) = (bus.kind(), bus.receive_buffer());
         let less = if bytes < options.receive_buffer { LIMITED } else { "" };
-        let why = match (options.kinds.of(name), kind) {
-            (Choice::Auto, BusKind::Embedded) => format!(" (there is no interface {name})"),
+        let why = match (options.kinds.kind_of(name), kind) {
+            (KindChoice::Auto, BusKind::Embedded) => format!(" (there is no interface {name})"),
             _ => String::new(),
         };
-        say(&format!("{name} is {kind}{why}, with a receive buffer of {} KiB{less}", bytes / 1_024));
+        eprint_line(&format!("{name} is {kind}{why}, with a receive buffer of {} KiB{less}", bytes / 1_024));
     }
-    let (_, receive_end, slot) = Link::new(bus, target);
+    let (_, receive_end, slot) = SharedBus::new(bus, target);
     Ok((receive_end, slot))
 }
 
 /// Starts the recorder, if anything is to be recorded. Returns it with the queue for the loop's records.
 fn record(
-    options: &Options,
+    options: &RunOptions,
     outputs: Outputs,
     bus_feeds: Vec<feed::BusFeed>,
-    bus_links: &[BusLink],
+    bus_links: &[RunBus],
     idle: &Histogram<u64>,
-) -> Result<(Option<Recorder>, Option<rtrb::Producer<Timed>>), RunError> {
+) -> Result<(Option<Recorder>, Option<rtrb::Producer<TimedRecord>>), RunError> {
     if outputs.is_empty() {
         return Ok((None, None));
     }
@@ -244,56 +244,56 @@ fn record(
 }
 
 /// Head of each file of a recording.
-fn head(options: &Options, mcap: &Mcap, bus_links: &[BusLink], idle: &Histogram<u64>) -> Head {
+fn head(options: &RunOptions, mcap: &Mcap, bus_links: &[RunBus], idle: &Histogram<u64>) -> FileHead {
     let nanos = realtime::wall();
     let mut run = vec![
         ("duration_s".to_owned(), options.scenario.duration.seconds().to_string()),
         ("spawn".to_owned(), options.spawn.to_string()),
         ("cells_per_process".to_owned(), options.cells_per_process.to_string()),
     ];
-    run.extend(bus_links.iter().map(|BusLink { link, format, .. }| {
+    run.extend(bus_links.iter().map(|RunBus { link, format, .. }| {
         let format = format.name();
         let how = format!("{}, {format}, receive buffer {} bytes", link.kind, link.receive_buffer);
         (format!("bus/{}", link.name), how)
     }));
     let metadata = vec![
         ("program", facts::program(&mcap.command_line, nanos)),
-        ("machine", facts::machine(&Quantiles::of(idle, 1e-3))),
+        ("machine", facts::machine(&Quantiles::from_histogram(idle, 1e-3))),
         ("configuration", facts::configuration(&options.skin, run)),
         ("configuration_hashes", facts::hashes(&options.skin)),
     ];
-    Head { nanos, metadata, attachments: mcap.attachments.clone() }
+    FileHead { nanos, metadata, attachments: mcap.attachments.clone() }
 }
 
 /// Starts the receiver of a bus.
 fn listen(
-    options: &Options,
+    options: &RunOptions,
     index: usize,
     (receive_end, slot): (ReceiveEnd, Slot),
     view: Arc<Mutex<View>>,
     outlet: Option<Outlet>,
     shared: &Arc<Shared>,
     bus_event: mpsc::Sender<(usize, BusEvent)>,
-) -> Result<BusLink, RunError> {
+) -> Result<RunBus, RunError> {
     let skin = &options.skin;
     let (link, shared) = (Arc::clone(&receive_end.link), Arc::clone(shared));
     let mut table = Table::new(skin, index);
-    if !ReceiveFilter::of(skin, index, outlet.is_some()).all_sums {
+    if !ReceiveFilter::for_bus(skin, index, outlet.is_some()).all_sums {
         table.hear_sums_of_roots_only();
     }
     let (snapshots, snapshot) = triple_buffer::triple_buffer(table.snapshot());
     let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; MAX_JOINTS])>::new(64);
     let format = skin.buses.get(index).map_or(Format::Fd, |bus| bus.format);
-    let line = Line { format, snapshot, positions, state: Arc::clone(&link.state) };
+    let line = BusPort { format, snapshot, positions, state: Arc::clone(&link.state) };
     let (in_doubt, not_reached) = mpsc::channel();
     let receiver = Receiver {
         index,
         receive_end,
         follower: Follower::new(
-            Roots::of(skin, index),
+            RootWires::for_bus(skin, index),
             Duration::from_nanos(skin.timing.tick_nanos()).min(GATHER),
         ),
-        look: look_at(skin.cells.len()),
+        check_interval: look_at(skin.cells.len()),
         table,
         snapshots,
         positions: of_broadcasts,
@@ -304,7 +304,7 @@ fn listen(
         in_doubt: not_reached,
     };
     let receiver = Some(spawn(&format!("rx {}", link.name), move || receiver.run())?);
-    let network = Network::of(skin, index);
+    let network = Network::for_bus(skin, index);
     let line = Some((line, slot));
-    Ok(BusLink { link, format, line, view, receiver, in_doubt, hosts: Hosts::new(), network, shared })
+    Ok(RunBus { link, format, line, view, receiver, in_doubt, hosts: Hosts::new(), network, shared })
 }

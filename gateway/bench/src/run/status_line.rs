@@ -1,6 +1,6 @@
 //! The text of a run's progress line, for any line width.
 
-use protocol::usage::shown;
+use protocol::usage::printable;
 
 /// Duration in s from which a run counts as endless.
 const ENDLESS_S: f64 = 86_400.0;
@@ -94,13 +94,13 @@ impl StatusLine<'_> {
         match (self.lost, detail) {
             ([], _) => None,
             (lost, 0) => Some(format!("LOST: {}", lost.len())),
-            (lost, _) => Some(format!("LOST: {}", shown(&lost.join(", ")))),
+            (lost, _) => Some(format!("LOST: {}", printable(&lost.join(", ")))),
         }
     }
 
     fn halted(&self, detail: u8) -> Option<String> {
         let why = self.halted?;
-        Some(if detail > 0 { format!("HALTED: {}", shown(why)) } else { "HALTED".to_owned() })
+        Some(if detail > 0 { format!("HALTED: {}", printable(why)) } else { "HALTED".to_owned() })
     }
 
     /// Formats the cells in contact. Stale and dead cells appear at full detail, or if there are any.

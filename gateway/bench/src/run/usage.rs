@@ -7,7 +7,7 @@ use rustix::time::{ClockId, clock_gettime};
 
 use crate::bus::served::ServedBus;
 use crate::processes::Processes;
-use crate::summary::Processor;
+use crate::summary::ProcessorUse;
 
 /// Processor time of this process so far in s.
 fn own_seconds() -> f64 {
@@ -58,14 +58,14 @@ impl Spent {
     }
 
     /// Processor use since `before` in cores, over the processes that still run.
-    pub(super) fn since(&self, before: &Self, seconds: f64) -> Processor {
+    pub(super) fn cores_since(&self, before: &Self, seconds: f64) -> ProcessorUse {
         let since = |now: &HashMap<u32, f64>, before: &HashMap<u32, f64>| {
             // A thread that has ended takes its time with it.
             let one = |(pid, spent): (&u32, &f64)| (spent - before.get(pid).unwrap_or(&0.0)).max(0.0);
             // Not `sum()`, which returns -0.0 without processes.
             now.iter().map(one).fold(0.0, |all, one| all + one) / seconds
         };
-        Processor {
+        ProcessorUse {
             gateway: (self.gateway - before.gateway) / seconds,
             cells: since(&self.cells, &before.cells),
             buses: since(&self.buses, &before.buses),

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use protocol::bus::BusKind;
 use protocol::can::Frame;
 use protocol::id::{CellId, Node};
-use protocol::message::{From, Message, SensorPage};
+use protocol::message::{AppliesFrom, Message, SensorPage};
 use protocol::skin::Cell;
 use protocol::time::Span;
 
@@ -18,7 +18,7 @@ use super::accelerations::{Accelerations, Moved};
 use super::begin::{Announced, SWITCH_AGAIN};
 use super::bench::Bench;
 use super::commanded::serve;
-use super::measured::Measured;
+use super::measured::LoopTotals;
 use super::receiver::BusEvent;
 use super::usage::{Spent, private_kib};
 use crate::bus::link::Slot;
@@ -26,17 +26,17 @@ use crate::bus::realtime::{self, Granted};
 use crate::error::RunError;
 use crate::progress::Progress;
 use crate::record::Recorder;
-use crate::summary::{Memory, Summary};
+use crate::summary::{PrivateMemory, Summary};
 use crate::threads::{ThreadError, spawn};
-use control::cycle::turn::{Timed, Turn};
+use control::cycle::turn::{TimedRecord, TickDriver};
 use control::external::Absence;
 use model::scenario::{FaultKind, Stimulus, Touches};
 use model::table::Notice;
 
 /// Number of epochs by which stimuli are sent before the epoch that latches them; cells queue 8.
-const LEAD: u64 = 5;
+const LEAD_EPOCHS: u64 = 5;
 /// Interval between rounds of the main thread.
-pub(super) const LOOK: Duration = Duration::from_millis(10);
+pub(super) const ROUND_PAUSE: Duration = Duration::from_millis(10);
 /// Queue length for the loop's records: more than a second of ticks.
 const RECORDS: usize = 1_024;
 
@@ -75,13 +75,13 @@ impl Script {
 
 impl Bench<'_> {
     /// Runs the loop to its end or to its failure, and fills in the summary.
-    pub(super) fn drive(&mut self, summary: &mut Summary, measured: &mut Measured) -> Result<(), RunError> {
+    pub(super) fn drive(&mut self, summary: &mut Summary, measured: &mut LoopTotals) -> Result<(), RunError> {
         let options = self.options;
         let (records, mut inlet) = rtrb::RingBuffer::new(RECORDS);
         let cycle = self.cycle.take().expect("the loop begins once");
         let (lines, slots) = self.bus_links.iter_mut().filter_map(|bus_link| bus_link.line.take()).unzip();
         let scenario = Arc::new(options.scenario.clone());
-        let turn = Turn::new(cycle, lines, scenario, Arc::clone(&self.shared), records);
+        let turn = TickDriver::new(cycle, lines, scenario, Arc::clone(&self.shared), records);
         let turn = turn.recorded(self.recorded.take());
         let touches = Touches::new(&options.scenario, &options.skin);
         let (announced, started) = (Announced::new(SWITCH_AGAIN), Instant::now());
@@ -97,7 +97,7 @@ impl Bench<'_> {
         let mut progress = Progress::new(options.quiet);
         let mut failure = None;
         while !control.is_finished() {
-            thread::sleep(LOOK);
+            thread::sleep(ROUND_PAUSE);
             summary.interrupted = self.signalled.load(Ordering::Relaxed);
             failure = self.step(&mut script, &mut progress, measured, &mut inlet).err();
             if failure.is_some() || summary.interrupted {
@@ -110,17 +110,17 @@ impl Bench<'_> {
         let ended = control.join();
         summary.duration_s = script.started.elapsed().as_secs_f64();
         progress.clear();
-        measured.take(&mut inlet, self.began);
-        summary.processor = Spent::by(&self.processes, &self.served).since(&before, summary.duration_s);
+        measured.add_records(&mut inlet, self.began);
+        summary.processor = Spent::by(&self.processes, &self.served).cores_since(&before, summary.duration_s);
         let of_buses = self.served.iter().filter_map(|bus| private_kib(bus.pid()));
-        summary.memory = Memory {
+        summary.memory = PrivateMemory {
             cell_private_kib: self.processes.pids().filter_map(private_kib).max(),
             gateway_private_kib: private_kib(std::process::id()),
             buses_private_kib: of_buses.reduce(|all, one| all + one),
         };
         if failure.is_some() || ended.is_err() {
             // The cells get no further commands.
-            let _ = self.say(&Message::Halt);
+            let _ = self.send_to_all(&Message::Halt);
         }
         let LoopEnd { granted, counts, absence } = ended.map_err(|_| RunError::Panicked("control loop"))?;
         let control = &mut summary.control;
@@ -137,14 +137,14 @@ impl Bench<'_> {
     }
 
     /// Starts the loop's thread.
-    fn start_loop(&self, mut turn: Turn, mut slots: Vec<Slot>) -> Result<JoinHandle<LoopEnd>, ThreadError> {
+    fn start_loop(&self, mut turn: TickDriver, mut slots: Vec<Slot>) -> Result<JoinHandle<LoopEnd>, ThreadError> {
         let period_ns = self.options.skin.timing.tick_nanos();
         let ticks = self.options.scenario.duration.0 * 1_000 / period_ns;
         let shared = Arc::clone(&self.shared);
         spawn("control", move || {
             let granted = realtime::prepare();
             let send = |bus: usize, frames: &[Frame]| {
-                slots.get_mut(bus).is_some_and(|slot| slot.read().offer(frames))
+                slots.get_mut(bus).is_some_and(|slot| slot.read().try_send_all(frames))
             };
             realtime::run(&mut turn, &shared, period_ns, ticks, send);
             let counts = turn.counts().into_iter().filter(|(_, count)| *count > 0).collect();
@@ -157,8 +157,8 @@ impl Bench<'_> {
         &mut self,
         script: &mut Script,
         progress: &mut Progress,
-        measured: &mut Measured,
-        records: &mut rtrb::Consumer<Timed>,
+        measured: &mut LoopTotals,
+        records: &mut rtrb::Consumer<TimedRecord>,
     ) -> Result<(), RunError> {
         self.press(script, measured.moved())?;
         if self
@@ -171,7 +171,7 @@ impl Bench<'_> {
         }
         self.inject_faults(script, progress)?;
         self.obey(measured, progress);
-        self.hear(script, progress)?;
+        self.handle_events(script, progress)?;
         self.look_at_processes(progress, false);
         self.serve_again(progress);
         self.look_at_hosts(script, progress)?;
@@ -181,7 +181,7 @@ impl Bench<'_> {
         self.switch_again(&mut script.announced)?;
         self.clear_contacts(script)?;
         let was_halted = measured.halts.why().is_some();
-        measured.take(records, self.began);
+        measured.add_records(records, self.began);
         match (was_halted, measured.halts.why()) {
             (false, Some(why)) => {
                 // One bus is enough: the loop repeats on the others what is received on it.
@@ -199,7 +199,7 @@ impl Bench<'_> {
             (true, None) => progress.note("the robot goes on"),
             (true, Some(_)) | (false, None) => {}
         }
-        for line in self.recorder.iter().flat_map(Recorder::said) {
+        for line in self.recorder.iter().flat_map(Recorder::messages) {
             progress.note(&line);
         }
         let lost = self.bus_links.iter().filter(|bus_link| !bus_link.link.state.is_there());
@@ -218,12 +218,12 @@ impl Bench<'_> {
         // Skipped broadcasts have no epoch, but their time has passed.
         let skipped = self.shared.broadcasts_skipped.load(Ordering::Relaxed);
         let seconds = |touches: &Touches, epoch: u64| Span(touches.time_of(epoch + skipped).0).seconds();
-        while script.epoch < broadcasts + LEAD {
+        while script.epoch < broadcasts + LEAD_EPOCHS {
             // Epochs that passed while this thread was delayed cannot be made up for one by one.
             let epoch = script.epoch.max(broadcasts);
-            let numbered = self.first_epoch.plus(epoch.to_le_bytes()[0]);
+            let numbered = self.first_epoch.advanced_by(epoch.to_le_bytes()[0]);
             for stimulus in script.touches.changes(script.epoch.checked_sub(1), epoch) {
-                self.stimulate(&stimulus, From::Epoch(numbered))?;
+                self.stimulate(&stimulus, AppliesFrom::Epoch(numbered))?;
             }
             if let Some(accelerations) = &script.accelerations {
                 let now = seconds(&script.touches, epoch);
@@ -247,17 +247,17 @@ impl Bench<'_> {
     }
 
     /// Resends the scenario's stimuli to the selected cells. Leaves stimuli from other senders alone.
-    pub(super) fn remind(&self, script: &Script, target: impl Fn(&Cell) -> bool) -> Result<(), RunError> {
+    pub(super) fn remind(&self, script: &Script, selects: impl Fn(&Cell) -> bool) -> Result<(), RunError> {
         let touched =
             script.touches.cells().filter_map(|place| Some((place, self.options.skin.cells.get(place)?)));
-        for (cell, &Cell { bus, node, .. }) in touched.filter(|(_, cell)| target(cell)) {
+        for (cell, &Cell { bus, node, .. }) in touched.filter(|(_, cell)| selects(cell)) {
             let sensors = script.touches.sensors(cell, script.epoch.saturating_sub(1));
-            self.stimulate(&Stimulus { cell, bus, node, sensors }, From::Next)?;
+            self.stimulate(&Stimulus { cell, bus, node, sensors }, AppliesFrom::Next)?;
         }
         Ok(())
     }
 
-    fn stimulate(&self, stimulus: &Stimulus, from: From) -> Result<(), RunError> {
+    fn stimulate(&self, stimulus: &Stimulus, from: AppliesFrom) -> Result<(), RunError> {
         let page = SensorPage::Skin(stimulus.sensors);
         let message = Message::Stimulus { to: Node::Cell(stimulus.node), from, page };
         // The cells' contact state follows the frames that the bus carried.
@@ -315,7 +315,7 @@ impl Bench<'_> {
     }
 
     /// Handles the events of the receivers.
-    fn hear(&self, script: &Script, progress: &Progress) -> Result<(), RunError> {
+    fn handle_events(&self, script: &Script, progress: &Progress) -> Result<(), RunError> {
         let bus_event: Vec<_> = self.bus_event.try_iter().collect();
         let mut returned = BTreeSet::new();
         let mut changed = BTreeMap::<(usize, &str), Vec<CellId>>::new();
@@ -378,7 +378,7 @@ impl Bench<'_> {
     /// Shows notes about cell processes that have ended; with `last`, all pending notes.
     fn look_at_processes(&mut self, progress: &Progress, last: bool) {
         let ended = self.processes.ended();
-        for note in self.ended.take(ended, last) {
+        for note in self.ended.add_ended(ended, last) {
             progress.note(&note);
         }
     }
@@ -387,7 +387,7 @@ impl Bench<'_> {
     fn look_at_hosts(&mut self, script: &Script, progress: &Progress) -> Result<(), RunError> {
         let mut reached = BTreeSet::new();
         for (bus, bus_link) in self.bus_links.iter_mut().enumerate() {
-            let changes = bus_link.hosts.look(&bus_link.link);
+            let changes = bus_link.hosts.read_reports(&bus_link.link);
             changes.notes.iter().for_each(|note| progress.note(note));
             reached.extend(changes.reached.into_iter().map(|cell| (bus, cell)));
             if !changes.in_doubt.is_empty() {
@@ -416,7 +416,7 @@ impl Bench<'_> {
         let gone = gone.filter(|&(bus, bus_link)| bus_link.link.is_gone() && !self.commanded.is_down(bus));
         let gone: Vec<_> = gone.map(|(_, bus_link)| bus_link.link.name.clone()).collect();
         for served in self.served.iter_mut().filter(|served| gone.iter().any(|name| name == served.bus())) {
-            let Some(status) = served.ended() else { continue };
+            let Some(status) = served.exit_status() else { continue };
             let name = served.bus().to_owned();
             progress.note(&match serve(self.options, &name) {
                 Ok(again) => {

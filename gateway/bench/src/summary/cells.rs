@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use model::table::{Cell, Errors, Replies};
+use model::table::{CellState, Errors, Replies};
 use protocol::skin::{self, Skin};
 use serde::Serialize;
 
@@ -37,7 +37,7 @@ pub struct RepliesSummary {
 
 impl RepliesSummary {
     /// Adds the replies of a cell, and explains missing ones as far as reasons are known.
-    pub(super) fn add(&mut self, cell: &Cell) {
+    pub(super) fn add(&mut self, cell: &CellState) {
         let Replies { due, in_time, late, missing, in_doubt, unasked, contact_unknown, unexpected, too_late } =
             cell.replies;
         let mut rest = missing.saturating_sub(in_doubt);
@@ -106,10 +106,10 @@ pub struct CellSummary {
 impl CellSummary {
     /// Creates the summary of a cell of the skin; `known` is its table entry if its bus was opened.
     #[must_use]
-    pub fn new(skin: &Skin, described: &skin::Cell, known: Option<&Cell>) -> Self {
+    pub fn new(skin: &Skin, described: &skin::Cell, known: Option<&CellState>) -> Self {
         let mut replies = RepliesSummary::default();
         known.into_iter().for_each(|cell| replies.add(cell));
-        let mode = known.and_then(Cell::measures).map(|measures| if measures { "measure" } else { "test" });
+        let mode = known.and_then(CellState::measures).map(|measures| if measures { "measure" } else { "test" });
         Self {
             node: described.node.get(),
             bus: skin.buses.get(described.bus).map_or_else(String::new, |bus| bus.name.clone()),
@@ -119,8 +119,8 @@ impl CellSummary {
             late: replies.late,
             missing: replies.missing().into_iter().filter(|(_, count)| *count > 0).collect(),
             contact_unknown: replies.contact_unknown,
-            error: known.map(Cell::errors).unwrap_or_default(),
-            stuck: known.into_iter().flat_map(Cell::stuck).collect(),
+            error: known.map(CellState::errors).unwrap_or_default(),
+            stuck: known.into_iter().flat_map(CellState::stuck).collect(),
             restarts: known.map_or(0, |cell| cell.uplink().restarts),
         }
     }

@@ -114,7 +114,7 @@ pub fn cells_in_error(errors: &[CellError], with_reasons: bool) -> Option<String
 
 /// A halt of the robot.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Halted {
+pub struct HaltSummary {
     /// Time in s since the start of the loop.
     pub at_s: f64,
     /// Number of the tick.
@@ -180,7 +180,7 @@ mod tests {
 
     /// Creates a summary with the flagged conditions: controller absent, errors of cells, a halt, an interruption.
     fn summary([absent, errors, halted, interrupted]: [bool; 4]) -> Summary {
-        let halt = Halted { at_s: 1.0, tick: 500, epoch: 62, reason: "no answer".to_owned(), until_s: None };
+        let halt = HaltSummary { at_s: 1.0, tick: 500, epoch: 62, reason: "no answer".to_owned(), until_s: None };
         Summary {
             no_controller: absent.then(|| "no hello".to_owned()),
             cell_errors: if errors { vec![error("no memory", &[1, 2, 3])] } else { Vec::new() },
@@ -196,10 +196,10 @@ mod tests {
         for bits in 0..16_u8 {
             let flags = [8, 4, 2, 1].map(|bit| bits & bit != 0);
             let [absent, errors, halted, _] = flags;
-            let failed = summary(flags).rated(Some("a bus is lost".to_owned()));
+            let failed = summary(flags).with_verdict(Some("a bus is lost".to_owned()));
             assert_eq!((failed.outcome, failed.outcome.exit_code()), (Outcome::Failed, 1));
             assert_eq!(failed.complaints(true).last().unwrap(), "a bus is lost");
-            let rated = summary(flags).rated(None);
+            let rated = summary(flags).with_verdict(None);
             let lines = rated.complaints(true);
             let last = lines.last().map_or("", String::as_str);
             let (code, words) = match rated.outcome {

@@ -34,7 +34,7 @@ pub struct Verdict {
 impl Verdict {
     /// Returns the verdict on a run from the other figures of its summary.
     #[must_use]
-    pub fn of(summary: &Summary) -> Self {
+    pub fn new(summary: &Summary) -> Self {
         let mut look_at = Vec::new();
         ending(&mut look_at, summary);
         let buses = || summary.buses.iter();

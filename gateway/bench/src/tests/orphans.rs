@@ -7,11 +7,11 @@ use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt, symlink};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use crate::record::{Mcap, Options, Outputs};
+use crate::record::{Mcap, RecordOptions, Outputs};
 use rustix::fs::{FlockOperation, Mode, flock};
 use tempfile::TempDir;
 use trace::recording::file::FileWriter;
-use trace::recording::names::Part;
+use trace::recording::names::PartFile;
 use trace::ros2::standard::JointState;
 
 /// Content of the file of a writer that has not finished.
@@ -25,7 +25,7 @@ fn begun(mut writer: FileWriter<Vec<u8>>) -> Vec<u8> {
 
 /// Leaves the file of a run that was killed while it recorded.
 fn left(folder: &TempDir, name: &str) {
-    let (_, mut file) = Part::create(folder.path().join(name)).unwrap();
+    let (_, mut file) = PartFile::create(folder.path().join(name)).unwrap();
     let there = usize::try_from(file.metadata().unwrap().len()).unwrap();
     let bytes = begun(FileWriter::in_file(Vec::new(), &file.metadata().unwrap()).unwrap());
     file.write_all(&bytes[there..]).unwrap();
@@ -35,12 +35,12 @@ fn left(folder: &TempDir, name: &str) {
 fn claims(folder: &Path, name: &str) -> (Result<Outputs, String>, Vec<String>) {
     let mcap = Mcap {
         path: folder.join(name),
-        split: trace::recording::series::Split::default(),
+        split: trace::recording::series::SplitLimits::default(),
         attachments: Vec::new(),
         robot: None,
         command_line: Vec::new(),
     };
-    let options = Options { mcap: Some(mcap), ..Options::default() };
+    let options = RecordOptions { mcap: Some(mcap), ..RecordOptions::default() };
     let mut said = Vec::new();
     let claimed = Outputs::claim(&options, &AtomicBool::new(false), |line| {
         said.push(line.replace(&format!("{}/", folder.display()), ""));
@@ -91,7 +91,7 @@ fn an_original_that_is_damaged_before_its_end_is_kept() {
 #[test]
 fn what_was_killed_before_it_recorded_anything_is_taken_away() {
     let folder = tempfile::tempdir().unwrap();
-    let (part, file) = Part::create(folder.path().join("run.mcap")).unwrap();
+    let (part, file) = PartFile::create(folder.path().join("run.mcap")).unwrap();
     drop((part, file));
     let (claimed, said) = claims(folder.path(), "run.mcap");
     assert!(claimed.is_ok());
@@ -183,7 +183,7 @@ fn what_is_not_ours_is_named_and_stays_as_it_is() {
 fn a_file_that_takes_a_name_meanwhile_keeps_it() {
     let folder = tempfile::tempdir().unwrap();
     let goal = folder.path().join("run.mcap");
-    let (part, _file) = Part::create(goal.clone()).unwrap();
+    let (part, _file) = PartFile::create(goal.clone()).unwrap();
     fs::remove_file(&part.path).unwrap();
     fs::write(&part.path, "somebody's").unwrap();
     assert!(part.finish(true).unwrap_err().to_string().ends_with("run.mcap.part is another file now"));

@@ -4,8 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::summary::{
-    BusSummary, CellError, CellSummary, ErrorCells, Halted, HostSummary, Loop, Memory, NetworkSummary,
-    Outcome, Processor, Recording, RepliesSummary, Summary, SumsSummary, TickBefore, Verdict, Written,
+    BusSummary, CellError, CellSummary, ErrorCells, HaltSummary, HostSummary, LoopSummary, PrivateMemory, NetworkSummary,
+    Outcome, ProcessorUse, RecordingAccount, RepliesSummary, Summary, SumsSummary, TickBefore, Verdict, WrittenFile,
 };
 use model::quantiles::{Quantiles, histogram};
 use model::table::{Accuracy, Event, Status, Table};
@@ -13,7 +13,7 @@ use protocol::can::Format;
 use protocol::fixed::{Q3_12, Q5_10};
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{
-    Answer, From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
+    Answer, AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
 };
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::Parameter;
@@ -33,7 +33,7 @@ fn skin() -> Skin {
 
 /// A run whose optional figures are all present.
 fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
-    let quantiles = Quantiles::of(&histogram(), 1.0);
+    let quantiles = Quantiles::from_histogram(&histogram(), 1.0);
     Summary {
         skin: "two-cells".to_owned(),
         verdict: Verdict {
@@ -46,7 +46,7 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
         duration_s: 1.0,
         interrupted: false,
         halted: Some("a halt frame was received".to_owned()),
-        halts: vec![Halted {
+        halts: vec![HaltSummary {
             at_s: 0.5,
             tick: 250,
             epoch: 31,
@@ -80,7 +80,7 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
             cells: vec![ErrorCells { bus: "vcan0".to_owned(), nodes: vec![1] }],
         }],
         first_broadcast_s: 1.0,
-        control: Loop {
+        control: LoopSummary {
             ticks: 500,
             ticks_skipped: 0,
             broadcasts: 63,
@@ -100,21 +100,21 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
         accuracy: Accuracy::default(),
         backlog_dropped: Some(0),
         buses: vec![bus],
-        processor: Processor::default(),
-        memory: Memory {
+        processor: ProcessorUse::default(),
+        memory: PrivateMemory {
             cell_private_kib: Some(768),
             gateway_private_kib: Some(9_000),
             buses_private_kib: Some(500),
         },
-        recording: Some(Recording {
-            files: vec![Written {
+        recording: Some(RecordingAccount {
+            files: vec![WrittenFile {
                 path: "run.log".to_owned(),
                 format: "candump",
                 frames: 0,
                 messages: 0,
                 bytes: 0,
             }],
-            ..Recording::default()
+            ..RecordingAccount::default()
         }),
     }
 }
@@ -287,7 +287,7 @@ fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
         let answer = Answer::Value { number, written: true, words };
         say(&mut table, false, &Message::Configured { from, tag: 0, answer }, false);
     }
-    let press = Message::Stimulus { to: Node::Everyone, from: From::Next, page: SensorPage::Skin(skin_page) };
+    let press = Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page: SensorPage::Skin(skin_page) };
     say(&mut table, true, &press, false);
     for epoch in 0..8 {
         say(&mut table, true, &Message::Joints { epoch: Epoch(epoch), joints }, false);

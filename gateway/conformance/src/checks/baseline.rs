@@ -2,13 +2,13 @@
 
 use protocol::fixed::Q9_6;
 use protocol::message::{BaselinePage, SensorPage, SkinSensors};
-use protocol::packet::{WORDS, words};
+use protocol::packet::{WORDS, padded_words};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Span;
 
 use crate::arm;
-use crate::bus::Stop;
-use crate::session::{Heard, Reply, Session, Step};
+use crate::bus::StopReason;
+use crate::session::{CellPacket, Reply, Session, JointsResult};
 
 const BASELINE: u8 = 11;
 const TARE: u8 = 12;
@@ -20,15 +20,15 @@ const FOLLOW: [i16; WORDS] = [2, 102, 8_192, -1, LIMIT, 0];
 /// 0.02 N/°C.
 const SLOPE: i16 = 328;
 /// The number of joints messages before the first tare, with some margin.
-const START: usize = 40;
+const JOINTS_BEFORE_TARE: usize = 40;
 /// 25 °C.
-const WARM: i16 = 25 << 6;
+const TEMPERATURE_25_C: i16 = 25 << 6;
 const TOUCH: i32 = 1_024;
-const TOUCHED: i16 = 20;
-const BEYOND: i16 = 21;
+const REASON_TOUCHED: i16 = 20;
+const REASON_BEYOND_LIMIT: i16 = 21;
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::in_time(6))?;
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.ready(&arm::fast_parameters(6))?;
     (session.known.senses, session.known.adapts) = (true, true);
     let done = ranges(session)
         .and_then(|()| start(session))
@@ -38,10 +38,10 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
         .and_then(|()| tares(session))
         .and_then(|()| pages(session));
     done?;
-    session.set(BASELINE, [0])?;
+    session.write_first_words(BASELINE, [0])?;
     session.settle()?;
     (session.known.senses, session.known.adapts) = (false, false);
-    session.ready(&arm::in_time(6))?;
+    session.ready(&arm::fast_parameters(6))?;
     Ok(())
 }
 
@@ -50,7 +50,7 @@ fn reading(sum: i32, temperature: i16) -> SkinSensors {
 }
 
 /// Sends a number of joints messages with this reading, and returns the last step.
-fn reads(session: &mut Session<'_>, sum: i32, temperature: i16, joints: usize) -> Result<Step, Stop> {
+fn send_reading(session: &mut Session<'_>, sum: i32, temperature: i16, joints: usize) -> Result<JointsResult, StopReason> {
     session.press(reading(sum, temperature))?;
     let mut step = session.step(&[0x0321; MAX_JOINTS])?;
     for _ in 1..joints {
@@ -60,10 +60,10 @@ fn reads(session: &mut Session<'_>, sum: i32, temperature: i16, joints: usize) -
 }
 
 /// Requests a report, and returns the sum of the contact words, the zero (page 3) and page 0.
-fn report(session: &mut Session<'_>) -> Result<Option<(i32, BaselinePage, SkinSensors)>, Stop> {
-    session.quiet(Span::from_millis(30))?;
+fn report(session: &mut Session<'_>) -> Result<Option<(i32, BaselinePage, SkinSensors)>, StopReason> {
+    session.wait_for_quiet(Span::from_millis(30))?;
     let pages = session.report()?;
-    let pages: Vec<_> = pages.iter().filter_map(Heard::sensors).map(|(_, page)| *page).collect();
+    let pages: Vec<_> = pages.iter().filter_map(CellPacket::sensors).map(|(_, page)| *page).collect();
     let skin =
         pages.iter().find_map(|page| if let SensorPage::Skin(skin) = page { Some(*skin) } else { None });
     let zero = pages.iter().find_map(zero_of);
@@ -77,7 +77,7 @@ const fn zero_of(page: &SensorPage) -> Option<BaselinePage> {
 }
 
 /// Writes another rule, which makes the cell find its zero again.
-fn set(session: &mut Session<'_>, rule: [i16; WORDS]) -> Result<(), Stop> {
+fn set(session: &mut Session<'_>, rule: [i16; WORDS]) -> Result<(), StopReason> {
     let reply = session.write(BASELINE, rule)?;
     session.check("BASE-1", reply == Reply::Value(rule), || {
         format!("parameter 11 was written with {}: {reply}", Reply::Value(rule))
@@ -86,9 +86,9 @@ fn set(session: &mut Session<'_>, rule: [i16; WORDS]) -> Result<(), Stop> {
 }
 
 /// Writes another rule, and waits for a first tare at this reading.
-fn tared(session: &mut Session<'_>, rule: [i16; WORDS], sum: i32) -> Result<(), Stop> {
+fn tared(session: &mut Session<'_>, rule: [i16; WORDS], sum: i32) -> Result<(), StopReason> {
     set(session, rule)?;
-    reads(session, sum, WARM, START)?;
+    send_reading(session, sum, TEMPERATURE_25_C, JOINTS_BEFORE_TARE)?;
     Ok(())
 }
 
@@ -96,7 +96,7 @@ fn near(value: i32, expected: i32, by: i32) -> bool {
     (value - expected).abs() <= by
 }
 
-fn ranges(session: &mut Session<'_>) -> Result<(), Stop> {
+fn ranges(session: &mut Session<'_>) -> Result<(), StopReason> {
     let bad = [
         [3, 102, 8_192, 2_000, 512, 0],
         [-1, 102, 8_192, 2_000, 512, 0],
@@ -109,7 +109,7 @@ fn ranges(session: &mut Session<'_>) -> Result<(), Stop> {
     ];
     set(session, [0; WORDS])?;
     let cases = bad.map(|words| (BASELINE, words)).into_iter();
-    for (number, bad) in cases.chain([3, -1, 1, 2].map(|word| (TARE, words([word])))) {
+    for (number, bad) in cases.chain([3, -1, 1, 2].map(|word| (TARE, padded_words([word])))) {
         let reply = session.write(number, bad)?;
         session.check("BASE-1", reply == Reply::Refused(19), || {
             format!("parameter {number} was written with {}, without a baseline: {reply}", Reply::Value(bad))
@@ -122,27 +122,27 @@ fn ranges(session: &mut Session<'_>) -> Result<(), Stop> {
         });
     }
     set(session, [0; WORDS])?;
-    let step = reads(session, 307, WARM, 1)?;
+    let step = send_reading(session, 307, TEMPERATURE_25_C, 1)?;
     session.check("BASE-1", step.torque.is_some(), || "without a baseline 0.3 N made no torque".to_owned());
-    reads(session, 0, WARM, 2)?;
+    send_reading(session, 0, TEMPERATURE_25_C, 2)?;
     Ok(())
 }
 
-fn start(session: &mut Session<'_>) -> Result<(), Stop> {
+fn start(session: &mut Session<'_>) -> Result<(), StopReason> {
     set(session, HOLD)?;
-    let first = reads(session, 307, WARM, 1)?;
+    let first = send_reading(session, 307, TEMPERATURE_25_C, 1)?;
     session.check("BASE-2", first.torque.is_none_or(|torque| torque.is_zero()), || {
         "0.3 N before the first tare, within the limit of 0.5 N: a torque came".to_owned()
     });
-    reads(session, 307, WARM, START)?;
+    send_reading(session, 307, TEMPERATURE_25_C, JOINTS_BEFORE_TARE)?;
     if let Some((sum, zero, _)) = report(session)? {
         let is_so = zero.tared && near(zero.zero.to_bits().into(), 307, 1) && near(sum, 0, 1);
         session.check("BASE-2", is_so, || {
-            format!("after {START} joints with 0.3 N: {}, page 0 adds up to {sum}", text(zero))
+            format!("after {JOINTS_BEFORE_TARE} joints with 0.3 N: {}, page 0 adds up to {sum}", text(zero))
         });
     }
-    let raw = reading(307 + TOUCH, WARM);
-    let step = reads(session, 307 + TOUCH, WARM, 1)?;
+    let raw = reading(307 + TOUCH, TEMPERATURE_25_C);
+    let step = send_reading(session, 307 + TOUCH, TEMPERATURE_25_C, 1)?;
     session.check("BASE-8", step.torque.is_some(), || "1 N above the zero: no torque came".to_owned());
     if let Some((_, zero, skin)) = report(session)? {
         let zero = i32::from(zero.zero.to_bits());
@@ -160,7 +160,7 @@ fn start(session: &mut Session<'_>) -> Result<(), Stop> {
     }
     // A reading beyond the limit is a touch from the start.
     set(session, HOLD)?;
-    let step = reads(session, 700, WARM, START)?;
+    let step = send_reading(session, 700, TEMPERATURE_25_C, JOINTS_BEFORE_TARE)?;
     session.check("BASE-2", step.torque.is_some(), || {
         "0.68 N from the start, beyond the limit of 0.5 N: no torque came".to_owned()
     });
@@ -173,31 +173,31 @@ fn start(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 fn text(zero: BaselinePage) -> String {
-    arm::page(SensorPage::Baseline(zero))
+    arm::format_page(SensorPage::Baseline(zero))
 }
 
-fn holds(session: &mut Session<'_>) -> Result<(), Stop> {
+fn holds(session: &mut Session<'_>) -> Result<(), StopReason> {
     tared(session, FOLLOW, 0)?;
     for joints in [1, 60] {
-        reads(session, TOUCH, WARM, joints)?;
+        send_reading(session, TOUCH, TEMPERATURE_25_C, joints)?;
         if let Some((sum, zero, _)) = report(session)? {
             session.check("BASE-3", near(sum, TOUCH, 1) && near(zero.zero.to_bits().into(), 0, 1), || {
                 format!("{joints} joints under 1 N: {}, page 0 adds up to {sum}, not {TOUCH}", text(zero))
             });
         }
     }
-    reads(session, 0, WARM, 2)?;
+    send_reading(session, 0, TEMPERATURE_25_C, 2)?;
     Ok(())
 }
 
-fn follows(session: &mut Session<'_>) -> Result<(), Stop> {
+fn follows(session: &mut Session<'_>) -> Result<(), StopReason> {
     const JOINTS: usize = 30;
     for (rate, min, max) in [(-1, 15, 34), (1_000, -1, 2)] {
         let mut rule = FOLLOW;
         rule.iter_mut().skip(3).take(1).for_each(|word| *word = rate);
         tared(session, rule, 0)?;
         let skips = session.skips;
-        reads(session, 80, WARM, JOINTS)?;
+        send_reading(session, 80, TEMPERATURE_25_C, JOINTS)?;
         let Some((_, zero, _)) = report(session)? else { continue };
         let steps = i32::from(zero.zero.to_bits());
         let is_so = (min..=max).contains(&steps) || skips != session.skips;
@@ -211,13 +211,13 @@ fn follows(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-fn temperature(session: &mut Session<'_>) -> Result<(), Stop> {
+fn temperature(session: &mut Session<'_>) -> Result<(), StopReason> {
     let mut rule = HOLD;
     rule.iter_mut().skip(5).take(1).for_each(|word| *word = SLOPE);
     tared(session, rule, 0)?;
     // 5 °C more, in contact, shift the zero by 0.1 N; 5 °C less shift it back.
     for (degrees, expected) in [(5, 102), (-5, -102)] {
-        reads(session, TOUCH, WARM + (degrees << 6), 1)?;
+        send_reading(session, TOUCH, TEMPERATURE_25_C + (degrees << 6), 1)?;
         if let Some((sum, zero, _)) = report(session)? {
             session.check("BASE-5", near(sum, TOUCH - expected, 2), || {
                 format!(
@@ -228,18 +228,18 @@ fn temperature(session: &mut Session<'_>) -> Result<(), Stop> {
             });
         }
     }
-    reads(session, 0, WARM, 2)?;
+    send_reading(session, 0, TEMPERATURE_25_C, 2)?;
     Ok(())
 }
 
-fn tares(session: &mut Session<'_>) -> Result<(), Stop> {
+fn tares(session: &mut Session<'_>) -> Result<(), StopReason> {
     tared(session, HOLD, 0)?;
     let tare = |session: &mut Session<'_>, word: i16, expected: Reply, what: &str| {
-        let reply = session.set(TARE, [word])?;
+        let reply = session.write_first_words(TARE, [word])?;
         session.check("BASE-6", reply == expected, || {
             format!("parameter 12 was written with {word}, {what}: {reply}")
         });
-        Ok::<_, Stop>(())
+        Ok::<_, StopReason>(())
     };
     let zero_is = |session: &mut Session<'_>, expected: i32, refused: Option<u16>, what: &str| {
         if let Some((_, zero, _)) = report(session)? {
@@ -247,19 +247,19 @@ fn tares(session: &mut Session<'_>) -> Result<(), Stop> {
             let is_so = near(zero.zero.to_bits().into(), expected, 2) && is_counted;
             session.check("BASE-6", is_so, || format!("{what}: {}", text(zero)));
         }
-        Ok::<_, Stop>(())
+        Ok::<_, StopReason>(())
     };
-    reads(session, 300, WARM, 40)?;
+    send_reading(session, 300, TEMPERATURE_25_C, 40)?;
     let before = report(session)?.map(|(_, zero, _)| zero.refused.wrapping_add(1));
-    tare(session, 1, Reply::Refused(TOUCHED), "touched with 0.3 N")?;
+    tare(session, 1, Reply::Refused(REASON_TOUCHED), "touched with 0.3 N")?;
     zero_is(session, 0, before, "after a tare that was refused")?;
-    tare(session, 2, Reply::Value(words([1])), "touched, forced")?;
+    tare(session, 2, Reply::Value(padded_words([1])), "touched, forced")?;
     zero_is(session, 300, None, "after a forced tare at 0.3 N")?;
-    reads(session, 250, WARM, 40)?;
-    tare(session, 1, Reply::Value(words([1])), "not touched")?;
+    send_reading(session, 250, TEMPERATURE_25_C, 40)?;
+    tare(session, 1, Reply::Value(padded_words([1])), "not touched")?;
     zero_is(session, 250, None, "after a tare at 0.24 N")?;
-    reads(session, 800, WARM, 40)?;
-    tare(session, 2, Reply::Refused(BEYOND), "forced, beyond the limit of 0.5 N")?;
+    send_reading(session, 800, TEMPERATURE_25_C, 40)?;
+    tare(session, 2, Reply::Refused(REASON_BEYOND_LIMIT), "forced, beyond the limit of 0.5 N")?;
     zero_is(session, 250, None, "after a tare beyond the limit")?;
     tare(session, 0, Reply::Value([0; WORDS]), "to forget the zero")?;
     let reply = session.read(TARE)?;
@@ -269,24 +269,24 @@ fn tares(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-fn pages(session: &mut Session<'_>) -> Result<(), Stop> {
+fn pages(session: &mut Session<'_>) -> Result<(), StopReason> {
     tared(session, HOLD, 0)?;
     for (sum, touched) in [(TOUCH, true), (0, false)] {
-        session.quiet(Span::from_millis(60))?;
-        let step = reads(session, sum, WARM, 1)?;
-        let mut pages = step.exchange.answers.iter().filter_map(Heard::sensors);
+        session.wait_for_quiet(Span::from_millis(60))?;
+        let step = send_reading(session, sum, TEMPERATURE_25_C, 1)?;
+        let mut pages = step.exchange.answers.iter().filter_map(CellPacket::sensors);
         let came = pages.find_map(|(_, page)| zero_of(page));
         session.check("BASE-7", came.is_some_and(|page| page.touched == touched), || {
             let came = came.map_or_else(|| "none".to_owned(), text);
             format!("a touch or its end must send page 3; {came} came")
         });
     }
-    session.quiet(Span::from_millis(60))?;
-    session.mark();
-    session.start();
+    session.wait_for_quiet(Span::from_millis(60))?;
+    session.begin_exchange();
+    session.begin_expected_exchange();
     session.idle(Span::from_millis(2_050))?;
     let beats = session.answers().iter().filter(|it| it.beat().is_some()).count();
-    let pages = session.answers().iter().filter_map(Heard::sensors);
+    let pages = session.answers().iter().filter_map(CellPacket::sensors);
     let count = pages.filter(|(_, page)| zero_of(page).is_some()).count();
     session.consume();
     session.check("BASE-7", count >= beats / 4 && count <= beats / 4 + 1, || {

@@ -5,19 +5,19 @@ use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
 
-use super::claims::twin;
+use super::claims::twin_heartbeat;
 use crate::arm;
-use crate::bus::Stop;
-use crate::session::{Heard, Session};
+use crate::bus::StopReason;
+use crate::session::{CellPacket, Session};
 
-const BEAT: u64 = 250_000;
+const HEARTBEAT_INTERVAL_US: u64 = 250_000;
 /// The allowed lateness of a heartbeat, in us.
-const LATE: u64 = 20_000;
+const MAX_LATENESS_US: u64 = 20_000;
 /// The allowed error of a clock and of time stamps in one of these checks, in us.
-const SLACK: u64 = 3_000;
+const CLOCK_TOLERANCE_US: u64 = 3_000;
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::in_time(2))?;
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.ready(&arm::fast_parameters(2))?;
     session.settle()?;
     let first = regular(session, 1_300)?;
     shifted(session)?;
@@ -43,7 +43,7 @@ struct Grid {
 }
 
 /// Formats times in us as ms.
-pub(super) fn in_ms(times: impl Iterator<Item = u64>) -> String {
+pub(super) fn format_ms(times: impl Iterator<Item = u64>) -> String {
     times.map(|us| (us / 1_000).to_string()).collect::<Vec<_>>().join(", ")
 }
 
@@ -53,48 +53,48 @@ fn times(session: &Session<'_>) -> Vec<u64> {
 }
 
 /// Checks that a halt and a latched stimulus last longer than 2 s, and that heartbeats continue meanwhile.
-fn held(session: &mut Session<'_>) -> Result<Option<Grid>, Stop> {
+fn held(session: &mut Session<'_>) -> Result<Option<Grid>, StopReason> {
     let presses = session.about.test_mode && session.about.committed;
     if presses {
-        session.pressed(&[0; MAX_JOINTS], arm::press(4_096))?;
+        session.press_and_step(&[0; MAX_JOINTS], arm::press(4_096))?;
     }
-    session.say(&[Message::Halt])?;
+    session.send_messages(&[Message::Halt])?;
     (session.known.halted, session.known.active) = (Some(true), Some(false));
-    let first = session.heard.len();
+    let first = session.packets.len();
     let grid = regular(session, 2_300)?;
-    let beats = session.heard.get(first..).unwrap_or_default().iter().filter_map(Heard::beat);
+    let beats = session.packets.get(first..).unwrap_or_default().iter().filter_map(CellPacket::beat);
     let is_halted = beats.clone().all(|(beat, _)| beat.state.has(State::HALTED));
     session.check("CMD-1", is_halted, || "HALTED is not set any more, without a resume".to_owned());
     session.step(&[0; MAX_JOINTS])?;
-    session.say(&[Message::Resume])?;
+    session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);
     if presses {
         let step = session.step(&[0; MAX_JOINTS])?;
         let is_there = step.torque.is_some();
         session.check("STIM-7", is_there, || "a stimulus does not hold for more than 2 s".to_owned());
-        session.pressed(&[0; MAX_JOINTS], arm::press(0))?;
+        session.press_and_step(&[0; MAX_JOINTS], arm::press(0))?;
     }
     Ok(grid)
 }
 
 /// Checks that without any request a heartbeat comes every 250 ms, at most 20 ms late.
-fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, Stop> {
-    let due = usize::try_from(ms * 1_000 / BEAT).unwrap_or_default();
+fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, StopReason> {
+    let due = usize::try_from(ms * 1_000 / HEARTBEAT_INTERVAL_US).unwrap_or_default();
     for attempt in 0..3 {
-        session.mark();
+        session.begin_exchange();
         session.idle(Span::from_millis(ms))?;
         let late = session.lateness();
         let times = times(session);
         session.consume();
         let apart: Vec<_> = times.windows(2).filter_map(|pair| Some(pair.get(1)? - pair.first()?)).collect();
-        let (from, to) = (BEAT - LATE - SLACK, BEAT + LATE + SLACK);
+        let (from, to) = (HEARTBEAT_INTERVAL_US - MAX_LATENESS_US - CLOCK_TOLERANCE_US, HEARTBEAT_INTERVAL_US + MAX_LATENESS_US + CLOCK_TOLERANCE_US);
         let is_so =
             (due..=due + 1).contains(&times.len()) && apart.iter().all(|span| (from..=to).contains(span));
         if is_so || attempt == 2 || late.0 < 1_000 {
             session.check("BEAT-1", is_so, || {
-                format!("{} heartbeats in {ms} ms, {} ms apart", times.len(), in_ms(apart.iter().copied()))
+                format!("{} heartbeats in {ms} ms, {} ms apart", times.len(), format_ms(apart.iter().copied()))
             });
-            let due = times.iter().zip(0..).map(|(at, place)| at.saturating_sub(place * BEAT)).min();
+            let due = times.iter().zip(0..).map(|(at, place)| at.saturating_sub(place * HEARTBEAT_INTERVAL_US)).min();
             let each = apart.iter().sum::<u64>().checked_div(apart.len() as u64);
             let grid = due.zip(each).map(|(due, each)| Grid { due, each });
             return Ok(grid.filter(|_| is_so));
@@ -104,32 +104,32 @@ fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, Stop> {
 }
 
 /// Checks that heartbeats that answer a sync or a claimant do not shift the regular ones.
-fn shifted(session: &mut Session<'_>) -> Result<(), Stop> {
-    let claim = twin(session, 1, true);
+fn shifted(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let claim = twin_heartbeat(session, 1, true);
     for (what, message, offset) in
         [("a sync", Message::Sync, 100), ("a claim", claim, 170), ("a sync", Message::Sync, 60)]
     {
         for attempt in 0..3 {
             let Some(grid) = next_beat(session)? else { return Ok(()) };
             session.idle(Span::from_millis(offset))?;
-            session.mark();
-            let at = session.say(&[message])?;
-            session.idle(Span((grid.0 + 2 * BEAT + 60_000).saturating_sub(session.now().0)))?;
+            session.begin_exchange();
+            let at = session.send_messages(&[message])?;
+            session.idle(Span((grid.0 + 2 * HEARTBEAT_INTERVAL_US + 60_000).saturating_sub(session.now().0)))?;
             let late = session.lateness();
             let times = times(session);
             session.consume();
             // The answer, and two regular heartbeats.
             let is_so = match times.as_slice() {
                 [answer, first, second] => {
-                    answer - at.0 < LATE + SLACK
-                        && first.abs_diff(grid.0 + BEAT) <= LATE + SLACK
-                        && second.abs_diff(grid.0 + 2 * BEAT) <= LATE + SLACK
+                    answer - at.0 < MAX_LATENESS_US + CLOCK_TOLERANCE_US
+                        && first.abs_diff(grid.0 + HEARTBEAT_INTERVAL_US) <= MAX_LATENESS_US + CLOCK_TOLERANCE_US
+                        && second.abs_diff(grid.0 + 2 * HEARTBEAT_INTERVAL_US) <= MAX_LATENESS_US + CLOCK_TOLERANCE_US
                 }
                 _ => false,
             };
             if is_so || attempt == 2 || late.0 < 1_000 {
                 session.check("BEAT-3", is_so, || {
-                    let times = in_ms(times.iter().map(|at| at - grid.0));
+                    let times = format_ms(times.iter().map(|at| at - grid.0));
                     format!(
                         "{what} {offset} ms after a regular heartbeat: heartbeats came {times} ms after it, and \
                          {offset}, 250 and 500 are right"
@@ -143,9 +143,9 @@ fn shifted(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Waits for the next regular heartbeat.
-fn next_beat(session: &mut Session<'_>) -> Result<Option<Micros>, Stop> {
+fn next_beat(session: &mut Session<'_>) -> Result<Option<Micros>, StopReason> {
     session.settle()?;
-    let until = session.now() + Span(BEAT + LATE + 50_000);
+    let until = session.now() + Span(HEARTBEAT_INTERVAL_US + MAX_LATENESS_US + 50_000);
     let came = session.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
     session.check("BEAT-1", came, || "no heartbeat came for 320 ms".to_owned());
     let at = session.answers().iter().rev().find(|it| it.beat().is_some()).map(|it| it.at);
@@ -155,26 +155,26 @@ fn next_beat(session: &mut Session<'_>) -> Result<Option<Micros>, Stop> {
 
 /// Checks that while joints come, a heartbeat is early only as far as allowed: right after the answer to the last
 /// joints before it.
-fn early(session: &mut Session<'_>) -> Result<(), Stop> {
+fn early(session: &mut Session<'_>) -> Result<(), StopReason> {
     const PERIOD: u64 = 16_000;
     for press in [4_096, 0] {
         for attempt in 0..3 {
             let Some(grid) = next_beat(session)? else { return Ok(()) };
-            session.mark();
+            session.begin_exchange();
             session.press(arm::press(press))?;
             for step in 1..=64 {
                 let due = grid + Span(5_000 + step * PERIOD);
                 session.wait(due, |_| false)?;
                 let epoch = session.next_epoch();
                 let joints = session.joints(epoch, &[0; MAX_JOINTS]);
-                session.say(&[joints])?;
+                session.send_messages(&[joints])?;
                 session.known.epoch = Some(epoch);
             }
             session.idle(Span::from_millis(40))?;
             let late = session.lateness();
             let times = times(session);
             if press > 0 {
-                look_at_order(session);
+                check_order(session);
             }
             session.consume();
             session.known.pending = None;
@@ -184,17 +184,17 @@ fn early(session: &mut Session<'_>) -> Result<(), Stop> {
             let slots: Vec<_> = times
                 .iter()
                 .map(|at| {
-                    let since = at.saturating_sub(grid.0) + PERIOD + SLACK;
-                    (since / BEAT, since % BEAT)
+                    let since = at.saturating_sub(grid.0) + PERIOD + CLOCK_TOLERANCE_US;
+                    (since / HEARTBEAT_INTERVAL_US, since % HEARTBEAT_INTERVAL_US)
                 })
                 .collect();
             let is_early = |(place, (slot, rest)): (u64, &(u64, u64))| {
-                *slot == place && *rest <= PERIOD + LATE + 2 * SLACK
+                *slot == place && *rest <= PERIOD + MAX_LATENESS_US + 2 * CLOCK_TOLERANCE_US
             };
             let is_so = (4..=5).contains(&slots.len()) && (1..).zip(&slots).all(is_early);
             if is_so || attempt == 2 || late.0 < 1_000 {
                 session.check("BEAT-2", is_so, || {
-                    let times = in_ms(times.iter().map(|at| at.saturating_sub(grid.0)));
+                    let times = format_ms(times.iter().map(|at| at.saturating_sub(grid.0)));
                     format!(
                         "with joints every 16 ms heartbeats came {times} ms after a regular one; 250, 500, 750 and \
                          1000 are right, and up to a period before"
@@ -210,7 +210,7 @@ fn early(session: &mut Session<'_>) -> Result<(), Stop> {
 
 /// Checks that a heartbeat that is early, or due at that moment, follows the torque of its epoch. One exception is
 /// allowed: the cell may send a heartbeat between receiving joints and answering them.
-fn look_at_order(session: &mut Session<'_>) {
+fn check_order(session: &mut Session<'_>) {
     let before = |place: usize, of: Epoch| {
         let later = session.answers().get(place..).unwrap_or_default();
         later.iter().any(|it| it.torque().is_some_and(|(epoch, _)| epoch == of))
@@ -229,9 +229,9 @@ fn clock(session: &mut Session<'_>, first: Grid, last: Grid) {
     let each = ((first.each + last.each) / 2).max(1);
     let beats = (span + each / 2) / each;
     // 1 %, plus the lateness that the earliest of five heartbeats may have.
-    let allowed = span / 100 + LATE / 4 + SLACK;
-    let off = span.abs_diff(beats * BEAT);
-    session.start();
+    let allowed = span / 100 + MAX_LATENESS_US / 4 + CLOCK_TOLERANCE_US;
+    let off = span.abs_diff(beats * HEARTBEAT_INTERVAL_US);
+    session.begin_expected_exchange();
     session.check("TIME-1", off <= allowed, || {
         format!(
             "{beats} heartbeats in {} ms: its clock is off by {} us; {allowed} us are allowed",

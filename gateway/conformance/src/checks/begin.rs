@@ -6,18 +6,18 @@ use protocol::time::Span;
 
 use super::{baseline, unconfigured};
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::{Reply, Session};
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.mark();
-    session.say(&[Message::Resume])?;
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.begin_exchange();
+    session.send_messages(&[Message::Resume])?;
     // Stops sensor values without a request.
     session.known.senses = true;
-    session.set(Parameter::Sensing.number(), [0])?;
-    session.set(Parameter::Reply.number(), [0])?;
+    session.write_first_words(Parameter::Sensing.number(), [0])?;
+    session.write_first_words(Parameter::Reply.number(), [0])?;
     session.idle(Span::from_millis(20))?;
-    session.mark();
+    session.begin_exchange();
     session.known.senses = false;
     session.measure()?;
     identity(session)?;
@@ -29,14 +29,14 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
         let why = "what a cell without a configuration does: it had one";
         session.findings.not_tested("JOINTS-2", why);
     }
-    let document = arm::document(2);
+    let document = arm::example_parameters(2);
     session.about.committed = session.commit(&document)?;
     session.known.halted = Some(false);
     // Before the commit the hash may have been 0.
     if session.about.committed { identity(session) } else { Ok(()) }
 }
 
-fn identity(session: &mut Session<'_>) -> Result<(), Stop> {
+fn identity(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.read(Parameter::Identity.number())?;
     let Reply::Value([.., version, hash, state, _]) = reply else {
         session.check("CONF-1", false, || format!("the identity was answered with {reply}"));
@@ -57,8 +57,8 @@ fn identity(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-fn options(session: &mut Session<'_>) -> Result<(), Stop> {
-    let reply = session.set(Parameter::Mode.number(), [1])?;
+fn options(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let reply = session.write_first_words(Parameter::Mode.number(), [1])?;
     let words = reply.words().map(|[first, ..]| first);
     session.about.test_mode = words == Some(1);
     session.known.test_mode = Some(words == Some(1));
@@ -68,18 +68,18 @@ fn options(session: &mut Session<'_>) -> Result<(), Stop> {
         session.test_mode(true)?;
     }
     session.known.senses = true;
-    let reply = session.set(Parameter::Sensing.number(), [2])?;
+    let reply = session.write_first_words(Parameter::Sensing.number(), [2])?;
     session.about.sensing = reply.words().is_some();
     session.check("OPT-1", session.about.sensing || reply == Reply::Refused(19), || {
         format!("a write of parameter 7 with 2 was answered with {reply}")
     });
-    session.set(Parameter::Sensing.number(), [0])?;
+    session.write_first_words(Parameter::Sensing.number(), [0])?;
     let reply = session.write(Parameter::Baseline.number(), baseline::HOLD)?;
     session.about.baseline = reply.words().is_some();
     // A cell that implements the protocol without baselines refuses with 18.
     let is_known = session.about.baseline || matches!(reply, Reply::Refused(18 | 19));
     session.check("OPT-1", is_known, || format!("a write of parameter 11 was answered with {reply}"));
-    session.set(Parameter::Baseline.number(), [0])?;
+    session.write_first_words(Parameter::Baseline.number(), [0])?;
     session.settle()?;
     session.known.senses = false;
     Ok(())

@@ -1,20 +1,20 @@
 //! Claims of the node id of a settled cell: it receives its own `4nn`.
 
 use protocol::id::Node;
-use protocol::message::{Heard as HeardPage, Heartbeat, Message, NetworkPage, Ports, Refused, State, Tree};
+use protocol::message::{ReceivedCounts as HeardPage, Heartbeat, Message, NetworkPage, Ports, RejectedCounts, State, Tree};
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
 use protocol::time::{Micros, Span};
 
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::Session;
 
 /// The minimum time between two answered claims.
-const DEFEND: Span = Span::from_millis(10);
+const DEFENCE_INTERVAL: Span = Span::from_millis(10);
 
 /// Returns a heartbeat of another cell with this node id.
-pub(super) fn twin(session: &Session<'_>, serial: u32, claiming: bool) -> Message {
+pub(super) fn twin_heartbeat(session: &Session<'_>, serial: u32, claiming: bool) -> Message {
     let state = State::default().with(State::CLAIMING, claiming).with_joint(0);
     let beat = Heartbeat { serial, state, ..Heartbeat::default() };
     Message::Network { from: Node::Cell(session.cell), epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
@@ -25,8 +25,8 @@ pub(super) fn page(session: &Session<'_>, page: NetworkPage) -> Message {
     Message::Network { from: Node::Cell(session.cell), epoch: Epoch(0), page }
 }
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::document(2))?;
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.ready(&arm::example_parameters(2))?;
     let own = session.about.serial.unwrap_or_default();
     for serial in [own.wrapping_sub(1), own.wrapping_add(1), 0, u32::MAX, own] {
         defended(session, serial)?;
@@ -35,23 +35,23 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     // The words of a heartbeat's serial number and CLAIMING have other meanings in these pages.
     let state = State::CLAIMING.0 | 1 << 12;
     let pages = [
-        NetworkPage::Heard(HeardPage::default()),
-        NetworkPage::Refused(Refused::default()),
-        NetworkPage::Heard(HeardPage { joints: 1, torques: state, ..HeardPage::default() }),
-        NetworkPage::Refused(Refused { length: 1, stimuli: state, ..Refused::default() }),
+        NetworkPage::Received(HeardPage::default()),
+        NetworkPage::Rejected(RejectedCounts::default()),
+        NetworkPage::Received(HeardPage { joints: 1, torques: state, ..HeardPage::default() }),
+        NetworkPage::Rejected(RejectedCounts { length: 1, stimuli: state, ..RejectedCounts::default() }),
         NetworkPage::Tree(Tree::default()),
         NetworkPage::Ports(Ports::default()),
     ];
     let mut others: Vec<_> = pages.into_iter().map(|it| page(session, it)).collect();
-    others.push(twin(session, own.wrapping_sub(1), false));
-    others.push(twin(session, own, false));
+    others.push(twin_heartbeat(session, own.wrapping_sub(1), false));
+    others.push(twin_heartbeat(session, own, false));
     for other in others {
         not_answered(session, &other)?;
     }
     // A claim is answered regardless of the packets before it.
-    session.quiet(Span::from_millis(120))?;
-    let other = page(session, NetworkPage::Heard(HeardPage::default()));
-    session.say(&[other])?;
+    session.wait_for_quiet(Span::from_millis(120))?;
+    let other = page(session, NetworkPage::Received(HeardPage::default()));
+    session.send_messages(&[other])?;
     defended(session, own.wrapping_sub(1))?;
     session.exchange_all(&[])?;
     Ok(())
@@ -63,12 +63,12 @@ fn beats(session: &Session<'_>) -> Vec<(Micros, State)> {
 }
 
 /// Checks that a claim is answered at once with DUPLICATE, and that DUPLICATE is clear in the next heartbeat.
-fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), Stop> {
+fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), StopReason> {
     // The time of the answer is a matter of TIME-2.
-    session.quiet(Span::from_millis(160))?;
-    session.mark();
-    let claim = twin(session, serial, true);
-    let at = session.say(&[claim])?;
+    session.wait_for_quiet(Span::from_millis(160))?;
+    session.begin_exchange();
+    let claim = twin_heartbeat(session, serial, true);
+    let at = session.send_messages(&[claim])?;
     let came =
         session.wait(at + Span::from_millis(120), |heard| heard.iter().any(|it| it.beat().is_some()))?;
     session.check("CLAIM-6", came, || format!("a claim with serial number {serial} was not answered"));
@@ -85,23 +85,23 @@ fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), Stop> {
     session.consume();
     // The heartbeat that answers the sync is checked as usual.
     session.exchange_all(&[])?;
-    session.idle(DEFEND)
+    session.idle(DEFENCE_INTERVAL)
 }
 
 /// Checks that of two claims within 10 ms one is answered, and so is the next one after that time.
-fn twice(session: &mut Session<'_>, own: u32) -> Result<(), Stop> {
+fn twice(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
     if session.is_slow() {
         session.findings.not_tested("CLAIM-6", "claims within 10 ms: the connection to the cell is too slow");
         return Ok(());
     }
     for _ in 0..3 {
-        session.quiet(Span::from_millis(120))?;
-        session.mark();
+        session.wait_for_quiet(Span::from_millis(120))?;
+        session.begin_exchange();
         let frames: Vec<_> =
-            (1..=3).flat_map(|it| session.frames(&twin(session, own.wrapping_add(it), true))).collect();
+            (1..=3).flat_map(|it| session.frames(&twin_heartbeat(session, own.wrapping_add(it), true))).collect();
         let times = session.send_all(&frames)?;
         let apart =
-            times.last().copied().unwrap_or_default().since(times.first().copied().unwrap_or_default());
+            times.last().copied().unwrap_or_default().elapsed_since(times.first().copied().unwrap_or_default());
         session.idle(Span::from_millis(25))?;
         let count = beats(session).len();
         session.consume();
@@ -112,8 +112,8 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), Stop> {
             format!("three claims within {} us were answered with {count} heartbeats", apart.0)
         });
         // The next heartbeat shows the later claims.
-        session.mark();
-        let at = session.say(&[Message::Sync])?;
+        session.begin_exchange();
+        let at = session.send_messages(&[Message::Sync])?;
         session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
         let is_set = beats(session).first().is_some_and(|(_, state)| state.has(State::DUPLICATE));
         session.check("CLAIM-7", is_set, || {
@@ -128,10 +128,10 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), Stop> {
 }
 
 /// Checks that a `4nn` that is not a claim gets no answer, and sets DUPLICATE in one heartbeat.
-fn not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), Stop> {
-    session.quiet(Span::from_millis(80))?;
-    session.mark();
-    session.say(&[*other])?;
+fn not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), StopReason> {
+    session.wait_for_quiet(Span::from_millis(80))?;
+    session.begin_exchange();
+    session.send_messages(&[*other])?;
     session.idle(Span::from_millis(25))?;
     let count = beats(session).len();
     session.check("CLAIM-6", count == 0, || "a 4nn that is not a claim was answered".to_owned());
@@ -143,8 +143,8 @@ fn not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), Stop> 
     session.check("CONF-1", is_set, || {
         format!("DUPLICATE is not set in the identity after a 4nn of another cell: {:04X}", shown.0)
     });
-    session.mark();
-    let at = session.say(&[Message::Sync])?;
+    session.begin_exchange();
+    let at = session.send_messages(&[Message::Sync])?;
     session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
     let state = beats(session).last().map(|(_, state)| *state).unwrap_or_default();
     session.check("CLAIM-7", state.has(State::DUPLICATE), || {

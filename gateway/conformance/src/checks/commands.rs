@@ -3,19 +3,19 @@
 use model::central::Central;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use protocol::id::Node;
-use protocol::message::{From, Message, SensorPage, SkinSensors, State};
+use protocol::message::{AppliesFrom, Message, SensorPage, SkinSensors, State};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Span;
 
 use crate::arm;
-use crate::bus::Stop;
-use crate::session::{Exchange, PATIENT, Session};
+use crate::bus::StopReason;
+use crate::session::{Exchange, ANSWER_TIMEOUT, Session};
 
 const HERE: [i16; MAX_JOINTS] = [0x0400, -0x2100, 0x1700, -0x0300, 0x2900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
 const THERE: [i16; MAX_JOINTS] = [-0x1400, 0x1100, -0x0700, 0x2300, -0x1900, 0x0800, 0, 0, 0, 0, 0, 0, 0, 0];
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    if !session.ready(&arm::document(6))? {
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    if !session.ready(&arm::example_parameters(6))? {
         return Ok(());
     }
     alone(session)?;
@@ -24,7 +24,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     report(session)
 }
 
-fn command(session: &mut Session<'_>, command: Message, id: &'static str) -> Result<Exchange, Stop> {
+fn command(session: &mut Session<'_>, command: Message, id: &'static str) -> Result<Exchange, StopReason> {
     let is_halt = command == Message::Halt;
     session.known.halted = Some(is_halt);
     if is_halt {
@@ -41,7 +41,7 @@ fn command(session: &mut Session<'_>, command: Message, id: &'static str) -> Res
 
 /// Checks that a halt or a resume is not answered, and that a halted cell answers a sync with one heartbeat. No regular
 /// heartbeat is due meanwhile.
-fn alone(session: &mut Session<'_>) -> Result<(), Stop> {
+fn alone(session: &mut Session<'_>) -> Result<(), StopReason> {
     const ATTEMPTS: usize = 3;
     let cases = [
         ("a halt", Message::Halt, "CMD-1"),
@@ -51,9 +51,9 @@ fn alone(session: &mut Session<'_>) -> Result<(), Stop> {
     for (what, message, id) in cases {
         let expected = usize::from(message == Message::Sync);
         for attempt in 1..=ATTEMPTS {
-            session.quiet(Span::from_millis(120))?;
-            session.mark();
-            let at = session.say(&[message])?;
+            session.wait_for_quiet(Span::from_millis(120))?;
+            session.begin_exchange();
+            let at = session.send_messages(&[message])?;
             session.wait(at + Span::from_millis(25 + 60 * expected as u64), |heard| {
                 expected > 0 && heard.iter().any(|it| it.beat().is_some())
             })?;
@@ -74,11 +74,11 @@ fn alone(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
+fn halt(session: &mut Session<'_>) -> Result<(), StopReason> {
     let unit = arm::press(arm::unit_press(protocol::fixed::TorqueFormat::Q3_12));
-    let central = Central::of_cell(&arm::document(6));
+    let central = Central::of_cell(&arm::example_parameters(6));
     for round in 0..2 {
-        session.pressed(&HERE, unit)?;
+        session.press_and_step(&HERE, unit)?;
         let exchange = command(session, Message::Halt, "CMD-1")?;
         session
             .check("STATE-1", !exchange.state().has(State::ACTIVE), || "ACTIVE is set after halt".to_owned());
@@ -86,8 +86,8 @@ fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
             command(session, Message::Halt, "CMD-1")?;
         } else {
             // Only a resume ends a halt: neither a commit nor an exchange does.
-            session.commit(&protocol::parameters::Parameters { period_us: 46_500, ..arm::document(6) })?;
-            session.commit(&arm::document(6))?;
+            session.commit(&protocol::parameters::Parameters { period_us: 46_500, ..arm::example_parameters(6) })?;
+            session.commit(&arm::example_parameters(6))?;
             session.exchange_all(&[])?;
         }
         let before = session.counters()?.heard;
@@ -96,7 +96,7 @@ fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
             session.step_at(epoch, &positions)?;
         }
         let after = session.counters()?.heard;
-        let taken = |of: &protocol::message::Heard| of.joints.wrapping_add(of.joints_late);
+        let taken = |of: &protocol::message::ReceivedCounts| of.joints.wrapping_add(of.joints_late);
         let counted = taken(&after).wrapping_sub(taken(&before));
         session
             .check("CMD-1", counted == 5, || format!("5 joints were counted as {counted} by a halted cell"));
@@ -107,48 +107,48 @@ fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
         let step = session.step(&THERE)?;
         let exact = arm::exact_jacobian(&central, &THERE);
         let off =
-            step.words().iter().zip(exact).map(|(word, exact)| arm::off(*word, exact)).max().unwrap_or(0);
+            step.words().iter().zip(exact).map(|(word, exact)| arm::steps_off(*word, exact)).max().unwrap_or(0);
         session.check("CMD-2", off <= 8, || {
-            format!("the first torque after a resume is not of the new joints: {}", arm::list(&step.words()))
+            format!("the first torque after a resume is not of the new joints: {}", arm::format_words(&step.words()))
         });
         // A release while halted clears ACTIVE, so no torque of zeros is due.
         command(session, Message::Halt, "CMD-1")?;
-        session.pressed(&HERE, arm::press(0))?;
+        session.press_and_step(&HERE, arm::press(0))?;
         command(session, Message::Resume, "CMD-2")?;
         let step = session.step(&THERE)?;
         session.check("CMD-1", step.torque.is_none(), || "released while halted: a torque came".to_owned());
     }
     // A resume does not change a cell that is not halted.
-    session.pressed(&HERE, unit)?;
+    session.press_and_step(&HERE, unit)?;
     command(session, Message::Resume, "CMD-2")?;
-    session.pressed(&HERE, arm::press(0))?;
+    session.press_and_step(&HERE, arm::press(0))?;
     session.step(&HERE)?;
     Ok(())
 }
 
 /// Checks that each sync is answered with one heartbeat.
-fn syncs(session: &mut Session<'_>) -> Result<(), Stop> {
+fn syncs(session: &mut Session<'_>) -> Result<(), StopReason> {
     const SYNCS: usize = 8;
-    session.mark();
+    session.begin_exchange();
     let mut beats = 0;
     let began = session.now();
     for _ in 0..SYNCS {
-        let at = session.say(&[Message::Sync])?;
+        let at = session.send_messages(&[Message::Sync])?;
         let before = beats;
-        let count = |heard: &[crate::session::Heard]| heard.iter().filter(|it| it.beat().is_some()).count();
-        session.wait(at + PATIENT, |heard| count(heard) > before)?;
+        let count = |heard: &[crate::session::CellPacket]| heard.iter().filter(|it| it.beat().is_some()).count();
+        session.wait(at + ANSWER_TIMEOUT, |heard| count(heard) > before)?;
         session.idle(Span::from_millis(4))?;
         beats = count(session.answers());
     }
     // Regular heartbeats may come between.
-    let regular = 1 + usize::try_from(session.now().since(began).0 / 250_000).unwrap_or(0);
+    let regular = 1 + usize::try_from(session.now().elapsed_since(began).0 / 250_000).unwrap_or(0);
     session.check("CMD-3", (SYNCS..=SYNCS + regular).contains(&beats), || {
         format!("{SYNCS} syncs were answered with {beats} heartbeats")
     });
     Ok(())
 }
 
-fn report(session: &mut Session<'_>) -> Result<(), Stop> {
+fn report(session: &mut Session<'_>) -> Result<(), StopReason> {
     let skin = SkinSensors {
         contact: [100, -200, 300].map(Q5_10::from_bits),
         proximity: Q1_14::from_bits(0x1234),
@@ -157,13 +157,13 @@ fn report(session: &mut Session<'_>) -> Result<(), Stop> {
     let acceleration = [11, -22, 4_096].map(Q3_12::from_bits);
     let to = Node::Cell(session.cell);
     let page = SensorPage::Acceleration(acceleration);
-    session.say(&[Message::Stimulus { to, from: From::Next, page }])?;
-    session.pressed(&HERE, skin)?;
+    session.send_messages(&[Message::Stimulus { to, from: AppliesFrom::Next, page }])?;
+    session.press_and_step(&HERE, skin)?;
     // Pending values are not reported yet.
     session.press(arm::press(77))?;
     for _ in 0..3 {
-        session.mark();
-        let asked = session.say(&[Message::Report])?;
+        session.begin_exchange();
+        let asked = session.send_messages(&[Message::Report])?;
         let answers = session.pages(asked)?;
         session.idle(Span::from_millis(5))?;
         if let Some(last) = answers.last() {
@@ -179,12 +179,12 @@ fn report(session: &mut Session<'_>) -> Result<(), Stop> {
             .check("SENSE-1", sent.len() == 2, || format!("{} sensors pages came to a report", sent.len()));
         session.check("SENSE-2", sent == latched, || {
             let text = |pages: &[SensorPage]| {
-                pages.iter().map(|page| arm::page(*page)).collect::<Vec<_>>().join("; ")
+                pages.iter().map(|page| arm::format_page(*page)).collect::<Vec<_>>().join("; ")
             };
             format!("{} was reported, and {} is latched", text(&sent), text(&latched))
         });
     }
-    session.pressed(&HERE, arm::press(0))?;
+    session.press_and_step(&HERE, arm::press(0))?;
     session.step(&HERE)?;
     Ok(())
 }

@@ -2,12 +2,12 @@
 
 use protocol::can::{BIT_RATE_SWITCH, EXTENDED, Format, Frame};
 use protocol::id::{Command, Id, Kind, Node};
-use protocol::message::{Refused, State};
+use protocol::message::{RejectedCounts, State};
 use protocol::packet::{Epoch, Length, Packet, Words, crc16};
 use protocol::parameters::MAX_JOINTS;
 
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::Session;
 
 /// The reason under which page 2 counts a packet.
@@ -38,8 +38,8 @@ impl Reason {
 /// The number of attempts, to tell an answer from a regular heartbeat.
 const ATTEMPTS: usize = 3;
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::document(2))?;
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.ready(&arm::example_parameters(2))?;
     let mut before = session.counters()?;
     for (what, frames, reason) in cases(session) {
         let mut beats = usize::MAX;
@@ -51,7 +51,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
                 format!("{what} had an effect: state {:04X}", exchange.state().0)
             });
             if has_effect {
-                session.say(&[protocol::message::Message::Resume])?;
+                session.send_messages(&[protocol::message::Message::Resume])?;
             }
             let after = session.counters()?;
             let is_so = is_counted(before.refused, after.refused, reason) && before.heard == after.heard;
@@ -70,7 +70,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-fn is_counted(before: Refused, after: Refused, reason: Reason) -> bool {
+fn is_counted(before: RejectedCounts, after: RejectedCounts, reason: Reason) -> bool {
     let mut expected = before;
     let field = match reason {
         Reason::Length => &mut expected.length,

@@ -5,8 +5,8 @@ use protocol::message::SkinSensors;
 use protocol::parameters::{Contact, MAX_JOINTS, Parameters};
 
 use super::kinematics::look_at_words;
-use crate::arm::{self, Dice};
-use crate::bus::Stop;
+use crate::arm::{self, TestRandom};
+use crate::bus::StopReason;
 use crate::session::Session;
 
 /// The number of random forces for each of several rules.
@@ -23,16 +23,16 @@ struct Known {
     j: [i16; MAX_JOINTS],
 }
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    let mut dice = Dice::new(2);
-    let parameters = arm::document(6);
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let mut dice = TestRandom::new(2);
+    let parameters = arm::example_parameters(6);
     if !session.ready(&parameters)? {
         return Ok(());
     }
     let mut known = Vec::new();
     for _ in 0..4 {
         let positions = arm::positions(&mut dice, &parameters);
-        let j = session.pressed(&positions, arm::press(arm::unit_press(TorqueFormat::Q3_12)))?.words();
+        let j = session.press_and_step(&positions, arm::press(arm::unit_press(TorqueFormat::Q3_12)))?.words();
         known.push(Known { positions, j });
     }
     ties(session, &parameters, &known)?;
@@ -44,7 +44,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     }
     for format in [TorqueFormat::Q5_10, TorqueFormat::Q7_8] {
         let parameters = Parameters { torque_format: format, contact: arm::PLAIN, ..parameters };
-        if session.about.abilities.lacks(&parameters).is_none() && session.ready(&parameters)? {
+        if session.about.abilities.first_missing(&parameters).is_none() && session.ready(&parameters)? {
             ties(session, &parameters, &known)?;
         }
     }
@@ -58,14 +58,14 @@ fn press(
     known: &Known,
     skin: SkinSensors,
     id: &'static str,
-) -> Result<(), Stop> {
-    let step = session.pressed(&known.positions, skin)?;
+) -> Result<(), StopReason> {
+    let step = session.press_and_step(&known.positions, skin)?;
     let force = arm::force(&parameters.contact, &skin);
     let is_there = step.torque.is_some_and(|words| !words.is_zero() || force > 0);
     let sensed = || {
         format!(
             "contact {}, proximity {}",
-            arm::list(&skin.contact.map(Q5_10::to_bits)),
+            arm::format_words(&skin.contact.map(Q5_10::to_bits)),
             skin.proximity.to_bits()
         )
     };
@@ -80,7 +80,7 @@ fn press(
 }
 
 /// Checks products that end in exactly half a step, and words at the limits of their range.
-fn ties(session: &mut Session<'_>, parameters: &Parameters, known: &[Known]) -> Result<(), Stop> {
+fn ties(session: &mut Session<'_>, parameters: &Parameters, known: &[Known]) -> Result<(), StopReason> {
     let format = parameters.torque_format;
     let bits = 30 - i64::from(format.fraction());
     let product = |j: i16, sum: i32| i64::from(j) * i64::from(sum) * 64;
@@ -186,11 +186,11 @@ fn rules() -> Vec<(Contact, Vec<Sensed>)> {
 
 fn rule(
     session: &mut Session<'_>,
-    dice: &mut Dice,
+    dice: &mut TestRandom,
     parameters: &Parameters,
     known: &[Known],
     crafted: &[Sensed],
-) -> Result<(), Stop> {
+) -> Result<(), StopReason> {
     let skin = |(contact, proximity): Sensed| SkinSensors {
         contact: contact.map(Q5_10::from_bits),
         proximity: Q1_14::from_bits(proximity),
@@ -216,7 +216,7 @@ fn rule(
         let (Some(known), skin) = (known.get(attempt % 4), skin(random(3))) else { continue };
         let force = arm::force(&parameters.contact, &skin);
         let shows = |j: &i16| {
-            let word = |force| arm::word(*j, force, parameters.torque_format);
+            let word = |force| arm::torque_word(*j, force, parameters.torque_format);
             word(force) != word(force - 1) && !protocol::fixed::is_saturated(word(force))
         };
         if force > 1 && is_rounded_up(&parameters.contact, &skin) && known.j.iter().any(shows) {

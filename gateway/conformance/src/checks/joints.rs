@@ -6,17 +6,17 @@ use protocol::parameters::{MAX_JOINTS, Parameters};
 use protocol::time::{Micros, Span};
 
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::Session;
 
 const POSITIONS: [i16; MAX_JOINTS] =
     [0x0400, -0x2100, 0x1700, -0x0300, 0x2900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    if !session.ready(&arm::document(6))? {
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    if !session.ready(&arm::example_parameters(6))? {
         return Ok(());
     }
-    session.pressed(&POSITIONS, arm::press(4_096))?;
+    session.press_and_step(&POSITIONS, arm::press(4_096))?;
     epochs(session)?;
     repeats(session)?;
     counts(session)?;
@@ -24,7 +24,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks that each epoch other than the last one is accepted, at any distance; more than 256 in a row.
-fn epochs(session: &mut Session<'_>) -> Result<(), Stop> {
+fn epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
     let before = session.counters()?.heard;
     let mut torque: Option<Words> = None;
     let mut epoch = session.known.last_epoch;
@@ -36,7 +36,7 @@ fn epochs(session: &mut Session<'_>) -> Result<(), Stop> {
             format!("joints {epoch}, {} epochs after the last ones, were not answered", step.cast_signed())
         });
         if let (Some(came), Some(before)) = (came, torque) {
-            let words = |words: &Words| arm::list(words.as_slice());
+            let words = |words: &Words| arm::format_words(words.as_slice());
             session.check("TORQUE-1", came == before, || {
                 format!("the same joints gave {} and {}", words(&came), words(&before))
             });
@@ -54,9 +54,9 @@ fn epochs(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks that the epoch of the last joints is dropped when it is repeated; epoch 0 is not special.
-fn repeats(session: &mut Session<'_>) -> Result<(), Stop> {
+fn repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
     for is_zero in [false, true] {
-        session.pressed(&POSITIONS, arm::press(4_096))?;
+        session.press_and_step(&POSITIONS, arm::press(4_096))?;
         let before = session.counters()?.heard;
         let first = if is_zero { 0 } else { session.next_epoch() };
         session.step_at(first, &POSITIONS)?;
@@ -71,7 +71,7 @@ fn repeats(session: &mut Session<'_>) -> Result<(), Stop> {
         session.exchange_all(&[joints])?;
         let skin = session.latched()?;
         session.check("JOINTS-1", skin == Some(arm::press(4_096)), || {
-            format!("repeated joints latched a stimulus: {}", arm::skin(skin))
+            format!("repeated joints latched a stimulus: {}", arm::format_skin(skin))
         });
         let second = session.next_epoch();
         session.step_at(second, &POSITIONS)?;
@@ -86,8 +86,8 @@ fn repeats(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks joints whose count is not that of the chain, or is impossible.
-fn counts(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.pressed(&POSITIONS, arm::press(4_096))?;
+fn counts(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.press_and_step(&POSITIONS, arm::press(4_096))?;
     let mut before = session.counters()?;
     for count in [5, 1, 4, 0, 7, 15, 255] {
         let epoch = session.next_epoch();
@@ -100,7 +100,7 @@ fn counts(session: &mut Session<'_>) -> Result<(), Stop> {
         let exchange = session.exchange(&frames)?;
         let skin = session.latched()?;
         session.check("JOINTS-2", skin == before_press, || {
-            format!("joints with count {count} latched a stimulus: {}", arm::skin(skin))
+            format!("joints with count {count} latched a stimulus: {}", arm::format_skin(skin))
         });
         session.check("JOINTS-2", exchange.is_silent(), || {
             format!("joints with count {count} were answered; the chain has 6")
@@ -158,25 +158,25 @@ fn raw(session: &Session<'_>, epoch: u8, count: u8, length: Length) -> Vec<Frame
 }
 
 /// Checks touches and releases: a torque for each joints message, zeros once, then nothing.
-fn contacts(session: &mut Session<'_>) -> Result<(), Stop> {
+fn contacts(session: &mut Session<'_>) -> Result<(), StopReason> {
     for round in 0..4 {
         for sum in [3_000, 3_000, 0, 0, 0, 9_000, 0, 0] {
             let positions = POSITIONS.map(|word| word.wrapping_add(round * 0x0111));
-            session.pressed(&positions, arm::press(sum))?;
+            session.press_and_step(&positions, arm::press(sum))?;
         }
         session.press(arm::press(500))?;
         for _ in 0..3 {
             session.step(&POSITIONS)?;
         }
-        session.pressed(&POSITIONS, arm::press(0))?;
+        session.press_and_step(&POSITIONS, arm::press(0))?;
         session.step(&POSITIONS)?;
     }
     Ok(())
 }
 
 /// Checks joints that are older than a period of 1 us when the cell processes them.
-pub(super) fn old(session: &mut Session<'_>) -> Result<(), Stop> {
-    if !session.ready(&arm::document(6))? {
+pub(super) fn old(session: &mut Session<'_>) -> Result<(), StopReason> {
+    if !session.ready(&arm::example_parameters(6))? {
         return Ok(());
     }
     let mut shown = Old::default();
@@ -188,7 +188,7 @@ pub(super) fn old(session: &mut Session<'_>) -> Result<(), Stop> {
     }
     session.known.active = None;
     none_is_lost(session)?;
-    session.ready(&arm::document(6))?;
+    session.ready(&arm::example_parameters(6))?;
     Ok(())
 }
 
@@ -203,16 +203,16 @@ struct Old {
 /// The number of bursts of joints.
 const BURSTS: usize = 4;
 
-fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), Stop> {
+fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), StopReason> {
     const BURST: u8 = 24;
     // In contact: skipped joints change the contact as little as the commit does.
-    session.commit(&arm::document(6))?;
-    session.pressed(&POSITIONS, arm::press(press + 1))?;
-    session.commit(&Parameters { period_us: 1, ..arm::document(6) })?;
+    session.commit(&arm::example_parameters(6))?;
+    session.press_and_step(&POSITIONS, arm::press(press + 1))?;
+    session.commit(&Parameters { period_us: 1, ..arm::example_parameters(6) })?;
     session.exchange_all(&[])?;
     let before = session.counters()?;
     session.press(arm::press(press))?;
-    session.mark();
+    session.begin_exchange();
     let mut sent: Vec<(u8, Micros)> = Vec::new();
     let mut frames = Vec::new();
     for _ in 0..BURST {
@@ -255,7 +255,7 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
         // Skipped joints still count as the last ones, latch stimuli and leave ACTIVE unchanged.
         let page = session.latched()?;
         session.check("STIM-8", page == Some(arm::press(press)), || {
-            format!("skipped joints did not latch a stimulus: {}", arm::skin(page))
+            format!("skipped joints did not latch a stimulus: {}", arm::format_skin(page))
         });
         session.known.epoch = Some(session.known.last_epoch);
         session.known.active = Some(true);
@@ -275,7 +275,7 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
 fn look_at_old(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<String> {
     const MARGIN: Span = Span(100);
     let late = answers.windows(2).find(|pair| match pair {
-        [(before, _), (_, epoch)] => sent.iter().any(|(of, at)| of == epoch && before.since(*at) > MARGIN),
+        [(before, _), (_, epoch)] => sent.iter().any(|(of, at)| of == epoch && before.elapsed_since(*at) > MARGIN),
         _ => false,
     });
     let Some([(before, first), (_, epoch)]) = late else { return None };
@@ -286,13 +286,13 @@ fn look_at_old(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<String
 }
 
 /// Checks that joints that wait behind others are accepted too: the counters add up to the number sent.
-fn none_is_lost(session: &mut Session<'_>) -> Result<(), Stop> {
+fn none_is_lost(session: &mut Session<'_>) -> Result<(), StopReason> {
     const WAIT: usize = 3;
-    session.commit(&arm::document(6))?;
-    session.pressed(&POSITIONS, arm::press(4_096))?;
+    session.commit(&arm::example_parameters(6))?;
+    session.press_and_step(&POSITIONS, arm::press(4_096))?;
     session.counters()?;
     for _ in 0..8 {
-        session.mark();
+        session.begin_exchange();
         let all: Vec<_> = (0..WAIT)
             .map(|_| {
                 let epoch = session.next_epoch();

@@ -4,8 +4,8 @@ use model::central::Central;
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::parameters::{Abilities, MAX_JOINTS, Parameters, Pose, Row, RowKind};
 
-use crate::arm::{self, Dice, Shape};
-use crate::bus::Stop;
+use crate::arm::{self, TestRandom, ChainShape};
+use crate::bus::StopReason;
 use crate::session::Session;
 
 /// The number of joint positions per arm.
@@ -13,8 +13,8 @@ const POSES: usize = 20;
 /// The same for arms that differ only in their number of joints.
 const FEW: usize = 4;
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    let mut dice = Dice::new(1);
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let mut dice = TestRandom::new(1);
     for parameters in arms(&mut dice, session.about.abilities) {
         one(session, &mut dice, &parameters, POSES)?;
     }
@@ -26,32 +26,32 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
 
 /// Returns arms that the cell can compute: a UR5, six revolute joints of any shape, and the further shapes that its
 /// identity allows.
-fn arms(dice: &mut Dice, abilities: Abilities) -> Vec<Parameters> {
-    let mut arms: Vec<_> = [2, 6, 1].map(arm::document).into();
+fn arms(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
+    let mut arms: Vec<_> = [2, 6, 1].map(arm::example_parameters).into();
     arms.extend(half_turns());
-    let six = |prismatic, rows| Shape { joints: 6, rows, prismatic };
-    arms.extend((0..4).map(|_| arm::random(dice, six(false, 6))));
+    let six = |prismatic, rows| ChainShape { joints: 6, rows, prismatic };
+    arms.extend((0..4).map(|_| arm::random_parameters(dice, six(false, 6))));
     let (joints, rows) = (abilities.joints(), abilities.rows());
     // Few joints, many joints, and other kinds of rows.
     let more = [
-        Shape { joints: 1, rows: 1, prismatic: false },
-        Shape { joints: 3, rows: 3, prismatic: false },
+        ChainShape { joints: 1, rows: 1, prismatic: false },
+        ChainShape { joints: 3, rows: 3, prismatic: false },
         six(true, 6),
-        Shape { joints: 3, rows: 6, prismatic: false },
-        Shape { joints: 7, rows: 9, prismatic: true },
-        Shape { joints: 10, rows: 14, prismatic: false },
-        Shape { joints: 14, rows: 20, prismatic: true },
-        Shape { joints: 14, rows: 32, prismatic: true },
+        ChainShape { joints: 3, rows: 6, prismatic: false },
+        ChainShape { joints: 7, rows: 9, prismatic: true },
+        ChainShape { joints: 10, rows: 14, prismatic: false },
+        ChainShape { joints: 14, rows: 20, prismatic: true },
+        ChainShape { joints: 14, rows: 32, prismatic: true },
     ];
     for shape in more.into_iter().filter(|shape| shape.joints <= joints && shape.rows <= rows) {
-        let parameters = arm::random(dice, shape);
-        if abilities.lacks(&parameters).is_none() {
+        let parameters = arm::random_parameters(dice, shape);
+        if abilities.first_missing(&parameters).is_none() {
             arms.push(parameters);
         }
     }
     for format in [TorqueFormat::Q5_10, TorqueFormat::Q7_8] {
-        let parameters = Parameters { torque_format: format, ..arm::document(6) };
-        if abilities.lacks(&parameters).is_none() {
+        let parameters = Parameters { torque_format: format, ..arm::example_parameters(6) };
+        if abilities.first_missing(&parameters).is_none() {
             arms.push(parameters);
         }
     }
@@ -61,7 +61,7 @@ fn arms(dice: &mut Dice, abilities: Abilities) -> Vec<Parameters> {
 /// Returns a UR5 with half turns, whose word is the lowest one: in two twists, and in two joints.
 fn half_turns() -> [Parameters; 2] {
     let half = |places: [usize; 2], turn: fn(&mut Row)| {
-        let mut parameters = arm::document(6);
+        let mut parameters = arm::example_parameters(6);
         for place in places {
             parameters.rows.iter_mut().skip(place).take(1).for_each(turn);
         }
@@ -71,10 +71,10 @@ fn half_turns() -> [Parameters; 2] {
 }
 
 /// Returns arms of each number of joints above six, with a row for each joint and the cell at the tip.
-fn lengths(dice: &mut Dice, abilities: Abilities) -> Vec<Parameters> {
+fn lengths(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
     let most = abilities.joints().min(abilities.rows());
     let of = |joints| {
-        let arm = arm::random(dice, Shape { joints, rows: joints, prismatic: false });
+        let arm = arm::random_parameters(dice, ChainShape { joints, rows: joints, prismatic: false });
         Parameters { joint: arm.joints, ..arm }
     };
     (7..=most).map(of).collect()
@@ -83,10 +83,10 @@ fn lengths(dice: &mut Dice, abilities: Abilities) -> Vec<Parameters> {
 /// Checks one arm at many joint positions.
 fn one(
     session: &mut Session<'_>,
-    dice: &mut Dice,
+    dice: &mut TestRandom,
     parameters: &Parameters,
     poses: usize,
-) -> Result<(), Stop> {
+) -> Result<(), StopReason> {
     if !session.ready(parameters)? {
         return Ok(());
     }
@@ -98,11 +98,11 @@ fn one(
         // Every third time only joints beyond the sixth move.
         let stays = if pose % 3 == 2 && parameters.joints > 6 { 6 } else { 0 };
         positions.iter_mut().zip(next).skip(stays).for_each(|(position, next)| *position = next);
-        let j = session.pressed(&positions, arm::press(arm::unit_press(format)))?.words();
+        let j = session.press_and_step(&positions, arm::press(arm::unit_press(format)))?.words();
         look_at_j(session, parameters, &central, &positions, &j);
         // The same joints again, with any force: J is known now.
         let press = arm::press(i32::from(dice.word()).abs() * 3);
-        let words = session.pressed(&positions, press)?.words();
+        let words = session.press_and_step(&positions, press)?.words();
         look_at_words(session, parameters, &j, arm::force(&parameters.contact, &press), &words, "TORQUE-1");
     }
     Ok(())
@@ -116,15 +116,15 @@ fn look_at_j(
     j: &[i16; MAX_JOINTS],
 ) {
     let exact = arm::exact_jacobian(central, positions);
-    let off = j.iter().zip(exact).map(|(&word, exact)| arm::off(word, exact)).max().unwrap_or(0);
+    let off = j.iter().zip(exact).map(|(&word, exact)| arm::steps_off(word, exact)).max().unwrap_or(0);
     let most = arm::tolerance(parameters);
     let joints = usize::from(parameters.joints);
     session.check("J-3", off <= most, || {
         let nearest = exact.map(|x| Q1_14::nearest(x).to_bits());
         format!(
             "J is {}, {off} steps off {}; {most} are allowed",
-            arm::list(j.get(..joints).unwrap_or_default()),
-            arm::list(nearest.get(..joints).unwrap_or_default())
+            arm::format_words(j.get(..joints).unwrap_or_default()),
+            arm::format_words(nearest.get(..joints).unwrap_or_default())
         )
     });
 }
@@ -138,34 +138,34 @@ pub(super) fn look_at_words(
     words: &[i16; MAX_JOINTS],
     id: &'static str,
 ) {
-    let expected = j.map(|j| arm::word(j, force, parameters.torque_format));
+    let expected = j.map(|j| arm::torque_word(j, force, parameters.torque_format));
     let joints = usize::from(parameters.joints);
     session.check(id, expected == *words, || {
         format!(
             "the torque of {force} steps of 2^-16 N is {}, not {}; J is {}",
-            arm::list(words.get(..joints).unwrap_or_default()),
-            arm::list(expected.get(..joints).unwrap_or_default()),
-            arm::list(j.get(..joints).unwrap_or_default())
+            arm::format_words(words.get(..joints).unwrap_or_default()),
+            arm::format_words(expected.get(..joints).unwrap_or_default()),
+            arm::format_words(j.get(..joints).unwrap_or_default())
         )
     });
 }
 
 /// Checks levers of 3.8 m: one of a link, and one of a prismatic joint that slides beyond the range of a word.
-fn out_of_reach(session: &mut Session<'_>) -> Result<(), Stop> {
+fn out_of_reach(session: &mut Session<'_>) -> Result<(), StopReason> {
     let far = Q1_14::from_bits(31_000);
-    let mut long = Parameters { joint: 1, joints: 1, ..arm::document(1) };
+    let mut long = Parameters { joint: 1, joints: 1, ..arm::example_parameters(1) };
     long.rows = [Row { a: far, ..Row::default() }; protocol::parameters::MAX_ROWS];
     long.pose.position = [far, Q1_14::ZERO, Q1_14::ZERO];
     held(session, &long, &[0x2345; MAX_JOINTS], [0, 0x4000, 0])?;
     // The second joint slides along y of the first; the force is along x.
-    let mut slides = Parameters { joint: 2, joints: 2, row: 2, table_rows: 2, ..arm::document(2) };
+    let mut slides = Parameters { joint: 2, joints: 2, row: 2, table_rows: 2, ..arm::example_parameters(2) };
     slides.rows = [Row::default(); protocol::parameters::MAX_ROWS];
     if let [first, second, ..] = slides.rows.as_mut_slice() {
         first.alpha = Q1_14::from_bits(-0x4000);
         (second.kind, second.d) = (RowKind::Prismatic, far);
     }
     slides.pose.position = [Q1_14::ZERO; 3];
-    if session.about.abilities.lacks(&slides).is_none() {
+    if session.about.abilities.first_missing(&slides).is_none() {
         let mut positions = [0; MAX_JOINTS];
         positions.iter_mut().skip(1).take(1).for_each(|slide| *slide = far.to_bits());
         held(session, &slides, &positions, [-0x4000, 0, 0])?;
@@ -180,7 +180,7 @@ fn held(
     arm: &Parameters,
     positions: &[i16; MAX_JOINTS],
     normal: [i16; 3],
-) -> Result<(), Stop> {
+) -> Result<(), StopReason> {
     for sign in [1, -1] {
         let pose = Pose { normal: normal.map(|word| Q1_14::from_bits(word * sign)), ..arm.pose };
         let parameters = Parameters { pose, ..*arm };
@@ -188,7 +188,7 @@ fn held(
             return Ok(());
         }
         let press = arm::press(arm::unit_press(parameters.torque_format));
-        let [first, ..] = session.pressed(positions, press)?.words();
+        let [first, ..] = session.press_and_step(positions, press)?.words();
         let is_held = if sign > 0 { first <= i16::MIN + 8 } else { first >= i16::MAX - 8 };
         session.check("J-2", is_held, || {
             let word = if sign > 0 { "8000" } else { "7FFF" };

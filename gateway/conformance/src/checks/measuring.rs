@@ -4,14 +4,14 @@ use protocol::message::State;
 use protocol::parameters::MAX_JOINTS;
 
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::Session;
 
 /// The number of joints messages.
 const JOINTS: i16 = 12;
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    if !session.ready(&arm::document(2))? {
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    if !session.ready(&arm::example_parameters(2))? {
         return Ok(());
     }
     if session.about.test_mode {
@@ -43,6 +43,6 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
         });
         before = Some(is_active);
     }
-    session.ready(&arm::document(2))?;
+    session.ready(&arm::example_parameters(2))?;
     Ok(())
 }

@@ -26,13 +26,13 @@ use std::collections::BTreeSet;
 use protocol::can::Format;
 use protocol::time::Span;
 
-use crate::bus::Stop;
-use crate::findings::Only;
+use crate::bus::StopReason;
+use crate::findings::RequirementFilter;
 use crate::session::Session;
 
 /// The precondition of a group of checks.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Needs {
+enum Precondition {
     Nothing,
     /// Test mode, and a configuration that can be committed.
     Press,
@@ -50,52 +50,52 @@ enum Needs {
 struct Group {
     /// The requirements that the group covers.
     about: &'static [&'static str],
-    needs: Needs,
-    run: fn(&mut Session<'_>) -> Result<(), Stop>,
+    needs: Precondition,
+    run: fn(&mut Session<'_>) -> Result<(), StopReason>,
 }
 
 const fn group(
     about: &'static [&'static str],
-    needs: Needs,
-    run: fn(&mut Session<'_>) -> Result<(), Stop>,
+    needs: Precondition,
+    run: fn(&mut Session<'_>) -> Result<(), StopReason>,
 ) -> Group {
     Group { about, needs, run }
 }
 
 const GROUPS: &[Group] = &[
-    group(&["CONF-1", "CONF-2", "CONF-3", "CONF-4", "CONF-7", "CONF-12"], Needs::Nothing, parameters::run),
-    group(&["CONF-11", "CONF-13", "ID-2", "OPT-1"], Needs::Nothing, parameters::others),
-    group(&["CONF-7", "CONF-9", "CMD-2", "STATE-1"], Needs::Press, leaves::run),
-    group(&["CONF-5", "CONF-6", "COUNT-2"], Needs::Nothing, refusals::run),
-    group(&["CONF-9", "CONF-10", "SENSE-3", "OPT-1", "LINK-1"], Needs::Nothing, options::switches),
-    group(&["OPT-2"], Needs::Nothing, options::ignored),
-    group(&["J-1", "J-2", "J-3", "TORQUE-1"], Needs::Press, kinematics::run),
-    group(&["FORCE-1", "TORQUE-1", "TORQUE-2", "STATE-1"], Needs::Press, force::run),
-    group(&["JOINTS-1", "JOINTS-2", "JOINTS-3", "JOINTS-5", "JOINTS-6"], Needs::Press, joints::run),
-    group(&["JOINTS-4", "STIM-8"], Needs::Press, joints::old),
-    group(&["JOINTS-6"], Needs::Nothing, measuring::run),
+    group(&["CONF-1", "CONF-2", "CONF-3", "CONF-4", "CONF-7", "CONF-12"], Precondition::Nothing, parameters::run),
+    group(&["CONF-11", "CONF-13", "ID-2", "OPT-1"], Precondition::Nothing, parameters::others),
+    group(&["CONF-7", "CONF-9", "CMD-2", "STATE-1"], Precondition::Press, leaves::run),
+    group(&["CONF-5", "CONF-6", "COUNT-2"], Precondition::Nothing, refusals::run),
+    group(&["CONF-9", "CONF-10", "SENSE-3", "OPT-1", "LINK-1"], Precondition::Nothing, options::switches),
+    group(&["OPT-2"], Precondition::Nothing, options::ignored),
+    group(&["J-1", "J-2", "J-3", "TORQUE-1"], Precondition::Press, kinematics::run),
+    group(&["FORCE-1", "TORQUE-1", "TORQUE-2", "STATE-1"], Precondition::Press, force::run),
+    group(&["JOINTS-1", "JOINTS-2", "JOINTS-3", "JOINTS-5", "JOINTS-6"], Precondition::Press, joints::run),
+    group(&["JOINTS-4", "STIM-8"], Precondition::Press, joints::old),
+    group(&["JOINTS-6"], Precondition::Nothing, measuring::run),
     group(
         &["STIM-1", "STIM-2", "STIM-3", "STIM-4", "STIM-5", "STIM-6", "STIM-7", "STIM-8"],
-        Needs::Press,
+        Precondition::Press,
         stimuli::run,
     ),
     group(
         &["CMD-1", "CMD-2", "CMD-3", "CMD-4", "STATE-1", "SENSE-1", "SENSE-2"],
-        Needs::Press,
+        Precondition::Press,
         commands::run,
     ),
     group(
         &["BASE-1", "BASE-2", "BASE-3", "BASE-4", "BASE-5", "BASE-6", "BASE-7", "BASE-8"],
-        Needs::Baseline,
+        Precondition::Baseline,
         baseline::run,
     ),
-    group(&["COUNT-1", "SEND-1"], Needs::Nothing, counters::run),
-    group(&["COUNT-3"], Needs::Classic, segments::run),
-    group(&["CLAIM-6", "CLAIM-7", "STATE-2"], Needs::Nothing, claims::run),
-    group(&["BEAT-1", "BEAT-2", "BEAT-3", "CMD-1", "STIM-7", "TIME-1", "TIME-3"], Needs::Nothing, beats::run),
+    group(&["COUNT-1", "SEND-1"], Precondition::Nothing, counters::run),
+    group(&["COUNT-3"], Precondition::Classic, segments::run),
+    group(&["CLAIM-6", "CLAIM-7", "STATE-2"], Precondition::Nothing, claims::run),
+    group(&["BEAT-1", "BEAT-2", "BEAT-3", "CMD-1", "STIM-7", "TIME-1", "TIME-3"], Precondition::Nothing, beats::run),
     group(
         &["SENSE-4", "SENSE-5", "SENSE-6", "SENSE-7", "SENSE-8", "SENSE-9", "SENSE-10", "SENSE-11", "TIME-3"],
-        Needs::Sensing,
+        Precondition::Sensing,
         sensing::run,
     ),
     group(
@@ -103,7 +103,7 @@ const GROUPS: &[Group] = &[
             "CLAIM-1", "CLAIM-2", "CLAIM-3", "CLAIM-4", "CLAIM-5", "CLAIM-7", "CONF-2", "CONF-8", "CONF-9",
             "ID-3",
         ],
-        Needs::Restart,
+        Precondition::Restart,
         restart::run,
     ),
 ];
@@ -112,7 +112,7 @@ const GROUPS: &[Group] = &[
 const RESERVE: Span = Span::from_millis(20_000);
 
 /// The parts of requirements that cannot be tested from the bus of any cell, with the reason.
-const BEYOND: &[(&str, &str)] = &[
+const UNTESTABLE: &[(&str, &str)] = &[
     ("CLAIM-8", "wires cannot be reached from the bus"),
     ("TIME-3", "the order of packets of the tree"),
     ("CONF-7", "a failing flash: the bus cannot cause it"),
@@ -126,10 +126,10 @@ const BEYOND: &[(&str, &str)] = &[
 ///
 /// # Errors
 /// Returns the reason why the test could not continue.
-pub fn run(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
+pub fn run(session: &mut Session<'_>, only: &RequirementFilter) -> Result<(), StopReason> {
     let done = groups(session, only);
     if done.is_ok() {
-        for (id, why) in BEYOND {
+        for (id, why) in UNTESTABLE {
             session.findings.not_tested(id, *why);
         }
     }
@@ -137,11 +137,11 @@ pub fn run(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
     done
 }
 
-fn groups(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
+fn groups(session: &mut Session<'_>, only: &RequirementFilter) -> Result<(), StopReason> {
     begin::run(session)?;
-    tree(session);
+    mark_tree_requirements(session);
     for group in GROUPS {
-        if let Err((is_applicable, why)) = met(session, group.needs) {
+        if let Err((is_applicable, why)) = check_needs(session, group.needs) {
             for id in group.about {
                 if is_applicable {
                     session.findings.not_tested(id, why);
@@ -150,7 +150,7 @@ fn groups(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
                 }
             }
         } else if group.about.iter().any(|id| only.has(id)) {
-            if group.needs == Needs::Restart {
+            if group.needs == Precondition::Restart {
                 session.check_all_beats();
             }
             run_group(session, group)?;
@@ -163,7 +163,7 @@ fn groups(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
 
 /// Runs a group, and repeats it if something failed while this computer was late: a cell that is a process may have
 /// waited for a processor as well. The cell then has to meet each requirement in one of a few attempts.
-fn run_group(session: &mut Session<'_>, group: &Group) -> Result<(), Stop> {
+fn run_group(session: &mut Session<'_>, group: &Group) -> Result<(), StopReason> {
     const ATTEMPTS: usize = 4;
     const LATE: Span = Span::from_millis(4);
     let before = session.findings.clone();
@@ -174,22 +174,22 @@ fn run_group(session: &mut Session<'_>, group: &Group) -> Result<(), Stop> {
         session.regular_beat()?;
         (group.run)(session)?;
         session.settle()?;
-        if group.needs != Needs::Restart {
+        if group.needs != Precondition::Restart {
             session.regular_beat()?;
         }
         let now: BTreeSet<_> = session.findings.failed_since(&before).collect();
         let each: BTreeSet<_> =
             failed.map_or_else(|| now.clone(), |failed| failed.intersection(&now).copied().collect());
         for forgiven in now.difference(&each) {
-            session.findings.forgive(forgiven, &before);
+            session.findings.retract(forgiven, &before);
         }
-        let took = session.now().since(began);
-        let is_over = attempt == ATTEMPTS || session.left().0 < took.0 + RESERVE.0;
+        let took = session.now().elapsed_since(began);
+        let is_over = attempt == ATTEMPTS || session.remaining_time().0 < took.0 + RESERVE.0;
         if each.is_empty() || is_over || session.worst_lateness() < LATE {
             break;
         }
         session.findings = before.clone();
-        session.forget();
+        session.forget_state();
         failed = Some(each);
     }
     Ok(())
@@ -197,36 +197,36 @@ fn run_group(session: &mut Session<'_>, group: &Group) -> Result<(), Stop> {
 
 /// Checks that the cell has the group's precondition. The error gives the reason, and true if the cell might have it
 /// (not tested) or false if it does not (not applicable).
-fn met(session: &Session<'_>, needs: Needs) -> Result<(), (bool, &'static str)> {
+fn check_needs(session: &Session<'_>, needs: Precondition) -> Result<(), (bool, &'static str)> {
     let about = &session.about;
     match needs {
-        Needs::Press if !about.test_mode => {
+        Precondition::Press if !about.test_mode => {
             Err((true, "without test mode (parameter 5) nothing can press the cell"))
         }
-        Needs::Press if !about.committed => Err((true, "the cell does not take a configuration")),
-        Needs::Restart if !session.can_restart() => Err((true, "without --restart")),
-        Needs::Sensing if !about.sensing => Err((false, "it sends no sensor values without a request")),
-        Needs::Sensing if !about.test_mode => {
+        Precondition::Press if !about.committed => Err((true, "the cell does not take a configuration")),
+        Precondition::Restart if !session.can_restart() => Err((true, "without --restart")),
+        Precondition::Sensing if !about.sensing => Err((false, "it sends no sensor values without a request")),
+        Precondition::Sensing if !about.test_mode => {
             Err((true, "without test mode (parameter 5) nothing can press the cell"))
         }
-        Needs::Baseline if !about.baseline => Err((false, "it subtracts no zero from its readings")),
-        Needs::Baseline if !about.test_mode || !about.committed => {
+        Precondition::Baseline if !about.baseline => Err((false, "it subtracts no zero from its readings")),
+        Precondition::Baseline if !about.test_mode || !about.committed => {
             Err((true, "without test mode (parameter 5) and a configuration nothing can press the cell"))
         }
-        Needs::Classic if session.format == Format::Fd => {
+        Precondition::Classic if session.format == Format::Fd => {
             Err((false, "the bus is FD: there are no segments"))
         }
-        Needs::Nothing
-        | Needs::Press
-        | Needs::Restart
-        | Needs::Sensing
-        | Needs::Baseline
-        | Needs::Classic => Ok(()),
+        Precondition::Nothing
+        | Precondition::Press
+        | Precondition::Restart
+        | Precondition::Sensing
+        | Precondition::Baseline
+        | Precondition::Classic => Ok(()),
     }
 }
 
 /// Marks the requirements that need wires.
-fn tree(session: &mut Session<'_>) {
+fn mark_tree_requirements(session: &mut Session<'_>) {
     use crate::requirements::{Document, REQUIREMENTS};
     let ids = REQUIREMENTS.iter().filter(|it| it.document == Document::Tree && it.id != "LINK-1");
     for id in ids.map(|it| it.id).chain(["CLAIM-8"]) {

@@ -3,11 +3,11 @@
 use protocol::can::{Format, Frame};
 use protocol::id::{Command, Id, Kind, Node};
 use protocol::message::{Message, State};
-use protocol::packet::{Epoch, Packet, WORDS, words};
+use protocol::packet::{Epoch, Packet, WORDS, padded_words};
 use protocol::parameters::{Events, MAX_JOINTS, Parameter};
 
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::{Reply, Session};
 
 const REPLY: u8 = 6;
@@ -17,8 +17,8 @@ const LINKS: u8 = 9;
 const BASELINE: u8 = 11;
 const TARE: u8 = 12;
 
-pub(super) fn switches(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::document(2))?;
+pub(super) fn switches(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.ready(&arm::example_parameters(2))?;
     session.known.senses = true;
     mode(session)?;
     reply_mode(session)?;
@@ -26,7 +26,7 @@ pub(super) fn switches(session: &mut Session<'_>) -> Result<(), Stop> {
     no_baseline(session)?;
     links(session)?;
     rows(session)?;
-    session.set(SENSING, [0])?;
+    session.write_first_words(SENSING, [0])?;
     session.settle()?;
     session.known.senses = false;
     Ok(())
@@ -39,7 +39,7 @@ fn expect(
     number: u8,
     written: [i16; WORDS],
     expected: Reply,
-) -> Result<(), Stop> {
+) -> Result<(), StopReason> {
     let reply = session.write(number, written)?;
     session.check(id, reply == expected, || {
         format!("parameter {number} was written with {}: {reply}, not {expected}", Reply::Value(written))
@@ -53,7 +53,7 @@ fn refuse(
     id: &'static str,
     number: u8,
     written: [i16; WORDS],
-) -> Result<(), Stop> {
+) -> Result<(), StopReason> {
     let before = session.read(number)?;
     expect(session, id, number, written, Reply::Refused(19))?;
     let after = session.read(number)?;
@@ -64,20 +64,20 @@ fn refuse(
 }
 
 /// Checks that test mode is on after 1 and off after every other value, at once.
-fn mode(session: &mut Session<'_>) -> Result<(), Stop> {
+fn mode(session: &mut Session<'_>) -> Result<(), StopReason> {
     if !session.about.test_mode {
         expect(session, "OPT-1", 5, [0; WORDS], Reply::Value([0; WORDS]))?;
-        return refuse(session, "OPT-1", 5, words([1]));
+        return refuse(session, "OPT-1", 5, padded_words([1]));
     }
     for (written, on) in
         [(2, false), (1, true), (-1, false), (1, true), (0x0101, false), (0, false), (1, true)]
     {
         let junk = [written, 7, -7, 9, 0x7FFF, 1];
-        expect(session, "CONF-3", 5, junk, Reply::Value(words([on.into()])))?;
+        expect(session, "CONF-3", 5, junk, Reply::Value(padded_words([on.into()])))?;
         session.known.test_mode = Some(on);
         session.known.skin = on.then(Default::default);
         let reply = session.read(5)?;
-        session.check("CONF-9", reply == Reply::Value(words([on.into()])), || {
+        session.check("CONF-9", reply == Reply::Value(padded_words([on.into()])), || {
             format!("mode is read as {reply}")
         });
         let state = session.exchange_all(&[])?.state();
@@ -88,7 +88,7 @@ fn mode(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-fn reply_mode(session: &mut Session<'_>) -> Result<(), Stop> {
+fn reply_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
     for bad in [[2, 0, 0, 0, 0, 0], [-1, 0, 0, 0, 0, 0], [1, 0, 3, 0, 0, 0], [1, 500, 254, 0, 0, 0]] {
         refuse(session, "CONF-10", REPLY, bad)?;
     }
@@ -96,10 +96,10 @@ fn reply_mode(session: &mut Session<'_>) -> Result<(), Stop> {
         refuse(session, "CONF-10", REPLY, bad)?;
     }
     if session.about.ports {
-        let sum = words([1, 500, 3, 1]);
+        let sum = padded_words([1, 500, 3, 1]);
         expect(session, "CONF-10", REPLY, sum, Reply::Value(sum))?;
     } else {
-        refuse(session, "OPT-1", REPLY, words([1, 500, 3, 1]))?;
+        refuse(session, "OPT-1", REPLY, padded_words([1, 500, 3, 1]))?;
     }
     expect(session, "CONF-3", REPLY, [0, 5, 6, 7, 8, 9], Reply::Value([0; WORDS]))?;
     let reply = session.read(REPLY)?;
@@ -107,7 +107,7 @@ fn reply_mode(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-fn sensing(session: &mut Session<'_>) -> Result<(), Stop> {
+fn sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
     if !session.about.sensing {
         for number in [SENSING, EVENTS] {
             expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
@@ -115,19 +115,19 @@ fn sensing(session: &mut Session<'_>) -> Result<(), Stop> {
             session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
                 format!("parameter {number} of an option that it does not have is read as {reply}")
             });
-            refuse(session, "OPT-1", number, words([1, 50]))?;
+            refuse(session, "OPT-1", number, padded_words([1, 50]))?;
         }
         session.findings.not_applicable("SENSE-3", "it sends no sensor values without a request");
         return Ok(());
     }
     for bad in [[3, 50], [-1, 50], [1, 0], [i16::MAX, 1]] {
-        refuse(session, "SENSE-3", SENSING, words(bad))?;
+        refuse(session, "SENSE-3", SENSING, padded_words(bad))?;
     }
-    expect(session, "CONF-3", SENSING, [2, 50, 3, 4, 5, 6], Reply::Value(words([2])))?;
+    expect(session, "CONF-3", SENSING, [2, 50, 3, 4, 5, 6], Reply::Value(padded_words([2])))?;
     expect(session, "CONF-3", SENSING, [0, 50, 3, 4, 5, 6], Reply::Value([0; WORDS]))?;
     // 65 535 ms.
-    expect(session, "SENSE-3", SENSING, [1, -1, 3, 4, 5, 6], Reply::Value(words([1, -1])))?;
-    refuse(session, "SENSE-3", SENSING, words([1, 0]))?;
+    expect(session, "SENSE-3", SENSING, [1, -1, 3, 4, 5, 6], Reply::Value(padded_words([1, -1])))?;
+    refuse(session, "SENSE-3", SENSING, padded_words([1, 0]))?;
     expect(session, "SENSE-3", SENSING, [0; WORDS], Reply::Value([0; WORDS]))?;
     let usual = Events::default().words();
     for place in 0..5 {
@@ -147,30 +147,30 @@ fn sensing(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks that a cell without a baseline accepts only zeros in its parameters.
-fn no_baseline(session: &mut Session<'_>) -> Result<(), Stop> {
+fn no_baseline(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.read(BASELINE)?;
     if session.about.baseline || reply == Reply::Refused(18) {
         return Ok(());
     }
     for number in [BASELINE, TARE] {
         expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
-        refuse(session, "OPT-1", number, words([1, 102]))?;
+        refuse(session, "OPT-1", number, padded_words([1, 102]))?;
     }
     Ok(())
 }
 
-fn links(session: &mut Session<'_>) -> Result<(), Stop> {
+fn links(session: &mut Session<'_>) -> Result<(), StopReason> {
     if session.about.test_mode {
         if session.about.ports {
-            expect(session, "LINK-1", LINKS, words([0x1F]), Reply::Value(words([0x1F])))?;
+            expect(session, "LINK-1", LINKS, padded_words([0x1F]), Reply::Value(padded_words([0x1F])))?;
         } else {
-            refuse(session, "OPT-1", LINKS, words([1]))?;
+            refuse(session, "OPT-1", LINKS, padded_words([1]))?;
         }
         // Bits 5 to 15 are not used.
         expect(session, "CONF-3", LINKS, [-32, 9, 9, 9, 9, 9], Reply::Value([0; WORDS]))?;
         session.test_mode(false)?;
     }
-    for written in [words([0]), words([1])] {
+    for written in [padded_words([0]), padded_words([1])] {
         refuse(session, "LINK-1", LINKS, written)?;
     }
     if session.about.test_mode {
@@ -180,7 +180,7 @@ fn links(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks rows that the cell cannot have.
-fn rows(session: &mut Session<'_>) -> Result<(), Stop> {
+fn rows(session: &mut Session<'_>) -> Result<(), StopReason> {
     let most = session.about.abilities.rows();
     let Some(number) = u8::try_from(most).ok().filter(|most| *most < 32).map(|most| 16 + most) else {
         return Ok(());
@@ -190,12 +190,12 @@ fn rows(session: &mut Session<'_>) -> Result<(), Stop> {
         format!("row {} of a cell that can have {most} is read as {reply}", most + 1)
     });
     expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
-    refuse(session, "OPT-1", number, words([1, 2, 3, 4]))
+    refuse(session, "OPT-1", number, padded_words([1, 2, 3, 4]))
 }
 
 /// Checks that unused words, bytes and bits are ignored.
-pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::document(2))?;
+pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.ready(&arm::example_parameters(2))?;
     let junk = |command| Packet {
         id: Id::command(command),
         words: [1, -1, 0x7FFF, 3, 4, 5].into(),
@@ -214,27 +214,27 @@ pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), Stop> {
     session.check("OPT-2", !resumed.state().has(State::HALTED), || {
         "a resume with words, epoch and count that mean nothing had no effect".to_owned()
     });
-    session.mark();
+    session.begin_exchange();
     let asked = session.send(&frames(session, junk(Command::Report)))?;
     let pages = session.pages(asked)?;
     session
         .check("OPT-2", !pages.is_empty(), || "a report with words that mean nothing was ignored".to_owned());
     let frames_of_sync = frames(session, junk(Command::Sync));
-    session.mark();
+    session.begin_exchange();
     let at = session.send(&frames_of_sync)?;
     let is_there =
-        session.wait(at + crate::session::PATIENT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+        session.wait(at + crate::session::ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
     session.check("OPT-2", is_there, || "a sync with words that mean nothing was ignored".to_owned());
     read_with_words(session)?;
     if session.format == Format::Fd {
         // A frame without the bit-rate switch.
         let sync = Message::Sync.encode();
         let frame = Frame::fd(sync.id.to_bits().into(), 0, &sync.encode());
-        session.mark();
+        session.begin_exchange();
         let frames: Vec<_> = frame.into_iter().collect();
         let at = session.send(&frames)?;
         let is_there =
-            session.wait(at + crate::session::PATIENT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+            session.wait(at + crate::session::ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
         session.check("OPT-2", is_there, || "a frame without bit-rate switch was ignored".to_owned());
     }
     if session.about.test_mode && session.about.committed {
@@ -244,12 +244,12 @@ pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks that the words of a read are ignored.
-fn read_with_words(session: &mut Session<'_>) -> Result<(), Stop> {
+fn read_with_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     let id = Id::new(Kind::Configure, Node::Cell(session.cell));
     let packet = Packet { id, words: [9, 8, 7, 6, 5, 4].into(), epoch: Epoch(3), count: 2 };
     let frames: Vec<_> = packet.frames(session.format).collect();
     let exchange = session.exchange(&frames)?;
-    let expected = arm::document(2).words(Parameter::Pose);
+    let expected = arm::example_parameters(2).words(Parameter::Pose);
     let answer = protocol::message::Answer::Value { number: 2, written: false, words: expected };
     let answer = Message::Configured { from: session.cell, tag: 3, answer };
     let is_so = exchange.answers.iter().any(|heard| heard.message == answer);
@@ -258,13 +258,13 @@ fn read_with_words(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks joints of a shorter chain with further words, and a stimulus with words that its page does not have.
-fn words_beyond(session: &mut Session<'_>) -> Result<(), Stop> {
-    let short = protocol::parameters::Parameters { joints: 3, ..arm::document(2) };
+fn words_beyond(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let short = protocol::parameters::Parameters { joints: 3, ..arm::example_parameters(2) };
     if !session.ready(&short)? {
         return Ok(());
     }
     let positions = [0x0123, -0x2345, 0x0456, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
-    let expected = session.pressed(&positions, arm::press(4_096))?.words();
+    let expected = session.press_and_step(&positions, arm::press(4_096))?.words();
     let epoch = session.next_epoch();
     let id = Id::command(Command::Joints);
     let words = [0x0123, -0x2345, 0x0456, 0x7777, -1, 0x1111].into();
@@ -274,22 +274,22 @@ fn words_beyond(session: &mut Session<'_>) -> Result<(), Stop> {
     let exchange = session.exchange(&frames)?;
     let got = exchange.answers.iter().find_map(|heard| heard.torque()).map(|(_, words)| words.padded());
     session.check("OPT-2", got == Some(expected), || {
-        let got = got.map_or_else(|| "nothing".to_owned(), |got| arm::list(&got));
+        let got = got.map_or_else(|| "nothing".to_owned(), |got| arm::format_words(&got));
         format!(
             "words behind the joints of the chain changed the torque from {} to {got}",
-            arm::list(&expected)
+            arm::format_words(&expected)
         )
     });
     // Page 1 has three words.
     let id = Id::new(Kind::Stimulus, Node::Cell(session.cell));
     let packet = Packet { id, words: [1, 2, 3, 4, 5, 6].into(), epoch: Epoch(200), count: 0x81 };
     let frames: Vec<_> = packet.frames(session.format).collect();
-    session.mark();
+    session.begin_exchange();
     session.send(&frames)?;
     let after = session.step(&positions)?.words();
     session.check("OPT-2", after == expected, || {
         "a stimulus of the acceleration with words that it does not use changed the torque".to_owned()
     });
-    session.pressed(&[0; MAX_JOINTS], arm::press(0))?;
+    session.press_and_step(&[0; MAX_JOINTS], arm::press(0))?;
     Ok(())
 }

@@ -3,16 +3,16 @@
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::id::{CellId, Node};
 use protocol::message::{Message, Request};
-use protocol::packet::{WORDS, words};
+use protocol::packet::{WORDS, padded_words};
 use protocol::parameters::{MAX_JOINTS, Parameter, Parameters};
 
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::{Reply, Session};
 
 /// Returns a configuration that differs in each parameter.
 fn other() -> Parameters {
-    let mut other = Parameters { joint: 6, period_us: 50_000, ..arm::document(6) };
+    let mut other = Parameters { joint: 6, period_us: 50_000, ..arm::example_parameters(6) };
     other.contact.alpha_c = Q3_12::from_bits(5_000);
     other.pose.position = [0x0777, -0x0333, 0x0123].map(Q1_14::from_bits);
     for (row, step) in other.rows.iter_mut().zip(1..=6) {
@@ -21,8 +21,8 @@ fn other() -> Parameters {
     other
 }
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    let (one, other) = (arm::document(2), other());
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let (one, other) = (arm::example_parameters(2), other());
     if !session.ready(&one)? {
         return Ok(());
     }
@@ -35,16 +35,16 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     if session.about.test_mode {
         // The joints of the chain are those in use, too.
         session.stage(&Parameters { joints: 3, joint: 3, ..other })?;
-        let step = session.pressed(&[0x0222; MAX_JOINTS], arm::press(4_096))?;
+        let step = session.press_and_step(&[0x0222; MAX_JOINTS], arm::press(4_096))?;
         session.check("JOINTS-2", step.torque.is_some(), || {
             "joints of the chain in use were not answered while a shorter one was staged".to_owned()
         });
-        session.pressed(&[0x0222; MAX_JOINTS], arm::press(0))?;
+        session.press_and_step(&[0x0222; MAX_JOINTS], arm::press(0))?;
         session.stage(&other)?;
     }
     for wrong in [0x0001, 0x0080, 0x0100, 0x8000, 0xFFFF, one.hash() ^ other.hash(), other.hash()] {
         let hash = other.hash() ^ wrong;
-        let reply = session.set(Parameter::Commit.number(), [hash.cast_signed()])?;
+        let reply = session.write_first_words(Parameter::Commit.number(), [hash.cast_signed()])?;
         session.check("CONF-7", reply == Reply::Refused(16), || {
             format!("commit with hash {hash:04X} of {:04X} staged was answered with {reply}", other.hash())
         });
@@ -62,7 +62,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks that each stored parameter reads as the value in use.
-fn reads(session: &mut Session<'_>, expected: &Parameters, id: &'static str) -> Result<(), Stop> {
+fn reads(session: &mut Session<'_>, expected: &Parameters, id: &'static str) -> Result<(), StopReason> {
     for parameter in Parameter::stored(6) {
         let reply = session.read(parameter.number())?;
         let words = expected.words(parameter);
@@ -79,33 +79,33 @@ fn computes(
     expected: &Parameters,
     not: &Parameters,
     id: &'static str,
-) -> Result<(), Stop> {
+) -> Result<(), StopReason> {
     if !session.about.test_mode {
         return Ok(());
     }
     let positions = [0x0111, -0x1222, 0x2333, 0x0444, -0x0555, 0x0666, 0, 0, 0, 0, 0, 0, 0, 0];
     debug_assert_eq!(positions.len(), MAX_JOINTS);
     let press = arm::press(4_096);
-    let step = session.pressed(&positions, press)?;
+    let step = session.press_and_step(&positions, press)?;
     let near = |parameters: &Parameters| {
         let central = model::central::Central::of_cell(parameters);
         let exact = arm::exact_jacobian(&central, &positions);
         let force = arm::force(&parameters.contact, &press);
         let word =
-            |x: f64| i32::from(arm::word(Q1_14::nearest(x).to_bits(), force, parameters.torque_format));
+            |x: f64| i32::from(arm::torque_word(Q1_14::nearest(x).to_bits(), force, parameters.torque_format));
         step.words().iter().zip(exact).all(|(got, x)| (i32::from(*got) - word(x)).abs() <= 24)
     };
     debug_assert!(!near(expected) || !near(not), "they are apart");
     session.check(id, near(expected), || {
-        format!("the torque {} does not follow from the parameters in use", arm::list(&step.words()))
+        format!("the torque {} does not follow from the parameters in use", arm::format_words(&step.words()))
     });
-    session.pressed(&positions, arm::press(0))?;
+    session.press_and_step(&positions, arm::press(0))?;
     Ok(())
 }
 
 /// Checks words that a parameter does not use.
-fn unused(session: &mut Session<'_>) -> Result<(), Stop> {
-    let expected = Parameters { period_us: 57_001, ..arm::document(3) };
+fn unused(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let expected = Parameters { period_us: 57_001, ..arm::example_parameters(3) };
     session.stage(&expected)?;
     session.known.staged = None;
     for parameter in Parameter::stored(6).filter(|it| *it != Parameter::Pose) {
@@ -127,7 +127,7 @@ fn unused(session: &mut Session<'_>) -> Result<(), Stop> {
     }
     let hash = expected.hash();
     let reply = session.write(Parameter::Commit.number(), [hash.cast_signed(), 1, 2, 3, 4, 5])?;
-    let is_so = reply == Reply::Value(words([hash.cast_signed()]));
+    let is_so = reply == Reply::Value(padded_words([hash.cast_signed()]));
     session.check("CONF-3", is_so, || {
         format!("unused words must be hashed as 0: commit {hash:04X} was answered with {reply}")
     });
@@ -144,25 +144,25 @@ fn unused(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-fn tags(session: &mut Session<'_>) -> Result<(), Stop> {
+fn tags(session: &mut Session<'_>) -> Result<(), StopReason> {
     let own = Node::Cell(session.cell);
     let (number, on) = (Parameter::Mode.number(), i16::from(session.about.test_mode));
     for tag in [0, 1, 0x7E, 0x7F, 0x80, 0xFE, 0xFF, 0xFF, 0] {
         session.request_with(own, tag, Request::Read { number: 2 })?;
-        session.request_with(own, tag, Request::Write { number, words: words([on]) })?;
+        session.request_with(own, tag, Request::Write { number, words: padded_words([on]) })?;
         session.request_with(own, tag, Request::Read { number: 99 })?;
     }
     // An identical request is answered each time.
-    let pose = arm::document(3).words(Parameter::Pose);
+    let pose = arm::example_parameters(3).words(Parameter::Pose);
     let hash = session.known.hash.unwrap_or_default().cast_signed();
     session.write(Parameter::Pose.number(), pose)?;
     let staged = session.known.staged.take();
     let requests = [
         (Request::Read { number: 2 }, "CONF-1"),
         (Request::Write { number: 2, words: pose }, "CONF-4"),
-        (Request::Write { number, words: words([on]) }, "CONF-4"),
+        (Request::Write { number, words: padded_words([on]) }, "CONF-4"),
         (Request::Write { number: 0, words: [1; 6] }, "CONF-6"),
-        (Request::Write { number: Parameter::Commit.number(), words: words([!hash]) }, "CONF-6"),
+        (Request::Write { number: Parameter::Commit.number(), words: padded_words([!hash]) }, "CONF-6"),
     ];
     for (request, id) in requests {
         let replies = [session.request_with(own, 0x2A, request)?, session.request_with(own, 0x2A, request)?];
@@ -171,17 +171,17 @@ fn tags(session: &mut Session<'_>) -> Result<(), Stop> {
             format!("the same request again was answered with {second}, and with {first} before")
         });
     }
-    session.known.staged = staged.map(|staged| Parameters { pose: arm::document(3).pose, ..staged });
+    session.known.staged = staged.map(|staged| Parameters { pose: arm::example_parameters(3).pose, ..staged });
     session.known.skin = session.about.test_mode.then(Default::default);
     session.known.pending = None;
     Ok(())
 }
 
 /// Checks requests to everyone and to other cells, and parameters that do not exist.
-pub(super) fn others(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::document(2))?;
+pub(super) fn others(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.ready(&arm::example_parameters(2))?;
     let reply = session.request(Node::Everyone, Request::Read { number: 2 })?;
-    let expected = arm::document(2).words(Parameter::Pose);
+    let expected = arm::example_parameters(2).words(Parameter::Pose);
     session.check("CONF-11", reply == Reply::Value(expected), || {
         format!("a read of everyone was answered with {reply}")
     });
@@ -197,10 +197,10 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), Stop> {
     session.check("CONF-11", reply == Reply::Value(on), || {
         format!("test mode of everyone was answered with {reply}")
     });
-    let staged = Parameters { pose: other().pose, ..arm::document(2) };
+    let staged = Parameters { pose: other().pose, ..arm::example_parameters(2) };
     session.known.staged = Some(staged);
     // A commit to everyone is a commit of this cell.
-    let hash = words([staged.hash().cast_signed()]);
+    let hash = padded_words([staged.hash().cast_signed()]);
     let commit = Request::Write { number: Parameter::Commit.number(), words: hash };
     let reply = session.request(Node::Everyone, commit)?;
     session.check("CONF-11", reply == Reply::Value(hash), || {
@@ -216,16 +216,16 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), Stop> {
     not_its_own(session)
 }
 
-fn unknown(session: &mut Session<'_>) -> Result<(), Stop> {
+fn unknown(session: &mut Session<'_>) -> Result<(), StopReason> {
     for number in (10..=10).chain(13..16).chain(48..127) {
         // Reads and writes alternate.
-        let reply = if number % 2 == 0 { session.read(number)? } else { session.set(number, [1, 2, 3])? };
+        let reply = if number % 2 == 0 { session.read(number)? } else { session.write_first_words(number, [1, 2, 3])? };
         session.check("CONF-13", reply == Reply::Refused(18), || {
             format!("parameter {number} does not exist, and was answered with {reply}")
         });
     }
     for number in [10, 15, 48, 126] {
-        let replies = [session.read(number)?, session.set(number, [0])?];
+        let replies = [session.read(number)?, session.write_first_words(number, [0])?];
         session.check("CONF-13", replies == [Reply::Refused(18); 2], || {
             let [read, write] = replies;
             format!("parameter {number} does not exist, and was answered with {read} and {write}")
@@ -235,7 +235,7 @@ fn unknown(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks that a packet for another cell gets no answer and has no effect.
-fn not_its_own(session: &mut Session<'_>) -> Result<(), Stop> {
+fn not_its_own(session: &mut Session<'_>) -> Result<(), StopReason> {
     let before = session.counters()?;
     let own = session.cell.get();
     let near = [own ^ 1, own ^ 0x80, own.wrapping_add(1), own.wrapping_sub(1)];
@@ -244,7 +244,7 @@ fn not_its_own(session: &mut Session<'_>) -> Result<(), Stop> {
         let to = Node::Cell(cell);
         let read = Message::Configure { to, tag: 9, request: Request::Read { number: 0 } };
         let press = protocol::message::SensorPage::Skin(arm::press(4_096));
-        let press = Message::Stimulus { to, from: protocol::message::From::Next, page: press };
+        let press = Message::Stimulus { to, from: protocol::message::AppliesFrom::Next, page: press };
         let exchange = session.exchange_all(&[read, press])?;
         session.check("ID-2", exchange.is_silent(), || format!("a request to cell {cell} was answered"));
         session.step(&[0; MAX_JOINTS])?;

@@ -5,20 +5,20 @@ use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::parameters::{MAX_ROWS, Parameter, Parameters, Row, RowKind};
 
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::{Reply, Session};
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    if !session.ready(&arm::document(2))? {
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    if !session.ready(&arm::example_parameters(2))? {
         return Ok(());
     }
     let before = session.counters()?;
-    let staged = Parameters { period_us: 45_000, ..arm::document(5) };
+    let staged = Parameters { period_us: 45_000, ..arm::example_parameters(5) };
     session.stage(&staged)?;
     writes(session, &staged)?;
     // A refused write does not change the staged copy.
     let hash = staged.hash().cast_signed();
-    let reply = session.set(Parameter::Commit.number(), [hash])?;
+    let reply = session.write_first_words(Parameter::Commit.number(), [hash])?;
     let is_so = reply.words().is_some_and(|words| words.first() == Some(&hash));
     session.check("CONF-5", is_so, || {
         format!("after refused writes the staged copy has another hash: commit {hash:04X} was answered with {reply}")
@@ -46,7 +46,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks writes that are refused at once. Of several bad words, the lowest reason is reported.
-fn writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), Stop> {
+fn writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), StopReason> {
     let mount = |words: [i16; 5], reason| (Parameter::Mount, words, reason);
     let row = |kind: i16| (Parameter::Row(1), [1, 2, 3, 4, kind], 9);
     let large = session.about.abilities.word() != 0;
@@ -77,12 +77,12 @@ fn writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), Stop> {
         ]);
     }
     for (parameter, words, reason) in all {
-        let reply = session.set(parameter.number(), words)?;
+        let reply = session.write_first_words(parameter.number(), words)?;
         session.check("CONF-6", reply == Reply::Refused(reason), || {
             format!(
                 "parameter {} with {} must be refused with {reason}: {reply}",
                 parameter.number(),
-                arm::list(&words)
+                arm::format_words(&words)
             )
         });
         if reply.words().is_some() {
@@ -140,10 +140,10 @@ const ROWS: &[Flaw] = &[
 ];
 
 /// Checks defects that are refused at the commit. The hash is wrong too, so that a faulty cell commits nothing.
-fn commits(session: &mut Session<'_>) -> Result<(), Stop> {
+fn commits(session: &mut Session<'_>) -> Result<(), StopReason> {
     let can_rows = session.about.abilities.word() != 0;
     let is_apt = |flaw: &&Flaw| can_rows || !matches!(flaw.0, 7 | 8);
-    let base = arm::document(2);
+    let base = arm::example_parameters(2);
     if session.about.abilities.rows() == MAX_ROWS {
         one_row_more(session, &base)?;
     }
@@ -168,7 +168,7 @@ fn commits(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks 33 rows with any joints.
-fn one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), Stop> {
+fn one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), StopReason> {
     let mut full = Parameters { table_rows: 32, row: 6, joint: 6, ..*base };
     for (place, row) in full.rows.iter_mut().enumerate().skip(6) {
         let a = Q1_14::from_bits(i16::try_from(place).unwrap_or_default());
@@ -178,7 +178,7 @@ fn one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), Stop
     for joints in [6, 7] {
         let over = Parameters { table_rows: 33, joints, ..full };
         session.write(Parameter::Mount.number(), over.words(Parameter::Mount))?;
-        let reply = session.set(Parameter::Commit.number(), [1])?;
+        let reply = session.write_first_words(Parameter::Commit.number(), [1])?;
         session.check("CONF-6", reply == Reply::Refused(7), || {
             format!("a commit of 33 rows with {joints} joints must be refused with 7: {reply}")
         });
@@ -187,10 +187,10 @@ fn one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), Stop
     Ok(())
 }
 
-fn refused(session: &mut Session<'_>, parameters: &Parameters, reason: i16) -> Result<(), Stop> {
+fn refused(session: &mut Session<'_>, parameters: &Parameters, reason: i16) -> Result<(), StopReason> {
     session.stage(parameters)?;
     let hash = !parameters.hash();
-    let reply = session.set(Parameter::Commit.number(), [hash.cast_signed()])?;
+    let reply = session.write_first_words(Parameter::Commit.number(), [hash.cast_signed()])?;
     session.check("CONF-6", reply == Reply::Refused(reason), || {
         let words = |parameter| Reply::Value(parameters.words(parameter));
         format!(

@@ -6,21 +6,21 @@ mod tests;
 
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, Request, State};
-use protocol::packet::{WORDS, Words, words};
+use protocol::packet::{WORDS, Words, padded_words};
 use protocol::parameters::{Events, MAX_JOINTS, Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
-use super::claims::{page, twin};
+use super::claims::{page, twin_heartbeat};
 use crate::arm;
-use crate::bus::Stop;
-use crate::session::{Heard, Known, PATIENT, Reply, Session};
+use crate::bus::StopReason;
+use crate::session::{CellPacket, TrackedState, ANSWER_TIMEOUT, Reply, Session};
 use claiming::{gives_way, invalid, stays, while_claiming};
 
 /// The time limit from switching the cell off to its first packet.
 const BOOT: Span = Span::from_millis(8_000);
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::document(2))?;
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.ready(&arm::example_parameters(2))?;
     let after_test_mode = survives(session)?;
     while_claiming(session, after_test_mode)?;
     stays(session)?;
@@ -29,15 +29,15 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     // CLAIMING and a higher serial number have these meanings in a heartbeat only.
     let state = State::CLAIMING.0 | 1 << 12;
     let other =
-        protocol::message::Refused { length: 0xFFFF, crc: 0xFFFF, stimuli: state, ..Default::default() };
+        protocol::message::RejectedCounts { length: 0xFFFF, crc: 0xFFFF, stimuli: state, ..Default::default() };
     let lower = own.wrapping_sub(0x1_0000).wrapping_add(1);
     let others = [
-        ("a claim with a lower serial number", twin(session, own.wrapping_sub(1), true)),
-        ("a claim with a lower serial number, whose low word is higher", twin(session, lower, true)),
-        ("network page 2", page(session, NetworkPage::Refused(other))),
-        ("a claim with its own serial number", twin(session, own, true)),
-        ("a heartbeat without CLAIMING", twin(session, own.wrapping_add(1), false)),
-        ("network page 1", page(session, NetworkPage::Heard(protocol::message::Heard::default()))),
+        ("a claim with a lower serial number", twin_heartbeat(session, own.wrapping_sub(1), true)),
+        ("a claim with a lower serial number, whose low word is higher", twin_heartbeat(session, lower, true)),
+        ("network page 2", page(session, NetworkPage::Rejected(other))),
+        ("a claim with its own serial number", twin_heartbeat(session, own, true)),
+        ("a heartbeat without CLAIMING", twin_heartbeat(session, own.wrapping_add(1), false)),
+        ("network page 1", page(session, NetworkPage::Received(protocol::message::ReceivedCounts::default()))),
     ];
     let has_lower = |what: &str| match what.contains("low word") {
         true => own >= 0x1_0000 && own & 0xFFFF != 0xFFFF,
@@ -55,12 +55,12 @@ fn claim(session: &Session<'_>) -> Span {
 }
 
 /// Switches the cell off and on, and returns the time of its first packet.
-fn restart(session: &mut Session<'_>) -> Result<Micros, Stop> {
+fn restart(session: &mut Session<'_>) -> Result<Micros, StopReason> {
     let came = restart_with(session, BOOT, |_| Ok(()))?;
     came.ok_or_else(|| {
         let what = "no heartbeat with CLAIMING within 8 s after a restart";
         session.check("CLAIM-1", false, || what.to_owned());
-        Stop::Restart(what.to_owned())
+        StopReason::Restart(what.to_owned())
     })
 }
 
@@ -68,21 +68,21 @@ fn restart(session: &mut Session<'_>) -> Result<Micros, Stop> {
 fn restart_with(
     session: &mut Session<'_>,
     longest: Span,
-    meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), Stop>,
-) -> Result<Option<Micros>, Stop> {
+    meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), StopReason>,
+) -> Result<Option<Micros>, StopReason> {
     let keep =
-        Known { last_epoch: session.known.last_epoch, joints: session.known.joints, ..Known::default() };
+        TrackedState { last_epoch: session.known.last_epoch, joints: session.known.joints, ..TrackedState::default() };
     let (parameters, senses) = (session.known.parameters, session.known.senses);
     session.consume();
     session.begin_restart()?;
-    session.known = Known { may_be_silent: true, ..keep };
-    session.start();
+    session.known = TrackedState { may_be_silent: true, ..keep };
+    session.begin_expected_exchange();
     let done = await_claim(session, longest, meanwhile);
     session.end_restart();
     done?;
     let Some(came) = session.claimed() else { return Ok(None) };
     // Packets from before the cell was switched off: it was settled, and may have received requests.
-    let is_old = |it: &Heard| {
+    let is_old = |it: &CellPacket| {
         let is_answer = matches!(it.message, Message::Configured { .. });
         is_answer || it.beat().is_some() || senses && it.sensors().is_some()
     };
@@ -99,11 +99,11 @@ fn restart_with(
 fn await_claim(
     session: &mut Session<'_>,
     longest: Span,
-    mut meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), Stop>,
-) -> Result<(), Stop> {
+    mut meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), StopReason>,
+) -> Result<(), StopReason> {
     const LOOK: Span = Span::from_millis(12);
     let give_up = session.now() + longest;
-    let is_claim = |it: &Heard| it.beat().is_some_and(|(beat, _)| beat.state.has(State::CLAIMING));
+    let is_claim = |it: &CellPacket| it.beat().is_some_and(|(beat, _)| beat.state.has(State::CLAIMING));
     loop {
         let is_restarting = session.is_restarting()?;
         if session.claimed().is_some() {
@@ -124,13 +124,13 @@ fn await_claim(
 }
 
 /// Waits until the node id is settled, and returns the time of the first heartbeat without CLAIMING.
-fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>, Stop> {
+fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>, StopReason> {
     let is_settled =
-        |it: &Heard| it.at > claimed && it.beat().is_some_and(|(beat, _)| !beat.state.has(State::CLAIMING));
+        |it: &CellPacket| it.at > claimed && it.beat().is_some_and(|(beat, _)| !beat.state.has(State::CLAIMING));
     let until = claimed + claim(session) + Span::from_millis(300);
     // It may have come in an earlier exchange, if the bench was late.
     let first = |session: &Session<'_>| {
-        let since = session.heard.iter().rev().take_while(|it| it.at > claimed);
+        let since = session.packets.iter().rev().take_while(|it| it.at > claimed);
         since.filter(|it| is_settled(it)).last().map(|it| it.at)
     };
     if first(session).is_none() {
@@ -148,22 +148,22 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
 }
 
 /// Checks a plain restart: the values that are kept, lost and counted.
-fn survives(session: &mut Session<'_>) -> Result<bool, Stop> {
-    let kept = arm::distinct(session.about.abilities);
+fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
+    let kept = arm::distinct_parameters(session.about.abilities);
     session.ready(&kept)?;
     let before = touched(session)?;
     session.press(arm::press(0))?;
     session.step(&[0; MAX_JOINTS])?;
-    let staged = Parameters { period_us: 44_000, ..arm::document(4) };
+    let staged = Parameters { period_us: 44_000, ..arm::example_parameters(4) };
     session.stage(&staged)?;
     if session.about.sensing {
         session.known.senses = true;
         // Sensor pages are set to come only after the cell is switched off.
-        session.set(7, [1, i16::MAX])?;
-        session.set(8, [1, 2, 3, 4, 5])?;
+        session.write_first_words(7, [1, i16::MAX])?;
+        session.write_first_words(8, [1, 2, 3, 4, 5])?;
     }
-    session.mark();
-    session.say(&[Message::Halt])?;
+    session.begin_exchange();
+    session.send_messages(&[Message::Halt])?;
     let claimed = restart(session)?;
     // Earlier packets belong to the time before the restart.
     let mut new = session.answers().iter().filter(|it| it.at >= claimed);
@@ -182,7 +182,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, Stop> {
     let others = session.answers().iter().filter(|it| it.at >= claimed).count();
     let at = settled(session, claimed)?;
     if let Some(at) = at {
-        let (took, expected) = (at.since(claimed).0, claim(session).0);
+        let (took, expected) = (at.elapsed_since(claimed).0, claim(session).0);
         let late = session.lateness().0;
         let range = expected - expected / 100 - 2_000..=expected + expected / 100 + 22_000 + late;
         session.check("CLAIM-5", range.contains(&took), || {
@@ -210,7 +210,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, Stop> {
     }
     // Values that were only staged are gone.
     let hash = staged.hash().cast_signed();
-    let reply = session.set(Parameter::Commit.number(), [hash])?;
+    let reply = session.write_first_words(Parameter::Commit.number(), [hash])?;
     session.check("CONF-2", reply == Reply::Refused(16), || {
         format!("after a restart a commit of what was only staged was answered with {reply}")
     });
@@ -224,7 +224,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, Stop> {
     session.check("CONF-2", done, || "after a restart the staged copy is not what is in use".to_owned());
     let after = if session.known.test_mode == Some(true) { touched(session)? } else { None };
     session.check("CONF-8", after.is_none() || before.is_none() || before == after, || {
-        let words = |words: Option<Words>| words.map_or_else(String::new, |it| arm::list(it.as_slice()));
+        let words = |words: Option<Words>| words.map_or_else(String::new, |it| arm::format_words(it.as_slice()));
         format!(
             "the same press gave a torque of {} before a restart, and {} after it",
             words(before),
@@ -232,14 +232,14 @@ fn survives(session: &mut Session<'_>) -> Result<bool, Stop> {
         )
     });
     let counters = session.counters()?;
-    session.check("BEAT-4", counters.refused == protocol::message::Refused::default(), || {
+    session.check("BEAT-4", counters.refused == protocol::message::RejectedCounts::default(), || {
         format!("counters do not begin with 0 after a restart: {counters}")
     });
     Ok(first.0.state.has(State::TEST_MODE))
 }
 
 /// Checks that volatile parameters have their initial values.
-fn volatile(session: &mut Session<'_>) -> Result<(), Stop> {
+fn volatile(session: &mut Session<'_>) -> Result<(), StopReason> {
     let events = if session.about.sensing { Events::default().words() } else { [0; WORDS] };
     for (number, expected) in [(6, [0; WORDS]), (7, [0; WORDS]), (8, events), (9, [0; WORDS])] {
         let reply = session.read(number)?;
@@ -254,34 +254,34 @@ fn volatile(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Returns the torque of a press at some joints.
-fn touched(session: &mut Session<'_>) -> Result<Option<Words>, Stop> {
+fn touched(session: &mut Session<'_>) -> Result<Option<Words>, StopReason> {
     if !session.about.test_mode {
         return Ok(None);
     }
     session.known.active = None;
     let positions =
         core::array::from_fn(|place| [0x0777, -0x0555, 0x0333].get(place % 3).copied().unwrap_or(0));
-    Ok(session.pressed(&positions, arm::press(9_000))?.torque)
+    Ok(session.press_and_step(&positions, arm::press(9_000))?.torque)
 }
 
 /// Checks a reset just after a commit was requested: flash has the old or the new configuration, or the cell reports
 /// that it is damaged.
-fn in_the_middle(session: &mut Session<'_>) -> Result<(), Stop> {
+fn in_the_middle(session: &mut Session<'_>) -> Result<(), StopReason> {
     let claimed = restart(session)?;
     settled(session, claimed)?;
     session.known.hash = None;
-    let (old, new) = (arm::document(2), Parameters { period_us: 44_000, ..arm::document(4) });
+    let (old, new) = (arm::example_parameters(2), Parameters { period_us: 44_000, ..arm::example_parameters(4) });
     session.ready(&old)?;
     session.stage(&new)?;
     let request =
-        Request::Write { number: Parameter::Commit.number(), words: words([new.hash().cast_signed()]) };
-    session.say(&[Message::Configure { to: Node::Cell(session.cell), tag: 1, request }])?;
+        Request::Write { number: Parameter::Commit.number(), words: padded_words([new.hash().cast_signed()]) };
+    session.send_messages(&[Message::Configure { to: Node::Cell(session.cell), tag: 1, request }])?;
     session.consume();
     let claimed = restart(session)?;
     settled(session, claimed)?;
-    session.start();
-    let sync = session.say(&[Message::Sync])?;
-    session.wait(sync + PATIENT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+    session.begin_expected_exchange();
+    let sync = session.send_messages(&[Message::Sync])?;
+    session.wait(sync + ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
     let beat =
         session.answers().iter().rev().find_map(|it| it.beat().map(|(beat, _)| *beat)).unwrap_or_default();
     session.consume();

@@ -2,12 +2,12 @@
 
 use protocol::can::{Format, Frame, FrameError};
 use protocol::id::Node;
-use protocol::message::{From, Message, Request, SensorPage};
+use protocol::message::{AppliesFrom, Message, Request, SensorPage};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
 
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::Session;
 
 /// Both segments of a packet.
@@ -41,8 +41,8 @@ fn read(session: &Session<'_>, number: u8, tag: u8) -> Two {
     two(session, &Message::Configure { to, tag, request: Request::Read { number } })
 }
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::document(6))?;
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.ready(&arm::example_parameters(6))?;
     for series in series(session) {
         one(session, &series)?;
     }
@@ -57,16 +57,16 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks three segments. The first is too old for the last one, though each comes in time after the one before.
-fn three(session: &mut Session<'_>) -> Result<(), Stop> {
-    let mut dice = arm::Dice::new(7);
-    let parameters = arm::random(&mut dice, arm::Shape { joints: 8, rows: 8, prismatic: false });
-    if session.about.abilities.lacks(&parameters).is_some() || !session.ready(&parameters)? {
+fn three(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let mut dice = arm::TestRandom::new(7);
+    let parameters = arm::random_parameters(&mut dice, arm::ChainShape { joints: 8, rows: 8, prismatic: false });
+    if session.about.abilities.first_missing(&parameters).is_some() || !session.ready(&parameters)? {
         return Ok(());
     }
-    session.pressed(&[0x0111; MAX_JOINTS], arm::press(4_096))?;
+    session.press_and_step(&[0x0111; MAX_JOINTS], arm::press(4_096))?;
     let epoch = session.next_epoch();
     let frames = session.frames(&session.joints(epoch, &[0x0111; MAX_JOINTS]));
-    session.mark();
+    session.begin_exchange();
     for frame in frames {
         session.send(&[frame])?;
         session.idle(Span::from_millis(9))?;
@@ -79,7 +79,7 @@ fn three(session: &mut Session<'_>) -> Result<(), Stop> {
     });
     session.step(&[0x0111; MAX_JOINTS])?;
     session.forget_counters();
-    session.ready(&arm::document(6))?;
+    session.ready(&arm::example_parameters(6))?;
     Ok(())
 }
 
@@ -88,7 +88,7 @@ fn series(session: &Session<'_>) -> Vec<Series> {
     let [b1, b2] = read(session, 2, 0x22);
     let stimulus = Message::Stimulus {
         to: Node::Cell(session.cell),
-        from: From::Next,
+        from: AppliesFrom::Next,
         page: SensorPage::Skin(arm::press(0)),
     };
     let [s1, s2] = two(session, &stimulus);
@@ -145,10 +145,10 @@ fn flipped(frame: &Frame) -> Frame {
 }
 
 /// Checks a series, and repeats it up to three times if the bench was late.
-fn one(session: &mut Session<'_>, series: &Series) -> Result<(), Stop> {
+fn one(session: &mut Session<'_>, series: &Series) -> Result<(), StopReason> {
     for _ in 0..3 {
         let before = session.counters()?.refused;
-        session.mark();
+        session.begin_exchange();
         let mut last: Option<Micros> = None;
         let mut in_time = true;
         let mut pause = 0;
@@ -161,7 +161,7 @@ fn one(session: &mut Session<'_>, series: &Series) -> Result<(), Stop> {
                 Send(frame) => {
                     let at = session.send(&[*frame])?;
                     if let Some(last) = last {
-                        let late = at.since(last).0.saturating_sub(pause * 1_000);
+                        let late = at.elapsed_since(last).0.saturating_sub(pause * 1_000);
                         in_time &= late < 30_000;
                     }
                     (last, pause) = (Some(at), 0);
@@ -194,7 +194,7 @@ fn one(session: &mut Session<'_>, series: &Series) -> Result<(), Stop> {
 }
 
 /// Checks the document's example: seven segments, no two of which form a packet, and a packet.
-fn seven(session: &mut Session<'_>) -> Result<(), Stop> {
+fn seven(session: &mut Session<'_>) -> Result<(), StopReason> {
     let firsts: Vec<_> = (0..7)
         .map(|index| {
             let to = Node::Cell(session.cell);
@@ -230,7 +230,7 @@ fn between(
     what: &str,
     [first, last]: Two,
     other: Result<Frame, FrameError>,
-) -> Result<(), Stop> {
+) -> Result<(), StopReason> {
     let Ok(other) = other else { return Ok(()) };
     let before = session.counters()?;
     let exchange = session.exchange(&[first, other, last])?;
@@ -250,22 +250,22 @@ fn between(
 }
 
 /// Checks that segments of joints wait for 15 ms.
-fn joints(session: &mut Session<'_>) -> Result<(), Stop> {
+fn joints(session: &mut Session<'_>) -> Result<(), StopReason> {
     let positions = [0x0111; MAX_JOINTS];
-    session.pressed(&positions, arm::press(4_096))?;
+    session.press_and_step(&positions, arm::press(4_096))?;
     for (ms, arrives) in [(5, true), (13, true), (40, false)] {
         for _ in 0..3 {
             let before = session.counters()?;
             let epoch = session.next_epoch();
             let [first, second] = two(session, &session.joints(epoch, &positions));
-            session.mark();
+            session.begin_exchange();
             let began = session.send(&[first])?;
             session.idle(Span::from_millis(ms))?;
             let ended = session.send(&[second])?;
             session.idle(Span::from_millis(10))?;
             session.consume();
             let came = session.answers().iter().any(|heard| heard.torque().is_some());
-            let apart = ended.since(began);
+            let apart = ended.elapsed_since(began);
             if arrives {
                 session.known.epoch = Some(epoch);
             }

@@ -2,23 +2,23 @@
 
 use protocol::fixed::{Q, Q1_14, Q3_12};
 use protocol::id::Node;
-use protocol::message::{From, Message, SensorPage, SkinSensors};
-use protocol::packet::{Epoch, words};
+use protocol::message::{AppliesFrom, Message, SensorPage, SkinSensors};
+use protocol::packet::{Epoch, padded_words};
 use protocol::parameters::{Events, MAX_JOINTS};
 use protocol::time::Span;
 
-use super::beats::in_ms;
+use super::beats::format_ms;
 use super::sensing_model::Model;
-use crate::arm::{self, Dice};
-use crate::bus::Stop;
-use crate::session::{Heard, Session};
+use crate::arm::{self, TestRandom};
+use crate::bus::StopReason;
+use crate::session::{CellPacket, Session};
 
 const SENSING: u8 = 7;
 const EVENTS: u8 = 8;
 const STEPS: usize = 160;
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::in_time(6))?;
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.ready(&arm::fast_parameters(6))?;
     session.known.senses = true;
     session.write(EVENTS, Events::default().words())?;
     let done = switches(session)
@@ -29,12 +29,12 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
         .and_then(|()| halted(session))
         .and_then(|()| continuous(session));
     done?;
-    session.set(SENSING, [0])?;
+    session.write_first_words(SENSING, [0])?;
     session.write(EVENTS, Events::default().words())?;
     session.settle()?;
     session.known.senses = false;
     session.idle(Span::from_millis(300))?;
-    session.mark();
+    session.begin_exchange();
     Ok(())
 }
 
@@ -51,7 +51,7 @@ fn fine() -> Events {
 }
 
 /// Returns the page numbers since the exchange began.
-fn pages(heard: &[Heard]) -> Vec<u8> {
+fn pages(heard: &[CellPacket]) -> Vec<u8> {
     let number = |page: &SensorPage| u8::from(matches!(page, SensorPage::Acceleration(_)));
     heard.iter().filter_map(|it| Some(number(it.sensors()?.1))).collect()
 }
@@ -64,10 +64,10 @@ fn list(pages: &[u8]) -> String {
 }
 
 /// Writes parameter 7, and checks the pages that follow at once.
-fn switched(session: &mut Session<'_>, mode: [i16; 2], expected: &[u8], what: &str) -> Result<(), Stop> {
-    session.quiet(Span::from_millis(60))?;
-    session.mark();
-    session.write(SENSING, words(mode))?;
+fn switched(session: &mut Session<'_>, mode: [i16; 2], expected: &[u8], what: &str) -> Result<(), StopReason> {
+    session.wait_for_quiet(Span::from_millis(60))?;
+    session.begin_exchange();
+    session.write(SENSING, padded_words(mode))?;
     session.idle(Span::from_millis(8))?;
     let pages = pages(session.answers());
     session.check("SENSE-4", pages == expected, || {
@@ -77,8 +77,8 @@ fn switched(session: &mut Session<'_>, mode: [i16; 2], expected: &[u8], what: &s
     Ok(())
 }
 
-fn switches(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.set(SENSING, [0])?;
+fn switches(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.write_first_words(SENSING, [0])?;
     session.settle()?;
     switched(session, [2, 0], &[0, 1], "a switch to event mode")?;
     switched(session, [2, 0], &[], "the same mode again")?;
@@ -90,9 +90,9 @@ fn switches(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks that the torque of a touch is sent before the page.
-fn order(session: &mut Session<'_>) -> Result<(), Stop> {
+fn order(session: &mut Session<'_>) -> Result<(), StopReason> {
     for sum in [4_096, 0] {
-        session.quiet(Span::from_millis(60))?;
+        session.wait_for_quiet(Span::from_millis(60))?;
         session.press(arm::press(sum))?;
         let step = session.step(&[0x0321; MAX_JOINTS])?;
         let kinds: Vec<_> = step.exchange.answers.iter().map(|it| it.message.id().kind.name()).collect();
@@ -105,17 +105,17 @@ fn order(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks random values around the thresholds: a page comes exactly when the model requires it.
-fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), Stop> {
-    let mut dice = Dice::new(seed);
-    session.set(SENSING, [0])?;
+fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), StopReason> {
+    let mut dice = TestRandom::new(seed);
+    session.write_first_words(SENSING, [0])?;
     session.write(EVENTS, events.words())?;
     session.test_mode(true)?;
     session.known.active = None;
     session.step(&[0; MAX_JOINTS])?;
     session.known.active = Some(false);
-    session.set(SENSING, [2])?;
+    session.write_first_words(SENSING, [2])?;
     session.idle(Span::from_millis(10))?;
-    session.mark();
+    session.begin_exchange();
     let mut model = Model::new(events);
     for step in 0..session.attempts(STEPS) {
         let (skin, acceleration) = match crafted(&events).get(step) {
@@ -130,7 +130,7 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
         if let Some(acceleration) = acceleration {
             let to = Node::Cell(session.cell);
             let page = SensorPage::Acceleration(acceleration);
-            session.say(&[Message::Stimulus { to, from: From::Next, page }])?;
+            session.send_messages(&[Message::Stimulus { to, from: AppliesFrom::Next, page }])?;
         }
         // Pages that came with a regular heartbeat count as sent, too.
         for heard in session.unmarked() {
@@ -141,23 +141,23 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
         let turned = model.turned();
         let (expected, ids) = model.latch(skin, acceleration);
         let before = Epoch(session.known.last_epoch);
-        let (from, skips) = (session.heard.len(), session.skips);
+        let (from, skips) = (session.packets.len(), session.skips);
         let came = session.step(&[0; MAX_JOINTS])?;
         let beats = session.answers().iter().filter(|it| it.beat().is_some()).count();
         let sent: Vec<_> =
             came.exchange.answers.iter().filter_map(|it| it.sensors().map(|(_, page)| *page)).collect();
         let numbers = pages(&came.exchange.answers);
-        let all = session.heard.get(from..).unwrap_or_default().iter().filter_map(Heard::sensors);
+        let all = session.packets.get(from..).unwrap_or_default().iter().filter_map(CellPacket::sensors);
         all.for_each(|(_, page)| model.sends(page));
         // Skipped joints make no event, and a page with a heartbeat may replace the one that the next joints would have
         // sent.
         if beats == 1 && skips == session.skips {
             session.check(ids, numbers == expected, || {
                 let moved =
-                    acceleration.map_or_else(String::new, |it| arm::page(SensorPage::Acceleration(it)));
+                    acceleration.map_or_else(String::new, |it| arm::format_page(SensorPage::Acceleration(it)));
                 format!(
                     "{} {moved} is latched, at step {}, {turned}: pages {} came, not {}",
-                    arm::skin(Some(skin)),
+                    arm::format_skin(Some(skin)),
                     step + 1,
                     list(&numbers),
                     list(&expected)
@@ -166,20 +166,20 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
         }
         // Pages with a regular heartbeat may have come before the joints, or have crossed them on the bus.
         let after = came.exchange.answers.iter().filter(|it| it.at > came.exchange.at);
-        let mut pages = after.filter_map(Heard::sensors).filter(|(epoch, _)| *epoch != before);
+        let mut pages = after.filter_map(CellPacket::sensors).filter(|(epoch, _)| *epoch != before);
         let is_latched = pages.all(|(_, page)| model.has(page));
         session.check("SENSE-7", is_latched, || {
-            let sent: Vec<_> = sent.iter().map(|page| arm::page(*page)).collect();
+            let sent: Vec<_> = sent.iter().map(|page| arm::format_page(*page)).collect();
             format!("{} was sent, but is not latched", sent.join("; "))
         });
         if step % 40 == 39 {
             // The pages of a report count as sent, too.
-            for page in session.report()?.iter().filter_map(Heard::sensors) {
+            for page in session.report()?.iter().filter_map(CellPacket::sensors) {
                 model.sends(page.1);
             }
         }
     }
-    session.pressed(&[0; MAX_JOINTS], arm::press(0))?;
+    session.press_and_step(&[0; MAX_JOINTS], arm::press(0))?;
     session.step(&[0; MAX_JOINTS])?;
     Ok(())
 }
@@ -197,13 +197,13 @@ fn crafted(events: &Events) -> [SkinSensors; CRAFTED] {
 }
 
 /// Returns sensor values near the last sent ones, and near the thresholds.
-fn values(dice: &mut Dice, events: &Events, model: &Model, step: usize) -> (SkinSensors, Option<[Q3_12; 3]>) {
+fn values(dice: &mut TestRandom, events: &Events, model: &Model, step: usize) -> (SkinSensors, Option<[Q3_12; 3]>) {
     let sent = model.sent_skin();
     let mut skin = sent;
-    let near = |dice: &mut Dice, threshold: i16| {
+    let near = |dice: &mut TestRandom, threshold: i16| {
         let steps =
             [0, 1, -1, threshold, threshold - 1, -threshold, 1 - threshold, threshold / 2, -threshold / 2];
-        dice.one(&steps)
+        dice.choose(&steps)
     };
     match step % 5 {
         0 => skin.contact = [0, 0, 0].map(Q::from_bits),
@@ -213,13 +213,13 @@ fn values(dice: &mut Dice, events: &Events, model: &Model, step: usize) -> (Skin
         }
         2 => {
             let threshold = events.contact.to_bits();
-            let sum = dice.one(&[threshold, threshold - 1, threshold / 2, threshold / 2 - 1, 1, 0, -1]);
+            let sum = dice.choose(&[threshold, threshold - 1, threshold / 2, threshold / 2 - 1, 1, 0, -1]);
             skin.contact = [sum, 0, 0].map(Q::from_bits);
         }
         3 => {
             let threshold = events.proximity.to_bits();
             let steps = [0, threshold, threshold - 1, threshold / 2, threshold / 2 - 1, 1, threshold * 2];
-            skin.proximity = Q1_14::from_bits(dice.one(&steps));
+            skin.proximity = Q1_14::from_bits(dice.choose(&steps));
         }
         _ => {
             let [a, b] = skin.temperature.map(Q::<6>::to_bits);
@@ -235,13 +235,13 @@ fn values(dice: &mut Dice, events: &Events, model: &Model, step: usize) -> (Skin
 }
 
 /// Checks that in event mode page 0 follows each regular heartbeat, and page 1 every fourth one since the switch.
-fn after_beats(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.set(SENSING, [0])?;
-    session.quiet(Span::from_millis(60))?;
-    session.mark();
-    session.set(SENSING, [2])?;
+fn after_beats(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.write_first_words(SENSING, [0])?;
+    session.wait_for_quiet(Span::from_millis(60))?;
+    session.begin_exchange();
+    session.write_first_words(SENSING, [2])?;
     session.idle(Span::from_millis(10))?;
-    session.start();
+    session.begin_expected_exchange();
     session.idle(Span::from_millis(2_050))?;
     let mut beats: Vec<Vec<u8>> = Vec::new();
     for heard in session.answers() {
@@ -265,17 +265,17 @@ fn after_beats(session: &mut Session<'_>) -> Result<(), Stop> {
         format!("pages after each of {count} heartbeats in event mode: {}; expected are page 0, and page 1 after each fourth", all.join(", "))
     });
     // Other heartbeats are not followed by pages.
-    session.quiet(Span::from_millis(60))?;
+    session.wait_for_quiet(Span::from_millis(60))?;
     let sync = session.exchange_all(&[])?;
     session.check("SENSE-10", sync.is_silent(), || "a page came with the heartbeat to a sync".to_owned());
     Ok(())
 }
 
-fn halted(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.mark();
-    session.say(&[Message::Halt])?;
+fn halted(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.begin_exchange();
+    session.send_messages(&[Message::Halt])?;
     (session.known.halted, session.known.active) = (Some(true), Some(false));
-    session.quiet(Span::from_millis(60))?;
+    session.wait_for_quiet(Span::from_millis(60))?;
     for sum in [5_000, 0] {
         session.press(arm::press(sum))?;
         let step = session.step(&[0; MAX_JOINTS])?;
@@ -285,13 +285,13 @@ fn halted(session: &mut Session<'_>) -> Result<(), Stop> {
             format!("halted, in event mode: pages {pages} came at a touch or its end, not 0")
         });
     }
-    session.say(&[Message::Resume])?;
+    session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);
-    session.set(SENSING, [0])?;
+    session.write_first_words(SENSING, [0])?;
     session.settle()
 }
 
-fn continuous(session: &mut Session<'_>) -> Result<(), Stop> {
+fn continuous(session: &mut Session<'_>) -> Result<(), StopReason> {
     for period in [50, 120] {
         grid(session, period, false)?;
     }
@@ -305,7 +305,7 @@ fn continuous(session: &mut Session<'_>) -> Result<(), Stop> {
 
 /// Checks the times of page 0: `t + P + P n / 255 + i P`. With joints and a longer P, a page may be earlier by up to
 /// the joints' period.
-fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(), Stop> {
+fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(), StopReason> {
     const JOINTS: u64 = 16_000;
     const LATE: u64 = 20_000;
     const SLACK: u64 = 2_000;
@@ -315,11 +315,11 @@ fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(),
         false => ("SENSE-5", 0),
     };
     for attempt in 0..3 {
-        session.set(SENSING, [0])?;
+        session.write_first_words(SENSING, [0])?;
         session.settle()?;
-        session.mark();
+        session.begin_exchange();
         let period_ms = i16::try_from(period).unwrap_or_default();
-        session.set(SENSING, [1, period_ms])?;
+        session.write_first_words(SENSING, [1, period_ms])?;
         let Some(began) = session.answers().first().map(|it| it.at) else { return Ok(()) };
         let span = Span::from_millis(12 * period);
         let mut due = began + Span(7_000);
@@ -327,7 +327,7 @@ fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(),
             session.wait(due, |_| false)?;
             let epoch = session.next_epoch();
             let joints = session.joints(epoch, &[0; MAX_JOINTS]);
-            session.say(&[joints])?;
+            session.send_messages(&[joints])?;
             session.known.epoch = Some(epoch);
             due = due + Span(JOINTS);
         }
@@ -336,7 +336,7 @@ fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(),
         let all: Vec<_> = session.answers().iter().filter_map(|it| Some((it.at, *it.sensors()?.1))).collect();
         session.consume();
         let skin = all.iter().filter(|(_, page)| matches!(page, SensorPage::Skin(_))).skip(1);
-        let times: Vec<_> = skin.map(|(at, _)| at.since(began).0).collect();
+        let times: Vec<_> = skin.map(|(at, _)| at.elapsed_since(began).0).collect();
         let first = period * 1_000 + period * 1_000 * u64::from(session.cell.get()) / 255;
         let is_in_time = |(place, at): (usize, &u64)| {
             let due = first + place as u64 * period * 1_000;
@@ -346,7 +346,7 @@ fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(),
         let is_so = (10..=12).contains(&times.len()) && times.iter().enumerate().all(is_in_time);
         if is_so || attempt == 2 || late.0 < 1_000 {
             session.check(id, is_so, || {
-                let times = in_ms(times.iter().copied());
+                let times = format_ms(times.iter().copied());
                 format!(
                     "every {period} ms{}: page 0 came {times} ms after the switch; {} ms and then every {period} ms \
                      are right",

@@ -1,13 +1,13 @@
 //! Stimuli: the joints that latch them, the number that can be pending, and the events that clear them.
 
 use protocol::id::Node;
-use protocol::message::{From, Message, SensorPage};
+use protocol::message::{AppliesFrom, Message, SensorPage};
 use protocol::packet::Epoch;
 use protocol::parameters::{MAX_JOINTS, Parameters};
 
 use super::kinematics::look_at_words;
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::Session;
 
 const POSITIONS: [i16; MAX_JOINTS] =
@@ -19,12 +19,12 @@ struct Pressed {
     j: [i16; MAX_JOINTS],
 }
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    let parameters = arm::document(6);
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let parameters = arm::example_parameters(6);
     if !session.ready(&parameters)? {
         return Ok(());
     }
-    let j = session.pressed(&POSITIONS, arm::press(arm::unit_press(parameters.torque_format)))?.words();
+    let j = session.press_and_step(&POSITIONS, arm::press(arm::unit_press(parameters.torque_format)))?.words();
     let cell = Pressed { parameters, j };
     let before = session.counters()?;
     let mut count = next(session, &cell)?;
@@ -52,7 +52,7 @@ fn latched(
     epoch: u8,
     sum: i32,
     id: &'static str,
-) -> Result<(), Stop> {
+) -> Result<(), StopReason> {
     let skin = arm::press(sum);
     session.known.skin = Some(skin);
     session.known.pending = None;
@@ -63,7 +63,7 @@ fn latched(
         format!(
             "at joints {epoch} {} N are latched, and the torque is {}",
             f64::from(sum) / 1024.0,
-            arm::list(&step.words())
+            arm::format_words(&step.words())
         )
     });
     if is_there && sum > 0 {
@@ -73,7 +73,7 @@ fn latched(
 }
 
 /// Checks stimuli for the next joints, and returns the number of stimuli sent.
-fn next(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
+fn next(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
     let mut count = 0;
     let start = session.known.last_epoch;
     for (jump, sum) in [(1, 1_000), (200, 1_500), (3, 0), (128, 2_000), (255, 2_500)] {
@@ -90,7 +90,7 @@ fn next(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     {
         let sum = 3_000 + i32::from(epoch);
         let page = SensorPage::Skin(arm::press(sum));
-        let mut packet = Message::Stimulus { to, from: From::Next, page }.encode();
+        let mut packet = Message::Stimulus { to, from: AppliesFrom::Next, page }.encode();
         packet.epoch = Epoch(epoch);
         let frames: Vec<_> = packet.frames(session.format).collect();
         session.send(&frames)?;
@@ -102,7 +102,7 @@ fn next(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
 }
 
 /// Checks first epochs that are near, far, or past the wrap-around.
-fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
+fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
     let mut held = 4_000;
     let mut count = 1;
     session.press(arm::press(held))?;
@@ -142,7 +142,7 @@ fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
 }
 
 /// Checks stimuli for epochs that are over, and returns the number of stimuli sent.
-fn too_late(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
+fn too_late(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
     let mut count = 0;
     for (behind, jump) in [(0, 1), (5, 1), (2, 250), (127, 1)] {
         let last = session.known.last_epoch;
@@ -159,7 +159,7 @@ fn too_late(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
 }
 
 /// Checks several stimuli for the same joints, and returns the number of stimuli sent.
-fn order(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
+fn order(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
     let mut count = 0;
     for (first, second, jump) in [(1, 1, 1), (2, 1, 2), (1, 2, 2), (3, 0, 3)] {
         let last = session.known.last_epoch;
@@ -174,7 +174,7 @@ fn order(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
         // The acceleration is another page.
         let to = Node::Cell(session.cell);
         let page = SensorPage::Acceleration([1, 2, 3].map(protocol::fixed::Q3_12::from_bits));
-        session.say(&[Message::Stimulus { to, from: From::Next, page }])?;
+        session.send_messages(&[Message::Stimulus { to, from: AppliesFrom::Next, page }])?;
         count += 1;
         latched(session, cell, last.wrapping_add(jump), 7_000, "STIM-7")?;
         // A stimulus stays latched, whatever else comes.
@@ -189,7 +189,7 @@ fn order(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
 }
 
 /// Checks that eight stimuli can be pending, and the ninth is refused.
-fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
+fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), StopReason> {
     let before = session.counters()?;
     let last = session.known.last_epoch;
     let to = Node::Cell(session.cell);
@@ -199,8 +199,8 @@ fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
         } else {
             SensorPage::Skin(arm::press(1_000 * i32::from(ahead)))
         };
-        let first = From::Epoch(Epoch(last.wrapping_add(20 + ahead)));
-        session.say(&[Message::Stimulus { to, from: first, page }])?;
+        let first = AppliesFrom::Epoch(Epoch(last.wrapping_add(20 + ahead)));
+        session.send_messages(&[Message::Stimulus { to, from: first, page }])?;
     }
     let after = session.counters()?;
     let counted = (
@@ -221,7 +221,7 @@ fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
 }
 
 /// Checks that a write of parameter 5 clears the latched and the pending stimuli.
-fn forgotten(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
+fn forgotten(session: &mut Session<'_>, cell: &Pressed) -> Result<(), StopReason> {
     for on_between in [true, false] {
         session.press(arm::press(3_333))?;
         let epoch = session.next_epoch();
@@ -238,7 +238,7 @@ fn forgotten(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
 }
 
 /// Checks that a cell that measures accepts no stimuli.
-fn measuring(session: &mut Session<'_>) -> Result<(), Stop> {
+fn measuring(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.test_mode(false)?;
     let before = session.counters()?;
     session.press(arm::press(5_555))?;
@@ -261,10 +261,10 @@ fn measuring(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks that a halted cell accepts and latches stimuli.
-fn halted(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
+fn halted(session: &mut Session<'_>, cell: &Pressed) -> Result<(), StopReason> {
     let epoch = session.next_epoch();
-    session.mark();
-    session.say(&[Message::Halt])?;
+    session.begin_exchange();
+    session.send_messages(&[Message::Halt])?;
     (session.known.halted, session.known.active) = (Some(true), Some(false));
     session.press_at(epoch.wrapping_add(1), arm::press(2_222))?;
     session.step_at(epoch, &POSITIONS)?;
@@ -272,11 +272,11 @@ fn halted(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
     session.step_at(epoch.wrapping_add(1), &POSITIONS)?;
     let skin = session.latched()?;
     session.check("STIM-8", skin == Some(arm::press(2_222)), || {
-        format!("a halted cell did not latch a stimulus: {}", arm::skin(skin))
+        format!("a halted cell did not latch a stimulus: {}", arm::format_skin(skin))
     });
-    session.say(&[Message::Resume])?;
+    session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);
     latched(session, cell, epoch.wrapping_add(2), 2_222, "STIM-8")?;
-    session.pressed(&POSITIONS, arm::press(0))?;
+    session.press_and_step(&POSITIONS, arm::press(0))?;
     Ok(())
 }

@@ -5,13 +5,13 @@ use protocol::packet::{Epoch, Length, Packet, WORDS, Words};
 use protocol::parameters::{MAX_JOINTS, Parameter};
 
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 use crate::session::{Reply, Session};
 
 const POSITIONS: [i16; MAX_JOINTS] = [0x0111; MAX_JOINTS];
 
-pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.mark();
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
+    session.begin_exchange();
     session.known.halted = Some(false);
     staged(session)?;
     let skin = arm::press(4_096);
@@ -25,8 +25,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
         session.check("JOINTS-3", latched == Some(skin), || {
             format!(
                 "a cell without a configuration latched {}, not {}",
-                arm::skin(latched),
-                arm::skin(Some(skin))
+                arm::format_skin(latched),
+                arm::format_skin(Some(skin))
             )
         });
         session.test_mode(true)?;
@@ -36,8 +36,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks that a read returns the staged value while no configuration is in use.
-fn staged(session: &mut Session<'_>) -> Result<(), Stop> {
-    let pose = arm::document(2).words(Parameter::Pose);
+fn staged(session: &mut Session<'_>) -> Result<(), StopReason> {
+    let pose = arm::example_parameters(2).words(Parameter::Pose);
     let number = Parameter::Pose.number();
     let before = session.read(number)?;
     session.write(number, pose)?;
@@ -49,7 +49,7 @@ fn staged(session: &mut Session<'_>) -> Result<(), Stop> {
         )
     });
     session.write(number, before.words().unwrap_or([0; WORDS]))?;
-    let reply = session.set(Parameter::Commit.number(), [0])?;
+    let reply = session.write_first_words(Parameter::Commit.number(), [0])?;
     let is_refused = matches!(reply, Reply::Refused(_));
     session.check("CONF-7", is_refused, || {
         format!("a commit without a configuration was answered with {reply}")
@@ -58,7 +58,7 @@ fn staged(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks that the cell accepts joints of any chain, if their count matches their length, and does not answer them.
-fn joints(session: &mut Session<'_>) -> Result<(), Stop> {
+fn joints(session: &mut Session<'_>) -> Result<(), StopReason> {
     let before = session.counters()?;
     // The cell need not accept more joints than it can compute.
     let most = u8::try_from(session.about.abilities.joints()).unwrap_or(u8::MAX);

@@ -33,7 +33,7 @@ impl Probe {
         let own = Arc::clone(&shared);
         thread::Builder::new().spawn(move || {
             // Cells do the same.
-            protocol::bus::never_interrupt();
+            protocol::bus::set_batch_scheduling();
             while !own.over.load(Ordering::Relaxed) {
                 let due = now().0 + 1_000;
                 own.due.store(due, Ordering::Relaxed);

@@ -2,20 +2,20 @@
 
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id};
-use protocol::message::{Heard as HeardPage, Message, NetworkPage, Refused, State};
-use protocol::packet::{Epoch, Lengths, Packet, Reassembly, Segment, data_id};
+use protocol::message::{ReceivedCounts as HeardPage, Message, NetworkPage, RejectedCounts, State};
+use protocol::packet::{Epoch, Lengths, Packet, Reassembly, Reassembler, data_id};
 use protocol::time::{Micros, Span};
 
-use crate::bus::Seen;
+use crate::bus::ObservedFrame;
 
 /// The interval of regular heartbeats.
-pub(crate) const BEAT: Span = Span::from_millis(250);
+pub(crate) const HEARTBEAT_INTERVAL: Span = Span::from_millis(250);
 /// A claim within this time after an answered one may be answered or not.
-const DEFENDED: Span = Span::from_millis(40);
+const DEFENCE_MARGIN: Span = Span::from_millis(40);
 
 /// The packets that a cell counts, modulo 2^16.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(super) struct Counts {
+pub(super) struct PacketCounts {
     /// Joints that it must accept.
     taken: u16,
     /// Joints with the epoch of the last ones.
@@ -37,12 +37,12 @@ struct Beats {
 #[derive(Debug, Default)]
 pub(super) struct Accounts {
     /// Segments of the test's own packets.
-    segments: Vec<(Id, Segment)>,
+    segments: Vec<(Id, Reassembler)>,
     /// The epoch of the last accepted joints.
     last: Option<Epoch>,
-    counts: Counts,
+    counts: PacketCounts,
     /// The last counters of the cell, with the accounts at that time.
-    compared: Option<(HeardPage, Refused, Counts)>,
+    compared: Option<(HeardPage, RejectedCounts, PacketCounts)>,
     beats: Beats,
     defended: Option<Micros>,
     /// The time of a regular heartbeat, and the heartbeats until then.
@@ -54,11 +54,11 @@ pub(super) struct Accounts {
 }
 
 /// A discrepancy: the requirement, and a description.
-pub(super) type Difference = (&'static str, String);
+pub(super) type Discrepancy = (&'static str, String);
 
 impl Accounts {
     /// Accounts for a frame of the test; `joints` is the number of joints of the chain, if the cell has one.
-    pub(super) fn own(&mut self, seen: &Seen, cell: CellId, format: Format, joints: Option<u8>) {
+    pub(super) fn count_own_frame(&mut self, seen: &ObservedFrame, cell: CellId, format: Format, joints: Option<u8>) {
         let Some(message) = self.message(seen, format) else { return };
         if let Message::Joints { epoch, joints: came } = message {
             if self.last == Some(epoch) {
@@ -67,16 +67,16 @@ impl Accounts {
                 self.last = Some(epoch);
                 self.counts.taken = self.counts.taken.wrapping_add(1);
             }
-        } else if matches!(message, Message::Stimulus { to, .. } if to.names(cell)) {
+        } else if matches!(message, Message::Stimulus { to, .. } if to.addresses(cell)) {
             self.counts.stimuli = self.counts.stimuli.wrapping_add(1);
         } else if message == Message::Sync {
             self.beats.asked.0 += 1;
             self.beats.asked.1 += 1;
         } else if let Message::Network { from, page: NetworkPage::Heartbeat(beat), .. } = message
-            && from.names(cell)
+            && from.addresses(cell)
             && beat.state.has(State::CLAIMING)
         {
-            let is_again = self.defended.is_some_and(|at| seen.at.since(at) < DEFENDED);
+            let is_again = self.defended.is_some_and(|at| seen.at.elapsed_since(at) < DEFENCE_MARGIN);
             self.beats.asked.0 += u64::from(!is_again);
             self.beats.asked.1 += 1;
             self.defended = Some(seen.at);
@@ -84,8 +84,8 @@ impl Accounts {
     }
 
     /// Returns the message that a frame of the test completes, as the cell decodes it.
-    fn message(&mut self, seen: &Seen, format: Format) -> Option<Message> {
-        let Seen { at, frame, .. } = seen;
+    fn message(&mut self, seen: &ObservedFrame, format: Format) -> Option<Message> {
+        let ObservedFrame { at, frame, .. } = seen;
         let id = data_id(frame).ok().filter(|_| frame.format() == format)?;
         let packet = match format {
             Format::Fd => Packet::from_fd(frame).ok()?,
@@ -96,18 +96,18 @@ impl Accounts {
 
     fn segment(&mut self, at: Micros, id: Id, frame: &Frame) -> Option<Packet> {
         let place = self.segments.iter().position(|(of, _)| *of == id).unwrap_or_else(|| {
-            self.segments.push((id, Segment::NONE));
+            self.segments.push((id, Reassembler::NONE));
             self.segments.len() - 1
         });
         let (_, waiting) = self.segments.get_mut(place)?;
-        match waiting.push(at, id, Lengths::of(id), frame.data()) {
+        match waiting.push(at, id, Lengths::for_id(id), frame.data()) {
             Ok(Reassembly::Complete(packet)) => Some(packet),
             _ => None,
         }
     }
 
     /// Accounts for a packet of the cell.
-    pub(super) fn heard(&mut self, message: &Message) {
+    pub(super) fn count_cell_packet(&mut self, message: &Message) {
         if matches!(message, Message::Network { page: NetworkPage::Heartbeat(_), .. }) {
             self.beats.came += 1;
         } else if matches!(message, Message::Torque { .. }) {
@@ -126,7 +126,7 @@ impl Accounts {
     }
 
     /// Compares the cell's counters with the accounts, and returns the discrepancies since the last comparison.
-    pub(super) fn compare(&mut self, heard: HeardPage, refused: Refused) -> Vec<Difference> {
+    pub(super) fn compare(&mut self, heard: HeardPage, refused: RejectedCounts) -> Vec<Discrepancy> {
         let now = self.counts;
         let Some((heard_before, refused_before, before)) = self.compared.replace((heard, refused, now))
         else {
@@ -178,7 +178,7 @@ impl Accounts {
 
     fn missing(&self, now: Micros) -> u64 {
         let Some((at, before)) = self.anchor else { return 0 };
-        let regular = now.since(at).0 / BEAT.0;
+        let regular = now.elapsed_since(at).0 / HEARTBEAT_INTERVAL.0;
         let asked = self.beats.asked.0 - before.asked.0;
         (regular + asked).saturating_sub(self.beats.came - before.came)
     }
@@ -193,7 +193,7 @@ impl Accounts {
     pub(super) fn regular(&mut self, at: Micros) -> Option<(u64, u64, u64)> {
         self.given_up = 0;
         let (before_at, before) = self.anchor.replace((at, self.beats))?;
-        let regular = (at.since(before_at).0 + BEAT.0 / 2) / BEAT.0;
+        let regular = (at.elapsed_since(before_at).0 + HEARTBEAT_INTERVAL.0 / 2) / HEARTBEAT_INTERVAL.0;
         let asked = |of: fn(&Beats) -> u64| regular + of(&self.beats) - of(&before);
         let (came, min, max) =
             (self.beats.came - before.came, asked(|it| it.asked.0), asked(|it| it.asked.1));

@@ -3,19 +3,19 @@
 use protocol::time::Span;
 
 use super::Session;
-use super::accounts::BEAT;
-use crate::bus::Stop;
+use super::accounts::HEARTBEAT_INTERVAL;
+use crate::bus::StopReason;
 
 /// No request is sent within this time of a regular heartbeat.
-const EDGE: Span = Span::from_millis(25);
+const QUIET_MARGIN: Span = Span::from_millis(25);
 
 impl Session<'_> {
     /// Waits for a regular heartbeat, and checks the number of heartbeats since the last one: one every 250 ms, and one
     /// for each sync and claim.
-    pub(crate) fn regular_beat(&mut self) -> Result<(), Stop> {
+    pub(crate) fn regular_beat(&mut self) -> Result<(), StopReason> {
         // Lets the answers to earlier requests arrive.
         self.settle()?;
-        let until = self.now() + BEAT + EDGE + EDGE;
+        let until = self.now() + HEARTBEAT_INTERVAL + QUIET_MARGIN + QUIET_MARGIN;
         let came = self.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
         let at = self.answers().iter().find(|it| it.beat().is_some()).map(|it| it.at);
         self.check("BEAT-1", came, || "no heartbeat came for 300 ms".to_owned());
@@ -26,7 +26,7 @@ impl Session<'_> {
                 format!("{came} heartbeats came; {due} were due, every 250 ms and to each sync and claim")
             });
         }
-        self.idle(EDGE)?;
+        self.idle(QUIET_MARGIN)?;
         self.consume();
         Ok(())
     }
@@ -35,8 +35,8 @@ impl Session<'_> {
     /// ms.
     pub(crate) fn check_all_beats(&mut self) {
         let surplus = self.life.accounts.surplus();
-        if self.clock.longest < BEAT {
-            self.start();
+        if self.clock.longest < HEARTBEAT_INTERVAL {
+            self.begin_expected_exchange();
             self.check("BEAT-1", surplus == 0, || {
                 let many = if surplus > 0 { "too many" } else { "too few" };
                 format!("{} heartbeats {many} came over the whole test", surplus.abs())
@@ -45,11 +45,11 @@ impl Session<'_> {
     }
 
     /// Waits until no regular heartbeat is due within a time, which must be less than 200 ms.
-    pub(crate) fn quiet(&mut self, span: Span) -> Result<(), Stop> {
+    pub(crate) fn wait_for_quiet(&mut self, span: Span) -> Result<(), StopReason> {
         let now = self.now();
         let is_free = self.life.regular.is_some_and(|at| {
-            let since = now.since(at);
-            since > EDGE && since.0 + span.0 + EDGE.0 < BEAT.0
+            let since = now.elapsed_since(at);
+            since > QUIET_MARGIN && since.0 + span.0 + QUIET_MARGIN.0 < HEARTBEAT_INTERVAL.0
         });
         if is_free { Ok(()) } else { self.regular_beat() }
     }

@@ -5,8 +5,8 @@ use protocol::message::{Heartbeat, Message, State};
 use protocol::packet::Epoch;
 use protocol::time::{Micros, Span};
 
-use super::{Heard, LINGER, PATIENT, Session};
-use crate::bus::Stop;
+use super::{CellPacket, SYNC_GRACE, ANSWER_TIMEOUT, Session};
+use crate::bus::StopReason;
 
 /// The result of an exchange.
 #[derive(Clone, Debug)]
@@ -14,7 +14,7 @@ pub(crate) struct Exchange {
     /// The time at which the bench's first packet was completely on the bus.
     pub(crate) at: Micros,
     /// The cell's packets, without heartbeats.
-    pub(crate) answers: Vec<Heard>,
+    pub(crate) answers: Vec<CellPacket>,
     /// The number of heartbeats.
     pub(crate) beats: usize,
     /// The heartbeat that answers the sync, and its epoch byte.
@@ -34,29 +34,29 @@ impl Exchange {
 
 impl Session<'_> {
     /// Sends frames and then a sync, and collects packets until the sync is answered.
-    pub(crate) fn exchange(&mut self, frames: &[Frame]) -> Result<Exchange, Stop> {
-        self.mark();
+    pub(crate) fn exchange(&mut self, frames: &[Frame]) -> Result<Exchange, StopReason> {
+        self.begin_exchange();
         let at = self.send(frames)?;
         self.finish(at)
     }
 
     /// Sends packets and then a sync, and collects packets until the sync is answered.
-    pub(crate) fn exchange_all(&mut self, messages: &[Message]) -> Result<Exchange, Stop> {
-        self.mark();
-        let at = self.say(messages)?;
+    pub(crate) fn exchange_all(&mut self, messages: &[Message]) -> Result<Exchange, StopReason> {
+        self.begin_exchange();
+        let at = self.send_messages(messages)?;
         self.finish(at)
     }
 
     /// Sends a sync, and returns the result of the exchange.
-    fn finish(&mut self, at: Micros) -> Result<Exchange, Stop> {
-        let sync = self.say(&[Message::Sync])?;
-        let is_answer = |heard: &Heard| heard.beat().is_some() && heard.at >= sync;
+    fn finish(&mut self, at: Micros) -> Result<Exchange, StopReason> {
+        let sync = self.send_messages(&[Message::Sync])?;
+        let is_answer = |heard: &CellPacket| heard.beat().is_some() && heard.at >= sync;
         let answered = self.wait_for_answer(sync)?;
         self.check("CMD-3", answered, || "no heartbeat after a sync".to_owned());
         let beats = |it: &Self| it.answers().iter().filter(|heard| heard.beat().is_some()).count();
         if self.answers().len() == beats(self) || self.known.senses {
             // A regular heartbeat may have come between, and a faulty cell may answer later.
-            self.idle(LINGER)?;
+            self.idle(SYNC_GRACE)?;
         }
         let first = self.answers().iter().find(|heard| is_answer(heard)).copied();
         if let (Some(first), 1) = (first, beats(self)) {
@@ -77,16 +77,16 @@ impl Session<'_> {
         let answers = self.answers().iter().filter(|heard| heard.beat().is_none()).copied().collect();
         self.consume();
         let exchange = Exchange { at, answers, beats: came, beat };
-        self.look_at_state(&exchange);
+        self.check_state(&exchange);
         Ok(exchange)
     }
 
     /// Returns true if a heartbeat comes after a sync; waits for another one if a regular one may have come instead.
-    fn wait_for_answer(&mut self, sync: Micros) -> Result<bool, Stop> {
-        let until = sync + PATIENT;
+    fn wait_for_answer(&mut self, sync: Micros) -> Result<bool, StopReason> {
+        let until = sync + ANSWER_TIMEOUT;
         loop {
             let epoch = self.known.epoch.filter(|_| !self.clock.other_epochs);
-            let beats = self.answers().iter().filter(|heard| heard.at >= sync).filter_map(Heard::beat);
+            let beats = self.answers().iter().filter(|heard| heard.at >= sync).filter_map(CellPacket::beat);
             let (mut any, mut right) = (false, false);
             for (_, of) in beats {
                 // A heartbeat that was due before the cell processed the joints has the previous epoch.
@@ -101,7 +101,7 @@ impl Session<'_> {
                 self.clock.other_epochs |= any && !right;
                 return Ok(any);
             }
-            self.pump(until)?;
+            self.process_next_frame(until)?;
         }
     }
 }

@@ -1,23 +1,23 @@
 //! Joints, and the answers that a cell owes to them.
 
 use protocol::id::Node;
-use protocol::message::{From, Message, Request, SensorPage, SkinSensors, State};
-use protocol::packet::{Epoch, Length, Words, words};
+use protocol::message::{AppliesFrom, Message, Request, SensorPage, SkinSensors, State};
+use protocol::packet::{Epoch, Length, Words, padded_words};
 use protocol::parameters::{MAX_JOINTS, Parameter};
 
-use super::{Exchange, Heard, Session};
+use super::{Exchange, CellPacket, Session};
 use crate::arm;
-use crate::bus::Stop;
+use crate::bus::StopReason;
 
 /// The result of joints.
 #[derive(Clone, Debug)]
-pub(crate) struct Step {
+pub(crate) struct JointsResult {
     pub(crate) exchange: Exchange,
     /// The torque, if one came.
     pub(crate) torque: Option<Words>,
 }
 
-impl Step {
+impl JointsResult {
     /// Returns the torque's words; zeros if none came.
     pub(crate) fn words(&self) -> [i16; MAX_JOINTS] {
         self.torque.map_or([0; MAX_JOINTS], |torque| torque.padded())
@@ -26,7 +26,7 @@ impl Step {
 
 /// The expected answer.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Due {
+enum ExpectedAnswer {
     Torque,
     Zeros,
     Nothing,
@@ -40,22 +40,22 @@ impl Session<'_> {
     }
 
     /// Sends a stimulus for the next joints.
-    pub(crate) fn press(&mut self, skin: SkinSensors) -> Result<(), Stop> {
+    pub(crate) fn press(&mut self, skin: SkinSensors) -> Result<(), StopReason> {
         self.known.pending = Some(skin);
         let to = Node::Cell(self.cell);
-        self.say(&[Message::Stimulus { to, from: From::Next, page: SensorPage::Skin(skin) }])?;
+        self.send_messages(&[Message::Stimulus { to, from: AppliesFrom::Next, page: SensorPage::Skin(skin) }])?;
         Ok(())
     }
 
     /// Sends a stimulus for the joints of an epoch.
-    pub(crate) fn press_at(&mut self, first: u8, skin: SkinSensors) -> Result<(), Stop> {
+    pub(crate) fn press_at(&mut self, first: u8, skin: SkinSensors) -> Result<(), StopReason> {
         let to = Node::Cell(self.cell);
-        self.say(&[Message::Stimulus { to, from: From::Epoch(Epoch(first)), page: SensorPage::Skin(skin) }])?;
+        self.send_messages(&[Message::Stimulus { to, from: AppliesFrom::Epoch(Epoch(first)), page: SensorPage::Skin(skin) }])?;
         Ok(())
     }
 
     /// Sends joints of the next epoch, and repeats them if the cell processed them too late.
-    pub(crate) fn step(&mut self, positions: &[i16; MAX_JOINTS]) -> Result<Step, Stop> {
+    pub(crate) fn step(&mut self, positions: &[i16; MAX_JOINTS]) -> Result<JointsResult, StopReason> {
         const ATTEMPTS: usize = 6;
         let mut attempt = 1;
         loop {
@@ -69,29 +69,29 @@ impl Session<'_> {
     }
 
     /// Sends a press for the next joints, and those joints.
-    pub(crate) fn pressed(&mut self, positions: &[i16; MAX_JOINTS], skin: SkinSensors) -> Result<Step, Stop> {
+    pub(crate) fn press_and_step(&mut self, positions: &[i16; MAX_JOINTS], skin: SkinSensors) -> Result<JointsResult, StopReason> {
         self.press(skin)?;
         self.step(positions)
     }
 
     /// Sends joints of an epoch other than the last one.
-    pub(crate) fn step_at(&mut self, epoch: u8, positions: &[i16; MAX_JOINTS]) -> Result<Step, Stop> {
+    pub(crate) fn step_at(&mut self, epoch: u8, positions: &[i16; MAX_JOINTS]) -> Result<JointsResult, StopReason> {
         let joints = self.joints(epoch, positions);
         if let Some(skin) = self.known.pending.take() {
             self.known.skin = Some(skin);
         }
-        let due = self.due();
+        let due = self.expected_answer();
         (self.known.epoch, self.known.last_epoch) = (Some(epoch), epoch);
         // After joints without a force the cell is not active, whatever it was before.
         self.known.active = match due {
-            Some(due) => Some(due == Due::Torque),
+            Some(due) => Some(due == ExpectedAnswer::Torque),
             None => self.force().map(|force| force > 0),
         };
         let active = self.known.active.take();
         let exchange = self.exchange_all(&[joints])?;
-        let step = self.look_at_torques(epoch, due, exchange)?;
+        let step = self.check_torques(epoch, due, exchange)?;
         self.known.active = active;
-        self.look_at_state(&step.exchange);
+        self.check_state(&step.exchange);
         if self.clock.skipped {
             // The cell is as it was before the skipped joints.
             self.known.active = None;
@@ -100,15 +100,15 @@ impl Session<'_> {
     }
 
     /// Returns the expected answer to the next joints, if it is known.
-    fn due(&self) -> Option<Due> {
+    fn expected_answer(&self) -> Option<ExpectedAnswer> {
         let known = &self.known;
         if known.halted == Some(true) {
-            return Some(Due::Nothing);
+            return Some(ExpectedAnswer::Nothing);
         }
         match (self.force()? > 0, known.active) {
-            (true, _) => Some(Due::Torque),
-            (false, Some(true)) => Some(Due::Zeros),
-            (false, Some(false)) => Some(Due::Nothing),
+            (true, _) => Some(ExpectedAnswer::Torque),
+            (false, Some(true)) => Some(ExpectedAnswer::Zeros),
+            (false, Some(false)) => Some(ExpectedAnswer::Nothing),
             (false, None) => None,
         }
     }
@@ -120,7 +120,7 @@ impl Session<'_> {
     }
 
     /// Checks the answers to joints.
-    fn look_at_torques(&mut self, epoch: u8, due: Option<Due>, exchange: Exchange) -> Result<Step, Stop> {
+    fn check_torques(&mut self, epoch: u8, due: Option<ExpectedAnswer>, exchange: Exchange) -> Result<JointsResult, StopReason> {
         let torques: Vec<_> =
             exchange.answers.iter().filter(|heard| heard.torque().is_some()).copied().collect();
         let count = torques.len();
@@ -135,9 +135,9 @@ impl Session<'_> {
         self.clock.skipped = first.is_none() && self.came_late(&exchange);
         self.skips = self.skips.wrapping_add(u16::from(self.clock.skipped));
         let expected = match due {
-            Some(Due::Torque) => Some(true),
-            Some(Due::Zeros) => Some(true),
-            Some(Due::Nothing) => Some(false),
+            Some(ExpectedAnswer::Torque) => Some(true),
+            Some(ExpectedAnswer::Zeros) => Some(true),
+            Some(ExpectedAnswer::Nothing) => Some(false),
             None => None,
         };
         if let Some(expected) = expected {
@@ -145,8 +145,8 @@ impl Session<'_> {
             let id = if halted { "CMD-1" } else { "JOINTS-6" };
             self.check(id, first.is_some() == expected, || {
                 let what = match due {
-                    Some(Due::Torque) => "in contact: a torque was due, and none came",
-                    Some(Due::Zeros) => "released: one torque of zeros was due, and none came",
+                    Some(ExpectedAnswer::Torque) => "in contact: a torque was due, and none came",
+                    Some(ExpectedAnswer::Zeros) => "released: one torque of zeros was due, and none came",
                     _ if halted => "halted: a torque came",
                     _ => "not in contact: nothing was due, and a torque came",
                 };
@@ -155,19 +155,19 @@ impl Session<'_> {
         }
         if let Some((at, of, words)) = first {
             // The limit is a quarter of the period, and the test's period is long except where times are measured.
-            if self.known.parameters.is_some_and(|it| it.period_us == arm::in_time(1).period_us) {
+            if self.known.parameters.is_some_and(|it| it.period_us == arm::fast_parameters(1).period_us) {
                 self.note_time("torque", exchange.at, at);
             }
             self.check("JOINTS-6", of.0 == epoch, || format!("a torque of epoch {of} to joints {epoch}"));
-            if due == Some(Due::Zeros) {
+            if due == Some(ExpectedAnswer::Zeros) {
                 self.check("JOINTS-6", words.is_zero(), || "released: the torque is not of zeros".to_owned());
             }
-            self.look_at_words(&words);
-            self.look_at_saturation(&words);
+            self.check_words(&words);
+            self.check_saturation(&words);
         } else {
-            self.look_at_saturation(&Words::zeros(Length::Six));
+            self.check_saturation(&Words::zeros(Length::Six));
         }
-        Ok(Step { torque: first.map(|(.., words)| words), exchange })
+        Ok(JointsResult { torque: first.map(|(.., words)| words), exchange })
     }
 
     /// Returns true if the cell processed the joints when they were older than a period, as the answer to the sync
@@ -175,10 +175,10 @@ impl Session<'_> {
     fn came_late(&self, exchange: &Exchange) -> bool {
         let period = self.known.parameters.map_or(u64::MAX, |it| it.period_us.into());
         let beat = self.answers().iter().rev().find(|heard| heard.beat().is_some());
-        beat.is_some_and(|heard| heard.at.since(exchange.at).0 > period && period > 1_000)
+        beat.is_some_and(|heard| heard.at.elapsed_since(exchange.at).0 > period && period > 1_000)
     }
 
-    fn look_at_words(&mut self, words: &Words) {
+    fn check_words(&mut self, words: &Words) {
         let Some(parameters) = self.known.parameters else { return };
         let length = Length::for_joints(parameters.joints.into());
         self.check("SEND-1", words.length() == length, || {
@@ -186,16 +186,16 @@ impl Session<'_> {
         });
         let beyond = words.padded().iter().skip(parameters.joint.into()).all(|word| *word == 0);
         self.check("J-1", beyond, || {
-            format!("a word beyond joint {} is not 0: {}", parameters.joint, arm::list(words.as_slice()))
+            format!("a word beyond joint {} is not 0: {}", parameters.joint, arm::format_words(words.as_slice()))
         });
     }
 
     /// Checks that SATURATED is set in the next heartbeat and in no other.
-    fn look_at_saturation(&mut self, words: &Words) {
+    fn check_saturation(&mut self, words: &Words) {
         let expected = words.is_saturated();
-        let after = |heard: &[Heard]| {
+        let after = |heard: &[CellPacket]| {
             let torque = heard.iter().rposition(|it| it.torque().is_some()).unwrap_or(0);
-            let beats = heard.iter().skip(torque).filter_map(Heard::beat);
+            let beats = heard.iter().skip(torque).filter_map(CellPacket::beat);
             beats.map(|(beat, _)| beat.state.has(State::SATURATED)).collect::<Vec<_>>()
         };
         let beats = after(self.answers());
@@ -203,7 +203,7 @@ impl Session<'_> {
             // A flag that stays set from the heartbeat before does not concern this torque.
             let stays = *first && !expected && self.life.saturated;
             self.check(if stays { "STATE-2" } else { "TORQUE-2" }, *first == expected, || {
-                let (set, words) = (if *first { "" } else { "not " }, arm::list(words.as_slice()));
+                let (set, words) = (if *first { "" } else { "not " }, arm::format_words(words.as_slice()));
                 format!("SATURATED is {set}set after a torque of {words}")
             });
             let again = expected && rest.contains(&true);
@@ -213,7 +213,7 @@ impl Session<'_> {
     }
 
     /// Returns the skin page of a report.
-    pub(crate) fn latched(&mut self) -> Result<Option<SkinSensors>, Stop> {
+    pub(crate) fn latched(&mut self) -> Result<Option<SkinSensors>, StopReason> {
         let pages = self.report()?;
         Ok(pages.iter().find_map(|heard| match heard.sensors() {
             Some((_, SensorPage::Skin(skin))) => Some(*skin),
@@ -222,13 +222,13 @@ impl Session<'_> {
     }
 
     /// Switches test mode on or off, which clears all stimuli.
-    pub(crate) fn test_mode(&mut self, on: bool) -> Result<(), Stop> {
-        self.switch(Node::Cell(self.cell), on)
+    pub(crate) fn test_mode(&mut self, on: bool) -> Result<(), StopReason> {
+        self.set_test_mode(Node::Cell(self.cell), on)
     }
 
     /// The same for one cell or for everyone.
-    pub(crate) fn switch(&mut self, to: Node, on: bool) -> Result<(), Stop> {
-        let (number, words) = (Parameter::Mode.number(), words([on.into()]));
+    pub(crate) fn set_test_mode(&mut self, to: Node, on: bool) -> Result<(), StopReason> {
+        let (number, words) = (Parameter::Mode.number(), padded_words([on.into()]));
         let reply = self.request(to, Request::Write { number, words })?;
         self.known.test_mode = reply.words().map(|words| words.first() == Some(&1));
         (self.known.skin, self.known.pending) = (on.then(SkinSensors::default), None);
@@ -236,9 +236,9 @@ impl Session<'_> {
     }
 
     /// Makes the cell compute with parameters, in test mode, not in contact and not halted. Returns true if it does.
-    pub(crate) fn ready(&mut self, parameters: &protocol::parameters::Parameters) -> Result<bool, Stop> {
-        self.mark();
-        self.say(&[Message::Resume])?;
+    pub(crate) fn ready(&mut self, parameters: &protocol::parameters::Parameters) -> Result<bool, StopReason> {
+        self.begin_exchange();
+        self.send_messages(&[Message::Resume])?;
         self.known.halted = Some(false);
         let done = self.commit(parameters)?;
         if self.about.test_mode {

@@ -7,7 +7,7 @@ use super::{Exchange, Session};
 
 /// The abilities of the cell.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct About {
+pub(crate) struct CellAbilities {
     pub(crate) serial: Option<u32>,
     pub(crate) abilities: Abilities,
     /// True if it sends the pages of a cell with ports.
@@ -24,7 +24,7 @@ pub(crate) struct About {
 
 /// The present state of the cell; `None` means unknown.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Known {
+pub(crate) struct TrackedState {
     pub(crate) hash: Option<u16>,
     /// The parameters in use, if this bench committed them.
     pub(crate) parameters: Option<Parameters>,
@@ -50,11 +50,11 @@ pub(crate) struct Known {
     pub(crate) pending: Option<SkinSensors>,
 }
 
-impl Known {
+impl TrackedState {
     /// Returns the requirement that forbids the cell to send this packet unrequested.
     pub(crate) fn unexpected(&self, message: &Message) -> Option<&'static str> {
         match message {
-            Message::Network { page: NetworkPage::Heard(_) | NetworkPage::Refused(_), .. } => Some("CMD-4"),
+            Message::Network { page: NetworkPage::Received(_) | NetworkPage::Rejected(_), .. } => Some("CMD-4"),
             Message::Network { .. } => None,
             Message::Sensors { .. } if self.senses => None,
             Message::Torque { .. } => Some("JOINTS-6"),
@@ -74,7 +74,7 @@ impl Known {
 
 impl Session<'_> {
     /// Checks the state that the heartbeat to a sync reports.
-    pub(super) fn look_at_state(&mut self, exchange: &Exchange) {
+    pub(super) fn check_state(&mut self, exchange: &Exchange) {
         let Some((beat, epoch)) = exchange.beat else { return };
         let (state, known) = (beat.state, self.known);
         let bits = [

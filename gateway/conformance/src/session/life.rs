@@ -7,20 +7,20 @@
 use protocol::can::{Format, Frame};
 use protocol::id::{Id, Kind};
 use protocol::message::{Heartbeat, Message, NetworkPage, State};
-use protocol::packet::{Length, Lengths, Packet, Reassembly, Segment};
+use protocol::packet::{Length, Lengths, Packet, Reassembly, Reassembler};
 use protocol::time::Micros;
 
 use super::Session;
 use super::accounts::Accounts;
-use crate::bus::{Seen, Stop};
+use crate::bus::{ObservedFrame, StopReason};
 
 /// The state of the test for one life of the cell.
 #[derive(Debug, Default)]
-pub(super) struct Life {
+pub(super) struct CellLife {
     /// The time of its first heartbeat with CLAIMING, after a restart.
     pub(super) claimed: Option<Micros>,
     /// Segments that wait for others, by kind, with the last one received.
-    pub(super) segments: [(Segment, Option<Seen>); 8],
+    pub(super) segments: [(Reassembler, Option<ObservedFrame>); 8],
     /// The kinds of which a whole packet has come; the test may have begun in the middle of the first one.
     pub(super) joined: [bool; 8],
     /// The accounts of the bus.
@@ -35,7 +35,7 @@ pub(super) struct Life {
     pub(super) regular: Option<Micros>,
 }
 
-impl Life {
+impl CellLife {
     /// Returns the life that begins with a heartbeat of that time. The segments of the test's own packets are kept:
     /// they were on the bus.
     fn after(former: Self, claimed: Micros) -> Self {
@@ -44,7 +44,7 @@ impl Life {
     }
 
     /// Notes that packets of a kind are received from their beginnings on; returns true if that was so before.
-    pub(super) fn joins(&mut self, place: usize) -> bool {
+    pub(super) fn join_kind(&mut self, place: usize) -> bool {
         self.joined.get_mut(place).is_none_or(|joined| core::mem::replace(joined, true))
     }
 
@@ -56,7 +56,7 @@ impl Life {
 
 impl Session<'_> {
     /// Begins to switch the cell off and on.
-    pub(crate) fn begin_restart(&mut self) -> Result<(), Stop> {
+    pub(crate) fn begin_restart(&mut self) -> Result<(), StopReason> {
         self.bus.begin_restart()?;
         self.held = Some(Vec::new());
         self.life.claimed = None;
@@ -64,14 +64,14 @@ impl Session<'_> {
     }
 
     /// Returns true while the command of the restart is running.
-    pub(crate) fn is_restarting(&mut self) -> Result<bool, Stop> {
+    pub(crate) fn is_restarting(&mut self) -> Result<bool, StopReason> {
         self.bus.is_restarting()
     }
 
     /// Ends the wait for a new life: frames belong to the present one from here on.
     pub(crate) fn end_restart(&mut self) {
         for (seen, id) in self.held.take().unwrap_or_default() {
-            self.take(seen, id);
+            self.handle_cell_frame(seen, id);
         }
     }
 
@@ -81,8 +81,8 @@ impl Session<'_> {
     }
 
     /// Receives a frame of the cell.
-    pub(super) fn receive(&mut self, seen: Seen, id: Id) {
-        let Some(held) = &mut self.held else { return self.take(seen, id) };
+    pub(super) fn receive(&mut self, seen: ObservedFrame, id: Id) {
+        let Some(held) = &mut self.held else { return self.handle_cell_frame(seen, id) };
         held.push((seen, id));
         let Some((beat, places)) = claim(held, self.format) else { return };
         // A contact that bounces starts the cell more than once; an answer to another claim is not a start.
@@ -94,17 +94,17 @@ impl Session<'_> {
             if places.contains(&place) { of_claim.push(frame) } else { before.push(frame) }
         }
         for (seen, id) in before {
-            self.take(seen, id);
+            self.handle_cell_frame(seen, id);
         }
-        self.life = Life::after(core::mem::take(&mut self.life), seen.at);
+        self.life = CellLife::after(core::mem::take(&mut self.life), seen.at);
         for (seen, id) in of_claim {
-            self.take(seen, id);
+            self.handle_cell_frame(seen, id);
         }
     }
 }
 
 /// Returns the heartbeat with CLAIMING that the last frame completes, if there is one, and the indices of its frames.
-fn claim(held: &[(Seen, Id)], format: Format) -> Option<(Heartbeat, Vec<usize>)> {
+fn claim(held: &[(ObservedFrame, Id)], format: Format) -> Option<(Heartbeat, Vec<usize>)> {
     let (last, id) = held.last()?;
     if id.kind != Kind::Network || last.frame.format() != format {
         return None;
@@ -112,12 +112,12 @@ fn claim(held: &[(Seen, Id)], format: Format) -> Option<(Heartbeat, Vec<usize>)>
     let (packet, places) = match format {
         Format::Fd => (Packet::from_fd(&last.frame).ok()?, vec![held.len() - 1]),
         Format::Classic => {
-            let is_of_it = |(_, (seen, of)): &(usize, &(Seen, Id))| of == id && seen.frame.format() == format;
+            let is_of_it = |(_, (seen, of)): &(usize, &(ObservedFrame, Id))| of == id && seen.frame.format() == format;
             let of_it: Vec<_> = held.iter().enumerate().filter(is_of_it).collect();
             // Pages have six words.
             let of_it = of_it.get(of_it.len().checked_sub(Length::Six.segments())?..)?;
             let frames = of_it.iter().map(|(_, (seen, _))| &seen.frame);
-            (whole(*id, frames)?, of_it.iter().map(|(place, _)| *place).collect())
+            (assemble_packet(*id, frames)?, of_it.iter().map(|(place, _)| *place).collect())
         }
     };
     let Message::Network { page: NetworkPage::Heartbeat(beat), .. } = Message::decode(&packet).ok()? else {
@@ -127,8 +127,8 @@ fn claim(held: &[(Seen, Id)], format: Format) -> Option<(Heartbeat, Vec<usize>)>
 }
 
 /// Returns the packet that these segments form.
-fn whole<'a>(id: Id, frames: impl Iterator<Item = &'a Frame>) -> Option<Packet> {
-    let mut segments = Segment::NONE;
-    let last = frames.map(|frame| segments.push(Micros(0), id, Lengths::of(id), frame.data())).last()?;
+fn assemble_packet<'a>(id: Id, frames: impl Iterator<Item = &'a Frame>) -> Option<Packet> {
+    let mut segments = Reassembler::NONE;
+    let last = frames.map(|frame| segments.push(Micros(0), id, Lengths::for_id(id), frame.data())).last()?;
     if let Ok(Reassembly::Complete(packet)) = last { Some(packet) } else { None }
 }

@@ -3,31 +3,31 @@
 use protocol::can::{BIT_RATE_SWITCH, Format};
 use protocol::id::Id;
 use protocol::message::{Heartbeat, Message, State};
-use protocol::packet::{self, Lengths, Packet, PacketError, Reassembly, Segment};
+use protocol::packet::{self, Lengths, Packet, PacketError, Reassembly, Reassembler};
 use protocol::time::{Micros, Span};
 
-use super::{Heard, PATIENT, SILENT, Session};
-use crate::bus::{Seen, Stop};
+use super::{CellPacket, ANSWER_TIMEOUT, SILENCE_TIMEOUT, Session};
+use crate::bus::{ObservedFrame, StopReason};
 
 impl Session<'_> {
     /// Processes the next frame, if one arrives by then.
-    pub(super) fn pump(&mut self, until: Micros) -> Result<Option<Seen>, Stop> {
+    pub(super) fn process_next_frame(&mut self, until: Micros) -> Result<Option<ObservedFrame>, StopReason> {
         let Some(seen) = self.bus.receive(until)? else {
-            self.look_at_segments(self.bus.now());
-            self.look_at_time()?;
+            self.check_waiting_segments(self.bus.now());
+            self.check_time_limits()?;
             return Ok(None);
         };
-        self.look_at_segments(seen.at);
+        self.check_waiting_segments(seen.at);
         if seen.own {
             self.log.frames.push(seen);
             let joints = (self.known.hash != Some(0)).then_some(self.known.joints);
-            self.life.accounts.own(&seen, self.cell, self.format, joints);
+            self.life.accounts.count_own_frame(&seen, self.cell, self.format, joints);
             return Ok(Some(seen));
         }
-        self.look_at_time()?;
+        self.check_time_limits()?;
         let Ok(id) = packet::data_id(&seen.frame) else { return Ok(Some(seen)) };
         if id.sender().is_none() && !self.clock.finishing {
-            return Err(Stop::Gateway(seen.frame.to_string()));
+            return Err(StopReason::Gateway(seen.frame.to_string()));
         }
         if id.node == self.cell.get() {
             self.log.frames.push(seen);
@@ -37,38 +37,38 @@ impl Session<'_> {
         Ok(Some(seen))
     }
 
-    fn look_at_time(&self) -> Result<(), Stop> {
+    fn check_time_limits(&self) -> Result<(), StopReason> {
         let now = self.bus.now();
         if now >= self.clock.end {
-            return Err(Stop::Time);
+            return Err(StopReason::Time);
         }
-        let is_silent = now.since(self.clock.last) > SILENT && !self.known.may_be_silent;
-        if is_silent { Err(Stop::Silent) } else { Ok(()) }
+        let is_silent = now.elapsed_since(self.clock.last) > SILENCE_TIMEOUT && !self.known.may_be_silent;
+        if is_silent { Err(StopReason::Silent) } else { Ok(()) }
     }
 
     /// Checks that no segment has waited longer for the others of its packet than any answer takes.
-    fn look_at_segments(&mut self, now: Micros) {
+    fn check_waiting_segments(&mut self, now: Micros) {
         if self.held.is_some() {
             // It may be a part of the life that was cut off.
             return;
         }
         for place in 0..self.life.segments.len() {
             let Some((segments, Some(last))) = self.life.segments.get_mut(place) else { continue };
-            if segments.is_waiting() && now.since(last.at) > PATIENT {
-                *segments = Segment::NONE;
+            if segments.is_waiting() && now.elapsed_since(last.at) > ANSWER_TIMEOUT {
+                *segments = Reassembler::NONE;
                 let frame = last.frame;
-                if !self.life.joins(place) {
+                if !self.life.join_kind(place) {
                     continue;
                 }
                 self.check("SEND-1", false, || {
-                    format!("{frame} is not a packet: no other segment within {} ms", PATIENT.0 / 1_000)
+                    format!("{frame} is not a packet: no other segment within {} ms", ANSWER_TIMEOUT.0 / 1_000)
                 });
             }
         }
     }
 
     /// Processes a frame under an identifier of the cell.
-    pub(super) fn take(&mut self, seen: Seen, id: Id) {
+    pub(super) fn handle_cell_frame(&mut self, seen: ObservedFrame, id: Id) {
         let frame = &seen.frame;
         if frame.format() != self.format {
             self.check("SEND-1", false, || format!("a {} frame on this bus", frame.format().name()));
@@ -82,17 +82,17 @@ impl Session<'_> {
             }
             Format::Classic => {
                 let Some((segments, last)) = self.life.segments.get_mut(id.kind as usize) else { return };
-                let apart = last.replace(seen).map_or(Span(0), |last| seen.at.since(last.at));
-                self.clock.torn += usize::from(segments.is_waiting() && apart > Segment::within(id));
+                let apart = last.replace(seen).map_or(Span(0), |last| seen.at.elapsed_since(last.at));
+                self.clock.torn += usize::from(segments.is_waiting() && apart > Reassembler::max_gap(id));
                 // Late segments are counted, but still belong together.
-                match segments.push(Micros(0), id, Lengths::of(id), frame.data()) {
+                match segments.push(Micros(0), id, Lengths::for_id(id), frame.data()) {
                     Ok(Reassembly::Waiting) => return,
                     Ok(Reassembly::Complete(packet)) => {
-                        self.life.joins(id.kind as usize);
+                        self.life.join_kind(id.kind as usize);
                         Ok(packet)
                     }
                     // The previous segment is the end of a packet that began before the test.
-                    Ok(Reassembly::Incomplete) if !self.life.joins(id.kind as usize) => return,
+                    Ok(Reassembly::Incomplete) if !self.life.join_kind(id.kind as usize) => return,
                     Ok(Reassembly::Incomplete) => Err(PacketError::Incomplete),
                     Ok(Reassembly::Ambiguous) => Err(PacketError::Ambiguous),
                     Err(error) => Err(error),
@@ -107,9 +107,9 @@ impl Session<'_> {
         match message {
             Ok(message) => {
                 self.findings.pass("SEND-1");
-                let heard = Heard { at: seen.at, message };
-                self.heard.push(heard);
-                self.look_at(&heard);
+                let heard = CellPacket { at: seen.at, message };
+                self.packets.push(heard);
+                self.check_packet(&heard);
             }
             Err(error) => {
                 self.check("SEND-1", false, || format!("{frame} is not a packet: {error}"));
@@ -118,8 +118,8 @@ impl Session<'_> {
     }
 
     /// Checks the rules for every packet; heartbeats count the packets sent.
-    fn look_at(&mut self, heard: &Heard) {
-        self.life.accounts.heard(&heard.message);
+    fn check_packet(&mut self, heard: &CellPacket) {
+        self.life.accounts.count_cell_packet(&heard.message);
         if let Some((&Heartbeat { serial, sent, state, .. }, _)) = heard.beat() {
             // The cell has been switched off and on.
             let begins = state.has(State::CLAIMING) && !self.life.claiming;

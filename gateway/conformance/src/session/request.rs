@@ -2,20 +2,20 @@
 
 use model::decode::Decoded;
 use protocol::id::Node;
-use protocol::message::{Answer, Heard as HeardPage, Message, NetworkPage, Refused, Request, SensorPage};
-use protocol::packet::{Epoch, WORDS, words};
+use protocol::message::{Answer, ReceivedCounts as HeardPage, Message, NetworkPage, RejectedCounts, Request, SensorPage};
+use protocol::packet::{Epoch, WORDS, padded_words};
 use protocol::parameters::{Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
-use super::{Heard, PATIENT, Session};
-use crate::bus::Stop;
+use super::{CellPacket, ANSWER_TIMEOUT, Session};
+use crate::bus::StopReason;
 
 /// The time by which all pages of a report have come.
-const REPORT: Span = Span::from_millis(150);
+const REPORT_TIMEOUT: Span = Span::from_millis(150);
 /// The time in which the right answer may follow one with another tag.
-const LATER: Span = Span::from_millis(30);
+const LATE_ANSWER_TIMEOUT: Span = Span::from_millis(30);
 /// The time limit of a commit, which writes flash.
-const COMMIT: Span = Span::from_millis(900);
+const COMMIT_TIMEOUT: Span = Span::from_millis(900);
 
 /// The reply of a cell to a request.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -35,14 +35,14 @@ impl Reply {
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(crate) struct Counters {
     pub(crate) heard: HeardPage,
-    pub(crate) refused: Refused,
+    pub(crate) refused: RejectedCounts,
 }
 
 impl core::fmt::Display for Counters {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let (from, epoch) = (Node::Gateway, Epoch(0));
         let text = |page| Decoded::Message(Message::Network { from, epoch, page }).to_string();
-        let [heard, refused] = [NetworkPage::Heard(self.heard), NetworkPage::Refused(self.refused)].map(text);
+        let [heard, refused] = [NetworkPage::Received(self.heard), NetworkPage::Rejected(self.refused)].map(text);
         let fields =
             |text: &str| text.split_once(": ").map_or_else(String::new, |(_, fields)| fields.to_owned());
         write!(f, "{}; refused: {}", fields(&heard), fields(&refused))
@@ -50,14 +50,14 @@ impl core::fmt::Display for Counters {
 }
 
 /// The names of the pages that answer a report.
-const REPORT_OF: [&str; 6] = ["network 1", "network 2", "sensors 0", "sensors 1", "network 3", "network 4"];
+const REPORT_PAGES: [&str; 6] = ["network 1", "network 2", "sensors 0", "sensors 1", "network 3", "network 4"];
 
 fn page_name(message: &Message) -> &'static str {
     if let Message::Network { page, .. } = message {
         match page {
             NetworkPage::Heartbeat(_) => "heartbeat",
-            NetworkPage::Heard(_) => "network 1",
-            NetworkPage::Refused(_) => "network 2",
+            NetworkPage::Received(_) => "network 1",
+            NetworkPage::Rejected(_) => "network 2",
             NetworkPage::Tree(_) => "network 3",
             NetworkPage::Ports(_) => "network 4",
         }
@@ -88,7 +88,7 @@ impl core::fmt::Display for Reply {
 }
 
 /// Returns the time, the tag and the content of an answer to a request.
-const fn configured(heard: &Heard) -> Option<(Micros, u8, Answer)> {
+const fn configured(heard: &CellPacket) -> Option<(Micros, u8, Answer)> {
     if let Message::Configured { tag, answer, .. } = heard.message {
         Some((heard.at, tag, answer))
     } else {
@@ -97,48 +97,48 @@ const fn configured(heard: &Heard) -> Option<(Micros, u8, Answer)> {
 }
 
 impl Session<'_> {
-    fn own(&self) -> Node {
+    fn cell_node(&self) -> Node {
         Node::Cell(self.cell)
     }
 
     /// Reads a parameter.
-    pub(crate) fn read(&mut self, number: u8) -> Result<Reply, Stop> {
-        self.request(self.own(), Request::Read { number })
+    pub(crate) fn read(&mut self, number: u8) -> Result<Reply, StopReason> {
+        self.request(self.cell_node(), Request::Read { number })
     }
 
     /// Writes a parameter.
-    pub(crate) fn write(&mut self, number: u8, words: [i16; WORDS]) -> Result<Reply, Stop> {
-        self.request(self.own(), Request::Write { number, words })
+    pub(crate) fn write(&mut self, number: u8, words: [i16; WORDS]) -> Result<Reply, StopReason> {
+        self.request(self.cell_node(), Request::Write { number, words })
     }
 
     /// Writes the first words of a parameter, and zeros for the others.
-    pub(crate) fn set<const N: usize>(&mut self, number: u8, first: [i16; N]) -> Result<Reply, Stop> {
-        self.write(number, words(first))
+    pub(crate) fn write_first_words<const N: usize>(&mut self, number: u8, first: [i16; N]) -> Result<Reply, StopReason> {
+        self.write(number, padded_words(first))
     }
 
     /// Sends a request with the next tag and waits for the answer.
-    pub(crate) fn request(&mut self, to: Node, request: Request) -> Result<Reply, Stop> {
+    pub(crate) fn request(&mut self, to: Node, request: Request) -> Result<Reply, StopReason> {
         self.tag = self.tag.wrapping_mul(5).wrapping_add(0x35);
         self.request_with(to, self.tag, request)
     }
 
     /// Sends a request with this tag and waits for the answer.
-    pub(crate) fn request_with(&mut self, to: Node, tag: u8, request: Request) -> Result<Reply, Stop> {
+    pub(crate) fn request_with(&mut self, to: Node, tag: u8, request: Request) -> Result<Reply, StopReason> {
         let (number, is_write) = match request {
             Request::Read { number } => (number, false),
             Request::Write { number, .. } => (number, true),
         };
         let id = if is_write { "CONF-4" } else { "CONF-1" };
         let is_commit = is_write && number == Parameter::Commit.number();
-        self.mark();
-        let at = self.say(&[Message::Configure { to, tag, request }])?;
-        let longest = if is_commit { COMMIT } else { PATIENT };
+        self.begin_exchange();
+        let at = self.send_messages(&[Message::Configure { to, tag, request }])?;
+        let longest = if is_commit { COMMIT_TIMEOUT } else { ANSWER_TIMEOUT };
         self.wait(at + longest, |heard| {
             heard.iter().any(|it| matches!(it.message, Message::Configured { .. }))
         })?;
         // The answer to an earlier, interrupted request may come first.
-        let is_its = |heard: &Heard| heard.message.tag() == Some(tag) && configured(heard).is_some();
-        self.wait(self.now() + LATER, |heard| {
+        let is_its = |heard: &CellPacket| heard.message.tag() == Some(tag) && configured(heard).is_some();
+        self.wait(self.now() + LATE_ANSWER_TIMEOUT, |heard| {
             heard.iter().any(is_its) || !heard.iter().any(|it| configured(it).is_some())
         })?;
         let place = self.answers().iter().position(is_its);
@@ -168,13 +168,13 @@ impl Session<'_> {
             }
         };
         self.log.ended = self.log.frames.len();
-        let place = self.heard.iter().rposition(|it| matches!(it.message, Message::Configured { .. }));
-        self.consumed = place.map_or(self.heard.len(), |place| place + 1);
+        let place = self.packets.iter().rposition(|it| matches!(it.message, Message::Configured { .. }));
+        self.consumed = place.map_or(self.packets.len(), |place| place + 1);
         Ok(reply)
     }
 
     /// Writes all stored parameters that differ from the staged ones.
-    pub(crate) fn stage(&mut self, parameters: &Parameters) -> Result<(), Stop> {
+    pub(crate) fn stage(&mut self, parameters: &Parameters) -> Result<(), StopReason> {
         let before = self.known.staged.take();
         for parameter in Parameter::stored(parameters.table().len()) {
             let words = parameters.words(parameter);
@@ -196,15 +196,15 @@ impl Session<'_> {
     }
 
     /// Commits parameters. Returns true if the cell uses them.
-    pub(crate) fn commit(&mut self, parameters: &Parameters) -> Result<bool, Stop> {
+    pub(crate) fn commit(&mut self, parameters: &Parameters) -> Result<bool, StopReason> {
         let is_so = |known: Option<Parameters>| known.is_some_and(|it| it.hash() == parameters.hash());
         if self.known.parameters == Some(*parameters) && is_so(self.known.staged) {
             return Ok(true);
         }
         self.stage(parameters)?;
         let hash = parameters.hash();
-        let reply = self.set(Parameter::Commit.number(), [hash.cast_signed()])?;
-        let done = reply == Reply::Value(words([hash.cast_signed()]));
+        let reply = self.write_first_words(Parameter::Commit.number(), [hash.cast_signed()])?;
+        let done = reply == Reply::Value(padded_words([hash.cast_signed()]));
         self.check("CONF-7", done, || format!("commit with hash {hash:04X} was answered with {reply}"));
         if done {
             self.known.parameters = Some(*parameters);
@@ -216,37 +216,37 @@ impl Session<'_> {
     }
 
     /// Requests a report, and returns its packets, without heartbeats.
-    pub(crate) fn report(&mut self) -> Result<Vec<Heard>, Stop> {
-        self.mark();
-        let asked = self.say(&[Message::Report])?;
+    pub(crate) fn report(&mut self) -> Result<Vec<CellPacket>, StopReason> {
+        self.begin_exchange();
+        let asked = self.send_messages(&[Message::Report])?;
         self.pages(asked)
     }
 
     /// Returns true if the cell sends the pages of a cell with ports.
-    pub(crate) fn has_ports(&mut self) -> Result<bool, Stop> {
-        self.mark();
-        let asked = self.say(&[Message::Report])?;
-        let pages = self.collect(asked, REPORT_OF.len())?;
+    pub(crate) fn has_ports(&mut self) -> Result<bool, StopReason> {
+        self.begin_exchange();
+        let asked = self.send_messages(&[Message::Report])?;
+        let pages = self.collect(asked, REPORT_PAGES.len())?;
         let is_of_ports = |page: &NetworkPage| matches!(page, NetworkPage::Tree(_) | NetworkPage::Ports(_));
         Ok(pages.iter().any(|it| matches!(&it.message, Message::Network { page, .. } if is_of_ports(page))))
     }
 
     /// Collects a number of pages, or fewer if no more come.
-    fn collect(&mut self, asked: Micros, expected: usize) -> Result<Vec<Heard>, Stop> {
-        let pages = |heard: &[Heard]| heard.iter().filter(|it| it.beat().is_none()).count();
-        self.wait(asked + REPORT, |heard| pages(heard) >= expected)?;
+    fn collect(&mut self, asked: Micros, expected: usize) -> Result<Vec<CellPacket>, StopReason> {
+        let pages = |heard: &[CellPacket]| heard.iter().filter(|it| it.beat().is_none()).count();
+        self.wait(asked + REPORT_TIMEOUT, |heard| pages(heard) >= expected)?;
         let pages = self.answers().iter().filter(|it| it.beat().is_none()).copied().collect();
         self.consume();
         Ok(pages)
     }
 
     /// Returns the pages of a report that was requested at a time.
-    pub(crate) fn pages(&mut self, asked: Micros) -> Result<Vec<Heard>, Stop> {
+    pub(crate) fn pages(&mut self, asked: Micros) -> Result<Vec<CellPacket>, StopReason> {
         let expected = if self.about.ports { 6 } else { 4 };
         let pages = self.collect(asked, expected + usize::from(self.known.adapts))?;
         if !self.known.senses {
             let names: Vec<_> = pages.iter().map(|it| page_name(&it.message)).collect();
-            let order = REPORT_OF.get(..expected).unwrap_or_default();
+            let order = REPORT_PAGES.get(..expected).unwrap_or_default();
             self.check("CMD-4", names == order, || {
                 format!("a report was answered with {}, not {}", names.join(", "), order.join(", "))
             });
@@ -255,14 +255,14 @@ impl Session<'_> {
     }
 
     /// Requests the counters, and checks that they match the packets sent and received.
-    pub(crate) fn counters(&mut self) -> Result<Counters, Stop> {
+    pub(crate) fn counters(&mut self) -> Result<Counters, StopReason> {
         let report = self.report()?;
         let (mut heard, mut refused) = (None, None);
         for answer in &report {
             if let Message::Network { page, .. } = answer.message {
                 match page {
-                    NetworkPage::Heard(page) => heard = Some(page),
-                    NetworkPage::Refused(page) => refused = Some(page),
+                    NetworkPage::Received(page) => heard = Some(page),
+                    NetworkPage::Rejected(page) => refused = Some(page),
                     NetworkPage::Heartbeat(_) | NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
                 }
             }
@@ -276,7 +276,7 @@ impl Session<'_> {
         }
         let sync = self.exchange_all(&[])?;
         if let (Some((beat, _)), Some((_, refused))) = (sync.beat, refused.and(whole)) {
-            let Refused { length, crc, foreign, meaning, incomplete, stimuli } = refused;
+            let RejectedCounts { length, crc, foreign, meaning, incomplete, stimuli } = refused;
             let sum =
                 [length, crc, foreign, meaning, incomplete, stimuli].into_iter().fold(0, u16::wrapping_add);
             self.check("BEAT-4", beat.rejected == sum, || {

@@ -6,13 +6,13 @@
 use protocol::packet::Epoch;
 use protocol::skin::Safety;
 
-use model::table::Sums;
+use model::table::BusTotals;
 
 /// State of one bus as input of a tick.
 #[derive(Clone, Copy, Debug)]
-pub struct Heard<'a> {
+pub struct BusInput<'a> {
     /// Totals of its table.
-    pub sums: &'a Sums,
+    pub sums: &'a BusTotals,
     /// True if the bus works, by its receiver.
     pub works: bool,
 }
@@ -38,7 +38,7 @@ impl Carried {
     pub(super) fn unanswered(&mut self, last: Option<Epoch>, epoch: Epoch, broadcasts: u64) -> u64 {
         // Epochs wrap around, so compare each once, when it is new.
         if let Some(read) = last.filter(|_| last != self.last) {
-            self.number = broadcasts.saturating_sub(u64::try_from(epoch.since(read)).unwrap_or(0));
+            self.number = broadcasts.saturating_sub(u64::try_from(epoch.epochs_since(read)).unwrap_or(0));
             self.last = last;
         }
         broadcasts.saturating_sub(self.number + 1)

@@ -16,19 +16,19 @@ pub(super) struct Chain {
 
 impl Chain {
     pub(super) fn new(skin: &Skin, bus: usize) -> Self {
-        let joints: Vec<_> = skin.joints_of(bus).map(|(index, joint)| (index, joint.kind)).collect();
+        let joints: Vec<_> = skin.joints_on_bus(bus).map(|(index, joint)| (index, joint.kind)).collect();
         let in_use = u8::try_from(joints.len()).unwrap_or(u8::MAX);
         Self { joints, said: Joints { positions: [Q1_14::ZERO; MAX_JOINTS], in_use } }
     }
 
     /// The last broadcast words.
-    pub(super) const fn said(&self) -> Joints {
+    pub(super) const fn broadcast_joints(&self) -> Joints {
         self.said
     }
 
     /// Converts the robot's positions to words. A position that is not a number keeps its last word; a robot refuses
     /// velocities that lead there anyway.
-    pub(super) fn say(&mut self, q: &[f64; MAX_ROBOT_JOINTS]) {
+    pub(super) fn set_positions(&mut self, q: &[f64; MAX_ROBOT_JOINTS]) {
         for (word, &(joint, kind)) in self.said.positions.iter_mut().zip(&self.joints) {
             if let Some(said) = q.get(joint).and_then(|&q| kind.word(q)) {
                 *word = said;

@@ -1,30 +1,30 @@
 use super::*;
 use crate::controller::Kinesthetic;
 use crate::robot::SimulatedArm;
-use model::table::Sums;
+use model::table::BusTotals;
 use model::testing;
 use protocol::time::Span;
 
 struct Dead;
 
 impl Controller for Dead {
-    fn step(&mut self, _: &Input) -> Step {
-        Step::Bad(BadCycle::NoAnswer)
+    fn step(&mut self, _: &Input) -> ControllerOutput {
+        ControllerOutput::Bad(BadCycle::NoAnswer)
     }
 }
 
-const fn works(sums: &Sums) -> Heard<'_> {
-    Heard { sums, works: true }
+const fn works(sums: &BusTotals) -> BusInput<'_> {
+    BusInput { sums, works: true }
 }
 
 fn tick(number: u64) -> Tick {
     Tick { number, time: Micros(number * 2_000) }
 }
 
-fn cycle(controller: Box<dyn Controller>) -> (Cycle, Sums) {
+fn cycle(controller: Box<dyn Controller>) -> (Cycle, BusTotals) {
     let skin = testing::skin();
     let robot = SimulatedArm::new(&skin, [0.0; MAX_ROBOT_JOINTS]);
-    (Cycle::new(&skin, controller, Box::new(robot)), Sums::default())
+    (Cycle::new(&skin, controller, Box::new(robot)), BusTotals::default())
 }
 
 #[test]
@@ -64,10 +64,10 @@ struct Absent {
 }
 
 impl Controller for Absent {
-    fn step(&mut self, _: &Input) -> Step {
+    fn step(&mut self, _: &Input) -> ControllerOutput {
         self.ticks += 1;
         let moves = [0.5; MAX_ROBOT_JOINTS];
-        if self.misses.contains(&self.ticks) { Step::Bad(BadCycle::NoAnswer) } else { Step::Move(moves) }
+        if self.misses.contains(&self.ticks) { ControllerOutput::Bad(BadCycle::NoAnswer) } else { ControllerOutput::Move(moves) }
     }
 }
 
@@ -79,7 +79,7 @@ fn another_program_may_take_its_time_to_begin() {
     let halts = |skin: &Skin, misses: Vec<u64>| {
         let robot = SimulatedArm::new(skin, [0.0; MAX_ROBOT_JOINTS]);
         let mut cycle = Cycle::new(skin, Box::new(Absent { misses, ticks: 0 }), Box::new(robot));
-        let bus = Sums::default();
+        let bus = BusTotals::default();
         let records: Vec<_> =
             (0..3_000).map(|number| cycle.tick(tick(number), 0, [works(&bus)]).record).collect();
         let halted = records.iter().position(|record| record.halted.is_some()).map(|tick| tick as u64);
@@ -106,7 +106,7 @@ fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
     let skin = testing::skin();
     let limit = u64::from(skin.safety.hold_epochs + skin.safety.decay_epochs + 1);
     let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&skin).unwrap()));
-    let bad = |cycle: &mut Cycle, bus: &Sums, number| cycle.tick(tick(number), 0, [works(bus)]).record.bad;
+    let bad = |cycle: &mut Cycle, bus: &BusTotals, number| cycle.tick(tick(number), 0, [works(bus)]).record.bad;
     for number in 0..=limit * 8 {
         assert_eq!(bad(&mut cycle, &bus, number), None, "tick {number}");
     }
@@ -118,7 +118,7 @@ fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
 /// Two buses in a loop with eight ticks per epoch; each has a torque of 1 Nm.
 struct Two {
     cycle: Cycle,
-    buses: [Sums; 2],
+    buses: [BusTotals; 2],
     works: [bool; 2],
     number: u64,
 }
@@ -129,16 +129,16 @@ impl Two {
         skin.safety.lost_bus = lost_bus;
         let robot = SimulatedArm::new(&skin, [0.0; MAX_ROBOT_JOINTS]);
         let controller = Box::new(Kinesthetic::new(&skin).unwrap());
-        let reference_torque = Sums { torque: [1.0; MAX_JOINTS], contributing: 1, ..Sums::default() };
+        let reference_torque = BusTotals { torque: [1.0; MAX_JOINTS], contributing: 1, ..BusTotals::default() };
         let cycle = Cycle::new(&skin, controller, Box::new(robot));
         Self { cycle, buses: [reference_torque; 2], works: [true; 2], number: 0 }
     }
 
     /// Runs the ticks of an epoch and returns the last one; the buses that carry the epoch read it back.
-    fn epoch(&mut self, carries: [bool; 2]) -> Record {
+    fn epoch(&mut self, carries: [bool; 2]) -> TickRecord {
         let mut last = None;
         for _ in 0..8 {
-            let heard = self.buses.iter().zip(self.works).map(|(sums, works)| Heard { sums, works });
+            let heard = self.buses.iter().zip(self.works).map(|(sums, works)| BusInput { sums, works });
             let outcome = self.cycle.tick(tick(self.number), 0, heard);
             self.number += 1;
             if let Some(epoch) = outcome.broadcast {
@@ -154,7 +154,7 @@ impl Two {
 
 #[test]
 fn a_lost_bus_decays_by_the_rule_for_cells_and_the_others_go_on() {
-    let mut two = Two::new(LostBus::GoOn);
+    let mut two = Two::new(LostBus::Continue);
     for _ in 0..5 {
         let record = two.epoch([true, true]);
         assert_eq!((record.torque[0], record.contributing, record.missing), (2.0, 2, 0));
@@ -181,7 +181,7 @@ fn a_lost_bus_decays_by_the_rule_for_cells_and_the_others_go_on() {
 
 #[test]
 fn a_bus_that_carries_nothing_is_lost_also_without_a_report() {
-    let mut two = Two::new(LostBus::GoOn);
+    let mut two = Two::new(LostBus::Continue);
     two.epoch([true, true]);
     let missing: Vec<_> = (0..300).map(|_| two.epoch([true, false]).missing).collect();
     assert_eq!(missing[..7], [0; 7]);
@@ -190,7 +190,7 @@ fn a_bus_that_carries_nothing_is_lost_also_without_a_report() {
 
 #[test]
 fn without_any_bus_the_torque_is_not_valid() {
-    let mut two = Two::new(LostBus::GoOn);
+    let mut two = Two::new(LostBus::Continue);
     two.epoch([true, true]);
     two.works = [false, false];
     assert_eq!(two.epoch([false, false]).bad, Some(BadCycle::Torque));
@@ -232,9 +232,9 @@ fn a_halted_robot_stands_whatever_is_commanded() {
 struct Present(std::ops::Range<u64>);
 
 impl Controller for Present {
-    fn step(&mut self, input: &Input) -> Step {
+    fn step(&mut self, input: &Input) -> ControllerOutput {
         let answers = self.0.contains(&input.tick);
-        if answers { Step::Move([0.0; MAX_ROBOT_JOINTS]) } else { Step::Bad(BadCycle::NoPeer) }
+        if answers { ControllerOutput::Move([0.0; MAX_ROBOT_JOINTS]) } else { ControllerOutput::Bad(BadCycle::NoPeer) }
     }
 
     fn absence(&self, silent: Option<u32>) -> Option<Absence> {

@@ -10,8 +10,8 @@ use protocol::message::Message;
 use protocol::packet::{Epoch, Length, Packet};
 use protocol::parameters::MAX_JOINTS;
 
-use crate::cycle::carried::Heard;
-use crate::cycle::{Cycle, Record, Reference, Tick};
+use crate::cycle::carried::BusInput;
+use crate::cycle::{Cycle, TickRecord, CentralTorque, Tick};
 use crate::external::Absence;
 use model::scenario::{Mode, Scenario};
 use model::table::Snapshot;
@@ -44,9 +44,9 @@ pub struct Shared {
 
 /// Record of a tick, with its timing.
 #[derive(Clone, Copy, Debug)]
-pub struct Timed {
+pub struct TimedRecord {
     /// Record of the tick.
-    pub record: Record,
+    pub record: TickRecord,
     /// Nominal start in ns of the monotonic clock.
     pub due_ns: u64,
     /// Lateness of the start in ns.
@@ -54,7 +54,7 @@ pub struct Timed {
     /// Duration in ns.
     pub took_ns: u64,
     /// Duration of the central computation in ns, and its result, if the tick compared.
-    pub central: Option<(u64, Reference)>,
+    pub central: Option<(u64, CentralTorque)>,
 }
 
 /// State of a bus, shared by all threads.
@@ -84,7 +84,7 @@ impl BusState {
 
 /// A tick's access to one bus.
 #[derive(Debug)]
-pub struct Line {
+pub struct BusPort {
     /// Format of the packets: one FD frame, or two classic ones.
     pub format: Format,
     /// Snapshot from the receiver.
@@ -97,37 +97,37 @@ pub struct Line {
 
 /// Driver of the ticks: the control loop between two readings of the clock.
 #[derive(Debug)]
-pub struct Turn {
+pub struct TickDriver {
     cycle: Cycle,
-    lines: Vec<Line>,
+    lines: Vec<BusPort>,
     scenario: Arc<Scenario>,
     shared: Arc<Shared>,
-    records: rtrb::Producer<Timed>,
+    records: rtrb::Producer<TimedRecord>,
     /// Queue of records to the recorder, if any.
-    recorded: Option<rtrb::Producer<Timed>>,
+    recorded: Option<rtrb::Producer<TimedRecord>>,
     /// Halt or resume that each bus has not accepted yet: its cells must follow the robot's state.
-    owed: Vec<Option<Message>>,
+    pending_commands: Vec<Option<Message>>,
     /// True for each bus that worked in the tick before.
     worked: Vec<bool>,
 }
 
-impl Turn {
+impl TickDriver {
     /// Creates a loop over some buses that has not started.
     #[must_use]
     pub fn new(
         cycle: Cycle,
-        lines: Vec<Line>,
+        lines: Vec<BusPort>,
         scenario: Arc<Scenario>,
         shared: Arc<Shared>,
-        records: rtrb::Producer<Timed>,
+        records: rtrb::Producer<TimedRecord>,
     ) -> Self {
         let (owed, worked) = (vec![None; lines.len()], vec![true; lines.len()]);
-        Self { cycle, lines, scenario, shared, records, recorded: None, owed, worked }
+        Self { cycle, lines, scenario, shared, records, recorded: None, pending_commands: owed, worked }
     }
 
     /// Also queues all ticks to a recorder.
     #[must_use]
-    pub fn recorded(mut self, queue: Option<rtrb::Producer<Timed>>) -> Self {
+    pub fn recorded(mut self, queue: Option<rtrb::Producer<TimedRecord>>) -> Self {
         self.recorded = queue;
         self
     }
@@ -164,7 +164,7 @@ impl Turn {
         let heard = self
             .lines
             .iter()
-            .map(|line| Heard { sums: &line.snapshot.output_buffer().sums, works: line.state.is_there() });
+            .map(|line| BusInput { sums: &line.snapshot.output_buffer().sums, works: line.state.is_there() });
         let outcome = self.cycle.tick(tick, skipped, heard);
         let central = (mode == Mode::Compare).then(|| {
             let before = now();
@@ -172,13 +172,13 @@ impl Turn {
             // Without `black_box` the compiler could drop this work if the result is unused.
             (now().saturating_sub(before), std::hint::black_box(reference_torque))
         });
-        self.owe_to_returned_buses(outcome.record.halted.is_some());
+        self.requeue_for_returned_buses(outcome.record.halted.is_some());
         if let Some(epoch) = outcome.broadcast {
             // A cell that restarted, or missed the halt, would go on answering.
             if outcome.record.halted.is_some() && epoch.0.is_multiple_of(HALT_AGAIN) {
-                self.owed.fill(Some(Message::Halt));
+                self.pending_commands.fill(Some(Message::Halt));
             }
-            self.say_what_is_owed(&mut send);
+            self.send_pending(&mut send);
             // Many buses have the same joints: encode them once.
             let mut said: Option<(usize, Format, Encoded, [f64; MAX_JOINTS])> = None;
             for (bus, line) in self.lines.iter_mut().enumerate() {
@@ -202,7 +202,7 @@ impl Turn {
         } else if outcome.command == Some(Command::Resume) {
             self.command(Message::Resume, &mut send);
         }
-        let timed = Timed {
+        let timed = TimedRecord {
             record: outcome.record,
             due_ns: due,
             late_ns: began.saturating_sub(due),
@@ -221,8 +221,8 @@ impl Turn {
 
     /// Requeues the halt or resume for buses that work again, and for buses whose cells send again: cells missed
     /// commands that the bus accepted just before its loss, or before they returned.
-    fn owe_to_returned_buses(&mut self, halted: bool) {
-        for ((line, owed), worked) in self.lines.iter().zip(&mut self.owed).zip(&mut self.worked) {
+    fn requeue_for_returned_buses(&mut self, halted: bool) {
+        for ((line, owed), worked) in self.lines.iter().zip(&mut self.pending_commands).zip(&mut self.worked) {
             let works = line.state.is_there();
             // Load before swap: a swap in every tick is costly, and the flag is rarely set.
             let returned = &line.state.returned;
@@ -236,20 +236,20 @@ impl Turn {
 
     /// Sends a halt or resume on all buses. A bus that refuses it gets it again before each of its next joints.
     fn command(&mut self, message: Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
-        self.owed.fill(Some(message));
-        self.say_what_is_owed(send);
+        self.pending_commands.fill(Some(message));
+        self.send_pending(send);
     }
 
-    fn say_what_is_owed(&mut self, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
-        for (bus, (line, owed)) in self.lines.iter().zip(&mut self.owed).enumerate() {
-            owed.take_if(|message| line.say(bus, message, &self.shared, send));
+    fn send_pending(&mut self, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
+        for (bus, (line, owed)) in self.lines.iter().zip(&mut self.pending_commands).enumerate() {
+            owed.take_if(|message| line.send_command(bus, message, &self.shared, send));
         }
     }
 }
 
-impl Line {
+impl BusPort {
     /// Sends a command on this bus and counts it. Returns true if the bus accepted it.
-    fn say(
+    fn send_command(
         &self,
         bus: usize,
         message: &Message,

@@ -19,7 +19,7 @@ pub enum Absence {
         /// Path of the gateway's socket.
         socket: PathBuf,
         /// Datagrams that came instead.
-        others: Others,
+        others: OtherDatagrams,
     },
     /// It sent a hello, but no answer in time.
     #[error(
@@ -54,14 +54,14 @@ pub enum Absence {
 
 /// Datagrams of programs that sent no hello.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Others {
+pub struct OtherDatagrams {
     /// Number from senders with an address.
     pub named: u64,
     /// Number from senders without an address, which cannot be answered.
     pub unnamed: u64,
 }
 
-impl Display for Others {
+impl Display for OtherDatagrams {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let named = |count| format!("{count} datagrams came that are no hello of this version");
         let unnamed = |count| format!("{count} came from a socket without an address, which must be bound");

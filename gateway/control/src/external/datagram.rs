@@ -43,7 +43,7 @@ const fn answer_bytes(joints: usize) -> usize {
 
 /// State that the gateway sends in each tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct State {
+pub struct StateDatagram {
     /// Input that all controllers get.
     pub input: Input,
     /// Number of the robot's joints.
@@ -52,16 +52,16 @@ pub struct State {
 
 /// Answer of the other program.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Answer {
+pub struct AnswerDatagram {
     /// Tick that it answers.
     pub tick: u64,
     /// Command for the robot.
-    pub command: Command,
+    pub command: JointCommand,
 }
 
 /// Command for the robot until the next tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Command {
+pub enum JointCommand {
     /// 1: joint velocities in rad/s.
     Velocity([f64; MAX_ROBOT_JOINTS]),
     /// 2: joint positions in rad, reached by the next tick as far as the speed limits allow.
@@ -71,15 +71,15 @@ pub enum Command {
 /// A datagram that the gateway accepts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "one at a time, on the stack: the loop allocates nothing")]
-pub(super) enum Heard {
+pub(super) enum ReceivedDatagram {
     Hello,
-    Answer(Answer),
+    Answer(AnswerDatagram),
 }
 
 /// Reason why a datagram is neither an answer nor a hello.
 #[derive(Clone, Copy, Debug, Eq, Error, Hash, PartialEq)]
 #[non_exhaustive]
-pub enum Nonsense {
+pub enum InvalidDatagram {
     /// No datagram of this kind has this length.
     #[error("wrong length")]
     Length,
@@ -103,7 +103,7 @@ pub enum Nonsense {
     Ahead,
 }
 
-impl Nonsense {
+impl InvalidDatagram {
     /// All reasons.
     pub const ALL: [Self; 7] =
         [Self::Length, Self::Magic, Self::Version, Self::Kind, Self::Command, Self::NotFinite, Self::Ahead];
@@ -153,21 +153,21 @@ impl Reader<'_> {
     }
 
     /// Reads the kind if the header is valid.
-    fn head(&mut self) -> Result<u16, Nonsense> {
+    fn head(&mut self) -> Result<u16, InvalidDatagram> {
         if self.0.len() < HEAD_BYTES {
-            return Err(Nonsense::Length);
+            return Err(InvalidDatagram::Length);
         }
         if self.take() != MAGIC {
-            return Err(Nonsense::Magic);
+            return Err(InvalidDatagram::Magic);
         }
         if u16::from_le_bytes(self.take()) != VERSION {
-            return Err(Nonsense::Version);
+            return Err(InvalidDatagram::Version);
         }
         Ok(u16::from_le_bytes(self.take()))
     }
 }
 
-impl State {
+impl StateDatagram {
     const VALID: u32 = 1;
     const HALTED: u32 = 1 << 1;
     /// Bit 16 is the first bus; bit 31 is the 16th and all after it.
@@ -197,25 +197,25 @@ impl State {
     }
 }
 
-impl Answer {
+impl AnswerDatagram {
     const VELOCITY: u32 = 1;
     const POSITION: u32 = 2;
 }
 
-impl Heard {
+impl ReceivedDatagram {
     /// Decodes a datagram for a robot with `joints` joints. Never panics.
     ///
     /// # Errors
     /// Returns [`Nonsense`] if the datagram is neither an answer nor a hello.
-    pub(super) fn decode(bytes: &[u8], joints: usize) -> Result<Self, Nonsense> {
+    pub(super) fn decode(bytes: &[u8], joints: usize) -> Result<Self, InvalidDatagram> {
         let mut from = Reader(bytes);
         let expected = match from.head()? {
             HELLO => HEAD_BYTES,
             ANSWER => answer_bytes(joints),
-            _ => return Err(Nonsense::Kind),
+            _ => return Err(InvalidDatagram::Kind),
         };
         if bytes.len() != expected {
-            return Err(Nonsense::Length);
+            return Err(InvalidDatagram::Length);
         }
         if expected == HEAD_BYTES {
             return Ok(Self::Hello);
@@ -225,14 +225,14 @@ impl Heard {
         let _zero: [u8; 4] = from.take();
         let values = from.joints(joints);
         if !values.iter().all(|value| value.is_finite()) {
-            return Err(Nonsense::NotFinite);
+            return Err(InvalidDatagram::NotFinite);
         }
         let command = match command {
-            Answer::VELOCITY => Command::Velocity(values),
-            Answer::POSITION => Command::Position(values),
-            _ => return Err(Nonsense::Command),
+            AnswerDatagram::VELOCITY => JointCommand::Velocity(values),
+            AnswerDatagram::POSITION => JointCommand::Position(values),
+            _ => return Err(InvalidDatagram::Command),
         };
-        Ok(Self::Answer(Answer { tick, command }))
+        Ok(Self::Answer(AnswerDatagram { tick, command }))
     }
 }
 
@@ -241,12 +241,12 @@ impl Heard {
 mod peer {
     use super::*;
 
-    impl State {
+    impl StateDatagram {
         /// Decodes a state. Never panics.
-        pub(crate) fn decode(bytes: &[u8]) -> Result<Self, Nonsense> {
+        pub(crate) fn decode(bytes: &[u8]) -> Result<Self, InvalidDatagram> {
             let mut from = Reader(bytes);
             if from.head()? != STATE {
-                return Err(Nonsense::Kind);
+                return Err(InvalidDatagram::Kind);
             }
             let mut input = Input {
                 tick: u64::from_le_bytes(from.take()),
@@ -262,7 +262,7 @@ mod peer {
             let joints = u32::from_le_bytes(from.take());
             let count = usize::try_from(joints).unwrap();
             if bytes.len() != state_bytes(count) {
-                return Err(Nonsense::Length);
+                return Err(InvalidDatagram::Length);
             }
             input.q = from.joints(count);
             input.qdot = from.joints(count);
@@ -271,7 +271,7 @@ mod peer {
         }
     }
 
-    impl Answer {
+    impl AnswerDatagram {
         /// Encodes the answer.
         pub(crate) fn encode(&self, joints: usize) -> Vec<u8> {
             let mut bytes = vec![0; answer_bytes(joints)];
@@ -279,8 +279,8 @@ mod peer {
             out.head(ANSWER);
             out.put(self.tick.to_le_bytes());
             let (command, values) = match self.command {
-                Command::Velocity(values) => (Self::VELOCITY, values),
-                Command::Position(values) => (Self::POSITION, values),
+                JointCommand::Velocity(values) => (Self::VELOCITY, values),
+                JointCommand::Position(values) => (Self::POSITION, values),
             };
             out.put(command.to_le_bytes());
             out.put([0; 4]);

@@ -2,13 +2,13 @@
 
 use std::path::PathBuf;
 
-use super::absence::{Absence, Others};
-use super::datagram::{Command, Heard, Nonsense};
-use crate::controller::{BadCycle, Input, Pace, Step};
+use super::absence::{Absence, OtherDatagrams};
+use super::datagram::{JointCommand, ReceivedDatagram, InvalidDatagram};
+use crate::controller::{BadCycle, Input, SpeedLimits, ControllerOutput};
 
 /// Counts of events since the start.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
-pub(super) struct Counts {
+pub(super) struct ExchangeCounts {
     /// Hellos.
     pub(super) hellos: u64,
     /// Answers in time.
@@ -28,10 +28,10 @@ pub(super) struct Counts {
     /// Datagrams that could not be received, and hellos from unnamed senders.
     pub(super) failed: u64,
     /// Invalid datagrams from the peer, in the order of [`Nonsense::ALL`].
-    pub(super) nonsense: [u64; Nonsense::ALL.len()],
+    pub(super) nonsense: [u64; InvalidDatagram::ALL.len()],
 }
 
-impl Counts {
+impl ExchangeCounts {
     /// All counts with their names.
     pub(super) fn each(&self) -> impl Iterator<Item = (String, u64)> {
         let own = [
@@ -45,7 +45,7 @@ impl Counts {
             ("gone", self.gone),
             ("failed", self.failed),
         ];
-        let nonsense = Nonsense::ALL.iter().zip(self.nonsense);
+        let nonsense = InvalidDatagram::ALL.iter().zip(self.nonsense);
         own.into_iter()
             .map(|(name, count)| (name.to_owned(), count))
             .chain(nonsense.map(|(why, count)| (format!("nonsense: {why}"), count)))
@@ -57,7 +57,7 @@ impl Counts {
         let &Self { hellos, answers, missing, late, other_senders, failed, .. } = self;
         match (hellos, answers, silent) {
             (0, ..) => {
-                let others = Others { named: other_senders, unnamed: failed };
+                let others = OtherDatagrams { named: other_senders, unnamed: failed };
                 Some(Absence::NoHello { socket, others })
             }
             (_, 0, _) => {
@@ -69,8 +69,8 @@ impl Counts {
         }
     }
 
-    fn nonsense(&mut self, why: Nonsense) {
-        let at = Nonsense::ALL.iter().position(|it| *it == why);
+    fn nonsense(&mut self, why: InvalidDatagram) {
+        let at = InvalidDatagram::ALL.iter().position(|it| *it == why);
         if let Some(count) = at.and_then(|at| self.nonsense.get_mut(at)) {
             *count += 1;
         }
@@ -86,7 +86,7 @@ pub(super) enum Sender {
 
 /// Result of sending a state.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Sent {
+pub(super) enum SendResult {
     Taken,
     QueueFull,
     NobodyThere,
@@ -98,9 +98,9 @@ pub(super) struct Exchange {
     connected: bool,
     /// Tick whose answer is due.
     due: Option<u64>,
-    answer: Option<Command>,
+    answer: Option<JointCommand>,
     nonsense: bool,
-    pub(super) counts: Counts,
+    pub(super) counts: ExchangeCounts,
     /// Number of the robot's joints.
     joints: usize,
 }
@@ -113,9 +113,9 @@ impl Exchange {
 
     /// Handles a datagram. Returns true if its sender is the peer from now on.
     pub(super) fn handle(&mut self, bytes: &[u8], sender: Sender) -> bool {
-        let answer = match (Heard::decode(bytes, self.joints), sender) {
-            (Ok(Heard::Hello), _) => {
-                let counts = Counts { hellos: self.counts.hellos + 1, ..core::mem::take(&mut self.counts) };
+        let answer = match (ReceivedDatagram::decode(bytes, self.joints), sender) {
+            (Ok(ReceivedDatagram::Hello), _) => {
+                let counts = ExchangeCounts { hellos: self.counts.hellos + 1, ..core::mem::take(&mut self.counts) };
                 // A second hello of the peer keeps its pending answer.
                 if sender == Sender::Other || !self.connected {
                     *self = Self::new(self.joints);
@@ -132,12 +132,12 @@ impl Exchange {
                 self.counts.nonsense(why);
                 return false;
             }
-            (Ok(Heard::Answer(answer)), Sender::Peer) => answer,
+            (Ok(ReceivedDatagram::Answer(answer)), Sender::Peer) => answer,
         };
         match self.due {
             Some(due) if answer.tick > due => {
                 self.nonsense = true;
-                self.counts.nonsense(Nonsense::Ahead);
+                self.counts.nonsense(InvalidDatagram::Ahead);
             }
             Some(due) if answer.tick == due => {
                 if self.answer.is_some() {
@@ -152,7 +152,7 @@ impl Exchange {
     }
 
     /// Returns the command of the tick; call it after all datagrams have been handled.
-    pub(super) fn step(&mut self, input: &Input, pace: &Pace) -> Step {
+    pub(super) fn step(&mut self, input: &Input, pace: &SpeedLimits) -> ControllerOutput {
         let (due, answer) = (self.due.take(), self.answer.take());
         let nonsense = core::mem::take(&mut self.nonsense);
         if answer.is_some() {
@@ -161,23 +161,23 @@ impl Exchange {
             self.counts.missing += 1;
         }
         match (answer, due) {
-            _ if nonsense => Step::Bad(BadCycle::Nonsense),
-            (Some(Command::Velocity(velocity)), _) => Step::Move(pace.limited(velocity, input)),
-            (Some(Command::Position(goal)), _) => Step::Move(pace.towards(&goal, input)),
-            (None, Some(_)) => Step::Bad(BadCycle::NoAnswer),
-            (None, None) => Step::Bad(BadCycle::NoPeer),
+            _ if nonsense => ControllerOutput::Bad(BadCycle::Nonsense),
+            (Some(JointCommand::Velocity(velocity)), _) => ControllerOutput::Move(pace.limited(velocity, input)),
+            (Some(JointCommand::Position(goal)), _) => ControllerOutput::Move(pace.towards(&goal, input)),
+            (None, Some(_)) => ControllerOutput::Bad(BadCycle::NoAnswer),
+            (None, None) => ControllerOutput::Bad(BadCycle::NoPeer),
         }
     }
 
     /// Notes the result of sending this tick's state.
-    pub(super) fn sent(&mut self, tick: u64, sent: Sent) {
+    pub(super) fn sent(&mut self, tick: u64, sent: SendResult) {
         match sent {
-            Sent::Taken => self.due = Some(tick),
-            Sent::QueueFull => {
+            SendResult::Taken => self.due = Some(tick),
+            SendResult::QueueFull => {
                 self.due = Some(tick);
                 self.counts.unsent += 1;
             }
-            Sent::NobodyThere => {
+            SendResult::NobodyThere => {
                 self.connected = false;
                 self.counts.gone += 1;
             }

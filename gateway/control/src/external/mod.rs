@@ -14,8 +14,8 @@ mod datagram;
 mod exchange;
 mod socket;
 
-pub use absence::{Absence, Others};
-pub use datagram::{Answer, Command, Nonsense, State};
+pub use absence::{Absence, OtherDatagrams};
+pub use datagram::{AnswerDatagram, JointCommand, InvalidDatagram, StateDatagram};
 pub use socket::{External, SocketError};
 
 #[cfg(test)]

@@ -13,9 +13,9 @@ use rustix::net::SocketAddrUnix;
 use thiserror::Error;
 
 use super::absence::Absence;
-use super::datagram::{MAX_ANSWER_BYTES, State};
-use super::exchange::{Exchange, Sender, Sent};
-use crate::controller::{Controller, Input, Pace, Step};
+use super::datagram::{MAX_ANSWER_BYTES, StateDatagram};
+use super::exchange::{Exchange, Sender, SendResult};
+use crate::controller::{Controller, Input, SpeedLimits, ControllerOutput};
 
 /// Maximum number of datagrams received per tick: the rest waits, so that no sender can delay the tick.
 const PER_TICK: usize = 16;
@@ -29,7 +29,7 @@ pub struct External {
     file: Option<(u64, u64)>,
     peer: Option<SocketAddr>,
     exchange: Exchange,
-    pace: Pace,
+    pace: SpeedLimits,
     joints: u32,
 }
 
@@ -79,7 +79,7 @@ impl External {
             path: path.to_owned(),
             peer: None,
             exchange: Exchange::new(skin.robot.joints.len()),
-            pace: Pace::of(skin),
+            pace: SpeedLimits::from_skin(skin),
             joints: u32::try_from(skin.robot.joints.len()).unwrap_or_default(),
         })
     }
@@ -110,14 +110,14 @@ impl External {
 
     fn send(&mut self, input: &Input) {
         let Some(peer) = &self.peer else { return };
-        let state = State { input: *input, joints: self.joints }.encode();
+        let state = StateDatagram { input: *input, joints: self.joints }.encode();
         let sent = match self.socket.send_to_addr(&state, peer) {
-            Ok(_) => Sent::Taken,
+            Ok(_) => SendResult::Taken,
             // None of these errors means that the peer has gone.
-            Err(error) if passes(&error) => Sent::QueueFull,
-            Err(_) => Sent::NobodyThere,
+            Err(error) if passes(&error) => SendResult::QueueFull,
+            Err(_) => SendResult::NobodyThere,
         };
-        if sent == Sent::NobodyThere {
+        if sent == SendResult::NobodyThere {
             self.peer = None;
         }
         self.exchange.sent(input.tick, sent);
@@ -125,7 +125,7 @@ impl External {
 }
 
 impl Controller for External {
-    fn step(&mut self, input: &Input) -> Step {
+    fn step(&mut self, input: &Input) -> ControllerOutput {
         self.receive();
         let step = self.exchange.step(input, &self.pace);
         self.send(input);

@@ -6,9 +6,9 @@ use std::process;
 use proptest::prelude::*;
 use tempfile::TempDir;
 
-use super::datagram::Heard;
+use super::datagram::ReceivedDatagram;
 use super::*;
-use crate::controller::{BadCycle, Controller, Input, Step};
+use crate::controller::{BadCycle, Controller, Input, ControllerOutput};
 use model::testing::skin;
 use protocol::packet::padded;
 
@@ -39,14 +39,14 @@ fn input(tick: u64) -> Input {
 }
 
 fn velocity(tick: u64, first: f64) -> Vec<u8> {
-    let command = Command::Velocity(padded(&[first, 0.0, 0.0, 0.0, 0.0, 0.0]));
-    Answer { tick, command }.encode(6)
+    let command = JointCommand::Velocity(padded(&[first, 0.0, 0.0, 0.0, 0.0, 0.0]));
+    AnswerDatagram { tick, command }.encode(6)
 }
 
-fn state(socket: &UnixDatagram) -> State {
+fn state(socket: &UnixDatagram) -> StateDatagram {
     let mut bytes = [0; 1_000];
     let length = socket.recv(&mut bytes).unwrap();
-    State::decode(&bytes[..length]).unwrap()
+    StateDatagram::decode(&bytes[..length]).unwrap()
 }
 
 fn count(gateway: &External, name: &str) -> u64 {
@@ -67,71 +67,71 @@ fn a_state_is_the_bytes_of_the_documented_table() {
         missing: 0b101,
         halted: true,
     };
-    let bytes = State { input, joints: 6 }.encode();
+    let bytes = StateDatagram { input, joints: 6 }.encode();
     assert_eq!(bytes[..16], *b"SKBC\x01\x00\x01\x00\x02\x01\0\0\0\0\0\0");
     assert_eq!(bytes[16..40], *b"\xa0\xdf\x07\0\0\0\0\0\x03\0\0\0\x14\0\0\0\x03\0\x05\0\x06\0\0\0");
     assert_eq!(bytes[40..48], *b"\0\0\0\0\0\0\xf0\x3f");
     assert_eq!(bytes[80..96], *b"\0\0\0\0\0\0\0\xc0\0\0\0\0\0\0\xe0\x3f");
     assert_eq!(bytes[176..], *b"\0\0\0\0\0\0\xd0\x3f");
-    assert_eq!(State::decode(&bytes), Ok(State { input, joints: 6 }));
+    assert_eq!(StateDatagram::decode(&bytes), Ok(StateDatagram { input, joints: 6 }));
 }
 
 #[test]
 fn a_robot_of_more_joints_has_longer_datagrams() {
     let mut input = Input::default();
     (input.q[0], input.qdot[0], input.torque[12]) = (1.0, 0.5, 0.25);
-    let bytes = State { input, joints: 13 }.encode();
+    let bytes = StateDatagram { input, joints: 13 }.encode();
     assert_eq!(bytes.len(), 40 + 3 * 13 * 8);
     assert_eq!(bytes[40 + 13 * 8..][..8], *b"\0\0\0\0\0\0\xe0\x3f");
     assert_eq!(bytes[40 + 39 * 8 - 8..], *b"\0\0\0\0\0\0\xd0\x3f");
-    assert_eq!(State::decode(&bytes), Ok(State { input, joints: 13 }));
-    let answer = Answer { tick: 7, command: Command::Velocity(padded(&[1.0; 13])) };
+    assert_eq!(StateDatagram::decode(&bytes), Ok(StateDatagram { input, joints: 13 }));
+    let answer = AnswerDatagram { tick: 7, command: JointCommand::Velocity(padded(&[1.0; 13])) };
     assert_eq!(answer.encode(13).len(), 24 + 13 * 8);
-    assert_eq!(Heard::decode(&answer.encode(13), 13), Ok(Heard::Answer(answer)));
-    assert_eq!(Heard::decode(&answer.encode(13), 7), Err(Nonsense::Length));
+    assert_eq!(ReceivedDatagram::decode(&answer.encode(13), 13), Ok(ReceivedDatagram::Answer(answer)));
+    assert_eq!(ReceivedDatagram::decode(&answer.encode(13), 7), Err(InvalidDatagram::Length));
 }
 
 #[test]
 fn buses_beyond_the_16th_share_its_bit() {
     let said = |missing| {
-        let bytes = State { input: Input { missing, ..Input::default() }, joints: 6 }.encode();
-        State::decode(&bytes).unwrap().input.missing
+        let bytes = StateDatagram { input: Input { missing, ..Input::default() }, joints: 6 }.encode();
+        StateDatagram::decode(&bytes).unwrap().input.missing
     };
     assert_eq!([1, 1 << 15, 1 << 16, 1 << 31].map(said), [1, 1 << 15, 1 << 15, 1 << 15]);
 }
 
 #[test]
 fn an_answer_is_the_bytes_of_the_documented_table() {
-    let command = Command::Position(padded(&[-2.0, 0.0, 0.0, 0.0, 0.0, 1.0]));
-    let bytes = Answer { tick: 7, command }.encode(6);
+    let command = JointCommand::Position(padded(&[-2.0, 0.0, 0.0, 0.0, 0.0, 1.0]));
+    let bytes = AnswerDatagram { tick: 7, command }.encode(6);
     assert_eq!(bytes[..24], *b"SKBC\x01\x00\x02\x00\x07\0\0\0\0\0\0\0\x02\0\0\0\0\0\0\0");
     assert_eq!(bytes[24..32], *b"\0\0\0\0\0\0\0\xc0");
     assert_eq!(bytes[64..], *b"\0\0\0\0\0\0\xf0\x3f");
-    assert_eq!(Heard::decode(&bytes, 6), Ok(Heard::Answer(Answer { tick: 7, command })));
+    assert_eq!(ReceivedDatagram::decode(&bytes, 6), Ok(ReceivedDatagram::Answer(AnswerDatagram { tick: 7, command })));
 }
 
 #[test]
 fn an_answer_is_executed_in_the_next_tick() {
     let (folder, _, mut gateway) = gateway();
-    assert_eq!(gateway.step(&input(0)), Step::Bad(BadCycle::NoPeer));
+    assert_eq!(gateway.step(&input(0)), ControllerOutput::Bad(BadCycle::NoPeer));
     let program = program(&folder, "program");
     program.send(HELLO).unwrap();
-    assert_eq!(gateway.step(&input(1)), Step::Bad(BadCycle::NoPeer), "it has not got a state yet");
-    assert_eq!(state(&program), State { input: input(1), joints: 6 });
+    assert_eq!(gateway.step(&input(1)), ControllerOutput::Bad(BadCycle::NoPeer), "it has not got a state yet");
+    assert_eq!(state(&program), StateDatagram { input: input(1), joints: 6 });
     program.send(&velocity(1, 0.5)).unwrap();
-    assert_eq!(gateway.step(&input(2)), Step::Move(padded(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0])));
-    let command = Command::Position(padded(&[0.001, 0.0, 0.0, 0.0, 0.0, -9.0]));
-    program.send(&Answer { tick: 2, command }.encode(6)).unwrap();
-    let Step::Move([first, _, _, _, _, last, ..]) = gateway.step(&input(3)) else {
+    assert_eq!(gateway.step(&input(2)), ControllerOutput::Move(padded(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0])));
+    let command = JointCommand::Position(padded(&[0.001, 0.0, 0.0, 0.0, 0.0, -9.0]));
+    program.send(&AnswerDatagram { tick: 2, command }.encode(6)).unwrap();
+    let ControllerOutput::Move([first, _, _, _, _, last, ..]) = gateway.step(&input(3)) else {
         panic!("an answer was there")
     };
     assert!((first - 0.5).abs() < 1e-12, "a thousandth of a radian in 2 ms");
     assert!((last + 3.0).abs() < 1e-12, "no quicker than it may");
     program.send(&velocity(3, 99.0)).unwrap();
-    assert_eq!(gateway.step(&input(4)), Step::Move(padded(&[2.0, 0.0, 0.0, 0.0, 0.0, 0.0])));
+    assert_eq!(gateway.step(&input(4)), ControllerOutput::Move(padded(&[2.0, 0.0, 0.0, 0.0, 0.0, 0.0])));
     program.send(&velocity(4, 1.0)).unwrap();
     let halted = Input { halted: true, ..input(5) };
-    assert_eq!(gateway.step(&halted), Step::Move(padded(&[0.0; 6])), "a halted robot stays");
+    assert_eq!(gateway.step(&halted), ControllerOutput::Move(padded(&[0.0; 6])), "a halted robot stays");
     assert_eq!((count(&gateway, "answers"), count(&gateway, "missing")), (4, 0));
 }
 
@@ -141,16 +141,16 @@ fn a_missing_answer_is_a_bad_cycle_and_a_late_one_is_none() {
     let program = program(&folder, "program");
     program.send(HELLO).unwrap();
     gateway.step(&input(1));
-    assert_eq!(gateway.step(&input(2)), Step::Bad(BadCycle::NoAnswer));
+    assert_eq!(gateway.step(&input(2)), ControllerOutput::Bad(BadCycle::NoAnswer));
     program.send(&velocity(1, 0.5)).unwrap();
-    assert_eq!(gateway.step(&input(3)), Step::Bad(BadCycle::NoAnswer), "an old tick");
+    assert_eq!(gateway.step(&input(3)), ControllerOutput::Bad(BadCycle::NoAnswer), "an old tick");
     program.send(&velocity(2, 0.5)).unwrap();
     program.send(&velocity(3, 0.25)).unwrap();
     program.send(&velocity(3, 0.75)).unwrap();
     let step = gateway.step(&input(7));
     assert_eq!(
         step,
-        Step::Move(padded(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])),
+        ControllerOutput::Move(padded(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])),
         "the first answer to the last tick"
     );
     assert_eq!((count(&gateway, "missing"), count(&gateway, "late")), (2, 2));
@@ -184,11 +184,11 @@ fn nonsense_is_counted_by_reason_and_makes_the_cycle_bad() {
         let before = count(&gateway, &format!("nonsense: {why}"));
         program.send(&velocity(tick - 1, 0.5)).unwrap();
         program.send(bytes).unwrap();
-        assert_eq!(gateway.step(&input(tick)), Step::Bad(BadCycle::Nonsense), "{why}");
+        assert_eq!(gateway.step(&input(tick)), ControllerOutput::Bad(BadCycle::Nonsense), "{why}");
         assert_eq!(count(&gateway, &format!("nonsense: {why}")), before + 1);
     }
     program.send(&velocity(10, 0.5)).unwrap();
-    assert!(matches!(gateway.step(&input(11)), Step::Move(_)), "valid answers still work");
+    assert!(matches!(gateway.step(&input(11)), ControllerOutput::Move(_)), "valid answers still work");
 }
 
 #[test]
@@ -200,15 +200,15 @@ fn the_sender_of_the_last_hello_is_the_peer_and_others_are_ignored() {
     second.send(b"nonsense").unwrap();
     second.send(&velocity(1, 1.0)).unwrap();
     first.send(&velocity(1, 0.5)).unwrap();
-    assert_eq!(gateway.step(&input(2)), Step::Move(padded(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0])));
+    assert_eq!(gateway.step(&input(2)), ControllerOutput::Move(padded(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0])));
     assert_eq!(count(&gateway, "other senders"), 2);
     second.send(HELLO).unwrap();
     first.send(&velocity(2, 0.5)).unwrap();
-    assert_eq!(gateway.step(&input(3)), Step::Bad(BadCycle::NoPeer), "the new one has not got a state yet");
+    assert_eq!(gateway.step(&input(3)), ControllerOutput::Bad(BadCycle::NoPeer), "the new one has not got a state yet");
     second.send(HELLO).unwrap();
     second.send(&velocity(3, 0.25)).unwrap();
     let step = gateway.step(&input(4));
-    assert_eq!(step, Step::Move(padded(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])), "a second hello changes nothing");
+    assert_eq!(step, ControllerOutput::Move(padded(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])), "a second hello changes nothing");
 }
 
 #[test]
@@ -218,15 +218,15 @@ fn a_peer_that_goes_away_is_noticed_and_may_come_back() {
     first.send(HELLO).unwrap();
     gateway.step(&input(1));
     drop(first);
-    assert_eq!(gateway.step(&input(2)), Step::Bad(BadCycle::NoAnswer));
-    assert_eq!(gateway.step(&input(3)), Step::Bad(BadCycle::NoPeer));
+    assert_eq!(gateway.step(&input(2)), ControllerOutput::Bad(BadCycle::NoAnswer));
+    assert_eq!(gateway.step(&input(3)), ControllerOutput::Bad(BadCycle::NoPeer));
     assert_eq!(count(&gateway, "gone"), 1);
     std::fs::remove_file(folder.path().join("program")).unwrap();
     let again = program(&folder, "program");
     again.send(HELLO).unwrap();
     gateway.step(&input(4));
     again.send(&velocity(4, 0.5)).unwrap();
-    assert!(matches!(gateway.step(&input(5)), Step::Move(_)));
+    assert!(matches!(gateway.step(&input(5)), ControllerOutput::Move(_)));
 }
 
 #[test]
@@ -313,15 +313,15 @@ fn another_socket_under_the_same_name_is_not_removed() {
 proptest! {
     #[test]
     fn no_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
-        let _ = Heard::decode(&bytes, 6);
-        let _ = State::decode(&bytes);
+        let _ = ReceivedDatagram::decode(&bytes, 6);
+        let _ = StateDatagram::decode(&bytes);
     }
 
     #[test]
     fn an_answer_comes_back(tick: u64, values in proptest::array::uniform6(-1e9..1e9), which: bool) {
-        let command = if which { Command::Velocity(padded(&values)) } else { Command::Position(padded(&values)) };
-        let answer = Answer { tick, command };
-        prop_assert_eq!(Heard::decode(&answer.encode(6), 6), Ok(Heard::Answer(answer)));
+        let command = if which { JointCommand::Velocity(padded(&values)) } else { JointCommand::Position(padded(&values)) };
+        let answer = AnswerDatagram { tick, command };
+        prop_assert_eq!(ReceivedDatagram::decode(&answer.encode(6), 6), Ok(ReceivedDatagram::Answer(answer)));
     }
 }
 

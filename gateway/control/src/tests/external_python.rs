@@ -6,7 +6,7 @@ use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::controller::{Controller, Input, Step};
+use crate::controller::{Controller, Input, ControllerOutput};
 use crate::external::External;
 use protocol::packet::padded;
 use protocol::skin::Skin;
@@ -32,7 +32,7 @@ fn the_example_in_python_makes_the_arm_give_way() {
     let python = Command::new("python3").arg(example).arg(&path).stdout(Stdio::piped()).spawn();
     let mut python = Running(python.expect("python3 is needed: apt install python3"));
     let torque = [2.0, -1.0, 0.5, 0.0, 0.0, 0.0];
-    let target = Step::Move(padded(&[0.5, -0.25, 0.125, 0.0, 0.0, 0.0]));
+    let target = ControllerOutput::Move(padded(&[0.5, -0.25, 0.125, 0.0, 0.0, 0.0]));
     let (start, mut tick, mut answers) = (Instant::now(), 0, 0);
     let mut report = BufReader::new(python.0.stdout.take().unwrap());
     let report = thread::spawn(move || {
@@ -46,8 +46,8 @@ fn the_example_in_python_makes_the_arm_give_way() {
         let input =
             Input { tick, time, torque: padded(&torque), contributing: 3, valid: true, ..Input::default() };
         tick += 1;
-        if let Step::Move(velocity) = gateway.step(&input) {
-            assert_eq!(Step::Move(velocity), target);
+        if let ControllerOutput::Move(velocity) = gateway.step(&input) {
+            assert_eq!(ControllerOutput::Move(velocity), target);
             answers += 1;
         }
         thread::yield_now();

@@ -1,7 +1,7 @@
 //! Checks the purposes of the ready-made scenarios: plays them without a bus, with the central computation as the skin.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
-use crate::controller::{Input, Step};
+use crate::controller::{Input, ControllerOutput};
 use crate::motion::controller_of;
 use crate::robot::{Robot, SimulatedArm};
 use model::central::Central;
@@ -59,7 +59,7 @@ fn play(scenario: &str) -> Most {
         let (q, qdot) = (arm.positions(), arm.velocities());
         let time = Micros(tick * 2_000);
         let input = Input { tick, time, q, qdot, torque: padded(&torque), valid: true, ..Input::default() };
-        let Step::Move(velocity) = controller.step(&input) else { unreachable!("the input is valid") };
+        let ControllerOutput::Move(velocity) = controller.step(&input) else { unreachable!("the input is valid") };
         most.at_limit |= arm.step(&velocity, 0.002).at_limit;
         for (q, start) in arm.positions().iter().zip(start) {
             most.way = most.way.max((q - start).abs());

@@ -43,7 +43,7 @@ fn kind(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
 
 /// Names XML that is not COLLADA, or COLLADA with another extension.
 fn xml(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
-    let text = protocol::xml::text(bytes).ok()?;
+    let text = protocol::xml::decode(bytes).ok()?;
     let prepared = protocol::xml::prepare(&text).ok()?;
     let document = Document::parse(&prepared.text).ok()?;
     let name = document.root_element().tag_name().name();

@@ -16,7 +16,7 @@ use std::io;
 use std::path::Path;
 
 use nalgebra::{Matrix3, Point3, Vector3};
-use protocol::xml::{Fault, Foreign, foreign};
+use protocol::xml::{XmlFault, ForeignFile, detect_foreign};
 use thiserror::Error;
 
 pub use simplify::simplify;
@@ -84,7 +84,7 @@ pub enum MeshError {
         /// The file.
         file: String,
         /// The fault, with its hint.
-        fault: Fault,
+        fault: XmlFault,
     },
     /// The file has another format, or is a placeholder for another file.
     #[error("mesh {file}{}: {what}: {hint}", line.map_or_else(String::new, |line| format!(":{line}")))]
@@ -199,7 +199,7 @@ impl Mesh {
     /// # Errors
     /// Returns [`MeshError`] as [`Mesh::load`] does.
     pub fn parse(name: &str, bytes: &[u8], up: UpAxis) -> Result<Self, MeshError> {
-        if let Some(Foreign { line, what, hint }) = foreign(bytes) {
+        if let Some(ForeignFile { line, what, hint }) = detect_foreign(bytes) {
             return Err(MeshError::Foreign { file: name.to_owned(), line, what: what.to_owned(), hint });
         }
         let extension = Path::new(name).extension().and_then(OsStr::to_str).unwrap_or_default();

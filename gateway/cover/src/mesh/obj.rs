@@ -2,13 +2,13 @@
 
 use nalgebra::Point3;
 
-use super::polygon::Filled;
+use super::polygon::Triangulation;
 use super::{MAX_TRIANGLES, MeshError, Triangle, syntax, too_many};
 
 /// Returns the triangles of a file.
 pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
     let mut vertices: Vec<Point3<f64>> = Vec::new();
-    let mut filled = Filled::default();
+    let mut filled = Triangulation::default();
     // Names may have any encoding; numbers are ASCII.
     let text = String::from_utf8_lossy(bytes);
     for (line, words) in lines(&text) {

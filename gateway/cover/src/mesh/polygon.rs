@@ -11,18 +11,18 @@ const AREA_TOLERANCE: f64 = 1e-6;
 
 /// The maximum area of a nonplanar polygon's triangles relative to the polygon's area: that of triangles tilted by 60
 /// degrees.
-const BENT: f64 = 2.0;
+const MAX_BENT_AREA: f64 = 2.0;
 
 /// The tolerated share of a mesh's area in polygons that intersect themselves or are bent. Meshes of real robots have
 /// some, of a square millimetre each.
-const FAULTY: f64 = 1e-3;
+const MAX_FAULTY_SHARE: f64 = 1e-3;
 
 /// The width of a polygon without an area, relative to its length.
-const THIN: f64 = 1e-6;
+const MAX_THIN_WIDTH: f64 = 1e-6;
 
 /// The triangles of polygons.
 #[derive(Debug, Default)]
-pub(super) struct Filled {
+pub(super) struct Triangulation {
     pub(super) triangles: Vec<Triangle>,
     /// The total difference in area of polygons that intersect themselves or are bent.
     off: f64,
@@ -30,7 +30,7 @@ pub(super) struct Filled {
     worst: Option<(f64, String)>,
 }
 
-impl Filled {
+impl Triangulation {
     /// Adds the triangles of a polygon with holes. The polygon is projected along the mean of its normals (Newell's
     /// method), so it need not be planar. A polygon without an area adds no triangles.
     pub(super) fn add(&mut self, outline: &[Point3<f64>], holes: &[Vec<Point3<f64>>]) {
@@ -39,7 +39,7 @@ impl Filled {
             return;
         }
         let corners = outline.len() + holes.iter().map(Vec::len).sum::<usize>();
-        let plane = match Plane::of(outline) {
+        let plane = match Plane::project(outline) {
             Outline::Flat(plane) => plane,
             Outline::Thin => return,
             Outline::Opposite { area } => {
@@ -67,7 +67,7 @@ impl Filled {
         }
         let added = self.triangles.get(from..).unwrap_or_default();
         let bent = added.iter().map(surface::area).sum::<f64>() / scale;
-        if bent > BENT * expected {
+        if bent > MAX_BENT_AREA * expected {
             let share = bent / expected;
             let why = format!(
                 "a polygon with {corners} corners is bent, as triangles it has {share:.4} times its area"
@@ -121,7 +121,7 @@ impl Filled {
     pub(super) fn finish(self) -> Result<Vec<Triangle>, String> {
         let whole: f64 = self.triangles.iter().map(surface::area).sum();
         match self.worst {
-            Some((_, why)) if self.off.is_nan() || self.off > FAULTY * whole => {
+            Some((_, why)) if self.off.is_nan() || self.off > MAX_FAULTY_SHARE * whole => {
                 Err(format!("{why}: make triangles of it where it was drawn"))
             }
             _ => Ok(self.triangles),
@@ -158,7 +158,7 @@ struct Plane {
 }
 
 impl Plane {
-    fn of(outline: &[Point3<f64>]) -> Outline {
+    fn project(outline: &[Point3<f64>]) -> Outline {
         let [origin, ..] = *outline else { return Outline::Thin };
         let far = |point: &Point3<f64>| (point - origin).norm();
         let farthest = outline.iter().max_by(|a, b| far(a).total_cmp(&far(b))).unwrap_or(&origin);
@@ -166,12 +166,12 @@ impl Plane {
         let from = |point: &Point3<f64>| (point - origin) / extent;
         let along = from(farthest);
         let width = outline.iter().map(|point| from(point).cross(&along).norm()).fold(0.0, f64::max);
-        if width < THIN || !along.norm().is_finite() {
+        if width < MAX_THIN_WIDTH || !along.norm().is_finite() {
             return Outline::Thin;
         }
         let next = outline.iter().cycle().skip(1);
         let normal: Vector3<f64> = outline.iter().zip(next).map(|(a, b)| from(a).cross(&from(b))).sum();
-        match Unit::try_new(normal, THIN * width) {
+        match Unit::try_new(normal, MAX_THIN_WIDTH * width) {
             Some(normal) => Outline::Flat(Self { origin, axes: tangents(&normal), extent }),
             None => Outline::Opposite { area: width * extent * extent },
         }
@@ -234,7 +234,7 @@ mod tests {
             ring.iter().map(|&[x, y]| pose * Point3::new(x, y, 0.0)).collect()
         };
         let holes: Vec<_> = holes.iter().map(|hole| points(hole)).collect();
-        let mut filled = Filled::default();
+        let mut filled = Triangulation::default();
         filled.add(&points(outline), &holes);
         let triangles = filled.finish()?;
         Ok(triangles.iter().map(|triangle| triangle.map(|corner| pose.inverse() * corner)).collect())
@@ -297,7 +297,7 @@ mod tests {
         let star: Vec<_> =
             (0..5).map(|at| f64::from(at) * TAU * 0.4).map(|it| [it.cos(), it.sin()]).collect();
         assert!(filled(&star, &[]).unwrap_err().contains("5 corners crosses itself"));
-        let mut filled = Filled::default();
+        let mut filled = Triangulation::default();
         let corner = |&[x, y]: &[f64; 2]| Point3::new(x, y, 0.0);
         filled.add(&[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]].each_ref().map(corner), &[]);
         filled.add(&[[0.0, 0.0], [0.01, 0.01], [0.01, 0.0], [0.0, 0.01]].each_ref().map(corner), &[]);
@@ -307,7 +307,7 @@ mod tests {
     #[test]
     fn polygons_that_are_folded_are_refused() {
         let folded = |lift: f64| {
-            let mut filled = Filled::default();
+            let mut filled = Triangulation::default();
             let corner = |[x, y, z]: [f64; 3]| Point3::new(x, y, z);
             filled.add(
                 &[[0.0, 0.0, 0.0], [1.0, 0.0, lift], [1.0, 1.0, 0.0], [0.0, 1.0, lift]].map(corner),
@@ -357,7 +357,7 @@ mod tests {
             hole in proptest::collection::vec(proptest::array::uniform3(-1.0..1.0_f64), 0..6),
         ) {
             let points = |corners: Vec<[f64; 3]>| -> Vec<_> { corners.into_iter().map(Point3::from).collect() };
-            let mut filled = Filled::default();
+            let mut filled = Triangulation::default();
             filled.add(&points(corners), &[points(hole)]);
             let _ = filled.finish().is_ok();
         }

@@ -12,7 +12,7 @@ use std::env;
 use std::path::PathBuf;
 
 use crate::mesh::{Mesh, Triangle, UpAxis};
-use crate::{Cell, Link, Options, Part, Skin, cover};
+use crate::{CoverCell, RobotLink, CoverOptions, LinkMesh, Cover, cover};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -22,7 +22,7 @@ const NAMES: [&str; 9] = ["link0", "link1", "link2", "link3", "link4", "link5", 
 const COVERED: core::ops::Range<usize> = 3..7;
 
 /// Returns the robot with bent elbow and wrist: each joint's origin and roll as in `panda.urdf`, and an angle.
-fn robot() -> Vec<Link> {
+fn robot() -> Vec<RobotLink> {
     let folder =
         env::var("SKINBUS_ROBOTS").expect("SKINBUS_ROBOTS is the folder of example-robot-data's robots");
     let folder = PathBuf::from(folder).join("panda_description/meshes/visual");
@@ -47,12 +47,12 @@ fn robot() -> Vec<Link> {
     }
     let link = |(name, pose): (&str, Isometry3<f64>)| {
         let mesh = Mesh::load(&folder.join(format!("{name}.dae")), UpAxis::Ignore).unwrap();
-        Link { name: name.to_owned(), parts: vec![Part::new(mesh)], pose }
+        RobotLink { name: name.to_owned(), parts: vec![LinkMesh::new(mesh)], pose }
     };
     NAMES.into_iter().zip(poses).map(link).collect()
 }
 
-fn triangles(link: &Link, pose: &Isometry3<f64>) -> Vec<Triangle> {
+fn triangles(link: &RobotLink, pose: &Isometry3<f64>) -> Vec<Triangle> {
     let meshes = link.parts.iter().flat_map(|part| part.mesh.triangles());
     meshes.map(|triangle| triangle.map(|corner| pose * corner)).collect()
 }
@@ -131,7 +131,7 @@ fn height(point: &Point3<f64>, triangle: &Triangle) -> Option<f64> {
     (above(a, b) && above(b, c) && above(c, a)).then(|| ((point - a).dot(&up) / up.norm()).abs())
 }
 
-fn vectors(cell: &Cell) -> (Point3<f64>, Vector3<f64>) {
+fn vectors(cell: &CoverCell) -> (Point3<f64>, Vector3<f64>) {
     (Point3::from(cell.position), Vector3::from(cell.normal))
 }
 
@@ -143,14 +143,14 @@ fn panda_wears_a_skin_of_the_real_pitch() {
     let others: Vec<_> =
         all.iter().filter(|link| covered.iter().all(|one| one.name != link.name)).cloned().collect();
     let start = std::time::Instant::now();
-    let skin = cover(covered, &others, &Options { pitch: PITCH, ..Options::default() }).unwrap();
+    let skin = cover(covered, &others, &CoverOptions { pitch: PITCH, ..CoverOptions::default() }).unwrap();
     println!("{} cells on {} buses in {:.1} s", skin.cells.len(), skin.buses, start.elapsed().as_secs_f64());
     for index in 0..covered.len() {
         measure(&skin, &all, index);
     }
 }
 
-fn measure(skin: &Skin, all: &[Link], index: usize) {
+fn measure(skin: &Cover, all: &[RobotLink], index: usize) {
     let (link, figures) = (&all[COVERED][index], &skin.links[index]);
     let own = triangles(link, &Isometry3::identity());
     let frame = link.pose.inverse();

@@ -10,9 +10,9 @@ use nalgebra::{Matrix3, Point3, SymmetricEigen, Vector3};
 use std::collections::VecDeque;
 
 use crate::grid::Grid;
-use crate::place::Spot;
+use crate::place::CellPosition;
 use crate::surface::{real, tangents};
-use crate::{Cell, Options};
+use crate::{CoverCell, CoverOptions};
 
 /// The number of ports of a cell.
 pub const PORTS: usize = 4;
@@ -21,22 +21,22 @@ pub const PORTS: usize = 4;
 pub const MAX_NODES: usize = 250;
 
 /// The maximum length of a wire, in pitches.
-const LONGEST: f64 = 1.5;
+const MAX_WIRE_LENGTH: f64 = 1.5;
 
 /// The minimum cosine between the normals of two wired cells. Cells are wired around a sharp edge, but not through a
 /// wall.
-const AGREE: f64 = -0.2;
+const MIN_NORMAL_COSINE: f64 = -0.2;
 
 /// The maximum deviation from a bus' even share that lets the bus end with a link, relative to its budget of nodes.
-const SLACK: f64 = 0.1;
+const MAX_UNEVENNESS: f64 = 0.1;
 
 /// Returns the cells of all links with their wires, and the number of buses.
-pub(crate) fn wire(placed: &[Vec<Spot>], options: &Options) -> (Vec<Cell>, usize) {
+pub(crate) fn wire(placed: &[Vec<CellPosition>], options: &CoverOptions) -> (Vec<CoverCell>, usize) {
     let sizes: Vec<_> = placed.iter().map(Vec::len).collect();
     let buses = shares(&sizes, options.nodes_per_bus);
     let all = placed.iter().enumerate().flat_map(|(link, spots)| {
-        let limb = Limb::of(spots);
-        limb.order(spots, options.pitch).into_iter().map(move |spot| Place { link, spot, axis: limb.axis })
+        let limb = Limb::from_cells(spots);
+        limb.order(spots, options.pitch).into_iter().map(move |spot| UnwiredCell { link, spot, axis: limb.axis })
     });
     let mut all = all.collect::<Vec<_>>().into_iter();
     let mut cells = Vec::new();
@@ -66,7 +66,7 @@ fn shares(links: &[usize], budget: usize) -> Vec<usize> {
         let of_links =
             ends.iter().map(|end| end.saturating_sub(from)).filter(|share| possible.contains(share));
         let share =
-            of_links.filter(|share| real(off(share)) <= SLACK * real(budget)).min_by_key(off).unwrap_or(even);
+            of_links.filter(|share| real(off(share)) <= MAX_UNEVENNESS * real(budget)).min_by_key(off).unwrap_or(even);
         shares.push(share);
         from += share;
     }
@@ -75,9 +75,9 @@ fn shares(links: &[usize], budget: usize) -> Vec<usize> {
 
 /// A cell before it has wires.
 #[derive(Clone, Copy, Debug)]
-struct Place {
+struct UnwiredCell {
     link: usize,
-    spot: Spot,
+    spot: CellPosition,
     axis: Vector3<f64>,
 }
 
@@ -90,7 +90,7 @@ struct Limb {
 
 impl Limb {
     /// Computes the axis: the direction in which the cells spread farthest, away from the link's origin.
-    fn of(spots: &[Spot]) -> Self {
+    fn from_cells(spots: &[CellPosition]) -> Self {
         let count = real(spots.len().max(1));
         let middle = Point3::from(spots.iter().map(|spot| spot.point.coords).sum::<Vector3<f64>>() / count);
         let spread: Matrix3<f64> = spots
@@ -107,8 +107,8 @@ impl Limb {
     }
 
     /// Orders cells by ring along the axis, and around it within a ring.
-    fn order(&self, spots: &[Spot], pitch: f64) -> Vec<Spot> {
-        let along = |spot: &Spot| (spot.point - self.middle).dot(&self.axis);
+    fn order(&self, spots: &[CellPosition], pitch: f64) -> Vec<CellPosition> {
+        let along = |spot: &CellPosition| (spot.point - self.middle).dot(&self.axis);
         let first = spots.iter().map(along).min_by(f64::total_cmp).unwrap_or_default();
         let row = pitch * 0.75_f64.sqrt();
         let (s, t) = tangents(&self.axis);
@@ -126,16 +126,16 @@ impl Limb {
 }
 
 /// Wires the cells of one bus.
-fn wired(bus: usize, places: &[Place], pitch: f64) -> Vec<Cell> {
+fn wired(bus: usize, places: &[UnwiredCell], pitch: f64) -> Vec<CoverCell> {
     let wires = joined(places.len(), &near(places, pitch));
     let roots = roots(&wires);
-    let cell = |(index, place): (usize, &Place)| {
+    let cell = |(index, place): (usize, &UnwiredCell)| {
         let others = wires.get(index).map_or(&[][..], Vec::as_slice);
         let directions: Vec<_> = others
             .iter()
             .filter_map(|&other| Some((other, places.get(other)?.spot.point - place.spot.point)))
             .collect();
-        Cell {
+        CoverCell {
             link: place.link,
             position: place.spot.point.coords.into(),
             normal: place.spot.normal.into(),
@@ -156,15 +156,15 @@ fn node(index: usize) -> u8 {
 }
 
 /// Returns pairs of cells that a wire may join, the nearest ones first.
-fn near(places: &[Place], pitch: f64) -> Vec<[usize; 2]> {
-    let longest = LONGEST * pitch;
+fn near(places: &[UnwiredCell], pitch: f64) -> Vec<[usize; 2]> {
+    let longest = MAX_WIRE_LENGTH * pitch;
     let mut found = Vec::new();
-    let grid = Grid::of(longest, places.iter().map(|place| &place.spot.point));
+    let grid = Grid::with_points(longest, places.iter().map(|place| &place.spot.point));
     for (index, place) in places.iter().enumerate() {
         for other in grid.around(grid.cube(&place.spot.point)).filter(|&other| other > index) {
             let Some(there) = places.get(other).filter(|there| there.link == place.link) else { continue };
             let distance = (there.spot.point - place.spot.point).norm();
-            if distance <= longest && there.spot.normal.dot(&place.spot.normal) > AGREE {
+            if distance <= longest && there.spot.normal.dot(&place.spot.normal) > MIN_NORMAL_COSINE {
                 found.push((distance, [index, other]));
             }
         }

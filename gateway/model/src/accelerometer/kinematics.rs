@@ -61,7 +61,7 @@ impl Arm {
     #[must_use]
     pub fn new(skin: &Skin, bus: usize, gravity: [f64; 3]) -> Self {
         let kinds = skin.chain(bus).rows.iter().map(|row| row.kind).collect();
-        Self { central: Central::unquantised(&skin.part_on(bus)), kinds, gravity: gravity.into() }
+        Self { central: Central::unquantised(&skin.with_cells_of_bus(bus)), kinds, gravity: gravity.into() }
     }
 
     /// Returns the specific force field on each row; the first is the base of the chain, which no joint moves.

@@ -57,7 +57,7 @@ impl Accelerometers {
     /// Creates one sensor per cell from a data sheet and a seed; `gravity` is in the robot's base frame, in m/s2.
     #[must_use]
     pub fn new(skin: &Skin, sheet: &DataSheet, seed: u64, gravity: [f64; 3]) -> Self {
-        let arm = |bus: usize| skin.cells_of(bus).next().map(|_| Arm::new(skin, bus, gravity));
+        let arm = |bus: usize| skin.cells_on_bus(bus).next().map(|_| Arm::new(skin, bus, gravity));
         let sensors = skin.cells.iter().map(|cell| {
             let stream = u64::from(cell.serial).wrapping_mul(0x9e37_79b9_7f4a_7c15);
             Accelerometer::new(sheet, seed ^ stream)

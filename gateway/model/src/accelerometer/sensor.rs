@@ -7,7 +7,7 @@
 use core::f64::consts::{PI, TAU};
 
 use nalgebra::{Matrix3, Vector3};
-use protocol::document::{Fault, Place};
+use protocol::document::{DocumentFault, KeyPath};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
@@ -38,7 +38,7 @@ pub struct DataSheet {
 /// The data sheet in a file: a kind, and the values that differ from it.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Given {
+pub struct DataSheetInput {
     kind: Option<String>,
     bias_g: Option<f64>,
     gain: Option<f64>,
@@ -51,14 +51,14 @@ pub struct Given {
     step_g: Option<f64>,
 }
 
-impl Given {
+impl DataSheetInput {
     /// Returns the data sheet, if all values are in range.
     ///
     /// # Errors
     /// Returns the first value that is out of range.
-    pub fn sheet(&self, at: &Place) -> Result<DataSheet, Fault> {
+    pub fn sheet(&self, at: &KeyPath) -> Result<DataSheet, DocumentFault> {
         let kinds = [("perfect", DataSheet::PERFECT), ("bma250", DataSheet::BMA250)];
-        let mut sheet = at.key("kind").word(self.kind.as_deref().unwrap_or("bma250"), &kinds)?;
+        let mut sheet = at.key("kind").choose(self.kind.as_deref().unwrap_or("bma250"), &kinds)?;
         let all = [
             ("bias_g", self.bias_g, &mut sheet.bias_g, [0.0, 1.0]),
             ("gain", self.gain, &mut sheet.gain, [0.0, 0.5]),

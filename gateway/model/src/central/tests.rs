@@ -24,7 +24,7 @@ fn torques_agree_with_the_table_of_another_program() {
         let [q1, q2, q3, q4, q5, q6, tx, ty, tz, nx, ny, nz] = *q else { panic!("{line}") };
         let joint = (1..=6_u8).find(|&k| f64::from(k) == *joint).unwrap().into();
         // In the table, n is the direction of the force: inwards.
-        central.cells = vec![Place {
+        central.cells = vec![CellGeometry {
             row: joint,
             position: [tx, ty, tz].into(),
             normal: [-nx, -ny, -nz].into(),

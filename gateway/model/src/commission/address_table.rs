@@ -4,28 +4,28 @@ use protocol::id::CellId;
 use protocol::message::Heartbeat;
 use protocol::time::Micros;
 
-use crate::tracker::{Claim, PerCell, Word};
+use crate::tracker::{AddressClaim, PerCell, HeartbeatKind};
 
 /// The claims to all node ids of a bus.
 #[derive(Debug, Default)]
-pub(super) struct AddressTable(PerCell<Claim>);
+pub(super) struct AddressTable(PerCell<AddressClaim>);
 
 impl AddressTable {
     /// Records a heartbeat. Returns two serial numbers that use one node id in turn.
     ///
     /// A single change means that one cell replaced another; only a change back proves that both are present. A claim
     /// for a taken node id will be given up and does not change the owner.
-    pub(super) fn hear(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat) -> Option<[u32; 2]> {
+    pub(super) fn receive_heartbeat(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat) -> Option<[u32; 2]> {
         let claim = self.0.get_mut(number)?;
         let before = *claim;
-        let took = matches!(claim.hear(now, heartbeat), Word::Started { again: true } | Word::Shared);
+        let took = matches!(claim.receive(now, heartbeat), HeartbeatKind::Started { again: true } | HeartbeatKind::Shared);
         let [holder, earlier] = [before.serial()?, before.previous()?];
         (took && claim.serial() == Some(earlier) && earlier != holder).then_some([earlier, holder])
     }
 
     /// Returns the serial number of the owner of a node id.
     pub(super) fn holder(&self, number: CellId) -> Option<u32> {
-        self.0.get(number).and_then(Claim::serial)
+        self.0.get(number).and_then(AddressClaim::serial)
     }
 
     /// Returns all node ids in use, with the serial numbers of their owners.
@@ -42,7 +42,7 @@ mod tests {
     fn heard(said: &[(u32, State)]) -> Vec<Option<[u32; 2]>> {
         let (mut address_table, number) = (AddressTable::default(), CellId::new(5).unwrap());
         let beat = |(at, &(serial, state)): (u16, &(u32, State))| {
-            address_table.hear(
+            address_table.receive_heartbeat(
                 Micros(0),
                 number,
                 &Heartbeat { serial, state, sent: 40 + at, ..Heartbeat::default() },

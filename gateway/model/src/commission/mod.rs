@@ -32,27 +32,27 @@ use protocol::time::{Micros, Span};
 use address_table::AddressTable;
 use task::{Stage, Task};
 
-use crate::repeat::{Attempt, Limits, Turn};
-pub use outcome::{Outcome, Reason, Step, Trouble};
+use crate::repeat::{Attempt, Limits, RetryAction};
+pub use outcome::{Outcome, Reason, Step, AbortReason};
 pub use report::{CellReport, Progress, Report, UnknownNode};
-pub use task::Wish;
+pub use task::CommissionOptions;
 
 /// Duration of listening before the first request. Two gateways detect each other in this time.
-pub const LISTEN: Span = Span::from_millis(500);
+pub const LISTEN_TIME: Span = Span::from_millis(500);
 /// Time to wait for further cells after the last one appeared.
-const SHOWING: Span = Span::from_millis(3_000);
+const DISCOVERY_TIMEOUT: Span = Span::from_millis(3_000);
 /// Maximum number of cells with a pending request of their own.
-const WINDOW: usize = 16;
+const MAX_PENDING_CELLS: usize = 16;
 /// Limits of a broadcast request while most cells do not answer. After this time without any answer, the remaining
 /// cells get requests of their own.
-const CALLS: Limits = Limits { first: QUIET, longest: QUIET, tries: 3 };
-const QUIET: Span = Span::from_millis(150);
+const BROADCAST_LIMITS: Limits = Limits { first: BROADCAST_TIMEOUT, longest: BROADCAST_TIMEOUT, tries: 3 };
+const BROADCAST_TIMEOUT: Span = Span::from_millis(150);
 /// Interval of syncs while waiting for heartbeats.
-const SYNC: Span = Span::from_millis(300);
+const SYNC_INTERVAL: Span = Span::from_millis(300);
 /// Interval of this gateway's heartbeats, by which other gateways detect it.
-const ANNOUNCE: Span = Span::from_millis(250);
+const HEARTBEAT_INTERVAL: Span = Span::from_millis(250);
 /// The bit that marks the tags of broadcast requests.
-const EVERYONE: u8 = 0x80;
+const BROADCAST_TAG: u8 = 0x80;
 
 /// The phases of a commissioning, in order.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -85,7 +85,7 @@ struct Call {
 /// The commissioning of one bus.
 #[derive(Debug)]
 pub struct Commission {
-    wish: Wish,
+    wish: CommissionOptions,
     /// Number of answers that a broadcast request may bring at once.
     room: usize,
     tasks: Vec<Task>,
@@ -102,16 +102,16 @@ pub struct Commission {
     announced: Option<Micros>,
     requests: u64,
     repeated: u64,
-    trouble: Option<Trouble>,
+    trouble: Option<AbortReason>,
 }
 
 impl Commission {
     /// Starts the commissioning of a skin's bus, with listening; `room` is the number of packets that may arrive at
     /// once without loss.
     #[must_use]
-    pub fn new(skin: &Skin, bus: usize, wish: Wish, room: usize, now: Micros) -> Self {
+    pub fn new(skin: &Skin, bus: usize, wish: CommissionOptions, room: usize, now: Micros) -> Self {
         let tasks: Vec<_> =
-            skin.cells_of(bus).map(|cell| Task::new(cell.serial, cell.node, skin.parameters(cell))).collect();
+            skin.cells_on_bus(bus).map(|cell| Task::new(cell.serial, cell.node, skin.parameters(cell))).collect();
         let by_serial = tasks.iter().enumerate().map(|(place, task)| (task.serial, place)).collect();
         let others = skin.cells.iter().filter(|cell| cell.bus != bus);
         let elsewhere =
@@ -123,7 +123,7 @@ impl Commission {
             by_serial,
             elsewhere,
             address_table: AddressTable::default(),
-            phase: Phase::Listen(now + LISTEN),
+            phase: Phase::Listen(now + LISTEN_TIME),
             calls: VecDeque::new(),
             call: None,
             called: Vec::new(),
@@ -143,25 +143,25 @@ impl Commission {
 
     /// Returns true if it may send on the bus: not while it listens, and not in a dry run.
     #[must_use]
-    pub const fn speaks(&self) -> bool {
+    pub const fn may_send(&self) -> bool {
         !matches!(self.phase, Phase::Listen(_) | Phase::Over) && !self.wish.dry_run
     }
 
     /// Handles a message from another sender on the bus. [`Commission::handle_time`] acts on it.
     pub fn handle_message(&mut self, now: Micros, message: &Message) {
         if let Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } = message {
-            self.end(Trouble::OtherGateway);
+            self.end(AbortReason::OtherGateway);
         } else if let Message::Configure { request: Request::Write { number, .. }, .. } = *message
             && is_stored(number)
         {
-            self.end(Trouble::Meddler);
+            self.end(AbortReason::Meddler);
         } else if let Message::Network {
             from: Node::Cell(node),
             page: NetworkPage::Heartbeat(heartbeat),
             ..
         } = *message
         {
-            self.hear(now, node, &heartbeat);
+            self.handle_heartbeat(now, node, &heartbeat);
         } else if let Message::Configured { from, tag, answer } = *message {
             let called = self.called.iter().rev().copied().find(|(_, called)| *called == tag);
             let wish = self.wish;
@@ -180,9 +180,9 @@ impl Commission {
         (task.number == Some(number)).then_some(task)
     }
 
-    fn hear(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat) {
+    fn handle_heartbeat(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat) {
         let before = self.address_table.holder(number).filter(|&serial| serial != heartbeat.serial);
-        if let Some([one, other]) = self.address_table.hear(now, number, heartbeat) {
+        if let Some([one, other]) = self.address_table.receive_heartbeat(now, number, heartbeat) {
             for (serial, other) in [(one, other), (other, one)] {
                 self.fail(serial, Reason::Shared { number, other });
             }
@@ -199,7 +199,7 @@ impl Commission {
         let wish = self.wish;
         let Some(task) = self.task(heartbeat.serial) else { return };
         let new = task.number.is_none();
-        task.hear(now, number, heartbeat, wish);
+        task.handle_heartbeat(now, number, heartbeat, wish);
         if let (true, Phase::Find(since)) = (new, &mut self.phase) {
             *since = now;
         }
@@ -215,7 +215,7 @@ impl Commission {
         }
     }
 
-    fn end(&mut self, trouble: Trouble) {
+    fn end(&mut self, trouble: AbortReason) {
         if self.phase != Phase::Over {
             self.trouble = Some(trouble);
             self.stop();
@@ -249,7 +249,7 @@ impl Commission {
         while let Some(next) = self.turn(now) {
             self.phase = next;
         }
-        if self.speaks() && self.announced.is_none_or(|at| now.since(at) >= ANNOUNCE) {
+        if self.may_send() && self.announced.is_none_or(|at| now.elapsed_since(at) >= HEARTBEAT_INTERVAL) {
             self.announced = Some(now);
             let heartbeat = Heartbeat { state: State::default().with_joint(0), ..Heartbeat::default() };
             let page = NetworkPage::Heartbeat(heartbeat);
@@ -272,7 +272,7 @@ impl Commission {
             }
             Phase::Find(since) => {
                 let all = self.tasks.iter().all(|task| task.stage != Stage::Missing);
-                if !all && now.since(since) < SHOWING {
+                if !all && now.elapsed_since(since) < DISCOVERY_TIMEOUT {
                     return None;
                 }
                 self.calls = self.common_writes();
@@ -297,7 +297,7 @@ impl Commission {
             Phase::Beat(synced) => {
                 if self.works(now, |stage| stage != Stage::Missing) {
                     let waits = self.any(|stage| matches!(stage, Stage::Beat(_)));
-                    if waits && now.since(synced) >= SYNC {
+                    if waits && now.elapsed_since(synced) >= SYNC_INTERVAL {
                         self.outbox.push_back(Message::Sync);
                         self.phase = Phase::Beat(now);
                     }
@@ -322,7 +322,7 @@ impl Commission {
         }
         let mut pending = self.tasks.iter().filter(|task| task.is_requested()).count();
         for place in 0..self.tasks.len() {
-            if pending >= WINDOW {
+            if pending >= MAX_PENDING_CELLS {
                 break;
             }
             let Some(task) = self.tasks.get_mut(place).filter(|task| is(task.stage)) else { continue };
@@ -342,14 +342,14 @@ impl Commission {
                 let first = waiting.next().map(|(place, _)| place);
                 // If most cells did not answer, a repeated broadcast costs less than a request to each.
                 match first.map(|place| (place, call.attempt.turn(now))) {
-                    Some((_, Turn::Wait)) => return true,
-                    Some((place, Turn::Again)) if 2 * (waiting.count() + 1) > call.needed => {
+                    Some((_, RetryAction::Wait)) => return true,
+                    Some((place, RetryAction::Again)) if 2 * (waiting.count() + 1) > call.needed => {
                         let Call { step, tag, .. } = *call;
                         self.repeated += 1;
                         self.request(place, Node::Everyone, step, tag);
                         return true;
                     }
-                    Some((_, Turn::Again | Turn::GiveUp)) | None => self.call = None,
+                    Some((_, RetryAction::Again | RetryAction::GiveUp)) | None => self.call = None,
                 }
             }
             let Some(step) = self.calls.pop_front() else { return false };
@@ -361,9 +361,9 @@ impl Commission {
                 continue;
             }
             // There are fewer broadcast requests than tags.
-            let tag = EVERYONE | self.called.last().map_or(0, |(_, tag)| tag.wrapping_add(1));
+            let tag = BROADCAST_TAG | self.called.last().map_or(0, |(_, tag)| tag.wrapping_add(1));
             self.called.push((step, tag));
-            self.call = Some(Call { step, tag, needed, attempt: Attempt::new(now, CALLS) });
+            self.call = Some(Call { step, tag, needed, attempt: Attempt::new(now, BROADCAST_LIMITS) });
             self.request(place, Node::Everyone, step, tag);
         }
     }
@@ -420,12 +420,12 @@ impl Commission {
         let phase = match self.phase {
             Phase::Listen(until) => return Some(until),
             Phase::Over => return None,
-            Phase::Find(since) => Some(since + SHOWING),
-            Phase::Beat(synced) => Some(synced + SYNC),
+            Phase::Find(since) => Some(since + DISCOVERY_TIMEOUT),
+            Phase::Beat(synced) => Some(synced + SYNC_INTERVAL),
             Phase::Write | Phase::Read => None,
         };
         let call = self.call.map(|call| call.attempt.due());
-        let announcement = self.announced.map(|at| at + ANNOUNCE);
+        let announcement = self.announced.map(|at| at + HEARTBEAT_INTERVAL);
         let tasks = self.tasks.iter().filter_map(Task::due);
         tasks.chain([phase, call, announcement].into_iter().flatten()).min()
     }

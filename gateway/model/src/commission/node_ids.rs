@@ -36,7 +36,7 @@ pub type NodeIds = BTreeMap<u32, Option<CellId>>;
 /// Returns [`NodeIdsError`] if a node id is not known, or if the text is not the skin's.
 pub fn renumbered(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String, NodeIdsError> {
     for (bus, described) in skin.buses.iter().enumerate() {
-        let here = || skin.cells_of(bus).filter_map(|cell| node_ids.get(&cell.serial));
+        let here = || skin.cells_on_bus(bus).filter_map(|cell| node_ids.get(&cell.serial));
         let missing = here().filter(|number| number.is_none()).count();
         if missing > 0 {
             return Err(NodeIdsError::Missing {

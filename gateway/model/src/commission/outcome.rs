@@ -5,12 +5,12 @@ use core::fmt;
 use protocol::id::CellId;
 use protocol::message::VERSION;
 use protocol::packet::WORDS;
-use protocol::parameters::{Ability, Parameter};
+use protocol::parameters::{MissingAbility, Parameter};
 use protocol::schema::reason;
 use serde::{Serialize, Serializer};
 use thiserror::Error;
 
-use crate::decode::parameter::{Name, Words};
+use crate::decode::parameter::{ParameterName, ParameterWords};
 
 /// A request to a cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -35,7 +35,7 @@ impl Step {
 
 impl fmt::Display for Step {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let name = Name(self.parameter().number());
+        let name = ParameterName(self.parameter().number());
         match self {
             Self::Write(_) => write!(f, "a write of {name}"),
             Self::Commit => write!(f, "a commit"),
@@ -106,12 +106,12 @@ pub enum Reason {
     },
     /// It lacks an ability that the skin needs.
     #[error("does not support {0}: install newer firmware, or leave it out of the skin")]
-    Cannot(Ability),
+    Cannot(MissingAbility),
     /// Its answer differs from the written value.
     #[error(
         "answers {step} with {}, not {}",
-        Words(.step.parameter().number(), *.got),
-        Words(.step.parameter().number(), *.target)
+        ParameterWords(.step.parameter().number(), *.got),
+        ParameterWords(.step.parameter().number(), *.target)
     )]
     Differs {
         /// The request.
@@ -142,14 +142,14 @@ impl Serialize for Reason {
 
 /// The reason for stopping the commissioning of a whole bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Trouble {
+pub enum AbortReason {
     /// Another gateway sends on the bus.
     OtherGateway,
     /// Another program writes parameters.
     Meddler,
 }
 
-impl Trouble {
+impl AbortReason {
     /// Returns the text for users, with the name of the bus.
     #[must_use]
     pub fn on(self, bus: &str) -> String {

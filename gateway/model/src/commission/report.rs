@@ -4,13 +4,13 @@ use protocol::id::CellId;
 use serde::Serialize;
 
 use super::task::{Stage, Task};
-use super::{Commission, Outcome, Phase, Reason, Trouble, is_failed};
+use super::{Commission, Outcome, Phase, Reason, AbortReason, is_failed};
 
 /// The progress of a commissioning, for display.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Progress {
     /// The current activity: listening, looking for cells, writing, reading back, waiting for heartbeats.
-    pub doing: &'static str,
+    pub activity: &'static str,
     /// Cells of the description on this bus.
     pub cells: usize,
     /// Described cells that were found on the bus.
@@ -61,7 +61,7 @@ pub struct Report {
     /// Repeated requests among them.
     pub repeated: u64,
     /// The reason why it stopped early.
-    pub trouble: Option<Trouble>,
+    pub trouble: Option<AbortReason>,
 }
 
 impl Commission {
@@ -79,7 +79,7 @@ impl Commission {
             Phase::Over => "done",
         };
         Progress {
-            doing,
+            activity: doing,
             cells: self.tasks.len(),
             found: count(&|task| task.number.is_some()),
             done: count(&|task| task.is_done()) - failed,

@@ -7,18 +7,18 @@ use protocol::parameters::{Abilities, Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
 use super::outcome::{Outcome, Reason, Step};
-use crate::repeat::{Attempt, Limits, Turn};
+use crate::repeat::{Attempt, Limits, RetryAction};
 
 /// Retry limit and timeout of a request to one cell.
-const ANSWER: Limits = Limits { first: Span::from_millis(100), longest: Span::from_millis(800), tries: 6 };
+const REQUEST_LIMITS: Limits = Limits { first: Span::from_millis(100), longest: Span::from_millis(800), tries: 6 };
 /// Retry limit and timeouts of a commit, which writes flash and takes longer.
-const COMMIT: Limits = Limits { first: Span::from_millis(400), ..ANSWER };
+const COMMIT_LIMITS: Limits = Limits { first: Span::from_millis(400), ..REQUEST_LIMITS };
 /// Number of times that a cell is written again from the beginning after it restarted in the middle.
-const ROUNDS: u8 = 6;
+const MAX_ROUNDS: u8 = 6;
 /// Longest time to settle for a cell that has started or lost its node id.
-pub(super) const SETTLING: Span = Span::from_millis(3_000);
+pub(super) const SETTLE_TIMEOUT: Span = Span::from_millis(3_000);
 /// Timeout for a heartbeat with the right hash, after everything was read back.
-const BEAT: Span = Span::from_millis(2_000);
+const HEARTBEAT_TIMEOUT: Span = Span::from_millis(2_000);
 
 /// The stage of a cell.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -70,12 +70,12 @@ pub(super) struct Task {
     before: Option<CellId>,
     /// The time since when it cannot receive requests: it claims an address, or has lost its node id.
     pub(super) unsettled: Option<Micros>,
-    said_hash: u16,
+    reported_hash: u16,
 }
 
 /// Restrictions on a commissioning, and its checks.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Wish {
+pub struct CommissionOptions {
     /// True to write nothing.
     pub dry_run: bool,
     /// True to read back cells that have the right hash, too.
@@ -103,14 +103,14 @@ impl Task {
             rounds: 0,
             before: None,
             unsettled: None,
-            said_hash: 0,
+            reported_hash: 0,
         }
     }
 
     /// Returns the words that the cell should have for a parameter.
     pub(super) fn words(&self, parameter: Parameter) -> [i16; WORDS] {
         if parameter == Parameter::Commit {
-            return protocol::packet::words([self.hash.cast_signed()]);
+            return protocol::packet::padded_words([self.hash.cast_signed()]);
         }
         self.target.words(parameter)
     }
@@ -150,7 +150,7 @@ impl Task {
     }
 
     /// Records a heartbeat that arrived under a node id.
-    pub(super) fn hear(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat, wish: Wish) {
+    pub(super) fn handle_heartbeat(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat, wish: CommissionOptions) {
         if let Some(old) = self.number.filter(|&old| old != number) {
             // One change is a cell with a new node id; a change back means two cells.
             if self.before == Some(number) {
@@ -160,7 +160,7 @@ impl Task {
             self.restart();
         }
         self.number = Some(number);
-        self.said_hash = heartbeat.configuration;
+        self.reported_hash = heartbeat.configuration;
         let version = heartbeat.state.version();
         if version != u16::from(VERSION) {
             return self.fail(Reason::Version { got: version });
@@ -172,7 +172,7 @@ impl Task {
         self.unsettled = None;
         match self.stage {
             Stage::Missing => self.place(wish),
-            Stage::Beat(_) if self.said_hash == self.hash => self.finish(),
+            Stage::Beat(_) if self.reported_hash == self.hash => self.finish(),
             Stage::Ask | Stage::Write | Stage::Read | Stage::Beat(_) | Stage::Done(_) => {}
         }
     }
@@ -188,13 +188,13 @@ impl Task {
     }
 
     /// Chooses the stage of a cell that has settled.
-    fn place(&mut self, wish: Wish) {
-        let has_it = self.said_hash == self.hash;
+    fn place(&mut self, wish: CommissionOptions) {
+        let has_it = self.reported_hash == self.hash;
         self.stage = match (has_it, wish.dry_run, wish.verify || self.touched) {
             (true, _, true) => Stage::Read,
             (true, _, false) => Stage::Done(Outcome::AlreadySo),
             // A configuration that needs only the default abilities requires no query.
-            (false, ..) if Abilities::default().lacks(&self.target).is_some() => Stage::Ask,
+            (false, ..) if Abilities::default().first_missing(&self.target).is_some() => Stage::Ask,
             (false, true, _) => Stage::Done(Outcome::WouldWrite),
             (false, false, _) => Stage::Write,
         };
@@ -233,27 +233,27 @@ impl Task {
         self.tag = self.tag.wrapping_add(1) & 0x7F;
         // A commit may take effect without an answer.
         self.touched |= step == Step::Commit;
-        let attempt = Attempt::new(now, if step == Step::Commit { COMMIT } else { ANSWER });
+        let attempt = Attempt::new(now, if step == Step::Commit { COMMIT_LIMITS } else { REQUEST_LIMITS });
         self.pending = Some(Pending { step, tag: self.tag, attempt });
         Some((step, self.tag))
     }
 
     /// Handles timeouts: repeats the request, and fails at the retry limit or if the cell does not settle.
     pub(super) fn time(&mut self, now: Micros) -> Option<(Step, u8)> {
-        if self.unsettled.is_some_and(|since| now.since(since) >= SETTLING) && !self.is_done() {
+        if self.unsettled.is_some_and(|since| now.elapsed_since(since) >= SETTLE_TIMEOUT) && !self.is_done() {
             self.fail(Reason::Gone);
         }
         if let Stage::Beat(since) = self.stage
-            && now.since(since) >= BEAT
+            && now.elapsed_since(since) >= HEARTBEAT_TIMEOUT
         {
-            self.fail(Reason::Hash { target: self.hash, got: self.said_hash });
+            self.fail(Reason::Hash { target: self.hash, got: self.reported_hash });
         }
         let Pending { step, tag, attempt } = self.pending.as_mut()?;
         let (step, tag, tries) = (*step, *tag, attempt.tries());
         match attempt.turn(now) {
-            Turn::Wait => None,
-            Turn::Again => Some((step, tag)),
-            Turn::GiveUp => {
+            RetryAction::Wait => None,
+            RetryAction::Again => Some((step, tag)),
+            RetryAction::GiveUp => {
                 self.fail(Reason::Silent { step, tries });
                 None
             }
@@ -262,13 +262,13 @@ impl Task {
 
     /// Returns the time of the next call of [`Task::time`].
     pub(super) fn due(&self) -> Option<Micros> {
-        let settled = self.unsettled.filter(|_| !self.is_done()).map(|since| since + SETTLING);
-        let beat = if let Stage::Beat(since) = self.stage { Some(since + BEAT) } else { None };
+        let settled = self.unsettled.filter(|_| !self.is_done()).map(|since| since + SETTLE_TIMEOUT);
+        let beat = if let Stage::Beat(since) = self.stage { Some(since + HEARTBEAT_TIMEOUT) } else { None };
         [self.pending.map(|pending| pending.attempt.due()), settled, beat].into_iter().flatten().min()
     }
 
     /// Handles an answer to its own request or to `call`, the broadcast request with this tag.
-    pub(super) fn answer(&mut self, now: Micros, tag: u8, answer: Answer, call: Option<Step>, wish: Wish) {
+    pub(super) fn answer(&mut self, now: Micros, tag: u8, answer: Answer, call: Option<Step>, wish: CommissionOptions) {
         let own = self.pending.filter(|pending| pending.tag == tag).map(|pending| pending.step);
         let called = call.filter(|&step| self.needs(step));
         let Some(step) = own.or(called) else { return };
@@ -289,7 +289,7 @@ impl Task {
                 self.pending = None;
                 if self.stage == Stage::Ask {
                     let [.., abilities] = words;
-                    return match (Abilities::from_word(abilities).lacks(&self.target), wish.dry_run) {
+                    return match (Abilities::from_word(abilities).first_missing(&self.target), wish.dry_run) {
                         (Some(ability), _) => self.fail(Reason::Cannot(ability)),
                         (None, true) => self.stage = Stage::Done(Outcome::WouldWrite),
                         (None, false) => self.stage = Stage::Write,
@@ -323,7 +323,7 @@ impl Task {
                 if self.first_missing(self.read).is_none() {
                     self.stage = Stage::Beat(now);
                     // A heartbeat may have brought the right hash meanwhile.
-                    if self.said_hash == self.hash {
+                    if self.reported_hash == self.hash {
                         self.finish();
                     }
                 }
@@ -334,7 +334,7 @@ impl Task {
     /// Starts over, up to a limit.
     fn again(&mut self, why: Reason) {
         self.rounds += 1;
-        if self.rounds > ROUNDS {
+        if self.rounds > MAX_ROUNDS {
             return self.fail(why);
         }
         (self.written, self.read, self.stage) = (0, 0, Stage::Write);

@@ -1,7 +1,7 @@
 use super::*;
 use protocol::message::Answer;
 
-const WISH: Wish = Wish { dry_run: false, verify: false };
+const WISH: CommissionOptions = CommissionOptions { dry_run: false, verify: false };
 
 /// Builds a skin with this number of cells at different positions.
 fn skin(cells: usize) -> Skin {
@@ -23,7 +23,7 @@ fn begun(skin: &Skin) -> (Commission, Micros) {
         let message = Message::Network { from: Node::Cell(cell.node), epoch: Epoch(0), page };
         commission.handle_message(Micros(0), &message);
     }
-    let now = Micros(0) + LISTEN;
+    let now = Micros(0) + LISTEN_TIME;
     commission.handle_time(now);
     (commission, now)
 }
@@ -65,7 +65,7 @@ fn a_request_to_everyone_is_repeated_while_most_cells_have_not_answered() {
     let first = requests(&mut commission);
     let [(Node::Everyone, tag, request)] = first[..] else { panic!("{first:?}") };
     let (again, repeated) = next_requests(&mut commission);
-    assert_eq!((again, &repeated), (now + QUIET, &first));
+    assert_eq!((again, &repeated), (now + BROADCAST_TIMEOUT, &first));
     for cell in &skin.cells[..2] {
         confirm(&mut commission, again, cell.node, tag, request);
     }
@@ -84,7 +84,7 @@ fn a_write_is_repeated_after_100_ms_and_a_commit_after_400() {
     let repeated_after = |commission: &mut Commission, now, sent: &[_]| {
         let (again, repeated) = next_requests(commission);
         assert_eq!(repeated, sent);
-        again.since(now)
+        again.elapsed_since(now)
     };
     assert_eq!(repeated_after(&mut commission, now, &sent), Span::from_millis(100));
     now = now + Span::from_millis(100);
@@ -103,10 +103,10 @@ fn a_write_is_repeated_after_100_ms_and_a_commit_after_400() {
 fn other_gateways_hear_of_one_that_sends() {
     let skin = skin(1);
     let announced = |dry_run| {
-        let mut commission = Commission::new(&skin, 0, Wish { dry_run, verify: false }, 1_000, Micros(0));
+        let mut commission = Commission::new(&skin, 0, CommissionOptions { dry_run, verify: false }, 1_000, Micros(0));
         let mut times = Vec::new();
         while let Some(now) = commission.poll_timeout().filter(|now| *now <= Micros(1_000_000)) {
-            assert!(!commission.speaks() || now > Micros(0) + LISTEN);
+            assert!(!commission.may_send() || now > Micros(0) + LISTEN_TIME);
             commission.handle_time(now);
             for message in std::iter::from_fn(|| commission.poll_transmit()) {
                 let is_heartbeat = matches!(
@@ -116,9 +116,9 @@ fn other_gateways_hear_of_one_that_sends() {
                 times.extend(is_heartbeat.then_some(now.0 / 1_000));
             }
         }
-        let speaks = commission.speaks();
+        let speaks = commission.may_send();
         commission.stop();
-        assert!(!commission.speaks());
+        assert!(!commission.may_send());
         (times, speaks)
     };
     assert_eq!(announced(false), (vec![500, 750, 1_000], true));

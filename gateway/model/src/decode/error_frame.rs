@@ -54,7 +54,7 @@ pub struct ErrorFrame {
 }
 
 impl ErrorFrame {
-    pub(super) fn of(frame: &Frame) -> Self {
+    pub(super) fn new(frame: &Frame) -> Self {
         let mut data = [0; 8];
         data.iter_mut().zip(frame.data()).for_each(|(byte, got)| *byte = *got);
         Self { classes: frame.id(), data }

@@ -4,33 +4,33 @@ use core::fmt::{self, Display, Formatter};
 
 use protocol::message::State;
 use protocol::packet::WORDS;
-use protocol::schema::{self, Field, Format, Layout, Part, Piece, Units};
+use protocol::schema::{self, Field, FieldFormat, Layout, TextPart, TextPiece, Units};
 
-use super::ports::{Bits, Port, around, joined};
+use super::ports::{PortSet, Port, write_neighbors, joined};
 
 /// The words of the parameter with this number, formatted as values with units.
 #[derive(Clone, Copy, Debug)]
-pub struct Words(pub u8, pub [i16; WORDS]);
+pub struct ParameterWords(pub u8, pub [i16; WORDS]);
 
-impl Display for Words {
+impl Display for ParameterWords {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let bytes: Vec<u8> = self.1.into_iter().flat_map(i16::to_le_bytes).collect();
-        say(f, schema::value(self.0, self.1), &bytes)
+        write_layout(f, schema::parameter_layout(self.0, self.1), &bytes)
     }
 }
 
 /// The name of the parameter with this number, or the number if it has no name.
 #[derive(Clone, Copy, Debug)]
-pub struct Name(pub u8);
+pub struct ParameterName(pub u8);
 
-impl Name {
+impl ParameterName {
     /// Converts the number from a field's raw value.
-    pub(super) fn of(raw: i64) -> Self {
+    pub(super) fn from_raw(raw: i64) -> Self {
         Self(raw.to_le_bytes()[0])
     }
 }
 
-impl Display for Name {
+impl Display for ParameterName {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         match schema::parameter_name(self.0) {
             Some(name) => f.write_str(name),
@@ -40,7 +40,7 @@ impl Display for Name {
 }
 
 /// Writes the fields of a layout from these bytes.
-pub(super) fn say(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
+pub(super) fn write_layout(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
     fields(f, layout, Bytes { bytes, units: Units::default() })
 }
 
@@ -70,7 +70,7 @@ pub(super) type Find<'a> = dyn Fn(&mut Formatter<'_>, &str) -> Result<Option<&'a
 /// Writes the parts of a text that apply to a number.
 pub(super) fn fill<'a>(
     f: &mut Formatter<'_>,
-    text: &[Part],
+    text: &[TextPart],
     number: u16,
     words: Bytes<'_>,
     find: &Find<'a>,
@@ -86,16 +86,16 @@ pub(super) fn fill<'a>(
     Ok(())
 }
 
-fn pieces<'a>(f: &mut Formatter<'_>, pieces: &[Piece], words: Bytes<'_>, find: &Find<'a>) -> fmt::Result {
+fn pieces<'a>(f: &mut Formatter<'_>, pieces: &[TextPiece], words: Bytes<'_>, find: &Find<'a>) -> fmt::Result {
     for piece in pieces {
         match piece {
-            Piece::Words(text) => f.write_str(text)?,
-            Piece::Field { name, decimals } => {
+            TextPiece::Literal(text) => f.write_str(text)?,
+            TextPiece::Field { name, decimals } => {
                 if let Some(field) = find(f, name)? {
                     show(f, field, words, *decimals)?;
                 }
             }
-            Piece::Either { name, words: [no, yes] } => {
+            TextPiece::Either { name, words: [no, yes] } => {
                 let is = find(f, name)?.is_some_and(|field| field.raw(words.bytes, 0) == 1);
                 f.write_str(if is { yes } else { no })?;
             }
@@ -114,26 +114,26 @@ fn show(
 ) -> fmt::Result {
     let first = field.raw(bytes, 0);
     match &field.format {
-        Format::Choice => f.write_str(field.name_of(first).unwrap_or_default()),
-        Format::Hex => write!(f, "{first:04X}"),
-        Format::Port => write!(f, "{}", Port(first)),
-        Format::Ports(..) => write!(f, "{}", Bits(first)),
-        Format::State => write!(f, "{}", Flags(State(u16::try_from(first).unwrap_or_default()))),
-        Format::Parameter(_) => write!(f, "{}", Name::of(first)),
-        Format::Reason => write!(f, "{} (reason {first})", schema::reason(first)),
-        Format::Total(_) => write!(f, "{:.decimals$}", field.total(bytes)),
-        Format::Group(parts) => around(f, parts, bytes, field.elements()),
-        Format::Fixed(_)
-        | Format::Threshold(_)
-        | Format::Saturating(_)
-        | Format::Torque
-        | Format::Angle
-        | Format::Position
-        | Format::Word
-        | Format::Unsigned(_)
-        | Format::Signed
-        | Format::Flag(_)
-        | Format::Page(_) => (0..field.elements_in(bytes)).try_for_each(|element| {
+        FieldFormat::Choice => f.write_str(field.name_of(first).unwrap_or_default()),
+        FieldFormat::Hex => write!(f, "{first:04X}"),
+        FieldFormat::Port => write!(f, "{}", Port(first)),
+        FieldFormat::Ports(..) => write!(f, "{}", PortSet(first)),
+        FieldFormat::State => write!(f, "{}", Flags(State(u16::try_from(first).unwrap_or_default()))),
+        FieldFormat::Parameter(_) => write!(f, "{}", ParameterName::from_raw(first)),
+        FieldFormat::Reason => write!(f, "{} (reason {first})", schema::reason(first)),
+        FieldFormat::Total(_) => write!(f, "{:.decimals$}", field.total(bytes)),
+        FieldFormat::Group(parts) => write_neighbors(f, parts, bytes, field.elements()),
+        FieldFormat::Fixed(_)
+        | FieldFormat::Threshold(_)
+        | FieldFormat::Saturating(_)
+        | FieldFormat::Torque
+        | FieldFormat::Angle
+        | FieldFormat::Position
+        | FieldFormat::Word
+        | FieldFormat::Unsigned(_)
+        | FieldFormat::Signed
+        | FieldFormat::Flag(_)
+        | FieldFormat::Page(_) => (0..field.elements_in(bytes)).try_for_each(|element| {
             f.write_str(if element == 0 { "" } else { " " })?;
             let raw = field.raw(bytes, element);
             match i16::try_from(raw) {
@@ -157,7 +157,7 @@ struct Flags(State);
 
 impl Display for Flags {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        joined(f, self.0.names())?;
+        joined(f, self.0.flag_names())?;
         write!(f, ", joint {}, version {}", self.0.joint(), self.0.version())
     }
 }

@@ -7,16 +7,16 @@ use protocol::id::{Id, Kind};
 use protocol::message::{Message, State};
 use protocol::packet::{Bytes, PacketError};
 use protocol::port::LinkId;
-use protocol::schema::{self, Absent, Field, Format, Layout, PacketSchema, Units};
+use protocol::schema::{self, Absent, Field, FieldFormat, Layout, PacketSchema, Units};
 use serde::ser::{Error, Serialize, SerializeMap, Serializer};
 
-use super::fields::Name;
-use super::ports::Bits;
+use super::fields::ParameterName;
+use super::ports::PortSet;
 use super::{Decoded, Foreign, wires};
 
 /// The JSON object of a frame.
 #[derive(serde::Serialize)]
-struct Line<'a> {
+struct FrameObject<'a> {
     time_ns: u64,
     bus: &'a str,
     /// The identifier, as candump prints it.
@@ -93,20 +93,20 @@ fn entries<M: SerializeMap>(
     let Some(first) = fields.first() else { return Ok(()) };
     for field in fields.iter().filter(|field| !matches!(field.name.as_str(), "" | "epoch" | "tag")) {
         let raw = field.raw(bytes, 0);
-        if !field.is_there(bytes, first) {
+        if !field.is_present(bytes, first) {
             if field.absent == Absent::Null {
                 map.serialize_entry(&field.name, &())?;
             }
-        } else if let Format::Page(_) = field.format {
+        } else if let FieldFormat::Page(_) = field.format {
             map.serialize_entry(&field.name, page)?;
-        } else if field.format == Format::State {
+        } else if field.format == FieldFormat::State {
             let state = State(u16::try_from(raw).map_err(M::Error::custom)?);
-            map.serialize_entry("state", &state.names().collect::<Vec<_>>())?;
+            map.serialize_entry("state", &state.flag_names().collect::<Vec<_>>())?;
             map.serialize_entry("joint", &state.joint())?;
             map.serialize_entry("version", &state.version())?;
         } else {
             map.serialize_entry(&field.name, &Shown(field, bytes, units))?;
-            if field.format == Format::Reason {
+            if field.format == FieldFormat::Reason {
                 map.serialize_entry("because", schema::reason(raw))?;
             }
         }
@@ -123,35 +123,35 @@ impl Serialize for Shown<'_> {
         let (first, elements) = (field.raw(bytes, 0), 0..field.elements_in(bytes));
         let real = |element| field.real_in(field.raw(bytes, element), element, units);
         match &field.format {
-            Format::Choice => serializer.serialize_str(field.name_of(first).unwrap_or_default()),
-            Format::Flag(_) => serializer.serialize_bool(first == 1),
-            Format::Hex => serializer.collect_str(&format_args!("{first:04X}")),
-            Format::Parameter(_) => serializer.collect_str(&Name::of(first)),
-            Format::Ports(..) => serializer.collect_seq(Bits(first).ports()),
-            Format::Total(_) => serializer.serialize_f64(field.total(bytes)),
-            Format::Group(parts) => {
+            FieldFormat::Choice => serializer.serialize_str(field.name_of(first).unwrap_or_default()),
+            FieldFormat::Flag(_) => serializer.serialize_bool(first == 1),
+            FieldFormat::Hex => serializer.collect_str(&format_args!("{first:04X}")),
+            FieldFormat::Parameter(_) => serializer.collect_str(&ParameterName::from_raw(first)),
+            FieldFormat::Ports(..) => serializer.collect_seq(PortSet(first).ports()),
+            FieldFormat::Total(_) => serializer.serialize_f64(field.total(bytes)),
+            FieldFormat::Group(parts) => {
                 let of = |element: usize| Group(parts, bytes.get(element * 2..).unwrap_or_default());
                 serializer.collect_seq(elements.map(of))
             }
-            Format::Fixed(_)
-            | Format::Threshold(_)
-            | Format::Saturating(_)
-            | Format::Torque
-            | Format::Angle
-            | Format::Position => {
+            FieldFormat::Fixed(_)
+            | FieldFormat::Threshold(_)
+            | FieldFormat::Saturating(_)
+            | FieldFormat::Torque
+            | FieldFormat::Angle
+            | FieldFormat::Position => {
                 if field.labels.is_empty() {
                     serializer.serialize_f64(real(0))
                 } else {
                     serializer.collect_seq(elements.map(real))
                 }
             }
-            Format::Word
-            | Format::Unsigned(_)
-            | Format::Signed
-            | Format::Port
-            | Format::Page(_)
-            | Format::State
-            | Format::Reason => {
+            FieldFormat::Word
+            | FieldFormat::Unsigned(_)
+            | FieldFormat::Signed
+            | FieldFormat::Port
+            | FieldFormat::Page(_)
+            | FieldFormat::State
+            | FieldFormat::Reason => {
                 if field.labels.is_empty() {
                     serializer.serialize_i64(first)
                 } else {
@@ -169,7 +169,7 @@ impl Serialize for Shown<'_> {
 pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units: Units) -> io::Result<()> {
     let raw = record.frame.to_string();
     let id = raw.split('#').next().unwrap_or_default().to_owned();
-    let mut line = Line {
+    let mut line = FrameObject {
         time_ns: record.time.nanos,
         bus: record.interface,
         id,
@@ -199,7 +199,7 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units
         Decoded::Wire(link_id, message) => {
             line.kind = Some("wire");
             line.crc = Some(word(last_word(record)));
-            let (bytes, layout) = wires::said(message);
+            let (bytes, layout) = wires::encoded(message);
             line.epoch = wires::epoch(message);
             line.values = Some(Values { link_id: Some(link_id), end: &[], layout, bytes, units });
         }
@@ -218,7 +218,7 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units
             line.about(message.id());
             line.crc = Some(word(last_word(record)));
             line.saturated = message.is_saturated();
-            line.say(&message, units);
+            line.set_message(&message, units);
         }
     }
     serde_json::to_writer(&mut *out, &line)?;
@@ -234,7 +234,7 @@ fn word(word: u16) -> String {
     format!("{word:04X}")
 }
 
-impl Line<'_> {
+impl FrameObject<'_> {
     /// Sets the kind and the node.
     fn about(&mut self, id: Id) {
         self.kind = Some(id.name());
@@ -248,11 +248,11 @@ impl Line<'_> {
         }
     }
 
-    fn say(&mut self, message: &Message, units: Units) {
+    fn set_message(&mut self, message: &Message, units: Units) {
         (self.epoch, self.tag) = (message.epoch().map(|epoch| epoch.0), message.tag());
         let packet = message.encode();
         let layout = schema::layout(message, &packet);
-        let end = PacketSchema::of(packet.id).map_or(&[][..], |schema| schema.end(layout));
+        let end = PacketSchema::for_id(packet.id).map_or(&[][..], |schema| schema.end(layout));
         let is_bare = end.is_empty() && layout.fields.is_empty();
         self.values =
             (!is_bare).then(|| Values { link_id: None, end, layout, bytes: packet.fields(), units });
@@ -263,7 +263,7 @@ impl Line<'_> {
 mod tests {
     use super::*;
     use crate::decode::Decoder;
-    use protocol::candump::{self, Line};
+    use protocol::candump::{self, CandumpLine};
     use protocol::time::Micros;
     use serde_json::{Value, json};
 
@@ -278,7 +278,7 @@ mod tests {
         let (mut comment, mut all) = ("", Vec::new());
         for line in log.lines() {
             match candump::parse(line).unwrap() {
-                Line::Frame(record) => {
+                CandumpLine::Frame(record) => {
                     let at = Micros(record.time.nanos / 1_000);
                     let decoded = decoder.decode(at, record.interface, &record.frame);
                     let mut text = Vec::new();
@@ -286,7 +286,7 @@ mod tests {
                     assert_eq!(text.iter().filter(|&&byte| byte == b'\n').count(), 1);
                     all.push((comment.to_owned(), serde_json::from_slice(&text).unwrap()));
                 }
-                Line::Dropped { .. } | Line::CanXl | Line::Other => comment = line.trim_start_matches("# "),
+                CandumpLine::Dropped { .. } | CandumpLine::CanXl | CandumpLine::Other => comment = line.trim_start_matches("# "),
             }
         }
         all

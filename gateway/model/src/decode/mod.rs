@@ -35,9 +35,9 @@ use thiserror::Error;
 use crate::packets::{Content, PacketReader, Received};
 
 /// Maximum number of buses followed at the same time. Beyond it, the oldest is forgotten or buses share state.
-pub const BUSES: usize = 64;
+pub const MAX_BUSES: usize = 64;
 /// The number of identifiers of 11 bits.
-const IDS: usize = 0x800;
+const IDENTIFIER_COUNT: usize = 0x800;
 
 /// The class of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -89,7 +89,7 @@ pub enum Foreign {
 impl Foreign {
     fn of(frame: &Frame) -> Self {
         if frame.is_error() {
-            Self::Error(ErrorFrame::of(frame))
+            Self::Error(ErrorFrame::new(frame))
         } else if frame.is_remote() {
             Self::Remote
         } else {
@@ -135,7 +135,7 @@ impl Decoded {
 #[must_use]
 pub fn wired(frame: &Frame) -> Option<(port::LinkId, PortMessage)> {
     let link_id = port::LinkId::from_raw_id(frame.raw_id()).filter(|_| frame.format() == Format::Classic)?;
-    Some((link_id, link_id.read(frame)?))
+    Some((link_id, link_id.decode_frame(frame)?))
 }
 
 /// Classifies a frame that cannot be a packet.
@@ -178,14 +178,14 @@ impl Traffic {
 #[derive(Clone, Debug)]
 pub struct Decoder {
     format: Option<Format>,
-    buses: Vec<Bus>,
+    buses: Vec<BusDecoder>,
     /// Number of buses seen, including forgotten ones.
     seen: u64,
 }
 
 /// The state of one bus.
 #[derive(Clone, Debug)]
-struct Bus {
+struct BusDecoder {
     name: String,
     /// A number that no earlier bus has had.
     number: u64,
@@ -269,7 +269,7 @@ impl Classifier {
 
     fn slot(&mut self, id: Id) -> &mut Slot {
         if self.ids.is_empty() {
-            self.ids.resize(IDS, None);
+            self.ids.resize(IDENTIFIER_COUNT, None);
         }
         self.ids
             .get_mut(usize::from(id.to_bits()))
@@ -316,13 +316,13 @@ impl Decoder {
         slot.refuse(id, PacketError::Incomplete)
     }
 
-    fn bus(&mut self, name: &str) -> &mut Bus {
+    fn bus(&mut self, name: &str) -> &mut BusDecoder {
         let at = self.buses.iter().position(|bus| bus.name == name).unwrap_or_else(|| {
-            if self.buses.len() == BUSES {
+            if self.buses.len() == MAX_BUSES {
                 self.buses.remove(0);
             }
             self.seen += 1;
-            self.buses.push(Bus {
+            self.buses.push(BusDecoder {
                 name: name.to_owned(),
                 number: self.seen,
                 packets: PacketReader::new(self.format),

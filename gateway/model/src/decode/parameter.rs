@@ -4,10 +4,10 @@ use protocol::fixed::{OutOfRange, Q, Q1_14};
 use protocol::packet::WORDS;
 use protocol::parameters::Parameter;
 use protocol::port::{PORTS, UPLINK};
-use protocol::schema::{self, Field, Format, Layout, Range};
+use protocol::schema::{self, Field, FieldFormat, Layout, FieldRange};
 use thiserror::Error;
 
-pub use super::fields::{Name, Words};
+pub use super::fields::{ParameterName, ParameterWords};
 
 /// The largest parameter number; the next higher bit marks a write.
 const MAX: u8 = 127;
@@ -72,7 +72,7 @@ fn values(count: usize) -> String {
 /// # Errors
 /// Returns [`ParameterTextError::Unknown`] if the text is neither a name nor a number up to 127.
 pub fn number(text: &str) -> Result<u8, ParameterTextError> {
-    let named = schema::parameter_named(text).map(|layout| layout.number);
+    let named = schema::find_parameter(text).map(|layout| layout.number);
     let number = || text.parse().ok().filter(|&number| number <= MAX);
     named.or_else(number).ok_or_else(|| ParameterTextError::Unknown { got: text.to_owned() })
 }
@@ -89,7 +89,7 @@ pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), P
         got: text.to_owned(),
         allowed,
     };
-    let Some(layout) = schema::parameter_named(parameter) else {
+    let Some(layout) = schema::find_parameter(parameter) else {
         if values.len() > WORDS {
             return Err(ParameterTextError::Words { number, got: values.len() });
         }
@@ -118,7 +118,7 @@ pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), P
 /// follow.
 fn written(layout: &'static Layout, values: &[String]) -> impl Iterator<Item = (&'static Field, String)> {
     let first = layout.fields.first().zip(values.first()).and_then(|(field, text)| read(field, text).ok());
-    let follows = move |field: &&Field| field.follows(first.map(i64::from));
+    let follows = move |field: &&Field| field.is_present_for(first.map(i64::from));
     layout
         .fields
         .iter()
@@ -133,30 +133,30 @@ fn written(layout: &'static Layout, values: &[String]) -> impl Iterator<Item = (
 pub fn read(field: &Field, text: &str) -> Result<i16, String> {
     let allowed = || field.allowed.clone();
     let known = |number: &i16| match field.range {
-        Range::Within(min, max) => (i32::from(min)..=i32::from(max)).contains(&i32::from(*number)),
-        Range::All | Range::NotNegative | Range::NotNegativeAtCommit => {
+        FieldRange::Within(min, max) => (i32::from(min)..=i32::from(max)).contains(&i32::from(*number)),
+        FieldRange::All | FieldRange::NotNegative | FieldRange::NotNegativeAtCommit => {
             field.name_of(i64::from(*number)).is_some()
         }
     };
     match field.format {
-        Format::Choice => field.value_of(text).ok_or_else(allowed),
-        Format::Ports(..) => ports(text).ok_or_else(allowed),
-        Format::Hex => u16::from_str_radix(text, 16).map(u16::cast_signed).map_err(|_| allowed()),
-        Format::Word | Format::Unsigned(_) => {
+        FieldFormat::Choice => field.value_of(text).ok_or_else(allowed),
+        FieldFormat::Ports(..) => ports(text).ok_or_else(allowed),
+        FieldFormat::Hex => u16::from_str_radix(text, 16).map(u16::cast_signed).map_err(|_| allowed()),
+        FieldFormat::Word | FieldFormat::Unsigned(_) => {
             text.parse().ok().filter(|&number| number > 0).map(u16::cast_signed).ok_or_else(allowed)
         }
-        Format::Signed | Format::Flag(_) => text.parse().ok().filter(known).ok_or_else(allowed),
-        Format::Angle | Format::Position => angle(text),
-        Format::Threshold(fraction) => step(text, fraction, Q::<0>::try_at_least),
-        Format::Fixed(fraction) | Format::Saturating(fraction) | Format::Total(fraction) => {
+        FieldFormat::Signed | FieldFormat::Flag(_) => text.parse().ok().filter(known).ok_or_else(allowed),
+        FieldFormat::Angle | FieldFormat::Position => angle(text),
+        FieldFormat::Threshold(fraction) => step(text, fraction, Q::<0>::try_at_least),
+        FieldFormat::Fixed(fraction) | FieldFormat::Saturating(fraction) | FieldFormat::Total(fraction) => {
             let word = step(text, fraction, Q::<0>::try_nearest);
             match field.range {
-                Range::All | Range::NotNegativeAtCommit => word,
-                Range::NotNegative => {
+                FieldRange::All | FieldRange::NotNegativeAtCommit => word,
+                FieldRange::NotNegative => {
                     let max = field.real(i64::from(i16::MAX));
                     word.ok().filter(|word| *word >= 0).ok_or_else(|| format!("it must be in [0, {max}]"))
                 }
-                Range::Within(min, max) => {
+                FieldRange::Within(min, max) => {
                     let bounds = [min, max].map(|bound| i64::from(bound) << fraction);
                     word.ok()
                         .filter(|word| (bounds[0]..=bounds[1]).contains(&i64::from(*word)))
@@ -164,13 +164,13 @@ pub fn read(field: &Field, text: &str) -> Result<i16, String> {
                 }
             }
         }
-        Format::Port
-        | Format::State
-        | Format::Parameter(_)
-        | Format::Page(_)
-        | Format::Reason
-        | Format::Torque
-        | Format::Group(_) => raw(text),
+        FieldFormat::Port
+        | FieldFormat::State
+        | FieldFormat::Parameter(_)
+        | FieldFormat::Page(_)
+        | FieldFormat::Reason
+        | FieldFormat::Torque
+        | FieldFormat::Group(_) => raw(text),
     }
 }
 
@@ -234,7 +234,7 @@ mod tests {
     #[test]
     fn every_parameter_has_a_name_that_leads_back() {
         for byte in 0..=MAX {
-            let name = Name(byte).to_string();
+            let name = ParameterName(byte).to_string();
             let known = Parameter::from_number(byte).is_some();
             assert_eq!(known, !name.starts_with("parameter "), "{byte}");
             assert_eq!(number(if known { &name } else { name.rsplit_once(' ').unwrap().1 }), Ok(byte));
@@ -350,9 +350,9 @@ mod tests {
         ] {
             let values: Vec<_> = values.split(' ').map(str::to_owned).collect();
             let (number, words) = write(parameter, &values).unwrap();
-            assert_eq!(Words(number, words).to_string(), text);
+            assert_eq!(ParameterWords(number, words).to_string(), text);
         }
-        assert_eq!(Words(6, [2, 1, 1, 1, 0, 0]).to_string(), "words 2 1 1 1 0 0");
+        assert_eq!(ParameterWords(6, [2, 1, 1, 1, 0, 0]).to_string(), "words 2 1 1 1 0 0");
     }
 
     #[test]

@@ -136,7 +136,7 @@ impl FromStr for IdMask {
 
 /// The filters of a command. The default shows everything.
 #[derive(Clone, Debug, Default)]
-pub struct Pick {
+pub struct FrameFilter {
     /// Shows any of these kinds; all if empty.
     pub kinds: Vec<Selector>,
     /// Shows frames with any of these senders or addressees; all if empty. Commands are from the gateway.
@@ -151,7 +151,7 @@ pub struct Pick {
     pub to: Option<u64>,
 }
 
-impl Pick {
+impl FrameFilter {
     /// Returns true if a frame is shown that arrived on `bus` at `nanos` and has this class; times count from `origin`.
     #[must_use]
     pub fn takes(&self, origin: u64, nanos: u64, bus: &str, frame: &Frame, decoded: &Decoded) -> bool {
@@ -237,7 +237,7 @@ mod tests {
         packet.frames(Format::Fd).next().unwrap()
     }
 
-    fn takes(pick: &Pick, frame: &Frame) -> bool {
+    fn takes(pick: &FrameFilter, frame: &Frame) -> bool {
         pick.takes(0, 0, "can0", frame, &Decoder::new(None).decode(Micros(0), "can0", frame))
     }
 
@@ -245,10 +245,10 @@ mod tests {
     fn kinds_and_nodes_follow_from_the_identifier_of_a_packet() {
         let ids = [0x000, 0x001, 0x20C, 0x50C, 0x5FF, 0x400, 0x1234 | EXTENDED];
         let taken = |kinds: &[&str], nodes: &[&str]| -> Vec<u32> {
-            let pick = Pick {
+            let pick = FrameFilter {
                 kinds: kinds.iter().map(|word| word.parse().unwrap()).collect(),
                 parties: nodes.iter().map(|word| word.parse().unwrap()).collect(),
-                ..Pick::default()
+                ..FrameFilter::default()
             };
             ids.into_iter().filter(|&id| takes(&pick, &frame(id))).collect()
         };
@@ -261,17 +261,17 @@ mod tests {
         assert_eq!(taken(&[], &["can0:12", "can1:everyone"]), [0x20C, 0x50C]);
         assert_eq!(taken(&[], &["can1:12"]), [0_u32; 0]);
         assert_eq!(taken(&["damaged"], &[]), [0_u32; 0]);
-        let wire = port::LinkId { wire: 3, back: true }.frame(port::PortMessage::Join);
+        let wire = port::LinkId { wire: 3, back: true }.encode_frame(port::PortMessage::Join);
         let kinds = ["wire", "foreign", "command"];
-        let of = |kind: &str| Pick { kinds: vec![kind.parse().unwrap()], ..Pick::default() };
+        let of = |kind: &str| FrameFilter { kinds: vec![kind.parse().unwrap()], ..FrameFilter::default() };
         assert_eq!(kinds.map(|kind| takes(&of(kind), &wire)), [true, false, false]);
-        assert!(takes(&Pick::default(), &wire));
+        assert!(takes(&FrameFilter::default(), &wire));
     }
 
     #[test]
     fn a_frame_that_is_no_packet_is_foreign_with_every_identifier_and_damaged_only_with_ours() {
         let wrong = Frame::fd(0x20C, 0, &[1; 16]).unwrap();
-        let of = |kind: &str| Pick { kinds: vec![kind.parse().unwrap()], ..Pick::default() };
+        let of = |kind: &str| FrameFilter { kinds: vec![kind.parse().unwrap()], ..FrameFilter::default() };
         let mut decoder = Decoder::new(None);
         let mut taken = |frame: &Frame| {
             let decoded = decoder.decode(Micros(0), "can0", frame);
@@ -280,13 +280,13 @@ mod tests {
         assert_eq!(taken(&wrong), [false, true, false]);
         assert_eq!([0, 1].map(|_| taken(&frame(0x20C))), [[true, false, false]; 2]);
         assert_eq!(taken(&wrong), [true, true, true]);
-        let cell = Pick { parties: vec!["12".parse().unwrap()], ..Pick::default() };
+        let cell = FrameFilter { parties: vec!["12".parse().unwrap()], ..FrameFilter::default() };
         assert!(!takes(&cell, &wrong), "nothing is known of another bus");
     }
 
     #[test]
     fn times_count_from_the_first_frame_and_leave_out_the_end() {
-        let pick = Pick { from: Some(10), to: Some(20), ..Pick::default() };
+        let pick = FrameFilter { from: Some(10), to: Some(20), ..FrameFilter::default() };
         let taken: Vec<u64> = (95..=125)
             .filter(|&at| pick.takes(100, at, "can0", &frame(1), &Decoded::Foreign(Foreign::Remote)))
             .collect();
@@ -298,7 +298,7 @@ mod tests {
         let ids = [0x000, 0x001, 0x20C, 0x50C, 0x5FF, 0x1234 | EXTENDED, 0x20C | EXTENDED];
         let taken = |words: &[&str]| -> Vec<u32> {
             let pick =
-                Pick { ids: words.iter().map(|word| word.parse().unwrap()).collect(), ..Pick::default() };
+                FrameFilter { ids: words.iter().map(|word| word.parse().unwrap()).collect(), ..FrameFilter::default() };
             ids.into_iter().filter(|&id| takes(&pick, &frame(id))).collect()
         };
         assert_eq!(taken(&["0x20C"]), [0x20C]);

@@ -18,7 +18,7 @@ impl Display for Port {
 }
 
 /// Writes the neighbour at each port.
-pub(super) fn around(f: &mut Formatter<'_>, parts: &[Field], bytes: &[u8], ports: usize) -> fmt::Result {
+pub(super) fn write_neighbors(f: &mut Formatter<'_>, parts: &[Field], bytes: &[u8], ports: usize) -> fmt::Result {
     for index in 0..ports {
         let word = bytes.get(2 * index..).unwrap_or_default();
         let part =
@@ -43,9 +43,9 @@ pub(super) fn around(f: &mut Formatter<'_>, parts: &[Field], bytes: &[u8], ports
 }
 
 /// The ports whose bits are set: `0+2`, or `none`.
-pub(super) struct Bits(pub(super) i64);
+pub(super) struct PortSet(pub(super) i64);
 
-impl Bits {
+impl PortSet {
     /// Returns their numbers.
     pub(super) fn ports(&self) -> impl Iterator<Item = u8> + use<> {
         let bits = self.0;
@@ -53,7 +53,7 @@ impl Bits {
     }
 }
 
-impl Display for Bits {
+impl Display for PortSet {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         joined(f, self.ports())
     }

@@ -12,15 +12,15 @@ use std::collections::VecDeque;
 
 use protocol::can::{Format, Frame};
 use protocol::id::Id;
-use protocol::packet::Segment;
+use protocol::packet::Reassembler;
 use protocol::time::{Micros, Span};
 
 use super::{Decoded, Decoder};
 
 /// Maximum number of pending frames. Beyond it, the oldest is given up without the rest of its packet.
-const FRAMES: usize = 1 << 16;
+const MAX_PENDING_FRAMES: usize = 1 << 16;
 /// Added to the timeout of segments: frames of several buses may be out of order by this time.
-const SLACK: Span = Span::from_millis(100);
+const REORDER_TOLERANCE: Span = Span::from_millis(100);
 
 /// Classifies frames in order of arrival; `T` is returned with each.
 #[derive(Debug)]
@@ -99,8 +99,8 @@ impl<T> Settler<T> {
     /// Returns the oldest frame, if its class is known.
     pub fn pop(&mut self) -> Option<(T, Decoded)> {
         if let Entry { at, state: State::Waits(bus, id), .. } = *self.waiting.front()? {
-            let is_in_time = self.now.since(at) <= Span(Segment::within(id).0 + SLACK.0);
-            if is_in_time && !self.is_at_end && self.waiting.len() < FRAMES {
+            let is_in_time = self.now.elapsed_since(at) <= Span(Reassembler::max_gap(id).0 + REORDER_TOLERANCE.0);
+            if is_in_time && !self.is_at_end && self.waiting.len() < MAX_PENDING_FRAMES {
                 return None;
             }
             let decoded = self.decoder.give_up(self.oldest, bus, id);

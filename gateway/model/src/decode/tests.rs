@@ -5,7 +5,7 @@ use core::f64::consts::FRAC_PI_2;
 use super::settle::Settler;
 use super::*;
 use proptest::prelude::*;
-use protocol::candump::{self, Line, Timestamp};
+use protocol::candump::{self, CandumpLine, Timestamp};
 use protocol::fixed::TorqueFormat;
 use protocol::id::{Command, Kind};
 use protocol::schema::Units;
@@ -23,11 +23,11 @@ fn decoded(log: &str, format: Option<Format>) -> Vec<(String, String)> {
     let mut comment = "";
     for line in log.lines() {
         match candump::parse(line).unwrap() {
-            Line::Frame(record) => {
+            CandumpLine::Frame(record) => {
                 let at = Micros(record.time.nanos / 1_000);
                 settler.push(at, record.interface, &record.frame, comment.to_owned());
             }
-            Line::Dropped { .. } | Line::CanXl | Line::Other => comment = line.trim_start_matches("# "),
+            CandumpLine::Dropped { .. } | CandumpLine::CanXl | CandumpLine::Other => comment = line.trim_start_matches("# "),
         }
     }
     settler.finish();
@@ -400,7 +400,7 @@ fn foreign_frames_have_a_reason() {
 fn saturation_is_noticed() {
     let mut decoder = Decoder::new(None);
     for line in FD.lines() {
-        if let Line::Frame(record) = candump::parse(line).unwrap() {
+        if let CandumpLine::Frame(record) = candump::parse(line).unwrap() {
             let decoded = decoder.decode(Micros(0), record.interface, &record.frame);
             // `+saturated` is also the name of a heartbeat flag.
             let said =
@@ -432,8 +432,8 @@ fn joints_and_torques_are_in_the_units_of_their_bus() {
     let mut skin = crate::testing::skin();
     skin.buses[0].torque_format = TorqueFormat::Q5_10;
     skin.robot.joints[1].kind = JointKind::Prismatic;
-    let units = Units::of(&skin, 0);
-    assert_eq!(Units::of(&skin, 9).torque_format(), TorqueFormat::Q3_12);
+    let units = Units::for_bus(&skin, 0);
+    assert_eq!(Units::for_bus(&skin, 9).torque_format(), TorqueFormat::Q3_12);
     let words: [i16; protocol::packet::WORDS] = [1024, -8192, 16384, 0, i16::MAX, i16::MIN];
     let said = |id, count| {
         let epoch = protocol::packet::Epoch(7);
@@ -472,10 +472,10 @@ fn memory_is_bounded_whatever_buses_a_log_names() {
     for bus in 0..1_000 {
         decoder.decode(Micros(0), &format!("can{bus}"), &frame);
     }
-    assert_eq!(decoder.buses.len(), BUSES);
+    assert_eq!(decoder.buses.len(), MAX_BUSES);
     // Unused identifiers cost no more than a pointer, and no time when a log names 100 000 buses.
     let slots = decoder.buses.iter().flat_map(|bus| &bus.classifier.ids).flatten().count();
-    assert_eq!(slots, BUSES);
+    assert_eq!(slots, MAX_BUSES);
 }
 
 proptest! {

@@ -8,7 +8,7 @@ use protocol::schema::{self, PacketSchema, Units};
 
 use super::Decoded;
 use super::fields::{Bytes, field, fields, fill};
-use super::wires::Said;
+use super::wires::WireText;
 
 impl Display for Decoded {
     /// Formats with default units: no torque format of the bus, revolute joints.
@@ -36,7 +36,7 @@ impl Display for InUnits<'_> {
         write!(f, "{:<7} ", decoded.verdict())?;
         match *decoded {
             Decoded::Foreign(foreign) => write!(f, "{foreign}"),
-            Decoded::Wire(link_id, message) => write!(f, "{}", Said(link_id, message)),
+            Decoded::Wire(link_id, message) => write!(f, "{}", WireText(link_id, message)),
             Decoded::Segment { id } => write!(f, "{}", Subject(id)),
             Decoded::Damaged { id, fault } => write!(f, "{}: {fault}", Subject(id)),
             Decoded::Meaningless { packet, error } => write!(f, "{}: {error}", Subject(packet.id)),
@@ -69,7 +69,7 @@ impl Display for Meaning<'_> {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let packet = self.0.encode();
         write!(f, "{}", Subject(packet.id))?;
-        let Some(schema) = PacketSchema::of(packet.id).filter(|schema| !schema.text.is_empty()) else {
+        let Some(schema) = PacketSchema::for_id(packet.id).filter(|schema| !schema.text.is_empty()) else {
             return Ok(());
         };
         let (layout, bytes) = (schema::layout(self.0, &packet), packet.fields());

@@ -7,11 +7,11 @@ use protocol::packet::{BYTES, Bytes};
 use protocol::port::{Hello, LinkId, PortMessage, Rank, Walk};
 use protocol::schema::{self, Layout};
 
-use super::fields::say;
+use super::fields::write_layout;
 use super::ports::Port;
 
 /// Returns the bytes of a message over a wire, and their layout.
-pub(super) fn said(message: PortMessage) -> (Bytes, &'static Layout) {
+pub(super) fn encoded(message: PortMessage) -> (Bytes, &'static Layout) {
     let body = message.encode();
     let bytes = body.into_iter().chain([0; BYTES]).take(BYTES).collect();
     (
@@ -26,15 +26,15 @@ pub(super) const fn epoch(message: PortMessage) -> Option<u8> {
 }
 
 /// A message over a wire, formatted with the wire's number and direction: `wire 12 ->: join`.
-pub(super) struct Said(pub(super) LinkId, pub(super) PortMessage);
+pub(super) struct WireText(pub(super) LinkId, pub(super) PortMessage);
 
-impl Display for Said {
+impl Display for WireText {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let Self(LinkId { wire, back }, message) = *self;
-        let (bytes, layout) = said(message);
+        let (bytes, layout) = encoded(message);
         write!(f, "wire {wire} {}: {}", if back { "<-" } else { "->" }, layout.name)?;
         if let PortMessage::Hello(hello) = message {
-            return greet(f, hello);
+            return write_hello(f, hello);
         }
         if let PortMessage::Return(Walk { walk, first, last }) = message {
             write!(f, ", walk {walk}, ")?;
@@ -44,12 +44,12 @@ impl Display for Said {
                 write!(f, "{first} to {last} remaining")
             };
         }
-        say(f, layout, &bytes)
+        write_layout(f, layout, &bytes)
     }
 }
 
-fn greet(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
-    let Hello { version, number, port, hears, up, unnumbered, rank } = hello;
+fn write_hello(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
+    let Hello { version, number, port, receives: hears, is_parent: up, unnumbered, rank } = hello;
     if version != VERSION {
         write!(f, ", version {version}")?;
     }
@@ -63,13 +63,13 @@ fn greet(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
             write!(f, ", {word}")?;
         }
     }
-    write!(f, ", {}", Far(rank))
+    write!(f, ", {}", RankText(rank))
 }
 
 /// The rank of a cell, formatted.
-struct Far(Option<Rank>);
+struct RankText(Option<Rank>);
 
-impl Display for Far {
+impl Display for RankText {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         match self.0 {
             Some(Rank { round, depth }) => write!(f, "round {round} depth {depth}"),

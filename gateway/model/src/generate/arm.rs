@@ -80,12 +80,12 @@ pub(super) struct Covered {
     pub(super) pitch_mm: usize,
     /// Name and number of cells of each limb.
     pub(super) limbs: [(&'static str, usize); 2],
-    pub(super) buses: Vec<Vec<Place>>,
+    pub(super) buses: Vec<Vec<PlacedCell>>,
 }
 
 /// A cell; its node id is its index in its bus, plus 1.
 #[derive(Clone, Debug)]
-pub(super) struct Place {
+pub(super) struct PlacedCell {
     pub(super) joint: u8,
     pub(super) position: [f64; 3],
     /// Its angle around the limb, from the z axis to the y axis, in rad.
@@ -185,7 +185,7 @@ impl Rings {
     }
 
     /// Returns the cells with these numbers, of the `all` on the limb, wired among themselves.
-    fn wired(&self, limb: &Limb, all: usize, numbers: core::ops::Range<usize>) -> Vec<Place> {
+    fn wired(&self, limb: &Limb, all: usize, numbers: core::ops::Range<usize>) -> Vec<PlacedCell> {
         let rings = all.div_ceil(self.around);
         let place = |number| {
             let (ring, place) = self.spot(number);
@@ -200,7 +200,7 @@ impl Rings {
             let turn = TAU * (real(place) + real(ring % 2) / 2.0) / real(self.around);
             let radius = real(self.around) * self.pitch / TAU;
             let [x, z] = limb.middle;
-            Place {
+            PlacedCell {
                 joint: limb.joint,
                 position: [
                     x + (real(rings - 1) / 2.0 - real(ring)) * self.step(),
@@ -218,7 +218,7 @@ impl Rings {
 
 /// Puts the cells of two limbs on one bus. A cable connects the free port 3 of the last cell with the free port 2 of
 /// the first cell of the other limb.
-fn join(upper: &mut Vec<Place>, lower: &mut Vec<Place>) {
+fn join(upper: &mut Vec<PlacedCell>, lower: &mut Vec<PlacedCell>) {
     let shift = upper.len();
     for wire in lower.iter_mut().flat_map(|place| &mut place.wires).flatten() {
         *wire += shift;
@@ -231,7 +231,7 @@ fn join(upper: &mut Vec<Place>, lower: &mut Vec<Place>) {
 
 /// Wires the gateway to the centre of a bus' cells: the first cell with the smallest distance to its farthest cell, so
 /// that sums have the shortest path.
-fn root(places: &mut [Place]) {
+fn root(places: &mut [PlacedCell]) {
     let nearest = (0..places.len()).min_by_key(|&from| depth(places, from));
     if let Some(root) = nearest.and_then(|at| places.get_mut(at)) {
         root.root = true;
@@ -239,7 +239,7 @@ fn root(places: &mut [Place]) {
 }
 
 /// Returns the number of wires from a cell to the farthest reachable cell.
-pub(super) fn depth(places: &[Place], from: usize) -> usize {
+pub(super) fn depth(places: &[PlacedCell], from: usize) -> usize {
     let mut distance = vec![None; places.len()];
     let mut next = VecDeque::from([(from, 0)]);
     let mut deepest = 0;

@@ -70,7 +70,7 @@ fn every_bus_is_one_connected_patch_with_one_root() {
         let skin = skin(&target(cells, buses));
         assert_eq!((skin.cells.len(), skin.buses.len()), (cells, buses));
         for bus in 0..buses {
-            let here: Vec<&Cell> = skin.cells_of(bus).collect();
+            let here: Vec<&Cell> = skin.cells_on_bus(bus).collect();
             assert!(here.iter().zip(1..).all(|(cell, node)| i64::from(cell.node.get()) == node));
             assert_eq!(here.iter().filter(|cell| cell.root).count(), 1, "{cells} {buses}");
             assert!(buses == 1 || here.iter().all(|cell| cell.joint == here[0].joint), "limbs stay together");
@@ -123,7 +123,7 @@ fn the_reply_and_the_format_are_the_requested_ones() {
         assert_eq!(bus.format, Format::Classic);
         // The slots share 15 ms; there are at most 20.
         assert!(
-            matches!(bus.reply, protocol::skin::Reply::Sum { slot_us: 750..2_000, carry: true }),
+            matches!(bus.reply, protocol::skin::SkinReply::Sum { slot_us: 750..2_000, carry: true }),
             "{bus:?}"
         );
     }

@@ -3,7 +3,7 @@
 use protocol::skin::DenavitHartenberg;
 use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
 
-use super::arm::{self, Covered, Place};
+use super::arm::{self, Covered, PlacedCell};
 use super::{Format, Reply, Target};
 
 /// Maximum share of the broadcast period for the slots of sums.
@@ -52,8 +52,8 @@ pub(super) fn toml(target: &Target, arm: &Covered) -> String {
     }
     draft.table("[controller]", Some("M q'' + D q' = tau, joint by joint"));
     draft.set("kind", Value::Text("kinesthetic"));
-    draft.set_remarked("inertia", Value::Numbers(&[1.0, 1.0, 1.0, 0.5, 0.5, 0.5]), 11, "kg m2");
-    draft.set_remarked("damping", Value::Numbers(&[4.0, 4.0, 4.0, 2.0, 2.0, 2.0]), 11, "Nm s/rad");
+    draft.set_with_comment("inertia", Value::Numbers(&[1.0, 1.0, 1.0, 0.5, 0.5, 0.5]), 11, "kg m2");
+    draft.set_with_comment("damping", Value::Numbers(&[4.0, 4.0, 4.0, 2.0, 2.0, 2.0]), 11, "Nm s/rad");
     draft.set("max_speed_rad_s", Value::Numbers(&[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]));
     for (bus, places) in arm.buses.iter().enumerate() {
         places.iter().zip(1..).for_each(|(place, node)| cell(&mut draft, bus, place, node));
@@ -66,7 +66,7 @@ fn bus_name(bus: usize) -> String {
 }
 
 /// Adds a cell of a bus with its node id.
-fn cell(draft: &mut Draft, bus: usize, place: &Place, node: usize) {
+fn cell(draft: &mut Draft, bus: usize, place: &PlacedCell, node: usize) {
     // A rotation about x, the limb's direction: the cell's z axis points away from the limb.
     let (sin, cos) = (-place.turn / 2.0).sin_cos();
     let [qx, qw] = [sin, cos].map(|value| round(value, 1e9));
@@ -91,7 +91,7 @@ fn cell(draft: &mut Draft, bus: usize, place: &Place, node: usize) {
     clippy::cast_sign_loss,
     reason = "small and positive; the skin's check refuses what is not"
 )]
-fn slot_us(places: &[Place], broadcast_hz: f64) -> u64 {
+fn slot_us(places: &[PlacedCell], broadcast_hz: f64) -> u64 {
     let root = places.iter().position(|place| place.root).unwrap_or_default();
     let slots = arm::depth(places, root) + 1;
     (1e5 * SLOTS_SHARE / broadcast_hz / slots as f64).floor().max(1.0) as u64 * 10

@@ -24,6 +24,6 @@ pub mod packets;
 pub mod state;
 pub mod touched;
 
-pub use packets::{Latched, Seen};
+pub use packets::{LatchedPackets, ReceivedFrame};
 pub use state::State;
-pub use touched::Touched;
+pub use touched::KnownContacts;

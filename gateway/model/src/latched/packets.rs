@@ -17,20 +17,20 @@ use std::sync::Arc;
 use protocol::can::{Format, Frame};
 use protocol::id::{Id, Kind};
 use protocol::message::{Answer, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
-use protocol::packet::{self, Epoch, PacketError, Segment};
+use protocol::packet::{self, Epoch, PacketError, Reassembler};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use crate::packets::{Content, PacketReader};
-use crate::tracker::{Claim, Contact, PerCell, Word};
+use crate::tracker::{AddressClaim, Contact, PerCell, HeartbeatKind};
 
 /// A received frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Seen {
+pub struct ReceivedFrame {
     /// Arrival time in ns since 1970.
     pub at_nanos: u64,
     /// True if the gateway sent it.
-    pub own: bool,
+    pub from_gateway: bool,
     /// The frame.
     pub frame: Frame,
 }
@@ -39,60 +39,60 @@ pub struct Seen {
 #[derive(Debug)]
 struct PlacedPacket {
     place: u64,
-    frames: Vec<Seen>,
+    frames: Vec<ReceivedFrame>,
 }
 
-type Kept = Option<Arc<PlacedPacket>>;
+type SharedPacket = Option<Arc<PlacedPacket>>;
 
 /// A latched page: its packet, the last joints before it, and the joints at which it was latched.
 #[derive(Clone, Debug)]
 struct ContactPage {
     placed_packet: Arc<PlacedPacket>,
-    before: Kept,
-    since: Kept,
+    before: SharedPacket,
+    since: SharedPacket,
 }
 
 /// The latched state of one cell.
 #[derive(Clone, Debug, Default)]
-struct Cell {
-    claim: Claim,
+struct LatchedCell {
+    claim: AddressClaim,
     /// Its last heartbeat.
-    heartbeat: Kept,
+    heartbeat: SharedPacket,
     /// The first and the last heartbeat of its last start.
-    starts: [Kept; 2],
+    starts: [SharedPacket; 2],
     /// Its last report of its parent in the tree.
-    tree: Kept,
+    tree: SharedPacket,
     /// By parameter: the last writes of volatile parameters.
     switches: BTreeMap<u8, Arc<PlacedPacket>>,
     /// By parameter: the last writes that a commit activated, and that commit.
     committed: BTreeMap<u8, Arc<PlacedPacket>>,
-    commit: Kept,
+    commit: SharedPacket,
     /// By parameter: the last writes since then, and a commit that has not been answered.
     staged: BTreeMap<u8, Arc<PlacedPacket>>,
-    requested: Kept,
+    requested: SharedPacket,
     contact: Contact<ContactPage>,
     /// The packet with which the cell proved that all its stimuli are on the bus: its counters, or its answer to a
     /// write of its mode.
-    shown: Kept,
+    shown: SharedPacket,
 }
 
 /// The packets of one bus that are latched.
 #[derive(Clone, Debug)]
-pub struct Latched {
+pub struct LatchedPackets {
     /// Number of packets so far.
     places: u64,
-    cells: PerCell<Cell>,
+    cells: PerCell<LatchedCell>,
     joints: Option<(Epoch, Arc<PlacedPacket>)>,
     /// The last halt or resume.
-    halt: Kept,
+    halt: SharedPacket,
     packets: PacketReader,
     /// By identifier: segments of incomplete packets.
-    waiting: BTreeMap<u16, Vec<Seen>>,
+    waiting: BTreeMap<u16, Vec<ReceivedFrame>>,
     /// Identifiers of the gateway's packets with pending segments, and the time of the newest, in ns since 1970.
     open: BTreeMap<u16, u64>,
 }
 
-impl Default for Latched {
+impl Default for LatchedPackets {
     fn default() -> Self {
         Self {
             places: 0,
@@ -106,7 +106,7 @@ impl Default for Latched {
     }
 }
 
-impl Cell {
+impl LatchedCell {
     /// Resets the contact state, after a start or a write of the mode.
     fn clear(&mut self, obeys: bool) {
         self.contact.write_mode();
@@ -126,11 +126,11 @@ impl Cell {
 
     fn heartbeat(&mut self, heartbeat: &Heartbeat, placed_packet: &Arc<PlacedPacket>) {
         let at = placed_packet.frames.last().map_or(Micros(0), |seen| Micros(seen.at_nanos / 1_000));
-        let word = self.claim.hear(at, heartbeat);
-        if matches!(word, Word::Claimant | Word::Outsider) {
+        let word = self.claim.receive(at, heartbeat);
+        if matches!(word, HeartbeatKind::Claimant | HeartbeatKind::Outsider) {
             return;
         }
-        if let Word::Started { .. } = word {
+        if let HeartbeatKind::Started { .. } = word {
             self.clear(true);
             self.switches.clear();
             self.staged.clear();
@@ -179,7 +179,7 @@ impl Cell {
             .iter()
             .any(|(_, _, contact_page)| contact_page.placed_packet.place < joints)
         {
-            self.contact.learn(page, contact_page);
+            self.contact.apply_reported_page(page, contact_page);
         }
     }
 
@@ -197,9 +197,9 @@ impl Cell {
     }
 }
 
-impl Latched {
+impl LatchedPackets {
     /// Handles a frame from the bus. Bounded work; frames that are not packets are ignored.
-    pub fn take(&mut self, seen: Seen) {
+    pub fn receive(&mut self, seen: ReceivedFrame) {
         let Ok(id) = packet::data_id(&seen.frame) else { return };
         match id.kind {
             Kind::Command | Kind::Network | Kind::Stimulus | Kind::Configure => {}
@@ -229,17 +229,17 @@ impl Latched {
         frames.push(seen);
         let Some(message) = received.message() else { return };
         self.places += 1;
-        self.hear(message, &Arc::new(PlacedPacket { place: self.places, frames }));
+        self.apply_message(message, &Arc::new(PlacedPacket { place: self.places, frames }));
     }
 
     /// Returns true if segments of a gateway packet are pending: a file must not begin between them.
     #[must_use]
     pub fn is_within_a_packet(&self, now_nanos: u64) -> bool {
-        let within = |bits: u16| Segment::within(Id::from_bits(bits)).0 * 1_000;
+        let within = |bits: u16| Reassembler::max_gap(Id::from_bits(bits)).0 * 1_000;
         self.open.iter().any(|(bits, at)| now_nanos < at.saturating_add(within(*bits)))
     }
 
-    fn hear(&mut self, message: &Message, placed_packet: &Arc<PlacedPacket>) {
+    fn apply_message(&mut self, message: &Message, placed_packet: &Arc<PlacedPacket>) {
         let last = self.joints.as_ref().map(|(epoch, _)| *epoch);
         let contact_page = || ContactPage {
             placed_packet: Arc::clone(placed_packet),
@@ -263,7 +263,7 @@ impl Latched {
                 cell.heartbeat(&heartbeat, placed_packet);
             } else if let NetworkPage::Tree(_) = page {
                 cell.tree = Some(Arc::clone(placed_packet));
-            } else if let NetworkPage::Heard(heard) = page {
+            } else if let NetworkPage::Received(heard) = page {
                 cell.show(contact_page(), |contact, tag| contact.count(heard.stimuli, tag));
             }
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
@@ -297,7 +297,7 @@ impl Latched {
 
     /// Returns all frames, in the bus' order.
     #[must_use]
-    pub fn frames(&self) -> Vec<Seen> {
+    pub fn frames(&self) -> Vec<ReceivedFrame> {
         let joints = self.joints.iter().map(|(_, joints)| joints);
         let packets = self.cells.iter().flat_map(|(_, cell)| cell.packets()).chain(joints).chain(&self.halt);
         let ordered: BTreeMap<_, _> =
@@ -311,12 +311,12 @@ mod tests {
     use super::*;
     use protocol::fixed::Q5_10;
     use protocol::id::{CellId, Node};
-    use protocol::message::{From, Joints, SkinSensors, Tree};
+    use protocol::message::{AppliesFrom, Joints, SkinSensors, Tree};
     use protocol::packet::WORDS;
 
-    fn say(force: &mut Latched, at_nanos: u64, format: Format, message: &Message) -> Vec<Frame> {
+    fn say(force: &mut LatchedPackets, at_nanos: u64, format: Format, message: &Message) -> Vec<Frame> {
         let frames: Vec<_> = message.encode().frames(format).collect();
-        frames.iter().for_each(|&frame| force.take(Seen { at_nanos, own: true, frame }));
+        frames.iter().for_each(|&frame| force.receive(ReceivedFrame { at_nanos, from_gateway: true, frame }));
         frames
     }
 
@@ -324,7 +324,7 @@ mod tests {
         let skin = SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() };
         Message::Stimulus {
             to: Node::from_byte(node),
-            from: From::Epoch(Epoch(epoch)),
+            from: AppliesFrom::Epoch(Epoch(epoch)),
             page: SensorPage::Skin(skin),
         }
     }
@@ -342,7 +342,7 @@ mod tests {
     #[test]
     fn the_last_of_everything_is_kept_in_both_formats() {
         for format in [Format::Fd, Format::Classic] {
-            let mut force = Latched::default();
+            let mut force = LatchedPackets::default();
             let cell = CellId::new(3).unwrap();
             say(&mut force, 1, format, &heartbeat(3, 1));
             let write = |number, word| Message::Configure {
@@ -380,7 +380,7 @@ mod tests {
 
     #[test]
     fn latched_and_waiting_stimuli_are_kept_with_the_joints_that_tell_which() {
-        let mut force = Latched::default();
+        let mut force = LatchedPackets::default();
         let mut kept = vec![];
         let mut now = 0;
         let mut say = |message: &Message, keep: bool| {
@@ -403,7 +403,7 @@ mod tests {
 
     #[test]
     fn a_restarted_cell_has_nothing_latched_but_what_was_committed() {
-        let mut force = Latched::default();
+        let mut force = LatchedPackets::default();
         let to = Node::Cell(CellId::new(3).unwrap());
         let write = |number, word| {
             let request = Request::Write { number, words: [word, 0, 0, 0, 0, 0] };
@@ -417,7 +417,7 @@ mod tests {
         };
         let placed_packet = [write(1, 1), write(127, 9), taken, write(2, 1), write(1, 2), write(7, 1)];
         let placed_packet = [&placed_packet[..], &[stimulus(3, 1.0, 0), joints(0)]].concat();
-        let kept = |force: &Latched| force.frames().iter().map(|seen| seen.at_nanos).collect::<Vec<_>>();
+        let kept = |force: &LatchedPackets| force.frames().iter().map(|seen| seen.at_nanos).collect::<Vec<_>>();
         (0..).zip(&placed_packet).for_each(|(at, message)| drop(say(&mut force, at, Format::Fd, message)));
         assert_eq!(kept(&force), [0, 1, 3, 4, 5, 6, 7]);
         say(&mut force, 8, Format::Fd, &claims(0));
@@ -427,11 +427,11 @@ mod tests {
 
     #[test]
     fn no_file_begins_between_the_segments_of_a_gateway_packet() {
-        let mut force = Latched::default();
+        let mut force = LatchedPackets::default();
         let segments = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
         let (ours, theirs) = (segments(&joints(1)), segments(&heartbeat(3, 1)));
         let mut take = |at_nanos, frame| {
-            force.take(Seen { at_nanos, own: true, frame });
+            force.receive(ReceivedFrame { at_nanos, from_gateway: true, frame });
             [0, 14_000_000, 16_000_000].map(|later| force.is_within_a_packet(at_nanos + later))
         };
         assert_eq!(take(5, theirs[0]), [false; 3]);
@@ -450,7 +450,7 @@ mod tests {
             |number| Message::Configure { to, tag: 0, request: Request::Write { number, words: [1; 6] } };
         let placed_packet =
             [beat(7, 40, State::CONFIGURED), write(7), write(1), joints(1), stimulus(3, 1.0, 2), joints(2)];
-        let mut force = Latched::default();
+        let mut force = LatchedPackets::default();
         (0..).zip(&placed_packet).for_each(|(at, message)| drop(say(&mut force, at, Format::Fd, message)));
         let before = force.frames();
         say(&mut force, 9, Format::Fd, &beat(9, 0, State::CLAIMING));

@@ -11,16 +11,16 @@
 
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node};
-use protocol::message::{From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
-use super::touched::Touched;
-use crate::tracker::{Claim, Contact, PerCell, Word};
+use super::touched::KnownContacts;
+use crate::tracker::{AddressClaim, Contact, PerCell, HeartbeatKind};
 
 /// Maximum number of messages since the last joints that are kept as they were sent.
-const SINCE: usize = 16_384;
+const MAX_PENDING_MESSAGES: usize = 16_384;
 
 /// The contact state of one cell.
 type ContactState = Contact<()>;
@@ -51,7 +51,7 @@ fn pages(contact_state: &ContactState) -> impl Iterator<Item = SensorPage> {
 
 /// The state of a bus before its last joints.
 #[derive(Clone, Debug, Default)]
-struct Before {
+struct StateBeforeJoints {
     /// Parameter writes in order, without overwritten ones.
     writes: Vec<(Node, u8, Message)>,
     halted: bool,
@@ -61,16 +61,16 @@ struct Before {
 /// The state of one bus.
 #[derive(Clone, Debug, Default)]
 pub struct State {
-    before: Before,
+    before: StateBeforeJoints,
     /// The owners of node ids.
-    claims: PerCell<Claim>,
+    claims: PerCell<AddressClaim>,
     /// The last joints. The state before them decides whether a cell was in contact at them.
     joints: Option<(Epoch, Joints)>,
     /// Messages since the last joints, as they were sent.
     since: Vec<Message>,
 }
 
-impl Before {
+impl StateBeforeJoints {
     /// Applies a message that came after the joints `last`.
     fn take(&mut self, message: &Message, last: Option<Epoch>) {
         if let Message::Halt | Message::Resume = message {
@@ -114,7 +114,7 @@ fn is_volatile(number: u8) -> bool {
 
 impl State {
     /// Applies the bus' next message.
-    pub fn take(&mut self, message: &Message) {
+    pub fn apply(&mut self, message: &Message) {
         if let Message::Joints { epoch, joints } = *message {
             // Cells drop joints of the last epoch.
             if self.joints.is_none_or(|(last, _)| last != epoch) {
@@ -126,7 +126,7 @@ impl State {
         | Message::Stimulus { .. }
         | Message::Configure { request: Request::Write { .. }, .. } = message
         {
-            if self.since.len() == SINCE {
+            if self.since.len() == MAX_PENDING_MESSAGES {
                 self.fold();
             }
             self.since.push(*message);
@@ -134,12 +134,12 @@ impl State {
             // The cell's own report counts if its contact state is not known otherwise.
             let cell = self.before.cells.get_mut(from).filter(|cell| cell.waiting().is_empty());
             if let Some(cell) = cell.filter(|_| self.joints.is_none_or(|(last, _)| last == epoch)) {
-                cell.learn(page, ());
+                cell.apply_reported_page(page, ());
             }
         } else if let Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             // Use the order of the capture: its times may be wrong.
-            let hear = |claim: &mut Claim| claim.hear(Micros(0), heartbeat);
-            let started = |claim: &mut Claim| matches!(hear(claim), Word::Started { .. });
+            let hear = |claim: &mut AddressClaim| claim.receive(Micros(0), heartbeat);
+            let started = |claim: &mut AddressClaim| matches!(hear(claim), HeartbeatKind::Started { .. });
             if self.claims.named(*from).iter_mut().any(started) {
                 self.start_again(*from);
             }
@@ -169,7 +169,7 @@ impl State {
 
     /// Returns the owner of a node id.
     #[must_use]
-    pub fn claim(&self, cell: CellId) -> Option<&Claim> {
+    pub fn claim(&self, cell: CellId) -> Option<&AddressClaim> {
         self.claims.get(cell)
     }
 
@@ -181,8 +181,8 @@ impl State {
 
     /// Returns the cells in contact since the last joints, by the messages before them.
     #[must_use]
-    pub fn touched(&self) -> Touched {
-        let mut touched = Touched::default();
+    pub fn touched(&self) -> KnownContacts {
+        let mut touched = KnownContacts::default();
         let Some((epoch, _)) = self.joints else { return touched };
         for (cell, contact_state) in self.before.cells.iter() {
             if let Some(is_touched) = is_touched_from(contact_state, epoch) {
@@ -195,7 +195,7 @@ impl State {
     /// Returns true if a cell that has just started is already in this state.
     #[must_use]
     pub fn is_fresh(&self) -> bool {
-        let Before { writes, halted, cells } = &self.before;
+        let StateBeforeJoints { writes, halted, cells } = &self.before;
         let contact =
             cells.iter().any(|(_, cell)| pages(cell).next().is_some() || !cell.waiting().is_empty());
         !contact && writes.is_empty() && !halted && self.joints.is_none() && self.since.is_empty()
@@ -213,19 +213,19 @@ impl State {
     /// without joints so far: they make the cells drop the epoch of an earlier gateway.
     #[must_use]
     pub fn restoring(&self, cells: impl Fn(CellId) -> bool, next: Option<(Epoch, Joints)>) -> Vec<Message> {
-        let Before { writes, halted, cells: contact_states } = &self.before;
+        let StateBeforeJoints { writes, halted, cells: contact_states } = &self.before;
         // Links can be down only in test mode, and the mode may have been written again since.
         let links_down = |write: &&(Node, u8, Message)| write.1 == Parameter::LinksDown.number();
-        let (plan_summary, others): (Vec<_>, Vec<_>) = writes.iter().partition(links_down);
+        let (links_down_writes, others): (Vec<_>, Vec<_>) = writes.iter().partition(links_down);
         let mut messages: Vec<_> =
-            others.iter().chain(&plan_summary).map(|(_, _, message)| *message).collect();
+            others.iter().chain(&links_down_writes).map(|(_, _, message)| *message).collect();
         messages.push(Message::Resume);
         let known: Vec<_> = contact_states.iter().filter(|(cell, _)| cells(*cell)).collect();
         let stimulus = |cell, from, page| Message::Stimulus { to: Node::Cell(cell), from, page };
         let contact: Vec<_> = known
             .iter()
             .flat_map(|(cell, contact_state)| {
-                pages(contact_state).map(|page| stimulus(*cell, From::Next, page))
+                pages(contact_state).map(|page| stimulus(*cell, AppliesFrom::Next, page))
             })
             .collect();
         let pending = known
@@ -233,10 +233,10 @@ impl State {
             .flat_map(|(cell, it)| it.waiting().iter().map(|&(from, page, ())| stimulus(*cell, from, page)));
         let pending: Vec<_> = pending.collect();
         let steps_before = |steps: u8, (epoch, joints): (Epoch, Joints)| Message::Joints {
-            epoch: epoch.plus(0_u8.wrapping_sub(steps)),
+            epoch: epoch.advanced_by(0_u8.wrapping_sub(steps)),
             joints,
         };
-        let last = self.joints.or_else(|| next.map(|(epoch, joints)| (epoch.plus(u8::MAX), joints)));
+        let last = self.joints.or_else(|| next.map(|(epoch, joints)| (epoch.advanced_by(u8::MAX), joints)));
         if let Some(last) = last.filter(|_| !contact.is_empty() || !pending.is_empty()) {
             // A cell drops joints of its last epoch, so the joints that matter must not be the first ones.
             messages.push(steps_before(2, last));
@@ -268,7 +268,7 @@ mod tests {
         CellId::new(node).unwrap()
     }
 
-    fn to(node: i64, from: From, newtons: f64) -> Message {
+    fn to(node: i64, from: AppliesFrom, newtons: f64) -> Message {
         Message::Stimulus { to: Node::Cell(cell(node)), from, page: press(newtons) }
     }
 
@@ -278,46 +278,46 @@ mod tests {
 
     fn mode(to: Node, words: i16) -> Message {
         let request =
-            Request::Write { number: Parameter::Mode.number(), words: protocol::packet::words([words]) };
+            Request::Write { number: Parameter::Mode.number(), words: protocol::packet::padded_words([words]) };
         Message::Configure { to, tag: 0, request }
     }
 
     fn restored(messages: &[Message]) -> Vec<Message> {
         let mut state = State::default();
         for message in messages {
-            state.take(message);
+            state.apply(message);
         }
         state.restoring(|_| true, None)
     }
 
     #[test]
     fn latched_waiting_and_later_stimuli_are_distinguished() {
-        let at = |epoch| From::Epoch(Epoch(epoch));
+        let at = |epoch| AppliesFrom::Epoch(Epoch(epoch));
         let said = [
             joints(10),
             to(1, at(11), 1.0),
             joints(11),
             to(1, at(13), 2.0),
             joints(12),
-            to(2, From::Next, 3.0),
+            to(2, AppliesFrom::Next, 3.0),
         ];
         let expected = [
             Message::Resume,
             joints(10),
-            to(1, From::Next, 1.0),
+            to(1, AppliesFrom::Next, 1.0),
             joints(11),
             to(1, at(13), 2.0),
             joints(12),
-            to(2, From::Next, 3.0),
+            to(2, AppliesFrom::Next, 3.0),
         ];
         assert_eq!(restored(&said), expected);
     }
 
     #[test]
     fn a_late_stimulus_waits_for_the_next_joints() {
-        let late = to(1, From::Epoch(Epoch(11)), 1.0);
+        let late = to(1, AppliesFrom::Epoch(Epoch(11)), 1.0);
         assert_eq!(restored(&[joints(11), late]), [Message::Resume, joints(11), late]);
-        let next = to(1, From::Next, 1.0);
+        let next = to(1, AppliesFrom::Next, 1.0);
         let expected = [Message::Resume, joints(10), joints(11), next, joints(12)];
         assert_eq!(restored(&[joints(11), late, joints(12)]), expected);
     }
@@ -337,12 +337,12 @@ mod tests {
         let heartbeat = Heartbeat { state: Flags::CLAIMING, ..Heartbeat::default() };
         let page = NetworkPage::Heartbeat(heartbeat);
         let restarted = Message::Network { from: Node::Cell(cell(1)), epoch: Epoch(0), page };
-        for end in [to(1, From::Next, 0.0), restarted] {
-            let said = [to(1, From::Next, 1.0), joints(1), end, joints(2), joints(3)];
+        for end in [to(1, AppliesFrom::Next, 0.0), restarted] {
+            let said = [to(1, AppliesFrom::Next, 1.0), joints(1), end, joints(2), joints(3)];
             assert_eq!(restored(&said), [Message::Resume, joints(3)]);
         }
         let measure = mode(Node::Everyone, 0);
-        let said = [to(1, From::Next, 1.0), joints(1), measure, to(1, From::Next, 1.0), joints(2), joints(3)];
+        let said = [to(1, AppliesFrom::Next, 1.0), joints(1), measure, to(1, AppliesFrom::Next, 1.0), joints(2), joints(3)];
         assert_eq!(restored(&said), [measure, Message::Resume, joints(3)]);
     }
 
@@ -411,7 +411,7 @@ mod tests {
         let says =
             |newtons, epoch| Message::Sensors { from: cell(1), epoch: Epoch(epoch), page: press(newtons) };
         let said = [joints(1), says(5.0, 0), says(1.0, 1), says(2.0, 1)];
-        let expected = [Message::Resume, joints(255), to(1, From::Next, 1.0), joints(0), joints(1)];
+        let expected = [Message::Resume, joints(255), to(1, AppliesFrom::Next, 1.0), joints(0), joints(1)];
         assert_eq!(restored(&said), expected);
     }
 
@@ -426,10 +426,10 @@ mod tests {
     #[test]
     fn only_cells_that_are_there_are_pressed() {
         let mut state = State::default();
-        state.take(&Message::Stimulus { to: Node::Everyone, from: From::Next, page: press(1.0) });
-        state.take(&joints(1));
+        state.apply(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page: press(1.0) });
+        state.apply(&joints(1));
         let messages = state.restoring(|it| it.get() == 7, None);
-        assert_eq!(messages, [Message::Resume, joints(255), joints(0), to(7, From::Next, 1.0), joints(1)]);
+        assert_eq!(messages, [Message::Resume, joints(255), joints(0), to(7, AppliesFrom::Next, 1.0), joints(1)]);
     }
 
     #[test]
@@ -445,7 +445,7 @@ mod tests {
             request: Request::Write { number, words: [1; 6] },
         };
         let said =
-            [owner, write(7), to(1, From::Next, 1.0), joints(1), joints(2), to(1, From::Next, 2.0), write(8)];
+            [owner, write(7), to(1, AppliesFrom::Next, 1.0), joints(1), joints(2), to(1, AppliesFrom::Next, 2.0), write(8)];
         let whole = restored(&said);
         for at in 1..=said.len() {
             let (before, after) = said.split_at(at);

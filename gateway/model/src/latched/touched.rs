@@ -4,15 +4,15 @@ use protocol::id::CellId;
 
 /// The contact of each cell; `None` if unknown.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Touched([Option<bool>; CellId::COUNT]);
+pub struct KnownContacts([Option<bool>; CellId::COUNT]);
 
-impl Default for Touched {
+impl Default for KnownContacts {
     fn default() -> Self {
         Self([None; CellId::COUNT])
     }
 }
 
-impl Touched {
+impl KnownContacts {
     /// Returns true if a cell is in contact; `None` if unknown.
     #[must_use]
     pub fn is(&self, cell: CellId) -> Option<bool> {
@@ -33,7 +33,7 @@ mod tests {
 
     #[test]
     fn every_cell_has_a_place_of_its_own() {
-        let mut touched = Touched::default();
+        let mut touched = KnownContacts::default();
         for (before, cell) in CellId::all().enumerate() {
             assert_eq!(CellId::all().filter(|cell| touched.is(*cell).is_some()).count(), before);
             touched.insert(cell, before % 3 == 0);

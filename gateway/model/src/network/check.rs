@@ -11,11 +11,11 @@ use protocol::port::PORTS;
 use protocol::skin::Wires;
 use thiserror::Error;
 
-use super::tree::{Places, places};
+use super::tree::{TreePlaces, places};
 
 /// The known state of one cell.
 #[derive(Clone, Copy, Debug)]
-pub struct Seen {
+pub struct ObservedCell {
     /// Its node id.
     pub node: CellId,
     /// The described serial number for this node id; `None` if the node id is not described.
@@ -34,14 +34,14 @@ pub struct Seen {
 
 /// A port of a cell.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
-pub struct End {
+pub struct WireEnd {
     /// The cell.
     pub cell: CellId,
     /// Its port, from 0.
     pub port: usize,
 }
 
-impl fmt::Display for End {
+impl fmt::Display for WireEnd {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "port {} of cell {}", self.port, self.cell)
     }
@@ -49,7 +49,7 @@ impl fmt::Display for End {
 
 /// The directions in which a damaged wire works.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
-pub enum Carries {
+pub enum WorkingDirection {
     /// Neither direction, or unknown.
     Nothing,
     /// From the first end to the second.
@@ -58,7 +58,7 @@ pub enum Carries {
     Back,
 }
 
-impl Carries {
+impl WorkingDirection {
     /// Describes a damaged wire between two cells for users.
     fn between(self, first: CellId, second: CellId) -> String {
         match self {
@@ -113,30 +113,30 @@ pub enum Difference {
     #[error("the wire from {first} to {second} {}: check its plugs", carries.between(first.cell, second.cell))]
     MissingWire {
         /// The end with the smaller node id.
-        first: End,
+        first: WireEnd,
         /// The other end.
-        second: End,
+        second: WireEnd,
         /// The directions that still work.
-        carries: Carries,
+        carries: WorkingDirection,
     },
     /// A wire is not described.
     #[error("a wire leads from {0} to {1} and is not described: describe it, or unplug it")]
-    ExtraWire(End, End),
+    ExtraWire(WireEnd, WireEnd),
     /// A port leads to another end than described.
     #[error(
         "{end} leads to {leads} and should lead to {described}: plug it there, or change the description"
     )]
     SwappedWire {
         /// The port.
-        end: End,
+        end: WireEnd,
         /// The end to which it leads.
-        leads: End,
+        leads: WireEnd,
         /// The end to which it should lead.
-        described: End,
+        described: WireEnd,
     },
     /// A cell without a node id is at a port.
     #[error("a cell without a node id is at {0}: it gets one from the network, unless all are used")]
-    Unnumbered(End),
+    Unnumbered(WireEnd),
     /// Cells that are each other's parents, in order.
     #[error("{} are each other's parents, a circle that would count cells twice: restart them", names(.0))]
     Circle(Vec<CellId>),
@@ -202,13 +202,13 @@ impl Difference {
 
 /// Returns all differences, each once.
 #[must_use]
-pub fn differences(wires: &Wires, cells: &[Seen]) -> Vec<Difference> {
+pub fn differences(wires: &Wires, cells: &[ObservedCell]) -> Vec<Difference> {
     let mut found: Vec<_> = cells.iter().flat_map(|cell| of_cell(cell, cells)).collect();
     let versions = other_versions(wires, cells);
     found.extend(versions.iter().map(|(&cell, &version)| Difference::Version { cell, version }));
     let network = Network::new(wires, cells, &versions);
     network.wires(&mut found);
-    let Places { circles, unreachable, .. } =
+    let TreePlaces { circles, unreachable, .. } =
         places(cells.iter().map(|cell| (cell.node, cell.alive, cell.tree)));
     let circling: BTreeSet<_> = circles.iter().flatten().copied().collect();
     found.extend(circles.into_iter().map(Difference::Circle));
@@ -222,7 +222,7 @@ pub fn differences(wires: &Wires, cells: &[Seen]) -> Vec<Difference> {
 }
 
 /// Returns the differences of a cell by itself.
-fn of_cell(cell: &Seen, all: &[Seen]) -> Vec<Difference> {
+fn of_cell(cell: &ObservedCell, all: &[ObservedCell]) -> Vec<Difference> {
     let node = cell.node;
     let heartbeat = cell.heartbeat.filter(|_| cell.alive);
     let Some(described) = cell.serial else {
@@ -245,7 +245,7 @@ fn of_cell(cell: &Seen, all: &[Seen]) -> Vec<Difference> {
 }
 
 /// Returns the cells with another version, by their own or by their neighbours' reports.
-fn other_versions(wires: &Wires, cells: &[Seen]) -> BTreeMap<CellId, Option<u16>> {
+fn other_versions(wires: &Wires, cells: &[ObservedCell]) -> BTreeMap<CellId, Option<u16>> {
     let alive = || cells.iter().filter(|cell| cell.alive && cell.serial.is_some());
     let mut versions = BTreeMap::new();
     for cell in alive() {
@@ -276,8 +276,8 @@ struct Network<'a> {
 }
 
 impl<'a> Network<'a> {
-    fn new(wires: &'a Wires, cells: &'a [Seen], versions: &BTreeMap<CellId, Option<u16>>) -> Self {
-        let sound = |cell: &&Seen| {
+    fn new(wires: &'a Wires, cells: &'a [ObservedCell], versions: &BTreeMap<CellId, Option<u16>>) -> Self {
+        let sound = |cell: &&ObservedCell| {
             let single = cell.heartbeat.is_some_and(|heartbeat| !heartbeat.state.has(State::DUPLICATE));
             cell.alive && single && !versions.contains_key(&cell.node)
         };
@@ -286,23 +286,23 @@ impl<'a> Network<'a> {
     }
 
     /// Returns the described end to which a port should lead.
-    fn described(&self, end: End) -> Option<End> {
-        self.wires.other_end(end.cell, end.port).map(|(cell, port)| End { cell, port })
+    fn described(&self, end: WireEnd) -> Option<WireEnd> {
+        self.wires.other_end(end.cell, end.port).map(|(cell, port)| WireEnd { cell, port })
     }
 
-    fn state(&self, end: End) -> Option<protocol::message::PortState> {
+    fn state(&self, end: WireEnd) -> Option<protocol::message::PortState> {
         self.sound.get(&end.cell)?.ports.get(end.port).copied()
     }
 
     /// Returns the end to which a port leads, if its cell receives anything there.
-    fn leads(&self, end: End) -> Option<End> {
-        let state = self.state(end).filter(|state| state.hears)?;
+    fn leads(&self, end: WireEnd) -> Option<WireEnd> {
+        let state = self.state(end).filter(|state| state.receives)?;
         let cell = CellId::new(state.number.into()).ok()?;
-        Some(End { cell, port: state.port.into() })
+        Some(WireEnd { cell, port: state.port.into() })
     }
 
-    fn ends(&self) -> impl Iterator<Item = End> {
-        self.sound.keys().flat_map(|&cell| (0..PORTS).map(move |port| End { cell, port }))
+    fn ends(&self) -> impl Iterator<Item = WireEnd> {
+        self.sound.keys().flat_map(|&cell| (0..PORTS).map(move |port| WireEnd { cell, port }))
     }
 
     fn wires(&self, found: &mut Vec<Difference>) {
@@ -310,7 +310,7 @@ impl<'a> Network<'a> {
         let mut elsewhere = BTreeSet::new();
         for end in self.ends() {
             let described = self.described(end);
-            let state = self.state(end).filter(|state| state.hears);
+            let state = self.state(end).filter(|state| state.receives);
             if state.is_some_and(|state| state.number == 0 && !state.other_version) {
                 found.push(Difference::Unnumbered(end));
                 elsewhere.insert(end);
@@ -339,10 +339,10 @@ impl<'a> Network<'a> {
             if elsewhere.contains(&first) || elsewhere.contains(&second) || (here.works && there.works) {
                 continue;
             }
-            let carries = match (here.hears, there.hears) {
-                (true, false) => Carries::Back,
-                (false, true) => Carries::There,
-                (false, false) | (true, true) => Carries::Nothing,
+            let carries = match (here.receives, there.receives) {
+                (true, false) => WorkingDirection::Back,
+                (false, true) => WorkingDirection::There,
+                (false, false) | (true, true) => WorkingDirection::Nothing,
             };
             found.push(Difference::MissingWire { first, second, carries });
         }

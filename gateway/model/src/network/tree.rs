@@ -8,7 +8,7 @@ use protocol::port::UPLINK;
 
 /// The places of cells in their tree.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
-pub struct Places {
+pub struct TreePlaces {
     /// Number of wires from each reachable cell to its root; a root has 0.
     pub depths: BTreeMap<CellId, u8>,
     /// True if all these cells report the same depth.
@@ -19,7 +19,7 @@ pub struct Places {
     pub circles: Vec<Vec<CellId>>,
 }
 
-impl Places {
+impl TreePlaces {
     /// Returns the depth of the deepest cell.
     #[must_use]
     pub fn deepest(&self) -> Option<u8> {
@@ -28,14 +28,14 @@ impl Places {
 }
 
 /// Returns the places of cells, given for each cell its node id, whether it sends, and its report.
-pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Places {
+pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> TreePlaces {
     let alive: BTreeMap<_, _> =
         cells.filter(|(_, alive, _)| *alive).map(|(node, _, tree)| (node, tree)).collect();
     let parent = |node: &CellId| {
         let tree = alive.get(node).copied().flatten()?;
         Some((tree, tree.parent.and_then(|parent| CellId::new(parent.into()).ok())))
     };
-    let mut places = Places { agree: true, ..Places::default() };
+    let mut places = TreePlaces { agree: true, ..TreePlaces::default() };
     let mut circling = BTreeSet::new();
     for &node in alive.keys() {
         let (mut route, mut at, mut steps) = (Vec::new(), node, 0_u8);
@@ -65,7 +65,7 @@ pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Plac
 
 /// Returns true if the cell is wired to the gateway and uses that wire.
 fn is_root(tree: &Tree) -> bool {
-    tree.parent == Some(0) && usize::from(tree.up) == UPLINK
+    tree.parent == Some(0) && usize::from(tree.parent_port) == UPLINK
 }
 
 fn from_the_smallest(mut circle: Vec<CellId>) -> Vec<CellId> {
@@ -83,7 +83,7 @@ mod tests {
     }
 
     fn says(node: i64, parent: Option<u8>, up: u8, depth: u8) -> (CellId, bool, Option<Tree>) {
-        (cell(node), true, Some(Tree { parent, up, depth, ..Tree::default() }))
+        (cell(node), true, Some(Tree { parent, parent_port: up, depth, ..Tree::default() }))
     }
 
     #[test]
@@ -104,7 +104,7 @@ mod tests {
             says(2, None, 0, 0),
             says(3, Some(2), 0, 1),
             says(4, Some(9), 0, 1),
-            (cell(5), false, Some(Tree { parent: Some(0), up: 4, ..Tree::default() })),
+            (cell(5), false, Some(Tree { parent: Some(0), parent_port: 4, ..Tree::default() })),
             says(6, Some(5), 0, 1),
             (cell(7), true, None),
             says(8, Some(0), 2, 0),

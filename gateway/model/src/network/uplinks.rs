@@ -14,11 +14,11 @@ use protocol::port::{Hello, PortMessage, Rank, Walk};
 use protocol::time::{Micros, Span};
 
 /// Interval of hellos.
-const HELLO: Span = Span::from_millis(250);
+const HELLO_INTERVAL: Span = Span::from_millis(250);
 /// Timeout of a root's hellos.
-const SILENT: Span = Span::from_millis(600);
+const HELLO_TIMEOUT: Span = Span::from_millis(600);
 /// Timeout of a walk.
-const LOST: Span = Span::from_millis(400);
+const WALK_TIMEOUT: Span = Span::from_millis(400);
 /// The port of the gateway's side, in its hellos.
 const PORT: u8 = 0;
 
@@ -27,7 +27,7 @@ const PORT: u8 = 0;
 struct Wire {
     /// The index of the wire in the description.
     root: usize,
-    heard: Option<(Hello, Micros)>,
+    last_hello: Option<(Hello, Micros)>,
     is_child: bool,
 }
 
@@ -58,7 +58,7 @@ impl Uplinks {
     /// an earlier gateway.
     #[must_use]
     pub fn new(roots: usize, walk: u8, now: Micros) -> Self {
-        let wire = |root| Wire { root, heard: None, is_child: false };
+        let wire = |root| Wire { root, last_hello: None, is_child: false };
         Self {
             wires: (0..roots).map(wire).collect(),
             round: 1,
@@ -84,7 +84,7 @@ impl Uplinks {
     /// Returns the time of the next call of [`Uplinks::handle_time`].
     #[must_use]
     pub fn poll_timeout(&self) -> Micros {
-        let lost = self.walking.map(|walking| walking.since + LOST);
+        let lost = self.walking.map(|walking| walking.since + WALK_TIMEOUT);
         let waits = Some(self.wait).filter(|_| self.walking.is_none() && self.needs_node_ids().is_some());
         [lost, waits].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
@@ -101,13 +101,13 @@ impl Uplinks {
         let Some(wire) = self.wires.get_mut(root) else { return };
         match message {
             PortMessage::Hello(hello) => {
-                let is_new = wire.heard.is_none_or(|(_, at)| now.since(at) > SILENT);
-                wire.heard = Some((hello, now));
+                let is_new = wire.last_hello.is_none_or(|(_, at)| now.elapsed_since(at) > HELLO_TIMEOUT);
+                wire.last_hello = Some((hello, now));
                 // Only the root knows whether a grant arrived, and whether one from an earlier gateway is still valid.
-                wire.is_child = hello.up;
-                if hello.up && hello.rank.is_some_and(|own| own.is_better_than(rank.below())) {
+                wire.is_child = hello.is_parent;
+                if hello.is_parent && hello.rank.is_some_and(|own| own.is_better_than(rank.below())) {
                     self.renew(now, hello.rank.map_or(self.round, |own| own.round));
-                } else if is_new || !hello.hears {
+                } else if is_new || !hello.receives {
                     self.hello(now, root);
                 }
             }
@@ -138,13 +138,13 @@ impl Uplinks {
     }
 
     fn hello(&mut self, now: Micros, root: usize) {
-        let heard = self.wires.get(root).and_then(|wire| wire.heard);
+        let heard = self.wires.get(root).and_then(|wire| wire.last_hello);
         let hello = Hello {
             version: VERSION,
             number: 0,
             port: PORT,
-            hears: heard.is_some_and(|(_, at)| now.since(at) <= SILENT),
-            up: false,
+            receives: heard.is_some_and(|(_, at)| now.elapsed_since(at) <= HELLO_TIMEOUT),
+            is_parent: false,
             unnumbered: false,
             rank: Some(Rank { round: self.round, depth: 0 }),
         };
@@ -160,23 +160,23 @@ impl Uplinks {
     /// Handles timeouts.
     pub fn handle_time(&mut self, now: Micros) {
         if now >= self.next_hello {
-            let skipped = now.since(self.next_hello).0 / HELLO.0;
-            self.next_hello = self.next_hello + Span((skipped + 1) * HELLO.0);
+            let skipped = now.elapsed_since(self.next_hello).0 / HELLO_INTERVAL.0;
+            self.next_hello = self.next_hello + Span((skipped + 1) * HELLO_INTERVAL.0);
             for wire in &mut self.wires {
-                wire.is_child &= wire.heard.is_some_and(|(_, at)| now.since(at) <= SILENT);
+                wire.is_child &= wire.last_hello.is_some_and(|(_, at)| now.elapsed_since(at) <= HELLO_TIMEOUT);
             }
             self.hello_to_all(now);
         }
-        if self.walking.is_some_and(|walking| now.since(walking.since) >= LOST) {
+        if self.walking.is_some_and(|walking| now.elapsed_since(walking.since) >= WALK_TIMEOUT) {
             self.walking = None;
-            self.wait = now + LOST;
+            self.wait = now + WALK_TIMEOUT;
         }
         self.walk(now);
     }
 
     /// Returns a root above a cell without a node id.
     fn needs_node_ids(&self) -> Option<usize> {
-        let needs = |wire: &&Wire| wire.is_child && wire.heard.is_some_and(|(hello, _)| hello.unnumbered);
+        let needs = |wire: &&Wire| wire.is_child && wire.last_hello.is_some_and(|(hello, _)| hello.unnumbered);
         self.wires.iter().find(needs).map(|wire| wire.root)
     }
 
@@ -230,8 +230,8 @@ mod tests {
             version: VERSION,
             number: 1,
             port: 4,
-            hears: true,
-            up: true,
+            receives: true,
+            is_parent: true,
             unnumbered,
             rank,
         })

@@ -2,25 +2,25 @@
 
 use core::f64::consts::TAU;
 
-use protocol::document::{Checked, Place};
+use protocol::document::{Checked, KeyPath};
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 use protocol::time::Span;
 
-use super::names::Names;
+use super::names::NameTable;
 use super::times::{EndS, length};
 use super::{Mode, ModeChange, Motion, MotionKind, Scenario, Touch, faults, pressed, raw, sensors};
 
 pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     if raw.version != 1 {
-        return Err(Place::named("version").fault(raw.version, "this program reads version 1"));
+        return Err(KeyPath::top_level_key("version").fault(raw.version, "this program reads version 1"));
     }
     let end = EndS(raw.duration_s());
-    let duration = length(&Place::named("duration_s"), end.0)?;
-    let negative = |_| Place::named("seed").fault(raw.seed, "must not be negative");
+    let duration = length(&KeyPath::top_level_key("duration_s"), end.0)?;
+    let negative = |_| KeyPath::top_level_key("seed").fault(raw.seed, "must not be negative");
     let seed = u64::try_from(raw.seed).map_err(negative)?;
     let motion = motion(&raw.motion, skin)?;
     let modes = modes(&raw.mode, end)?;
-    let names = Names::of(skin);
+    let names = NameTable::new(skin);
     let touches = pressed::touches(&raw.touch, end, &names)?;
     let touches_repeat =
         raw.touches_repeat_s.map(|seconds| repeat(&raw.touch, &touches, seconds)).transpose()?;
@@ -30,7 +30,7 @@ pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
 }
 
 fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
-    let at = Place::named("motion");
+    let at = KeyPath::top_level_key("motion");
     let robot = &skin.robot;
     let joints = |key, values: &[f64]| {
         if values.len() != robot.joints.len() {
@@ -51,7 +51,7 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
         [("hold", Some(MotionKind::Hold)), ("sine", None), ("kinesthetic", Some(MotionKind::Kinesthetic))];
     let needed = "needed with kind = \"sine\"";
     let only = "only with kind = \"sine\"";
-    let (kind, reach) = match (at.key("kind").word(&raw.kind, &kinds)?, amplitude, raw.period_s) {
+    let (kind, reach) = match (at.key("kind").choose(&raw.kind, &kinds)?, amplitude, raw.period_s) {
         (Some(kind), None, None) => (kind, [0.0; MAX_ROBOT_JOINTS]),
         (Some(_), Some(_), _) => return Err(at.key(key).fault("", only)),
         (Some(_), None, Some(got)) => return Err(at.key("period_s").fault(got, only)),
@@ -71,7 +71,7 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
             let swings =
                 if reach > 0.0 { format!(", and it swings by {reach} {unit}") } else { String::new() };
             let why = format!("{} is limited to {min:.4} to {max:.4} {unit}{swings}", joint.name);
-            return Err(at.key(start_key).nth(index).fault(format_args!("{start} {unit}"), why));
+            return Err(at.key(start_key).element(index).fault(format_args!("{start} {unit}"), why));
         }
     }
     Ok(Motion { start, kind })
@@ -79,7 +79,7 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
 
 /// Returns the value under its key or under the former key, with that key.
 fn either<'a, T>(
-    at: &Place,
+    at: &KeyPath,
     (key, value): (&'static str, &'a Option<T>),
     (former, given): (&'static str, &'a Option<T>),
 ) -> Checked<(&'static str, Option<&'a T>)> {
@@ -93,7 +93,7 @@ fn either<'a, T>(
 }
 
 /// Checks that no joint exceeds its speed limit; the swing is fastest at the start.
-fn speeds(at: &Place, skin: &Skin, amplitude: &[f64; MAX_ROBOT_JOINTS], period_s: f64) -> Checked<()> {
+fn speeds(at: &KeyPath, skin: &Skin, amplitude: &[f64; MAX_ROBOT_JOINTS], period_s: f64) -> Checked<()> {
     let limits = skin.controller.max_speed.iter().zip(&skin.robot.joints);
     for (index, (amplitude, (&max, joint))) in amplitude.iter().zip(limits).enumerate() {
         let (speed, unit) = (TAU * amplitude.abs() / period_s, joint.kind.unit());
@@ -102,7 +102,7 @@ fn speeds(at: &Place, skin: &Skin, amplitude: &[f64; MAX_ROBOT_JOINTS], period_s
                 "in {period_s} s this takes {speed:.3} {unit}/s, but the limit of joint {} is {max}",
                 index + 1
             );
-            return Err(at.nth(index).fault(amplitude, why));
+            return Err(at.element(index).fault(amplitude, why));
         }
     }
     Ok(())
@@ -111,20 +111,20 @@ fn speeds(at: &Place, skin: &Skin, amplitude: &[f64; MAX_ROBOT_JOINTS], period_s
 fn modes(raw: &[raw::Mode], end: EndS) -> Checked<Vec<ModeChange>> {
     let mut modes: Vec<ModeChange> = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let path = Place::named("mode").nth(index);
+        let path = KeyPath::top_level_key("mode").element(index);
         let at = end.moment(&path.key("at_s"), raw.at_s)?;
         if modes.last().is_some_and(|last| last.at >= at) {
             return Err(path.key("at_s").fault(raw.at_s, "modes must be in order of time"));
         }
         let kinds = [Mode::Compare, Mode::Distributed].map(|mode| (mode.name(), mode));
-        modes.push(ModeChange { at, mode: path.key("kind").word(&raw.kind, &kinds)? });
+        modes.push(ModeChange { at, mode: path.key("kind").choose(&raw.kind, &kinds)? });
     }
     Ok(modes)
 }
 
 /// Checks the period of the touches: each touch must end before all begin again.
 fn repeat(raw: &[raw::Touch], touches: &[Touch], seconds: f64) -> Checked<Span> {
-    let period = length(&Place::named("touches_repeat_s"), seconds)?;
+    let period = length(&KeyPath::top_level_key("touches_repeat_s"), seconds)?;
     for (index, (raw, touch)) in raw.iter().zip(touches).enumerate() {
         // A touch without a length must begin within the period.
         let lasts = if touch.length == Span(u64::MAX) { 0 } else { touch.length.0 };
@@ -133,7 +133,7 @@ fn repeat(raw: &[raw::Touch], touches: &[Touch], seconds: f64) -> Checked<Span> 
             let got = raw.for_s.unwrap_or(raw.at_s);
             let why =
                 format_args!("the touch must end before touches_repeat_s = {seconds}, when all begin again");
-            return Err(Place::named("touch").nth(index).key(key).fault(got, why));
+            return Err(KeyPath::top_level_key("touch").element(index).key(key).fault(got, why));
         }
     }
     Ok(period)

@@ -1,9 +1,9 @@
 //! Checks the faults of a scenario's file.
 
-use protocol::document::{Checked, Place};
+use protocol::document::{Checked, KeyPath};
 use protocol::time::Span;
 
-use super::names::{Given, Names};
+use super::names::{CellSelection, NameTable};
 use super::times::{EndS, length};
 use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
 
@@ -11,10 +11,10 @@ pub(super) const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \
      \"stuck\", \"drift\"; of buses \"drop\", \"delay\", \"duplicate\", \"corrupt\", \"reorder\", \"babble\"";
 
 /// Checks the faults and sorts them by time.
-pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &Names<'_>) -> Checked<Vec<Fault>> {
+pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &NameTable<'_>) -> Checked<Vec<Fault>> {
     let mut faults = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let entry = Entry { at: Place::named("fault").nth(index), raw, names };
+        let entry = Entry { at: KeyPath::top_level_key("fault").element(index), raw, names };
         let fault = entry.fault(end)?;
         faults.extend(entry.end_of(&fault)?);
         faults.push(fault);
@@ -25,9 +25,9 @@ pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &Names<'_>) -> Checke
 
 /// One entry of `[[fault]]`.
 struct Entry<'a> {
-    at: Place,
+    at: KeyPath,
     raw: &'a raw::Fault,
-    names: &'a Names<'a>,
+    names: &'a NameTable<'a>,
 }
 
 impl Entry<'_> {
@@ -115,9 +115,9 @@ impl Entry<'_> {
         self.names.cells(self.named())
     }
 
-    fn named(&self) -> Given<'_> {
+    fn named(&self) -> CellSelection<'_> {
         let Self { at, raw, .. } = self;
-        Given { at, bus: raw.bus.as_deref(), cells: raw.cells.as_deref(), all: raw.all }
+        CellSelection { at, bus: raw.bus.as_deref(), cells: raw.cells.as_deref(), all: raw.all }
     }
 
     /// Returns the duration of the fault; without `for_s` it lasts to the end.

@@ -27,7 +27,7 @@ pub fn contact_words(force_n: f64) -> [Q5_10; 3] {
 impl Touch {
     /// Returns true if the touch is active at a time.
     pub(super) fn holds_at(&self, time: Micros) -> bool {
-        self.at <= time && time.since(self.at) < self.length
+        self.at <= time && time.elapsed_since(self.at) < self.length
     }
 
     /// Returns the force in N at a time; `None` if the touch is not active.
@@ -35,7 +35,7 @@ impl Touch {
         if !self.holds_at(time) {
             return None;
         }
-        let since = time.since(self.at);
+        let since = time.elapsed_since(self.at);
         let part = seconds(since) / seconds(self.length);
         Some(match &self.profile {
             Profile::Step => self.force_n,

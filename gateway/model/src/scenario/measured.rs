@@ -21,7 +21,7 @@ const CREEP_S: [f64; 4] = [1.0, 10.0, 100.0, 1_000.0];
 
 /// The true input of a cell's sensors.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct True {
+pub(super) struct TrueInput {
     /// The force of touches in N.
     pub(super) force_n: f64,
     /// Proximity, and the temperature set by a touch.
@@ -34,7 +34,7 @@ pub(super) struct True {
 
 /// The imperfect sensors of all cells.
 #[derive(Clone, Debug)]
-pub(super) struct Measured {
+pub(super) struct ImperfectSensors {
     sensors: Sensors,
     seed: u64,
     period_s: f64,
@@ -59,7 +59,7 @@ struct CellSensors {
     dice: Pcg64Mcg,
 }
 
-impl Measured {
+impl ImperfectSensors {
     /// Creates the sensors of a skin, before the first epoch.
     pub(super) fn new(sensors: &Sensors, seed: u64, skin: &Skin) -> Self {
         let find = |cell: &protocol::skin::Cell, node| {
@@ -99,7 +99,7 @@ impl Measured {
     }
 
     /// Computes the next epoch, at `time`, from the true inputs of the cells.
-    pub(super) fn step(&mut self, time: Micros, there: &[True]) {
+    pub(super) fn step(&mut self, time: Micros, there: &[TrueInput]) {
         let ambient = self.sensors.temperature_at(time).unwrap_or(REFERENCE_C);
         for ((cell, there_is), words) in self.cells.iter_mut().zip(there).zip(&mut self.words) {
             let beside: f64 =

@@ -22,7 +22,7 @@ use std::path::Path;
 
 use protocol::document::{self, DocumentError};
 use protocol::fixed::{Q1_14, Q9_6};
-use protocol::skin::{KEYS, MAX_ROBOT_JOINTS, Skin};
+use protocol::skin::{SKIN_KEYS, MAX_ROBOT_JOINTS, Skin};
 use protocol::time::{Micros, Span};
 use serde::{Deserialize, Serialize};
 
@@ -33,7 +33,7 @@ pub use sensors::{ForceErrors, REFERENCE_C, Sensors};
 pub use touches::{Stimulus, Touches};
 
 /// The default duration of a run without events.
-pub const IDLE: Span = Span::from_millis(10_000);
+pub const DEFAULT_DURATION: Span = Span::from_millis(10_000);
 
 /// A checked description of a run.
 #[derive(Clone, Debug, PartialEq)]
@@ -354,7 +354,7 @@ impl Scenario {
     /// # Errors
     /// Returns [`DocumentError`] if the file cannot be read, with the first fault otherwise.
     pub fn read(path: &Path, skin: &Skin) -> Result<Self, DocumentError> {
-        Self::parse(&path.display().to_string(), &document::text(path)?, skin)
+        Self::parse(&path.display().to_string(), &document::read_text(path)?, skin)
     }
 
     /// Checks a text; errors show `path` as its name.
@@ -364,7 +364,7 @@ impl Scenario {
     pub fn parse(path: &str, text: &str, skin: &Skin) -> Result<Self, DocumentError> {
         let what = "this is a skin, not a scenario: `skinbus run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, |raw| check::scenario(raw, skin))
-            .map_err(|error: DocumentError| error.or_mistaken(text, KEYS, &[], what))
+            .map_err(|error: DocumentError| error.or_wrong_kind(text, SKIN_KEYS, &[], what))
     }
 
     /// Returns a scenario without touches and faults, in which the skin's controller moves the robot from zero.

@@ -2,37 +2,37 @@
 
 use std::collections::HashMap;
 
-use protocol::document::{Checked, Place};
+use protocol::document::{Checked, KeyPath};
 use protocol::port::PORTS;
-use protocol::skin::{CellName, Reply, Skin};
+use protocol::skin::{CellName, SkinReply, Skin};
 
 use super::raw;
 use crate::listing::ranges;
 
 /// Maximum number of node id ranges in an error.
-const LISTED: usize = 8;
+const MAX_LISTED_RANGES: usize = 8;
 
 /// The buses and cells of a skin, by their names.
-pub(super) struct Names<'a> {
+pub(super) struct NameTable<'a> {
     skin: &'a Skin,
     index: HashMap<(usize, i64), usize>,
 }
 
 /// The keys of a table that select cells.
 #[derive(Clone, Copy)]
-pub(super) struct Given<'a> {
+pub(super) struct CellSelection<'a> {
     /// The table.
-    pub(super) at: &'a Place,
+    pub(super) at: &'a KeyPath,
     /// The bus of cells that are given by node id alone.
     pub(super) bus: Option<&'a str>,
     /// Node ids, or cells with their buses.
-    pub(super) cells: Option<&'a [raw::Named]>,
+    pub(super) cells: Option<&'a [raw::CellReference]>,
     /// True for every cell (of the bus, if that is given).
     pub(super) all: bool,
 }
 
-impl<'a> Names<'a> {
-    pub(super) fn of(skin: &'a Skin) -> Self {
+impl<'a> NameTable<'a> {
+    pub(super) fn new(skin: &'a Skin) -> Self {
         let cells = skin.cells.iter().enumerate();
         let index = cells.map(|(index, cell)| ((cell.bus, cell.node.get().into()), index)).collect();
         Self { skin, index }
@@ -48,7 +48,7 @@ impl<'a> Names<'a> {
     }
 
     /// Returns the bus with this name; `at` and `value` are the key and the value for errors.
-    fn named(&self, at: &Place, value: &dyn core::fmt::Display, name: &str) -> Checked<usize> {
+    fn named(&self, at: &KeyPath, value: &dyn core::fmt::Display, name: &str) -> Checked<usize> {
         let wrong = || at.fault(value, format_args!("no such bus; there is {}", self.buses()));
         self.skin.bus_named(name).ok_or_else(wrong)
     }
@@ -59,7 +59,7 @@ impl<'a> Names<'a> {
     }
 
     /// Returns the bus that the key `bus` names. The key is optional if the skin has one bus only.
-    fn key(&self, given: Given<'_>) -> Checked<usize> {
+    fn key(&self, given: CellSelection<'_>) -> Checked<usize> {
         let at = given.at.key("bus");
         match given.bus {
             Some(name) => self.named(&at, &format_args!("{name:?}"), name),
@@ -74,10 +74,10 @@ impl<'a> Names<'a> {
     }
 
     /// Returns the bus of a table: that of its key, else that of its first cell.
-    pub(super) fn bus(&self, given: Given<'_>) -> Checked<usize> {
+    pub(super) fn bus(&self, given: CellSelection<'_>) -> Checked<usize> {
         match given.cells {
             Some([first, ..]) if given.bus.is_none() => {
-                let cell = self.cell(&given.at.key("cells").nth(0), first, given)?;
+                let cell = self.cell(&given.at.key("cells").element(0), first, given)?;
                 Ok(self.skin.cells.get(cell).map_or(0, |cell| cell.bus))
             }
             _ => self.key(given),
@@ -85,10 +85,10 @@ impl<'a> Names<'a> {
     }
 
     /// Returns the cell that is named at `at`.
-    fn cell(&self, at: &Place, named: &raw::Named, given: Given<'_>) -> Checked<usize> {
+    fn cell(&self, at: &KeyPath, named: &raw::CellReference, given: CellSelection<'_>) -> Checked<usize> {
         let (bus, node) = match named {
-            raw::Named::Node(node) => (self.key(given)?, *node),
-            raw::Named::Text(text) => {
+            raw::CellReference::Node(node) => (self.key(given)?, *node),
+            raw::CellReference::Text(text) => {
                 let name: CellName = text.parse().map_err(|why: String| at.fault(named, why))?;
                 let bus = match &name.bus {
                     Some(bus) => self.named(at, named, bus)?,
@@ -105,25 +105,25 @@ impl<'a> Names<'a> {
 
     /// Formats the node ids of a bus for an error.
     fn nodes(&self, bus: usize) -> String {
-        let mut nodes: Vec<_> = self.skin.cells_of(bus).map(|cell| cell.node.get()).collect();
+        let mut nodes: Vec<_> = self.skin.cells_on_bus(bus).map(|cell| cell.node.get()).collect();
         nodes.sort_unstable();
         let all = ranges(&nodes);
-        match all.get(..LISTED) {
+        match all.get(..MAX_LISTED_RANGES) {
             _ if all.is_empty() => "it has no cells".to_owned(),
-            Some(few) if all.len() > LISTED => format!("it has {}, ...", few.join(", ")),
+            Some(few) if all.len() > MAX_LISTED_RANGES => format!("it has {}, ...", few.join(", ")),
             _ => format!("it has {}", all.join(", ")),
         }
     }
 
     /// Returns the cells that a table lists, in the file's order. A cell must not occur twice.
-    fn each(&self, given: Given<'_>, named: &[raw::Named]) -> Checked<Vec<usize>> {
+    fn each(&self, given: CellSelection<'_>, named: &[raw::CellReference]) -> Checked<Vec<usize>> {
         if given.bus.is_some() {
             self.key(given)?;
         }
         let path = given.at.key("cells");
         let mut cells = Vec::with_capacity(named.len());
         for (index, named) in named.iter().enumerate() {
-            let at = path.nth(index);
+            let at = path.element(index);
             let cell = self.cell(&at, named, given)?;
             if let Some(first) = cells.iter().position(|&before| before == cell) {
                 return Err(at.fault(named, format_args!("cells[{first}] names it already")));
@@ -134,7 +134,7 @@ impl<'a> Names<'a> {
     }
 
     /// Returns the cells that a table lists, or all of them; sorted.
-    pub(super) fn cells(&self, given: Given<'_>) -> Checked<Vec<usize>> {
+    pub(super) fn cells(&self, given: CellSelection<'_>) -> Checked<Vec<usize>> {
         let path = given.at.key("cells");
         match given.cells {
             Some(_) if given.all => Err(path.fault("", "either some cells, or all = true")),
@@ -155,12 +155,12 @@ impl<'a> Names<'a> {
     }
 
     /// Returns the cells that a table lists, all of which must be on one bus; sorted.
-    pub(super) fn cells_on(&self, given: Given<'_>, bus: usize) -> Checked<Vec<usize>> {
+    pub(super) fn cells_on(&self, given: CellSelection<'_>, bus: usize) -> Checked<Vec<usize>> {
         let cells = self.cells(given)?;
         let is_here = |cell: usize| self.skin.cells.get(cell).is_some_and(|cell| cell.bus == bus);
         let path = given.at.key("cells");
         for (index, named) in given.cells.unwrap_or_default().iter().enumerate() {
-            let at = path.nth(index);
+            let at = path.element(index);
             if !is_here(self.cell(&at, named, given)?) {
                 let why = format_args!(
                     "this fault is on one bus, {:?}: use another table for this cell",
@@ -173,7 +173,7 @@ impl<'a> Names<'a> {
     }
 
     /// Returns the two cells of one bus that a table lists, in the file's order. A wire must connect them.
-    pub(super) fn wired(&self, given: Given<'_>) -> Checked<(usize, usize)> {
+    pub(super) fn wired(&self, given: CellSelection<'_>) -> Checked<(usize, usize)> {
         let path = given.at.key("cells");
         self.cells(given)?;
         let named = given.cells.unwrap_or_default();
@@ -183,7 +183,7 @@ impl<'a> Names<'a> {
         let bus = self.bus(given)?;
         self.cells_on(given, bus)?;
         let described = self.skin.buses.get(bus);
-        if described.is_some_and(|bus| bus.reply == Reply::Torque) {
+        if described.is_some_and(|bus| bus.reply == SkinReply::Torque) {
             return Err(path.fault("", "wires are used on a bus with reply = \"sum\" only"));
         }
         let wires = self.skin.wires(bus);
@@ -192,7 +192,7 @@ impl<'a> Names<'a> {
             let (Some(from), Some(to)) = (node(from), node(to)) else { return false };
             (0..PORTS).any(|port| wires.other_end(from, port).is_some_and(|(other, _)| other == to))
         };
-        let pair = (self.cell(&path.nth(0), one, given)?, self.cell(&path.nth(1), other, given)?);
+        let pair = (self.cell(&path.element(0), one, given)?, self.cell(&path.element(1), other, given)?);
         let wrong = || path.fault(format_args!("[{one}, {other}]"), "no wire connects them");
         Some(pair).filter(leads).ok_or_else(wrong)
     }

@@ -1,26 +1,26 @@
 //! Checks the touches of a scenario's file.
 
-use protocol::document::{Checked, Place, span};
+use protocol::document::{Checked, KeyPath, span_from_seconds};
 use protocol::fixed::{Q, Q1_14};
 use protocol::time::Span;
 
 use super::force::MAX_FORCE_N;
-use super::names::{Given, Names};
+use super::names::{CellSelection, NameTable};
 use super::times::{EndS, LONGEST_S, length};
 use super::{Profile, Touch, raw};
 
 /// Checks the touches; returns them in the file's order.
-pub(super) fn touches(raw: &[raw::Touch], end: EndS, names: &Names<'_>) -> Checked<Vec<Touch>> {
+pub(super) fn touches(raw: &[raw::Touch], end: EndS, names: &NameTable<'_>) -> Checked<Vec<Touch>> {
     let mut touches = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let at = Place::named("touch").nth(index);
+        let at = KeyPath::top_level_key("touch").element(index);
         touches.push(touch(&at, raw, end, names)?);
         together(&at, &touches, names)?;
     }
     Ok(touches)
 }
 
-fn touch(at: &Place, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<Touch> {
+fn touch(at: &KeyPath, raw: &raw::Touch, end: EndS, names: &NameTable<'_>) -> Checked<Touch> {
     let (profile, length, force_n) = match &raw.profile {
         raw::Profile::Word(word) => named(at, raw, word)?,
         raw::Profile::Points(points) => drawn(at, raw, points)?,
@@ -28,12 +28,12 @@ fn touch(at: &Place, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<
     if !(0.0..=1.0).contains(&raw.proximity) {
         return Err(at.key("proximity").fault(raw.proximity, "0 (nothing near) to 1 are possible"));
     }
-    let degrees = |got| at.key("temperature_c").fit(got, Q::try_nearest);
+    let degrees = |got| at.key("temperature_c").to_fixed(got, Q::try_nearest);
     let temperature = match raw.temperature_c {
         Some([first, second]) => Some([degrees(first)?, degrees(second)?]),
         None => None,
     };
-    let given = Given { at, bus: raw.bus.as_deref(), cells: raw.cells.as_deref(), all: raw.all };
+    let given = CellSelection { at, bus: raw.bus.as_deref(), cells: raw.cells.as_deref(), all: raw.all };
     Ok(Touch {
         at: end.moment(&at.key("at_s"), raw.at_s)?,
         length,
@@ -46,7 +46,7 @@ fn touch(at: &Place, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<
 }
 
 /// Returns a profile that is given by a word, the touch's duration, and its peak force in N.
-fn named(at: &Place, raw: &raw::Touch, word: &str) -> Checked<(Profile, Span, f64)> {
+fn named(at: &KeyPath, raw: &raw::Touch, word: &str) -> Checked<(Profile, Span, f64)> {
     let profiles = [Profile::HalfSine, Profile::Step, Profile::Ramp].map(|profile| (profile.name(), profile));
     let Some((_, profile)) = profiles.iter().find(|(name, _)| *name == word).cloned() else {
         let words = profiles.map(|(name, _)| format!("{name:?}")).join(", ");
@@ -69,26 +69,26 @@ fn named(at: &Place, raw: &raw::Touch, word: &str) -> Checked<(Profile, Span, f6
 }
 
 /// Returns a profile that is given by points, with their duration and peak force.
-fn drawn(at: &Place, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile, Span, f64)> {
+fn drawn(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile, Span, f64)> {
     let path = at.key("profile");
     let mut points: Vec<(Span, f64)> = Vec::with_capacity(given.len() + 1);
     let mut peak_n = 0.0_f64;
     for (index, given) in given.iter().enumerate() {
-        let point = path.nth(index);
+        let point = path.element(index);
         let &[seconds, force_n] = given.as_slice() else {
             let why = format_args!("a point is two numbers, [t_s, force_n], not {}", given.len());
             return Err(point.fault("", why));
         };
         if !(0.0..=LONGEST_S).contains(&seconds) {
             let why = format!("0 to {LONGEST_S:e} s after the start of the touch are possible");
-            return Err(point.nth(0).fault(seconds, why));
+            return Err(point.element(0).fault(seconds, why));
         }
-        let moment = span(seconds);
+        let moment = span_from_seconds(seconds);
         if points.last().is_some_and(|(last, _)| *last >= moment) {
             let why = "times of points increase, by at least 1e-6 s";
-            return Err(point.nth(0).fault(seconds, why));
+            return Err(point.element(0).fault(seconds, why));
         }
-        newtons(&point.nth(1), force_n)?;
+        newtons(&point.element(1), force_n)?;
         if points.is_empty() && moment > Span(0) {
             points.push((Span(0), 0.0));
         }
@@ -101,7 +101,7 @@ fn drawn(at: &Place, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile, 
             path.fault(got, "a point [t_s, force_n] with t_s above 0 is needed: there the touch ends")
         );
     };
-    if let Some(for_s) = raw.for_s.filter(|seconds| !(*seconds >= 0.0 && span(*seconds) == length)) {
+    if let Some(for_s) = raw.for_s.filter(|seconds| !(*seconds >= 0.0 && span_from_seconds(*seconds) == length)) {
         let why = format!("the points of the profile end at {} s: leave for_s out", length.seconds());
         return Err(at.key("for_s").fault(for_s, why));
     }
@@ -114,7 +114,7 @@ fn drawn(at: &Place, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile, 
 }
 
 /// Checks that a force fits three contact words.
-fn newtons(at: &Place, force_n: f64) -> Checked<()> {
+fn newtons(at: &KeyPath, force_n: f64) -> Checked<()> {
     if (0.0..=MAX_FORCE_N).contains(&force_n) {
         return Ok(());
     }
@@ -125,7 +125,7 @@ fn newtons(at: &Place, force_n: f64) -> Checked<()> {
 /// Checks that the last of these touches, together with those before it in the file, stays within the contact words of
 /// every cell. The check adds peak forces at the start of each touch, where the number of simultaneous touches is
 /// largest.
-fn together(at: &Place, touches: &[Touch], names: &Names<'_>) -> Checked<()> {
+fn together(at: &KeyPath, touches: &[Touch], names: &NameTable<'_>) -> Checked<()> {
     let Some((last, before)) = touches.split_last() else { return Ok(()) };
     for start in touches.iter().map(|touch| touch.at).filter(|&at| last.holds_at(at)) {
         let at_once: Vec<&Touch> = before.iter().filter(|touch| touch.holds_at(start)).collect();
@@ -291,7 +291,7 @@ mod tests {
                 prop_assert_eq!(at(moment), Some(force_n), "at a point, its force");
             }
             for part in parts {
-                let since = span(part * Span(end).seconds()).0;
+                let since = span_from_seconds(part * Span(end).seconds()).0;
                 let level = at(since);
                 prop_assert_eq!(level.is_some(), since < end);
                 let Some(level) = level else { continue };

@@ -6,8 +6,8 @@ use serde::de::{Error, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
 use super::times::LONGEST_S;
-use super::{IDLE, MotionKind};
-use crate::accelerometer::sensor::Given;
+use super::{DEFAULT_DURATION, MotionKind};
+use crate::accelerometer::sensor::DataSheetInput;
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -76,13 +76,13 @@ impl<'de> Deserialize<'de> for Profile {
 
 /// A cell as named in the file.
 #[derive(Debug)]
-pub(super) enum Named {
+pub(super) enum CellReference {
     Node(i64),
     /// `BUS:NODE`.
     Text(String),
 }
 
-impl fmt::Display for Named {
+impl fmt::Display for CellReference {
     /// Formats the name as in the file.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -92,22 +92,22 @@ impl fmt::Display for Named {
     }
 }
 
-impl<'de> Deserialize<'de> for Named {
+impl<'de> Deserialize<'de> for CellReference {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
         struct Either;
         impl Visitor<'_> for Either {
-            type Value = Named;
+            type Value = CellReference;
 
             fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
                 f.write_str("either a node id or \"BUS:NODE\"")
             }
 
-            fn visit_i64<E: Error>(self, node: i64) -> Result<Named, E> {
-                Ok(Named::Node(node))
+            fn visit_i64<E: Error>(self, node: i64) -> Result<CellReference, E> {
+                Ok(CellReference::Node(node))
             }
 
-            fn visit_str<E: Error>(self, text: &str) -> Result<Named, E> {
-                Ok(Named::Text(text.to_owned()))
+            fn visit_str<E: Error>(self, text: &str) -> Result<CellReference, E> {
+                Ok(CellReference::Text(text.to_owned()))
             }
         }
         from.deserialize_any(Either)
@@ -123,7 +123,7 @@ impl Scenario {
         let faults = self.fault.iter().map(|fault| end(fault.at_s, fault.for_s));
         let ends = touches.chain(faults).chain(self.mode.iter().map(|mode| mode.at_s));
         let last = || ends.fold(0.0, f64::max) + 1.0;
-        self.duration_s.unwrap_or_else(|| last().clamp(IDLE.seconds(), LONGEST_S))
+        self.duration_s.unwrap_or_else(|| last().clamp(DEFAULT_DURATION.seconds(), LONGEST_S))
     }
 }
 
@@ -165,7 +165,7 @@ pub(super) struct Touch {
     pub(super) at_s: f64,
     pub(super) for_s: Option<f64>,
     pub(super) bus: Option<String>,
-    pub(super) cells: Option<Vec<Named>>,
+    pub(super) cells: Option<Vec<CellReference>>,
     #[serde(default)]
     pub(super) all: bool,
     pub(super) force_n: Option<f64>,
@@ -193,7 +193,7 @@ pub(super) struct Fault {
     pub(super) kind: String,
     pub(super) for_s: Option<f64>,
     pub(super) bus: Option<String>,
-    pub(super) cells: Option<Vec<Named>>,
+    pub(super) cells: Option<Vec<CellReference>>,
     #[serde(default)]
     pub(super) all: bool,
     pub(super) one_way: Option<bool>,
@@ -210,7 +210,7 @@ pub(super) struct Sensors {
     /// Times in s and temperatures in °C.
     pub(super) temperature_c: Vec<[f64; 2]>,
     pub(super) force: Option<ForceErrors>,
-    pub(super) acceleration: Option<Given>,
+    pub(super) acceleration: Option<DataSheetInput>,
 }
 
 #[derive(Debug, Default, Deserialize)]

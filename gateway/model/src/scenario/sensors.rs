@@ -1,6 +1,6 @@
 //! The errors of the sensors in a run: the table `[sensors]`.
 
-use protocol::document::{Checked, Place};
+use protocol::document::{Checked, KeyPath};
 use protocol::fixed::Q9_6;
 use protocol::time::Micros;
 
@@ -99,34 +99,34 @@ impl ForceErrors {
 
 /// Checks the table `[sensors]`.
 pub(super) fn sensors(raw: &raw::Sensors, end: EndS) -> Checked<Sensors> {
-    let at = Place::named("sensors");
+    let at = KeyPath::top_level_key("sensors");
     let temperature = temperature(&at.key("temperature_c"), &raw.temperature_c, end)?;
     let force = raw.force.as_ref().map_or(Ok(ForceErrors::PERFECT), |raw| force(&at.key("force"), raw))?;
     let acceleration = raw.acceleration.as_ref().map(|raw| raw.sheet(&at.key("acceleration"))).transpose()?;
     Ok(Sensors { temperature, force, acceleration })
 }
 
-fn temperature(at: &Place, points: &[[f64; 2]], end: EndS) -> Checked<Vec<(Micros, f64)>> {
+fn temperature(at: &KeyPath, points: &[[f64; 2]], end: EndS) -> Checked<Vec<(Micros, f64)>> {
     let mut temperature: Vec<(Micros, f64)> = Vec::with_capacity(points.len());
     for (index, &[seconds, degrees]) in points.iter().enumerate() {
-        let at = at.nth(index);
-        let moment = end.moment_or_end(&at.nth(0), seconds)?;
+        let at = at.element(index);
+        let moment = end.moment_or_end(&at.element(0), seconds)?;
         if temperature.last().is_some_and(|(last, _)| *last >= moment) {
-            return Err(at.nth(0).fault(seconds, "times must increase"));
+            return Err(at.element(0).fault(seconds, "times must increase"));
         }
-        at.nth(1).fit(degrees, Q9_6::try_nearest)?;
+        at.element(1).to_fixed(degrees, Q9_6::try_nearest)?;
         temperature.push((moment, degrees));
     }
     Ok(temperature)
 }
 
-fn force(at: &Place, raw: &raw::ForceErrors) -> Checked<ForceErrors> {
+fn force(at: &KeyPath, raw: &raw::ForceErrors) -> Checked<ForceErrors> {
     let kinds = [
         ("perfect", ForceErrors::PERFECT),
         ("piezoresistive", ForceErrors::PIEZORESISTIVE),
         ("resistive", ForceErrors::RESISTIVE),
     ];
-    let mut errors = at.key("kind").word(raw.kind.as_deref().unwrap_or("piezoresistive"), &kinds)?;
+    let mut errors = at.key("kind").choose(raw.kind.as_deref().unwrap_or("piezoresistive"), &kinds)?;
     let keys = [
         ("offset_n", raw.offset_n, &mut errors.offset_n, 30.0),
         ("gain", raw.gain, &mut errors.gain, 0.9),

@@ -66,7 +66,7 @@ fn good() -> Scenario {
 
 /// Formats an error with its line only; columns have their own test.
 fn by_line(error: DocumentError) -> String {
-    let DocumentError::Wrong { path, line, what, .. } = error else { return error.to_string() };
+    let DocumentError::InvalidValue { path, line, what, .. } = error else { return error.to_string() };
     format!("{path}:{line}: {what}")
 }
 
@@ -122,11 +122,11 @@ fn most_keys_have_defaults() {
     assert_eq!(scenario, Scenario::idle(Span(2_500_000)));
     assert_eq!(scenario.mode_at(Micros(0)), Mode::Compare);
     let parse = |text: &str| Scenario::parse("s.toml", text, &skin()).unwrap();
-    assert_eq!(parse(""), Scenario::idle(IDLE));
+    assert_eq!(parse(""), Scenario::idle(DEFAULT_DURATION));
     // The shortest file with an effect: a constant force on one cell, until the end.
     let short = parse("[[touch]]\ncells = [1]\nforce_n = 3.0\n");
     let touch = &short.touches[0];
-    assert_eq!((short.duration, touch.at, touch.length), (IDLE, Micros(0), Span(u64::MAX)));
+    assert_eq!((short.duration, touch.at, touch.length), (DEFAULT_DURATION, Micros(0), Span(u64::MAX)));
     assert_eq!((&touch.profile, touch.cells.as_slice()), (&Profile::Step, [0].as_slice()));
     let pressed = Touches::new(&short, &skin()).sensors(0, 1_000_000);
     assert_eq!(pressed.contact, contact_words(3.0), "also when the run is longer");

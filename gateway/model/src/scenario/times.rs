@@ -1,6 +1,6 @@
 //! Times and durations in a scenario's file.
 
-use protocol::document::{Checked, Place, span};
+use protocol::document::{Checked, KeyPath, span_from_seconds};
 use protocol::time::{Micros, Span};
 
 /// The scenario's duration in s.
@@ -9,22 +9,22 @@ pub(super) struct EndS(pub(super) f64);
 
 impl EndS {
     /// Checks a time within the scenario.
-    pub(super) fn moment(self, at: &Place, seconds: f64) -> Checked<Micros> {
+    pub(super) fn moment(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
         if (0.0..self.0).contains(&seconds) {
-            return Ok(Micros(span(seconds).0));
+            return Ok(Micros(span_from_seconds(seconds).0));
         }
         self.outside(at, seconds)
     }
 
     /// Checks a time within the scenario, or its end.
-    pub(super) fn moment_or_end(self, at: &Place, seconds: f64) -> Checked<Micros> {
+    pub(super) fn moment_or_end(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
         if (0.0..=self.0).contains(&seconds) {
-            return Ok(Micros(span(seconds).0));
+            return Ok(Micros(span_from_seconds(seconds).0));
         }
         self.outside(at, seconds)
     }
 
-    fn outside(self, at: &Place, seconds: f64) -> Checked<Micros> {
+    fn outside(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
         let why = format_args!("the scenario goes from 0 to duration_s = {}", self.0);
         Err(at.fault(seconds, why))
     }
@@ -34,9 +34,9 @@ impl EndS {
 pub(super) const LONGEST_S: f64 = 3.2e7;
 
 /// Checks a duration.
-pub(super) fn length(at: &Place, seconds: f64) -> Checked<Span> {
+pub(super) fn length(at: &KeyPath, seconds: f64) -> Checked<Span> {
     if (1e-6..=LONGEST_S).contains(&seconds) {
-        return Ok(span(seconds));
+        return Ok(span_from_seconds(seconds));
     }
     Err(at.fault(seconds, "must be above 0, and at most 3.2e7"))
 }

@@ -11,7 +11,7 @@ use protocol::time::{Micros, Span};
 
 use super::curve::seconds;
 use super::force::contact_words;
-use super::measured::{Measured, True};
+use super::measured::{ImperfectSensors, TrueInput};
 use super::{FaultKind, Scenario, SensorFault, Touch};
 
 /// The sensor words of a cell from an epoch on.
@@ -38,28 +38,28 @@ pub struct Touches {
     repeat: Option<Span>,
     /// The touches' forces in N before and now: scratch memory of [`Touches::changes`].
     levels: Vec<[Option<f64>; 2]>,
-    cells: Vec<Touched>,
+    cells: Vec<AffectedCell>,
     /// The imperfect sensors, if any; `cells` then has every cell.
-    measured: Option<Measured>,
+    measured: Option<ImperfectSensors>,
     /// Scratch memory of [`Touches::changes`], as are the next two.
     changed: Vec<Stimulus>,
-    there: Vec<True>,
+    there: Vec<TrueInput>,
     before: Vec<SkinSensors>,
 }
 
 /// A cell with touches or faults.
 #[derive(Clone, Debug)]
-struct Touched {
+struct AffectedCell {
     cell: usize,
     bus: usize,
     node: CellId,
     /// Indices into the touches.
     touches: Vec<usize>,
-    faults: Vec<Wrong>,
+    faults: Vec<TimedSensorFault>,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Wrong {
+struct TimedSensorFault {
     at: Micros,
     length: Span,
     fault: SensorFault,
@@ -69,14 +69,14 @@ impl Touches {
     /// Collects the touches and sensor faults of each cell.
     #[must_use]
     pub fn new(scenario: &Scenario, skin: &Skin) -> Self {
-        let of_cell = |(index, cell): (usize, &protocol::skin::Cell)| Touched {
+        let of_cell = |(index, cell): (usize, &protocol::skin::Cell)| AffectedCell {
             cell: index,
             bus: cell.bus,
             node: cell.node,
             touches: Vec::new(),
             faults: Vec::new(),
         };
-        let mut cells: Vec<Touched> = skin.cells.iter().enumerate().map(of_cell).collect();
+        let mut cells: Vec<AffectedCell> = skin.cells.iter().enumerate().map(of_cell).collect();
         for (index, touch) in scenario.touches.iter().enumerate() {
             for &cell in &touch.cells {
                 if let Some(touched) = cells.get_mut(cell) {
@@ -88,12 +88,12 @@ impl Touches {
             let FaultKind::Sensor { fault: wrong, length, cells: hit } = &fault.kind else { continue };
             for &cell in hit {
                 if let Some(touched) = cells.get_mut(cell) {
-                    touched.faults.push(Wrong { at: fault.at, length: *length, fault: *wrong });
+                    touched.faults.push(TimedSensorFault { at: fault.at, length: *length, fault: *wrong });
                 }
             }
         }
         let measured = (!scenario.sensors.is_force_perfect())
-            .then(|| Measured::new(&scenario.sensors, scenario.seed, skin));
+            .then(|| ImperfectSensors::new(&scenario.sensors, scenario.seed, skin));
         if measured.is_none() {
             cells.retain(|touched| !touched.touches.is_empty() || !touched.faults.is_empty());
         }
@@ -149,7 +149,7 @@ impl Touches {
     }
 
     /// Computes the readings up to an epoch, from the start if that epoch has passed.
-    fn measure(&mut self, measured: &mut Measured, epoch: u64) {
+    fn measure(&mut self, measured: &mut ImperfectSensors, epoch: u64) {
         if measured.next() > epoch + 1 {
             measured.restart();
         }
@@ -157,15 +157,15 @@ impl Touches {
         while measured.next() <= epoch {
             let time = self.time_of(measured.next());
             there.clear();
-            there.extend(self.cells.iter().map(|touched| self.there(touched, time)));
+            there.extend(self.cells.iter().map(|touched| self.true_input(touched, time)));
             measured.step(time, &there);
         }
         self.there = there;
     }
 
     /// Returns the true input of a cell's sensors.
-    fn there(&self, touched: &Touched, time: Micros) -> True {
-        let mut there = True::default();
+    fn true_input(&self, touched: &AffectedCell, time: Micros) -> TrueInput {
+        let mut there = TrueInput::default();
         for touch in touched.touches.iter().filter_map(|&index| self.touches.get(index)) {
             let Some(level) = self.level(touch, time) else { continue };
             there.force_n += level;
@@ -177,7 +177,7 @@ impl Touches {
         for wrong in touched.faults.iter().filter(|wrong| wrong.holds_at(time)) {
             match wrong.fault {
                 SensorFault::Stuck => there.is_stuck = true,
-                SensorFault::Drift { n_per_s } => there.added_n += n_per_s * seconds(time.since(wrong.at)),
+                SensorFault::Drift { n_per_s } => there.added_n += n_per_s * seconds(time.elapsed_since(wrong.at)),
             }
         }
         there
@@ -253,7 +253,7 @@ impl Touches {
     }
 
     /// Returns the words before and now, from the scratch memory; `None` if no touch of this cell changed.
-    fn words_of_levels(&self, touched: &Touched) -> Option<[SkinSensors; 2]> {
+    fn words_of_levels(&self, touched: &AffectedCell) -> Option<[SkinSensors; 2]> {
         let levels = || touched.touches.iter().filter_map(|&index| Some((index, self.levels.get(index)?)));
         if levels().all(|(_, [before, now])| before == now) {
             return None;
@@ -264,13 +264,13 @@ impl Touches {
     }
 
     /// Returns the words of a cell at a time, with its faults.
-    fn words_at(&self, touched: &Touched, time: Micros) -> SkinSensors {
+    fn words_at(&self, touched: &AffectedCell, time: Micros) -> SkinSensors {
         let faults = || touched.faults.iter().filter(|wrong| wrong.holds_at(time));
         // A stuck sensor keeps its value from the start of the fault.
         let stuck = faults().filter(|wrong| wrong.fault == SensorFault::Stuck).map(|wrong| wrong.at).min();
         let time = stuck.unwrap_or(time);
         let drift = touched.faults.iter().map(|wrong| match wrong.fault {
-            SensorFault::Drift { n_per_s } if wrong.holds_at(time) => n_per_s * seconds(time.since(wrong.at)),
+            SensorFault::Drift { n_per_s } if wrong.holds_at(time) => n_per_s * seconds(time.elapsed_since(wrong.at)),
             SensorFault::Drift { .. } | SensorFault::Stuck => 0.0,
         });
         let levels = touched
@@ -294,8 +294,8 @@ impl Touches {
     }
 }
 
-impl Wrong {
+impl TimedSensorFault {
     fn holds_at(&self, time: Micros) -> bool {
-        self.at <= time && time.since(self.at) < self.length
+        self.at <= time && time.elapsed_since(self.at) < self.length
     }
 }

@@ -9,14 +9,14 @@ use super::replies::Expected;
 
 /// The effect of rounding exact torques to a torque format.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Rounded {
+pub struct RoundingErrors {
     /// Errors of the torques within its range.
     pub errors: Errors,
     /// Number of torques beyond its range, whose words are saturated.
     pub beyond: u64,
 }
 
-impl Rounded {
+impl RoundingErrors {
     fn take(&mut self, format: TorqueFormat, torque: f64) {
         let word = format.nearest(torque);
         if is_saturated(word) {
@@ -49,7 +49,7 @@ pub struct Accuracy {
     pub saturated: u64,
     /// The central torques of `single`, including saturated ones, in each of [`TorqueFormat::ALL`].
     #[serde(skip)]
-    pub formats: [Rounded; TorqueFormat::ALL.len()],
+    pub formats: [RoundingErrors; TorqueFormat::ALL.len()],
     /// `single` by joint.
     #[serde(skip)]
     pub single_by_joint: [Errors; MAX_JOINTS],
@@ -132,7 +132,7 @@ mod tests {
 
     #[test]
     fn torques_beyond_the_range_of_a_format_are_counted_apart() {
-        let (format, mut rounded) = (TorqueFormat::Q3_12, Rounded::default());
+        let (format, mut rounded) = (TorqueFormat::Q3_12, RoundingErrors::default());
         [1.0, 1.0 + 0.25 / 4_096.0, 8.0, -9.0].into_iter().for_each(|torque| rounded.take(format, torque));
         assert_eq!((rounded.errors.count(), rounded.errors.max(), rounded.beyond), (2, 0.25 / 4_096.0, 2));
         assert_eq!(rounded.with(rounded).beyond, 4);

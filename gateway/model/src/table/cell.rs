@@ -1,7 +1,7 @@
 //! The gateway's state of one cell.
 
 use protocol::id::CellId;
-use protocol::message::{Answer, From, Heartbeat, SensorPage, SkinSensors, State};
+use protocol::message::{Answer, AppliesFrom, Heartbeat, SensorPage, SkinSensors, State};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::{Events, LinksDown, Parameter, Parameters};
@@ -9,18 +9,18 @@ use protocol::skin::{self, Safety};
 use protocol::time::Micros;
 
 use super::errors::Errors;
-use super::held::{Change, Held};
-use super::replies::{Outstanding, Replies, Requested};
+use super::held::{Change, HeldTorque};
+use super::replies::{Outstanding, Replies, ReplyExpectation};
 use super::root_totals::RootSums;
-use super::sensed::Sensed;
-use super::sent::Sent;
+use super::sensed::SensorFrames;
+use super::sent::SentJoints;
 use super::status::Status;
-use super::switched::{SWITCHES, Switch, Switched};
-use crate::tracker::{Contact, Pages, Tracked, Update, Uplink, Word};
+use super::switched::{SWITCHES, Switch, SwitchStates};
+use crate::tracker::{Contact, Pages, CellTracker, Update, Uplink, HeartbeatKind};
 
 /// The requested packets that a cell has sent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Said {
+pub struct Responded {
     /// True if it sent a heartbeat since the last sync.
     pub heartbeat: bool,
     /// True if it sent its counters since the last report command.
@@ -38,7 +38,7 @@ struct Halt {
 
 /// The gateway's state of one cell.
 #[derive(Clone, Debug)]
-pub struct Cell {
+pub struct CellState {
     /// Its node id.
     pub node: CellId,
     /// Its described serial number.
@@ -54,34 +54,34 @@ pub struct Cell {
     /// Its reply parameter, as last confirmed since it started.
     pub reply: Option<[i16; WORDS]>,
     /// Ports that its parameter takes down, one bit each.
-    pub deaf: u8,
+    pub ports_down: u8,
     /// Replies due and received.
     pub replies: Replies,
     /// Its sensors frames.
-    pub sensed: Sensed,
-    pub(super) tracked: Tracked,
+    pub sensed: SensorFrames,
+    pub(super) tracked: CellTracker,
     /// The requested packets that it has sent.
-    pub(super) said: Said,
+    pub(super) said: Responded,
     /// Its contact state, as far as known from the bus.
     contact: Contact<()>,
     /// The switches that it should have, and those that it has confirmed.
-    switched: Switched,
+    switched: SwitchStates,
     halt: Halt,
-    sent: Sent,
+    sent: SentJoints,
     pub(super) outstanding: Outstanding,
     /// The number of the last broadcast that it answered.
     pub(super) answered: Option<u64>,
-    held: Held,
+    held: HeldTorque,
     /// The sums that it sends as a root, on a bus with sums.
     pub(super) sums: Option<RootSums>,
 }
 
-impl Cell {
+impl CellState {
     pub(super) fn new(
         described: &skin::Cell,
         parameters: &Parameters,
         summed: bool,
-        switched: Switched,
+        switched: SwitchStates,
     ) -> Self {
         Self {
             node: described.node,
@@ -91,18 +91,18 @@ impl Cell {
             configuration: parameters.hash(),
             last_joints: Epoch(0),
             reply: None,
-            deaf: 0,
+            ports_down: 0,
             replies: Replies::default(),
-            sensed: Sensed::default(),
-            tracked: Tracked::default(),
-            said: Said::default(),
+            sensed: SensorFrames::default(),
+            tracked: CellTracker::default(),
+            said: Responded::default(),
             contact: Contact::default(),
             switched,
             halt: Halt::default(),
-            sent: Sent::default(),
+            sent: SentJoints::default(),
             outstanding: Outstanding::default(),
             answered: None,
-            held: Held::default(),
+            held: HeldTorque::default(),
             sums: summed.then(|| RootSums::new(described.root)),
         }
     }
@@ -168,11 +168,11 @@ impl Cell {
     /// Applies its heartbeat.
     pub(super) fn take_heartbeat(&mut self, update: &Update, heartbeat: &Heartbeat, epoch: Epoch) -> Change {
         // Ignores heartbeats of a cell that does not own the node id.
-        let of_owner = |word: &Word| !matches!(word, Word::Claimant | Word::Outsider);
+        let of_owner = |word: &HeartbeatKind| !matches!(word, HeartbeatKind::Claimant | HeartbeatKind::Outsider);
         let Some(word) = update.word.filter(of_owner) else { return Change::default() };
-        let started = matches!(word, Word::Started { .. } | Word::Shared);
+        let started = matches!(word, HeartbeatKind::Started { .. } | HeartbeatKind::Shared);
         (self.said.heartbeat, self.last_joints) = (true, epoch);
-        if word != Word::Overtaken {
+        if word != HeartbeatKind::Overtaken {
             // The first heartbeat after a halt or a resume may have been sent before it.
             let old = core::mem::take(&mut self.halt.commanded) && !started;
             if !old {
@@ -182,12 +182,12 @@ impl Cell {
         if update.returned {
             self.contact.reset();
         }
-        if word == Word::First && self.tracked.claim().previous().is_some() {
+        if word == HeartbeatKind::First && self.tracked.claim().previous().is_some() {
             // An earlier claimant had counters of its own.
-            self.sent = Sent::default();
+            self.sent = SentJoints::default();
         }
         if started {
-            if word == Word::Shared {
+            if word == HeartbeatKind::Shared {
                 self.contact.reset();
             } else {
                 self.contact.start(());
@@ -195,7 +195,7 @@ impl Cell {
             self.sensed.restart();
             self.switched.restart();
             self.restart(word, update.taken_back, heartbeat.sent);
-            (self.reply, self.deaf) = (None, 0);
+            (self.reply, self.ports_down) = (None, 0);
         } else if !self.tracked.account.is_in_question() {
             self.sent.confirm();
         }
@@ -208,7 +208,7 @@ impl Cell {
 
     /// Returns which requested packets it has sent.
     #[must_use]
-    pub const fn said(&self) -> Said {
+    pub const fn responded(&self) -> Responded {
         self.said
     }
 
@@ -216,43 +216,43 @@ impl Cell {
     #[must_use]
     pub fn is_ready(&self) -> bool {
         let claim = self.tracked.claim();
-        !self.tracked.is_dead() && !self.halt.halted && claim.is_settled() && claim.says(State::CONFIGURED)
+        !self.tracked.is_dead() && !self.halt.halted && claim.is_settled() && claim.has_state(State::CONFIGURED)
     }
 
     /// Records a stimulus on the bus; `last` is the epoch of the last joints.
-    pub(super) fn stimulate(&mut self, from: From, page: SensorPage, last: Option<Epoch>) {
+    pub(super) fn stimulate(&mut self, from: AppliesFrom, page: SensorPage, last: Option<Epoch>) {
         self.contact.push(from, page, (), last);
     }
 
     /// Records a sensors frame of the cell; `is_newest` if the cell had the newest joints.
     pub(super) fn take_sensors(&mut self, at: Micros, page: &SensorPage, is_newest: bool, events: &Events) {
-        self.sensed.hear(at, page, events);
+        self.sensed.record(at, page, events);
         self.switched.subtracts |= matches!(page, SensorPage::Baseline(_));
         if self.sensors().is_some() {
             self.contact.latched().for_each(|(right, _)| self.outstanding.stuck.take_page(page, &right));
         }
         if is_newest {
-            self.contact.learn(*page, ());
+            self.contact.apply_reported_page(*page, ());
         }
     }
 
     /// Records its answer to a request.
-    pub(super) fn answers(&mut self, answer: &Answer) {
-        self.switched.answered(answer);
+    pub(super) fn receive_answer(&mut self, answer: &Answer) {
+        self.switched.record_answer(answer);
         let Answer::Value { number, written: true, words } = *answer else { return };
         if number == Parameter::Mode.number() && words.first() == Some(&1) {
             self.contact.confirm_mode(());
         } else if number == Parameter::Reply.number() {
             self.reply = Some(words);
         } else if number == Parameter::LinksDown.number() {
-            self.deaf = LinksDown::from_words(words).deaf;
+            self.ports_down = LinksDown::from_words(words).ports;
         }
     }
 
     /// Returns the switches that it should have but has not confirmed.
     #[must_use]
-    pub fn lacks(&self) -> [Option<Switch>; SWITCHES] {
-        self.switched.lacks()
+    pub fn unconfirmed_switches(&self) -> [Option<Switch>; SWITCHES] {
+        self.switched.unconfirmed()
     }
 
     /// Returns the sensor words that it computes with; `None` if unknown: it measures, subtracts its own zero, may be
@@ -270,7 +270,7 @@ impl Cell {
 
     /// Returns true if its torques follow from stimuli alone.
     fn computes_with_stimuli(&self) -> bool {
-        self.tracked.claim().says(State::TEST_MODE)
+        self.tracked.claim().has_state(State::TEST_MODE)
             && !self.switched.subtracts
             && !self.tracked.account.is_interrupted()
     }
@@ -312,7 +312,7 @@ impl Cell {
     }
 
     /// Records a repeated broadcast, which the cell receives and drops; no reply is due.
-    pub(super) const fn hear_again(&mut self) {
+    pub(super) const fn count_repeated_joints(&mut self) {
         self.sent.count();
     }
 
@@ -323,22 +323,22 @@ impl Cell {
 
     /// Returns true if it is in contact, by its own report if its sensors are unknown.
     fn is_in_contact(&self) -> bool {
-        self.outstanding.is_due() || self.sensors().is_none() && self.tracked.claim().says(State::ACTIVE)
+        self.outstanding.is_due() || self.sensors().is_none() && self.tracked.claim().has_state(State::ACTIVE)
     }
 
     /// Records a torque that answers the broadcast `number`, `lag` before the newest; `is_zero` if it only ends a
     /// contact. Returns whether it was due.
-    pub(super) fn answer(&mut self, number: u64, lag: usize, is_zero: bool) -> Requested {
+    pub(super) fn answer(&mut self, number: u64, lag: usize, is_zero: bool) -> ReplyExpectation {
         self.answered = Some(number);
         let asked = self.outstanding.answer(lag);
         let replies = &mut self.replies;
         match (asked, lag) {
-            (Requested::Due, 0) => replies.in_time += 1,
-            (Requested::Due, _) => replies.late += 1,
-            (Requested::Unknown | Requested::NotDue, _) => replies.unasked += 1,
+            (ReplyExpectation::Due, 0) => replies.in_time += 1,
+            (ReplyExpectation::Due, _) => replies.late += 1,
+            (ReplyExpectation::Unknown | ReplyExpectation::NotDue, _) => replies.unasked += 1,
         }
-        replies.contact_unknown += u64::from(asked == Requested::Unknown);
-        replies.unexpected += u64::from(asked == Requested::NotDue && !is_zero);
+        replies.contact_unknown += u64::from(asked == ReplyExpectation::Unknown);
+        replies.unexpected += u64::from(asked == ReplyExpectation::NotDue && !is_zero);
         asked
     }
 
@@ -429,7 +429,7 @@ impl Cell {
 
     /// Records a restart: outstanding replies will never arrive, and the counters can no longer explain missing ones.
     /// If an apparent restart is taken back, the counters continue and explain all but the outstanding replies.
-    fn restart(&mut self, word: Word, taken_back: bool, sent: u16) {
+    fn restart(&mut self, word: HeartbeatKind, taken_back: bool, sent: u16) {
         let due = self.outstanding.clear();
         let outstanding = if self.sums.is_some() { 0 } else { due };
         let in_doubt = self.sent.restart(word, taken_back, sent, (outstanding, self.replies.in_doubt));
@@ -469,13 +469,13 @@ mod tests {
     fn a_heartbeat_from_before_a_halt_does_not_end_it() {
         let skin = crate::testing::skin();
         let described = skin.cells.first().unwrap();
-        let switched = Switched::new(skin.events, Default::default(), Default::default());
-        let mut cell = Cell::new(described, &skin.parameters(described), false, switched);
-        let says = |cell: &mut Cell, sent, state: State| {
+        let switched = SwitchStates::new(skin.events, Default::default(), Default::default());
+        let mut cell = CellState::new(described, &skin.parameters(described), false, switched);
+        let says = |cell: &mut CellState, sent, state: State| {
             let heartbeat = Heartbeat { sent, state, ..Heartbeat::default() };
             let page = NetworkPage::Heartbeat(heartbeat);
             let message = Message::Network { from: Node::Cell(cell.node), epoch: Epoch(0), page };
-            let update = cell.tracked.hear(Micros(0), &message, None);
+            let update = cell.tracked.receive(Micros(0), &message, None);
             cell.take_heartbeat(&update, &heartbeat, Epoch(0));
         };
         says(&mut cell, 1, State::CONFIGURED);

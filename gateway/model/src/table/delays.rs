@@ -29,7 +29,7 @@ impl Delays {
         let _ = self.reply.record(span.0);
     }
 
-    pub(super) fn not_taken(&mut self, span: Span) {
+    pub(super) fn record_pending_joints(&mut self, span: Span) {
         let _ = self.not_taken.record(span.0);
     }
 

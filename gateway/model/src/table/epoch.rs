@@ -7,10 +7,10 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
 
 use super::Table;
-use super::cell::Cell;
+use super::cell::CellState;
 use super::replies::Expected as Reply;
 use super::root_totals::Expected;
-use crate::tracker::LATEST;
+use crate::tracker::MAX_LATE_EPOCHS;
 
 /// Looks up the positions in rad or m from which a broadcast's words were rounded.
 pub type Positions<'a> = dyn FnMut(Epoch) -> Option<[f64; MAX_JOINTS]> + 'a;
@@ -20,7 +20,7 @@ pub type Positions<'a> = dyn FnMut(Epoch) -> Option<[f64; MAX_JOINTS]> + 'a;
 pub(super) struct Broadcast {
     pub(super) epoch: Epoch,
     /// The epochs that may still be answered, with the times of their broadcasts, newest first.
-    recent: [Option<(Epoch, Micros)>; LATEST + 1],
+    recent: [Option<(Epoch, Micros)>; MAX_LATE_EPOCHS + 1],
     /// Number of broadcasts before this one.
     pub(super) number: u64,
     at: Micros,
@@ -35,7 +35,7 @@ pub(super) struct Broadcast {
 impl Broadcast {
     /// Returns the number of broadcasts after `heard`, the last one that a cell had received when it sent a page; only
     /// the most recent ones are searched.
-    pub(super) fn since(&self, heard: Epoch) -> u64 {
+    pub(super) fn broadcasts_since(&self, heard: Epoch) -> u64 {
         // If these are all broadcasts, the cell has received none.
         let recent = || self.recent.iter().flatten().count();
         let all = || usize::try_from(self.number + 1).ok().filter(|&all| all == recent());
@@ -49,18 +49,18 @@ impl Broadcast {
     }
 
     /// Returns the time of the broadcast `lag` before the newest.
-    pub(super) fn stood_at(&self, lag: usize) -> Micros {
+    pub(super) fn broadcast_time(&self, lag: usize) -> Micros {
         self.recent.get(lag).copied().flatten().map_or(self.at, |(_, at)| at)
     }
 
     /// Returns the age, at `now`, of the oldest joints that a cell had not received whose last joints were `taken`.
     /// Only the most recent broadcasts are searched.
-    pub(super) fn not_taken_for(&self, taken: Epoch, now: Micros) -> Span {
+    pub(super) fn pending_joints_age(&self, taken: Epoch, now: Micros) -> Span {
         let recent = self.recent.iter().flatten().count();
         self.lag(taken)
             .unwrap_or(recent)
             .checked_sub(1)
-            .map_or(Span(0), |first| now.since(self.stood_at(first)))
+            .map_or(Span(0), |first| now.elapsed_since(self.broadcast_time(first)))
     }
 
     /// Returns its number, its epoch, and its time on the bus.
@@ -85,10 +85,10 @@ impl Table {
     ) {
         if self.broadcast.is_some_and(|newest| newest.epoch == epoch) {
             // A repeated broadcast: cells drop it.
-            return self.cells.iter_mut().for_each(Cell::hear_again);
+            return self.cells.iter_mut().for_each(CellState::count_repeated_joints);
         }
         let number = self.broadcast.map_or(0, |before| before.number + 1);
-        let mut recent = self.broadcast.map_or([None; LATEST + 1], |before| before.recent);
+        let mut recent = self.broadcast.map_or([None; MAX_LATE_EPOCHS + 1], |before| before.recent);
         recent.rotate_right(1);
         if let Some(newest) = recent.first_mut() {
             *newest = Some((epoch, at));
@@ -147,7 +147,7 @@ impl Table {
     pub(super) fn close_epoch(&mut self) {
         let Some(before) = self.broadcast else { return };
         if let Some(last) = before.last_reply {
-            self.delays.last_reply(last.since(before.at));
+            self.delays.last_reply(last.elapsed_since(before.at));
         }
         if let Some(root_totals) = &mut self.root_totals {
             let (due, complete) = root_totals.close();
@@ -178,17 +178,17 @@ impl Table {
 
     /// Records cells that were or are unreachable while the bus works: packets from and to them may be lost.
     pub fn interrupt_cells(&mut self, is_in_doubt: impl Fn(CellId) -> bool) {
-        self.cells.iter_mut().filter(|cell| is_in_doubt(cell.node)).for_each(Cell::interrupt);
+        self.cells.iter_mut().filter(|cell| is_in_doubt(cell.node)).for_each(CellState::interrupt);
     }
 
     /// Releases torques that have decayed in the loop while the bus carried no joints, so that they do not come back.
     fn release_decayed(&mut self, epoch: Epoch) {
         // Broadcasts may change order on the way back: the last one to arrive is not always the newest.
         let recent = self.broadcast.iter().flat_map(|broadcast| broadcast.recent.into_iter().flatten());
-        let gap = recent.map(|(before, _)| epoch.since(before)).min().unwrap_or(0);
+        let gap = recent.map(|(before, _)| epoch.epochs_since(before)).min().unwrap_or(0);
         let over = i64::from(gap) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1;
         if core::mem::take(&mut self.interrupted) || over {
-            self.each_cell(Cell::release);
+            self.each_cell(CellState::release);
         }
     }
 }

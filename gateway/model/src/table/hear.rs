@@ -1,24 +1,24 @@
 //! The effects of frames on the table.
 
 use protocol::id::{Id, Node};
-use protocol::message::{From, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
+use protocol::message::{AppliesFrom, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
-use super::cell::Cell;
+use super::cell::CellState;
 use super::held::Change;
-use super::replies::Requested;
-use super::root_totals::{RootTotals, Sum, Taken};
+use super::replies::ReplyExpectation;
+use super::root_totals::{RootTotals, Sum, SumUse};
 use super::{Event, Notice, Positions, Table};
-use crate::tracker::{Update, Word};
+use crate::tracker::{Update, HeartbeatKind};
 
 /// Parameters that decide about a cell's answers and take effect at once.
 const SWITCHED: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];
 
 impl Table {
     /// Handles a frame of this gateway, read back from the bus.
-    pub(super) fn hear_own(&mut self, at: Micros, message: &Message, positions: &mut Positions<'_>) {
+    pub(super) fn receive_own(&mut self, at: Micros, message: &Message, positions: &mut Positions<'_>) {
         if let Message::Joints { epoch, joints } = *message {
             self.open_epoch(at, epoch, &joints, positions(epoch));
         } else if let Message::Stimulus { to, from, page } = *message {
@@ -28,7 +28,7 @@ impl Table {
                 self.write(to, number);
             }
         } else if *message == Message::Halt {
-            self.each_cell(Cell::halt);
+            self.each_cell(CellState::halt);
         } else if *message == Message::Sync {
             self.cells.iter_mut().for_each(|cell| cell.said.heartbeat = false);
         } else if *message == Message::Report {
@@ -37,7 +37,7 @@ impl Table {
     }
 
     /// Handles a frame of another sender.
-    pub(super) fn hear(&mut self, at: Micros, id: Id, message: &Message) {
+    pub(super) fn receive_foreign(&mut self, at: Micros, id: Id, message: &Message) {
         // A command-line tool may also send a gateway's messages.
         match *message {
             Message::Joints { .. } => {
@@ -51,11 +51,11 @@ impl Table {
             Message::Network { from: Node::Gateway, .. } => self.counters.count(Event::OtherGateway),
             Message::Halt => {
                 self.snapshot.sums.halts += 1;
-                self.each_cell(Cell::halt);
+                self.each_cell(CellState::halt);
             }
             Message::Resume => {
                 self.snapshot.sums.resumes += 1;
-                self.cells.iter_mut().for_each(Cell::resume);
+                self.cells.iter_mut().for_each(CellState::resume);
             }
             Message::Stimulus { to, from, page } => self.stimulate(to, from, page),
             Message::Configure { to, request: Request::Write { number, .. }, .. }
@@ -69,22 +69,22 @@ impl Table {
             | Message::Torque { .. }
             | Message::Sensors { .. }
             | Message::Network { .. }
-            | Message::Configured { .. } => self.hear_cell(at, id, message),
+            | Message::Configured { .. } => self.receive_from_cell(at, id, message),
         }
     }
 
-    fn stimulate(&mut self, to: Node, from: From, page: SensorPage) {
+    fn stimulate(&mut self, to: Node, from: AppliesFrom, page: SensorPage) {
         let last = self.broadcast.map(|broadcast| broadcast.epoch);
-        for cell in self.cells.iter_mut().filter(|cell| to.names(cell.node)) {
+        for cell in self.cells.iter_mut().filter(|cell| to.addresses(cell.node)) {
             cell.stimulate(from, page, last);
         }
     }
 
     fn write(&mut self, to: Node, number: u8) {
-        self.cells.iter_mut().filter(|cell| to.names(cell.node)).for_each(|cell| cell.write(number));
+        self.cells.iter_mut().filter(|cell| to.addresses(cell.node)).for_each(|cell| cell.write(number));
     }
 
-    fn hear_cell(&mut self, at: Micros, id: Id, message: &Message) {
+    fn receive_from_cell(&mut self, at: Micros, id: Id, message: &Message) {
         let Some(place) = self.places.get(usize::from(id.node).wrapping_sub(1)).copied().flatten() else {
             self.counters.count(Event::UnknownNode);
             if let Message::Network {
@@ -96,7 +96,7 @@ impl Table {
             return;
         };
         let Some(cell) = self.cells.get_mut(place) else { return };
-        let update = cell.tracked.hear(at, message, self.broadcast.map(|broadcast| broadcast.number));
+        let update = cell.tracked.receive(at, message, self.broadcast.map(|broadcast| broadcast.number));
         if update.revived {
             self.snapshot.sums.dead -= 1;
             self.notices.push_back(Notice::Back(cell.node));
@@ -104,7 +104,7 @@ impl Table {
         let is_answer = matches!(
             message,
             Message::Sensors { .. }
-                | Message::Network { page: NetworkPage::Heard(_) | NetworkPage::Refused(_), .. }
+                | Message::Network { page: NetworkPage::Received(_) | NetworkPage::Rejected(_), .. }
         );
         if !is_answer {
             cell.sensed.end_report();
@@ -114,18 +114,18 @@ impl Table {
                 NetworkPage::Heartbeat(heartbeat) => {
                     self.take_heartbeat(at, place, &update, &heartbeat, epoch)
                 }
-                NetworkPage::Heard(_) => {
+                NetworkPage::Received(_) => {
                     cell.sensed.answer_report();
-                    cell.report(self.broadcast.as_ref().map_or(0, |newest| newest.since(epoch)));
+                    cell.report(self.broadcast.as_ref().map_or(0, |newest| newest.broadcasts_since(epoch)));
                 }
-                NetworkPage::Refused(_) => cell.said.counters = true,
+                NetworkPage::Rejected(_) => cell.said.counters = true,
                 NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
             }
         } else if let Message::Sensors { epoch, page, .. } = *message {
             let is_newest = self.broadcast.as_ref().is_none_or(|broadcast| broadcast.epoch == epoch);
             cell.take_sensors(at, &page, is_newest, &self.events);
         } else if let Message::Configured { answer, .. } = *message {
-            cell.answers(&answer);
+            cell.receive_answer(&answer);
         } else if let Message::Torque { epoch, torque, .. } = *message {
             self.take_torque(at, place, epoch, &torque);
         } else if let Message::Sum { epoch, count, torque, .. } = *message {
@@ -142,17 +142,17 @@ impl Table {
         epoch: Epoch,
     ) {
         let Some(cell) = self.cells.get_mut(place) else { return };
-        let takes_joints = update.word == Some(Word::Known)
+        let takes_joints = update.word == Some(HeartbeatKind::Known)
             && !heartbeat.state.has(State::CLAIMING)
             && !heartbeat.state.has(State::HALTED);
         if takes_joints && let Some(broadcast) = &self.broadcast {
-            self.delays.not_taken(broadcast.not_taken_for(epoch, at));
+            self.delays.record_pending_joints(broadcast.pending_joints_age(epoch, at));
         }
         if heartbeat.state.has(State::DUPLICATE) {
             self.counters.count(Event::Duplicate);
             self.notices.push_back(Notice::Duplicate(cell.node));
         }
-        if matches!(update.word, Some(Word::Started { again: true } | Word::Shared)) {
+        if matches!(update.word, Some(HeartbeatKind::Started { again: true } | HeartbeatKind::Shared)) {
             self.notices.push_back(Notice::Restarted(cell.node));
         }
         if update.returned {
@@ -188,13 +188,13 @@ impl Table {
         let format = self.carried.torque_format;
         let is_zero = torque.as_slice().iter().all(|&word| word == 0);
         let asked = cell.answer(number, lag, is_zero);
-        self.delays.reply(at.since(broadcast.stood_at(lag)));
+        self.delays.reply(at.elapsed_since(broadcast.broadcast_time(lag)));
         if lag == 0 {
             broadcast.last_reply = Some(at);
-            broadcast.in_time += u32::from(asked == Requested::Due);
-            broadcast.is_whole &= asked == Requested::Due || is_zero && asked == Requested::NotDue;
+            broadcast.in_time += u32::from(asked == ReplyExpectation::Due);
+            broadcast.is_whole &= asked == ReplyExpectation::Due || is_zero && asked == ReplyExpectation::NotDue;
         }
-        if let (Requested::Due, Some(expected)) = (asked, cell.outstanding.expected(number)) {
+        if let (ReplyExpectation::Due, Some(expected)) = (asked, cell.outstanding.expected(number)) {
             let error =
                 self.accuracy.compare(cell.joint, format, torque, &expected, &mut cell.outstanding.errors);
             cell.outstanding
@@ -215,7 +215,7 @@ impl Table {
             return self.counters.count(Event::UnknownNode);
         };
         root_totals.counts.received += 1;
-        let Some(sums) = cell.sums.as_mut().filter(|sums| sums.feeds) else {
+        let Some(sums) = cell.sums.as_mut().filter(|sums| sums.is_for_gateway) else {
             root_totals.counts.overheard += 1;
             return;
         };
@@ -227,7 +227,7 @@ impl Table {
             root_totals.counts.stale += 1;
             return;
         };
-        if root_totals.take(lag, best, sum) == Taken::Resent {
+        if root_totals.take(lag, best, sum) == SumUse::Resent {
             return;
         }
         if lag == 0 {

@@ -13,7 +13,7 @@ pub(super) struct Change {
 
 /// The held torque of a cell.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Held {
+pub(super) struct HeldTorque {
     /// The last torque in steps of Q3.12, and its number of cells (for a root, those in its sum).
     torque: Option<([i32; MAX_JOINTS], u8)>,
     /// Its share of the running sum.
@@ -22,7 +22,7 @@ pub(super) struct Held {
     contributing: u8,
 }
 
-impl Held {
+impl HeldTorque {
     /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact.
     pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> Change {
         self.torque = (words != [0; MAX_JOINTS]).then_some((words, 1));

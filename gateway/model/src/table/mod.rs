@@ -34,35 +34,35 @@ use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Heartbeat, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::{Events, MAX_JOINTS, Sensing};
-use protocol::skin::{Reply, Safety, Skin};
+use protocol::skin::{SkinReply, Safety, Skin};
 use protocol::time::Micros;
 
 use crate::central::Central;
-use crate::network::check::Seen;
+use crate::network::check::ObservedCell;
 use crate::packets::{Content, PacketReader, Received};
 
 use epoch::Broadcast;
 use held::{Change, to_nm};
 use outsiders::Outsiders;
 use root_totals::RootTotals;
-use switched::Switched;
+use switched::SwitchStates;
 
 pub use crate::tracker::Uplink;
-pub use accuracy::{Accuracy, Rounded};
-pub use cell::{Cell, Said};
+pub use accuracy::{Accuracy, RoundingErrors};
+pub use cell::{CellState, Responded};
 pub use counters::{Counters, Event};
 pub use delays::Delays;
 pub use epoch::Positions;
 pub use errors::Errors;
 pub use replies::Replies;
 pub use root_totals::{Contributions, SumCounts};
-pub use sensed::Sensed;
+pub use sensed::SensorFrames;
 pub use status::Status;
 pub use switched::{SWITCHES, Switch};
 
 /// The totals of a bus that a tick needs; their size does not depend on the number of cells.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Sums {
+pub struct BusTotals {
     /// The sum of all held torques in Nm.
     pub torque: [f64; MAX_JOINTS],
     /// Number of cells in it.
@@ -87,14 +87,14 @@ pub struct Sums {
 #[derive(Clone, Debug)]
 pub struct Snapshot {
     /// The totals for a tick.
-    pub sums: Sums,
+    pub sums: BusTotals,
     /// The sensor words of each cell, in the order of the bus' cells; only updated while comparing.
     pub sensors: Vec<SkinSensors>,
 }
 
 impl Snapshot {
     /// Copies another snapshot without allocating; copies the sensors only if `sensors` is true.
-    pub fn take(&mut self, other: &Self, sensors: bool) {
+    pub fn copy_from(&mut self, other: &Self, sensors: bool) {
         self.sums = other.sums;
         if sensors {
             self.sensors.clone_from(&other.sensors);
@@ -122,13 +122,13 @@ pub enum Notice {
 /// The state of one bus.
 #[derive(Clone, Debug)]
 pub struct Table {
-    carried: Carried,
+    carried: BusFormat,
     safety: Safety,
     events: Events,
     central: Central,
     unquantised: Central,
     comparing: bool,
-    cells: Vec<Cell>,
+    cells: Vec<CellState>,
     /// The index of each node in `cells`.
     places: [Option<usize>; CellId::COUNT],
     packets: PacketReader,
@@ -151,7 +151,7 @@ pub struct Table {
 
 /// The torque format and the chain length of the bus.
 #[derive(Clone, Debug)]
-struct Carried {
+struct BusFormat {
     torque_format: TorqueFormat,
     /// Number of joints of the chain.
     joints: usize,
@@ -161,23 +161,23 @@ impl Table {
     /// Creates the table of a skin's bus, before any frame.
     #[must_use]
     pub fn new(skin: &Skin, bus: usize) -> Self {
-        let part = skin.part_on(bus);
+        let part = skin.with_cells_of_bus(bus);
         let mut places = [None; CellId::COUNT];
         let mut cells = Vec::with_capacity(part.cells.len());
-        let summed = skin.buses.get(bus).is_some_and(|bus| bus.reply != Reply::Torque);
+        let summed = skin.buses.get(bus).is_some_and(|bus| bus.reply != SkinReply::Torque);
         for described in &part.cells {
             if let Some(place) = places.get_mut(described.node.index()) {
                 *place = Some(cells.len());
             }
             let sensing = skin.buses.get(bus).map_or(Sensing::Off, |bus| bus.sensing);
-            let switched = Switched::new(skin.events, sensing, described.baseline);
-            cells.push(Cell::new(described, &part.parameters(described), summed, switched));
+            let switched = SwitchStates::new(skin.events, sensing, described.baseline);
+            cells.push(CellState::new(described, &part.parameters(described), summed, switched));
         }
-        let snapshot = Snapshot { sums: Sums::default(), sensors: vec![SkinSensors::default(); cells.len()] };
+        let snapshot = Snapshot { sums: BusTotals::default(), sensors: vec![SkinSensors::default(); cells.len()] };
         Self {
-            carried: Carried {
+            carried: BusFormat {
                 torque_format: skin.buses.get(bus).map(|bus| bus.torque_format).unwrap_or_default(),
-                joints: skin.joints_of(bus).len(),
+                joints: skin.joints_on_bus(bus).len(),
             },
             safety: skin.safety,
             events: skin.events,
@@ -211,7 +211,7 @@ impl Table {
     pub fn set_feeds(&mut self, root: CellId, feeds: bool) {
         let Some(cell) = self.cell_mut(root) else { return };
         let Some(sums) = &mut cell.sums else { return };
-        sums.feeds = feeds;
+        sums.is_for_gateway = feeds;
         if !feeds {
             let change = cell.release();
             self.apply(change);
@@ -232,12 +232,12 @@ impl Table {
     /// Returns the packets that all cells sent and those that arrived.
     #[must_use]
     pub fn uplink(&self) -> Uplink {
-        self.cells.iter().map(Cell::uplink).sum()
+        self.cells.iter().map(CellState::uplink).sum()
     }
 
     /// Returns the bus' cells, in the skin's order.
     #[must_use]
-    pub fn cells(&self) -> &[Cell] {
+    pub fn cells(&self) -> &[CellState] {
         &self.cells
     }
 
@@ -321,7 +321,7 @@ impl Table {
         let (id, event) = match received.content {
             Content::Message(id, _, ref message) => {
                 self.counters.frame(id.kind, own);
-                return if own { self.hear_own(at, message, positions) } else { self.hear(at, id, message) };
+                return if own { self.receive_own(at, message, positions) } else { self.receive_foreign(at, id, message) };
             }
             Content::NotData => {
                 let is_error = received.frame.is_error();
@@ -364,18 +364,18 @@ impl Table {
     }
 
     /// Returns the cell that sends frames with this identifier.
-    fn sender(&mut self, id: Id) -> Option<&mut Cell> {
+    fn sender(&mut self, id: Id) -> Option<&mut CellState> {
         self.cell_mut(id.sender()?)
     }
 
-    fn cell_mut(&mut self, cell: CellId) -> Option<&mut Cell> {
+    fn cell_mut(&mut self, cell: CellId) -> Option<&mut CellState> {
         let place = self.place(cell)?;
         self.cells.get_mut(place)
     }
 
     /// Starts new accounts: earlier frames set the state but do not count.
     pub fn begin_accounts(&mut self) {
-        self.cells.iter_mut().for_each(Cell::begin_accounts);
+        self.cells.iter_mut().for_each(CellState::begin_accounts);
         if let Some(broadcast) = &mut self.broadcast {
             broadcast.begin_accounts();
         }
@@ -412,7 +412,7 @@ impl Table {
         }
     }
 
-    fn each_cell(&mut self, change: impl Fn(&mut Cell) -> Change) {
+    fn each_cell(&mut self, change: impl Fn(&mut CellState) -> Change) {
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
             let change = change(cell);
@@ -433,8 +433,8 @@ impl Table {
     }
 
     /// Returns the network's cells, in the skin's order, then those that it does not describe.
-    pub fn network(&self, now: Micros) -> impl Iterator<Item = Seen> {
-        let described = self.statuses(now).map(|(cell, status)| Seen {
+    pub fn network(&self, now: Micros) -> impl Iterator<Item = ObservedCell> {
+        let described = self.statuses(now).map(|(cell, status)| ObservedCell {
             node: cell.node,
             serial: Some(cell.serial),
             configuration: cell.configuration,
@@ -443,7 +443,7 @@ impl Table {
             tree: cell.pages().tree,
             ports: cell.pages().ports,
         });
-        let unknown_nodes = self.unknown_nodes().map(|(node, heartbeat)| Seen {
+        let unknown_nodes = self.unknown_nodes().map(|(node, heartbeat)| ObservedCell {
             node,
             serial: None,
             configuration: heartbeat.configuration,
@@ -470,7 +470,7 @@ impl Table {
     }
 
     /// Returns the cells with their statuses now.
-    pub fn statuses(&self, now: Micros) -> impl Iterator<Item = (&Cell, Status)> {
+    pub fn statuses(&self, now: Micros) -> impl Iterator<Item = (&CellState, Status)> {
         let newest = self.broadcast.map(|broadcast| broadcast.number);
         self.cells.iter().map(move |cell| (cell, cell.status(now, newest)))
     }

@@ -7,9 +7,9 @@ use protocol::message::Heartbeat;
 use protocol::time::{Micros, Span};
 
 /// Number of joints from another sender within [`WITHIN`] that prove a gateway.
-const JOINTS: usize = 4;
+const GATEWAY_JOINTS: usize = 4;
 /// The time window for these joints; the slowest gateway sends fifteen in it.
-const WITHIN: Span = Span::from_millis(1_000);
+const GATEWAY_WINDOW: Span = Span::from_millis(1_000);
 
 /// The frames of other senders.
 #[derive(Clone, Debug, Default)]
@@ -17,7 +17,7 @@ pub(super) struct Outsiders {
     /// Nodes that are not in the skin, each with its last heartbeat.
     pub(super) nodes: BTreeMap<CellId, Heartbeat>,
     /// Arrival times of the last joints, newest first.
-    joints: [Option<Micros>; JOINTS],
+    joints: [Option<Micros>; GATEWAY_JOINTS],
 }
 
 impl Outsiders {
@@ -27,7 +27,7 @@ impl Outsiders {
         if let Some(newest) = self.joints.first_mut() {
             *newest = Some(at);
         }
-        self.joints.last().copied().flatten().is_some_and(|oldest| at.since(oldest) <= WITHIN)
+        self.joints.last().copied().flatten().is_some_and(|oldest| at.elapsed_since(oldest) <= GATEWAY_WINDOW)
     }
 }
 

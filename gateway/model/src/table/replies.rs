@@ -4,8 +4,8 @@ use derive_more::{Add, Sum};
 use protocol::parameters::MAX_JOINTS;
 
 use super::errors::Errors;
-use super::stuck::Stuck;
-use crate::tracker::LATEST;
+use super::stuck::StuckDetector;
+use crate::tracker::MAX_LATE_EPOCHS;
 
 /// Replies of one cell: due = in time + late + missing.
 ///
@@ -48,7 +48,7 @@ impl Replies {
 
 /// The expectation of a received torque.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Requested {
+pub(super) enum ReplyExpectation {
     /// It was due.
     Due,
     /// It was not due, by the known contact state of the cell.
@@ -72,18 +72,18 @@ pub(super) struct Outstanding {
     due: u8,
     /// Bit n: the cell's contact was known at the n-th broadcast before the newest one.
     known: u8,
-    expected: [Option<Expected>; LATEST + 1],
+    expected: [Option<Expected>; MAX_LATE_EPOCHS + 1],
     /// Errors of its answers.
     pub(super) errors: Errors,
     /// Its words compared with the expected ones.
-    pub(super) stuck: Stuck,
+    pub(super) stuck: StuckDetector,
 }
 
 impl Outstanding {
     /// Starts a broadcast, to be answered if `due`; `is_known` if the cell's contact is known. Returns true if the
     /// oldest broadcast is unanswered and can no longer be answered.
     pub(super) fn open(&mut self, due: bool, is_known: bool) -> bool {
-        let oldest = 1 << LATEST;
+        let oldest = 1 << MAX_LATE_EPOCHS;
         let unanswered = self.due & oldest != 0;
         self.due = (self.due & (oldest - 1)) << 1 | u8::from(due);
         self.known = (self.known & (oldest - 1)) << 1 | u8::from(is_known);
@@ -106,16 +106,16 @@ impl Outstanding {
     }
 
     /// Records the answer to the broadcast `lag` before the newest; returns whether it was due.
-    pub(super) const fn answer(&mut self, lag: usize) -> Requested {
+    pub(super) const fn answer(&mut self, lag: usize) -> ReplyExpectation {
         let bit = 1 << lag;
         let was_due = self.due & bit != 0;
         self.due &= !bit;
         if was_due {
-            Requested::Due
+            ReplyExpectation::Due
         } else if self.known & bit != 0 {
-            Requested::NotDue
+            ReplyExpectation::NotDue
         } else {
-            Requested::Unknown
+            ReplyExpectation::Unknown
         }
     }
 
@@ -148,7 +148,7 @@ mod tests {
     #[test]
     fn an_answer_is_to_the_broadcast_so_many_before_the_newest_and_counts_once() {
         let mut outstanding = Outstanding::default();
-        use Requested::{Due, NotDue, Unknown};
+        use ReplyExpectation::{Due, NotDue, Unknown};
         let broadcasts = [(false, false), (true, true), (false, true), (true, true)];
         broadcasts.into_iter().for_each(|(due, is_known)| _ = outstanding.open(due, is_known));
         assert!(outstanding.is_due());

@@ -5,10 +5,10 @@ use protocol::parameters::MAX_JOINTS;
 use serde::Serialize;
 
 use super::errors::Errors;
-use crate::tracker::LATEST;
+use crate::tracker::MAX_LATE_EPOCHS;
 
 /// Number of epochs over which errors of sums are averaged.
-const AVERAGED: u32 = 32;
+const AVERAGED_EPOCHS: u32 = 32;
 
 /// Counts of sums.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
@@ -69,14 +69,14 @@ impl Sum {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RootSums {
     /// True if its sums are for the gateway; otherwise another cell receives them.
-    pub(super) feeds: bool,
+    pub(super) is_for_gateway: bool,
     /// The best sum of each of the newest epochs.
-    pub(super) epochs: [Option<Sum>; LATEST + 1],
+    pub(super) epochs: [Option<Sum>; MAX_LATE_EPOCHS + 1],
 }
 
 impl RootSums {
     pub(super) const fn new(feeds: bool) -> Self {
-        Self { feeds, epochs: [None; LATEST + 1] }
+        Self { is_for_gateway: feeds, epochs: [None; MAX_LATE_EPOCHS + 1] }
     }
 
     /// Starts an epoch.
@@ -90,11 +90,11 @@ impl RootSums {
 
 /// An epoch that may still be answered.
 #[derive(Clone, Copy, Debug)]
-struct Open {
+struct OpenEpoch {
     due: u32,
     /// True if no other cell can be in it.
     known: bool,
-    came: u32,
+    received_cells: u32,
     /// Number of cells before the next joints.
     in_time: Option<u32>,
     /// Words in steps of Q7.8.
@@ -157,10 +157,10 @@ impl SumError {
         }
         self.last = Some(errors);
         self.epochs += 1;
-        if self.epochs == AVERAGED {
+        if self.epochs == AVERAGED_EPOCHS {
             let sums = self.sum;
             for sum in sums.iter().take(expected.joints) {
-                self.averaged.add(sum / f64::from(AVERAGED));
+                self.averaged.add(sum / f64::from(AVERAGED_EPOCHS));
             }
             self.interrupt();
         }
@@ -176,7 +176,7 @@ impl SumError {
 #[derive(Clone, Debug, Default)]
 pub(super) struct RootTotals {
     /// Newest first.
-    epochs: [Option<Open>; LATEST + 1],
+    epochs: [Option<OpenEpoch>; MAX_LATE_EPOCHS + 1],
     pub(super) counts: SumCounts,
     pub(super) contributions: Contributions,
     pub(super) error: SumError,
@@ -184,7 +184,7 @@ pub(super) struct RootTotals {
 
 /// The use of a received sum.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Taken {
+pub(super) enum SumUse {
     /// It is the root's best for its epoch.
     Best,
     /// A sum with at least as many cells arrived earlier.
@@ -193,25 +193,25 @@ pub(super) enum Taken {
 
 impl RootTotals {
     /// Records a root's sum for the epoch `lag` before the newest; `best` is its best sum for that epoch so far.
-    pub(super) fn take(&mut self, lag: usize, best: &mut Option<Sum>, sum: Sum) -> Taken {
+    pub(super) fn take(&mut self, lag: usize, best: &mut Option<Sum>, sum: Sum) -> SumUse {
         let before = *best;
         match before {
             Some(_) => self.counts.resent += 1,
             None => self.counts.first += 1,
         }
         if before.is_some_and(|before| sum.count <= before.count) {
-            return Taken::Resent;
+            return SumUse::Resent;
         }
         *best = Some(sum);
         if let Some(Some(open)) = self.epochs.get_mut(lag) {
             let (count, words) = before.map_or((0, [0; MAX_JOINTS]), |before| (before.count, before.words));
-            open.came += u32::from(sum.count) - u32::from(count);
+            open.received_cells += u32::from(sum.count) - u32::from(count);
             for ((total, word), before) in open.sum.iter_mut().zip(sum.words).zip(words) {
                 *total += word - before;
             }
             open.saturated |= sum.is_saturated();
         }
-        Taken::Best
+        SumUse::Best
     }
 
     /// Returns the number of cells due in the newest epoch's sum; `None` if the sensors of some are unknown.
@@ -223,10 +223,10 @@ impl RootTotals {
     pub(super) fn open(&mut self, due: u32, known: bool, expected: Option<Expected>) {
         self.epochs.rotate_right(1);
         if let Some(oldest) = self.epochs.first_mut() {
-            let settled = oldest.replace(Open {
+            let settled = oldest.replace(OpenEpoch {
                 due,
                 known,
-                came: 0,
+                received_cells: 0,
                 in_time: None,
                 sum: [0; MAX_JOINTS],
                 saturated: false,
@@ -240,11 +240,11 @@ impl RootTotals {
     pub(super) fn close(&mut self) -> (bool, bool) {
         self.error.last = None;
         let Some(Some(open)) = self.epochs.first_mut() else { return (false, false) };
-        open.in_time = Some(open.came);
-        let complete = open.came >= open.due;
+        open.in_time = Some(open.received_cells);
+        let complete = open.received_cells >= open.due;
         if open.due > 0
             && open.known
-            && open.came == open.due
+            && open.received_cells == open.due
             && let Some(expected) = &open.expected
         {
             self.error.take(&open.sum, open.saturated, expected);
@@ -263,8 +263,8 @@ impl RootTotals {
 }
 
 impl Contributions {
-    fn settle(&mut self, open: Option<Open>) {
-        let Some(Open { due, known, came, in_time, .. }) = open else { return };
+    fn settle(&mut self, open: Option<OpenEpoch>) {
+        let Some(OpenEpoch { due, known, received_cells: came, in_time, .. }) = open else { return };
         let in_time = in_time.unwrap_or(came).min(due);
         let all = came.min(due);
         self.due += u64::from(due);

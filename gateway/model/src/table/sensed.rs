@@ -5,11 +5,11 @@
 use protocol::message::SensorPage;
 use protocol::parameters::Events;
 use protocol::time::{Micros, Span};
-use protocol::touch::{Touch, contact};
+use protocol::touch::{Touch, contact_force};
 
 /// The sensors frames of one cell.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Sensed {
+pub struct SensorFrames {
     /// Number of frames.
     pub frames: u64,
     /// Number of touches: contact rose to its threshold.
@@ -18,7 +18,7 @@ pub struct Sensed {
     pub releases: u64,
     contact: Touch,
     /// Number of frames that do not answer a report command.
-    unasked: u64,
+    unrequested: u64,
     /// Arrival times of the first and the last of them.
     span: Option<(Micros, Micros)>,
     /// The kinds of pages that are still expected in answer to a report command.
@@ -28,9 +28,9 @@ pub struct Sensed {
 /// Number of kinds of sensors pages.
 const KINDS: usize = 3;
 /// Minimum number of frames for a rate.
-const FEWEST: u64 = 3;
+const MIN_RATE_FRAMES: u64 = 3;
 /// Minimum time for a rate.
-const SHORTEST: Span = Span::from_millis(1_000);
+const MIN_RATE_SPAN: Span = Span::from_millis(1_000);
 
 /// Returns the index of a page's kind in [`Sensed`].
 const fn kind(page: &SensorPage) -> usize {
@@ -41,7 +41,7 @@ const fn kind(page: &SensorPage) -> usize {
     }
 }
 
-impl Sensed {
+impl SensorFrames {
     /// Expects the answer to a report command: one page of each kind follows at once.
     pub(super) const fn answer_report(&mut self) {
         self.requested = [true; KINDS];
@@ -53,17 +53,17 @@ impl Sensed {
     }
 
     /// Records a sensors frame.
-    pub(super) fn hear(&mut self, at: Micros, page: &SensorPage, events: &Events) {
+    pub(super) fn record(&mut self, at: Micros, page: &SensorPage, events: &Events) {
         self.frames += 1;
         let requested = self.requested.get_mut(kind(page)).is_some_and(core::mem::take);
         if !requested {
-            self.unasked += 1;
+            self.unrequested += 1;
             let (first, _) = *self.span.get_or_insert((at, at));
             self.span = Some((first, at));
         }
         let SensorPage::Skin(skin) = page else { return };
         let before = self.contact;
-        self.contact = before.next(contact(skin), events.contact.to_bits(), events.hysteresis);
+        self.contact = before.next(contact_force(skin), events.contact.to_bits(), events.hysteresis);
         self.touches += u64::from(before != Touch::Touched && self.contact == Touch::Touched);
         self.releases += u64::from(before == Touch::Touched && self.contact != Touch::Touched);
     }
@@ -79,9 +79,9 @@ impl Sensed {
     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
     pub fn rate_hz(&self) -> Option<f64> {
         let (first, last) = self.span?;
-        let span = last.since(first);
-        let is_enough = self.unasked >= FEWEST && span >= SHORTEST;
-        is_enough.then(|| (self.unasked - 1) as f64 / span.seconds())
+        let span = last.elapsed_since(first);
+        let is_enough = self.unrequested >= MIN_RATE_FRAMES && span >= MIN_RATE_SPAN;
+        is_enough.then(|| (self.unrequested - 1) as f64 / span.seconds())
     }
 }
 
@@ -91,12 +91,12 @@ mod tests {
     use protocol::fixed::{Q3_12, Q5_10};
     use protocol::message::SkinSensors;
 
-    fn after(steps: &[i16]) -> Sensed {
-        let mut sensed = Sensed::default();
+    fn after(steps: &[i16]) -> SensorFrames {
+        let mut sensed = SensorFrames::default();
         for (&bits, ms) in steps.iter().zip(0..) {
             let contact = [Q5_10::from_bits(bits), Q5_10::ZERO, Q5_10::ZERO];
             let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-            sensed.hear(Micros(ms * 1_000), &page, &Events::default());
+            sensed.record(Micros(ms * 1_000), &page, &Events::default());
         }
         sensed
     }
@@ -113,9 +113,9 @@ mod tests {
     #[test]
     fn a_rate_needs_three_frames_and_a_second_and_pages_of_either_kind_count() {
         let rate = |times_us: &[u64]| {
-            let mut sensed = Sensed::default();
+            let mut sensed = SensorFrames::default();
             for (&at, page) in times_us.iter().zip([skin(), ACCELERATION].iter().cycle()) {
-                sensed.hear(Micros(at), page, &Events::default());
+                sensed.record(Micros(at), page, &Events::default());
             }
             sensed.rate_hz()
         };
@@ -127,20 +127,20 @@ mod tests {
 
     #[test]
     fn answers_to_reports_make_no_rate_and_are_frames() {
-        let mut sensed = Sensed::default();
+        let mut sensed = SensorFrames::default();
         for second in 0..10 {
             let at = Micros(second * 1_000_000);
             sensed.answer_report();
-            sensed.hear(at, &skin(), &Events::default());
-            sensed.hear(Micros(at.0 + 1), &ACCELERATION, &Events::default());
+            sensed.record(at, &skin(), &Events::default());
+            sensed.record(Micros(at.0 + 1), &ACCELERATION, &Events::default());
         }
         assert_eq!((sensed.rate_hz(), sensed.frames), (None, 20));
         // The acceleration of the answer was lost, and the next one does not belong to it.
         sensed.answer_report();
-        sensed.hear(Micros(0), &skin(), &Events::default());
+        sensed.record(Micros(0), &skin(), &Events::default());
         sensed.end_report();
         for at in [0, 1_000_000, 2_000_000] {
-            sensed.hear(Micros(at), &ACCELERATION, &Events::default());
+            sensed.record(Micros(at), &ACCELERATION, &Events::default());
         }
         assert!(sensed.rate_hz().is_some_and(|hz| (hz - 1.0).abs() < 1e-9));
     }

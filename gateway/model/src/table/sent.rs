@@ -1,26 +1,26 @@
 //! Joints sent to a cell, compared with those that it reports as received.
 
-use protocol::message::Heard;
+use protocol::message::ReceivedCounts;
 
-use crate::tracker::Word;
+use crate::tracker::HeartbeatKind;
 
 /// The counts of one cell.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Sent {
-    since: Since,
+pub(super) struct SentJoints {
+    since: CountsSince,
     /// The counts before its last start, with the replies then in doubt, while that start may still be taken back.
-    before: Option<(Since, u64)>,
+    before: Option<(CountsSince, u64)>,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
-struct Since {
+struct CountsSince {
     /// Its first page of receive counters since it started or the gateway did.
-    first: Option<Heard>,
+    first: Option<ReceivedCounts>,
     /// Number of broadcasts since that page.
     joints: u64,
 }
 
-impl Sent {
+impl SentJoints {
     /// Counts a broadcast.
     pub(super) const fn count(&mut self) {
         self.since.joints += 1;
@@ -32,9 +32,9 @@ impl Sent {
     }
 
     /// Records a page of counters that crossed `passed` joints on the bus. Later pages are compared with the first one.
-    pub(super) fn report(&mut self, heard: Option<Heard>, passed: u64) {
+    pub(super) fn report(&mut self, heard: Option<ReceivedCounts>, passed: u64) {
         if self.since.first.is_none() {
-            self.since = Since { first: heard, joints: passed };
+            self.since = CountsSince { first: heard, joints: passed };
         }
     }
 
@@ -46,11 +46,11 @@ impl Sent {
     /// Records a start of the cell, with a counter of `sent` packets, and with this number of replies outstanding and
     /// in doubt. If an apparent start is taken back, the earlier counts continue, and the returned number of replies is
     /// in doubt.
-    pub(super) fn restart(&mut self, word: Word, taken_back: bool, sent: u16, of: (u32, u64)) -> Option<u64> {
+    pub(super) fn restart(&mut self, word: HeartbeatKind, taken_back: bool, sent: u16, of: (u32, u64)) -> Option<u64> {
         let (outstanding, in_doubt) = of;
         if let Some((before, _)) = &mut self.before {
             before.joints += self.since.joints;
-        } else if word == (Word::Started { again: true }) {
+        } else if word == (HeartbeatKind::Started { again: true }) {
             self.before = Some((self.since, in_doubt));
         }
         if let Some((_, in_doubt)) = &mut self.before {
@@ -58,17 +58,17 @@ impl Sent {
         }
         let before = self.before.take_if(|_| taken_back);
         // The cell counts from zero; without its first heartbeat, compare from the next page on.
-        let restarted = Since { first: (sent == 0).then(Heard::default), joints: 0 };
+        let restarted = CountsSince { first: (sent == 0).then(ReceivedCounts::default), joints: 0 };
         self.since = before.map_or(restarted, |(since, _)| since);
         before.map(|(_, in_doubt)| in_doubt)
     }
 
     /// Returns the joints that it reports as skipped because they were old, and the joints that it does not report as
     /// received.
-    pub(super) fn unanswered(&self, last: Option<Heard>) -> Option<(u64, u64)> {
+    pub(super) fn unanswered(&self, last: Option<ReceivedCounts>) -> Option<(u64, u64)> {
         let first = self.since.first?;
         let last = last.unwrap_or(first);
-        let since = |count: fn(&Heard) -> u16| count(&last).wrapping_sub(count(&first));
+        let since = |count: fn(&ReceivedCounts) -> u16| count(&last).wrapping_sub(count(&first));
         let skipped = since(|heard| heard.joints_late);
         let heard = since(|heard| heard.joints).wrapping_add(since(|heard| heard.joints_repeated));
         // The cell counts modulo 2^16, so only the difference modulo 2^16 is known. A page may have crossed some joints

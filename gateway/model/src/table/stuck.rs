@@ -17,24 +17,24 @@ use protocol::packet::padded;
 use protocol::parameters::MAX_JOINTS;
 
 /// Length of a run of equal words from which a cell counts as stuck.
-const EQUAL: u64 = 32;
+const STUCK_RUN: u64 = 32;
 /// Minimum number of changes of the expected words in the run.
-const CHANGES: u32 = 4;
+const MIN_EXPECTED_CHANGES: u32 = 4;
 /// Smallest change of a word that counts, in steps.
-const STEPS: u16 = 16;
+const MIN_CHANGE_STEPS: u16 = 16;
 
 /// Kinds of words that may be stuck, with the names of [`Stuck::longest`].
 const NAMES: [&str; 3] = ["torque", "skin", "acceleration"];
 
 /// The sent words of a cell's torques and sensors.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Stuck {
-    kinds: [Words; NAMES.len()],
+pub(super) struct StuckDetector {
+    kinds: [WordRun; NAMES.len()],
 }
 
 /// The sent words of one kind.
 #[derive(Clone, Copy, Debug, Default)]
-struct Words {
+struct WordRun {
     sent: Option<[i16; MAX_JOINTS]>,
     /// Number of consecutive words equal to `sent`.
     equal: u64,
@@ -45,7 +45,7 @@ struct Words {
     longest: u64,
 }
 
-impl Words {
+impl WordRun {
     fn take(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
         if self.sent.replace(sent) != Some(sent) {
             (self.equal, self.right, self.changes) = (1, right, 0);
@@ -53,7 +53,7 @@ impl Words {
         }
         self.equal += 1;
         let mut both = self.right.iter().zip(&right);
-        if both.any(|(before, now)| before.abs_diff(*now) >= STEPS) {
+        if both.any(|(before, now)| before.abs_diff(*now) >= MIN_CHANGE_STEPS) {
             self.right = right;
             self.changes += 1;
         }
@@ -63,11 +63,11 @@ impl Words {
     }
 
     const fn is_stuck(&self) -> bool {
-        self.equal >= EQUAL && self.changes >= CHANGES
+        self.equal >= STUCK_RUN && self.changes >= MIN_EXPECTED_CHANGES
     }
 }
 
-impl Stuck {
+impl StuckDetector {
     /// Compares a due torque with the central one.
     pub(super) fn take_torque(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
         let [torque, ..] = &mut self.kinds;
@@ -87,7 +87,7 @@ impl Stuck {
 
     /// Returns true if the cell counts as stuck now.
     pub(super) fn is_now(&self) -> bool {
-        self.kinds.iter().any(Words::is_stuck)
+        self.kinds.iter().any(WordRun::is_stuck)
     }
 
     /// Returns the kinds of words that were stuck, each with its longest run.
@@ -120,7 +120,7 @@ mod tests {
 
     /// Returns the longest stuck run for pairs of sent and expected words.
     fn longest(words: impl Iterator<Item = (i16, i16)>) -> u64 {
-        let mut all = Words::default();
+        let mut all = WordRun::default();
         words.for_each(|(sent, right)| all.take(padded(&[0, sent]), padded(&[0, right])));
         all.longest
     }
@@ -146,7 +146,7 @@ mod tests {
 
     #[test]
     fn words_that_change_again_end_it_and_it_is_remembered() {
-        let mut stuck = Stuck::default();
+        let mut stuck = StuckDetector::default();
         (0..40).for_each(|n| stuck.take_torque(padded(&[9]), padded(&[n * MANY])));
         assert!(stuck.is_now());
         stuck.take_torque(padded(&[10]), padded(&[10]));
@@ -162,7 +162,7 @@ mod tests {
             let temperature = [protocol::fixed::Q9_6::from_bits(bits); 2];
             SensorPage::Skin(SkinSensors { temperature, ..SkinSensors::default() })
         };
-        let mut stuck = Stuck::default();
+        let mut stuck = StuckDetector::default();
         for n in 0..40 {
             stuck.take_page(&skin(0), &acceleration(n * MANY));
             stuck.take_page(&acceleration(n), &acceleration(n));

@@ -15,14 +15,14 @@ pub const SWITCHES: usize = 3;
 
 /// The switches of one cell, in the order of writing: thresholds before the mode that needs them.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Switched {
+pub(super) struct SwitchStates {
     target: [Switch; SWITCHES],
     confirmed: [bool; SWITCHES],
     /// True if the cell has a baseline, and so subtracts a zero from its input.
     pub(super) subtracts: bool,
 }
 
-impl Switched {
+impl SwitchStates {
     /// Creates the switches of a cell that has just started, with the skin's targets.
     pub(super) fn new(events: Events, sensing: Sensing, baseline: Baseline) -> Self {
         let target = [
@@ -45,11 +45,11 @@ impl Switched {
     }
 
     /// Records the answer to a write. A refused write is not repeated.
-    pub(super) fn answered(&mut self, answer: &Answer) {
+    pub(super) fn record_answer(&mut self, answer: &Answer) {
         let (of, words) = match *answer {
             Answer::Value { number, written: true, words } => (number, Some(words)),
             // A cell without the option can only have zeros.
-            Answer::Refused { number, reason: Answer::UNKNOWN | Answer::CANNOT_BE } => (number, None),
+            Answer::Refused { number, reason: Answer::UNKNOWN | Answer::INVALID } => (number, None),
             Answer::Value { .. } | Answer::Refused { .. } => return,
         };
         if let (Some(words), true) = (words, of == Parameter::Baseline.number()) {
@@ -63,7 +63,7 @@ impl Switched {
     }
 
     /// Returns the switches that must still be written.
-    pub(super) fn lacks(&self) -> [Option<Switch>; SWITCHES] {
+    pub(super) fn unconfirmed(&self) -> [Option<Switch>; SWITCHES] {
         let mut lacks = self.target.map(Some);
         for (lacks, confirmed) in lacks.iter_mut().zip(self.confirmed) {
             *lacks = lacks.filter(|_| !confirmed);
@@ -76,27 +76,27 @@ impl Switched {
 mod tests {
     use super::*;
     use protocol::fixed::Q;
-    use protocol::parameters::Zeroing;
+    use protocol::parameters::BaselineSettings;
 
     const MODE: u8 = 7;
 
-    fn lacks(switched: &Switched) -> Vec<u8> {
-        switched.lacks().iter().flatten().map(|(number, _)| *number).collect()
+    fn lacks(switched: &SwitchStates) -> Vec<u8> {
+        switched.unconfirmed().iter().flatten().map(|(number, _)| *number).collect()
     }
 
     #[test]
     fn a_cell_lacks_what_differs_from_its_start_until_it_confirms() {
-        let plain = Switched::new(Events::default(), Sensing::Off, Baseline::Off);
+        let plain = SwitchStates::new(Events::default(), Sensing::Off, Baseline::Off);
         assert_eq!(lacks(&plain), [0_u8; 0]);
         let finer = Events { contact: protocol::fixed::Q5_10::from_bits(5), ..Events::default() };
-        let mut switched = Switched::new(finer, Sensing::Event, Baseline::Off);
+        let mut switched = SwitchStates::new(finer, Sensing::Event, Baseline::Off);
         assert_eq!(lacks(&switched), [8, MODE], "thresholds first");
-        let (number, words) = switched.lacks()[1].unwrap();
-        switched.answered(&Answer::Value { number, written: false, words });
+        let (number, words) = switched.unconfirmed()[1].unwrap();
+        switched.record_answer(&Answer::Value { number, written: false, words });
         assert_eq!(lacks(&switched), [8, MODE], "it was only read");
-        switched.answered(&Answer::Value { number, written: true, words });
+        switched.record_answer(&Answer::Value { number, written: true, words });
         assert_eq!(lacks(&switched), [8]);
-        switched.answered(&Answer::Refused { number: 8, reason: Answer::UNKNOWN });
+        switched.record_answer(&Answer::Refused { number: 8, reason: Answer::UNKNOWN });
         assert_eq!(lacks(&switched), [0_u8; 0], "an unknown parameter");
         switched.restart();
         assert_eq!(lacks(&switched), [8, MODE]);
@@ -104,17 +104,17 @@ mod tests {
 
     #[test]
     fn a_cell_subtracts_a_zero_from_its_answer_on_until_it_restarts() {
-        let rule = Zeroing {
+        let rule = BaselineSettings {
             threshold: Q::from_bits(103),
             hysteresis: Q::from_bits(0),
             rate_un_per_s: 5,
             limit: Q::from_bits(512),
             n_per_c: Q::from_bits(0),
         };
-        let mut switched = Switched::new(Events::default(), Sensing::Off, Baseline::On(rule));
-        let (number, words) = switched.lacks()[2].unwrap();
+        let mut switched = SwitchStates::new(Events::default(), Sensing::Off, Baseline::On(rule));
+        let (number, words) = switched.unconfirmed()[2].unwrap();
         assert!(!switched.subtracts);
-        switched.answered(&Answer::Value { number, written: true, words });
+        switched.record_answer(&Answer::Value { number, written: true, words });
         assert!(switched.subtracts && lacks(&switched).is_empty());
         switched.restart();
         assert!(!switched.subtracts && lacks(&switched) == [11]);
@@ -122,11 +122,11 @@ mod tests {
 
     #[test]
     fn another_confirmed_value_becomes_the_target() {
-        let mut switched = Switched::new(Events::default(), Sensing::Off, Baseline::Off);
+        let mut switched = SwitchStates::new(Events::default(), Sensing::Off, Baseline::Off);
         let words = Sensing::Continuous { period_ms: 16 }.words();
-        switched.answered(&Answer::Value { number: MODE, written: true, words });
+        switched.record_answer(&Answer::Value { number: MODE, written: true, words });
         assert_eq!(lacks(&switched), [0_u8; 0]);
         switched.restart();
-        assert_eq!(switched.lacks()[1], Some((MODE, words)));
+        assert_eq!(switched.unconfirmed()[1], Some((MODE, words)));
     }
 }

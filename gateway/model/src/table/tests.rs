@@ -2,7 +2,7 @@
 
 use super::*;
 use protocol::can::Format;
-use protocol::message::{Answer, Heard, Joints, Message, NetworkPage, Request, SensorPage, State};
+use protocol::message::{Answer, ReceivedCounts, Joints, Message, NetworkPage, Request, SensorPage, State};
 use protocol::packet::{self, Packet};
 use protocol::parameters::Parameter;
 
@@ -81,7 +81,7 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_clear_contact() {
     };
     let contact = [protocol::fixed::Q5_10::nearest(2.0); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    let press = (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::From::Next, page });
+    let press = (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::AppliesFrom::Next, page });
     let hear = |table: &mut Table, heard: &[(bool, Message)]| {
         for (own, message) in heard {
             for frame in message.encode().frames(Format::Fd) {
@@ -97,7 +97,7 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_clear_contact() {
         Message::Network {
             from: Node::Cell(cell),
             epoch: Epoch(0),
-            page: NetworkPage::Heard(Heard::default()),
+            page: NetworkPage::Received(ReceivedCounts::default()),
         },
     );
     assert_eq!(hear(&mut table, &[heartbeat(1), untouched, press, joints(1), joints(2)]), (2, 0, 0));
@@ -108,7 +108,7 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_clear_contact() {
     assert_eq!(hear(&mut table, &[heartbeat(9), joints(5)]), (2, 2, 2), "its sensors are unknown");
     assert_eq!(table.notices().collect::<Vec<_>>(), [Notice::Returned(cell)]);
     assert_eq!(hear(&mut table, &[press, joints(6)]), (2, 2, 2), "others may wait in it");
-    let (number, words) = (Parameter::Mode.number(), packet::words([1]));
+    let (number, words) = (Parameter::Mode.number(), packet::padded_words([1]));
     let write = (
         true,
         Message::Configure { to: Node::Cell(cell), tag: 0, request: Request::Write { number, words } },
@@ -134,10 +134,10 @@ fn a_start_that_was_none_takes_no_counters_that_explain_missing_replies() {
         network(NetworkPage::Heartbeat(Heartbeat { sent, state, ..Heartbeat::default() }))
     };
     let heard =
-        |joints, joints_late| network(NetworkPage::Heard(Heard { joints, joints_late, ..Heard::default() }));
+        |joints, joints_late| network(NetworkPage::Received(ReceivedCounts { joints, joints_late, ..ReceivedCounts::default() }));
     let contact = [protocol::fixed::Q5_10::nearest(2.0); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    let press = (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::From::Next, page });
+    let press = (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::AppliesFrom::Next, page });
     let mut table = table(&[]);
     let mut ms = 0;
     let mut hear = |table: &mut Table, heard: &[(bool, Message)]| {
@@ -176,7 +176,7 @@ fn lost_joints_that_passed_a_report_on_its_way_are_counted() {
         (true, Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } })
     };
     let report = |epoch, joints| {
-        let page = NetworkPage::Heard(Heard { joints, ..Heard::default() });
+        let page = NetworkPage::Received(ReceivedCounts { joints, ..ReceivedCounts::default() });
         (false, Message::Network { from: Node::Cell(CellId::new(1).unwrap()), epoch: Epoch(epoch), page })
     };
     let unanswered = |heard: &[_]| table(heard).cells().first().unwrap().unanswered();
@@ -198,13 +198,13 @@ fn an_address_claim_for_a_taken_node_id_does_not_change_its_owner() {
     };
     let settled = State::CONFIGURED.with(State::TEST_MODE, true);
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    let press = Message::Stimulus { to: Node::Cell(cell), from: protocol::message::From::Next, page };
+    let press = Message::Stimulus { to: Node::Cell(cell), from: protocol::message::AppliesFrom::Next, page };
     let joints = |epoch| {
         let joints = Joints { in_use: 6, ..Joints::default() };
         (true, Message::Joints { epoch: Epoch(epoch), joints })
     };
     let result = |intruded| {
-        let untouched = NetworkPage::Heard(Heard::default());
+        let untouched = NetworkPage::Received(ReceivedCounts::default());
         let untouched = Message::Network { from: Node::Cell(cell), epoch: Epoch(0), page: untouched };
         let mut said = vec![says(7, 40, settled), (false, untouched), (true, press), joints(1)];
         said.extend([joints(2), says(7, 44, settled), joints(3)]);
@@ -295,7 +295,7 @@ impl There {
         there.table.set_comparing(true);
         let state = State::CONFIGURED.with(State::TEST_MODE, true);
         there.says(NetworkPage::Heartbeat(Heartbeat { sent: 70, state, ..Heartbeat::default() }));
-        there.says(NetworkPage::Heard(Heard { stimuli, joints: 50, ..Heard::default() }));
+        there.says(NetworkPage::Received(ReceivedCounts { stimuli, joints: 50, ..ReceivedCounts::default() }));
         there.hear(false, &Message::Sensors { from: Self::cell(), epoch: Epoch(10), page: Self::press(0.0) });
         there
     }
@@ -323,7 +323,7 @@ impl There {
     }
 
     fn stimulate(&mut self, newtons: f64) {
-        let from = protocol::message::From::Next;
+        let from = protocol::message::AppliesFrom::Next;
         let page = Self::press(newtons);
         self.hear(true, &Message::Stimulus { to: Node::Cell(Self::cell()), from, page });
     }
@@ -393,7 +393,7 @@ fn epochs_with_a_torque_that_was_not_due_are_not_the_whole_skin() {
     let whole = there.compared().1;
     assert!(whole > 0);
     // After another gateway's write, the contact is unknown until the next stimulus.
-    let request = Request::Write { number: Parameter::Reply.number(), words: packet::words([0]) };
+    let request = Request::Write { number: Parameter::Reply.number(), words: packet::padded_words([0]) };
     there.hear(false, &Message::Configure { to: Node::Everyone, tag: 0, request });
     let replies = there.answered(5);
     assert_eq!((replies.contact_unknown, replies.unasked), (5, 5));

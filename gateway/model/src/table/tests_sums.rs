@@ -2,7 +2,7 @@
 
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q5_10};
-use protocol::message::{From, Heard, Joints, Message, NetworkPage, SensorPage, State, Tree};
+use protocol::message::{AppliesFrom, ReceivedCounts, Joints, Message, NetworkPage, SensorPage, State, Tree};
 use protocol::packet::{self, Length, Words};
 use protocol::time::Span;
 
@@ -42,7 +42,7 @@ impl Bench {
         }
         for node in (1..=4).filter(|_| !pressed.is_empty()) {
             // The cell has received no stimulus before.
-            let page = NetworkPage::Heard(Heard::default());
+            let page = NetworkPage::Received(ReceivedCounts::default());
             bench.say(false, Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(0), page });
         }
         for &node in pressed {
@@ -68,18 +68,18 @@ impl Bench {
     fn press(&mut self, node: i64, newtons: f64) {
         let contact = [Q5_10::nearest(newtons); 3];
         let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-        self.say(true, Message::Stimulus { to: Node::Cell(cell(node)), from: From::Next, page });
+        self.say(true, Message::Stimulus { to: Node::Cell(cell(node)), from: AppliesFrom::Next, page });
     }
 
-    fn joints(&mut self, epoch: u8) -> Sums {
+    fn joints(&mut self, epoch: u8) -> BusTotals {
         let joints = Joints { in_use: 6, ..Joints::default() };
         self.say(true, Message::Joints { epoch: Epoch(epoch), joints });
         self.table.snapshot().sums
     }
 
     /// Sends a sum of `count` cells with this number of steps in its first word.
-    fn sum(&mut self, node: i64, epoch: u8, count: u8, steps: i16) -> Sums {
-        let torque = packet::words([steps]).into();
+    fn sum(&mut self, node: i64, epoch: u8, count: u8, steps: i16) -> BusTotals {
+        let torque = packet::padded_words([steps]).into();
         self.say(false, Message::Sum { from: cell(node), epoch: Epoch(epoch), torque, count });
         self.table.snapshot().sums
     }
@@ -94,7 +94,7 @@ impl Bench {
 }
 
 /// Returns the first joint's torque in steps of Q7.8, and the number of cells in it.
-fn first(sums: &Sums) -> (f64, u32) {
+fn first(sums: &BusTotals) -> (f64, u32) {
     (sums.torque[0] * 256.0, sums.contributing)
 }
 
@@ -317,7 +317,7 @@ fn the_network_is_of_all_cells_that_are_described_or_heard() {
     bench.heartbeat(9, 0, State::default());
     let seen = |bench: &Bench, at: Micros| {
         let of =
-            |seen: Seen| (seen.node, seen.serial.is_some(), seen.heartbeat.is_some(), seen.alive, seen.tree);
+            |seen: ObservedCell| (seen.node, seen.serial.is_some(), seen.heartbeat.is_some(), seen.alive, seen.tree);
         bench.table.network(at).map(of).collect::<Vec<_>>()
     };
     let expected = |alive| {

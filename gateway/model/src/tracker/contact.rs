@@ -11,24 +11,24 @@
 //! ```
 
 use protocol::fixed::Q3_12;
-use protocol::message::{From, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 
 /// Maximum number of pending stimuli in a cell.
-pub const PENDING: usize = 8;
+pub const MAX_PENDING_STIMULI: usize = 8;
 
 /// The contact state of one cell. The reader attaches a `T` to each stimulus, such as its time or its frames.
 #[derive(Clone, Debug)]
 pub struct Contact<T> {
-    waiting: Vec<(From, SensorPage, T)>,
+    waiting: Vec<(AppliesFrom, SensorPage, T)>,
     skin: Option<(SkinSensors, T)>,
     acceleration: Option<([Q3_12; 3], T)>,
     obeys: Option<bool>,
     /// True if `skin` includes all stimuli that the cell has received.
     is_known: bool,
-    unseen: Unseen,
+    unseen: UnseenStimuli,
     /// Number of stimuli since the reader began; `None` once their effect is uncertain.
-    came: Option<u16>,
+    received_stimuli: Option<u16>,
     /// True if the cell has counted stimuli that did not arrive here.
     is_short: bool,
     /// True if the mode was written, and the cell has not confirmed it.
@@ -37,7 +37,7 @@ pub struct Contact<T> {
 
 /// Stimuli that were not received here and may be pending in the cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Unseen {
+enum UnseenStimuli {
     /// Any, before the first joints.
     Any,
     /// Stimuli for one of the next `ahead` epochs after the last joints.
@@ -49,14 +49,14 @@ enum Unseen {
 /// A stimulus is pending for at most half of all epochs.
 const HALF: u8 = 1 << 7;
 
-impl Unseen {
+impl UnseenStimuli {
     /// Latches all stimuli for an epoch and for the half of all epochs before it.
     fn latch(&mut self, epoch: Epoch) {
         *self = match *self {
             Self::None => Self::None,
             Self::Any => Self::Ahead { last: epoch, ahead: HALF },
             Self::Ahead { last, ahead } => {
-                match u8::try_from(i32::from(ahead) - i32::from(epoch.since(last))).unwrap_or(0) {
+                match u8::try_from(i32::from(ahead) - i32::from(epoch.epochs_since(last))).unwrap_or(0) {
                     0 => Self::None,
                     ahead => Self::Ahead { last: epoch, ahead: ahead.min(HALF) },
                 }
@@ -73,8 +73,8 @@ impl<T> Default for Contact<T> {
             acceleration: None,
             obeys: None,
             is_known: false,
-            unseen: Unseen::Any,
-            came: Some(0),
+            unseen: UnseenStimuli::Any,
+            received_stimuli: Some(0),
             is_short: false,
             clears: false,
         }
@@ -83,27 +83,27 @@ impl<T> Default for Contact<T> {
 
 impl<T> Contact<T> {
     /// Adds a stimulus, unless the cell measures or has too many pending; `last` is the epoch of the last joints.
-    pub fn push(&mut self, from: From, page: SensorPage, tag: T, last: Option<Epoch>) {
-        self.came = self.came.map(|came| came.wrapping_add(1));
-        if self.obeys != Some(false) && self.waiting.len() < PENDING {
-            self.waiting.push((if is_late(from, last) { From::Next } else { from }, page, tag));
+    pub fn push(&mut self, from: AppliesFrom, page: SensorPage, tag: T, last: Option<Epoch>) {
+        self.received_stimuli = self.received_stimuli.map(|came| came.wrapping_add(1));
+        if self.obeys != Some(false) && self.waiting.len() < MAX_PENDING_STIMULI {
+            self.waiting.push((if is_late(from, last) { AppliesFrom::Next } else { from }, page, tag));
         }
     }
 
     /// Latches the stimuli for the joints of this epoch, calling `latched` for each; the newest of each page counts.
     pub fn latch(&mut self, epoch: Epoch, mut latched: impl FnMut(&mut T)) {
         self.unseen.latch(epoch);
-        self.is_short &= self.unseen != Unseen::None;
-        let is_due = move |(from, _, _): &mut (From, SensorPage, T)| match from {
-            From::Next => true,
-            From::Epoch(first) => epoch.since(*first) >= 0,
+        self.is_short &= self.unseen != UnseenStimuli::None;
+        let is_due = move |(from, _, _): &mut (AppliesFrom, SensorPage, T)| match from {
+            AppliesFrom::Next => true,
+            AppliesFrom::Epoch(first) => epoch.epochs_since(*first) >= 0,
         };
         for (_, page, mut tag) in self.waiting.extract_if(.., is_due) {
             latched(&mut tag);
             match page {
                 SensorPage::Skin(skin) => {
                     self.skin = Some((skin, tag));
-                    self.is_known |= self.unseen == Unseen::None;
+                    self.is_known |= self.unseen == UnseenStimuli::None;
                 }
                 SensorPage::Acceleration(acceleration) => self.acceleration = Some((acceleration, tag)),
                 SensorPage::Baseline(_) => {}
@@ -114,9 +114,9 @@ impl<T> Contact<T> {
     /// Applies the cell's own sensors page. It counts only if the state is not known otherwise, because it may be older
     /// than the joints at which the cell latched the next stimulus. It does not count while a stimulus that was not
     /// received here may be pending.
-    pub fn learn(&mut self, page: SensorPage, tag: T) {
+    pub fn apply_reported_page(&mut self, page: SensorPage, tag: T) {
         match page {
-            SensorPage::Skin(skin) if !self.is_known && self.unseen == Unseen::None => {
+            SensorPage::Skin(skin) if !self.is_known && self.unseen == UnseenStimuli::None => {
                 (self.skin, self.is_known) = (Some((skin, tag)), true);
             }
             SensorPage::Skin(_) if self.is_short => {}
@@ -132,10 +132,10 @@ impl<T> Contact<T> {
     /// Compares the number of stimuli that the cell has counted since its start with those received here. If they are
     /// equal, there are no others.
     pub fn count(&mut self, stimuli: u16, tag: T) {
-        if self.came == Some(stimuli) {
+        if self.received_stimuli == Some(stimuli) {
             self.settle(tag);
-        } else if self.came.is_some() {
-            self.is_short = self.unseen != Unseen::None;
+        } else if self.received_stimuli.is_some() {
+            self.is_short = self.unseen != UnseenStimuli::None;
         }
     }
 
@@ -161,7 +161,7 @@ impl<T> Contact<T> {
     /// Marks the state as known: all stimuli that matter were received here.
     fn settle(&mut self, tag: T) {
         self.skin.get_or_insert_with(|| (SkinSensors::default(), tag));
-        (self.is_known, self.unseen, self.is_short, self.clears) = (true, Unseen::None, false, false);
+        (self.is_known, self.unseen, self.is_short, self.clears) = (true, UnseenStimuli::None, false, false);
     }
 
     /// Returns the skin sensors if they are known.
@@ -184,7 +184,7 @@ impl<T> Contact<T> {
 
     /// Returns the pending stimuli in order, each with the joints from which it applies.
     #[must_use]
-    pub fn waiting(&self) -> &[(From, SensorPage, T)] {
+    pub fn waiting(&self) -> &[(AppliesFrom, SensorPage, T)] {
         &self.waiting
     }
 
@@ -192,13 +192,13 @@ impl<T> Contact<T> {
     pub fn reset(&mut self) {
         self.waiting.clear();
         (self.skin, self.acceleration) = (None, None);
-        (self.is_known, self.unseen, self.came) = (false, Unseen::Any, None);
+        (self.is_known, self.unseen, self.received_stimuli) = (false, UnseenStimuli::Any, None);
         (self.is_short, self.clears) = (false, false);
     }
 
     /// Forgets the contact state until the next stimulus; stimuli stay pending in the cell.
     pub fn forget(&mut self) {
-        (self.skin, self.acceleration, self.is_known, self.came) = (None, None, false, None);
+        (self.skin, self.acceleration, self.is_known, self.received_stimuli) = (None, None, false, None);
     }
 
     /// Returns true if the cell obeys stimuli; `None` if unknown, in which case callers assume that it does.
@@ -216,8 +216,8 @@ impl<T> Contact<T> {
 /// Returns true if the joints from which a stimulus should apply have passed, so that it applies from the next ones.
 /// `last` is the epoch of the last joints.
 #[must_use]
-pub fn is_late(from: From, last: Option<Epoch>) -> bool {
-    matches!((from, last), (From::Epoch(first), Some(last)) if last.since(first) >= 0)
+pub fn is_late(from: AppliesFrom, last: Option<Epoch>) -> bool {
+    matches!((from, last), (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0)
 }
 
 #[cfg(test)]
@@ -238,8 +238,8 @@ mod tests {
     fn stimuli_wait_for_their_epoch_and_late_ones_for_the_next() {
         let mut contact = Contact::default();
         assert_eq!(latch(&mut contact, 253), None, "not known");
-        contact.push(From::Epoch(Epoch(1)), press(2.0), 5, Some(Epoch(253)));
-        contact.push(From::Epoch(Epoch(253)), press(1.0), 6, Some(Epoch(253)));
+        contact.push(AppliesFrom::Epoch(Epoch(1)), press(2.0), 5, Some(Epoch(253)));
+        contact.push(AppliesFrom::Epoch(Epoch(253)), press(1.0), 6, Some(Epoch(253)));
         assert_eq!(latch(&mut contact, 254), Some((1.0, 6)), "late, so from the next on");
         assert_eq!(latch(&mut contact, 0), Some((1.0, 6)));
         assert_eq!(latch(&mut contact, 1), Some((2.0, 5)));
@@ -250,11 +250,11 @@ mod tests {
     #[test]
     fn the_ninth_waiting_stimulus_is_refused_whatever_its_page() {
         let mut contact = Contact::default();
-        for _ in 0..PENDING {
-            contact.push(From::Next, SensorPage::Acceleration([Q3_12::ZERO; 3]), 0, None);
+        for _ in 0..MAX_PENDING_STIMULI {
+            contact.push(AppliesFrom::Next, SensorPage::Acceleration([Q3_12::ZERO; 3]), 0, None);
         }
-        contact.push(From::Next, press(1.0), 0, None);
-        assert_eq!(contact.waiting().len(), PENDING);
+        contact.push(AppliesFrom::Next, press(1.0), 0, None);
+        assert_eq!(contact.waiting().len(), MAX_PENDING_STIMULI);
         assert_eq!(latch(&mut contact, 0), None);
         assert_eq!(contact.latched().count(), 1);
     }
@@ -262,11 +262,11 @@ mod tests {
     #[test]
     fn the_cells_own_page_counts_only_while_nothing_else_is_known() {
         let mut contact = Contact::default();
-        contact.learn(press(3.0), 1);
+        contact.apply_reported_page(press(3.0), 1);
         assert_eq!(latch(&mut contact, 0), Some((3.0, 1)));
-        contact.push(From::Next, press(1.0), 2, None);
+        contact.push(AppliesFrom::Next, press(1.0), 2, None);
         assert_eq!(latch(&mut contact, 1), Some((1.0, 2)));
-        contact.learn(press(3.0), 3);
+        contact.apply_reported_page(press(3.0), 3);
         assert_eq!(latch(&mut contact, 2), Some((1.0, 2)), "an old page");
     }
 
@@ -277,8 +277,8 @@ mod tests {
     #[test]
     fn a_contact_is_known_from_a_start_a_confirmed_mode_or_equal_counts_on() {
         let mut contact = Contact::default();
-        contact.learn(press(3.0), 1);
-        contact.push(From::Next, press(1.0), 1, None);
+        contact.apply_reported_page(press(3.0), 1);
+        contact.push(AppliesFrom::Next, press(1.0), 1, None);
         assert_eq!((latch(&mut contact, 1), known(&contact)), (Some((1.0, 1)), None), "others may wait");
         contact.count(2, 1);
         assert_eq!(known(&contact), None, "it has taken one that did not come here");
@@ -290,14 +290,14 @@ mod tests {
         contact.start(1);
         assert_eq!(known(&contact), Some(0.0));
         contact.write_mode();
-        contact.push(From::Next, press(2.0), 1, None);
+        contact.push(AppliesFrom::Next, press(2.0), 1, None);
         assert_eq!((latch(&mut contact, 2), known(&contact)), (Some((2.0, 1)), None), "not confirmed");
         contact.confirm_mode(1);
         assert_eq!(known(&contact), Some(2.0), "the stimulus came after the write");
         contact.forget();
         contact.confirm_mode(1);
         assert_eq!(known(&contact), None, "nothing was written");
-        contact.push(From::Next, press(1.0), 1, None);
+        contact.push(AppliesFrom::Next, press(1.0), 1, None);
         assert_eq!((latch(&mut contact, 3), known(&contact)), (Some((1.0, 1)), Some(1.0)));
         contact.reset();
         contact.confirm_mode(1);
@@ -312,13 +312,13 @@ mod tests {
             let mut contact = Contact::<u64>::default();
             let mut waiting: Vec<u8> = (0..=255).collect();
             let (mut epoch, mut joints) = (77_u8, 0);
-            while contact.unseen != Unseen::None {
+            while contact.unseen != UnseenStimuli::None {
                 contact.latch(Epoch(epoch), |_| {});
-                waiting.retain(|&first| Epoch(epoch).since(Epoch(first)) < 0);
+                waiting.retain(|&first| Epoch(epoch).epochs_since(Epoch(first)) < 0);
                 let ahead = match contact.unseen {
-                    Unseen::Any => 256,
-                    Unseen::Ahead { ahead, .. } => usize::from(ahead),
-                    Unseen::None => 0,
+                    UnseenStimuli::Any => 256,
+                    UnseenStimuli::Ahead { ahead, .. } => usize::from(ahead),
+                    UnseenStimuli::None => 0,
                 };
                 assert!(waiting.len() <= ahead, "{waiting:?} after epoch {epoch}, {:?}", contact.unseen);
                 epoch = epoch.wrapping_add(steps[joints % steps.len()]);
@@ -327,7 +327,7 @@ mod tests {
             }
             assert!(waiting.is_empty());
             assert!(joints == 129 || steps != [1]);
-            contact.learn(press(3.0), 1);
+            contact.apply_reported_page(press(3.0), 1);
             assert_eq!(known(&contact), Some(3.0));
         }
     }
@@ -336,9 +336,9 @@ mod tests {
     fn a_page_of_a_cell_that_counted_other_stimuli_tells_nothing() {
         let mut contact = Contact::default();
         contact.count(1, 1);
-        contact.learn(press(0.0), 1);
+        contact.apply_reported_page(press(0.0), 1);
         assert_eq!(latch(&mut contact, 1), None, "the other one may wait");
-        contact.push(From::Next, press(1.0), 2, None);
+        contact.push(AppliesFrom::Next, press(1.0), 2, None);
         assert_eq!(latch(&mut contact, 2), Some((1.0, 2)));
     }
 
@@ -348,17 +348,17 @@ mod tests {
         assert_eq!(contact.obeys(), None);
         contact.set_obeys(false);
         assert_eq!(contact.obeys(), Some(false));
-        contact.push(From::Next, press(1.0), 1, None);
+        contact.push(AppliesFrom::Next, press(1.0), 1, None);
         assert_eq!(latch(&mut contact, 0), None);
     }
 
     #[test]
     fn a_stimulus_is_late_at_its_own_joints_and_after_them() {
-        let of = |first, last: Option<u8>| is_late(From::Epoch(Epoch(first)), last.map(Epoch));
+        let of = |first, last: Option<u8>| is_late(AppliesFrom::Epoch(Epoch(first)), last.map(Epoch));
         assert_eq!(
             [of(5, Some(4)), of(5, Some(5)), of(255, Some(1)), of(5, None)],
             [false, true, true, false]
         );
-        assert!(!is_late(From::Next, Some(Epoch(5))));
+        assert!(!is_late(AppliesFrom::Next, Some(Epoch(5))));
     }
 }

@@ -17,11 +17,11 @@ mod contact;
 mod per_cell;
 mod uplink;
 
-use protocol::message::{Heard, Message, NetworkPage, Ports, Refused, Tree};
+use protocol::message::{ReceivedCounts, Message, NetworkPage, Ports, RejectedCounts, Tree};
 use protocol::time::{Micros, Span};
 
-pub use claim::{Claim, Word};
-pub use contact::{Contact, PENDING, is_late};
+pub use claim::{AddressClaim, HeartbeatKind};
+pub use contact::{Contact, MAX_PENDING_STIMULI, is_late};
 pub use per_cell::PerCell;
 pub use uplink::{Account, Uplink};
 
@@ -30,15 +30,15 @@ pub use uplink::{Account, Uplink};
 pub const DEAD_AFTER: Span = Span::from_millis(600);
 
 /// Maximum age of an answer, in broadcasts before the newest one; older answers are dropped.
-pub const LATEST: usize = 3;
+pub const MAX_LATE_EPOCHS: usize = 3;
 
 /// The last page of each kind since a cell started.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Pages {
     /// Counters of what it received.
-    pub heard: Option<Heard>,
+    pub heard: Option<ReceivedCounts>,
     /// Counters of what the cell refused.
-    pub refused: Option<Refused>,
+    pub refused: Option<RejectedCounts>,
     /// Its place in the tree.
     pub tree: Option<Tree>,
     /// The neighbours at its ports.
@@ -50,8 +50,8 @@ impl Pages {
     const fn take(&mut self, page: &NetworkPage) {
         match *page {
             NetworkPage::Heartbeat(_) => {}
-            NetworkPage::Heard(heard) => self.heard = Some(heard),
-            NetworkPage::Refused(refused) => self.refused = Some(refused),
+            NetworkPage::Received(heard) => self.heard = Some(heard),
+            NetworkPage::Rejected(refused) => self.refused = Some(refused),
             NetworkPage::Tree(tree) => self.tree = Some(tree),
             NetworkPage::Ports(ports) => self.ports = Some(ports),
         }
@@ -62,7 +62,7 @@ impl Pages {
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Update {
     /// Its meaning as a heartbeat, if it is one.
-    pub word: Option<Word>,
+    pub word: Option<HeartbeatKind>,
     /// True if the cell was dead before.
     pub revived: bool,
     /// True for the cell's first heartbeat after the bus was lost, if it has not restarted since.
@@ -73,18 +73,18 @@ pub struct Update {
 
 /// One cell, followed by the packets of its node id.
 #[derive(Clone, Debug, Default)]
-pub struct Tracked {
+pub struct CellTracker {
     /// Packets sent and arrived.
     pub account: Account,
-    claim: Claim,
+    claim: AddressClaim,
     pages: Pages,
     last_packet: Option<Micros>,
     dead: bool,
 }
 
-impl Tracked {
+impl CellTracker {
     /// Records a packet that arrived at `at`; `joints` is the number of the newest joints.
-    pub fn hear(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> Update {
+    pub fn receive(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> Update {
         let is_first = self.last_packet.replace(at).is_none();
         let revived = core::mem::take(&mut self.dead);
         self.account.arrive();
@@ -100,34 +100,34 @@ impl Tracked {
         if !self.claim.is_in_question(at) {
             self.account.confirm();
         }
-        let mut word = self.claim.hear(at, heartbeat);
-        if let Word::Started { again } = &mut word {
+        let mut word = self.claim.receive(at, heartbeat);
+        if let HeartbeatKind::Started { again } = &mut word {
             *again |= !is_first;
         }
         let mut taken_back = false;
         match word {
-            Word::Known => self.account.settle(heartbeat.sent),
-            Word::First => self.account.begin(heartbeat.sent, false),
-            Word::Shared => {
+            HeartbeatKind::Known => self.account.settle(heartbeat.sent),
+            HeartbeatKind::First => self.account.begin(heartbeat.sent, false),
+            HeartbeatKind::Shared => {
                 taken_back = self.account.take_back(heartbeat.sent);
                 // Some pages may be from the other sender.
                 self.pages = Pages::default();
             }
-            Word::Started { again } => {
+            HeartbeatKind::Started { again } => {
                 self.account.begin(heartbeat.sent, again);
                 self.pages = Pages::default();
             }
-            Word::Overtaken => self.account.pass_over(),
-            Word::Claimant | Word::Outsider => self.account.intrude(),
+            HeartbeatKind::Overtaken => self.account.pass_over(),
+            HeartbeatKind::Claimant | HeartbeatKind::Outsider => self.account.count_outsider(),
         }
         self.account.heartbeat_at(joints);
-        let returned = away && matches!(word, Word::First | Word::Known | Word::Started { again: false });
+        let returned = away && matches!(word, HeartbeatKind::First | HeartbeatKind::Known | HeartbeatKind::Started { again: false });
         Update { word: Some(word), revived, returned, taken_back }
     }
 
     /// Returns the claim: the owner of the node id, and its last heartbeat.
     #[must_use]
-    pub const fn claim(&self) -> &Claim {
+    pub const fn claim(&self) -> &AddressClaim {
         &self.claim
     }
 
@@ -160,6 +160,6 @@ impl Tracked {
     /// Returns true if it has sent packets, and then was silent for too long.
     #[must_use]
     pub fn is_silent(&self, now: Micros) -> bool {
-        self.last_packet.is_some_and(|last| now.since(last) > DEAD_AFTER)
+        self.last_packet.is_some_and(|last| now.elapsed_since(last) > DEAD_AFTER)
     }
 }

@@ -50,14 +50,14 @@ struct Counts {
     /// Number of packets since then, and of those refused among them.
     arrived: u64,
     rejected: u64,
-    sums: Option<Sums>,
+    sums: Option<UnreceivedSums>,
     /// True if the bus was lost since the last heartbeat.
     interrupted: bool,
 }
 
 /// Sums that a cell sends to another cell, by its own count; the gateway does not receive them.
 #[derive(Clone, Copy, Debug, Default)]
-struct Sums {
+struct UnreceivedSums {
     /// The count in its last page, modulo 2^16.
     reported: Option<u16>,
     /// Number of sums since the account began.
@@ -130,19 +130,19 @@ impl Account {
         if again {
             self.before.get_or_insert(self.now);
         }
-        self.before.iter_mut().for_each(Counts::intrude);
+        self.before.iter_mut().for_each(Counts::count_outsider);
         self.now.begin(sent, again);
     }
 
     /// Records a further heartbeat; the cell had sent `sent` packets before it, modulo 2^16.
     pub(super) fn settle(&mut self, sent: u16) {
-        self.before.iter_mut().for_each(Counts::intrude);
+        self.before.iter_mut().for_each(Counts::count_outsider);
         self.now.settle(sent);
     }
 
     /// Records an old heartbeat of the cell since its last start.
     pub(super) fn pass_over(&mut self) {
-        self.before.iter_mut().for_each(Counts::intrude);
+        self.before.iter_mut().for_each(Counts::count_outsider);
     }
 
     /// Confirms the last start, which can no longer be taken back.
@@ -171,8 +171,8 @@ impl Account {
     }
 
     /// Records that the last heartbeat is from another sender with this node id.
-    pub(super) fn intrude(&mut self) {
-        self.each(Counts::intrude);
+    pub(super) fn count_outsider(&mut self) {
+        self.each(Counts::count_outsider);
     }
 
     fn each(&mut self, change: impl Fn(&mut Counts)) {
@@ -206,7 +206,7 @@ impl Counts {
             self.finish();
             if let Some(sums) = &mut self.sums {
                 // The cell counts from zero.
-                *sums = Sums { reported: Some(0), ..Sums::default() };
+                *sums = UnreceivedSums { reported: Some(0), ..UnreceivedSums::default() };
             }
         }
         self.reported = Some(sent.wrapping_add(1));
@@ -233,7 +233,7 @@ impl Counts {
         self.reported = Some(reported);
     }
 
-    fn intrude(&mut self) {
+    fn count_outsider(&mut self) {
         self.arrived -= 1;
         self.total.delivered += 1;
         self.total.surplus += 1;
@@ -254,7 +254,7 @@ mod tests {
         account.arrive();
         account.reject();
         account.arrive();
-        account.intrude();
+        account.count_outsider();
         account.arrive(); // the heartbeat itself
         account.settle(3); // four were sent in between, and this one
         let uplink = account.uplink();

@@ -1,7 +1,7 @@
 //! Writes the section on benches over their cells.
 
-use super::{ACTIVE, Figures, HOLDS, Scale, Size, cells_of};
-use crate::distributed::{self, Over};
+use super::{ACTIVE_SHARE, BenchFigures, MIN_IN_TIME_SHARE, Scale, SizeFigures, cells_of};
+use crate::distributed::{self, TickTimes};
 use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table, number};
 
 /// The limits: of the start in s, of the gateway's memory in MB, and of the distributed tick relative to that of the
@@ -21,8 +21,8 @@ pub fn section(measured: &Scale) -> Section {
             "Whole benches on embedded buses, as few as have node ids for the cells, the cells of a bus in one process: first \
              with {} % of the cells touched, at half the rate where fewer than {} % of the replies come in time, and once more \
              at half of that; then with none touched, at the same rate.",
-            ACTIVE * 100.0,
-            HOLDS * 100.0
+            ACTIVE_SHARE * 100.0,
+            MIN_IN_TIME_SHARE * 100.0
         ))
         .text(
             "A tick of a bench is the median of those that computed nothing centrally. Ticks over cells are those of a loop \
@@ -38,14 +38,14 @@ pub fn section(measured: &Scale) -> Section {
 }
 
 /// The caption of a curve, and its value.
-type Series<'a> = (&'a str, fn(&Size) -> f64);
+type Curve<'a> = (&'a str, fn(&SizeFigures) -> f64);
 
 /// Returns a figure of benches over their cells, with a series for each pair of a caption and a value.
 fn drawn<const N: usize>(
     (name, title): (&str, &str),
     y: Axis,
-    sizes: &[Size],
-    series: [Series<'_>; N],
+    sizes: &[SizeFigures],
+    series: [Curve<'_>; N],
 ) -> Figure {
     let figure = Figure::new(format!("scale-{name}"), title, Axis::new("cells", ""), y).half();
     series.into_iter().fold(figure, |figure, (caption, value)| {
@@ -54,7 +54,7 @@ fn drawn<const N: usize>(
     })
 }
 
-fn of_benches(sizes: &[Size]) -> [Figure; 7] {
+fn of_benches(sizes: &[SizeFigures]) -> [Figure; 7] {
     [
         drawn(
             ("start", "From the start to the first joints"),
@@ -115,7 +115,7 @@ fn of_benches(sizes: &[Size]) -> [Figure; 7] {
     ]
 }
 
-fn over_cells(over: &Over) -> Figure {
+fn over_cells(over: &TickTimes) -> Figure {
     let micros = |place: fn(&[f64; 3]) -> f64| {
         over.points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
     };
@@ -126,12 +126,12 @@ fn over_cells(over: &Over) -> Figure {
 }
 
 /// Returns the findings on the bench with the most cells.
-fn of_most(size: &Size) -> Vec<Finding> {
-    let Size { cells, hz, holds, quiet, active, .. } = size;
+fn of_most(size: &SizeFigures) -> Vec<Finding> {
+    let SizeFigures { cells, hz, holds, quiet, active, .. } = size;
     let of = |what: &str| format!("{what}, {cells} cells");
-    let Figures { start_s, memory_mb, .. } = active;
+    let BenchFigures { start_s, memory_mb, .. } = active;
     let at = format!("replies in time at {} Hz, 5 % active", number(*hz));
-    let bar = format!("at least {} %, none unknown", HOLDS * 100.0);
+    let bar = format!("at least {} %, none unknown", MIN_IN_TIME_SHARE * 100.0);
     vec![
         Finding::stated(of("from the start to the first joints"), (*start_s, "s")).at_most(START_S),
         Finding::stated(of(&at), (active.share() * 100.0, "%")).must(bar, *holds),
@@ -147,7 +147,7 @@ fn of_most(size: &Size) -> Vec<Finding> {
 }
 
 /// Compares the tick of the most cells with that of the fewest.
-fn of_ticks(sizes: &[Size], [few, few_on_as_many, most]: &[f64; 3]) -> Vec<Finding> {
+fn of_ticks(sizes: &[SizeFigures], [few, few_on_as_many, most]: &[f64; 3]) -> Vec<Finding> {
     let (Some(fewest), Some(largest)) = (sizes.first(), sizes.last()) else { return Vec::new() };
     let (cells, buses, fewest_cells) = (largest.cells, largest.buses, fewest.cells);
     let beside = |what: &str| format!("distributed tick of {cells} cells by that of {fewest_cells}{what}");
@@ -162,11 +162,11 @@ fn of_ticks(sizes: &[Size], [few, few_on_as_many, most]: &[f64; 3]) -> Vec<Findi
     ]
 }
 
-fn table(sizes: &[Size]) -> Table {
-    let row = |size: &Size| {
-        let Size { cells, buses, hz, holds, quiet, active } = size;
+fn table(sizes: &[SizeFigures]) -> Table {
+    let row = |size: &SizeFigures| {
+        let SizeFigures { cells, buses, hz, holds, quiet, active } = size;
         let both =
-            |value: fn(&Figures) -> f64| format!("{}; {}", number(value(quiet)), number(value(active)));
+            |value: fn(&BenchFigures) -> f64| format!("{}; {}", number(value(quiet)), number(value(active)));
         [
             cells.to_string(),
             buses.to_string(),

@@ -13,7 +13,7 @@ use serde_json::json;
 /// A lab whose benches reply in time up to a number of replies per second. It records the benches.
 struct Made {
     most: f64,
-    ran: Vec<Bench>,
+    ran: Vec<ScaleBench>,
     clock: Cell<u64>,
 }
 
@@ -29,7 +29,7 @@ impl Lab for Made {
         Err("no bench of the moving arm is asked for")
     }
 
-    fn scaled(&mut self, bench: &Bench) -> Result<Value, &'static str> {
+    fn scaled(&mut self, bench: &ScaleBench) -> Result<Value, &'static str> {
         self.ran.push(*bench);
         Ok(summary(bench, bench.hz * count(bench.cells) <= self.most))
     }
@@ -40,7 +40,7 @@ impl Lab for Made {
 }
 
 /// Returns a summary; half of the replies of a bench that is too large are late.
-pub(crate) fn summary(bench: &Bench, in_time: bool) -> Value {
+pub(crate) fn summary(bench: &ScaleBench, in_time: bool) -> Value {
     let due = if bench.active { count(share(bench.cells)) * bench.hz } else { 0.0 };
     let bus = json!({
         "replies": { "due": due / 2.0, "in_time": if in_time { due / 2.0 } else { due / 4.0 }, "unknown": 0 },
@@ -63,7 +63,7 @@ fn made(most: f64) -> Made {
 #[test]
 fn every_bench_has_a_skin_and_a_scenario_that_fits_it_and_a_name_of_its_own() {
     for (cells, buses, active, touched) in [(24, 1, true, 2), (300, 2, true, 15), (300, 2, false, 0)] {
-        let bench = Bench { cells, buses, hz: 31.25, active, seconds: 2.0 };
+        let bench = ScaleBench { cells, buses, hz: 31.25, active, seconds: 2.0 };
         let skin = Skin::parse("skin.toml", &bench.skin()).unwrap();
         assert_eq!((skin.cells.len(), skin.buses.len()), (cells, buses));
         let scenario = Scenario::parse("scenario.toml", &bench.scenario(), &skin).unwrap();
@@ -90,16 +90,16 @@ fn rates_are_tried_from_the_highest_until_one_holds() {
 
 #[test]
 fn a_summary_is_added_up_over_its_buses() {
-    let bench = Bench { cells: 300, buses: 2, hz: 20.0, active: true, seconds: 1.0 };
-    let figures = Figures::of(&summary(&bench, true));
+    let bench = ScaleBench { cells: 300, buses: 2, hz: 20.0, active: true, seconds: 1.0 };
+    let figures = BenchFigures::from_summary(&summary(&bench, true));
     assert!((figures.due - 300.0).abs() < 1e-9 && (figures.share() - 1.0).abs() < 1e-9);
     assert!(figures.done && figures.holds());
     assert!((figures.memory_mb[0] - 102.4).abs() < 1e-9);
     let mut lost = summary(&bench, true);
     lost["buses"][1]["uplink"]["unknown"] = json!(1);
-    assert!(!Figures::of(&lost).holds(), "a packet is missing for no known reason");
+    assert!(!BenchFigures::from_summary(&lost).holds(), "a packet is missing for no known reason");
     let halted = json!({ "outcome": "halted" });
-    assert!(!Figures::of(&halted).holds());
+    assert!(!BenchFigures::from_summary(&halted).holds());
 }
 
 #[test]

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use cell_node::contact::{Force, Torque};
-use cell_node::sum::{Begin, Sum, Words};
+use cell_node::sum::{EpochStart, Sum, SumWords};
 use protocol::fixed::{Q, Q1_14, TorqueFormat};
 use protocol::packet::{Epoch, WORDS, padded};
 use protocol::parameters::{Parameter, Parameters, Slots};
@@ -59,12 +59,12 @@ fn sums_and_what_rounding_carries_are_those_of_the_other_program() {
             epoch = epoch.next();
             let at = Micros(index * PERIOD);
             let children = step["children"].as_array().unwrap();
-            let begin = Begin {
+            let begin = EpochStart {
                 epoch,
                 at,
                 period: Span(PERIOD),
                 depth: Some(0),
-                speaks: true,
+                may_send: true,
                 children: (1 << children.len()) - 1,
             };
             let own = step["own"].as_object().map(|_| {
@@ -74,16 +74,16 @@ fn sums_and_what_rounding_carries_are_those_of_the_other_program() {
             sum.begin(&begin, own.as_ref());
             for (port, child) in children.iter().enumerate() {
                 let count = u8::try_from(child["count"].as_u64().unwrap()).unwrap();
-                sum.state(at, port, epoch);
-                sum.take(
+                sum.handle_state(at, port, epoch);
+                sum.receive(
                     at,
                     port,
                     epoch,
-                    Words { torque: padded(&words::<WORDS>(&child["words"])).map(Q::from_bits), count },
+                    SumWords { torque: padded(&words::<WORDS>(&child["words"])).map(Q::from_bits), count },
                 );
             }
-            let sent = sum.say(at + Span(PERIOD / 2));
-            let sent = sent.map(|(_, Words { torque, count }, _)| (torque.map(Q::to_bits), count));
+            let sent = sum.poll_sum(at + Span(PERIOD / 2));
+            let sent = sent.map(|(_, SumWords { torque, count }, _)| (torque.map(Q::to_bits), count));
             let expected = step["sends"].as_object().map(|sends| {
                 (
                     padded(&words::<WORDS>(&sends["words"])),

@@ -12,7 +12,7 @@ mod arm;
 use arm::Case;
 use model::decode::{Decoder, json};
 use protocol::can::Format;
-use protocol::candump::{self, Line, Record};
+use protocol::candump::{self, CandumpLine, Record};
 use protocol::message::VERSION;
 use protocol::packet::Packet;
 use protocol::parameters::Parameter;
@@ -37,7 +37,7 @@ const ARITHMETIC: &str = include_str!("../../../../protocol/tests/golden/arithme
 fn said<T>(log: &str, tell: impl Fn(&Record<'_>, Map<String, Value>) -> T) -> Vec<T> {
     let mut all = Vec::new();
     for line in log.lines() {
-        if let Line::Frame(record) = candump::parse(line).unwrap() {
+        if let CandumpLine::Frame(record) = candump::parse(line).unwrap() {
             let decoded = Decoder::new(Some(Format::Fd)).decode(Micros(0), record.interface, &record.frame);
             let mut text = Vec::new();
             json::write(&mut text, &record, &decoded, Units::default()).unwrap();
@@ -73,7 +73,7 @@ fn commented(log: &str) -> impl Iterator<Item = (&str, &str, Record<'_>)> {
     log.lines().filter_map(move |line| {
         title = line.strip_prefix("## ").unwrap_or(title);
         comment = line.strip_prefix("# ").unwrap_or(comment);
-        if let Line::Frame(record) = candump::parse(line).unwrap() {
+        if let CandumpLine::Frame(record) = candump::parse(line).unwrap() {
             Some((title, comment, record))
         } else {
             None

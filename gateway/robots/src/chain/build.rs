@@ -7,22 +7,22 @@ use nalgebra::{Isometry3, Point3};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
 use protocol::skin::{REACH, reach};
 
-use super::path::{Hanging, behind, moves, path};
-use super::{Apart, Chain, Joint, LinkFrame};
-use crate::error::{Problem, RobotError};
+use super::path::{CarriedLink, behind, moves, path};
+use super::{NotCarried, UrdfChain, ChainJoint, LinkFrame};
+use crate::error::{RobotProblem, RobotError};
 use crate::residual::{self, Residual};
-use crate::rows::{self, Axis, MAX_LENGTH_M, MAX_RESIDUAL, Row, frames};
-use crate::urdf::{Kind, Urdf, UrdfJoint};
+use crate::rows::{self, Axis, MAX_LENGTH_M, MAX_RESIDUAL, DhRow, frames};
+use crate::urdf::{UrdfJointKind, Urdf, UrdfJoint};
 
 /// Builds a chain, or returns the reason why it cannot be built.
-pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<Chain, RobotError> {
+pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<UrdfChain, RobotError> {
     let root = urdf.index(root.unwrap_or_else(|| urdf.root()))?;
     let path = path(urdf, root, urdf.index(tip)?)?;
     let joints = joints(urdf, urdf.link_name(root), tip, &path)?;
     let build = |row_cost| with_rows(urdf, root, tip, &path, &joints, row_cost);
     let [usual, smallest] = rows::ROW_COSTS_M;
     build(usual).or_else(|error| {
-        let is_long = matches!(*error.problem, Problem::Reach { .. } | Problem::Length { .. });
+        let is_long = matches!(*error.problem, RobotProblem::Reach { .. } | RobotProblem::Length { .. });
         if is_long { build(smallest) } else { Err(error) }
     })
 }
@@ -33,9 +33,9 @@ fn with_rows(
     root: usize,
     tip: &str,
     path: &[&UrdfJoint],
-    joints: &[Joint],
+    joints: &[ChainJoint],
     row_cost: f64,
-) -> Result<Chain, RobotError> {
+) -> Result<UrdfChain, RobotError> {
     let root_name = urdf.link_name(root).to_owned();
     let (base, rows) = table(urdf, path, joints, tip, row_cost)?;
 
@@ -45,7 +45,7 @@ fn with_rows(
     let carried = hanging.iter().map(|it| (it.link.clone(), carrier(&rows, &at_zero, &behind, it)));
     let carried: Vec<_> = carried.collect();
     let below = urdf.pose(&root_name, &|joint| urdf.rest(joint))?;
-    let mut chain = Chain {
+    let mut chain = UrdfChain {
         below,
         root: root_name,
         tip: tip.to_owned(),
@@ -62,45 +62,45 @@ fn with_rows(
         let reach = reach(rows.get(..*row).unwrap_or_default(), frame.translation.vector.into());
         // Links beside the path may have no cells, so only the path must be within reach.
         if reach >= REACH && path.iter().any(|joint| urdf.link_name(joint.child) == link) {
-            return Err(urdf.error(Problem::Reach { link: link.clone(), reach }));
+            return Err(urdf.error(RobotProblem::Reach { link: link.clone(), reach }));
         }
     }
     let Residual { residual, link } = residual::residual(&chain, path, &hanging);
     if residual.is_nan() || residual > MAX_RESIDUAL {
-        return Err(urdf.error(Problem::Residual { link, residual }));
+        return Err(urdf.error(RobotProblem::Residual { link, residual }));
     }
     chain.residual = residual;
     Ok(chain)
 }
 
 /// Returns the moving joints of the path.
-fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec<Joint>, RobotError> {
+fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec<ChainJoint>, RobotError> {
     let mut joints = Vec::new();
     for joint in path {
         let name = joint.name.clone();
-        if let Kind::Floating | Kind::Planar = joint.kind {
-            let kind = if joint.kind == Kind::Floating { "floating" } else { "planar" };
-            return Err(urdf.error_at(joint, Problem::Kind { joint: name, kind }));
+        if let UrdfJointKind::Floating | UrdfJointKind::Planar = joint.kind {
+            let kind = if joint.kind == UrdfJointKind::Floating { "floating" } else { "planar" };
+            return Err(urdf.error_at(joint, RobotProblem::Kind { joint: name, kind }));
         }
         let Some(kind) = moves(joint) else { continue };
         if let Some(mimic) = &joint.mimic {
-            return Err(urdf.error_at(joint, Problem::Mimic { joint: name, of: mimic.joint.clone() }));
+            return Err(urdf.error_at(joint, RobotProblem::Mimic { joint: name, of: mimic.joint.clone() }));
         }
-        let limits = if joint.kind == Kind::Continuous { [-PI, PI] } else { joint.limits };
+        let limits = if joint.kind == UrdfJointKind::Continuous { [-PI, PI] } else { joint.limits };
         let [lower, upper] = limits;
-        if !joint.has_limit && joint.kind != Kind::Continuous {
-            return Err(urdf.error_at(joint, Problem::NoLimit { joint: name }));
+        if !joint.has_limit && joint.kind != UrdfJointKind::Continuous {
+            return Err(urdf.error_at(joint, RobotProblem::NoLimit { joint: name }));
         }
         if !(lower < upper && (upper - lower).is_finite()) {
-            return Err(urdf.error_at(joint, Problem::Limits { joint: name, lower, upper }));
+            return Err(urdf.error_at(joint, RobotProblem::Limits { joint: name, lower, upper }));
         }
         let max_speed = joint.velocity.filter(|speed| *speed > 0.0 && speed.is_finite());
-        joints.push(Joint { name, kind, limits, max_speed });
+        joints.push(ChainJoint { name, kind, limits, max_speed });
     }
     let (root, tip) = (root.to_owned(), tip.to_owned());
     match joints.len() {
-        0 => Err(urdf.error(Problem::NoMovingJoint { root, tip })),
-        count if count > MAX_JOINTS => Err(urdf.error(Problem::TooManyJoints { count, root, tip })),
+        0 => Err(urdf.error(RobotProblem::NoMovingJoint { root, tip })),
+        count if count > MAX_JOINTS => Err(urdf.error(RobotProblem::TooManyJoints { count, root, tip })),
         _ => Ok(joints),
     }
 }
@@ -109,10 +109,10 @@ fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec
 fn table(
     urdf: &Urdf,
     path: &[&UrdfJoint],
-    joints: &[Joint],
+    joints: &[ChainJoint],
     tip: &str,
     row_cost: f64,
-) -> Result<(Isometry3<f64>, Vec<Row>), RobotError> {
+) -> Result<(Isometry3<f64>, Vec<DhRow>), RobotError> {
     let moving = path.iter().filter_map(|joint| Some((joint, moves(joint)?)));
     let axes: Vec<_> = moving
         .zip(behind(path, &[]))
@@ -125,7 +125,7 @@ fn table(
     let end = Point3::from(end.translation.vector);
     let (base, rows) = rows::chain(&axes, &end, row_cost);
     if rows.len() > MAX_ROWS {
-        return Err(urdf.error(Problem::TooManyRows { count: rows.len(), tip: tip.to_owned() }));
+        return Err(urdf.error(RobotProblem::TooManyRows { count: rows.len(), tip: tip.to_owned() }));
     }
     let mut moved = Vec::new();
     for (index, row) in rows.iter().enumerate() {
@@ -145,7 +145,7 @@ fn table(
                 } else {
                     "choose a root behind that joint, or narrow its limits"
                 };
-                return Err(urdf.error(Problem::Length { row: index + 1, to, what, value, hint }));
+                return Err(urdf.error(RobotProblem::Length { row: index + 1, to, what, value, hint }));
             }
         }
     }
@@ -153,7 +153,7 @@ fn table(
 }
 
 /// Returns the links that move with the chain, those of the path first, and the reasons why the others do not.
-fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<Hanging>, Vec<(String, Apart)>) {
+fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<CarriedLink>, Vec<(String, NotCarried)>) {
     // The values are the number of moving joints before the link, and its fixed transform after them.
     let (mut count, mut fixed) = (0, Isometry3::identity());
     let mut order = vec![root];
@@ -177,16 +177,16 @@ fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<Hanging>, Vec<
                 break Some(found);
             }
             let Some(joint) = urdf.above(at).next() else { break None };
-            mover = mover.filter(|_| joint.kind == Kind::Fixed).or_else(|| joint.moving_name());
+            mover = mover.filter(|_| joint.kind == UrdfJointKind::Fixed).or_else(|| joint.moving_name());
             behind = joint.origin * behind;
             at = joint.parent;
         };
         match (found, mover) {
-            (None, _) => apart.push((link, Apart::Elsewhere)),
-            (_, Some(joint)) => apart.push((link, Apart::MovedBy(joint))),
-            (Some((0, _)), None) => apart.push((link, Apart::Still)),
+            (None, _) => apart.push((link, NotCarried::Elsewhere)),
+            (_, Some(joint)) => apart.push((link, NotCarried::MovedBy(joint))),
+            (Some((0, _)), None) => apart.push((link, NotCarried::Still)),
             (Some((joint, fixed)), None) => {
-                hanging.push(Hanging { link, joint: *joint, fixed: fixed * behind });
+                hanging.push(CarriedLink { link, joint: *joint, fixed: fixed * behind });
             }
         }
     }
@@ -195,10 +195,10 @@ fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<Hanging>, Vec<
 
 /// Returns the position of a link on the chain.
 fn carrier(
-    rows: &[Row],
+    rows: &[DhRow],
     at_zero: &[Isometry3<f64>],
     behind: &[Isometry3<f64>],
-    Hanging { joint, fixed, .. }: &Hanging,
+    CarriedLink { joint, fixed, .. }: &CarriedLink,
 ) -> LinkFrame {
     let pose = joint.checked_sub(1).and_then(|index| behind.get(index)).map_or(*fixed, |pose| pose * fixed);
     let mut moving = 0;

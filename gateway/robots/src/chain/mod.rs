@@ -7,24 +7,24 @@ use nalgebra::Isometry3;
 use protocol::parameters::RowKind;
 use protocol::skin::{ChainRow, JointKind};
 
-use crate::error::{Problem, RobotError};
+use crate::error::{RobotProblem, RobotError};
 use crate::nearest::nearest;
-use crate::rows::{Row, frames};
+use crate::rows::{DhRow, frames};
 use crate::urdf::Urdf;
 
-pub(crate) use path::{Hanging, behind};
+pub(crate) use path::{CarriedLink, behind};
 
 /// The joints between two links.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Chain {
+pub struct UrdfChain {
     /// The fixed link at the start.
     pub root: String,
     /// The link at the end.
     pub tip: String,
     /// The moving joints from root to tip; 1 to [`protocol::parameters::MAX_JOINTS`].
-    pub joints: Vec<Joint>,
+    pub joints: Vec<ChainJoint>,
     /// The rows from root to tip; at most [`protocol::parameters::MAX_ROWS`]. Moving rows are in the order of `joints`.
-    pub rows: Vec<Row>,
+    pub rows: Vec<DhRow>,
     /// The transform from the root link's frame to frame 0, whose z axis is that of the first joint.
     pub base: Isometry3<f64>,
     /// The transform from the URDF's root to the root link, with the joints between at rest.
@@ -34,14 +34,14 @@ pub struct Chain {
     /// The links that move with the chain, those of the path first.
     carried: Vec<(String, LinkFrame)>,
     /// The links that do not move with the chain, each with the reason.
-    apart: Vec<(String, Apart)>,
+    apart: Vec<(String, NotCarried)>,
     /// The name of the file.
     file: String,
 }
 
 /// A moving joint.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Joint {
+pub struct ChainJoint {
     /// The name.
     pub name: String,
     /// The kind of motion.
@@ -66,7 +66,7 @@ pub struct LinkFrame {
 
 /// The reason why a link cannot carry a cell.
 #[derive(Clone, Debug, PartialEq)]
-enum Apart {
+enum NotCarried {
     /// The link is before the first joint.
     Still,
     /// This joint, which is not in the chain, moves the link.
@@ -75,7 +75,7 @@ enum Apart {
     Elsewhere,
 }
 
-impl Chain {
+impl UrdfChain {
     /// Returns the position of a link after the first joint, on the path or fixed to it.
     ///
     /// # Errors
@@ -90,14 +90,14 @@ impl Chain {
         let problem = match apart {
             None => {
                 let names = self.carried.iter().map(|(name, _)| name.as_str());
-                Problem::NoSuchLink { nearest: nearest(&link, names), link }
+                RobotProblem::NoSuchLink { nearest: nearest(&link, names), link }
             }
-            Some(Apart::Still) => {
+            Some(NotCarried::Still) => {
                 let joint = self.joints.first().map_or_else(String::new, |joint| joint.name.clone());
-                Problem::BeforeFirstJoint { link, joint }
+                RobotProblem::BeforeFirstJoint { link, joint }
             }
-            Some(Apart::MovedBy(joint)) => Problem::OutsideChain { link, joint: joint.clone(), root, tip },
-            Some(Apart::Elsewhere) => Problem::AboveChain { link, root },
+            Some(NotCarried::MovedBy(joint)) => RobotProblem::OutsideChain { link, joint: joint.clone(), root, tip },
+            Some(NotCarried::Elsewhere) => RobotProblem::AboveChain { link, root },
         };
         Err(RobotError::new(&self.file, None, problem))
     }
@@ -117,7 +117,7 @@ impl Chain {
     #[must_use]
     pub fn chain_rows(&self) -> Vec<ChainRow> {
         let mut joints = self.joints.iter();
-        let row = |row: &Row| {
+        let row = |row: &DhRow| {
             let joint = if row.kind == RowKind::Fixed { None } else { joints.next() };
             row.with_limits(joint.map_or([0.0; 2], |joint| joint.limits))
         };
@@ -138,7 +138,7 @@ impl Urdf {
     /// Returns [`RobotError`] if one of the links does not exist or the tip is not below the root; if a joint between
     /// them is not revolute, continuous, prismatic or fixed, mimics another one, or cannot move within its limits; if
     /// no joint moves or too many do; if the chain is too long; or if rows and URDF differ.
-    pub fn chain(&self, root: Option<&str>, tip: &str) -> Result<Chain, RobotError> {
+    pub fn chain(&self, root: Option<&str>, tip: &str) -> Result<UrdfChain, RobotError> {
         build::build(self, root, tip)
     }
 }

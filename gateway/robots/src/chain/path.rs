@@ -3,11 +3,11 @@
 use nalgebra::Isometry3;
 use protocol::skin::JointKind;
 
-use crate::error::{Problem, RobotError};
-use crate::urdf::{Kind, Urdf, UrdfJoint};
+use crate::error::{RobotProblem, RobotError};
+use crate::urdf::{UrdfJointKind, Urdf, UrdfJoint};
 
 /// A link that moves with a chain.
-pub(crate) struct Hanging {
+pub(crate) struct CarriedLink {
     /// The name of the link.
     pub(crate) link: String,
     /// The number of moving joints of the chain before it.
@@ -32,15 +32,15 @@ pub(super) fn path(urdf: &Urdf, root: usize, tip: usize) -> Result<Vec<&UrdfJoin
     let mut names: Vec<_> = path.iter().rev().map(|joint| urdf.link_name(joint.parent)).collect();
     names.push(urdf.link_name(tip));
     let [root, tip] = [root, tip].map(|link| urdf.link_name(link).to_owned());
-    Err(urdf.error(Problem::NotBelow { tip, root, path: names.join(" > ") }))
+    Err(urdf.error(RobotProblem::NotBelow { tip, root, path: names.join(" > ") }))
 }
 
 /// Returns the motion of a joint on a path; `None` if it is fixed.
 pub(super) fn moves(joint: &UrdfJoint) -> Option<JointKind> {
     match joint.kind {
-        Kind::Revolute | Kind::Continuous => Some(JointKind::Revolute),
-        Kind::Prismatic => Some(JointKind::Prismatic),
-        Kind::Fixed | Kind::Floating | Kind::Planar => None,
+        UrdfJointKind::Revolute | UrdfJointKind::Continuous => Some(JointKind::Revolute),
+        UrdfJointKind::Prismatic => Some(JointKind::Prismatic),
+        UrdfJointKind::Fixed | UrdfJointKind::Floating | UrdfJointKind::Planar => None,
     }
 }
 

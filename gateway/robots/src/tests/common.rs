@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use crate::{Chain, RowKind};
+use crate::{UrdfChain, RowKind};
 use nalgebra::{Isometry3, Point3, Vector3};
 
 /// Returns the folder of example-robot-data, from the environment.
@@ -15,7 +15,7 @@ pub(crate) fn folder() -> PathBuf {
 /// Returns the torque of each joint in Nm, or its force in N, for a contact with `force` newtons against `normal` at
 /// `point`, both in a link's frame: the transposed Jacobian, from rows.
 pub(crate) fn torques(
-    chain: &Chain,
+    chain: &UrdfChain,
     link: &str,
     point: &Point3<f64>,
     normal: &Vector3<f64>,
@@ -49,7 +49,7 @@ pub(crate) fn difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
 }
 
 /// Returns a function from the name of a joint to its position.
-pub(crate) fn named<'a>(chain: &'a Chain, positions: &[f64]) -> impl Fn(&str) -> f64 + use<'a> {
+pub(crate) fn named<'a>(chain: &'a UrdfChain, positions: &[f64]) -> impl Fn(&str) -> f64 + use<'a> {
     let names = chain.joints.iter().map(|joint| joint.name.as_str());
     let all: BTreeMap<_, _> = names.zip(positions.to_vec()).collect();
     move |name| all.get(name).copied().unwrap_or_default()

@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use crate::{Chain, Geometry, JointKind, RowKind, Urdf};
+use crate::{UrdfChain, Geometry, JointKind, RowKind, Urdf};
 use nalgebra::Point3;
 use protocol::skin::reach;
 
@@ -13,7 +13,7 @@ const UR10: &str = include_str!("../../../examples/ur10.urdf");
 const TWO_ARMS: &str = include_str!("../../../examples/two-arms.urdf");
 const LIFT: &str = include_str!("../../../examples/lift.urdf");
 
-fn chain(xml: &str, tip: &str) -> Chain {
+fn chain(xml: &str, tip: &str) -> UrdfChain {
     let urdf = Urdf::parse("example.urdf", xml).unwrap();
     for link in urdf.links() {
         let shapes = urdf.visuals(link).unwrap();
@@ -32,19 +32,19 @@ fn chain(xml: &str, tip: &str) -> Chain {
 }
 
 /// Returns the maximum distance of the tip from an axis.
-fn far(chain: &Chain) -> f64 {
+fn far(chain: &UrdfChain) -> f64 {
     let place = chain.link(&chain.tip).unwrap();
     reach(&chain.chain_rows()[..place.row], place.frame.translation.vector.into())
 }
 
 /// Returns the position of the tip.
-fn at(chain: &Chain, positions: &[f64]) -> Point3<f64> {
+fn at(chain: &UrdfChain, positions: &[f64]) -> Point3<f64> {
     let place = chain.link(&chain.tip).unwrap();
     chain.frames(positions)[place.row] * place.frame * Point3::origin()
 }
 
 #[track_caller]
-fn assert_at(chain: &Chain, positions: &[f64], expected: [f64; 3]) {
+fn assert_at(chain: &UrdfChain, positions: &[f64], expected: [f64; 3]) {
     let got = at(chain, positions);
     assert!((got - Point3::from(expected)).norm() < 1e-9, "{got} for {expected:?}");
 }

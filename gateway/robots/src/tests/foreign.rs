@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::{Problem, RobotError, Urdf};
+use crate::{RobotProblem, RobotError, Urdf};
 use nalgebra::{Point3, Vector3};
 use protocol::skin::reach;
 
@@ -31,14 +31,14 @@ fn read(path: &Path) -> Result<Urdf, RobotError> {
 }
 
 /// Returns one word for a refusal.
-fn word(problem: &Problem) -> &'static str {
+fn word(problem: &RobotProblem) -> &'static str {
     let words = [
-        (matches!(problem, Problem::Mimic { .. }), "mimic"),
-        (matches!(problem, Problem::Kind { .. }), "floating"),
-        (matches!(problem, Problem::NoLimit { .. } | Problem::Limits { .. }), "limits"),
-        (matches!(problem, Problem::Reach { .. }), "reach"),
-        (matches!(problem, Problem::NoMovingJoint { .. }), "none moves"),
-        (matches!(problem, Problem::TooManyJoints { .. }), "joints"),
+        (matches!(problem, RobotProblem::Mimic { .. }), "mimic"),
+        (matches!(problem, RobotProblem::Kind { .. }), "floating"),
+        (matches!(problem, RobotProblem::NoLimit { .. } | RobotProblem::Limits { .. }), "limits"),
+        (matches!(problem, RobotProblem::Reach { .. }), "reach"),
+        (matches!(problem, RobotProblem::NoMovingJoint { .. }), "none moves"),
+        (matches!(problem, RobotProblem::TooManyJoints { .. }), "joints"),
     ];
     let found = words.iter().find(|(is, _)| *is);
     found.unwrap_or_else(|| panic!("not a reason to refuse a robot that others use: {problem}")).1

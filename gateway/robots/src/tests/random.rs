@@ -2,7 +2,7 @@
 
 use core::f64::consts::{FRAC_PI_2, PI};
 
-use crate::{Problem, RowKind, Urdf};
+use crate::{RobotProblem, RowKind, Urdf};
 use nalgebra::{Matrix4, Point3, Rotation3, Unit, Vector3};
 use proptest::prelude::*;
 use protocol::skin::reach;
@@ -84,7 +84,7 @@ proptest! {
         let chain = match urdf.chain(None, &tip) {
             Ok(chain) => chain,
             Err(error) => {
-                let fine = matches!(*error.problem, Problem::NoMovingJoint { .. } | Problem::Reach { .. });
+                let fine = matches!(*error.problem, RobotProblem::NoMovingJoint { .. } | RobotProblem::Reach { .. });
                 prop_assert!(fine, "{error}");
                 return Ok(());
             }

@@ -1,6 +1,6 @@
 //! Refused files and chains, and their error messages.
 
-use crate::{CellOnLink, Chain, Import, Urdf};
+use crate::{CellOnLink, UrdfChain, SkinImport, Urdf};
 
 use super::written::{Written, robot, wrap};
 
@@ -13,7 +13,7 @@ fn chain(xml: &str, tip: &str) -> String {
     Urdf::parse("t.urdf", xml).unwrap().chain(None, tip).unwrap_err().to_string()
 }
 
-fn good(xml: &str, tip: &str) -> Chain {
+fn good(xml: &str, tip: &str) -> UrdfChain {
     Urdf::parse("t.urdf", xml).unwrap().chain(None, tip).unwrap()
 }
 
@@ -228,7 +228,7 @@ fn what_the_skins_check_refuses_has_the_line_of_its_cell() {
     let urdf = Urdf::parse("t.urdf", &robot(&[Written::hinge([0.0, 0.0, 0.1], [0.0; 3])])).unwrap();
     let chains = [urdf.chain(None, "l1").unwrap()];
     let refused = |cells: &[CellOnLink]| {
-        let import = Import { name: "t", command: "", urdf: None, chains: &chains, cells };
+        let import = SkinImport { name: "t", command: "", urdf: None, chains: &chains, cells };
         let error = import.toml().unwrap_err();
         assert!(error.is_of_cells());
         error.to_string()

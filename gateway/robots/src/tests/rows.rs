@@ -2,26 +2,26 @@
 
 use core::f64::consts::{FRAC_PI_2, PI};
 
-use crate::{Chain, JointKind, Row, RowKind, Urdf};
+use crate::{UrdfChain, JointKind, DhRow, RowKind, Urdf};
 use nalgebra::{Isometry3, Point3};
 use protocol::skin::reach;
 
 use super::common::{difference, named};
 use super::written::{TWELVE_DIGITS, Written, robot};
 
-fn chain(joints: &[Written]) -> Chain {
+fn chain(joints: &[Written]) -> UrdfChain {
     let chain = Urdf::parse("t.urdf", &robot(joints)).unwrap().chain(None, &format!("l{}", joints.len()));
     let chain = chain.unwrap();
     assert!(chain.residual < 1e-10, "{chain:?}");
     chain
 }
 
-fn kinds(chain: &Chain) -> Vec<RowKind> {
+fn kinds(chain: &UrdfChain) -> Vec<RowKind> {
     chain.rows.iter().map(|row| row.kind).collect()
 }
 
 #[track_caller]
-fn assert_row(row: &Row, [a, alpha, d, theta_offset]: [f64; 4]) {
+fn assert_row(row: &DhRow, [a, alpha, d, theta_offset]: [f64; 4]) {
     for (got, expected) in [(row.a, a), (row.d, d)] {
         assert!((got - expected).abs() < 1e-11, "{row:?}");
     }
@@ -135,7 +135,7 @@ fn tilted_shoulder(forearm: f64) -> Vec<Written> {
 }
 
 /// Returns the greatest distance of the tip from any joint before it, over many positions, in m.
-fn farthest(urdf: &Urdf, chain: &Chain) -> f64 {
+fn farthest(urdf: &Urdf, chain: &UrdfChain) -> f64 {
     let (mut most, mut state) = (0.0_f64, 1_u32);
     for _ in 0..1000 {
         let positions: Vec<_> = chain

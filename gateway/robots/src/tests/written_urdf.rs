@@ -1,6 +1,6 @@
 //! The URDF that is written for a skin's rows has the kinematics of the rows.
 
-use crate::{Import, Isometry3, Row, Urdf, frames, pose_of, written};
+use crate::{SkinImport, Isometry3, DhRow, Urdf, frames, pose_of, written};
 use protocol::skin::Skin;
 
 const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples");
@@ -9,7 +9,7 @@ fn imported(file: &str, tips: &[&str]) -> Skin {
     let text = std::fs::read_to_string(format!("{EXAMPLES}/{file}")).unwrap();
     let urdf = Urdf::parse(file, &text).unwrap();
     let chains: Vec<_> = tips.iter().map(|tip| urdf.chain(None, tip).unwrap()).collect();
-    let import = Import { name: "robot", command: "", urdf: None, chains: &chains, cells: &[] };
+    let import = SkinImport { name: "robot", command: "", urdf: None, chains: &chains, cells: &[] };
     Skin::parse("skin.toml", &import.toml().unwrap()).unwrap()
 }
 
@@ -34,7 +34,7 @@ fn check(skin: &Skin) -> Urdf {
         };
         for (chain, links) in skin.robot.chains.iter().zip(&text.links) {
             assert_eq!(links.len(), chain.joints.len());
-            let rows: Vec<_> = chain.rows.iter().map(Row::from).collect();
+            let rows: Vec<_> = chain.rows.iter().map(DhRow::from).collect();
             let of_chain: Vec<_> = chain.joints.iter().map(|&joint| q[joint]).collect();
             let expected = *frames(&pose_of(&chain.base), &rows, &of_chain).last().unwrap();
             let prefix = if text.links.len() > 1 { format!("{}_", chain.name) } else { String::new() };

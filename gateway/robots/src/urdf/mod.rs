@@ -7,7 +7,7 @@ mod xml;
 
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
-use crate::error::{Problem, RobotError};
+use crate::error::{RobotProblem, RobotError};
 use crate::nearest::nearest;
 
 pub use shape::{Geometry, Shape};
@@ -21,7 +21,7 @@ pub struct Urdf {
     /// The name of the robot; empty if it has none.
     pub name: String,
     /// The links in the file's order.
-    links: Vec<Link>,
+    links: Vec<UrdfLink>,
     /// The joints in the file's order.
     joints: Vec<UrdfJoint>,
     /// The index of the link without a parent.
@@ -33,7 +33,7 @@ type Shapes = Result<Vec<Shape>, RobotError>;
 
 /// A link.
 #[derive(Clone, Debug, PartialEq)]
-struct Link {
+struct UrdfLink {
     name: String,
     visuals: Shapes,
     collisions: Shapes,
@@ -45,7 +45,7 @@ struct Link {
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct UrdfJoint {
     pub(crate) name: String,
-    pub(crate) kind: Kind,
+    pub(crate) kind: UrdfJointKind,
     /// The index of its parent link.
     pub(crate) parent: usize,
     /// The index of the link that it moves.
@@ -67,7 +67,7 @@ pub(crate) struct UrdfJoint {
 
 /// The type of a joint.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(crate) enum Kind {
+pub(crate) enum UrdfJointKind {
     Revolute,
     Continuous,
     Prismatic,
@@ -89,17 +89,17 @@ impl UrdfJoint {
     /// planar joints stay at their origin.
     pub(crate) fn transform(&self, position: f64) -> Isometry3<f64> {
         match self.kind {
-            Kind::Revolute | Kind::Continuous => {
+            UrdfJointKind::Revolute | UrdfJointKind::Continuous => {
                 self.origin * UnitQuaternion::from_axis_angle(&self.axis, position)
             }
-            Kind::Prismatic => self.origin * Translation3::from(self.axis.into_inner() * position),
-            Kind::Fixed | Kind::Floating | Kind::Planar => self.origin,
+            UrdfJointKind::Prismatic => self.origin * Translation3::from(self.axis.into_inner() * position),
+            UrdfJointKind::Fixed | UrdfJointKind::Floating | UrdfJointKind::Planar => self.origin,
         }
     }
 
     /// Returns the name of the joint; `None` if it is fixed.
     pub(crate) fn moving_name(&self) -> Option<String> {
-        (self.kind != Kind::Fixed).then(|| self.name.clone())
+        (self.kind != UrdfJointKind::Fixed).then(|| self.name.clone())
     }
 }
 
@@ -160,7 +160,7 @@ impl Urdf {
     pub fn rest(&self, joint: &str) -> f64 {
         let Some(joint) = self.joints.iter().find(|it| it.name == joint) else { return 0.0 };
         let [lower, upper] = joint.limits;
-        let limited = matches!(joint.kind, Kind::Revolute | Kind::Prismatic);
+        let limited = matches!(joint.kind, UrdfJointKind::Revolute | UrdfJointKind::Prismatic);
         let middle = f64::midpoint(lower, upper);
         if limited && !(lower <= 0.0 && 0.0 <= upper) && middle.is_finite() { middle } else { 0.0 }
     }
@@ -183,10 +183,10 @@ impl Urdf {
     }
 
     /// Returns a link and its index.
-    fn link(&self, name: &str) -> Result<(usize, &Link), RobotError> {
+    fn link(&self, name: &str) -> Result<(usize, &UrdfLink), RobotError> {
         let found = self.links.iter().enumerate().find(|(_, link)| link.name == name);
         found.ok_or_else(|| {
-            self.error(Problem::NoSuchLink { link: name.to_owned(), nearest: nearest(name, self.links()) })
+            self.error(RobotProblem::NoSuchLink { link: name.to_owned(), nearest: nearest(name, self.links()) })
         })
     }
 
@@ -212,12 +212,12 @@ impl Urdf {
     }
 
     /// Creates an error without a line.
-    pub(crate) fn error(&self, problem: Problem) -> RobotError {
+    pub(crate) fn error(&self, problem: RobotProblem) -> RobotError {
         RobotError::new(&self.file, None, problem)
     }
 
     /// Creates an error at a joint.
-    pub(crate) fn error_at(&self, joint: &UrdfJoint, problem: Problem) -> RobotError {
+    pub(crate) fn error_at(&self, joint: &UrdfJoint, problem: RobotProblem) -> RobotError {
         RobotError::new(&self.file, Some(joint.line), problem)
     }
 }

@@ -4,9 +4,9 @@ use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 use roxmltree::{Document, Node};
 
 use super::shape::{Geometry, Shape};
-use super::tree::{self, Loose, Placed};
-use super::{Kind, Link, Mimic, Shapes, Urdf, UrdfJoint, xml};
-use crate::error::{Problem, RobotError};
+use super::tree::{self, UnlinkedJoint, LinkWithLine};
+use super::{UrdfJointKind, UrdfLink, Mimic, Shapes, Urdf, UrdfJoint, xml};
+use crate::error::{RobotProblem, RobotError};
 
 /// The minimum length of an axis that has a direction.
 const SHORTEST_AXIS: f64 = 1e-6;
@@ -16,11 +16,11 @@ pub(super) fn read(file: &str, xml: &str) -> Result<Urdf, RobotError> {
     let prepared = xml::prepared(file, xml)?;
     let document = xml::parsed(file, &prepared)?;
     let breaks = prepared.text.match_indices('\n').map(|(at, _)| at).collect();
-    Reader { file, document: &document, lines_before: prepared.lines_before, breaks }.robot()
+    UrdfParser { file, document: &document, lines_before: prepared.lines_before, breaks }.robot()
 }
 
 /// The state of parsing a file.
-struct Reader<'a> {
+struct UrdfParser<'a> {
     file: &'a str,
     document: &'a Document<'a>,
     /// The number of lines before the document.
@@ -29,7 +29,7 @@ struct Reader<'a> {
     breaks: Vec<usize>,
 }
 
-impl<'a> Reader<'a> {
+impl<'a> UrdfParser<'a> {
     fn robot(&self) -> Result<Urdf, RobotError> {
         let robot = self.document.root_element();
         self.refuse_xacro(robot)?;
@@ -37,14 +37,14 @@ impl<'a> Reader<'a> {
         if outermost != "robot" {
             let kind = protocol::xml::kind_of_root(outermost).map(|kind| format!(" ({kind})"));
             let element = format!("{outermost:?}{}", kind.unwrap_or_default());
-            return Err(self.error(robot, Problem::NotARobot(element)));
+            return Err(self.error(robot, RobotProblem::NotARobot(element)));
         }
         let links = self.children(robot, "link").map(|node| self.link(node));
         let links = links.collect::<Result<Vec<_>, _>>()?;
         if links.is_empty() {
             let of_srdf = ["group", "group_state", "disable_collisions", "virtual_joint", "end_effector"];
             let is_srdf = of_srdf.iter().any(|name| self.child(robot, name).is_some());
-            return Err(self.error(robot, if is_srdf { Problem::Srdf } else { Problem::NoLinks }));
+            return Err(self.error(robot, if is_srdf { RobotProblem::Srdf } else { RobotProblem::NoLinks }));
         }
         let joints = self.children(robot, "joint").map(|node| self.joint(node));
         let joints = joints.collect::<Result<Vec<_>, _>>()?;
@@ -81,10 +81,10 @@ impl<'a> Reader<'a> {
     }
 
     fn xacro(&self, node: Node<'a, 'a>, what: String) -> RobotError {
-        self.error(node, Problem::Xacro { what, file: self.file.to_owned() })
+        self.error(node, RobotProblem::Xacro { what, file: self.file.to_owned() })
     }
 
-    fn link(&self, node: Node<'a, 'a>) -> Result<Placed, RobotError> {
+    fn link(&self, node: Node<'a, 'a>) -> Result<LinkWithLine, RobotError> {
         let name = self.text(node, "link", "name")?;
         let thing = format!("link {name:?}");
         let shapes = |element| {
@@ -92,7 +92,7 @@ impl<'a> Reader<'a> {
             shapes.filter_map(Result::transpose).collect::<Shapes>()
         };
         let (visuals, collisions) = (shapes("visual"), shapes("collision"));
-        Ok((Link { name, visuals, collisions, parent: None }, self.line(node)))
+        Ok((UrdfLink { name, visuals, collisions, parent: None }, self.line(node)))
     }
 
     /// Parses a shape; returns `None` if it has no geometry.
@@ -102,7 +102,7 @@ impl<'a> Reader<'a> {
         let Some(node) = geometry else { return Ok(None) };
         let size = |attribute| {
             let [size] = self.numbers(node, thing, attribute, "a length in m")?.ok_or_else(|| {
-                self.error(node, Problem::Missing { thing: thing.to_owned(), missing: attribute })
+                self.error(node, RobotProblem::Missing { thing: thing.to_owned(), missing: attribute })
             })?;
             Ok(size)
         };
@@ -118,7 +118,7 @@ impl<'a> Reader<'a> {
             }
             "box" => {
                 let size = self.numbers(node, thing, "size", "three lengths in m")?;
-                let missing = || Problem::Missing { thing: thing.to_owned(), missing: "size" };
+                let missing = || RobotProblem::Missing { thing: thing.to_owned(), missing: "size" };
                 Geometry::Box { size: size.ok_or_else(|| self.error(node, missing()))? }
             }
             "cylinder" => Geometry::Cylinder { radius: size("radius")?, length: size("length")? },
@@ -128,23 +128,23 @@ impl<'a> Reader<'a> {
         Ok(Some(Shape { origin, geometry }))
     }
 
-    fn joint(&self, node: Node<'a, 'a>) -> Result<Loose, RobotError> {
+    fn joint(&self, node: Node<'a, 'a>) -> Result<UnlinkedJoint, RobotError> {
         let name = self.text(node, "joint", "name")?;
         let thing = format!("joint {name:?}");
         let kind = match self.text(node, &thing, "type")?.as_str() {
-            "revolute" => Kind::Revolute,
-            "continuous" => Kind::Continuous,
-            "prismatic" => Kind::Prismatic,
-            "fixed" => Kind::Fixed,
-            "floating" => Kind::Floating,
-            "planar" => Kind::Planar,
+            "revolute" => UrdfJointKind::Revolute,
+            "continuous" => UrdfJointKind::Continuous,
+            "prismatic" => UrdfJointKind::Prismatic,
+            "fixed" => UrdfJointKind::Fixed,
+            "floating" => UrdfJointKind::Floating,
+            "planar" => UrdfJointKind::Planar,
             other => {
                 let allowed = "revolute, continuous, prismatic, fixed, floating or planar";
                 return Err(self.value(node, &thing, "type", other, allowed));
             }
         };
         let link = |role: &'static str| {
-            let missing = || Problem::Missing { thing: thing.clone(), missing: role };
+            let missing = || RobotProblem::Missing { thing: thing.clone(), missing: role };
             let found = self.child(node, role).ok_or_else(|| self.error(node, missing()))?;
             self.text(found, &format!("the {role} of {thing}"), "link")
         };
@@ -167,14 +167,14 @@ impl<'a> Reader<'a> {
             name,
             kind,
         };
-        Ok(Loose { joint, parent, child })
+        Ok(UnlinkedJoint { joint, parent, child })
     }
 
-    fn axis(&self, node: Node<'a, 'a>, thing: &str, kind: Kind) -> Result<Unit<Vector3<f64>>, RobotError> {
+    fn axis(&self, node: Node<'a, 'a>, thing: &str, kind: UrdfJointKind) -> Result<Unit<Vector3<f64>>, RobotError> {
         match kind {
-            Kind::Revolute | Kind::Continuous | Kind::Prismatic => {}
+            UrdfJointKind::Revolute | UrdfJointKind::Continuous | UrdfJointKind::Prismatic => {}
             // The axis of these joints is often 0 0 0, and is never used.
-            Kind::Fixed | Kind::Floating | Kind::Planar => return Ok(Vector3::z_axis()),
+            UrdfJointKind::Fixed | UrdfJointKind::Floating | UrdfJointKind::Planar => return Ok(Vector3::z_axis()),
         }
         let Some(node) = self.child(node, "axis") else { return Ok(Vector3::x_axis()) };
         let allowed = "three numbers, not all zero";
@@ -219,7 +219,7 @@ impl<'a> Reader<'a> {
     /// Returns a required attribute.
     fn text(&self, node: Node<'a, 'a>, thing: &str, attribute: &'static str) -> Result<String, RobotError> {
         let text = node.attribute(attribute).map(str::trim).filter(|text| !text.is_empty());
-        let missing = || Problem::Missing { thing: thing.to_owned(), missing: attribute };
+        let missing = || RobotProblem::Missing { thing: thing.to_owned(), missing: attribute };
         text.map(str::to_owned).ok_or_else(|| self.error(node, missing()))
     }
 
@@ -269,7 +269,7 @@ impl<'a> Reader<'a> {
             ""
         };
         let (thing, value, allowed) = (thing.to_owned(), value.to_owned(), format!("{allowed}{commas}"));
-        self.error(node, Problem::Value { thing, attribute, value, allowed })
+        self.error(node, RobotProblem::Value { thing, attribute, value, allowed })
     }
 
     fn source(&self, node: &Node<'a, 'a>) -> &'a str {
@@ -282,7 +282,7 @@ impl<'a> Reader<'a> {
         u32::try_from(line).unwrap_or(u32::MAX)
     }
 
-    fn error(&self, node: Node<'a, 'a>, problem: Problem) -> RobotError {
+    fn error(&self, node: Node<'a, 'a>, problem: RobotProblem) -> RobotError {
         RobotError::new(self.file, Some(self.line(node)), problem)
     }
 }

@@ -2,12 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{Link, Urdf, UrdfJoint};
-use crate::error::{Problem, RobotError};
+use super::{UrdfLink, Urdf, UrdfJoint};
+use crate::error::{RobotProblem, RobotError};
 use crate::nearest::nearest;
 
 /// A joint whose links are still names.
-pub(super) struct Loose {
+pub(super) struct UnlinkedJoint {
     /// The joint; its parent and child are not yet set.
     pub(super) joint: UrdfJoint,
     /// The name of the parent link.
@@ -17,42 +17,42 @@ pub(super) struct Loose {
 }
 
 /// A link and its line.
-pub(super) type Placed = (Link, u32);
+pub(super) type LinkWithLine = (UrdfLink, u32);
 
 /// Connects links with joints.
 pub(super) fn grow(
     file: &str,
     name: String,
-    placed: Vec<Placed>,
-    loose: Vec<Loose>,
+    placed: Vec<LinkWithLine>,
+    loose: Vec<UnlinkedJoint>,
 ) -> Result<Urdf, RobotError> {
     let error = |line, problem| RobotError::new(file, line, problem);
     let mut names = BTreeMap::new();
     let mut links = Vec::new();
     for (link, line) in placed {
         if names.insert(link.name.clone(), links.len()).is_some() {
-            return Err(error(Some(line), Problem::Duplicate { what: "link", name: link.name }));
+            return Err(error(Some(line), RobotProblem::Duplicate { what: "link", name: link.name }));
         }
         links.push(link);
     }
     let mut joints = Vec::<UrdfJoint>::new();
     let mut taken = BTreeSet::new();
-    for Loose { mut joint, parent, child } in loose {
+    for UnlinkedJoint { mut joint, parent, child } in loose {
         let line = Some(joint.line);
         if !taken.insert(joint.name.clone()) {
-            return Err(error(line, Problem::Duplicate { what: "joint", name: joint.name }));
+            return Err(error(line, RobotProblem::Duplicate { what: "joint", name: joint.name }));
         }
         let find = |role, link: String| {
             names.get(&link).copied().ok_or_else(|| {
                 let nearest = nearest(&link, names.keys().map(String::as_str));
-                error(line, Problem::JointWithoutLink { joint: joint.name.clone(), role, link, nearest })
+                error(line, RobotProblem::JointWithoutLink { joint: joint.name.clone(), role, link, nearest })
             })
         };
         (joint.parent, joint.child) = (find("parent", parent)?, find("child", child)?);
         if let Some(link) = links.get_mut(joint.child) {
             if let Some(first) = link.parent.and_then(|index| joints.get(index)) {
                 let (link, first) = (link.name.clone(), first.name.clone());
-                return Err(error(line, Problem::TwoParents { link, first, second: joint.name }));
+                return Err(error(line, RobotProblem::TwoParents { link, first, second: joint.name }));
             }
             link.parent = Some(joints.len());
         }
@@ -62,17 +62,17 @@ pub(super) fn grow(
     let root = roots.next().map(|(index, link)| (index, link.name.clone()));
     if let (Some((_, first)), Some((_, second))) = (&root, roots.next()) {
         let (first, second) = (first.clone(), second.name.clone());
-        return Err(error(None, Problem::TwoRoots { first, second }));
+        return Err(error(None, RobotProblem::TwoRoots { first, second }));
     }
     let urdf = Urdf { file: file.to_owned(), name, links, joints, root: root.map_or(0, |(index, _)| index) };
     match cycle(&urdf) {
         None => Ok(urdf),
-        Some(link) => Err(error(None, Problem::Cycle(link.name.clone()))),
+        Some(link) => Err(error(None, RobotProblem::Cycle(link.name.clone()))),
     }
 }
 
 /// Returns a link that is its own ancestor.
-fn cycle(urdf: &Urdf) -> Option<&Link> {
+fn cycle(urdf: &Urdf) -> Option<&UrdfLink> {
     // For each link met on a path to the root: the link from which that path began.
     let mut walked = vec![None; urdf.links.len()];
     for start in 0..urdf.links.len() {

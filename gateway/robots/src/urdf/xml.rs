@@ -2,11 +2,11 @@
 
 use std::borrow::Cow;
 
-use protocol::usage::shown;
-use protocol::xml::{Fault, Foreign, Prepared, foreign, prepare, utf16};
+use protocol::usage::printable;
+use protocol::xml::{XmlFault, ForeignFile, Prepared, detect_foreign, prepare, utf16_name};
 use roxmltree::{Document, Error};
 
-use crate::error::{Problem, RobotError};
+use crate::error::{RobotProblem, RobotError};
 
 /// Decodes the bytes of a file: UTF-8, or Latin-1 or Windows-1252 if the file declares it. UTF-16 is refused, as by the
 /// parser of ROS (urdfdom), so that a robot that is imported here also loads there.
@@ -16,24 +16,24 @@ use crate::error::{Problem, RobotError};
 /// saved web page).
 pub fn text<'a>(file: &str, bytes: &'a [u8]) -> Result<Cow<'a, str>, RobotError> {
     refuse_foreign(file, bytes)?;
-    if let Some(name) = utf16(bytes) {
+    if let Some(name) = utf16_name(bytes) {
         let what = format!(
             "it is UTF-16, which ROS does not read either: save it as UTF-8, as with `iconv -f {name} -t utf-8 FILE > NEW`"
         );
-        return Err(error(file, Fault { line: None, what }));
+        return Err(error(file, XmlFault { line: None, what }));
     }
-    protocol::xml::text(bytes).map_err(|fault| error(file, fault))
+    protocol::xml::decode(bytes).map_err(|fault| error(file, fault))
 }
 
 pub(super) fn prepared<'a>(file: &str, text: &'a str) -> Result<Prepared<'a>, RobotError> {
     refuse_foreign(file, text.as_bytes())?;
     let prepared = prepare(text).map_err(|fault| error(file, fault))?;
     if prepared.text.is_empty() {
-        return Err(RobotError::new(file, None, Problem::Empty));
+        return Err(RobotError::new(file, None, RobotProblem::Empty));
     }
     if !prepared.text.starts_with('<') {
         let line = u32::try_from(prepared.lines_before + 1).ok();
-        return Err(RobotError::new(file, line, Problem::NotXml));
+        return Err(RobotError::new(file, line, RobotProblem::NotXml));
     }
     Ok(prepared)
 }
@@ -44,24 +44,24 @@ pub(super) fn parsed<'a>(file: &str, prepared: &'a Prepared<'_>) -> Result<Docum
             matches!(reason, Error::UnclosedRootNode | Error::UnexpectedEndOfStream | Error::NoRootNode);
         let row = usize::try_from(reason.pos().row).unwrap_or_default();
         let row = if is_cut { prepared.text.lines().count() } else { row };
-        error(file, Fault { line: Some(prepared.lines_before + row), what: words(&reason) })
+        error(file, XmlFault { line: Some(prepared.lines_before + row), what: description(&reason) })
     })
 }
 
 fn refuse_foreign(file: &str, bytes: &[u8]) -> Result<(), RobotError> {
-    let Some(Foreign { line, what, hint }) = foreign(bytes) else { return Ok(()) };
+    let Some(ForeignFile { line, what, hint }) = detect_foreign(bytes) else { return Ok(()) };
     let line = line.and_then(|line| u32::try_from(line).ok());
-    Err(RobotError::new(file, line, Problem::Xml(format!("{what}: {hint}"))))
+    Err(RobotError::new(file, line, RobotProblem::Xml(format!("{what}: {hint}"))))
 }
 
-fn error(file: &str, Fault { line, what }: Fault) -> RobotError {
+fn error(file: &str, XmlFault { line, what }: XmlFault) -> RobotError {
     let line = line.and_then(|line| u32::try_from(line).ok());
-    RobotError::new(file, line, Problem::Xml(what))
+    RobotError::new(file, line, RobotProblem::Xml(what))
 }
 
 /// Describes an error of the parser, and the action to take.
 #[expect(clippy::wildcard_enum_match_arm, reason = "the parser's own words do for all others")]
-fn words(reason: &Error) -> String {
+fn description(reason: &Error) -> String {
     let plain = |what: &str| what.to_owned();
     match reason {
         Error::MalformedEntityReference(_) | Error::UnknownEntityReference(..) => {
@@ -88,7 +88,7 @@ fn words(reason: &Error) -> String {
         other => {
             let (text, place) = (other.to_string(), format!(" at {}", other.pos()));
             let text = text.strip_suffix(place.as_str()).unwrap_or(&text);
-            format!("not XML: {}, in column {}: correct this line", shown(text), other.pos().col)
+            format!("not XML: {}, in column {}: correct this line", printable(text), other.pos().col)
         }
     }
 }

@@ -5,13 +5,13 @@ use std::io::{self, Write};
 use analysis::fit::traffic::BenchFrames;
 use analysis::fit::verdict::percent;
 use analysis::shadow::{
-    Answering, BusShadow, Delays, Identifier, Loads, Most, Replies, Report, Shaded, Shadow, StartUp,
+    Answering, BusShadow, Delays, Identifier, Loads, Peak, Replies, Report, FrameTiming, Shadow, StartUp,
     Stretches,
 };
 
 use trace::capture::seconds_since;
 
-use crate::print::{Rows, count, harmless, list, or};
+use crate::print::{KeyValueTable, count, harmless, comma_separated, or_else_text};
 
 /// Writes the frames that have left the model, one object per line.
 pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {
@@ -24,8 +24,8 @@ pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Res
     Ok(())
 }
 
-fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &Shaded) -> io::Result<()> {
-    let Shaded { nanos, id, extended, bits, sent, .. } = *frame;
+fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &FrameTiming) -> io::Result<()> {
+    let FrameTiming { nanos, id, extended, bits, sent, .. } = *frame;
     line.extend_from_slice(b"{\"time\":");
     seconds(line, Some(nanos));
     line.extend_from_slice(b",\"bus\":");
@@ -58,7 +58,7 @@ fn seconds(line: &mut Vec<u8>, nanos: Option<u64>) {
 pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> String {
     let head = format!("{what}, {} frames", report.frames);
     let beside = if missing > 0 { format!("{missing} frames are missing in it") } else { String::new() };
-    let mut rows = Rows::new(name, head, beside).names_in_one_line();
+    let mut rows = KeyValueTable::new(name, head, beside).names_in_one_line();
     for bus in &report.buses {
         one(&mut rows, bus, report);
     }
@@ -66,7 +66,7 @@ pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> Str
     rows.text()
 }
 
-fn one(rows: &mut Rows, bus: &BusShadow, report: &Report) {
+fn one(rows: &mut KeyValueTable, bus: &BusShadow, report: &Report) {
     let bit_error_rate = report.bit_error_rate;
     let count = format!("{} frames in {:.3} s", bus.frames, bus.duration_s);
     let missing = if bus.counts.missing > 0 {
@@ -96,7 +96,7 @@ fn one(rows: &mut Rows, bus: &BusShadow, report: &Report) {
 }
 
 /// Rows on whether the traffic fits, in the worst case and in this run.
-fn fit(rows: &mut Rows, bus: &BusShadow, has_times: bool) {
+fn fit(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
     match (&bus.worst_case, &bus.answering) {
         (Some(worst), _) => rows.row(worst.case(), worst.value(), worst.cells),
         (None, Some(_)) => rows.row("worst case", "?", "needs a skin with this bus: --skin"),
@@ -123,7 +123,7 @@ fn fit(rows: &mut Rows, bus: &BusShadow, has_times: bool) {
     }
 }
 
-fn operation(rows: &mut Rows, bus: &BusShadow) {
+fn operation(rows: &mut KeyValueTable, bus: &BusShadow) {
     load(rows, bus, &bus.load, ("average load", &format!("{:.3} s in operation", bus.operation_s)));
     rows.row("  bus taken", share(bus.load.busy), "");
     pauses(rows, bus, &bus.stretches);
@@ -144,14 +144,14 @@ fn operation(rows: &mut Rows, bus: &BusShadow) {
 }
 
 /// Rows on the start-up, which has no limits and no rating.
-fn begin(rows: &mut Rows, bus: &BusShadow, start_up: &StartUp) {
+fn begin(rows: &mut KeyValueTable, bus: &BusShadow, start_up: &StartUp) {
     let beside = format!("{} frames in {:.3} s without joints", start_up.frames, start_up.duration_s);
     load(rows, bus, &start_up.load, ("start-up: average load", &beside));
     pauses(rows, bus, &start_up.stretches);
     rows.row("  delay, µs", delays(&start_up.delay_us), "50 % / 99 % / max");
 }
 
-fn bench(rows: &mut Rows, bus: &BusShadow) {
+fn bench(rows: &mut KeyValueTable, bus: &BusShadow) {
     let BenchFrames { stimuli, syncs, reports, wires } = bus.counts.bench;
     if bus.counts.bench.total() == 0 {
         return;
@@ -159,16 +159,16 @@ fn bench(rows: &mut Rows, bus: &BusShadow) {
     let name = if bus.counts.bench_omitted { "left out: bench traffic" } else { "counted: bench traffic" };
     let parts = [("stimuli", stimuli), ("sync", syncs), ("report", reports), ("simulated wires", wires)];
     let parts = parts.iter().filter(|it| it.1 > 0).map(|(what, count)| format!("{count} {what}"));
-    rows.row(name, format!("{} frames", bus.counts.bench.total()), list(parts));
+    rows.row(name, format!("{} frames", bus.counts.bench.total()), comma_separated(parts));
 }
 
-fn load(rows: &mut Rows, bus: &BusShadow, load: &Loads, (name, beside): (&str, &str)) {
+fn load(rows: &mut KeyValueTable, bus: &BusShadow, load: &Loads, (name, beside): (&str, &str)) {
     rows.row(name, share(load.mean), beside);
     rows.row("  most in any 16 ms", percent(load.worst_16_ms.value), at(bus, load.worst_16_ms));
     rows.row("  most in any second", percent(load.worst_1_s.value), at(bus, load.worst_1_s));
 }
 
-fn pauses(rows: &mut Rows, bus: &BusShadow, stretches: &Stretches) {
+fn pauses(rows: &mut KeyValueTable, bus: &BusShadow, stretches: &Stretches) {
     let longest = stretches.longest_s;
     let beside = format!("longest {:.1} ms, {}", 1e3 * longest.value, at(bus, longest));
     let times = format!("{}, {:.3} s", count(stretches.count, "time"), stretches.total_s);
@@ -176,10 +176,10 @@ fn pauses(rows: &mut Rows, bus: &BusShadow, stretches: &Stretches) {
 }
 
 fn share(share: Option<f64>) -> String {
-    or(share.map(percent), "?")
+    or_else_text(share.map(percent), "?")
 }
 
-fn answers(rows: &mut Rows, replies: &Replies) {
+fn answers(rows: &mut KeyValueTable, replies: &Replies) {
     let Replies { count, late_before, late, late_when_ready, after_joints_us } = replies;
     rows.row("answers after joints, µs", delays(after_joints_us), "50 % / 99 % / max");
     let beside = [
@@ -187,7 +187,7 @@ fn answers(rows: &mut Rows, replies: &Replies) {
         (*late_when_ready > 0).then(|| format!("{late_when_ready} were ready too late for any bus")),
         (*late_before > 0).then(|| format!("{late_before} more were late in the recording already")),
     ];
-    rows.row("  late", format!("{late} of {count}"), list(beside.into_iter().flatten()));
+    rows.row("  late", format!("{late} of {count}"), comma_separated(beside.into_iter().flatten()));
 }
 
 fn delays(delays: &Delays) -> String {
@@ -195,7 +195,7 @@ fn delays(delays: &Delays) -> String {
     format!("{p50:.0} / {p99:.0} / {max:.0}")
 }
 
-fn at(bus: &BusShadow, most: Most) -> String {
+fn at(bus: &BusShadow, most: Peak) -> String {
     format!("at {:.3} s", seconds_since(bus.zero_ns, most.at_ns))
 }
 

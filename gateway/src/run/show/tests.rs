@@ -1,13 +1,13 @@
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use bench::summary::{
-    Loop, Memory, OutagesSummary, Recording, RepliesSummary, UplinkSummary, Verdict, Written,
+    LoopSummary, PrivateMemory, OutagesSummary, RecordingAccount, RepliesSummary, UplinkSummary, Verdict, WrittenFile,
 };
 use model::quantiles::Quantiles;
 
 use super::*;
 
-const EIGHTY: Look = Look { is_verbose: false, is_coloured: false, columns: Some(80) };
+const EIGHTY: TableStyle = TableStyle { is_verbose: false, is_coloured: false, columns: Some(80) };
 const LONG: &str = "abcdefghijklmno";
 
 fn some(count: u64) -> Quantiles {
@@ -47,7 +47,7 @@ fn run(skin: &str, buses: &[&str], each: u8, replies: u64) -> Summary {
         skin: skin.to_owned(),
         cells: cells.collect(),
         duration_s: 12.0,
-        control: Loop {
+        control: LoopSummary {
             ticks: 6_000,
             broadcasts: 750,
             late_us: some(6_000),
@@ -57,11 +57,11 @@ fn run(skin: &str, buses: &[&str], each: u8, replies: u64) -> Summary {
             took_distributed_us: some(3_150),
             fifo: true,
             memory_locked: true,
-            ..Loop::default()
+            ..LoopSummary::default()
         },
         buses: buses.iter().map(|name| bus(name, each.into(), replies)).collect(),
-        processor: Processor { gateway: 0.061, cells: 0.412, buses: -0.0 },
-        memory: Memory {
+        processor: ProcessorUse { gateway: 0.061, cells: 0.412, buses: -0.0 },
+        memory: PrivateMemory {
             cell_private_kib: Some(768),
             gateway_private_kib: Some(12_345),
             buses_private_kib: Some(812),
@@ -74,14 +74,14 @@ fn run(skin: &str, buses: &[&str], each: u8, replies: u64) -> Summary {
         summary.accuracy.unquantised = errors(24_364);
         summary.accuracy.whole = errors(1_740);
     }
-    summary.rated(None)
+    summary.with_verdict(None)
 }
 
 /// Creates the run of the demonstration, with its log.
 fn demo() -> Summary {
     let path = "skinbus-demo.log".to_owned();
-    let file = Written { path, format: "candump", frames: 34_567, messages: 34_567, bytes: 2_345_678 };
-    let recording = Recording { files: vec![file], frames: 34_567, ..Recording::default() };
+    let file = WrittenFile { path, format: "candump", frames: 34_567, messages: 34_567, bytes: 2_345_678 };
+    let recording = RecordingAccount { files: vec![file], frames: 34_567, ..RecordingAccount::default() };
     Summary { recording: Some(recording), ..run("ur5-253", &["vcan0"], 253, 17_772) }
 }
 
@@ -105,7 +105,7 @@ fn a_run_that_is_well_is_short_and_fits_eighty_columns() {
 #[test]
 fn the_verdict_is_the_first_line() {
     let first = |summary: &Summary, columns| {
-        text(summary, Look { columns, ..EIGHTY }).split('┌').next().unwrap().to_owned()
+        text(summary, TableStyle { columns, ..EIGHTY }).split('┌').next().unwrap().to_owned()
     };
     let well = "all well: 253 cells, 575 of 575 epochs complete, 17772 replies in time, error 6.2e-5 Nm\n";
     assert_eq!(first(&demo(), Some(100)), well);
@@ -113,7 +113,7 @@ fn the_verdict_is_the_first_line() {
         first(&demo(), Some(80)),
         "all well: 253 cells, 575 of 575 epochs complete, 17772 replies in time, error\n  6.2e-5 Nm\n"
     );
-    let interrupted = Summary { interrupted: true, ..demo() }.rated(None);
+    let interrupted = Summary { interrupted: true, ..demo() }.with_verdict(None);
     assert!(first(&interrupted, None).starts_with("all well until it was interrupted: 253 cells, "));
     let look_at = [
         "first".to_owned(),
@@ -127,7 +127,7 @@ fn the_verdict_is_the_first_line() {
     let many = Summary { verdict: Verdict { well: false, look_at: vec!["one".to_owned(); 9] }, ..demo() };
     let all = first(&many, Some(80));
     assert!(all.lines().count() == 7 && all.ends_with("\n         and 3 more, with --verbose\n"), "{all}");
-    let verbose = text(&many, Look { is_verbose: true, ..EIGHTY });
+    let verbose = text(&many, TableStyle { is_verbose: true, ..EIGHTY });
     assert_eq!(verbose.lines().take_while(|line| line.ends_with("one")).count(), 9, "{verbose}");
 }
 
@@ -135,7 +135,7 @@ fn the_verdict_is_the_first_line() {
 fn verbose_has_all_rows() {
     let columns = Some(110);
     let [brief, verbose] =
-        [false, true].map(|is_verbose| text(&demo(), Look { is_verbose, columns, ..EIGHTY }));
+        [false, true].map(|is_verbose| text(&demo(), TableStyle { is_verbose, columns, ..EIGHTY }));
     let usual = [
         "against unrounded",
         "central computation",
@@ -154,7 +154,7 @@ fn verbose_has_all_rows() {
     for row in ["single cells", "the whole skin", "began late", "replies due", "recording", "vcan0"] {
         assert!(verbose.contains(row) && brief.contains(row), "{row}\n{brief}\n{verbose}");
     }
-    assert!(widest(&text(&demo(), Look { is_verbose: true, ..EIGHTY })) <= 80);
+    assert!(widest(&text(&demo(), TableStyle { is_verbose: true, ..EIGHTY })) <= 80);
     assert!(!brief.contains("-0.000") && !verbose.contains("-0.000"), "{verbose}");
 }
 
@@ -181,7 +181,7 @@ fn what_is_not_usual_is_shown_without_verbose() {
         let mut summary = demo();
         change(&mut summary);
         let columns = Some(110);
-        let text = text(&summary.rated(None), Look { columns, ..EIGHTY });
+        let text = text(&summary.with_verdict(None), TableStyle { columns, ..EIGHTY });
         assert!(text.contains(shown) && text.starts_with("look at: "), "{shown}:\n{text}");
     }
 }
@@ -191,10 +191,10 @@ fn colours_say_how_bad_it_is_and_only_where_they_are_due() {
     let in_colour = |change: fn(&mut Summary)| {
         let mut summary = demo();
         change(&mut summary);
-        let summary = summary.rated(None);
+        let summary = summary.with_verdict(None);
         let plain = text(&summary, EIGHTY);
         assert!(!plain.contains('\x1b'), "{plain}");
-        let coloured = text(&summary, Look { is_coloured: true, ..EIGHTY });
+        let coloured = text(&summary, TableStyle { is_coloured: true, ..EIGHTY });
         // Colours change no text.
         let mut without = String::new();
         let mut letters = coloured.chars();
@@ -224,6 +224,6 @@ fn names_cannot_command_a_terminal() {
     summary.skin = "a\x1b[2Jb".to_owned();
     summary.buses[0].name = "c\x1b[2Jd".to_owned();
     summary.buses[0].silent_cells = vec![7];
-    let text = text(&summary.rated(None), Look { columns: Some(110), ..EIGHTY });
+    let text = text(&summary.with_verdict(None), TableStyle { columns: Some(110), ..EIGHTY });
     assert!(!text.contains('\x1b') && text.matches("\\u{1b}[2J").count() >= 3, "{text}");
 }

@@ -8,29 +8,29 @@ use std::time::Duration;
 
 use bench::bus::listen::{Listener, send};
 use model::decode::Decoded;
-use protocol::bus::{Bus, BusKind, Choice, Inbox, Options};
+use protocol::bus::{Bus, BusKind, KindChoice, Inbox, BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::candump;
-use protocol::candump::Line;
+use protocol::candump::CandumpLine;
 use protocol::id::{CellId, Node};
 use protocol::message::{Answer, Heartbeat, Message, NetworkPage, Request, State};
 use protocol::packet::Epoch;
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
-use vcan_setup::embedded::Served;
+use vcan_setup::embedded::ServerThread;
 
 use super::*;
 
 /// A bus for one test.
 struct Bench {
     parent: TempDir,
-    _served: Served,
+    _served: ServerThread,
 }
 
 impl Bench {
     fn new() -> Self {
         let parent = TempDir::new().unwrap();
-        let served = Served::start_in(&parent.path().join("skinbus"), "vcan0").unwrap();
+        let served = ServerThread::start_in(&parent.path().join("skinbus"), "vcan0").unwrap();
         Self { parent, _served: served }
     }
 
@@ -75,7 +75,7 @@ impl Bench {
                     });
                     let mut answers =
                         vec![Message::Network { from: Node::Cell(from), epoch: Epoch(0), page }];
-                    cell.hear(Duration::from_millis(20)).unwrap();
+                    cell.receive(Duration::from_millis(20)).unwrap();
                     for (_, decoded) in cell.decoded() {
                         let Decoded::Message(Message::Configure { tag, request, .. }) = decoded else {
                             continue;
@@ -104,8 +104,8 @@ impl Bench {
 
     fn open(&self) -> Bus {
         let (directory, send_timeout) = (Some(self.directory()), Duration::from_secs(60));
-        let options = Options { directory, send_timeout, ..Options::default() };
-        Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap()
+        let options = BusOptions { directory, send_timeout, ..BusOptions::default() };
+        Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap()
     }
 }
 
@@ -137,7 +137,7 @@ fn what_is_sent_on_an_embedded_bus_is_shown() {
     assert_eq!((status.code(), text(&stderr)), (Some(0), ""));
     for line in text(&stdout).lines() {
         let raw = line.split_once('\t').unwrap().0;
-        let Ok(Line::Frame(record)) = candump::parse(raw) else { panic!("{line}") };
+        let Ok(CandumpLine::Frame(record)) = candump::parse(raw) else { panic!("{line}") };
         assert!(record.interface == "vcan0" && record.time.nanos > 0, "{line}");
     }
 }
@@ -307,7 +307,7 @@ fn a_bus_that_comes_later_is_waited_for() {
     kill_process(Pid::from_child(&gives_up), Signal::INT).unwrap();
     assert_eq!(gives_up.wait_with_output().unwrap().status.code(), Some(0));
     assert!(waits.try_wait().unwrap().is_none());
-    let bench = Bench { _served: Served::start_in(&directory, "vcan0").unwrap(), parent };
+    let bench = Bench { _served: ServerThread::start_in(&directory, "vcan0").unwrap(), parent };
     let mut line = [0; 18];
     waits.stderr.as_mut().unwrap().read_exact(&mut line).unwrap();
     bench.send("frame sync --bus vcan0");

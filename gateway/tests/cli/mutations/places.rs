@@ -32,7 +32,7 @@ const OF_COMMANDS: u64 = 10;
 type Message = (String, u32, u64, Vec<u8>);
 
 /// A record of a file: its position, operation code, messages, and the descriptions in it by kind and number.
-struct Part {
+struct FileRecord {
     bytes: Range<usize>,
     code: u8,
     messages: Vec<Message>,
@@ -43,7 +43,7 @@ struct Part {
 struct Seed {
     name: String,
     bytes: Vec<u8>,
-    parts: Vec<Part>,
+    parts: Vec<FileRecord>,
 }
 
 fn number<const N: usize>(body: &[u8], at: usize) -> [u8; N] {
@@ -60,7 +60,7 @@ impl Seed {
         for (code, body) in records(&bytes[8..]) {
             let end = at + 9 + body.len();
             let within = if code == op::CHUNK { records(&unpacked(&body)) } else { vec![(code, body)] };
-            let mut part = Part { bytes: at..end, code, messages: Vec::new(), described: BTreeSet::new() };
+            let mut part = FileRecord { bytes: at..end, code, messages: Vec::new(), described: BTreeSet::new() };
             for (code, body) in within {
                 match code {
                     op::SCHEMA | op::CHANNEL => {
@@ -87,14 +87,14 @@ impl Seed {
     }
 
     /// Records without a damaged byte.
-    fn intact(&self, damaged: &Range<usize>) -> impl Iterator<Item = &Part> {
-        let is_apart = |part: &&Part| damaged.end <= part.bytes.start || part.bytes.end <= damaged.start;
+    fn intact(&self, damaged: &Range<usize>) -> impl Iterator<Item = &FileRecord> {
+        let is_apart = |part: &&FileRecord| damaged.end <= part.bytes.start || part.bytes.end <= damaged.start;
         self.parts.iter().filter(is_apart)
     }
 
     /// Returns true if intact records contain all descriptions that the record's messages need.
     fn is_described(&self, damaged: &Range<usize>) -> bool {
-        let all = |parts: &mut dyn Iterator<Item = &Part>| -> BTreeSet<_> {
+        let all = |parts: &mut dyn Iterator<Item = &FileRecord>| -> BTreeSet<_> {
             parts.flat_map(|part| part.described.iter().copied()).collect()
         };
         all(&mut self.intact(damaged)) == all(&mut self.parts.iter())
@@ -258,8 +258,8 @@ fn messages(bytes: &[u8]) -> Vec<Message> {
 /// Returns true if the damage is in a description that no checksum covers and that the file contains once.
 fn is_unsaid(seed: &Seed, place: &Range<usize>) -> bool {
     let has_end = seed.bytes.ends_with(mcap::MAGIC);
-    let of_description = |part: &Part| part.code == op::SCHEMA || part.code == op::CHANNEL;
-    let is_there = |part: &Part| part.bytes.start < place.end && place.start < part.bytes.end;
+    let of_description = |part: &FileRecord| part.code == op::SCHEMA || part.code == op::CHANNEL;
+    let is_there = |part: &FileRecord| part.bytes.start < place.end && place.start < part.bytes.end;
     !seed.is_described(place)
         || (!has_end
             && seed
@@ -309,14 +309,14 @@ fn is_given(folder: &Path, seed: &Seed, what: &str, file: &[u8], place: &Range<u
     let write = |name: &str, bytes: &[u8]| fs::write(folder.join(name), bytes).unwrap();
     write("seed.mcap", &seed.bytes);
     write("m.mcap", file);
-    let is_entry = |part: &Part| {
+    let is_entry = |part: &FileRecord| {
         part.messages
             .iter()
             .filter(|(topic, ..)| topic.starts_with("/can/") || topic == "/from_can_bus")
             .count()
     };
     let intact: usize = seed.intact(place).map(is_entry).sum();
-    let frames = |part: &Part| {
+    let frames = |part: &FileRecord| {
         let of_bus =
             |topic: &str| (topic.starts_with("/can/") && topic != "/can/notes") || topic == "/from_can_bus";
         part.messages.iter().filter(|(topic, ..)| of_bus(topic)).count()

@@ -13,9 +13,9 @@ use protocol::id::CellId;
 use protocol::message::{Joints, Message as Packet};
 use protocol::packet::Epoch;
 use trace::capture::Reader;
-use trace::capture::convert::{Output, convert};
+use trace::capture::convert::{CaptureWriter, convert};
 use trace::capture::log::Style;
-use trace::ros2::cdr::Writer as Cdr;
+use trace::ros2::cdr::CdrWriter as Cdr;
 use trace::ros2::skin::{LoopTiming, Torques};
 use trace::ros2::standard::JointState;
 use trace::ros2::{Header, Message};
@@ -54,7 +54,7 @@ pub(crate) fn all(skin: &str) -> Vec<(&'static str, Vec<u8>)> {
 fn converted(log: &str) -> Vec<u8> {
     let mut out = Vec::new();
     let mut from = Reader::from_read("log", std::io::Cursor::new(log.to_owned().into_bytes())).unwrap();
-    let mut to = Output::new(&mut out, trace::capture::Format::Mcap, Style::default()).unwrap();
+    let mut to = CaptureWriter::new(&mut out, trace::capture::CaptureFormat::Mcap, Style::default()).unwrap();
     convert(&mut from, &mut to, |_, _| Ok(())).unwrap();
     to.finish().unwrap();
     drop(to);

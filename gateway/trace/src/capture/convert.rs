@@ -2,31 +2,31 @@
 
 use std::io::{self, Write};
 
-use super::log::{Less, LogWriter, Style, Wrote};
+use super::log::{OmittedProperties, LogWriter, Style, WriteOutcome};
 use super::mcap::McapWriter;
 pub use super::mcap::Origin;
-use super::{CaptureError, Entry, Format, Note, NoteKind, Reader};
+use super::{CaptureError, Entry, CaptureFormat, Note, NoteKind, Reader};
 use thiserror::Error;
 
 /// A capture that is being written, in either format.
 #[derive(Debug)]
-pub struct Output<W: Write>(Form<W>);
+pub struct CaptureWriter<W: Write>(FormatWriter<W>);
 
 #[derive(Debug)]
-enum Form<W: Write> {
+enum FormatWriter<W: Write> {
     Log(Box<LogWriter<W>>),
     Mcap(Box<McapWriter<W>>),
 }
 
-impl<W: Write> Output<W> {
+impl<W: Write> CaptureWriter<W> {
     /// Begins a capture that is converted from a log; `style` applies to candump text only.
     ///
     /// # Errors
     /// Returns an error if the head of the file cannot be written.
-    pub fn new(out: W, format: Format, style: Style) -> io::Result<Self> {
+    pub fn new(out: W, format: CaptureFormat, style: Style) -> io::Result<Self> {
         Ok(match format {
-            Format::Candump => Self(Form::Log(Box::new(LogWriter::new(out, style)))),
-            Format::Mcap => Self::recording(out, Origin { of_log: true, file: None })?,
+            CaptureFormat::Candump => Self(FormatWriter::Log(Box::new(LogWriter::new(out, style)))),
+            CaptureFormat::Mcap => Self::recording(out, Origin { of_log: true, file: None })?,
         })
     }
 
@@ -35,17 +35,17 @@ impl<W: Write> Output<W> {
     /// # Errors
     /// Returns an error if the head of the file cannot be written.
     pub fn recording(out: W, origin: Origin<'_>) -> io::Result<Self> {
-        Ok(Self(Form::Mcap(Box::new(McapWriter::new(out, origin)?))))
+        Ok(Self(FormatWriter::Mcap(Box::new(McapWriter::new(out, origin)?))))
     }
 
     /// Writes an entry.
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
-    pub fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote> {
+    pub fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome> {
         match &mut self.0 {
-            Form::Log(log) => log.write(entry),
-            Form::Mcap(mcap) => mcap.write(entry).map(|()| Wrote::All),
+            FormatWriter::Log(log) => log.write(entry),
+            FormatWriter::Mcap(mcap) => mcap.write(entry).map(|()| WriteOutcome::All),
         }
     }
 
@@ -53,10 +53,10 @@ impl<W: Write> Output<W> {
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
-    pub fn pass_on(&mut self) -> io::Result<()> {
+    pub fn flush_lines(&mut self) -> io::Result<()> {
         match &mut self.0 {
-            Form::Log(log) => log.pass_on(),
-            Form::Mcap(_) => Ok(()),
+            FormatWriter::Log(log) => log.flush_lines(),
+            FormatWriter::Mcap(_) => Ok(()),
         }
     }
 
@@ -64,10 +64,10 @@ impl<W: Write> Output<W> {
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
-    pub fn keep(&mut self) -> io::Result<()> {
+    pub fn flush_all(&mut self) -> io::Result<()> {
         match &mut self.0 {
-            Form::Log(log) => log.pass_on(),
-            Form::Mcap(mcap) => mcap.flush(),
+            FormatWriter::Log(log) => log.flush_lines(),
+            FormatWriter::Mcap(mcap) => mcap.flush(),
         }
     }
 
@@ -77,40 +77,40 @@ impl<W: Write> Output<W> {
     /// Returns an error if the output cannot be written.
     pub fn finish(&mut self) -> io::Result<()> {
         match &mut self.0 {
-            Form::Log(log) => log.flush(),
-            Form::Mcap(mcap) => mcap.finish(),
+            FormatWriter::Log(log) => log.flush(),
+            FormatWriter::Mcap(mcap) => mcap.finish(),
         }
     }
 }
 
 /// The destination of [`convert`].
-pub trait Target {
+pub trait EntrySink {
     /// Writes an entry.
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
-    fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote>;
+    fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome>;
 
     /// Flushes buffered lines.
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
-    fn pass_on(&mut self) -> io::Result<()>;
+    fn flush_lines(&mut self) -> io::Result<()>;
 }
 
-impl<W: Write> Target for Output<W> {
-    fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote> {
+impl<W: Write> EntrySink for CaptureWriter<W> {
+    fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome> {
         Self::write(self, entry)
     }
 
-    fn pass_on(&mut self) -> io::Result<()> {
-        Self::pass_on(self)
+    fn flush_lines(&mut self) -> io::Result<()> {
+        Self::flush_lines(self)
     }
 }
 
 /// Counts of frames that lost information in candump text, by the kind of information.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Shortened {
+pub struct LossCounts {
     /// Frames whose time lost digits.
     pub digits: u64,
     /// Frames that lost their direction.
@@ -123,7 +123,7 @@ pub struct Shortened {
 
 /// The counts of a conversion.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Converted {
+pub struct ConversionCounts {
     /// Frames written.
     pub frames: u64,
     /// Other lines and texts written.
@@ -137,7 +137,7 @@ pub struct Converted {
     /// Frames that the recorder of the capture lost.
     pub dropped: u64,
     /// Frames whose line holds less than the capture.
-    pub shortened: Shortened,
+    pub shortened: LossCounts,
     /// Notes that the output cannot hold.
     pub omitted: u64,
 }
@@ -164,17 +164,17 @@ pub enum ConvertError {
 /// Returns [`ConvertError`] if either side fails, or if `unreadable` returns an error.
 pub fn convert(
     from: &mut Reader,
-    to: &mut impl Target,
+    to: &mut impl EntrySink,
     mut unreadable: impl FnMut(&Note<'_>, &str) -> Result<(), String>,
-) -> Result<Converted, ConvertError> {
-    let mut done = Converted::default();
+) -> Result<ConversionCounts, ConvertError> {
+    let mut done = ConversionCounts::default();
     loop {
         let entry = match from.next() {
             Ok(Some(entry)) => entry,
             Ok(None) => return Ok(done),
             Err(error) => {
                 // A reader that follows the output gets everything before the error.
-                to.pass_on().map_err(ConvertError::Write)?;
+                to.flush_lines().map_err(ConvertError::Write)?;
                 return Err(error.into());
             }
         };
@@ -188,23 +188,23 @@ pub fn convert(
             }
         }
         match to.write(&entry).map_err(ConvertError::Write)? {
-            Wrote::All => {}
-            Wrote::Less(less) => done.shortened.count(less),
-            Wrote::Nothing => {
+            WriteOutcome::All => {}
+            WriteOutcome::Less(less) => done.shortened.count(less),
+            WriteOutcome::Nothing => {
                 done.notes -= 1;
                 done.omitted += 1;
             }
         }
         if from.is_drained() {
             // A reader may be following the output.
-            to.pass_on().map_err(ConvertError::Write)?;
+            to.flush_lines().map_err(ConvertError::Write)?;
         }
     }
 }
 
-impl Shortened {
-    fn count(&mut self, less: Less) {
-        let Less { digits, direction, raw_dlc, name } = less;
+impl LossCounts {
+    fn count(&mut self, less: OmittedProperties) {
+        let OmittedProperties { digits, direction, raw_dlc, name } = less;
         self.digits += u64::from(digits);
         self.direction += u64::from(direction);
         self.raw_dlc += u64::from(raw_dlc);
@@ -212,7 +212,7 @@ impl Shortened {
     }
 }
 
-impl Converted {
+impl ConversionCounts {
     fn note(&mut self, note: &Note<'_>) {
         self.notes += 1;
         match &note.kind {

@@ -4,9 +4,9 @@ use std::io;
 
 use thiserror::Error;
 
-use super::mcap::Fault;
+use super::mcap::ReadFault;
 use super::parts::PartsError;
-use crate::container::Damage;
+use crate::container::FormatError;
 
 /// An error of opening or reading a capture.
 #[derive(Debug, Error)]
@@ -42,15 +42,15 @@ pub enum CaptureError {
         /// The name of the capture.
         name: String,
         /// The damage.
-        what: Damage,
+        what: FormatError,
         /// The number of entries before the damage.
         entries: u64,
     },
 }
 
-impl Fault {
+impl ReadFault {
     /// Converts the fault into an error of the file `name`, of which `entries` have been read.
-    pub(super) fn of(self, name: &str, entries: u64) -> CaptureError {
+    pub(super) fn into_capture_error(self, name: &str, entries: u64) -> CaptureError {
         let name = name.to_owned();
         match self {
             Self::Io(source) => CaptureError::Io { name, source },

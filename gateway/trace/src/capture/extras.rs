@@ -9,11 +9,11 @@ use serde::Serialize;
 
 /// The contents of an MCAP recording other than frames and notes, as far as it has been read.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Extras {
+pub struct RecordingExtras {
     /// Topics that hold neither frames nor notes, in the order of their first messages.
     pub topics: Vec<Topic>,
     /// Earlier frames that are latched when the recording begins.
-    pub latched: Vec<Latched>,
+    pub latched: Vec<LatchedFrame>,
     /// Attachments by name. The largest are listed without their bytes.
     pub attachments: Vec<(String, Vec<u8>)>,
     /// Metadata records by name.
@@ -23,7 +23,7 @@ pub struct Extras {
 }
 
 /// The name of the metadata record that holds the start of a run's loop.
-pub const RUN: &str = "run";
+pub const RUN_METADATA: &str = "run";
 /// The key of the first tick's time in [`RUN`], in ns since 1970.
 const BEGAN: &str = "began_ns";
 
@@ -41,9 +41,9 @@ pub const fn seconds_since(zero: u64, nanos: u64) -> f64 {
 }
 
 /// The name of the attachment that holds the skin of a recorded run.
-pub const SKIN: &str = "skin.toml";
+pub const SKIN_ATTACHMENT: &str = "skin.toml";
 
-impl Extras {
+impl RecordingExtras {
     /// The empty contents.
     pub(super) const NONE: &Self = &Self {
         topics: Vec::new(),
@@ -65,7 +65,7 @@ impl Extras {
     /// earliest.
     #[must_use]
     pub fn run_began(&self) -> Option<u64> {
-        self.fact(RUN, BEGAN)?.parse().ok()
+        self.fact(RUN_METADATA, BEGAN)?.parse().ok()
     }
 
     /// Returns the attached skin; `None` if the recording has none.
@@ -74,14 +74,14 @@ impl Extras {
     /// Returns [`DocumentError`] if this version cannot read the skin.
     #[must_use]
     pub fn skin(&self) -> Option<Result<Skin, DocumentError>> {
-        let (_, text) = self.attachments.iter().find(|(name, _)| name == SKIN)?;
-        Some(Skin::parse_recorded(SKIN, &String::from_utf8_lossy(text)))
+        let (_, text) = self.attachments.iter().find(|(name, _)| name == SKIN_ATTACHMENT)?;
+        Some(Skin::parse_recorded(SKIN_ATTACHMENT, &String::from_utf8_lossy(text)))
     }
 }
 
 /// A frame that was sent before a recording began and is still latched.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Latched {
+pub struct LatchedFrame {
     /// The bus of the frame.
     pub bus: String,
     /// True if the recorder had sent it.

@@ -15,24 +15,24 @@ const UNPACK: &str = "unpack it first";
 const EXPORT: &str = "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can)";
 
 /// First bytes of known formats. Everything else is text.
-const MAGIC: &[(&[u8], Kind)] = &[
-    (b"\x89MCAP", Kind::Mcap),
-    (b"PK\x03\x04", Kind::Other("a zip archive", UNPACK)),
-    (b"PK\x05\x06", Kind::Other("an empty zip archive", UNPACK)),
-    (b"\x1F\x8B", Kind::Other("a gzip file", UNPACK)),
-    (b"\x28\xB5\x2F\xFD", Kind::Other("a zstd file", UNPACK)),
-    (b"\xFD7zXZ", Kind::Other("an xz file", UNPACK)),
-    (b"BZh", Kind::Other("a bzip2 file", UNPACK)),
-    (b"\x04\x22\x4D\x18", Kind::Other("an lz4 file", UNPACK)),
+const MAGIC: &[(&[u8], InputFormat)] = &[
+    (b"\x89MCAP", InputFormat::Mcap),
+    (b"PK\x03\x04", InputFormat::Other("a zip archive", UNPACK)),
+    (b"PK\x05\x06", InputFormat::Other("an empty zip archive", UNPACK)),
+    (b"\x1F\x8B", InputFormat::Other("a gzip file", UNPACK)),
+    (b"\x28\xB5\x2F\xFD", InputFormat::Other("a zstd file", UNPACK)),
+    (b"\xFD7zXZ", InputFormat::Other("an xz file", UNPACK)),
+    (b"BZh", InputFormat::Other("a bzip2 file", UNPACK)),
+    (b"\x04\x22\x4D\x18", InputFormat::Other("an lz4 file", UNPACK)),
     (b"\xD4\xC3\xB2\xA1", PCAP),
     (b"\xA1\xB2\xC3\xD4", PCAP),
     (b"\x4D\x3C\xB2\xA1", PCAP),
     (b"\xA1\xB2\x3C\x4D", PCAP),
     (b"\x0A\x0D\x0D\x0A", PCAP),
-    (b"LOGG", Kind::Other("a BLF file", EXPORT)),
+    (b"LOGG", InputFormat::Other("a BLF file", EXPORT)),
     (b"MDF  ", MDF),
     (b"UnFinMF ", MDF),
-    (b"date ", Kind::Other(ASC.0, ASC.1)),
+    (b"date ", InputFormat::Other(ASC.0, ASC.1)),
     (b";$FILEVERSION", TRC),
     (b"\xEF\xBB\xBF;$FILEVERSION", TRC),
     (b"timestamp,", CSV),
@@ -40,17 +40,17 @@ const MAGIC: &[(&[u8], Kind)] = &[
     (b"Timestamp;", CSV),
     (b"Time Stamp", CSV),
     (b"\xEF\xBB\xBFTime", CSV),
-    (b"version https://git-lfs", Kind::Other("a Git LFS pointer to a file", "fetch it with `git lfs pull`")),
+    (b"version https://git-lfs", InputFormat::Other("a Git LFS pointer to a file", "fetch it with `git lfs pull`")),
     (
         b"#ROSBAG V",
-        Kind::Other(
+        InputFormat::Other(
             "a ROS 1 bag",
             "make an MCAP of it with `rosbags-convert --src FILE --dst NEW --dst-storage mcap` (pip install rosbags), and name NEW/NEW.mcap",
         ),
     ),
     (
         b"SQLite format 3",
-        Kind::Other(
+        InputFormat::Other(
             "an SQLite database",
             "of a ROS 2 bag make an MCAP with `rosbags-convert --src FOLDER --dst NEW --dst-storage mcap` (pip install \
              rosbags), and name NEW/NEW.mcap; of python-can's a candump log with `can_logconvert FILE NEW.log`",
@@ -60,27 +60,27 @@ const MAGIC: &[(&[u8], Kind)] = &[
     (b"\xFE\xFF", UTF_16),
 ];
 
-const MDF: Kind = Kind::Other(
+const MDF: InputFormat = InputFormat::Other(
     "an MDF file",
     "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can[mf4])",
 );
-const TRC: Kind = Kind::Other("a PEAK trace", EXPORT);
-const CSV: Kind = Kind::Other(
+const TRC: InputFormat = InputFormat::Other("a PEAK trace", EXPORT);
+const CSV: InputFormat = InputFormat::Other(
     "a table in CSV",
     "`can_logconvert FILE NEW.log` makes a candump log of python-can's tables; of others write lines like \
      `(1700000000.123456) can0 123#00`",
 );
-const PCAP: Kind = Kind::Other(
+const PCAP: InputFormat = InputFormat::Other(
     "a packet capture",
     "write lines like `(1700000000.123456) can0 123#00` from what `tshark -T fields -e frame.time_epoch -e can.id \
      -e data.data -r FILE` shows (identifiers are decimal there), or take the capture with `candump -l`",
 );
-const UTF_16: Kind =
-    Kind::Other("text in UTF-16", "save it as UTF-8, as with `iconv -f utf-16 -t utf-8 FILE > NEW.log`");
+const UTF_16: InputFormat =
+    InputFormat::Other("text in UTF-16", "save it as UTF-8, as with `iconv -f utf-16 -t utf-8 FILE > NEW.log`");
 
 /// The format of an input.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Kind {
+pub(super) enum InputFormat {
     Text,
     Mcap,
     /// The name of the other format, and the action to take.
@@ -89,7 +89,7 @@ pub(super) enum Kind {
 
 /// Recognises the format of an input and returns the bytes that were read. Reads as few bytes as necessary, so that a
 /// pipe whose first line is slow does not block longer than needed.
-pub(super) fn look(input: &mut impl Read) -> io::Result<(Kind, Vec<u8>)> {
+pub(super) fn detect_format(input: &mut impl Read) -> io::Result<(InputFormat, Vec<u8>)> {
     let mut head = Vec::new();
     let longest = MAGIC.iter().map(|(magic, _)| magic.len()).max().unwrap_or(0);
     let mut room = vec![0; longest];
@@ -100,11 +100,11 @@ pub(super) fn look(input: &mut impl Read) -> io::Result<(Kind, Vec<u8>)> {
         let open = MAGIC.iter().any(|(magic, _)| magic.starts_with(&head));
         let free = room.get_mut(head.len()..).unwrap_or_default();
         if !open || free.is_empty() {
-            return Ok((Kind::Text, head));
+            return Ok((InputFormat::Text, head));
         }
         let got = read_some(input, free)?;
         if got == 0 {
-            return Ok((Kind::Text, head));
+            return Ok((InputFormat::Text, head));
         }
         head.extend_from_slice(free.get(..got).unwrap_or_default());
     }
@@ -112,14 +112,14 @@ pub(super) fn look(input: &mut impl Read) -> io::Result<(Kind, Vec<u8>)> {
 
 /// Returns true if the first or the last bytes are those of an MCAP recording, and rewinds the file.
 pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
-    let (kind, _) = look(file)?;
-    if kind == Kind::Mcap {
+    let (kind, _) = detect_format(file)?;
+    if kind == InputFormat::Mcap {
         file.rewind()?;
         return Ok(true);
     }
     let (mut first, mut last) = (vec![0; BEGINNING], [0; container::MAGIC.len()]);
     let size = file.metadata()?.len();
-    if kind == Kind::Text && size > 2 * container::MAGIC.len() as u64 {
+    if kind == InputFormat::Text && size > 2 * container::MAGIC.len() as u64 {
         let came = file.read_at(&mut first, 0)?;
         first.truncate(came);
         file.read_exact_at(&mut last, size - container::MAGIC.len() as u64)?;
@@ -134,7 +134,7 @@ pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
 
 /// Returns true if the bytes begin with a complete header record.
 fn is_header(bytes: &[u8]) -> bool {
-    let Some((&[code, ref length @ ..], body)) = bytes.split_first_chunk::<{ container::HEAD }>() else {
+    let Some((&[code, ref length @ ..], body)) = bytes.split_first_chunk::<{ container::RECORD_HEADER_BYTES }>() else {
         return false;
     };
     code == op::HEADER && container::own_length(code, body) == Some(u64::from_le_bytes(*length))
@@ -147,25 +147,25 @@ mod tests {
 
     #[test]
     fn files_are_told_by_their_first_bytes() {
-        let kind = |bytes: &[u8]| look(&mut Cursor::new(bytes)).unwrap();
-        assert_eq!(kind(mcap::MAGIC).0, Kind::Mcap);
-        assert_eq!(kind(b"PK\x03\x04 and more").0, Kind::Other("a zip archive", UNPACK));
-        assert_eq!(kind(b"(1.000000) can0 123#").0, Kind::Text);
+        let kind = |bytes: &[u8]| detect_format(&mut Cursor::new(bytes)).unwrap();
+        assert_eq!(kind(mcap::MAGIC).0, InputFormat::Mcap);
+        assert_eq!(kind(b"PK\x03\x04 and more").0, InputFormat::Other("a zip archive", UNPACK));
+        assert_eq!(kind(b"(1.000000) can0 123#").0, InputFormat::Text);
         for text in [&b""[..], b"P", b"PK\x03", b"\n", b"#", b"#ROS", b"BZ"] {
-            assert_eq!(kind(text), (Kind::Text, text.to_vec()));
+            assert_eq!(kind(text), (InputFormat::Text, text.to_vec()));
         }
         for (magic, expected) in MAGIC {
             assert_eq!(kind(magic).0, *expected);
-            assert_eq!(kind(magic).0 == Kind::Mcap, *magic == b"\x89MCAP");
-            assert_ne!(kind(magic).0, Kind::Text, "{magic:?}");
+            assert_eq!(kind(magic).0 == InputFormat::Mcap, *magic == b"\x89MCAP");
+            assert_ne!(kind(magic).0, InputFormat::Text, "{magic:?}");
         }
     }
 
     #[test]
     fn hints_name_a_program_that_reads_the_kind() {
-        let hint = |bytes: &[u8]| match look(&mut Cursor::new(bytes)).unwrap().0 {
-            Kind::Other(_, hint) => hint,
-            kind @ (Kind::Text | Kind::Mcap) => panic!("{kind:?}"),
+        let hint = |bytes: &[u8]| match detect_format(&mut Cursor::new(bytes)).unwrap().0 {
+            InputFormat::Other(_, hint) => hint,
+            kind @ (InputFormat::Text | InputFormat::Mcap) => panic!("{kind:?}"),
         };
         // can_logconvert writes an empty log for an ASC header of other programs.
         assert!(hint(b"date Mon Dec 6 11:21:13 am 2021\n").contains("asc2log"));
@@ -187,7 +187,7 @@ mod tests {
             }
         }
         // The magic of skippable zstd frames begins with a parenthesis too.
-        assert_eq!(look(&mut Slow(b"(1")).unwrap(), (Kind::Text, b"(1".to_vec()));
-        assert_eq!(look(&mut Slow(b"PK\x03\x04")).unwrap().0, Kind::Other("a zip archive", UNPACK));
+        assert_eq!(detect_format(&mut Slow(b"(1")).unwrap(), (InputFormat::Text, b"(1".to_vec()));
+        assert_eq!(detect_format(&mut Slow(b"PK\x03\x04")).unwrap().0, InputFormat::Other("a zip archive", UNPACK));
     }
 }

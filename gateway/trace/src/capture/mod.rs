@@ -24,13 +24,13 @@ mod text_kinds;
 mod times;
 
 pub use error::CaptureError;
-pub use extras::{Extras, Latched, RUN, SKIN, Topic, facts_of_run, seconds_since};
-pub use mcap::ORIGIN;
+pub use extras::{RecordingExtras, LatchedFrame, RUN_METADATA, SKIN_ATTACHMENT, Topic, facts_of_run, seconds_since};
+pub use mcap::ORIGIN_METADATA;
 pub(crate) use mcap::is_foreign_frame;
-pub use parts::{Part, PartsError};
-pub use place::{Place, Places};
+pub use parts::{RecordingPart, PartsError};
+pub use place::{SeekPoint, SeekIndex};
 pub use reader::Reader;
-pub use text_kinds::DESCRIPTION;
+pub use text_kinds::SKIN_OR_SCENARIO;
 
 pub use crate::note::{BusNote, Note, NoteKind};
 
@@ -40,11 +40,11 @@ use std::io::Read;
 use protocol::candump::Record;
 
 /// A wrapper around each opened file, such as a progress meter.
-pub type Through = Box<dyn Fn(File) -> Box<dyn Read + Send> + Send>;
+pub type FileWrapper = Box<dyn Fn(File) -> Box<dyn Read + Send> + Send>;
 
 /// The format of a capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Format {
+pub enum CaptureFormat {
     /// Text in the format of `candump -L`.
     Candump,
     /// An MCAP recording.
@@ -66,12 +66,12 @@ pub enum Item<'a> {
     /// A frame or a note.
     Entry(Entry<'a>),
     /// A message of another topic.
-    Other(Other<'a>),
+    Other(OtherMessage<'a>),
 }
 
 /// A message that is neither a frame nor a note.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Other<'a> {
+pub struct OtherMessage<'a> {
     /// The topic.
     pub topic: &'a str,
     /// The type of the message.

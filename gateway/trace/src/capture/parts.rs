@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use super::{Extras, Format};
+use super::{RecordingExtras, CaptureFormat};
 
 /// The error for files that are not the parts of one recording.
 #[derive(Debug, Error)]
@@ -55,9 +55,9 @@ pub enum PartsError {
     )]
     Different {
         /// One part.
-        one: Part,
+        one: RecordingPart,
         /// The other part.
-        other: Part,
+        other: RecordingPart,
     },
     /// Two files are the same part.
     #[error(
@@ -66,9 +66,9 @@ pub enum PartsError {
     )]
     Twice {
         /// One file.
-        one: Part,
+        one: RecordingPart,
         /// The other file.
-        other: Part,
+        other: RecordingPart,
     },
     /// One part is missing between two others.
     #[error(
@@ -77,24 +77,24 @@ pub enum PartsError {
     )]
     Missing {
         /// The part before the gap.
-        one: Part,
+        one: RecordingPart,
         /// The part after the gap.
-        next: Part,
+        next: RecordingPart,
     },
 }
 
 /// The number of a part, and the recording that it belongs to.
 #[derive(Clone, Debug)]
-pub struct Part {
+pub struct RecordingPart {
     path: PathBuf,
     /// The start of the recording, in ns since 1970. It identifies the recording.
     began: String,
     number: u32,
 }
 
-impl Part {
+impl RecordingPart {
     /// Reads the identity from the metadata of the file; `None` if the file is not a part.
-    fn of(path: &Path, extras: &Extras) -> Option<Self> {
+    fn of(path: &Path, extras: &RecordingExtras) -> Option<Self> {
         let (began, number) = extras.fact("program", "began_ns").zip(extras.fact("part", "number"))?;
         Some(Self { path: path.to_owned(), began: began.to_owned(), number: number.parse().ok()? })
     }
@@ -102,20 +102,20 @@ impl Part {
 
 /// One of several files, with the facts that decide its position.
 #[derive(Debug)]
-pub(super) struct Named {
+pub(super) struct CaptureFile {
     pub(super) path: PathBuf,
-    pub(super) format: Format,
-    part: Option<Part>,
+    pub(super) format: CaptureFormat,
+    part: Option<RecordingPart>,
     /// The time of its first frame, in ns since 1970.
     first: Option<u64>,
     /// True if it has lines and no frame.
     is_text: bool,
 }
 
-impl Named {
+impl CaptureFile {
     /// Describes a file. `lines` counts its lines up to the first frame; it is 0 for a recording.
-    pub(super) fn new(path: &Path, extras: &Extras, format: Format, first: Option<u64>, lines: u64) -> Self {
-        let (part, is_text) = (Part::of(path, extras), first.is_none() && lines > 0);
+    pub(super) fn new(path: &Path, extras: &RecordingExtras, format: CaptureFormat, first: Option<u64>, lines: u64) -> Self {
+        let (part, is_text) = (RecordingPart::of(path, extras), first.is_none() && lines > 0);
         Self { path: path.to_owned(), format, part, first, is_text }
     }
 }
@@ -125,13 +125,13 @@ impl Named {
 ///
 /// # Errors
 /// Returns [`PartsError`] if the files are not one capture.
-pub(super) fn together(mut files: Vec<Named>) -> Result<Vec<PathBuf>, PartsError> {
+pub(super) fn together(mut files: Vec<CaptureFile>) -> Result<Vec<PathBuf>, PartsError> {
     if let Some(text) = files.iter().find(|file| file.is_text) {
         return Err(PartsError::NoFrame(text.path.clone()));
     }
     let mut places = HashSet::new();
     let mut is_again =
-        |file: &&Named| !places.insert(fs::canonicalize(&file.path).unwrap_or_else(|_| file.path.clone()));
+        |file: &&CaptureFile| !places.insert(fs::canonicalize(&file.path).unwrap_or_else(|_| file.path.clone()));
     if let Some(again) = files.iter().find(|file| is_again(file)) {
         return Err(PartsError::Same(again.path.clone()));
     }
@@ -144,7 +144,7 @@ pub(super) fn together(mut files: Vec<Named>) -> Result<Vec<PathBuf>, PartsError
         (None, _) => {}
     }
     let of = |format| files.iter().find(|file| file.format == format).map(|file| file.path.clone());
-    if let (Some(log), Some(mcap)) = (of(Format::Candump), of(Format::Mcap)) {
+    if let (Some(log), Some(mcap)) = (of(CaptureFormat::Candump), of(CaptureFormat::Mcap)) {
         return Err(PartsError::Formats { log, mcap });
     }
     files.sort_by_key(|file| file.first);
@@ -156,7 +156,7 @@ pub(super) fn together(mut files: Vec<Named>) -> Result<Vec<PathBuf>, PartsError
 /// # Errors
 /// Returns [`PartsError`] if the parts belong to different recordings, if one is missing between two others, or if one
 /// occurs twice.
-fn ordered(mut parts: Vec<Part>) -> Result<Vec<PathBuf>, PartsError> {
+fn ordered(mut parts: Vec<RecordingPart>) -> Result<Vec<PathBuf>, PartsError> {
     parts.sort_by_key(|part| part.number);
     for pair in parts.windows(2) {
         let [one, next] = pair else { continue };

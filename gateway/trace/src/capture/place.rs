@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use super::log::Clock;
-use super::mcap::{Fault, State};
+use super::mcap::{ReadFault, McapState};
 
 /// The position of an entry in a capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Place {
+pub struct SeekPoint {
     /// The index of the part.
     pub(super) part: usize,
     /// The byte offset of the record or line in its part.
@@ -22,23 +22,23 @@ pub struct Place {
 
 /// An index of positions in a capture, by time.
 #[derive(Debug)]
-pub struct Places {
-    pub(super) parts: Vec<Part>,
+pub struct SeekIndex {
+    pub(super) parts: Vec<IndexedFile>,
     /// The positions in their order, each with the latest time of all entries before the next position, in ns since
     /// 1970.
-    pub(super) marks: Vec<(u64, Place)>,
+    pub(super) marks: Vec<(u64, SeekPoint)>,
     /// The minimum distance between two positions of a file, in bytes.
     pub(super) piece: u64,
 }
 
 #[derive(Debug)]
-pub(super) struct Part {
+pub(super) struct IndexedFile {
     pub(super) path: PathBuf,
     /// Records of the summary that describe the messages: operation codes and contents.
     pub(super) descriptions: Vec<(u8, Vec<u8>)>,
 }
 
-impl Places {
+impl SeekIndex {
     /// Returns the latest time in the capture, in ns since 1970, as far as the index knows; 0 for an empty capture.
     #[must_use]
     pub fn latest(&self) -> u64 {
@@ -47,7 +47,7 @@ impl Places {
 
     /// Returns the last position that has only entries earlier than `nanos` before it.
     #[must_use]
-    pub fn before(&self, nanos: u64) -> Place {
+    pub fn before(&self, nanos: u64) -> SeekPoint {
         let at = self.marks.partition_point(|(latest, _)| *latest < nanos);
         self.marks.get(at).or_else(|| self.marks.last()).map(|(_, place)| *place).unwrap_or_default()
     }
@@ -62,9 +62,9 @@ impl Places {
     }
 
     /// Passes the message descriptions of a part to the state of a reader.
-    pub(super) fn describe(&self, part: usize, state: &mut State) -> Result<(), Fault> {
+    pub(super) fn describe(&self, part: usize, state: &mut McapState) -> Result<(), ReadFault> {
         for (opcode, body) in self.parts.get(part).into_iter().flat_map(|part| &part.descriptions) {
-            state.take(*opcode, body, false)?;
+            state.process(*opcode, body, false)?;
         }
         Ok(())
     }

@@ -14,28 +14,28 @@ use std::path::{Path, PathBuf};
 use ::mcap::records::op;
 use protocol::input;
 
-use super::log::{LONGEST as LONGEST_LINE, LogReader, known_time};
+use super::log::{MAX_LINE_BYTES as LONGEST_LINE, LogReader, known_time};
 use super::magic::is_mcap;
-use super::place::{Part, Place, Places};
+use super::place::{IndexedFile, SeekPoint, SeekIndex};
 use super::{CaptureError, Entry, Reader};
-use crate::container::{LONGEST_DESCRIPTION, MAGIC, find};
+use crate::container::{MAX_DESCRIPTION_BYTES, MAGIC, find};
 use crate::order::WINDOW_NS;
 
 /// The minimum distance between two positions of a file, in bytes.
-const PIECE: u64 = 64 << 10;
+const MIN_DISTANCE_BYTES: u64 = 64 << 10;
 /// The maximum size of the descriptions that are kept for a part, in bytes.
 const DESCRIPTIONS: usize = 16 << 20;
 /// The length of a log's end in which its last frame is searched, in bytes.
 const END: u64 = 4 * LONGEST_LINE as u64;
 
-impl Places {
+impl SeekIndex {
     /// Indexes one file, or the parts of one recording in any order. Reads only the times in each file.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if a file cannot be read or is not seekable, or if the files are not parts of one
     /// recording.
-    pub fn of(paths: &[PathBuf]) -> Result<Self, CaptureError> {
-        Self::apart(paths, PIECE)
+    pub fn open(paths: &[PathBuf]) -> Result<Self, CaptureError> {
+        Self::apart(paths, MIN_DISTANCE_BYTES)
     }
 
     /// Indexes the files with a position every `piece` bytes.
@@ -54,14 +54,14 @@ impl Places {
             let why = "it is not a regular file, and not seekable: write it to a file first";
             return Err(io::Error::new(io::ErrorKind::NotSeekable, why));
         }
-        self.parts.push(Part { path: path.to_owned(), descriptions: Vec::new() });
+        self.parts.push(IndexedFile { path: path.to_owned(), descriptions: Vec::new() });
         if is_mcap(&mut file)? { self.add_mcap(file) } else { self.add_log(file) }
     }
 
     /// Adds a position in the last part if it is far enough from the one before. All entries before the next position
     /// have times up to `latest`.
-    fn mark(&mut self, place: Place, latest: u64) {
-        let place = Place { part: self.parts.len() - 1, ..place };
+    fn mark(&mut self, place: SeekPoint, latest: u64) {
+        let place = SeekPoint { part: self.parts.len() - 1, ..place };
         let latest = latest.max(self.latest());
         match self.marks.last_mut() {
             Some((of, last)) if last.part == place.part && place.offset - last.offset < self.piece => {
@@ -84,7 +84,7 @@ impl Places {
                 op::FOOTER => break,
                 op::CHUNK => 16,
                 op::MESSAGE => 14,
-                _ => length.min(LONGEST_DESCRIPTION as u64),
+                _ => length.min(MAX_DESCRIPTION_BYTES as u64),
             };
             (&mut from).take(kept.min(length)).read_to_end(&mut head)?;
             let rest = i64::try_from(length.saturating_sub(kept));
@@ -96,8 +96,8 @@ impl Places {
                 bytes.map_or(0, u64::from_le_bytes)
             };
             match opcode {
-                op::CHUNK => self.mark(Place { offset: at, ..Place::default() }, time(8)),
-                op::MESSAGE => self.mark(Place { offset: at, ..Place::default() }, time(6)),
+                op::CHUNK => self.mark(SeekPoint { offset: at, ..SeekPoint::default() }, time(8)),
+                op::MESSAGE => self.mark(SeekPoint { offset: at, ..SeekPoint::default() }, time(6)),
                 _ => {
                     described += head.len();
                     if let Some(part) = self.parts.last_mut().filter(|_| described <= DESCRIPTIONS) {
@@ -113,14 +113,14 @@ impl Places {
     /// the merge.
     fn add_log(&mut self, mut file: File) -> io::Result<()> {
         let length = file.metadata()?.len();
-        let mut last = Place::default();
+        let mut last = SeekPoint::default();
         let mut at = 0;
         while at < length {
             match line_at(&mut file, at)? {
                 Some((_, None)) => return self.add_by_reading(file),
                 Some((offset, Some(nanos))) if at > 0 => {
                     self.mark(last, nanos.saturating_add(WINDOW_NS));
-                    last = Place { offset, ..Place::default() };
+                    last = SeekPoint { offset, ..SeekPoint::default() };
                 }
                 Some(_) | None => {}
             }
@@ -144,7 +144,7 @@ impl Places {
             let (offset, line, clock) = (log.offset(), log.lines(), log.clock());
             match log.next()? {
                 Some(Entry::Frame(record)) => {
-                    let place = Place { offset, line, clock, ..Place::default() };
+                    let place = SeekPoint { offset, line, clock, ..SeekPoint::default() };
                     self.mark(place, record.time.nanos);
                 }
                 Some(Entry::Note(_)) => {}

@@ -9,13 +9,13 @@ use std::path::{Path, PathBuf};
 use protocol::input;
 
 use super::log::{Clock, LogReader, Remark};
-use super::magic::{self, Kind, is_mcap};
-use super::mcap::{Buses, Fault, McapReader, ORIGIN, SOURCE, State, Survey};
-use super::parts::{self, Named, PartsError};
-use super::place::{Place, Places};
+use super::magic::{self, InputFormat, is_mcap};
+use super::mcap::{ForeignBuses, ReadFault, McapReader, ORIGIN_METADATA, SOURCE, McapState, TopicSurvey};
+use super::parts::{self, CaptureFile, PartsError};
+use super::place::{SeekPoint, SeekIndex};
 use super::text_kinds::kind_of;
-use super::times::Times;
-use super::{CaptureError, Entry, Extras, Format, Item, Through};
+use super::times::TimeChecks;
+use super::{CaptureError, Entry, RecordingExtras, CaptureFormat, Item, FileWrapper};
 
 /// Reads a capture from its beginning to its end in bounded memory. The parts of a split recording are one capture.
 pub struct Reader {
@@ -31,12 +31,12 @@ pub struct Reader {
     part: usize,
     /// The parts that follow.
     rest: VecDeque<PathBuf>,
-    through: Through,
+    through: FileWrapper,
     /// True if a part before this one has no end.
     is_unfinished: bool,
     /// The buses of other programs' frames, if they are known before the frames are read.
-    buses: Buses,
-    times: Times,
+    buses: ForeignBuses,
+    times: TimeChecks,
     /// The name of the file before this one, until the first frame of this one is read.
     before: Option<String>,
     /// Remarks on the logs before this one.
@@ -50,7 +50,7 @@ enum Source {
 
 impl Source {
     /// Opens a file. The attachments and metadata of a recording are known from the beginning if it is a regular file.
-    fn open(path: &Path, through: &Through, mut state: State) -> Result<(String, Self), CaptureError> {
+    fn open(path: &Path, through: &FileWrapper, mut state: McapState) -> Result<(String, Self), CaptureError> {
         let name = path.display().to_string();
         let failed = |source| CaptureError::Io { name: name.clone(), source };
         let mut file = input::open(path).map_err(failed)?;
@@ -67,31 +67,31 @@ impl Source {
     fn begin(
         name: &str,
         input: impl Read + Send + 'static,
-        state: State,
+        state: McapState,
         file: Option<File>,
     ) -> Result<Self, CaptureError> {
         let (name, mut input) = (name.to_owned(), Box::new(input));
-        match magic::look(&mut input) {
+        match magic::detect_format(&mut input) {
             // The first bytes of the recording are damaged; the reader reports them.
-            Ok((Kind::Text, head)) if file.is_some() => Ok(Self::mcap(&head, input, state, file)),
-            Ok((Kind::Text, head)) => Ok(Self::Log(LogReader::new(&head, input))),
-            Ok((Kind::Mcap, head)) => Ok(Self::mcap(&head, input, state, file)),
-            Ok((Kind::Other(what, hint), _)) => Err(CaptureError::Other { name, what, hint }),
+            Ok((InputFormat::Text, head)) if file.is_some() => Ok(Self::mcap(&head, input, state, file)),
+            Ok((InputFormat::Text, head)) => Ok(Self::Log(LogReader::new(&head, input))),
+            Ok((InputFormat::Mcap, head)) => Ok(Self::mcap(&head, input, state, file)),
+            Ok((InputFormat::Other(what, hint), _)) => Err(CaptureError::Other { name, what, hint }),
             Err(source) => Err(CaptureError::Io { name, source }),
         }
     }
 
-    fn mcap(head: &[u8], input: Box<dyn Read + Send>, state: State, file: Option<File>) -> Self {
+    fn mcap(head: &[u8], input: Box<dyn Read + Send>, state: McapState, file: Option<File>) -> Self {
         Self::Mcap(Box::new(McapReader::new(head, input, state, file)))
     }
 
     /// Returns true after the last entry.
     fn is_at_its_end(&mut self, name: &str, entries: u64) -> Result<bool, CaptureError> {
         let at_its_end = match self {
-            Self::Log(log) => log.is_at_its_end().map_err(Fault::from),
+            Self::Log(log) => log.is_at_its_end().map_err(ReadFault::from),
             Self::Mcap(mcap) => mcap.is_at_its_end(),
         };
-        at_its_end.map_err(|fault| fault.of(name, entries))
+        at_its_end.map_err(|fault| fault.into_capture_error(name, entries))
     }
 }
 
@@ -122,7 +122,7 @@ impl Reader {
         input: impl Read + Send + 'static,
     ) -> Result<Self, CaptureError> {
         let name = name.into();
-        let source = Source::begin(&name, input, State::new(false, None), None)?;
+        let source = Source::begin(&name, input, McapState::new(false, None), None)?;
         Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), plain(), false))
     }
 
@@ -139,7 +139,7 @@ impl Reader {
     ///
     /// # Errors
     /// Returns [`CaptureError`] as [`Reader::open_all`] does.
-    pub fn open_through(paths: &[PathBuf], through: Through) -> Result<Self, CaptureError> {
+    pub fn open_through(paths: &[PathBuf], through: FileWrapper) -> Result<Self, CaptureError> {
         Self::open_parts(paths, through, false)
     }
 
@@ -151,13 +151,13 @@ impl Reader {
         Self::open_parts(paths, plain(), true)
     }
 
-    fn open_parts(paths: &[PathBuf], through: Through, others: bool) -> Result<Self, CaptureError> {
+    fn open_parts(paths: &[PathBuf], through: FileWrapper, others: bool) -> Result<Self, CaptureError> {
         if let [one] = paths
             && input::is_standard_input(one)
         {
             let name = "standard input".to_owned();
             let file = input::open(one).map_err(|source| CaptureError::Io { name: name.clone(), source })?;
-            let source = Source::begin(&name, through(file), State::new(others, None), None)?;
+            let source = Source::begin(&name, through(file), McapState::new(others, None), None)?;
             return Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), through, others));
         }
         let ordered = Self::ordered(paths)?;
@@ -165,26 +165,26 @@ impl Reader {
         let mut rest = VecDeque::from(ordered);
         let first = rest.pop_front().ok_or(PartsError::None)?;
         let buses = Self::survey([&first].into_iter().chain(&rest));
-        let opened = Source::open(&first, &through, State::new(others, None).with_buses(buses.clone()))?;
+        let opened = Source::open(&first, &through, McapState::new(others, None).with_buses(buses.clone()))?;
         Ok(Self { buses, ..Self::begin(name, opened, rest, through, others) })
     }
 
     /// Returns the buses of other programs' frames in all files; empty if they need not be known in advance. Unreadable
     /// files are skipped here, because reading reports them.
-    fn survey<'a>(paths: impl Iterator<Item = &'a PathBuf> + Clone) -> Buses {
+    fn survey<'a>(paths: impl Iterator<Item = &'a PathBuf> + Clone) -> ForeignBuses {
         let recording = |path: &&PathBuf| {
             let mut file = input::can_be_read_again(path).then(|| File::open(path).ok()).flatten()?;
             is_mcap(&mut file).is_ok_and(|is| is).then_some(file)
         };
-        let mut survey = Survey::default();
+        let mut survey = TopicSurvey::default();
         for mut file in paths.clone().filter_map(|path| recording(&path)) {
-            let _ = survey.look(&mut file);
+            let _ = survey.add_file(&mut file);
         }
         if !survey.is_needed() {
-            return Buses::default();
+            return ForeignBuses::default();
         }
         let files = paths.filter_map(|path| recording(&path));
-        files.fold(Buses::default(), |known, file| survey.buses_of(Box::new(file), known)).settled()
+        files.fold(ForeignBuses::default(), |known, file| survey.buses_of(Box::new(file), known)).settled()
     }
 
     /// Returns the parts of a recording in their order.
@@ -198,7 +198,7 @@ impl Reader {
                 let mut reader = Self::open(path)?;
                 // A part holds its number before its frames.
                 let first = reader.first_time();
-                Ok(Named::new(path, reader.extras(), reader.format(), first, reader.lines()))
+                Ok(CaptureFile::new(path, reader.extras(), reader.format(), first, reader.lines()))
             }
         };
         Ok(parts::together(paths.iter().map(named).collect::<Result<_, CaptureError>>()?)?)
@@ -233,7 +233,7 @@ impl Reader {
         name: String,
         (file, source): (String, Source),
         rest: VecDeque<PathBuf>,
-        through: Through,
+        through: FileWrapper,
         others: bool,
     ) -> Self {
         Self {
@@ -246,8 +246,8 @@ impl Reader {
             rest,
             through,
             is_unfinished: false,
-            buses: Buses::default(),
-            times: Times::default(),
+            buses: ForeignBuses::default(),
+            times: TimeChecks::default(),
             before: None,
             remarks: Vec::new(),
         }
@@ -271,7 +271,7 @@ impl Reader {
             *what = format!("{}: {what}", self.file);
             self.is_unfinished = true;
         }
-        let state = State::new(self.others, Some(before)).with_buses(self.buses.clone());
+        let state = McapState::new(self.others, Some(before)).with_buses(self.buses.clone());
         let source;
         (self.file, source) = Source::open(&path, &self.through, state)?;
         self.source = match source {
@@ -283,31 +283,31 @@ impl Reader {
 
     /// Returns the position of the next entry. It is useful only for seekable inputs.
     #[must_use]
-    pub const fn place(&self) -> Place {
+    pub const fn place(&self) -> SeekPoint {
         let (offset, skip) = match &self.source {
             Source::Log(log) => {
                 let (offset, line, clock) = (log.offset(), log.lines(), log.clock());
-                return Place { part: self.part, offset, line, skip: 0, clock };
+                return SeekPoint { part: self.part, offset, line, skip: 0, clock };
             }
             Source::Mcap(mcap) => mcap.anchor(),
         };
-        Place { part: self.part, offset, line: 0, skip, clock: Clock::NEW }
+        SeekPoint { part: self.part, offset, line: 0, skip, clock: Clock::NEW }
     }
 
     /// Seeks to a position of the same capture; the entry there is read next.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the capture cannot be read or is damaged; reading ends then.
-    pub fn go_to(&mut self, places: &Places, place: Place) -> Result<(), CaptureError> {
+    pub fn go_to(&mut self, places: &SeekIndex, place: SeekPoint) -> Result<(), CaptureError> {
         let Some(path) = places.path(place.part) else { return Ok(()) };
         if self.part != place.part || place.offset == 0 {
             let before = (place.part > 0).then(|| self.extras().clone());
-            let state = State::new(self.others, before).with_buses(self.buses.clone());
+            let state = McapState::new(self.others, before).with_buses(self.buses.clone());
             (self.file, self.source) = Source::open(path, &self.through, state)?;
             self.part = place.part;
             self.rest = places.behind(place.part).cloned().collect();
         }
-        self.times = Times::default();
+        self.times = TimeChecks::default();
         let name = self.file.clone();
         let failed = |source| CaptureError::Io { name: name.clone(), source };
         if place.offset > 0 {
@@ -317,11 +317,11 @@ impl Reader {
             let input = (self.through)(file);
             let empty = Source::Log(LogReader::new(&[], Box::new(io::empty())));
             self.source = match std::mem::replace(&mut self.source, empty) {
-                Source::Log(_) => Source::Log(LogReader::at((place.offset, place.line, place.clock), input)),
+                Source::Log(_) => Source::Log(LogReader::resume((place.offset, place.line, place.clock), input)),
                 Source::Mcap(mcap) => {
                     let mut state = mcap.into_state();
-                    places.describe(place.part, &mut state).map_err(|fault| fault.of(&name, self.entries))?;
-                    Source::Mcap(Box::new(McapReader::at(place.offset, input, state, Some(regular))))
+                    places.describe(place.part, &mut state).map_err(|fault| fault.into_capture_error(&name, self.entries))?;
+                    Source::Mcap(Box::new(McapReader::resume(place.offset, input, state, Some(regular))))
                 }
             };
         }
@@ -333,10 +333,10 @@ impl Reader {
 
     /// Returns the format of the current file.
     #[must_use]
-    pub const fn format(&self) -> Format {
+    pub const fn format(&self) -> CaptureFormat {
         match self.source {
-            Source::Log(_) => Format::Candump,
-            Source::Mcap(_) => Format::Mcap,
+            Source::Log(_) => CaptureFormat::Candump,
+            Source::Mcap(_) => CaptureFormat::Mcap,
         }
     }
 
@@ -367,16 +367,16 @@ impl Reader {
         }
         let Self { file: name, source, entries, times, before, .. } = self;
         let next = match source {
-            Source::Log(log) => log.next().map(|next| next.map(Item::Entry)).map_err(Fault::from),
+            Source::Log(log) => log.next().map(|next| next.map(Item::Entry)).map_err(ReadFault::from),
             Source::Mcap(mcap) => mcap.next(),
         };
-        let next = next.map_err(|fault| fault.of(name, *entries))?;
+        let next = next.map_err(|fault| fault.into_capture_error(name, *entries))?;
         *entries += u64::from(matches!(next, Some(Item::Entry(_))));
         if let Some(Item::Entry(Entry::Frame(record))) = &next {
             if let Some(before) = before.take().filter(|_| record.time.nanos < times.latest()) {
                 times.overlaps(name, &before);
             }
-            times.take(record.interface, record.time.nanos);
+            times.check(record.interface, record.time.nanos);
         }
         Ok(next)
     }
@@ -386,7 +386,7 @@ impl Reader {
     #[must_use]
     pub fn is_of_a_log(&self) -> bool {
         let (key, value) = SOURCE;
-        self.format() == Format::Candump || self.extras().fact(ORIGIN, key) == Some(value)
+        self.format() == CaptureFormat::Candump || self.extras().fact(ORIGIN_METADATA, key) == Some(value)
     }
 
     /// Returns the number of log lines read so far, which is the line number of the last entry; 0 for an MCAP
@@ -464,15 +464,15 @@ impl Reader {
     /// Returns the contents other than frames and notes, as far as they have been read. Those before the first frame
     /// are there from the beginning. A log has none.
     #[must_use]
-    pub fn extras(&self) -> &Extras {
+    pub fn extras(&self) -> &RecordingExtras {
         match &self.source {
-            Source::Log(_) => Extras::NONE,
+            Source::Log(_) => RecordingExtras::NONE,
             Source::Mcap(mcap) => mcap.extras(),
         }
     }
 }
 
 /// Returns the wrapper that leaves files unchanged.
-fn plain() -> Through {
+fn plain() -> FileWrapper {
     Box::new(|file| Box::new(file))
 }

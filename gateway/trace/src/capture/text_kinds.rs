@@ -6,7 +6,7 @@ pub(super) const ASC: (&str, &str) =
     ("a Vector ASC log", "write a candump log with can-utils' `asc2log -I FILE -O NEW.log`");
 
 /// The kind of a skin or scenario file.
-pub const DESCRIPTION: &str = "a skin or a scenario";
+pub const SKIN_OR_SCENARIO: &str = "a skin or a scenario";
 /// Headings of tables that occur in skins and scenarios and hardly in other files.
 const TABLES: [&str; 7] =
     ["[robot]", "[[chain]]", "[[bus]]", "[[cell]]", "[motion]", "[[touch]]", "[[fault]]"];
@@ -23,7 +23,7 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
         (begins_with("***BUSMASTER"), ("a BUSMASTER log", EXPORT)),
         (
             any(&|line| TABLES.iter().any(|table| line.starts_with(table))),
-            (DESCRIPTION, "there are no frames in it: name a capture"),
+            (SKIN_OR_SCENARIO, "there are no frames in it: name a capture"),
         ),
         (
             any(&|line| line == "BS_:" || line == "NS_ :" || line == "NS_:" || line.starts_with("BO_ "))
@@ -151,8 +151,8 @@ mod tests {
                 "Time   ID     DLC Data                    Comment\r\n00,000 00D00422 8 00 \r\n",
                 "a CANHacker trace",
             ),
-            ("# a skin\nname = \"arm\"\n\n[robot]\nname = \"UR5\"\n", DESCRIPTION),
-            ("duration_s = 4.0\n[[touch]] # one\ncells = [3]\n", DESCRIPTION),
+            ("# a skin\nname = \"arm\"\n\n[robot]\nname = \"UR5\"\n", SKIN_OR_SCENARIO),
+            ("duration_s = 4.0\n[[touch]] # one\ncells = [3]\n", SKIN_OR_SCENARIO),
             (";  Start time: 10.05.2016\n     1)      1841  0001  8  00 00 00\n", "a PEAK trace"),
             ("1) 2.5 Rx 0300 7 00 00\n", "a PEAK trace"),
             ("# Logger type: 29\n# HW rev: 00.01\nTimestamp ID Data\n", "a CSS Electronics CLX000 log"),

@@ -5,12 +5,12 @@ use std::fmt;
 /// The maximum number of buses whose times are checked.
 const BUSES: usize = 64;
 /// The number of frames with one time that is not a coincidence.
-const ENOUGH: u64 = 3;
+const MIN_CONSTANT_FRAMES: u64 = 3;
 
 /// Checks the times of frames, each bus by itself, because only frames of one bus have an order.
 #[derive(Debug, Default)]
-pub(super) struct Times {
-    buses: Vec<Bus>,
+pub(super) struct TimeChecks {
+    buses: Vec<BusTimes>,
     /// The index of the last frame's bus.
     current: usize,
     frames: u64,
@@ -23,7 +23,7 @@ pub(super) struct Times {
 }
 
 #[derive(Debug)]
-struct Bus {
+struct BusTimes {
     name: String,
     first: u64,
     last: u64,
@@ -32,10 +32,10 @@ struct Bus {
     has_several: bool,
 }
 
-impl Times {
+impl TimeChecks {
     /// Checks the time of a bus' next frame.
     #[inline]
-    pub(super) fn take(&mut self, bus: &str, nanos: u64) {
+    pub(super) fn check(&mut self, bus: &str, nanos: u64) {
         self.frames += 1;
         self.latest = self.latest.max(nanos);
         if self.buses.get(self.current).is_none_or(|current| current.name != bus) {
@@ -54,7 +54,7 @@ impl Times {
     fn place(&mut self, bus: &str, nanos: u64) -> Option<usize> {
         let known = self.buses.iter().position(|it| it.name == bus);
         known.or_else(|| {
-            let new = Bus { name: bus.to_owned(), first: nanos, last: nanos, frames: 0, has_several: false };
+            let new = BusTimes { name: bus.to_owned(), first: nanos, last: nanos, frames: 0, has_several: false };
             (self.buses.len() < BUSES).then(|| {
                 self.buses.push(new);
                 self.buses.len() - 1
@@ -85,8 +85,8 @@ impl Times {
                 "{file} begins before {before} ends: they are read one after the other, and not in the order of their times"
             )
         });
-        let constant = self.buses.iter().filter(|bus| !bus.has_several && bus.frames >= ENOUGH);
-        let constant = constant.map(|Bus { name, first, frames, .. }| {
+        let constant = self.buses.iter().filter(|bus| !bus.has_several && bus.frames >= MIN_CONSTANT_FRAMES);
+        let constant = constant.map(|BusTimes { name, first, frames, .. }| {
             format!(
                 "all {frames} frames of {name} have the time {}: rates, gaps and loads mean nothing",
                 Seconds(*first)
@@ -110,8 +110,8 @@ mod tests {
     use super::*;
 
     fn remarks(frames: &[(&str, u64)]) -> Vec<String> {
-        let mut times = Times::default();
-        frames.iter().for_each(|(bus, nanos)| times.take(bus, *nanos));
+        let mut times = TimeChecks::default();
+        frames.iter().for_each(|(bus, nanos)| times.check(bus, *nanos));
         times.backwards().into_iter().chain(times.remarks()).collect()
     }
 

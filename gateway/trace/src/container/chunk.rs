@@ -7,7 +7,7 @@ use lz4_flex::frame::FrameDecoder;
 use zstd::zstd_safe::{self, DCtx, ErrorCode, get_error_name};
 
 use super::field::Fields;
-use super::{Damage, LONGEST};
+use super::{FormatError, MAX_RECORD_BYTES};
 
 /// The number of bytes that a file's chunks may always decompress to in total, whatever the length of the file.
 const FREE_BYTES: u64 = 256 << 20;
@@ -18,7 +18,7 @@ const FREE_RECORDS: u64 = 1 << 17;
 /// The number of records allowed in addition per byte of the file. Each record should cost an index entry of 16 bytes.
 const RECORDS_A_BYTE: u64 = 1;
 /// The length of a record's header in bytes: operation code and length.
-const HEAD: usize = 9;
+const RECORD_HEADER_BYTES: usize = 9;
 
 /// The chunk that was decompressed last. It is checked as a whole before any record is returned: its length, its
 /// checksum, and that its last record ends where it does.
@@ -50,7 +50,7 @@ impl Chunk {
     ///
     /// # Errors
     /// Returns [`Damage`] if anything is wrong with the chunk; it then has no records.
-    pub fn unpack(&mut self, record: &[u8], read: u64) -> Result<(), Damage> {
+    pub fn unpack(&mut self, record: &[u8], read: u64) -> Result<(), FormatError> {
         self.rewind();
         let unpacked = self.open(record, read);
         if unpacked.is_err() {
@@ -87,7 +87,7 @@ impl Chunk {
         (self.at, self.body) = (0, 0);
     }
 
-    fn open(&mut self, record: &[u8], read: u64) -> Result<(), Damage> {
+    fn open(&mut self, record: &[u8], read: u64) -> Result<(), FormatError> {
         let mut from = Fields::new("chunk", record);
         from.u64("start time")?;
         from.u64("end time")?;
@@ -96,30 +96,30 @@ impl Chunk {
         let compression = from.text("compression")?;
         let packed = from.u64("compressed size")?;
         let packed = from.bytes(packed, "records")?;
-        if claimed > LONGEST {
-            return Err(Damage::Long { what: "chunk, unpacked,", bytes: claimed, limit: LONGEST });
+        if claimed > MAX_RECORD_BYTES {
+            return Err(FormatError::Long { what: "chunk, unpacked,", bytes: claimed, limit: MAX_RECORD_BYTES });
         }
         let limit = FREE_BYTES.saturating_add(read.saturating_mul(BYTES_A_BYTE));
         self.total_bytes = self.total_bytes.saturating_add(claimed);
         if self.total_bytes > limit {
-            return Err(Damage::Bomb { read, limit, what: "bytes" });
+            return Err(FormatError::Bomb { read, limit, what: "bytes" });
         }
         self.bytes.clear();
         match compression {
             "" => self.bytes.extend_from_slice(packed),
             "zstd" => self.unpack_zstd(packed, claimed)?,
             "lz4" => self.unpack_lz4(packed, claimed)?,
-            other => return Err(Damage::Compression(other.chars().take(20).collect())),
+            other => return Err(FormatError::Compression(other.chars().take(20).collect())),
         }
         let found = self.bytes.len() as u64;
         if found != claimed {
-            return Err(Damage::Unpacked { claimed, found });
+            return Err(FormatError::Unpacked { claimed, found });
         }
         self.is_checked = saved != 0;
         if saved != 0 {
             let found = crc32fast::hash(&self.bytes);
             if found != saved {
-                return Err(Damage::Checksum { what: "a chunk", saved, found });
+                return Err(FormatError::Checksum { what: "a chunk", saved, found });
             }
         }
         let mut rest = self.bytes.as_slice();
@@ -130,14 +130,14 @@ impl Chunk {
         }
         let limit = FREE_RECORDS.saturating_add(read.saturating_mul(RECORDS_A_BYTE));
         if self.total_records > limit {
-            return Err(Damage::Bomb { read, limit, what: "records" });
+            return Err(FormatError::Bomb { read, limit, what: "records" });
         }
         Ok(())
     }
 
     /// Decompresses frame by frame into one buffer, so that a frame cannot choose a window size.
-    fn unpack_zstd(&mut self, mut packed: &[u8], claimed: u64) -> Result<(), Damage> {
-        let wrong = |code: ErrorCode| Damage::Unpack(get_error_name(code).to_owned());
+    fn unpack_zstd(&mut self, mut packed: &[u8], claimed: u64) -> Result<(), FormatError> {
+        let wrong = |code: ErrorCode| FormatError::Unpack(get_error_name(code).to_owned());
         let context = self.zstd.get_or_insert_with(DCtx::create);
         while !packed.is_empty() && (self.bytes.len() as u64) < claimed {
             let frame = zstd_safe::find_frame_compressed_size(packed).map_err(wrong)?;
@@ -157,8 +157,8 @@ impl Chunk {
         Ok(())
     }
 
-    fn unpack_lz4(&mut self, mut packed: &[u8], claimed: u64) -> Result<(), Damage> {
-        let wrong = |error: io::Error| Damage::Unpack(error.to_string());
+    fn unpack_lz4(&mut self, mut packed: &[u8], claimed: u64) -> Result<(), FormatError> {
+        let wrong = |error: io::Error| FormatError::Unpack(error.to_string());
         while !packed.is_empty() && (self.bytes.len() as u64) < claimed {
             let before = (packed.len(), self.bytes.len());
             let mut decoder = FrameDecoder::new(packed);
@@ -177,17 +177,17 @@ impl Chunk {
 type First<'a> = (u8, &'a [u8], usize);
 
 /// Splits off the first record.
-fn split(records: &[u8]) -> Option<Result<First<'_>, Damage>> {
+fn split(records: &[u8]) -> Option<Result<First<'_>, FormatError>> {
     if records.is_empty() {
         return None;
     }
     let leftover = records.len() as u64;
-    let Some((&[opcode, ref length @ ..], rest)) = records.split_first_chunk::<HEAD>() else {
-        return Some(Err(Damage::Overrun { bytes: HEAD as u64, leftover }));
+    let Some((&[opcode, ref length @ ..], rest)) = records.split_first_chunk::<RECORD_HEADER_BYTES>() else {
+        return Some(Err(FormatError::Overrun { bytes: RECORD_HEADER_BYTES as u64, leftover }));
     };
     let bytes = u64::from_le_bytes(*length);
     let whole = usize::try_from(bytes).ok().and_then(|bytes| rest.split_at_checked(bytes));
-    let whole = whole.ok_or(Damage::Overrun { bytes, leftover: rest.len() as u64 });
+    let whole = whole.ok_or(FormatError::Overrun { bytes, leftover: rest.len() as u64 });
     Some(whole.map(|(body, rest)| (opcode, body, rest.len())))
 }
 
@@ -213,7 +213,7 @@ mod tests {
         encoder.finish().unwrap()
     }
 
-    fn unpacked(record: &[u8]) -> Result<Vec<(u8, Vec<u8>)>, Damage> {
+    fn unpacked(record: &[u8]) -> Result<Vec<(u8, Vec<u8>)>, FormatError> {
         let mut chunk = Chunk::default();
         chunk.unpack(record, 1_000)?;
         Ok(std::iter::from_fn(|| chunk.next().map(|(code, body)| (code, body.to_vec()))).collect())
@@ -235,7 +235,7 @@ mod tests {
         {
             assert_eq!(unpacked(&chunk(length, checksum, compression, &packed)), expected);
             assert_eq!(unpacked(&chunk(length, 0, compression, &packed)), expected, "no checksum");
-            let wrong = Damage::Checksum { what: "a chunk", saved: 1, found: checksum };
+            let wrong = FormatError::Checksum { what: "a chunk", saved: 1, found: checksum };
             assert_eq!(unpacked(&chunk(length, 1, compression, &packed)), Err(wrong));
         }
     }
@@ -244,14 +244,14 @@ mod tests {
     fn what_a_chunk_claims_is_compared_with_what_is_there() {
         let one = record(3, b"abc");
         let long = record(u64::MAX, b"abc");
-        assert_eq!(unpacked(&chunk(12, 0, "", &long)), Err(Damage::Overrun { bytes: u64::MAX, leftover: 3 }));
-        assert_eq!(unpacked(&chunk(5, 0, "", &one[..5])), Err(Damage::Overrun { bytes: 9, leftover: 5 }));
-        assert_eq!(unpacked(&chunk(11, 0, "", &one)), Err(Damage::Unpacked { claimed: 11, found: 12 }));
-        let none = Damage::Long { what: "chunk, unpacked,", bytes: u64::MAX, limit: LONGEST };
+        assert_eq!(unpacked(&chunk(12, 0, "", &long)), Err(FormatError::Overrun { bytes: u64::MAX, leftover: 3 }));
+        assert_eq!(unpacked(&chunk(5, 0, "", &one[..5])), Err(FormatError::Overrun { bytes: 9, leftover: 5 }));
+        assert_eq!(unpacked(&chunk(11, 0, "", &one)), Err(FormatError::Unpacked { claimed: 11, found: 12 }));
+        let none = FormatError::Long { what: "chunk, unpacked,", bytes: u64::MAX, limit: MAX_RECORD_BYTES };
         assert_eq!(unpacked(&chunk(u64::MAX, 0, "zstd", &one)), Err(none));
-        assert!(matches!(unpacked(&chunk(12, 0, "zstd", &one)), Err(Damage::Unpack(_))));
-        assert!(matches!(unpacked(&chunk(12, 0, "lz4", &one)), Err(Damage::Unpack(_))));
-        assert_eq!(unpacked(&chunk(12, 0, "br", &one)), Err(Damage::Compression("br".to_owned())));
+        assert!(matches!(unpacked(&chunk(12, 0, "zstd", &one)), Err(FormatError::Unpack(_))));
+        assert!(matches!(unpacked(&chunk(12, 0, "lz4", &one)), Err(FormatError::Unpack(_))));
+        assert_eq!(unpacked(&chunk(12, 0, "br", &one)), Err(FormatError::Compression("br".to_owned())));
         // An LZ4 frame ends with four bytes after its last block, which no chunk needs.
         for (compression, packed, spare) in
             [("zstd", zstd::bulk::compress(&one, 1).unwrap(), 0), ("lz4", lz4(&one), 4)]
@@ -277,7 +277,7 @@ mod tests {
         let record = chunk(zeros.len() as u64 + 9, 0, "zstd", &packed);
         let mut chunk = Chunk::default();
         assert_eq!((chunk.unpack(&record, 0), chunk.unpack(&record, 0)), (Ok(()), Ok(())));
-        let bomb = Damage::Bomb { read: 0, limit: FREE_BYTES, what: "bytes" };
+        let bomb = FormatError::Bomb { read: 0, limit: FREE_BYTES, what: "bytes" };
         assert_eq!(chunk.unpack(&record, 0), Err(bomb));
         assert_eq!(chunk.next(), None);
     }

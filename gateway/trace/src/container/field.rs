@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use mcap::records::op;
 
-use super::{Damage, LONGEST_DESCRIPTION};
+use super::{FormatError, MAX_DESCRIPTION_BYTES};
 
 /// A record with the fields that readers of recordings need.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -38,7 +38,7 @@ pub enum Record<'a> {
         /// The encoding of its messages.
         encoding: &'a str,
         /// Further properties.
-        facts: Facts<'a>,
+        facts: MetadataMap<'a>,
     },
     /// A message.
     Message {
@@ -71,7 +71,7 @@ pub enum Record<'a> {
         /// The name.
         name: &'a str,
         /// The keys and values.
-        facts: Facts<'a>,
+        facts: MetadataMap<'a>,
     },
     /// The end of the file.
     Footer {
@@ -89,9 +89,9 @@ pub enum Record<'a> {
 
 /// Keys and values as they stand in the file. They are complete and valid UTF-8.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Facts<'a>(&'a [u8]);
+pub struct MetadataMap<'a>(&'a [u8]);
 
-impl<'a> Facts<'a> {
+impl<'a> MetadataMap<'a> {
     /// Iterates over the pairs of key and value.
     pub fn iter(&self) -> impl Iterator<Item = (&'a str, &'a str)> + use<'a> {
         let mut rest = Fields { record: "", bytes: 0, rest: self.0 };
@@ -105,19 +105,19 @@ impl<'a> Facts<'a> {
     }
 }
 
-impl From<Facts<'_>> for BTreeMap<String, String> {
-    fn from(facts: Facts<'_>) -> Self {
+impl From<MetadataMap<'_>> for BTreeMap<String, String> {
+    fn from(facts: MetadataMap<'_>) -> Self {
         facts.iter().map(|(key, value)| (key.to_owned(), value.to_owned())).collect()
     }
 }
 
 /// A limit on the memory for names in a file, whose number and length an untrusted writer chose.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Names(usize);
+pub struct NameBudget(usize);
 
-impl Names {
+impl NameBudget {
     /// The memory overhead of a name, in bytes.
-    pub const ENTRY: usize = 128;
+    pub const ENTRY_OVERHEAD: usize = 128;
     /// The maximum size of all names together, in bytes.
     const LIMIT: usize = 32 << 20;
 
@@ -125,9 +125,9 @@ impl Names {
     ///
     /// # Errors
     /// Returns [`Damage::Names`] if the limit is exceeded.
-    pub fn add(&mut self, bytes: usize) -> Result<(), Damage> {
-        self.0 = self.0.saturating_add(bytes).saturating_add(Self::ENTRY);
-        if self.0 > Self::LIMIT { Err(Damage::Names { limit: Self::LIMIT }) } else { Ok(()) }
+    pub fn add(&mut self, bytes: usize) -> Result<(), FormatError> {
+        self.0 = self.0.saturating_add(bytes).saturating_add(Self::ENTRY_OVERHEAD);
+        if self.0 > Self::LIMIT { Err(FormatError::Names { limit: Self::LIMIT }) } else { Ok(()) }
     }
 }
 
@@ -144,25 +144,25 @@ impl<'a> Fields<'a> {
         Self { record, bytes: body.len(), rest: body }
     }
 
-    fn short(&self, field: &'static str) -> Damage {
-        Damage::Short { record: self.record, bytes: self.bytes, field }
+    fn short(&self, field: &'static str) -> FormatError {
+        FormatError::Short { record: self.record, bytes: self.bytes, field }
     }
 
-    fn array<const N: usize>(&mut self, field: &'static str) -> Result<[u8; N], Damage> {
+    fn array<const N: usize>(&mut self, field: &'static str) -> Result<[u8; N], FormatError> {
         let (head, rest) = self.rest.split_first_chunk().ok_or_else(|| self.short(field))?;
         self.rest = rest;
         Ok(*head)
     }
 
-    fn u16(&mut self, field: &'static str) -> Result<u16, Damage> {
+    fn u16(&mut self, field: &'static str) -> Result<u16, FormatError> {
         self.array(field).map(u16::from_le_bytes)
     }
 
-    pub(super) fn u32(&mut self, field: &'static str) -> Result<u32, Damage> {
+    pub(super) fn u32(&mut self, field: &'static str) -> Result<u32, FormatError> {
         self.array(field).map(u32::from_le_bytes)
     }
 
-    pub(super) fn u64(&mut self, field: &'static str) -> Result<u64, Damage> {
+    pub(super) fn u64(&mut self, field: &'static str) -> Result<u64, FormatError> {
         self.array(field).map(u64::from_le_bytes)
     }
 
@@ -170,20 +170,20 @@ impl<'a> Fields<'a> {
     ///
     /// # Errors
     /// Returns [`Damage::Short`] if the record has fewer.
-    pub(super) fn bytes(&mut self, count: u64, field: &'static str) -> Result<&'a [u8], Damage> {
+    pub(super) fn bytes(&mut self, count: u64, field: &'static str) -> Result<&'a [u8], FormatError> {
         let split = usize::try_from(count).ok().and_then(|count| self.rest.split_at_checked(count));
         let (bytes, rest) = split.ok_or_else(|| self.short(field))?;
         self.rest = rest;
         Ok(bytes)
     }
 
-    pub(super) fn text(&mut self, field: &'static str) -> Result<&'a str, Damage> {
+    pub(super) fn text(&mut self, field: &'static str) -> Result<&'a str, FormatError> {
         let bytes = self.u32(field)?;
         let bytes = self.bytes(bytes.into(), field)?;
-        std::str::from_utf8(bytes).map_err(|_| Damage::Text { record: self.record, field })
+        std::str::from_utf8(bytes).map_err(|_| FormatError::Text { record: self.record, field })
     }
 
-    fn facts(&mut self, field: &'static str) -> Result<Facts<'a>, Damage> {
+    fn facts(&mut self, field: &'static str) -> Result<MetadataMap<'a>, FormatError> {
         let bytes = self.u32(field)?;
         let facts = self.bytes(bytes.into(), field)?;
         let mut all = Self { rest: facts, ..*self };
@@ -191,7 +191,7 @@ impl<'a> Fields<'a> {
             all.text(field)?;
             all.text(field)?;
         }
-        Ok(Facts(facts))
+        Ok(MetadataMap(facts))
     }
 }
 
@@ -200,10 +200,10 @@ impl<'a> Fields<'a> {
 /// # Errors
 /// Returns [`Damage`] if the record is shorter than its fields, if a description is too long, if a name is not UTF-8,
 /// or if an attachment's checksum is wrong.
-pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, Damage> {
+pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, FormatError> {
     let description = |record| match body.len() as u64 {
-        bytes if body.len() > LONGEST_DESCRIPTION => {
-            Err(Damage::Long { what: record, bytes, limit: LONGEST_DESCRIPTION as u64 })
+        bytes if body.len() > MAX_DESCRIPTION_BYTES => {
+            Err(FormatError::Long { what: record, bytes, limit: MAX_DESCRIPTION_BYTES as u64 })
         }
         _ => Ok(Fields::new(record, body)),
     };
@@ -246,7 +246,7 @@ pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, Damage> {
     })
 }
 
-fn attachment(body: &[u8]) -> Result<Record<'_>, Damage> {
+fn attachment(body: &[u8]) -> Result<Record<'_>, FormatError> {
     let mut from = Fields::new("attachment", body);
     let (log_time, create_time) = (from.u64("log time")?, from.u64("create time")?);
     let (name, media_type) = (from.text("name")?, from.text("media type")?);
@@ -256,7 +256,7 @@ fn attachment(body: &[u8]) -> Result<Record<'_>, Damage> {
     let saved = from.u32("checksum")?;
     let found = if saved == 0 { 0 } else { crc32fast::hash(checked) };
     if saved != found {
-        return Err(Damage::Checksum { what: "an attachment", saved, found });
+        return Err(FormatError::Checksum { what: "an attachment", saved, found });
     }
     Ok(Record::Attachment { log_time, create_time, name, media_type, data })
 }

@@ -14,9 +14,9 @@ mod search;
 mod source;
 
 pub use chunk::Chunk;
-pub use field::{Facts, Names, Record, parse};
-pub use search::{HEAD, first_record, is_record, own_length};
-pub use source::{Framed, Source, find};
+pub use field::{MetadataMap, NameBudget, Record, parse};
+pub use search::{RECORD_HEADER_BYTES, first_record, is_record, own_length};
+pub use source::{Framed, RecordReader, find};
 
 use std::io::{self, Read};
 
@@ -28,9 +28,9 @@ use crate::ros2::MessageError;
 pub const MAGIC: &[u8] = mcap::MAGIC;
 /// The longest record that is read into memory, and the maximum decompressed size of a chunk, in bytes. Chunks of
 /// skinbus have 256 KiB, those of other writers a few MiB.
-pub const LONGEST: u64 = 128 << 20;
+pub const MAX_RECORD_BYTES: u64 = 128 << 20;
 /// The longest descriptive record in bytes: a schema, a channel, metadata.
-pub const LONGEST_DESCRIPTION: usize = 4 << 20;
+pub const MAX_DESCRIPTION_BYTES: usize = 4 << 20;
 
 /// Reads the available bytes and retries if a signal interrupts the call.
 pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<usize> {
@@ -45,7 +45,7 @@ pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<us
 /// An error in a record or a chunk.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
-pub enum Damage {
+pub enum FormatError {
     /// A length field leads beyond the end of its record.
     #[error("a {record} record of {bytes} bytes ends within its {field}")]
     Short {

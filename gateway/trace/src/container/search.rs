@@ -8,10 +8,10 @@ use std::io::{self, Read, Seek, SeekFrom};
 use mcap::records::op;
 
 use super::field::Fields;
-use super::{LONGEST, MAGIC, read_some};
+use super::{MAX_RECORD_BYTES, MAGIC, read_some};
 
 /// The length of a record's header in bytes: operation code and length.
-pub const HEAD: usize = 9;
+pub const RECORD_HEADER_BYTES: usize = 9;
 /// The number of bytes that are searched at once.
 const WINDOW: usize = 1 << 20;
 /// The maximum number of bytes that identify a record.
@@ -91,17 +91,17 @@ pub fn first_record(
 /// Returns the operation code and the length of the record that begins with these bytes, if they are possible and the
 /// record fits in `leftover` bytes.
 fn head(bytes: &[u8], leftover: u64) -> Option<(u8, u64)> {
-    let &[opcode, ref length @ ..] = bytes.first_chunk::<HEAD>()?;
+    let &[opcode, ref length @ ..] = bytes.first_chunk::<RECORD_HEADER_BYTES>()?;
     let length = u64::from_le_bytes(*length);
-    (min_length(opcode).is_some_and(|min| length >= min) && length <= leftover.checked_sub(HEAD as u64)?)
+    (min_length(opcode).is_some_and(|min| length >= min) && length <= leftover.checked_sub(RECORD_HEADER_BYTES as u64)?)
         .then_some((opcode, length))
 }
 
 /// Returns true if a chunk or an attachment begins with these bytes. Each of its lengths is stored twice.
 fn is_certain(bytes: &[u8], leftover: u64) -> bool {
     let Some((opcode, length)) = head(bytes, leftover) else { return false };
-    let body = bytes.get(HEAD..).unwrap_or_default();
-    let is_of_two = opcode == op::ATTACHMENT || (opcode == op::CHUNK && length <= LONGEST);
+    let body = bytes.get(RECORD_HEADER_BYTES..).unwrap_or_default();
+    let is_of_two = opcode == op::ATTACHMENT || (opcode == op::CHUNK && length <= MAX_RECORD_BYTES);
     is_of_two && own_length(opcode, body) == Some(length)
 }
 
@@ -147,7 +147,7 @@ fn chunk(body: &[u8]) -> Option<u64> {
     let compression = from.text("").ok()?;
     let packed = from.u64("").ok()?;
     let fields = 40 + compression.len() as u64;
-    (start <= end && unpacked <= LONGEST && matches!(compression, "" | "zstd" | "lz4"))
+    (start <= end && unpacked <= MAX_RECORD_BYTES && matches!(compression, "" | "zstd" | "lz4"))
         .then(|| packed.checked_add(fields))?
 }
 
@@ -178,13 +178,13 @@ pub(super) fn is_disguised(body: &[u8], length: u64) -> bool {
 #[must_use]
 pub(super) fn has_records(message: &[u8]) -> bool {
     let first = usize::try_from(MESSAGE_HEAD).unwrap_or(usize::MAX);
-    (first..message.len().saturating_sub(HEAD)).any(|start| {
+    (first..message.len().saturating_sub(RECORD_HEADER_BYTES)).any(|start| {
         let mut rest = message.get(start..).unwrap_or_default();
         let mut row = 0;
         while let Some((_, length)) = head(rest, rest.len() as u64) {
             row += 1;
             rest =
-                usize::try_from(length).ok().and_then(|length| rest.get(HEAD + length..)).unwrap_or_default();
+                usize::try_from(length).ok().and_then(|length| rest.get(RECORD_HEADER_BYTES + length..)).unwrap_or_default();
         }
         row >= ROW || (row > 0 && rest.is_empty())
     })
@@ -207,12 +207,12 @@ fn is_row(input: &mut (impl Read + Seek), mut at: u64, size: u64) -> io::Result<
 
 /// Returns the operation code of the record that begins at `at`, and the offset of its end.
 fn next(input: &mut (impl Read + Seek), at: u64, size: u64) -> io::Result<Option<(u8, u64)>> {
-    let mut bytes = [0; HEAD];
+    let mut bytes = [0; RECORD_HEADER_BYTES];
     input.seek(SeekFrom::Start(at))?;
     let mut read = 0;
     while let came @ 1.. = read_some(input, bytes.get_mut(read..).unwrap_or_default())? {
         read += came;
     }
     let there = bytes.get(..read).unwrap_or_default();
-    Ok(head(there, size.saturating_sub(at)).map(|(opcode, length)| (opcode, at + HEAD as u64 + length)))
+    Ok(head(there, size.saturating_sub(at)).map(|(opcode, length)| (opcode, at + RECORD_HEADER_BYTES as u64 + length)))
 }

@@ -5,8 +5,8 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use mcap::records::op;
 
 use super::field::{Record, attachment_name, parse};
-use super::search::{HEAD, has_records, is_disguised, is_known, is_plain, own_length};
-use super::{Damage, LONGEST, MAGIC, read_some};
+use super::search::{RECORD_HEADER_BYTES, has_records, is_disguised, is_known, is_plain, own_length};
+use super::{FormatError, MAX_RECORD_BYTES, MAGIC, read_some};
 
 /// The number of bytes kept of a record that is too long for memory, or that no reader needs.
 const BEGINNING: u64 = 64 << 10;
@@ -39,7 +39,7 @@ pub enum Framed {
 /// Frames the records of an input. Records that no reader needs are skipped: only the beginning of indexes, statistics
 /// and unknown records is kept.
 #[derive(Debug)]
-pub struct Source<R> {
+pub struct RecordReader<R> {
     input: R,
     body: Vec<u8>,
     /// The number of bytes read.
@@ -61,7 +61,7 @@ pub struct Source<R> {
     last: [u8; MAGIC.len()],
 }
 
-impl<R: Read> Source<R> {
+impl<R: Read> RecordReader<R> {
     /// Creates a reader that keeps attachments of at most `attachments` bytes.
     pub fn new(input: R, attachments: u64) -> Self {
         let checksum = Some(crc32fast::Hasher::new());
@@ -92,7 +92,7 @@ impl<R: Read> Source<R> {
     /// Returns an error if the input fails.
     pub fn magic(&mut self) -> io::Result<bool> {
         self.body.clear();
-        self.take(MAGIC.len() as u64)?;
+        self.read_into_body(MAGIC.len() as u64)?;
         self.update();
         Ok(self.body == MAGIC)
     }
@@ -138,9 +138,9 @@ impl<R: Read> Source<R> {
     ///
     /// # Errors
     /// Returns [`Damage`] if its operation code or its length is wrong.
-    pub fn check(&self, framed: Framed) -> Result<(), Damage> {
+    pub fn check(&self, framed: Framed) -> Result<(), FormatError> {
         let (code, bytes) = match framed {
-            Framed::Unknown(code, _) => return Err(Damage::Unknown(code)),
+            Framed::Unknown(code, _) => return Err(FormatError::Unknown(code)),
             Framed::End(_) => return Ok(()),
             Framed::Record(code) => (code, self.body.len() as u64),
             Framed::Passed(code, bytes) | Framed::Long(code, bytes) | Framed::Cut(code, bytes) => {
@@ -158,11 +158,11 @@ impl<R: Read> Source<R> {
         let is_other = code == op::MESSAGE
             && (is_of(op::SCHEMA) || is_of(op::CHANNEL) || (self.has_chunks && is_of(op::MESSAGE_INDEX)));
         if is_elsewhere || is_other || (code >= 0x80 && is_disguised(&self.body, bytes)) {
-            return Err(Damage::Code(code));
+            return Err(FormatError::Code(code));
         }
         match own_length(code, &self.body) {
-            Some(own) if own != bytes => Err(Damage::Length { code, bytes, own }),
-            _ if code == op::MESSAGE && has_records(&self.body) => Err(Damage::Swallowed(bytes)),
+            Some(own) if own != bytes => Err(FormatError::Length { code, bytes, own }),
+            _ if code == op::MESSAGE && has_records(&self.body) => Err(FormatError::Swallowed(bytes)),
             _ => Ok(()),
         }
     }
@@ -178,7 +178,7 @@ impl<R: Read> Source<R> {
     ///
     /// # Errors
     /// Returns [`Damage`] if the record or the checksum is wrong.
-    pub fn check_section(&mut self, code: u8) -> Result<(), Damage> {
+    pub fn check_section(&mut self, code: u8) -> Result<(), FormatError> {
         let found = self.checksum.take().map(crc32fast::Hasher::finalize);
         let (Record::DataEnd { crc: saved } | Record::Footer { crc: saved }) = parse(code, &self.body)?
         else {
@@ -186,7 +186,7 @@ impl<R: Read> Source<R> {
         };
         let what = if code == op::FOOTER { "the summary" } else { "the data section" };
         match found {
-            Some(found) if saved != 0 && saved != found => Err(Damage::Checksum { what, saved, found }),
+            Some(found) if saved != 0 && saved != found => Err(FormatError::Checksum { what, saved, found }),
             _ => Ok(()),
         }
     }
@@ -214,7 +214,7 @@ impl<R: Read> Source<R> {
         self.message_before = (self.code == op::MESSAGE).then_some(self.began);
         (self.began, self.code) = (self.read, 0);
         self.body.clear();
-        self.take(9)?;
+        self.read_into_body(9)?;
         let Some(&[opcode, ref length @ ..]) = self.body.first_chunk::<9>() else {
             return Ok(Framed::End(self.read - self.began));
         };
@@ -234,13 +234,13 @@ impl<R: Read> Source<R> {
             | op::MESSAGE
             | op::CHUNK
             | op::METADATA
-            | op::DATA_END => (LONGEST, BEGINNING),
+            | op::DATA_END => (MAX_RECORD_BYTES, BEGINNING),
             op::MESSAGE_INDEX => (0, INDEX),
             _ => (0, BEGINNING),
         };
         let is_long = length > limit;
         let kept = if is_long { length.min(beginning) } else { length };
-        let mut there = self.take(kept)? == kept;
+        let mut there = self.read_into_body(kept)? == kept;
         match opcode {
             op::DATA_END => {}
             op::FOOTER => self.update_to(FOOTER_CHECKED),
@@ -259,7 +259,7 @@ impl<R: Read> Source<R> {
     }
 
     /// Appends up to `bytes` bytes to the body. The body grows with the bytes read, not with those requested.
-    fn take(&mut self, bytes: u64) -> io::Result<u64> {
+    fn read_into_body(&mut self, bytes: u64) -> io::Result<u64> {
         let came = (&mut self.input).take(bytes).read_to_end(&mut self.body)?;
         self.read += came as u64;
         let from = self.body.len().saturating_sub(came.min(MAGIC.len()));
@@ -297,7 +297,7 @@ impl<R: Read> Source<R> {
     }
 }
 
-impl<R: Read + Seek> Source<R> {
+impl<R: Read + Seek> RecordReader<R> {
     /// Returns the input.
     pub const fn input(&mut self) -> &mut R {
         &mut self.input
@@ -331,10 +331,10 @@ impl<R: Read + Seek> Source<R> {
     /// # Errors
     /// Returns an error if the input fails.
     pub fn read_as(&mut self, began: u64, length: u64) -> io::Result<bool> {
-        self.move_to(began + HEAD as u64)?;
+        self.move_to(began + RECORD_HEADER_BYTES as u64)?;
         self.began = began;
         self.body.clear();
-        Ok(self.take(length)? == length)
+        Ok(self.read_into_body(length)? == length)
     }
 }
 

@@ -6,11 +6,11 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use protocol::input::folder_of;
-use protocol::stop::Stoppable;
+use protocol::stop::InterruptibleWriter;
 use rustix::fs::{Access, access};
 
 use super::target::{
-    Target, hold, identity, is_still, open_stream, open_unfollowed, or_exists, part_of, suffixed,
+    OutputTarget, hold, identity, is_still, open_stream, open_unfollowed, or_exists, part_of, suffixed,
     sync_folder, with_hint, write_all_patiently,
 };
 
@@ -19,20 +19,20 @@ use super::target::{
 #[derive(Debug)]
 pub struct LogFile {
     path: PathBuf,
-    state: State,
+    state: LogTarget,
     /// The number of bytes written.
     bytes: u64,
     ended: bool,
 }
 
 #[derive(Debug)]
-enum State {
+enum LogTarget {
     /// A regular file of this log.
     Ours(File),
     /// An existing file, which the first line replaces. It is locked until then.
     Old(File),
     /// A stream such as a terminal, which has no length and no lock.
-    Stream(Stoppable<File>),
+    Stream(InterruptibleWriter<File>),
 }
 
 impl LogFile {
@@ -41,17 +41,17 @@ impl LogFile {
     /// # Errors
     /// Returns an error that includes what to do if the file cannot be written.
     pub fn create(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
-        let state = match Target::of(path, force) {
-            Ok(Target::Stream) => State::Stream(Stoppable::new(open_stream(path, stopped)?)),
-            Ok(Target::New) => State::Ours(begin(path)?),
-            Ok(Target::Old) => {
+        let state = match OutputTarget::inspect(path, force) {
+            Ok(OutputTarget::Stream) => LogTarget::Stream(InterruptibleWriter::new(open_stream(path, stopped)?)),
+            Ok(OutputTarget::New) => LogTarget::Ours(begin(path)?),
+            Ok(OutputTarget::Old) => {
                 // A link that replaced the file meanwhile is not followed.
                 let old = open_unfollowed(path).map_err(with_hint)?;
                 hold_log(&old)?;
                 // A folder that allows no replacement is reported before the first line.
                 let writes = access(folder_of(path), Access::WRITE_OK | Access::EXEC_OK);
                 writes.map_err(|errno| with_hint(errno.into()))?;
-                State::Old(old)
+                LogTarget::Old(old)
             }
             Err(error) => {
                 // The error that another run writes the file is more useful than that it exists.
@@ -111,23 +111,23 @@ impl LogFile {
         if lines.is_empty() {
             return Ok(());
         }
-        if let State::Old(_) = &self.state {
-            self.state = State::Ours(self.take_place()?);
+        if let LogTarget::Old(_) = &self.state {
+            self.state = LogTarget::Ours(self.take_place()?);
         }
         let written = match &mut self.state {
-            State::Ours(file) | State::Old(file) => write_all_patiently(file, lines),
-            State::Stream(stream) => stream.write_all(lines),
+            LogTarget::Ours(file) | LogTarget::Old(file) => write_all_patiently(file, lines),
+            LogTarget::Stream(stream) => stream.write_all(lines),
         };
         match &self.state {
             _ if written.is_ok() => self.bytes += lines.len() as u64,
             // The file must not end within a line. If truncating fails too, nothing more can be done.
-            State::Ours(file) => {
+            LogTarget::Ours(file) => {
                 // Only make the file shorter: another program may have truncated it.
                 if file.metadata().is_ok_and(|about| about.len() > self.bytes) {
                     let _ = file.set_len(self.bytes);
                 }
             }
-            State::Old(_) | State::Stream(_) => {}
+            LogTarget::Old(_) | LogTarget::Stream(_) => {}
         }
         written
     }
@@ -136,8 +136,8 @@ impl LogFile {
     ///
     /// # Errors
     /// Returns an error if another program has renamed, removed, truncated or written it.
-    pub fn look(&self) -> io::Result<()> {
-        let State::Ours(file) = &self.state else { return Ok(()) };
+    pub fn check(&self) -> io::Result<()> {
+        let LogTarget::Ours(file) = &self.state else { return Ok(()) };
         // A failure to query the file is not evidence of a change.
         let Ok(about) = file.metadata() else { return Ok(()) };
         let (bytes, written) = (about.len(), self.bytes);
@@ -160,7 +160,7 @@ impl LogFile {
     /// # Errors
     /// Returns an error if the file cannot be read.
     pub fn lines(&self, begin: &str) -> io::Result<Option<u64>> {
-        let State::Ours(file) = &self.state else { return Ok(None) };
+        let LogTarget::Ours(file) = &self.state else { return Ok(None) };
         let there = open_unfollowed(&self.path);
         let Some(there) = there.ok().filter(|there| is_same(there, file)) else { return Ok(None) };
         let mut lines = 0;
@@ -185,12 +185,12 @@ impl LogFile {
     /// # Errors
     /// Returns an error if the disk cannot store them.
     pub fn finish(mut self) -> io::Result<()> {
-        if let State::Old(_) = &self.state {
+        if let LogTarget::Old(_) = &self.state {
             // An empty log also replaces the old file.
-            self.state = State::Ours(self.take_place()?);
+            self.state = LogTarget::Ours(self.take_place()?);
         }
         self.ended = true;
-        let State::Ours(file) = &self.state else { return Ok(()) };
+        let LogTarget::Ours(file) = &self.state else { return Ok(()) };
         file.sync_data()?;
         sync_folder(&self.path);
         Ok(())
@@ -200,7 +200,7 @@ impl LogFile {
 impl Drop for LogFile {
     /// Removes a log that was never ended and is empty.
     fn drop(&mut self) {
-        let State::Ours(file) = &self.state else { return };
+        let LogTarget::Ours(file) = &self.state else { return };
         let is_there =
             file.metadata().is_ok_and(|about| is_still(&self.path, identity(&about)) == Some(true));
         if !self.ended && self.bytes == 0 && is_there {

@@ -14,7 +14,7 @@ use std::sync::atomic::AtomicBool;
 pub use log::LogFile;
 pub use protocol::input::folder_of;
 pub use target::{STANDARD_OUTPUT, check, check_regular, rename, suffixed, sync_folder, with_hint};
-use target::{Target, open_stream, or_exists, part_of};
+use target::{OutputTarget, open_stream, or_exists, part_of};
 pub(crate) use target::{hold, identity, is_still, link, nameless, open_unfollowed, write_patiently};
 
 /// A file that gets its name only when it is complete. Until then it is unnamed, and so disappears if the program is
@@ -49,7 +49,7 @@ impl WholeFile {
     /// Returns an error that includes what to do if the file cannot be written.
     pub fn create_unless(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<(Self, File)> {
         let begun = |file, is_part| Self { path: path.to_owned(), force, file, is_part };
-        if Target::of(path, force)? == Target::Stream {
+        if OutputTarget::inspect(path, force)? == OutputTarget::Stream {
             let file = open_stream(path, stopped).map_err(with_hint)?;
             return Ok((begun(None, false), file));
         }

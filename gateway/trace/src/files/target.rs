@@ -17,14 +17,14 @@ use rustix::fs::{
 use rustix::io::Errno;
 
 /// The interval between two attempts to open a FIFO that has no reader.
-const LOOK: Duration = Duration::from_millis(20);
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
 /// The name of standard output. A file of this name is written as `./-`.
 pub const STANDARD_OUTPUT: &str = "-";
 
 /// The kind of target under a name.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Target {
+pub(super) enum OutputTarget {
     /// The name is free.
     New,
     /// A regular file, which is to be overwritten.
@@ -33,10 +33,10 @@ pub(super) enum Target {
     Stream,
 }
 
-impl Target {
+impl OutputTarget {
     /// Determines the target under a name. A regular file is accepted only with `force`; a symlink to one, or to
     /// nothing, is never followed.
-    pub(super) fn of(path: &Path, force: bool) -> io::Result<Self> {
+    pub(super) fn inspect(path: &Path, force: bool) -> io::Result<Self> {
         if path == Path::new(STANDARD_OUTPUT) {
             return Ok(Self::Stream);
         }
@@ -74,7 +74,7 @@ impl Target {
 /// # Errors
 /// Returns an error that includes what to do if it may not.
 pub fn check(path: &Path, force: bool) -> io::Result<()> {
-    Target::of(path, force).map(|_| ())
+    OutputTarget::inspect(path, force).map(|_| ())
 }
 
 /// Checks early that a regular file may be written.
@@ -82,9 +82,9 @@ pub fn check(path: &Path, force: bool) -> io::Result<()> {
 /// # Errors
 /// Returns an error that includes what to do if it may not.
 pub fn check_regular(path: &Path, force: bool) -> io::Result<()> {
-    match Target::of(path, force)? {
-        Target::New | Target::Old => Ok(()),
-        Target::Stream => Err(no_regular_file()),
+    match OutputTarget::inspect(path, force)? {
+        OutputTarget::New | OutputTarget::Old => Ok(()),
+        OutputTarget::Stream => Err(no_regular_file()),
     }
 }
 
@@ -128,7 +128,7 @@ pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File>
                         "interrupted: no program read it",
                     ));
                 }
-                std::thread::sleep(LOOK);
+                std::thread::sleep(POLL_INTERVAL);
             }
             opened => break opened?,
         }
@@ -207,7 +207,7 @@ pub(crate) fn is_still(path: &Path, is: (u64, u64)) -> Option<bool> {
 /// The time for which a blocked write is retried.
 const RETRY_TIMEOUT: Duration = Duration::from_secs(1);
 /// The interval between two attempts.
-const PAUSE: Duration = Duration::from_millis(2);
+const RETRY_INTERVAL: Duration = Duration::from_millis(2);
 
 /// Writes as many bytes as the file accepts. An interrupted call is retried, a blocked one for up to a second, and one
 /// with any other error once.
@@ -224,7 +224,7 @@ pub(crate) fn write_patiently(file: &mut impl Write, bytes: &[u8]) -> io::Result
                 if since.get_or_insert_with(Instant::now).elapsed() >= RETRY_TIMEOUT {
                     return Err(error);
                 }
-                std::thread::sleep(PAUSE);
+                std::thread::sleep(RETRY_INTERVAL);
             }
             Err(error) if is_second => return Err(error),
             Err(_) => is_second = true,

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 /// One file of a recording.
 #[derive(Clone, Debug, Serialize)]
-pub struct Written {
+pub struct WrittenFile {
     /// The name of the file.
     pub path: String,
     /// The format: `candump` or `mcap`.
@@ -22,14 +22,14 @@ pub struct Written {
 
 /// Counts of messages.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Count {
+pub struct MessageCount {
     /// Frames.
     pub frames: u64,
     /// Other messages.
     pub others: u64,
 }
 
-impl Count {
+impl MessageCount {
     /// One frame of a bus.
     pub const FRAME: Self = Self { frames: 1, others: 0 };
 
@@ -45,17 +45,17 @@ impl Count {
     }
 
     /// Returns the account of a file that holds these messages.
-    pub(super) fn in_file(self, path: &Path, bytes: u64) -> Written {
+    pub(super) fn in_file(self, path: &Path, bytes: u64) -> WrittenFile {
         let Self { frames, others } = self;
-        Written { path: path.display().to_string(), format: "mcap", frames, messages: frames + others, bytes }
+        WrittenFile { path: path.display().to_string(), format: "mcap", frames, messages: frames + others, bytes }
     }
 }
 
 /// The account of a run's recording.
 #[derive(Clone, Debug, Default, Serialize)]
-pub struct Recording {
+pub struct RecordingAccount {
     /// The files, in the order in which they were finished.
-    pub files: Vec<Written>,
+    pub files: Vec<WrittenFile>,
     /// Frames that are in every requested format.
     pub frames: u64,
     /// Lost frames: the sum of the two below.

@@ -17,20 +17,20 @@ use mcap::write::Metadata;
 use mcap::{Attachment, McapError, WriteOptions, Writer};
 use protocol::candump::Record as Frame;
 
-use super::TOPIC_OF_BUS;
-use super::output::Output;
-use crate::container::{Framed, Record, Source, parse};
+use super::BUS_TOPIC_PREFIX;
+use super::output::SharedOutput;
+use crate::container::{Framed, Record, RecordReader, parse};
 use crate::ros2::Message;
 
 /// The number of bytes that are compressed together. Larger chunks block the writer for so long that its queues fill
 /// up.
-pub const CHUNK: u64 = 256 << 10;
+pub const CHUNK_BYTES: u64 = 256 << 10;
 
 /// The number of chunks between two descriptions of all schemas and channels.
-pub const DESCRIBED_EVERY: u32 = 64;
+pub const CHUNKS_PER_DESCRIPTION: u32 = 64;
 
 /// The overhead of a message record in bytes.
-const HEAD: u64 = 31;
+const MESSAGE_OVERHEAD: u64 = 31;
 
 /// Returns the settings of every written file. The crate does not seek, so that flushed data stays readable whatever
 /// happens afterwards, and uses no threads, which cost more than they save. The [`FileWriter`] ends chunks, and the
@@ -41,7 +41,7 @@ fn options() -> WriteOptions {
         .library(format!("{PROGRAM}{}", env!("CARGO_PKG_VERSION")))
         .compression(Some(mcap::Compression::Zstd))
         .compression_threads(0)
-        .chunk_size(Some(2 * CHUNK))
+        .chunk_size(Some(2 * CHUNK_BYTES))
         .calculate_data_section_crc(false)
         .disable_seeking(true)
 }
@@ -82,7 +82,7 @@ pub fn mark(about: &fs::Metadata) -> io::Result<Vec<u8>> {
 pub fn is_marked(file: &mut File) -> io::Result<bool> {
     let target = identity(&file.metadata()?);
     file.rewind()?;
-    let mut from = Source::new(file, 0);
+    let mut from = RecordReader::new(file, 0);
     if !from.magic()? || from.next()? != Framed::Record(op::HEADER) {
         return Ok(false);
     }
@@ -127,13 +127,13 @@ impl Channel {
 /// Returns true if a channel holds frames of a bus.
 #[must_use]
 pub(super) fn is_frames(topic: &str, schema: &str) -> bool {
-    schema == Frame::TYPE && topic.starts_with(TOPIC_OF_BUS)
+    schema == Frame::TYPE && topic.starts_with(BUS_TOPIC_PREFIX)
 }
 
 /// A file that is being written. It is unusable after an error.
 pub struct FileWriter<W: Write> {
-    writer: Writer<Output<W>>,
-    output: Output<W>,
+    writer: Writer<SharedOutput<W>>,
+    output: SharedOutput<W>,
     buffer: Vec<u8>,
     /// The number of complete chunks.
     chunks: u64,
@@ -144,7 +144,7 @@ pub struct FileWriter<W: Write> {
     /// The numbers of the schemas and channels in `descriptions`.
     described: (BTreeSet<u16>, BTreeSet<u16>),
     /// The number of chunks since the descriptions were written; `None` if some have not been written yet.
-    since: Option<u32>,
+    chunks_since_description: Option<u32>,
 }
 
 impl<W: Write> core::fmt::Debug for FileWriter<W> {
@@ -167,7 +167,7 @@ impl<W: Write> FileWriter<W> {
     /// # Errors
     /// Returns an error if the file cannot be written.
     pub(super) fn with_profile(out: W, profile: &str) -> io::Result<Self> {
-        let output = Output::new(out);
+        let output = SharedOutput::new(out);
         let writer = options().profile(profile).create(output.clone()).map_err(io_error)?;
         Ok(Self {
             writer,
@@ -177,7 +177,7 @@ impl<W: Write> FileWriter<W> {
             open: 0,
             descriptions: Vec::new(),
             described: (BTreeSet::new(), BTreeSet::new()),
-            since: Some(0),
+            chunks_since_description: Some(0),
         })
     }
 
@@ -293,7 +293,7 @@ impl<W: Write> FileWriter<W> {
         self.descriptions.push(opcode);
         self.descriptions.extend((body.len() as u64).to_le_bytes());
         self.descriptions.extend(body);
-        self.since = None;
+        self.chunks_since_description = None;
     }
 
     /// Writes a message. Allocates only when the chunk grows.
@@ -316,12 +316,12 @@ impl<W: Write> FileWriter<W> {
         (log_time, publish_time): (u64, u64),
         data: &[u8],
     ) -> io::Result<()> {
-        if self.open > CHUNK {
+        if self.open > CHUNK_BYTES {
             self.end_chunk()?;
         }
         let header = MessageHeader { channel_id, sequence, log_time, publish_time };
         self.writer.write_to_known_channel(&header, data).map_err(io_error)?;
-        self.open += HEAD + data.len() as u64;
+        self.open += MESSAGE_OVERHEAD + data.len() as u64;
         Ok(())
     }
 
@@ -333,8 +333,8 @@ impl<W: Write> FileWriter<W> {
         self.writer.flush().map_err(io_error)?;
         self.open = 0;
         self.chunks += 1;
-        self.since = match self.since {
-            Some(since) if since + 1 < DESCRIBED_EVERY => Some(since + 1),
+        self.chunks_since_description = match self.chunks_since_description {
+            Some(since) if since + 1 < CHUNKS_PER_DESCRIPTION => Some(since + 1),
             Some(_) | None => {
                 self.output.records(&self.descriptions)?;
                 Some(0)

@@ -4,10 +4,10 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 
 use model::central::Central;
-use robots::{Taken, chain_words, word};
+use robots::{UniqueNames, chain_words, word};
 
-use super::robot::Robot;
-use super::{TOPIC_OF_BUS, TOPIC_OF_STATE};
+use super::robot::RecordedRobot;
+use super::{BUS_TOPIC_PREFIX, STATE_TOPIC_PREFIX};
 
 /// The reference frame of positions if no robot description names one.
 const BASE: &str = "base";
@@ -51,7 +51,7 @@ pub struct Layout {
     /// The interval between two recordings of link poses, in ticks.
     pub ticks_per_poses: u64,
     /// The robot's links, if they are known.
-    pub robot: Option<Robot>,
+    pub robot: Option<RecordedRobot>,
 }
 
 impl Layout {
@@ -59,15 +59,15 @@ impl Layout {
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
         let buses: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
-        let (chain_words, mut topics) = (chain_words(skin), Taken::default());
-        let bus_words = Taken::default().give(buses.iter().map(|bus| word(bus)).collect());
+        let (chain_words, mut topics) = (chain_words(skin), UniqueNames::default());
+        let bus_words = UniqueNames::default().give(buses.iter().map(|bus| word(bus)).collect());
         let mut patches = Vec::new();
         for (index, chain) in skin.robot.chains.iter().enumerate() {
             let on_chain = |bus: &usize| skin.buses.get(*bus).is_some_and(|bus| bus.chain == index);
             for joint in 1..=chain.joints.len() {
                 let on_bus = |bus: usize| {
                     let on_joint = move |cell: &protocol::skin::Cell| usize::from(cell.joint) == joint;
-                    let cells = skin.cells_of(bus).enumerate().filter(move |(_, cell)| on_joint(cell));
+                    let cells = skin.cells_on_bus(bus).enumerate().filter(move |(_, cell)| on_joint(cell));
                     cells.map(|(place, cell)| (place, u16::from(cell.node.get()))).collect::<Vec<_>>()
                 };
                 let parts = (0..buses.len()).filter(on_chain).map(|bus| (bus, on_bus(bus)));
@@ -90,7 +90,7 @@ impl Layout {
         )]
         let epochs_per_cloud = (skin.timing.broadcast_hz() / POINTS_HZ).ceil().max(1.0) as u64;
         Self {
-            central: (0..buses.len()).map(|bus| Central::new(&skin.part_on(bus))).collect(),
+            central: (0..buses.len()).map(|bus| Central::new(&skin.with_cells_of_bus(bus))).collect(),
             buses,
             arm: if skin.robot.name.is_empty() { "robot".to_owned() } else { word(&skin.robot.name) },
             joints: skin.robot.joints.iter().map(|joint| joint.name.clone()).collect(),
@@ -105,7 +105,7 @@ impl Layout {
 
     /// Adds the robot's links, whose names the patches get.
     #[must_use]
-    pub fn with_robot(mut self, robot: Robot) -> Self {
+    pub fn with_robot(mut self, robot: RecordedRobot) -> Self {
         for patch in &mut self.patches {
             if let Some(link) = robot.link(patch.joint) {
                 link.clone_into(&mut patch.link);
@@ -118,10 +118,10 @@ impl Layout {
     /// topics of the patches and `others`: readers identify a bus by its messages, not by its topic.
     #[must_use]
     pub fn bus_topics(&self, others: impl Iterator<Item = String>) -> [Vec<String>; 2] {
-        let mut taken = Taken::default();
+        let mut taken = UniqueNames::default();
         let points = |Patch { topic, .. }: &Patch| [topic.clone(), format!("{topic}/points")];
         taken.give(others.chain(self.patches.iter().flat_map(points)).collect());
-        [TOPIC_OF_BUS, TOPIC_OF_STATE]
+        [BUS_TOPIC_PREFIX, STATE_TOPIC_PREFIX]
             .map(|before| taken.give(self.buses.iter().map(|bus| format!("{before}{bus}")).collect()))
     }
 
@@ -134,7 +134,7 @@ impl Layout {
     /// Returns the frame of the cells' positions: the robot's base.
     #[must_use]
     pub fn base(&self) -> &str {
-        self.robot.as_ref().map_or(BASE, Robot::base)
+        self.robot.as_ref().map_or(BASE, RecordedRobot::base)
     }
 
     /// Selects the positions of a bus' chain from those of the robot.
@@ -153,7 +153,7 @@ mod tests {
     use std::collections::BTreeSet;
 
     use super::*;
-    use crate::recording::NOTES;
+    use crate::recording::NOTES_TOPIC;
     use model::testing;
 
     #[test]
@@ -179,14 +179,14 @@ mod tests {
         // Names that map to the same topic word stay distinct, and topics of buses avoid all others.
         skin.buses[0].name = "notes".to_owned();
         skin.buses[1].name = "vcan_1".to_owned();
-        skin.buses.push(protocol::skin::Bus { name: "vcan-1".to_owned(), ..skin.buses[0].clone() });
+        skin.buses.push(protocol::skin::SkinBus { name: "vcan-1".to_owned(), ..skin.buses[0].clone() });
         let cells: Vec<_> = skin.cells.iter().filter(|cell| cell.bus == 0).cloned().collect();
         skin.cells.extend(cells.into_iter().map(|cell| protocol::skin::Cell { bus: 2, ..cell }));
         let layout = Layout::new(&skin);
         let topics: BTreeSet<_> = layout.patches.iter().map(|patch| patch.topic.as_str()).collect();
         assert_eq!(topics.len(), layout.patches.len());
         assert!(topics.contains(format!("/skin/{first}_vcan_1_2").as_str()), "{topics:?}");
-        let others = [NOTES, "/can/torques", "/state/vcan_1"].map(str::to_owned);
+        let others = [NOTES_TOPIC, "/can/torques", "/state/vcan_1"].map(str::to_owned);
         let [can, state] = layout.bus_topics(others.into_iter());
         assert_eq!(can, ["/can/notes_2", "/can/vcan_1", "/can/vcan-1"]);
         assert_eq!(state, ["/state/notes", "/state/vcan_1_2", "/state/vcan-1"]);

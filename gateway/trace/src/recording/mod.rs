@@ -14,8 +14,8 @@ pub mod sink;
 pub mod window;
 
 /// The prefix of topics of frames; the name of the bus follows.
-pub const TOPIC_OF_BUS: &str = "/can/";
+pub const BUS_TOPIC_PREFIX: &str = "/can/";
 /// The prefix of topics of frames that were latched before the file began.
-pub const TOPIC_OF_STATE: &str = "/state/";
+pub const STATE_TOPIC_PREFIX: &str = "/state/";
 /// The topic of notes between frames.
-pub const NOTES: &str = "/can/notes";
+pub const NOTES_TOPIC: &str = "/can/notes";

@@ -29,7 +29,7 @@ const MCAP: &str = "mcap";
 
 /// A file that is being written and locked.
 #[derive(Debug)]
-pub struct Part {
+pub struct PartFile {
     /// The temporary name.
     pub path: PathBuf,
     /// The final name.
@@ -99,7 +99,7 @@ pub fn series(path: &Path) -> Vec<PathBuf> {
     if all.is_empty() { from(1) } else { all }
 }
 
-impl Part {
+impl PartFile {
     /// Creates and locks a part file.
     ///
     /// # Errors
@@ -214,7 +214,7 @@ pub fn is_held(file: &File) -> bool {
 /// The reason why a `.part` file is not repaired or removed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum Leftover {
+pub enum PartFileError {
     /// It is a symlink.
     #[error("it is a symlink")]
     Symlink,
@@ -246,7 +246,7 @@ pub enum Leftover {
     Unmarked,
 }
 
-impl Leftover {
+impl PartFileError {
     /// Returns true if it may be a recording.
     #[must_use]
     pub const fn may_be_recording(&self) -> bool {
@@ -255,7 +255,7 @@ impl Leftover {
 }
 
 /// A file that a killed run left, which is locked from now on; or the reason why it is not touched.
-pub type Orphan = Result<File, Leftover>;
+pub type Orphan = Result<File, PartFileError>;
 
 /// Returns the part files in a recording's folder.
 ///
@@ -268,7 +268,7 @@ pub fn parts(path: &Path) -> io::Result<Vec<(PathBuf, Orphan)>> {
         let is_part = path.extension() == Some(OsStr::new(PART))
             && goal_of(&path).extension() == Some(OsStr::new(MCAP));
         if is_part {
-            let what = look(&path);
+            let what = claim_orphan(&path);
             found.push((path, what));
         }
     }
@@ -277,31 +277,31 @@ pub fn parts(path: &Path) -> io::Result<Vec<(PathBuf, Orphan)>> {
 }
 
 /// Locks a part file if it is an orphan.
-fn look(path: &Path) -> Orphan {
+fn claim_orphan(path: &Path) -> Orphan {
     // Opening anything but a regular file may have side effects.
     let kind = fs::symlink_metadata(path)?.file_type();
     if kind.is_symlink() {
-        return Err(Leftover::Symlink);
+        return Err(PartFileError::Symlink);
     }
     if !kind.is_file() {
-        return Err(Leftover::Irregular);
+        return Err(PartFileError::Irregular);
     }
-    let mut file = open_unfollowed(path).map_err(Leftover::Unreadable)?;
+    let mut file = open_unfollowed(path).map_err(PartFileError::Unreadable)?;
     let about = file.metadata()?;
     let (owner, me) = (about.uid(), rustix::process::geteuid().as_raw());
     if !about.is_file() {
-        return Err(Leftover::Irregular);
+        return Err(PartFileError::Irregular);
     }
     if owner != me {
-        return Err(Leftover::Owner { owner, me });
+        return Err(PartFileError::Owner { owner, me });
     }
     if about.nlink() != 1 {
-        return Err(Leftover::Linked(about.nlink()));
+        return Err(PartFileError::Linked(about.nlink()));
     }
     hold(&file).map_err(|error| {
-        if error.kind() == io::ErrorKind::WouldBlock { Leftover::Held } else { error.into() }
+        if error.kind() == io::ErrorKind::WouldBlock { PartFileError::Held } else { error.into() }
     })?;
-    if file::is_marked(&mut file).map_err(Leftover::Unreadable)? { Ok(file) } else { Err(Leftover::Unmarked) }
+    if file::is_marked(&mut file).map_err(PartFileError::Unreadable)? { Ok(file) } else { Err(PartFileError::Unmarked) }
 }
 
 /// Removes an orphan, if its name still belongs to it.
@@ -342,9 +342,9 @@ mod tests {
     fn a_part_is_held_until_its_writer_is_gone_and_then_orphaned() {
         let folder = tempfile::tempdir().unwrap();
         let goal = folder.path().join("run.mcap");
-        let (part, file) = Part::create(goal.clone()).unwrap();
+        let (part, file) = PartFile::create(goal.clone()).unwrap();
         assert_eq!(orphans(&goal).len(), 0, "somebody writes it");
-        let error = Part::create(goal.clone()).unwrap_err().to_string();
+        let error = PartFile::create(goal.clone()).unwrap_err().to_string();
         assert!(
             error.ends_with("part exists: another run is recording to this name: record to another name"),
             "{error}"
@@ -359,7 +359,7 @@ mod tests {
     fn a_name_is_taken_by_force_only() {
         let folder = tempfile::tempdir().unwrap();
         let goal = folder.path().join("run.mcap");
-        let (part, _file) = Part::create(goal.clone()).unwrap();
+        let (part, _file) = PartFile::create(goal.clone()).unwrap();
         fs::write(&goal, "somebody's").unwrap();
         assert_eq!(part.finish(false).unwrap_err().kind(), io::ErrorKind::AlreadyExists);
         assert_eq!(fs::read_to_string(&goal).unwrap(), "somebody's");

@@ -50,15 +50,15 @@ impl<W: Write> Inner<W> {
 }
 
 /// A handle of the output. Flushes by the crate are ignored, because it flushes after each chunk.
-pub(super) struct Output<W>(Arc<Mutex<Inner<W>>>);
+pub(super) struct SharedOutput<W>(Arc<Mutex<Inner<W>>>);
 
-impl<W> Clone for Output<W> {
+impl<W> Clone for SharedOutput<W> {
     fn clone(&self) -> Self {
         Self(Arc::clone(&self.0))
     }
 }
 
-impl<W: Write> Output<W> {
+impl<W: Write> SharedOutput<W> {
     pub(super) fn new(out: W) -> Self {
         let checksum = crc32fast::Hasher::new();
         Self(Arc::new(Mutex::new(Inner { out, place: 0, checksum, end: None })))
@@ -90,7 +90,7 @@ impl<W: Write> Output<W> {
     }
 }
 
-impl<W: Write> Write for Output<W> {
+impl<W: Write> Write for SharedOutput<W> {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let mut inner = self.inner();
         match inner.put_end(bytes)? {
@@ -104,7 +104,7 @@ impl<W: Write> Write for Output<W> {
     }
 }
 
-impl<W: Write> Seek for Output<W> {
+impl<W: Write> Seek for SharedOutput<W> {
     /// Returns the current offset. No other seek is supported.
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         match to {

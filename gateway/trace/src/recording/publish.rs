@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::sync::mpsc::{self, Receiver, Sender};
 use std::thread::{self, JoinHandle};
 
-use super::names::{self, Part};
+use super::names::{self, PartFile};
 use crate::files::sync_folder;
 
 /// A complete file, and the information that is returned with its final name.
@@ -15,7 +15,7 @@ use crate::files::sync_folder;
 pub(super) struct Ended<T> {
     /// The file, which stays locked until it is renamed.
     pub(super) file: File,
-    pub(super) part: Part,
+    pub(super) part: PartFile,
     pub(super) about: T,
 }
 
@@ -122,7 +122,7 @@ mod tests {
     fn a_whole_file_whose_name_is_taken_is_not_to_be_repaired() {
         let folder = tempfile::tempdir().unwrap();
         let goal = folder.path().join("run.mcap");
-        let (part, file) = Part::create(goal.clone()).unwrap();
+        let (part, file) = PartFile::create(goal.clone()).unwrap();
         std::fs::write(&goal, "another program's").unwrap();
         let published = publish(Ended { file, part, about: () }, false);
         let error = published.error.unwrap();

@@ -19,16 +19,16 @@ use std::io::{self, Read, Seek, Write};
 use mcap::records::op;
 use thiserror::Error;
 
-use self::survey::{Piece, Survey};
+use self::survey::{IntactRange, FileSurvey};
 use super::file::FileWriter;
-use crate::container::{Chunk, Damage, Framed, Record, Source, parse};
+use crate::container::{Chunk, FormatError, Framed, Record, RecordReader, parse};
 
 /// The longest attachment that is copied, in bytes.
 const LONGEST_ATTACHMENT: u64 = 1 << 30;
 
 /// The result of a recovery.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
-pub struct Recovered {
+pub struct RecoveryResult {
     /// Messages kept.
     pub messages: u64,
     /// Frames of buses among them.
@@ -40,7 +40,7 @@ pub struct Recovered {
     /// The number of damaged places, and the bytes lost there.
     pub damaged: (u64, u64),
     /// Messages whose channel was described only in a lost part.
-    pub homeless: u64,
+    pub orphaned_messages: u64,
     /// The number of messages according to the statistics of the file, if it has any.
     pub stated: Option<u64>,
     /// True if the file had its end.
@@ -49,11 +49,11 @@ pub struct Recovered {
     pub checksum: bool,
 }
 
-impl Recovered {
+impl RecoveryResult {
     /// Returns true if only the data that a killed writer had not finished is lost.
     #[must_use]
     pub const fn is_undamaged(&self) -> bool {
-        self.damaged.0 == 0 && self.homeless == 0
+        self.damaged.0 == 0 && self.orphaned_messages == 0
     }
 
     /// Returns true if the file was complete and correct.
@@ -67,11 +67,11 @@ impl Recovered {
     #[must_use]
     pub fn is_little(&self) -> bool {
         let missing = self.stated.map_or(0, |stated| stated.saturating_sub(self.messages));
-        missing.max(self.homeless) > self.messages
+        missing.max(self.orphaned_messages) > self.messages
     }
 }
 
-impl fmt::Display for Recovered {
+impl fmt::Display for RecoveryResult {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let seconds = (self.last_nanos / 1_000_000_000, self.last_nanos % 1_000_000_000 / 1_000);
         let of = self.stated.filter(|stated| *stated != self.messages);
@@ -90,8 +90,8 @@ impl fmt::Display for Recovered {
             (1, bytes) => write!(f, "; {bytes} damaged bytes are lost")?,
             (places, bytes) => write!(f, "; {bytes} damaged bytes in {places} places are lost")?,
         }
-        if self.homeless > 0 {
-            write!(f, "; {} messages of topics that are described nowhere else are lost", self.homeless)?;
+        if self.orphaned_messages > 0 {
+            write!(f, "; {} messages of topics that are described nowhere else are lost", self.orphaned_messages)?;
         }
         if self.checksum && self.is_undamaged() {
             write!(f, "; a checksum of the whole was wrong, and none of a part")?;
@@ -134,8 +134,8 @@ fn hex(bytes: &[u8]) -> String {
 ///
 /// # Errors
 /// Returns [`RecoverError`] if there is nothing to keep, if a file fails, or if the input is not seekable.
-pub fn recover(mut from: impl Read + Seek, out: impl Write) -> Result<Recovered, RecoverError> {
-    let Survey { profile, pieces, described, recovered } = Survey::of(&mut from)?;
+pub fn recover(mut from: impl Read + Seek, out: impl Write) -> Result<RecoveryResult, RecoverError> {
+    let FileSurvey { profile, pieces, described, recovered } = FileSurvey::new(&mut from)?;
     let begin = || -> io::Result<_> {
         let mut writer = FileWriter::with_profile(out, &profile)?;
         let topics = described.write(&mut writer)?;
@@ -145,22 +145,22 @@ pub fn recover(mut from: impl Read + Seek, out: impl Write) -> Result<Recovered,
     let (writer, topics) = begin().map_err(RecoverError::Write)?;
     drop(described);
     let mut copy = Copy { writer, topics, recovered };
-    let mut source = Source::new(from, LONGEST_ATTACHMENT);
+    let mut source = RecordReader::new(from, LONGEST_ATTACHMENT);
     let mut chunk = Chunk::default();
     for piece in pieces {
         match piece {
-            Piece::Records { from, to } => {
+            IntactRange::Records { from, to } => {
                 source.move_to(from).map_err(RecoverError::Read)?;
                 while source.read() < to {
                     let framed = source.next().map_err(RecoverError::Read)?;
                     if let Framed::Record(code) = framed {
-                        copy.take(&mut chunk, code, source.body(), source.read())?;
+                        copy.copy_record(&mut chunk, code, source.body(), source.read())?;
                     }
                 }
             }
-            Piece::Record { at, code, length } => {
+            IntactRange::Record { at, code, length } => {
                 source.read_as(at, length).map_err(RecoverError::Read)?;
-                copy.take(&mut chunk, code, source.body(), source.read())?;
+                copy.copy_record(&mut chunk, code, source.body(), source.read())?;
             }
         }
     }
@@ -172,12 +172,12 @@ struct Copy<W: Write> {
     writer: FileWriter<W>,
     /// Channel numbers, each with true if its messages are frames.
     topics: BTreeMap<u16, bool>,
-    recovered: Recovered,
+    recovered: RecoveryResult,
 }
 
 impl<W: Write> Copy<W> {
     /// Copies a record that the survey found intact; `read` is the number of bytes of the file read so far.
-    fn take(&mut self, chunk: &mut Chunk, code: u8, body: &[u8], read: u64) -> Result<(), RecoverError> {
+    fn copy_record(&mut self, chunk: &mut Chunk, code: u8, body: &[u8], read: u64) -> Result<(), RecoverError> {
         if code != op::CHUNK {
             return self.record(code, body).map_err(RecoverError::Write);
         }
@@ -195,11 +195,11 @@ impl<W: Write> Copy<W> {
         match parse(code, body).map_err(io::Error::other)? {
             Record::Message { channel, sequence, log_time, publish_time, data } => {
                 let Some(is_frame) = self.topics.get(&channel) else {
-                    self.recovered.homeless += 1;
+                    self.recovered.orphaned_messages += 1;
                     return Ok(());
                 };
                 self.writer.put((channel, sequence), (log_time, publish_time), data)?;
-                let Recovered { messages, frames, last_nanos, .. } = &mut self.recovered;
+                let RecoveryResult { messages, frames, last_nanos, .. } = &mut self.recovered;
                 *messages += 1;
                 *frames += u64::from(*is_frame);
                 *last_nanos = log_time.max(*last_nanos);
@@ -221,6 +221,6 @@ impl<W: Write> Copy<W> {
 }
 
 /// The input changed between the survey and the copy.
-fn changed(damage: Damage) -> RecoverError {
+fn changed(damage: FormatError) -> RecoverError {
     RecoverError::Read(io::Error::other(format!("it was changed meanwhile: {damage}")))
 }

@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::{Gid, fchown};
 
-use super::names::{self, Part};
-use super::recover::{RecoverError, Recovered, recover};
+use super::names::{self, PartFile};
+use super::recover::{RecoverError, RecoveryResult, recover};
 use super::sink::is_full;
 use crate::files::{WholeFile, folder_of, nameless};
 
@@ -19,7 +19,7 @@ const NAMES: u32 = 100;
 #[derive(Clone, Debug)]
 pub struct Repaired {
     /// The result of the recovery.
-    pub recovered: Recovered,
+    pub recovered: RecoveryResult,
     /// The new file and its length in bytes; `None` if nothing was recorded.
     pub new: Option<(PathBuf, u64)>,
     /// The new name of the original, if it is damaged before its end; otherwise the original is removed.
@@ -37,8 +37,8 @@ pub fn repair(
     mut goal: impl FnMut() -> PathBuf,
     force: bool,
 ) -> Result<Repaired, RecoverError> {
-    let something = |recovered: &Recovered| {
-        let Recovered { messages, unfinished, damaged, homeless, .. } = *recovered;
+    let something = |recovered: &RecoveryResult| {
+        let RecoveryResult { messages, unfinished, damaged, orphaned_messages: homeless, .. } = *recovered;
         messages + unfinished + damaged.0 + homeless > 0
     };
     let mut attempts = 0;
@@ -63,7 +63,7 @@ pub fn repair(
 }
 
 /// Returns the message for a file that broke off and could not be repaired.
-pub(super) fn unrepaired(Part { path, goal, .. }: &Part, error: &RecoverError) -> String {
+pub(super) fn unrepaired(PartFile { path, goal, .. }: &PartFile, error: &RecoverError) -> String {
     let path = path.display();
     let is = |kind: fn(&io::Error) -> bool| matches!(error, RecoverError::Write(error) if kind(error));
     let why = if is(|error| error.kind() == io::ErrorKind::AlreadyExists) {
@@ -84,7 +84,7 @@ pub fn copy_unless_sound(
     from: &File,
     to: &Path,
     force: bool,
-) -> Result<(Recovered, Option<u64>), RecoverError> {
+) -> Result<(RecoveryResult, Option<u64>), RecoverError> {
     copy(from, to, force, |recovered| !recovered.is_sound() && recovered.messages > 0)
 }
 
@@ -92,8 +92,8 @@ fn copy(
     from: &File,
     to: &Path,
     force: bool,
-    is_worth_it: impl FnOnce(&Recovered) -> bool,
-) -> Result<(Recovered, Option<u64>), RecoverError> {
+    is_worth_it: impl FnOnce(&RecoveryResult) -> bool,
+) -> Result<(RecoveryResult, Option<u64>), RecoverError> {
     let (whole, file) = WholeFile::create(to, force).map_err(RecoverError::Write)?;
     as_private(from, &file).map_err(RecoverError::Write)?;
     let mut out = BufWriter::new(file);
@@ -178,7 +178,7 @@ mod tests {
     #[test]
     fn what_cannot_be_repaired_where_it_is_is_repaired_elsewhere() {
         let folder = tempfile::tempdir().unwrap();
-        let (part, _file) = Part::create(folder.path().join("run.mcap")).unwrap();
+        let (part, _file) = PartFile::create(folder.path().join("run.mcap")).unwrap();
         let line = |kind: io::ErrorKind| unrepaired(&part, &RecoverError::Write(kind.into()));
         let full = line(io::ErrorKind::StorageFull);
         assert!(full.ends_with("run.mcap.part -o FILE`, a file on another disk"), "{full}");

@@ -2,7 +2,7 @@
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use protocol::skin::{Cell, Chain, Skin};
-use robots::{LinkPose, Problem, RobotError, Row, Urdf, frames, pose_of, written};
+use robots::{LinkPose, RobotProblem, RobotError, DhRow, Urdf, frames, pose_of, written};
 
 use crate::ros2::robot::Transform;
 
@@ -13,7 +13,7 @@ const STEP: f64 = 0.3;
 
 /// The robot in a recording.
 #[derive(Clone, Debug)]
-pub struct Robot {
+pub struct RecordedRobot {
     /// The URDF text.
     pub description: String,
     base: String,
@@ -31,7 +31,7 @@ struct Described {
     links: Vec<Vec<String>>,
 }
 
-impl Robot {
+impl RecordedRobot {
     /// Describes the robot of a skin by its Denavit-Hartenberg rows.
     ///
     /// # Errors
@@ -88,14 +88,14 @@ impl Robot {
     #[must_use]
     pub fn moving(&self, q: &[f64]) -> Vec<Transform<'_>> {
         let moving = self.poses.iter().filter(|pose| pose.moves());
-        moving.map(|pose| transform(&pose.parent, &pose.child, &pose.at(q))).collect()
+        moving.map(|pose| transform(&pose.parent, &pose.child, &pose.pose(q))).collect()
     }
 
     /// Returns the poses of fixed links and of cells.
     #[must_use]
     pub fn still(&self) -> Vec<Transform<'_>> {
         let links = self.poses.iter().filter(|pose| !pose.moves());
-        let links = links.map(|pose| transform(&pose.parent, &pose.child, &pose.at(&[])));
+        let links = links.map(|pose| transform(&pose.parent, &pose.child, &pose.pose(&[])));
         links.chain(self.cells.iter().map(|(link, cell, pose)| transform(link, cell, pose))).collect()
     }
 }
@@ -119,7 +119,7 @@ impl Described {
         if apart.is_nan() || apart > TOLERANCE_M {
             let joint = chain.joints.get(of_chain).and_then(|joint| skin.robot.joints.get(*joint));
             let joint = joint.map_or_else(String::new, |joint| joint.name.clone());
-            let problem = Box::new(Problem::OtherRows { joint, chain: chain.name.clone() });
+            let problem = Box::new(RobotProblem::OtherRows { joint, chain: chain.name.clone() });
             return Err(RobotError { file: self.urdf.file.clone(), line: None, problem });
         }
         let normal = Vector3::from(cell.normal);
@@ -135,12 +135,12 @@ impl Described {
     fn row_on(&self, link: &str, chain: &Chain, row: usize, q: &[f64]) -> Isometry3<f64> {
         let of_chain: Vec<_> =
             chain.joints.iter().map(|joint| q.get(*joint).copied().unwrap_or_default()).collect();
-        let rows: Vec<_> = chain.rows.iter().map(Row::from).collect();
+        let rows: Vec<_> = chain.rows.iter().map(DhRow::from).collect();
         let frames = frames(&pose_of(&chain.base), &rows, &of_chain);
         let frame = frames.get(row).copied().unwrap_or_else(Isometry3::identity);
         let (mut pose, mut at) = (Isometry3::identity(), link);
         while let Some(above) = self.poses.iter().find(|pose| pose.child == at) {
-            pose = above.at(q) * pose;
+            pose = above.pose(q) * pose;
             at = &above.parent;
         }
         pose.inverse() * frame

@@ -13,40 +13,40 @@ use std::time::{Duration, Instant};
 
 use rustix::fs::statvfs;
 
-use super::account::{Count, Written};
+use super::account::{MessageCount, WrittenFile};
 use super::file::FileWriter;
-use super::names::{self, Part};
+use super::names::{self, PartFile};
 use super::publish::{Ended, Published, Publisher};
 use super::recover::RecoverError;
 use super::repair::{self, Repaired};
-use super::sink::{Gauge, Sink};
-use super::window::Window;
+use super::sink::{FileGauge, ReservedFile};
+use super::window::ReorderWindow;
 use crate::files::folder_of;
 
 /// The size of the write buffer in bytes. A chunk is larger and bypasses it.
 const BUFFER: usize = 64 << 10;
 /// The interval between two attempts after an error.
-const RETRY: Duration = Duration::from_secs(5);
+const RETRY_INTERVAL: Duration = Duration::from_secs(5);
 /// The maximum time for which an open segment delays the end of a file, because any traffic may look like a segment.
-const HOLD: Duration = Duration::from_millis(500);
+const MAX_HOLD: Duration = Duration::from_millis(500);
 /// The interval between two checks that a file still has its name.
-const LOOK: Duration = Duration::from_secs(1);
+const NAME_CHECK_INTERVAL: Duration = Duration::from_secs(1);
 /// The free space that a full disk must have before recording is tried again, in bytes.
-const ROOM: u64 = 64 << 20;
+const MIN_FREE_BYTES: u64 = 64 << 20;
 
 /// The writer of a file.
-pub type Writer = FileWriter<BufWriter<Sink>>;
+pub type Writer = FileWriter<BufWriter<ReservedFile>>;
 
 /// The limits at which another file is begun.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Split {
+pub struct SplitLimits {
     /// The size of a file in bytes, without what each file begins with.
     pub bytes: u64,
     /// The age of a file.
     pub age: Duration,
 }
 
-impl Default for Split {
+impl Default for SplitLimits {
     /// Returns 1 GiB and 10 minutes.
     fn default() -> Self {
         Self { bytes: 1 << 30, age: Duration::from_secs(600) }
@@ -55,7 +55,7 @@ impl Default for Split {
 
 /// An attachment.
 #[derive(Clone, Debug)]
-pub struct Attached {
+pub struct AttachedFile {
     /// The name of the attachment.
     pub name: String,
     /// Its media type.
@@ -66,23 +66,23 @@ pub struct Attached {
 
 /// The contents at the beginning of each file.
 #[derive(Clone, Debug, Default)]
-pub struct Head {
+pub struct FileHead {
     /// The start of the recording, in ns since 1970.
     pub nanos: u64,
     /// Metadata records by name.
     pub metadata: Vec<(&'static str, BTreeMap<String, String>)>,
     /// Attachments.
-    pub attachments: Vec<Attached>,
+    pub attachments: Vec<AttachedFile>,
 }
 
-impl Head {
+impl FileHead {
     fn write(&self, writer: &mut Writer, number: u32) -> io::Result<()> {
         for (name, facts) in &self.metadata {
             writer.metadata(name, facts)?;
         }
         let place = [("number".to_owned(), number.to_string())];
         writer.metadata("part", &BTreeMap::from(place))?;
-        for Attached { name, media_type, bytes } in &self.attachments {
+        for AttachedFile { name, media_type, bytes } in &self.attachments {
             writer.attach(name, media_type, self.nanos, bytes)?;
         }
         Ok(())
@@ -91,14 +91,14 @@ impl Head {
 
 /// An event to be reported.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub enum Said {
+pub enum RecordingEvent {
     /// A file failed; the run goes on.
     BrokeOff(String),
     /// Any other event.
     Else(String),
 }
 
-impl Said {
+impl RecordingEvent {
     /// Returns the description of the event, for the end of the run.
     #[must_use]
     pub fn what(&self) -> &str {
@@ -108,7 +108,7 @@ impl Said {
     }
 }
 
-impl core::fmt::Display for Said {
+impl core::fmt::Display for RecordingEvent {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let more = match self {
             Self::BrokeOff(_) => {
@@ -122,11 +122,11 @@ impl core::fmt::Display for Said {
 
 /// A file that is being written.
 #[derive(Debug)]
-struct Open<T> {
+struct OpenFile<T> {
     writer: Writer,
     topics: T,
-    part: Part,
-    gauge: Arc<Gauge>,
+    part: PartFile,
+    gauge: Arc<FileGauge>,
     /// The number of bytes before the first message.
     head: u64,
     began: Instant,
@@ -135,14 +135,14 @@ struct Open<T> {
     /// The time since when it is large or old enough.
     enough: Option<Instant>,
     /// Messages that are flushed to the file.
-    kept: Count,
+    kept: MessageCount,
     /// Messages written since the last flush.
-    written: Count,
+    written: MessageCount,
 }
 
-impl<T> Open<T> {
+impl<T> OpenFile<T> {
     /// Writes messages that have waited long enough, or all that wait.
-    fn release(&mut self, window: &mut Window, all: bool) -> io::Result<()> {
+    fn release(&mut self, window: &mut ReorderWindow, all: bool) -> io::Result<()> {
         let Self { writer, written, .. } = self;
         written.add(if all { window.release_all(writer) } else { window.release(writer) }?);
         Ok(())
@@ -151,49 +151,49 @@ impl<T> Open<T> {
 
 /// A file that broke off and is locked until it is repaired.
 #[derive(Debug)]
-struct Broken {
-    part: Part,
+struct BrokenFile {
+    part: PartFile,
     file: File,
-    kept: Count,
+    kept: MessageCount,
 }
 
 /// The files of a recording. `T` holds the channels of a file.
 #[derive(Debug)]
-pub struct Series<T> {
+pub struct SplitRecording<T> {
     path: PathBuf,
     force: bool,
-    split: Split,
-    head: Head,
+    split: SplitLimits,
+    head: FileHead,
     /// The recorder's time.
     now: u64,
     /// The number of the open file, or of the last one.
     number: u32,
     /// The first file, claimed but not begun.
-    claimed: Option<(Part, File)>,
+    claimed: Option<(PartFile, File)>,
     /// Files of an earlier recording that this one replaces.
     stale: Vec<PathBuf>,
-    open: Option<Open<T>>,
+    open: Option<OpenFile<T>>,
     /// Messages that wait for the open file. All files share the window, so that its buffers stay allocated.
-    window: Window,
+    window: ReorderWindow,
     /// The time of the last error.
     failed: Option<Instant>,
     /// The time at which a file was last begun at once after an error, and true if this is to be done next.
     prompt: (Option<Instant>, bool),
-    broken: Vec<Broken>,
+    broken: Vec<BrokenFile>,
     /// Publishes complete files, each with its message counts and its length.
-    publisher: Publisher<(Count, u64)>,
-    written: Vec<Written>,
-    lost: Count,
+    publisher: Publisher<(MessageCount, u64)>,
+    written: Vec<WrittenFile>,
+    lost: MessageCount,
     /// Events that have not been reported yet.
-    said: Vec<Said>,
+    said: Vec<RecordingEvent>,
 }
 
-impl<T> Series<T> {
+impl<T> SplitRecording<T> {
     /// Claims the first file early, so that errors are reported before there is anything to write.
     ///
     /// # Errors
     /// Returns an error if another program is writing it, or if it cannot be written.
-    pub fn claim(path: &Path, force: bool, split: Split) -> io::Result<Self> {
+    pub fn claim(path: &Path, force: bool, split: SplitLimits) -> io::Result<Self> {
         let stale = names::series(path);
         if let Some(there) = stale.first().filter(|_| !force) {
             let why =
@@ -201,28 +201,28 @@ impl<T> Series<T> {
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, why));
         }
         Ok(Self {
-            claimed: Some(Part::create(path.to_owned())?),
+            claimed: Some(PartFile::create(path.to_owned())?),
             stale,
             path: path.to_owned(),
             force,
             split,
-            head: Head::default(),
+            head: FileHead::default(),
             now: 0,
             number: 0,
             open: None,
-            window: Window::default(),
+            window: ReorderWindow::default(),
             failed: None,
             prompt: (None, false),
             broken: Vec::new(),
             publisher: Publisher::new(force),
             written: Vec::new(),
-            lost: Count::default(),
+            lost: MessageCount::default(),
             said: Vec::new(),
         })
     }
 
     /// Begins the first file.
-    pub fn begin(&mut self, head: Head, topics: impl FnOnce(&mut Writer) -> io::Result<T>) {
+    pub fn begin(&mut self, head: FileHead, topics: impl FnOnce(&mut Writer) -> io::Result<T>) {
         (self.now, self.head) = (head.nanos, head);
         let Some((part, file)) = self.claimed.take() else { return };
         match self.start(part, file, topics) {
@@ -242,13 +242,13 @@ impl<T> Series<T> {
 
     fn start(
         &mut self,
-        part: Part,
+        part: PartFile,
         file: File,
         topics: impl FnOnce(&mut Writer) -> io::Result<T>,
-    ) -> io::Result<Open<T>> {
+    ) -> io::Result<OpenFile<T>> {
         let begin = || {
             let about = file.metadata()?;
-            let (sink, gauge) = Sink::new(file, folder_of(&part.path))?;
+            let (sink, gauge) = ReservedFile::new(file, folder_of(&part.path))?;
             let mut writer = Writer::in_file(BufWriter::with_capacity(BUFFER, sink), &about)?;
             self.head.write(&mut writer, self.number)?;
             let topics = topics(&mut writer)?;
@@ -262,22 +262,22 @@ impl<T> Series<T> {
         let (writer, topics, gauge) = begin().inspect_err(|_: &io::Error| part.remove())?;
         self.window.begin(self.now);
         let (head, began) = (gauge.bytes(), Instant::now());
-        let (kept, written) = (Count::default(), Count::default());
-        Ok(Open { writer, topics, part, gauge, head, began, looked: began, enough: None, kept, written })
+        let (kept, written) = (MessageCount::default(), MessageCount::default());
+        Ok(OpenFile { writer, topics, part, gauge, head, began, looked: began, enough: None, kept, written })
     }
 
     /// Sets the recorder's time, in ns since 1970, by which messages are ordered.
-    pub fn look(&mut self, now: u64) {
+    pub fn set_time(&mut self, now: u64) {
         self.now = now;
-        let Some(Open { writer, written, .. }) = &mut self.open else { return };
-        match self.window.look(now, writer) {
+        let Some(OpenFile { writer, written, .. }) = &mut self.open else { return };
+        match self.window.set_time(now, writer) {
             Ok(count) => written.add(count),
             Err(error) => self.break_off(&error),
         }
     }
 
     /// Adds messages to the open file. They count as lost if no file is open.
-    pub fn put(&mut self, count: Count, write: impl FnOnce(&mut Window, &mut T)) {
+    pub fn put(&mut self, count: MessageCount, write: impl FnOnce(&mut ReorderWindow, &mut T)) {
         let Some(open) = &mut self.open else { return self.lost.add(count) };
         write(&mut self.window, &mut open.topics);
         if self.window.is_full() {
@@ -301,7 +301,7 @@ impl<T> Series<T> {
     pub fn flush(&mut self, holds: bool) -> bool {
         self.take_published();
         let Some(open) = &mut self.open else {
-            let due = self.failed.is_some_and(|at| at.elapsed() >= RETRY);
+            let due = self.failed.is_some_and(|at| at.elapsed() >= RETRY_INTERVAL);
             let prompt = std::mem::replace(&mut self.prompt.1, false);
             return (due || prompt) && has_room(&self.path);
         };
@@ -310,7 +310,7 @@ impl<T> Series<T> {
             return false;
         }
         open.kept.add(std::mem::take(&mut open.written));
-        if open.looked.elapsed() >= LOOK {
+        if open.looked.elapsed() >= NAME_CHECK_INTERVAL {
             open.looked = Instant::now();
             if !open.part.is_there() {
                 self.end();
@@ -326,7 +326,7 @@ impl<T> Series<T> {
         let enough =
             open.gauge.bytes() >= self.split.bytes + open.head || open.began.elapsed() >= self.split.age;
         let since = enough.then(|| *open.enough.get_or_insert_with(Instant::now));
-        let enough = since.is_some_and(|since| !holds || since.elapsed() >= HOLD);
+        let enough = since.is_some_and(|since| !holds || since.elapsed() >= MAX_HOLD);
         if enough {
             self.end();
         }
@@ -339,11 +339,11 @@ impl<T> Series<T> {
         let goal = names::numbered(&self.path, number);
         let failed_before = self.failed;
         let before = std::mem::replace(&mut self.number, number);
-        match Part::create(goal).and_then(|(part, file)| self.start(part, file, topics)) {
+        match PartFile::create(goal).and_then(|(part, file)| self.start(part, file, topics)) {
             Ok(open) => {
                 if failed_before.is_some() {
                     let goal = open.part.goal.display();
-                    self.said.push(Said::Else(format!("recording goes on in {goal}")));
+                    self.said.push(RecordingEvent::Else(format!("recording goes on in {goal}")));
                 }
                 (self.failed, self.open) = (None, Some(open));
                 true
@@ -364,7 +364,7 @@ impl<T> Series<T> {
 
     /// Returns the messages that were not written.
     #[must_use]
-    pub const fn lost(&self) -> Count {
+    pub const fn lost(&self) -> MessageCount {
         self.lost
     }
 
@@ -381,7 +381,7 @@ impl<T> Series<T> {
     }
 
     /// Returns the events since the last call.
-    pub fn said(&mut self) -> std::vec::Drain<'_, Said> {
+    pub fn drain_events(&mut self) -> std::vec::Drain<'_, RecordingEvent> {
         self.said.drain(..)
     }
 
@@ -401,7 +401,7 @@ impl<T> Series<T> {
     /// Collects the files that have their final names by now.
     fn take_published(&mut self) {
         for Published { path, about: (kept, bytes), error } in self.publisher.done() {
-            self.said.extend(error.map(Said::Else));
+            self.said.extend(error.map(RecordingEvent::Else));
             match path {
                 Some(path) => self.written.push(kept.in_file(&path, bytes)),
                 // The file is complete, but its name is unknown.
@@ -417,19 +417,19 @@ impl<T> Series<T> {
         self.lost.add(self.window.count());
         // The buffer holds an incomplete record and is dropped. The file stays locked until it is repaired.
         let (sink, _) = open.writer.into_inner().into_parts();
-        self.broken.push(Broken { part: open.part, file: sink.into_file(), kept: open.kept });
+        self.broken.push(BrokenFile { part: open.part, file: sink.into_file(), kept: open.kept });
         self.fail(error);
     }
 
     /// Requests another file at once, unless that was tried a moment ago: then the error is not a single one.
     fn fail(&mut self, error: &io::Error) {
         let (last, prompt) = &mut self.prompt;
-        if last.is_none_or(|at| at.elapsed() >= RETRY) {
+        if last.is_none_or(|at| at.elapsed() >= RETRY_INTERVAL) {
             (*last, *prompt) = (Some(Instant::now()), true);
         }
         if self.failed.replace(Instant::now()).is_none() {
             let path = names::numbered(&self.path, self.number);
-            self.said.push(Said::BrokeOff(format!("{}: {error}", path.display())));
+            self.said.push(RecordingEvent::BrokeOff(format!("{}: {error}", path.display())));
         }
     }
 
@@ -442,11 +442,11 @@ impl<T> Series<T> {
     }
 
     /// Ends the recording. Returns its files and the lost messages.
-    pub fn finish(&mut self) -> (Vec<Written>, Count) {
+    pub fn finish(&mut self) -> (Vec<WrittenFile>, MessageCount) {
         self.end();
         self.publisher.finish();
         self.take_published();
-        for Broken { part, file, kept } in std::mem::take(&mut self.broken) {
+        for BrokenFile { part, file, kept } in std::mem::take(&mut self.broken) {
             let from = part.open().map_err(RecoverError::Read);
             let goal = || part.goal.clone();
             match from.and_then(|from| repair::repair(&part.path, &from, goal, self.force)) {
@@ -455,11 +455,11 @@ impl<T> Series<T> {
                     self.lost.frames = (self.lost.frames + kept.frames).saturating_sub(recovered.frames);
                     let others = recovered.messages - recovered.frames;
                     self.lost.others = (self.lost.others + kept.others).saturating_sub(others);
-                    self.written.push(Count { frames: recovered.frames, others }.in_file(&goal, bytes));
+                    self.written.push(MessageCount { frames: recovered.frames, others }.in_file(&goal, bytes));
                 }
                 Ok(Repaired { new: None, .. }) => self.lost.add(kept),
                 Err(error) => {
-                    self.said.push(Said::Else(repair::unrepaired(&part, &error)));
+                    self.said.push(RecordingEvent::Else(repair::unrepaired(&part, &error)));
                     let bytes = file.metadata().map_or(0, |about| about.len());
                     self.written.push(kept.in_file(&part.path, bytes));
                 }
@@ -476,7 +476,7 @@ impl<T> Series<T> {
     }
 }
 
-impl<T> Drop for Series<T> {
+impl<T> Drop for SplitRecording<T> {
     fn drop(&mut self) {
         if let Some((part, _)) = &self.claimed {
             // The file is still empty.
@@ -486,5 +486,5 @@ impl<T> Drop for Series<T> {
 }
 
 fn has_room(path: &Path) -> bool {
-    statvfs(folder_of(path)).is_ok_and(|about| about.f_bavail.saturating_mul(about.f_frsize) >= ROOM)
+    statvfs(folder_of(path)).is_ok_and(|about| about.f_bavail.saturating_mul(about.f_frsize) >= MIN_FREE_BYTES)
 }

@@ -18,7 +18,7 @@ const RESERVE_FOR_CHUNK: u64 = 400;
 
 /// The state of a file that is visible outside of its writer.
 #[derive(Debug, Default)]
-pub struct Gauge {
+pub struct FileGauge {
     bytes: AtomicU64,
     full: AtomicBool,
     reserve: Mutex<Option<Reserve>>,
@@ -31,7 +31,7 @@ struct Reserve {
     bytes: u64,
 }
 
-impl Gauge {
+impl FileGauge {
     /// Returns the size of the file in bytes.
     #[must_use]
     pub fn bytes(&self) -> u64 {
@@ -69,22 +69,22 @@ impl Gauge {
 
 /// A file that can be finished although its disk becomes full.
 #[derive(Debug)]
-pub struct Sink {
+pub struct ReservedFile {
     file: File,
     /// The number of bytes that the file already holds; the writer writes them again, and they are skipped.
     there: u64,
-    gauge: Arc<Gauge>,
+    gauge: Arc<FileGauge>,
 }
 
-impl Sink {
+impl ReservedFile {
     /// Wraps a file, and reserves space in its folder. The writer must begin with the bytes that are already in the
     /// file. If the file system reserves no space, a full disk is an ordinary error.
     ///
     /// # Errors
     /// Returns an error if the file cannot be queried.
-    pub fn new(file: File, folder: &Path) -> io::Result<(Self, Arc<Gauge>)> {
+    pub fn new(file: File, folder: &Path) -> io::Result<(Self, Arc<FileGauge>)> {
         let (reserve, there) = (reserve(folder), file.metadata()?.len());
-        let gauge = Arc::new(Gauge { reserve: Mutex::new(reserve), ..Gauge::default() });
+        let gauge = Arc::new(FileGauge { reserve: Mutex::new(reserve), ..FileGauge::default() });
         Ok((Self { file, there, gauge: Arc::clone(&gauge) }, gauge))
     }
 
@@ -108,7 +108,7 @@ pub fn is_full(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }
 
-impl Write for Sink {
+impl Write for ReservedFile {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         if self.there > 0 {
             let there = bytes.len().min(usize::try_from(self.there).unwrap_or(usize::MAX));

@@ -10,7 +10,7 @@
 
 use std::io::{self, Write};
 
-use super::account::Count;
+use super::account::MessageCount;
 use super::file::{Channel, FileWriter};
 use crate::ros2::Message;
 
@@ -21,13 +21,13 @@ const MESSAGES: usize = 65_536;
 /// The maximum size of waiting messages, in bytes.
 const BYTES: usize = 16 << 20;
 /// The initial size of each buffer, in bytes. Growth while a file was blocked is given back.
-const KEPT: usize = 1 << 20;
+const INITIAL_BYTES: usize = 1 << 20;
 
 /// A waiting message.
 #[derive(Clone, Copy, Debug)]
-struct Waiting {
+struct WaitingMessage {
     /// The position in the order of the file, in ns since 1970.
-    at: u64,
+    log_nanos: u64,
     /// The message's own time.
     nanos: u64,
     /// The range of its bytes in the buffer.
@@ -40,8 +40,8 @@ struct Waiting {
 
 /// Messages that wait to be written, for one file after the other.
 #[derive(Debug)]
-pub struct Window {
-    waiting: Vec<Waiting>,
+pub struct ReorderWindow {
+    waiting: Vec<WaitingMessage>,
     bytes: Vec<u8>,
     /// The latest position of each channel.
     latest: Vec<u64>,
@@ -54,17 +54,17 @@ pub struct Window {
     buffers: (Vec<u8>, Vec<u8>),
 }
 
-impl Default for Window {
+impl Default for ReorderWindow {
     /// Returns an empty window. Its memory is written to once, so that a recorder occupies it from its start on, and
     /// not when it is late for the first time.
     fn default() -> Self {
         let bytes = || {
-            let mut bytes = vec![1; KEPT];
+            let mut bytes = vec![1; INITIAL_BYTES];
             bytes.clear();
             bytes
         };
-        let none = Waiting { at: 1, nanos: 1, begin: 0, end: 0, channel: 0, sequence: 0, is_frame: false };
-        let mut waiting = vec![none; KEPT / size_of::<Waiting>()];
+        let none = WaitingMessage { log_nanos: 1, nanos: 1, begin: 0, end: 0, channel: 0, sequence: 0, is_frame: false };
+        let mut waiting = vec![none; INITIAL_BYTES / size_of::<WaitingMessage>()];
         waiting.clear();
         Self {
             waiting,
@@ -78,7 +78,7 @@ impl Default for Window {
     }
 }
 
-impl Window {
+impl ReorderWindow {
     /// Begins the order of another file at `now`, in ns since 1970. Waiting messages are dropped; the buffers stay
     /// allocated.
     pub fn begin(&mut self, now: u64) {
@@ -110,7 +110,7 @@ impl Window {
         self.bytes.extend_from_slice(&self.buffers.0);
         let end = self.bytes.len();
         let (channel, sequence, is_frame) = channel.next();
-        self.waiting.push(Waiting { at, nanos, begin, end, channel, sequence, is_frame });
+        self.waiting.push(WaitingMessage { log_nanos: at, nanos, begin, end, channel, sequence, is_frame });
     }
 
     /// Returns the latest position of a channel's messages; 0 without messages.
@@ -121,7 +121,7 @@ impl Window {
 
     /// Returns the number of waiting messages.
     #[must_use]
-    pub fn count(&self) -> Count {
+    pub fn count(&self) -> MessageCount {
         count(&self.waiting)
     }
 
@@ -135,14 +135,14 @@ impl Window {
     ///
     /// # Errors
     /// Returns an error if the file cannot be written, as all methods below do.
-    pub fn look<W: Write>(&mut self, now: u64, file: &mut FileWriter<W>) -> io::Result<Count> {
+    pub fn set_time<W: Write>(&mut self, now: u64, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
         let written = if now < self.now {
             let written = self.release_all(file)?;
             self.latest.clear();
             self.released = 0;
             written
         } else {
-            Count::default()
+            MessageCount::default()
         };
         self.now = now;
         Ok(written)
@@ -152,10 +152,10 @@ impl Window {
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
-    pub fn release<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<Count> {
+    pub fn release<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
         self.sort();
         let until = self.now.saturating_sub(WINDOW_NS);
-        let due = self.waiting.partition_point(|it| it.at <= until);
+        let due = self.waiting.partition_point(|it| it.log_nanos <= until);
         let due = if self.is_full() { due.max(self.waiting.len() / 2) } else { due };
         self.write_out(due, file)
     }
@@ -170,23 +170,23 @@ impl Window {
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
-    pub fn release_all<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<Count> {
+    pub fn release_all<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
         self.sort();
         self.write_out(self.waiting.len(), file)
     }
 
     /// Sorts the messages. Those of the same position keep their order of arrival.
     fn sort(&mut self) {
-        self.waiting.sort_by_key(|it| it.at);
+        self.waiting.sort_by_key(|it| it.log_nanos);
     }
 
     /// Writes the first `due` messages.
-    fn write_out<W: Write>(&mut self, due: usize, file: &mut FileWriter<W>) -> io::Result<Count> {
+    fn write_out<W: Write>(&mut self, due: usize, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
         let Self { waiting, bytes, released, late, buffers: (_, kept), .. } = self;
         let written = waiting.get(..due).unwrap_or_default();
         for it in written {
-            *late += u64::from(it.at < *released);
-            *released = it.at.max(*released);
+            *late += u64::from(it.log_nanos < *released);
+            *released = it.log_nanos.max(*released);
             let data = bytes.get(it.begin..it.end).unwrap_or_default();
             file.put((it.channel, it.sequence), (*released, it.nanos), data)?;
         }
@@ -199,19 +199,19 @@ impl Window {
             (it.begin, it.end) = (begin, kept.len());
         }
         std::mem::swap(bytes, kept);
-        if bytes.len() < KEPT {
+        if bytes.len() < INITIAL_BYTES {
             kept.clear();
-            kept.shrink_to(KEPT);
-            bytes.shrink_to(KEPT);
-            waiting.shrink_to(KEPT / size_of::<Waiting>());
+            kept.shrink_to(INITIAL_BYTES);
+            bytes.shrink_to(INITIAL_BYTES);
+            waiting.shrink_to(INITIAL_BYTES / size_of::<WaitingMessage>());
         }
         Ok(written)
     }
 }
 
-fn count(messages: &[Waiting]) -> Count {
+fn count(messages: &[WaitingMessage]) -> MessageCount {
     let frames = messages.iter().filter(|it| it.is_frame).count() as u64;
-    Count { frames, others: messages.len() as u64 - frames }
+    MessageCount { frames, others: messages.len() as u64 - frames }
 }
 
 #[cfg(test)]

@@ -12,12 +12,12 @@ use thiserror::Error;
 /// "Plain CDR, little endian", and two option bytes.
 const HEAD: [u8; 4] = [0, 1, 0, 0];
 /// The maximum number of elements in a decoded sequence.
-const LONGEST: u32 = 64;
+const MAX_ELEMENTS: u32 = 64;
 
 /// A part of a message that can be encoded.
 pub trait Encode {
     /// Appends it to the message.
-    fn encode(&self, out: &mut Writer<'_>);
+    fn encode(&self, out: &mut CdrWriter<'_>);
 }
 
 /// A part of a message that can be decoded. Texts are borrowed from the message.
@@ -26,19 +26,19 @@ pub trait Decode<'a>: Sized {
     ///
     /// # Errors
     /// Returns [`CdrError`] if the message ends too early or holds an invalid value.
-    fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError>;
+    fn decode(from: &mut CdrReader<'a>) -> Result<Self, CdrError>;
 }
 
 macro_rules! numbers {
     ($($number:ty: $what:literal),+) => {$(
         impl Encode for $number {
-            fn encode(&self, out: &mut Writer<'_>) {
+            fn encode(&self, out: &mut CdrWriter<'_>) {
                 out.number(self.to_le_bytes());
             }
         }
 
         impl Decode<'_> for $number {
-            fn decode(from: &mut Reader<'_>) -> Result<Self, CdrError> {
+            fn decode(from: &mut CdrReader<'_>) -> Result<Self, CdrError> {
                 from.number($what).map(Self::from_le_bytes)
             }
         }
@@ -55,19 +55,19 @@ numbers!(
 );
 
 impl Encode for bool {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(u8::from(*self));
     }
 }
 
 impl Decode<'_> for bool {
-    fn decode(from: &mut Reader<'_>) -> Result<Self, CdrError> {
+    fn decode(from: &mut CdrReader<'_>) -> Result<Self, CdrError> {
         Ok(from.get::<u8>()? != 0)
     }
 }
 
 impl Encode for str {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.count(self.len() + 1);
         out.out.extend_from_slice(self.as_bytes());
         out.out.push(0);
@@ -75,7 +75,7 @@ impl Encode for str {
 }
 
 impl<'a> Decode<'a> for &'a str {
-    fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
+    fn decode(from: &mut CdrReader<'a>) -> Result<Self, CdrError> {
         let bytes = from.bytes()?;
         let wrong = CdrError::Text { at: from.at - bytes.len() };
         let text = match bytes {
@@ -91,9 +91,9 @@ impl<'a> Decode<'a> for &'a str {
 
 /// Decodes at most `LONGEST` elements.
 impl<'a, T: Decode<'a>> Decode<'a> for Vec<T> {
-    fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
+    fn decode(from: &mut CdrReader<'a>) -> Result<Self, CdrError> {
         let count = from.get::<u32>()?;
-        if count > LONGEST {
+        if count > MAX_ELEMENTS {
             return Err(CdrError::Value { what: "a count", got: count.into(), allowed: "0 to 64" });
         }
         (0..count).map(|_| from.get()).collect()
@@ -102,7 +102,7 @@ impl<'a, T: Decode<'a>> Decode<'a> for Vec<T> {
 
 /// Decodes the elements without a count.
 impl<'a, T: Decode<'a> + Copy + Default, const N: usize> Decode<'a> for [T; N] {
-    fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
+    fn decode(from: &mut CdrReader<'a>) -> Result<Self, CdrError> {
         let mut all = [T::default(); N];
         for one in &mut all {
             *one = from.get()?;
@@ -112,25 +112,25 @@ impl<'a, T: Decode<'a> + Copy + Default, const N: usize> Decode<'a> for [T; N] {
 }
 
 impl<A: Encode, B: Encode> Encode for (A, B) {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(&self.0);
         out.put(&self.1);
     }
 }
 
 impl<T: Encode + ?Sized> Encode for &T {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         (**self).encode(out);
     }
 }
 
 /// Writes a message into a buffer that can be reused.
 #[derive(Debug)]
-pub struct Writer<'a> {
+pub struct CdrWriter<'a> {
     out: &'a mut Vec<u8>,
 }
 
-impl<'a> Writer<'a> {
+impl<'a> CdrWriter<'a> {
     /// Begins a message and clears the buffer.
     pub fn new(out: &'a mut Vec<u8>) -> Self {
         out.clear();
@@ -233,13 +233,13 @@ enum Form {
 
 /// Decodes a message. Texts and bytes are borrowed from it. Never panics.
 #[derive(Clone, Debug)]
-pub struct Reader<'a> {
+pub struct CdrReader<'a> {
     bytes: &'a [u8],
     at: usize,
     form: Form,
 }
 
-impl<'a> Reader<'a> {
+impl<'a> CdrReader<'a> {
     /// Begins at the first field of a message.
     ///
     /// # Errors
@@ -272,7 +272,7 @@ impl<'a> Reader<'a> {
     /// Returns [`CdrError::Short`] if the message ends too early.
     pub fn bytes(&mut self) -> Result<&'a [u8], CdrError> {
         let count = self.get::<u32>()?;
-        self.take(usize::try_from(count).unwrap_or(usize::MAX), "a sequence of bytes")
+        self.read_bytes(usize::try_from(count).unwrap_or(usize::MAX), "a sequence of bytes")
     }
 
     fn number<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], CdrError> {
@@ -284,11 +284,11 @@ impl<'a> Reader<'a> {
             self.at += N - over;
         }
         let &bytes =
-            self.take(N, what)?.first_chunk().ok_or(CdrError::Short { at: self.bytes.len(), what })?;
+            self.read_bytes(N, what)?.first_chunk().ok_or(CdrError::Short { at: self.bytes.len(), what })?;
         Ok(bytes)
     }
 
-    fn take(&mut self, count: usize, what: &'static str) -> Result<&'a [u8], CdrError> {
+    fn read_bytes(&mut self, count: usize, what: &'static str) -> Result<&'a [u8], CdrError> {
         let end = self.at.saturating_add(count);
         let taken = self.bytes.get(self.at..end).ok_or(CdrError::Short { at: self.bytes.len(), what })?;
         self.at = end;
@@ -336,7 +336,7 @@ mod tests {
 
     fn ours(value: &Everything) -> Vec<u8> {
         let mut buffer = b"what was there before".to_vec();
-        let mut out = Writer::new(&mut buffer);
+        let mut out = CdrWriter::new(&mut buffer);
         out.put(value.byte);
         out.put(value.wide);
         out.put(value.truth);
@@ -353,7 +353,7 @@ mod tests {
     }
 
     fn read(bytes: &[u8]) -> Result<Everything, CdrError> {
-        let mut from = Reader::new(bytes)?;
+        let mut from = CdrReader::new(bytes)?;
         Ok(Everything {
             byte: from.get()?,
             wide: from.get()?,
@@ -373,7 +373,7 @@ mod tests {
     #[test]
     fn numbers_stand_at_multiples_of_their_size_counted_from_byte_4() {
         let mut buffer = Vec::new();
-        let mut out = Writer::new(&mut buffer);
+        let mut out = CdrWriter::new(&mut buffer);
         out.put("ab");
         out.put(1_u64);
         assert_eq!(
@@ -385,18 +385,18 @@ mod tests {
 
     #[test]
     fn what_is_no_message_is_said() {
-        let wrong = |bytes: &[u8]| Reader::new(bytes).map(|_| ()).unwrap_err().to_string();
+        let wrong = |bytes: &[u8]| CdrReader::new(bytes).map(|_| ()).unwrap_err().to_string();
         assert_eq!(
             wrong(&[0, 0, 0, 0]),
             "a message begins with [00, 00], not with 00 01: only little-endian CDR is read"
         );
-        assert_eq!(Reader::new(&[]).unwrap_err(), CdrError::Encoding { got: [0; 2] });
-        let mut short = Reader::new(&[0, 1, 0, 0, 9, 0, 0, 0, 1]).unwrap();
+        assert_eq!(CdrReader::new(&[]).unwrap_err(), CdrError::Encoding { got: [0; 2] });
+        let mut short = CdrReader::new(&[0, 1, 0, 0, 9, 0, 0, 0, 1]).unwrap();
         assert_eq!(
             short.bytes().unwrap_err().to_string(),
             "a message ends at byte 9 in the middle of a sequence of bytes"
         );
-        let mut text = Reader::new(&[0, 1, 0, 0, 1, 0, 0, 0, b'a']).unwrap();
+        let mut text = CdrReader::new(&[0, 1, 0, 0, 1, 0, 0, 0, b'a']).unwrap();
         assert_eq!(text.get::<&str>(), Err(CdrError::Text { at: 8 }));
     }
 

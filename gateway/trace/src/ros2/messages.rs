@@ -3,10 +3,10 @@
 //! No existing message type for CAN holds all information of a candump line: `can_msgs/Frame` has 8 bytes of data, and
 //! `ros2_socketcan_msgs/FdFrame` has no flags. These types do, and any viewer can read them.
 
-use protocol::can::{ERROR, EXTENDED, Format, Frame, REMOTE, identifier};
+use protocol::can::{ERROR, EXTENDED, Format, Frame, REMOTE, check_identifier};
 use protocol::candump::{Direction, Record, Timestamp};
 
-use super::cdr::{CdrError, Encode, Reader, Writer};
+use super::cdr::{CdrError, Encode, CdrReader, CdrWriter};
 use super::{Header, Message, definition};
 use crate::note::{Note, NoteKind};
 
@@ -18,7 +18,7 @@ impl Message for Record<'_> {
 }
 
 impl Encode for Record<'_> {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         let Self { time, interface, frame, direction } = self;
         out.put(Header { nanos: time.nanos, frame_id: interface });
         out.put(frame.id());
@@ -43,7 +43,7 @@ impl Encode for Record<'_> {
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not such a message.
 pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
-    Ok(Reader::new(message)?.get::<Header<'_>>()?.nanos)
+    Ok(CdrReader::new(message)?.get::<Header<'_>>()?.nanos)
 }
 
 /// Decodes a frame, with the time of its record. Never panics.
@@ -51,13 +51,13 @@ pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not such a message.
 pub fn frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrError> {
-    let mut from = Reader::new(message)?;
+    let mut from = CdrReader::new(message)?;
     let (Header { frame_id: interface, .. }, number) = (from.get()?, from.get::<u32>()?);
     let mut kind = 0;
     for flag in [EXTENDED, REMOTE, ERROR] {
         kind |= if from.get()? { flag } else { 0 };
     }
-    let id = identifier(number, kind)?;
+    let id = check_identifier(number, kind)?;
     let format = if from.get()? { Format::Fd } else { Format::Classic };
     let [flags, length, raw_dlc, direction]: [u8; 4] = from.get()?;
     let direction = match direction {
@@ -105,7 +105,7 @@ impl Message for Note<'_> {
 }
 
 impl Encode for Note<'_> {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         // Some readers end a CDR text at its first NUL.
         let same = || str::from_utf8(self.text).ok().filter(|text| !text.contains('\0'));
         let (kind, frames, same) = match self.kind {
@@ -131,7 +131,7 @@ impl Encode for Note<'_> {
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not such a message.
 pub fn note(message: &[u8], nanos: u64) -> Result<Note<'_>, CdrError> {
-    let mut from = Reader::new(message)?;
+    let mut from = CdrReader::new(message)?;
     let (Header { frame_id: interface, .. }, kind) = (from.get()?, from.get::<u8>()?);
     let [frames, line]: [u64; 2] = from.get()?;
     let (words, bytes) = (from.get::<&str>()?, from.bytes()?);

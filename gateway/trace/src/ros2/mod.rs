@@ -10,7 +10,7 @@ pub mod robot;
 pub mod skin;
 pub mod standard;
 
-use cdr::{CdrError, Decode, Encode, Reader, Writer};
+use cdr::{CdrError, Decode, Encode, CdrReader, CdrWriter};
 use thiserror::Error;
 
 /// A message type with its definition and its encoding.
@@ -22,7 +22,7 @@ pub trait Message: Encode {
 
     /// Encodes the message into a buffer and replaces its contents. Allocates only if the buffer grows.
     fn encode_into(&self, buffer: &mut Vec<u8>) {
-        self.encode(&mut Writer::new(buffer));
+        self.encode(&mut CdrWriter::new(buffer));
     }
 }
 
@@ -71,7 +71,7 @@ pub struct Header<'a> {
 }
 
 impl Encode for Header<'_> {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(i32::try_from(self.nanos / NANOS).unwrap_or(i32::MAX));
         out.put(u32::try_from(self.nanos % NANOS).unwrap_or(0));
         out.put(self.frame_id);
@@ -79,7 +79,7 @@ impl Encode for Header<'_> {
 }
 
 impl<'a> Decode<'a> for Header<'a> {
-    fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
+    fn decode(from: &mut CdrReader<'a>) -> Result<Self, CdrError> {
         let (sec, nanosec) = (from.get::<i32>()?, from.get::<u32>()?);
         Ok(Self { nanos: nanos(sec.into(), nanosec)?, frame_id: from.get()? })
     }

@@ -1,7 +1,7 @@
 //! Decodes messages of the control loop from a recording.
 
 use super::Header;
-use super::cdr::{CdrError, Reader};
+use super::cdr::{CdrError, CdrReader};
 use super::skin::LoopTiming;
 
 /// The robot's joints at a tick.
@@ -29,7 +29,7 @@ pub struct Torques {
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not such a message.
 pub fn joints(message: &[u8]) -> Result<Joints, CdrError> {
-    let mut from = Reader::new(message)?;
+    let mut from = CdrReader::new(message)?;
     from.get::<Header<'_>>()?;
     from.get::<Vec<&str>>()?;
     Ok(Joints { position: from.get()?, velocity: from.get()? })
@@ -40,7 +40,7 @@ pub fn joints(message: &[u8]) -> Result<Joints, CdrError> {
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not such a message.
 pub fn torques(message: &[u8]) -> Result<Torques, CdrError> {
-    let mut from = Reader::new(message)?;
+    let mut from = CdrReader::new(message)?;
     from.get::<Header<'_>>()?;
     let [distributed, central, _difference] = [from.get()?, from.get()?, from.get()?];
     Ok(Torques { distributed, central, active: from.get()? })
@@ -51,7 +51,7 @@ pub fn torques(message: &[u8]) -> Result<Torques, CdrError> {
 /// # Errors
 /// Returns [`CdrError`] if the bytes are not such a message.
 pub fn timing(message: &[u8]) -> Result<LoopTiming, CdrError> {
-    Reader::new(message)?.get()
+    CdrReader::new(message)?.get()
 }
 
 #[cfg(test)]

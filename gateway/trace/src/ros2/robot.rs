@@ -1,6 +1,6 @@
 //! ROS 2 message types that show a robot: the poses of its links, and its description.
 
-use super::cdr::{Encode, Writer};
+use super::cdr::{Encode, CdrWriter};
 use super::{Header, Message, definition};
 
 /// The pose of a frame relative to its parent.
@@ -39,7 +39,7 @@ impl Message for Transforms<'_> {
 }
 
 impl Encode for Transforms<'_> {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.sequence(self.transforms.iter().map(|transform| Stamped(self.nanos, transform)));
     }
 }
@@ -48,7 +48,7 @@ impl Encode for Transforms<'_> {
 struct Stamped<'a>(u64, &'a Transform<'a>);
 
 impl Encode for Stamped<'_> {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         let Self(nanos, Transform { parent, child, translation, rotation }) = self;
         out.put(Header { nanos: *nanos, frame_id: parent });
         out.put(*child);
@@ -66,7 +66,7 @@ impl Message for Text<'_> {
 }
 
 impl Encode for Text<'_> {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(self.0);
     }
 }

@@ -1,6 +1,6 @@
 //! Message types of skinbus for a run: the timing of the loop, torques, and the state of cells.
 
-use super::cdr::{CdrError, Decode, Encode, Reader, Writer};
+use super::cdr::{CdrError, Decode, Encode, CdrReader, CdrWriter};
 use super::{Header, Message, definition};
 
 /// The timing and state of a tick, in numbers that any viewer can plot.
@@ -46,14 +46,14 @@ impl Message for LoopTiming {
 macro_rules! fields {
     ($message:ty: $($field:ident),+) => {
         impl Encode for $message {
-            fn encode(&self, out: &mut Writer<'_>) {
+            fn encode(&self, out: &mut CdrWriter<'_>) {
                 out.put(Header { nanos: self.nanos, frame_id: "" });
                 $(out.put(self.$field);)+
             }
         }
 
         impl Decode<'_> for $message {
-            fn decode(from: &mut Reader<'_>) -> Result<Self, CdrError> {
+            fn decode(from: &mut CdrReader<'_>) -> Result<Self, CdrError> {
                 let Header { nanos, .. } = from.get()?;
                 Ok(Self { nanos, $($field: from.get()?),+ })
             }
@@ -85,7 +85,7 @@ impl Message for Torques<'_> {
 }
 
 impl Encode for Torques<'_> {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: "" });
         out.sequence(self.distributed.iter());
         out.sequence(self.central.iter());
@@ -128,7 +128,7 @@ impl Message for PatchState<'_> {
 }
 
 impl Encode for PatchState<'_> {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: self.frame_id });
         out.put(self.epoch);
         out.sequence(self.cells.iter().map(|cell| cell.node));

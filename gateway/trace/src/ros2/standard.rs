@@ -1,6 +1,6 @@
 //! Standard ROS 2 message types, which every viewer supports.
 
-use super::cdr::{Encode, Writer};
+use super::cdr::{Encode, CdrWriter};
 use super::{Header, Message, definition};
 
 /// `sensor_msgs/JointState`: the joints of a robot. Unknown values are empty.
@@ -25,7 +25,7 @@ impl Message for JointState<'_> {
 }
 
 impl Encode for JointState<'_> {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: "" });
         out.sequence(self.names.iter().map(String::as_str));
         for values in [self.position, self.velocity, self.effort] {
@@ -72,7 +72,7 @@ impl Message for PointCloud<'_> {
 }
 
 impl Encode for PointCloud<'_> {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: self.frame_id });
         let width = u32::try_from(self.points.len()).unwrap_or(u32::MAX);
         out.put((1_u32, width));
@@ -136,14 +136,14 @@ impl Message for Diagnostics<'_> {
 }
 
 impl Encode for Diagnostics<'_> {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put(Header { nanos: self.nanos, frame_id: "" });
         out.sequence(self.parts.iter());
     }
 }
 
 impl Encode for Diagnosis {
-    fn encode(&self, out: &mut Writer<'_>) {
+    fn encode(&self, out: &mut CdrWriter<'_>) {
         out.put((self.level as u8, self.name.as_str()));
         out.put((self.message.as_str(), ""));
         out.sequence(self.values.iter().map(|(name, value)| (*name, value.as_str())));

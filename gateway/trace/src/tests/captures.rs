@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::Cursor;
 
-use crate::capture::convert::{Converted, Output, convert};
-use crate::capture::log::{LONGEST, Style};
-use crate::capture::{CaptureError, Entry, Format, Note, NoteKind, Reader};
+use crate::capture::convert::{ConversionCounts, CaptureWriter, convert};
+use crate::capture::log::{MAX_LINE_BYTES, Style};
+use crate::capture::{CaptureError, Entry, CaptureFormat, Note, NoteKind, Reader};
 use crate::recording::file::FileWriter;
 use proptest::prelude::*;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, STANDARD_MASK};
@@ -20,11 +20,11 @@ fn reader(bytes: &[u8]) -> Reader {
     Reader::from_read("the capture", Cursor::new(bytes.to_vec())).unwrap()
 }
 
-fn converted(bytes: &[u8], format: Format) -> (Vec<u8>, Converted) {
+fn converted(bytes: &[u8], format: CaptureFormat) -> (Vec<u8>, ConversionCounts) {
     let mut out = Vec::new();
     let mut from = reader(bytes);
     let style = Style { directions: from.is_of_a_log(), ..Style::default() };
-    let mut to = Output::new(&mut out, format, style).unwrap();
+    let mut to = CaptureWriter::new(&mut out, format, style).unwrap();
     let done = convert(&mut from, &mut to, |_, _| Ok(())).unwrap();
     to.finish().unwrap();
     drop(to);
@@ -33,7 +33,7 @@ fn converted(bytes: &[u8], format: Format) -> (Vec<u8>, Converted) {
 
 /// Converts to the other format and back.
 fn there_and_back(log: &[u8]) -> Vec<u8> {
-    converted(&converted(log, Format::Mcap).0, Format::Candump).0
+    converted(&converted(log, CaptureFormat::Mcap).0, CaptureFormat::Candump).0
 }
 
 /// Returns all entries as text, and the end of the capture.
@@ -173,8 +173,8 @@ fn more_buses_than_a_recording_has_channels_for_keep_their_names() {
             writeln!(log, "({round}.{digits}) can{bus} 123#{bus:02X}").unwrap();
         }
     }
-    let (mcap, done) = converted(log.as_bytes(), Format::Mcap);
-    assert_eq!(done, Converted { frames: 200, ..Converted::default() });
+    let (mcap, done) = converted(log.as_bytes(), CaptureFormat::Mcap);
+    assert_eq!(done, ConversionCounts { frames: 200, ..ConversionCounts::default() });
     assert_eq!(String::from_utf8(there_and_back(log.as_bytes())).unwrap(), log);
     let summary = ::mcap::Summary::read(&mcap).unwrap().unwrap();
     assert!(summary.channels.len() <= 66, "{}", summary.channels.len());
@@ -183,7 +183,7 @@ fn more_buses_than_a_recording_has_channels_for_keep_their_names() {
 #[test]
 fn notes_before_the_first_frame_have_its_time_in_a_recording() {
     let log = b"# who, where\n\n(1700000000.000001) can0 123#\n";
-    let (mcap, _) = converted(log, Format::Mcap);
+    let (mcap, _) = converted(log, CaptureFormat::Mcap);
     let times: Vec<_> =
         ::mcap::MessageStream::new(&mcap).unwrap().map(|message| message.unwrap().log_time).collect();
     assert_eq!(times, [NANOS + 1_000; 3]);
@@ -200,10 +200,10 @@ fn backwards(log: &str) -> Vec<String> {
 #[test]
 fn times_that_run_backwards_are_counted_and_keep_their_order() {
     let log = "(3.000000) can0 001#\n(2.000000) can0 002#\n(2.500000) can0 003#\n(1.000000) can0 004#\n";
-    let (mcap, done) = converted(log.as_bytes(), Format::Mcap);
+    let (mcap, done) = converted(log.as_bytes(), CaptureFormat::Mcap);
     assert_eq!(done.frames, 4);
     assert_eq!(backwards(log), ["times run backwards 2 times, first at frame 2; the order is kept"]);
-    assert_eq!(converted(&mcap, Format::Candump).0, log.as_bytes());
+    assert_eq!(converted(&mcap, CaptureFormat::Candump).0, log.as_bytes());
 }
 
 #[test]
@@ -222,7 +222,7 @@ fn recording() -> (Vec<u8>, Vec<(u64, Vec<u8>)>) {
         let (sec, micro, bus, id) = (line / 1_000, line % 1_000, line % 2, line % 0x7FF);
         writeln!(log, "({sec}.{micro:06}) can{bus} {id:03X}##5{bits:016X}").unwrap();
     }
-    (converted(log.as_bytes(), Format::Mcap).0, frames(log.as_bytes()).0)
+    (converted(log.as_bytes(), CaptureFormat::Mcap).0, frames(log.as_bytes()).0)
 }
 
 /// The end of a capture, according to its reader.
@@ -319,7 +319,7 @@ fn what_else_a_recording_has_is_named_and_counted() {
     assert_eq!((extras.latched[0].frame, extras.latched.len()), (frame, 1));
     assert_eq!(extras.attachments, [("skin.toml".to_owned(), b"version = 1".to_vec())]);
     assert_eq!(extras.metadata[0], ("run".to_owned(), vec![("git".to_owned(), "abc".to_owned())]));
-    let (log, _) = converted(&bytes, Format::Candump);
+    let (log, _) = converted(&bytes, CaptureFormat::Candump);
     let expected = "(1700000000.000000000) can0 123#01\n\
                     DROPCOUNT: dropped 2 CAN frames on 'can0' socket (total drops 2)\n";
     assert_eq!(String::from_utf8(log).unwrap(), expected);
@@ -327,7 +327,7 @@ fn what_else_a_recording_has_is_named_and_counted() {
 
 #[test]
 fn of_a_line_that_is_too_long_the_beginning_is_kept() {
-    let log = [&b"(".repeat(3 * LONGEST), &b"\n(1.000000) can0 123#\n"[..]].concat();
+    let log = [&b"(".repeat(3 * MAX_LINE_BYTES), &b"\n(1.000000) can0 123#\n"[..]].concat();
     let back = there_and_back(&log);
-    assert_eq!(back, [&b"(".repeat(LONGEST), &b"\n(1.000000) can0 123#\n"[..]].concat());
+    assert_eq!(back, [&b"(".repeat(MAX_LINE_BYTES), &b"\n(1.000000) can0 123#\n"[..]].concat());
 }

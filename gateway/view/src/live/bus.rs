@@ -1,29 +1,29 @@
 //! The state of one bus: the table of its cells, and the torques of the last epoch.
 
-use analysis::fit::rates::Requested;
+use analysis::fit::rates::RequestedRates;
 use bench::view::CellView;
 use model::central::Central;
 use model::decode::wired;
 use model::packets::Content;
-use model::table::{Cell, Status, Table};
+use model::table::{CellState, Status, Table};
 use protocol::can::Frame;
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::id::CellId;
 use protocol::message::{Message, SkinSensors};
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{Reply, Skin};
+use protocol::skin::{SkinReply, Skin};
 use protocol::time::Micros;
 use protocol::wire_time::{BitRates, Bits};
 
 use super::flag;
 
 /// The window over which the bus load is measured, in µs.
-const WINDOW_US: u64 = 1_000_000;
+const LOAD_WINDOW_US: u64 = 1_000_000;
 
 /// The joints of an epoch, as seen on the bus.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Heard {
+pub(super) struct BroadcastJoints {
     pub(super) epoch: Epoch,
     pub(super) positions: [Q1_14; MAX_JOINTS],
 }
@@ -45,8 +45,8 @@ pub(super) struct LiveBus {
     pub(super) torque_format: TorqueFormat,
     pub(super) sums: bool,
     /// The joints of the current epoch, and those of the previous one.
-    pub(super) heard: Option<Heard>,
-    before: Option<Heard>,
+    pub(super) current: Option<BroadcastJoints>,
+    previous: Option<BroadcastJoints>,
     /// Distributed and central torque in the last completed epoch, by joint of the chain.
     torques: [(f64, f64); MAX_JOINTS],
     joints: usize,
@@ -69,16 +69,16 @@ impl LiveBus {
         let cells = table.cells().len();
         Self {
             name: described.map(|bus| bus.name.clone()).unwrap_or_default(),
-            central: Central::new(&skin.part_on(bus)),
+            central: Central::new(&skin.with_cells_of_bus(bus)),
             torque_format: described.map(|bus| bus.torque_format).unwrap_or_default(),
-            sums: described.is_some_and(|bus| bus.reply != Reply::Torque),
-            heard: None,
-            before: None,
+            sums: described.is_some_and(|bus| bus.reply != SkinReply::Torque),
+            current: None,
+            previous: None,
             torques: [(0.0, 0.0); MAX_JOINTS],
-            joints: skin.joints_of(bus).len(),
+            joints: skin.joints_on_bus(bus).len(),
             last: vec![None; cells],
             dead_since: vec![None; cells],
-            rates: described.and_then(|bus| Some(Requested::default().of_bus(bus).ok()?.rates)),
+            rates: described.and_then(|bus| Some(RequestedRates::default().of_bus(bus).ok()?.rates)),
             load: Load::default(),
             halted: false,
             is_up: false,
@@ -88,22 +88,22 @@ impl LiveBus {
     }
 
     /// Applies a frame. Returns true if it carries joints, which begin an epoch.
-    pub(super) fn frame(&mut self, at: Micros, frame: &Frame) -> bool {
+    pub(super) fn apply_frame(&mut self, at: Micros, frame: &Frame) -> bool {
         let received = self.table.read(at, frame);
         let message = received.message().copied();
         let is_wire = received.content == Content::NotData && wired(frame).is_some();
         if !is_wire && !matches!(message, Some(Message::Stimulus { .. })) {
             // Wire states and stimuli come from the bench, and do not load the real bus.
-            let busy = self.rates.zip(Bits::of(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
+            let busy = self.rates.zip(Bits::from_frame(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
             self.load.busy_s += busy;
         }
         let mut joints = false;
         match message {
             Some(Message::Joints { epoch, joints: said }) => {
                 joints = true;
-                self.close();
-                let heard = Heard { epoch, positions: said.positions };
-                self.before = self.heard.replace(heard);
+                self.close_epoch();
+                let heard = BroadcastJoints { epoch, positions: said.positions };
+                self.previous = self.current.replace(heard);
             }
             Some(Message::Torque { from, epoch, torque }) => {
                 let place = self.table.place(from);
@@ -132,8 +132,8 @@ impl LiveBus {
     }
 
     /// Closes the epoch before the next joints: stores the sum of the received torques and the centrally computed one.
-    fn close(&mut self) {
-        let Some(heard) = self.heard else { return };
+    fn close_epoch(&mut self) {
+        let Some(heard) = self.current else { return };
         let frames = self.central.frames(&heard.positions);
         let cells = self.table.cells().iter();
         let sensors: Vec<_> = cells.map(|cell| cell.presumed_sensors().unwrap_or_default()).collect();
@@ -155,7 +155,7 @@ impl LiveBus {
         }
         let since = *self.load.since.get_or_insert(now);
         let passed = now.0.saturating_sub(since.0);
-        if passed >= WINDOW_US {
+        if passed >= LOAD_WINDOW_US {
             #[expect(clippy::cast_precision_loss, reason = "a few seconds")]
             let share = self.load.busy_s / (passed as f64 * 1e-6);
             self.load = Load { since: Some(now), busy_s: 0.0, share: Some(share) };
@@ -170,7 +170,7 @@ impl LiveBus {
         self.load.share
     }
 
-    pub(super) fn cell(&self, node: CellId) -> Option<&Cell> {
+    pub(super) fn cell(&self, node: CellId) -> Option<&CellState> {
         self.table.cells().get(self.table.place(node)?)
     }
 
@@ -185,33 +185,33 @@ impl LiveBus {
 
     /// Returns the position of a joint of the chain in rad or m, once joints have been received.
     pub(super) fn position(&self, joint: usize) -> Option<f64> {
-        self.central.positions(&self.heard?.positions).get(joint).copied()
+        self.central.positions(&self.current?.positions).get(joint).copied()
     }
 
     /// Returns the positions that were broadcast in an epoch, for the last two epochs.
     pub(super) fn positions_of(&self, epoch: Epoch) -> Option<[Q1_14; MAX_JOINTS]> {
-        let both = [self.heard, self.before];
+        let both = [self.current, self.previous];
         both.into_iter().flatten().find(|heard| heard.epoch == epoch).map(|heard| heard.positions)
     }
 
     /// Encodes each cell for a snapshot.
-    pub(super) fn shown(&self, now: Micros) -> Vec<[u8; 8]> {
+    pub(super) fn encode_cells(&self, now: Micros) -> Vec<[u8; 8]> {
         let cells = self.table.cells().iter().zip(self.table.sensors(now)).enumerate();
         let bytes = cells.map(|(place, (cell, (sensors, status)))| {
-            let view = CellView::of(cell, status);
+            let view = CellView::new(cell, status);
             let flags = [
                 (view.unconfigured, flag::UNCONFIGURED),
-                (view.heard && view.other, flag::OTHER_CONFIGURATION),
+                (view.seen && view.other, flag::OTHER_CONFIGURATION),
                 (view.measures, flag::MEASURES),
                 (view.halted, flag::HALTED),
                 (cell.is_stuck(), flag::STUCK),
             ];
             let flags = flags.iter().filter(|(is, _)| *is).fold(0, |all, (_, bit)| all | bit);
             let sensors = sensors.unwrap_or_default();
-            let force = whole(self.central.force(place, &sensors) * 1e3, 0.0, f64::from(u16::MAX));
-            let proximity = whole(sensors.proximity.to_f64() * 32_768.0, 0.0, f64::from(u16::MAX));
+            let force = clamped_integer(self.central.force(place, &sensors) * 1e3, 0.0, f64::from(u16::MAX));
+            let proximity = clamped_integer(sensors.proximity.to_f64() * 32_768.0, 0.0, f64::from(u16::MAX));
             let [warmth, _] =
-                sensors.temperature.map(|word| whole(word.to_f64() * 100.0, -32_768.0, 32_767.0));
+                sensors.temperature.map(|word| clamped_integer(word.to_f64() * 100.0, -32_768.0, 32_767.0));
             let [f0, f1, ..] = force.to_le_bytes();
             let [p0, p1, ..] = proximity.to_le_bytes();
             let [t0, t1, ..] = warmth.to_le_bytes();
@@ -223,6 +223,6 @@ impl LiveBus {
 
 /// Rounds to the nearest integer and clamps to the bounds.
 #[expect(clippy::cast_possible_truncation, reason = "within 17 bits")]
-fn whole(value: f64, min: f64, max: f64) -> i32 {
+fn clamped_integer(value: f64, min: f64, max: f64) -> i32 {
     value.round().clamp(min, max) as i32
 }

@@ -2,10 +2,10 @@
 
 use std::collections::VecDeque;
 
-use analysis::explain::{CellExplained, Requested, Watch, explain};
+use analysis::explain::{CellExplained, RequestedJoints, Watch, explain};
 use model::decode::settle::Settler;
 use model::decode::{Decoded, Decoder};
-use model::latched::{Latched, Seen};
+use model::latched::{LatchedPackets, ReceivedFrame};
 use protocol::can::Frame;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::Message;
@@ -16,26 +16,26 @@ use protocol::time::Micros;
 use serde::Serialize;
 
 /// The time that frames are kept, in µs.
-const KEPT_US: u64 = 3_000_000;
+const RETENTION_US: u64 = 3_000_000;
 /// The maximum number of frames that are kept.
-const FRAMES: usize = 65_536;
+const MAX_FRAMES: usize = 65_536;
 /// The number of frames that are listed for a cell.
-const NAMED: usize = 8;
+const MAX_LISTED_FRAMES: usize = 8;
 /// The joints that a torque replies to are searched this long before the torque, in ns.
-const BEFORE_NS: u64 = 500_000_000;
+const JOINTS_LOOKBACK_NS: u64 = 500_000_000;
 
 /// The frames of the last seconds on all buses.
 #[derive(Clone, Debug)]
-pub struct Recent {
-    frames: VecDeque<Kept>,
+pub struct RecentFrames {
+    frames: VecDeque<RecentFrame>,
     /// The number of frames so far.
     count: u64,
     /// The state that was latched on each bus before the oldest kept frame.
-    latched: Vec<Latched>,
+    latched: Vec<LatchedPackets>,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Kept {
+struct RecentFrame {
     at: Micros,
     bus: usize,
     frame: Frame,
@@ -43,7 +43,7 @@ struct Kept {
 
 /// A decoded frame.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct FrameSaid {
+pub struct DecodedFrame {
     /// The frame's number, by which the page requests more.
     pub number: u64,
     /// Seconds of the run, or since the first frame.
@@ -58,7 +58,7 @@ pub struct FrameSaid {
 
 /// The explanation of a torque.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Why {
+pub struct TorqueExplanation {
     /// The frame's number.
     pub number: u64,
     /// The epoch of the joints.
@@ -69,24 +69,24 @@ pub struct Why {
     pub missing: Vec<String>,
 }
 
-impl Recent {
+impl RecentFrames {
     pub(super) fn new(skin: &Skin) -> Self {
-        let latched = skin.buses.iter().map(|_| Latched::default()).collect();
+        let latched = skin.buses.iter().map(|_| LatchedPackets::default()).collect();
         Self { frames: VecDeque::new(), count: 0, latched }
     }
 
     pub(super) fn push(&mut self, at: Micros, bus: usize, frame: &Frame) {
-        self.frames.push_back(Kept { at, bus, frame: *frame });
+        self.frames.push_back(RecentFrame { at, bus, frame: *frame });
         self.count += 1;
-        while self.frames.len() > FRAMES
-            || self.frames.front().is_some_and(|first| at.since(first.at).0 > KEPT_US)
+        while self.frames.len() > MAX_FRAMES
+            || self.frames.front().is_some_and(|first| at.elapsed_since(first.at).0 > RETENTION_US)
         {
             self.drop_first();
         }
     }
 
     /// Drops all frames, and keeps the latched state.
-    pub(super) fn forget(&mut self) {
+    pub(super) fn clear(&mut self) {
         while !self.frames.is_empty() {
             self.drop_first();
         }
@@ -94,20 +94,20 @@ impl Recent {
     }
 
     fn drop_first(&mut self) {
-        let Some(Kept { at, bus, frame }) = self.frames.pop_front() else { return };
+        let Some(RecentFrame { at, bus, frame }) = self.frames.pop_front() else { return };
         if let Some(latched) = self.latched.get_mut(bus) {
-            latched.take(Seen { at_nanos: at.0 * 1_000, own: false, frame });
+            latched.receive(ReceivedFrame { at_nanos: at.0 * 1_000, from_gateway: false, frame });
         }
     }
 
     /// Returns the newest frames from and to a cell, newest first; `seconds` converts a time to seconds of the run, or
     /// since the first frame.
-    pub(super) fn of_cell(
+    pub(super) fn cell_frames(
         &self,
         skin: &Skin,
         (bus, node): (usize, CellId),
         seconds: impl Fn(Micros) -> f64,
-    ) -> Vec<FrameSaid> {
+    ) -> Vec<DecodedFrame> {
         let format = skin.buses.get(bus).map(|bus| bus.format);
         let mut settler = Settler::new(format);
         for (number, kept) in (self.first_number()..).zip(&self.frames).filter(|(_, kept)| kept.bus == bus) {
@@ -119,16 +119,16 @@ impl Recent {
             }
         }
         settler.finish();
-        let units = Units::of(skin, bus);
+        let units = Units::for_bus(skin, bus);
         let mut all = VecDeque::new();
         while let Some(((number, kept, is_command), decoded)) = settler.pop() {
             if is_command {
                 continue;
             }
-            if all.len() == NAMED {
+            if all.len() == MAX_LISTED_FRAMES {
                 all.pop_back();
             }
-            all.push_front(FrameSaid {
+            all.push_front(DecodedFrame {
                 number,
                 at_s: seconds(kept.at),
                 frame: kept.frame.to_string(),
@@ -140,7 +140,7 @@ impl Recent {
     }
 
     /// Explains the torque in a frame while the frame is kept.
-    pub(super) fn why(&self, skin: &Skin, number: u64) -> Option<Why> {
+    pub(super) fn explain_torque(&self, skin: &Skin, number: u64) -> Option<TorqueExplanation> {
         let place = usize::try_from(number.checked_sub(self.first_number())?).ok()?;
         let asked = self.frames.get(place)?;
         let mut decoder = Decoder::new(None);
@@ -150,8 +150,8 @@ impl Recent {
         }
         let Some(Message::Torque { from, epoch, .. }) = found else { return None };
         let first = self.frames.front()?.at;
-        let from_ns = (asked.at.since(first).0 * 1_000).saturating_sub(BEFORE_NS);
-        let mut watch = Watch::new(skin, Requested { epoch, from_ns, occurrence: 1 });
+        let from_ns = (asked.at.elapsed_since(first).0 * 1_000).saturating_sub(JOINTS_LOOKBACK_NS);
+        let mut watch = Watch::new(skin, RequestedJoints { epoch, from_ns, occurrence: 1 });
         let mut decoder = Decoder::new(None);
         let name = |bus: usize| skin.buses.get(bus).map_or("", |bus| bus.name.as_str());
         for (bus, latched) in self.latched.iter().enumerate() {
@@ -164,14 +164,14 @@ impl Recent {
         }
         for kept in &self.frames {
             let decoded = decoder.decode(kept.at, name(kept.bus), &kept.frame);
-            if watch.take(kept.at.0 * 1_000, name(kept.bus), decoded.message()) {
+            if watch.receive(kept.at.0 * 1_000, name(kept.bus), decoded.message()) {
                 break;
             }
         }
         let said = match watch.moments() {
             Ok(moments) => explain(skin, &moments),
             Err(error) => {
-                return Some(Why { number, epoch: epoch.0, cell: None, missing: vec![error.to_string()] });
+                return Some(TorqueExplanation { number, epoch: epoch.0, cell: None, missing: vec![error.to_string()] });
             }
         };
         let bus = name(asked.bus);
@@ -179,7 +179,7 @@ impl Recent {
         let here = [format!("{bus} {from}:"), format!("{bus}:"), format!("{bus} answers")];
         let missing = said.missing.into_iter();
         let missing = missing.filter(|line| here.iter().any(|here| line.starts_with(here))).collect();
-        Some(Why { number, epoch: epoch.0, cell, missing })
+        Some(TorqueExplanation { number, epoch: epoch.0, cell, missing })
     }
 
     fn first_number(&self) -> u64 {

@@ -1,6 +1,6 @@
 //! The status message: values that change slowly, as JSON for the page.
 
-use bench::remote::State;
+use bench::remote::BenchState;
 use model::table::{Event, Status};
 use protocol::fixed::is_saturated;
 use protocol::id::CellId;
@@ -9,16 +9,16 @@ use protocol::time::Micros;
 use serde::Serialize;
 
 use super::bus::LiveBus;
-use super::{FrameSaid, Live, Why};
-use crate::command::Chosen;
+use super::{DecodedFrame, Live, TorqueExplanation};
+use crate::command::SelectedCell;
 use crate::player::Playback;
 
 /// The maximum number of dead cells that are listed.
-const NAMED: usize = 20;
+const MAX_LISTED_DEAD_CELLS: usize = 20;
 
 /// The status that the page shows as text.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Said {
+pub struct StatusMessage {
     /// The type of this message: `said`.
     pub is: &'static str,
     /// The number of cells in contact.
@@ -26,22 +26,22 @@ pub struct Said {
     /// The number of dead cells.
     pub dead: usize,
     /// The first dead cells.
-    pub dead_cells: Vec<Dead>,
+    pub dead_cells: Vec<DeadCell>,
     /// True while any bus is halted.
     pub halted: bool,
     /// The state of each bus.
-    pub buses: Vec<BusSaid>,
+    pub buses: Vec<BusStatus>,
     /// The details of the cell that the page has chosen.
-    pub detail: Option<Detail>,
+    pub detail: Option<CellDetail>,
     /// The position in a recording.
     pub playback: Option<Playback>,
     /// The state that the run reports; it lists only the process of the chosen cell.
-    pub bench: Option<State>,
+    pub bench: Option<BenchState>,
 }
 
 /// A dead cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Dead {
+pub struct DeadCell {
     /// The name of its bus.
     pub bus: String,
     /// Its node id.
@@ -52,7 +52,7 @@ pub struct Dead {
 
 /// The status of a bus.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct BusSaid {
+pub struct BusStatus {
     /// The bus's name.
     pub name: String,
     /// True if the bus works.
@@ -83,12 +83,12 @@ pub struct BusSaid {
     pub error_nm: Option<f64>,
     /// On a bus with sums, the place of each cell in the tree, in the skin's order; null for a cell that is silent or
     /// has not reported it.
-    pub tree: Option<Vec<Option<Wires>>>,
+    pub tree: Option<Vec<Option<TreePlace>>>,
 }
 
 /// A cell's place in the tree, as the cell reports it.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
-pub struct Wires(
+pub struct TreePlace(
     /// The parent: the node id of a cell, or 0 for the gateway's side; null if the cell is unreachable.
     pub Option<u8>,
     /// Bit p is set if port p works in both directions.
@@ -97,7 +97,7 @@ pub struct Wires(
 
 /// The details of a cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Detail {
+pub struct CellDetail {
     /// The cell's bus, as an index into the skin's buses.
     pub bus: usize,
     /// The cell's node id.
@@ -119,7 +119,7 @@ pub struct Detail {
     /// Its force by Algorithm 1, in N.
     pub force_n: f64,
     /// Its last torque.
-    pub torque: Option<Answer>,
+    pub torque: Option<TorqueReply>,
     /// Replies due, and replies in time.
     pub replies: [u64; 2],
     /// Packets lost, by the cell's own count.
@@ -127,9 +127,9 @@ pub struct Detail {
     /// The number of restarts.
     pub restarts: u32,
     /// The newest frames from and to the cell, newest first.
-    pub frames: Vec<FrameSaid>,
+    pub frames: Vec<DecodedFrame>,
     /// The explanation of the torque in the chosen frame, while that frame is kept.
-    pub why: Option<Why>,
+    pub why: Option<TorqueExplanation>,
 }
 
 /// The gains and thresholds of Algorithm 1.
@@ -142,7 +142,7 @@ pub struct Gains {
 }
 
 impl Gains {
-    fn of(contact: Contact) -> Self {
+    fn from_contact(contact: Contact) -> Self {
         let Contact { alpha_c, alpha_p, contact_threshold, proximity_threshold, force_threshold } = contact;
         Self {
             alpha: [alpha_c.to_f64(), alpha_p.to_f64()],
@@ -153,7 +153,7 @@ impl Gains {
 
 /// A torque reply of a cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Answer {
+pub struct TorqueReply {
     /// The epoch.
     pub epoch: u8,
     /// The words of the reply.
@@ -171,25 +171,25 @@ pub struct Answer {
 impl Live {
     /// Returns the status for all pages, without the details of a cell.
     #[must_use]
-    pub fn said(&self, now: Micros) -> Said {
+    pub fn status_message(&self, now: Micros) -> StatusMessage {
         let (mut contacts, mut dead, mut dead_cells) = (0, 0, Vec::new());
         for bus in &self.buses {
             for ((cell, status), since) in bus.table.statuses(now).zip(&bus.dead_since) {
                 contacts += usize::from(matches!(status, Status::Active | Status::Stale));
                 dead += usize::from(status == Status::Dead);
-                if let Some(since) = since.filter(|_| dead_cells.len() < NAMED) {
+                if let Some(since) = since.filter(|_| dead_cells.len() < MAX_LISTED_DEAD_CELLS) {
                     let for_s = (self.seconds(now) - self.seconds(since)).max(0.0);
-                    dead_cells.push(Dead { bus: bus.name.clone(), node: cell.node.get(), for_s });
+                    dead_cells.push(DeadCell { bus: bus.name.clone(), node: cell.node.get(), for_s });
                 }
             }
         }
-        Said {
+        StatusMessage {
             is: "said",
             contacts,
             dead,
             dead_cells,
             halted: self.buses.iter().any(|bus| bus.halted),
-            buses: self.buses.iter().map(|bus| bus.said(now)).collect(),
+            buses: self.buses.iter().map(|bus| bus.status(now)).collect(),
             detail: None,
             playback: None,
             bench: None,
@@ -198,8 +198,8 @@ impl Live {
 
     /// Returns the details of a cell, or `None` if the skin does not have the cell.
     #[must_use]
-    pub fn detail(&self, chosen: Chosen, now: Micros) -> Option<Detail> {
-        let Chosen { bus: index, node, frame } = chosen;
+    pub fn detail(&self, chosen: SelectedCell, now: Micros) -> Option<CellDetail> {
+        let SelectedCell { bus: index, node, frame } = chosen;
         let bus = self.buses.get(index)?;
         let id = CellId::new(node.into()).ok()?;
         let place = bus.table.place(id)?;
@@ -210,12 +210,12 @@ impl Live {
         let torque = bus.last.get(place).copied().flatten().map(|(epoch, words)| {
             let words = words.as_slice();
             let frames = bus.positions_of(epoch).map(|positions| bus.central.frames(&positions));
-            let joints = self.skin.joints_of(index).len();
+            let joints = self.skin.joints_on_bus(index).len();
             let at = |force_n: f64| {
                 let torque = bus.central.torque(place, frames.as_ref()?, force_n);
                 Some(torque.into_iter().take(joints).collect())
             };
-            Answer {
+            TorqueReply {
                 epoch: epoch.0,
                 words: words.iter().take(joints).copied().collect(),
                 distributed: words.iter().take(joints).map(|&word| bus.torque_format.real(word)).collect(),
@@ -227,7 +227,7 @@ impl Live {
         let skin_cell = self.skin.cells.iter().find(|it| it.bus == index && it.node == id)?;
         let hash = |hash: u16| format!("{hash:04X}");
         let uplink = cell.uplink();
-        Some(Detail {
+        Some(CellDetail {
             bus: index,
             node,
             serial: cell.serial,
@@ -236,7 +236,7 @@ impl Live {
                 cell.heartbeat().map(|it| hash(it.configuration)),
                 Some(hash(cell.configuration)),
             ],
-            gains: Gains::of(skin_cell.contact),
+            gains: Gains::from_contact(skin_cell.contact),
             contact_n: sensors.contact.map(|word| word.to_f64()),
             proximity: sensors.proximity.to_f64(),
             temperature_c: sensors.temperature.map(|word| word.to_f64()),
@@ -245,20 +245,20 @@ impl Live {
             replies: [cell.replies.due, cell.replies.in_time],
             lost: uplink.lost,
             restarts: uplink.restarts,
-            frames: self.recent.of_cell(&self.skin, (index, id), |at| self.seconds(at)),
-            why: frame.and_then(|frame| self.recent.why(&self.skin, frame)),
+            frames: self.recent.cell_frames(&self.skin, (index, id), |at| self.seconds(at)),
+            why: frame.and_then(|frame| self.recent.explain_torque(&self.skin, frame)),
         })
     }
 }
 
 impl LiveBus {
-    fn said(&self, now: Micros) -> BusSaid {
+    fn status(&self, now: Micros) -> BusStatus {
         let counters = self.table.counters();
         let uplink = self.table.uplink();
         let account = self.table.replies();
         let accuracy = self.table.accuracy();
         let errors = if self.sums { accuracy.sums } else { accuracy.single };
-        BusSaid {
+        BusStatus {
             name: self.name.clone(),
             up: self.is_up,
             load: self.load(),
@@ -277,7 +277,7 @@ impl LiveBus {
                 let cells = self.table.statuses(now).map(|(cell, status)| {
                     let sends = !matches!(status, Status::Dead | Status::Unknown);
                     let tree = cell.pages().tree.filter(|_| sends);
-                    tree.map(|tree| Wires(tree.parent, tree.works))
+                    tree.map(|tree| TreePlace(tree.parent, tree.working_ports))
                 });
                 cells.collect()
             }),

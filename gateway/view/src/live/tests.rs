@@ -1,11 +1,11 @@
 //! Synthetic frames, and the state after them.
 
 use super::*;
-use crate::command::Chosen;
+use crate::command::SelectedCell;
 use model::generate::{Reply, Target, generate};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
-use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, State, Tree};
+use protocol::message::{AppliesFrom, Heartbeat, Joints, Message, NetworkPage, SensorPage, State, Tree};
 use protocol::packet::{Epoch, Packet};
 
 fn skin() -> Skin {
@@ -29,7 +29,7 @@ impl Bench {
         self.now.0 += 100;
         let packet: Packet = message.encode();
         for frame in packet.frames(protocol::can::Format::Fd) {
-            self.live.frame(self.bus, self.now, &frame);
+            self.live.apply_frame(self.bus, self.now, &frame);
         }
     }
 
@@ -54,7 +54,7 @@ impl Bench {
 
     fn snapshot(&mut self) -> Vec<u8> {
         self.live.handle_time(self.now);
-        self.live.snapshot(self.now, &Pressed::default())
+        self.live.snapshot(self.now, &TouchRegistry::default())
     }
 }
 
@@ -73,7 +73,7 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     bench.joints(1, Q);
     let node = CellId::new(5).unwrap();
     let page = SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() });
-    bench.say(&Message::Stimulus { to: Node::Cell(node), from: From::Next, page });
+    bench.say(&Message::Stimulus { to: Node::Cell(node), from: AppliesFrom::Next, page });
     bench.joints(2, Q);
     let words = [100_i16, -200, 0, 0, 0, 0];
     bench.say(&Message::Torque { from: node, epoch: Epoch(2), torque: words.into() });
@@ -97,10 +97,10 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     assert_eq!((cell(6)[0], cell(6)[1]), (1, flag::OTHER_CONFIGURATION), "quiet, with another configuration");
     assert_eq!(cell(7)[0], 0, "never heard");
 
-    let said = bench.live.said(bench.now);
+    let said = bench.live.status_message(bench.now);
     // The table has not seen the cell's start, so that no reply is due.
     assert_eq!((said.contacts, said.dead, said.halted, said.buses[0].due), (1, 0, false, 0));
-    let detail = bench.live.detail(Chosen { bus: 0, node: 5, frame: None }, bench.now).unwrap();
+    let detail = bench.live.detail(SelectedCell { bus: 0, node: 5, frame: None }, bench.now).unwrap();
     let answer = detail.torque.unwrap();
     assert_eq!((answer.epoch, answer.words[..2].to_vec(), detail.serial), (2, vec![100, -200], 100_005));
     let exact = answer.central.unwrap();
@@ -112,8 +112,8 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     assert_eq!(detail.gains.alpha[0], contact.alpha_c.to_f64());
     assert_eq!(detail.gains.thresholds[2], contact.force_threshold.to_f64());
     assert!((exact[0] - f64::from(central)).abs() < 1e-6, "the only cell in contact: {exact:?} {central}");
-    assert_eq!(bench.live.detail(Chosen { bus: 0, node: 254, frame: None }, bench.now), None);
-    assert_eq!(bench.live.detail(Chosen { bus: 7, node: 1, frame: None }, bench.now), None);
+    assert_eq!(bench.live.detail(SelectedCell { bus: 0, node: 254, frame: None }, bench.now), None);
+    assert_eq!(bench.live.detail(SelectedCell { bus: 7, node: 1, frame: None }, bench.now), None);
 }
 
 #[test]
@@ -126,23 +126,23 @@ fn a_silent_cell_is_dead_since_it_was_noticed_and_a_halt_stands_until_the_resume
     let bytes = bench.snapshot();
     assert_eq!(bytes[24 + 72 + 8 * 4], 4);
     bench.now.0 += 3_000_000;
-    let said = bench.live.said(bench.now);
+    let said = bench.live.status_message(bench.now);
     assert!(said.halted && said.dead == 1 && (said.dead_cells[0].for_s - 3.0).abs() < 0.1, "{said:?}");
     bench.say(&Message::Resume);
-    assert!(!bench.live.said(bench.now).halted);
+    assert!(!bench.live.status_message(bench.now).halted);
     bench.heartbeat(5, 0);
     bench.snapshot();
-    assert_eq!(bench.live.said(bench.now).dead_cells, []);
+    assert_eq!(bench.live.status_message(bench.now).dead_cells, []);
 }
 
 #[test]
 fn only_cells_of_the_skin_in_test_mode_may_be_pressed() {
     let mut bench = Bench::new();
-    assert_eq!(bench.live.may_press(0, 12), None, "it has not said that it is in test mode");
+    assert_eq!(bench.live.pressable_cell(0, 12), None, "it has not said that it is in test mode");
     bench.heartbeat(12, 0);
-    assert_eq!(bench.live.may_press(0, 12), Some((0, CellId::new(12).unwrap())));
+    assert_eq!(bench.live.pressable_cell(0, 12), Some((0, CellId::new(12).unwrap())));
     assert_eq!(
-        (bench.live.may_press(0, 0), bench.live.may_press(0, 254), bench.live.may_press(1, 12)),
+        (bench.live.pressable_cell(0, 0), bench.live.pressable_cell(0, 254), bench.live.pressable_cell(1, 12)),
         (None, None, None)
     );
 }
@@ -174,14 +174,14 @@ fn ten_thousand_cells_on_forty_buses_are_shown() {
     let (bus, node) = (buses - 1, CellId::new(250).unwrap());
     let page = SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() });
     bench.heartbeat(250, 0);
-    bench.say(&Message::Stimulus { to: Node::Cell(node), from: From::Next, page });
+    bench.say(&Message::Stimulus { to: Node::Cell(node), from: AppliesFrom::Next, page });
     bench.joints(3, Q);
     let bytes = bench.snapshot();
     let pressed: Vec<_> =
         bytes[24 + 72..].chunks(8).enumerate().filter(|(_, cell)| cell[2..4] != [0, 0]).collect();
     let expected = bench.live.skin.cells.iter().position(|cell| (cell.bus, cell.node) == (bus, node));
     assert_eq!(pressed.iter().map(|(at, _)| *at).collect::<Vec<_>>(), [expected.unwrap()]);
-    assert_eq!(bench.live.said(bench.now).buses.len(), buses);
+    assert_eq!(bench.live.status_message(bench.now).buses.len(), buses);
 }
 
 #[test]
@@ -189,11 +189,11 @@ fn a_bus_with_sums_says_where_cells_are_in_the_tree() {
     let target = Target { cells: 4, reply: Reply::Sum, ..Target::default() };
     let skin = Skin::parse("sums", &generate(&target).unwrap()).unwrap();
     let mut bench = Bench { live: Live::new(skin), now: Micros(1_000_000), bus: 0 };
-    let places = |bench: &Bench| bench.live.said(bench.now).buses[0].tree.clone().unwrap();
+    let places = |bench: &Bench| bench.live.status_message(bench.now).buses[0].tree.clone().unwrap();
     bench.joints(1, Q);
     for (node, parent) in [(1, Some(0)), (2, Some(1)), (3, None)] {
         bench.heartbeat(node, 0);
-        let page = NetworkPage::Tree(Tree { parent, up: 0, works: 0b0101, ..Tree::default() });
+        let page = NetworkPage::Tree(Tree { parent, parent_port: 0, working_ports: 0b0101, ..Tree::default() });
         bench.say(&Message::Network {
             from: Node::Cell(CellId::new(node.into()).unwrap()),
             epoch: Epoch(1),
@@ -202,12 +202,12 @@ fn a_bus_with_sums_says_where_cells_are_in_the_tree() {
     }
     assert_eq!(
         places(&bench),
-        [Some(Wires(Some(0), 0b0101)), Some(Wires(Some(1), 0b0101)), Some(Wires(None, 0b0101)), None]
+        [Some(TreePlace(Some(0), 0b0101)), Some(TreePlace(Some(1), 0b0101)), Some(TreePlace(None, 0b0101)), None]
     );
-    let json = serde_json::to_string(&bench.live.said(bench.now)).unwrap();
+    let json = serde_json::to_string(&bench.live.status_message(bench.now)).unwrap();
     assert!(json.contains(r#""tree":[[0,5],[1,5],[null,5],null]"#), "{json}");
     bench.now.0 += 5_000_000;
     bench.live.handle_time(bench.now);
     assert_eq!(places(&bench), [None; 4], "they are silent");
-    assert_eq!(Bench::new().live.said(Micros(0)).buses[0].tree, None, "torques have no tree");
+    assert_eq!(Bench::new().live.status_message(Micros(0)).buses[0].tree, None, "torques have no tree");
 }

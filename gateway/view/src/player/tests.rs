@@ -4,15 +4,15 @@
 use std::io::Write;
 
 use super::*;
-use crate::command::Chosen;
-use crate::live::Said;
-use crate::pressed::Pressed;
+use crate::command::SelectedCell;
+use crate::live::StatusMessage;
+use crate::pressed::TouchRegistry;
 use proptest::prelude::*;
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node};
-use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::message::{AppliesFrom, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::Epoch;
 
 /// The time of the first frame, in ns since 1970.
@@ -55,7 +55,7 @@ fn log(skin: &Skin) -> Vec<u8> {
         }
         let force = |n: f64| {
             let sensors = SkinSensors { contact: [Q5_10::nearest(n); 3], ..SkinSensors::default() };
-            Message::Stimulus { to: Node::Cell(cell(5)), from: From::Next, page: SensorPage::Skin(sensors) }
+            Message::Stimulus { to: Node::Cell(cell(5)), from: AppliesFrom::Next, page: SensorPage::Skin(sensors) }
         };
         match ms {
             6_000 | 30_000 => say(ms, 7, &force(1.0)),
@@ -83,9 +83,9 @@ fn log(skin: &Skin) -> Vec<u8> {
 
 /// Returns what a page would show, without the snapshot's number.
 fn shown(tape: &mut Live, now: Micros) -> (Vec<u8>, String) {
-    let detail = tape.detail(Chosen { bus: 0, node: 5, frame: None }, now);
-    let said = Said { detail, ..tape.said(now) };
-    (tape.snapshot(now, &Pressed::default()).split_off(4), serde_json::to_string(&said).unwrap())
+    let detail = tape.detail(SelectedCell { bus: 0, node: 5, frame: None }, now);
+    let said = StatusMessage { detail, ..tape.status_message(now) };
+    (tape.snapshot(now, &TouchRegistry::default()).split_off(4), serde_json::to_string(&said).unwrap())
 }
 
 /// Returns the same after reading everything from the beginning.
@@ -94,9 +94,9 @@ fn straight(bytes: &[u8], skin: &Skin, until: u64) -> (Vec<u8>, String) {
     let mut tape = Tape::new(skin.clone(), BEGAN + 10_000);
     loop {
         match tape.step(until) {
-            Step::Hungry => tape.feed(&mut reader).unwrap(),
-            Step::There | Step::Over => break,
-            Step::Looked | Step::Applied { .. } => {}
+            TapeStep::NeedsEntries => tape.feed(&mut reader).unwrap(),
+            TapeStep::Reached | TapeStep::Over => break,
+            TapeStep::Updated | TapeStep::Applied { .. } => {}
         }
     }
     shown(tape.live_mut(), Micros(until / 1_000))
@@ -138,7 +138,7 @@ fn events_are_found_and_gone_to() {
     bench.build(&player);
     let mut at = |kind, forward| {
         assert!(player.jump(kind, forward).unwrap(), "{kind:?}");
-        player.said().at_s
+        player.playback().at_s
     };
     let near = |found: f64, expected: f64| (expected..expected + 0.06).contains(&found);
     assert!(near(at(EventKind::Touch, true), 6.0));
@@ -149,7 +149,7 @@ fn events_are_found_and_gone_to() {
     assert!((20.3..20.8).contains(&silent), "{silent}");
     assert!(!player.jump(EventKind::Silence, true).unwrap(), "only one cell falls silent");
     assert_eq!(player.marks(EventKind::Touch, 100), [15, 75]);
-    let said = player.said();
+    let said = player.playback();
     assert!((39.9..40.1).contains(&said.of_s) && said.read == 1.0 && said.others == 0);
 }
 
@@ -161,18 +161,18 @@ fn an_epoch_forth_and_back_is_where_it_began() {
     player.seek(7.0).unwrap();
     player.play(1.0);
     player.step(true).unwrap();
-    let first = player.said();
+    let first = player.playback();
     assert!(!first.playing && (first.at_s - 7.008).abs() < 1e-4, "{}", first.at_s);
     player.step(true).unwrap();
-    assert!((player.said().at_s - 7.024).abs() < 1e-4);
+    assert!((player.playback().at_s - 7.024).abs() < 1e-4);
     player.step(false).unwrap();
-    assert_eq!(player.said().at_s, first.at_s);
+    assert_eq!(player.playback().at_s, first.at_s);
     player.seek(0.0).unwrap();
     player.step(false).unwrap();
-    assert!(player.said().at_s < 0.001);
+    assert!(player.playback().at_s < 0.001);
     player.seek(1e300).unwrap();
     player.step(true).unwrap();
-    assert!(player.said().at_s >= 39.9);
+    assert!(player.playback().at_s >= 39.9);
 }
 
 #[test]
@@ -181,15 +181,15 @@ fn time_passes_at_its_speed_and_ends_with_the_recording() {
     let mut player = bench.player();
     bench.build(&player);
     player.play(2.0);
-    assert!(player.pass(Duration::from_millis(500)).unwrap());
-    assert!((player.said().at_s - 1.0).abs() < 1e-6);
+    assert!(player.advance_time(Duration::from_millis(500)).unwrap());
+    assert!((player.playback().at_s - 1.0).abs() < 1e-6);
     player.play(f64::NAN);
-    assert_eq!(player.said().speed, 1.0);
+    assert_eq!(player.playback().speed, 1.0);
     player.play(1e9);
-    assert_eq!(player.said().speed, 100.0);
-    player.pass(Duration::from_secs(1)).unwrap();
-    assert!(!player.said().playing, "it is over");
-    assert!(!player.pass(Duration::from_secs(1)).unwrap());
+    assert_eq!(player.playback().speed, 100.0);
+    player.advance_time(Duration::from_secs(1)).unwrap();
+    assert!(!player.playback().playing, "it is over");
+    assert!(!player.advance_time(Duration::from_secs(1)).unwrap());
     let history = player.history();
     let moments = u32::from_le_bytes(history[8..12].try_into().unwrap()) as usize;
     assert!((300..=625).contains(&moments), "{moments}");
@@ -201,12 +201,12 @@ fn what_is_not_known_yet_is_said_and_is_exact_later() {
     let bench = Bench::new();
     let mut player = bench.player();
     player.seek(35.0).unwrap();
-    assert!(!player.said().exact);
+    assert!(!player.playback().exact);
     let now = player.now();
-    let glance = player.live().said(now);
+    let glance = player.live().status_message(now);
     assert!(glance.contacts <= 1 && glance.buses[0].epochs_due < 250, "the last seconds");
     bench.build(&player);
-    assert!(player.pass(Duration::ZERO).unwrap() && player.said().exact);
+    assert!(player.advance_time(Duration::ZERO).unwrap() && player.playback().exact);
     let (now, until) = (player.now(), BEGAN + 10_000 + 35_000 * MS);
     assert_eq!(shown(player.live(), now), straight(&bench.bytes, &bench.skin, until));
 }
@@ -247,9 +247,9 @@ proptest! {
             player.step(false).unwrap();
             player.jump(EventKind::Halt, true).unwrap();
             player.play(1e9);
-            player.pass(Duration::from_secs(3)).unwrap();
+            player.advance_time(Duration::from_secs(3)).unwrap();
             let now = player.now();
-            prop_assert!(player.said().at_s >= 0.0 && !player.history().is_empty());
+            prop_assert!(player.playback().at_s >= 0.0 && !player.history().is_empty());
             shown(player.live(), now);
         }
     }

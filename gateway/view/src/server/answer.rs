@@ -7,7 +7,7 @@ use super::request::Request;
 use crate::web;
 
 /// The content security policy: no resources from elsewhere, and no embedding in other pages.
-const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; \
+const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; \
                       base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
 /// A complete answer.
@@ -20,7 +20,7 @@ pub(super) struct Answer {
 
 /// The reasons for a refusal.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Turned {
+pub(super) enum Refusal {
     /// The head is not a GET of HTTP/1.1.
     Malformed,
     /// The request asks for another host, or comes from a page of another site.
@@ -41,9 +41,9 @@ pub(super) enum Turned {
     Full,
 }
 
-impl Turned {
+impl Refusal {
     /// Returns the status line, and a text that says what to do.
-    const fn words(self) -> (&'static str, &'static str) {
+    const fn status_and_advice(self) -> (&'static str, &'static str) {
         match self {
             Self::Malformed => ("400 Bad Request", "only GET requests of HTTP/1.1 are answered"),
             Self::Elsewhere => (
@@ -73,8 +73,8 @@ impl Turned {
 
 impl Answer {
     /// Creates the answer for a refused client.
-    pub(super) fn of(why: Turned) -> Self {
-        let (status, words) = why.words();
+    pub(super) fn refusal(why: Refusal) -> Self {
+        let (status, words) = why.status_and_advice();
         let number = status.split(' ').next().unwrap_or_default();
         Self::new(status, "text/plain; charset=utf-8", format!("{number}: {words}\n").as_bytes(), false)
     }
@@ -83,7 +83,7 @@ impl Answer {
         let more = if status.starts_with("426") { "Upgrade: websocket\r\n" } else { "" };
         let mut bytes = format!(
             "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {}\r\nConnection: close\r\nCache-Control: no-store\r\n\
-             Content-Security-Policy: {POLICY}\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
+             Content-Security-Policy: {CONTENT_SECURITY_POLICY}\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
              Cross-Origin-Resource-Policy: same-origin\r\n{more}\r\n",
             body.len()
         )
@@ -100,28 +100,28 @@ impl Answer {
 pub(super) fn answer(head: &[u8], shared: &Shared) -> Option<Answer> {
     let turned = |why| {
         shared.refused.fetch_add(1, Ordering::Relaxed);
-        Some(Answer::of(why))
+        Some(Answer::refusal(why))
     };
     let Some(request) = str::from_utf8(head).ok().and_then(Request::parse) else {
-        return turned(Turned::Malformed);
+        return turned(Refusal::Malformed);
     };
     if !request.is_for(shared.address) {
-        return turned(Turned::Elsewhere);
+        return turned(Refusal::Elsewhere);
     }
-    let is_known = request.has(shared.access.token.as_ref());
+    let is_known = request.has_token(shared.access.token.as_ref());
     let is_code = web::is_code(&request.path);
     if !is_known && !is_code {
-        return turned(Turned::Unknown);
+        return turned(Refusal::Unknown);
     }
     match request.path.as_str() {
         "/live" if request.is_upgrade => None,
-        "/live" if shared.pages.load(Ordering::Relaxed) >= super::PAGES => turned(Turned::Full),
-        "/live" => turned(Turned::NoPage),
+        "/live" if shared.pages.load(Ordering::Relaxed) >= super::MAX_PAGES => turned(Refusal::Full),
+        "/live" => turned(Refusal::NoPage),
         "/surface" => Some(Answer::new("200 OK", "application/octet-stream", &shared.surface, is_known)),
         path => match web::file(path) {
             // A request for a script does not show that the client knows the token.
             Some((kind, bytes)) => Some(Answer::new("200 OK", kind, bytes, is_known && !is_code)),
-            None => turned(Turned::NoFile),
+            None => turned(Refusal::NoFile),
         },
     }
 }

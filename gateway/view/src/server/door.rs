@@ -16,29 +16,29 @@ use std::time::{Duration, Instant};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::process::{Resource, getrlimit, setpriority_process};
 
-use super::answer::{Answer, Turned, answer};
-use super::page::{self, Begun};
-use super::request::LONGEST;
-use super::{PAGES, Shared};
+use super::answer::{Answer, Refusal, answer};
+use super::page::{self, PrefixedStream};
+use super::request::MAX_HEAD_BYTES;
+use super::{MAX_PAGES, Shared};
 
 /// The time limit for a whole head, and for sending an answer.
-const HEAD_TIME: Duration = Duration::from_secs(5);
+const HEAD_TIMEOUT: Duration = Duration::from_secs(5);
 /// The time limit per piece of an answer to a client with the token.
-const PIECE_TIME: Duration = Duration::from_secs(5);
+const PIECE_TIMEOUT: Duration = Duration::from_secs(5);
 /// The maximum number of clients that are neither answered nor pages.
-const VISITORS: usize = 256;
+const MAX_VISITORS: usize = 256;
 /// The number of file descriptors that are kept free for buses and pages.
-const OTHER_FILES: u64 = 64;
+const RESERVED_FILES: u64 = 64;
 /// The maximum number of connections that are accepted before the other clients are served.
-const ACCEPTED_AT_ONCE: usize = 32;
+const MAX_ACCEPTED_AT_ONCE: usize = 32;
 /// The interval at which the server checks whether it has to stop.
 const POLL_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
 /// The pause after accepting has failed.
-const REST: Duration = Duration::from_millis(50);
+const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
 /// The niceness of the door's thread, so that a storm of connections does not take the bench's processor time.
 const NICE: i32 = 10;
 /// The read size in bytes.
-const PIECE: usize = 4 * 1024;
+const READ_SIZE: usize = 4 * 1024;
 
 /// A client that has not got its answer yet.
 #[derive(Debug)]
@@ -51,20 +51,20 @@ struct Visitor {
 }
 
 /// The next step with a visitor.
-enum Next {
+enum NextStep {
     /// The visitor waits.
     Stays(Visitor),
     /// The visitor becomes a page.
-    Page(Begun),
+    Page(PrefixedStream),
     /// The visitor has its answer, or has gone.
     Done,
 }
 
 /// Serves until the server stops, and passes on the clients that become pages.
-pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Begun>) {
+pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<PrefixedStream>) {
     // On Linux the priority is the thread's own. The door also works without it.
     let _ = setpriority_process(None, NICE);
-    let room = room();
+    let room = visitor_limit();
     let mut visitors = Vec::<Visitor>::new();
     let mut resting = None::<Instant>;
     while !shared.stop.load(Ordering::Relaxed) {
@@ -78,7 +78,7 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Begu
                 shared.refused.fetch_add(1, Ordering::Relaxed);
                 // Browsers connect ahead of a request, and would show this text as its answer.
                 if !visitor.head.is_empty() {
-                    visitor.turn_away(Turned::Late);
+                    visitor.turn_away(Refusal::Late);
                 }
             } else if *is_ready {
                 enter(visitor.advance(shared), &mut visitors, pages);
@@ -89,7 +89,7 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Begu
         if !listener_is_ready || resting.is_some() {
             continue;
         }
-        for _ in 0..ACCEPTED_AT_ONCE {
+        for _ in 0..MAX_ACCEPTED_AT_ONCE {
             match listener.accept() {
                 Ok((stream, _)) => {
                     if stream.set_nonblocking(true).is_err() {
@@ -107,7 +107,7 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Begu
                 Err(_) => {
                     // Out of file descriptors: this lasts until some are closed, so close one connection.
                     turn_oldest_away(&mut visitors, shared);
-                    resting = Some(Instant::now() + REST);
+                    resting = Some(Instant::now() + ACCEPT_PAUSE);
                     break;
                 }
             }
@@ -116,9 +116,9 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Begu
 }
 
 /// Returns the number of visitors that may wait: it leaves file descriptors for buses and pages.
-fn room() -> usize {
+fn visitor_limit() -> usize {
     let files = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
-    usize::try_from(files.saturating_sub(OTHER_FILES) / 2).unwrap_or(VISITORS).clamp(4, VISITORS)
+    usize::try_from(files.saturating_sub(RESERVED_FILES) / 2).unwrap_or(MAX_VISITORS).clamp(4, MAX_VISITORS)
 }
 
 /// Waits for the listener and the visitors, and returns a flag for each: true if it is ready.
@@ -138,22 +138,22 @@ fn wait(listener: &TcpListener, accepts: bool, visitors: &[Visitor]) -> Vec<bool
 }
 
 /// Handles the next step of a visitor.
-fn enter(next: Next, visitors: &mut Vec<Visitor>, pages: &Sender<Begun>) {
+fn enter(next: NextStep, visitors: &mut Vec<Visitor>, pages: &Sender<PrefixedStream>) {
     match next {
-        Next::Stays(visitor) => visitors.push(visitor),
-        Next::Done => {}
+        NextStep::Stays(visitor) => visitors.push(visitor),
+        NextStep::Done => {}
         // The receiving end stops together with this one.
-        Next::Page(begun) => _ = pages.send(begun),
+        NextStep::Page(begun) => _ = pages.send(begun),
     }
 }
 
 /// Starts a thread for each page, up to the limit. These threads have the normal priority of this one.
-pub(super) fn open(pages: Receiver<Begun>, shared: &Arc<Shared>) {
+pub(super) fn open(pages: Receiver<PrefixedStream>, shared: &Arc<Shared>) {
     for (page, begun) in (1..).zip(pages) {
-        if shared.pages.fetch_add(1, Ordering::Relaxed) >= PAGES {
+        if shared.pages.fetch_add(1, Ordering::Relaxed) >= MAX_PAGES {
             shared.pages.fetch_sub(1, Ordering::Relaxed);
             shared.refused.fetch_add(1, Ordering::Relaxed);
-            Visitor::new(begun.into_stream()).turn_away(Turned::Full);
+            Visitor::new(begun.into_stream()).turn_away(Refusal::Full);
             continue;
         }
         let of_thread = Arc::clone(shared);
@@ -178,70 +178,70 @@ fn turn_oldest_away(visitors: &mut Vec<Visitor>, shared: &Shared) {
     let oldest = visitors.remove(at);
     shared.refused.fetch_add(1, Ordering::Relaxed);
     if oldest.answer.is_none() {
-        oldest.turn_away(Turned::Crowded);
+        oldest.turn_away(Refusal::Crowded);
     }
 }
 
 impl Visitor {
     fn new(stream: TcpStream) -> Self {
-        Self { stream, head: Vec::new(), answer: None, until: Instant::now() + HEAD_TIME }
+        Self { stream, head: Vec::new(), answer: None, until: Instant::now() + HEAD_TIMEOUT }
     }
 
     /// Reads the data that has arrived, and writes as much as the socket accepts.
-    fn advance(mut self, shared: &Shared) -> Next {
+    fn advance(mut self, shared: &Shared) -> NextStep {
         while self.answer.is_none() {
-            let mut piece = [0; PIECE];
+            let mut piece = [0; READ_SIZE];
             // The end of the head may begin in the last three bytes of the data before.
             let seen = self.head.len().saturating_sub(3);
             match self.stream.read(&mut piece) {
-                Ok(0) => return Next::Done,
+                Ok(0) => return NextStep::Done,
                 Ok(read) => self.head.extend(piece.iter().take(read)),
                 Err(error) if error.kind() == ErrorKind::Interrupted => continue,
-                Err(error) if error.kind() == ErrorKind::WouldBlock => return Next::Stays(self),
-                Err(_) => return Next::Done,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return NextStep::Stays(self),
+                Err(_) => return NextStep::Done,
             }
             let new = self.head.get(seen..).unwrap_or_default();
             let end = new.windows(4).position(|end| end == b"\r\n\r\n").map(|at| seen + at + 4);
-            if self.head.len() > LONGEST {
+            if self.head.len() > MAX_HEAD_BYTES {
                 shared.refused.fetch_add(1, Ordering::Relaxed);
-                self.answer = Some((Answer::of(Turned::Long), 0));
+                self.answer = Some((Answer::refusal(Refusal::Long), 0));
             } else if let Some(head) = end.and_then(|end| self.head.get(..end)) {
                 match answer(head, shared) {
                     Some(answer) => self.answer = Some((answer, 0)),
-                    None => return Next::Page(Begun::new(self.head, self.stream)),
+                    None => return NextStep::Page(PrefixedStream::new(self.head, self.stream)),
                 }
             }
         }
         self.write()
     }
 
-    fn write(mut self) -> Next {
+    fn write(mut self) -> NextStep {
         while let Some((answer, sent)) = &mut self.answer {
             let rest = answer.bytes.get(*sent..).unwrap_or_default();
             if rest.is_empty() {
                 self.close();
-                return Next::Done;
+                return NextStep::Done;
             }
             match self.stream.write(rest) {
-                Ok(0) => return Next::Done,
+                Ok(0) => return NextStep::Done,
                 Ok(written) => {
                     *sent += written;
                     if answer.is_known {
-                        self.until = Instant::now() + PIECE_TIME;
+                        self.until = Instant::now() + PIECE_TIMEOUT;
                     }
                 }
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                Err(error) if error.kind() == ErrorKind::WouldBlock => return Next::Stays(self),
-                Err(_) => return Next::Done,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return NextStep::Stays(self),
+                Err(_) => return NextStep::Done,
             }
         }
-        Next::Stays(self)
+        NextStep::Stays(self)
     }
 
     /// Sends the reason of the refusal, as far as that is possible without waiting.
-    fn turn_away(mut self, why: Turned) {
+    fn turn_away(mut self, why: Refusal) {
         if self.answer.is_none() {
-            let _ = self.stream.write(&Answer::of(why).bytes);
+            let _ = self.stream.write(&Answer::refusal(why).bytes);
         }
         self.close();
     }
@@ -249,7 +249,7 @@ impl Visitor {
     /// Closes the connection. Unread bytes would reset it, and the client might not read its answer.
     fn close(mut self) {
         let _ = self.stream.shutdown(Shutdown::Write);
-        let mut piece = [0; PIECE];
+        let mut piece = [0; READ_SIZE];
         for _ in 0..8 {
             if !matches!(self.stream.read(&mut piece), Ok(1..)) {
                 break;

@@ -15,18 +15,18 @@ use crate::locked;
 /// The time limit for a page to receive a piece of a message.
 const TIMEOUT: Duration = Duration::from_secs(5);
 /// The time that the thread waits for a page's message before it checks for a new snapshot.
-const LOOK: Duration = Duration::from_millis(15);
+const POLL_INTERVAL: Duration = Duration::from_millis(15);
 /// The maximum number of messages that are read in a row.
-const AT_ONCE: usize = 64;
+const MAX_MESSAGES_AT_ONCE: usize = 64;
 
 /// A stream whose first bytes were already read.
 #[derive(Debug)]
-pub(super) struct Begun {
+pub(super) struct PrefixedStream {
     head: Cursor<Vec<u8>>,
     stream: TcpStream,
 }
 
-impl Begun {
+impl PrefixedStream {
     pub(super) const fn new(head: Vec<u8>, stream: TcpStream) -> Self {
         Self { head: Cursor::new(head), stream }
     }
@@ -36,7 +36,7 @@ impl Begun {
     }
 }
 
-impl Read for Begun {
+impl Read for PrefixedStream {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         match self.head.read(buffer)? {
             0 => self.stream.read(buffer),
@@ -45,7 +45,7 @@ impl Read for Begun {
     }
 }
 
-impl Write for Begun {
+impl Write for PrefixedStream {
     fn write(&mut self, buffer: &[u8]) -> io::Result<usize> {
         self.stream.write(buffer)
     }
@@ -56,19 +56,19 @@ impl Write for Begun {
 }
 
 /// Serves a page until it disconnects, or takes too long.
-pub(super) fn serve(begun: Begun, page: u64, shared: &Shared) {
+pub(super) fn serve(begun: PrefixedStream, page: u64, shared: &Shared) {
     let _ = live(begun, page, shared);
 }
 
-fn live(begun: Begun, page: u64, shared: &Shared) -> io::Result<()> {
+fn live(begun: PrefixedStream, page: u64, shared: &Shared) -> io::Result<()> {
     let stream = &begun.stream;
     stream.set_nonblocking(false)?;
     stream.set_nodelay(true)?;
     stream.set_read_timeout(Some(TIMEOUT))?;
     stream.set_write_timeout(Some(TIMEOUT))?;
     let config = WebSocketConfig::default()
-        .max_message_size(Some(command::LONGEST))
-        .max_frame_size(Some(command::LONGEST))
+        .max_message_size(Some(command::MAX_MESSAGE_BYTES))
+        .max_frame_size(Some(command::MAX_MESSAGE_BYTES))
         .write_buffer_size(0)
         .max_write_buffer_size(64 << 20);
     let Ok(mut socket) = accept_with_config(begun, Some(config)) else {
@@ -76,7 +76,7 @@ fn live(begun: Begun, page: u64, shared: &Shared) -> io::Result<()> {
         return Ok(());
     };
     shared.clients.fetch_add(1, Ordering::Relaxed);
-    let ended = talk(&mut socket, page, shared);
+    let ended = exchange_messages(&mut socket, page, shared);
     locked(&shared.chosen).remove(&page);
     locked(&shared.gone).push(page);
     if ended.is_ok() {
@@ -87,9 +87,9 @@ fn live(begun: Begun, page: u64, shared: &Shared) -> io::Result<()> {
     Ok(())
 }
 
-fn talk(socket: &mut WebSocket<Begun>, page: u64, shared: &Shared) -> Result<(), Error> {
+fn exchange_messages(socket: &mut WebSocket<PrefixedStream>, page: u64, shared: &Shared) -> Result<(), Error> {
     socket.send(Message::text(shared.scene.as_str()))?;
-    socket.get_ref().stream.set_read_timeout(Some(LOOK))?;
+    socket.get_ref().stream.set_read_timeout(Some(POLL_INTERVAL))?;
     let (mut sent, mut said_number, mut jumps) = (0, 0, 0);
     while !shared.stop.load(Ordering::Relaxed) {
         let (history, snapshot, said) = {
@@ -107,9 +107,9 @@ fn talk(socket: &mut WebSocket<Begun>, page: u64, shared: &Shared) -> Result<(),
         if let Some(said) = said {
             socket.send(Message::Text(said))?;
         }
-        for _ in 0..AT_ONCE {
+        for _ in 0..MAX_MESSAGES_AT_ONCE {
             match socket.read() {
-                Ok(Message::Text(text)) => take(text.as_str(), page, shared),
+                Ok(Message::Text(text)) => handle_message(text.as_str(), page, shared),
                 Ok(Message::Close(_)) => return Ok(()),
                 Ok(Message::Binary(_)) => _ = shared.ignored.fetch_add(1, Ordering::Relaxed),
                 Ok(Message::Ping(_) | Message::Pong(_) | Message::Frame(_)) => {}
@@ -130,12 +130,12 @@ fn talk(socket: &mut WebSocket<Begun>, page: u64, shared: &Shared) -> Result<(),
 }
 
 /// Handles a message of a page.
-fn take(text: &str, page: u64, shared: &Shared) {
+fn handle_message(text: &str, page: u64, shared: &Shared) {
     let ignore = || _ = shared.ignored.fetch_add(1, Ordering::Relaxed);
     match Command::parse(text) {
         None => ignore(),
-        Some(command) if command.acts() && !shared.access.may_act => ignore(),
-        Some(command) if command.plays() && !shared.access.may_play => ignore(),
+        Some(command) if command.affects_cells() && !shared.access.may_act => ignore(),
+        Some(command) if command.controls_playback() && !shared.access.may_play => ignore(),
         Some(Command::Choose(chosen)) => _ = locked(&shared.chosen).insert(page, chosen),
         Some(Command::Unchoose) => _ = locked(&shared.chosen).remove(&page),
         Some(command) => {

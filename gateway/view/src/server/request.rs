@@ -5,9 +5,9 @@ use std::net::{IpAddr, SocketAddr};
 use crate::token::Token;
 
 /// The maximum length of a head, in bytes.
-pub(super) const LONGEST: usize = 8 * 1024;
+pub(super) const MAX_HEAD_BYTES: usize = 8 * 1024;
 /// The port of an address without a port.
-const HTTP: u16 = 80;
+const DEFAULT_PORT: u16 = 80;
 
 /// The relevant parts of a request.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
@@ -52,14 +52,14 @@ impl Request {
         let is_origin = self.origin.as_ref().is_none_or(|origin| {
             origin.strip_prefix("http://").and_then(Authority::parse).is_some_and(|origin| origin == host)
         });
-        host.is_of(address) && is_origin
+        host.matches_address(address) && is_origin
     }
 
     /// Checks that the request carries the token, if there is one.
-    pub(super) fn has(&self, token: Option<&Token>) -> bool {
+    pub(super) fn has_token(&self, token: Option<&Token>) -> bool {
         let Some(token) = token else { return true };
         let given = self.query.split('&').find_map(|part| part.strip_prefix("token="));
-        given.is_some_and(|given| token.is(given))
+        given.is_some_and(|given| token.matches(given))
     }
 }
 
@@ -80,7 +80,7 @@ impl<'a> Authority<'a> {
             Some(digits) if digits.bytes().all(|byte| byte.is_ascii_digit()) && !digits.is_empty() => {
                 digits.parse().ok()?
             }
-            None | Some("") => HTTP,
+            None | Some("") => DEFAULT_PORT,
             Some(_) => return None,
         };
         Some(Self { host, port })
@@ -89,7 +89,7 @@ impl<'a> Authority<'a> {
     /// Compares the authority with the address that the server listens on. Other sites can make their names resolve to
     /// this machine. Names other than localhost are therefore refused, so that a page of such a site cannot read this
     /// one.
-    fn is_of(self, listen: SocketAddr) -> bool {
+    fn matches_address(self, listen: SocketAddr) -> bool {
         let is_anywhere = listen.ip().is_unspecified();
         let inner = self.host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
         let ip = match inner {
@@ -173,7 +173,7 @@ mod tests {
         let token = Token::parse("abcdef0123456789").unwrap();
         let has = |query: &str| {
             let request = Request::parse(&format!("GET /{query} HTTP/1.1\r\n\r\n")).unwrap();
-            request.has(Some(&token))
+            request.has_token(Some(&token))
         };
         assert!(has("?token=abcdef0123456789") && has("?more&token=abcdef0123456789"));
         for wrong in
@@ -181,7 +181,7 @@ mod tests {
         {
             assert!(!has(wrong), "{wrong}");
         }
-        assert!(Request::default().has(None));
+        assert!(Request::default().has_token(None));
     }
 
     proptest! {

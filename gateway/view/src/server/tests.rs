@@ -147,7 +147,7 @@ fn a_page_too_many_is_refused_in_words() {
     let server = served(Some(TOKEN));
     let query = format!("?token={TOKEN}");
     assert_eq!(status(&get(&server, &format!("/live{query}"))), "426");
-    let pages: Vec<_> = (0..PAGES).map(|_| page(&server, &query).unwrap()).collect();
+    let pages: Vec<_> = (0..MAX_PAGES).map(|_| page(&server, &query).unwrap()).collect();
     assert_eq!(page(&server, &query).err(), Some(503));
     let answer = get(&server, &format!("/live{query}"));
     assert!(answer.contains("503: 16 pages are open, the maximum"), "{answer}");

@@ -9,9 +9,9 @@ use serde::{Deserialize, Serialize};
 use crate::live::Live;
 
 /// Losses on a bus within this time of each other count as one event, in ns.
-const TOGETHER_NS: u64 = 200_000_000;
+const LOSS_MERGE_NS: u64 = 200_000_000;
 /// The maximum number of events that are kept.
-const EVENTS: usize = 1 << 18;
+const MAX_EVENTS: usize = 1 << 18;
 
 /// The kind of an event.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, Hash, Ord, PartialEq, PartialOrd, Serialize)]
@@ -42,7 +42,7 @@ pub struct Event {
 
 /// Compares the state with the previous one, and reports the changes as events.
 #[derive(Clone, Debug, Default)]
-pub struct Watcher {
+pub struct EventDetector {
     /// For each bus: its losses, true if it is halted, and the time of the last loss.
     buses: Vec<(u64, bool, Option<u64>)>,
     /// For each cell: true if it is touched, and true if it is dead.
@@ -50,9 +50,9 @@ pub struct Watcher {
     events: usize,
 }
 
-impl Watcher {
+impl EventDetector {
     /// Returns the events since the last call.
-    pub fn look(&mut self, at: u64, live: &Live) -> Vec<Event> {
+    pub fn detect(&mut self, at: u64, live: &Live) -> Vec<Event> {
         let mut events = Vec::new();
         for (bus, (losses, halted)) in live.losses().enumerate() {
             if self.buses.len() <= bus {
@@ -60,7 +60,7 @@ impl Watcher {
             }
             let Some((before, was_halted, last)) = self.buses.get_mut(bus) else { continue };
             if losses > *before {
-                if last.is_none_or(|last| at.saturating_sub(last) > TOGETHER_NS) {
+                if last.is_none_or(|last| at.saturating_sub(last) > LOSS_MERGE_NS) {
                     events.push(Event { at, kind: EventKind::Loss, bus, node: None });
                 }
                 *last = Some(at);
@@ -81,7 +81,7 @@ impl Watcher {
             }
         }
         // Only the first events are kept.
-        events.truncate(EVENTS - self.events.min(EVENTS));
+        events.truncate(MAX_EVENTS - self.events.min(MAX_EVENTS));
         self.events += events.len();
         events
     }

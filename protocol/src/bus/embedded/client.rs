@@ -10,16 +10,16 @@ use rustix::io::Errno;
 use rustix::net::{AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, sockopt};
 use socketcan::{CanFdSocket, SocketOptions};
 
-use super::{Answer, FilterPart, Hello, OWN_BYTE, VERSION, decode_dropped};
-use super::{address, open_directory, usual_directory};
+use super::{HelloReply, FilterPart, ClientHello, OWN_BYTE, VERSION, decode_dropped};
+use super::{address, open_directory, default_directory};
 use crate::bus::batch::{self, Datagram};
 use crate::bus::carrier::Carrier;
-use crate::bus::{Bus, BusError, Filter, Options};
+use crate::bus::{Bus, BusError, Filter, BusOptions};
 
 /// Maximum time to wait for a server, which answers at once unless it is stopped.
-const TIMEOUT: Duration = Duration::from_secs(2);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 /// Time within which a server that is ending resets connections.
-const RESET: Duration = Duration::from_millis(50);
+const RESET_TIMEOUT: Duration = Duration::from_millis(50);
 /// Size of the send buffer: some 700 FD frames, the answers of a whole skin at once.
 const SEND_BUFFER: usize = 1 << 18;
 
@@ -27,20 +27,20 @@ const SEND_BUFFER: usize = 1 << 18;
 pub(in crate::bus) struct Embedded;
 
 impl Carrier for Embedded {
-    fn open(&self, name: &str, options: &Options) -> Result<(CanFdSocket, usize), BusError> {
-        let failed = |errno: Errno| BusError::refused(name, "connect to", errno);
+    fn open(&self, name: &str, options: &BusOptions) -> Result<(CanFdSocket, usize), BusError> {
+        let failed = |errno: Errno| BusError::open_error(name, "connect to", errno);
         let gone = |errno| match errno {
-            Errno::PIPE | Errno::CONNRESET => match closed(name, options.directory.as_deref()) {
+            Errno::PIPE | Errno::CONNRESET => match closed_error(name, options.directory.as_deref()) {
                 // A busy client's hello comes after the server has turned it away.
-                BusError::HungUp(name) => BusError::TurnedAway(name),
+                BusError::HungUp(name) => BusError::NoRoom(name),
                 error => error,
             },
             errno => failed(errno),
         };
-        let no_answer = || BusError::NoAnswer { name: name.to_owned(), waited: TIMEOUT };
+        let no_answer = || BusError::NoAnswer { name: name.to_owned(), waited: ANSWER_TIMEOUT };
         let socket = CanFdSocket::from(connect(name, options.directory.as_deref())?);
-        socket.set_recv_timestamp(true).map_err(|source| BusError::refused(name, "set up", source))?;
-        let hello = Hello {
+        socket.set_recv_timestamp(true).map_err(|source| BusError::open_error(name, "set up", source))?;
+        let hello = ClientHello {
             filters: options.filters.clone(),
             own_frames: options.own_frames,
             fd: options.fd,
@@ -48,7 +48,7 @@ impl Carrier for Embedded {
             buffer: options.receive_buffer as u64,
         };
         rustix::net::send(&socket, &hello.encode(), SendFlags::NOSIGNAL).map_err(gone)?;
-        let wait = Timespec::try_from(TIMEOUT).unwrap_or_default();
+        let wait = Timespec::try_from(ANSWER_TIMEOUT).unwrap_or_default();
         let mut polled = [PollFd::new(&socket, PollFlags::IN)];
         if rustix::io::retry_on_intr(|| poll(&mut polled, Some(&wait))).map_err(failed)? == 0 {
             return Err(no_answer());
@@ -58,21 +58,21 @@ impl Carrier for Embedded {
         sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, None).map_err(failed)?;
         // A server that is ending resets the connection; one without room hangs up without an answer.
         if len == 0 {
-            return Err(BusError::TurnedAway(name.to_owned()));
+            return Err(BusError::NoRoom(name.to_owned()));
         }
-        match Answer::decode(bytes.get(..len).unwrap_or_default()) {
-            Some(Answer::Welcome { granted }) => Ok((socket, usize::try_from(granted).unwrap_or(usize::MAX))),
-            Some(Answer::Refused { version }) => {
+        match HelloReply::decode(bytes.get(..len).unwrap_or_default()) {
+            Some(HelloReply::Welcome { granted }) => Ok((socket, usize::try_from(granted).unwrap_or(usize::MAX))),
+            Some(HelloReply::Refused { version }) => {
                 Err(BusError::Refused { name: name.to_owned(), ours: VERSION, theirs: version })
             }
-            None => Err(closed(name, options.directory.as_deref())),
+            None => Err(closed_error(name, options.directory.as_deref())),
         }
     }
 
     fn set_filters(&self, bus: &Bus, filters: &[Filter]) -> Result<(), BusError> {
         let parts: Vec<_> = FilterPart::split(filters).map(|part| part.encode()).collect();
         let send = |sent| parts.get::<usize>(sent).map_or(Ok(0), |part| batch::send_one(&bus.socket, part));
-        Ok(bus.patiently(parts.len(), send)?)
+        Ok(bus.send_all(parts.len(), send)?)
     }
 
     fn is_virtual(&self, _name: &str) -> io::Result<bool> {
@@ -87,21 +87,21 @@ impl Carrier for Embedded {
         decode_dropped(notice)
     }
 
-    fn cause(&self, errno: Errno) -> Option<fn(String) -> BusError> {
+    fn bus_error(&self, errno: Errno) -> Option<fn(String) -> BusError> {
         matches!(errno, Errno::PIPE | Errno::CONNRESET | Errno::NOTCONN).then_some(BusError::Closed)
     }
 }
 
 /// Returns the error for a lost connection: its server has ended, or still serves others and hung up on this
 /// client.
-pub(in crate::bus) fn closed(name: &str, directory: Option<&Path>) -> BusError {
+pub(in crate::bus) fn closed_error(name: &str, directory: Option<&Path>) -> BusError {
     let is_served = connect(name, directory).is_ok_and(|socket| is_kept(&socket));
     if is_served { BusError::HungUp(name.to_owned()) } else { BusError::Closed(name.to_owned()) }
 }
 
 /// Returns true if a server keeps a new connection open. A server that is ending resets it.
 fn is_kept(socket: &OwnedFd) -> bool {
-    let wait = Timespec::try_from(RESET).unwrap_or_default();
+    let wait = Timespec::try_from(RESET_TIMEOUT).unwrap_or_default();
     let mut polled = [PollFd::new(socket, PollFlags::IN)];
     let is_quiet = rustix::io::retry_on_intr(|| poll(&mut polled, Some(&wait))) == Ok(0);
     is_quiet || rustix::net::recv(socket, &mut [0; 64], RecvFlags::DONTWAIT).is_ok()
@@ -110,20 +110,20 @@ fn is_kept(socket: &OwnedFd) -> bool {
 /// Connects to a server. The socket may still be in the server's queue; sending on it is limited by a
 /// timeout.
 fn connect(name: &str, directory: Option<&Path>) -> Result<OwnedFd, BusError> {
-    let directory = directory.map_or_else(usual_directory, Path::to_owned);
-    let failed = |errno: Errno| BusError::refused(name, "connect to", errno);
+    let directory = directory.map_or_else(default_directory, Path::to_owned);
+    let failed = |errno: Errno| BusError::open_error(name, "connect to", errno);
     let not_served = || BusError::NotServed { name: name.to_owned(), directory: directory.clone() };
     open_directory(&directory)
         .map_err(|error| if error.is_absent() { not_served() } else { error.into() })?;
     let address = address(&directory, name)?;
     let socket = seqpacket(SocketFlags::empty()).map_err(failed)?;
     // `connect` blocks while the server's queue of new clients is full; the timeout limits that.
-    sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, Some(TIMEOUT)).map_err(failed)?;
+    sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, Some(ANSWER_TIMEOUT)).map_err(failed)?;
     sockopt::set_socket_send_buffer_size(&socket, SEND_BUFFER).map_err(failed)?;
     match rustix::net::connect(&socket, &address) {
         Ok(()) => Ok(socket),
         Err(Errno::NOENT | Errno::CONNREFUSED) => Err(not_served()),
-        Err(Errno::AGAIN) => Err(BusError::NoAnswer { name: name.to_owned(), waited: TIMEOUT }),
+        Err(Errno::AGAIN) => Err(BusError::NoAnswer { name: name.to_owned(), waited: ANSWER_TIMEOUT }),
         Err(errno) => Err(failed(errno)),
     }
 }

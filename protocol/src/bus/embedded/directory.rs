@@ -17,7 +17,7 @@ pub const MARK: &str = ".skinbus";
 /// Returns the default directory of embedded buses: `$SKINBUS_DIR`, else `$XDG_RUNTIME_DIR/skinbus`, else
 /// `/tmp/skinbus-<user>`.
 #[must_use]
-pub fn usual_directory() -> PathBuf {
+pub fn default_directory() -> PathBuf {
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     set("SKINBUS_DIR")
         .or_else(|| set("XDG_RUNTIME_DIR").map(|path| path.join("skinbus")))

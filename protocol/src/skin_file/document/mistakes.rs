@@ -8,20 +8,20 @@ use toml::de::{DeTable, DeValue};
 use crate::skin::CellName;
 
 /// Maximum number of characters quoted from a value.
-const QUOTED: usize = 40;
+const MAX_QUOTED_CHARS: usize = 40;
 
 /// Rewrites the parser's message about the value at these bytes.
-pub(super) fn explained(text: &str, at: Range<usize>, message: &str) -> String {
-    let found = DeTable::parse(text).ok().and_then(|root| find(root.get_ref(), at.start));
+pub(super) fn explain(text: &str, at: Range<usize>, message: &str) -> String {
+    let found = DeTable::parse(text).ok().and_then(|root| find_in_table(root.get_ref(), at.start));
     if let Some(field) = message.strip_prefix("missing field ") {
         // A key that is missing at the top level has no table.
         let table = found.filter(|found| found.value == at).map(|found| format!("{}: ", found.path));
         return format!("{}key {field} is missing", table.unwrap_or_default());
     }
-    let Some(Found { path, value }) = found else { return unparsed(message) };
+    let Some(FoundValue { path, value }) = found else { return explain_syntax_error(message) };
     let value = text.get(value).unwrap_or_default().lines().next().unwrap_or_default();
-    let quoted = value.chars().take(QUOTED).collect::<String>();
-    let Some(allowed) = allowed(&path, message) else { return message.to_owned() };
+    let quoted = value.chars().take(MAX_QUOTED_CHARS).collect::<String>();
+    let Some(allowed) = describe_allowed(&path, message) else { return message.to_owned() };
     match quoted.starts_with('[') && allowed.contains("[[") {
         true => format!("{path}: {allowed}"),
         false => format!("{path} = {quoted}: {allowed}"),
@@ -29,7 +29,7 @@ pub(super) fn explained(text: &str, at: Range<usize>, message: &str) -> String {
 }
 
 /// Describes the values that the parser expected.
-fn allowed(path: &str, message: &str) -> Option<String> {
+fn describe_allowed(path: &str, message: &str) -> Option<String> {
     if let Some((got, target)) = message
         .strip_prefix("invalid length ")
         .and_then(|rest| rest.split_once(", expected an array of length "))
@@ -65,7 +65,7 @@ fn cell_of_bus(got: &str) -> Option<CellName> {
 }
 
 /// Rewrites the message about text that is not TOML. The parser's advice only fits strings.
-fn unparsed(message: &str) -> String {
+fn explain_syntax_error(message: &str) -> String {
     let more = if message.starts_with("string values must be quoted") {
         "; write numbers without units or formulas, such as 5000000 or 1.5708"
     } else if message.starts_with("duplicate key") {
@@ -77,30 +77,30 @@ fn unparsed(message: &str) -> String {
 }
 
 /// A value and its path.
-struct Found {
+struct FoundValue {
     path: String,
     value: Range<usize>,
 }
 
 /// Returns the innermost value at this byte of a table.
-fn find(table: &DeTable<'_>, at: usize) -> Option<Found> {
-    table.iter().find_map(|(key, value)| within(key.get_ref(), value, at))
+fn find_in_table(table: &DeTable<'_>, at: usize) -> Option<FoundValue> {
+    table.iter().find_map(|(key, value)| find_in_value(key.get_ref(), value, at))
 }
 
-fn within(path: &str, value: &Spanned<DeValue<'_>>, at: usize) -> Option<Found> {
+fn find_in_value(path: &str, value: &Spanned<DeValue<'_>>, at: usize) -> Option<FoundValue> {
     let inner = match value.get_ref() {
         DeValue::Table(table) => {
-            find(table, at).map(|found| Found { path: format!("{path}.{}", found.path), ..found })
+            find_in_table(table, at).map(|found| FoundValue { path: format!("{path}.{}", found.path), ..found })
         }
         DeValue::Array(values) => values
             .iter()
             .enumerate()
-            .find_map(|(index, value)| within(&format!("{path}[{index}]"), value, at)),
+            .find_map(|(index, value)| find_in_value(&format!("{path}[{index}]"), value, at)),
         DeValue::String(_)
         | DeValue::Integer(_)
         | DeValue::Float(_)
         | DeValue::Boolean(_)
         | DeValue::Datetime(_) => None,
     };
-    inner.or_else(|| value.span().contains(&at).then(|| Found { path: path.to_owned(), value: value.span() }))
+    inner.or_else(|| value.span().contains(&at).then(|| FoundValue { path: path.to_owned(), value: value.span() }))
 }

@@ -1,12 +1,12 @@
 //! The baseline of the force sensors in a skin file.
 
 use super::raw;
-use crate::document::{Fault, Place};
+use crate::document::{DocumentFault, KeyPath};
 use crate::fixed::{Q1_14, Q5_10};
-use crate::parameters::{Baseline, Zeroing};
+use crate::parameters::{Baseline, BaselineSettings};
 
 /// Values for omitted keys.
-const DEFAULT: Zeroing = Zeroing {
+const DEFAULT: BaselineSettings = BaselineSettings {
     threshold: Q5_10::from_bits(103),
     hysteresis: Q1_14::from_bits(8_192),
     rate_un_per_s: 2_000,
@@ -15,22 +15,22 @@ const DEFAULT: Zeroing = Zeroing {
 };
 
 /// Checks the table `[baseline]`.
-pub(super) fn of_skin(raw: Option<raw::Baseline>) -> Result<Baseline, Fault> {
+pub(super) fn skin_baseline(raw: Option<raw::Baseline>) -> Result<Baseline, DocumentFault> {
     let Some(raw) = raw else { return Ok(Baseline::Off) };
-    let at = Place::named("baseline");
+    let at = KeyPath::top_level_key("baseline");
     let modes = [("off", None), ("hold", Some(false)), ("follow", Some(true))];
-    let follows = at.key("mode").word(raw.mode.as_deref().unwrap_or("follow"), &modes)?;
+    let follows = at.key("mode").choose(raw.mode.as_deref().unwrap_or("follow"), &modes)?;
     let mut to = DEFAULT;
-    at.key("threshold_n").set(raw.threshold_n, &mut to.threshold, Q5_10::try_at_least)?;
+    at.key("threshold_n").set_word(raw.threshold_n, &mut to.threshold, Q5_10::try_at_least)?;
     if let Some(got) = raw.threshold_n.filter(|_| to.threshold <= Q5_10::ZERO) {
         return Err(at.key("threshold_n").fault(got, "must be above 0"));
     }
-    at.key("hysteresis").set(raw.hysteresis, &mut to.hysteresis, Q1_14::try_nearest)?;
+    at.key("hysteresis").set_word(raw.hysteresis, &mut to.hysteresis, Q1_14::try_nearest)?;
     if let Some(got) = raw.hysteresis.filter(|&part| part > 1.0) {
         return Err(at.key("hysteresis").fault(got, "a part of the threshold: 0 to 1 is possible"));
     }
-    at.key("limit_n").set(raw.limit_n, &mut to.limit, Q5_10::try_nearest)?;
-    slope(&at.key("n_per_c"), raw.n_per_c, &mut to)?;
+    at.key("limit_n").set_word(raw.limit_n, &mut to.limit, Q5_10::try_nearest)?;
+    set_slope(&at.key("n_per_c"), raw.n_per_c, &mut to)?;
     if let Some(got) = raw.rate_n_per_s {
         to.rate_un_per_s = rate(got)
             .ok_or_else(|| at.key("rate_n_per_s").fault(got, "1e-6 to 0.065535 N/s are possible"))?;
@@ -38,12 +38,12 @@ pub(super) fn of_skin(raw: Option<raw::Baseline>) -> Result<Baseline, Fault> {
     Ok(match follows {
         None => Baseline::Off,
         Some(true) => Baseline::On(to),
-        Some(false) => Baseline::On(Zeroing { rate_un_per_s: 0, ..to }),
+        Some(false) => Baseline::On(BaselineSettings { rate_un_per_s: 0, ..to }),
     })
 }
 
 /// Applies the overrides of a cell.
-pub(super) fn of_cell(at: &Place, raw: &raw::Cell, base: Baseline) -> Result<Baseline, Fault> {
+pub(super) fn cell_baseline(at: &KeyPath, raw: &raw::RawCell, base: Baseline) -> Result<Baseline, DocumentFault> {
     let Baseline::On(mut to) = base else {
         let given = [("baseline_limit_n", raw.baseline_limit_n), ("baseline_n_per_c", raw.baseline_n_per_c)];
         let given = given.into_iter().find_map(|(key, value)| Some((key, value?)));
@@ -51,15 +51,15 @@ pub(super) fn of_cell(at: &Place, raw: &raw::Cell, base: Baseline) -> Result<Bas
             Err(at.key(key).fault(value, "the skin has no [baseline], or its mode is \"off\""))
         });
     };
-    at.key("baseline_limit_n").set(raw.baseline_limit_n, &mut to.limit, Q5_10::try_nearest)?;
-    slope(&at.key("baseline_n_per_c"), raw.baseline_n_per_c, &mut to)?;
+    at.key("baseline_limit_n").set_word(raw.baseline_limit_n, &mut to.limit, Q5_10::try_nearest)?;
+    set_slope(&at.key("baseline_n_per_c"), raw.baseline_n_per_c, &mut to)?;
     Ok(Baseline::On(to))
 }
 
 /// Sets the temperature slope, which may be negative.
-fn slope(at: &Place, given: Option<f64>, to: &mut Zeroing) -> Result<(), Fault> {
+fn set_slope(at: &KeyPath, given: Option<f64>, to: &mut BaselineSettings) -> Result<(), DocumentFault> {
     if let Some(given) = given {
-        to.n_per_c = at.fit(given, Q1_14::try_nearest)?;
+        to.n_per_c = at.to_fixed(given, Q1_14::try_nearest)?;
     }
     Ok(())
 }
@@ -91,7 +91,7 @@ mod tests {
         assert_eq!(read("", ""), Ok(Baseline::Off));
         assert_eq!(read("[baseline]\nmode = \"off\"\nlimit_n = 1.0", ""), Ok(Baseline::Off));
         assert_eq!(read("[baseline]", ""), Ok(Baseline::On(DEFAULT)));
-        let hold = Zeroing { rate_un_per_s: 0, ..DEFAULT };
+        let hold = BaselineSettings { rate_un_per_s: 0, ..DEFAULT };
         assert_eq!(read("[baseline]\nmode = \"hold\"", ""), Ok(Baseline::On(hold)));
         let said = "threshold_n = 0.1\nhysteresis = 0.5\nrate_n_per_s = 0.002\nlimit_n = 0.5\nn_per_c = 0.0";
         assert_eq!(read(&format!("[baseline]\n{said}"), ""), Ok(Baseline::On(DEFAULT)), "the defaults");
@@ -99,7 +99,7 @@ mod tests {
 
     #[test]
     fn a_cell_overrides_limit_and_slope() {
-        let own = Zeroing { limit: Q5_10::nearest(1.5), n_per_c: Q1_14::nearest(-0.02), ..DEFAULT };
+        let own = BaselineSettings { limit: Q5_10::nearest(1.5), n_per_c: Q1_14::nearest(-0.02), ..DEFAULT };
         let cell = "baseline_limit_n = 1.5\nbaseline_n_per_c = -0.02";
         assert_eq!(read("[baseline]", cell), Ok(Baseline::On(own)));
         let why = read("", cell).unwrap_err();

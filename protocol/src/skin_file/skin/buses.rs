@@ -2,28 +2,28 @@
 
 use std::collections::HashSet;
 
-use super::{Bus, JointKind, Reply, Robot, raw, sensing};
+use super::{SkinBus, JointKind, SkinReply, Robot, raw, sensing};
 use crate::can::Format;
-use crate::document::{Checked, Place};
+use crate::document::{Checked, KeyPath};
 use crate::fixed::TorqueFormat;
 use crate::wire_time::BitRates;
 
 /// Maximum number of buses of a skin.
-const BUSES: usize = 64;
+const MAX_BUSES: usize = 64;
 
-pub(super) fn buses(raw: &[raw::Bus], robot: &Robot) -> Checked<Vec<Bus>> {
+pub(super) fn buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<SkinBus>> {
     if raw.is_empty() {
-        return Err(Place::named("bus").fault("[]", "at least one bus is needed"));
+        return Err(KeyPath::top_level_key("bus").fault("[]", "at least one bus is needed"));
     }
-    if raw.len() > BUSES {
-        let why = format!("a skin has at most {BUSES} buses");
-        return Err(Place::named("bus").fault(format!("{} buses", raw.len()), why));
+    if raw.len() > MAX_BUSES {
+        let why = format!("a skin has at most {MAX_BUSES} buses");
+        return Err(KeyPath::top_level_key("bus").fault(format!("{} buses", raw.len()), why));
     }
     let mut seen = HashSet::new();
-    let bus = |(index, bus): (usize, &raw::Bus)| {
-        let at = Place::named("bus").nth(index);
+    let bus = |(index, bus): (usize, &raw::RawBus)| {
+        let at = KeyPath::top_level_key("bus").element(index);
         let name = bus.name.clone();
-        if !crate::bus::is_plain(&name) || name.starts_with('.') {
+        if !crate::bus::is_plain_name(&name) || name.starts_with('.') {
             let why = "an interface's name has 1 to 15 letters, digits, `-`, `_` or `.`";
             return Err(at.key("name").fault(format_args!("{name:?}"), why));
         }
@@ -32,18 +32,18 @@ pub(super) fn buses(raw: &[raw::Bus], robot: &Robot) -> Checked<Vec<Bus>> {
         }
         let reply = reply(&at, bus)?;
         let format =
-            at.key("format").word(&bus.format, &[("fd", Format::Fd), ("classic", Format::Classic)])?;
+            at.key("format").choose(&bus.format, &[("fd", Format::Fd), ("classic", Format::Classic)])?;
         let (bitrate, data_bitrate) = bit_rates(&at, bus, format)?;
         let chain = chain(&at, bus, robot)?;
         let torque_format = torque_format(&at, bus, robot, chain)?;
-        let sensing = sensing::of_bus(&at, bus)?;
-        Ok(Bus { name, reply, format, chain, torque_format, bitrate, data_bitrate, sensing })
+        let sensing = sensing::bus_sensing(&at, bus)?;
+        Ok(SkinBus { name, reply, format, chain, torque_format, bitrate, data_bitrate, sensing })
     };
     raw.iter().enumerate().map(bus).collect()
 }
 
 /// Returns the chain of a bus. The name may be omitted if there is only one chain.
-fn chain(at: &Place, bus: &raw::Bus, robot: &Robot) -> Checked<usize> {
+fn chain(at: &KeyPath, bus: &raw::RawBus, robot: &Robot) -> Checked<usize> {
     let names =
         || robot.chains.iter().map(|chain| format!("{:?}", chain.name)).collect::<Vec<_>>().join(", ");
     let at = at.key("chain");
@@ -58,10 +58,10 @@ fn chain(at: &Place, bus: &raw::Bus, robot: &Robot) -> Checked<usize> {
 
 /// Returns the torque format of a bus. The default is the finest, or Q5.10 for a chain with prismatic joints,
 /// where a range of 8 N would be too small.
-fn torque_format(at: &Place, bus: &raw::Bus, robot: &Robot, chain: usize) -> Checked<TorqueFormat> {
+fn torque_format(at: &KeyPath, bus: &raw::RawBus, robot: &Robot, chain: usize) -> Checked<TorqueFormat> {
     if let Some(name) = &bus.torque_format {
         let formats = TorqueFormat::ALL.map(|format| (format.name(), format));
-        return at.key("torque_format").word(name, &formats);
+        return at.key("torque_format").choose(name, &formats);
     }
     let joints = robot.chains.get(chain).map_or(&[][..], |chain| &chain.joints);
     let slides = |&joint: &usize| robot.joints.get(joint).is_some_and(|it| it.kind == JointKind::Prismatic);
@@ -69,15 +69,15 @@ fn torque_format(at: &Place, bus: &raw::Bus, robot: &Robot, chain: usize) -> Che
 }
 
 /// Checks the reply of a bus.
-fn reply(at: &Place, bus: &raw::Bus) -> Checked<Reply> {
-    let sums = at.key("reply").word(&bus.reply, &[("torque", false), ("sum", true)])?;
+fn reply(at: &KeyPath, bus: &raw::RawBus) -> Checked<SkinReply> {
+    let sums = at.key("reply").choose(&bus.reply, &[("torque", false), ("sum", true)])?;
     let only_sum = "only with reply = \"sum\"";
     match (sums, bus.slot_us, bus.carry) {
-        (false, None, None) => Ok(Reply::Torque),
+        (false, None, None) => Ok(SkinReply::Torque),
         (false, Some(got), _) => Err(at.key("slot_us").fault(got, only_sum)),
         (false, None, Some(got)) => Err(at.key("carry").fault(got, only_sum)),
         (true, Some(got), carry) => match u32::try_from(got) {
-            Ok(slot_us @ 1..) => Ok(Reply::Sum { slot_us, carry: carry.unwrap_or(true) }),
+            Ok(slot_us @ 1..) => Ok(SkinReply::Sum { slot_us, carry: carry.unwrap_or(true) }),
             Ok(0) | Err(_) => Err(at.key("slot_us").fault(got, "must be above 0")),
         },
         (true, None, _) => Err(at.key("reply").fault("\"sum\"", "slot_us is needed with it")),
@@ -85,8 +85,8 @@ fn reply(at: &Place, bus: &raw::Bus) -> Checked<Reply> {
 }
 
 /// Checks the optional bit rates of real hardware.
-fn bit_rates(at: &Place, bus: &raw::Bus, format: Format) -> Checked<(Option<u32>, Option<u32>)> {
-    let within = |key, got, min, max| at.key(key).within(got, min..=max, " bit/s");
+fn bit_rates(at: &KeyPath, bus: &raw::RawBus, format: Format) -> Checked<(Option<u32>, Option<u32>)> {
+    let within = |key, got, min, max| at.key(key).check_range(got, min..=max, " bit/s");
     let (min, max) = (BitRates::MIN_NOMINAL, BitRates::MAX_NOMINAL);
     let bitrate = bus.bitrate.map(|got| within("bitrate", got, min, max)).transpose()?;
     let data_bitrate = match (bus.data_bitrate, format, bitrate) {

@@ -2,27 +2,27 @@
 
 use std::collections::HashMap;
 
-use super::chains::unit;
+use super::chains::normalized;
 use super::reach::{REACH, reach};
-use super::{Bus, Cell, Robot, baseline, raw};
-use crate::document::{Checked, Place};
+use super::{SkinBus, Cell, Robot, baseline, raw};
+use crate::document::{Checked, KeyPath};
 use crate::fixed::Q;
 use crate::id::CellId;
 use crate::parameters::{Baseline, Contact};
 
 /// The values that cells inherit from the skin.
 #[derive(Clone, Copy)]
-pub(super) struct Base {
+pub(super) struct CellDefaults {
     pub(super) contact: Contact,
     pub(super) baseline: Baseline,
 }
 
-pub(super) fn cells(raw: &[raw::Cell], robot: &Robot, buses: &[Bus], base: Base) -> Checked<Vec<Cell>> {
+pub(super) fn cells(raw: &[raw::RawCell], robot: &Robot, buses: &[SkinBus], base: CellDefaults) -> Checked<Vec<Cell>> {
     let mut taken = HashMap::new();
     let mut serials = HashMap::new();
     let mut cells = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let at = Place::named("cell").nth(index);
+        let at = KeyPath::top_level_key("cell").element(index);
         let cell = cell(&at, raw, robot, buses, base)?;
         if let Some(first) = taken.insert((cell.bus, cell.node), index) {
             let bus = buses.get(cell.bus).map_or("", |bus| &bus.name);
@@ -35,18 +35,18 @@ pub(super) fn cells(raw: &[raw::Cell], robot: &Robot, buses: &[Bus], base: Base)
         }
         cells.push(cell);
     }
-    for (index, port, cell, neighbor) in mentions(&cells) {
+    for (index, port, cell, neighbor) in neighbor_mentions(&cells) {
         if neighbor == cell.node || !taken.contains_key(&(cell.bus, neighbor)) {
             let why = "must be the node of another cell on the same bus, or 0";
-            return Err(Place::named("cell").nth(index).key("neighbors").nth(port).fault(neighbor, why));
+            return Err(KeyPath::top_level_key("cell").element(index).key("neighbors").element(port).fault(neighbor, why));
         }
     }
-    contradictions(&cells)?;
+    check_wire_ends(&cells)?;
     Ok(cells)
 }
 
 /// Iterates over the neighbours that cells name: cell index, port, cell and neighbour.
-fn mentions(cells: &[Cell]) -> impl Iterator<Item = (usize, usize, &Cell, CellId)> {
+fn neighbor_mentions(cells: &[Cell]) -> impl Iterator<Item = (usize, usize, &Cell, CellId)> {
     cells.iter().enumerate().flat_map(|(index, cell)| {
         let ports = cell.neighbors.iter().enumerate();
         ports.filter_map(move |(port, neighbor)| Some((index, port, cell, (*neighbor)?)))
@@ -54,13 +54,13 @@ fn mentions(cells: &[Cell]) -> impl Iterator<Item = (usize, usize, &Cell, CellId
 }
 
 /// Checks that every wire has two ends: two cells must name each other equally often.
-fn contradictions(cells: &[Cell]) -> Checked<()> {
+fn check_wire_ends(cells: &[Cell]) -> Checked<()> {
     let mut all = HashMap::new();
-    for (.., cell, neighbor) in mentions(cells) {
+    for (.., cell, neighbor) in neighbor_mentions(cells) {
         *all.entry((cell.bus, cell.node, neighbor)).or_insert(0) += 1;
     }
     let mut named = HashMap::new();
-    for (index, port, cell, neighbor) in mentions(cells) {
+    for (index, port, cell, neighbor) in neighbor_mentions(cells) {
         let node = cell.node;
         let so_far = named.entry((cell.bus, node, neighbor)).or_insert(0);
         *so_far += 1;
@@ -69,20 +69,20 @@ fn contradictions(cells: &[Cell]) -> Checked<()> {
                 "this wire has no other end: name node {node} in a further one of the neighbors of node {neighbor}, \
                  or put 0 here"
             );
-            return Err(Place::named("cell").nth(index).key("neighbors").nth(port).fault(neighbor, why));
+            return Err(KeyPath::top_level_key("cell").element(index).key("neighbors").element(port).fault(neighbor, why));
         }
     }
     Ok(())
 }
 
-fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Base) -> Checked<Cell> {
+fn cell(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, buses: &[SkinBus], base: CellDefaults) -> Checked<Cell> {
     let bus = bus(at, raw, buses)?;
     let node = CellId::new(raw.node);
     let why = "a cell's node is 1 to 254; further cells need another bus";
     let node = node.map_err(|_| at.key("node").fault(raw.node, why))?;
-    let (joint, row) = place(at, raw, robot, buses.get(bus).map_or(0, |bus| bus.chain))?;
+    let (joint, row) = joint_and_row(at, raw, robot, buses.get(bus).map_or(0, |bus| bus.chain))?;
     for (axis, &value) in raw.position.iter().enumerate() {
-        at.key("position").nth(axis).finite(value)?;
+        at.key("position").element(axis).check_finite(value)?;
     }
     let chain = buses.get(bus).and_then(|bus| robot.chains.get(bus.chain));
     let rows = chain.and_then(|chain| chain.rows.get(..usize::from(row))).unwrap_or_default();
@@ -98,7 +98,7 @@ fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Base) -
     let mut neighbors = [None; 4];
     for (port, (neighbor, &got)) in neighbors.iter_mut().zip(&raw.neighbors).enumerate() {
         if got != 0 {
-            let wrong = |_| at.key("neighbors").nth(port).fault(got, "a node is 1 to 254, or 0 for none");
+            let wrong = |_| at.key("neighbors").element(port).fault(got, "a node is 1 to 254, or 0 for none");
             *neighbor = Some(CellId::new(got).map_err(wrong)?);
         }
     }
@@ -106,28 +106,28 @@ fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Base) -
     Ok(Cell {
         bus,
         node,
-        serial: at.key("serial").within(serial, 0..=u32::MAX, "")?,
+        serial: at.key("serial").check_range(serial, 0..=u32::MAX, "")?,
         joint,
         row,
         position: raw.position,
         normal: normal(at, raw)?,
-        orientation: raw.orientation.map(|it| unit(&at.key("orientation"), "quaternion", it)).transpose()?,
+        orientation: raw.orientation.map(|it| normalized(&at.key("orientation"), "quaternion", it)).transpose()?,
         neighbors,
         root: raw.root,
         contact: contact(at, raw.contact(), base.contact)?,
-        baseline: baseline::of_cell(at, raw, base.baseline)?,
+        baseline: baseline::cell_baseline(at, raw, base.baseline)?,
     })
 }
 
 /// Applies the given gains and thresholds to `base`.
-pub(super) fn contact(at: &Place, raw: raw::Contact, base: Contact) -> Checked<Contact> {
+pub(super) fn contact(at: &KeyPath, raw: raw::Contact, base: Contact) -> Checked<Contact> {
     let raw::Contact { alpha_c, alpha_p, contact_threshold_n, proximity_threshold, force_threshold_n } = raw;
     let mut to = base;
-    at.key("alpha_c").set(alpha_c, &mut to.alpha_c, Q::try_nearest)?;
-    at.key("alpha_p").set(alpha_p, &mut to.alpha_p, Q::try_nearest)?;
-    at.key("contact_threshold_n").set(contact_threshold_n, &mut to.contact_threshold, Q::try_at_least)?;
-    at.key("proximity_threshold").set(proximity_threshold, &mut to.proximity_threshold, Q::try_at_least)?;
-    at.key("force_threshold_n").set(force_threshold_n, &mut to.force_threshold, Q::try_at_least)?;
+    at.key("alpha_c").set_word(alpha_c, &mut to.alpha_c, Q::try_nearest)?;
+    at.key("alpha_p").set_word(alpha_p, &mut to.alpha_p, Q::try_nearest)?;
+    at.key("contact_threshold_n").set_word(contact_threshold_n, &mut to.contact_threshold, Q::try_at_least)?;
+    at.key("proximity_threshold").set_word(proximity_threshold, &mut to.proximity_threshold, Q::try_at_least)?;
+    at.key("force_threshold_n").set_word(force_threshold_n, &mut to.force_threshold, Q::try_at_least)?;
     Ok(to)
 }
 
@@ -137,7 +137,7 @@ fn default_serial(bus: usize, node: CellId) -> i64 {
 }
 
 /// Returns the joint that moves a cell and the row that carries it. Either may be omitted, but not both.
-fn place(at: &Place, raw: &raw::Cell, robot: &Robot, chain: usize) -> Checked<(u8, u8)> {
+fn joint_and_row(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, chain: usize) -> Checked<(u8, u8)> {
     let Some(chain) = robot.chains.get(chain) else { return Ok((0, 0)) };
     let (joints, rows) = (chain.joints.len(), chain.rows.len());
     let within = |key, got: i64, max: usize, what: &str| {
@@ -151,7 +151,7 @@ fn place(at: &Place, raw: &raw::Cell, robot: &Robot, chain: usize) -> Checked<(u
             .key("joint")
             .fault("", format_args!("which joint moves the cell? the joints are 1 to {joints}"))),
         (Some(joint), None) => Ok((joint, chain.row_of(joint).unwrap_or_default())),
-        (given, Some(row)) => match chain.joint_below(row) {
+        (given, Some(row)) => match chain.joint_of_row(row) {
             0 => Err(at.key("row").fault(row, "no joint moves what this row carries")),
             joint if given.is_none_or(|given| given == joint) => Ok((joint, row)),
             joint => {
@@ -163,7 +163,7 @@ fn place(at: &Place, raw: &raw::Cell, robot: &Robot, chain: usize) -> Checked<(u
 }
 
 /// Returns the bus of a cell. The name may be omitted if there is only one bus.
-fn bus(at: &Place, raw: &raw::Cell, buses: &[Bus]) -> Checked<usize> {
+fn bus(at: &KeyPath, raw: &raw::RawCell, buses: &[SkinBus]) -> Checked<usize> {
     let names = || buses.iter().map(|bus| format!("{:?}", bus.name)).collect::<Vec<_>>().join(", ");
     let at = at.key("bus");
     match &raw.bus {
@@ -176,13 +176,13 @@ fn bus(at: &Place, raw: &raw::Cell, buses: &[Bus]) -> Checked<usize> {
 }
 
 /// Returns the outward normal: the given one, or the z axis of the orientation.
-fn normal(at: &Place, raw: &raw::Cell) -> Checked<[f64; 3]> {
+fn normal(at: &KeyPath, raw: &raw::RawCell) -> Checked<[f64; 3]> {
     match (raw.orientation, raw.normal) {
         (Some(orientation), None) => {
-            let [x, y, z, w] = unit(&at.key("orientation"), "quaternion", orientation)?;
+            let [x, y, z, w] = normalized(&at.key("orientation"), "quaternion", orientation)?;
             Ok([2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)])
         }
-        (None, Some(normal)) => unit(&at.key("normal"), "vector", normal),
+        (None, Some(normal)) => normalized(&at.key("normal"), "vector", normal),
         (Some(_), Some(_)) => Err(at.key("normal").fault("", "either a normal or an orientation, not both")),
         (None, None) => {
             let why = "where does the cell face? give the x, y, z of its outward normal, or its orientation";

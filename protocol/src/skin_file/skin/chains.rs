@@ -3,26 +3,26 @@
 use core::f64::consts::TAU;
 
 use super::raw;
-use super::robot::{Base, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
-use crate::document::{Checked, Place};
+use super::robot::{ChainBase, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
+use crate::document::{Checked, KeyPath};
 use crate::fixed::Q1_14;
 use crate::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
 
 /// Maximum position of a prismatic joint in m: the 2 m of a word, less a margin for rounding.
-const SLIDE: f64 = 2.0 - 1e-3;
+const MAX_PRISMATIC_POSITION: f64 = 2.0 - 1e-3;
 /// Maximum coordinate of a chain's base relative to the robot's base, in m.
-const FAR: f64 = 100.0;
+const MAX_BASE_COORDINATE: f64 = 100.0;
 /// Maximum deviation of a vector's or quaternion's length from one.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
 /// Checks the robot.
 pub(super) fn robot(raw: raw::Robot) -> Checked<Robot> {
-    let at = Place::named("robot");
+    let at = KeyPath::top_level_key("robot");
     if raw.urdf.as_ref().is_some_and(String::is_empty) {
         return Err(at.key("urdf").fault("\"\"", "the path of a file, from the skin's file"));
     }
     match (raw.joints, raw.joint.is_empty() && raw.chain.is_empty()) {
-        (Some(rows), true) => Ok(Robot { urdf: raw.urdf, ..serial(&at, raw.name, &rows, raw.limits_rad)? }),
+        (Some(rows), true) => Ok(Robot { urdf: raw.urdf, ..serial_robot(&at, raw.name, &rows, raw.limits_rad)? }),
         (None, false) => {
             if raw.limits_rad.is_some() {
                 return Err(at.key("limits_rad").fault("", "with [[robot.joint]] each joint has its limits"));
@@ -43,8 +43,8 @@ pub(super) fn robot(raw: raw::Robot) -> Checked<Robot> {
 }
 
 /// Creates a robot with one chain of revolute joints, one row per joint.
-fn serial(
-    at: &Place,
+fn serial_robot(
+    at: &KeyPath,
     name: String,
     rows: &[DenavitHartenberg],
     limits: Option<Vec<[f64; 2]>>,
@@ -55,12 +55,12 @@ fn serial(
         return Err(at.key("joints").fault(format_args!("{count} joints"), why));
     }
     for (index, row) in rows.iter().enumerate() {
-        fits(&at.key("joints").nth(index), row)?;
+        check_row(&at.key("joints").element(index), row)?;
     }
     let all = limits.unwrap_or_else(|| vec![[-TAU, TAU]; count]);
-    same_length(&at.key("limits_rad"), all.len(), count)?;
+    check_length(&at.key("limits_rad"), all.len(), count)?;
     for (index, &limits) in all.iter().enumerate() {
-        self::limits(&at.key("limits_rad").nth(index), limits, JointKind::Revolute)?;
+        self::limits(&at.key("limits_rad").element(index), limits, JointKind::Revolute)?;
     }
     let joint = |(index, &limits): (usize, &[f64; 2])| Joint {
         name: format!("joint{}", index + 1),
@@ -71,7 +71,7 @@ fn serial(
     let rows = rows.map(|(&table, &limits)| ChainRow { kind: RowKind::Revolute, table, limits });
     let chain = Chain {
         name: "chain".to_owned(),
-        base: Base::default(),
+        base: ChainBase::default(),
         joints: (0..count).collect(),
         rows: rows.collect(),
     };
@@ -79,27 +79,27 @@ fn serial(
 }
 
 /// Checks that the lengths of a row fit their words and its angles are finite.
-fn fits(at: &Place, row: &DenavitHartenberg) -> Checked<()> {
-    at.key("a").fit(row.a, Q1_14::try_nearest)?;
-    at.key("d").fit(row.d, Q1_14::try_nearest)?;
-    at.key("alpha").finite(row.alpha)?;
-    at.key("theta_offset").finite(row.theta_offset)?;
+fn check_row(at: &KeyPath, row: &DenavitHartenberg) -> Checked<()> {
+    at.key("a").to_fixed(row.a, Q1_14::try_nearest)?;
+    at.key("d").to_fixed(row.d, Q1_14::try_nearest)?;
+    at.key("alpha").check_finite(row.alpha)?;
+    at.key("theta_offset").check_finite(row.theta_offset)?;
     Ok(())
 }
 
-fn limits(at: &Place, [min, max]: [f64; 2], kind: JointKind) -> Checked<[f64; 2]> {
+fn limits(at: &KeyPath, [min, max]: [f64; 2], kind: JointKind) -> Checked<[f64; 2]> {
     let got = format!("[{min}, {max}]");
     // This form also refuses NaN.
     if !(min.is_finite() && max.is_finite() && min < max) {
         return Err(at.fault(got, "the smaller position comes first"));
     }
-    if kind == JointKind::Prismatic && (min < -SLIDE || max > SLIDE) {
-        return Err(at.fault(got, format_args!("a joint slides within -{SLIDE} to {SLIDE} m")));
+    if kind == JointKind::Prismatic && (min < -MAX_PRISMATIC_POSITION || max > MAX_PRISMATIC_POSITION) {
+        return Err(at.fault(got, format_args!("a joint slides within -{MAX_PRISMATIC_POSITION} to {MAX_PRISMATIC_POSITION} m")));
     }
     Ok([min, max])
 }
 
-fn joints(at: &Place, raw: &[raw::Joint]) -> Checked<Vec<Joint>> {
+fn joints(at: &KeyPath, raw: &[raw::Joint]) -> Checked<Vec<Joint>> {
     let count = raw.len();
     if count == 0 || count > MAX_ROBOT_JOINTS {
         let why = format!("a robot has 1 to {MAX_ROBOT_JOINTS} joints");
@@ -107,13 +107,13 @@ fn joints(at: &Place, raw: &[raw::Joint]) -> Checked<Vec<Joint>> {
     }
     let mut joints: Vec<Joint> = Vec::with_capacity(count);
     for (index, raw) in raw.iter().enumerate() {
-        let at = at.key("joint").nth(index);
+        let at = at.key("joint").element(index);
         if raw.name.is_empty() || joints.iter().any(|joint| joint.name == raw.name) {
             let why = "each joint has a name of its own";
             return Err(at.key("name").fault(format_args!("{:?}", raw.name), why));
         }
         let kinds = [JointKind::Revolute, JointKind::Prismatic].map(|kind| (kind.name(), kind));
-        let kind = at.key("kind").word(&raw.kind, &kinds)?;
+        let kind = at.key("kind").choose(&raw.kind, &kinds)?;
         let given = match (raw.limits, kind) {
             (Some(limits), _) => limits,
             (None, JointKind::Revolute) => [-TAU, TAU],
@@ -127,13 +127,13 @@ fn joints(at: &Place, raw: &[raw::Joint]) -> Checked<Vec<Joint>> {
     Ok(joints)
 }
 
-fn chains(at: &Place, raw: &[raw::Chain], joints: &[Joint]) -> Checked<Vec<Chain>> {
+fn chains(at: &KeyPath, raw: &[raw::Chain], joints: &[Joint]) -> Checked<Vec<Chain>> {
     if raw.is_empty() {
         return Err(at.key("chain").fault("[]", "at least one chain is needed"));
     }
     let mut chains: Vec<Chain> = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
-        let at = at.key("chain").nth(index);
+        let at = at.key("chain").element(index);
         if raw.name.is_empty() || chains.iter().any(|chain| chain.name == raw.name) {
             let why = "each chain has a name of its own";
             return Err(at.key("name").fault(format_args!("{:?}", raw.name), why));
@@ -142,29 +142,29 @@ fn chains(at: &Place, raw: &[raw::Chain], joints: &[Joint]) -> Checked<Vec<Chain
     }
     let unused = |(index, _): &(usize, &Joint)| chains.iter().all(|chain| !chain.joints.contains(index));
     if let Some((index, joint)) = joints.iter().enumerate().find(unused) {
-        let at = at.key("joint").nth(index).key("name");
+        let at = at.key("joint").element(index).key("name");
         return Err(at.fault(format_args!("{:?}", joint.name), "no chain has this joint"));
     }
     Ok(chains)
 }
 
-fn base(at: &Place, raw: &raw::Base) -> Checked<Base> {
+fn base(at: &KeyPath, raw: &raw::Base) -> Checked<ChainBase> {
     if let Some((index, value)) =
-        raw.position.iter().enumerate().find(|(_, it)| it.is_nan() || it.abs() > FAR)
+        raw.position.iter().enumerate().find(|(_, it)| it.is_nan() || it.abs() > MAX_BASE_COORDINATE)
     {
         return Err(at
             .key("position")
-            .nth(index)
-            .fault(value, format_args!("it must be within -{FAR} to {FAR} m")));
+            .element(index)
+            .fault(value, format_args!("it must be within -{MAX_BASE_COORDINATE} to {MAX_BASE_COORDINATE} m")));
     }
-    let orientation = raw.orientation.map(|it| unit(&at.key("orientation"), "quaternion", it));
-    Ok(Base {
+    let orientation = raw.orientation.map(|it| normalized(&at.key("orientation"), "quaternion", it));
+    Ok(ChainBase {
         position: raw.position,
-        orientation: orientation.unwrap_or_else(|| Ok(Base::default().orientation))?,
+        orientation: orientation.unwrap_or_else(|| Ok(ChainBase::default().orientation))?,
     })
 }
 
-fn chain(at: &Place, raw: &raw::Chain, joints: &[Joint]) -> Checked<Chain> {
+fn chain(at: &KeyPath, raw: &raw::Chain, joints: &[Joint]) -> Checked<Chain> {
     let count = raw.rows.len();
     if count > MAX_ROWS {
         let why = format!("a chain has at most {MAX_ROWS} rows");
@@ -172,15 +172,15 @@ fn chain(at: &Place, raw: &raw::Chain, joints: &[Joint]) -> Checked<Chain> {
     }
     let mut chain = Chain {
         name: raw.name.clone(),
-        base: raw.base.as_ref().map_or_else(|| Ok(Base::default()), |raw| base(&at.key("base"), raw))?,
+        base: raw.base.as_ref().map_or_else(|| Ok(ChainBase::default()), |raw| base(&at.key("base"), raw))?,
         joints: Vec::new(),
         rows: Vec::with_capacity(raw.rows.len()),
     };
     for (index, raw) in raw.rows.iter().enumerate() {
-        let at = at.key("rows").nth(index);
+        let at = at.key("rows").element(index);
         let table =
             DenavitHartenberg { a: raw.a, alpha: raw.alpha, d: raw.d, theta_offset: raw.theta_offset };
-        fits(&at, &table)?;
+        check_row(&at, &table)?;
         let Some(name) = &raw.joint else {
             chain.rows.push(ChainRow { kind: RowKind::Fixed, table, limits: [0.0; 2] });
             continue;
@@ -194,8 +194,8 @@ fn chain(at: &Place, raw: &raw::Chain, joints: &[Joint]) -> Checked<Chain> {
             return Err(at.fault(format_args!("{name:?}"), "this chain has the joint already"));
         }
         let [min, max] = joint.limits;
-        if joint.kind == JointKind::Prismatic && [min, max].iter().any(|q| (table.d + q).abs() > SLIDE) {
-            let why = format!("d and its position together stay within -{SLIDE} to {SLIDE} m");
+        if joint.kind == JointKind::Prismatic && [min, max].iter().any(|q| (table.d + q).abs() > MAX_PRISMATIC_POSITION) {
+            let why = format!("d and its position together stay within -{MAX_PRISMATIC_POSITION} to {MAX_PRISMATIC_POSITION} m");
             return Err(at.fault(format_args!("{name:?} from {min} to {max} with d = {}", table.d), why));
         }
         chain.joints.push(number);
@@ -209,7 +209,7 @@ fn chain(at: &Place, raw: &raw::Chain, joints: &[Joint]) -> Checked<Chain> {
     Ok(chain)
 }
 
-pub(super) fn same_length(at: &Place, got: usize, joints: usize) -> Checked<()> {
+pub(super) fn check_length(at: &KeyPath, got: usize, joints: usize) -> Checked<()> {
     if got == joints {
         return Ok(());
     }
@@ -218,7 +218,7 @@ pub(super) fn same_length(at: &Place, got: usize, joints: usize) -> Checked<()> 
 }
 
 /// Normalises a vector or quaternion, whose length must be one within the tolerance.
-pub(super) fn unit<const N: usize>(at: &Place, what: &str, parts: [f64; N]) -> Checked<[f64; N]> {
+pub(super) fn normalized<const N: usize>(at: &KeyPath, what: &str, parts: [f64; N]) -> Checked<[f64; N]> {
     let length = parts.iter().map(|part| part * part).sum::<f64>().sqrt();
     if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {
         let got = parts.map(|part| part.to_string()).join(", ");

@@ -1,61 +1,61 @@
 //! Checks of a skin file: conversion from raw values to checked types.
 
-use super::chains::{self, same_length};
-use super::{Bus, Cell, Controller, ControllerKind, LostBus, Reply, Safety, Skin, Timing};
+use super::chains::{self, check_length};
+use super::{SkinBus, Cell, Controller, ControllerKind, LostBus, SkinReply, Safety, Skin, Timing};
 use super::{baseline, buses, cells, names, raw, sensing};
-use crate::document::{Checked, Place, span};
+use crate::document::{Checked, KeyPath, span_from_seconds};
 use crate::fixed::Q;
 use crate::parameters::Contact;
 
 /// Checks a whole skin.
 pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
     names::check(&raw)?;
-    checked(raw, |_| true)
+    check_skin(raw, |_| true)
 }
 
 /// Checks a whole skin from a recording. Unprintable characters in names are escaped instead of refused.
 pub(super) fn recorded_skin(mut raw: raw::Skin) -> Checked<Skin> {
     names::escape(&mut raw);
-    checked(raw, |_| true)
+    check_skin(raw, |_| true)
 }
 
 /// Checks a skin that contains the cells of one bus only.
 pub(super) fn skin_on(raw: raw::Skin, bus: &str) -> Checked<Skin> {
-    let skin = checked(raw, |of| of.name == bus)?;
+    let skin = check_skin(raw, |of| of.name == bus)?;
     let is_other = |cell: &Cell| skin.buses.get(cell.bus).is_some_and(|of| of.name != bus);
     match skin.cells.iter().position(is_other) {
         None => Ok(skin),
-        Some(index) => Err(Place::named("cell").nth(index).key("bus").fault("", "the cell of another bus")),
+        Some(index) => Err(KeyPath::top_level_key("cell").element(index).key("bus").fault("", "the cell of another bus")),
     }
 }
 
 /// Checks everything. `has_cells` returns true for the buses whose cells are present.
-fn checked(raw: raw::Skin, has_cells: impl Fn(&Bus) -> bool) -> Checked<Skin> {
+fn check_skin(raw: raw::Skin, has_cells: impl Fn(&SkinBus) -> bool) -> Checked<Skin> {
     if raw.version != 1 {
-        return Err(Place::named("version").fault(raw.version, "this program reads version 1"));
+        return Err(KeyPath::top_level_key("version").fault(raw.version, "this program reads version 1"));
     }
     let robot = chains::robot(raw.robot)?;
     let timing = timing(&raw.timing)?;
     // The default of a skin without `[contact]`: the force is the sum of the three words.
     let plain = Contact { alpha_c: Q::nearest(1.0), ..Contact::default() };
-    let contact = cells::contact(&Place::named("contact"), raw.contact, plain)?;
+    let contact = cells::contact(&KeyPath::top_level_key("contact"), raw.contact, plain)?;
     let events = sensing::events(raw.events)?;
     let buses = buses::buses(&raw.bus, &robot)?;
     let controller = controller(raw.controller, robot.joints.len())?;
     let safety = safety(&raw.safety)?;
-    let base = cells::Base { contact, baseline: baseline::of_skin(raw.baseline)? };
+    let base = cells::CellDefaults { contact, baseline: baseline::skin_baseline(raw.baseline)? };
     let cells = cells::cells(&raw.cell, &robot, &buses, base)?;
     let skin = Skin { name: raw.name, robot, timing, events, buses, controller, safety, cells };
     let Some(period_us) = skin.period_us() else {
         let why = "at least 15.3 Hz are possible";
-        return Err(Place::named("timing")
+        return Err(KeyPath::top_level_key("timing")
             .key("joint_broadcast_hz")
             .fault(raw.timing.joint_broadcast_hz, why));
     };
     for (index, bus) in skin.buses.iter().enumerate() {
         match bus.reply {
-            Reply::Sum { slot_us, .. } if has_cells(bus) => tree(&skin, index, slot_us, period_us)?,
-            Reply::Torque | Reply::Sum { .. } => {}
+            SkinReply::Sum { slot_us, .. } if has_cells(bus) => check_tree(&skin, index, slot_us, period_us)?,
+            SkinReply::Torque | SkinReply::Sum { .. } => {}
         }
     }
     Ok(skin)
@@ -63,9 +63,9 @@ fn checked(raw: raw::Skin, has_cells: impl Fn(&Bus) -> bool) -> Checked<Skin> {
 
 /// Checks the tree of a bus with sums: every cell needs a path to the gateway's side, and every depth a slot
 /// within one period.
-fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> {
-    let at = Place::named("bus").nth(index);
-    if !skin.cells_of(index).any(|cell| cell.root) {
+fn check_tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> {
+    let at = KeyPath::top_level_key("bus").element(index);
+    if !skin.cells_on_bus(index).any(|cell| cell.root) {
         let why = "sums need a path to the gateway, but no cell of this bus has root = true: set it for one";
         return Err(at.key("reply").fault("\"sum\"", why));
     }
@@ -83,9 +83,9 @@ fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> 
             "no wire leads from here to a root of its bus{others}, which sums need: name neighbors on both ends, or \
              set root = true"
         );
-        return Err(Place::named("cell").nth(first).key("node").fault(node, why));
+        return Err(KeyPath::top_level_key("cell").element(first).key("node").fault(node, why));
     }
-    let slots = 1 + skin.cells_of(index).filter_map(depth).max().map_or(0, u32::from);
+    let slots = 1 + skin.cells_on_bus(index).filter_map(depth).max().map_or(0, u32::from);
     if u64::from(slots) * u64::from(slot_us) <= u64::from(period_us) {
         return Ok(());
     }
@@ -102,12 +102,12 @@ fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> 
 }
 
 fn timing(raw: &raw::Timing) -> Checked<Timing> {
-    let at = Place::named("timing");
+    let at = KeyPath::top_level_key("timing");
     let control_hz = raw.control_hz;
     if !(1.0..=10_000.0).contains(&control_hz) {
         return Err(at.key("control_hz").fault(control_hz, "1 to 10000 Hz are possible"));
     }
-    let broadcast_hz = at.key("joint_broadcast_hz").positive(raw.joint_broadcast_hz)?;
+    let broadcast_hz = at.key("joint_broadcast_hz").check_positive(raw.joint_broadcast_hz)?;
     let ratio = (control_hz / broadcast_hz).round();
     if ratio < 1.0 || (ratio * broadcast_hz - control_hz).abs() > 1e-6 * control_hz {
         let why = format!("must divide control_hz = {control_hz} evenly");
@@ -123,19 +123,19 @@ fn timing(raw: &raw::Timing) -> Checked<Timing> {
 }
 
 fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
-    let at = Place::named("controller");
+    let at = KeyPath::top_level_key("controller");
     let each_positive = |key, values: Vec<f64>| {
         let at = at.key(key);
-        same_length(&at, values.len(), joints)?;
+        check_length(&at, values.len(), joints)?;
         for (index, &value) in values.iter().enumerate() {
-            at.nth(index).positive(value)?;
+            at.element(index).check_positive(value)?;
         }
         Ok(values)
     };
     let each_or = |key, values: Option<Vec<f64>>, usual| {
         values.map_or_else(|| Ok(vec![usual; joints]), |values| each_positive(key, values))
     };
-    let kind = if at.key("kind").word(&raw.kind, &[("kinesthetic", true), ("external", false)])? {
+    let kind = if at.key("kind").choose(&raw.kind, &[("kinesthetic", true), ("external", false)])? {
         let external = [("socket", raw.socket.is_some()), ("start_s", raw.start_s.is_some())];
         if let Some((key, _)) = external.into_iter().find(|(_, is_there)| *is_there) {
             return Err(at.key(key).fault("", "only with kind = \"external\""));
@@ -156,7 +156,7 @@ fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
         }
         ControllerKind::External {
             socket: raw.socket.ok_or_else(|| at.key("socket").fault("", why))?,
-            start: span(start_s),
+            start: span_from_seconds(start_s),
         }
     };
     let max_speed = match (raw.max_speed, raw.max_speed_rad_s) {
@@ -171,13 +171,13 @@ fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
 }
 
 fn safety(raw: &raw::Safety) -> Checked<Safety> {
-    let at = Place::named("safety");
-    let lost_bus = [LostBus::GoOn, LostBus::Halt].map(|lost_bus| (lost_bus.name(), lost_bus));
-    let lost_bus = at.key("lost_bus").word(&raw.lost_bus, &lost_bus)?;
+    let at = KeyPath::top_level_key("safety");
+    let lost_bus = [LostBus::Continue, LostBus::Halt].map(|lost_bus| (lost_bus.name(), lost_bus));
+    let lost_bus = at.key("lost_bus").choose(&raw.lost_bus, &lost_bus)?;
     Ok(Safety {
-        hold_epochs: at.key("hold_epochs").within(raw.hold_epochs, 0..=10_000, "")?,
-        decay_epochs: at.key("decay_epochs").within(raw.decay_epochs, 0..=10_000, "")?,
-        bad_cycles: at.key("bad_cycles").within(raw.bad_cycles, 1..=10_000, "")?,
+        hold_epochs: at.key("hold_epochs").check_range(raw.hold_epochs, 0..=10_000, "")?,
+        decay_epochs: at.key("decay_epochs").check_range(raw.decay_epochs, 0..=10_000, "")?,
+        bad_cycles: at.key("bad_cycles").check_range(raw.bad_cycles, 1..=10_000, "")?,
         lost_bus,
     })
 }

@@ -30,11 +30,11 @@ use crate::time::Span;
 
 pub use cell_name::{CellName, split_bus};
 pub use reach::{REACH, reach};
-pub use robot::{Base, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
+pub use robot::{ChainBase, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
 pub use wires::Wires;
 
 /// Keys that distinguish a skin from a scenario.
-pub const KEYS: &[&str] = &["robot", "cell"];
+pub const SKIN_KEYS: &[&str] = &["robot", "cell"];
 /// Keys that distinguish a scenario from a skin; see [`KEYS`].
 const SCENARIO_KEYS: &[&str] = &["duration_s", "motion", "mode", "touch", "fault", "sensors"];
 
@@ -50,7 +50,7 @@ pub struct Skin {
     /// The thresholds of event mode.
     pub events: Events,
     /// The buses, in the order of the file.
-    pub buses: Vec<Bus>,
+    pub buses: Vec<SkinBus>,
     /// The controller that turns torques into motion.
     pub controller: Controller,
     /// Limits for holding torques and halting the robot.
@@ -85,7 +85,7 @@ impl Timing {
 
 /// The reply of the cells of a bus to joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Reply {
+pub enum SkinReply {
     /// Each cell sends its own torque, in the bus' [`Bus::torque_format`].
     Torque,
     /// Cells send sums along the tree, Q7.8.
@@ -99,11 +99,11 @@ pub enum Reply {
 
 /// A bus of a skin.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Bus {
+pub struct SkinBus {
     /// The name of the interface.
     pub name: String,
     /// The reply of its cells.
-    pub reply: Reply,
+    pub reply: SkinReply,
     /// The frame format: one FD frame per packet, or several classic ones.
     pub format: Format,
     /// The chain that carries its cells: an index into [`Robot::chains`].
@@ -165,7 +165,7 @@ pub enum LostBus {
     /// The torques of a lost bus decay to zero like those of missing cells; the robot continues with the
     /// others.
     #[default]
-    GoOn,
+    Continue,
     /// The torque is invalid; the bad cycles halt the robot.
     Halt,
 }
@@ -175,7 +175,7 @@ impl LostBus {
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
-            Self::GoOn => "go-on",
+            Self::Continue => "go-on",
             Self::Halt => "halt",
         }
     }
@@ -214,7 +214,7 @@ impl Skin {
     /// Returns the part of the skin on some buses, given as indices into [`Skin::buses`]. Invalid indices are
     /// ignored.
     #[must_use]
-    pub fn on_buses(&self, kept: &[usize]) -> Self {
+    pub fn restricted_to_buses(&self, kept: &[usize]) -> Self {
         let place = |bus: usize| kept.iter().position(|&it| it == bus);
         let cells = self.cells.iter();
         let cells = cells.filter_map(|cell| Some(Cell { bus: place(cell.bus)?, ..cell.clone() }));
@@ -243,7 +243,7 @@ impl Skin {
     /// # Errors
     /// Returns an error if it cannot be read, or the first error in it.
     pub fn read(path: &Path) -> Result<Self, DocumentError> {
-        Self::parse(&path.display().to_string(), &document::text(path)?)
+        Self::parse(&path.display().to_string(), &document::read_text(path)?)
     }
 
     /// Parses and checks a text. `path` is its name in errors.
@@ -253,7 +253,7 @@ impl Skin {
     pub fn parse(path: &str, text: &str) -> Result<Self, DocumentError> {
         let what = "this is a scenario, not a skin: `skinbus run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, check::skin)
-            .map_err(|error: DocumentError| error.or_mistaken(text, SCENARIO_KEYS, KEYS, what))
+            .map_err(|error: DocumentError| error.or_wrong_kind(text, SCENARIO_KEYS, SKIN_KEYS, what))
     }
 
     /// Parses and checks the text of a skin in a recording. `path` is its name in errors.
@@ -298,7 +298,7 @@ impl Skin {
                 theta_offset: Q1_14::from_radians(table.theta_offset)?,
             };
         }
-        Some(parameters.shortest())
+        Some(parameters.shortest_form())
     }
 
     /// Returns the chain of a bus, given as an index into [`Skin::buses`].
@@ -310,7 +310,7 @@ impl Skin {
     }
 
     /// Returns the joints of a bus' chain from base to tip, each with its index into [`Robot::joints`].
-    pub fn joints_of(&self, bus: usize) -> impl ExactSizeIterator<Item = (usize, &Joint)> {
+    pub fn joints_on_bus(&self, bus: usize) -> impl ExactSizeIterator<Item = (usize, &Joint)> {
         self.chain(bus).joints.iter().map(|&joint| (joint, self.joint(joint)))
     }
 
@@ -321,7 +321,7 @@ impl Skin {
 
     /// Returns the packet length of joints, torques and sums on a bus.
     #[must_use]
-    pub fn length_of(&self, bus: usize) -> Length {
+    pub fn packet_length(&self, bus: usize) -> Length {
         Length::for_joints(self.chain(bus).joints.len())
     }
 
@@ -337,14 +337,14 @@ impl Skin {
     }
 
     /// Returns the cells of a bus, in the order of the file.
-    pub fn cells_of(&self, bus: usize) -> impl Iterator<Item = &Cell> {
+    pub fn cells_on_bus(&self, bus: usize) -> impl Iterator<Item = &Cell> {
         self.cells.iter().filter(move |cell| cell.bus == bus)
     }
 
     /// Returns a copy with the cells of one bus only. All buses are kept.
     #[must_use]
-    pub fn part_on(&self, bus: usize) -> Self {
-        self.with_cells(self.cells_of(bus).cloned().collect())
+    pub fn with_cells_of_bus(&self, bus: usize) -> Self {
+        self.with_cells(self.cells_on_bus(bus).cloned().collect())
     }
 
     /// Returns the index of the bus with this name in [`Skin::buses`].

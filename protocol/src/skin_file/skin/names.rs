@@ -2,8 +2,8 @@
 //! misleading there.
 
 use super::raw;
-use crate::document::{Checked, Place};
-use crate::usage::{is_unprintable, shown};
+use crate::document::{Checked, KeyPath};
+use crate::usage::{is_unprintable, printable};
 
 /// Maximum length of a name in characters.
 const MAX_CHARACTERS: usize = 200;
@@ -11,29 +11,29 @@ const MAX_CHARACTERS: usize = 200;
 /// Refuses names that are empty, too long, or contain characters that control a terminal, change the
 /// direction of text, or are not allowed in XML.
 pub(super) fn check(skin: &raw::Skin) -> Checked<()> {
-    let robot = Place::named("robot");
-    for (at, given) in [(Place::named("name"), &skin.name), (robot.key("name"), &skin.robot.name)] {
+    let robot = KeyPath::top_level_key("robot");
+    for (at, given) in [(KeyPath::top_level_key("name"), &skin.name), (robot.key("name"), &skin.robot.name)] {
         if given.is_empty() {
             return Err(at.fault("\"\"", "a name has at least one character"));
         }
-        name(&at, given)?;
+        check_name(&at, given)?;
     }
     for (index, joint) in skin.robot.joint.iter().enumerate() {
-        name(&robot.key("joint").nth(index).key("name"), &joint.name)?;
+        check_name(&robot.key("joint").element(index).key("name"), &joint.name)?;
     }
     for (index, chain) in skin.robot.chain.iter().enumerate() {
-        name(&robot.key("chain").nth(index).key("name"), &chain.name)?;
+        check_name(&robot.key("chain").element(index).key("name"), &chain.name)?;
     }
     Ok(())
 }
 
-fn name(at: &Place, name: &str) -> Checked<()> {
+fn check_name(at: &KeyPath, name: &str) -> Checked<()> {
     let count = name.chars().count();
     if count > MAX_CHARACTERS {
         return Err(at.fault(format!("{count} characters"), format!("a name has at most {MAX_CHARACTERS}")));
     }
     if let Some(character) = name.chars().find(|&character| is_unprintable(character)) {
-        let value = format!("\"{}\"", shown(name));
+        let value = format!("\"{}\"", printable(name));
         let why = format!("U+{:04X} is not a printable character: remove it", u32::from(character));
         return Err(at.fault(value, why));
     }
@@ -52,6 +52,6 @@ pub(super) fn escape(skin: &mut raw::Skin) {
     });
     let buses = skin.bus.iter_mut().filter_map(|bus| bus.chain.as_mut());
     for name in named.chain(joints).chain(chains).chain(buses) {
-        *name = shown(name).into_owned();
+        *name = printable(name).into_owned();
     }
 }

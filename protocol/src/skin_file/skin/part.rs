@@ -12,7 +12,7 @@ impl Skin {
     /// # Errors
     /// Returns an error if it cannot be read, or the first error in it.
     pub fn read_on(path: &Path, bus: &str) -> Result<Self, DocumentError> {
-        Self::parse_on(&path.display().to_string(), &document::text(path)?, bus)
+        Self::parse_on(&path.display().to_string(), &document::read_text(path)?, bus)
     }
 
     /// Like [`Skin::parse`], but with the cells of one bus only, as from [`Skin::part_on`]; with all cells if
@@ -22,20 +22,20 @@ impl Skin {
     /// # Errors
     /// Returns the first error in the text.
     pub fn parse_on(path: &str, text: &str, bus: &str) -> Result<Self, DocumentError> {
-        if let Some(part) = without_others(text, bus)
+        if let Some(part) = without_other_cells(text, bus)
             && let Ok(skin) = document::parse(path, &part, |raw| check::skin_on(raw, bus))
         {
             return Ok(skin);
         }
         let skin = Self::parse(path, text)?;
         let index = skin.bus_named(bus);
-        Ok(index.map(|index| skin.part_on(index)).unwrap_or(skin))
+        Ok(index.map(|index| skin.with_cells_of_bus(index)).unwrap_or(skin))
     }
 }
 
 /// Returns the text without each `[[cell]]` that names another bus; `None` if a line may be inside a
 /// multi-line string.
-fn without_others(text: &str, bus: &str) -> Option<String> {
+fn without_other_cells(text: &str, bus: &str) -> Option<String> {
     if text.contains("\"\"\"") || text.contains("'''") {
         return None;
     }
@@ -50,7 +50,7 @@ fn without_others(text: &str, bus: &str) -> Option<String> {
             part.push_str(text.get(begun..at).filter(|_| !is_other).unwrap_or_default());
             (begun, is_cell, is_other) = (at, word.starts_with("[[cell]]"), false);
         } else if is_cell && !is_other {
-            is_other = named_bus(word).is_some_and(|named| named != bus);
+            is_other = bus_of_line(word).is_some_and(|named| named != bus);
         }
         at += line.len();
     }
@@ -59,7 +59,7 @@ fn without_others(text: &str, bus: &str) -> Option<String> {
 }
 
 /// Returns the bus that a line of a cell names in the usual notation.
-fn named_bus(line: &str) -> Option<&str> {
+fn bus_of_line(line: &str) -> Option<&str> {
     let value = line.strip_prefix("bus")?.trim_start().strip_prefix('=')?.trim_start().strip_prefix('"')?;
     let (name, _) = value.split_once('"')?;
     (!name.contains('\\')).then_some(name)
@@ -89,8 +89,8 @@ mod tests {
             let text = two_buses(reply);
             let whole = Skin::parse("skin.toml", &text).unwrap();
             for (index, bus) in ["vcan0", "vcan1"].into_iter().enumerate() {
-                assert_eq!(Skin::parse_on("skin.toml", &text, bus).unwrap(), whole.part_on(index), "{bus}");
-                let part = without_others(&text, bus).unwrap();
+                assert_eq!(Skin::parse_on("skin.toml", &text, bus).unwrap(), whole.with_cells_of_bus(index), "{bus}");
+                let part = without_other_cells(&text, bus).unwrap();
                 assert_eq!((part.matches("[[cell]]").count(), part.matches("[[bus]]").count()), (2, 2));
             }
             assert_eq!(Skin::parse_on("skin.toml", &text, "vcan2").unwrap(), whole, "of no bus, all");
@@ -113,7 +113,7 @@ mod tests {
         ] {
             let text = text.replace(from, to);
             for (index, bus) in ["vcan0", "vcan1"].into_iter().enumerate() {
-                assert_eq!(Skin::parse_on("skin.toml", &text, bus).unwrap(), whole.part_on(index), "{to}");
+                assert_eq!(Skin::parse_on("skin.toml", &text, bus).unwrap(), whole.with_cells_of_bus(index), "{to}");
             }
         }
     }
@@ -138,7 +138,7 @@ mod tests {
     proptest::proptest! {
         #[test]
         fn no_text_panics(text in "(\\[\\[cell\\]\\]|\\[bus|bus = \"a|\"|\n|=|'| |é){0,40}") {
-            let _ = (without_others(&text, "a"), Skin::parse_on("skin.toml", &text, "a"));
+            let _ = (without_other_cells(&text, "a"), Skin::parse_on("skin.toml", &text, "a"));
         }
     }
 }

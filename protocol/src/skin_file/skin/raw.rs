@@ -21,12 +21,12 @@ pub(super) struct Skin {
     pub(super) events: Events,
     pub(super) baseline: Option<Baseline>,
     #[serde(default = "one_bus")]
-    pub(super) bus: Vec<Bus>,
+    pub(super) bus: Vec<RawBus>,
     #[serde(default)]
     pub(super) controller: Controller,
     #[serde(default)]
     pub(super) safety: Safety,
-    pub(super) cell: Vec<Cell>,
+    pub(super) cell: Vec<RawCell>,
 }
 
 const fn version() -> i64 {
@@ -37,8 +37,8 @@ fn name() -> String {
     "skin".to_owned()
 }
 
-fn one_bus() -> Vec<Bus> {
-    vec![Bus::default()]
+fn one_bus() -> Vec<RawBus> {
+    vec![RawBus::default()]
 }
 
 #[derive(Debug, Deserialize)]
@@ -127,7 +127,7 @@ pub(super) struct Contact {
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub(super) struct Bus {
+pub(super) struct RawBus {
     pub(super) name: String,
     pub(super) reply: String,
     pub(super) format: String,
@@ -141,7 +141,7 @@ pub(super) struct Bus {
     pub(super) sensing_hz: Option<f64>,
 }
 
-impl Default for Bus {
+impl Default for RawBus {
     fn default() -> Self {
         Self {
             name: "vcan0".to_owned(),
@@ -221,13 +221,13 @@ pub(super) struct Safety {
 impl Default for Safety {
     /// Two missing replies are held, four more decay to zero, and 25 bad cycles (1/20 s) halt the robot.
     fn default() -> Self {
-        Self { hold_epochs: 2, decay_epochs: 4, bad_cycles: 25, lost_bus: LostBus::GoOn.name().to_owned() }
+        Self { hold_epochs: 2, decay_epochs: 4, bad_cycles: 25, lost_bus: LostBus::Continue.name().to_owned() }
     }
 }
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Cell {
+pub(super) struct RawCell {
     pub(super) bus: Option<String>,
     pub(super) node: i64,
     pub(super) serial: Option<i64>,
@@ -249,7 +249,7 @@ pub(super) struct Cell {
     pub(super) baseline_n_per_c: Option<f64>,
 }
 
-impl Cell {
+impl RawCell {
     /// Returns the overrides of this cell.
     pub(super) const fn contact(&self) -> Contact {
         Contact {

@@ -42,7 +42,7 @@ impl Circle {
     }
 
     /// Returns the distance of its farthest point from the origin.
-    fn farthest(&self) -> f64 {
+    fn farthest_distance(&self) -> f64 {
         let along = dot(self.center, self.axis);
         let across = (dot(self.center, self.center) - along * along).max(0.0).sqrt();
         (across + self.radius).hypot(along)
@@ -64,7 +64,7 @@ impl Circle {
 #[must_use]
 pub fn reach(rows: &[ChainRow], position: [f64; 3]) -> f64 {
     let mut circles = vec![Circle { center: position, axis: [0.0, 0.0, 1.0], radius: 0.0 }];
-    let farthest = |circles: &[Circle]| circles.iter().map(Circle::farthest).fold(0.0, f64::max);
+    let farthest = |circles: &[Circle]| circles.iter().map(Circle::farthest_distance).fold(0.0, f64::max);
     let mut most = farthest(&circles);
     // A simpler bound without directions: no distance grows by more than the length of a row.
     let mut sphere = most;

@@ -101,7 +101,7 @@ pub struct Chain {
     /// Its name.
     pub name: String,
     /// The pose of frame 0 of its table, relative to the robot's base.
-    pub base: Base,
+    pub base: ChainBase,
     /// Its joints as indices into [`Robot::joints`]; 1 to 14.
     pub joints: Vec<usize>,
     /// Its table from base to tip: a row for each joint, and fixed rows; at most 32.
@@ -110,20 +110,20 @@ pub struct Chain {
 
 /// The pose of a chain's base. No cell uses it.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Base {
+pub struct ChainBase {
     /// Position in m.
     pub position: [f64; 3],
     /// Orientation as a unit quaternion x, y, z, w.
     pub orientation: [f64; 4],
 }
 
-impl Default for Base {
+impl Default for ChainBase {
     fn default() -> Self {
         Self { position: [0.0; 3], orientation: [0.0, 0.0, 0.0, 1.0] }
     }
 }
 
-impl Base {
+impl ChainBase {
     /// Returns the transform from frame 0 to the robot's base, as a 4 by 4 matrix in columns, lengths in m.
     #[must_use]
     pub fn matrix(&self) -> [[f64; 4]; 4] {
@@ -175,7 +175,7 @@ impl Chain {
     /// Returns the joint that moves the link of a row, both counted from 1; 0 for rows before the first
     /// joint.
     #[must_use]
-    pub fn joint_below(&self, row: u8) -> u8 {
+    pub fn joint_of_row(&self, row: u8) -> u8 {
         let moving = self.rows.iter().take(row.into()).filter(|row| row.kind != RowKind::Fixed);
         u8::try_from(moving.count()).unwrap_or(u8::MAX)
     }

@@ -1,7 +1,7 @@
 //! The sensing modes of buses in a skin file.
 
 use super::raw;
-use crate::document::{Fault, Place};
+use crate::document::{DocumentFault, KeyPath};
 use crate::fixed::{OutOfRange, Q};
 use crate::parameters::{Events, Sensing};
 
@@ -10,7 +10,7 @@ use crate::parameters::{Events, Sensing};
 /// # Errors
 /// Returns a text with the possible values: the period must be a whole number of ms, 1 to 65 535.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within 1 to 65535")]
-pub fn continuous(hz: f64) -> Result<Sensing, String> {
+pub fn continuous_sensing(hz: f64) -> Result<Sensing, String> {
     let period = 1_000.0 / hz;
     if !(hz > 0.0 && (0.999..65_535.5).contains(&period)) {
         return Err("0.0153 to 1000 Hz are possible".to_owned());
@@ -26,7 +26,7 @@ pub fn continuous(hz: f64) -> Result<Sensing, String> {
 }
 
 /// Checks the sensing mode of a bus.
-pub(super) fn of_bus(at: &Place, bus: &raw::Bus) -> Result<Sensing, Fault> {
+pub(super) fn bus_sensing(at: &KeyPath, bus: &raw::RawBus) -> Result<Sensing, DocumentFault> {
     /// The words for a mode.
     #[derive(Clone, Copy)]
     enum Mode {
@@ -35,9 +35,9 @@ pub(super) fn of_bus(at: &Place, bus: &raw::Bus) -> Result<Sensing, Fault> {
         Event,
     }
     let words = [("off", Mode::Off), ("continuous", Mode::Continuous), ("event", Mode::Event)];
-    let mode = at.key("sensing").word(bus.sensing.as_deref().unwrap_or("off"), &words)?;
+    let mode = at.key("sensing").choose(bus.sensing.as_deref().unwrap_or("off"), &words)?;
     match (mode, bus.sensing_hz) {
-        (Mode::Continuous, Some(hz)) => continuous(hz).map_err(|why| at.key("sensing_hz").fault(hz, why)),
+        (Mode::Continuous, Some(hz)) => continuous_sensing(hz).map_err(|why| at.key("sensing_hz").fault(hz, why)),
         (Mode::Continuous, None) => {
             Err(at.key("sensing").fault("\"continuous\"", "sensing_hz is needed with it"))
         }
@@ -50,21 +50,21 @@ pub(super) fn of_bus(at: &Place, bus: &raw::Bus) -> Result<Sensing, Fault> {
 }
 
 /// Checks the thresholds of event mode; omitted values are a cell's defaults.
-pub(super) fn events(raw: raw::Events) -> Result<Events, Fault> {
+pub(super) fn events(raw: raw::Events) -> Result<Events, DocumentFault> {
     /// Rounds a threshold; the range in its errors begins with 0.
     fn magnitude<const F: u32>(value: f64) -> Result<Q<F>, OutOfRange> {
         Q::try_nearest(value).map_err(|error| OutOfRange { min: 0.0, ..error })
     }
-    let at = Place::named("events");
+    let at = KeyPath::top_level_key("events");
     let mut events = Events::default();
-    at.key("hysteresis").set(raw.hysteresis, &mut events.hysteresis, magnitude)?;
+    at.key("hysteresis").set_word(raw.hysteresis, &mut events.hysteresis, magnitude)?;
     if let Some(got) = raw.hysteresis.filter(|&part| part > 1.0) {
         return Err(at.key("hysteresis").fault(got, "a part of a threshold: 0 to 1 is possible"));
     }
-    at.key("contact_n").set(raw.contact_n, &mut events.contact, magnitude)?;
-    at.key("proximity").set(raw.proximity, &mut events.proximity, magnitude)?;
-    at.key("temperature_c").set(raw.temperature_c, &mut events.temperature, magnitude)?;
-    at.key("acceleration_g").set(raw.acceleration_g, &mut events.acceleration, magnitude)?;
+    at.key("contact_n").set_word(raw.contact_n, &mut events.contact, magnitude)?;
+    at.key("proximity").set_word(raw.proximity, &mut events.proximity, magnitude)?;
+    at.key("temperature_c").set_word(raw.temperature_c, &mut events.temperature, magnitude)?;
+    at.key("acceleration_g").set_word(raw.acceleration_g, &mut events.acceleration, magnitude)?;
     Ok(events)
 }
 
@@ -74,7 +74,7 @@ mod tests {
 
     #[test]
     fn a_rate_is_a_period_of_whole_milliseconds() {
-        let period = |hz| continuous(hz).map(|sensing| sensing.words()[1].cast_unsigned());
+        let period = |hz| continuous_sensing(hz).map(|sensing| sensing.words()[1].cast_unsigned());
         assert_eq!(
             [62.5, 1_000.0, 1.0, 0.1, 33.333].map(period),
             [Ok(16), Ok(1), Ok(1_000), Ok(10_000), Ok(30)]

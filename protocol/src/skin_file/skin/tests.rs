@@ -67,7 +67,7 @@ fn wired_text(reply: &str, cells: &[([i64; 4], bool)]) -> String {
 
 /// Formats an error with its line but without its column.
 fn by_line(error: DocumentError) -> String {
-    let DocumentError::Wrong { path, line, what, .. } = error else { return error.to_string() };
+    let DocumentError::InvalidValue { path, line, what, .. } = error else { return error.to_string() };
     format!("{path}:{line}: {what}")
 }
 
@@ -212,7 +212,7 @@ fn a_robot_of_joints_and_chains_names_what_is_wrong_with_them() {
     assert_eq!(kinds, ["prismatic", "revolute"]);
     let wrong = |from: &str, to: &str| {
         assert!(good.contains(from), "{from}");
-        let DocumentError::Wrong { what, .. } =
+        let DocumentError::InvalidValue { what, .. } =
             Skin::parse("skin.toml", &good.replacen(from, to, 1)).unwrap_err()
         else {
             panic!("{from}")
@@ -259,9 +259,9 @@ fn sums_need_a_tree_that_reaches_everyone_and_fits_the_period() {
     let parse = |reply: &str, cells: &[_]| Skin::parse("skin.toml", &wired_text(reply, cells));
     let bus = |reply: &str| parse(reply, &CHAIN).unwrap().buses[0].reply;
     let fault = |reply: &str, cells: &[_]| by_line(parse(reply, cells).unwrap_err());
-    assert_eq!(bus("reply = \"sum\"\nslot_us = 4000"), Reply::Sum { slot_us: 4_000, carry: true });
+    assert_eq!(bus("reply = \"sum\"\nslot_us = 4000"), SkinReply::Sum { slot_us: 4_000, carry: true });
     let without = "reply = \"sum\"\nslot_us = 1\ncarry = false";
-    assert_eq!(bus(without), Reply::Sum { slot_us: 1, carry: false });
+    assert_eq!(bus(without), SkinReply::Sum { slot_us: 1, carry: false });
     assert_eq!(
         fault("reply = \"torque\"\ncarry = true", &CHAIN),
         "skin.toml:22: bus[0].carry = true: only with reply = \"sum\""

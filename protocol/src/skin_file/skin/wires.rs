@@ -16,13 +16,13 @@ use std::collections::VecDeque;
 
 use super::{Cell, Skin};
 use crate::id::CellId;
-use crate::port::{LinkId, MAX, PORTS, UPLINK};
+use crate::port::{LinkId, MAX_WIRES, PORTS, UPLINK};
 
 /// A port of a cell; [`UPLINK`] for a root's wire to the gateway's side.
-type End = (CellId, usize);
+type PortEnd = (CellId, usize);
 
 // A bus never has more wires than link ids.
-const _: () = assert!(CellId::COUNT * (PORTS + 1) <= MAX);
+const _: () = assert!(CellId::COUNT * (PORTS + 1) <= MAX_WIRES);
 
 /// The wires of one bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -30,14 +30,14 @@ pub struct Wires {
     /// The link id that each port sends with, by cell ([`CellId::index`]) and port.
     link_ids: Vec<[Option<LinkId>; PORTS + 1]>,
     /// The ends of each wire: the one mentioned first, and the other, which is `None` at the gateway's side.
-    ends: Vec<(End, Option<End>)>,
+    ends: Vec<(PortEnd, Option<PortEnd>)>,
 }
 
 impl Skin {
     /// Returns the wires of a bus, given as an index into [`Skin::buses`].
     #[must_use]
     pub fn wires(&self, bus: usize) -> Wires {
-        let cells: Vec<_> = self.cells_of(bus).collect();
+        let cells: Vec<_> = self.cells_on_bus(bus).collect();
         Wires::new(&cells)
     }
 }
@@ -72,7 +72,7 @@ impl Wires {
         wires
     }
 
-    fn add(&mut self, first: End, second: Option<End>) {
+    fn add(&mut self, first: PortEnd, second: Option<PortEnd>) {
         let Ok(wire) = u16::try_from(self.ends.len()) else { return };
         self.ends.push((first, second));
         for (end, back) in [(Some(first), false), (second, true)] {
@@ -92,7 +92,7 @@ impl Wires {
     /// Returns the link id that each port of a cell sends with; [`UPLINK`] is a root's wire to the gateway's
     /// side. The cell receives with the reversed link ids.
     #[must_use]
-    pub fn of_cell(&self, cell: CellId) -> [Option<LinkId>; PORTS + 1] {
+    pub fn link_ids_of(&self, cell: CellId) -> [Option<LinkId>; PORTS + 1] {
         self.link_ids.get(cell.index()).copied().unwrap_or_default()
     }
 
@@ -156,17 +156,17 @@ mod tests {
         assert_eq!(wires.count(), 5);
         let none = None;
         assert_eq!(
-            wires.of_cell(id(1)),
+            wires.link_ids_of(id(1)),
             [link_id(0, false), link_id(1, false), none, none, link_id(3, false)]
         );
-        assert_eq!(wires.of_cell(id(2)), [link_id(2, false), link_id(0, true), link_id(1, true), none, none]);
-        assert_eq!(wires.of_cell(id(3)), [none, none, none, link_id(2, true), link_id(4, false)]);
+        assert_eq!(wires.link_ids_of(id(2)), [link_id(2, false), link_id(0, true), link_id(1, true), none, none]);
+        assert_eq!(wires.link_ids_of(id(3)), [none, none, none, link_id(2, true), link_id(4, false)]);
         let roots: Vec<_> = wires.roots().collect();
         assert_eq!(roots, [(id(1), LinkId { wire: 3, back: true }), (id(3), LinkId { wire: 4, back: true })]);
         assert_eq!(wires.other_end(id(1), 1), Some((id(2), 2)));
         assert_eq!(wires.other_end(id(1), 2), None, "a free port");
         assert_eq!(wires.other_end(id(1), UPLINK), None, "the gateway's side");
-        assert_eq!(wires.of_cell(id(200)), [None; PORTS + 1], "no such cell");
+        assert_eq!(wires.link_ids_of(id(200)), [None; PORTS + 1], "no such cell");
     }
 
     #[test]
@@ -205,7 +205,7 @@ mod tests {
             let mut senders = HashMap::new();
             for (at, (neighbors, root)) in cells.iter().enumerate() {
                 let cell = id(at + 1);
-                let link_ids = wires.of_cell(cell);
+                let link_ids = wires.link_ids_of(cell);
                 prop_assert_eq!(link_ids[UPLINK].is_some(), *root);
                 for (port, link_id) in link_ids.into_iter().enumerate().filter_map(|(port, link_id)| Some((port, link_id?))) {
                     prop_assert_eq!(senders.insert(link_id, cell), None, "one sender for a link id");
@@ -215,7 +215,7 @@ mod tests {
                     let (other, back) = wires.other_end(cell, port).unwrap();
                     prop_assert_eq!(i64::from(other.get()), neighbors[port]);
                     prop_assert_eq!(wires.other_end(other, back), Some((cell, port)));
-                    prop_assert_eq!(wires.of_cell(other)[back], Some(link_id.reversed()));
+                    prop_assert_eq!(wires.link_ids_of(other)[back], Some(link_id.reversed()));
                 }
                 let wired = neighbors.iter().filter(|&&neighbor| neighbor != 0).count();
                 prop_assert_eq!(link_ids[..PORTS].iter().flatten().count(), wired, "no end is left out");

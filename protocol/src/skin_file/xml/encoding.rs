@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use super::{Fault, line_of};
+use super::{XmlFault, line_of};
 
 /// The characters of 0x80 to 0x9F in Windows-1252.
 const WINDOWS_1252: [char; 32] = [
@@ -18,14 +18,14 @@ const WINDOWS_1252: [char; 32] = [
 ///
 /// # Errors
 /// Returns an error for any other encoding.
-pub fn text(bytes: &[u8]) -> Result<Cow<'_, str>, Fault> {
+pub fn decode(bytes: &[u8]) -> Result<Cow<'_, str>, XmlFault> {
     let wide = |bytes: &[u8], read: fn([u8; 2]) -> u16| {
         let words: Vec<_> = bytes.as_chunks().0.iter().map(|word| read(*word)).collect();
         let text = String::from_utf16(&words).ok().filter(|_| bytes.len().is_multiple_of(2));
         let wrong =
             || "it begins like UTF-16 but is invalid: it is truncated or damaged; copy or download it again";
         text.map(|text| Cow::Owned(redeclared(text)))
-            .ok_or_else(|| Fault { line: None, what: wrong().to_owned() })
+            .ok_or_else(|| XmlFault { line: None, what: wrong().to_owned() })
     };
     match bytes {
         [0xff, 0xfe, rest @ ..] => return wide(rest, u16::from_le_bytes),
@@ -56,14 +56,14 @@ pub fn text(bytes: &[u8]) -> Result<Cow<'_, str>, Fault> {
                 "it is not UTF-8{declared}: save it as UTF-8, as with `iconv -f {from} -t utf-8 FILE > NEW` (if it is in Latin-1)"
             );
             let what = if from == "latin1" { what } else { what.replace(" (if it is in Latin-1)", "") };
-            Err(Fault { line: Some(line), what })
+            Err(XmlFault { line: Some(line), what })
         }
     }
 }
 
 /// Returns `iconv`'s name for the encoding of a file in UTF-16; `None` for other encodings.
 #[must_use]
-pub fn utf16(bytes: &[u8]) -> Option<&'static str> {
+pub fn utf16_name(bytes: &[u8]) -> Option<&'static str> {
     match bytes {
         [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => Some("utf-16"),
         [b'<', 0, b'?', 0, ..] => Some("utf-16le"),
@@ -76,13 +76,13 @@ pub fn utf16(bytes: &[u8]) -> Option<&'static str> {
 fn declared(bytes: &[u8]) -> Option<String> {
     let head = bytes.get(..bytes.len().min(1024)).unwrap_or_default();
     let head = String::from_utf8_lossy(head);
-    let (begin, end) = place(&head)?;
+    let (begin, end) = encoding_range(&head)?;
     let name = head.get(begin..end)?;
     name.bytes().all(|byte| byte.is_ascii_graphic()).then(|| name.to_ascii_lowercase())
 }
 
 /// Returns the byte range of the encoding's name in the declaration.
-fn place(text: &str) -> Option<(usize, usize)> {
+fn encoding_range(text: &str) -> Option<(usize, usize)> {
     let begin = text.find("<?xml")?;
     let declaration = text.get(begin..begin + text.get(begin..)?.find("?>")?)?;
     let after = begin + declaration.find("encoding")? + "encoding".len();
@@ -92,7 +92,7 @@ fn place(text: &str) -> Option<(usize, usize)> {
 }
 
 fn redeclared(mut text: String) -> String {
-    if let Some((begin, end)) = place(&text) {
+    if let Some((begin, end)) = encoding_range(&text) {
         text.replace_range(begin..end, "UTF-8");
     }
     text
@@ -113,28 +113,28 @@ mod tests {
     fn a_declared_encoding_is_read() {
         let expected = WORDS.replace("ENC", "UTF-8");
         for name in ["ISO-8859-1", "latin1", "windows-1252"] {
-            assert_eq!(text(&single(name)).unwrap(), expected, "{name}");
+            assert_eq!(decode(&single(name)).unwrap(), expected, "{name}");
         }
-        let dash = text(b"<?xml version='1.0' encoding='cp1252'?><r n='\x96\xfc'/>").unwrap().into_owned();
+        let dash = decode(b"<?xml version='1.0' encoding='cp1252'?><r n='\x96\xfc'/>").unwrap().into_owned();
         assert!(dash.contains("n='\u{2013}\u{fc}'"), "{dash}");
         let wide = WORDS.replace("ENC", "UTF-16");
         for (mark, names) in [("", ["utf-16le", "utf-16be"]), ("\u{feff}", ["utf-16"; 2])] {
             let words: Vec<_> = format!("{mark}{wide}").encode_utf16().collect();
             let little: Vec<_> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
             let big: Vec<_> = words.iter().flat_map(|word| word.to_be_bytes()).collect();
-            assert_eq!(text(&little).unwrap(), expected);
-            assert_eq!(text(&big).unwrap(), expected);
-            assert_eq!([&little, &big].map(|bytes| utf16(bytes).unwrap()), names);
+            assert_eq!(decode(&little).unwrap(), expected);
+            assert_eq!(decode(&big).unwrap(), expected);
+            assert_eq!([&little, &big].map(|bytes| utf16_name(bytes).unwrap()), names);
         }
         // Valid UTF-8 is not read as Latin-1, whatever the declaration.
         let both = WORDS.replace("ENC", "latin1");
-        assert_eq!(utf16(both.as_bytes()), None);
-        assert_eq!(text(both.as_bytes()).unwrap(), both);
+        assert_eq!(utf16_name(both.as_bytes()), None);
+        assert_eq!(decode(both.as_bytes()).unwrap(), both);
     }
 
     #[test]
     fn other_encodings_are_refused_with_the_line_and_a_command() {
-        let refused = |bytes: &[u8]| text(bytes).unwrap_err().to_string();
+        let refused = |bytes: &[u8]| decode(bytes).unwrap_err().to_string();
         assert_eq!(
             refused(b"<r>\n<!-- \xfc --></r>"),
             "line 2: it is not UTF-8: save it as UTF-8, as with `iconv -f latin1 -t utf-8 FILE > NEW` (if it is in Latin-1)"

@@ -2,7 +2,7 @@
 
 /// The detected kind of a file, and a hint.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Foreign {
+pub struct ForeignFile {
     /// The line, from 1, if it matters.
     pub line: Option<usize>,
     /// The kind of the file, as the continuation of "it is".
@@ -16,8 +16,8 @@ const CONFLICT: &[u8] = b"<<<<<<< ";
 /// Detects a file that stands for another one: a Git LFS pointer, a saved web page, an archive, or a file
 /// with an unresolved merge conflict.
 #[must_use]
-pub fn foreign(bytes: &[u8]) -> Option<Foreign> {
-    let whole = |what, hint| Some(Foreign { line: None, what, hint });
+pub fn detect_foreign(bytes: &[u8]) -> Option<ForeignFile> {
+    let whole = |what, hint| Some(ForeignFile { line: None, what, hint });
     let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes).trim_ascii_start();
     if text.starts_with(b"version https://git-lfs") {
         return whole("a Git LFS pointer to a file, not the file", "fetch it with `git lfs pull`");
@@ -37,7 +37,7 @@ pub fn foreign(bytes: &[u8]) -> Option<Foreign> {
     }
     let conflict = bytes.split(|byte| *byte == b'\n').position(|line| line.starts_with(CONFLICT))?;
     let hint = "keep one side, and delete the lines <<<<<<<, =======, >>>>>>> and the other side";
-    Some(Foreign { line: Some(conflict + 1), what: "a merge conflict of git", hint })
+    Some(ForeignFile { line: Some(conflict + 1), what: "a merge conflict of git", hint })
 }
 
 /// Returns the file format whose root element has this name.
@@ -63,14 +63,14 @@ mod tests {
 
     #[test]
     fn files_that_stand_for_others_are_named() {
-        let what = |bytes: &[u8]| foreign(bytes).map(|it| (it.line, it.what.split(' ').nth(1).unwrap()));
+        let what = |bytes: &[u8]| detect_foreign(bytes).map(|it| (it.line, it.what.split(' ').nth(1).unwrap()));
         assert_eq!(what(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"), Some((None, "Git")));
         assert_eq!(what(b"\n<!DOCTYPE html>\n<html>"), Some((None, "web")));
         assert_eq!(what(b"<HTML lang='en'>"), Some((None, "web")));
         assert_eq!(what(b"PK\x03\x04"), Some((None, "zip")));
         assert_eq!(what(b"<r>\n<<<<<<< HEAD\n=======\n>>>>>>> x\n</r>"), Some((Some(2), "merge")));
         for good in [&b""[..], b"<robot/>", b"solid a", b"<r>\n <<<<<<< HEAD</r>"] {
-            assert_eq!(foreign(good), None);
+            assert_eq!(detect_foreign(good), None);
         }
     }
 }

@@ -15,10 +15,10 @@ use std::collections::BTreeSet;
 use std::fmt;
 use std::ops::Range;
 
-pub use encoding::{text, utf16};
+pub use encoding::{decode, utf16_name};
 pub use escape::escaped;
-pub use foreign::{Foreign, foreign, kind_of_root};
-use tags::{Part, Tag, parts};
+pub use foreign::{ForeignFile, detect_foreign, kind_of_root};
+use tags::{XmlPart, Tag, parts};
 
 /// Maximum number of attributes of an element; a parser compares each with all others.
 pub const MAX_ATTRIBUTES: usize = 256;
@@ -30,20 +30,20 @@ const MAX_BINDINGS: usize = 10_000;
 
 /// An error in a file, with advice.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Fault {
+pub struct XmlFault {
     /// The line, from 1, if it is known.
     pub line: Option<usize>,
     /// The problem and the remedy, in one line.
     pub what: String,
 }
 
-impl Fault {
+impl XmlFault {
     fn at(text: &str, offset: usize, what: impl Into<String>) -> Self {
         Self { line: Some(line_of(text.as_bytes(), offset)), what: what.into() }
     }
 }
 
-impl fmt::Display for Fault {
+impl fmt::Display for XmlFault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.line {
             Some(line) => write!(f, "line {line}: {}", self.what),
@@ -72,14 +72,14 @@ pub struct Prepared<'a> {
 /// # Errors
 /// Returns an error if the text has a document type with definitions, an element with more than
 /// [`MAX_ATTRIBUTES`] attributes, or content after the root element.
-pub fn prepare(file: &str) -> Result<Prepared<'_>, Fault> {
+pub fn prepare(file: &str) -> Result<Prepared<'_>, XmlFault> {
     let end = file.trim_end_matches(|letter: char| letter == '\0' || letter.is_whitespace()).len();
     let whole = file.get(..end).unwrap_or(file);
     let text = whole.trim_start_matches('\u{feff}').trim_start();
     let before = whole.len() - text.len();
     let mut survey = Survey::default();
     for part in parts(text) {
-        survey.take(text, part).map_err(|(offset, what)| Fault::at(whole, before + offset, what))?;
+        survey.visit(text, part).map_err(|(offset, what)| XmlFault::at(whole, before + offset, what))?;
     }
     survey.check()?;
     Ok(Prepared { text: survey.repaired(text), lines_before: line_of(whole.as_bytes(), before) - 1 })
@@ -106,13 +106,13 @@ struct Survey<'a> {
 
 impl<'a> Survey<'a> {
     /// Processes the next part. An error has the offset of its cause.
-    fn take(&mut self, text: &str, part: Part<'a>) -> Result<(), (usize, String)> {
+    fn visit(&mut self, text: &str, part: XmlPart<'a>) -> Result<(), (usize, String)> {
         let of = |range: &Range<usize>| text.get(range.clone()).unwrap_or_default();
         let content = match &part {
-            Part::Text(range) => Some(range).filter(|range| !of(range).trim().is_empty()),
-            Part::Close(range) => Some(range),
-            Part::Open(tag) => Some(&tag.range),
-            Part::Comment(_) | Part::Type(_) | Part::Other => None,
+            XmlPart::Text(range) => Some(range).filter(|range| !of(range).trim().is_empty()),
+            XmlPart::Close(range) => Some(range),
+            XmlPart::Open(tag) => Some(&tag.range),
+            XmlPart::Comment(_) | XmlPart::DocType(_) | XmlPart::Other => None,
         };
         if self.is_over
             && let Some(range) = content
@@ -121,13 +121,13 @@ impl<'a> Survey<'a> {
             return Err((range.end - of(range).trim_start().len(), what.to_owned()));
         }
         match part {
-            Part::Comment(range) => {
+            XmlPart::Comment(range) => {
                 let inner = text.get(range.start + 4..range.end.saturating_sub(3)).unwrap_or_default();
                 if inner.contains("--") || inner.ends_with('-') {
                     self.blanked.push(range);
                 }
             }
-            Part::Type(range) => {
+            XmlPart::DocType(range) => {
                 if of(&range).contains('[') {
                     let what = "a <!DOCTYPE with definitions, which are not read: delete it, and write what its \
                                 entities stand for in their places";
@@ -135,12 +135,12 @@ impl<'a> Survey<'a> {
                 }
                 self.blanked.push(range);
             }
-            Part::Text(_) | Part::Other => {}
-            Part::Close(_) => {
+            XmlPart::Text(_) | XmlPart::Other => {}
+            XmlPart::Close(_) => {
                 self.depth = self.depth.saturating_sub(1);
                 self.is_over = self.depth == 0 && self.root.is_some();
             }
-            Part::Open(tag) => self.open(&tag)?,
+            XmlPart::Open(tag) => self.open(&tag)?,
         }
         Ok(())
     }
@@ -177,7 +177,7 @@ impl<'a> Survey<'a> {
     }
 
     /// Checks the limits on which a parser's running time depends.
-    fn check(&self) -> Result<(), Fault> {
+    fn check(&self) -> Result<(), XmlFault> {
         for (count, what, most) in [
             (self.prefixes.len(), "prefixes of names", MAX_PREFIXES),
             (self.bindings, "xmlns attributes", MAX_BINDINGS),
@@ -186,7 +186,7 @@ impl<'a> Survey<'a> {
                 let what = format!(
                     "it has {count} {what}, and at most {most} are read: delete those that nothing needs"
                 );
-                return Err(Fault { line: None, what });
+                return Err(XmlFault { line: None, what });
             }
         }
         Ok(())
@@ -194,7 +194,7 @@ impl<'a> Survey<'a> {
 
     /// Binds unbound prefixes at the root element, and blanks what a parser refuses.
     fn repaired(self, text: &str) -> Cow<'_, str> {
-        let unbound = self.used.difference(&self.bound).filter(|prefix| is_name(prefix));
+        let unbound = self.used.difference(&self.bound).filter(|prefix| is_bindable_prefix(prefix));
         let names = unbound.map(|prefix| format!(" xmlns:{prefix}=\"unbound:{prefix}\"")).collect::<String>();
         let insert = self.root.filter(|_| !names.is_empty()).map(|at| at..at);
         let mut changes: Vec<_> = self.blanked.into_iter().chain(insert).collect();
@@ -219,7 +219,7 @@ impl<'a> Survey<'a> {
 }
 
 /// Returns true for a prefix that a file may bind; `xml` and `xmlns` are predefined.
-fn is_name(prefix: &str) -> bool {
+fn is_bindable_prefix(prefix: &str) -> bool {
     let mut letters = prefix.chars();
     !matches!(prefix, "xml" | "xmlns")
         && letters.next().is_some_and(|first| first.is_alphabetic() || first == '_')

@@ -4,10 +4,10 @@ use std::ops::Range;
 
 /// A part of a text.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub(super) enum Part<'a> {
+pub(super) enum XmlPart<'a> {
     Comment(Range<usize>),
     /// `<!DOCTYPE ...>`.
-    Type(Range<usize>),
+    DocType(Range<usize>),
     /// A start tag.
     Open(Tag<'a>),
     /// An end tag.
@@ -28,7 +28,7 @@ pub(super) struct Tag<'a> {
 }
 
 /// Returns the parts in the order of the text.
-pub(super) fn parts(text: &str) -> impl Iterator<Item = Part<'_>> {
+pub(super) fn parts(text: &str) -> impl Iterator<Item = XmlPart<'_>> {
     let mut at = 0;
     core::iter::from_fn(move || {
         let rest = text.get(at..).filter(|rest| !rest.is_empty())?;
@@ -39,38 +39,38 @@ pub(super) fn parts(text: &str) -> impl Iterator<Item = Part<'_>> {
 }
 
 /// Returns the first part of `rest`, and its length.
-fn part(rest: &str, at: usize) -> (Part<'_>, usize) {
+fn part(rest: &str, at: usize) -> (XmlPart<'_>, usize) {
     let until = |end: &str, from: usize| {
         let found = rest.get(from..).and_then(|rest| rest.find(end));
         found.map_or(rest.len(), |found| from + found + end.len())
     };
     if !rest.starts_with('<') {
         let length = rest.find('<').unwrap_or(rest.len());
-        return (Part::Text(at..at + length), length);
+        return (XmlPart::Text(at..at + length), length);
     }
     if rest.starts_with("<!--") {
         let length = until("-->", 4);
-        return (Part::Comment(at..at + length), length);
+        return (XmlPart::Comment(at..at + length), length);
     }
     if rest.starts_with("<![CDATA[") {
-        return (Part::Other, until("]]>", 9));
+        return (XmlPart::Other, until("]]>", 9));
     }
     if rest.starts_with("<?") {
-        return (Part::Other, until("?>", 2));
+        return (XmlPart::Other, until("?>", 2));
     }
     if rest.starts_with("</") {
         let length = until(">", 2);
-        return (Part::Close(at..at + length), length);
+        return (XmlPart::Close(at..at + length), length);
     }
     if rest.get(..9).is_some_and(|word| word.eq_ignore_ascii_case("<!DOCTYPE")) {
-        let length = type_length(rest);
-        return (Part::Type(at..at + length), length);
+        let length = doctype_length(rest);
+        return (XmlPart::DocType(at..at + length), length);
     }
     tag(rest, at)
 }
 
 /// Returns the length of a document type. Brackets enclose its definitions; quotes hide brackets and the end.
-fn type_length(rest: &str) -> usize {
+fn doctype_length(rest: &str) -> usize {
     let (mut quote, mut depth) = (None, 0_usize);
     for (index, byte) in rest.bytes().enumerate() {
         match (quote, byte) {
@@ -85,7 +85,7 @@ fn type_length(rest: &str) -> usize {
     rest.len()
 }
 
-fn tag(rest: &str, at: usize) -> (Part<'_>, usize) {
+fn tag(rest: &str, at: usize) -> (XmlPart<'_>, usize) {
     let bytes = rest.as_bytes();
     let ends_name = |byte: u8| byte.is_ascii_whitespace() || matches!(byte, b'>' | b'/' | b'=' | b'<');
     let skip = |from: usize, is: &dyn Fn(u8) -> bool| {
@@ -119,7 +119,7 @@ fn tag(rest: &str, at: usize) -> (Part<'_>, usize) {
             }
         }
     }
-    (Part::Open(Tag { range: at..at + end, name, attributes, is_empty }), end)
+    (XmlPart::Open(Tag { range: at..at + end, name, attributes, is_empty }), end)
 }
 
 #[cfg(test)]
@@ -167,12 +167,12 @@ mod tests {
     fn quotes_hide_what_ends_a_tag() {
         let text = "<a b='/>' c = \"'<\" xs:d='1'>t</a>";
         let found: Vec<_> = parts(text).collect();
-        let Part::Open(tag) = &found[0] else { panic!("{found:?}") };
+        let XmlPart::Open(tag) = &found[0] else { panic!("{found:?}") };
         assert_eq!(
             (tag.name, tag.attributes.as_slice(), tag.is_empty),
             ("a", &["b", "c", "xs:d"][..], false)
         );
         assert_eq!(&text[tag.range.clone()], "<a b='/>' c = \"'<\" xs:d='1'>");
-        assert!(matches!(found[1..], [Part::Text(_), Part::Close(_)]));
+        assert!(matches!(found[1..], [XmlPart::Text(_), XmlPart::Close(_)]));
     }
 }

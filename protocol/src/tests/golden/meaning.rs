@@ -6,13 +6,13 @@ use std::str::FromStr;
 use crate::fixed::{Q, TorqueFormat};
 use crate::id::{CellId, Kind, Node};
 use crate::message::{
-    Answer, BaselinePage, From, Heard, Heartbeat, Joints, Message, MessageError, NetworkPage, PortState,
-    Ports, Refused, Request, SensorPage, SkinSensors, State, Tree,
+    Answer, BaselinePage, AppliesFrom, ReceivedCounts, Heartbeat, Joints, Message, MessageError, NetworkPage, PortState,
+    Ports, RejectedCounts, Request, SensorPage, SkinSensors, State, Tree,
 };
 use crate::packet::{Epoch, Length, MAX_WORDS, PacketError, WORDS, Words};
 use crate::parameters::{
     Baseline, Contact, Events, LinksDown, Parameter, Parameters, Pose, Reply, Row, RowKind, Sensing, Slots,
-    Zeroing,
+    BaselineSettings,
 };
 use crate::port::{Hello, LinkId, PortMessage, Rank, Walk};
 
@@ -147,7 +147,7 @@ impl<'a> Meaning<'a> {
         PortState {
             number: number.parse().unwrap(),
             port: port.parse().unwrap(),
-            hears,
+            receives: hears,
             works,
             other_version,
         }
@@ -172,8 +172,8 @@ impl<'a> Meaning<'a> {
                     version: self.number("version"),
                     number: self.number("node_id"),
                     port: self.number("port"),
-                    hears,
-                    up,
+                    receives: hears,
+                    is_parent: up,
                     unnumbered,
                     rank: self.rank(),
                 })
@@ -231,7 +231,7 @@ impl<'a> Meaning<'a> {
         if kind == "off" {
             return Baseline::Off;
         }
-        let zeroing = Zeroing {
+        let zeroing = BaselineSettings {
             threshold: self.one("threshold"),
             hysteresis: self.one("hysteresis"),
             rate_un_per_s: self.number("rate_un_per_s"),
@@ -288,7 +288,7 @@ impl<'a> Meaning<'a> {
             Parameter::Reply => return self.reply().words(),
             Parameter::Sensing => return self.sensing().words(),
             Parameter::Events => return self.events().words(),
-            Parameter::LinksDown => return LinksDown { deaf: self.bits("deaf") }.words(),
+            Parameter::LinksDown => return LinksDown { ports: self.bits("deaf") }.words(),
             Parameter::Baseline => return self.baseline().words(),
             Parameter::Tare => return [self.number("tare"), 0, 0, 0, 0, 0],
             Parameter::Commit => return [self.hex("hash").cast_signed(), 0, 0, 0, 0, 0],
@@ -306,7 +306,7 @@ impl<'a> Meaning<'a> {
                 rejected: self.number("rejected"),
                 state: self.state(),
             }),
-            "heard" => NetworkPage::Heard(Heard {
+            "heard" => NetworkPage::Received(ReceivedCounts {
                 joints: self.number("joints"),
                 joints_late: self.number("joints_late"),
                 joints_repeated: self.number("joints_repeated"),
@@ -319,20 +319,20 @@ impl<'a> Meaning<'a> {
                     "none" => None,
                     number => Some(number.parse().expect(self.text)),
                 },
-                up: self.number("up"),
+                parent_port: self.number("up"),
                 depth: self.number("depth"),
                 round: self.number("round"),
                 children: self.bits("children"),
-                works: self.bits("works"),
+                working_ports: self.bits("works"),
                 sent: self.number("sent"),
-                taken: self.number("taken"),
+                accepted: self.number("taken"),
                 dropped: self.number("dropped"),
             }),
             "ports" => NetworkPage::Ports(Ports {
                 ports: ["port0", "port1", "port2", "port3"].map(|key| self.port(key)),
                 changes: self.number("changes"),
             }),
-            _ => NetworkPage::Refused(Refused {
+            _ => NetworkPage::Rejected(RejectedCounts {
                 length: self.number("length"),
                 crc: self.number("crc"),
                 foreign: self.number("foreign"),
@@ -395,8 +395,8 @@ impl<'a> Meaning<'a> {
             "value" | "written" | "refusal" => self.configured(),
             "stimulus" => {
                 let from = match self.take("from") {
-                    "next" => From::Next,
-                    epoch => From::Epoch(Epoch(epoch.parse().expect(self.text))),
+                    "next" => AppliesFrom::Next,
+                    epoch => AppliesFrom::Epoch(Epoch(epoch.parse().expect(self.text))),
                 };
                 Message::Stimulus { to: self.node("to"), from, page: self.sensors() }
             }

@@ -159,7 +159,7 @@ fn no_classic_frame_is_longer_or_shorter_and_one_is_as_long_and_one_as_short() {
 /// Returns the minimum and maximum of nominal and data bits of some frames.
 fn ends(frames: impl Iterator<Item = Frame>) -> (Bits, Bits) {
     let start = (Bits { nominal: u32::MAX, data: u32::MAX }, Bits::default());
-    frames.map(|frame| Bits::of(&frame).unwrap()).fold(start, |(best, worst), bits| {
+    frames.map(|frame| Bits::from_frame(&frame).unwrap()).fold(start, |(best, worst), bits| {
         (
             Bits { nominal: best.nominal.min(bits.nominal), data: best.data.min(bits.data) },
             Bits { nominal: worst.nominal.max(bits.nominal), data: worst.data.max(bits.data) },
@@ -180,7 +180,7 @@ fn short_frames_one_by_one_are_within_the_bounds_and_reach_them() {
         let ids = (0..0x800).flat_map(|id| flags.map(|flags| Frame::fd(id, flags, &[0x55]).unwrap()));
         let ids = ends(ids);
         let id = (0..0x800).find(|&id| {
-            let bits = Bits::of(&Frame::fd(id, flags[0], &[0x55]).unwrap()).unwrap();
+            let bits = Bits::from_frame(&Frame::fd(id, flags[0], &[0x55]).unwrap()).unwrap();
             bits.nominal == ids.1.nominal
         });
         for len in 0..=2_u8 {

@@ -7,37 +7,37 @@
 //!   0          11     18 20   3 or 8 digits, # or ## and flags, whole bytes, the end of the line
 //! ```
 
-use super::read::{eight_digits, four_bytes, is_blank, value};
+use super::read::{eight_digits, four_bytes, is_blank, hex_value};
 use super::{Record, Timestamp};
 use crate::can::{EXTENDED, EXTENDED_MASK, Format, Frame, STANDARD_MASK};
 
 /// Length of a time with 10 + 6 digits, its parentheses and the space after it.
-const TIME: usize = 20;
+const TIME_LEN: usize = 20;
 
 /// Parses a line without its line ending. Returns `None` if the line needs the general parser.
 #[inline(always)]
-pub(super) fn record(line: &[u8]) -> Option<Record<'_>> {
-    let (time, rest) = line.split_first_chunk::<TIME>()?;
-    let nanos = nanos(time)?;
+pub(super) fn parse_record(line: &[u8]) -> Option<Record<'_>> {
+    let (time, rest) = line.split_first_chunk::<TIME_LEN>()?;
+    let nanos = parse_nanos(time)?;
     let blank = rest.iter().position(|&byte| is_blank(byte))?;
     let (name, frame) = rest.split_at_checked(blank)?;
     let interface = core::str::from_utf8(name).ok().filter(|name| !name.is_empty())?;
     let frame = match frame {
         [_, a, b, c, b'#', rest @ ..] => {
-            let [a, b, c] = [value(*a), value(*b), value(*c)];
+            let [a, b, c] = [hex_value(*a), hex_value(*b), hex_value(*c)];
             let id = u32::from(a) << 8 | u32::from(b) << 4 | u32::from(c);
             // `value` returns 0xFF for other bytes, so more than the low four bits would be set.
             if a | b | c > 0xF || id > STANDARD_MASK {
                 return None;
             }
-            data(id, rest)?
+            parse_data(id, rest)?
         }
         [_, a, b, c, d, e, f, g, h, b'#', rest @ ..] => {
             let id = u32::from_be_bytes(four_bytes([*a, *b, *c, *d, *e, *f, *g, *h])?);
             if id > EXTENDED_MASK {
                 return None;
             }
-            data(id | EXTENDED, rest)?
+            parse_data(id | EXTENDED, rest)?
         }
         _ => return None,
     };
@@ -47,7 +47,7 @@ pub(super) fn record(line: &[u8]) -> Option<Record<'_>> {
 }
 
 #[inline(always)]
-fn nanos(time: &[u8; TIME]) -> Option<u64> {
+fn parse_nanos(time: &[u8; TIME_LEN]) -> Option<u64> {
     let &[b'(', a, b, c, d, e, f, g, h, i, j, b'.', k, l, m, n, o, p, q @ b')', r @ b' '] = time else {
         return None;
     };
@@ -63,9 +63,9 @@ fn nanos(time: &[u8; TIME]) -> Option<u64> {
 
 /// Parses the data of a frame, from the byte after the first `#` to the end of the line.
 #[inline(always)]
-fn data(id: u32, text: &[u8]) -> Option<Frame> {
+fn parse_data(id: u32, text: &[u8]) -> Option<Frame> {
     let (format, flags, digits) = match text {
-        [b'#', flags, digits @ ..] => (Format::Fd, value(*flags), digits),
+        [b'#', flags, digits @ ..] => (Format::Fd, hex_value(*flags), digits),
         digits => (Format::Classic, 0, digits),
     };
     let len = digits.len() / 2;
@@ -84,12 +84,12 @@ fn data(id: u32, text: &[u8]) -> Option<Frame> {
         last.get_mut(..rest.len())?.copy_from_slice(rest);
         *places.next()? = four_bytes(last)?;
     }
-    Frame::filled(id, format, flags, data, len).ok()
+    Frame::with_buffer(id, format, flags, data, len).ok()
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::{Line, parse_widely};
+    use super::super::{CandumpLine, parse_general};
     use super::*;
     use proptest::prelude::*;
 
@@ -102,8 +102,8 @@ mod tests {
             "(1700000000.123456) vcan0 22C##5AABBCC",
             "(1700000000.123456) vcan0 1F334455##F",
         ] {
-            let record = record(line.as_bytes()).expect(line);
-            assert_eq!(parse_widely(line.as_bytes()), Ok(Line::Frame(record)), "{line}");
+            let record = parse_record(line.as_bytes()).expect(line);
+            assert_eq!(parse_general(line.as_bytes()), Ok(CandumpLine::Frame(record)), "{line}");
         }
     }
 
@@ -128,8 +128,8 @@ mod tests {
     }
 
     fn agrees(line: &[u8]) {
-        if let Some(record) = record(line) {
-            assert_eq!(parse_widely(line), Ok(Line::Frame(record)), "{:?}", String::from_utf8_lossy(line));
+        if let Some(record) = parse_record(line) {
+            assert_eq!(parse_general(line), Ok(CandumpLine::Frame(record)), "{:?}", String::from_utf8_lossy(line));
         }
     }
 

@@ -2,12 +2,12 @@
 
 use super::write::MAX_PAD;
 use super::{Direction, LineError, Timestamp};
-use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, identifier};
+use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, check_identifier};
 
 /// The value of each byte as a hexadecimal digit; [`NONE`] for other bytes.
 #[expect(clippy::indexing_slicing, reason = "when this is compiled")]
 const NIBBLES: [u8; 256] = {
-    let mut nibbles = [NONE; 256];
+    let mut nibbles = [NOT_A_DIGIT; 256];
     let mut value = 0;
     while value < 16 {
         nibbles[b"0123456789ABCDEF"[value as usize] as usize] = value;
@@ -16,35 +16,35 @@ const NIBBLES: [u8; 256] = {
     }
     nibbles
 };
-const NONE: u8 = 0xFF;
+const NOT_A_DIGIT: u8 = 0xFF;
 
 /// Returns the value of a hexadecimal digit; [`NONE`] for any other byte.
 #[expect(clippy::indexing_slicing, reason = "a byte is less than 256")]
 #[inline]
-pub(super) const fn value(digit: u8) -> u8 {
+pub(super) const fn hex_value(digit: u8) -> u8 {
     NIBBLES[digit as usize]
 }
 
 fn nibble(digit: u8) -> Option<u8> {
-    Some(value(digit)).filter(|&value| value < 16)
+    Some(hex_value(digit)).filter(|&value| value < 16)
 }
 
 /// Decodes eight hexadecimal digits to four bytes. Returns `None` if one of them is not a digit.
 #[inline]
 pub(super) const fn four_bytes(digits: [u8; 8]) -> Option<[u8; 4]> {
     /// Returns `byte` repeated eight times.
-    const fn all(byte: u8) -> u64 {
+    const fn repeated(byte: u8) -> u64 {
         u64::from_le_bytes([byte; 8])
     }
     let text = u64::from_le_bytes(digits);
-    let letters = text & all(0x40);
+    let letters = text & repeated(0x40);
     // '1' is 31, 'A' is 41 and 'a' is 61: a letter's value is 9 more than its lower half.
-    let values = (text & all(0x0F)).wrapping_add((letters >> 6).wrapping_mul(9));
+    let values = (text & repeated(0x0F)).wrapping_add((letters >> 6).wrapping_mul(9));
     // The upper half of a digit is 3, that of a letter 4 or 6; this maps 6 to 4.
-    let segments = (text & all(0xF0) & !(letters >> 1)) ^ (letters >> 2).wrapping_add(all(0x30));
+    let segments = (text & repeated(0xF0) & !(letters >> 1)) ^ (letters >> 2).wrapping_add(repeated(0x30));
     // A value has 4 bits; that of a letter is 10 or more.
-    let tens = (values.wrapping_add(all(6)) ^ (letters >> 2)) & all(0x10);
-    if segments | values & all(0xF0) | tens != 0 {
+    let tens = (values.wrapping_add(repeated(6)) ^ (letters >> 2)) & repeated(0x10);
+    if segments | values & repeated(0xF0) | tens != 0 {
         return None;
     }
     // Combine neighbours into one, two, then four bytes.
@@ -111,25 +111,25 @@ impl<'a> Cursor<'a> {
         self.text.get(self.at).copied()
     }
 
-    fn take(&mut self, byte: u8) -> bool {
+    fn accept(&mut self, byte: u8) -> bool {
         let there = self.peek() == Some(byte);
         self.at += usize::from(there);
         there
     }
 
     pub(super) fn expect(&mut self, byte: u8, expected: &'static str) -> Result<(), LineError> {
-        if self.take(byte) { Ok(()) } else { Err(self.error(expected)) }
+        if self.accept(byte) { Ok(()) } else { Err(self.error(expected)) }
     }
 
     /// Skips spaces and tabs; at least one is required.
-    pub(super) fn blanks(&mut self) -> Result<(), LineError> {
+    pub(super) fn skip_blanks(&mut self) -> Result<(), LineError> {
         let blanks = self.rest().iter().take_while(|byte| is_blank(**byte)).count();
         self.at += blanks;
         if blanks == 0 { Err(self.error("a space")) } else { Ok(()) }
     }
 
     /// Reads the interface name up to the next space or tab.
-    pub(super) fn word(&mut self) -> Result<&'a str, LineError> {
+    pub(super) fn interface(&mut self) -> Result<&'a str, LineError> {
         let rest = self.rest();
         let len = rest.iter().position(|&byte| is_blank(byte)).unwrap_or(rest.len());
         let word = rest.get(..len).and_then(|word| core::str::from_utf8(word).ok());
@@ -154,7 +154,7 @@ impl<'a> Cursor<'a> {
     pub(super) fn time(&mut self) -> Result<Timestamp, LineError> {
         let padded = self.peek() == Some(b'0');
         let (seconds, whole_digits) = self.digits("seconds since 1970")?;
-        let (nanos, digits) = if self.take(b'.') { self.fraction()? } else { (0, 0) };
+        let (nanos, digits) = if self.accept(b'.') { self.fraction()? } else { (0, 0) };
         let whole = seconds.checked_mul(1_000_000_000).and_then(|whole| whole.checked_add(nanos));
         let nanos = whole.ok_or_else(|| self.error("a time before the year 2554"))?;
         let min_digits = if padded { u8::try_from(whole_digits).unwrap_or(MAX_PAD).min(MAX_PAD) } else { 1 };
@@ -187,11 +187,11 @@ impl<'a> Cursor<'a> {
         self.expect(b'#', expected)?;
         let wrong = |expected| LineError { column: start + 1, expected };
         let id = match digits {
-            3 => identifier(id, 0).map_err(|_| wrong("an 11-bit identifier, at most 7FF"))?,
+            3 => check_identifier(id, 0).map_err(|_| wrong("an 11-bit identifier, at most 7FF"))?,
             8 => eight_digit_identifier(id),
             _ => return Err(wrong(expected)),
         };
-        if self.take(b'#') {
+        if self.accept(b'#') {
             let flags = self.peek().and_then(nibble).ok_or_else(|| self.error("one digit of FD flags"))?;
             self.at += 1;
             // CAN FD has no remote frames.
@@ -228,7 +228,7 @@ impl<'a> Cursor<'a> {
         let mut data = [0; 64];
         let mut len = 0;
         loop {
-            self.take(b'.');
+            self.accept(b'.');
             let Some(high) = self.peek().and_then(nibble) else {
                 break;
             };
@@ -238,13 +238,13 @@ impl<'a> Cursor<'a> {
             *data.get_mut(len).ok_or_else(|| self.error("at most 64 bytes"))? = high << 4 | low;
             len += 1;
         }
-        let frame = Frame::filled(id, format, flags, data, len);
+        let frame = Frame::with_buffer(id, format, flags, data, len);
         let frame = frame.map_err(|_| self.error("at most 8 bytes in a classic frame"))?;
         self.raw_dlc(frame)
     }
 
     fn raw_dlc(&mut self, frame: Frame) -> Result<Frame, LineError> {
-        if !self.take(b'_') {
+        if !self.accept(b'_') {
             return Ok(frame);
         }
         match self.peek().and_then(nibble) {
@@ -261,13 +261,13 @@ impl<'a> Cursor<'a> {
         if self.is_at_end() {
             return Ok(None);
         }
-        self.blanks()?;
+        self.skip_blanks()?;
         let rest = self.rest();
         let len = rest.iter().position(|&byte| is_blank(byte)).unwrap_or(rest.len());
         match rest.get(..len) {
             Some(b"T") => Ok(Some(Direction::Sent)),
             Some(b"R") => Ok(Some(Direction::Received)),
-            Some([high, low]) if value(*high) < 16 && value(*low) < 16 => {
+            Some([high, low]) if hex_value(*high) < 16 && hex_value(*low) < 16 => {
                 Err(self.error("the end of the data: a byte follows a space"))
             }
             Some(_) | None => Ok(None),

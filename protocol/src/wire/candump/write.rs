@@ -20,26 +20,26 @@ const HEX: [[u8; 2]; 256] = {
 };
 
 /// Maximum length of a frame: 8 digits of an identifier, `##`, flags, 64 bytes, a raw DLC.
-const FRAME: usize = 8 + 2 + 1 + 128 + 2;
+const MAX_FRAME_LEN: usize = 8 + 2 + 1 + 128 + 2;
 /// Maximum number of digits that seconds are padded to.
 pub(super) const MAX_PAD: u8 = 20;
 /// Maximum length of a time: two parentheses, digits of seconds, a point, 9 digits, a space.
-const TIME: usize = 2 + MAX_PAD as usize + 1 + 9 + 1;
+const MAX_TIME_LEN: usize = 2 + MAX_PAD as usize + 1 + 9 + 1;
 
 /// Writes one line without a line ending: single spaces, upper case, no direction.
 ///
 /// # Errors
 /// Returns an error if `out` fails.
 pub fn write_record(out: &mut impl Write, record: &Record<'_>) -> fmt::Result {
-    let mut time = Text::<TIME>::new();
+    let mut time = TextBuffer::<MAX_TIME_LEN>::new();
     let (seconds, nanos) = (record.time.nanos / 1_000_000_000, record.time.nanos % 1_000_000_000);
     time.push(b'(');
-    time.decimal(seconds, usize::from(record.time.min_digits.clamp(1, MAX_PAD)));
+    time.push_decimal(seconds, usize::from(record.time.min_digits.clamp(1, MAX_PAD)));
     time.push(b'.');
     if record.time.nine_digits {
-        time.decimal(nanos, 9);
+        time.push_decimal(nanos, 9);
     } else {
-        time.decimal(nanos / 1_000, 6);
+        time.push_decimal(nanos / 1_000, 6);
     }
     time.push(b')');
     time.push(b' ');
@@ -54,37 +54,37 @@ pub fn write_record(out: &mut impl Write, record: &Record<'_>) -> fmt::Result {
 /// # Errors
 /// Returns an error if `out` fails.
 pub fn write_frame(out: &mut impl Write, frame: &Frame) -> fmt::Result {
-    let mut text = Text::<FRAME>::new();
+    let mut text = TextBuffer::<MAX_FRAME_LEN>::new();
     if frame.is_error() || frame.is_extended() {
         let id = if frame.is_error() { frame.raw_id() & (ERROR | EXTENDED_MASK) } else { frame.id() };
         for byte in id.to_be_bytes() {
-            text.byte(byte);
+            text.push_byte(byte);
         }
     } else {
         let [.., high, low] = frame.id().to_be_bytes();
-        text.digit(high);
-        text.byte(low);
+        text.push_digit(high);
+        text.push_byte(low);
     }
     text.push(b'#');
     match frame.format() {
         Format::Classic if frame.is_remote() => {
             text.push(b'R');
             if !frame.is_empty() {
-                text.digit(frame.len());
+                text.push_digit(frame.len());
             }
         }
         Format::Classic => {}
         Format::Fd => {
             text.push(b'#');
-            text.digit(frame.flags());
+            text.push_digit(frame.flags());
         }
     }
     for &byte in frame.data() {
-        text.byte(byte);
+        text.push_byte(byte);
     }
     if frame.raw_dlc() != 0 {
         text.push(b'_');
-        text.digit(frame.raw_dlc());
+        text.push_digit(frame.raw_dlc());
     }
     out.write_str(text.as_str())
 }
@@ -96,12 +96,12 @@ impl fmt::Debug for Frame {
 }
 
 /// An ASCII buffer of at most `N` bytes.
-struct Text<const N: usize> {
+struct TextBuffer<const N: usize> {
     bytes: [u8; N],
     len: usize,
 }
 
-impl<const N: usize> Text<N> {
+impl<const N: usize> TextBuffer<N> {
     const fn new() -> Self {
         Self { bytes: [0; N], len: 0 }
     }
@@ -114,21 +114,21 @@ impl<const N: usize> Text<N> {
     }
 
     /// Appends the lower hexadecimal digit of a value.
-    fn digit(&mut self, value: u8) {
-        let [_, digit] = pair(value);
+    fn push_digit(&mut self, value: u8) {
+        let [_, digit] = hex_digits(value);
         self.push(digit);
     }
 
     /// Appends both hexadecimal digits of a value.
-    fn byte(&mut self, value: u8) {
+    fn push_byte(&mut self, value: u8) {
         if let Some(place) = self.bytes.get_mut(self.len..).and_then(<[u8]>::first_chunk_mut) {
-            *place = pair(value);
+            *place = hex_digits(value);
             self.len += 2;
         }
     }
 
     /// Appends a number with at least `min` decimal digits.
-    fn decimal(&mut self, value: u64, min: usize) {
+    fn push_decimal(&mut self, value: u64, min: usize) {
         let mut digits = [b'0'; 20];
         let (mut rest, mut from) = (value, digits.len());
         for digit in digits.iter_mut().rev() {
@@ -150,6 +150,6 @@ impl<const N: usize> Text<N> {
     }
 }
 
-fn pair(value: u8) -> [u8; 2] {
+fn hex_digits(value: u8) -> [u8; 2] {
     HEX.get(usize::from(value)).copied().unwrap_or_default()
 }

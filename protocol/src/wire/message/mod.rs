@@ -17,7 +17,7 @@ mod network;
 mod sensors;
 mod state;
 
-pub use network::{Heard, Heartbeat, NetworkPage, PortState, Ports, Refused, Tree};
+pub use network::{ReceivedCounts, Heartbeat, NetworkPage, PortState, Ports, RejectedCounts, Tree};
 pub use sensors::{BaselinePage, SensorPage, SkinSensors};
 pub use state::State;
 
@@ -34,11 +34,11 @@ use crate::parameters::MAX_JOINTS;
 pub const VERSION: u8 = 1;
 
 /// Set in the count of a stimulus: it applies from the next joints on, whatever their epoch.
-pub(crate) const FROM_THE_NEXT: u8 = 0x80;
+pub(crate) const FROM_NEXT_FLAG: u8 = 0x80;
 /// Set in the count of `configure` and `configured`: the request is a write.
-pub(crate) const WRITE: u8 = 0x80;
+pub(crate) const WRITE_FLAG: u8 = 0x80;
 /// The parameter number of a refusal.
-pub(crate) const REFUSED: u8 = 126;
+pub(crate) const REFUSAL_NUMBER: u8 = 126;
 
 /// The joint positions of one epoch.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -51,7 +51,7 @@ pub struct Joints {
 
 /// The time from which a stimulus applies.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum From {
+pub enum AppliesFrom {
     /// From the joints of this epoch on.
     Epoch(Epoch),
     /// From the next joints on, whatever their epoch.
@@ -105,7 +105,7 @@ impl Answer {
     /// Refusal: the parameter does not exist.
     pub const UNKNOWN: i16 = 18;
     /// Refusal: the words are invalid for this parameter, or `links_down` was written outside test mode.
-    pub const CANNOT_BE: i16 = 19;
+    pub const INVALID: i16 = 19;
     /// Refusal: a tare while the cell is touched, or before it has received joints.
     pub const TOUCHED: i16 = 20;
     /// Refusal: the sensor value exceeds the limit of the baseline.
@@ -191,7 +191,7 @@ pub enum Message {
         /// The addressee.
         to: Node,
         /// The time from which it applies.
-        from: From,
+        from: AppliesFrom,
         /// The sensor values.
         page: SensorPage,
     },
@@ -284,8 +284,8 @@ impl Message {
                 }
             },
             Kind::Configure => {
-                let number = count & !WRITE;
-                let request = if count & WRITE == 0 {
+                let number = count & !WRITE_FLAG;
+                let request = if count & WRITE_FLAG == 0 {
                     Request::Read { number }
                 } else {
                     Request::Write { number, words: words.six() }
@@ -293,19 +293,19 @@ impl Message {
                 Self::Configure { to: addressee(kind, node)?, tag: epoch.0, request }
             }
             Kind::Configured => {
-                let number = count & !WRITE;
+                let number = count & !WRITE_FLAG;
                 let words = words.six();
                 let answer = match words {
-                    [refused, reason, ..] if number == REFUSED => {
+                    [refused, reason, ..] if number == REFUSAL_NUMBER => {
                         Answer::Refused { number: refused.to_le_bytes()[0], reason }
                     }
-                    _ => Answer::Value { number, written: count & WRITE != 0, words },
+                    _ => Answer::Value { number, written: count & WRITE_FLAG != 0, words },
                 };
                 Self::Configured { from: sender()?, tag: epoch.0, answer }
             }
             Kind::Stimulus => {
-                let from = if count & FROM_THE_NEXT == 0 { From::Epoch(epoch) } else { From::Next };
-                let page = SensorPage::decode(kind, count & !FROM_THE_NEXT, words.six())?;
+                let from = if count & FROM_NEXT_FLAG == 0 { AppliesFrom::Epoch(epoch) } else { AppliesFrom::Next };
+                let page = SensorPage::decode(kind, count & !FROM_NEXT_FLAG, words.six())?;
                 Self::Stimulus { to: addressee(kind, node)?, from, page }
             }
         })
@@ -331,18 +331,18 @@ impl Message {
             }
             Self::Configure { tag, request, .. } => {
                 let (count, words) = match request {
-                    Request::Read { number } => (number & !WRITE, [0; WORDS]),
-                    Request::Write { number, words } => (number | WRITE, words),
+                    Request::Read { number } => (number & !WRITE_FLAG, [0; WORDS]),
+                    Request::Write { number, words } => (number | WRITE_FLAG, words),
                 };
                 packet(words, Epoch(tag), count)
             }
             Self::Configured { tag, answer, .. } => {
                 let (count, words) = match answer {
                     Answer::Value { number, written, words } => {
-                        (number | if written { WRITE } else { 0 }, words)
+                        (number | if written { WRITE_FLAG } else { 0 }, words)
                     }
                     Answer::Refused { number, reason } => {
-                        (REFUSED, packet::words([i16::from(number), reason]))
+                        (REFUSAL_NUMBER, packet::padded_words([i16::from(number), reason]))
                     }
                 };
                 packet(words, Epoch(tag), count)
@@ -350,8 +350,8 @@ impl Message {
             Self::Stimulus { from, page, .. } => {
                 let (page, words) = page.encode();
                 let (epoch, flag) = match from {
-                    From::Epoch(epoch) => (epoch, 0),
-                    From::Next => (Epoch(0), FROM_THE_NEXT),
+                    AppliesFrom::Epoch(epoch) => (epoch, 0),
+                    AppliesFrom::Next => (Epoch(0), FROM_NEXT_FLAG),
                 };
                 packet(words, epoch, page | flag)
             }
@@ -395,14 +395,14 @@ impl Message {
             | Self::Torque { epoch, .. }
             | Self::Sensors { epoch, .. }
             | Self::Network { epoch, .. }
-            | Self::Stimulus { from: From::Epoch(epoch), .. } => Some(epoch),
+            | Self::Stimulus { from: AppliesFrom::Epoch(epoch), .. } => Some(epoch),
             Self::Halt
             | Self::Sync
             | Self::Resume
             | Self::Report
             | Self::Configure { .. }
             | Self::Configured { .. }
-            | Self::Stimulus { from: From::Next, .. } => None,
+            | Self::Stimulus { from: AppliesFrom::Next, .. } => None,
         }
     }
 

@@ -5,16 +5,16 @@ use crate::id::Kind;
 use crate::packet::{self, WORDS};
 
 /// The parent field of a tree page without a parent.
-const NOBODY: u8 = 255;
+const NO_PARENT: u8 = 255;
 /// A page of a cell's state and its part of the network.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum NetworkPage {
     /// Page 0: the heartbeat.
     Heartbeat(Heartbeat),
     /// Page 1: counters of accepted packets.
-    Heard(Heard),
+    Received(ReceivedCounts),
     /// Page 2: counters of rejected frames, by reason.
-    Refused(Refused),
+    Rejected(RejectedCounts),
     /// Page 3: the place in the tree, and counters of sums.
     Tree(Tree),
     /// Page 4: the state of each port.
@@ -40,7 +40,7 @@ pub struct Heartbeat {
 /// Page 1: counters of accepted packets, each modulo 2^16.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 #[cfg_attr(feature = "host", derive(serde::Serialize))]
-pub struct Heard {
+pub struct ReceivedCounts {
     /// Joints accepted (and answered if the cell is in contact).
     pub joints: u16,
     /// Joints skipped because they were older than one period.
@@ -58,7 +58,7 @@ pub struct Heard {
 /// Page 2: counters of rejected frames, each modulo 2^16.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 #[cfg_attr(feature = "host", derive(serde::Serialize))]
-pub struct Refused {
+pub struct RejectedCounts {
     /// Frames with a length or format that the bus does not use: 16 bytes FD, or classic segments of 8 bytes.
     pub length: u16,
     /// Packets with a wrong CRC.
@@ -80,7 +80,7 @@ pub struct Tree {
     /// the cell is unreachable.
     pub parent: Option<u8>,
     /// The port that leads to the parent, 0 to 4; undefined without a parent.
-    pub up: u8,
+    pub parent_port: u8,
     /// Number of wires to the root of its tree; 0 for a root. Undefined without a parent.
     pub depth: u8,
     /// The round of the exploration that determined the depth.
@@ -88,11 +88,11 @@ pub struct Tree {
     /// Bit p is set if the cell at port p is a child.
     pub children: u8,
     /// Bit p is set if port p works in both directions.
-    pub works: u8,
+    pub working_ports: u8,
     /// Sums sent, including repetitions, modulo 2^16.
     pub sent: u16,
     /// Sums accepted from children, modulo 2^16.
-    pub taken: u16,
+    pub accepted: u16,
     /// Sums of children that were dropped, because they were late or lacked a state message; modulo 2^16.
     pub dropped: u16,
 }
@@ -114,7 +114,7 @@ pub struct PortState {
     /// The port at the other end.
     pub port: u8,
     /// True if hellos arrive from the other end.
-    pub hears: bool,
+    pub receives: bool,
     /// True if the other end also receives this cell.
     pub works: bool,
     /// True if the other end uses another version of the protocol.
@@ -122,7 +122,7 @@ pub struct PortState {
 }
 
 impl PortState {
-    const HEARS: u16 = 1 << 12;
+    const RECEIVES: u16 = 1 << 12;
     const WORKS: u16 = 1 << 13;
     const OTHER_VERSION: u16 = 1 << 14;
 
@@ -131,7 +131,7 @@ impl PortState {
         Self {
             number,
             port: high & 7,
-            hears: word & Self::HEARS != 0,
+            receives: word & Self::RECEIVES != 0,
             works: word & Self::WORKS != 0,
             other_version: word & Self::OTHER_VERSION != 0,
         }
@@ -140,7 +140,7 @@ impl PortState {
     fn encode(self) -> u16 {
         let flag = |set: bool, flag| if set { flag } else { 0 };
         u16::from_le_bytes([self.number, self.port & 7])
-            | flag(self.hears, Self::HEARS)
+            | flag(self.receives, Self::RECEIVES)
             | flag(self.works, Self::WORKS)
             | flag(self.other_version, Self::OTHER_VERSION)
     }
@@ -157,7 +157,7 @@ impl NetworkPage {
                 rejected: e,
                 state: State(f),
             })),
-            1 => Ok(Self::Heard(Heard {
+            1 => Ok(Self::Received(ReceivedCounts {
                 joints: a,
                 joints_late: b,
                 joints_repeated: c,
@@ -165,7 +165,7 @@ impl NetworkPage {
                 stimuli_late: e,
                 torques: f,
             })),
-            2 => Ok(Self::Refused(Refused {
+            2 => Ok(Self::Rejected(RejectedCounts {
                 length: a,
                 crc: b,
                 foreign: c,
@@ -176,16 +176,16 @@ impl NetworkPage {
             3 => {
                 let ([parent, up], [depth, round]) = (a.to_le_bytes(), b.to_le_bytes());
                 let [children, works] = c.to_le_bytes();
-                let parent = (parent != NOBODY).then_some(parent);
+                let parent = (parent != NO_PARENT).then_some(parent);
                 Ok(Self::Tree(Tree {
                     parent,
-                    up,
+                    parent_port: up,
                     depth,
                     round,
                     children,
-                    works,
+                    working_ports: works,
                     sent: d,
-                    taken: e,
+                    accepted: e,
                     dropped: f,
                 }))
             }
@@ -201,26 +201,26 @@ impl NetworkPage {
                 let segments = [u16::from_le_bytes([a, b]), u16::from_le_bytes([c, d])];
                 (0, [segments[0], segments[1], configuration, sent, rejected, state.0])
             }
-            Self::Heard(Heard { joints, joints_late, joints_repeated, stimuli, stimuli_late, torques }) => {
+            Self::Received(ReceivedCounts { joints, joints_late, joints_repeated, stimuli, stimuli_late, torques }) => {
                 (1, [joints, joints_late, joints_repeated, stimuli, stimuli_late, torques])
             }
-            Self::Refused(Refused { length, crc, foreign, meaning, incomplete, stimuli }) => {
+            Self::Rejected(RejectedCounts { length, crc, foreign, meaning, incomplete, stimuli }) => {
                 (2, [length, crc, foreign, meaning, incomplete, stimuli])
             }
             Self::Tree(tree) => {
                 let pair = |low, high| u16::from_le_bytes([low, high]);
                 let place = [
-                    pair(tree.parent.unwrap_or(NOBODY), tree.up),
+                    pair(tree.parent.unwrap_or(NO_PARENT), tree.parent_port),
                     pair(tree.depth, tree.round),
-                    pair(tree.children, tree.works),
+                    pair(tree.children, tree.working_ports),
                 ];
-                (3, [place[0], place[1], place[2], tree.sent, tree.taken, tree.dropped])
+                (3, [place[0], place[1], place[2], tree.sent, tree.accepted, tree.dropped])
             }
             Self::Ports(Ports { ports: [a, b, c, d], changes }) => {
                 let [a, b, c, d] = [a, b, c, d].map(PortState::encode);
                 (4, [a, b, c, d, changes, 0])
             }
         };
-        (page, packet::words(words.map(u16::cast_signed)))
+        (page, packet::padded_words(words.map(u16::cast_signed)))
     }
 }

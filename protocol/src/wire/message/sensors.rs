@@ -73,14 +73,14 @@ impl SensorPage {
         match self {
             Self::Skin(SkinSensors { contact, proximity, temperature }) => {
                 let ([a, b, c], [e, f]) = (contact.map(Q5_10::to_bits), temperature.map(Q9_6::to_bits));
-                (0, packet::words([a, b, c, proximity.to_bits(), e, f]))
+                (0, packet::padded_words([a, b, c, proximity.to_bits(), e, f]))
             }
-            Self::Acceleration(xyz) => (1, packet::words(xyz.map(Q3_12::to_bits))),
+            Self::Acceleration(xyz) => (1, packet::padded_words(xyz.map(Q3_12::to_bits))),
             Self::Baseline(BaselinePage { zero, n_per_c, temperature, tared, touched, limited, refused }) => {
                 let state = i16::from(tared) | i16::from(touched) << 1 | i16::from(limited) << 2;
                 let words =
                     [zero.to_bits(), n_per_c.to_bits(), temperature.to_bits(), state, refused.cast_signed()];
-                (3, packet::words(words))
+                (3, packet::padded_words(words))
             }
         }
     }

@@ -38,7 +38,7 @@ impl State {
     ];
 
     /// Returns the names of the flags that are set.
-    pub fn names(self) -> impl Iterator<Item = &'static str> {
+    pub fn flag_names(self) -> impl Iterator<Item = &'static str> {
         Self::NAMES.into_iter().filter(move |(bit, _)| self.has(*bit)).map(|(_, name)| name)
     }
 

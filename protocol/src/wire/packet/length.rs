@@ -70,7 +70,7 @@ impl Length {
 
     /// Returns the length with this size in bytes, if there is one.
     #[must_use]
-    pub fn of_bytes(bytes: usize) -> Option<Self> {
+    pub fn from_byte_count(bytes: usize) -> Option<Self> {
         Self::ALL.into_iter().find(|length| length.bytes() == bytes)
     }
 }
@@ -91,14 +91,14 @@ impl Lengths {
 
     /// Returns the set for a chain: one length if it is known, else all.
     #[must_use]
-    pub fn of_chain(length: Option<Length>) -> Self {
+    pub fn for_chain(length: Option<Length>) -> Self {
         length.map_or(Self::ALL, Self::only)
     }
 
     /// Returns the lengths that packets with this identifier can have on any chain. Only joints, torques and
     /// sums vary.
     #[must_use]
-    pub fn of(id: Id) -> Self {
+    pub fn for_id(id: Id) -> Self {
         let grows = matches!(id.kind, Kind::Torque | Kind::Sum) || id == Id::command(Command::Joints);
         if grows { Self::ALL } else { Self::only(Length::Six) }
     }
@@ -106,20 +106,20 @@ impl Lengths {
     /// Restricts this set to the lengths that packets with this identifier can have. Kinds with a fixed
     /// length always get six words.
     #[must_use]
-    pub fn of_these(self, id: Id) -> Self {
-        let own = Self::of(id);
+    pub fn restricted_to(self, id: Id) -> Self {
+        let own = Self::for_id(id);
         if own == Self::ALL { self } else { own }
     }
 
     /// Returns true if the set contains `length`.
     #[must_use]
-    pub const fn has(self, length: Length) -> bool {
+    pub const fn contains(self, length: Length) -> bool {
         self.0 & 1 << length as u8 != 0
     }
 
     /// Returns the lengths in the set, the shortest first.
     pub fn iter(self) -> impl Iterator<Item = Length> {
-        Length::ALL.into_iter().filter(move |&length| self.has(length))
+        Length::ALL.into_iter().filter(move |&length| self.contains(length))
     }
 
     /// Returns the shortest length.

@@ -27,37 +27,37 @@ pub enum Reassembly {
 /// its kind and the chain of its bus; where the chain is unknown, every length is tried. When the CRC fails,
 /// only the oldest segment is dropped, so that a lost frame costs one packet and not all later ones.
 #[derive(Clone, Debug, Default)]
-pub struct Segment {
-    waiting: Deque<Waiting, { Length::MAX_SEGMENTS }>,
+pub struct Reassembler {
+    waiting: Deque<PendingSegment, { Length::MAX_SEGMENTS }>,
     /// The number of oldest segments that may belong to a packet already reported as incomplete; they are not
     /// reported again.
-    counted: usize,
+    reported: usize,
     /// True if a packet was lost before the last complete one and has not been reported yet.
-    owed: bool,
+    unreported_loss: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
-struct Waiting {
+struct PendingSegment {
     data: [u8; SEGMENT_BYTES],
     len: usize,
     since: Micros,
 }
 
-impl Segment {
+impl Reassembler {
     /// The maximum time between the segments of joints, torques and sums. It is below the usual 16 ms between
     /// two broadcasts, because one in 65 536 groups of segments of different packets has a correct CRC.
-    const WITHIN_A_PERIOD: Span = Span::from_millis(15);
+    const MAX_PERIODIC_GAP: Span = Span::from_millis(15);
     /// The maximum time between the segments of all other packets, most of which are sent once.
-    const WITHIN: Span = Span::from_millis(100);
+    const MAX_GAP: Span = Span::from_millis(100);
 
     /// An empty buffer.
-    pub const NONE: Self = Self { waiting: Deque::new(), counted: 0, owed: false };
+    pub const NONE: Self = Self { waiting: Deque::new(), reported: 0, unreported_loss: false };
 
     /// Returns the maximum time between the arrivals of the first and the last segment of a packet.
     #[must_use]
-    pub fn within(id: Id) -> Span {
+    pub fn max_gap(id: Id) -> Span {
         let is_periodic = matches!(id.kind, Kind::Sum | Kind::Torque) || id == Id::command(Command::Joints);
-        if is_periodic { Self::WITHIN_A_PERIOD } else { Self::WITHIN }
+        if is_periodic { Self::MAX_PERIODIC_GAP } else { Self::MAX_GAP }
     }
 
     /// Returns true if the buffer holds a segment of an incomplete packet.
@@ -84,11 +84,11 @@ impl Segment {
         lengths: Lengths,
         data: &[u8],
     ) -> Result<Reassembly, PacketError> {
-        let lengths = lengths.of_these(id);
+        let lengths = lengths.restricted_to(id);
         if !lengths.iter().any(|length| [SEGMENT_BYTES, length.last_segment()].contains(&data.len())) {
             return Err(PacketError::Length { expected: SEGMENT_BYTES, got: data.len() });
         }
-        let mut newest = Waiting { data: [0; SEGMENT_BYTES], len: data.len(), since: at };
+        let mut newest = PendingSegment { data: [0; SEGMENT_BYTES], len: data.len(), since: at };
         for (byte, &data) in newest.data.iter_mut().zip(data) {
             *byte = data;
         }
@@ -97,12 +97,12 @@ impl Segment {
         }
         let _ = self.waiting.push_back(newest);
 
-        let within = Self::within(id);
+        let within = Self::max_gap(id);
         let mut found = None;
         let mut belong_together = false;
         for length in lengths.iter() {
-            let Some((packet, since)) = self.ends_with(id, length) else { continue };
-            if at.since(since) > within {
+            let Some((packet, since)) = self.packet_ending_with(id, length) else { continue };
+            if at.elapsed_since(since) > within {
                 belong_together = true;
             } else if found.replace((packet, length.segments())).is_some() {
                 *self = Self::NONE;
@@ -110,8 +110,8 @@ impl Segment {
             }
         }
         if let Some((packet, segments)) = found {
-            let lost = self.waiting.len().saturating_sub(segments) > self.counted || self.owed;
-            *self = Self { owed: lost, ..Self::NONE };
+            let lost = self.waiting.len().saturating_sub(segments) > self.reported || self.unreported_loss;
+            *self = Self { unreported_loss: lost, ..Self::NONE };
             return Ok(Reassembly::Complete(packet));
         }
         Ok(self.drop_oldest(at, within, lengths.longest().segments(), belong_together))
@@ -119,7 +119,7 @@ impl Segment {
 
     /// Returns the packet of this length that ends with the newest segment, if its CRC is correct, and the
     /// arrival time of its first segment.
-    fn ends_with(&self, id: Id, length: Length) -> Option<(Packet, Micros)> {
+    fn packet_ending_with(&self, id: Id, length: Length) -> Option<(Packet, Micros)> {
         let skipped = self.waiting.len().checked_sub(length.segments())?;
         let mut bytes = [0; MAX_BYTES];
         let mut rest = bytes.get_mut(..length.bytes())?;
@@ -146,20 +146,20 @@ impl Segment {
         segments: usize,
         belong_together: bool,
     ) -> Reassembly {
-        let is_late = |waiting: &Waiting| now.since(waiting.since) > within;
+        let is_late = |waiting: &PendingSegment| now.elapsed_since(waiting.since) > within;
         let late = self.waiting.iter().filter(|waiting| is_late(waiting)).count();
         let dropped = if late > 0 { late } else { (self.waiting.len() + 1).saturating_sub(segments) };
         for _ in 0..dropped {
             self.waiting.pop_front();
         }
-        let is_new = dropped > self.counted;
-        self.counted = match (is_new, late > 0 && !belong_together) {
-            _ if dropped == 0 => self.counted,
+        let is_new = dropped > self.reported;
+        self.reported = match (is_new, late > 0 && !belong_together) {
+            _ if dropped == 0 => self.reported,
             (true, false) => segments - 1,
             (true, true) => 0,
-            (false, _) => self.counted - dropped,
+            (false, _) => self.reported - dropped,
         };
-        let owed = core::mem::take(&mut self.owed);
+        let owed = core::mem::take(&mut self.unreported_loss);
         if is_new || owed { Reassembly::Incomplete } else { Reassembly::Waiting }
     }
 }

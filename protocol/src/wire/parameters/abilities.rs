@@ -20,7 +20,7 @@ pub struct Abilities(u16);
 
 /// An ability that parameters require and a cell lacks.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Ability {
+pub enum MissingAbility {
     /// A chain of this length.
     Joints {
         /// Required number of joints.
@@ -41,7 +41,7 @@ pub enum Ability {
     Format(TorqueFormat),
 }
 
-impl fmt::Display for Ability {
+impl fmt::Display for MissingAbility {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             Self::Joints { needed, most } => write!(f, "{needed} joints (it can have {most})"),
@@ -104,13 +104,13 @@ impl Abilities {
 
     /// Returns the first ability that `parameters` require and the cell lacks.
     #[must_use]
-    pub fn lacks(self, parameters: &Parameters) -> Option<Ability> {
+    pub fn first_missing(self, parameters: &Parameters) -> Option<MissingAbility> {
         let (joints, table) = (usize::from(parameters.joints), parameters.table());
         if joints > self.joints() {
-            return Some(Ability::Joints { needed: joints, most: self.joints() });
+            return Some(MissingAbility::Joints { needed: joints, most: self.joints() });
         }
         if table.len() > self.rows() {
-            return Some(Ability::Rows { needed: table.len(), most: self.rows() });
+            return Some(MissingAbility::Rows { needed: table.len(), most: self.rows() });
         }
         let can = |kind| match kind {
             RowKind::Revolute => true,
@@ -118,14 +118,14 @@ impl Abilities {
             RowKind::Fixed => self.has(Self::FIXED),
         };
         if let Some(row) = table.iter().find(|row| !can(row.kind)) {
-            return Some(Ability::Kind(row.kind));
+            return Some(MissingAbility::Kind(row.kind));
         }
         let has_format = match parameters.torque_format {
             TorqueFormat::Q3_12 => true,
             TorqueFormat::Q5_10 => self.has(Self::Q5_10),
             TorqueFormat::Q7_8 => self.has(Self::Q7_8),
         };
-        (!has_format).then_some(Ability::Format(parameters.torque_format))
+        (!has_format).then_some(MissingAbility::Format(parameters.torque_format))
     }
 }
 
@@ -138,9 +138,9 @@ mod tests {
     fn a_cell_that_says_nothing_can_what_the_first_cells_could() {
         let plain = Parameters { joint: 6, joints: 6, ..Parameters::default() };
         let none = Abilities::from_word(0);
-        assert_eq!(none.lacks(&plain), None);
+        assert_eq!(none.first_missing(&plain), None);
         let lacks = |abilities: Abilities, parameters: Parameters| {
-            abilities.lacks(&parameters).map(|ability| ability.to_string())
+            abilities.first_missing(&parameters).map(|ability| ability.to_string())
         };
         let seven = Parameters { joint: 7, joints: 7, ..plain };
         assert_eq!(lacks(none, seven).unwrap(), "7 joints (it can have 6)");
@@ -154,7 +154,7 @@ mod tests {
         let wide = Parameters { torque_format: TorqueFormat::Q5_10, ..plain };
         assert_eq!(lacks(none, wide).unwrap(), "torques in Q5.10");
         for parameters in [plain, seven, helped, sliding, wide] {
-            assert_eq!(Abilities::ALL.lacks(&parameters), None);
+            assert_eq!(Abilities::ALL.first_missing(&parameters), None);
         }
         assert_eq!(Abilities::ALL.word(), 14 | 32 << 4 | 0b1111 << 10);
     }

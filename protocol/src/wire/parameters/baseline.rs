@@ -10,12 +10,12 @@ pub enum Baseline {
     #[default]
     Off,
     /// The zero found by a tare is subtracted.
-    On(Zeroing),
+    On(BaselineSettings),
 }
 
 /// The way a cell finds its zero and follows its drift.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct Zeroing {
+pub struct BaselineSettings {
     /// Force above the zero from which the cell counts as touched, in N; greater than 0.
     pub threshold: Q5_10,
     /// Fraction of the threshold by which the force must fall below it for a release, 0 to 1.
@@ -36,8 +36,8 @@ impl Baseline {
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
         let Self::On(zeroing) = self else { return [0; WORDS] };
-        let Zeroing { threshold, hysteresis, rate_un_per_s, limit, n_per_c } = zeroing;
-        packet::words([
+        let BaselineSettings { threshold, hysteresis, rate_un_per_s, limit, n_per_c } = zeroing;
+        packet::padded_words([
             if rate_un_per_s == 0 { Self::HOLD } else { Self::FOLLOW },
             threshold.to_bits(),
             hysteresis.to_bits(),
@@ -59,7 +59,7 @@ impl Baseline {
             _ => return None,
         };
         let sound = threshold > 0 && (0..=1 << 14).contains(&hysteresis) && limit >= 0;
-        sound.then_some(Self::On(Zeroing {
+        sound.then_some(Self::On(BaselineSettings {
             threshold: Q5_10::from_bits(threshold),
             hysteresis: Q1_14::from_bits(hysteresis),
             rate_un_per_s,
@@ -77,7 +77,7 @@ pub enum Tare {
     /// 1: uses the present reading as zero, unless the cell is touched.
     Untouched,
     /// 2: uses the present reading as zero, even if the cell is touched.
-    Anyhow,
+    Forced,
 }
 
 impl Tare {
@@ -87,7 +87,7 @@ impl Tare {
         match words {
             [0, ..] => Some(Self::Forget),
             [1, ..] => Some(Self::Untouched),
-            [2, ..] => Some(Self::Anyhow),
+            [2, ..] => Some(Self::Forced),
             _ => None,
         }
     }

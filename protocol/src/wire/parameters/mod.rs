@@ -29,14 +29,14 @@ mod error;
 mod rows;
 mod switches;
 
-pub use abilities::{Abilities, Ability};
-pub use baseline::{Baseline, Tare, Zeroing};
+pub use abilities::{Abilities, MissingAbility};
+pub use baseline::{Baseline, Tare, BaselineSettings};
 pub use error::ParameterError;
 pub use rows::{Row, RowKind};
 pub use switches::{Events, LinksDown, Reply, Sensing, Slots};
 
 use crate::fixed::{Q1_14, Q3_12, Q5_10, TorqueFormat};
-use crate::packet::{MAX_WORDS, WORDS, crc16_of, words};
+use crate::packet::{MAX_WORDS, WORDS, crc16_of_parts, padded_words};
 
 /// Maximum number of joints of a chain.
 pub const MAX_JOINTS: usize = MAX_WORDS;
@@ -48,7 +48,7 @@ const IMAGE_ROWS: usize = 6;
 const FIRST_ROW: u8 = 16;
 /// The parameter number after the last row.
 #[expect(clippy::cast_possible_truncation, reason = "32 rows")]
-const AFTER_ROWS: u8 = FIRST_ROW + MAX_ROWS as u8;
+const END_ROW: u8 = FIRST_ROW + MAX_ROWS as u8;
 
 /// A parameter. `configure` and `configured` packets carry its number.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -120,7 +120,7 @@ impl Parameter {
     /// Returns the parameter with this number, if it exists.
     #[must_use]
     pub fn from_number(number: u8) -> Option<Self> {
-        if (FIRST_ROW..AFTER_ROWS).contains(&number) {
+        if (FIRST_ROW..END_ROW).contains(&number) {
             return Some(Self::Row(number - FIRST_ROW));
         }
         NUMBERS.iter().find(|(_, known)| *known == number).map(|(parameter, _)| *parameter)
@@ -130,7 +130,7 @@ impl Parameter {
     #[must_use]
     pub fn number(self) -> u8 {
         if let Self::Row(row) = self
-            && row < AFTER_ROWS - FIRST_ROW
+            && row < END_ROW - FIRST_ROW
         {
             return FIRST_ROW + row;
         }
@@ -155,7 +155,7 @@ impl Parameter {
     /// Returns true if a cell accepts these words. Stored parameters are accepted here and checked at the
     /// commit.
     #[must_use]
-    pub fn can_be(self, words: [i16; WORDS]) -> bool {
+    pub fn accepts(self, words: [i16; WORDS]) -> bool {
         match self {
             Self::Reply => Reply::from_words(words).is_some(),
             Self::Sensing => Sensing::from_words(words).is_some(),
@@ -262,20 +262,20 @@ impl Parameters {
         match parameter {
             Parameter::Mount => {
                 let format = self.torque_format.number();
-                words([self.joint, self.joints, self.row, self.table_rows, format].map(i16::from))
+                padded_words([self.joint, self.joints, self.row, self.table_rows, format].map(i16::from))
             }
             Parameter::Pose => {
                 let ([x, y, z], [nx, ny, nz]) = (self.pose.position, self.pose.normal);
-                words([x, y, z, nx, ny, nz].map(Q1_14::to_bits))
+                padded_words([x, y, z, nx, ny, nz].map(Q1_14::to_bits))
             }
-            Parameter::Contact => words([
+            Parameter::Contact => padded_words([
                 self.contact.alpha_c.to_bits(),
                 self.contact.alpha_p.to_bits(),
                 self.contact.contact_threshold.to_bits(),
                 self.contact.proximity_threshold.to_bits(),
                 self.contact.force_threshold.to_bits(),
             ]),
-            Parameter::Timing => words([self.period_us.cast_signed()]),
+            Parameter::Timing => padded_words([self.period_us.cast_signed()]),
             Parameter::Row(row) => self.rows.get(usize::from(row)).copied().unwrap_or_default().words(),
             Parameter::Identity
             | Parameter::Mode
@@ -411,7 +411,7 @@ impl Parameters {
     /// Returns equivalent parameters in the shortest form: row numbers are 0 where they follow from the
     /// joints.
     #[must_use]
-    pub fn shortest(self) -> Self {
+    pub fn shortest_form(self) -> Self {
         let short = Self { row: 0, table_rows: 0, ..self };
         if self.table_rows == self.joints && self.row == self.joint && short.is_plain() {
             short
@@ -465,7 +465,7 @@ impl Parameters {
     /// Returns the configuration hash of heartbeats: the CRC-16 of packets over [`Parameters::image`].
     #[must_use]
     pub fn hash(&self) -> u16 {
-        crc16_of(self.image_parts())
+        crc16_of_parts(self.image_parts())
     }
 }
 

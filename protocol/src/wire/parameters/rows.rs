@@ -2,7 +2,7 @@
 
 use super::ParameterError;
 use crate::fixed::Q1_14;
-use crate::packet::{WORDS, words};
+use crate::packet::{WORDS, padded_words};
 
 /// The joint of a row.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -66,7 +66,7 @@ impl Row {
     #[must_use]
     pub(super) fn words(self) -> [i16; WORDS] {
         let [a, d, alpha, theta_offset] = [self.a, self.d, self.alpha, self.theta_offset].map(Q1_14::to_bits);
-        words([a, d, alpha, theta_offset, self.kind as i16])
+        padded_words([a, d, alpha, theta_offset, self.kind as i16])
     }
 
     /// Decodes the words. `row` is counted from 0.

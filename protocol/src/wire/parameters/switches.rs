@@ -32,7 +32,7 @@ impl Reply {
         match self {
             Self::Torque => [0; WORDS],
             Self::Sum(Slots { slot_us, deepest, carry }) => {
-                packet::words([1, slot_us.cast_signed(), i16::from(deepest), i16::from(carry)])
+                packet::padded_words([1, slot_us.cast_signed(), i16::from(deepest), i16::from(carry)])
             }
         }
     }
@@ -75,8 +75,8 @@ impl Sensing {
     pub fn words(self) -> [i16; WORDS] {
         match self {
             Self::Off => [0; WORDS],
-            Self::Continuous { period_ms } => packet::words([1, period_ms.cast_signed()]),
-            Self::Event => packet::words([2]),
+            Self::Continuous { period_ms } => packet::padded_words([1, period_ms.cast_signed()]),
+            Self::Event => packet::padded_words([2]),
         }
     }
 
@@ -127,7 +127,7 @@ impl Events {
     /// Encodes the words of the parameter.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
-        packet::words([
+        packet::padded_words([
             self.contact.to_bits(),
             self.proximity.to_bits(),
             self.temperature.to_bits(),
@@ -156,14 +156,14 @@ impl LinksDown {
     /// Encodes the words of the parameter.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
-        packet::words([i16::from(self.deaf)])
+        packet::padded_words([i16::from(self.ports)])
     }
 
     /// Decodes the words; bits without a port are ignored.
     #[must_use]
     pub const fn from_words(words: [i16; WORDS]) -> Self {
         let [deaf, ..] = words;
-        Self { deaf: deaf.to_le_bytes()[0] & 0x1F }
+        Self { ports: deaf.to_le_bytes()[0] & 0x1F }
     }
 }
 
@@ -172,7 +172,7 @@ impl LinksDown {
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct LinksDown {
     /// Bit p is set if port p receives nothing; bit 4 is the wire to the gateway's side.
-    pub deaf: u8,
+    pub ports: u8,
 }
 
 #[cfg(test)]
@@ -182,7 +182,7 @@ mod tests {
     #[test]
     fn only_the_bits_of_ports_are_looked_at() {
         for (word, deaf) in [(0, 0), (0b1_0010, 0b1_0010), (-1, 0x1F), (0x7FE0, 0)] {
-            assert_eq!(LinksDown::from_words([word, 0, 0, 0, 0, 0]).deaf, deaf);
+            assert_eq!(LinksDown::from_words([word, 0, 0, 0, 0, 0]).ports, deaf);
         }
     }
 }

@@ -13,7 +13,7 @@ const COUNT: usize = WORD_BYTES + 1;
 /// The format of a field's bits.
 #[derive(Clone, Debug, Default, Deserialize, PartialEq)]
 #[serde(rename_all = "snake_case")]
-pub enum Format {
+pub enum FieldFormat {
     /// An unsigned word.
     #[default]
     Word,
@@ -60,7 +60,7 @@ pub enum Format {
 /// The valid values of a field.
 #[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq)]
 #[serde(rename_all = "snake_case")]
-pub enum Range {
+pub enum FieldRange {
     /// All values.
     #[default]
     All,
@@ -96,11 +96,11 @@ pub struct Field {
     byte: u8,
     bit: u8,
     /// The format of the bits.
-    pub format: Format,
+    pub format: FieldFormat,
     /// The unit of the values.
     pub unit: String,
     /// The valid values.
-    pub range: Range,
+    pub range: FieldRange,
     /// The names of the elements, if the field has several words.
     pub labels: Vec<String>,
     /// Values with a name.
@@ -121,27 +121,27 @@ pub struct Field {
 impl Field {
     /// Returns the position of the first bit, counted from the lowest bit of byte 0.
     #[must_use]
-    pub fn at(&self) -> usize {
+    pub fn first_bit(&self) -> usize {
         usize::from(self.word) * 16 + usize::from(self.byte) * 8 + usize::from(self.bit)
     }
 
     /// Returns the bits of one element, its fraction bits, and true if it is two's complement.
     fn shape(&self) -> (u8, u32, bool) {
         match self.format {
-            Format::Unsigned(bits)
-            | Format::Ports(bits, _)
-            | Format::Parameter(bits)
-            | Format::Page(bits) => (bits, 0, false),
-            Format::Flag(bits) => (bits, 0, bits == 16),
-            Format::Port => (8, 0, false),
-            Format::Word | Format::Hex | Format::State | Format::Group(_) => (16, 0, false),
-            Format::Signed | Format::Choice | Format::Reason => (16, 0, true),
-            Format::Angle | Format::Position => (16, 14, true),
-            Format::Torque => (16, TorqueFormat::default().fraction(), true),
-            Format::Fixed(fraction)
-            | Format::Threshold(fraction)
-            | Format::Saturating(fraction)
-            | Format::Total(fraction) => (16, fraction, true),
+            FieldFormat::Unsigned(bits)
+            | FieldFormat::Ports(bits, _)
+            | FieldFormat::Parameter(bits)
+            | FieldFormat::Page(bits) => (bits, 0, false),
+            FieldFormat::Flag(bits) => (bits, 0, bits == 16),
+            FieldFormat::Port => (8, 0, false),
+            FieldFormat::Word | FieldFormat::Hex | FieldFormat::State | FieldFormat::Group(_) => (16, 0, false),
+            FieldFormat::Signed | FieldFormat::Choice | FieldFormat::Reason => (16, 0, true),
+            FieldFormat::Angle | FieldFormat::Position => (16, 14, true),
+            FieldFormat::Torque => (16, TorqueFormat::default().fraction(), true),
+            FieldFormat::Fixed(fraction)
+            | FieldFormat::Threshold(fraction)
+            | FieldFormat::Saturating(fraction)
+            | FieldFormat::Total(fraction) => (16, fraction, true),
         }
     }
 
@@ -171,7 +171,7 @@ impl Field {
 
     /// Returns true if the number of elements varies with the length of the packet.
     #[must_use]
-    pub fn grows(&self) -> bool {
+    pub fn varies_with_chain(&self) -> bool {
         self.labels.len() == MAX_WORDS
     }
 
@@ -181,7 +181,7 @@ impl Field {
     pub fn raw(&self, bytes: &[u8], element: usize) -> i64 {
         // Epoch and count follow the sixth word.
         let element = element + usize::from(element >= WORDS);
-        let (at, width) = (self.at() + element * 16, u32::from(self.width()));
+        let (at, width) = (self.first_bit() + element * 16, u32::from(self.width()));
         let there = bytes.get(at / 8..).unwrap_or_default();
         let all = there.iter().take(5).rev().fold(0_u64, |all, &byte| all << 8 | u64::from(byte));
         let bits = (all >> (at % 8) & ((1 << width) - 1)).cast_signed();
@@ -200,8 +200,8 @@ impl Field {
     pub fn elements_in(&self, bytes: &[u8]) -> usize {
         let there = bytes.len().saturating_sub(WORD_BYTES + 2) / 2 + WORDS;
         match bytes.get(COUNT) {
-            Some(&in_use) if self.format == Format::Position => self.elements().min(usize::from(in_use)),
-            Some(_) | None if self.grows() => there,
+            Some(&in_use) if self.format == FieldFormat::Position => self.elements().min(usize::from(in_use)),
+            Some(_) | None if self.varies_with_chain() => there,
             Some(_) | None => self.elements(),
         }
     }
@@ -221,19 +221,19 @@ impl Field {
     /// Returns true if the largest and the smallest value mean *saturated*.
     #[must_use]
     pub fn is_saturating(&self) -> bool {
-        matches!(self.format, Format::Saturating(_) | Format::Torque)
+        matches!(self.format, FieldFormat::Saturating(_) | FieldFormat::Torque)
     }
 
     /// Returns true if the field is present in these bytes of a packet; `first` is the first field of its
     /// layout.
     #[must_use]
-    pub fn is_there(&self, bytes: &[u8], first: &Self) -> bool {
-        self.follows(Some(first.raw(bytes, 0)))
+    pub fn is_present(&self, bytes: &[u8], first: &Self) -> bool {
+        self.is_present_for(Some(first.raw(bytes, 0)))
     }
 
     /// Returns true if the field is present when the first field of its layout has the value `first`.
     #[must_use]
-    pub fn follows(&self, first: Option<i64>) -> bool {
+    pub fn is_present_for(&self, first: Option<i64>) -> bool {
         let within = |[min, max]: [u16; 2]| {
             first.is_some_and(|first| (i64::from(min)..=i64::from(max)).contains(&first))
         };

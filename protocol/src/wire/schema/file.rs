@@ -61,20 +61,20 @@ struct Schema {
 
 /// One part of a human-readable text.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Part {
+pub struct TextPart {
     /// The part is used while a number lies within these bounds, inclusive.
     pub when: [u16; 2],
     /// The field with that number; by default the one that selects a part.
     pub of: Option<String>,
     /// The pieces of the text.
-    pub pieces: Vec<Piece>,
+    pub pieces: Vec<TextPiece>,
 }
 
 /// A piece of a text.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Piece {
+pub enum TextPiece {
     /// Literal text.
-    Words(String),
+    Literal(String),
     /// `{name}`: a field; `{name:3}`: with this many decimals; `{}`: the text of the page.
     Field {
         /// The name of the field.
@@ -91,9 +91,9 @@ pub enum Piece {
     },
 }
 
-impl Piece {
+impl TextPiece {
     /// Parses the text between braces.
-    fn inside(text: &str) -> Self {
+    fn parse_braces(text: &str) -> Self {
         if let Some((name, (no, yes))) =
             text.split_once('?').and_then(|(name, words)| Some((name, words.split_once('|')?)))
         {
@@ -108,29 +108,29 @@ impl Piece {
         while let Some((before, (inside, after))) =
             text.split_once('{').and_then(|(before, after)| Some((before, after.split_once('}')?)))
         {
-            pieces.extend([Self::Words(before.to_owned()), Self::inside(inside)]);
+            pieces.extend([Self::Literal(before.to_owned()), Self::parse_braces(inside)]);
             text = after;
         }
-        pieces.push(Self::Words(text.to_owned()));
+        pieces.push(Self::Literal(text.to_owned()));
         pieces
     }
 }
 
-impl<'de> Deserialize<'de> for Part {
+impl<'de> Deserialize<'de> for TextPart {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         #[derive(Deserialize)]
         #[serde(untagged)]
-        enum Either {
+        enum RawPart {
             Always(String),
             Within(u16, u16, String),
             Of(String, u16, u16, String),
         }
-        let (when, of, text) = match Either::deserialize(deserializer)? {
-            Either::Always(text) => (ALWAYS, None, text),
-            Either::Within(min, max, text) => ([min, max], None, text),
-            Either::Of(field, min, max, text) => ([min, max], Some(field), text),
+        let (when, of, text) = match RawPart::deserialize(deserializer)? {
+            RawPart::Always(text) => (ALWAYS, None, text),
+            RawPart::Within(min, max, text) => ([min, max], None, text),
+            RawPart::Of(field, min, max, text) => ([min, max], Some(field), text),
         };
-        Ok(Self { when, of, pieces: Piece::all(&text) })
+        Ok(Self { when, of, pieces: TextPiece::all(&text) })
     }
 }
 
@@ -147,14 +147,14 @@ pub struct Layout {
     /// The prefix of the signals in a DBC.
     pub prefix: String,
     /// The human-readable text; the number that selects a part is the first field.
-    pub text: Vec<Part>,
+    pub text: Vec<TextPart>,
     /// The fields, in order.
     pub fields: Vec<Field>,
 }
 
 impl Layout {
     /// Returns one layout for each of its numbers.
-    fn each(&self) -> impl Iterator<Item = Self> {
+    fn expand(&self) -> impl Iterator<Item = Self> {
         (0..self.times.unwrap_or(1)).map(|index| {
             let named = |text: &str| text.replace("{}", &(index + 1).to_string());
             let (name, prefix) = (named(&self.name), named(&self.prefix));
@@ -173,7 +173,7 @@ pub struct PacketSchema {
     /// The meaning, in a sentence or a few.
     pub meaning: String,
     /// The human-readable text; the number that selects a part is byte 13.
-    pub text: Vec<Part>,
+    pub text: Vec<TextPart>,
     /// The fields of bytes 12 and 13, in the order of JSON output.
     pub end: Vec<Field>,
     /// The layouts of the words, by page or parameter.
@@ -191,11 +191,11 @@ struct File {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawPacket {
-    #[serde(rename = "name", deserialize_with = "named")]
+    #[serde(rename = "name", deserialize_with = "kind_or_command")]
     of: (Kind, Option<Command>),
     meaning: String,
     #[serde(default)]
-    text: Vec<Part>,
+    text: Vec<TextPart>,
     #[serde(default)]
     end: Vec<Field>,
     #[serde(default)]
@@ -203,7 +203,7 @@ struct RawPacket {
 }
 
 /// Decodes the name of a kind or command.
-fn named<'de, D: Deserializer<'de>>(deserializer: D) -> Result<(Kind, Option<Command>), D::Error> {
+fn kind_or_command<'de, D: Deserializer<'de>>(deserializer: D) -> Result<(Kind, Option<Command>), D::Error> {
     let name = String::deserialize(deserializer)?;
     let command = Command::ALL.into_iter().find(|command| command.name() == name);
     let kind = Kind::ALL.into_iter().find(|kind| kind.name() == name);
@@ -214,7 +214,7 @@ fn named<'de, D: Deserializer<'de>>(deserializer: D) -> Result<(Kind, Option<Com
 impl From<File> for Schema {
     fn from(File { packets, layouts, reasons }: File) -> Self {
         let set = |name: &str| -> Vec<_> {
-            layouts.get(name).into_iter().flatten().flat_map(Layout::each).collect()
+            layouts.get(name).into_iter().flatten().flat_map(Layout::expand).collect()
         };
         let packet = |RawPacket { of: (kind, command), meaning, text, end, layouts }| {
             let layouts = layouts.iter().flat_map(|name: &String| set(name)).collect();

@@ -13,12 +13,12 @@ mod field;
 mod file;
 mod units;
 
-pub use field::{Absent, Field, Format, Range};
-pub use file::{Layout, PacketSchema, Part, Piece, packets, parameters, reasons, wires};
+pub use field::{Absent, Field, FieldFormat, FieldRange};
+pub use file::{Layout, PacketSchema, TextPart, TextPiece, packets, parameters, reasons, wires};
 pub use units::Units;
 
 use crate::id::{Id, Kind};
-use crate::message::{FROM_THE_NEXT, Message, REFUSED, Request, WRITE};
+use crate::message::{FROM_NEXT_FLAG, Message, REFUSAL_NUMBER, Request, WRITE_FLAG};
 use crate::packet::{Packet, WORDS};
 use crate::parameters::Parameter;
 
@@ -28,7 +28,7 @@ const ALWAYS: [u16; 2] = [0, u16::MAX];
 impl PacketSchema {
     /// Returns the schema of an identifier; `None` for an undefined command.
     #[must_use]
-    pub fn of(id: Id) -> Option<&'static Self> {
+    pub fn for_id(id: Id) -> Option<&'static Self> {
         let is_it = |schema: &&Self| {
             schema.kind == id.kind && schema.command.is_none_or(|command| Id::command(command) == id)
         };
@@ -38,7 +38,7 @@ impl PacketSchema {
     /// Returns the fields of bytes 12 and 13 that apply with this layout.
     #[must_use]
     pub fn end(&self, layout: &Layout) -> &[Field] {
-        if self.kind == Kind::Configured && layout.number == REFUSED { &[] } else { &self.end }
+        if self.kind == Kind::Configured && layout.number == REFUSAL_NUMBER { &[] } else { &self.end }
     }
 }
 
@@ -48,25 +48,25 @@ pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
     let number = match packet.id.kind {
         Kind::Command | Kind::Sum | Kind::Torque => 0,
         Kind::Sensors | Kind::Network => packet.count,
-        Kind::Stimulus => packet.count & !FROM_THE_NEXT,
-        Kind::Configure | Kind::Configured => packet.count & !WRITE,
+        Kind::Stimulus => packet.count & !FROM_NEXT_FLAG,
+        Kind::Configure | Kind::Configured => packet.count & !WRITE_FLAG,
     };
     if matches!(message, Message::Configure { request: Request::Read { .. }, .. }) {
         return file::empty();
     }
-    let is_refusal = packet.id.kind == Kind::Configured && number == REFUSED;
+    let is_refusal = packet.id.kind == Kind::Configured && number == REFUSAL_NUMBER;
     if matches!(packet.id.kind, Kind::Configure | Kind::Configured) && !is_refusal {
-        return value(number, packet.words.six());
+        return parameter_layout(number, packet.words.six());
     }
-    let layouts = PacketSchema::of(packet.id).map_or(&[][..], |schema| &schema.layouts);
+    let layouts = PacketSchema::for_id(packet.id).map_or(&[][..], |schema| &schema.layouts);
     layouts.iter().find(|layout| layout.number == number).unwrap_or_else(file::empty)
 }
 
 /// Returns the layout of a parameter's words. Invalid words and unknown parameters get a layout of plain
 /// words.
 #[must_use]
-pub fn value(number: u8, words: [i16; WORDS]) -> &'static Layout {
-    let can_be = Parameter::from_number(number).is_some_and(|parameter| parameter.can_be(words));
+pub fn parameter_layout(number: u8, words: [i16; WORDS]) -> &'static Layout {
+    let can_be = Parameter::from_number(number).is_some_and(|parameter| parameter.accepts(words));
     parameters().iter().find(|layout| can_be && layout.number == number).unwrap_or_else(file::unknown)
 }
 
@@ -78,7 +78,7 @@ pub fn parameter_name(number: u8) -> Option<&'static str> {
 
 /// Returns the layout of the parameter with this name.
 #[must_use]
-pub fn parameter_named(name: &str) -> Option<&'static Layout> {
+pub fn find_parameter(name: &str) -> Option<&'static Layout> {
     parameters().iter().find(|layout| layout.name == name)
 }
 

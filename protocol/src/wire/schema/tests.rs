@@ -15,11 +15,11 @@ fn all() -> impl Iterator<Item = (&'static [Field], &'static Layout)> {
 fn fields_stand_side_by_side_within_the_packet() {
     for (end, layout) in all() {
         let mut taken = [false; MAX_WORDS * 16 + 16];
-        let real = |field: &&Field| !matches!(field.format, Format::Total(_));
+        let real = |field: &&Field| !matches!(field.format, FieldFormat::Total(_));
         for field in end.iter().chain(&layout.fields).filter(real) {
             for element in 0..field.elements() {
                 // Epoch and count follow the sixth word.
-                let at = field.at() + (element + usize::from(element >= 6)) * 16;
+                let at = field.first_bit() + (element + usize::from(element >= 6)) * 16;
                 for bit in &mut taken[at..at + usize::from(field.width())] {
                     assert!(!*bit, "{} {}", layout.name, field.name);
                     *bit = true;
@@ -31,10 +31,10 @@ fn fields_stand_side_by_side_within_the_packet() {
 
 #[test]
 fn texts_name_fields_that_are_there() {
-    let names = |text: &'static [Part]| {
-        let name = |piece: &'static Piece| match piece {
-            Piece::Words(_) => None,
-            Piece::Field { name, .. } | Piece::Either { name, .. } => Some(name.as_str()),
+    let names = |text: &'static [TextPart]| {
+        let name = |piece: &'static TextPiece| match piece {
+            TextPiece::Literal(_) => None,
+            TextPiece::Field { name, .. } | TextPiece::Either { name, .. } => Some(name.as_str()),
         };
         text.iter().flat_map(|part| &part.pieces).filter_map(name).collect::<Vec<_>>()
     };
@@ -82,7 +82,7 @@ fn a_field_gives_its_bits_with_their_sign() {
 
 #[test]
 fn names_are_of_fields_of_labels_and_of_units() {
-    let field = |parameter: &str, place: usize| &parameter_named(parameter).unwrap().fields[place];
+    let field = |parameter: &str, place: usize| &find_parameter(parameter).unwrap().fields[place];
     assert_eq!(field("pose", 0).written_names(), ["x_m", "y_m", "z_m"]);
     assert_eq!(field("pose", 1).written_names(), ["normal_x", "normal_y", "normal_z"]);
     assert_eq!(field("timing", 0).written_names(), ["period_us"]);
@@ -97,8 +97,8 @@ fn names_are_of_fields_of_labels_and_of_units() {
 fn a_refusal_has_no_tag_and_no_parameter_beside_its_layout() {
     let schema = |kind| packets().iter().find(|schema| schema.kind == kind).unwrap();
     let configured = schema(Kind::Configured);
-    let refusal = configured.layouts.iter().find(|layout| layout.number == REFUSED).unwrap();
+    let refusal = configured.layouts.iter().find(|layout| layout.number == REFUSAL_NUMBER).unwrap();
     assert_eq!(configured.end(refusal), []);
-    assert_eq!(configured.end(value(5, [0; WORDS])), configured.end);
+    assert_eq!(configured.end(parameter_layout(5, [0; WORDS])), configured.end);
     assert_eq!(schema(Kind::Configure).end(refusal), schema(Kind::Configure).end);
 }

@@ -2,7 +2,7 @@
 
 use core::f64::consts::FRAC_PI_2;
 
-use super::{Field, Format};
+use super::{Field, FieldFormat};
 use crate::fixed::TorqueFormat;
 use crate::skin::{JointKind, Skin};
 
@@ -18,10 +18,10 @@ pub struct Units {
 impl Units {
     /// Returns the units of a bus, given as an index into [`Skin::buses`].
     #[must_use]
-    pub fn of(skin: &Skin, bus: usize) -> Self {
+    pub fn for_bus(skin: &Skin, bus: usize) -> Self {
         let torque = skin.buses.get(bus).map(|bus| bus.torque_format).unwrap_or_default();
         let is_prismatic = |kind| u16::from(kind == JointKind::Prismatic);
-        let bits = skin.joints_of(bus).zip(0..16).map(|((_, joint), at)| is_prismatic(joint.kind) << at);
+        let bits = skin.joints_on_bus(bus).zip(0..16).map(|((_, joint), at)| is_prismatic(joint.kind) << at);
         Self { torque, prismatic: bits.fold(0, |all, bit| all | bit) }
     }
 
@@ -47,7 +47,7 @@ impl Units {
 
     /// Returns true if the element of a field is a position or torque of a prismatic joint.
     fn is_prismatic(self, field: &Field, element: usize) -> bool {
-        field.grows() && self.slides(element)
+        field.varies_with_chain() && self.slides(element)
     }
 }
 
@@ -56,10 +56,10 @@ impl Field {
     #[must_use]
     pub fn step_in(&self, element: usize, units: Units) -> f64 {
         let step = 1.0 / f64::from(1_u32 << self.fraction());
-        if self.format == Format::Torque {
+        if self.format == FieldFormat::Torque {
             units.torque.step()
-        } else if self.format == Format::Angle
-            || self.format == Format::Position && !units.is_prismatic(self, element)
+        } else if self.format == FieldFormat::Angle
+            || self.format == FieldFormat::Position && !units.is_prismatic(self, element)
         {
             step * FRAC_PI_2
         } else {
@@ -101,9 +101,9 @@ mod tests {
     fn what_grows_with_the_chain_has_the_unit_of_its_joint() {
         let units = Units { prismatic: 0b10, ..Units::default() };
         let fields = || packets().iter().flat_map(|packet| packet.layouts.iter().flat_map(|it| &it.fields));
-        let positions = fields().find(|field| field.format == Format::Position).unwrap();
+        let positions = fields().find(|field| field.format == FieldFormat::Position).unwrap();
         assert_eq!([0, 1, 2].map(|joint| positions.unit_in(joint, units)), ["rad", "m", "rad"]);
-        let torques = fields().find(|field| field.format == Format::Torque).unwrap();
+        let torques = fields().find(|field| field.format == FieldFormat::Torque).unwrap();
         assert_eq!([0, 1].map(|joint| torques.unit_in(joint, units)), ["Nm", "N"]);
         assert_eq!([0, 1].map(|joint| torques.unit_in(joint, Units::default())), ["Nm", "Nm"]);
     }

@@ -1,20 +1,20 @@
 //! The decoder of slcan: from bytes to frames, commands and acknowledgements.
 
 #[cfg(feature = "host")]
-use super::Report;
-use super::{BEL, CR, Command, MAX_LINE, digit, dlc_len, number};
+use super::AdapterReport;
+use super::{BEL, CR, SlcanCommand, MAX_LINE, digit, dlc_len, number};
 use crate::can::{
     BIT_RATE_SWITCH, ERROR_STATE, EXTENDED, EXTENDED_MASK, FD_FORMAT, Format, Frame, STANDARD_MASK,
 };
 
 /// A decoded line.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Line {
+pub enum SlcanLine {
     /// A frame: received from the bus if an adapter wrote the line, to be sent if a host did. Its time stamp
     /// is ignored.
     Frame(Frame),
     /// A command of a host.
-    Command(Command),
+    Command(SlcanCommand),
     /// An empty line: the acknowledgement of an adapter. Hosts send it too, without a meaning.
     Done,
     /// `z` or `Z`: the adapter has accepted a frame for sending.
@@ -24,7 +24,7 @@ pub enum Line {
     /// A fault or the bus state, reported by an adapter. Only hosts decode it, because a board has no
     /// adapter.
     #[cfg(feature = "host")]
-    Reported(Report),
+    Reported(AdapterReport),
     /// Any other line of printable characters, such as the version of an adapter. To be ignored.
     Other,
     /// An invalid line, counted in [`Decoder::refused`].
@@ -48,7 +48,7 @@ pub enum Refusal {
 
 /// Numbers of refused lines, by reason. The counters saturate.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Refused {
+pub struct RejectedLines {
     /// [`Refusal::Garbage`].
     pub garbage: u32,
     /// [`Refusal::Long`].
@@ -61,7 +61,7 @@ pub struct Refused {
     pub identifier: u32,
 }
 
-impl Refused {
+impl RejectedLines {
     /// Returns the sum of all counters.
     #[must_use]
     pub fn total(&self) -> u64 {
@@ -98,7 +98,7 @@ pub struct Decoder {
     line: heapless::Vec<u8, MAX_LINE>,
     /// The reason for which the current line will be refused.
     fault: Option<Refusal>,
-    refused: Refused,
+    refused: RejectedLines,
     endings: Endings,
 }
 
@@ -109,31 +109,31 @@ pub struct Decoder {
 struct Endings {
     has_state: bool,
     /// Number of consecutive frames with this ending.
-    same: u8,
+    run_length: u8,
     /// True if the last frame had the other ending.
-    other: bool,
+    deviated: bool,
 }
 
 impl Endings {
     /// Number of frames after which a single frame with the other ending is refused; two in a row switch.
-    const SURE: u8 = 16;
+    const CONFIRMED_AFTER: u8 = 16;
 
     const fn new() -> Self {
-        Self { has_state: false, same: 0, other: false }
+        Self { has_state: false, run_length: 0, deviated: false }
     }
 
     /// Records the ending of a frame. Returns true if it is plausible.
-    const fn take(&mut self, has_state: bool) -> bool {
+    const fn record(&mut self, has_state: bool) -> bool {
         if self.has_state == has_state {
-            self.same = self.same.saturating_add(1);
-            self.other = false;
+            self.run_length = self.run_length.saturating_add(1);
+            self.deviated = false;
             return true;
         }
-        let is_sure = self.same >= Self::SURE && !self.other;
+        let is_sure = self.run_length >= Self::CONFIRMED_AFTER && !self.deviated;
         if is_sure {
-            self.other = true;
+            self.deviated = true;
         } else {
-            *self = Self { has_state, same: 1, other: false };
+            *self = Self { has_state, run_length: 1, deviated: false };
         }
         !is_sure
     }
@@ -146,7 +146,7 @@ impl Decoder {
         Self {
             line: heapless::Vec::new(),
             fault: None,
-            refused: Refused { garbage: 0, long: 0, short: 0, dlc: 0, identifier: 0 },
+            refused: RejectedLines { garbage: 0, long: 0, short: 0, dlc: 0, identifier: 0 },
             endings: Endings::new(),
         }
     }
@@ -155,7 +155,7 @@ impl Decoder {
     ///
     /// CR and LF both end a line, but an empty line that ends with LF is ignored. BEL is a line of its own;
     /// an unfinished line before it is counted as garbage.
-    pub fn push(&mut self, byte: u8) -> Option<Line> {
+    pub fn push(&mut self, byte: u8) -> Option<SlcanLine> {
         match byte {
             CR => Some(self.end()),
             b'\n' => (!self.is_empty()).then(|| self.end()),
@@ -164,7 +164,7 @@ impl Decoder {
                     self.refused.count(Refusal::Garbage);
                 }
                 self.clear();
-                Some(Line::Failed)
+                Some(SlcanLine::Failed)
             }
             b' '..=b'~' => {
                 if self.line.push(byte).is_err() {
@@ -181,7 +181,7 @@ impl Decoder {
 
     /// Returns the numbers of refused lines so far.
     #[must_use]
-    pub const fn refused(&self) -> Refused {
+    pub const fn refused(&self) -> RejectedLines {
         self.refused
     }
 
@@ -205,10 +205,10 @@ impl Decoder {
         self.fault = None;
     }
 
-    fn end(&mut self) -> Line {
+    fn end(&mut self) -> SlcanLine {
         let endings = &mut self.endings;
-        let line = self.fault.map_or_else(|| read(&self.line, endings), Line::Refused);
-        if let Line::Refused(refusal) = line {
+        let line = self.fault.map_or_else(|| decode_line(&self.line, endings), SlcanLine::Refused);
+        if let SlcanLine::Refused(refusal) = line {
             self.refused.count(refusal);
         }
         self.clear();
@@ -217,25 +217,25 @@ impl Decoder {
 }
 
 /// Decodes a line of printable characters without its line ending.
-fn read(line: &[u8], endings: &mut Endings) -> Line {
-    let [kind, rest @ ..] = line else { return Line::Done };
+fn decode_line(line: &[u8], endings: &mut Endings) -> SlcanLine {
+    let [kind, rest @ ..] = line else { return SlcanLine::Done };
     let flags = match kind.to_ascii_lowercase() {
         b't' | b'r' => None,
         b'd' => Some(FD_FORMAT),
         b'b' => Some(FD_FORMAT | BIT_RATE_SWITCH),
-        b'z' if rest.is_empty() => return Line::Sent,
+        b'z' if rest.is_empty() => return SlcanLine::Sent,
         _ => {
             #[cfg(feature = "host")]
-            if let Some(report) = Report::read(line) {
-                return Line::Reported(report);
+            if let Some(report) = AdapterReport::read(line) {
+                return SlcanLine::Reported(report);
             }
-            return Command::decode(line).map_or(Line::Other, Line::Command);
+            return SlcanCommand::decode(line).map_or(SlcanLine::Other, SlcanLine::Command);
         }
     };
     let is_remote = kind.eq_ignore_ascii_case(&b'r');
     match frame(rest, kind.is_ascii_uppercase(), flags, is_remote, endings) {
-        Ok(frame) => Line::Frame(frame),
-        Err(refusal) => Line::Refused(refusal),
+        Ok(frame) => SlcanLine::Frame(frame),
+        Err(refusal) => SlcanLine::Refused(refusal),
     }
 }
 
@@ -283,14 +283,14 @@ fn frame(
     }
     // `S` cannot be mistaken for a digit, so it is always plausible.
     let has_state = matches!(state, Some(b'0' | b'1'));
-    if state != Some(b'S') && !endings.take(has_state) {
+    if state != Some(b'S') && !endings.record(has_state) {
         return Err(if has_state { Refusal::Long } else { Refusal::Short });
     }
     let passive = if matches!(state, Some(b'1' | b'S')) { ERROR_STATE } else { 0 };
     let frame = match flags {
         None if is_remote => Frame::remote(id, dlc),
-        None => Frame::filled(id, Format::Classic, 0, data, len),
-        Some(flags) => Frame::filled(id, Format::Fd, flags | passive, data, len),
+        None => Frame::with_buffer(id, Format::Classic, 0, data, len),
+        Some(flags) => Frame::with_buffer(id, Format::Fd, flags | passive, data, len),
     };
     frame.map_err(|_| Refusal::Dlc)
 }

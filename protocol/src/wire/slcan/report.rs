@@ -79,7 +79,7 @@ impl BusState {
 /// A fault other than a state.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 #[repr(u16)]
-pub enum Fault {
+pub enum AdapterFault {
     /// No receiver acknowledged a frame.
     Ack = 0x001,
     /// A dominant bit was sent and a recessive one received.
@@ -108,7 +108,7 @@ pub enum Fault {
     TransmitFailed = 0x1000,
 }
 
-impl Fault {
+impl AdapterFault {
     /// All faults.
     pub const ALL: [Self; 13] = [
         Self::Ack,
@@ -177,7 +177,7 @@ pub struct ErrorCounters {
 
 /// A fault report of an adapter.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
-pub struct Report {
+pub struct AdapterReport {
     faults: u16,
     state: Option<BusState>,
     counters: Option<ErrorCounters>,
@@ -185,10 +185,10 @@ pub struct Report {
     is_bus_error: bool,
 }
 
-impl Report {
+impl AdapterReport {
     /// Returns the faults.
-    pub fn faults(self) -> impl Iterator<Item = Fault> {
-        Fault::ALL.into_iter().filter(move |&fault| self.has(fault))
+    pub fn faults(self) -> impl Iterator<Item = AdapterFault> {
+        AdapterFault::ALL.into_iter().filter(move |&fault| self.has(fault))
     }
 
     /// Returns the controller state, if the report contains it.
@@ -209,7 +209,7 @@ impl Report {
     pub fn frame(self, before: BusState) -> Option<Frame> {
         let bus_error = if self.is_bus_error { CLASS_PROTOCOL | CLASS_BUS_ERROR } else { 0 };
         let (mut class, mut controller, mut protocol, mut location) = (bus_error, 0, 0, 0);
-        for error in self.faults().map(Fault::error) {
+        for error in self.faults().map(AdapterFault::error) {
             class |= error.0;
             controller |= error.1;
             protocol |= error.2;
@@ -242,16 +242,16 @@ impl Report {
         Frame::with_data(ERROR | class, Format::Classic, 0, &data).ok()
     }
 
-    const fn has(self, fault: Fault) -> bool {
+    const fn has(self, fault: AdapterFault) -> bool {
         self.faults & fault as u16 != 0
     }
 
-    const fn with(mut self, fault: Fault) -> Self {
+    const fn with(mut self, fault: AdapterFault) -> Self {
         self.faults |= fault as u16;
         self
     }
 
-    fn with_flags(self, flags: u8, meanings: &[(u8, Fault)]) -> Self {
+    fn with_flags(self, flags: u8, meanings: &[(u8, AdapterFault)]) -> Self {
         let set = meanings.iter().filter(|(bit, _)| flags & bit != 0);
         set.fold(self, |report, &(_, fault)| report.with(fault))
     }
@@ -264,17 +264,17 @@ impl Report {
             }
             [b's', state, counters @ ..] => Self::state_line(*state, counters),
             [b'E', state @ b'0'..=b'3', last @ b'0'..=b'6', digits @ ..] => {
-                let [flags, transmit, receive] = bytes(digits)?;
+                let [flags, transmit, receive] = hex_bytes(digits)?;
                 let counters = Some(ErrorCounters { transmit: transmit.into(), receive: receive.into() });
                 let state = BusState::ALL.get(usize::from(state - b'0')).copied();
-                Some(Self { state, counters, ..Self::default() }.with_last(last - b'0').with_flags(
+                Some(Self { state, counters, ..Self::default() }.with_last_error(last - b'0').with_flags(
                     flags,
                     &[
-                        (0x01, Fault::ReceiveFailed),
-                        (0x02, Fault::TransmitFailed),
-                        (0x04, Fault::TransmitOverrun),
-                        (0x08, Fault::ReceiveOverrun),
-                        (0x10, Fault::TransmitTimeout),
+                        (0x01, AdapterFault::ReceiveFailed),
+                        (0x02, AdapterFault::TransmitFailed),
+                        (0x04, AdapterFault::TransmitOverrun),
+                        (0x08, AdapterFault::ReceiveOverrun),
+                        (0x10, AdapterFault::TransmitTimeout),
                     ],
                 ))
             }
@@ -285,11 +285,11 @@ impl Report {
                 Some(Self { state, ..Self::default() }.with_flags(
                     flags,
                     &[
-                        (0x01, Fault::ReceiveOverrun),
-                        (0x02, Fault::TransmitOverrun),
-                        (0x08, Fault::ReceiveOverrun),
-                        (0x40, Fault::Arbitration),
-                        (0x80, Fault::Bus),
+                        (0x01, AdapterFault::ReceiveOverrun),
+                        (0x02, AdapterFault::TransmitOverrun),
+                        (0x08, AdapterFault::ReceiveOverrun),
+                        (0x40, AdapterFault::Arbitration),
+                        (0x80, AdapterFault::Bus),
                     ],
                 ))
             }
@@ -301,14 +301,14 @@ impl Report {
     fn bus_errors(letters: &[u8]) -> Option<Self> {
         letters.iter().try_fold(Self { is_bus_error: true, ..Self::default() }, |report, letter| {
             Some(report.with(match letter {
-                b'a' => Fault::Ack,
-                b'b' => Fault::Bit0,
-                b'B' => Fault::Bit1,
-                b'c' => Fault::Crc,
-                b'f' => Fault::Form,
-                b'o' => Fault::ReceiveOverrun,
-                b'O' => Fault::TransmitOverrun,
-                b's' => Fault::Stuff,
+                b'a' => AdapterFault::Ack,
+                b'b' => AdapterFault::Bit0,
+                b'B' => AdapterFault::Bit1,
+                b'c' => AdapterFault::Crc,
+                b'f' => AdapterFault::Form,
+                b'o' => AdapterFault::ReceiveOverrun,
+                b'O' => AdapterFault::TransmitOverrun,
+                b's' => AdapterFault::Stuff,
                 _ => return None,
             }))
         })
@@ -333,21 +333,21 @@ impl Report {
     }
 
     /// Adds the last error of the controller, by its number.
-    const fn with_last(self, last: u8) -> Self {
+    const fn with_last_error(self, last: u8) -> Self {
         match last {
-            1 => self.with(Fault::Stuff),
-            2 => self.with(Fault::Form),
-            3 => self.with(Fault::Ack),
-            4 => self.with(Fault::Bit1),
-            5 => self.with(Fault::Bit0),
-            6 => self.with(Fault::Crc),
+            1 => self.with(AdapterFault::Stuff),
+            2 => self.with(AdapterFault::Form),
+            3 => self.with(AdapterFault::Ack),
+            4 => self.with(AdapterFault::Bit1),
+            5 => self.with(AdapterFault::Bit0),
+            6 => self.with(AdapterFault::Crc),
             _ => self,
         }
     }
 }
 
 /// Decodes six hexadecimal digits to three bytes.
-fn bytes(digits: &[u8]) -> Option<[u8; 3]> {
+fn hex_bytes(digits: &[u8]) -> Option<[u8; 3]> {
     let [_, bytes @ ..] = number(<&[u8; 6]>::try_from(digits).ok()?)?.to_be_bytes();
     Some(bytes)
 }

@@ -2,12 +2,12 @@ use super::*;
 use crate::can::{ERROR, ERROR_STATE, EXTENDED, FD_FORMAT, REMOTE};
 use proptest::prelude::*;
 
-fn lines(bytes: &[u8]) -> Vec<Line> {
+fn lines(bytes: &[u8]) -> Vec<SlcanLine> {
     let mut decoder = Decoder::new();
     bytes.iter().filter_map(|&byte| decoder.push(byte)).collect()
 }
 
-fn one(text: &str) -> Line {
+fn one(text: &str) -> SlcanLine {
     let lines = lines(format!("{text}\r").as_bytes());
     assert_eq!(lines.len(), 1, "{text}");
     lines[0]
@@ -35,9 +35,9 @@ fn frames_are_these_lines() {
         ("b1230", fd(0x123, BIT_RATE_SWITCH, &[])),
         ("B000001239000102030405060708090A0B", fd(EXTENDED | 0x123, BIT_RATE_SWITCH, &count)),
     ] {
-        assert_eq!(one(text), Line::Frame(frame), "{text}");
+        assert_eq!(one(text), SlcanLine::Frame(frame), "{text}");
         assert_eq!(encode(&frame).unwrap().as_bytes(), format!("{text}\r").as_bytes());
-        assert_eq!(one(&format!("{}{}", &text[..1], text[1..].to_lowercase())), Line::Frame(frame));
+        assert_eq!(one(&format!("{}{}", &text[..1], text[1..].to_lowercase())), SlcanLine::Frame(frame));
     }
 }
 
@@ -48,7 +48,7 @@ fn every_length_of_fd_has_its_digit() {
     {
         let text = format!("b001{digit}{}", "5A".repeat(len));
         let frame = fd(1, BIT_RATE_SWITCH, &vec![0x5A; len]);
-        assert_eq!(one(&text), Line::Frame(frame));
+        assert_eq!(one(&text), SlcanLine::Frame(frame));
         assert_eq!(encode(&frame).unwrap().as_bytes(), format!("{text}\r").as_bytes());
     }
 }
@@ -75,12 +75,12 @@ fn what_slcan_cannot_say_is_left_out() {
 #[test]
 fn time_stamps_are_passed_over() {
     let frame = Frame::classic(0x123, &[1, 2]).unwrap();
-    assert_eq!(one("t12320102EA5F"), Line::Frame(frame));
-    assert_eq!(one("t12320102DEADBEEF"), Line::Frame(frame));
-    assert_eq!(one("r12320000"), Line::Frame(Frame::remote(0x123, 2).unwrap()));
+    assert_eq!(one("t12320102EA5F"), SlcanLine::Frame(frame));
+    assert_eq!(one("t12320102DEADBEEF"), SlcanLine::Frame(frame));
+    assert_eq!(one("r12320000"), SlcanLine::Frame(Frame::remote(0x123, 2).unwrap()));
     assert_eq!(
         one(&format!("B00000001F{}0123ABCD", "01".repeat(64))),
-        Line::Frame(fd(EXTENDED | 1, BIT_RATE_SWITCH, &[1; 64]))
+        SlcanLine::Frame(fd(EXTENDED | 1, BIT_RATE_SWITCH, &[1; 64]))
     );
     for (text, refusal) in [
         ("t12320102E", Refusal::Long),
@@ -89,7 +89,7 @@ fn time_stamps_are_passed_over() {
         ("t12320102EA5F2", Refusal::Long),
         ("t12320102EA5G", Refusal::Garbage),
     ] {
-        assert_eq!(one(text), Line::Refused(refusal), "{text}");
+        assert_eq!(one(text), SlcanLine::Refused(refusal), "{text}");
     }
 }
 
@@ -119,7 +119,7 @@ fn what_is_no_frame_is_refused_for_its_reason() {
         ("C\0", Refusal::Garbage),
         ("t1230é", Refusal::Garbage),
     ] {
-        assert_eq!(one(text), Line::Refused(refusal), "{text}");
+        assert_eq!(one(text), SlcanLine::Refused(refusal), "{text}");
     }
 }
 
@@ -143,11 +143,11 @@ fn the_state_of_a_sender_behind_the_data_is_read() {
         ("b1230", fd(0x123, BIT_RATE_SWITCH, &[])),
         ("b1230S", fd(0x123, BIT_RATE_SWITCH | ERROR_STATE, &[])),
     ] {
-        assert_eq!(one(text), Line::Frame(frame), "{text}");
+        assert_eq!(one(text), SlcanLine::Frame(frame), "{text}");
     }
     let longest = format!("B00000001F{}0123ABCD1", "01".repeat(64));
     assert_eq!(longest.len(), MAX_LINE);
-    assert_eq!(one(&longest), Line::Frame(fd(EXTENDED | 1, BIT_RATE_SWITCH | ERROR_STATE, &[1; 64])));
+    assert_eq!(one(&longest), SlcanLine::Frame(fd(EXTENDED | 1, BIT_RATE_SWITCH | ERROR_STATE, &[1; 64])));
     for (text, refusal) in [
         ("t1232AABB2", Refusal::Long),
         ("t1232AABB00", Refusal::Long),
@@ -160,19 +160,19 @@ fn the_state_of_a_sender_behind_the_data_is_read() {
         ("t1230d0010", Refusal::Long),
         ("t1230b0012AAB0", Refusal::Long),
     ] {
-        assert_eq!(one(text), Line::Refused(refusal), "{text}");
+        assert_eq!(one(text), SlcanLine::Refused(refusal), "{text}");
     }
 }
 
 #[test]
 fn an_adapter_ends_all_frames_in_one_way_and_two_in_another_show_that_it_has_changed() {
-    let frame = Line::Frame(Frame::classic(0x123, &[0x11]).unwrap());
+    let frame = SlcanLine::Frame(Frame::classic(0x123, &[0x11]).unwrap());
     let [plain, ended] = [b"t123111\r", b"t1231110\r".as_slice()].map(|text| text.to_vec());
     for (usual, other, refusal) in [(&plain, &ended, Refusal::Long), (&ended, &plain, Refusal::Short)] {
         let mixed = [usual.repeat(15), other.clone(), usual.repeat(16)].concat();
         assert_eq!(lines(&mixed), [frame; 32], "nothing is sure yet");
         let bytes = [usual.repeat(16), other.clone(), usual.clone(), other.repeat(2), usual.clone()].concat();
-        let refused = Line::Refused(refusal);
+        let refused = SlcanLine::Refused(refusal);
         assert_eq!(lines(&bytes)[16..], [refused, frame, refused, frame, frame]);
         // `S` is not a digit, and may be missing.
         let letters = [usual.repeat(16), b"t123111S\r".to_vec()].concat();
@@ -180,8 +180,8 @@ fn an_adapter_ends_all_frames_in_one_way_and_two_in_another_show_that_it_has_cha
     }
 }
 
-fn reported(text: &str) -> Report {
-    let Line::Reported(report) = one(text) else { panic!("{text}: {:?}", one(text)) };
+fn reported(text: &str) -> AdapterReport {
+    let SlcanLine::Reported(report) = one(text) else { panic!("{text}: {:?}", one(text)) };
     report
 }
 
@@ -216,7 +216,7 @@ fn faults_of_an_adapter_are_the_error_frames_of_the_kernels_driver() {
         ("F52", Active, 0x46, [0, 0x02, 0, 0, 0, 0, 0, 0]),
     ] {
         if class == 0 {
-            assert_eq!(one(text), Line::Other, "{text}");
+            assert_eq!(one(text), SlcanLine::Other, "{text}");
             continue;
         }
         let frame = Frame::classic(ERROR | class, &data).unwrap();
@@ -230,7 +230,7 @@ fn faults_of_an_adapter_are_the_error_frames_of_the_kernels_driver() {
     }
     assert_eq!(reported("sp128007").counters(), Some(ErrorCounters { receive: 128, transmit: 7 }));
     assert_eq!(
-        reported("e3bcO").faults().map(Fault::name).collect::<Vec<_>>(),
+        reported("e3bcO").faults().map(AdapterFault::name).collect::<Vec<_>>(),
         ["bit 0 error", "CRC error", "transmit overrun"]
     );
     for text in [
@@ -258,32 +258,32 @@ fn faults_of_an_adapter_are_the_error_frames_of_the_kernels_driver() {
         "F800",
         "FG0",
     ] {
-        assert_eq!(one(text), Line::Other, "{text}");
+        assert_eq!(one(text), SlcanLine::Other, "{text}");
     }
 }
 
 #[test]
 fn commands_are_these_lines() {
     for (text, command) in [
-        ("C", Command::Close),
-        ("O", Command::Open),
-        ("L", Command::Listen),
-        ("S0", Command::BitRate(0)),
-        ("S9", Command::BitRate(9)),
-        ("Y2", Command::DataBitRate(2)),
-        ("Y5", Command::DataBitRate(5)),
-        ("V", Command::Version),
-        ("N", Command::SerialNumber),
-        ("F", Command::Flags),
-        ("Z0", Command::TimeStamps(false)),
-        ("Z1", Command::TimeStamps(true)),
-        ("M0000A5FF", Command::Code(0xA5FF)),
-        ("mFFFFFFFF", Command::Mask(u32::MAX)),
+        ("C", SlcanCommand::Close),
+        ("O", SlcanCommand::Open),
+        ("L", SlcanCommand::Listen),
+        ("S0", SlcanCommand::BitRate(0)),
+        ("S9", SlcanCommand::BitRate(9)),
+        ("Y2", SlcanCommand::DataBitRate(2)),
+        ("Y5", SlcanCommand::DataBitRate(5)),
+        ("V", SlcanCommand::Version),
+        ("N", SlcanCommand::SerialNumber),
+        ("F", SlcanCommand::Flags),
+        ("Z0", SlcanCommand::TimeStamps(false)),
+        ("Z1", SlcanCommand::TimeStamps(true)),
+        ("M0000A5FF", SlcanCommand::Code(0xA5FF)),
+        ("mFFFFFFFF", SlcanCommand::Mask(u32::MAX)),
     ] {
-        assert_eq!(one(text), Line::Command(command), "{text}");
+        assert_eq!(one(text), SlcanLine::Command(command), "{text}");
         assert_eq!(command.encode().as_bytes(), format!("{text}\r").as_bytes());
     }
-    assert_eq!(one("v"), Line::Command(Command::Version));
+    assert_eq!(one("v"), SlcanLine::Command(SlcanCommand::Version));
 }
 
 #[test]
@@ -301,14 +301,14 @@ fn bit_rates_have_these_commands() {
         (1_000_000, 8),
         (83_300, 9),
     ] {
-        assert_eq!(Command::nominal(bit_rate), Some(Command::BitRate(digit)), "{bit_rate}");
+        assert_eq!(SlcanCommand::nominal_bit_rate(bit_rate), Some(SlcanCommand::BitRate(digit)), "{bit_rate}");
     }
-    assert_eq!(Command::nominal(300_000), None);
+    assert_eq!(SlcanCommand::nominal_bit_rate(300_000), None);
     for (bit_rate, digit) in [(500_000, 0), (1_000_000, 1), (2_000_000, 2), (5_000_000, 5), (8_000_000, 8)] {
-        assert_eq!(Command::data(bit_rate), Some(Command::DataBitRate(digit)), "{bit_rate}");
+        assert_eq!(SlcanCommand::data_bit_rate(bit_rate), Some(SlcanCommand::DataBitRate(digit)), "{bit_rate}");
     }
-    assert_eq!(Command::data(9_000_000), None);
-    assert_eq!(Command::data(2_500_000), None);
+    assert_eq!(SlcanCommand::data_bit_rate(9_000_000), None);
+    assert_eq!(SlcanCommand::data_bit_rate(2_500_000), None);
 }
 
 #[test]
@@ -316,21 +316,21 @@ fn adapters_answer_as_they_like() {
     assert_eq!(
         lines(b"\rz\rZ\r\x07V1013\rNA123\rF0\rS\rSA\rM0\rA1\r?\r"),
         [
-            Line::Done,
-            Line::Sent,
-            Line::Sent,
-            Line::Failed,
-            Line::Other,
-            Line::Other,
-            Line::Other,
-            Line::Other,
-            Line::Other,
-            Line::Other,
-            Line::Other,
-            Line::Other,
+            SlcanLine::Done,
+            SlcanLine::Sent,
+            SlcanLine::Sent,
+            SlcanLine::Failed,
+            SlcanLine::Other,
+            SlcanLine::Other,
+            SlcanLine::Other,
+            SlcanLine::Other,
+            SlcanLine::Other,
+            SlcanLine::Other,
+            SlcanLine::Other,
+            SlcanLine::Other,
         ]
     );
-    let frame = Line::Frame(Frame::classic(0x123, &[]).unwrap());
+    let frame = SlcanLine::Frame(Frame::classic(0x123, &[]).unwrap());
     assert_eq!(lines(b"t1230\r\nt1230\n\n\nt1230\r"), [frame; 3]);
 }
 
@@ -338,8 +338,8 @@ fn adapters_answer_as_they_like() {
 fn a_bell_in_a_line_ends_it() {
     let mut decoder = Decoder::new();
     let lines: Vec<_> = b"t12\x07t1230\r".iter().filter_map(|&byte| decoder.push(byte)).collect();
-    assert_eq!(lines, [Line::Failed, Line::Frame(Frame::classic(0x123, &[]).unwrap())]);
-    assert_eq!(decoder.refused(), Refused { garbage: 1, ..Refused::default() });
+    assert_eq!(lines, [SlcanLine::Failed, SlcanLine::Frame(Frame::classic(0x123, &[]).unwrap())]);
+    assert_eq!(decoder.refused(), RejectedLines { garbage: 1, ..RejectedLines::default() });
 }
 
 #[test]
@@ -351,16 +351,16 @@ fn what_was_refused_is_counted_by_reason() {
     assert_eq!(refused, 8);
     assert!(decoder.restart());
     assert!(!decoder.restart());
-    let expected = Refused { garbage: 2, long: 2, short: 3, dlc: 1, identifier: 1 };
+    let expected = RejectedLines { garbage: 2, long: 2, short: 3, dlc: 1, identifier: 1 };
     assert_eq!(decoder.refused(), expected);
     assert_eq!(expected.total(), 9);
 }
 
 #[test]
 fn the_longest_line_fits_and_one_byte_more_does_not() {
-    assert_eq!(one(&"x".repeat(MAX_LINE)), Line::Other);
-    assert_eq!(one(&"x".repeat(MAX_LINE + 1)), Line::Refused(Refusal::Long));
-    assert_eq!(one(&"x".repeat(1_000_000)), Line::Refused(Refusal::Long));
+    assert_eq!(one(&"x".repeat(MAX_LINE)), SlcanLine::Other);
+    assert_eq!(one(&"x".repeat(MAX_LINE + 1)), SlcanLine::Refused(Refusal::Long));
+    assert_eq!(one(&"x".repeat(1_000_000)), SlcanLine::Refused(Refusal::Long));
 }
 
 /// Frames that slcan carries without loss.
@@ -380,7 +380,7 @@ fn frames() -> impl Strategy<Value = Frame> {
 proptest! {
     #[test]
     fn every_frame_comes_back(frame in frames()) {
-        prop_assert_eq!(lines(encode(&frame).unwrap().as_bytes()), [Line::Frame(frame)]);
+        prop_assert_eq!(lines(encode(&frame).unwrap().as_bytes()), [SlcanLine::Frame(frame)]);
     }
 
     #[test]
@@ -393,7 +393,7 @@ proptest! {
         match encode(&frame) {
             None => prop_assert!(frame.is_error()),
             Some(text) => {
-                let [Line::Frame(again)] = lines(text.as_bytes())[..] else { panic!("{text:?}") };
+                let [SlcanLine::Frame(again)] = lines(text.as_bytes())[..] else { panic!("{text:?}") };
                 prop_assert_eq!(encode(&again), Some(text));
                 prop_assert_eq!(again.id(), frame.id());
                 prop_assert_eq!(again.is_extended(), frame.is_extended());
@@ -405,7 +405,7 @@ proptest! {
     fn no_bytes_panic_and_each_line_is_counted_or_says_something(bytes in proptest::collection::vec(any::<u8>(), 0..600)) {
         let mut decoder = Decoder::new();
         let ended: Vec<_> = bytes.iter().filter_map(|&byte| decoder.push(byte)).collect();
-        let refused = ended.iter().filter(|line| matches!(line, Line::Refused(_))).count() as u64;
+        let refused = ended.iter().filter(|line| matches!(line, SlcanLine::Refused(_))).count() as u64;
         let bells = bytes.iter().filter(|&&byte| byte == BEL).count() as u64;
         prop_assert!((refused..=refused + bells).contains(&decoder.refused().total()));
         prop_assert!(decoder.refused().total() <= bytes.len() as u64);
@@ -420,7 +420,7 @@ proptest! {
         decoder.push(CR);
         let text = encode(&frame).unwrap();
         let last = text.as_bytes().iter().filter_map(|&byte| decoder.push(byte)).last();
-        prop_assert_eq!(last, Some(Line::Frame(frame)));
+        prop_assert_eq!(last, Some(SlcanLine::Frame(frame)));
     }
 
     #[test]
@@ -433,13 +433,13 @@ proptest! {
         for &byte in b"t1230\r".repeat(16).iter() {
             decoder.push(byte);
         }
-        prop_assert!(!bytes.iter().filter_map(|&byte| decoder.push(byte)).any(|line| matches!(line, Line::Frame(_))));
+        prop_assert!(!bytes.iter().filter_map(|&byte| decoder.push(byte)).any(|line| matches!(line, SlcanLine::Frame(_))));
     }
 
     #[test]
     fn two_lines_that_lost_the_end_between_them_are_no_frame(one in frames(), other in frames()) {
         let (one, other) = (encode(&one).unwrap(), encode(&other).unwrap());
         let bytes = [&one.as_bytes()[..one.as_bytes().len() - 1], other.as_bytes()].concat();
-        prop_assert!(matches!(lines(&bytes)[..], [Line::Refused(_)]));
+        prop_assert!(matches!(lines(&bytes)[..], [SlcanLine::Refused(_)]));
     }
 }

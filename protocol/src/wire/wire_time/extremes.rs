@@ -6,7 +6,7 @@
 //! data, so a table is used, which the test `every_frame` computes from all possible frames. Its maxima are
 //! one to four bits below the usual formula, which treats the CRC as free.
 
-use super::{Bits, CLASSIC_TAIL, parts, stuffing};
+use super::{Bits, CLASSIC_TAIL, fd_bits, stuffing};
 use crate::can::{BIT_RATE_SWITCH, Format, Frame, fd_dlc, fd_len};
 
 /// The kind of a frame as far as it determines the number of bits.
@@ -37,7 +37,7 @@ pub struct Shape {
 impl Shape {
     /// Returns the shape of a frame.
     #[must_use]
-    pub const fn of(frame: &Frame) -> Self {
+    pub const fn from_frame(frame: &Frame) -> Self {
         let coding = match frame.format() {
             Format::Classic if frame.is_remote() => Coding::Remote,
             Format::Classic => Coding::Classic,
@@ -101,7 +101,7 @@ impl Shape {
             Ok(0) | Err(_) => ways.fixed(dlc >> 1, 3),
             Ok(len) => ways.fixed(dlc, 4).free(8 * len - 1),
         };
-        parts(switched, head, len, pick(ways.stuffed()))
+        fd_bits(switched, head, len, pick(ways.stuffed()))
     }
 }
 

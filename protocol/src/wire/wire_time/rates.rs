@@ -92,7 +92,7 @@ impl BitRates {
 ///
 /// # Errors
 /// Returns an error if it is not a whole number of bit/s in [0, 2^32).
-pub fn bit_rate(text: &str) -> Result<u32, BitRatesError> {
+pub fn parse_bit_rate(text: &str) -> Result<u32, BitRatesError> {
     let (number, unit) = match text.as_bytes().last() {
         Some(b'k' | b'K') => (text.get(..text.len() - 1).unwrap_or(""), 1_000),
         Some(b'M') => (text.get(..text.len() - 1).unwrap_or(""), 1_000_000),
@@ -121,7 +121,7 @@ impl FromStr for BitRates {
 
     fn from_str(text: &str) -> Result<Self, BitRatesError> {
         let (nominal, data) = text.split_once('/').unwrap_or((text, text));
-        Self::new(bit_rate(nominal)?, bit_rate(data)?)
+        Self::new(parse_bit_rate(nominal)?, parse_bit_rate(data)?)
     }
 }
 
@@ -161,7 +161,7 @@ mod tests {
             ("1.0", 1),
             ("4294967295", u32::MAX),
         ] {
-            assert_eq!(bit_rate(text), Ok(rate), "{text}");
+            assert_eq!(parse_bit_rate(text), Ok(rate), "{text}");
         }
         for text in [
             "",
@@ -179,7 +179,7 @@ mod tests {
             "4294967296",
             "1M/5M",
         ] {
-            assert_eq!(bit_rate(text), Err(BitRatesError::Text), "{text}");
+            assert_eq!(parse_bit_rate(text), Err(BitRatesError::Text), "{text}");
         }
     }
 

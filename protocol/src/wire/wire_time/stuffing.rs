@@ -7,9 +7,9 @@
 /// Number of states. A state has three bits: the value of the bit, and its repetitions minus one.
 pub(super) const STATES: usize = 8;
 /// Number of sequences of up to eight bits, each encoded behind a leading one.
-const WORDS: usize = 512;
+const SEQUENCES: usize = 512;
 /// The result for each state and sequence: the number of stuff bits above the three bits of the next state.
-static STEPS: [u8; STATES * WORDS] = steps();
+static STEPS: [u8; STATES * SEQUENCES] = steps();
 
 /// The current run of equal bits, and the number of stuff bits so far.
 #[derive(Clone, Copy, Debug)]
@@ -44,13 +44,13 @@ impl Run {
 
     /// Returns true if `last`, the last bit of a sequence, caused a stuff bit.
     #[inline]
-    pub(super) const fn ended_on(self, last: u8) -> bool {
+    pub(super) const fn ended_with_stuff_bit(self, last: u8) -> bool {
         self.state >> 2 != last & 1
     }
 
     #[inline]
     fn step(self, word: usize) -> Self {
-        let at = (usize::from(self.state) * WORDS + word) % STEPS.len();
+        let at = (usize::from(self.state) * SEQUENCES + word) % STEPS.len();
         let step = STEPS.get(at).copied().unwrap_or(0);
         Self { state: step & 7, stuffed: self.stuffed + u32::from(step >> 3) }
     }
@@ -71,12 +71,12 @@ pub(super) const fn next(state: u8, bit: u8) -> (u8, u8) {
     clippy::cast_possible_truncation,
     reason = "worked out by the compiler, which would stop; a state has three bits"
 )]
-const fn steps() -> [u8; STATES * WORDS] {
-    let mut steps = [0; STATES * WORDS];
+const fn steps() -> [u8; STATES * SEQUENCES] {
+    let mut steps = [0; STATES * SEQUENCES];
     let mut state = 0;
     while state < STATES {
         let mut word = 1;
-        while word < WORDS {
+        while word < SEQUENCES {
             let (mut now, mut stuffed) = (state as u8, 0);
             let mut left = word.ilog2();
             while left > 0 {
@@ -85,7 +85,7 @@ const fn steps() -> [u8; STATES * WORDS] {
                 now = then;
                 stuffed += more;
             }
-            steps[state * WORDS + word] = (stuffed << 3) | now;
+            steps[state * SEQUENCES + word] = (stuffed << 3) | now;
             word += 1;
         }
         state += 1;

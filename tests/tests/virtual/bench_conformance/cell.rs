@@ -2,10 +2,10 @@
 
 use std::collections::VecDeque;
 
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
-use conformance::bus::{Bus, Seen, Stop};
+use conformance::bus::{TestBus, ObservedFrame, StopReason};
 use protocol::can::{Format, Frame};
 use protocol::id::CellId;
 use protocol::packet::Packet;
@@ -43,12 +43,12 @@ pub(crate) trait Mutant {
     }
 
     /// Returns the content that flash keeps.
-    fn stores(&mut self, flash: Flash) -> Flash {
+    fn stores(&mut self, flash: FlashState) -> FlashState {
         flash
     }
 
     /// Returns the flash with which the cell is switched on.
-    fn starts(&mut self, _now: Micros, flash: Flash) -> Flash {
+    fn starts(&mut self, _now: Micros, flash: FlashState) -> FlashState {
         flash
     }
 
@@ -85,10 +85,10 @@ pub(crate) struct Virtual {
     identity: Identity,
     test_mode: bool,
     node: Option<Node>,
-    flash: Flash,
+    flash: FlashState,
     mutant: Box<dyn Mutant>,
     /// Frames in order, each on the bus from its time on, and marked as the bench's own or not.
-    wire: VecDeque<Seen>,
+    wire: VecDeque<ObservedFrame>,
     /// The time from which the bus is free.
     free: Micros,
     /// Frames for the cell, with their arrival times.
@@ -131,7 +131,7 @@ impl Virtual {
             identity,
             test_mode: true,
             node: None,
-            flash: Flash::Empty,
+            flash: FlashState::Empty,
             mutant,
             wire: VecDeque::new(),
             free: Micros(0),
@@ -217,7 +217,7 @@ impl Virtual {
         let Some(node) = &mut self.node else { return };
         let mut stored = Span(0);
         if let Some(kept) = node.poll_store() {
-            self.flash = self.mutant.stores(kept.parameters.map_or(Flash::Empty, Flash::Sound));
+            self.flash = self.mutant.stores(kept.parameters.map_or(FlashState::Empty, FlashState::Valid));
             node.handle_stored(true);
             stored = self.stores;
         }
@@ -233,7 +233,7 @@ impl Virtual {
             self.later.extend(frames.into_iter().map(|frame| (at + delay, frame)));
         }
         self.later.sort_by_key(|(at, _)| *at);
-        if node.taken().is_some() && self.mutant.obeys_claims() {
+        if node.other_owner().is_some() && self.mutant.obeys_claims() {
             self.node = None;
             self.inbox.clear();
         }
@@ -243,7 +243,7 @@ impl Virtual {
         let at = at.max(self.free + self.frame);
         self.free = at;
         let place = self.wire.iter().rposition(|seen| seen.at <= at).map_or(0, |place| place + 1);
-        self.wire.insert(place, Seen { at, frame, own });
+        self.wire.insert(place, ObservedFrame { at, frame, own });
         if own {
             self.inbox.push_back((at, frame));
         }
@@ -285,7 +285,7 @@ impl Virtual {
             Event::Hears => {
                 self.busy = at;
                 let Some((came, frame)) = self.inbox.pop_front() else { return };
-                for (age, frame) in self.mutant.hears(at, at.since(came), frame) {
+                for (age, frame) in self.mutant.hears(at, at.elapsed_since(came), frame) {
                     if let Some(node) = &mut self.node {
                         node.handle_frame(at, age, &frame);
                     }
@@ -305,7 +305,7 @@ enum Event {
     Ends,
 }
 
-impl Bus for Virtual {
+impl TestBus for Virtual {
     fn now(&self) -> Micros {
         self.now
     }
@@ -314,7 +314,7 @@ impl Bus for Virtual {
         true
     }
 
-    fn send(&mut self, frames: &[Frame]) -> Result<(), Stop> {
+    fn send(&mut self, frames: &[Frame]) -> Result<(), StopReason> {
         for frame in frames {
             // A real bus does the same, one frame at a time.
             self.put(self.now, *frame, true);
@@ -322,7 +322,7 @@ impl Bus for Virtual {
         Ok(())
     }
 
-    fn receive(&mut self, until: Micros) -> Result<Option<Seen>, Stop> {
+    fn receive(&mut self, until: Micros) -> Result<Option<ObservedFrame>, StopReason> {
         loop {
             self.starve();
             let seen = self.wire.front().map(|seen| seen.at);
@@ -353,7 +353,7 @@ impl Bus for Virtual {
         self.restarts
     }
 
-    fn begin_restart(&mut self) -> Result<(), Stop> {
+    fn begin_restart(&mut self) -> Result<(), StopReason> {
         let Cuts { step, longest, next, .. } = self.cuts;
         self.cuts.at = Some(self.now + next);
         self.cuts.next = if next.0 + step.0 > longest.0 {
@@ -364,7 +364,7 @@ impl Bus for Virtual {
         Ok(())
     }
 
-    fn is_restarting(&mut self) -> Result<bool, Stop> {
+    fn is_restarting(&mut self) -> Result<bool, StopReason> {
         Ok(self.cuts.at.is_some() || self.restart.is_some())
     }
 }

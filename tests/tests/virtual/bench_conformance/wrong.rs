@@ -1,14 +1,14 @@
 //! Faulty cells: this project's cell, with its input and output changed.
 
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use cell_node::kernel::{Kernel, Wrench};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q1_14;
 use protocol::id::CellId;
 use protocol::message::{
-    Answer, From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
+    Answer, AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
 };
-use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembly, Segment, WORDS, Words};
+use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembly, Reassembler, WORDS, Words};
 use protocol::parameters::{MAX_JOINTS, Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
@@ -24,7 +24,7 @@ pub(crate) struct Memory {
     pub(crate) joints: usize,
     pub(crate) last: Option<(Epoch, Joints)>,
     pub(crate) latched: SkinSensors,
-    pub(crate) pending: Vec<(From, SensorPage)>,
+    pub(crate) pending: Vec<(AppliesFrom, SensorPage)>,
     pub(crate) staged: Parameters,
     pub(crate) commits: Vec<Parameters>,
     pub(crate) test_mode: bool,
@@ -40,7 +40,7 @@ pub(crate) struct Memory {
     pub(crate) frame: Option<Frame>,
     /// True if it is not in test mode at a start.
     pub(crate) measures: bool,
-    segments: Vec<(u16, Segment)>,
+    segments: Vec<(u16, Reassembler)>,
     /// The number of packets that were sent, and of those that the correct cell inside sent before its present one.
     sent: [u16; 2],
 }
@@ -84,7 +84,7 @@ impl Memory {
                 self.last = Some((epoch, joints));
                 let latched = &mut self.latched;
                 self.pending.retain(|(from, page)| {
-                    let waits = matches!(from, From::Epoch(first) if epoch.since(*first) < 0);
+                    let waits = matches!(from, AppliesFrom::Epoch(first) if epoch.epochs_since(*first) < 0);
                     if let (false, SensorPage::Skin(skin)) = (waits, page) {
                         *latched = *skin;
                     }
@@ -94,16 +94,16 @@ impl Memory {
             Message::Halt => self.halted = true,
             Message::Resume => self.halted = false,
             Message::Stimulus { to, from, page }
-                if to.names(cell) && self.test_mode && self.pending.len() < 8 =>
+                if to.addresses(cell) && self.test_mode && self.pending.len() < 8 =>
             {
                 let from = match (from, self.last) {
-                    (From::Epoch(first), Some((last, _))) if last.since(first) >= 0 => From::Next,
+                    (AppliesFrom::Epoch(first), Some((last, _))) if last.epochs_since(first) >= 0 => AppliesFrom::Next,
                     (from, _) => from,
                 };
                 self.pending.push((from, page));
             }
             Message::Configure { to, request: Request::Write { number, words }, .. }
-                if to.names(cell) && self.settled =>
+                if to.addresses(cell) && self.settled =>
             {
                 if number == Parameter::Mode.number() {
                     self.test_mode = words[0] == 1;
@@ -129,7 +129,7 @@ pub(crate) struct Wrong {
     pub(crate) say: Say,
     pub(crate) add: Add,
     pub(crate) put: fn(&mut Memory, &Packet, Format) -> Vec<Frame>,
-    pub(crate) store: fn(&mut Memory, Flash) -> Flash,
+    pub(crate) store: fn(&mut Memory, FlashState) -> FlashState,
     pub(crate) ages: bool,
     pub(crate) yields: bool,
     pub(crate) memory: Memory,
@@ -160,10 +160,10 @@ impl Wrong {
             Format::Classic => {
                 let segments = &mut self.memory.segments;
                 let place = segments.iter().position(|(of, _)| *of == id.to_bits()).unwrap_or_else(|| {
-                    segments.push((id.to_bits(), Segment::NONE));
+                    segments.push((id.to_bits(), Reassembler::NONE));
                     segments.len() - 1
                 });
-                match segments[place].1.push(self.memory.now, id, Lengths::of(id), frame.data()).ok()? {
+                match segments[place].1.push(self.memory.now, id, Lengths::for_id(id), frame.data()).ok()? {
                     Reassembly::Complete(packet) => packet,
                     _ => return None,
                 }
@@ -220,11 +220,11 @@ impl Mutant for Wrong {
         (self.put)(&mut self.memory, packet, format)
     }
 
-    fn stores(&mut self, flash: Flash) -> Flash {
+    fn stores(&mut self, flash: FlashState) -> FlashState {
         (self.store)(&mut self.memory, flash)
     }
 
-    fn starts(&mut self, now: Micros, flash: Flash) -> Flash {
+    fn starts(&mut self, now: Micros, flash: FlashState) -> FlashState {
         let Memory { commits, starts, kept, count, measures, .. } = core::mem::take(&mut self.memory);
         let staged = commits.last().copied().unwrap_or_default();
         self.memory = Memory {

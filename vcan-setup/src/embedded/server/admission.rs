@@ -4,8 +4,8 @@ use std::io;
 use std::os::fd::OwnedFd;
 use std::time::Duration;
 
-use protocol::bus::batch::{is_shortage, send_one};
-use protocol::bus::embedded::{Answer, HELLO_MAX, Hello, VERSION};
+use protocol::bus::batch::{is_memory_shortage, send_one};
+use protocol::bus::embedded::{HelloReply, MAX_HELLO_BYTES, ClientHello, VERSION};
 use rustix::event::epoll::{self, EventData, EventFlags};
 use rustix::io::Errno;
 use rustix::net::{RecvFlags, Shutdown, SocketFlags, shutdown, sockopt};
@@ -95,16 +95,16 @@ impl Server {
     /// Reads a client's first datagram, and sets its filters.
     pub(super) fn greet(&mut self, id: ClientId) {
         let Some(client) = self.client(id) else { return };
-        let mut bytes = [0; HELLO_MAX + 1];
+        let mut bytes = [0; MAX_HELLO_BYTES + 1];
         let hello = match rustix::net::recv(&client.socket, &mut bytes, RecvFlags::DONTWAIT) {
             Err(Errno::AGAIN | Errno::INTR) => return,
             Err(errno @ (Errno::NOMEM | Errno::NOBUFS)) => return self.fails(id, errno),
             Ok((0, _)) | Err(_) => return self.forget(id),
-            Ok((len, _)) => Hello::decode(bytes.get(..len).unwrap_or_default()),
+            Ok((len, _)) => ClientHello::decode(bytes.get(..len).unwrap_or_default()),
         };
         let Some(hello) = hello else {
             // The client may not wait for an answer.
-            let _ = send_one(&client.socket, &Answer::Refused { version: VERSION }.encode());
+            let _ = send_one(&client.socket, &HelloReply::Refused { version: VERSION }.encode());
             self.post.totals.refused += 1;
             return self.forget(id);
         };
@@ -128,16 +128,16 @@ impl Server {
 /// other end see an end of file rather than a reset, which would mean that the server ended.
 fn hang_up(socket: &OwnedFd) -> bool {
     let _ = shutdown(socket, Shutdown::Write);
-    rustix::net::recv(socket, &mut [0; HELLO_MAX + 1], RecvFlags::DONTWAIT).err() != Some(Errno::AGAIN)
+    rustix::net::recv(socket, &mut [0; MAX_HELLO_BYTES + 1], RecvFlags::DONTWAIT).err() != Some(Errno::AGAIN)
 }
 
 /// Sends the answer, the first datagram in the socket. Only a lack of memory can prevent that.
 fn welcome(socket: &OwnedFd, granted: u64) -> io::Result<usize> {
-    let answer = Answer::Welcome { granted }.encode();
+    let answer = HelloReply::Welcome { granted }.encode();
     let mut tries = 0..10;
     loop {
         match send_one(socket, &answer) {
-            Err(error) if is_shortage(&error) && tries.next().is_some() => {
+            Err(error) if is_memory_shortage(&error) && tries.next().is_some() => {
                 std::thread::sleep(Duration::from_millis(1));
             }
             done => return done,

@@ -1,7 +1,7 @@
 use std::collections::VecDeque;
 use std::os::unix::net::UnixStream;
 
-use protocol::bus::{Bus, Choice, Filter, Inbox, Options};
+use protocol::bus::{Bus, KindChoice, Filter, Inbox, BusOptions};
 use protocol::can::{Frame, STANDARD_MASK};
 use tempfile::TempDir;
 
@@ -33,7 +33,7 @@ impl Receive for Faulty {
 struct Bench {
     directory: TempDir,
     stop: UnixStream,
-    thread: std::thread::JoinHandle<Result<Totals, ServeError>>,
+    thread: std::thread::JoinHandle<Result<BusTotals, ServeError>>,
 }
 
 impl Bench {
@@ -51,17 +51,17 @@ impl Bench {
     }
 
     fn open_with(&self, filters: Vec<Filter>) -> Bus {
-        let options = Options {
+        let options = BusOptions {
             filters,
             directory: Some(self.directory.path().join("skinbus")),
             send_timeout: Duration::from_secs(20),
             receive_buffer: 4 << 20,
-            ..Options::default()
+            ..BusOptions::default()
         };
-        Bus::open("vcan0", Choice::Only(protocol::bus::BusKind::Embedded), &options).unwrap()
+        Bus::open("vcan0", KindChoice::Only(protocol::bus::BusKind::Embedded), &options).unwrap()
     }
 
-    fn end(self) -> Totals {
+    fn end(self) -> BusTotals {
         drop(self.stop);
         self.thread.join().unwrap().unwrap()
     }

@@ -39,11 +39,11 @@ impl World {
         let next = |all: &[Interface]| all.iter().map(|it| it.index).max().unwrap_or(0) + 1;
         let Step { name, action } = step;
         match action {
-            Action::MakeVcan => {
+            StepAction::MakeVcan => {
                 assert!(find(&self.here, name).is_none(), "{name} is there already");
                 self.here.push(ours(name, next(&self.here)));
             }
-            Action::MakePair { peer, namespace } => {
+            StepAction::MakePair { peer, namespace } => {
                 let first = next(&self.here);
                 let (id, back, second) = match namespace {
                     None => (None, None, first + 1),
@@ -51,7 +51,7 @@ impl World {
                 };
                 let end = |name: &str, index, peer_index, peer: &str, namespace_id| {
                     let peer = Peer { name: Some(peer.to_owned()), namespace_id, ..number(peer_index) };
-                    Interface { ours: true, ..interface(name, index, Kind::Vxcan(Some(peer))) }
+                    Interface { ours: true, ..interface(name, index, InterfaceKind::Vxcan(Some(peer))) }
                 };
                 assert!(find(&self.here, name).is_none(), "{name} is there already");
                 self.here.push(end(name, first, second, peer, id));
@@ -59,23 +59,23 @@ impl World {
                 assert!(find(others, peer).is_none(), "{peer} is there already");
                 others.push(end(peer, second, first, name, back));
             }
-            Action::BringUp { index } => self.ours(*index, name).up = true,
-            Action::Widen { index, from, was_up } => {
+            StepAction::BringUp { index } => self.ours(*index, name).up = true,
+            StepAction::Widen { index, from, was_up } => {
                 let found = self.ours(*index, name);
                 assert_eq!((found.mtu, found.up), (*from, *was_up));
                 (found.mtu, found.up) = (FD_MTU, true);
             }
-            Action::SetRates { index, rates, before, was_up } => {
+            StepAction::SetRates { index, rates, before, was_up } => {
                 let found = self.by_number(*index, name);
                 assert_eq!(found.up, *was_up);
-                let Kind::Hardware(hardware) = &mut found.kind else { panic!("no hardware: {found:?}") };
+                let InterfaceKind::Hardware(hardware) = &mut found.kind else { panic!("no hardware: {found:?}") };
                 assert_eq!(hardware.rates(), *before);
                 (hardware.bitrate, hardware.data_bitrate) = (rates.bitrate, rates.data_bitrate);
                 hardware.fd = rates.data_bitrate.is_some();
                 found.mtu = if hardware.fd { FD_MTU } else { CLASSIC_MTU };
                 found.up = true;
             }
-            Action::Remove { index } => {
+            StepAction::Remove { index } => {
                 let removed = self.ours(*index, name).clone();
                 let peer = removed.peer().filter(|peer| peer.namespace_id.is_none()).map(|peer| peer.index);
                 self.here.retain(|it| it.index != *index && Some(it.index) != peer);
@@ -106,20 +106,20 @@ fn any_world() -> impl Strategy<Value = World> {
             for ((name, given), index) in NAMES.into_iter().zip(given).zip(2..) {
                 let Some((kind, ours, up, wide, rate, data)) = given else { continue };
                 let kind = match kind {
-                    0 | 1 => Kind::Vcan,
-                    2 => Kind::Vxcan(None),
-                    3 => Kind::Hardware(kvaser(
+                    0 | 1 => InterfaceKind::Vcan,
+                    2 => InterfaceKind::Vxcan(None),
+                    3 => InterfaceKind::Hardware(kvaser(
                         (rate > 0).then_some(rate * 250_000),
                         (rate > 0 && data > 0).then_some(data * 1_000_000),
                     )),
-                    _ => Kind::Other("a network interface (ether)".to_owned()),
+                    _ => InterfaceKind::Other("a network interface (ether)".to_owned()),
                 };
                 let mtu = if wide { FD_MTU } else { CLASSIC_MTU };
                 here.push(Interface { ours, up, mtu, ..interface(name, index, kind) });
             }
             if let (true, [first, second, ..]) = (pair, here.as_mut_slice()) {
                 let to = |it: &Interface| number(it.index);
-                let kinds = (Kind::Vxcan(Some(to(second))), Kind::Vxcan(Some(to(first))));
+                let kinds = (InterfaceKind::Vxcan(Some(to(second))), InterfaceKind::Vxcan(Some(to(first))));
                 (first.kind, second.kind) = kinds;
             }
             World::of(here)
@@ -127,12 +127,12 @@ fn any_world() -> impl Strategy<Value = World> {
     )
 }
 
-fn any_target() -> impl Strategy<Value = Vec<Target>> {
+fn any_target() -> impl Strategy<Value = Vec<InterfaceTarget>> {
     let one = (0..NAMES.len(), any::<bool>(), any::<bool>(), 0..3_u32, 0..3_u32);
     let target = one.prop_map(|(name, skin, fd, rate, data)| {
         let name = NAMES[name];
         if !skin {
-            return Target::named(name);
+            return InterfaceTarget::named(name);
         }
         let format = if fd { Format::Fd } else { Format::Classic };
         let bitrate = (rate > 0).then_some(rate * 250_000);
@@ -153,7 +153,7 @@ proptest! {
         world in any_world(), target in any_target(), set: bool,
     ) {
         let Ok(plan) = up(&target, &world.here, set) else {
-            let harmless = |target: &Target| find(&world.here, &target.name)
+            let harmless = |target: &InterfaceTarget| find(&world.here, &target.name)
                 .map_or_else(|| target.hardware().is_none(), |it| it.is_virtual() && it.ours);
             prop_assert!(!target.iter().all(harmless), "refused, and all could have been had");
             return Ok(());
@@ -164,7 +164,7 @@ proptest! {
             prop_assert!(it.is_can() && it.up && target.carried_by(it.mtu), "{it:?}");
         }
         for before in &world.here {
-            let hardware = matches!(before.kind, Kind::Hardware(_));
+            let hardware = matches!(before.kind, InterfaceKind::Hardware(_));
             let may_change = target.iter().any(|it| it.name == before.name)
                 && (before.is_virtual() && before.ours || hardware && set);
             prop_assert!(may_change || after.named(&before.name) == before, "{before:?}");
@@ -177,7 +177,7 @@ proptest! {
     fn down_takes_back_what_up_made(world in any_world(), target in any_target()) {
         let Ok(plan) = up(&target, &world.here, false) else { return Ok(()) };
         let after = world.carry_out_all(&plan);
-        let made: Vec<_> = plan.steps.iter().map(|step| Target::named(&step.name)).collect();
+        let made: Vec<_> = plan.steps.iter().map(|step| InterfaceTarget::named(&step.name)).collect();
         let end = after.carry_out_all(&down(&made, &after.here).unwrap());
         let kept = |it: &&Interface| plan.steps.iter().all(|step| step.name != it.name);
         for before in world.here.iter().filter(kept) {
@@ -190,7 +190,7 @@ proptest! {
     #[test]
     fn down_removes_what_is_ours_and_only_that(world in any_world(), target in any_target()) {
         let Ok(plan) = down(&target, &world.here) else {
-            let foreign = |target: &Target| find(&world.here, &target.name)
+            let foreign = |target: &InterfaceTarget| find(&world.here, &target.name)
                 .is_some_and(|it| !it.ours || !it.is_virtual());
             prop_assert!(target.iter().any(|target| target.skin.is_none() && foreign(target)));
             return Ok(());

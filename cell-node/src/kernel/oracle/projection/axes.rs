@@ -181,9 +181,9 @@ impl ToBase {
 /// Axes have length 1 except for rounding and the error of the sine, so no component can leave the range of a
 /// word, and no saturation is needed: see [`super::range`].
 #[derive(Clone, Copy)]
-pub(super) struct Turn<N>(pub(super) [N; 2]);
+pub(super) struct Rotation<N>(pub(super) [N; 2]);
 
-impl<N: Number> Turn<N> {
+impl<N: Number> Rotation<N> {
     /// Returns `c a + s b`.
     #[inline(always)]
     pub(super) fn ahead(self, mix: Mix, &[a0, a1, a2]: &Vector<N>, &[b0, b1, b2]: &Vector<N>) -> Vector<N> {

@@ -1,7 +1,7 @@
 //! Rounding of sums with more than two products.
 
 use crate::kernel::Number;
-use crate::kernel::rounding::{Bounded, Held, Rounding};
+use crate::kernel::rounding::{Bounded, Saturating, Rounding};
 
 /// Sums of products of three-component vectors, in addition to those of the cell's kernel.
 pub(super) trait Sums: Rounding {
@@ -13,7 +13,7 @@ pub(super) trait Sums: Rounding {
     fn round<N: Number>(sum: N::Wide) -> N;
 }
 
-impl Sums for Held {
+impl Sums for Saturating {
     #[inline(always)]
     fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N {
         N::round(N::plus(N::plus(number.widen(), first), second))

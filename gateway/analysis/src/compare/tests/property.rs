@@ -92,8 +92,8 @@ proptest! {
             true => compared(&skin, options, &b, &a),
         };
         let only = |count| match swaps {
-            false => Only { only_a: count, only_b: 0 },
-            true => Only { only_a: 0, only_b: count },
+            false => UnpairedCounts { only_a: count, only_b: 0 },
+            true => UnpairedCounts { only_a: 0, only_b: count },
         };
         let missing = last - first + 1 - there.len() as u64;
         prop_assert_eq!(report.epochs.compared, there.len() as u64);

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use protocol::fixed::{Q, Q1_14, Q3_12, Q7_8};
-use protocol::message::{Answer, From, Message, NetworkPage, Request, SensorPage, State};
+use protocol::message::{Answer, AppliesFrom, Message, NetworkPage, Request, SensorPage, State};
 use protocol::packet::{Packet, WORDS};
 use protocol::parameters::Parameter;
 
@@ -193,7 +193,7 @@ pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeM
                     said.put("rejected", heartbeat.rejected);
                     said.state(heartbeat.state);
                 }
-                NetworkPage::Heard(heard) => {
+                NetworkPage::Received(heard) => {
                     said.put("page", 1);
                     said.put("heard_joints", heard.joints);
                     said.put("heard_joints_skipped", heard.joints_late);
@@ -202,7 +202,7 @@ pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeM
                     said.put("heard_stimuli_late", heard.stimuli_late);
                     said.put("heard_torques", heard.torques);
                 }
-                NetworkPage::Refused(refused) => {
+                NetworkPage::Rejected(refused) => {
                     said.put("page", 2);
                     said.put("refused_length", refused.length);
                     said.put("refused_crc", refused.crc);
@@ -214,17 +214,17 @@ pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeM
                 NetworkPage::Tree(tree) => {
                     said.put("page", 3);
                     said.put("parent", tree.parent.unwrap_or(255));
-                    said.put("up", tree.up);
+                    said.put("up", tree.parent_port);
                     said.put("depth", tree.depth);
                     said.put("round", tree.round);
                     for port in 0..4 {
                         said.put(format!("child_at_{port}"), tree.children >> port & 1);
                     }
                     for port in 0..5 {
-                        said.put(format!("port_{port}_works"), tree.works >> port & 1);
+                        said.put(format!("port_{port}_works"), tree.working_ports >> port & 1);
                     }
                     said.put("sums_sent", tree.sent);
-                    said.put("sums_taken", tree.taken);
+                    said.put("sums_taken", tree.accepted);
                     said.put("sums_dropped", tree.dropped);
                 }
                 NetworkPage::Ports(ports) => {
@@ -232,7 +232,7 @@ pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeM
                     for (index, port) in ports.ports.into_iter().enumerate() {
                         said.put(format!("port_{index}_leads_to"), port.number);
                         said.put(format!("port_{index}_leads_to_port"), port.port);
-                        said.put(format!("port_{index}_hears"), u8::from(port.hears));
+                        said.put(format!("port_{index}_hears"), u8::from(port.receives));
                         said.put(format!("port_{index}_both_ways"), u8::from(port.works));
                         said.put(format!("port_{index}_other_version"), u8::from(port.other_version));
                     }
@@ -268,8 +268,8 @@ pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeM
             format!("configured_{from}")
         }
         Message::Stimulus { to, from, page } => {
-            said.put("epoch", if let From::Epoch(epoch) = from { epoch.0 } else { 0 });
-            said.put("from_next", u8::from(from == From::Next));
+            said.put("epoch", if let AppliesFrom::Epoch(epoch) = from { epoch.0 } else { 0 });
+            said.put("from_next", u8::from(from == AppliesFrom::Next));
             said.contact_state(page);
             format!("stimulus_{to}")
         }

@@ -116,10 +116,10 @@ impl Bench<'_> {
             let tag = u64::try_from(self.on_the_way.len()).unwrap();
             self.on_the_way.push((sent, due, index + 1 == frames.len()));
             let bits = match self.data {
-                Data::Any | Data::Zeros => Bits::of(frame).unwrap(),
+                Data::Any | Data::Zeros => Bits::from_frame(frame).unwrap(),
                 Data::Longest => self.longest,
             };
-            let priority = Priority::of(frame);
+            let priority = Priority::from_frame(frame);
             self.bus.request(Request { at, priority, bits, queue: None, tag });
         }
     }

@@ -6,20 +6,20 @@ use protocol::id::{Command, Kind};
 use protocol::message::{Message, SensorPage};
 use protocol::packet::data_id;
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{Reply, Skin};
+use protocol::skin::{SkinReply, Skin};
 use protocol::time::Micros;
 use protocol::wire_time::Bits;
 
 use super::moments::Moments;
-use super::touched::Touched;
-use crate::fit::rates::Chosen;
-use crate::report::thin::{Binned, Thinned};
+use super::touched::TouchHistory;
+use crate::fit::rates::ChosenRates;
+use crate::report::thin::{BinnedSums, ThinnedLine};
 use model::central::Central;
-use model::table::{Replies, Sums, Table};
-use trace::capture::Latched;
+use model::table::{Replies, BusTotals, Table};
+use trace::capture::LatchedFrame;
 
 /// Interval of timeout handling for the cells in µs, as in a receiver.
-const LOOK_US: u64 = 20_000;
+const TIMEOUT_INTERVAL_US: u64 = 20_000;
 /// The reply times of a cell, in µs.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Latency {
@@ -30,7 +30,7 @@ pub(super) struct Latency {
 
 /// The open epoch.
 #[derive(Clone, Copy, Debug, Default)]
-struct Open {
+struct OpenEpoch {
     number: u64,
     at: f64,
     /// Number of due replies.
@@ -48,16 +48,16 @@ struct Open {
 /// Lines over time with one point per epoch.
 #[derive(Debug, Default)]
 pub(super) struct Lines {
-    pub(super) due: Thinned,
-    pub(super) in_time: Thinned,
-    pub(super) late: Thinned,
-    pub(super) missing: Thinned,
+    pub(super) due: ThinnedLine,
+    pub(super) in_time: ThinnedLine,
+    pub(super) late: ThinnedLine,
+    pub(super) missing: ThinnedLine,
     /// The slowest reply, in ms.
-    pub(super) slowest: Thinned,
+    pub(super) slowest: ThinnedLine,
     /// Mean absolute error of the whole bus' torque in an epoch that all cells answered, in Nm.
-    pub(super) error: Thinned,
+    pub(super) error: ThinnedLine,
     /// By joint of the chain: distributed minus central torque of an epoch that all cells answered, in Nm or N.
-    pub(super) difference: Vec<Thinned>,
+    pub(super) difference: Vec<ThinnedLine>,
 }
 
 /// The effect of a frame on the lines of a capture without a loop.
@@ -81,32 +81,32 @@ fn is_for_cells(frame: &Frame) -> bool {
 /// The state of a bus after the frames so far.
 #[derive(Debug)]
 pub(super) struct Received {
-    looked: Micros,
+    last_timeout_check: Micros,
     /// True if frames have no direction that identifies the gateway's own.
     is_of_frames_only: bool,
     /// The totals before the newest joints.
-    pub(super) before: Sums,
+    pub(super) before: BusTotals,
     /// Number of cells in contact since the newest joints; `None` if unknown for some cell.
     pub(super) in_contact: Option<u32>,
 }
 
 /// The figures of one bus.
 #[derive(Debug)]
-pub(super) struct LinkId {
+pub(super) struct BusFigures {
     pub(super) name: String,
     pub(super) table: Table,
     /// The central computation of its cells' forces.
     central: Central,
     /// By index of the cell on the bus: the last reported force in N, for cells that measure.
     measured: Vec<Option<f64>>,
-    pub(super) touched: Touched,
+    pub(super) touched: TouchHistory,
     pub(super) moments: Moments,
     /// Time and size of the largest error of the whole bus' torque.
     pub(super) farthest: Option<(f64, f64)>,
     /// True if cells answer with sums.
     pub(super) sums: bool,
     pub(super) received: Received,
-    open: Option<Open>,
+    open: Option<OpenEpoch>,
     pub(super) lines: Lines,
     /// By index of the cell on the bus.
     pub(super) latency: Vec<Latency>,
@@ -114,22 +114,22 @@ pub(super) struct LinkId {
     /// Times of the first and the last joints on the bus, in s, and the number of joints.
     pub(super) joints: Option<(f64, f64, u64)>,
     /// The bit rates of the corresponding real bus.
-    pub(super) rates: Chosen,
+    pub(super) rates: ChosenRates,
     /// The source of the rates; `None` for defaults.
     pub(super) rates_from: Option<&'static str>,
     /// Seconds of transmission on the real bus.
-    pub(super) load: Binned,
+    pub(super) load: BinnedSums,
     /// Seconds of transmission, including frames that only a bench sends.
-    pub(super) load_of_all: Binned,
+    pub(super) load_of_all: BinnedSums,
     /// Frames that the recorder lost, by its own notes.
     pub(super) dropped: u64,
 }
 
-impl LinkId {
+impl BusFigures {
     pub(super) fn new(
         skin: &Skin,
         bus: usize,
-        (rates, rates_from): (Chosen, Option<&'static str>),
+        (rates, rates_from): (ChosenRates, Option<&'static str>),
         is_of_frames_only: bool,
     ) -> Self {
         let mut table = Table::new(skin, bus);
@@ -139,50 +139,50 @@ impl LinkId {
             name: described.map(|bus| bus.name.clone()).unwrap_or_default(),
             latency: vec![Latency::default(); table.cells().len()],
             measured: vec![None; table.cells().len()],
-            central: Central::new(&skin.part_on(bus)),
-            touched: Touched::new(skin, bus),
+            central: Central::new(&skin.with_cells_of_bus(bus)),
+            touched: TouchHistory::new(skin, bus),
             moments: Moments::default(),
             farthest: None,
             table,
-            sums: described.is_some_and(|bus| bus.reply != Reply::Torque),
+            sums: described.is_some_and(|bus| bus.reply != SkinReply::Torque),
             received: Received {
-                looked: Micros(0),
+                last_timeout_check: Micros(0),
                 is_of_frames_only,
-                before: Sums::default(),
+                before: BusTotals::default(),
                 in_contact: None,
             },
             open: None,
             lines: Lines {
-                difference: vec![Thinned::default(); skin.joints_of(bus).len()],
+                difference: vec![ThinnedLine::default(); skin.joints_on_bus(bus).len()],
                 ..Lines::default()
             },
             frames: 0,
             joints: None,
             rates,
             rates_from,
-            load: Binned::default(),
-            load_of_all: Binned::default(),
+            load: BinnedSums::default(),
+            load_of_all: BinnedSums::default(),
             dropped: 0,
         }
     }
 
     /// Handles a frame that was latched before the start of the recording.
-    pub(super) fn latched(&mut self, before: &Latched) {
+    pub(super) fn latched(&mut self, before: &LatchedFrame) {
         self.table.handle_frame(Micros(before.nanos / 1_000), before.own, &before.frame, &mut |_| None);
     }
 
     /// Starts the recording.
     pub(super) fn begin(&mut self) {
         self.table.begin_accounts();
-        self.open = self.table.newest().map(|(number, _, _)| Open { number, ..Open::default() });
+        self.open = self.table.newest().map(|(number, _, _)| OpenEpoch { number, ..OpenEpoch::default() });
     }
 
     /// Handles the next frame, `at` seconds after the start of the recording.
     pub(super) fn frame(&mut self, at: f64, record: &Record<'_>) -> Option<Effect> {
         let now = Micros(record.time.nanos / 1_000);
         self.frames += 1;
-        if now.0 >= self.received.looked.0 + LOOK_US {
-            self.received.looked = now;
+        if now.0 >= self.received.last_timeout_check.0 + TIMEOUT_INTERVAL_US {
+            self.received.last_timeout_check = now;
             self.table.handle_time(now);
             for notice in self.table.notices() {
                 self.moments.notice(at, notice);
@@ -198,7 +198,7 @@ impl LinkId {
             self.answer(now, message);
             self.measure(message);
         }
-        let seconds = Bits::of(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates.rates));
+        let seconds = Bits::from_frame(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates.rates));
         self.load_of_all.add(at, seconds);
         let before = self.table.snapshot().sums;
         self.table.receive(now, own, &read, &mut |_| None);
@@ -234,7 +234,7 @@ impl LinkId {
         else {
             return;
         };
-        let took = now.since(opened).0;
+        let took = now.elapsed_since(opened).0;
         latency.max = latency.max.max(took);
         latency.sum = latency.sum.saturating_add(took);
         latency.count += 1;
@@ -255,7 +255,7 @@ impl LinkId {
     /// Updates the force on each cell since the newest joints, from its stimuli or from its measurement.
     fn forces(&mut self, at: f64) {
         let (table, central, measured) = (&self.table, &self.central, &self.measured);
-        let sensors = table.sensors(self.received.looked).zip(table.cells()).zip(measured).enumerate();
+        let sensors = table.sensors(self.received.last_timeout_check).zip(table.cells()).zip(measured).enumerate();
         let mut in_contact = Some(0);
         let forces = sensors.map(|(place, (((sensors, _), cell), measured))| {
             let stimulated = sensors.map(|sensors| central.force(place, &sensors));
@@ -287,14 +287,14 @@ impl LinkId {
         self.joints = Some((first, at, count + 1));
         let (due, before, errors) = self.close();
         let lost = self.table.uplink().lost;
-        self.open = Some(Open { number, at, due, before, errors, lost, slowest: None });
+        self.open = Some(OpenEpoch { number, at, due, before, errors, lost, slowest: None });
         self.forces(at);
     }
 
     /// Closes the open epoch. Returns the number of newly due replies, the account and the errors now.
     fn close(&mut self) -> (u64, Replies, (u64, f64)) {
         let (account, errors) = (self.account(), self.errors());
-        let Some(Open { at, due, before, errors: errors_before, lost, slowest, .. }) = self.open.take()
+        let Some(OpenEpoch { at, due, before, errors: errors_before, lost, slowest, .. }) = self.open.take()
         else {
             return (account.due, account, errors);
         };

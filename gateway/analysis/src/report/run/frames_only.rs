@@ -3,7 +3,7 @@
 
 use protocol::skin::Skin;
 
-use super::bus_figures::{Effect, LinkId};
+use super::bus_figures::{Effect, BusFigures};
 use super::motion::Motion;
 
 /// The kind of a capture without a loop, and the state of reading it.
@@ -33,10 +33,10 @@ impl FramesOnly {
     }
 
     /// Handles a frame of one of the skin's buses with its effect there.
-    pub(super) fn take(
+    pub(super) fn receive(
         &mut self,
         (at, bus, effect): (f64, usize, Option<Effect>),
-        (skin, bus_figures): (&Skin, &[LinkId]),
+        (skin, bus_figures): (&Skin, &[BusFigures]),
         motion: &mut Motion,
     ) {
         self.end = self.end.max(at);
@@ -46,11 +46,11 @@ impl FramesOnly {
                 if *self.clock.get_or_insert(bus) == bus {
                     sums(at, skin, bus_figures, motion);
                 }
-                for ((joint, _), position) in skin.joints_of(bus).zip(positions) {
+                for ((joint, _), position) in skin.joints_on_bus(bus).zip(positions) {
                     // The buses of all its chains broadcast a joint of several chains.
                     let owner = (0..bus_figures.len()).find(|bus| {
                         let has_joints = bus_figures.get(*bus).is_some_and(|it| it.joints.is_some());
-                        has_joints && skin.joints_of(*bus).any(|(it, _)| it == joint)
+                        has_joints && skin.joints_on_bus(*bus).any(|(it, _)| it == joint)
                     });
                     if let Some(line) = motion.position.get_mut(joint).filter(|_| owner == Some(bus)) {
                         line.push(at, position);
@@ -73,7 +73,7 @@ impl FramesOnly {
     }
 
     /// Returns the missing parts of the report, as list items.
-    pub(super) fn missing(&self, bus_figures: &[LinkId], motion: &Motion) -> Vec<&'static str> {
+    pub(super) fn missing(&self, bus_figures: &[BusFigures], motion: &Motion) -> Vec<&'static str> {
         let has_joints = bus_figures.iter().any(|it| it.joints.is_some());
         let compared = bus_figures.iter().any(|it| {
             let accuracy = it.table.accuracy();
@@ -93,11 +93,11 @@ impl FramesOnly {
 }
 
 /// Adds the sums of all buses before the joints.
-fn sums(at: f64, skin: &Skin, bus_figures: &[LinkId], motion: &mut Motion) {
+fn sums(at: f64, skin: &Skin, bus_figures: &[BusFigures], motion: &mut Motion) {
     let mut torque = vec![0.0; motion.distributed.len()];
     let (mut contributing, mut active) = (0, Some(0));
     for (bus, figures) in bus_figures.iter().enumerate() {
-        for ((joint, _), of_bus) in skin.joints_of(bus).zip(figures.received.before.torque) {
+        for ((joint, _), of_bus) in skin.joints_on_bus(bus).zip(figures.received.before.torque) {
             if let Some(torque) = torque.get_mut(joint) {
                 *torque += of_bus;
             }
@@ -120,7 +120,7 @@ mod tests {
         let mut motion = Motion::new(6);
         let mut frames_only = FramesOnly::new(true, "skin.toml");
         for (at, is_halted) in [(1.0, true), (1.1, true), (2.0, false), (3.0, false)] {
-            frames_only.take((at, 0, Some(Effect::Halted(is_halted))), (&skin, &[]), &mut motion);
+            frames_only.receive((at, 0, Some(Effect::Halted(is_halted))), (&skin, &[]), &mut motion);
         }
         frames_only.finish(&mut motion);
         assert_eq!(motion.turns, [(1.0, "halted"), (2.0, "goes on")]);

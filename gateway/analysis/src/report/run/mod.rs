@@ -20,18 +20,18 @@ mod touched;
 
 use std::path::PathBuf;
 
-use protocol::skin::{Bus, Skin};
+use protocol::skin::{SkinBus, Skin};
 use protocol::wire_time::BitRatesError;
 use thiserror::Error;
 
 use super::figure::Page;
-use crate::fit::rates::{Chosen, Requested};
+use crate::fit::rates::{ChosenRates, RequestedRates};
 use crate::shadow::{self, Shadow};
-use bus_figures::LinkId;
+use bus_figures::BusFigures;
 use frames_only::FramesOnly;
 use motion::Motion;
 use trace::capture::{
-    CaptureError, Entry, Extras, Format, Item, Note, NoteKind, Other, Reader, SKIN, seconds_since,
+    CaptureError, Entry, RecordingExtras, CaptureFormat, Item, Note, NoteKind, OtherMessage, Reader, SKIN_ATTACHMENT, seconds_since,
 };
 use trace::recording::layout::Layout;
 use trace::ros2::read;
@@ -132,7 +132,7 @@ pub struct Options {
 
 impl Options {
     /// Returns the source of a bus' rates: the options' names, or the skin's key; `None` for defaults.
-    fn origin(&self, bus: &Bus) -> Option<&'static str> {
+    fn origin(&self, bus: &SkinBus) -> Option<&'static str> {
         match (self.nominal, self.data, bus.bitrate) {
             (Some(_), Some(_), _) => Some("--nominal, --data"),
             (Some(_), None, _) => Some("--nominal"),
@@ -143,8 +143,8 @@ impl Options {
     }
 
     /// Returns the bit rates for a bus' load.
-    fn rates(&self, bus: &Bus) -> Result<Chosen, ReportError> {
-        let rates = Requested { nominal: self.nominal, data: self.data }.of_bus(bus);
+    fn rates(&self, bus: &SkinBus) -> Result<ChosenRates, ReportError> {
+        let rates = RequestedRates { nominal: self.nominal, data: self.data }.of_bus(bus);
         rates.map_err(|source| ReportError::Rates { bus: bus.name.clone(), source })
     }
 }
@@ -158,7 +158,7 @@ pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportErro
     let (run, broken, is_damaged) = read(paths, options)?;
     let missing = broken.map(|why| run.missing(&why));
     let page = page::page(&run, &options.command, missing.as_deref());
-    let lacking = run.frames_only.as_ref().map(|it| format!("not in {}: {}", it.noun, run.lacking()));
+    let lacking = run.frames_only.as_ref().map(|it| format!("not in {}: {}", it.noun, run.missing_parts()));
     let remarks = lacking.into_iter().chain(run.remarks).collect();
     Ok(Report { page, missing, is_damaged, name: run.name, remarks })
 }
@@ -178,7 +178,7 @@ fn open(paths: &[PathBuf], options: &Options) -> Result<(Reader, Option<u64>), R
     let bytes =
         |path: &PathBuf| path.metadata().ok().filter(std::fs::Metadata::is_file).map(|about| about.len());
     let bytes = paths.iter().map(bytes).sum::<Option<u64>>();
-    if items.format() == Format::Candump && (options.skin.is_none() || bytes == Some(0)) {
+    if items.format() == CaptureFormat::Candump && (options.skin.is_none() || bytes == Some(0)) {
         let empty = bytes == Some(0);
         // A text of another kind would be refused with a skin, too.
         if bytes.is_some()
@@ -236,8 +236,8 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bo
 }
 
 /// Creates the computation of real buses for these buses.
-fn shadow(skin: &Skin, bus_figures: &[LinkId]) -> Shadow {
-    let rates = Requested::default().rates().expect("the default rates are valid");
+fn shadow(skin: &Skin, bus_figures: &[BusFigures]) -> Shadow {
+    let rates = RequestedRates::default().rates().expect("the default rates are valid");
     let of_bus =
         bus_figures.iter().map(|bus_figures| (bus_figures.name.clone(), bus_figures.rates.rates)).collect();
     let options =
@@ -265,7 +265,7 @@ struct Run {
     /// Start of the loop, in ns since 1970, if the recording has it.
     run_began: Option<u64>,
     motion: Motion,
-    bus_figures: Vec<LinkId>,
+    bus_figures: Vec<BusFigures>,
     shadow: Shadow,
     /// Packets of any network that the kernel dropped before they reached their sockets.
     backlog: u64,
@@ -284,17 +284,17 @@ impl Run {
     fn begin(
         name: &str,
         bytes: u64,
-        (format, extras): (Format, &Extras),
+        (format, extras): (CaptureFormat, &RecordingExtras),
         options: &Options,
     ) -> Result<Self, ReportError> {
         let has_skin = options.skin.is_some();
         let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what, has_skin };
         let recorded = extras.skin();
         let skin_file = options.skin.as_ref().map_or("", |(file, _)| file);
-        let is_log = format == Format::Candump;
+        let is_log = format == CaptureFormat::Candump;
         let frames_only = recorded.is_none().then(|| FramesOnly::new(is_log, skin_file));
         let Some(skin) = recorded.or_else(|| options.skin.clone().map(|(_, skin)| Ok(skin))) else {
-            let what = format!("{SKIN} is not attached to it");
+            let what = format!("{SKIN_ATTACHMENT} is not attached to it");
             return Err(match &extras.unfinished {
                 Some(why) => {
                     ReportError::Unfinished { name: name.to_owned(), what: format!("{what} ({why})") }
@@ -310,7 +310,7 @@ impl Run {
         let buses = skin.buses.iter().enumerate();
         let bus_figures = buses.map(|(at, bus)| {
             let rates = (options.rates(bus)?, options.origin(bus));
-            Ok(LinkId::new(&skin, at, rates, frames_only.is_some()))
+            Ok(BusFigures::new(&skin, at, rates, frames_only.is_some()))
         });
         let mut bus_figures = bus_figures.collect::<Result<Vec<_>, ReportError>>()?;
         let mut shadow = shadow(&skin, &bus_figures);
@@ -320,7 +320,7 @@ impl Run {
                 bus_figures.latched(before);
             }
         }
-        bus_figures.iter_mut().for_each(LinkId::begin);
+        bus_figures.iter_mut().for_each(BusFigures::begin);
         Ok(Self {
             topics: ["joint_states", "torques"].map(|topic| format!("/{}/{topic}", layout.arm)),
             motion: Motion::new(layout.joints.len()),
@@ -356,7 +356,7 @@ impl Run {
                         if let Some(frames_only) = &mut self.frames_only {
                             frames_only.began.get_or_insert(record.time.nanos);
                             let so_far = (&self.skin, self.bus_figures.as_slice());
-                            frames_only.take((at, bus, effect), so_far, &mut self.motion);
+                            frames_only.receive((at, bus, effect), so_far, &mut self.motion);
                         }
                         self.shadow.frame(record.interface, record.time.nanos, &record.frame);
                         self.carried();
@@ -387,7 +387,7 @@ impl Run {
         }
     }
 
-    fn message(&mut self, other: &Other<'_>) {
+    fn message(&mut self, other: &OtherMessage<'_>) {
         let at = self.seconds(other.nanos);
         let [states, torques] = &self.topics;
         let taken = if other.topic == states {
@@ -418,7 +418,7 @@ impl Run {
     }
 
     fn finish(&mut self) {
-        self.bus_figures.iter_mut().for_each(LinkId::finish);
+        self.bus_figures.iter_mut().for_each(BusFigures::finish);
         self.shadow.finish();
         self.carried();
         if let Some(frames_only) = &self.frames_only {
@@ -432,7 +432,7 @@ impl Run {
     }
 
     /// Returns the missing parts of a capture with frames only, as a list.
-    fn lacking(&self) -> String {
+    fn missing_parts(&self) -> String {
         let missing = self.frames_only.as_ref().map(|it| it.missing(&self.bus_figures, &self.motion));
         missing.unwrap_or_default().join("; ")
     }

@@ -3,12 +3,12 @@
 use std::collections::VecDeque;
 
 use model::table::{Notice, Replies};
-use model::tracker::LATEST;
+use model::tracker::MAX_LATE_EPOCHS;
 
 /// Maximum distance of losses that are joined into one, in s.
-const TOGETHER_S: f64 = 0.5;
+const MAX_LOSS_GAP_S: f64 = 0.5;
 /// Maximum number of entries of each kind that are kept.
-const KEPT: usize = 500;
+const MAX_KEPT: usize = 500;
 
 /// Losses shortly after each other.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -43,18 +43,18 @@ impl Moments {
     /// lost.
     pub(super) fn epoch(&mut self, at: f64, before: &Replies, now: &Replies, packets: u64) {
         self.opened.push_front(at);
-        self.opened.truncate(LATEST + 1);
+        self.opened.truncate(MAX_LATE_EPOCHS + 1);
         let late = now.late.saturating_sub(before.late);
         let missing = now.missing.saturating_sub(before.missing);
         if late + missing + packets == 0 {
             return;
         }
         // A reply is late for one of the previous epochs, and missing once it can no longer arrive.
-        let behind = if missing > 0 { LATEST } else { usize::from(late > 0) };
+        let behind = if missing > 0 { MAX_LATE_EPOCHS } else { usize::from(late > 0) };
         let from = self.opened.get(behind).or_else(|| self.opened.back()).copied().unwrap_or(at);
-        let is_full = self.losses.len() >= KEPT;
+        let is_full = self.losses.len() >= MAX_KEPT;
         match self.losses.last_mut() {
-            Some(last) if from - last.seconds.1 <= TOGETHER_S => {
+            Some(last) if from - last.seconds.1 <= MAX_LOSS_GAP_S => {
                 last.seconds.1 = at.max(last.seconds.1);
                 last.late += late;
                 last.missing += missing;
@@ -67,7 +67,7 @@ impl Moments {
 
     /// Records a notice of a table.
     pub(super) fn notice(&mut self, at: f64, notice: Notice) {
-        if self.notices.len() < KEPT {
+        if self.notices.len() < MAX_KEPT {
             self.notices.push((at, notice));
         } else {
             self.further += 1;

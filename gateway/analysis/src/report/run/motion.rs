@@ -1,22 +1,22 @@
 //! Series from the ticks of a recording: joints, torques, the loop's timing.
 
-use crate::report::thin::Thinned;
+use crate::report::thin::ThinnedLine;
 use model::quantiles::Times;
 use trace::ros2::read::{Joints, Torques};
 use trace::ros2::skin::LoopTiming;
 
 /// Maximum number of changes of the loop that are listed.
-const TURNS: usize = 12;
+const MAX_CHANGES: usize = 12;
 
 /// The series and counts of all ticks.
 #[derive(Debug, Default)]
 pub(super) struct Motion {
-    pub(super) position: Vec<Thinned>,
-    pub(super) velocity: Vec<Thinned>,
-    pub(super) distributed: Vec<Thinned>,
-    pub(super) central: Vec<Thinned>,
-    pub(super) active: Thinned,
-    pub(super) contributing: Thinned,
+    pub(super) position: Vec<ThinnedLine>,
+    pub(super) velocity: Vec<ThinnedLine>,
+    pub(super) distributed: Vec<ThinnedLine>,
+    pub(super) central: Vec<ThinnedLine>,
+    pub(super) active: ThinnedLine,
+    pub(super) contributing: ThinnedLine,
     pub(super) late: Timed,
     pub(super) took: Timed,
     pub(super) central_took: Timed,
@@ -52,7 +52,7 @@ pub(super) struct Counts {
 /// A duration in each tick: a line in µs, and a histogram.
 #[derive(Debug, Default)]
 pub(super) struct Timed {
-    pub(super) line: Thinned,
+    pub(super) line: ThinnedLine,
     pub(super) times: Times,
 }
 
@@ -65,7 +65,7 @@ impl Timed {
 
 impl Motion {
     pub(super) fn new(joints: usize) -> Self {
-        let each = || vec![Thinned::default(); joints];
+        let each = || vec![ThinnedLine::default(); joints];
         Self { position: each(), velocity: each(), distributed: each(), central: each(), ..Self::default() }
     }
 
@@ -112,7 +112,7 @@ impl Motion {
     }
 
     pub(super) fn turn(&mut self, at: f64, what: &'static str) {
-        if self.turns.len() < TURNS {
+        if self.turns.len() < MAX_CHANGES {
             self.turns.push((at, what));
         }
     }
@@ -138,7 +138,7 @@ impl Counts {
     }
 }
 
-fn push(lines: &mut [Thinned], at: f64, values: impl Iterator<Item = f64>) {
+fn push(lines: &mut [ThinnedLine], at: f64, values: impl Iterator<Item = f64>) {
     lines.iter_mut().zip(values).for_each(|(line, value)| line.push(at, value));
 }
 

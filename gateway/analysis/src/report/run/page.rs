@@ -8,13 +8,13 @@ mod moments;
 mod skin;
 
 use super::Run;
-use super::bus_figures::LinkId;
+use super::bus_figures::BusFigures;
 use super::frames_only::FramesOnly;
 use super::moments::Loss;
 use crate::paper;
 use crate::report::figure::{Axis, Figure, Finding, Mark, Page, Section, Series, Shape, number, quantity};
-use crate::report::thin::Thinned;
-use model::table::{Accuracy, Cell, Uplink};
+use crate::report::thin::ThinnedLine;
+use model::table::{Accuracy, CellState, Uplink};
 
 /// The paper's number of cells, control loop rate and broadcast rate.
 const PAPER_CELLS: f64 = 253.0;
@@ -24,7 +24,7 @@ const PAPER_BROADCAST_HZ: f64 = 62.5;
 const PAPER_CENTRAL_US: [f64; 3] = [0.798, 0.827, 10.7];
 
 /// Maximum number of stuck cells that are listed.
-const NAMED: usize = 10;
+const MAX_LISTED_CELLS: usize = 10;
 
 /// The inputs of a page.
 struct Draft<'a> {
@@ -73,7 +73,7 @@ fn intro_of_frames(run: &Run, frames_only: &FramesOnly) -> String {
         frames_only.format,
         run.name,
         frames_only.noun,
-        run.lacking(),
+        run.missing_parts(),
     )
 }
 
@@ -86,11 +86,11 @@ fn hundredths(seconds: f64) -> String {
 }
 
 impl Draft<'_> {
-    fn points(&self, thinned: &Thinned) -> Vec<(f64, f64)> {
+    fn points(&self, thinned: &ThinnedLine) -> Vec<(f64, f64)> {
         thinned.points().into_iter().map(|(x, y)| (x - self.zero, y)).collect()
     }
 
-    fn line(&self, caption: impl Into<String>, thinned: &Thinned) -> Series {
+    fn line(&self, caption: impl Into<String>, thinned: &ThinnedLine) -> Series {
         Series::new(caption, Shape::Line, self.points(thinned))
     }
 
@@ -109,7 +109,7 @@ impl Draft<'_> {
         self.run.motion.turns.iter().map(|&(at, what)| Mark::x(at - self.zero, what)).collect()
     }
 
-    fn named(&self, bus_figures: &LinkId) -> String {
+    fn named(&self, bus_figures: &BusFigures) -> String {
         if self.run.bus_figures.len() > 1 { bus_figures.name.clone() } else { String::new() }
     }
 
@@ -125,7 +125,7 @@ impl Draft<'_> {
             .reduce(Accuracy::with);
         let accuracy = accuracy.unwrap_or_default();
         let farthest = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.farthest);
-        let farthest = farthest.max_by(|one, other| one.1.total_cmp(&other.1)).map(|(at, _)| self.look(at));
+        let farthest = farthest.max_by(|one, other| one.1.total_cmp(&other.1)).map(|(at, _)| self.view_command(at));
         for (what, theirs, errors, is_whole) in [
             ("torques of single cells, loaded joints", paper::SINGLE_NM, accuracy.single, false),
             ("the whole skin's torque, all joints", paper::SUMMED_NM, accuracy.whole, true),
@@ -134,7 +134,7 @@ impl Draft<'_> {
             let finding = |mean| {
                 let what = format!("{what}: mean absolute error");
                 Finding::less_is_better(what, theirs, (mean, "Nm"))
-                    .look(farthest.clone().filter(|_| is_whole))
+                    .with_command(farthest.clone().filter(|_| is_whole))
             };
             findings.extend(errors.mean().map(finding));
         }
@@ -168,10 +168,10 @@ impl Draft<'_> {
             }
             if motion.counts.ticks > 0 {
                 let skipped = none("ticks skipped".to_owned(), motion.counts.skipped);
-                findings.push(skipped.look(motion.skip.map(|(at, _)| self.look(at))));
+                findings.push(skipped.with_command(motion.skip.map(|(at, _)| self.view_command(at))));
             }
         }
-        let accounts = self.run.bus_figures.iter().map(LinkId::account);
+        let accounts = self.run.bus_figures.iter().map(BusFigures::account);
         let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));
         if due > 0 {
             let what = format!("replies not received before the next joints, of {due} due");
@@ -180,13 +180,13 @@ impl Draft<'_> {
             let late = due - in_time;
             let finding = Finding::stated(what, late as f64).must(bar, late == 0);
             let worst = self.worst_loss(|loss| loss.late + loss.missing);
-            findings.push(finding.from("skin: joint_broadcast_hz").look(worst));
+            findings.push(finding.from("skin: joint_broadcast_hz").with_command(worst));
         }
         findings.extend(self.beyond_range());
         findings.extend(self.fits());
         let uplink: Uplink = self.run.bus_figures.iter().map(|bus_figures| bus_figures.table.uplink()).sum();
         let lost = none("packets of cells lost, by their own count".to_owned(), uplink.lost);
-        findings.push(lost.look(self.worst_loss(|loss| loss.packets)));
+        findings.push(lost.with_command(self.worst_loss(|loss| loss.packets)));
         findings.extend(self.stuck());
         Section::new("summary", "In numbers").findings(findings).text(
             "Compared with the paper (Efficient Distributed Torque Computation for Large Scale Robot Skin). Numbers within \
@@ -197,7 +197,7 @@ impl Draft<'_> {
     /// Returns the finding of cells that sent constant words while the expected words changed; `None` without any.
     fn stuck(&self) -> Option<Finding> {
         let cells = self.run.bus_figures.iter().flat_map(|bus_figures| {
-            let name = |cell: &Cell| {
+            let name = |cell: &CellState| {
                 let kinds: Vec<_> =
                     cell.stuck().map(|(kind, count)| format!("{count} times one {kind}")).collect();
                 (!kinds.is_empty())
@@ -206,8 +206,8 @@ impl Draft<'_> {
             bus_figures.table.cells().iter().filter_map(name)
         });
         let cells: Vec<_> = cells.collect();
-        let more = if cells.len() > NAMED { ", and others" } else { "" };
-        let named: Vec<_> = cells.iter().take(NAMED).map(String::as_str).collect();
+        let more = if cells.len() > MAX_LISTED_CELLS { ", and others" } else { "" };
+        let named: Vec<_> = cells.iter().take(MAX_LISTED_CELLS).map(String::as_str).collect();
         let what = format!(
             "stuck cells, which sent constant words while others were due ({}{more})",
             named.join("; ")
@@ -216,7 +216,7 @@ impl Draft<'_> {
     }
 
     /// Returns a sentence about a part that only a recording of a run has; `None` for such a recording.
-    fn lacks(&self, what: &str) -> Option<String> {
+    fn missing_sentence(&self, what: &str) -> Option<String> {
         let frames_only = self.run.frames_only.as_ref()?;
         Some(format!("Not in {}: {what}.", frames_only.noun))
     }
@@ -224,7 +224,7 @@ impl Draft<'_> {
     /// Returns the command that shows the loss with the highest count.
     fn worst_loss(&self, of: impl Fn(&Loss) -> u64) -> Option<String> {
         let all = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.moments.worst(&of));
-        all.max_by_key(|loss| of(loss)).map(|loss| self.look(loss.seconds.0))
+        all.max_by_key(|loss| of(loss)).map(|loss| self.view_command(loss.seconds.0))
     }
 }
 

@@ -6,10 +6,10 @@ use std::collections::BTreeMap;
 use protocol::skin::Skin;
 
 /// Maximum number of bins, and their initial width in s.
-const BINS: usize = 600;
+const MAX_BINS: usize = 600;
 const BIN_S: f64 = 0.016;
 /// Maximum number of touches with details.
-const TOUCHES: usize = 2_000;
+const MAX_TOUCHES: usize = 2_000;
 
 /// A time span with contact on some cell of a link.
 #[derive(Clone, Debug, PartialEq)]
@@ -26,7 +26,7 @@ pub(super) struct Touch {
 
 /// The touches of the cells of one bus.
 #[derive(Debug)]
-pub(super) struct Touched {
+pub(super) struct TouchHistory {
     /// By index of the cell on the bus: the row that carries it.
     rows: Vec<u8>,
     width: f64,
@@ -44,9 +44,9 @@ pub(super) struct Touched {
     pub(super) further: u64,
 }
 
-impl Touched {
+impl TouchHistory {
     pub(super) fn new(skin: &Skin, bus: usize) -> Self {
-        let rows: Vec<_> = skin.cells_of(bus).map(|cell| cell.row).collect();
+        let rows: Vec<_> = skin.cells_on_bus(bus).map(|cell| cell.row).collect();
         Self {
             width: BIN_S,
             bins: BTreeMap::new(),
@@ -104,7 +104,7 @@ impl Touched {
     fn end(&mut self, row: u8, at: f64) {
         let Some(mut touch) = self.open.remove(&row) else { return };
         touch.seconds.1 = at;
-        if self.touches.len() < TOUCHES {
+        if self.touches.len() < MAX_TOUCHES {
             self.touches.push(touch);
         } else {
             self.further += 1;
@@ -119,7 +119,7 @@ impl Touched {
     )]
     fn until(&mut self, at: f64) {
         let Some(from) = self.at.map(|from| from.max(0.0)).filter(|from| at > *from) else { return };
-        while at / self.width >= BINS as f64 {
+        while at / self.width >= MAX_BINS as f64 {
             self.width *= 2.0;
             for bins in self.bins.values_mut() {
                 *bins = bins.chunks(2).map(|two| two.iter().copied().fold(0.0, f64::max)).collect();
@@ -159,14 +159,14 @@ mod tests {
     use super::*;
     use model::generate::{Target, generate};
 
-    fn touched() -> Touched {
+    fn touched() -> TouchHistory {
         let skin =
             Skin::parse("skin", &generate(&Target { cells: 40, ..Target::default() }).unwrap()).unwrap();
-        Touched::new(&skin, 0)
+        TouchHistory::new(&skin, 0)
     }
 
     /// Records joints with forces by index of the cell; all others are 0.
-    fn joints(touched: &mut Touched, at: f64, forces: &[(usize, f64)]) {
+    fn joints(touched: &mut TouchHistory, at: f64, forces: &[(usize, f64)]) {
         let cells = touched.rows.len();
         let force = |place| forces.iter().find(|(of, _)| *of == place).map_or(0.0, |(_, force)| *force);
         touched.joints(at, (0..cells).map(|place| Some(force(place))));

@@ -12,7 +12,7 @@ use super::{FAINT, INK, LETTERS, dark, natural};
 /// Mean width of a letter.
 const LETTER: f64 = 0.56 * LETTERS;
 /// Margin of a drawing.
-const EDGE: f64 = 12.0;
+const MARGIN: f64 = 12.0;
 /// Height of the legend, with the space below it.
 const LEGEND: f64 = 52.0;
 /// Height of the heading of a panel or group.
@@ -22,7 +22,7 @@ const PITCH: f64 = 18.0;
 /// Overlap of adjacent areas, which hides seams.
 const SEAM: f64 = 0.3;
 /// Distance of cells for a link with one cell, in m.
-const ALONE_M: f64 = 0.028;
+const SINGLE_CELL_PITCH_M: f64 = 0.028;
 
 /// Draws a standalone SVG file.
 #[must_use]
@@ -119,8 +119,8 @@ fn rectangle(path: &mut String, (x, y): (f64, f64), (width, height): (f64, f64))
 /// Draws the legend of the colours at the top.
 fn legend(out: &mut String, legend: &Legend, width: f64) {
     let bar = (width * 0.4).min(260.0);
-    let left = EDGE + LETTER * legend.caption.chars().count() as f64 + 14.0;
-    words(out, (EDGE, 23.0), Anchor::Start, false, &legend.caption);
+    let left = MARGIN + LETTER * legend.caption.chars().count() as f64 + 14.0;
+    words(out, (MARGIN, 23.0), Anchor::Start, false, &legend.caption);
     let mut levels = Levels::default();
     for at in 0..LEVELS {
         let part = bar / LEVELS as f64;
@@ -139,14 +139,14 @@ fn strip_of(out: &mut String, strip: &Strip, width: f64) -> f64 {
     let rows: usize = strip.groups.iter().map(|group| group.rows.len()).sum();
     let row = if rows > 20 { 14.0 } else { 18.0 };
     let captions = strip.groups.iter().flat_map(|group| &group.rows).map(|row| row.caption.chars().count());
-    let left = EDGE + LETTER * captions.max().unwrap_or(0) as f64 + 10.0;
+    let left = MARGIN + LETTER * captions.max().unwrap_or(0) as f64 + 10.0;
     let right = width - 24.0;
     let time = Axis::new("time", "s").between(strip.seconds.0, strip.seconds.1);
     let span = Span::new(&time, [].into_iter(), 0.0);
     let place = |seconds: f64| left + span.place(seconds).clamp(0.0, 1.0) * (right - left);
     let (mut tracks, mut levels, mut y) = (String::new(), Levels::default(), LEGEND);
     for group in &strip.groups {
-        words(out, (EDGE, y + 16.0), Anchor::Start, false, &group.title);
+        words(out, (MARGIN, y + 16.0), Anchor::Start, false, &group.title);
         y += HEADING;
         for of_cell in &group.rows {
             words(out, (left - 8.0, y + row * 0.5 + 4.5), Anchor::End, true, &of_cell.caption);
@@ -198,7 +198,7 @@ impl<'a> Sheet<'a> {
         });
         let mut nearest: Vec<_> = nearest.collect();
         nearest.sort_by(|one, other| one.0.total_cmp(&other.0));
-        let pitch = nearest.get(nearest.len() / 2).map_or(ALONE_M, |(distance, _)| *distance);
+        let pitch = nearest.get(nearest.len() / 2).map_or(SINGLE_CELL_PITCH_M, |(distance, _)| *distance);
         let [sine, cosine] = nearest.iter().fold([0.0, 0.0], |[sine, cosine], (_, way)| {
             [sine + (6.0 * way).sin(), cosine + (6.0 * way).cos()]
         });
@@ -222,13 +222,13 @@ fn map_of(out: &mut String, map: &Map, width: f64) -> f64 {
     let max = |of: &dyn Fn(&Sheet<'_>) -> f64| sheets.iter().map(of).fold(f64::MIN_POSITIVE, f64::max);
     let pitch = sheets.iter().map(|sheet| sheet.pitch).fold(f64::INFINITY, f64::min);
     // Scale in pixels per metre, the same for all links.
-    let scale = (PITCH / pitch).min((width - 2.0 * EDGE - 50.0) / max(&|sheet| sheet.size[0]));
-    let (mut x, mut y, mut height) = (EDGE, LEGEND, 0.0_f64);
+    let scale = (PITCH / pitch).min((width - 2.0 * MARGIN - 50.0) / max(&|sheet| sheet.size[0]));
+    let (mut x, mut y, mut height) = (MARGIN, LEGEND, 0.0_f64);
     for sheet in &sheets {
         let title = LETTER * sheet.panel.title.chars().count() as f64;
         let wide = (sheet.size[0] * scale + 50.0).max(title);
-        if x > EDGE && x + wide > width - EDGE {
-            (x, y, height) = (EDGE, y + height, 0.0);
+        if x > MARGIN && x + wide > width - MARGIN {
+            (x, y, height) = (MARGIN, y + height, 0.0);
         }
         let high = panel_of(out, sheet, &map.legend, (x, y), scale);
         (x, height) = (x + wide + 20.0, height.max(high + 12.0));

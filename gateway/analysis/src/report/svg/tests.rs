@@ -1,5 +1,5 @@
 use super::*;
-use crate::report::figure::{Axis, Below};
+use crate::report::figure::{Axis, LowerDiagram};
 use roxmltree::{Document, Node};
 
 fn figure(series: Vec<Series>) -> Figure {
@@ -138,7 +138,7 @@ fn every_colour_has_another_one_on_a_dark_screen() {
 fn a_diagram_below_has_its_own_scale_and_the_same_time() {
     let upper = [(0.0, -100_000.0), (10.0, 100_000.0)];
     let lower = Series::new("", Shape::Line, vec![(0.0, -1e-4), (10.0, 1e-4)]);
-    let below = Below {
+    let below = LowerDiagram {
         y: Axis::new("difference", "Nm").between(-1e-4, 1e-4),
         series: vec![lower],
         marks: Vec::new(),

@@ -8,7 +8,7 @@ use protocol::can::{BIT_RATE_SWITCH, FD_FORMAT, Format};
 use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Node};
 use protocol::message::{
-    From, Heard, Heartbeat, Joints, Message, NetworkPage, Refused, Request, SensorPage, SkinSensors, State,
+    AppliesFrom, ReceivedCounts, Heartbeat, Joints, Message, NetworkPage, RejectedCounts, Request, SensorPage, SkinSensors, State,
 };
 use protocol::packet::{Epoch, WORDS};
 
@@ -47,7 +47,7 @@ fn sensors(from: i64, second: bool) -> Message {
 
 fn stimulus(to: i64) -> Message {
     let to = Node::Cell(cell(to));
-    Message::Stimulus { to, from: From::Next, page: SensorPage::Skin(SkinSensors::default()) }
+    Message::Stimulus { to, from: AppliesFrom::Next, page: SensorPage::Skin(SkinSensors::default()) }
 }
 
 impl Run {
@@ -79,8 +79,8 @@ impl Run {
     /// Sends a report command and its answers.
     fn report(&mut self, cells: i64) {
         for node in 1..=cells {
-            self.say(&page(node, NetworkPage::Heard(Heard::default())));
-            self.say(&page(node, NetworkPage::Refused(Refused::default())));
+            self.say(&page(node, NetworkPage::Received(ReceivedCounts::default())));
+            self.say(&page(node, NetworkPage::Rejected(RejectedCounts::default())));
             self.say(&sensors(node, false));
             self.say(&sensors(node, true));
         }

@@ -5,9 +5,9 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use model::tracker::{Claim, PerCell, Word};
+use model::tracker::{AddressClaim, PerCell, HeartbeatKind};
 use protocol::id::CellId;
-use protocol::message::{Answer, Heard, Joints, Message, NetworkPage};
+use protocol::message::{Answer, ReceivedCounts, Joints, Message, NetworkPage};
 use protocol::packet::{Epoch, Words};
 use protocol::schema::Units;
 use protocol::time::Micros;
@@ -15,16 +15,16 @@ use protocol::time::Micros;
 use super::WINDOW;
 use super::states::contact::{Contact, End};
 use super::states::first_joints::{self, FirstJoints};
-use super::states::line::{self, Line};
+use super::states::line::{self, BusCondition};
 use super::states::pass::{self, Pass};
 use super::states::progress::{self, Progress};
 use super::states::sending::{self, Sending};
-use super::sums::{Sums, Trees};
-use super::tally::Lacking;
-use crate::replay::difference::What;
-use crate::replay::survey::Cell as Surveyed;
+use super::sums::{SumsByCell, Trees};
+use super::tally::Uncompared;
+use crate::replay::difference::ReplyKind;
+use crate::replay::survey::SurveyedCell as Surveyed;
 use model::latched::State;
-use model::latched::Touched;
+use model::latched::KnownContacts;
 
 /// Maximum number of remembered unanswered requests per cell.
 const ANNOUNCED: usize = 256;
@@ -33,16 +33,16 @@ const AT_THE_END: u64 = 8;
 
 /// A cell on the bus now.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Present {
+pub struct PresentCell {
     /// Claim of its node id, with its last heartbeat.
-    pub claim: Claim,
+    pub claim: AddressClaim,
     /// First and last counters received from it.
-    pub heard: Option<(Heard, Heard)>,
+    pub counters: Option<(ReceivedCounts, ReceivedCounts)>,
     /// Progress with the joints announced last.
     pub(super) progress: Progress,
 }
 
-impl Present {
+impl PresentCell {
     /// Returns true if the next joints wait for this cell.
     pub(super) fn is_awaited(&self) -> bool {
         self.claim.is_settled() && matches!(self.progress, Progress::Awaited { .. })
@@ -77,11 +77,11 @@ pub(super) struct Round {
     /// State of resending the joints.
     pub(super) sending: Sending,
     /// Words of each reply, recorded and now.
-    pub(super) replies: BTreeMap<(CellId, What), Both<Option<Words>>>,
+    pub(super) replies: BTreeMap<(CellId, ReplyKind), Both<Option<Words>>>,
     /// Sums, recorded and now.
-    pub(super) sums: Both<Sums>,
+    pub(super) sums: Both<SumsByCell>,
     /// Cells that the recorded stimuli touch at the joints before, and at these.
-    pub(super) touched: [Touched; 2],
+    pub(super) touched: [KnownContacts; 2],
     /// True if a pass begins with these joints.
     pub(super) is_first: bool,
 }
@@ -144,7 +144,7 @@ struct Reading {
     pass: Pass,
     /// State at the last recorded joints, and the cells touched at them.
     state: State,
-    touched: Touched,
+    touched: KnownContacts,
     /// Number of its first round.
     first_round: u64,
 }
@@ -164,7 +164,7 @@ pub(super) struct BusComparator {
     pub(super) name: String,
     /// Units of its torques, as far as a skin gives them.
     pub(super) units: Units,
-    pub(super) present: BTreeMap<CellId, Present>,
+    pub(super) present: BTreeMap<CellId, PresentCell>,
     pub(super) known: BTreeMap<CellId, KnownCell>,
     pub(super) announcements: u64,
     /// Latest announced joints of each epoch.
@@ -188,7 +188,7 @@ pub(super) struct BusComparator {
     pub(super) sent: u64,
     /// Last round with joints in the capture, once known.
     pub(super) last_round: Option<u64>,
-    line: Line,
+    line: BusCondition,
 }
 
 impl BusComparator {
@@ -214,7 +214,7 @@ impl BusComparator {
     }
 
     pub(super) const fn is_down(&self) -> bool {
-        matches!(self.line, Line::Down)
+        matches!(self.line, BusCondition::Down)
     }
 
     /// Handles an event of the bus.
@@ -245,7 +245,7 @@ impl BusComparator {
     }
 
     /// Counts a torque or sum of the part whose joints are not in it, with the reason.
-    pub(super) fn count_without_joints(&self, epoch: Epoch, lacking: &mut Lacking) {
+    pub(super) fn count_without_joints(&self, epoch: Epoch, lacking: &mut Uncompared) {
         if self.is_earlier(epoch) {
             lacking.joints_earlier += 1;
         } else if !self.rounds.is_empty() {
@@ -288,7 +288,7 @@ impl BusComparator {
             answers.recorded.retain(|(rounds, ..)| *rounds < sent);
         }
         if let Some(last) = sent.checked_sub(1).and_then(|last| self.round(last)) {
-            last.replies.retain(|(_, what), pair| *what == What::Torque || pair.now.is_some());
+            last.replies.retain(|(_, what), pair| *what == ReplyKind::Torque || pair.now.is_some());
         }
     }
 
@@ -320,8 +320,8 @@ impl BusComparator {
         round
     }
 
-    fn take_joints(&mut self, epoch: Epoch) -> Touched {
-        self.reading.state.take(&Message::Joints { epoch, joints: Joints::default() });
+    fn take_joints(&mut self, epoch: Epoch) -> KnownContacts {
+        self.reading.state.apply(&Message::Joints { epoch, joints: Joints::default() });
         std::mem::replace(&mut self.reading.touched, self.reading.state.touched())
     }
 
@@ -333,12 +333,12 @@ impl BusComparator {
         if let Message::Joints { epoch, .. } = *message {
             self.take_joints(epoch);
         } else {
-            self.reading.state.take(message);
+            self.reading.state.apply(message);
         }
         if let (Message::Configure { to, tag, .. }, true) = (*message, is_in_part) {
             let round = self.rounds_so_far();
             let nanos = self.rounds.back().map_or(0, |round| round.nanos);
-            for cell in self.known.keys().filter(|cell| to.names(**cell)) {
+            for cell in self.known.keys().filter(|cell| to.addresses(**cell)) {
                 let announced = &mut self.answers.entry(*cell).or_default().announced;
                 if announced.len() == ANNOUNCED {
                     announced.pop_front();
@@ -359,7 +359,7 @@ impl BusComparator {
         let Reading { pass, state, first_round, .. } = &self.reading;
         let last = pass.earlier(state.last_epoch());
         self.rounds_so_far() - first_round < WINDOW
-            && last.is_some_and(|last| (0..100).contains(&last.since(epoch)))
+            && last.is_some_and(|last| (0..100).contains(&last.epochs_since(epoch)))
     }
 
     /// Records an answer to `configure`. Returns true if its request is in the part.
@@ -380,23 +380,23 @@ impl BusComparator {
     pub(super) fn record_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let next = self.base + self.rounds.len() as u64;
         let last = self.recorded.get(usize::from(epoch.0)).copied().flatten();
-        self.trees.recorded.say(cell, parent, last.map_or(next, |last| last + 1));
+        self.trees.recorded.set_parent(cell, parent, last.map_or(next, |last| last + 1));
     }
 
     /// Notes the parent that a cell reports now.
     fn hear_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let last = self.announced(epoch).and_then(|announced| announced.round);
-        self.trees.now.say(cell, parent, last.map_or(self.sent, |last| last + 1));
+        self.trees.now.set_parent(cell, parent, last.map_or(self.sent, |last| last + 1));
     }
 
     pub(super) fn network(&mut self, cell: CellId, epoch: Epoch, page: &NetworkPage) {
         let reported = self.announced(epoch).map(|announced| announced.announcement);
         let has_announced = self.announcements > 0;
-        let found = || Present { progress: Progress::found(has_announced), ..Present::default() };
+        let found = || PresentCell { progress: Progress::found(has_announced), ..PresentCell::default() };
         let present = self.present.entry(cell).or_insert_with(found);
         match *page {
             NetworkPage::Heartbeat(heartbeat) => {
-                if matches!(present.claim.hear(Micros(0), &heartbeat), Word::Claimant | Word::Outsider) {
+                if matches!(present.claim.receive(Micros(0), &heartbeat), HeartbeatKind::Claimant | HeartbeatKind::Outsider) {
                     return;
                 }
                 present.progress = present.progress.next(if reported == Some(self.announcements) {
@@ -408,12 +408,12 @@ impl BusComparator {
                     self.hear_parent(cell, epoch, None);
                 }
             }
-            NetworkPage::Heard(heard) => {
-                let first = present.heard.map_or(heard, |(first, _)| first);
-                present.heard = Some((first, heard));
+            NetworkPage::Received(heard) => {
+                let first = present.counters.map_or(heard, |(first, _)| first);
+                present.counters = Some((first, heard));
             }
             NetworkPage::Tree(tree) => self.hear_parent(cell, epoch, tree.parent),
-            NetworkPage::Refused(_) | NetworkPage::Ports(_) => {}
+            NetworkPage::Rejected(_) | NetworkPage::Ports(_) => {}
         }
     }
 
@@ -428,7 +428,7 @@ impl Answers {
     /// `rounds` is the total number of rounds.
     pub(super) fn explain_extra(
         &mut self,
-        lacking: &mut Lacking,
+        lacking: &mut Uncompared,
         known_cell: Option<&mut KnownCell>,
         tag: u8,
         rounds: u64,
@@ -458,7 +458,7 @@ impl Answers {
 
 /// Updates the first-joints state of the message's cell.
 pub(super) fn take_first_joints(cells: &mut PerCell<FirstJoints>, message: &Message) {
-    let Some((cell, input)) = first_joints::Input::of(message) else { return };
+    let Some((cell, input)) = first_joints::Input::from_message(message) else { return };
     if let Some(place) = cells.get_mut(cell) {
         *place = place.next(input);
     }

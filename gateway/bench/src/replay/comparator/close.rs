@@ -7,14 +7,14 @@ use protocol::packet::Words;
 
 use super::bus_comparator::{Both, BusComparator, KnownCell, Round};
 use super::states::contact::{self, End};
-use super::sums::{Outcome, ROUNDING, Side, Why, compare};
-use super::tally::Lacking;
+use super::sums::{SumComparison, ROUNDING, EpochSums, OmitReason, compare};
+use super::tally::Uncompared;
 use super::{Comparator, First, Tally};
-use crate::replay::difference::{How, Said, What};
+use crate::replay::difference::{DifferenceKind, SentValue, ReplyKind};
 
 impl Comparator {
     pub(super) fn close_round(&mut self, index: usize) {
-        let Self { bus_comparators, tolerance, tally, first, .. } = self;
+        let Self { buses: bus_comparators, tolerance, tally, first, .. } = self;
         let Some(bus_comparator) = bus_comparators.get_mut(index) else { return };
         let Some(round) = bus_comparator.rounds.pop_front() else { return };
         let number = bus_comparator.base;
@@ -31,7 +31,7 @@ impl Comparator {
                 bus_comparator.compare_reply(number, &round, (cell, what), pair, (tally, tolerance))
             {
                 tally.count(how, round.sending.is_unsent());
-                let said = [pair.recorded, pair.now].map(|words| Some(Said::Words(what, words?)));
+                let said = [pair.recorded, pair.now].map(|words| Some(SentValue::Words(what, words?)));
                 first.note(how, bus_comparator.called(), cell, at, said);
             }
         }
@@ -49,12 +49,12 @@ impl BusComparator {
         &mut self,
         number: u64,
         round: &Round,
-        (cell, what): (CellId, What),
+        (cell, what): (CellId, ReplyKind),
         Both { recorded, now }: Both<Option<Words>>,
         (tally, tolerance): (&mut Tally, u16),
-    ) -> Option<How> {
+    ) -> Option<DifferenceKind> {
         let (is_last, begins_later) = (self.last_round == Some(number), self.begins_later());
-        let is_torque = what == What::Torque;
+        let is_torque = what == ReplyKind::Torque;
         let mut known_cell = self.known.get_mut(&cell);
         let contact = known_cell.as_ref().map(|known_cell| known_cell.contact).unwrap_or_default();
         if let (Some(known_cell), Some(recorded), true) = (&mut known_cell, recorded, is_torque) {
@@ -69,17 +69,17 @@ impl BusComparator {
                     known_cell.end = known_cell.end.next(contact::Round::Both);
                 }
                 let is_equal = match what {
-                    What::Torque => tally.compare_torque(&recorded, &now, tolerance),
-                    What::Skin | What::Acceleration => recorded == now,
+                    ReplyKind::Torque => tally.compare_torque(&recorded, &now, tolerance),
+                    ReplyKind::Skin | ReplyKind::Acceleration => recorded == now,
                 };
                 tally.equal += u64::from(is_equal);
-                (!is_equal).then_some(How::Different)
+                (!is_equal).then_some(DifferenceKind::Different)
             }
             (Some(_), None) if !is_torque && self.senses => {
                 tally.lacking.sensed_otherwise += 1;
                 None
             }
-            (Some(_), None) if round.sending.is_unsent() => Some(How::Missing),
+            (Some(_), None) if round.sending.is_unsent() => Some(DifferenceKind::Missing),
             (Some(recorded), None) => {
                 let is_end = is_torque && recorded.is_zero();
                 // The cell had not received the joints at which the contact ended.
@@ -88,7 +88,7 @@ impl BusComparator {
                     let was_over = was_over && !known_cell.cell.is_counted_at(round.nanos);
                     is_end && (known_cell.end == End::Earlier || was_over)
                 };
-                let Some(known_cell) = known_cell.filter(is_later) else { return Some(How::Missing) };
+                let Some(known_cell) = known_cell.filter(is_later) else { return Some(DifferenceKind::Missing) };
                 known_cell.end = known_cell.end.next(contact::Round::LateEnd);
                 tally.lacking.said_later += 1;
                 None
@@ -97,7 +97,7 @@ impl BusComparator {
             (None, Some(now)) => {
                 let counts = is_torque
                     && !explain_extra(&mut tally.lacking, known_cell, (cell, round), is_last, now.is_zero());
-                counts.then_some(How::Extra)
+                counts.then_some(DifferenceKind::Extra)
             }
         }
     }
@@ -110,8 +110,8 @@ impl BusComparator {
         (tally, tolerance): (&mut Tally, u16),
         first: &mut First,
     ) {
-        let then = Side::new(&round.sums.recorded, &self.trees.recorded, number);
-        let now = Side::new(&round.sums.now, &self.trees.now, number);
+        let then = EpochSums::new(&round.sums.recorded, &self.trees.recorded, number);
+        let now = EpochSums::new(&round.sums.now, &self.trees.now, number);
         let cells: BTreeSet<_> = round.sums.recorded.cells().chain(round.sums.now.cells()).collect();
         let is_last = self.last_round == Some(number);
         for cell in cells {
@@ -127,45 +127,45 @@ impl BusComparator {
                 then.is_doubtful(cell, is_touched, false)
                     || round.sending.is_repeated() && now.is_doubtful(cell, is_touched, true)
             };
-            if matches!(outcome, Outcome::Different | Outcome::Missing | Outcome::Extra) && is_doubtful() {
-                outcome = Outcome::Omitted(Why::NotTaken);
+            if matches!(outcome, SumComparison::Different | SumComparison::Missing | SumComparison::Extra) && is_doubtful() {
+                outcome = SumComparison::Omitted(OmitReason::NotTaken);
             }
-            let owns = [then.own(cell), now.own(cell)];
-            if let ([Some(then), Some(now)], Outcome::Equal | Outcome::Different) = (&owns, outcome) {
+            let owns = [then.own_term(cell), now.own_term(cell)];
+            if let ([Some(then), Some(now)], SumComparison::Equal | SumComparison::Different) = (&owns, outcome) {
                 let max = tally.sum_words.count(then.differences(now));
-                tally.tolerated += u64::from(outcome == Outcome::Equal && max > ROUNDING);
+                tally.tolerated += u64::from(outcome == SumComparison::Equal && max > ROUNDING);
             }
             let how = match outcome {
-                Outcome::Nothing => continue,
-                Outcome::Equal => {
+                SumComparison::Nothing => continue,
+                SumComparison::Equal => {
                     tally.equal += 1;
                     tally.sums += 1;
                     continue;
                 }
-                Outcome::Omitted(why) => {
+                SumComparison::Omitted(why) => {
                     *match why {
                         _ if round.sending.is_unsent() => &mut tally.not_requested,
-                        Why::Changing => &mut lacking.parent_changing,
-                        Why::Unknown => &mut lacking.tree_unknown,
-                        Why::NotTaken => &mut lacking.sums_not_taken,
+                        OmitReason::Changing => &mut lacking.parent_changing,
+                        OmitReason::Unknown => &mut lacking.tree_unknown,
+                        OmitReason::NotTaken => &mut lacking.sums_not_taken,
                     } += 1;
                     continue;
                 }
-                Outcome::Different => How::Different,
-                Outcome::Missing => How::Missing,
+                SumComparison::Different => DifferenceKind::Different,
+                SumComparison::Missing => DifferenceKind::Missing,
                 // The cell had to send again or end its contact then, but missed its slot.
-                Outcome::Extra if self.speaking.contains(&cell) => {
+                SumComparison::Extra if self.speaking.contains(&cell) => {
                     lacking.slot_skipped += 1;
                     continue;
                 }
                 // Only a torque's words show that a contact has ended; a sum does not.
-                Outcome::Extra if explain_extra(lacking, known_cell, (cell, round), is_last, false) => {
+                SumComparison::Extra if explain_extra(lacking, known_cell, (cell, round), is_last, false) => {
                     continue;
                 }
-                Outcome::Extra => How::Extra,
+                SumComparison::Extra => DifferenceKind::Extra,
             };
             tally.count(how, round.sending.is_unsent());
-            let said = owns.map(|own| own.map(Said::Sum));
+            let said = owns.map(|own| own.map(SentValue::Sum));
             first.note(how, self.called(), cell, Some((number, round.epoch, round.nanos)), said);
         }
         for (cell, count) in round.sums.recorded.counts() {
@@ -197,12 +197,12 @@ impl BusComparator {
                         tally.equal += 1;
                         continue;
                     }
-                    (Some(_), Some(_)) => How::Different,
-                    (Some(_), None) => How::Missing,
-                    (None, Some(_)) => How::Extra,
+                    (Some(_), Some(_)) => DifferenceKind::Different,
+                    (Some(_), None) => DifferenceKind::Missing,
+                    (None, Some(_)) => DifferenceKind::Extra,
                 };
                 tally.count(how, false);
-                let said = [recorded, now].map(|said| said.map(|(tag, answer)| Said::Answer(tag, answer)));
+                let said = [recorded, now].map(|said| said.map(|(tag, answer)| SentValue::Answer(tag, answer)));
                 first.note(how, self.called(), cell, None, said);
             }
         }
@@ -211,7 +211,7 @@ impl BusComparator {
 
 /// Returns true and counts the reason if the recording explains why it lacks this reply.
 fn explain_extra(
-    lacking: &mut Lacking,
+    lacking: &mut Uncompared,
     known_cell: Option<&mut KnownCell>,
     (cell, round): (CellId, &Round),
     is_last: bool,

@@ -25,17 +25,17 @@ use protocol::parameters::{Parameter, Sensing};
 use protocol::schema::Units;
 use protocol::skin::Skin;
 
-pub use bus_comparator::Present;
+pub use bus_comparator::PresentCell;
 use bus_comparator::{Announced, Both, BusComparator, take_first_joints};
 use states::first_joints::FirstJoints;
 use states::progress::Progress;
 use states::{line, sending};
-pub use sums::Own;
-use sums::{Side, Sum};
-pub use tally::{Lacking, Steps, Tally};
+pub use sums::OwnTerm;
+use sums::{EpochSums, CellSum};
+pub use tally::{Uncompared, Steps, Tally};
 
-use super::difference::{Difference, How, Said, What, When};
-use super::survey::Cell as Surveyed;
+use super::difference::{Difference, DifferenceKind, SentValue, ReplyKind, Position};
+use super::survey::SurveyedCell as Surveyed;
 
 /// Maximum number of joints between those that a reply answers and the reply; far below the 256 epochs.
 const WINDOW: u64 = 100;
@@ -52,18 +52,18 @@ impl First {
     /// Keeps the first difference, with the number, the epoch and the time of its joints.
     fn note(
         &mut self,
-        how: How,
+        how: DifferenceKind,
         (bus, units): (&str, Units),
         cell: CellId,
         round: Option<(u64, Epoch, u64)>,
-        [recorded, now]: [Option<Said>; 2],
+        [recorded, now]: [Option<SentValue>; 2],
     ) {
         if self.difference.is_some() {
             return;
         }
         let when = round.map(|(joints, epoch, nanos)| {
             let at_s = std::time::Duration::from_nanos(nanos.saturating_sub(self.nanos)).as_secs_f64();
-            When { joints, epoch: epoch.0, at_s }
+            Position { joints, epoch: epoch.0, at_s }
         });
         self.difference =
             Some(Difference::new(how, (bus, units), cell, when, recorded.as_ref(), now.as_ref()));
@@ -73,7 +73,7 @@ impl First {
 /// Compares the replies on all buses with the capture.
 #[derive(Debug)]
 pub struct Comparator {
-    bus_comparators: Vec<BusComparator>,
+    buses: Vec<BusComparator>,
     /// Tolerance in steps between a torque's words and the recorded ones; `None` if replies are not compared.
     tolerance: Option<u16>,
     /// True while a state is restored: replies then differ from the capture's.
@@ -95,7 +95,7 @@ impl Comparator {
         let bus_comparators =
             buses.into_iter().map(|(name, cells)| BusComparator::new(name, cells)).collect();
         Self {
-            bus_comparators,
+            buses: bus_comparators,
             tolerance,
             is_muted: true,
             tally: Tally::default(),
@@ -106,29 +106,29 @@ impl Comparator {
 
     /// Sets the units of the buses that the skin describes, by name.
     pub fn describe(&mut self, skin: &Skin) {
-        for bus in &mut self.bus_comparators {
+        for bus in &mut self.buses {
             if let Some(index) = skin.bus_named(&bus.name) {
-                bus.units = Units::of(skin, index);
+                bus.units = Units::for_bus(skin, index);
             }
         }
     }
 
     /// Records the next joints of the capture. Returns the number of their round on their bus if they will be sent.
-    pub fn record_joints(
+    pub fn expect_joints(
         &mut self,
-        bus_comparator: usize,
+        bus_index: usize,
         nanos: u64,
         epoch: Epoch,
         is_sent: bool,
     ) -> Option<u64> {
-        self.bus_comparators.get_mut(bus_comparator)?.record_joints(nanos, epoch, is_sent)
+        self.buses.get_mut(bus_index)?.record_joints(nanos, epoch, is_sent)
     }
 
     /// Records any other message of the capture. `is_in_part` is true in the part that is replayed.
-    pub fn record(&mut self, bus_comparator: usize, message: &Message, is_in_part: bool) {
+    pub fn expect(&mut self, bus_index: usize, message: &Message, is_in_part: bool) {
         let expects = self.tolerance.is_some();
         let (Some(bus_comparator), tally) =
-            (self.bus_comparators.get_mut(bus_comparator).filter(|_| expects), &mut self.tally)
+            (self.buses.get_mut(bus_index).filter(|_| expects), &mut self.tally)
         else {
             return;
         };
@@ -145,7 +145,7 @@ impl Comparator {
             }
         } else if let Message::Sum { from, epoch, torque, count } = *message {
             match bus_comparator.recorded_round(epoch) {
-                Some(round) => round.sums.recorded.take(from, Sum { torque, count }),
+                Some(round) => round.sums.recorded.insert(from, CellSum { torque, count }),
                 None if is_in_part => bus_comparator.count_without_joints(epoch, &mut tally.lacking),
                 None => {}
             }
@@ -157,7 +157,7 @@ impl Comparator {
         take_first_joints(&mut bus_comparator.first_joints.recorded, message);
         let Some((cell, epoch, what, words)) = reply(message) else { return };
         let untaken = FirstJoints::Awaited { epoch };
-        if what != What::Torque && bus_comparator.first_joints.recorded.get(cell) == Some(&untaken) {
+        if what != ReplyKind::Torque && bus_comparator.first_joints.recorded.get(cell) == Some(&untaken) {
             // The reply belongs to no joints, even if joints of that epoch were on the bus by then.
             return;
         }
@@ -166,7 +166,7 @@ impl Comparator {
             Some(_) if measured => tally.lacking.measured += 1,
             Some(round) => round.replies.entry((cell, what)).or_default().recorded = Some(words),
             // Before the first joints, sensor replies belong to no joints.
-            None if is_in_part && what == What::Torque => {
+            None if is_in_part && what == ReplyKind::Torque => {
                 bus_comparator.count_without_joints(epoch, &mut tally.lacking)
             }
             None => {}
@@ -174,21 +174,21 @@ impl Comparator {
     }
 
     /// Starts a new pass of the capture: replies before its first joints answer joints of no earlier pass.
-    pub fn record_begin(&mut self) {
-        self.bus_comparators.iter_mut().for_each(BusComparator::begin);
+    pub fn expect_restart(&mut self) {
+        self.buses.iter_mut().for_each(BusComparator::begin);
     }
 
     /// Notes that the capture has no more joints.
-    pub fn record_end(&mut self) {
-        for bus_comparator in &mut self.bus_comparators {
+    pub fn expect_end(&mut self) {
+        for bus_comparator in &mut self.buses {
             bus_comparator.last_round =
                 (bus_comparator.base + bus_comparator.rounds.len() as u64).checked_sub(1);
         }
     }
 
     /// Notes that joints are about to be sent: those of a round, or others.
-    pub fn announce(&mut self, bus_comparator: usize, round: Option<u64>, epoch: Epoch) {
-        let Some(it) = self.bus_comparators.get_mut(bus_comparator) else { return };
+    pub fn sent_joints(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch) {
+        let Some(it) = self.buses.get_mut(bus_index) else { return };
         it.announce();
         let announced = Announced { announcement: it.announcements, round };
         if let Some(place) = it.announced.get_mut(usize::from(epoch.0)) {
@@ -198,17 +198,17 @@ impl Comparator {
         it.sent = it.sent.max(number + 1);
         it.send(number, sending::Input::Sent { under: epoch });
         while self
-            .bus_comparators
-            .get(bus_comparator)
+            .buses
+            .get(bus_index)
             .is_some_and(|bus_comparator| bus_comparator.base + WINDOW < number)
         {
-            self.close_round(bus_comparator);
+            self.close_round(bus_index);
         }
     }
 
     /// Notes a sync without joints: all cells must confirm everything sent so far.
-    pub fn announce_again(&mut self, bus_comparator: usize) {
-        let Some(it) = self.bus_comparators.get_mut(bus_comparator) else { return };
+    pub fn announce_sync(&mut self, bus_index: usize) {
+        let Some(it) = self.buses.get_mut(bus_index) else { return };
         it.announce();
         let (announcement, last) = (it.announcements, it.announcements - 1);
         if let Some(announced) =
@@ -219,15 +219,15 @@ impl Comparator {
     }
 
     /// Notes that a bus refused the joints of a round.
-    pub fn was_not_sent(&mut self, bus_comparator: usize, round: u64) {
-        if let Some(bus_comparator) = self.bus_comparators.get_mut(bus_comparator) {
+    pub fn mark_unsent(&mut self, bus_index: usize, round: u64) {
+        if let Some(bus_comparator) = self.buses.get_mut(bus_index) {
             bus_comparator.send(round, sending::Input::Refused);
         }
     }
 
     /// Handles a message of another sender on a bus.
-    pub fn hear(&mut self, index: usize, message: &Message) {
-        let Some(bus_comparator) = self.bus_comparators.get_mut(index) else { return };
+    pub fn observe(&mut self, index: usize, message: &Message) {
+        let Some(bus_comparator) = self.buses.get_mut(index) else { return };
         bus_comparator.line(line::Input::Message);
         take_first_joints(&mut bus_comparator.first_joints.now, message);
         if let Message::Network { from: Node::Cell(cell), epoch, page } = *message {
@@ -246,11 +246,11 @@ impl Comparator {
             && let Some((_, round)) =
                 bus_comparator.announced_round(epoch).filter(|(_, round)| round.has_sums_of(epoch))
         {
-            round.sums.now.take(from, Sum { torque, count });
+            round.sums.now.insert(from, CellSum { torque, count });
         }
         let Some((cell, epoch, what, words)) = reply(message) else { return };
         let untaken = FirstJoints::Awaited { epoch };
-        if what != What::Torque && bus_comparator.first_joints.now.get(cell) == Some(&untaken) {
+        if what != ReplyKind::Torque && bus_comparator.first_joints.now.get(cell) == Some(&untaken) {
             return;
         }
         let Some((number, round)) = bus_comparator.announced_round(epoch) else { return };
@@ -261,12 +261,12 @@ impl Comparator {
             // Joints that are sent twice are answered twice.
             Some(before) if before == words => {}
             // The last reply counts, as in the capture.
-            Some(_) if what != What::Torque => pair.now = Some(words),
+            Some(_) if what != ReplyKind::Torque => pair.now = Some(words),
             Some(_) => {
                 self.tally.extra += 1;
-                let said = [None, Some(Said::Words(what, words))];
+                let said = [None, Some(SentValue::Words(what, words))];
                 self.first.note(
-                    How::Extra,
+                    DifferenceKind::Extra,
                     bus_comparator.called(),
                     cell,
                     Some((number, epoch, nanos)),
@@ -278,29 +278,29 @@ impl Comparator {
 
     /// Returns true if all awaited cells of a bus have processed the joints announced last.
     #[must_use]
-    pub fn is_done(&self, bus_comparator: usize) -> bool {
-        self.bus_comparators
-            .get(bus_comparator)
+    pub fn is_done(&self, bus_index: usize) -> bool {
+        self.buses
+            .get(bus_index)
             .is_none_or(|bus_comparator| bus_comparator.is_down() || bus_comparator.undone().next().is_none())
     }
 
     /// Number of cells that have processed the joints announced last, to show progress.
     #[must_use]
-    pub fn done(&self, bus_comparator: usize) -> usize {
-        self.bus_comparators.get(bus_comparator).map_or(0, |bus_comparator| {
+    pub fn done(&self, bus_index: usize) -> usize {
+        self.buses.get(bus_index).map_or(0, |bus_comparator| {
             bus_comparator.present.values().filter(|present| present.progress == Progress::Done).count()
         })
     }
 
     /// Gives up and returns the cells that are not done.
-    pub fn give_up(&mut self, bus_comparator: usize) -> Vec<CellId> {
-        self.bus_comparators.get_mut(bus_comparator).map_or_else(Vec::new, BusComparator::give_up)
+    pub fn give_up(&mut self, bus_index: usize) -> Vec<CellId> {
+        self.buses.get_mut(bus_index).map_or_else(Vec::new, BusComparator::give_up)
     }
 
     /// Number of recorded torques and sums of a round whose present counterparts have not arrived, of present cells.
     #[must_use]
-    pub fn unanswered(&self, bus_comparator: usize, number: u64) -> usize {
-        let Some(bus_comparator) = self.bus_comparators.get(bus_comparator) else { return 0 };
+    pub fn unanswered(&self, bus_index: usize, number: u64) -> usize {
+        let Some(bus_comparator) = self.buses.get(bus_index) else { return 0 };
         let Some(round) = number
             .checked_sub(bus_comparator.base)
             .and_then(|at| bus_comparator.rounds.get(usize::try_from(at).ok()?))
@@ -309,21 +309,21 @@ impl Comparator {
         };
         let is_there =
             |cell: &CellId| bus_comparator.present.get(cell).is_some_and(|present| !present.is_given_up());
-        let replies = round.replies.iter().filter(|((_, what), _)| *what == What::Torque);
+        let replies = round.replies.iter().filter(|((_, what), _)| *what == ReplyKind::Torque);
         let unanswered = replies.filter(|(_, pair)| pair.recorded.is_some() && pair.now.is_none());
         let torques = unanswered.filter(|((cell, _), _)| is_there(cell)).count();
         let Both { recorded: then, now } = &round.sums;
         if then.is_empty() {
             return torques;
         }
-        let then = Side::new(then, &bus_comparator.trees.recorded, number);
+        let then = EpochSums::new(then, &bus_comparator.trees.recorded, number);
         let misses = |cell: &CellId| is_there(cell) && !now.has(*cell) && then.feels(*cell);
         torques + round.sums.recorded.cells().filter(misses).count()
     }
 
     /// Marks a bus as down, so that its cells are not awaited. The next message ends this.
-    pub fn is_down(&mut self, bus_comparator: usize) {
-        if let Some(bus_comparator) = self.bus_comparators.get_mut(bus_comparator) {
+    pub fn mark_down(&mut self, bus_index: usize) {
+        if let Some(bus_comparator) = self.buses.get_mut(bus_index) {
             bus_comparator.line(line::Input::Lost);
         }
     }
@@ -332,7 +332,7 @@ impl Comparator {
     pub fn mute(&mut self, is_muted: bool) {
         self.is_muted = is_muted;
         for announced in self
-            .bus_comparators
+            .buses
             .iter_mut()
             .flat_map(|bus_comparator| bus_comparator.announced.iter_mut().flatten())
         {
@@ -347,42 +347,42 @@ impl Comparator {
     }
 
     /// Cells that are on a bus now.
-    pub fn present(&self, bus_comparator: usize) -> impl Iterator<Item = (CellId, &Present)> {
-        self.bus_comparators
-            .get(bus_comparator)
+    pub fn present_cells(&self, bus_index: usize) -> impl Iterator<Item = (CellId, &PresentCell)> {
+        self.buses
+            .get(bus_index)
             .into_iter()
             .flat_map(|bus_comparator| bus_comparator.present.iter().map(|(cell, it)| (*cell, it)))
     }
 
     /// Cells on a bus that own their node id.
-    pub fn settled(&self, bus_comparator: usize) -> impl Iterator<Item = (CellId, &Present)> {
-        self.present(bus_comparator).filter(|(_, present)| present.claim.is_settled())
+    pub fn settled_cells(&self, bus_index: usize) -> impl Iterator<Item = (CellId, &PresentCell)> {
+        self.present_cells(bus_index).filter(|(_, present)| present.claim.is_settled())
     }
 
     /// Cells that have not reported a parent for their sums, or are unreachable.
     #[must_use]
-    pub fn unreachable(&self, bus_comparator: usize) -> Vec<CellId> {
-        let settled = self.settled(bus_comparator);
-        let Some(bus_comparator) = self.bus_comparators.get(bus_comparator) else { return Vec::new() };
+    pub fn unreachable(&self, bus_index: usize) -> Vec<CellId> {
+        let settled = self.settled_cells(bus_index);
+        let Some(bus_comparator) = self.buses.get(bus_index) else { return Vec::new() };
         settled.map(|(cell, _)| cell).filter(|cell| !bus_comparator.trees.now.is_reachable(*cell)).collect()
     }
 
     /// Compares all that has been sent; call it once. `is_whole` is true if all of the capture was sent.
     pub fn finish(&mut self, is_whole: bool) {
         self.is_muted = true;
-        for bus_comparator in self.bus_comparators.iter_mut().filter(|_| !is_whole) {
+        for bus_comparator in self.buses.iter_mut().filter(|_| !is_whole) {
             bus_comparator.forget_the_unsent();
         }
-        for bus_comparator in 0..self.bus_comparators.len() {
+        for bus_comparator in 0..self.buses.len() {
             while self
-                .bus_comparators
+                .buses
                 .get(bus_comparator)
                 .is_some_and(|bus_comparator| !bus_comparator.rounds.is_empty())
             {
                 self.close_round(bus_comparator);
             }
         }
-        for bus_comparator in &mut self.bus_comparators {
+        for bus_comparator in &mut self.buses {
             bus_comparator.close_answers(&mut self.tally, &mut self.first);
         }
     }
@@ -406,11 +406,11 @@ fn is_compared(answer: Answer) -> bool {
 }
 
 /// Decodes a reply that carries the epoch of the joints that it answers or follows.
-fn reply(message: &Message) -> Option<(CellId, Epoch, What, Words)> {
+fn reply(message: &Message) -> Option<(CellId, Epoch, ReplyKind, Words)> {
     let (from, epoch, what) = if let Message::Torque { from, epoch, .. } = *message {
-        (from, epoch, What::Torque)
+        (from, epoch, ReplyKind::Torque)
     } else if let Message::Sensors { from, epoch, page } = *message {
-        (from, epoch, if matches!(page, SensorPage::Skin(_)) { What::Skin } else { What::Acceleration })
+        (from, epoch, if matches!(page, SensorPage::Skin(_)) { ReplyKind::Skin } else { ReplyKind::Acceleration })
     } else {
         return None;
     };

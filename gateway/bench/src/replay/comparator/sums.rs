@@ -31,7 +31,7 @@ struct Step {
 
 impl Trees {
     /// Sets the parent that a cell reports from round `since` on.
-    pub(super) fn say(&mut self, cell: CellId, parent: Option<u8>, since: u64) {
+    pub(super) fn set_parent(&mut self, cell: CellId, parent: Option<u8>, since: u64) {
         let steps = self.0.entry(cell).or_default();
         if steps.back().is_none_or(|last| last.parent != parent) {
             steps.push_back(Step { since, parent });
@@ -83,7 +83,7 @@ impl Trees {
 
 /// Sum sent by one cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) struct Sum {
+pub(super) struct CellSum {
     pub(super) torque: Words,
     /// Number of cells in it.
     pub(super) count: u8,
@@ -91,10 +91,10 @@ pub(super) struct Sum {
 
 /// Last sum of each cell for one epoch: the sum with the most cells.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Sums(BTreeMap<CellId, Sum>);
+pub(super) struct SumsByCell(BTreeMap<CellId, CellSum>);
 
-impl Sums {
-    pub(super) fn take(&mut self, cell: CellId, sum: Sum) {
+impl SumsByCell {
+    pub(super) fn insert(&mut self, cell: CellId, sum: CellSum) {
         let last = self.0.entry(cell).or_insert(sum);
         if sum.count > last.count {
             *last = sum;
@@ -129,7 +129,7 @@ pub(super) const ROUNDING: u32 = 1;
 
 /// A cell's own contribution to its sum.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Own {
+pub struct OwnTerm {
     /// The sum as sent.
     pub sum: Words,
     /// Number of cells in it.
@@ -143,7 +143,7 @@ pub struct Own {
     pub cells: i32,
 }
 
-impl Own {
+impl OwnTerm {
     /// Returns true if all unsaturated words are zero.
     fn is_nothing(&self) -> bool {
         self.steps.iter().flatten().all(|step| *step == 0)
@@ -157,8 +157,8 @@ impl Own {
 }
 
 /// Sums of one epoch and their tree, recorded or now.
-pub(super) struct Side<'a> {
-    sums: &'a Sums,
+pub(super) struct EpochSums<'a> {
+    sums: &'a SumsByCell,
     children: BTreeMap<u8, Vec<CellId>>,
     affected: BTreeSet<CellId>,
     /// All remembered parents of each cell that changed its parent.
@@ -169,7 +169,7 @@ pub(super) struct Side<'a> {
 
 /// Reason why a sum is not compared.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Why {
+pub(super) enum OmitReason {
     /// The cell, or a former or present child, was changing its parent.
     Changing,
     /// A cell has not reported its parent.
@@ -180,18 +180,18 @@ pub(super) enum Why {
 
 /// Result of the comparison of a cell's sums.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Outcome {
+pub(super) enum SumComparison {
     /// The cell contributed nothing itself, neither then nor now.
     Nothing,
     Equal,
     Different,
     Missing,
     Extra,
-    Omitted(Why),
+    Omitted(OmitReason),
 }
 
-impl<'a> Side<'a> {
-    pub(super) fn new(sums: &'a Sums, trees: &Trees, round: u64) -> Self {
+impl<'a> EpochSums<'a> {
+    pub(super) fn new(sums: &'a SumsByCell, trees: &Trees, round: u64) -> Self {
         let mut children: BTreeMap<u8, Vec<CellId>> = BTreeMap::new();
         for cell in trees.0.keys() {
             if let Some(parent) = trees.parent(*cell, round).flatten() {
@@ -209,8 +209,8 @@ impl<'a> Side<'a> {
     }
 
     /// A cell's own contribution to its sum, or `None` if it sent no sum.
-    pub(super) fn own(&self, cell: CellId) -> Option<Own> {
-        let Sum { torque: sum, count } = *self.sums.0.get(&cell)?;
+    pub(super) fn own_term(&self, cell: CellId) -> Option<OwnTerm> {
+        let CellSum { torque: sum, count } = *self.sums.0.get(&cell)?;
         let below = self.children(cell).iter().filter_map(|child| Some((*child, self.sums.0.get(child)?)));
         let (mut children, mut cells) = (Vec::new(), i32::from(count));
         let mut steps = sum.padded().map(exact);
@@ -221,13 +221,13 @@ impl<'a> Side<'a> {
                 *own = own.zip(exact(word)).map(|(own, word)| own - word);
             }
         }
-        Some(Own { sum, count, children, steps, cells })
+        Some(OwnTerm { sum, count, children, steps, cells })
     }
 
     /// Returns true if the remainder of a cell's sum cannot be its own contribution, given whether it was touched: it
     /// had other children than their pages report. If joints were resent, sums of two sendings may be mixed too.
     pub(super) fn is_doubtful(&self, cell: CellId, is_touched: Option<bool>, is_mixed: bool) -> bool {
-        self.own(cell).is_some_and(|own| {
+        self.own_term(cell).is_some_and(|own| {
             let adds = own.cells == 0 && !own.is_nothing();
             is_touched.is_some_and(|is_touched| is_touched != (own.cells > 0)) || is_mixed && adds
         })
@@ -235,13 +235,13 @@ impl<'a> Side<'a> {
 
     /// Returns true if the cell itself is in contact.
     pub(super) fn feels(&self, cell: CellId) -> bool {
-        self.own(cell).is_some_and(|own| own.cells > 0)
+        self.own_term(cell).is_some_and(|own| own.cells > 0)
     }
 
     /// Returns true if a cell's sum contains the received sums of all its children, so that the remainder is its own
     /// contribution.
     fn is_whole(&self, cell: CellId, other: &Self) -> bool {
-        let Some(own) = self.own(cell) else { return true };
+        let Some(own) = self.own_term(cell) else { return true };
         let adds_up = match own.cells {
             // It contains the cell's own contribution but lacks the sum of a child of one cell.
             0 => own.is_nothing() || !other.feels(cell),
@@ -257,9 +257,9 @@ impl<'a> Side<'a> {
     /// is not a child in this epoch: pages follow the change that they report. That sum must not be in another parent's
     /// sum.
     fn holds_a_mover(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
-        let own_of = |cell| Some((self.own(cell)?, other.own(cell)?));
+        let own_of = |cell| Some((self.own_term(cell)?, other.own_term(cell)?));
         let Some((own, its)) = own_of(cell) else { return false };
-        let adds = |sum: &Sum| {
+        let adds = |sum: &CellSum| {
             let words = own.steps.iter().zip(&its.steps).zip(sum.torque.padded());
             let mut words =
                 words.filter_map(|((own, its), word)| Some(own.as_ref()? - its.as_ref()? - exact(word)?));
@@ -298,22 +298,22 @@ fn exact(word: i16) -> Option<i32> {
 /// sum across one more bound. The children's differences cancel, so the tolerance does not depend on the number of
 /// cells in the sum.
 pub(super) fn compare(
-    recorded: &Side<'_>,
-    now: &Side<'_>,
+    recorded: &EpochSums<'_>,
+    now: &EpochSums<'_>,
     cell: CellId,
     tolerance: u16,
     format: TorqueFormat,
-) -> Outcome {
+) -> SumComparison {
     if recorded.affected.contains(&cell) || now.affected.contains(&cell) {
-        return Outcome::Omitted(Why::Changing);
+        return SumComparison::Omitted(OmitReason::Changing);
     }
     if !recorded.is_known || !now.is_known {
-        return Outcome::Omitted(Why::Unknown);
+        return SumComparison::Omitted(OmitReason::Unknown);
     }
     if !recorded.is_whole(cell, now) || !now.is_whole(cell, recorded) {
-        return Outcome::Omitted(Why::NotTaken);
+        return SumComparison::Omitted(OmitReason::NotTaken);
     }
-    let (then, today) = (recorded.own(cell), now.own(cell));
+    let (then, today) = (recorded.own_term(cell), now.own_term(cell));
     match (then, today) {
         (Some(then), Some(today)) => {
             // The whole subtree saturates a word: in another tree, other cells do.
@@ -335,19 +335,19 @@ pub(super) fn compare(
                     (None, _) | (_, None) => alike(sum, other),
                 });
             if same {
-                Outcome::Equal
+                SumComparison::Equal
             } else if now.holds_a_mover(cell, recorded, allowed) || recorded.holds_a_mover(cell, now, allowed)
             {
-                Outcome::Omitted(Why::NotTaken)
+                SumComparison::Omitted(OmitReason::NotTaken)
             } else {
-                Outcome::Different
+                SumComparison::Different
             }
         }
-        (Some(then), None) if then.cells > 0 => Outcome::Missing,
-        (None, Some(today)) if today.cells > 0 => Outcome::Extra,
+        (Some(then), None) if then.cells > 0 => SumComparison::Missing,
+        (None, Some(today)) if today.cells > 0 => SumComparison::Extra,
         // The tree decides whether a cell forwards others' sums, but it adds nothing to them.
-        (Some(own), None) | (None, Some(own)) if !own.is_nothing() => Outcome::Different,
-        (Some(_), None) | (None, Some(_) | None) => Outcome::Nothing,
+        (Some(own), None) | (None, Some(own)) if !own.is_nothing() => SumComparison::Different,
+        (Some(_), None) | (None, Some(_) | None) => SumComparison::Nothing,
     }
 }
 

@@ -3,7 +3,7 @@
 use protocol::packet::Words;
 use serde::Serialize;
 
-use crate::replay::difference::How;
+use crate::replay::difference::DifferenceKind;
 
 /// Counts of compared replies.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
@@ -27,7 +27,7 @@ pub struct Tally {
     /// Words of sums less their children, in steps of Q7.8.
     pub sum_words: Steps,
     /// Replies that the recording lacks, or whose joints it lacks.
-    pub lacking: Lacking,
+    pub lacking: Uncompared,
 }
 
 /// Histogram of the differences between words and recorded ones, in steps.
@@ -58,7 +58,7 @@ impl Steps {
 
 /// Replies that were not recorded, or not with their joints, by the reason that the recording shows.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-pub struct Lacking {
+pub struct Uncompared {
     /// The cell was silent in the recording: absent, killed, hung, or claiming its node id.
     pub silent: u64,
     /// The cell missed this many joints, by its own counters.
@@ -94,12 +94,12 @@ pub struct Lacking {
 
 impl Tally {
     /// Counts a reply that differs from the recorded one. Joints that a bus refused get no reply.
-    pub(super) const fn count(&mut self, how: How, is_unsent: bool) {
+    pub(super) const fn count(&mut self, how: DifferenceKind, is_unsent: bool) {
         let count = match how {
-            How::Missing if is_unsent => &mut self.not_requested,
-            How::Missing => &mut self.missing,
-            How::Different => &mut self.different,
-            How::Extra => &mut self.extra,
+            DifferenceKind::Missing if is_unsent => &mut self.not_requested,
+            DifferenceKind::Missing => &mut self.missing,
+            DifferenceKind::Different => &mut self.different,
+            DifferenceKind::Extra => &mut self.extra,
         };
         *count += 1;
     }

@@ -1,10 +1,10 @@
 use super::bus_comparator::KnownCell;
 use super::*;
-use crate::replay::survey::{Part, Survey};
+use crate::replay::survey::{TimeRange, Survey};
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
 use protocol::fixed::Q3_12;
-use protocol::message::{Heard, Heartbeat, Joints, State as Flags, Tree};
+use protocol::message::{ReceivedCounts, Heartbeat, Joints, State as Flags, Tree};
 use protocol::packet;
 use protocol::parameters::Parameter as P;
 
@@ -15,7 +15,7 @@ fn cell(node: i64) -> CellId {
 }
 
 fn torque(node: i64, epoch: u8, bits: i16) -> Message {
-    let torque = packet::words([bits]).into();
+    let torque = packet::padded_words([bits]).into();
     Message::Torque { from: cell(node), epoch: Epoch(epoch), torque }
 }
 
@@ -25,12 +25,12 @@ fn heartbeat(node: i64, epoch: u8, sent: u16, state: Flags) -> Message {
 }
 
 fn heard(node: i64, epoch: u8, joints: u16) -> Message {
-    let page = NetworkPage::Heard(Heard { joints, ..Heard::default() });
+    let page = NetworkPage::Received(ReceivedCounts { joints, ..ReceivedCounts::default() });
     Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(epoch), page }
 }
 
 fn sum(node: i64, epoch: u8, bits: i16, count: u8) -> Message {
-    let torque = packet::words([bits]).into();
+    let torque = packet::padded_words([bits]).into();
     Message::Sum { from: cell(node), epoch: Epoch(epoch), torque, count }
 }
 
@@ -50,35 +50,35 @@ fn rated(recording: &[Message], now: &[Message]) -> Comparator {
 
 /// Compares with a tolerance in steps of torques.
 fn rated_within(tolerance: u16, recording: &[Message], now: &[Message]) -> Comparator {
-    let mut survey = Survey::new(Part::default());
+    let mut survey = Survey::new(TimeRange::default());
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(tolerance));
     let times = (1_u64..).map(|at| at * MS);
     for (nanos, message) in times.clone().zip(recording) {
         let time = Timestamp::six_digits(nanos);
         for frame in message.encode().frames(Format::Fd) {
-            survey.take(&Record { time, interface: "vcan0", frame, direction: None });
+            survey.add_frame(&Record { time, interface: "vcan0", frame, direction: None });
         }
     }
     survey.finish();
     let cells = survey.buses[0].cells.clone();
-    comparator.bus_comparators[0].known =
+    comparator.buses[0].known =
         cells.into_iter().map(|(node, cell)| (node, KnownCell::new(cell))).collect();
     comparator.mute(false);
     for (nanos, message) in times.zip(recording) {
         if let Message::Joints { epoch, .. } = *message {
-            comparator.record_joints(0, nanos, epoch, true);
+            comparator.expect_joints(0, nanos, epoch, true);
         } else {
-            comparator.record(0, message, true);
+            comparator.expect(0, message, true);
         }
     }
-    comparator.record_end();
+    comparator.expect_end();
     let mut round = 0;
     for message in now {
         if let Message::Joints { epoch, .. } = *message {
-            comparator.announce(0, Some(round), epoch);
+            comparator.sent_joints(0, Some(round), epoch);
             round += 1;
         } else {
-            comparator.hear(0, message);
+            comparator.observe(0, message);
         }
     }
     comparator.finish(true);
@@ -123,7 +123,7 @@ fn one_step_is_a_difference() {
     let comparator = rated(&run(), &now);
     assert_eq!(counts(&comparator), [2, 1, 0, 0]);
     let first = comparator.first().unwrap();
-    assert_eq!((first.how, first.when.map(|when| (when.joints, when.epoch))), (How::Different, Some((2, 2))));
+    assert_eq!((first.how, first.when.map(|when| (when.joints, when.epoch))), (DifferenceKind::Different, Some((2, 2))));
     assert!(first.text.ends_with("joint 1: 1 step more (0.0002 Nm)"), "{first:?}");
 }
 
@@ -132,11 +132,11 @@ fn missing_and_extra_replies_are_distinguished() {
     let mut now = run();
     now.remove(5);
     let comparator = rated(&run(), &now);
-    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([2, 0, 1, 0], How::Missing));
+    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([2, 0, 1, 0], DifferenceKind::Missing));
     let mut now = run();
     now.insert(9, torque(1, 4, 9));
     let comparator = rated(&[&run()[..], &[joints(5)]].concat(), &now);
-    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([3, 0, 0, 1], How::Extra));
+    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([3, 0, 0, 1], DifferenceKind::Extra));
     // Two equal replies count as one, as for joints that were resent; two different ones do not.
     let mut now = run();
     now.insert(4, torque(1, 1, 5));
@@ -176,7 +176,7 @@ fn joints_that_a_cell_did_not_take_then_explain_an_answer_now() {
         heard(1, 5, 105),
     ];
     let comparator = rated(&recording, &run());
-    let Lacking { untaken, said_later, .. } = comparator.tally.lacking;
+    let Uncompared { untaken, said_later, .. } = comparator.tally.lacking;
     assert_eq!((counts(&comparator), untaken, said_later), ([2, 0, 0, 0], 1, 1));
     let mut knows = recording;
     knows[10] = heard(1, 5, 106);
@@ -273,10 +273,10 @@ fn the_contact_of_a_cell_before_its_first_joints_belongs_to_no_joints() {
 fn joints_that_a_bus_did_not_take_have_no_answer() {
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
     comparator.mute(false);
-    comparator.record_joints(0, 1, Epoch(1), true);
-    comparator.record(0, &torque(1, 1, 5), true);
-    comparator.announce(0, Some(0), Epoch(1));
-    comparator.was_not_sent(0, 0);
+    comparator.expect_joints(0, 1, Epoch(1), true);
+    comparator.expect(0, &torque(1, 1, 5), true);
+    comparator.sent_joints(0, Some(0), Epoch(1));
+    comparator.mark_unsent(0, 0);
     comparator.finish(true);
     assert_eq!((counts(&comparator), comparator.tally.not_requested), ([0, 0, 0, 0], 1));
     assert!(!comparator.tally.is_good());
@@ -311,9 +311,9 @@ fn epochs_wrap_around_and_old_rounds_are_compared_on_the_way() {
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
     for number in 0..1_000_u64 {
         let epoch = Epoch(number.to_le_bytes()[0]);
-        comparator.record_joints(0, number, epoch, true);
-        comparator.announce(0, Some(number), epoch);
-        assert!(comparator.bus_comparators[0].rounds.len() <= 102);
+        comparator.expect_joints(0, number, epoch, true);
+        comparator.sent_joints(0, Some(number), epoch);
+        assert!(comparator.buses[0].rounds.len() <= 102);
     }
 }
 
@@ -380,7 +380,7 @@ fn a_cell_that_adds_nothing_any_more_is_missing() {
     );
     let comparator = rated(&row(), &now);
     // It is unknown whether the parent received it then.
-    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([11, 0, 1, 0], How::Missing));
+    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([11, 0, 1, 0], DifferenceKind::Missing));
 }
 
 #[test]
@@ -439,19 +439,19 @@ fn joints_that_are_retried_have_the_sums_of_the_last_time() {
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
     comparator.mute(false);
     for message in &row()[3..6] {
-        comparator.record(0, message, true);
-        comparator.hear(0, message);
+        comparator.expect(0, message, true);
+        comparator.observe(0, message);
     }
-    comparator.hear(0, &heartbeat(1, 0, 0, Flags::TEST_MODE));
-    comparator.record_joints(0, 1, Epoch(7), true);
-    comparator.record(0, &sum(1, 7, 40, 1), true);
-    comparator.announce(0, Some(0), Epoch(7));
-    comparator.hear(0, &sum(1, 7, 90, 2));
+    comparator.observe(0, &heartbeat(1, 0, 0, Flags::TEST_MODE));
+    comparator.expect_joints(0, 1, Epoch(7), true);
+    comparator.expect(0, &sum(1, 7, 40, 1), true);
+    comparator.sent_joints(0, Some(0), Epoch(7));
+    comparator.observe(0, &sum(1, 7, 90, 2));
     assert_eq!(comparator.unanswered(0, 0), 0);
-    comparator.announce(0, Some(0), Epoch(6));
+    comparator.sent_joints(0, Some(0), Epoch(6));
     assert_eq!(comparator.unanswered(0, 0), 1);
-    comparator.hear(0, &sum(1, 7, 90, 2));
-    comparator.hear(0, &sum(1, 6, 40, 1));
+    comparator.observe(0, &sum(1, 7, 90, 2));
+    comparator.observe(0, &sum(1, 6, 40, 1));
     assert_eq!(comparator.unanswered(0, 0), 0);
     comparator.finish(true);
     assert_eq!(counts(&comparator), [1, 0, 0, 0]);
@@ -461,27 +461,27 @@ fn joints_that_are_retried_have_the_sums_of_the_last_time() {
 fn in_lockstep_a_cell_is_done_when_its_heartbeat_has_the_epoch() {
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(0));
     let beat = |node, epoch| heartbeat(node, epoch, 0, Flags::TEST_MODE);
-    comparator.hear(0, &beat(1, 0));
-    comparator.hear(0, &heartbeat(2, 0, 0, Flags::CLAIMING));
+    comparator.observe(0, &beat(1, 0));
+    comparator.observe(0, &heartbeat(2, 0, 0, Flags::CLAIMING));
     assert!(comparator.is_done(0), "nothing was sent");
-    comparator.announce(0, None, Epoch(9));
+    comparator.sent_joints(0, None, Epoch(9));
     assert!(!comparator.is_done(0));
-    comparator.hear(0, &beat(1, 8));
+    comparator.observe(0, &beat(1, 8));
     assert!(!comparator.is_done(0), "sent before it took them");
-    comparator.hear(0, &beat(1, 9));
+    comparator.observe(0, &beat(1, 9));
     assert!(comparator.is_done(0), "a cell that claims its node id is not waited for");
-    comparator.announce(0, None, Epoch(10));
+    comparator.sent_joints(0, None, Epoch(10));
     // A cell that refuses these joints sends its old epoch: once in its periodic heartbeat, once because of the sync.
-    comparator.hear(0, &beat(1, 9));
+    comparator.observe(0, &beat(1, 9));
     assert!(!comparator.is_done(0));
-    comparator.hear(0, &beat(1, 9));
+    comparator.observe(0, &beat(1, 9));
     assert!(comparator.is_done(0));
-    comparator.announce(0, None, Epoch(11));
+    comparator.sent_joints(0, None, Epoch(11));
     assert_eq!(comparator.give_up(0), [cell(1)]);
     assert!(comparator.is_done(0), "given up");
-    comparator.hear(0, &beat(1, 10));
+    comparator.observe(0, &beat(1, 10));
     assert!(!comparator.is_done(0), "it sends again");
-    comparator.is_down(0);
+    comparator.mark_down(0);
     assert!(comparator.is_done(0), "no cell is waited for on a bus that is down");
 }
 

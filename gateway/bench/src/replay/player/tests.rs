@@ -43,10 +43,10 @@ impl Stage for Fake {
         self.clock += self.takes;
         if self.outcomes.is_empty() { Ok(()) } else { self.outcomes.remove(0) }
     }
-    fn was_not_sent(&mut self, bus_link: usize, round: u64) {
+    fn mark_unsent(&mut self, bus_link: usize, round: u64) {
         self.unsent.push((bus_link, round));
     }
-    fn wait_for_answers(&mut self, bus_link: usize, _: &Open) {
+    fn wait_for_answers(&mut self, bus_link: usize, _: &OpenJoints) {
         self.waited.push((self.sent.len(), bus_link));
     }
     fn restore(&mut self, _: &[(usize, Vec<Message>)]) -> Result<(), ReplayError> {
@@ -60,28 +60,28 @@ impl Stage for Fake {
 /// The error of a bus that stayed full after `sent` frames.
 fn full(sent: usize) -> Result<(), SendError> {
     let cause = BusError::Full { name: "vcan0".to_owned(), waited: Duration::from_millis(100) };
-    Err(SendError { sent, target: sent, cause })
+    Err(SendError { sent, total: sent, cause })
 }
 
 /// The error of a bus that went down after `sent` frames.
 fn down(sent: usize) -> Result<(), SendError> {
-    Err(SendError { sent, target: sent, cause: BusError::Down("vcan0".to_owned()) })
+    Err(SendError { sent, total: sent, cause: BusError::Down("vcan0".to_owned()) })
 }
 
 fn frame(id: u32) -> Frame {
     Frame::classic(id, &[]).unwrap()
 }
 
-fn plain(at_us: u64, bus_link: usize, id: u32) -> Step {
-    Step::Frame(Due { at: at_us * 1_000, bus_link, frame: frame(id), role: Role::Plain, is_late: false })
+fn plain(at_us: u64, bus_link: usize, id: u32) -> PlayerStep {
+    PlayerStep::Frame(DueFrame { at: at_us * 1_000, bus_index: bus_link, frame: frame(id), role: FrameRole::Plain, is_late: false })
 }
 
-fn joints(at_us: u64, bus_link: usize, round: u64) -> Step {
-    let role = Role::Joints(Open { epoch: Epoch(7), joints: Joints::default(), round: Some(round) });
-    Step::Frame(Due { at: at_us * 1_000, bus_link, frame: frame(1), role, is_late: false })
+fn joints(at_us: u64, bus_link: usize, round: u64) -> PlayerStep {
+    let role = FrameRole::Joints(OpenJoints { epoch: Epoch(7), joints: Joints::default(), round: Some(round) });
+    PlayerStep::Frame(DueFrame { at: at_us * 1_000, bus_index: bus_link, frame: frame(1), role, is_late: false })
 }
 
-fn play(player: Player, stage: &mut Fake, steps: impl IntoIterator<Item = Step>) -> Played {
+fn play(player: Player, stage: &mut Fake, steps: impl IntoIterator<Item = PlayerStep>) -> PlayerResult {
     let (mut all, mut queue) = rtrb::RingBuffer::new(1_024);
     steps.into_iter().for_each(|step| all.push(step).unwrap());
     drop(all);
@@ -148,7 +148,7 @@ fn in_lockstep_joints_wait_for_the_answers_to_those_before_on_their_bus() {
 #[test]
 fn the_first_segment_of_joints_waits_too() {
     let segment =
-        Step::Frame(Due { at: 0, bus_link: 0, frame: frame(1), role: Role::SegmentOfJoints, is_late: false });
+        PlayerStep::Frame(DueFrame { at: 0, bus_index: 0, frame: frame(1), role: FrameRole::SegmentOfJoints, is_late: false });
     let sync = vec![vec![frame(2), frame(2)]];
     let mut stage = Fake::default();
     play(
@@ -162,7 +162,7 @@ fn the_first_segment_of_joints_waits_too() {
 
 #[test]
 fn what_a_bus_does_not_take_is_counted_by_its_reason() {
-    let gone = Err(SendError { sent: 0, target: 1, cause: BusError::Gone("vcan0".to_owned()) });
+    let gone = Err(SendError { sent: 0, total: 1, cause: BusError::Gone("vcan0".to_owned()) });
     let outcomes = vec![full(1), down(0), down(0), Ok(()), gone];
     let mut stage = Fake { outcomes, ..Fake::default() };
     let steps = [
@@ -188,10 +188,10 @@ fn what_a_bus_does_not_take_is_counted_by_its_reason() {
 fn a_state_that_is_restored_takes_its_time_and_the_clock_begins_after_it() {
     let mut stage = Fake::default();
     let steps = [
-        Step::Restore(Vec::new()),
+        PlayerStep::Restore(Vec::new()),
         plain(0, 0, 1),
         plain(500, 0, 2),
-        Step::Restore(Vec::new()),
+        PlayerStep::Restore(Vec::new()),
         plain(1_000, 0, 3),
     ];
     let played = play(Player::new(1, Pace::Timed(1.0), None), &mut stage, steps);
@@ -201,10 +201,10 @@ fn a_state_that_is_restored_takes_its_time_and_the_clock_begins_after_it() {
 
 #[test]
 fn frames_older_than_the_last_one_are_sent_at_once_and_are_not_late() {
-    let late = Due { at: 9_000_000, bus_link: 0, frame: frame(9), role: Role::Plain, is_late: true };
+    let late = DueFrame { at: 9_000_000, bus_index: 0, frame: frame(9), role: FrameRole::Plain, is_late: true };
     let mut stage = Fake::default();
     let played =
-        play(Player::new(1, Pace::Timed(1.0), None), &mut stage, [plain(0, 0, 1), Step::Frame(late)]);
+        play(Player::new(1, Pace::Timed(1.0), None), &mut stage, [plain(0, 0, 1), PlayerStep::Frame(late)]);
     assert_eq!((identifiers(&stage), played.late.len()), (vec![vec![1, 9]], 1));
 }
 
@@ -230,7 +230,7 @@ proptest! {
             at += step;
             let mut due = if is_joints { joints(at, bus_link, rounds[bus_link]) } else { plain(at, bus_link, 0) };
             rounds[bus_link] += u64::from(is_joints);
-            if let Step::Frame(due) = &mut due {
+            if let PlayerStep::Frame(due) = &mut due {
                 due.frame = frame(id);
             }
             due
@@ -247,10 +247,10 @@ proptest! {
             .flat_map(|(at, bus_link, frames)| frames.iter().map(move |frame| (*at, *bus_link, *frame)))
             .filter(|(_, _, frame)| frame.id() != 0x7FF).collect();
         prop_assert_eq!(tried.len(), steps.len());
-        let first = match &steps.first() { Some(Step::Frame(due)) => due.at, _ => 0 };
+        let first = match &steps.first() { Some(PlayerStep::Frame(due)) => due.at, _ => 0 };
         for ((at, bus_link, frame), step) in tried.iter().zip(&steps) {
-            let Step::Frame(due) = step else { unreachable!() };
-            prop_assert_eq!((*bus_link, *frame), (due.bus_link, due.frame));
+            let PlayerStep::Frame(due) = step else { unreachable!() };
+            prop_assert_eq!((*bus_link, *frame), (due.bus_index, due.frame));
             prop_assert!(*at >= due.at - first + LEAD_NS, "early");
         }
         let total: u64 = played.bus_links.iter().map(|bus_link| bus_link.sent + bus_link.refused + bus_link.lost).sum();

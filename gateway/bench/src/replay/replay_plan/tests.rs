@@ -1,11 +1,11 @@
 use std::collections::BTreeMap;
 
 use super::*;
-use crate::replay::survey::Part;
+use crate::replay::survey::TimeRange;
 use protocol::can::{ERROR, EXTENDED, Format};
 use protocol::candump::Timestamp;
 use protocol::id::{CellId, Node};
-use protocol::message::From;
+use protocol::message::AppliesFrom;
 use protocol::message::{SensorPage, SkinSensors};
 use protocol::port;
 
@@ -22,7 +22,7 @@ fn joints(epoch: u8) -> Frame {
 
 fn press(number: i64) -> Frame {
     let page = SensorPage::Skin(SkinSensors::default());
-    frame(&Message::Stimulus { to: Node::Cell(CellId::new(number).unwrap()), from: From::Next, page })
+    frame(&Message::Stimulus { to: Node::Cell(CellId::new(number).unwrap()), from: AppliesFrom::Next, page })
 }
 
 fn torque(number: i64, epoch: u8) -> Frame {
@@ -50,16 +50,16 @@ fn decoded(frame: &Frame) -> Decoded {
 }
 
 /// All steps of `passes` passes.
-fn plan_summary(part: Part, selection: impl FnOnce(&mut Selection), passes: u32) -> (Vec<Due>, PlanSummary) {
+fn plan_summary(part: TimeRange, selection: impl FnOnce(&mut Selection), passes: u32) -> (Vec<DueFrame>, PlanSummary) {
     share_of(&capture(), part, selection, passes)
 }
 
 fn share_of(
     capture: &[(u64, &'static str, Frame)],
-    part: Part,
+    part: TimeRange,
     selection: impl FnOnce(&mut Selection),
     passes: u32,
-) -> (Vec<Due>, PlanSummary) {
+) -> (Vec<DueFrame>, PlanSummary) {
     let mut survey = Survey::new(part);
     let record = |(nanos, interface, frame): &(u64, &'static str, Frame)| Record {
         time: Timestamp::nine_digits(*nanos),
@@ -67,10 +67,10 @@ fn share_of(
         frame: *frame,
         direction: None,
     };
-    capture.iter().for_each(|it| survey.take(&record(it)));
+    capture.iter().for_each(|it| survey.add_frame(&record(it)));
     survey.finish();
     let bus_links = vec![Some(0), Some(1)];
-    let mut chosen = Selection { only: Only::All, bus_links, reads: true };
+    let mut chosen = Selection { only: SenderFilter::All, destinations: bus_links, reads: true };
     selection(&mut chosen);
     let names = ["a", "b"].map(|name| (name.to_owned(), BTreeMap::new()));
     let mut comparator = Comparator::new(names, 0, Some(0));
@@ -78,7 +78,7 @@ fn share_of(
     let mut steps = Vec::new();
     for _ in 0..passes {
         for it in capture {
-            if replay_plan.take(&record(it), &mut comparator).is_break() {
+            if replay_plan.add_frame(&record(it), &mut comparator).is_break() {
                 break;
             }
         }
@@ -86,26 +86,26 @@ fn share_of(
         steps.extend(std::iter::from_fn(|| replay_plan.next_step()));
     }
     let due = |step| match step {
-        Step::Frame(due) => due,
-        Step::Restore(_) => panic!("no restore was requested"),
+        PlayerStep::Frame(due) => due,
+        PlayerStep::Restore(_) => panic!("no restore was requested"),
     };
     (steps.into_iter().map(due).collect(), replay_plan.into_summary())
 }
 
-fn shown(due: &[Due]) -> Vec<(u64, usize, u32)> {
-    due.iter().map(|due| (due.at / MS, due.bus_link, due.frame.id())).collect()
+fn shown(due: &[DueFrame]) -> Vec<(u64, usize, u32)> {
+    due.iter().map(|due| (due.at / MS, due.bus_index, due.frame.id())).collect()
 }
 
 #[test]
 fn all_is_sent_but_what_never_was_on_a_bus() {
-    let (due, plan_summary) = plan_summary(Part::default(), |_| {}, 1);
+    let (due, plan_summary) = plan_summary(TimeRange::default(), |_| {}, 1);
     let ids = [(0, 0, 0x701), (1, 0, 1), (2, 1, 1), (3, 0, 0x201), (4, 0, 5), (6, 0, 1), (7, 1, 0x202)];
     assert_eq!(shown(&due), ids);
     assert_eq!(plan_summary.skipped, BTreeMap::from([(reason::ERROR, 1)]));
     // Joints are numbered per bus.
     let rounds = due.iter().filter_map(|due| match due.role {
-        Role::Joints(Open { round, .. }) => Some((due.bus_link, round)),
-        Role::Plain | Role::SegmentOfJoints => None,
+        FrameRole::Joints(OpenJoints { round, .. }) => Some((due.bus_index, round)),
+        FrameRole::Plain | FrameRole::SegmentOfJoints => None,
     });
     assert_eq!(rounds.collect::<Vec<_>>(), [(0, Some(0)), (1, Some(0)), (0, Some(1))]);
 }
@@ -113,11 +113,11 @@ fn all_is_sent_but_what_never_was_on_a_bus() {
 #[test]
 fn inputs_and_replies_are_the_two_sides() {
     let (inputs, truncate_inputs) =
-        plan_summary(Part::default(), |selection| selection.only = Only::Inputs, 1);
+        plan_summary(TimeRange::default(), |selection| selection.only = SenderFilter::Inputs, 1);
     assert_eq!(shown(&inputs), [(0, 0, 0x701), (1, 0, 1), (2, 1, 1), (6, 0, 1)]);
     assert_eq!(truncate_inputs.skipped, BTreeMap::from([(reason::ERROR, 1), (reason::NO_INPUT, 3)]));
     let (replies, share_of_replies) =
-        plan_summary(Part::default(), |selection| selection.only = Only::Replies, 1);
+        plan_summary(TimeRange::default(), |selection| selection.only = SenderFilter::Replies, 1);
     assert_eq!(shown(&replies), [(0, 0, 0x201), (4, 1, 0x202)], "the first one begins");
     assert_eq!(share_of_replies.skipped, BTreeMap::from([(reason::ERROR, 1), (reason::NO_REPLY, 5)]));
 }
@@ -128,31 +128,31 @@ fn foreign_frames_are_neither_inputs_nor_replies_whatever_their_identifiers_are(
     let data = |id: u32, byte| Frame::classic(id, &[byte; 8]).unwrap();
     let classic = |message: &Message| message.encode().frames(Format::Classic).collect::<Vec<_>>();
     let page = SensorPage::Skin(SkinSensors::default());
-    let press = Message::Stimulus { to: Node::Cell(CellId::new(2).unwrap()), from: From::Next, page };
+    let press = Message::Stimulus { to: Node::Cell(CellId::new(2).unwrap()), from: AppliesFrom::Next, page };
     let halt = classic(&Message::Halt);
     let frames: Vec<_> = [data(0x001, 1), data(0x201, 2), halt[0], data(0x701, 3), halt[1], data(0x001, 4)]
         .into_iter()
         .chain(classic(&press))
         .collect();
     let capture: Vec<_> = (5_000_u64..).zip(frames).map(|(at, frame)| (at * MS, "a", frame)).collect();
-    let of = |only| share_of(&capture, Part::default(), |selection| selection.only = only, 1);
-    let ids = |due: &[Due]| due.iter().map(|due| due.frame.id()).collect::<Vec<_>>();
-    let (inputs, plan_summary) = of(Only::Inputs);
+    let of = |only| share_of(&capture, TimeRange::default(), |selection| selection.only = only, 1);
+    let ids = |due: &[DueFrame]| due.iter().map(|due| due.frame.id()).collect::<Vec<_>>();
+    let (inputs, plan_summary) = of(SenderFilter::Inputs);
     assert_eq!(ids(&inputs), [0, 0, 0x702, 0x702]);
     assert_eq!(plan_summary.skipped, BTreeMap::from([(reason::NO_INPUT, 4)]));
-    assert_eq!(of(Only::Replies).0.len(), 0);
-    let (all, _) = of(Only::All);
+    assert_eq!(of(SenderFilter::Replies).0.len(), 0);
+    let (all, _) = of(SenderFilter::All);
     assert_eq!(ids(&all), [0x001, 0x201, 0, 0x701, 0, 0x001, 0x702, 0x702], "in their order");
-    assert!(all.iter().all(|due| due.role == Role::Plain));
+    assert!(all.iter().all(|due| due.role == FrameRole::Plain));
 }
 
 #[test]
 fn wire_messages_are_never_sent() {
-    let survey = Survey::new(Part::default());
-    for only in [Only::All, Only::Inputs, Only::Replies] {
-        let selection = Selection { only, bus_links: vec![Some(0)], reads: true };
+    let survey = Survey::new(TimeRange::default());
+    for only in [SenderFilter::All, SenderFilter::Inputs, SenderFilter::Replies] {
+        let selection = Selection { only, destinations: vec![Some(0)], reads: true };
         let replay_plan = ReplayPlan::new(&survey, &selection);
-        let frame = port::LinkId { wire: 9, back: false }.frame(port::PortMessage::Join);
+        let frame = port::LinkId { wire: 9, back: false }.encode_frame(port::PortMessage::Join);
         assert_eq!(replay_plan.unwanted(0, &frame, &decoded(&frame)), Some(reason::WIRE));
         // A damaged frame proves nothing, and counts as foreign.
         let other = Frame::classic(frame.raw_id(), &[0; 8]).unwrap();
@@ -162,8 +162,8 @@ fn wire_messages_are_never_sent() {
 
 #[test]
 fn a_part_begins_and_ends_at_its_times_and_buses_are_mapped() {
-    let part = Part { from: Some(MS), to: Some(6 * MS) };
-    let (due, plan_summary) = plan_summary(part, |selection| selection.bus_links = vec![None, Some(0)], 1);
+    let part = TimeRange { from: Some(MS), to: Some(6 * MS) };
+    let (due, plan_summary) = plan_summary(part, |selection| selection.destinations = vec![None, Some(0)], 1);
     assert_eq!(shown(&due), [(0, 0, 1)]);
     let skipped = [(reason::BEFORE, 1), (reason::AFTER, 2), (reason::NOT_PICKED, 3), (reason::ERROR, 1)];
     assert_eq!(plan_summary.skipped, BTreeMap::from(skipped));
@@ -171,13 +171,13 @@ fn a_part_begins_and_ends_at_its_times_and_buses_are_mapped() {
 
 #[test]
 fn passes_follow_each_other_as_joints_do() {
-    let (due, _) = plan_summary(Part::default(), |selection| selection.only = Only::Inputs, 3);
+    let (due, _) = plan_summary(TimeRange::default(), |selection| selection.only = SenderFilter::Inputs, 3);
     let starts: Vec<_> = due.iter().step_by(4).map(|due| due.at / MS).collect();
     // A pass lasts 6 ms, which is also the time from the first joints to the second.
     assert_eq!(starts, [0, 12, 24]);
     let rounds = due.iter().filter_map(|due| match due.role {
-        Role::Joints(Open { round, .. }) if due.bus_link == 0 => round,
-        Role::Joints(_) | Role::Plain | Role::SegmentOfJoints => None,
+        FrameRole::Joints(OpenJoints { round, .. }) if due.bus_index == 0 => round,
+        FrameRole::Joints(_) | FrameRole::Plain | FrameRole::SegmentOfJoints => None,
     });
     assert_eq!(rounds.collect::<Vec<_>>(), [0, 1, 2, 3, 4, 5]);
 }

@@ -4,9 +4,9 @@ use super::*;
 
 #[test]
 fn counters_that_cannot_be_of_one_life_account_for_no_joints() {
-    let mut cell = Cell::new(0, None);
+    let mut cell = SurveyedCell::new(0, None);
     let mut report = |joints, after, last| {
-        cell.report(Heard { joints, ..Heard::default() }, Some((after, last)));
+        cell.report(ReceivedCounts { joints, ..ReceivedCounts::default() }, Some((after, last)));
         (cell.untaken, cell.accounted.clone())
     };
     assert_eq!(report(0, 100, 10), (0, vec![]));
@@ -21,11 +21,11 @@ fn a_part_has_counters_elsewhere_though_one_of_its_buses_began_lost() {
     let torque = Message::Torque { from: CellId::new(1).unwrap(), epoch: Epoch(3), torque: [0; 6].into() };
     let frames: Vec<_> = torque.encode().frames(Format::Fd).collect();
     let time = Timestamp { nanos: 5, nine_digits: true, min_digits: 0 };
-    let of = |latched: &[Latched]| {
-        let mut survey = Survey::new(Part::default());
-        survey.begin(latched);
+    let of = |latched: &[LatchedFrame]| {
+        let mut survey = Survey::new(TimeRange::default());
+        survey.add_latched(latched);
         for interface in ["vcan0", "vcan1"] {
-            survey.take(&Record { time, interface, frame: frames[0], direction: None });
+            survey.add_frame(&Record { time, interface, frame: frames[0], direction: None });
         }
         survey.finish();
         let buses = survey.buses.iter().filter(|bus| !bus.cells.is_empty());
@@ -33,7 +33,7 @@ fn a_part_has_counters_elsewhere_though_one_of_its_buses_began_lost() {
     };
     assert_eq!(of(&[]), [true, true], "a log of a bench that has no counters");
     let frame = Message::Resume.encode().frames(Format::Fd).next().unwrap();
-    let latched = Latched { bus: "vcan0".into(), own: true, frame, nanos: 1 };
+    let latched = LatchedFrame { bus: "vcan0".into(), own: true, frame, nanos: 1 };
     assert_eq!(of(&[latched]), [false, false]);
 }
 
@@ -44,7 +44,7 @@ impl Counting {
     fn take(&mut self, message: &Message) {
         for frame in message.encode().frames(Format::Fd) {
             let time = Timestamp { nanos: self.1, nine_digits: true, min_digits: 0 };
-            self.0.take(&Record { time, interface: "vcan0", frame, direction: None });
+            self.0.add_frame(&Record { time, interface: "vcan0", frame, direction: None });
         }
     }
 
@@ -65,13 +65,13 @@ impl Counting {
     }
 
     fn heard(&mut self, epoch: u8, joints: u16) -> u64 {
-        self.page(epoch, NetworkPage::Heard(Heard { joints, ..Heard::default() }))
+        self.page(epoch, NetworkPage::Received(ReceivedCounts { joints, ..ReceivedCounts::default() }))
     }
 }
 
 #[test]
 fn a_page_counts_up_to_the_joints_that_it_names() {
-    let mut bus = Counting(Survey::new(Part::default()), 0);
+    let mut bus = Counting(Survey::new(TimeRange::default()), 0);
     bus.joints(1..=10);
     assert_eq!(bus.heard(8, 700), 0);
     bus.joints(11..=20);
@@ -83,7 +83,7 @@ fn a_page_counts_up_to_the_joints_that_it_names() {
 
 #[test]
 fn a_cell_may_have_taken_joints_before_its_first_heartbeat() {
-    let mut bus = Counting(Survey::new(Part::default()), 0);
+    let mut bus = Counting(Survey::new(TimeRange::default()), 0);
     let heartbeat = |sent, state| NetworkPage::Heartbeat(Heartbeat { sent, state, ..Heartbeat::default() });
     bus.joints(1..=10);
     bus.page(10, heartbeat(900, Flags::default()));

@@ -5,10 +5,10 @@ use std::collections::BTreeSet;
 
 use super::*;
 use crate::summary::{
-    CellError, ErrorCells, Halted, HostSummary, NetworkSummary, OutagesSummary, SumsSummary, UplinkSummary,
+    CellError, ErrorCells, HaltSummary, HostSummary, NetworkSummary, OutagesSummary, SumsSummary, UplinkSummary,
 };
 use model::table::{Contributions, Errors};
-use trace::recording::account::{Recording, Written};
+use trace::recording::account::{RecordingAccount, WrittenFile};
 
 /// A run of 253 cells that is well.
 fn well() -> Summary {
@@ -49,19 +49,19 @@ fn well_in_sums() -> Summary {
 fn look_at(change: impl FnOnce(&mut Summary)) -> Vec<String> {
     let mut summary = well();
     change(&mut summary);
-    let verdict = Verdict::of(&summary);
+    let verdict = Verdict::new(&summary);
     assert_eq!(verdict.well, verdict.look_at.is_empty());
     verdict.look_at
 }
 
 #[test]
 fn a_run_without_any_fault_is_well() {
-    assert_eq!(Verdict::of(&well()), Verdict { well: true, look_at: Vec::new() });
+    assert_eq!(Verdict::new(&well()), Verdict { well: true, look_at: Vec::new() });
     let sums = "253 cells, 575 of 575 epochs complete, 17772 replies in time, error 6.2e-5 Nm";
     assert_eq!(well().sums_of_all(), sums);
-    assert!(Verdict::of(&Summary { outcome: Outcome::Interrupted, ..well() }).well);
+    assert!(Verdict::new(&Summary { outcome: Outcome::Interrupted, ..well() }).well);
 
-    assert!(Verdict::of(&well_in_sums()).well);
+    assert!(Verdict::new(&well_in_sums()).well);
     let sums = "253 cells, 575 of 575 epochs complete, 900 cells due in sums in time, error 3.5e-3 Nm";
     assert_eq!(well_in_sums().sums_of_all(), sums);
 
@@ -82,9 +82,9 @@ fn a_run_without_any_fault_is_well() {
 #[test]
 fn nothing_is_well_that_is_not_known() {
     assert!(!Verdict::default().well);
-    assert!(!Summary::default().rated(None).verdict.well, "of a run without a bus");
+    assert!(!Summary::default().with_verdict(None).verdict.well, "of a run without a bus");
     for outcome in Outcome::ALL {
-        let verdict = Verdict::of(&Summary { outcome, ..well() });
+        let verdict = Verdict::new(&Summary { outcome, ..well() });
         assert_eq!(verdict.well, outcome.exit_code() == 0, "{outcome}: {verdict:?}");
     }
     let untouched = look_at(|it| {
@@ -164,7 +164,7 @@ const CASES: &[Case] = &[
     }),
     ("the recording is incomplete, without 2 frames and 1 other message: ", |it| {
         let messages_lost = [("ticks", 1)].into();
-        it.recording = Some(Recording { lost: 2, lost_queue: 2, messages_lost, ..Recording::default() });
+        it.recording = Some(RecordingAccount { lost: 2, lost_queue: 2, messages_lost, ..RecordingAccount::default() });
     }),
     ("replies missing on vcan0: 3 lost on the way to the gateway, 1 in doubt", |it| {
         it.buses[0].replies.in_time -= 4;
@@ -194,8 +194,8 @@ const CASES: &[Case] = &[
     ("anomalies on vcan0: 2 wrong CRC", |it| count(it, "wrong CRC", 2)),
 ];
 
-fn halt(at_s: f64, until_s: Option<f64>) -> Halted {
-    Halted { at_s, tick: 1, epoch: 1, reason: "a halt frame".to_owned(), until_s }
+fn halt(at_s: f64, until_s: Option<f64>) -> HaltSummary {
+    HaltSummary { at_s, tick: 1, epoch: 1, reason: "a halt frame".to_owned(), until_s }
 }
 
 fn network(summary: &mut Summary) -> &mut NetworkSummary {
@@ -240,9 +240,9 @@ fn the_most_important_fault_comes_first() {
 fn the_error_of_a_file_says_what_to_do_with_it_and_no_other_hint_does() {
     let failure = |lost_write, errors: &[&str]| {
         let path = "r.mcap.part".to_owned();
-        let file = Written { path, format: "mcap", frames: 0, messages: 0, bytes: 0 };
+        let file = WrittenFile { path, format: "mcap", frames: 0, messages: 0, bytes: 0 };
         let errors = errors.iter().map(|&error| error.to_owned()).collect();
-        let recording = Recording { lost_write, errors, files: vec![file], ..Recording::default() };
+        let recording = RecordingAccount { lost_write, errors, files: vec![file], ..RecordingAccount::default() };
         Summary { recording: Some(recording), ..well() }.lost_frames().unwrap()
     };
     let taken = "r.mcap: taken; r.mcap.part is the whole recording: rename it";
@@ -300,7 +300,7 @@ fn torques_in_sums_are_checked_too() {
     let change = |change: fn(&mut Summary)| {
         let mut summary = well_in_sums();
         change(&mut summary);
-        Verdict::of(&summary).look_at
+        Verdict::new(&summary).look_at
     };
     let late = change(|it| {
         let parts = &mut it.buses[0].sums.as_mut().unwrap().contributions;

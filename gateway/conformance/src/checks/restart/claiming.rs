@@ -2,15 +2,15 @@
 
 use protocol::id::Node;
 use protocol::message::{Message, Request, SensorPage, State};
-use protocol::packet::words;
+use protocol::packet::padded_words;
 use protocol::parameters::{MAX_JOINTS, Parameter};
 use protocol::time::{Micros, Span};
 
-use super::super::claims::twin;
+use super::super::claims::twin_heartbeat;
 use super::{claim, restart, restart_with, settled};
 use crate::arm;
-use crate::bus::Stop;
-use crate::session::{Heard, Session};
+use crate::bus::StopReason;
+use crate::session::{CellPacket, Session};
 
 /// The number of restarts for a check that a late bench has spoilt.
 const ATTEMPTS: usize = 4;
@@ -26,7 +26,7 @@ fn earliest_end(session: &Session<'_>, claimed: Micros) -> Micros {
 }
 
 /// Checks the packets that a claiming cell accepts and those that it ignores.
-pub(super) fn while_claiming(session: &mut Session<'_>, after_test_mode: bool) -> Result<(), Stop> {
+pub(super) fn while_claiming(session: &mut Session<'_>, after_test_mode: bool) -> Result<(), StopReason> {
     // Test mode is off after a start, whatever it was before.
     if session.about.test_mode {
         session.test_mode(false)?;
@@ -40,27 +40,27 @@ pub(super) fn while_claiming(session: &mut Session<'_>, after_test_mode: bool) -
     session.idle(claim(session))?;
     session.known.may_be_silent = false;
     session.extend_life();
-    session.ready(&arm::document(2))?;
+    session.ready(&arm::example_parameters(2))?;
     Ok(())
 }
 
 /// Sends packets that a claiming cell must ignore. Returns true if all of them arrived while it was claiming.
-fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Stop> {
+fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, StopReason> {
     let claimed = restart(session)?;
     let end = earliest_end(session, claimed);
     let state =
-        session.answers().last().and_then(Heard::beat).map(|(beat, _)| beat.state).unwrap_or_default();
+        session.answers().last().and_then(CellPacket::beat).map(|(beat, _)| beat.state).unwrap_or_default();
     let presses = state.has(State::TEST_MODE);
     session.check("CONF-9", presses == after_test_mode || !session.about.test_mode, || {
         "test mode after a restart is as it was before".to_owned()
     });
-    session.start();
+    session.begin_expected_exchange();
     session.press(arm::press(4_096))?;
     let first = session.next_epoch();
     let second = session.next_epoch();
     let own = Node::Cell(session.cell);
     let request = |number, request| Message::Configure { to: own, tag: number, request };
-    let write = Request::Write { number: 1, words: words([999, 999]) };
+    let write = Request::Write { number: 1, words: padded_words([999, 999]) };
     let all = [
         session.joints(first, &[0; MAX_JOINTS]),
         Message::Sync,
@@ -68,15 +68,15 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
         request(1, Request::Read { number: 0 }),
         request(2, write),
         request(3, Request::Read { number: 77 }),
-        request(4, Request::Write { number: Parameter::Mode.number(), words: words([(!presses).into()]) }),
-        request(5, Request::Write { number: Parameter::Sensing.number(), words: words([2]) }),
-        request(6, Request::Write { number: Parameter::Mode.number(), words: words([(!presses).into()]) }),
+        request(4, Request::Write { number: Parameter::Mode.number(), words: padded_words([(!presses).into()]) }),
+        request(5, Request::Write { number: Parameter::Sensing.number(), words: padded_words([2]) }),
+        request(6, Request::Write { number: Parameter::Mode.number(), words: padded_words([(!presses).into()]) }),
         session.joints(second, &[0; MAX_JOINTS]),
         Message::Halt,
     ];
     let mut last = claimed;
     for message in all {
-        last = session.say(&[message])?;
+        last = session.send_messages(&[message])?;
         session.idle(Span::from_millis(3))?;
     }
     if last + MARGIN >= end {
@@ -103,7 +103,7 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
     let counters = session.counters()?;
     let is_so = counters.heard.joints == 2 && counters.heard.torques == 0;
     session.check("CLAIM-2", is_so, || format!("a claiming cell takes joints; of 2: {counters}"));
-    let refused = protocol::message::Refused { stimuli: u16::from(!presses), ..Default::default() };
+    let refused = protocol::message::RejectedCounts { stimuli: u16::from(!presses), ..Default::default() };
     session.check("CLAIM-2", counters.refused == refused, || {
         format!("a claiming cell counted packets that it must ignore: {counters}")
     });
@@ -114,15 +114,15 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
             _ => None,
         });
         session.check("STIM-8", skin == Some(arm::press(4_096)), || {
-            format!("a claiming cell did not latch a stimulus: {}", arm::skin(skin))
+            format!("a claiming cell did not latch a stimulus: {}", arm::format_skin(skin))
         });
     }
-    session.ready(&arm::document(2))?;
+    session.ready(&arm::example_parameters(2))?;
     Ok(true)
 }
 
 /// Checks a claim with a higher serial number, before and after the first heartbeat.
-pub(super) fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
+pub(super) fn stays(session: &mut Session<'_>) -> Result<(), StopReason> {
     let own = session.about.serial.unwrap_or_default();
     let Some(higher) = own.checked_add(1) else {
         session.findings.not_tested("CLAIM-3", "no serial number is higher than its own");
@@ -132,9 +132,9 @@ pub(super) fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
     let low_is_lower = if own & 0xFFFF > 0 { own.checked_add(0xFFFF) } else { None };
     let end = earliest_end(session, claimed);
     for serial in [Some(higher), low_is_lower, Some(u32::MAX)].into_iter().flatten() {
-        session.start();
-        let claim = twin(session, serial, true);
-        let at = session.say(&[claim])?;
+        session.begin_expected_exchange();
+        let claim = twin_heartbeat(session, serial, true);
+        let at = session.send_messages(&[claim])?;
         if at + Span::from_millis(20) >= end {
             session
                 .findings
@@ -157,25 +157,25 @@ pub(super) fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
         }
         session.idle(Span::from_millis(30))?;
     }
-    session.start();
+    session.begin_expected_exchange();
     let at = settled(session, claimed)?;
     session.check("CLAIM-3", at.is_some(), || "it gave way to a higher serial number".to_owned());
     session.known.hash = None;
-    session.ready(&arm::document(2))?;
+    session.ready(&arm::example_parameters(2))?;
     Ok(())
 }
 
 /// Sends claims with a higher serial number continuously while the cell starts, and returns the time of its first
 /// heartbeat. DUPLICATE is set in it if one of the claims came before it, (serial mod 64) ms after the start; a late
 /// computer may delay the claims.
-fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Option<Micros>, Stop> {
+fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Option<Micros>, StopReason> {
     const ATTEMPTS: usize = 3;
-    let rest = twin(session, higher, true);
+    let rest = twin_heartbeat(session, higher, true);
     let is_long = session.about.serial.unwrap_or_default() % 64 >= 30;
     let longest = Span::from_millis(3_000);
     for attempt in 1..=ATTEMPTS {
         // With pauses: each claim is answered only 10 ms after the last answer.
-        let claimed = restart_with(session, longest, |session| session.say(&[rest]).map(|_| ()))?;
+        let claimed = restart_with(session, longest, |session| session.send_messages(&[rest]).map(|_| ()))?;
         let Some(claimed) = claimed else {
             session.check("CLAIM-3", false, || {
                 format!(
@@ -186,7 +186,7 @@ fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Op
         };
         // The answer, and then a regular heartbeat.
         session.idle(Span::from_millis(80))?;
-        let new = session.answers().iter().filter(|it| it.at >= claimed).filter_map(Heard::beat);
+        let new = session.answers().iter().filter(|it| it.at >= claimed).filter_map(CellPacket::beat);
         let is_set = new.clone().next().is_some_and(|(beat, _)| beat.state.has(State::DUPLICATE));
         let is_answered = new.count() > 1;
         if is_set && is_answered || !is_long || attempt == ATTEMPTS {
@@ -204,13 +204,13 @@ fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Op
 }
 
 /// Checks that an invalid `4nn` changes nothing.
-pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), Stop> {
+pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), StopReason> {
     let claimed = restart(session)?;
-    session.start();
-    let mut packet = twin(session, 0, true).encode();
+    session.begin_expected_exchange();
+    let mut packet = twin_heartbeat(session, 0, true).encode();
     packet.count = 7;
     let mut frames: Vec<_> = packet.frames(session.format).collect();
-    let mut other = twin(session, 0, true).encode();
+    let mut other = twin_heartbeat(session, 0, true).encode();
     other.count = 9;
     frames.extend(other.frames(session.format));
     session.send(&frames)?;
@@ -218,7 +218,7 @@ pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), Stop> {
     session
         .check("CLAIM-3", at.is_some(), || "it gave way to a 4nn of a page that does not exist".to_owned());
     let is_set =
-        session.answers().iter().filter_map(Heard::beat).any(|(beat, _)| beat.state.has(State::DUPLICATE));
+        session.answers().iter().filter_map(CellPacket::beat).any(|(beat, _)| beat.state.has(State::DUPLICATE));
     session
         .check("COUNT-1", !is_set, || "DUPLICATE is set by a 4nn of a page that does not exist".to_owned());
     session.known.hash = None;
@@ -226,11 +226,11 @@ pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// Checks that a claiming cell gives way to a packet, and is silent after it.
-pub(super) fn gives_way(session: &mut Session<'_>, what: &str, other: &Message) -> Result<(), Stop> {
+pub(super) fn gives_way(session: &mut Session<'_>, what: &str, other: &Message) -> Result<(), StopReason> {
     for _ in 0..ATTEMPTS {
         let claimed = restart(session)?;
-        session.start();
-        let at = session.say(&[*other])?;
+        session.begin_expected_exchange();
+        let at = session.send_messages(&[*other])?;
         if at + MARGIN < earliest_end(session, claimed) {
             return is_silent(session, claimed, what);
         }
@@ -240,15 +240,15 @@ pub(super) fn gives_way(session: &mut Session<'_>, what: &str, other: &Message) 
 }
 
 /// Checks that a cell that gave way sends nothing.
-fn is_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Result<(), Stop> {
+fn is_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Result<(), StopReason> {
     session.idle(Span::from_millis(3))?;
     session.consume();
-    session.start();
+    session.begin_expected_exchange();
     for message in [Message::Sync, Message::Report] {
-        session.say(&[message])?;
+        session.send_messages(&[message])?;
     }
-    let claim = twin(session, u32::MAX, true);
-    session.say(&[claim])?;
+    let claim = twin_heartbeat(session, u32::MAX, true);
+    session.send_messages(&[claim])?;
     let until = claimed + claim_end(session);
     session.wait(until, |_| false)?;
     let came = session.answers().len();

@@ -8,7 +8,7 @@ use protocol::message::{Answer, Heartbeat};
 use protocol::packet::Epoch;
 
 use super::*;
-use crate::bus::{Bus, Seen};
+use crate::bus::{TestBus, ObservedFrame};
 
 const OLD: Span = Span(120);
 const NEW: Span = Span::from_millis(60);
@@ -18,7 +18,7 @@ const COMMANDS: [Span; 2] = [Span::from_millis(40), Span::from_millis(100)];
 /// A bus that plays back a script of the cell's frames.
 struct Script {
     now: Micros,
-    wire: VecDeque<Seen>,
+    wire: VecDeque<ObservedFrame>,
     /// The frames after the command of each restart.
     next: VecDeque<Vec<(Span, Frame)>>,
     /// The duration of the command, and the time at which it is done.
@@ -26,7 +26,7 @@ struct Script {
     restarted: Micros,
 }
 
-impl Bus for Script {
+impl TestBus for Script {
     fn now(&self) -> Micros {
         self.now
     }
@@ -35,11 +35,11 @@ impl Bus for Script {
         true
     }
 
-    fn send(&mut self, _: &[Frame]) -> Result<(), Stop> {
+    fn send(&mut self, _: &[Frame]) -> Result<(), StopReason> {
         Ok(())
     }
 
-    fn receive(&mut self, until: Micros) -> Result<Option<Seen>, Stop> {
+    fn receive(&mut self, until: Micros) -> Result<Option<ObservedFrame>, StopReason> {
         let seen = self.wire.pop_front_if(|seen| seen.at <= until);
         self.now = self.now.max(seen.map_or(until, |seen| seen.at));
         Ok(seen)
@@ -55,20 +55,20 @@ impl Bus for Script {
         true
     }
 
-    fn begin_restart(&mut self) -> Result<(), Stop> {
+    fn begin_restart(&mut self) -> Result<(), StopReason> {
         self.restarted = self.now + self.takes;
         let frames = self.next.pop_front().unwrap_or_default();
         self.wire.extend(frames.into_iter().map(|(after, frame)| seen(self.now + after, frame)));
         Ok(())
     }
 
-    fn is_restarting(&mut self) -> Result<bool, Stop> {
+    fn is_restarting(&mut self) -> Result<bool, StopReason> {
         Ok(self.now < self.restarted)
     }
 }
 
-fn seen(at: Micros, frame: Frame) -> Seen {
-    Seen { at, frame, own: false }
+fn seen(at: Micros, frame: Frame) -> ObservedFrame {
+    ObservedFrame { at, frame, own: false }
 }
 
 fn beat(sent: u16, claiming: bool) -> Message {

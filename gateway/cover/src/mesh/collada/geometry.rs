@@ -3,8 +3,8 @@
 use nalgebra::Point3;
 use roxmltree::Node;
 
-use super::{Named as _, Names, child, children, floats, numbers};
-use crate::mesh::polygon::{Filled, fan};
+use super::{Named as _, ElementIds, child, children, floats, numbers};
+use crate::mesh::polygon::{Triangulation, fan};
 use crate::mesh::{MAX_TRIANGLES, MeshError, Triangle, syntax, too_many};
 
 /// The maximum number of indices per corner.
@@ -12,14 +12,14 @@ const MAX_OFFSET: usize = 64;
 
 /// A `mesh` element.
 #[derive(Debug)]
-pub(super) struct Mesh<'a, 'i, 'n> {
+pub(super) struct MeshElement<'a, 'i, 'n> {
     /// The name of the file, for errors.
     name: &'a str,
     mesh: Node<'a, 'i>,
     /// The ids of the mesh's own elements.
-    own: Names<'a, 'i>,
+    own: ElementIds<'a, 'i>,
     /// The ids of the whole file.
-    all: &'n Names<'a, 'i>,
+    all: &'n ElementIds<'a, 'i>,
 }
 
 /// The corners of a primitive, as indices into a list of points.
@@ -32,9 +32,9 @@ struct Corners {
     points: Vec<Point3<f64>>,
 }
 
-impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
-    pub(super) fn new(name: &'a str, mesh: Node<'a, 'i>, all: &'n Names<'a, 'i>) -> Self {
-        Self { name, mesh, own: Names::of(name, mesh.descendants()), all }
+impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
+    pub(super) fn new(name: &'a str, mesh: Node<'a, 'i>, all: &'n ElementIds<'a, 'i>) -> Self {
+        Self { name, mesh, own: ElementIds::from_nodes(name, mesh.descendants()), all }
     }
 
     fn error(&self, reason: &str) -> MeshError {
@@ -43,7 +43,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
 
     /// Returns the triangles in the file's own coordinates.
     pub(super) fn triangles(&self) -> Result<Vec<Triangle>, MeshError> {
-        let mut filled = Filled::default();
+        let mut filled = Triangulation::default();
         for element in self.mesh.children().filter(Node::is_element) {
             let kinds = ["triangles", "polylist", "polygons", "tristrips", "trifans"];
             let Some(kind) = kinds.into_iter().find(|kind| element.has_tag_name_of(kind)) else { continue };
@@ -75,7 +75,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         &self,
         element: Node<'a, 'i>,
         corners: &Corners,
-        Filled { triangles, .. }: &mut Filled,
+        Triangulation { triangles, .. }: &mut Triangulation,
     ) -> Result<(), MeshError> {
         let before = triangles.len();
         for indices in children(element, "p") {
@@ -94,7 +94,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         &self,
         element: Node<'a, 'i>,
         corners: &Corners,
-        filled: &mut Filled,
+        filled: &mut Triangulation,
     ) -> Result<(), MeshError> {
         let sizes = child(element, "vcount").map(|node| numbers(self.name, node, str::parse::<usize>));
         let sizes = sizes.transpose()?.unwrap_or_default();
@@ -120,7 +120,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         &self,
         element: Node<'a, 'i>,
         corners: &Corners,
-        filled: &mut Filled,
+        filled: &mut Triangulation,
     ) -> Result<(), MeshError> {
         let mut count = 0;
         for polygon in element.children().filter(Node::is_element) {
@@ -207,7 +207,7 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
     fn positions(&self, source: Node<'a, 'i>) -> Result<Vec<Point3<f64>>, MeshError> {
         let accessor = child(source, "technique_common").and_then(|common| child(common, "accessor"));
         let number = |name: &str| accessor?.attribute(name)?.trim().parse::<usize>().ok();
-        let within = Names::of(self.name, source.descendants());
+        let within = ElementIds::from_nodes(self.name, source.descendants());
         let named = accessor.filter(|accessor| accessor.has_attribute("source")).map(|accessor| {
             let reference = accessor.attribute("source").unwrap_or_default();
             let near = within.find("float_array", reference)?;

@@ -12,12 +12,12 @@ mod tests;
 use std::collections::HashMap;
 
 use nalgebra::{Matrix3, Rotation3, Unit, Vector3};
-use protocol::usage::shown;
-use protocol::xml::Fault;
+use protocol::usage::printable;
+use protocol::xml::XmlFault;
 use roxmltree::{Document, Node};
 
 use super::{Affine, MAX_TRIANGLES, MeshError, Triangle, UpAxis, syntax, too_many};
-use geometry::Mesh;
+use geometry::MeshElement;
 
 /// The maximum nesting depth of nodes. A cycle of `instance_node` ends here.
 const MAX_DEPTH: usize = 64;
@@ -27,20 +27,20 @@ const MAX_NODES: usize = 100_000;
 
 /// Returns the triangles of a file's scene, in m.
 pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Triangle>, MeshError> {
-    let wrong = |fault: Fault| MeshError::Xml { file: name.to_owned(), fault };
-    let text = protocol::xml::text(bytes).map_err(wrong)?;
+    let wrong = |fault: XmlFault| MeshError::Xml { file: name.to_owned(), fault };
+    let text = protocol::xml::decode(bytes).map_err(wrong)?;
     let prepared = protocol::xml::prepare(&text).map_err(wrong)?;
     let document = Document::parse(&prepared.text).map_err(|error| {
         let (all, place) = (error.to_string(), format!(" at {}", error.pos()));
         let row = usize::try_from(error.pos().row).unwrap_or_default() + prepared.lines_before;
-        syntax(name, &format!("line {row}: {}", shown(all.strip_suffix(place.as_str()).unwrap_or(&all))))
+        syntax(name, &format!("line {row}: {}", printable(all.strip_suffix(place.as_str()).unwrap_or(&all))))
     })?;
     let root = document.root_element();
     if root.tag_name().name() != "COLLADA" {
         return Err(syntax(name, &format!("its first element is {}, not COLLADA", root.tag_name().name())));
     }
-    let names = Names::of(name, root.descendants());
-    let mut reader = Reader { name, names, geometry: HashMap::new(), visited: 0, triangles: Vec::new() };
+    let names = ElementIds::from_nodes(name, root.descendants());
+    let mut reader = SceneReader { name, names, geometry: HashMap::new(), visited: 0, triangles: Vec::new() };
     let outer = outer(name, root, up)?;
     let scene = child(root, "scene").and_then(|scene| child(scene, "instance_visual_scene"));
     let scene = scene.map(|instance| reader.referred(instance, "visual_scene")).transpose()?;
@@ -107,14 +107,14 @@ fn outer(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine, MeshError
 
 /// Elements by kind and id.
 #[derive(Debug)]
-struct Names<'a, 'i> {
+struct ElementIds<'a, 'i> {
     /// The name of the file, for errors.
     file: &'a str,
     elements: HashMap<(&'a str, &'a str), Vec<Node<'a, 'i>>>,
 }
 
-impl<'a, 'i> Names<'a, 'i> {
-    fn of(file: &'a str, nodes: impl Iterator<Item = Node<'a, 'i>>) -> Self {
+impl<'a, 'i> ElementIds<'a, 'i> {
+    fn from_nodes(file: &'a str, nodes: impl Iterator<Item = Node<'a, 'i>>) -> Self {
         let mut elements = HashMap::<_, Vec<_>>::new();
         for node in nodes {
             if let Some(id) = node.attribute("id") {
@@ -139,10 +139,10 @@ impl<'a, 'i> Names<'a, 'i> {
 }
 
 #[derive(Debug)]
-struct Reader<'a, 'i> {
+struct SceneReader<'a, 'i> {
     /// The name of the file, for errors.
     name: &'a str,
-    names: Names<'a, 'i>,
+    names: ElementIds<'a, 'i>,
     /// The triangles of geometries that were already read.
     geometry: HashMap<roxmltree::NodeId, Vec<Triangle>>,
     /// The number of visited nodes.
@@ -150,7 +150,7 @@ struct Reader<'a, 'i> {
     triangles: Vec<Triangle>,
 }
 
-impl<'a, 'i> Reader<'a, 'i> {
+impl<'a, 'i> SceneReader<'a, 'i> {
     fn error(&self, reason: &str) -> MeshError {
         syntax(self.name, reason)
     }
@@ -233,7 +233,7 @@ impl<'a, 'i> Reader<'a, 'i> {
     fn place(&mut self, geometry: Node<'a, 'i>, here: &Affine) -> Result<(), MeshError> {
         if !self.geometry.contains_key(&geometry.id()) {
             let read = match child(geometry, "mesh") {
-                Some(mesh) => Mesh::new(self.name, mesh, &self.names).triangles()?,
+                Some(mesh) => MeshElement::new(self.name, mesh, &self.names).triangles()?,
                 None => Vec::new(),
             };
             self.geometry.insert(geometry.id(), read);

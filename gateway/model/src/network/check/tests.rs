@@ -39,7 +39,7 @@ struct Truth {
     wires: Wires,
     cells: usize,
     /// From each end, the end at which its messages arrive.
-    leads: BTreeMap<End, End>,
+    leads: BTreeMap<WireEnd, WireEnd>,
     dead: BTreeSet<CellId>,
     beats: BTreeMap<CellId, Heartbeat>,
     versions: BTreeMap<CellId, u16>,
@@ -52,10 +52,10 @@ impl Truth {
     fn new(skin: &Skin) -> Self {
         let wires = skin.wires(0);
         let nodes: Vec<_> = skin.cells.iter().map(|cell| cell.node).collect();
-        let ends = nodes.iter().flat_map(|&cell| (0..PORTS).map(move |port| End { cell, port }));
+        let ends = nodes.iter().flat_map(|&cell| (0..PORTS).map(move |port| WireEnd { cell, port }));
         let leads = ends.filter_map(|end| {
             let (cell, port) = wires.other_end(end.cell, end.port)?;
-            Some((end, End { cell, port }))
+            Some((end, WireEnd { cell, port }))
         });
         let leads = leads.collect();
         let beat = |&node: &CellId| {
@@ -82,17 +82,17 @@ impl Truth {
         free
     }
 
-    fn is_free(&self, end: End) -> bool {
+    fn is_free(&self, end: WireEnd) -> bool {
         self.wires.other_end(end.cell, end.port).is_none()
     }
 
-    fn free_port(&self, cell: CellId) -> Option<End> {
-        (0..PORTS).map(|port| End { cell, port }).find(|&end| self.is_free(end))
+    fn free_port(&self, cell: CellId) -> Option<WireEnd> {
+        (0..PORTS).map(|port| WireEnd { cell, port }).find(|&end| self.is_free(end))
     }
 
     fn damage(&mut self, kind: u8, at: &Index, other: &Index) {
         let node = cell(at.index(self.cells) + 1);
-        let wires: Vec<(End, End)> =
+        let wires: Vec<(WireEnd, WireEnd)> =
             self.leads.iter().map(|(a, b)| (*a, *b)).filter(|(a, b)| a < b).collect();
         let wire = |index: &Index| wires.get(index.index(wires.len().max(1))).copied();
         match kind {
@@ -101,14 +101,14 @@ impl Truth {
                     return;
                 };
                 let carries = match kind {
-                    0 => Carries::Nothing,
-                    1 => Carries::There,
-                    _ => Carries::Back,
+                    0 => WorkingDirection::Nothing,
+                    1 => WorkingDirection::There,
+                    _ => WorkingDirection::Back,
                 };
-                if carries != Carries::There {
+                if carries != WorkingDirection::There {
                     self.leads.remove(&first);
                 }
-                if carries != Carries::Back {
+                if carries != WorkingDirection::Back {
                     self.leads.remove(&second);
                 }
                 self.expected.insert(Difference::MissingWire { first, second, carries });
@@ -199,7 +199,7 @@ impl Truth {
         !self.dead.contains(&cell)
     }
 
-    fn works(&self, end: End) -> Option<End> {
+    fn works(&self, end: WireEnd) -> Option<WireEnd> {
         let other = *self.leads.get(&end)?;
         let ours = |cell| self.sends(cell) && !self.versions.contains_key(&cell);
         (self.leads.get(&other) == Some(&end) && ours(end.cell) && ours(other.cell)).then_some(other)
@@ -208,34 +208,34 @@ impl Truth {
     /// Returns the tree that cells would build, breadth first.
     fn trees(&self) -> BTreeMap<CellId, Tree> {
         let mut trees = BTreeMap::new();
-        let mut next = VecDeque::from([(cell(1), Tree { parent: Some(0), up: 4, ..Tree::default() })]);
+        let mut next = VecDeque::from([(cell(1), Tree { parent: Some(0), parent_port: 4, ..Tree::default() })]);
         while let Some((node, tree)) = next.pop_front() {
             if trees.contains_key(&node) {
                 continue;
             }
             trees.insert(node, tree);
-            for other in (0..PORTS).filter_map(|port| self.works(End { cell: node, port })) {
+            for other in (0..PORTS).filter_map(|port| self.works(WireEnd { cell: node, port })) {
                 let up = u8::try_from(other.port).unwrap();
                 let depth = tree.depth + 1;
-                next.push_back((other.cell, Tree { parent: Some(node.get()), up, depth, ..Tree::default() }));
+                next.push_back((other.cell, Tree { parent: Some(node.get()), parent_port: up, depth, ..Tree::default() }));
             }
         }
         trees
     }
 
-    fn seen(&mut self) -> Vec<Seen> {
+    fn seen(&mut self) -> Vec<ObservedCell> {
         let trees = self.trees();
         let ports = |cell| {
             let mut ports = [PortState::default(); PORTS];
             for (port, state) in ports.iter_mut().enumerate() {
-                let end = End { cell, port };
+                let end = WireEnd { cell, port };
                 // A port receives if a cell sends towards it.
                 let from = self.leads.iter().find(|(from, to)| **to == end && self.sends(from.cell));
                 let Some((from, _)) = from else { continue };
                 *state = PortState {
                     number: from.cell.get(),
                     port: u8::try_from(from.port).unwrap(),
-                    hears: true,
+                    receives: true,
                     works: self.leads.contains_key(&end),
                     other_version: self.versions.contains_key(&from.cell)
                         || self.versions.contains_key(&cell),
@@ -246,7 +246,7 @@ impl Truth {
         let seen = |(&node, &heartbeat): (&CellId, &Heartbeat)| {
             let described = usize::from(node.get()) <= self.cells;
             let alive = self.sends(node);
-            Seen {
+            ObservedCell {
                 node,
                 serial: described.then(|| serial(node)),
                 configuration: HASH,
@@ -257,7 +257,7 @@ impl Truth {
             }
         };
         let seen: Vec<_> = self.beats.iter().map(seen).collect();
-        let lost = |cell: &&Seen| {
+        let lost = |cell: &&ObservedCell| {
             cell.alive
                 && cell.serial.is_some()
                 && !trees.contains_key(&cell.node)
@@ -346,7 +346,7 @@ fn exchanged_cells_and_cells_without_a_node_id_are_named() {
     let mut truth = Truth::new(&skin);
     let mut seen = truth.seen();
     seen[1].heartbeat.as_mut().unwrap().serial = serial(cell(1));
-    seen[1].ports.as_mut().unwrap().ports[2] = PortState { hears: true, ..PortState::default() };
+    seen[1].ports.as_mut().unwrap().ports[2] = PortState { receives: true, ..PortState::default() };
     let lines: Vec<_> = differences(&truth.wires, &seen).iter().map(ToString::to_string).collect();
     assert_eq!(
         lines,
@@ -360,8 +360,8 @@ fn exchanged_cells_and_cells_without_a_node_id_are_named() {
 
 #[test]
 fn a_wire_that_works_in_one_direction_says_which() {
-    let ends = |carries: Carries| carries.between(cell(2), cell(5));
-    assert_eq!(ends(Carries::Nothing), "does not work");
-    assert_eq!(ends(Carries::There), "works only from cell 2 to cell 5");
-    assert_eq!(ends(Carries::Back), "works only from cell 5 to cell 2");
+    let ends = |carries: WorkingDirection| carries.between(cell(2), cell(5));
+    assert_eq!(ends(WorkingDirection::Nothing), "does not work");
+    assert_eq!(ends(WorkingDirection::There), "works only from cell 2 to cell 5");
+    assert_eq!(ends(WorkingDirection::Back), "works only from cell 5 to cell 2");
 }

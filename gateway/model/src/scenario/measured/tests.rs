@@ -1,5 +1,5 @@
 use protocol::id::CellId;
-use protocol::touch::contact;
+use protocol::touch::contact_force;
 
 use super::*;
 use crate::scenario::{Scenario, Touches};
@@ -30,7 +30,7 @@ fn touches(text: &str) -> Touches {
 fn read(touches: &Touches, seconds: f64) -> [f64; 3] {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few seconds")]
     let epoch = (seconds * 62.5) as u64;
-    [0, 1, 2].map(|cell| f64::from(contact(&touches.sensors(cell, epoch))) / 1_024.0)
+    [0, 1, 2].map(|cell| f64::from(contact_force(&touches.sensors(cell, epoch))) / 1_024.0)
 }
 
 const PRESS: &str = "[[touch]]\nat_s = 1.0\nfor_s = 3.0\ncells = [2]\nforce_n = 4.0\n";

@@ -11,35 +11,35 @@
 
 use protocol::time::Span;
 
-use super::life::Life;
+use super::life::Incarnation;
 
 /// Number of heartbeats with a continuous counter that prove a start without its claim, on an id that two senders have
 /// used.
-const SHOWN_BY: u8 = 3;
+const PROVING_HEARTBEATS: u8 = 3;
 
 /// Minimum interval of a cell's heartbeats, which are 250 ms apart. Old heartbeats that happen to be repeated in order
 /// arrive much faster.
-const PACE: Span = Span::from_millis(100);
+const MIN_HEARTBEAT_INTERVAL: Span = Span::from_millis(100);
 
 /// An outsider: its last heartbeat, and the number of heartbeats with a continuous counter.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) struct Candidate {
-    last: Life,
+    last: Incarnation,
     shown: u8,
 }
 
 impl Candidate {
     /// Returns the candidate after a heartbeat of an outsider.
-    pub(super) fn next(before: Option<Self>, new: Life) -> Self {
-        let goes_on = |it: &Self| it.last.sent(&new).is_some() && new.at.since(it.last.at) >= PACE;
+    pub(super) fn next(before: Option<Self>, new: Incarnation) -> Self {
+        let goes_on = |it: &Self| it.last.sent(&new).is_some() && new.at.elapsed_since(it.last.at) >= MIN_HEARTBEAT_INTERVAL;
         let shown = before.filter(goes_on).map_or(1, |it| it.shown.saturating_add(1));
         Self { last: new, shown }
     }
 
     /// Returns true if it owns the id from its last heartbeat on.
-    pub(super) fn succeeds(&self, owner: Option<&Life>) -> bool {
+    pub(super) fn succeeds(&self, owner: Option<&Incarnation>) -> bool {
         let is_silent = owner.is_none_or(|owner| !owner.is_alive(self.last.at));
-        is_silent && (self.last.has_just_started() || self.shown >= SHOWN_BY)
+        is_silent && (self.last.has_just_started() || self.shown >= PROVING_HEARTBEATS)
     }
 }
 
@@ -50,9 +50,9 @@ mod tests {
 
     use super::*;
 
-    fn life(ms: u64, serial: u32, sent: u16) -> Life {
+    fn life(ms: u64, serial: u32, sent: u16) -> Incarnation {
         let state = if sent == 0 { State::CLAIMING } else { State::default() };
-        Life::new(Micros(ms * 1_000), &Heartbeat { serial, sent, state, ..Heartbeat::default() })
+        Incarnation::new(Micros(ms * 1_000), &Heartbeat { serial, sent, state, ..Heartbeat::default() })
     }
 
     fn after(heard: &[(u64, u32, u16)]) -> Candidate {

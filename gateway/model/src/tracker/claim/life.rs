@@ -6,31 +6,31 @@ use protocol::time::{Micros, Span};
 use crate::tracker::DEAD_AFTER;
 
 /// A counter that falls back by more than this proves a restart; less may be an overtaken heartbeat.
-pub(super) const OVERTAKES: u16 = 128;
+pub(super) const MAX_OVERTAKEN: u16 = 128;
 
 /// Upper bound of the packets that a cell sends until it is found dead: three packets for each of 500 joints per second
 /// make 900.
-pub(super) const AT_MOST: u16 = 2_048;
+pub(super) const MAX_PACKETS_BEFORE_DEAD: u16 = 2_048;
 
 /// Upper bound of the packets that a cell sends between two heartbeats.
-pub(super) const LEAP: u16 = 256;
+pub(super) const MAX_PACKETS_PER_HEARTBEAT: u16 = 256;
 
 /// The time without a heartbeat after which a cell is no longer expected to continue its counter.
 pub(super) const GONE_AFTER: Span = Span::from_millis(10_000);
 
 /// The minimum duration of a claim: 250 ms, minus 10 ms by which a frame may have been late.
-pub(super) const CLAIM_TAKES: Span = Span::from_millis(240);
+pub(super) const MIN_CLAIM_TIME: Span = Span::from_millis(240);
 
 /// A cell from one start to the next, with its last heartbeat.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) struct Life {
+pub(super) struct Incarnation {
     pub(super) heartbeat: Heartbeat,
     pub(super) at: Micros,
     /// Time of its claim, if that was received.
     pub(super) claimed: Option<Micros>,
 }
 
-impl Life {
+impl Incarnation {
     /// Creates a life with its first heartbeat.
     pub(super) fn new(at: Micros, heartbeat: &Heartbeat) -> Self {
         let claimed = heartbeat.state.has(State::CLAIMING).then_some(at);
@@ -57,12 +57,12 @@ impl Life {
     }
 
     pub(super) fn is_alive(&self, at: Micros) -> bool {
-        at.since(self.at) <= DEAD_AFTER
+        at.elapsed_since(self.at) <= DEAD_AFTER
     }
 
     /// Returns true if it may continue; its bus may have been lost.
     pub(super) fn may_go_on(&self, at: Micros) -> bool {
-        at.since(self.at) <= GONE_AFTER
+        at.elapsed_since(self.at) <= GONE_AFTER
     }
 
     /// Returns the distance of another counter behind its own, modulo 2^16.
@@ -79,18 +79,18 @@ impl Life {
 
     /// Returns true if a cell can have sent this number of packets since this one's last heartbeat.
     pub(super) fn has_time_for(&self, at: Micros, sent: u16) -> bool {
-        u64::from(sent) <= u64::from(AT_MOST) * (1 + at.since(self.at).0 / DEAD_AFTER.0)
+        u64::from(sent) <= u64::from(MAX_PACKETS_BEFORE_DEAD) * (1 + at.elapsed_since(self.at).0 / DEAD_AFTER.0)
     }
 
     /// Returns true if a heartbeat is an old one of this life, or its last one again.
     pub(super) fn is_past(&self, old: &Self) -> bool {
         let back = self.back(old);
-        self.is_same_cell(old) && (back == 0 || back <= OVERTAKES && old.heartbeat.sent > 1)
+        self.is_same_cell(old) && (back == 0 || back <= MAX_OVERTAKEN && old.heartbeat.sent > 1)
     }
 
     /// Returns true if this life still claims the id at `next`, so that a heartbeat without CLAIMING cannot be its own.
     pub(super) fn claims_until(&self, next: &Self) -> bool {
         let settles = !self.is_settled() && next.is_settled();
-        settles && self.claimed.is_some_and(|claimed| next.at.since(claimed) < CLAIM_TAKES)
+        settles && self.claimed.is_some_and(|claimed| next.at.elapsed_since(claimed) < MIN_CLAIM_TIME)
     }
 }

@@ -20,12 +20,12 @@ use protocol::message::{Heartbeat, State};
 use protocol::time::Micros;
 
 use candidate::Candidate;
-use life::Life;
+use life::Incarnation;
 use ownership::{Evidence, Ownership};
 
 /// The meaning of a heartbeat for its node id.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Word {
+pub enum HeartbeatKind {
     /// The first heartbeat of the owner, whose start was not observed.
     First,
     /// A further heartbeat of the owner.
@@ -55,7 +55,7 @@ pub enum Word {
 /// Heartbeats are not authenticated, and old ones may be repeated. So a start is accepted at once, and taken back if
 /// the counter before it continues; after that, a start is accepted only if the owner is silent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Claim {
+pub struct AddressClaim {
     ownership: Ownership,
     /// The outsider that sent the last heartbeat, unless the owner has sent one since.
     candidate: Option<Candidate>,
@@ -63,12 +63,12 @@ pub struct Claim {
     previous: Option<u32>,
 }
 
-impl Claim {
+impl AddressClaim {
     /// Records a heartbeat of this node id that arrived at `at`. Only this function detects restarts.
-    pub fn hear(&mut self, at: Micros, heartbeat: &Heartbeat) -> Word {
-        let new = Life::new(at, heartbeat);
+    pub fn receive(&mut self, at: Micros, heartbeat: &Heartbeat) -> HeartbeatKind {
+        let new = Incarnation::new(at, heartbeat);
         let (mut next, mut word) = self.ownership.next(self.ownership.evidence(&new), new);
-        if word == Word::Outsider {
+        if word == HeartbeatKind::Outsider {
             let candidate = Candidate::next(self.candidate, new);
             self.candidate = Some(candidate);
             if candidate.succeeds(self.ownership.owner()) {
@@ -76,8 +76,8 @@ impl Claim {
             }
         }
         match word {
-            Word::Overtaken | Word::Outsider | Word::Claimant => {}
-            Word::First | Word::Known | Word::Started { .. } | Word::Shared => {
+            HeartbeatKind::Overtaken | HeartbeatKind::Outsider | HeartbeatKind::Claimant => {}
+            HeartbeatKind::First | HeartbeatKind::Known | HeartbeatKind::Started { .. } | HeartbeatKind::Shared => {
                 self.candidate = None;
                 let before = self.serial().filter(|serial| *serial != heartbeat.serial);
                 self.previous = before.or(self.previous);
@@ -112,13 +112,13 @@ impl Claim {
 
     /// Returns true if that cell reports this state.
     #[must_use]
-    pub fn says(&self, state: State) -> bool {
+    pub fn has_state(&self, state: State) -> bool {
         self.ownership.owner().is_some_and(|owner| owner.heartbeat.state.has(state))
     }
 
     /// Returns true if a cell owns the id, and so answers.
     #[must_use]
     pub fn is_settled(&self) -> bool {
-        self.ownership.owner().is_some_and(Life::is_settled)
+        self.ownership.owner().is_some_and(Incarnation::is_settled)
     }
 }

@@ -38,8 +38,8 @@
 //! A shared id stays shared: `Shared` and `Inherited` never become `Sole` again. The owner's last heartbeat shows
 //! whether it has settled; this needs no state.
 
-use super::Word;
-use super::life::{LEAP, Life};
+use super::HeartbeatKind;
+use super::life::{MAX_PACKETS_PER_HEARTBEAT, Incarnation};
 
 /// The owner of a node id, and its certainty.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -48,13 +48,13 @@ pub(super) enum Ownership {
     #[default]
     Free,
     /// One cell owns the id, or is the first one to claim it.
-    Sole { owner: Life },
+    Sole { owner: Incarnation },
     /// The owner seems to have started; if the life before it goes on, that was not a start.
-    Doubted { owner: Life, former: Life },
+    Doubted { owner: Incarnation, former: Incarnation },
     /// Two senders have used the id in turn: only a successor of a silent owner is accepted.
-    Shared { owner: Life },
+    Shared { owner: Incarnation },
     /// The owner succeeded a silent one of a shared id; the life before it may go on.
-    Inherited { owner: Life, former: Life },
+    Inherited { owner: Incarnation, former: Incarnation },
 }
 
 /// A fact that a heartbeat proves. [`Ownership::evidence`] returns the first that holds.
@@ -89,7 +89,7 @@ pub(super) enum Evidence {
 
 impl Ownership {
     /// Returns the cell that owns the id, or claims it.
-    pub(super) const fn owner(&self) -> Option<&Life> {
+    pub(super) const fn owner(&self) -> Option<&Incarnation> {
         match self {
             Self::Free => None,
             Self::Sole { owner }
@@ -100,7 +100,7 @@ impl Ownership {
     }
 
     /// Returns the life before the owner's start, which may disprove that start.
-    pub(super) const fn former(&self) -> Option<&Life> {
+    pub(super) const fn former(&self) -> Option<&Incarnation> {
         match self {
             Self::Doubted { former, .. } | Self::Inherited { former, .. } => Some(former),
             Self::Free | Self::Sole { .. } | Self::Shared { .. } => None,
@@ -108,7 +108,7 @@ impl Ownership {
     }
 
     /// Returns the state with another owner.
-    const fn with_owner(self, owner: Life) -> Self {
+    const fn with_owner(self, owner: Incarnation) -> Self {
         match self {
             Self::Free => Self::Free,
             Self::Sole { .. } => Self::Sole { owner },
@@ -119,12 +119,12 @@ impl Ownership {
     }
 
     /// Returns the state after the owner's next heartbeat.
-    fn with_last(self, last: Life) -> Self {
+    fn with_last(self, last: Incarnation) -> Self {
         self.owner().map_or(self, |owner| self.with_owner(owner.with_last(last)))
     }
 
     /// Returns the fact that a heartbeat proves; `new` is the life that would begin with it.
-    pub(super) fn evidence(&self, new: &Life) -> Evidence {
+    pub(super) fn evidence(&self, new: &Incarnation) -> Evidence {
         let Some(owner) = self.owner() else {
             return if new.is_settled() { Evidence::Settles } else { Evidence::Claims };
         };
@@ -162,43 +162,43 @@ impl Ownership {
 
     /// Returns true if a counter that is `own` ahead of the owner's and `its` ahead of the former's more likely belongs
     /// to the former.
-    fn is_formers(&self, new: &Life, own: u16, its: u16) -> bool {
+    fn is_formers(&self, new: &Incarnation, own: u16, its: u16) -> bool {
         let is_alive = self.former().is_some_and(|former| former.is_alive(new.at));
-        its < own && (is_alive || own > LEAP && its < own / 8)
+        its < own && (is_alive || own > MAX_PACKETS_PER_HEARTBEAT && its < own / 8)
     }
 
     /// Returns the state after a heartbeat with this evidence, and the heartbeat's meaning; `new` is the life that
     /// would begin with it. The arms name the rows of the table.
-    pub(super) fn next(self, evidence: Evidence, new: Life) -> (Self, Word) {
+    pub(super) fn next(self, evidence: Evidence, new: Incarnation) -> (Self, HeartbeatKind) {
         use Evidence as E;
-        const AGAIN: Word = Word::Started { again: true };
-        let left_of = |former: Life, owner: Life| if former.may_go_on(new.at) { former } else { owner };
+        const AGAIN: HeartbeatKind = HeartbeatKind::Started { again: true };
+        let left_of = |former: Incarnation, owner: Incarnation| if former.may_go_on(new.at) { former } else { owner };
         match (self, evidence) {
             // first_claim
-            (Self::Free, E::Claims) => (Self::Sole { owner: new }, Word::Started { again: false }),
+            (Self::Free, E::Claims) => (Self::Sole { owner: new }, HeartbeatKind::Started { again: false }),
             // found
-            (Self::Free, E::Settles) => (Self::Sole { owner: new }, Word::First),
+            (Self::Free, E::Settles) => (Self::Sole { owner: new }, HeartbeatKind::First),
             // other_claim
             (
                 Self::Sole { .. } | Self::Doubted { .. } | Self::Shared { .. } | Self::Inherited { .. },
                 E::Claims,
-            ) => (self, Word::Claimant),
+            ) => (self, HeartbeatKind::Claimant),
             // claimant_lost
             (
                 Self::Sole { .. } | Self::Doubted { .. } | Self::Shared { .. } | Self::Inherited { .. },
                 E::Settles,
-            ) => (self.with_owner(new), Word::First),
+            ) => (self.with_owner(new), HeartbeatKind::First),
             // old
             (
                 Self::Sole { .. } | Self::Doubted { .. } | Self::Shared { .. } | Self::Inherited { .. },
                 E::Repeats,
-            ) => (self, Word::Overtaken),
+            ) => (self, HeartbeatKind::Overtaken),
             // next, away
             (
                 Self::Sole { .. } | Self::Doubted { .. } | Self::Shared { .. } | Self::Inherited { .. },
                 E::Continues,
             )
-            | (Self::Sole { .. } | Self::Doubted { .. }, E::Returns) => (self.with_last(new), Word::Known),
+            | (Self::Sole { .. } | Self::Doubted { .. }, E::Returns) => (self.with_last(new), HeartbeatKind::Known),
             // start
             (Self::Sole { owner }, E::Intrudes | E::Starts | E::Jumps | E::Succeeds) => {
                 (Self::Doubted { owner: new, former: owner }, AGAIN)
@@ -209,14 +209,14 @@ impl Ownership {
             }
             // taken_back
             (Self::Doubted { .. } | Self::Inherited { .. }, E::FormerContinues) => {
-                (Self::Shared { owner: new }, Word::Shared)
+                (Self::Shared { owner: new }, HeartbeatKind::Shared)
             }
             // impossible, outsider
             (Self::Sole { .. } | Self::Doubted { .. }, E::Exceeds)
             | (
                 Self::Shared { .. } | Self::Inherited { .. },
                 E::Intrudes | E::Starts | E::Jumps | E::Returns | E::Exceeds,
-            ) => (self, Word::Outsider),
+            ) => (self, HeartbeatKind::Outsider),
             // successor
             (Self::Shared { owner }, E::Succeeds) => (Self::Inherited { owner: new, former: owner }, AGAIN),
             // further_successor, successor_after_former
@@ -236,7 +236,7 @@ impl Ownership {
                 | E::Jumps
                 | E::Succeeds,
             )
-            | (Self::Sole { .. } | Self::Shared { .. }, E::FormerContinues) => (self, Word::Overtaken),
+            | (Self::Sole { .. } | Self::Shared { .. }, E::FormerContinues) => (self, HeartbeatKind::Overtaken),
         }
     }
 }

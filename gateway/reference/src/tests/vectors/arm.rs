@@ -1,6 +1,6 @@
 //! Reproducible arms with a cell on them, and Eq. 8 for them in double precision.
 
-use crate::Reference;
+use crate::ReferenceCell;
 use nalgebra::{IsometryMatrix3, Point3, Rotation3, Translation3, Unit, Vector3};
 use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10};
 use protocol::message::SkinSensors;
@@ -77,13 +77,13 @@ impl Case {
 
     /// Returns the words of sensors page 0.
     pub(crate) fn sensors(&self) -> [i16; WORDS] {
-        packet::words(self.contact.map(Q::to_bits))
+        packet::padded_words(self.contact.map(Q::to_bits))
     }
 
     /// Returns the Jacobian and the torques, as the cell computes them.
     pub(crate) fn answer(&self) -> ([Q1_14; MAX_JOINTS], [i16; MAX_JOINTS]) {
         let sensors = SkinSensors { contact: self.contact, ..SkinSensors::default() };
-        let cell = Reference::new(&self.parameters);
+        let cell = ReferenceCell::new(&self.parameters);
         (cell.jacobian(&self.q), cell.torque(&self.q, &sensors))
     }
 

@@ -15,7 +15,7 @@ const STEP_NS: u64 = 1_000;
 /// The maximum number of buses whose times are compared.
 const BUSES: usize = 16;
 /// The number of comparisons that decide.
-const ENOUGH: u32 = 20;
+const MIN_COMPARISONS: u32 = 20;
 
 /// A remark on the times and flags of a capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -86,7 +86,7 @@ impl Clock {
     }
 
     /// Sets the time of the last frame.
-    pub(super) const fn at(&mut self, nanos: u64) {
+    pub(super) const fn set(&mut self, nanos: u64) {
         self.last = Some(nanos);
     }
 
@@ -105,7 +105,7 @@ impl Clock {
             }
             Stamp::Relative(time) => (time, Some(Remark::SinceFirst)),
         };
-        self.at(time.nanos);
+        self.set(time.nanos);
         (time, remark)
     }
 }
@@ -120,7 +120,7 @@ pub(super) struct Evidence {
 }
 
 impl Evidence {
-    pub(super) fn take(&mut self, interface: &str, nanos: u64) {
+    pub(super) fn add(&mut self, interface: &str, nanos: u64) {
         let Some(last) = self.last.replace(interface, nanos) else { return };
         self.compared += 1;
         self.smaller += u32::from(nanos < last);
@@ -128,7 +128,7 @@ impl Evidence {
     }
 
     pub(super) const fn is_enough(&self) -> bool {
-        self.compared >= ENOUGH
+        self.compared >= MIN_COMPARISONS
     }
 
     /// Returns the reference. Times since the first frame grow on each bus, except for a few where the clock was set.

@@ -16,12 +16,12 @@
 //! Colours (`-c`) may stand between words. Any text may stand before a frame, such as a prompt, and any text except a
 //! further byte after its data.
 
-use protocol::can::{BIT_RATE_SWITCH, ERROR_STATE, Frame, REMOTE, identifier};
+use protocol::can::{BIT_RATE_SWITCH, ERROR_STATE, Frame, REMOTE, check_identifier};
 use protocol::candump::{self, Direction, LineError, Timestamp, eight_digit_identifier};
 
 /// A line that holds a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Seen<'a> {
+pub(super) struct ConsoleFrame<'a> {
     pub(super) stamp: Stamp,
     pub(super) interface: &'a str,
     pub(super) frame: Frame,
@@ -45,8 +45,8 @@ pub(super) enum Stamp {
 
 /// A line of console output.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum Console<'a> {
-    Frame(Seen<'a>),
+pub(super) enum ConsoleLine<'a> {
+    Frame(ConsoleFrame<'a>),
     CanXl,
 }
 
@@ -55,7 +55,7 @@ pub(super) enum Console<'a> {
 ///
 /// # Errors
 /// Returns [`LineError`] if the line begins like console output, but the text after the length is not a frame.
-pub(super) fn parse(line: &[u8]) -> Option<Result<Console<'_>, LineError>> {
+pub(super) fn parse(line: &[u8]) -> Option<Result<ConsoleLine<'_>, LineError>> {
     let text = line.trim_ascii_end();
     memchr::memchr3(b'[', b'{', b'#', text)?;
     let mut cursor = Cursor { text, at: 0 };
@@ -91,7 +91,7 @@ enum Length {
 fn identifier_of(digits: &[u8]) -> Option<u32> {
     let id = u32::from_str_radix(core::str::from_utf8(digits).ok()?, 16).ok()?;
     match digits.len() {
-        3 => identifier(id, 0).ok(),
+        3 => check_identifier(id, 0).ok(),
         // The text after the length shows whether the frame is remote.
         _ => Some(eight_digit_identifier(id) & !REMOTE),
     }
@@ -105,8 +105,8 @@ struct Cursor<'a> {
 
 impl<'a> Cursor<'a> {
     /// Parses the line from here on, after blanks.
-    fn line(mut self) -> Option<Result<Console<'a>, LineError>> {
-        let stamp = if self.take(b'(') { self.stamp()? } else { Stamp::None };
+    fn line(mut self) -> Option<Result<ConsoleLine<'a>, LineError>> {
+        let stamp = if self.accept(b'(') { self.stamp()? } else { Stamp::None };
         self.blanks();
         let interface = core::str::from_utf8(self.word()).ok().filter(|name| !name.is_empty())?;
         self.blanks();
@@ -118,8 +118,8 @@ impl<'a> Cursor<'a> {
             // The line is from a log whose times are dates.
             let frame = id.contains(&b'#').then(|| core::str::from_utf8(id).ok()).flatten();
             if let Some(frame) = frame.and_then(|text| candump::parse_frame(text).ok()) {
-                let seen = Seen { stamp, interface, frame, direction: self.direction(), has_flags: true };
-                return Some(Ok(Console::Frame(seen)));
+                let seen = ConsoleFrame { stamp, interface, frame, direction: self.direction(), has_flags: true };
+                return Some(Ok(ConsoleLine::Frame(seen)));
             }
         }
         if !matches!(id.len(), 3 | 8) || !id.iter().all(u8::is_ascii_hexdigit) || !self.blanks() {
@@ -127,7 +127,7 @@ impl<'a> Cursor<'a> {
         }
         let length = self.length()?;
         if let Length::CanXl = length {
-            return Some(Ok(Console::CanXl));
+            return Some(Ok(ConsoleLine::CanXl));
         }
         let (direction, flags) = marks.map_or((None, None), |(direction, flags)| (Some(direction), flags));
         let has_flags = flags.is_some() || !matches!(length, Length::Fd(_));
@@ -137,7 +137,7 @@ impl<'a> Cursor<'a> {
         if self.is_of_isotpsniffer(frame.is_ok()) {
             return None;
         }
-        Some(frame.map(|frame| Console::Frame(Seen { stamp, interface, frame, direction, has_flags })))
+        Some(frame.map(|frame| ConsoleLine::Frame(ConsoleFrame { stamp, interface, frame, direction, has_flags })))
     }
 
     /// Parses the direction after a frame of a log.
@@ -164,7 +164,7 @@ impl<'a> Cursor<'a> {
         self.text.get(self.at..).unwrap_or_default()
     }
 
-    fn take(&mut self, byte: u8) -> bool {
+    fn accept(&mut self, byte: u8) -> bool {
         let there = self.rest().first() == Some(&byte);
         self.at += usize::from(there);
         there
@@ -191,7 +191,7 @@ impl<'a> Cursor<'a> {
 
     /// Skips blanks, colours, and the quotation marks of mails and issues.
     fn quotes(&mut self) {
-        while self.blanks() || self.take(b'>') || self.take(b'|') {}
+        while self.blanks() || self.accept(b'>') || self.accept(b'|') {}
     }
 
     /// Returns the text up to the next blank or colour.
@@ -217,13 +217,13 @@ impl<'a> Cursor<'a> {
     fn stamp(&mut self) -> Option<Stamp> {
         let is_padded = self.rest().first() == Some(&b'0');
         let (number, digits) = self.number()?;
-        let is_date = self.take(b'-');
+        let is_date = self.accept(b'-');
         let seconds = if is_date { self.date(number)? } else { number };
-        let fraction = self.take(b'.').then(|| self.run(|byte| byte.is_ascii_digit()))?;
+        let fraction = self.accept(b'.').then(|| self.run(|byte| byte.is_ascii_digit()))?;
         let (fraction, fraction_digits) = candump::fraction(fraction)?;
         let nanos = seconds.checked_mul(1_000_000_000)?.checked_add(fraction)?;
         let time = Timestamp { nine_digits: fraction_digits > 6, ..Timestamp::six_digits(nanos) };
-        self.take(b')').then_some(())?;
+        self.accept(b')').then_some(())?;
         Some(match digits {
             _ if is_date => Stamp::Local(time),
             10.. => Stamp::Absolute(Timestamp { min_digits: if is_padded { 10 } else { 1 }, ..time }),
@@ -235,7 +235,7 @@ impl<'a> Cursor<'a> {
     fn date(&mut self, year: u64) -> Option<u64> {
         let mut two_digits = |end: Option<u8>| {
             let (number, digits) = self.number()?;
-            (digits == 2 && end.is_none_or(|end| self.take(end))).then_some(number)
+            (digits == 2 && end.is_none_or(|end| self.accept(end))).then_some(number)
         };
         let (month, day) = (two_digits(Some(b'-'))?, two_digits(Some(b' '))?);
         let (hour, minute, second) = (two_digits(Some(b':'))?, two_digits(Some(b':'))?, two_digits(None)?);
@@ -267,15 +267,15 @@ impl<'a> Cursor<'a> {
     }
 
     fn length(&mut self) -> Option<Length> {
-        let is_dlc = self.take(b'{');
+        let is_dlc = self.accept(b'{');
         if is_dlc {
             let digit = self.run(|byte| byte.is_ascii_hexdigit());
             let [digit] = digit else { return None };
             let dlc = char::from(*digit).to_digit(16).and_then(|dlc| u8::try_from(dlc).ok())?;
-            return self.take(b'}').then_some(Length::Dlc(dlc));
+            return self.accept(b'}').then_some(Length::Dlc(dlc));
         }
-        let (number, digits) = self.take(b'[').then(|| self.number())??;
-        self.take(b']').then_some(())?;
+        let (number, digits) = self.accept(b'[').then(|| self.number())??;
+        self.accept(b']').then_some(())?;
         let len = u8::try_from(number).unwrap_or(u8::MAX);
         match digits {
             1 => Some(Length::Classic(len)),
@@ -315,7 +315,7 @@ impl<'a> Cursor<'a> {
         let mut data = [0; 64];
         let mut is_swapped = false;
         for place in data.get_mut(..len).ok_or(too_long)? {
-            let swap = self.take(b'`');
+            let swap = self.accept(b'`');
             is_swapped |= swap;
             if !swap {
                 self.blanks();

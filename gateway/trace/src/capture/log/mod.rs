@@ -7,9 +7,9 @@ mod write;
 
 pub(super) use clock::Clock;
 pub use clock::Remark;
-pub use read::LONGEST;
+pub use read::MAX_LINE_BYTES;
 pub(super) use read::{LogReader, known_time};
 #[cfg(test)]
 mod tests;
 
-pub use write::{Digits, Less, LogWriter, Style, Wrote};
+pub use write::{Digits, OmittedProperties, LogWriter, Style, WriteOutcome};

@@ -3,15 +3,15 @@
 use std::io::{self, Read};
 use std::ops::Range;
 
-use protocol::candump::{self, Line, Record};
+use protocol::candump::{self, CandumpLine, Record};
 
 use super::clock::{Clock, Evidence, Remark};
-use super::console::{self, Console, Seen, Stamp};
+use super::console::{self, ConsoleLine, ConsoleFrame, Stamp};
 use crate::capture::{Entry, Note, NoteKind};
 use crate::container::read_some;
 
 /// The longest line that is read with its end, in bytes: twice the longest CAN XL frame.
-pub const LONGEST: usize = 8_192;
+pub const MAX_LINE_BYTES: usize = 8_192;
 /// The number of bytes that are read at once; a multiple of the longest line.
 const CHUNK: usize = 1 << 18;
 /// The length of the sample of lines before the first frame, from which the kind of a text is recognised.
@@ -58,7 +58,7 @@ impl LogReader {
     }
 
     /// Continues after bytes and lines that were skipped.
-    pub(crate) fn at((bytes, lines, clock): (u64, u64, Clock), input: Box<dyn Read + Send>) -> Self {
+    pub(crate) fn resume((bytes, lines, clock): (u64, u64, Clock), input: Box<dyn Read + Send>) -> Self {
         Self { taken: bytes, lines, clock, ..Self::new(&[], input) }
     }
 
@@ -112,16 +112,16 @@ impl LogReader {
         if long {
             return Ok(Some(Entry::Note(note(text, long, self.clock.last(), self.lines))));
         }
-        if let Ok(Line::Frame(record)) = candump::parse_bytes(text) {
-            self.clock.at(record.time.nanos);
+        if let Ok(CandumpLine::Frame(record)) = candump::parse_bytes(text) {
+            self.clock.set(record.time.nanos);
             self.any_frame = true;
             return Ok(Some(Entry::Frame(record)));
         }
         let mut note = note(text, long, self.clock.last(), self.lines);
         match console::parse(text) {
             None => {}
-            Some(Ok(Console::CanXl)) => note.kind = NoteKind::CanXl,
-            Some(Ok(Console::Frame(Seen { stamp, interface, frame, direction, has_flags }))) => {
+            Some(Ok(ConsoleLine::CanXl)) => note.kind = NoteKind::CanXl,
+            Some(Ok(ConsoleLine::Frame(ConsoleFrame { stamp, interface, frame, direction, has_flags }))) => {
                 let (time, remark) = self.clock.time(stamp);
                 let no_flags = (!has_flags).then_some(Remark::NoFlags);
                 for remark in remark.into_iter().chain(no_flags) {
@@ -153,7 +153,7 @@ impl LogReader {
             let line = fresh.get(..end.unwrap_or(fresh.len())).unwrap_or_default();
             if end.is_some() || self.at_end {
                 if let Some((interface, nanos)) = relative(line) {
-                    evidence.take(interface, nanos);
+                    evidence.add(interface, nanos);
                 }
                 seen += line.len() + 1;
             }
@@ -175,7 +175,7 @@ impl LogReader {
         let Range { start, end } = self.rest;
         let fresh = self.buffer.get(start..end).unwrap_or_default();
         match line_end(fresh) {
-            Some(at) if at < LONGEST => match fresh.get(at..) {
+            Some(at) if at < MAX_LINE_BYTES => match fresh.get(at..) {
                 Some([b'\r']) => self.line_beyond(),
                 Some([b'\r', b'\n', ..]) => Ok(Some((self.end_line(start + at, 2), false))),
                 _ => Ok(Some((self.end_line(start + at, 1), false))),
@@ -199,7 +199,7 @@ impl LogReader {
             let Range { start, end } = self.rest;
             let fresh = self.buffer.get(start + seen..end).unwrap_or_default();
             // A line end beyond the limit does not count.
-            let within = fresh.get(..LONGEST - seen).unwrap_or(fresh);
+            let within = fresh.get(..MAX_LINE_BYTES - seen).unwrap_or(fresh);
             match line_end(within).map(|at| (at, fresh.get(at..).unwrap_or_default())) {
                 // The line feed of this line end may follow.
                 Some((at, [b'\r'])) if !self.at_end => {
@@ -214,7 +214,7 @@ impl LogReader {
                 None => {}
             }
             seen += within.len();
-            if seen == LONGEST {
+            if seen == MAX_LINE_BYTES {
                 let line = self.skip_line(start..start + seen)?;
                 return Ok(Some((line, true)));
             }
@@ -276,7 +276,7 @@ fn relative(line: &[u8]) -> Option<(&str, u64)> {
         return None;
     }
     match console::parse(line) {
-        Some(Ok(Console::Frame(Seen { stamp: Stamp::Relative(time), interface, .. }))) => {
+        Some(Ok(ConsoleLine::Frame(ConsoleFrame { stamp: Stamp::Relative(time), interface, .. }))) => {
             Some((interface, time.nanos))
         }
         _ => None,
@@ -287,15 +287,15 @@ fn relative(line: &[u8]) -> Option<(&str, u64)> {
 /// before it.
 pub(crate) fn known_time(line: &[u8]) -> Option<Option<u64>> {
     let line = line.trim_ascii_end();
-    if let Ok(Line::Frame(record)) = candump::parse_bytes(line) {
+    if let Ok(CandumpLine::Frame(record)) = candump::parse_bytes(line) {
         return Some(Some(record.time.nanos));
     }
     match console::parse(line)?.ok()? {
-        Console::Frame(Seen { stamp: Stamp::Absolute(time) | Stamp::Local(time), .. }) => {
+        ConsoleLine::Frame(ConsoleFrame { stamp: Stamp::Absolute(time) | Stamp::Local(time), .. }) => {
             Some(Some(time.nanos))
         }
-        Console::Frame(_) => Some(None),
-        Console::CanXl => None,
+        ConsoleLine::Frame(_) => Some(None),
+        ConsoleLine::CanXl => None,
     }
 }
 
@@ -303,12 +303,12 @@ pub(crate) fn known_time(line: &[u8]) -> Option<Option<u64>> {
 /// as unreadable.
 #[cold]
 fn note(text: &[u8], long: bool, nanos: u64, line: u64) -> Note<'_> {
-    let why = format!("a line of more than {LONGEST} bytes, whose rest is left out");
+    let why = format!("a line of more than {MAX_LINE_BYTES} bytes, whose rest is left out");
     let kind = match candump::parse_bytes(text) {
         _ if long => NoteKind::Unreadable(why),
-        Ok(Line::Frame(_) | Line::Other) => NoteKind::Text,
-        Ok(Line::Dropped { frames }) => NoteKind::Dropped(frames),
-        Ok(Line::CanXl) => NoteKind::CanXl,
+        Ok(CandumpLine::Frame(_) | CandumpLine::Other) => NoteKind::Text,
+        Ok(CandumpLine::Dropped { frames }) => NoteKind::Dropped(frames),
+        Ok(CandumpLine::CanXl) => NoteKind::CanXl,
         Err(error) => NoteKind::Unreadable(error.to_string()),
     };
     let interface = if matches!(kind, NoteKind::Dropped(_)) { quoted(text) } else { "" };
@@ -368,16 +368,16 @@ mod tests {
 
     #[test]
     fn of_a_line_without_end_the_beginning_is_kept_and_the_next_one_is_read() {
-        let long = || Err::<(), _>(format!("a line of more than {LONGEST} bytes, whose rest is left out"));
+        let long = || Err::<(), _>(format!("a line of more than {MAX_LINE_BYTES} bytes, whose rest is left out"));
         for piece in [4097, CHUNK] {
             let mut bytes = vec![b'('; 3 * CHUNK];
             bytes.extend_from_slice(b"\nnext\n");
             bytes.extend_from_slice(&vec![b'x'; CHUNK]);
             let found = all(&bytes, piece);
             let unreadable = NoteKind::Unreadable(long().unwrap_err());
-            assert_eq!(found[0], (1, vec![b'('; LONGEST], unreadable.clone()));
+            assert_eq!(found[0], (1, vec![b'('; MAX_LINE_BYTES], unreadable.clone()));
             assert_eq!(found[1], text(2, b"next"));
-            assert_eq!(found[2], (3, vec![b'x'; LONGEST], unreadable));
+            assert_eq!(found[2], (3, vec![b'x'; MAX_LINE_BYTES], unreadable));
             assert_eq!(found.len(), 3);
         }
     }
@@ -386,9 +386,9 @@ mod tests {
     fn a_line_may_be_as_long_as_the_limit_and_not_longer() {
         let line = |len: usize| [b"#".repeat(len - 1).as_slice(), b"\nnext\n"].concat();
         for piece in [1023, CHUNK] {
-            let longest = all(&line(LONGEST), piece);
-            assert_eq!(longest, [text(1, &b"#".repeat(LONGEST - 1)), text(2, b"next")]);
-            let longer = all(&line(LONGEST + 1), piece);
+            let longest = all(&line(MAX_LINE_BYTES), piece);
+            assert_eq!(longest, [text(1, &b"#".repeat(MAX_LINE_BYTES - 1)), text(2, b"next")]);
+            let longer = all(&line(MAX_LINE_BYTES + 1), piece);
             assert!(matches!(longer[0].2, NoteKind::Unreadable(_)), "{:?}", longer[0].2);
             assert_eq!(longer[1..], [text(2, b"next")]);
         }

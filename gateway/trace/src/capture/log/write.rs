@@ -10,7 +10,7 @@ use protocol::usage::is_unprintable;
 use crate::capture::{Entry, Note, NoteKind};
 
 /// The number of bytes that are written together.
-const PIECE: usize = 1 << 16;
+const WRITE_BYTES: usize = 1 << 16;
 /// The maximum size of lines that wait for the first frame, in bytes. A text without frames is not a log, so nothing is
 /// written before.
 const WAITING: usize = 1 << 20;
@@ -41,18 +41,18 @@ pub struct Style {
 
 /// The result of writing an entry.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Wrote {
+pub enum WriteOutcome {
     /// The log holds the whole entry.
     All,
     /// The line holds less than the entry.
-    Less(Less),
+    Less(OmittedProperties),
     /// The log omits the entry: a note that was not requested, or that a log cannot hold.
     Nothing,
 }
 
 /// Properties of a frame that its line omits.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Less {
+pub struct OmittedProperties {
     /// Digits of its time.
     pub digits: bool,
     /// Its direction.
@@ -73,7 +73,7 @@ pub struct LogWriter<W> {
     any_frame: bool,
     /// The number of frames lost so far, by bus.
     lost: HashMap<String, u64>,
-    names: Names,
+    names: BusNames,
 }
 
 /// A text buffer that can hold any bytes.
@@ -89,7 +89,7 @@ impl fmt::Write for Lines {
 
 /// The names of buses in a log.
 #[derive(Debug, Default)]
-struct Names {
+struct BusNames {
     /// The bus of the last frame, and its name in the log if that differs.
     last: (String, Option<String>),
     /// Names in the log, by bus.
@@ -97,13 +97,13 @@ struct Names {
     taken: HashSet<String>,
 }
 
-impl Names {
+impl BusNames {
     /// The maximum number of buses with an entry.
-    const MOST: usize = 4_096;
+    const MAX_NAMES: usize = 4_096;
 
     /// Makes `bus` the last one, and returns its name in the log if that differs.
     #[inline]
-    fn of(&mut self, bus: &str) -> Option<&str> {
+    fn replacement(&mut self, bus: &str) -> Option<&str> {
         if self.last.0 != bus || self.taken.is_empty() {
             let written = self.assign(bus);
             self.last = (bus.to_owned(), Some(written).filter(|name| name != bus));
@@ -126,7 +126,7 @@ impl Names {
         let further = (2..).map(|number| format!("{plain}_{number}"));
         let mut candidates = [plain.clone()].into_iter().chain(further);
         let name = candidates.find(|name| !self.taken.contains(name)).unwrap_or_default();
-        if self.taken.len() < Self::MOST {
+        if self.taken.len() < Self::MAX_NAMES {
             self.taken.insert(name.clone());
             self.written.insert(bus.to_owned(), name.clone());
         }
@@ -137,23 +137,23 @@ impl Names {
 impl<W: Write> LogWriter<W> {
     /// Creates a writer that buffers lines.
     pub fn new(out: W, style: Style) -> Self {
-        let lines = Lines(Vec::with_capacity(2 * PIECE));
-        Self { out, style, lines, any_frame: false, lost: HashMap::new(), names: Names::default() }
+        let lines = Lines(Vec::with_capacity(2 * WRITE_BYTES));
+        Self { out, style, lines, any_frame: false, lost: HashMap::new(), names: BusNames::default() }
     }
 
     /// Writes an entry.
     ///
     /// # Errors
     /// Returns an error if `out` fails.
-    pub fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote> {
+    pub fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome> {
         match entry {
             Entry::Frame(record) => self.frame(record),
-            Entry::Note(_) if self.style.plain => Ok(Wrote::Nothing),
+            Entry::Note(_) if self.style.plain => Ok(WriteOutcome::Nothing),
             Entry::Note(note) => self.note(note),
         }
     }
 
-    fn frame(&mut self, record: &Record<'_>) -> io::Result<Wrote> {
+    fn frame(&mut self, record: &Record<'_>) -> io::Result<WriteOutcome> {
         let Record { time, interface, frame, direction } = *record;
         let Timestamp { nanos, nine_digits: own, .. } = time;
         let nine_digits = match self.style.digits {
@@ -161,7 +161,7 @@ impl<W: Write> LogWriter<W> {
             Digits::Six => false,
             Digits::Nine => true,
         };
-        let mut less = Less { digits: !nine_digits && nanos % 1_000 != 0, ..Less::default() };
+        let mut less = OmittedProperties { digits: !nine_digits && nanos % 1_000 != 0, ..OmittedProperties::default() };
         let mut written = Record { time: Timestamp { nine_digits, ..time }, interface, frame, direction };
         let mut way = match direction {
             None => "",
@@ -176,7 +176,7 @@ impl<W: Write> LogWriter<W> {
             less.raw_dlc = frame.raw_dlc() != 0;
             written.frame = frame.with_raw_dlc(0);
         }
-        if let Some(name) = self.names.of(interface) {
+        if let Some(name) = self.names.replacement(interface) {
             written.interface = name;
             less.name = true;
         }
@@ -185,11 +185,11 @@ impl<W: Write> LogWriter<W> {
         let _ = write_record(&mut self.lines, &written);
         self.lines.0.extend_from_slice(way.as_bytes());
         self.end_line()?;
-        Ok(if less == Less::default() { Wrote::All } else { Wrote::Less(less) })
+        Ok(if less == OmittedProperties::default() { WriteOutcome::All } else { WriteOutcome::Less(less) })
     }
 
     /// Writes a line of a log unchanged. A recording's own note becomes candump's message on lost frames, or a comment.
-    fn note(&mut self, note: &Note<'_>) -> io::Result<Wrote> {
+    fn note(&mut self, note: &Note<'_>) -> io::Result<WriteOutcome> {
         let lines = &mut self.lines.0;
         match note.kind {
             // A line feed in the text would begin a line that is not in the source.
@@ -200,7 +200,7 @@ impl<W: Write> LogWriter<W> {
             NoteKind::Dropped(frames) => {
                 let total = self.lost.entry(note.interface.to_owned()).or_default();
                 *total = total.saturating_add(frames);
-                let (bus, s) = (self.names.of(note.interface), if frames == 1 { "" } else { "s" });
+                let (bus, s) = (self.names.replacement(note.interface), if frames == 1 { "" } else { "s" });
                 let bus = bus.filter(|_| !note.interface.is_empty()).unwrap_or(note.interface);
                 let text = format!(
                     "DROPCOUNT: dropped {frames} CAN frame{s} on '{bus}' socket (total drops {total})"
@@ -212,15 +212,15 @@ impl<W: Write> LogWriter<W> {
                 lines.extend_from_slice(b"# ");
                 lines.extend_from_slice(text.as_bytes());
             }
-            NoteKind::CanXl | NoteKind::Unreadable(_) => return Ok(Wrote::Nothing),
+            NoteKind::CanXl | NoteKind::Unreadable(_) => return Ok(WriteOutcome::Nothing),
         }
         self.end_line()?;
-        Ok(Wrote::All)
+        Ok(WriteOutcome::All)
     }
 
     fn end_line(&mut self) -> io::Result<()> {
         self.lines.0.push(b'\n');
-        let most = if self.any_frame { PIECE } else { WAITING };
+        let most = if self.any_frame { WRITE_BYTES } else { WAITING };
         if self.lines.0.len() < most { Ok(()) } else { self.put() }
     }
 
@@ -234,7 +234,7 @@ impl<W: Write> LogWriter<W> {
     ///
     /// # Errors
     /// Returns an error if `out` fails.
-    pub fn pass_on(&mut self) -> io::Result<()> {
+    pub fn flush_lines(&mut self) -> io::Result<()> {
         if self.any_frame { self.flush() } else { Ok(()) }
     }
 
@@ -251,9 +251,9 @@ impl<W: Write> LogWriter<W> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::candump::{Line, parse};
+    use protocol::candump::{CandumpLine, parse};
 
-    fn written(style: Style, entries: &[Entry<'_>]) -> (String, Vec<Wrote>) {
+    fn written(style: Style, entries: &[Entry<'_>]) -> (String, Vec<WriteOutcome>) {
         let mut bytes = Vec::new();
         let mut log = LogWriter::new(&mut bytes, style);
         let wrote = entries.iter().map(|entry| log.write(entry).unwrap()).collect();
@@ -262,7 +262,7 @@ mod tests {
     }
 
     fn frame(line: &str) -> Entry<'_> {
-        let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}") };
+        let Ok(CandumpLine::Frame(record)) = parse(line) else { panic!("{line}") };
         Entry::Frame(record)
     }
 
@@ -274,18 +274,18 @@ mod tests {
     fn a_frame_is_written_as_it_was_or_as_was_requested() {
         let line = "(1.000000007) can0 123#1122334455667788_A T";
         let style = |digits, plain| Style { digits, plain, directions: !plain };
-        let as_is = |line: &str| (format!("{line}\n"), vec![Wrote::All]);
+        let as_is = |line: &str| (format!("{line}\n"), vec![WriteOutcome::All]);
         assert_eq!(written(style(Digits::Own, false), &[frame(line)]), as_is(line));
-        let less = Less::default();
-        let bare = (line.replace(" T", "\n"), vec![Wrote::Less(Less { direction: true, ..less })]);
+        let less = OmittedProperties::default();
+        let bare = (line.replace(" T", "\n"), vec![WriteOutcome::Less(OmittedProperties { direction: true, ..less })]);
         assert_eq!(written(Style::default(), &[frame(line)]), bare);
         let six = (
             "(1.000000) can0 123#1122334455667788_A T\n".to_owned(),
-            vec![Wrote::Less(Less { digits: true, ..less })],
+            vec![WriteOutcome::Less(OmittedProperties { digits: true, ..less })],
         );
         assert_eq!(written(style(Digits::Six, false), &[frame(line)]), six);
-        let less = Less { direction: true, raw_dlc: true, ..less };
-        let plain = ("(1.000000007) can0 123#1122334455667788\n".to_owned(), vec![Wrote::Less(less)]);
+        let less = OmittedProperties { direction: true, raw_dlc: true, ..less };
+        let plain = ("(1.000000007) can0 123#1122334455667788\n".to_owned(), vec![WriteOutcome::Less(less)]);
         assert_eq!(written(style(Digits::Own, true), &[frame(line)]), plain);
         let short = frame("(1.000001) can0 123#");
         assert_eq!(written(style(Digits::Nine, true), &[short]), as_is("(1.000001000) can0 123#"));
@@ -302,12 +302,12 @@ mod tests {
         let mut bytes = Vec::new();
         let mut log = LogWriter::new(&mut bytes, Style::default());
         for entry in &entries {
-            assert_eq!(log.write(entry).unwrap(), Wrote::All);
+            assert_eq!(log.write(entry).unwrap(), WriteOutcome::All);
         }
         log.flush().unwrap();
         assert_eq!(bytes, b" # odd  \n(\xFF\nDROPCOUNT: dropped 3 of them\n(1.0) xl\n");
         let plain = Style { plain: true, ..Style::default() };
-        assert_eq!(written(plain, &entries), (String::new(), vec![Wrote::Nothing; 4]));
+        assert_eq!(written(plain, &entries), (String::new(), vec![WriteOutcome::Nothing; 4]));
     }
 
     #[test]
@@ -323,7 +323,7 @@ mod tests {
                         DROPCOUNT: dropped 1 CAN frame on 'vcan0' socket (total drops 4)\n\
                         # two  lines\n";
         assert_eq!(text, expected);
-        assert_eq!(wrote, [Wrote::All, Wrote::All, Wrote::All, Wrote::Nothing]);
+        assert_eq!(wrote, [WriteOutcome::All, WriteOutcome::All, WriteOutcome::All, WriteOutcome::Nothing]);
     }
 
     #[test]
@@ -357,9 +357,9 @@ mod tests {
         let (text, wrote) = written(Style::default(), &entries);
         let lines = expected.map(|name| format!("(1.000000) {name} 123#"));
         assert_eq!(text.lines().collect::<Vec<_>>(), lines);
-        let other = Wrote::Less(Less { name: true, ..Less::default() });
+        let other = WriteOutcome::Less(OmittedProperties { name: true, ..OmittedProperties::default() });
         let is_other =
-            names.iter().zip(expected).map(|(bus, name)| if *bus == name { Wrote::All } else { other });
+            names.iter().zip(expected).map(|(bus, name)| if *bus == name { WriteOutcome::All } else { other });
         assert_eq!(wrote, is_other.collect::<Vec<_>>());
     }
 
@@ -368,10 +368,10 @@ mod tests {
         let mut bytes = Vec::new();
         let mut log = LogWriter::new(&mut bytes, Style::default());
         log.write(&note(NoteKind::Text, 1, b"words")).unwrap();
-        log.pass_on().unwrap();
+        log.flush_lines().unwrap();
         assert!(log.out.is_empty());
         log.write(&frame("(1.000000) can0 123#")).unwrap();
-        log.pass_on().unwrap();
+        log.flush_lines().unwrap();
         assert_eq!(log.out, b"words\n(1.000000) can0 123#\n");
     }
 }

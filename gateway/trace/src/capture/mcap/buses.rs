@@ -14,11 +14,11 @@ use std::collections::{HashMap, HashSet};
 /// The maximum number of pairs. Frames of further ones use their `frame_id` as the bus.
 const PAIRS: usize = 4_096;
 /// The maximum length of a bus name made from a topic, in bytes.
-const LONGEST: usize = 255;
+const MAX_NAME_BYTES: usize = 255;
 
 /// The names of buses.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Buses {
+pub(crate) struct ForeignBuses {
     /// Names by topic and `frame_id`.
     names: HashMap<String, HashMap<String, String>>,
     /// The topics with each `frame_id`.
@@ -29,7 +29,7 @@ pub(crate) struct Buses {
     is_shared: bool,
 }
 
-impl Buses {
+impl ForeignBuses {
     /// Returns the bus of a message.
     pub(super) fn name<'a>(&'a mut self, topic: &str, frame_id: &'a str) -> &'a str {
         let is_known = self.names.get(topic).is_some_and(|names| names.contains_key(frame_id));
@@ -74,7 +74,7 @@ impl Buses {
 
 /// Returns the beginning of a topic's name, at most [`LONGEST`] bytes.
 pub(super) fn beginning(topic: &str) -> &str {
-    let ends = (0..=LONGEST.min(topic.len())).rev();
+    let ends = (0..=MAX_NAME_BYTES.min(topic.len())).rev();
     ends.filter_map(|end| topic.get(..end)).next().unwrap_or_default()
 }
 
@@ -83,13 +83,13 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn named(buses: &mut Buses, pairs: &[(&str, &str)]) -> Vec<String> {
+    fn named(buses: &mut ForeignBuses, pairs: &[(&str, &str)]) -> Vec<String> {
         pairs.iter().map(|(topic, frame_id)| buses.name(topic, frame_id).to_owned()).collect()
     }
 
     #[test]
     fn a_frame_id_of_one_topic_is_the_bus() {
-        let mut buses = Buses::default();
+        let mut buses = ForeignBuses::default();
         let pairs = [("/a", "can0"), ("/a", "can1"), ("/b", "can7"), ("/c", ""), ("/a", "can0")];
         assert_eq!(named(&mut buses, &pairs), ["can0", "can1", "can7", "/c", "can0"]);
         assert!(!buses.is_shared());
@@ -98,7 +98,7 @@ mod tests {
     #[test]
     fn topics_with_one_frame_id_are_buses_of_their_own() {
         let pairs = [("/can0/in", "can"), ("/can1/in", "can"), ("/can1/in", "other")];
-        let mut buses = Buses::default();
+        let mut buses = ForeignBuses::default();
         assert_eq!(named(&mut buses, &pairs), ["can", "/can1/in", "other"], "of a pipe");
         let mut buses = buses.settled();
         assert_eq!(named(&mut buses, &pairs), ["/can0/in", "/can1/in", "other"], "of a file");
@@ -111,7 +111,7 @@ mod tests {
             pairs in proptest::collection::vec(("/[ab]{1,2}(/x)?", "(/?[ab]{1,2}|can|/a/x|)"), 1..40), settled: bool
         ) {
             let pairs: Vec<_> = pairs.iter().map(|(topic, name)| (topic.as_str(), name.as_str())).collect();
-            let mut buses = Buses::default();
+            let mut buses = ForeignBuses::default();
             let mut names = named(&mut buses, &pairs);
             if settled {
                 buses = buses.settled();

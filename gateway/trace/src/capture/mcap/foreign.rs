@@ -9,24 +9,24 @@
 //!   uint8[8] data                                  uint8[<=64] data
 //! ```
 
-use protocol::can::{ERROR, EXTENDED, FD_FORMAT, Format, Frame, REMOTE, identifier};
+use protocol::can::{ERROR, EXTENDED, FD_FORMAT, Format, Frame, REMOTE, check_identifier};
 use protocol::candump::{Record, Timestamp};
 
-use crate::ros2::cdr::{CdrError, Reader};
+use crate::ros2::cdr::{CdrError, CdrReader};
 use crate::ros2::{Header, nanos};
 
 /// A message type of other programs' frames.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Foreign {
+pub(super) enum ForeignType {
     Classic,
     /// A classic frame in the encoding of ROS 1.
     Ros1,
     Fd,
 }
 
-impl Foreign {
+impl ForeignType {
     /// Returns the type for an encoding and a schema name; `None` if it does not hold frames.
-    pub(super) fn of(encoding: &str, schema: &str) -> Option<Self> {
+    pub(super) fn from_schema(encoding: &str, schema: &str) -> Option<Self> {
         match (encoding, schema) {
             ("cdr", "can_msgs/msg/Frame") => Some(Self::Classic),
             ("ros1", "can_msgs/Frame") => Some(Self::Ros1),
@@ -36,15 +36,15 @@ impl Foreign {
     }
 
     /// Returns the header of a message, and the reader positioned after it.
-    fn header(self, message: &[u8]) -> Result<(Header<'_>, Reader<'_>), CdrError> {
+    fn header(self, message: &[u8]) -> Result<(Header<'_>, CdrReader<'_>), CdrError> {
         let mut from;
         let header = match self {
             Self::Classic | Self::Fd => {
-                from = Reader::new(message)?;
+                from = CdrReader::new(message)?;
                 from.get()?
             }
             Self::Ros1 => {
-                from = Reader::ros1(message);
+                from = CdrReader::ros1(message);
                 let [_sequence, sec, nanosec]: [u32; 3] = from.get()?;
                 Header { nanos: nanos(sec.into(), nanosec)?, frame_id: from.get()? }
             }
@@ -66,7 +66,7 @@ impl Foreign {
             got: length.into(),
             allowed: "8 in a classic frame, 64 in an FD one, and not more than there is data",
         };
-        let id = identifier(number, remote | extended | error)?;
+        let id = check_identifier(number, remote | extended | error)?;
         let frame = match self {
             Self::Classic | Self::Ros1 => {
                 let bytes: [u8; 8] = from.get()?;
@@ -86,9 +86,9 @@ impl Foreign {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ros2::cdr::Writer;
+    use crate::ros2::cdr::CdrWriter;
 
-    fn head(out: &mut Writer<'_>, nanos: u64, name: &str, id: u32) {
+    fn head(out: &mut CdrWriter<'_>, nanos: u64, name: &str, id: u32) {
         out.put(Header { nanos, frame_id: name });
         out.put(id);
     }
@@ -96,43 +96,43 @@ mod tests {
     #[test]
     fn a_classic_frame_of_another_bridge_is_read() {
         let mut bytes = Vec::new();
-        let mut out = Writer::new(&mut bytes);
+        let mut out = CdrWriter::new(&mut bytes);
         head(&mut out, 17_000_000_005, "can", 0x1F33_4455);
         for byte in [0_u8, 1, 0, 2, 0xAA, 0xBB, 0, 0, 0, 0, 0, 0] {
             out.put(byte);
         }
-        let record = Foreign::of("cdr", "can_msgs/msg/Frame").unwrap().decode(&bytes, 9).unwrap();
+        let record = ForeignType::from_schema("cdr", "can_msgs/msg/Frame").unwrap().decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#AABB");
         // The bytes become a remote frame, and then one that is too long.
         let at = bytes.len() - 12;
         bytes[at] = 1;
-        let record = Foreign::Classic.decode(&bytes, 9).unwrap();
+        let record = ForeignType::Classic.decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#R2");
         bytes[at + 3] = 9;
-        assert!(Foreign::Classic.decode(&bytes, 9).unwrap_err().to_string().starts_with("length"));
+        assert!(ForeignType::Classic.decode(&bytes, 9).unwrap_err().to_string().starts_with("length"));
     }
 
     #[test]
     fn an_fd_frame_of_another_bridge_is_read() {
         let mut bytes = Vec::new();
-        let mut out = Writer::new(&mut bytes);
+        let mut out = CdrWriter::new(&mut bytes);
         head(&mut out, 0, "", 0x22C);
         for byte in [0_u8, 0, 3] {
             out.put(byte);
         }
         out.bytes(&[1, 2, 3]);
-        let foreign = Foreign::of("cdr", "ros2_socketcan_msgs/msg/FdFrame").unwrap();
+        let foreign = ForeignType::from_schema("cdr", "ros2_socketcan_msgs/msg/FdFrame").unwrap();
         let record = foreign.decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(0.000000009)  22C##4010203");
-        assert_eq!(Foreign::of("cdr", "std_msgs/msg/String"), None);
-        assert_eq!(Foreign::of("ros1", "can_msgs/msg/Frame"), None);
+        assert_eq!(ForeignType::from_schema("cdr", "std_msgs/msg/String"), None);
+        assert_eq!(ForeignType::from_schema("ros1", "can_msgs/msg/Frame"), None);
     }
 
     #[test]
     fn a_frame_of_ros_1_is_read() {
         let mut bytes = vec![9, 0, 0, 0, 17, 0, 0, 0, 5, 0, 0, 0, 3, 0, 0, 0];
         bytes.extend(b"can\x55\x44\x33\x1F\0\x01\0\x02\xAA\xBB\0\0\0\0\0\0");
-        let foreign = Foreign::of("ros1", "can_msgs/Frame").unwrap();
+        let foreign = ForeignType::from_schema("ros1", "can_msgs/Frame").unwrap();
         let record = foreign.decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#AABB");
         assert!(foreign.decode(&bytes[..bytes.len() - 1], 9).is_err());
@@ -148,16 +148,16 @@ mod tests {
             (0x2000_0000, 1, false),
         ] {
             let mut bytes = Vec::new();
-            let mut out = Writer::new(&mut bytes);
+            let mut out = CdrWriter::new(&mut bytes);
             head(&mut out, 1, "can", id);
             [0, extended, 0, 1, 0xAA, 0, 0, 0, 0, 0, 0, 0].into_iter().for_each(|byte: u8| out.put(byte));
-            let read = Foreign::Classic.decode(&bytes, 9).map(|record| record.frame.id());
+            let read = ForeignType::Classic.decode(&bytes, 9).map(|record| record.frame.id());
             assert_eq!(read.ok(), fits.then_some(id), "{id:X}");
-            let mut out = Writer::new(&mut bytes);
+            let mut out = CdrWriter::new(&mut bytes);
             head(&mut out, 1, "can", id);
             [extended, 0, 1].into_iter().for_each(|byte| out.put(byte));
             out.bytes(&[0xAA]);
-            let read = Foreign::Fd.decode(&bytes, 9).map(|record| record.frame.id());
+            let read = ForeignType::Fd.decode(&bytes, 9).map(|record| record.frame.id());
             assert_eq!(read.ok(), fits.then_some(id), "{id:X}");
         }
     }

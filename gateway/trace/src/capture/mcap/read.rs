@@ -6,25 +6,25 @@ use std::os::unix::fs::FileExt;
 
 use ::mcap::records::op;
 
-use super::Fault;
-use super::buses::Buses;
-use super::state::{KEPT, State, Target};
-use crate::capture::{Extras, Item};
-use crate::container::{Chunk, Damage, Framed, LONGEST, MAGIC, Record, Source, first_record, parse};
+use super::ReadFault;
+use super::buses::ForeignBuses;
+use super::state::{MAX_KEPT_BYTES, McapState, RequestedMessage};
+use crate::capture::{RecordingExtras, Item};
+use crate::container::{Chunk, FormatError, Framed, MAX_RECORD_BYTES, MAGIC, Record, RecordReader, first_record, parse};
 
 /// The number of bytes that are read at once.
-const PIECE: usize = 1 << 18;
+const READ_BYTES: usize = 1 << 18;
 
 type Input = BufReader<Chain<Cursor<Vec<u8>>, Box<dyn Read + Send>>>;
 
 /// Reads the entries of a recording.
 pub(crate) struct McapReader {
-    source: Source<Input>,
+    source: RecordReader<Input>,
     chunk: Chunk,
-    place: Place,
-    state: State,
+    place: Phase,
+    state: McapState,
     /// The first requested message, or the error before it, read when the recording was opened.
-    first: Option<Result<Target, Fault>>,
+    first: Option<Result<RequestedMessage, ReadFault>>,
     /// The offset of the record that holds the next messages, and the number of its messages that were returned.
     anchor: (u64, u32),
     /// The file, if it can be read at other offsets.
@@ -37,7 +37,7 @@ pub(crate) struct McapReader {
 
 /// The phase of reading.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-enum Place {
+enum Phase {
     Magic,
     Records,
     InChunk,
@@ -46,13 +46,13 @@ enum Place {
 
 impl McapReader {
     /// Continues after `head`, which has already been read. `file` is the input if it is a regular file.
-    pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>, state: State, file: Option<File>) -> Self {
-        let input = BufReader::with_capacity(PIECE, Cursor::new(head.to_vec()).chain(input));
-        let (source, chunk) = (Source::new(input, KEPT as u64), Chunk::default());
+    pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>, state: McapState, file: Option<File>) -> Self {
+        let input = BufReader::with_capacity(READ_BYTES, Cursor::new(head.to_vec()).chain(input));
+        let (source, chunk) = (RecordReader::new(input, MAX_KEPT_BYTES as u64), Chunk::default());
         let mut reader = Self {
             source,
             chunk,
-            place: Place::Magic,
+            place: Phase::Magic,
             state,
             first: None,
             anchor: (0, 0),
@@ -66,13 +66,13 @@ impl McapReader {
     }
 
     /// Continues at a record that begins at the offset `bytes`, with the known state of the file.
-    pub(crate) fn at(bytes: u64, input: Box<dyn Read + Send>, state: State, file: Option<File>) -> Self {
-        let input = BufReader::with_capacity(PIECE, Cursor::new(Vec::new()).chain(input));
-        let (source, chunk) = (Source::at(bytes, input, KEPT as u64), Chunk::default());
+    pub(crate) fn resume(bytes: u64, input: Box<dyn Read + Send>, state: McapState, file: Option<File>) -> Self {
+        let input = BufReader::with_capacity(READ_BYTES, Cursor::new(Vec::new()).chain(input));
+        let (source, chunk) = (RecordReader::at(bytes, input, MAX_KEPT_BYTES as u64), Chunk::default());
         Self {
             source,
             chunk,
-            place: Place::Records,
+            place: Phase::Records,
             state,
             first: None,
             anchor: (bytes, 0),
@@ -82,7 +82,7 @@ impl McapReader {
         }
     }
 
-    pub(crate) fn into_state(self) -> State {
+    pub(crate) fn into_state(self) -> McapState {
         self.state
     }
 
@@ -92,11 +92,11 @@ impl McapReader {
         self.anchor
     }
 
-    pub(crate) const fn extras(&self) -> &Extras {
+    pub(crate) const fn extras(&self) -> &RecordingExtras {
         self.state.extras()
     }
 
-    pub(crate) const fn buses(&self) -> &Buses {
+    pub(crate) const fn buses(&self) -> &ForeignBuses {
         self.state.buses()
     }
 
@@ -106,7 +106,7 @@ impl McapReader {
     }
 
     /// Returns true after the last message. Reads up to the next message, which [`McapReader::next`] then returns.
-    pub(crate) fn is_at_its_end(&mut self) -> Result<bool, Fault> {
+    pub(crate) fn is_at_its_end(&mut self) -> Result<bool, ReadFault> {
         if self.first.is_none() {
             self.first = self.advance()?.map(Ok);
         }
@@ -114,12 +114,12 @@ impl McapReader {
     }
 
     /// Returns the next entry, or the next message of another topic if these are requested. Never panics.
-    pub(crate) fn next(&mut self) -> Result<Option<Item<'_>>, Fault> {
+    pub(crate) fn next(&mut self) -> Result<Option<Item<'_>>, ReadFault> {
         let target = match self.first.take() {
             Some(first) => Some(first?),
             None => self.advance()?,
         };
-        let Some(Target { channel, times, in_chunk }) = target else { return Ok(None) };
+        let Some(RequestedMessage { channel, times, in_chunk }) = target else { return Ok(None) };
         self.anchor.1 += 1;
         let body = if in_chunk { self.chunk.body() } else { self.source.body() };
         let Ok(Record::Message { data, .. }) = parse(op::MESSAGE, body) else { return Ok(None) };
@@ -127,13 +127,13 @@ impl McapReader {
     }
 
     /// Reads up to the next requested message.
-    fn advance(&mut self) -> Result<Option<Target>, Fault> {
-        while self.place != Place::Over {
+    fn advance(&mut self) -> Result<Option<RequestedMessage>, ReadFault> {
+        while self.place != Phase::Over {
             match self.step() {
                 Ok(None) => {}
                 Ok(target) => return Ok(target),
                 Err(fault) => {
-                    self.place = Place::Over;
+                    self.place = Phase::Over;
                     return Err(fault);
                 }
             }
@@ -142,42 +142,42 @@ impl McapReader {
     }
 
     /// Reads one record.
-    fn step(&mut self) -> Result<Option<Target>, Fault> {
+    fn step(&mut self) -> Result<Option<RequestedMessage>, ReadFault> {
         let Self { source, chunk, place, state, anchor, messages, .. } = self;
         let began = source.read();
         let mut take = |opcode, body: &[u8], in_chunk| {
             if let Some(messages) = messages.as_mut().filter(|_| opcode == op::MESSAGE) {
                 *messages += 1;
             }
-            state.take(opcode, body, in_chunk)
+            state.process(opcode, body, in_chunk)
         };
         match place {
-            Place::Over => {}
-            Place::Magic => {
-                *place = Place::Records;
+            Phase::Over => {}
+            Phase::Magic => {
+                *place = Phase::Records;
                 self.take_magic()?;
             }
-            Place::InChunk => match chunk.next() {
+            Phase::InChunk => match chunk.next() {
                 Some((opcode @ (op::SCHEMA | op::CHANNEL | op::MESSAGE), body)) => {
                     return take(opcode, body, true);
                 }
                 Some(_) => {}
-                None => *place = Place::Records,
+                None => *place = Phase::Records,
             },
-            Place::Records => {
+            Phase::Records => {
                 let framed = source.next()?;
                 source.check(framed)?;
                 match framed {
                     Framed::Record(op::CHUNK) => {
                         chunk.unpack(source.body(), source.read())?;
-                        (*place, *anchor) = (Place::InChunk, (began, 0));
+                        (*place, *anchor) = (Phase::InChunk, (began, 0));
                     }
                     Framed::Record(op::DATA_END) => {
                         source.check_section(op::DATA_END)?;
                         source.begin_summary();
                     }
                     Framed::Record(op::FOOTER) => {
-                        *place = Place::Over;
+                        *place = Phase::Over;
                         // Reading goes on without a damaged summary.
                         if source.check_section(op::FOOTER).is_err() {
                             self.stated = None;
@@ -199,7 +199,7 @@ impl McapReader {
                     Framed::Passed(..) | Framed::Unknown(..) => {}
                     Framed::Long(op::ATTACHMENT, _) => state.attachment(source.attachment_name(), &[]),
                     Framed::Long(_, bytes) => {
-                        return Err(Damage::Long { what: "record", bytes, limit: LONGEST }.into());
+                        return Err(FormatError::Long { what: "record", bytes, limit: MAX_RECORD_BYTES }.into());
                     }
                     Framed::Cut(_, bytes) => self.truncated(bytes)?,
                     Framed::End(bytes) => self.truncated(bytes)?,
@@ -210,10 +210,10 @@ impl McapReader {
     }
 
     /// Checks the magic bytes, which must be here.
-    fn take_magic(&mut self) -> Result<(), Fault> {
+    fn take_magic(&mut self) -> Result<(), ReadFault> {
         if !self.source.magic()? {
             if !MAGIC.starts_with(self.source.body()) {
-                return Err(Damage::Magic.into());
+                return Err(FormatError::Magic.into());
             }
             self.truncated(0)?;
         }
@@ -221,25 +221,25 @@ impl McapReader {
     }
 
     /// Checks that the number of messages is that of the statistics and that the file ends here.
-    fn end(&self) -> Result<(), Fault> {
+    fn end(&self) -> Result<(), ReadFault> {
         if let (Some(found), Some(stated)) = (self.messages, self.stated)
             && found != stated
         {
-            return Err(Damage::Messages { found, stated }.into());
+            return Err(FormatError::Messages { found, stated }.into());
         }
         match &self.file {
-            Some(file) if file.metadata()?.len() > self.source.read() => Err(Damage::Behind.into()),
+            Some(file) if file.metadata()?.len() > self.source.read() => Err(FormatError::Behind.into()),
             _ => Ok(()),
         }
     }
 
     /// Handles an input that ends within a record after `bytes` of it. The recording was cut off, unless its end or
     /// other records follow: then the record's length is wrong.
-    fn truncated(&mut self, bytes: u64) -> Result<(), Fault> {
-        self.place = Place::Over;
+    fn truncated(&mut self, bytes: u64) -> Result<(), ReadFault> {
+        self.place = Phase::Over;
         if self.source.ends_with_magic() && self.source.read() > 2 * MAGIC.len() as u64 {
             let is_footer = bytes == MAGIC.len() as u64;
-            return Err(if is_footer { Damage::Footer } else { Damage::Beyond { bytes } }.into());
+            return Err(if is_footer { FormatError::Footer } else { FormatError::Beyond { bytes } }.into());
         }
         let read = self.source.read();
         if let Some(file) = &self.file
@@ -249,8 +249,8 @@ impl McapReader {
             // A message before it may have a wrong length, which skipped other records and led into the middle of one.
             let before = self.source.message_before().filter(|_| any);
             let began = before.unwrap_or_else(|| self.source.began());
-            if first_record(&mut Apart { file, at: 0 }, began + 1, read, any)?.is_some() {
-                return Err(Damage::Beyond { bytes }.into());
+            if first_record(&mut OffsetReader { file, at: 0 }, began + 1, read, any)?.is_some() {
+                return Err(FormatError::Beyond { bytes }.into());
             }
         }
         self.state.truncated(read);
@@ -259,12 +259,12 @@ impl McapReader {
 }
 
 /// A reader with an offset of its own in a shared file.
-struct Apart<'a> {
+struct OffsetReader<'a> {
     file: &'a File,
     at: u64,
 }
 
-impl Read for Apart<'_> {
+impl Read for OffsetReader<'_> {
     fn read(&mut self, room: &mut [u8]) -> io::Result<usize> {
         let came = self.file.read_at(room, self.at)?;
         self.at += came as u64;
@@ -272,7 +272,7 @@ impl Read for Apart<'_> {
     }
 }
 
-impl Seek for Apart<'_> {
+impl Seek for OffsetReader<'_> {
     fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
         let (from, by) = match to {
             SeekFrom::Start(at) => (at, 0),

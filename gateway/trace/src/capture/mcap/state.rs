@@ -7,41 +7,41 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use ::mcap::records::op;
 use protocol::candump::{Direction, Record, Timestamp};
 
-use super::Fault;
-use super::buses::{Buses, beginning};
-use super::foreign::Foreign;
+use super::ReadFault;
+use super::buses::{ForeignBuses, beginning};
+use super::foreign::ForeignType;
 use super::write::{SECONDS_DIGITS, TIME_DIGITS};
-use crate::capture::log::LONGEST as LONGEST_LINE;
-use crate::capture::{Entry, Extras, Item, Latched, Note, NoteKind, Other, Topic};
-use crate::container::{Damage, Facts, MAGIC, Names, Record as Raw, find, parse};
-use crate::recording::TOPIC_OF_STATE;
+use crate::capture::log::MAX_LINE_BYTES as LONGEST_LINE;
+use crate::capture::{Entry, RecordingExtras, Item, LatchedFrame, Note, NoteKind, OtherMessage, Topic};
+use crate::container::{FormatError, MetadataMap, MAGIC, NameBudget, Record as Raw, find, parse};
+use crate::recording::STATE_TOPIC_PREFIX;
 use crate::ros2::cdr::CdrError;
 use crate::ros2::{Message, MessageError, messages};
 
 /// The maximum size of the attachments, metadata and latched frames that are kept, in bytes.
-pub(super) const KEPT: usize = 16 << 20;
+pub(super) const MAX_KEPT_BYTES: usize = 16 << 20;
 /// The memory overhead of an attachment, a metadata value or a frame, in bytes.
-const ENTRY: usize = Names::ENTRY;
+const ENTRY: usize = NameBudget::ENTRY_OVERHEAD;
 /// The longest message that is decoded as a frame, in bytes.
 const LONGEST_FRAME: usize = 4 << 10;
 /// The longest message that is decoded as a note, in bytes: a line and its position.
 const LONGEST_NOTE: usize = LONGEST_LINE + (1 << 10);
 
 /// The state of reading a recording.
-pub(crate) struct State {
+pub(crate) struct McapState {
     schemas: HashMap<u16, String>,
     channels: HashMap<u16, Channel>,
     /// The indices of topics that are only counted, by name and type.
     counted: HashMap<(String, String), usize>,
-    names: Names,
-    extras: Extras,
+    names: NameBudget,
+    extras: RecordingExtras,
     /// The size of the attachments and metadata so far, in bytes.
     kept: usize,
     /// True if attachments and metadata are already known.
     knows_files: bool,
     any_frame: bool,
     /// The buses of other programs' frames.
-    buses: Buses,
+    buses: ForeignBuses,
     /// True if messages that are only counted are requested too.
     others: bool,
     /// True if no other part of the recording came before.
@@ -50,15 +50,15 @@ pub(crate) struct State {
 
 /// A requested message. Its contents are in the record that was read last.
 #[derive(Clone, Copy)]
-pub(crate) struct Target {
+pub(crate) struct RequestedMessage {
     pub(super) channel: u16,
-    pub(super) times: Times,
+    pub(super) times: MessageTimes,
     pub(super) in_chunk: bool,
 }
 
 /// The times of a message, in ns since 1970.
 #[derive(Clone, Copy)]
-pub(crate) struct Times {
+pub(crate) struct MessageTimes {
     /// The time that orders the file.
     pub(super) logged: u64,
     /// The time at which the message was published.
@@ -68,26 +68,26 @@ pub(crate) struct Times {
 /// A channel: its topic and its use.
 struct Channel {
     topic: String,
-    what: What,
+    what: ChannelUsage,
 }
 
 #[derive(Clone, Copy)]
-enum What {
+enum ChannelUsage {
     /// Frames, whose times are written in this form.
     Frames(Timestamp),
     /// Earlier frames that are latched when the recording begins.
     Latched,
     Notes,
-    Foreign(Foreign),
+    Foreign(ForeignType),
     /// Messages that are counted, under this index in the list of topics.
     Counted(usize),
 }
 
-impl State {
+impl McapState {
     /// Creates an empty state, or one that continues the extras of the parts `before` this one. In the latter case
     /// latched frames at the beginning of this part are already known, and its topics are those of the earlier parts.
     /// `others` requests the messages that are otherwise only counted.
-    pub(crate) fn new(others: bool, before: Option<Extras>) -> Self {
+    pub(crate) fn new(others: bool, before: Option<RecordingExtras>) -> Self {
         let is_first = before.is_none();
         let extras = before.unwrap_or_default();
         let topics = extras.topics.iter().enumerate();
@@ -95,36 +95,36 @@ impl State {
             schemas: HashMap::new(),
             channels: HashMap::new(),
             counted: topics.map(|(at, it)| ((it.name.clone(), it.schema.clone()), at)).collect(),
-            names: Names::default(),
+            names: NameBudget::default(),
             extras,
             kept: 0,
             knows_files: !is_first,
             any_frame: false,
-            buses: Buses::default(),
+            buses: ForeignBuses::default(),
             others,
             is_first,
         }
     }
 
     /// Uses buses that are already known.
-    pub(crate) fn with_buses(self, buses: Buses) -> Self {
+    pub(crate) fn with_buses(self, buses: ForeignBuses) -> Self {
         Self { buses, ..self }
     }
 
-    pub(super) const fn buses(&self) -> &Buses {
+    pub(super) const fn buses(&self) -> &ForeignBuses {
         &self.buses
     }
 
-    pub(super) fn into_buses(self) -> Buses {
+    pub(super) fn into_buses(self) -> ForeignBuses {
         self.buses
     }
 
     /// Returns true if a channel so far has frames of another program's type.
     pub(super) fn has_foreign(&self) -> bool {
-        self.channels.values().any(|channel| matches!(channel.what, What::Foreign(_)))
+        self.channels.values().any(|channel| matches!(channel.what, ChannelUsage::Foreign(_)))
     }
 
-    pub(super) const fn extras(&self) -> &Extras {
+    pub(super) const fn extras(&self) -> &RecordingExtras {
         &self.extras
     }
 
@@ -162,7 +162,7 @@ impl State {
                 break;
             }
             body.clear();
-            let came = (&mut from).take(length.min(KEPT as u64)).read_to_end(&mut body)? as u64;
+            let came = (&mut from).take(length.min(MAX_KEPT_BYTES as u64)).read_to_end(&mut body)? as u64;
             if came < length {
                 let rest = i64::try_from(length - came);
                 if rest.is_err() || rest.is_ok_and(|rest| from.seek_relative(rest).is_err()) {
@@ -187,7 +187,7 @@ impl State {
     }
 
     /// Processes a record. Returns the message if it is requested.
-    pub(crate) fn take(&mut self, opcode: u8, body: &[u8], in_chunk: bool) -> Result<Option<Target>, Fault> {
+    pub(crate) fn process(&mut self, opcode: u8, body: &[u8], in_chunk: bool) -> Result<Option<RequestedMessage>, ReadFault> {
         match parse(opcode, body)? {
             Raw::Schema { id, name, .. } => {
                 if self.schemas.get(&id).is_none_or(|known| known != name) {
@@ -202,8 +202,8 @@ impl State {
             }
             Raw::Message { channel, log_time, publish_time, data, .. } => {
                 let target = self.is_requested(channel, data)?;
-                let times = Times { logged: log_time, published: publish_time };
-                return Ok(target.then_some(Target { channel, times, in_chunk }));
+                let times = MessageTimes { logged: log_time, published: publish_time };
+                return Ok(target.then_some(RequestedMessage { channel, times, in_chunk }));
             }
             Raw::Attachment { name, data, .. } if !self.knows_files => self.attachment(name, data),
             Raw::Metadata { name, facts } if !self.knows_files => self.metadata(name, &facts),
@@ -218,47 +218,47 @@ impl State {
     }
 
     /// Counts or keeps a message. Returns true if it is requested.
-    fn is_requested(&mut self, channel: u16, data: &[u8]) -> Result<bool, Fault> {
-        let Channel { topic, what } = self.channels.get(&channel).ok_or(Damage::Channel(channel))?;
+    fn is_requested(&mut self, channel: u16, data: &[u8]) -> Result<bool, ReadFault> {
+        let Channel { topic, what } = self.channels.get(&channel).ok_or(FormatError::Channel(channel))?;
         match *what {
-            What::Counted(topic) => {
+            ChannelUsage::Counted(topic) => {
                 if let Some(topic) = self.extras.topics.get_mut(topic) {
                     topic.messages += 1;
                 }
                 Ok(self.others)
             }
-            What::Latched if !self.is_first => Ok(false),
-            What::Latched => {
+            ChannelUsage::Latched if !self.is_first => Ok(false),
+            ChannelUsage::Latched => {
                 let record =
-                    latched(data).map_err(|source| Damage::Message { topic: topic.clone(), source })?;
+                    latched(data).map_err(|source| FormatError::Message { topic: topic.clone(), source })?;
                 let (bus, own) = (record.interface, record.direction == Some(Direction::Sent));
                 let (frame, nanos) = (record.frame, record.time.nanos);
                 self.keep(bus.len() + ENTRY, |extras| {
-                    extras.latched.push(Latched { bus: bus.to_owned(), own, frame, nanos });
+                    extras.latched.push(LatchedFrame { bus: bus.to_owned(), own, frame, nanos });
                 });
                 Ok(false)
             }
-            What::Frames(_) | What::Notes | What::Foreign(_) => Ok(true),
+            ChannelUsage::Frames(_) | ChannelUsage::Notes | ChannelUsage::Foreign(_) => Ok(true),
         }
     }
 
     /// Keeps something of `size` bytes while there is room.
-    fn keep(&mut self, size: usize, keep: impl FnOnce(&mut Extras)) {
+    fn keep(&mut self, size: usize, keep: impl FnOnce(&mut RecordingExtras)) {
         self.kept = self.kept.saturating_add(size);
-        if self.is_first && self.kept <= KEPT {
+        if self.is_first && self.kept <= MAX_KEPT_BYTES {
             keep(&mut self.extras);
         }
     }
 
     pub(super) fn attachment(&mut self, name: &str, data: &[u8]) {
-        let fits = self.kept.saturating_add(name.len() + ENTRY + data.len()) <= KEPT;
+        let fits = self.kept.saturating_add(name.len() + ENTRY + data.len()) <= MAX_KEPT_BYTES;
         let data = if fits { data } else { &[] };
         self.keep(name.len() + ENTRY + data.len(), |extras| {
             extras.attachments.push((name.to_owned(), data.to_vec()));
         });
     }
 
-    fn metadata(&mut self, name: &str, facts: &Facts<'_>) {
+    fn metadata(&mut self, name: &str, facts: &MetadataMap<'_>) {
         let size = facts.iter().map(|(key, value)| key.len() + value.len() + ENTRY).sum::<usize>();
         self.keep(name.len() + ENTRY + size, |extras| {
             let facts = facts.iter().map(|(key, value)| (key.to_owned(), value.to_owned()));
@@ -272,21 +272,21 @@ impl State {
         schema: u16,
         topic: &str,
         encoding: &str,
-        facts: &Facts<'_>,
-    ) -> Result<(), Fault> {
+        facts: &MetadataMap<'_>,
+    ) -> Result<(), ReadFault> {
         let schema = self.schemas.get(&schema).cloned().unwrap_or_default();
         // Topic and schema may be stored twice each.
         self.names.add(2 * (topic.len() + schema.len()))?;
-        let what = if let Some(foreign) = Foreign::of(encoding, &schema) {
-            Some(What::Foreign(foreign))
+        let what = if let Some(foreign) = ForeignType::from_schema(encoding, &schema) {
+            Some(ChannelUsage::Foreign(foreign))
         } else if encoding != "cdr" {
             None
-        } else if schema == Record::TYPE && topic.starts_with(TOPIC_OF_STATE) {
-            Some(What::Latched)
+        } else if schema == Record::TYPE && topic.starts_with(STATE_TOPIC_PREFIX) {
+            Some(ChannelUsage::Latched)
         } else if schema == Record::TYPE {
-            Some(What::Frames(form(facts)))
+            Some(ChannelUsage::Frames(form(facts)))
         } else if schema == Note::TYPE {
-            Some(What::Notes)
+            Some(ChannelUsage::Notes)
         } else {
             None
         };
@@ -297,38 +297,38 @@ impl State {
                     topics.push(Topic { name: name.clone(), schema: schema.clone(), messages: 0 });
                     topics.len() - 1
                 });
-            What::Counted(*place)
+            ChannelUsage::Counted(*place)
         });
         self.channels.insert(id, Channel { topic: topic.to_owned(), what });
         Ok(())
     }
 
-    pub(super) fn item<'a>(&'a mut self, channel: u16, times: Times, message: &'a [u8]) -> Item<'a> {
+    pub(super) fn item<'a>(&'a mut self, channel: u16, times: MessageTimes, message: &'a [u8]) -> Item<'a> {
         // Other programs may have published their messages by another clock.
-        let Times { logged: log_time, published } = times;
+        let MessageTimes { logged: log_time, published } = times;
         let Some(Channel { topic, what }) = self.channels.get(&channel) else {
             return Item::Entry(unreadable("", log_time, message, &"no channel"));
         };
         let decoded = match *what {
-            What::Counted(place) => {
+            ChannelUsage::Counted(place) => {
                 let topic = self.extras.topics.get(place);
                 let (topic, schema) = topic.map_or(("", ""), |topic| (&topic.name, &topic.schema));
-                return Item::Other(Other { topic, schema, nanos: published, message });
+                return Item::Other(OtherMessage { topic, schema, nanos: published, message });
             }
             // Latched frames are never requested.
-            What::Latched => latched(message).map(Entry::Frame),
-            What::Frames(form) => {
+            ChannelUsage::Latched => latched(message).map(Entry::Frame),
+            ChannelUsage::Frames(form) => {
                 let time = Timestamp { nanos: published, ..form };
                 decode(message, LONGEST_FRAME, |message| messages::frame(message, time)).map(Entry::Frame)
             }
-            What::Foreign(foreign) => {
+            ChannelUsage::Foreign(foreign) => {
                 let record = decode(message, LONGEST_FRAME, |message| foreign.decode(message, log_time));
                 let buses = &mut self.buses;
                 record.map(|record| {
                     Entry::Frame(Record { interface: buses.name(topic, record.interface), ..record })
                 })
             }
-            What::Notes => {
+            ChannelUsage::Notes => {
                 let note = decode(message, LONGEST_NOTE, |message| messages::note(message, published));
                 note.map(|mut note| {
                     if note.line > 0 && !self.any_frame {
@@ -345,7 +345,7 @@ impl State {
 }
 
 /// Returns the form of times that the metadata of a channel specify.
-fn form(facts: &Facts<'_>) -> Timestamp {
+fn form(facts: &MetadataMap<'_>) -> Timestamp {
     let nine_digits = facts.get(TIME_DIGITS).is_none_or(|digits| digits != "6");
     let min_digits = facts.get(SECONDS_DIGITS).and_then(|digits| digits.parse().ok()).unwrap_or(1);
     Timestamp { nanos: 0, nine_digits, min_digits }

@@ -6,29 +6,29 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
 use ::mcap::records::op;
 
-use super::buses::Buses;
-use super::foreign::Foreign;
+use super::buses::ForeignBuses;
+use super::foreign::ForeignType;
 use super::read::McapReader;
-use super::state::State;
-use crate::container::{LONGEST_DESCRIPTION, MAGIC, Record, find, parse};
+use super::state::McapState;
+use crate::container::{MAX_DESCRIPTION_BYTES, MAGIC, Record, find, parse};
 
 /// The maximum number of topics.
 const TOPICS: usize = 4_096;
 
 /// Finds the buses of recordings whose frames other programs wrote.
 #[derive(Debug, Default)]
-pub(crate) struct Survey {
+pub(crate) struct TopicSurvey {
     topics: HashSet<String>,
     /// True once a file had no channels outside its chunks.
     is_silent: bool,
 }
 
-impl Survey {
+impl TopicSurvey {
     /// Adds the topics of a file, which its summary repeats. Moves the position in the file.
     ///
     /// # Errors
     /// Returns an error if the file cannot be read.
-    pub(crate) fn look(&mut self, file: &mut File) -> io::Result<()> {
+    pub(crate) fn add_file(&mut self, file: &mut File) -> io::Result<()> {
         let mut from = BufReader::with_capacity(4 << 10, file);
         from.seek(SeekFrom::Start(MAGIC.len() as u64))?;
         let mut schemas = HashSet::new();
@@ -39,7 +39,7 @@ impl Survey {
                 return Ok(());
             }
             let mut body = Vec::new();
-            (&mut from).take(length.min(LONGEST_DESCRIPTION as u64)).read_to_end(&mut body)?;
+            (&mut from).take(length.min(MAX_DESCRIPTION_BYTES as u64)).read_to_end(&mut body)?;
             if body.len() as u64 != length {
                 break;
             }
@@ -48,7 +48,7 @@ impl Survey {
                 Ok(Record::Channel { schema, topic, encoding, .. }) => {
                     says = true;
                     let is_of =
-                        |name: &&(u16, String)| name.0 == schema && Foreign::of(encoding, &name.1).is_some();
+                        |name: &&(u16, String)| name.0 == schema && ForeignType::from_schema(encoding, &name.1).is_some();
                     if self.topics.len() < TOPICS && schemas.iter().any(|name| is_of(&name)) {
                         self.topics.insert(topic.to_owned());
                     }
@@ -66,8 +66,8 @@ impl Survey {
     }
 
     /// Reads the frames of a recording to find their buses. Adds them to the `known` ones.
-    pub(crate) fn buses_of(&self, input: Box<dyn Read + Send>, known: Buses) -> Buses {
-        let mut reader = McapReader::new(&[], input, State::new(false, None).with_buses(known), None);
+    pub(crate) fn buses_of(&self, input: Box<dyn Read + Send>, known: ForeignBuses) -> ForeignBuses {
+        let mut reader = McapReader::new(&[], input, McapState::new(false, None).with_buses(known), None);
         // If the topics are unknown, the type of the first messages decides.
         if self.topics.len() > 1 || reader.has_foreign() {
             // Errors are reported when the recording is read.

@@ -5,18 +5,18 @@ use std::fs::Metadata;
 use std::io::{self, Write};
 
 use protocol::candump::{Record, Timestamp};
-use robots::Taken;
+use robots::UniqueNames;
 
 use crate::capture::{Entry, Note, NoteKind};
 use crate::recording::file::{Channel, FileWriter};
-use crate::recording::{NOTES, TOPIC_OF_BUS};
+use crate::recording::{NOTES_TOPIC, BUS_TOPIC_PREFIX};
 
 /// The maximum number of frame channels. Each costs a reader memory, and a log may contain any number of buses.
 const CHANNELS: usize = 64;
 /// The topic of the frames of further buses. Each message holds the name of its bus.
 const FURTHER: &str = "/further";
 /// The name of the metadata record that holds the source of a converted recording.
-pub const ORIGIN: &str = "capture";
+pub const ORIGIN_METADATA: &str = "capture";
 /// The key and value of [`ORIGIN`] in a recording that was converted from a log.
 pub(crate) const SOURCE: (&str, &str) = ("from", "candump log");
 /// The key and value of [`ORIGIN`] in a recording that was converted from another recording.
@@ -35,12 +35,12 @@ pub(crate) struct McapWriter<W: Write> {
     channels: Vec<BusChannel>,
     /// The topic of each bus, for at most [`CHANNELS`] buses.
     topics: HashMap<String, String>,
-    taken: Taken,
+    taken: UniqueNames,
     /// The index of the last frame's channel.
     last: usize,
     notes: Option<Channel>,
     /// Notes before the first frame.
-    waiting: Option<Vec<Waiting>>,
+    waiting: Option<Vec<WaitingNote>>,
     /// The size of these notes, in bytes.
     bytes: usize,
 }
@@ -55,7 +55,7 @@ struct BusChannel {
 
 /// A waiting note.
 #[derive(Debug)]
-struct Waiting {
+struct WaitingNote {
     kind: NoteKind,
     interface: String,
     line: u64,
@@ -79,9 +79,9 @@ impl<W: Write> McapWriter<W> {
             None => FileWriter::new(out)?,
         };
         let (key, value) = if origin.of_log { SOURCE } else { OTHER_SOURCE };
-        file.metadata(ORIGIN, &[(key.to_owned(), value.to_owned())].into())?;
-        let mut taken = Taken::default();
-        taken.give_one(NOTES.to_owned());
+        file.metadata(ORIGIN_METADATA, &[(key.to_owned(), value.to_owned())].into())?;
+        let mut taken = UniqueNames::default();
+        taken.give_one(NOTES_TOPIC.to_owned());
         Ok(Self {
             file,
             channels: Vec::new(),
@@ -107,9 +107,9 @@ impl<W: Write> McapWriter<W> {
             }
             Entry::Note(note) => match &mut self.waiting {
                 Some(waiting) if note.line > 0 && self.bytes < WAITING => {
-                    self.bytes += note.text.len() + size_of::<Waiting>();
+                    self.bytes += note.text.len() + size_of::<WaitingNote>();
                     let (kind, interface) = (note.kind.clone(), note.interface.to_owned());
-                    waiting.push(Waiting { kind, interface, line: note.line, text: note.text.to_vec() });
+                    waiting.push(WaitingNote { kind, interface, line: note.line, text: note.text.to_vec() });
                     Ok(())
                 }
                 _ => {
@@ -123,7 +123,7 @@ impl<W: Write> McapWriter<W> {
     /// Writes the waiting notes. They get the time of the first frame, so that a viewer's time line does not begin in
     /// 1970.
     fn write_waiting(&mut self, nanos: u64) -> io::Result<()> {
-        for Waiting { kind, interface, line, text } in self.waiting.take().unwrap_or_default() {
+        for WaitingNote { kind, interface, line, text } in self.waiting.take().unwrap_or_default() {
             self.note(&Note { kind, nanos, interface: &interface, line, text: &text })?;
         }
         Ok(())
@@ -132,7 +132,7 @@ impl<W: Write> McapWriter<W> {
     fn note(&mut self, note: &Note<'_>) -> io::Result<()> {
         let channel = match &mut self.notes {
             Some(channel) => channel,
-            none => none.insert(self.file.channel::<Note<'_>>(NOTES, &[])?),
+            none => none.insert(self.file.channel::<Note<'_>>(NOTES_TOPIC, &[])?),
         };
         self.file.write(channel, note.nanos, note)
     }
@@ -154,7 +154,7 @@ impl<W: Write> McapWriter<W> {
         self.last = if let Some(place) = found {
             place
         } else {
-            let proposed = || format!("{TOPIC_OF_BUS}{}", name.trim_start_matches('/'));
+            let proposed = || format!("{BUS_TOPIC_PREFIX}{}", name.trim_start_matches('/'));
             let topic = self.topics.entry(name.to_owned()).or_insert_with(|| self.taken.give_one(proposed()));
             let padded = form.min_digits.to_string();
             let facts =

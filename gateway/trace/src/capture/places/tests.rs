@@ -1,6 +1,6 @@
 use super::*;
 use crate::capture::log::{Digits, Style};
-use crate::capture::{Entry, Format, convert::Output};
+use crate::capture::{Entry, CaptureFormat, convert::CaptureWriter};
 use protocol::can::Frame;
 use protocol::candump::{Record, Timestamp};
 use std::os::fd::AsRawFd;
@@ -9,9 +9,9 @@ const COUNT: u32 = 20_000;
 const MS: u64 = 1_000_000;
 
 /// A capture of two buses whose frames are read in turn, up to 0.3 s late.
-fn capture(path: &Path, format: Format) {
+fn capture(path: &Path, format: CaptureFormat) {
     let style = Style { digits: Digits::Nine, ..Style::default() };
-    let mut out = Output::new(File::create(path).unwrap(), format, style).unwrap();
+    let mut out = CaptureWriter::new(File::create(path).unwrap(), format, style).unwrap();
     for number in 0..COUNT {
         let burst = u64::from(number / 300);
         let (interface, nanos) = match number % 300 {
@@ -41,11 +41,11 @@ fn next(reader: &mut Reader, count: usize) -> Vec<(u32, u64)> {
 #[test]
 fn a_reader_goes_on_where_it_was_and_no_moment_is_before_its_place() {
     let folder = tempfile::tempdir().unwrap();
-    for format in [Format::Candump, Format::Mcap] {
+    for format in [CaptureFormat::Candump, CaptureFormat::Mcap] {
         let path = folder.path().join(format!("{format:?}"));
         capture(&path, format);
         let paths = [path];
-        let places = Places::of(&paths).unwrap();
+        let places = SeekIndex::open(&paths).unwrap();
         assert!(places.marks.len() > 3, "{format:?}: {}", places.marks.len());
         let mut reader = Reader::open_all(&paths).unwrap();
         let (mut here, mut all) = (Vec::new(), Vec::new());
@@ -87,7 +87,7 @@ fn in_console_text_whose_times_depend_on_other_lines_a_reader_goes_on_too() {
         };
         std::fs::write(&path, (0..9_000).map(line).collect::<String>()).unwrap();
         let paths = [path.clone()];
-        let places = Places::of(&paths).unwrap();
+        let places = SeekIndex::open(&paths).unwrap();
         assert!(places.marks.len() > 3, "{}", places.marks.len());
         let mut reader = Reader::open_all(&paths).unwrap();
         let all = next(&mut reader, 9_000);
@@ -123,11 +123,11 @@ fn messages_outside_chunks_and_files_without_an_end_have_places() {
         writer.write_to_known_channel(&header, &[0; 40]).unwrap();
     }
     drop(writer);
-    let whole = Places::apart(std::slice::from_ref(&path), 1_000).unwrap();
+    let whole = SeekIndex::apart(std::slice::from_ref(&path), 1_000).unwrap();
     assert!(whole.marks.len() > 100 && whole.latest() == 2_999);
     let bytes = std::fs::read(&path).unwrap();
     std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-    let cut = Places::apart(&[path], 1_000).unwrap();
+    let cut = SeekIndex::apart(&[path], 1_000).unwrap();
     assert!(cut.marks.len() > 40 && (1_000..2_000).contains(&cut.latest()), "{}", cut.latest());
 }
 
@@ -135,7 +135,7 @@ fn messages_outside_chunks_and_files_without_an_end_have_places() {
 fn what_cannot_be_gone_back_in_is_named() {
     let (reader, _writer) = io::pipe().unwrap();
     let pipe = format!("/dev/fd/{}", reader.as_raw_fd());
-    let error = Places::of(&[PathBuf::from(&pipe)]).unwrap_err().to_string();
+    let error = SeekIndex::open(&[PathBuf::from(&pipe)]).unwrap_err().to_string();
     assert!(error.starts_with(&format!("{pipe}: it is not a regular file")), "{error}");
     let folder = tempfile::tempdir().unwrap();
     for (name, bytes) in
@@ -143,7 +143,7 @@ fn what_cannot_be_gone_back_in_is_named() {
     {
         let path = folder.path().join(name);
         std::fs::write(&path, bytes).unwrap();
-        let places = Places::of(&[path]).unwrap();
+        let places = SeekIndex::open(&[path]).unwrap();
         assert_eq!((places.latest(), places.before(5).offset), (0, 0), "{name}");
     }
 }

@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::io::{self, Write};
 
 use crate::capture::is_foreign_frame;
-use crate::container::{Damage, Names, Record, parse};
+use crate::container::{FormatError, NameBudget, Record, parse};
 use crate::recording::file::{FileWriter, is_frames};
 use mcap::records::op;
 
@@ -41,12 +41,12 @@ type Statements = BTreeMap<u16, Vec<Statement>>;
 pub(super) struct Described {
     schemas: Statements,
     channels: Statements,
-    names: Names,
+    names: NameBudget,
 }
 
 impl Described {
     /// Adds a description. Ignores other records.
-    pub(super) fn take(&mut self, code: u8, body: &[u8], trust: Trust) -> Result<(), Damage> {
+    pub(super) fn add(&mut self, code: u8, body: &[u8], trust: Trust) -> Result<(), FormatError> {
         let (id, statements) = match parse(code, body)? {
             Record::Schema { id, .. } => (id, &mut self.schemas),
             Record::Channel { id, .. } => (id, &mut self.channels),

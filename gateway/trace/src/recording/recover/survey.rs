@@ -12,9 +12,9 @@ use std::io::{self, Read, Seek, SeekFrom};
 use mcap::records::op;
 
 use super::described::{Described, Trust};
-use super::{LONGEST_ATTACHMENT, RecoverError, Recovered};
+use super::{LONGEST_ATTACHMENT, RecoverError, RecoveryResult};
 use crate::container::{
-    Chunk, Damage, Framed, HEAD, LONGEST, MAGIC, Record, Source, first_record, is_record, parse,
+    Chunk, FormatError, Framed, RECORD_HEADER_BYTES, MAX_RECORD_BYTES, MAGIC, Record, RecordReader, first_record, is_record, parse,
 };
 
 /// The number of records before a wrong one that are searched for other records.
@@ -25,7 +25,7 @@ const FOOTER: usize = 29;
 
 /// A range of intact records.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Piece {
+pub(super) enum IntactRange {
     /// All records from one offset to another.
     Records { from: u64, to: u64 },
     /// One record whose length field is wrong, with the length of its contents.
@@ -34,11 +34,11 @@ pub(super) enum Piece {
 
 /// The contents of a file.
 #[derive(Debug, Default)]
-pub(super) struct Survey {
+pub(super) struct FileSurvey {
     pub(super) profile: String,
-    pub(super) pieces: Vec<Piece>,
+    pub(super) pieces: Vec<IntactRange>,
     pub(super) described: Described,
-    pub(super) recovered: Recovered,
+    pub(super) recovered: RecoveryResult,
 }
 
 /// The summary of a file, found from its end.
@@ -52,7 +52,7 @@ struct Summary {
 }
 
 /// The result of examining a record.
-enum Found {
+enum Examined {
     /// The record is intact.
     Right,
     /// The record is intact except for one of its lengths: its operation code, the length of its contents, and the
@@ -69,23 +69,23 @@ enum Found {
 
 /// The state of a survey.
 struct Surveyor<R> {
-    source: Source<R>,
+    source: RecordReader<R>,
     size: u64,
     /// The offset at which the data section ends at the latest.
     limit: u64,
     /// True if the file ends with the magic bytes.
     has_magic: bool,
     chunk: Chunk,
-    survey: Survey,
+    survey: FileSurvey,
     /// The last records whose lengths no checksum confirms: the offset of each, and the offset from which on rows of
     /// records inside it are accepted.
     unsure: VecDeque<(u64, u64)>,
 }
 
-impl Survey {
+impl FileSurvey {
     /// Surveys a file.
-    pub(super) fn of(from: impl Read + Seek) -> Result<Self, RecoverError> {
-        let mut source = Source::new(from, LONGEST_ATTACHMENT);
+    pub(super) fn new(from: impl Read + Seek) -> Result<Self, RecoverError> {
+        let mut source = RecordReader::new(from, LONGEST_ATTACHMENT);
         let is_begun = source.magic().map_err(RecoverError::Read)?;
         let first = source.body().to_vec();
         let size = source.size().map_err(RecoverError::Read)?;
@@ -127,19 +127,19 @@ impl<R: Read + Seek> Surveyor<R> {
         while self.source.read() < self.limit {
             let began = self.source.read();
             match self.examine()? {
-                Found::Right => self.right(began),
-                Found::As(code, length, end) => {
-                    self.survey.pieces.push(Piece::Record { at: began, code, length });
+                Examined::Right => self.right(began),
+                Examined::As(code, length, end) => {
+                    self.survey.pieces.push(IntactRange::Record { at: began, code, length });
                     self.lost(0);
                     self.unsure.clear();
                     self.source.move_to(end)?;
                 }
-                Found::End => {
+                Examined::End => {
                     is_ended = true;
                     break;
                 }
-                Found::NoEnd => {}
-                Found::Wrong { end, rows } => {
+                Examined::NoEnd => {}
+                Examined::Wrong { end, rows } => {
                     if !self.resume(began, end, rows)? {
                         break;
                     }
@@ -183,36 +183,36 @@ impl<R: Read + Seek> Surveyor<R> {
     fn right(&mut self, began: u64) {
         let to = self.source.read();
         match self.survey.pieces.last_mut() {
-            Some(Piece::Records { to: end, .. }) if *end == began => *end = to,
-            _ => self.survey.pieces.push(Piece::Records { from: began, to }),
+            Some(IntactRange::Records { to: end, .. }) if *end == began => *end = to,
+            _ => self.survey.pieces.push(IntactRange::Records { from: began, to }),
         }
     }
 
     /// Reads and examines the next record.
-    fn examine(&mut self) -> io::Result<Found> {
+    fn examine(&mut self) -> io::Result<Examined> {
         let framed = self.source.next()?;
         let (began, end) = (self.source.began(), self.source.read());
         let checked = self.source.check(framed);
-        let content = began + HEAD as u64;
+        let content = began + RECORD_HEADER_BYTES as u64;
         // Compressed data does not look like records. Where bytes are missing, later records have moved up to before
         // the end of the chunk.
         let own = self.source.plain_chunk();
         let rows = own.map_or(0, |own| content.saturating_add(own));
-        let wrong = Found::Wrong { end: Some(end), rows };
+        let wrong = Examined::Wrong { end: Some(end), rows };
         let code = match framed {
-            Framed::End(_) => return Ok(Found::Wrong { end: None, rows: 0 }),
+            Framed::End(_) => return Ok(Examined::Wrong { end: None, rows: 0 }),
             Framed::Unknown(_, length) => {
                 let end = content.checked_add(length).filter(|by_length| *by_length == end);
-                return Ok(Found::Wrong { end, rows: 0 });
+                return Ok(Examined::Wrong { end, rows: 0 });
             }
             Framed::Cut(code, _) => {
                 let found = self.by_content(code, &checked)?;
-                return Ok(found.unwrap_or(Found::Wrong { end: None, rows }));
+                return Ok(found.unwrap_or(Examined::Wrong { end: None, rows }));
             }
             Framed::Record(code) | Framed::Passed(code, _) | Framed::Long(code, _) => code,
         };
-        if let Err(Damage::Swallowed(_)) = checked {
-            return Ok(Found::Wrong { end: None, rows: 0 });
+        if let Err(FormatError::Swallowed(_)) = checked {
+            return Ok(Examined::Wrong { end: None, rows: 0 });
         }
         if checked.is_err() {
             return Ok(self.by_content(code, &checked)?.unwrap_or(wrong));
@@ -222,9 +222,9 @@ impl<R: Read + Seek> Surveyor<R> {
             (Framed::Record(_), op::FOOTER) => {
                 let ends = end + MAGIC.len() as u64 == self.size && self.source.magic()?;
                 self.survey.recovered.whole |= ends;
-                return Ok(if ends { Found::End } else { wrong });
+                return Ok(if ends { Examined::End } else { wrong });
             }
-            (Framed::Record(_), _) if self.take(code).is_err() => return Ok(wrong),
+            (Framed::Record(_), _) if self.check_contents(code).is_err() => return Ok(wrong),
             (Framed::Long(..), _) => return Ok(wrong),
             _ => {}
         }
@@ -234,7 +234,7 @@ impl<R: Read + Seek> Surveyor<R> {
             op::CHUNK | op::ATTACHMENT => self.doubt(began, end),
             _ => self.doubt(began, content),
         }
-        Ok(Found::Right)
+        Ok(Examined::Right)
     }
 
     /// Remembers a record whose length no checksum confirms.
@@ -246,10 +246,10 @@ impl<R: Read + Seek> Surveyor<R> {
     }
 
     /// Returns the last record with the length of its contents, if these are intact and only the length field is wrong.
-    fn by_content(&mut self, code: u8, checked: &Result<(), Damage>) -> io::Result<Option<Found>> {
-        let &Err(Damage::Length { own, bytes, .. }) = checked else { return Ok(None) };
-        let content = self.source.began() + HEAD as u64;
-        let limit = if code == op::ATTACHMENT { LONGEST_ATTACHMENT } else { LONGEST };
+    fn by_content(&mut self, code: u8, checked: &Result<(), FormatError>) -> io::Result<Option<Examined>> {
+        let &Err(FormatError::Length { own, bytes, .. }) = checked else { return Ok(None) };
+        let content = self.source.began() + RECORD_HEADER_BYTES as u64;
+        let limit = if code == op::ATTACHMENT { LONGEST_ATTACHMENT } else { MAX_RECORD_BYTES };
         let end = content + own.min(limit + 1);
         if own > limit || end > self.limit || matches!(code, op::DATA_END | op::FOOTER) {
             return Ok(None);
@@ -262,21 +262,21 @@ impl<R: Read + Seek> Surveyor<R> {
         if !is_sure && !is_record(self.source.input(), end, self.limit)? {
             return Ok(None);
         }
-        let is_right = self.source.read_as(content - HEAD as u64, own)? && self.take(code).is_ok();
+        let is_right = self.source.read_as(content - RECORD_HEADER_BYTES as u64, own)? && self.check_contents(code).is_ok();
         let end = if is_shorter { by_length } else { end };
-        Ok(is_right.then_some(Found::As(code, own, end)))
+        Ok(is_right.then_some(Examined::As(code, own, end)))
     }
 
     /// Checks the current record, and collects its schemas and channels.
-    fn take(&mut self, code: u8) -> Result<(), Damage> {
+    fn check_contents(&mut self, code: u8) -> Result<(), FormatError> {
         let Self { source, chunk, survey, .. } = self;
-        let Survey { described, profile, .. } = survey;
+        let FileSurvey { described, profile, .. } = survey;
         let body = source.body();
         if code != op::CHUNK {
             if let Record::Header { profile: of_file, .. } = parse(code, body)? {
                 of_file.clone_into(profile);
             }
-            return described.take(code, body, Trust::Plain);
+            return described.add(code, body, Trust::Plain);
         }
         chunk.unpack(body, source.read())?;
         while let Some((code, body)) = chunk.next() {
@@ -286,22 +286,22 @@ impl<R: Read + Seek> Surveyor<R> {
         let trust = if chunk.is_checked() { Trust::Certain } else { Trust::Plain };
         while let Some((code, body)) = chunk.next() {
             if matches!(code, op::SCHEMA | op::CHANNEL) {
-                described.take(code, body, trust)?;
+                described.add(code, body, trust)?;
             }
         }
         Ok(())
     }
 
     /// Handles the end of the data section, unless it is damage that looks like it: then records follow.
-    fn data_end(&mut self, began: u64) -> io::Result<Found> {
+    fn data_end(&mut self, began: u64) -> io::Result<Examined> {
         let checked = self.source.check_section(op::DATA_END).is_ok();
         let end = self.source.read();
         if self.limit < self.size && end < self.limit {
-            return Ok(Found::Wrong { end: Some(end), rows: 0 });
+            return Ok(Examined::Wrong { end: Some(end), rows: 0 });
         }
         self.survey.recovered.checksum |= !checked;
         if self.limit < self.size {
-            return Ok(Found::End);
+            return Ok(Examined::End);
         }
         self.source.begin_summary();
         let (mut all, mut of_all) = (Vec::new(), Trust::Doubtful);
@@ -332,14 +332,14 @@ impl<R: Read + Seek> Surveyor<R> {
         }
         for (code, body) in all {
             // Wrong descriptions are ignored.
-            let _ = self.survey.described.take(code, &body, of_all);
+            let _ = self.survey.described.add(code, &body, of_all);
         }
         self.source.end_summary();
-        let Some(more) = self.first(began + 1, self.size, false)? else { return Ok(Found::End) };
+        let Some(more) = self.first(began + 1, self.size, false)? else { return Ok(Examined::End) };
         self.lost(more - began);
         self.source.move_to(more)?;
         self.survey.recovered.whole = false;
-        Ok(Found::NoEnd)
+        Ok(Examined::NoEnd)
     }
 
     /// Seeks to the next records after a wrong one. Returns false if none follow.
@@ -381,7 +381,7 @@ impl<R: Read + Seek> Surveyor<R> {
 
     /// Removes the last record from the intact ones, because it contains others.
     fn cut(&mut self, at: u64) {
-        if let Some(Piece::Records { from, to }) = self.survey.pieces.last_mut() {
+        if let Some(IntactRange::Records { from, to }) = self.survey.pieces.last_mut() {
             *to = at;
             if from == to {
                 self.survey.pieces.pop();
@@ -397,7 +397,7 @@ impl<R: Read + Seek> Surveyor<R> {
         input.seek(SeekFrom::Start(footer))?;
         input.read_exact(&mut at_end)?;
         self.has_magic = at_end.ends_with(MAGIC);
-        let Some((&head, rest)) = at_end.split_first_chunk::<HEAD>() else { return Ok(None) };
+        let Some((&head, rest)) = at_end.split_first_chunk::<RECORD_HEADER_BYTES>() else { return Ok(None) };
         let Some((&start, _)) = rest.split_first_chunk::<8>() else { return Ok(None) };
         let is_footer = head == [op::FOOTER, 20, 0, 0, 0, 0, 0, 0, 0] && rest.ends_with(MAGIC);
         let start = match u64::from_le_bytes(start) {
@@ -408,7 +408,7 @@ impl<R: Read + Seek> Surveyor<R> {
             return Ok(None);
         }
         input.seek(SeekFrom::Start(start))?;
-        let mut of_summary = Source::at(start, input, 0);
+        let mut of_summary = RecordReader::at(start, input, 0);
         of_summary.begin_summary();
         let (mut stated, mut all) = (None, Vec::new());
         let checksum = loop {
@@ -441,7 +441,7 @@ impl<R: Read + Seek> Surveyor<R> {
         let trust = trust(is_right, at_end.ends_with(&[&[0; 4][..], MAGIC].concat()));
         for (code, body) in all {
             // Wrong descriptions are ignored.
-            let _ = self.survey.described.take(code, &body, trust);
+            let _ = self.survey.described.add(code, &body, trust);
         }
         Ok(Some(Summary { data_end: start, stated: stated.filter(|_| is_right), is_right }))
     }

@@ -38,8 +38,8 @@ normal = [1.0, 0.0, 0.0]
     Skin::parse("skin.toml", &text).unwrap()
 }
 
-fn arm(skin: &Skin) -> Result<Robot, RobotError> {
-    Robot::of_urdf(skin, Urdf::parse("arm.urdf", ARM).unwrap(), ARM.to_owned())
+fn arm(skin: &Skin) -> Result<RecordedRobot, RobotError> {
+    RecordedRobot::of_urdf(skin, Urdf::parse("arm.urdf", ARM).unwrap(), ARM.to_owned())
 }
 
 fn near(one: &[f64], other: &[f64]) -> bool {
@@ -75,13 +75,13 @@ fn a_urdf_of_another_robot_is_refused() {
     assert_eq!(error, "arm.urdf: no joint \"elbow\" moves; the nearest are \"grip\" or \"hinge\"");
     let error = arm(&skin(0.6)).unwrap_err().to_string();
     assert!(error.starts_with("arm.urdf: behind joint \"hinge\" it is not where chain \"upper\""), "{error}");
-    assert!(Robot::of_rows(&skin(0.6)).is_ok());
+    assert!(RecordedRobot::of_rows(&skin(0.6)).is_ok());
 }
 
 #[test]
 fn each_cell_of_a_skin_without_a_urdf_is_on_its_link() {
     let skin = testing::skin();
-    let robot = Robot::of_rows(&skin).unwrap();
+    let robot = RecordedRobot::of_rows(&skin).unwrap();
     let still = robot.still();
     let cells = still.iter().filter(|it| it.child.contains('/')).count();
     assert_eq!(cells, skin.cells.len());

@@ -13,7 +13,7 @@ type Seen = (String, u64, u64, u32);
 
 struct Bench {
     file: FileWriter<Vec<u8>>,
-    window: Window,
+    window: ReorderWindow,
     frames: Channel,
     joints: Channel,
 }
@@ -23,7 +23,7 @@ impl Bench {
         let mut file = FileWriter::new(Vec::new()).unwrap();
         let frames = file.channel::<CanFrame<'_>>("/can/vcan0", &[]).unwrap();
         let joints = file.channel::<JointState<'_>>("/arm/joint_states", &[]).unwrap();
-        let mut window = Window::default();
+        let mut window = ReorderWindow::default();
         window.begin(START);
         Self { file, window, frames, joints }
     }
@@ -39,8 +39,8 @@ impl Bench {
         self.window.write(&mut self.joints, nanos, &state);
     }
 
-    fn at(&mut self, now: u64) -> Count {
-        let mut written = self.window.look(now, &mut self.file).unwrap();
+    fn at(&mut self, now: u64) -> MessageCount {
+        let mut written = self.window.set_time(now, &mut self.file).unwrap();
         written.add(self.window.release(&mut self.file).unwrap());
         written
     }
@@ -48,7 +48,7 @@ impl Bench {
     /// Returns all messages, and the number of those that came too late.
     fn end(mut self) -> (Vec<Seen>, u64) {
         self.window.release_all(&mut self.file).unwrap();
-        assert_eq!(self.window.count(), Count::default());
+        assert_eq!(self.window.count(), MessageCount::default());
         self.file.finish().unwrap();
         let bytes = self.file.into_inner();
         let seen = mcap::MessageStream::new(&bytes).unwrap().map(|message| {
@@ -68,7 +68,7 @@ fn messages_of_several_topics_are_put_in_order_of_their_times() {
     for ms in [2, 3, 8] {
         bench.frame(START + ms * MS);
     }
-    assert_eq!(bench.at(START + 45 * MS), Count { frames: 2, others: 2 }, "8 and 9 ms wait");
+    assert_eq!(bench.at(START + 45 * MS), MessageCount { frames: 2, others: 2 }, "8 and 9 ms wait");
     let (seen, late) = bench.end();
     let times: Vec<_> =
         seen.iter().map(|(topic, logged, ..)| (&topic[1..2], (logged - START) / MS)).collect();
@@ -106,9 +106,9 @@ fn a_clock_that_is_set_back_begins_a_new_order() {
     let mut bench = Bench::new();
     bench.frame(START + MS);
     let back = START - 3_600_000 * MS;
-    assert_eq!(bench.at(back), Count { frames: 1, others: 0 }, "it does not wait an hour");
+    assert_eq!(bench.at(back), MessageCount { frames: 1, others: 0 }, "it does not wait an hour");
     bench.frame(back + MS);
-    assert_eq!(bench.at(back + 50 * MS), Count { frames: 1, others: 0 });
+    assert_eq!(bench.at(back + 50 * MS), MessageCount { frames: 1, others: 0 });
     let (seen, late) = bench.end();
     assert_eq!((seen[1].1, late), (back + MS, 0));
 }
@@ -146,7 +146,7 @@ fn another_file_begins_with_the_same_buffers_and_an_order_of_its_own() {
     assert_eq!((bench.at(START + 101 * MS).others, bench.window.late()), (1, 1));
     bench.frame(START + 99 * MS);
     bench.window.begin(START + 100 * MS);
-    assert_eq!(bench.window.count(), Count::default(), "it was for the file before");
+    assert_eq!(bench.window.count(), MessageCount::default(), "it was for the file before");
     let Bench { file, frames, joints, .. } = Bench::new();
     let mut bench = Bench { file, frames, joints, window: bench.window };
     bench.frame(START);
@@ -161,11 +161,11 @@ fn buffers_that_grew_while_a_file_stood_still_are_given_back() {
     for at in 0..MESSAGES as u64 {
         bench.frame(START + at);
     }
-    assert!(bench.window.waiting.capacity() >= MESSAGES && bench.window.bytes.capacity() > KEPT);
+    assert!(bench.window.waiting.capacity() >= MESSAGES && bench.window.bytes.capacity() > INITIAL_BYTES);
     bench.at(START + 100 * MS);
-    let Window { waiting, bytes, buffers, .. } = &bench.window;
-    let waiting = waiting.capacity() * size_of::<Waiting>();
-    assert!([waiting, bytes.capacity(), buffers.1.capacity()].iter().all(|&bytes| bytes <= KEPT));
+    let ReorderWindow { waiting, bytes, buffers, .. } = &bench.window;
+    let waiting = waiting.capacity() * size_of::<WaitingMessage>();
+    assert!([waiting, bytes.capacity(), buffers.1.capacity()].iter().all(|&bytes| bytes <= INITIAL_BYTES));
 }
 
 proptest! {

@@ -4,7 +4,7 @@ use core::fmt::Write;
 
 use super::Value;
 use crate::can::Format;
-use crate::usage::shown;
+use crate::usage::printable;
 
 /// The text of a new skin, written from top to bottom.
 #[derive(Clone, Debug, Default)]
@@ -62,7 +62,7 @@ impl Draft {
     pub fn comment(&mut self, text: &str) {
         match text {
             "" => self.0.push_str("#\n"),
-            text => self.line(format_args!("# {}", shown(text))),
+            text => self.line(format_args!("# {}", printable(text))),
         }
     }
 
@@ -73,7 +73,7 @@ impl Draft {
     /// Adds an empty line and a table header, with an optional comment. `head` includes the brackets.
     pub fn table(&mut self, head: &str, remark: Option<&str>) {
         match remark {
-            Some(remark) => self.line(format_args!("\n{head}   # {}", shown(remark))),
+            Some(remark) => self.line(format_args!("\n{head}   # {}", printable(remark))),
             None => self.line(format_args!("\n{head}")),
         }
     }
@@ -84,8 +84,8 @@ impl Draft {
     }
 
     /// Adds a key with a value and a comment, separated by this many spaces.
-    pub fn set_remarked(&mut self, key: &str, value: Value<'_>, blanks: usize, remark: &str) {
-        self.line(format_args!("{key} = {value}{:blanks$}# {}", "", shown(remark)));
+    pub fn set_with_comment(&mut self, key: &str, value: Value<'_>, blanks: usize, remark: &str) {
+        self.line(format_args!("{key} = {value}{:blanks$}# {}", "", printable(remark)));
     }
 
     /// Adds a key with an inline table.
@@ -101,7 +101,7 @@ impl Draft {
         rows: impl Iterator<Item = Vec<(&'v str, Value<'v>)>>,
     ) {
         match remark {
-            Some(remark) => self.line(format_args!("{key} = [   # {}", shown(remark))),
+            Some(remark) => self.line(format_args!("{key} = [   # {}", printable(remark))),
             None => self.line(format_args!("{key} = [")),
         }
         rows.for_each(|row| self.line(format_args!("  {},", inline(&row))));

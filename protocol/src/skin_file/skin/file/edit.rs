@@ -69,7 +69,7 @@ impl<'a> Edit<'a> {
     }
 
     /// Returns the byte ranges of a cell's key and its value.
-    fn places(&self, cell: usize, key: &str) -> Option<(Range<usize>, Range<usize>)> {
+    fn key_and_value_ranges(&self, cell: usize, key: &str) -> Option<(Range<usize>, Range<usize>)> {
         let (key, item) = self.cell(cell)?.get_key_value(key)?;
         Some((Key::span(key)?, item.span()?))
     }
@@ -77,12 +77,12 @@ impl<'a> Edit<'a> {
     /// Returns true if a cell has a key.
     #[must_use]
     pub fn has(&self, cell: usize, key: &str) -> bool {
-        self.places(cell, key).is_some()
+        self.key_and_value_ranges(cell, key).is_some()
     }
 
     /// Replaces the value of a key, if the cell has it.
     pub fn set(&mut self, cell: usize, key: &str, value: Value<'_>) {
-        if let Some((_, place)) = self.places(cell, key) {
+        if let Some((_, place)) = self.key_and_value_ranges(cell, key) {
             self.changes.push((place, value.to_string()));
         }
     }
@@ -97,7 +97,7 @@ impl<'a> Edit<'a> {
 
     /// Replaces a key and its value by another key and value, if the cell has it.
     pub fn replace(&mut self, cell: usize, key: &str, other: &str, value: Value<'_>) {
-        if let Some((name, place)) = self.places(cell, key) {
+        if let Some((name, place)) = self.key_and_value_ranges(cell, key) {
             self.changes.push((name, other.to_owned()));
             self.changes.push((place, value.to_string()));
         }
@@ -105,7 +105,7 @@ impl<'a> Edit<'a> {
 
     /// Adds a key after the key `after`: on a new line, or in an inline table after the value.
     pub fn insert(&mut self, cell: usize, key: &str, value: Value<'_>, after: &str) {
-        let Some((name, place)) = self.places(cell, after) else { return };
+        let Some((name, place)) = self.key_and_value_ranges(cell, after) else { return };
         let rest = self.text.get(place.end..).unwrap_or_default();
         let is_inline = self.document.get("cell").is_some_and(Item::is_value);
         let (offset, text) = if is_inline {

@@ -2,7 +2,7 @@
 
 use protocol::fixed::{Q, Q5_10};
 use protocol::message::{Answer, Message, Request, SensorPage, SkinSensors};
-use protocol::touch::contact;
+use protocol::touch::contact_force;
 
 use super::Spoilt;
 use crate::bench_conformance::wrong::Memory;
@@ -30,7 +30,7 @@ pub(crate) const BASELINE: &[Spoilt] = &[
         // Readings beyond the limit reach the cell as smaller ones, until another rule is written.
         it.say = |memory, message| {
             page_0(memory, message, |memory, skin| {
-                if contact(&memory.latched) == 700 {
+                if contact_force(&memory.latched) == 700 {
                     skin.contact = [Q::ZERO; 3];
                 }
             })
@@ -39,7 +39,7 @@ pub(crate) const BASELINE: &[Spoilt] = &[
     ("the zero follows a touch", "BASE-3", |it| {
         it.say = |memory, message| {
             page_0(memory, message, |memory, skin| {
-                let sum = contact(&memory.latched);
+                let sum = contact_force(&memory.latched);
                 memory.count = if sum == 1_024 { memory.count + 1 } else { 0 };
                 if memory.count > 1 && sum == 1_024 {
                     skin.contact[0] = Q5_10::from_bits(skin.contact[0].to_bits() - 100);
@@ -67,7 +67,7 @@ pub(crate) const BASELINE: &[Spoilt] = &[
         it.say = |memory, message| {
             page_0(memory, message, |memory, skin| {
                 let [temperature, _] = memory.latched.temperature;
-                if contact(&memory.latched) == 1_024 && temperature.to_bits() != 25 << 6 {
+                if contact_force(&memory.latched) == 1_024 && temperature.to_bits() != 25 << 6 {
                     skin.contact = memory.latched.contact;
                 }
             })

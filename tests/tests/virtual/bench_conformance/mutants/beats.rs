@@ -32,7 +32,7 @@ pub(crate) const BEATS: &[Spoilt] = &[
                 return vec![(0, message)];
             }
             if is_asked(memory) {
-                memory.count = memory.now.since(memory.at).0 % 250_000;
+                memory.count = memory.now.elapsed_since(memory.at).0 % 250_000;
                 return vec![(0, message)];
             }
             memory.at = memory.now;
@@ -68,7 +68,7 @@ pub(crate) const BEATS: &[Spoilt] = &[
     }),
     ("refused leaves out wrong CRCs", "BEAT-4", |it| {
         it.say = |memory, mut message| {
-            if let Message::Network { page: NetworkPage::Refused(page), .. } = message {
+            if let Message::Network { page: NetworkPage::Rejected(page), .. } = message {
                 memory.count = page.crc.into();
             }
             if let Some(beat) = beat(&mut message) {

@@ -80,13 +80,13 @@ pub(crate) const COMMANDS: &[Spoilt] = &[
     }),
     ("a page of a report is left out", "CMD-4", |it| {
         it.say = |_, message| match message {
-            Message::Network { page: NetworkPage::Refused(_), .. } => Vec::new(),
+            Message::Network { page: NetworkPage::Rejected(_), .. } => Vec::new(),
             other => vec![(0, other)],
         };
     }),
     ("pages of a report come in another order", "CMD-4", |it| {
         it.say = |_, message| match message {
-            Message::Network { page: NetworkPage::Heard(_), .. } => vec![(200, message)],
+            Message::Network { page: NetworkPage::Received(_), .. } => vec![(200, message)],
             other => vec![(0, other)],
         };
     }),

@@ -12,7 +12,7 @@ pub(crate) const COUNTERS: &[Spoilt] = &[
     ("a wrong CRC is not counted", "COUNT-1", |it| {
         it.say = |memory, mut message| {
             let crc = match &mut message {
-                Message::Network { page: NetworkPage::Refused(page), .. } => core::mem::take(&mut page.crc),
+                Message::Network { page: NetworkPage::Rejected(page), .. } => core::mem::take(&mut page.crc),
                 _ => 0,
             };
             memory.count = memory.count.max(crc.into());
@@ -21,7 +21,7 @@ pub(crate) const COUNTERS: &[Spoilt] = &[
     }),
     ("a wrong length is counted twice", "COUNT-1", |it| {
         it.say = |_, mut message| {
-            if let Message::Network { page: NetworkPage::Refused(page), .. } = &mut message {
+            if let Message::Network { page: NetworkPage::Rejected(page), .. } = &mut message {
                 page.length = page.length.wrapping_mul(2);
             }
             vec![(0, message)]
@@ -94,7 +94,7 @@ pub(crate) const COUNTERS: &[Spoilt] = &[
             vec![frame]
         };
         it.say = |memory, mut message| {
-            if let Message::Network { page: NetworkPage::Refused(page), .. } = &mut message {
+            if let Message::Network { page: NetworkPage::Rejected(page), .. } = &mut message {
                 page.meaning = page.meaning.wrapping_add(u16::try_from(memory.count).unwrap());
             }
             vec![(0, message)]

@@ -1,6 +1,6 @@
 //! Cells whose flash loses values, or whose commits change values that they should leave.
 
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use protocol::fixed::{Q, TorqueFormat};
 use protocol::message::{Answer, Message, Request, State};
 use protocol::parameters::{Parameters, Row, RowKind};
@@ -9,11 +9,11 @@ use super::{NODE, Spoilt};
 use crate::bench_conformance::wrong::{Memory, beat, fd, with};
 
 /// Returns flash without some of the committed values.
-fn loses(flash: Flash, lose: fn(&mut Parameters)) -> Flash {
+fn loses(flash: FlashState, lose: fn(&mut Parameters)) -> FlashState {
     match flash {
-        Flash::Sound(mut parameters) => {
+        FlashState::Valid(mut parameters) => {
             lose(&mut parameters);
-            Flash::Sound(parameters)
+            FlashState::Valid(parameters)
         }
         other => other,
     }
@@ -22,7 +22,7 @@ fn loses(flash: Flash, lose: fn(&mut Parameters)) -> Flash {
 /// Faults at a restart after a commit.
 pub(crate) const FLASH: &[Spoilt] = &[
     ("flash takes ten commits and no more", "CONF-8", |it| {
-        it.store = |memory, flash| memory.commits.get(9).copied().map_or(flash, Flash::Sound);
+        it.store = |memory, flash| memory.commits.get(9).copied().map_or(flash, FlashState::Valid);
     }),
     ("flash loses the threshold of the force", "CONF-8", |it| {
         it.store = |_, flash| loses(flash, |it| it.contact.force_threshold = Q::ZERO);
@@ -134,7 +134,7 @@ pub(crate) const LEAVES: &[Spoilt] = &[
             ) {
                 memory.count = memory.joints as u64;
             }
-            if let Message::Network { page: protocol::message::NetworkPage::Heard(page), .. } = &mut message {
+            if let Message::Network { page: protocol::message::NetworkPage::Received(page), .. } = &mut message {
                 page.joints = page.joints.saturating_sub(u16::try_from(memory.count % 65_536).unwrap());
             }
             vec![(0, message)]

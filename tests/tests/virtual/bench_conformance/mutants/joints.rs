@@ -30,7 +30,7 @@ pub(crate) const JOINTS: &[Spoilt] = &[
     ("a torque has the epoch before", "JOINTS-6", |it| {
         it.say = |_, message| match message {
             Message::Torque { from, epoch, torque } => {
-                vec![(0, Message::Torque { from, epoch: epoch.before(), torque })]
+                vec![(0, Message::Torque { from, epoch: epoch.previous(), torque })]
             }
             other => vec![(0, other)],
         };
@@ -48,13 +48,13 @@ pub(crate) const JOINTS: &[Spoilt] = &[
     }),
     ("takes increasing epochs only", "JOINTS-1", |it| {
         it.hear = |memory, message, frame| match (message, memory.last) {
-            (Some(Message::Joints { epoch, .. }), Some((last, _))) if epoch.since(last) < 0 => Vec::new(),
+            (Some(Message::Joints { epoch, .. }), Some((last, _))) if epoch.epochs_since(last) < 0 => Vec::new(),
             _ => vec![frame],
         };
     }),
     ("takes no epoch that is more than 16 ahead", "JOINTS-1", |it| {
         it.hear = |memory, message, frame| match (message, memory.last) {
-            (Some(Message::Joints { epoch, .. }), Some((last, _))) if epoch.since(last) > 16 => Vec::new(),
+            (Some(Message::Joints { epoch, .. }), Some((last, _))) if epoch.epochs_since(last) > 16 => Vec::new(),
             _ => vec![frame],
         };
     }),
@@ -68,7 +68,7 @@ pub(crate) const JOINTS: &[Spoilt] = &[
     ("answers joints that it skips", "JOINTS-4", |it| {
         it.ages = false;
         it.say = |memory, mut message| {
-            if let Message::Network { page: NetworkPage::Heard(page), .. } = &mut message
+            if let Message::Network { page: NetworkPage::Received(page), .. } = &mut message
                 && memory.in_use().period_us == 1
             {
                 page.joints_late += 1;
@@ -133,7 +133,7 @@ pub(crate) const JOINTS: &[Spoilt] = &[
     }),
     ("joints without a contact are not counted", "JOINTS-5", |it| {
         it.say = |_, mut message| {
-            if let Message::Network { page: NetworkPage::Heard(page), .. } = &mut message {
+            if let Message::Network { page: NetworkPage::Received(page), .. } = &mut message {
                 page.joints = page.joints.wrapping_add(page.joints / 16);
             }
             vec![(0, message)]

@@ -189,7 +189,7 @@ pub(crate) const PARAMETERS: &[Spoilt] = &[
                 memory.count += 1;
             }
             let refusals = u16::try_from(memory.count % 65_536).unwrap();
-            if let Message::Network { page: NetworkPage::Refused(page), .. } = &mut message {
+            if let Message::Network { page: NetworkPage::Rejected(page), .. } = &mut message {
                 page.meaning = page.meaning.wrapping_add(refusals);
             }
             if let Some(beat) = beat(&mut message) {

@@ -44,7 +44,7 @@ pub(crate) const SEGMENTS: &[Spoilt] = &[
             if !is_request {
                 return vec![frame];
             }
-            let late = memory.now.since(memory.at) > protocol::time::Span::from_millis(100);
+            let late = memory.now.elapsed_since(memory.at) > protocol::time::Span::from_millis(100);
             memory.at = memory.now;
             let before = memory.frame.replace(frame);
             match before {
@@ -75,7 +75,7 @@ pub(crate) const SEGMENTS: &[Spoilt] = &[
     }),
     ("incomplete packets are counted for each segment", "COUNT-3", |it| {
         it.say = |_, mut message| {
-            if let Message::Network { page: NetworkPage::Refused(page), .. } = &mut message {
+            if let Message::Network { page: NetworkPage::Rejected(page), .. } = &mut message {
                 page.incomplete = page.incomplete.wrapping_mul(2);
             }
             vec![(0, message)]

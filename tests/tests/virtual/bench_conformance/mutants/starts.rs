@@ -1,6 +1,6 @@
 //! Cells with wrong starts and address claims.
 
-use cell_node::flash::Flash;
+use cell_node::flash::FlashState;
 use protocol::message::{Answer, Message, NetworkPage, Request, State};
 use protocol::time::Micros;
 
@@ -89,9 +89,9 @@ pub(crate) const STARTS: &[Spoilt] = &[
             vec![(if is_first { 80_000 } else { 0 }, message)]
         };
     }),
-    ("what was committed is lost in a reset", "CONF-8", |it| it.store = |_, _| Flash::Empty),
+    ("what was committed is lost in a reset", "CONF-8", |it| it.store = |_, _| FlashState::Empty),
     ("the first configuration comes back after a reset", "CONF-8", |it| {
-        it.store = |memory, flash| memory.commits.first().copied().map_or(flash, Flash::Sound);
+        it.store = |memory, flash| memory.commits.first().copied().map_or(flash, FlashState::Valid);
     }),
     ("what was only staged survives a reset", "CONF-2", |it| {
         it.hear = |memory, message, frame| {

@@ -11,7 +11,7 @@ pub(crate) const STIMULI: &[Spoilt] = &[
     ("stimuli of later epochs are latched at once", "STIM-3", |it| {
         it.hear = |_, message, frame| match message {
             Some(Message::Stimulus { to, page, .. }) => {
-                vec![fd(&Message::Stimulus { to: *to, from: protocol::message::From::Next, page: *page })]
+                vec![fd(&Message::Stimulus { to: *to, from: protocol::message::AppliesFrom::Next, page: *page })]
             }
             _ => vec![frame],
         };
@@ -19,20 +19,20 @@ pub(crate) const STIMULI: &[Spoilt] = &[
     ("epochs of stimuli are compared without a corner", "STIM-3", |it| {
         it.hear = |memory, message, frame| match (message, memory.last) {
             (
-                Some(Message::Stimulus { to, from: protocol::message::From::Epoch(first), page }),
+                Some(Message::Stimulus { to, from: protocol::message::AppliesFrom::Epoch(first), page }),
                 Some((last, _)),
             ) if first.0 < last.0 => {
-                vec![fd(&Message::Stimulus { to: *to, from: protocol::message::From::Next, page: *page })]
+                vec![fd(&Message::Stimulus { to: *to, from: protocol::message::AppliesFrom::Next, page: *page })]
             }
             _ => vec![frame],
         };
     }),
     ("stimuli from the next joints on have an epoch", "STIM-4", |it| {
         it.hear = |_, message, frame| match message {
-            Some(Message::Stimulus { to, from: protocol::message::From::Next, page })
+            Some(Message::Stimulus { to, from: protocol::message::AppliesFrom::Next, page })
                 if frame.data()[12] != 0 =>
             {
-                let from = protocol::message::From::Epoch(Epoch(frame.data()[12]));
+                let from = protocol::message::AppliesFrom::Epoch(Epoch(frame.data()[12]));
                 vec![fd(&Message::Stimulus { to: *to, from, page: *page })]
             }
             _ => vec![frame],
@@ -41,15 +41,15 @@ pub(crate) const STIMULI: &[Spoilt] = &[
     ("late stimuli are dropped", "STIM-5", |it| {
         it.hear = |memory, message, frame| match (message, memory.last) {
             (
-                Some(Message::Stimulus { from: protocol::message::From::Epoch(first), .. }),
+                Some(Message::Stimulus { from: protocol::message::AppliesFrom::Epoch(first), .. }),
                 Some((last, _)),
-            ) if last.since(*first) >= 0 => Vec::new(),
+            ) if last.epochs_since(*first) >= 0 => Vec::new(),
             _ => vec![frame],
         };
     }),
     ("late stimuli are not counted as late", "STIM-5", |it| {
         it.say = |_, mut message| {
-            if let Message::Network { page: NetworkPage::Heard(page), .. } = &mut message {
+            if let Message::Network { page: NetworkPage::Received(page), .. } = &mut message {
                 page.stimuli_late = 0;
             }
             vec![(0, message)]
@@ -66,7 +66,7 @@ pub(crate) const STIMULI: &[Spoilt] = &[
             Some(Message::Joints { .. }) if memory.pending.is_empty() && memory.test_mode => {
                 let own = protocol::id::Node::Cell(protocol::id::CellId::new(NODE.into()).unwrap());
                 let page = SensorPage::Skin(protocol::message::SkinSensors::default());
-                vec![fd(&Message::Stimulus { to: own, from: protocol::message::From::Next, page }), frame]
+                vec![fd(&Message::Stimulus { to: own, from: protocol::message::AppliesFrom::Next, page }), frame]
             }
             _ => vec![frame],
         };

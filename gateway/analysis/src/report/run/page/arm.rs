@@ -2,16 +2,16 @@
 
 use hdrhistogram::Histogram;
 
-use super::super::bus_figures::LinkId;
+use super::super::bus_figures::BusFigures;
 use super::facts::micros;
 use super::{Draft, shown};
 use crate::paper;
-use crate::report::figure::{Axis, Below, Figure, Mark, Section, Shape, Table, quantity};
-use crate::report::thin::Thinned;
+use crate::report::figure::{Axis, LowerDiagram, Figure, Mark, Section, Shape, Table, quantity};
+use crate::report::thin::ThinnedLine;
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Errors};
 use protocol::fixed::TorqueFormat;
-use protocol::skin::{JointKind, Reply};
+use protocol::skin::{JointKind, SkinReply};
 
 /// Upper bound of the central computation's rounding error, in Nm: smaller errors count as zero.
 const ROUNDING_NM: f64 = 1e-12;
@@ -48,7 +48,7 @@ impl Draft<'_> {
              answer in time is a gap. Dotted: one step of the torque words."));
             let is_compared = self.run.bus_figures.iter().any(|it| it.lines.error.count() > 0);
             let lacks = self
-                .lacks("stimuli or sensors from which central torques, and the difference to them, follow");
+                .missing_sentence("stimuli or sensors from which central torques, and the difference to them, follow");
             section.text.extend(lacks.filter(|_| !is_compared));
         }
         if !free.is_empty() {
@@ -66,9 +66,9 @@ impl Draft<'_> {
     }
 
     /// Returns the buses with cells that may load a joint, each with the joint's index in its chain.
-    fn buses_of(&self, joint: usize) -> impl Iterator<Item = (usize, usize, &LinkId)> {
+    fn buses_of(&self, joint: usize) -> impl Iterator<Item = (usize, usize, &BusFigures)> {
         self.run.bus_figures.iter().enumerate().filter_map(move |(bus, bus_figures)| {
-            let place = self.run.skin.joints_of(bus).position(|(of_chain, _)| of_chain == joint)?;
+            let place = self.run.skin.joints_on_bus(bus).position(|(of_chain, _)| of_chain == joint)?;
             Some((bus, place, bus_figures))
         })
     }
@@ -77,8 +77,8 @@ impl Draft<'_> {
     fn step(&self, bus: usize) -> f64 {
         let bus = self.run.skin.buses.get(bus);
         let format = bus.map_or_else(TorqueFormat::default, |bus| match bus.reply {
-            Reply::Torque => bus.torque_format,
-            Reply::Sum { .. } => TorqueFormat::Q7_8,
+            SkinReply::Torque => bus.torque_format,
+            SkinReply::Sum { .. } => TorqueFormat::Q7_8,
         });
         format.step()
     }
@@ -86,8 +86,8 @@ impl Draft<'_> {
     /// Returns true if a joint had a torque of at least half a step of the words.
     fn is_loaded(&self, joint: usize) -> bool {
         let step = self.buses_of(joint).map(|(bus, ..)| self.step(bus)).fold(f64::INFINITY, f64::min);
-        let largest = |line: Option<&Thinned>| {
-            let points = line.map(Thinned::points).unwrap_or_default();
+        let largest = |line: Option<&ThinnedLine>| {
+            let points = line.map(ThinnedLine::points).unwrap_or_default();
             points.iter().map(|point| point.1.abs()).fold(0.0, f64::max)
         };
         let motion = &self.run.motion;
@@ -108,7 +108,7 @@ impl Draft<'_> {
         let quantity = if kind == JointKind::Prismatic { "force" } else { "torque" };
         let unit = kind.torque_unit();
         let distributed = self.run.motion.distributed.get(joint).map(|line| self.line("", line));
-        let of_bus = |(_, place, bus_figures): (usize, usize, &LinkId)| {
+        let of_bus = |(_, place, bus_figures): (usize, usize, &BusFigures)| {
             let line = bus_figures.lines.difference.get(place)?;
             (line.count() > 0).then(|| self.line(self.named(bus_figures), line))
         };
@@ -122,7 +122,7 @@ impl Draft<'_> {
         }
         let step = self.buses_of(joint).map(|(bus, ..)| self.step(bus)).fold(0.0, f64::max);
         let marks = vec![Mark::y(step, "one step"), Mark::y(-step, "")];
-        figure.below(Below { y: Axis::new("difference", unit), series, marks })
+        figure.below(LowerDiagram { y: Axis::new("difference", unit), series, marks })
     }
 
     /// Returns a joint's name in the skin's file, with its number unless the name contains it.
@@ -148,7 +148,7 @@ impl Draft<'_> {
         for (bus, bus_figures) in self.run.bus_figures.iter().enumerate() {
             let here = bus_figures.table.accuracy();
             let both = here.single_by_joint.iter().zip(&here.whole_by_joint);
-            for ((joint, _), (single, whole)) in skin.joints_of(bus).zip(both) {
+            for ((joint, _), (single, whole)) in skin.joints_on_bus(bus).zip(both) {
                 if let Some([sum, of_whole]) = by_joint.get_mut(joint) {
                     (*sum, *of_whole) = (sum.with(*single), of_whole.with(*whole));
                 }
@@ -184,7 +184,7 @@ impl Draft<'_> {
     pub(super) fn motion(&self) -> Section {
         let motion = &self.run.motion;
         let figures = self.groups().into_iter().enumerate().flat_map(|(group, (kind, joints))| {
-            let figure = |name: &str, title: &str, y: Axis, all: &[Thinned]| {
+            let figure = |name: &str, title: &str, y: Axis, all: &[ThinnedLine]| {
                 let of_joint = |&joint: &usize| Some(self.line(self.joint(joint), all.get(joint)?));
                 let name = if group == 0 { name.to_owned() } else { format!("{name}-{}", group + 1) };
                 self.figure(name, title, y).series(joints.iter().filter_map(of_joint)).marks(self.marks())
@@ -195,7 +195,7 @@ impl Draft<'_> {
                 figure("velocities", "Joint velocities", Axis::new("velocity", speed), &motion.velocity),
             ]
         });
-        let no_velocity = self.lacks("joint velocities, as joints frames have positions");
+        let no_velocity = self.missing_sentence("joint velocities, as joints frames have positions");
         let is_there = |figure: &Figure| no_velocity.is_none() || !figure.name.starts_with("velocities");
         let (still, figures): (Vec<_>, Vec<_>) = figures.filter(is_there).partition(is_zero);
         let mut section = Section::new("motion", "The arm").figures(figures.into_iter().filter_map(shown));
@@ -236,7 +236,7 @@ impl Draft<'_> {
             .marks(self.marks());
         let mut section = Section::new("cells", "Active cells");
         section.text.extend(
-            self.lacks("stimuli or sensors of all cells, and so which are in contact").filter(|_| !is_known),
+            self.missing_sentence("stimuli or sensors of all cells, and so which are in contact").filter(|_| !is_known),
         );
         if is_zero(&figure) {
             let none =
@@ -251,10 +251,10 @@ impl Draft<'_> {
     pub(super) fn cycle(&self) -> Section {
         let motion = &self.run.motion;
         let lacks = "the durations of ticks and of the central computation, and the lateness of ticks";
-        if let Some(lacks) = self.lacks(lacks) {
+        if let Some(lacks) = self.missing_sentence(lacks) {
             return Section::new("cycle", "Cycle times").text(lacks);
         }
-        let figure = |name: &str, title: &str, series: &[(&str, &Thinned)]| {
+        let figure = |name: &str, title: &str, series: &[(&str, &ThinnedLine)]| {
             let series = series.iter().map(|(caption, thinned)| self.line(*caption, thinned));
             self.figure(name, title, Axis::new("time", "µs").log()).series(series).marks(self.marks())
         };
@@ -271,7 +271,7 @@ impl Draft<'_> {
         ];
         let rows = rows.into_iter().map(|(name, times)| (name, times.histogram()));
         let row = |(name, histogram): (&str, &Histogram<u64>)| {
-            let Quantiles { p50, p90, p99, max, count } = Quantiles::of(histogram, 1e-3);
+            let Quantiles { p50, p90, p99, max, count } = Quantiles::from_histogram(histogram, 1e-3);
             let values = [p50, p90, p99, max].map(|micros| quantity(micros, "µs"));
             [name.to_owned()].into_iter().chain(values).chain([count.to_string()]).collect::<Vec<_>>()
         };

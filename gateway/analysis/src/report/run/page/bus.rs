@@ -1,18 +1,18 @@
 //! The sections on the buses: replies and packets of the cells, and the load of real buses.
 
-use super::super::bus_figures::{Latency, LinkId};
+use super::super::bus_figures::{Latency, BusFigures};
 use super::{Draft, shown};
-use crate::fit::limits::NODES;
+use crate::fit::limits::MAX_NODES;
 use crate::fit::verdict::{Answer, percent};
 use crate::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table, number, quantity};
 use crate::report::svg::stairs;
-use crate::report::thin::{Binned, Thinned};
+use crate::report::thin::{BinnedSums, ThinnedLine};
 use crate::shadow::BusShadow;
 use model::quantiles::Quantiles;
-use model::table::{Cell, Event};
+use model::table::{CellState, Event};
 
 /// Maximum number of cells in the table of the worst cells.
-const WORST: usize = 12;
+const MAX_WORST_CELLS: usize = 12;
 
 impl Draft<'_> {
     pub(super) fn replies(&self) -> Section {
@@ -25,13 +25,13 @@ impl Draft<'_> {
             .figures(due.flat_map(|bus_figures| self.replies_of(bus_figures)).filter_map(shown))
             .tables([self.accounts()])
             .tables(self.worst());
-        let none_due = |bus_figures: &&LinkId| bus_figures.account().due == 0;
-        let complete = |bus_figures: &&LinkId| {
+        let none_due = |bus_figures: &&BusFigures| bus_figures.account().due == 0;
+        let complete = |bus_figures: &&BusFigures| {
             let account = bus_figures.account();
             account.due > 0 && account.late + account.missing == 0
         };
         for (which, sentence) in [
-            (&none_due as &dyn Fn(&&LinkId) -> bool, "no reply was due"),
+            (&none_due as &dyn Fn(&&BusFigures) -> bool, "no reply was due"),
             (&complete, "every reply that was due came in time"),
         ] {
             let names: Vec<_> =
@@ -43,10 +43,10 @@ impl Draft<'_> {
         section
     }
 
-    fn replies_of(&self, bus_figures: &LinkId) -> Vec<Figure> {
+    fn replies_of(&self, bus_figures: &BusFigures) -> Vec<Figure> {
         let name = &bus_figures.name;
         let unit = if bus_figures.sums { "cells in sums" } else { "replies" };
-        let steps = |figure: &str, title: &str, y: Axis, of: [(&str, &Thinned); 2]| {
+        let steps = |figure: &str, title: &str, y: Axis, of: [(&str, &ThinnedLine); 2]| {
             let of = of.map(|(caption, thinned)| Series::new(caption, Shape::Steps, self.points(thinned)));
             self.figure(format!("{figure}-{name}"), format!("{name}: {unit} {title}"), y).half().series(of)
         };
@@ -66,10 +66,10 @@ impl Draft<'_> {
     }
 
     fn accounts(&self) -> Table {
-        let row = |bus_figures: &LinkId| {
+        let row = |bus_figures: &BusFigures| {
             let account = bus_figures.account();
             let counters = bus_figures.table.counters();
-            let reply = Quantiles::of(bus_figures.table.delays().of_last_replies(), 1.0);
+            let reply = Quantiles::from_histogram(bus_figures.table.delays().of_last_replies(), 1.0);
             let numbers = [
                 account.due,
                 account.in_time,
@@ -102,19 +102,19 @@ impl Draft<'_> {
     /// Creates the table of cells, by their problems and then by their slowness.
     fn worst(&self) -> Option<Table> {
         let cells = self.run.bus_figures.iter().enumerate().flat_map(|(bus, bus_figures)| {
-            let described = self.run.skin.cells_of(bus);
+            let described = self.run.skin.cells_on_bus(bus);
             bus_figures.table.cells().iter().zip(described).zip(&bus_figures.latency).map(
                 move |((cell, described), latency)| {
                     // The robot's numbering of joints.
                     let joint =
-                        self.run.skin.joints_of(bus).nth(usize::from(described.joint).saturating_sub(1));
+                        self.run.skin.joints_on_bus(bus).nth(usize::from(described.joint).saturating_sub(1));
                     (bus_figures, cell, joint.map_or(0, |(joint, _)| joint + 1), latency)
                 },
             )
         });
         let mut cells: Vec<_> = cells.collect();
         let stands_out =
-            |cell: &Cell| cell.replies.due + cell.uplink().lost > 0 || cell.uplink().restarts > 0;
+            |cell: &CellState| cell.replies.due + cell.uplink().lost > 0 || cell.uplink().restarts > 0;
         if !cells.iter().any(|(_, cell, ..)| stands_out(cell)) {
             return None;
         }
@@ -122,7 +122,7 @@ impl Draft<'_> {
             let (replies, uplink) = (&cell.replies, cell.uplink());
             std::cmp::Reverse((replies.missing + replies.late, uplink.lost, uplink.restarts, latency.max))
         });
-        let row = |(bus_figures, cell, joint, latency): &(&LinkId, &Cell, usize, &Latency)| {
+        let row = |(bus_figures, cell, joint, latency): &(&BusFigures, &CellState, usize, &Latency)| {
             let (mean, slowest) = if latency.count == 0 {
                 (f64::NAN, f64::NAN)
             } else {
@@ -137,7 +137,7 @@ impl Draft<'_> {
                 .chain([cell.uplink().restarts.to_string(), quantity(mean, "µs"), quantity(slowest, "µs")])
                 .collect::<Vec<_>>()
         };
-        let rows: Vec<_> = cells.iter().take(WORST).map(row).collect();
+        let rows: Vec<_> = cells.iter().take(MAX_WORST_CELLS).map(row).collect();
         let head = [
             "cell",
             "joint",
@@ -152,13 +152,13 @@ impl Draft<'_> {
         ];
         let of = self.run.skin.cells.len();
         let title =
-            if rows.len() < of { format!("The {WORST} worst of {of} cells") } else { "All cells".to_owned() };
+            if rows.len() < of { format!("The {MAX_WORST_CELLS} worst of {of} cells") } else { "All cells".to_owned() };
         let title = format!("{title}: by replies late or missing, then losses, then the slowest reply");
         Some(Table::new(title, head, rows))
     }
 
     /// Returns a load in % from the first tick or joints on; before that, all cells start at once.
-    pub(super) fn percent(&self, binned: &Binned) -> Vec<(f64, f64)> {
+    pub(super) fn percent(&self, binned: &BinnedSums) -> Vec<(f64, f64)> {
         let rates = binned.rates().into_iter().map(|(x, part)| (x - self.zero, part * 100.0));
         rates.filter(|(x, _)| *x >= 0.0).collect()
     }
@@ -173,7 +173,7 @@ impl Draft<'_> {
     /// rated, not defaults.
     pub(super) fn fits(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
-        let limits = format!("at most 100 %, replies before the next joints, {NODES} nodes");
+        let limits = format!("at most 100 %, replies before the next joints, {MAX_NODES} nodes");
         for bus in self.shadows() {
             let bus_figures = self.run.bus_figures.iter().find(|bus_figures| bus_figures.name == bus.bus);
             let origin = bus_figures.and_then(|bus_figures| bus_figures.rates_from);
@@ -192,8 +192,8 @@ impl Draft<'_> {
 
     /// Creates the section on the load of real buses.
     pub(super) fn load(&self) -> Section {
-        let figure = |bus_figures: &LinkId| {
-            let LinkId { name, load, load_of_all, rates, .. } = bus_figures;
+        let figure = |bus_figures: &BusFigures| {
+            let BusFigures { name, load, load_of_all, rates, .. } = bus_figures;
             let (rates, width) = (rates.rates, quantity(load.width(), "s"));
             let title = format!("{name}: load of a real bus at {rates}, over {width} each");
             self.figure(format!("load-{name}"), title, Axis::new("load", "%"))
@@ -251,7 +251,7 @@ impl Draft<'_> {
         row("messages or lines that cannot be read".to_owned(), run.unreadable, false);
         let mut section = Section::new("losses", "Losses")
             .text("Rows of possible losses are always shown; other rows only when they are not 0.");
-        section.text.extend(self.lacks("skipped ticks and bad cycles"));
+        section.text.extend(self.missing_sentence("skipped ticks and bad cycles"));
         section.tables(self.lost()).tables([Table::new("All counts", ["what", "count"], rows)])
     }
 }

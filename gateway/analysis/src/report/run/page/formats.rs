@@ -1,9 +1,9 @@
 //! The comparison of torque formats for the torques of a bus.
 
-use model::table::Rounded;
+use model::table::RoundingErrors;
 use protocol::fixed::TorqueFormat;
 
-use super::super::bus_figures::LinkId;
+use super::super::bus_figures::BusFigures;
 use super::Draft;
 use crate::report::figure::{Finding, Table, quantity};
 
@@ -11,17 +11,17 @@ use crate::report::figure::{Finding, Table, quantity};
 struct Choice<'a> {
     bus: &'a str,
     used: TorqueFormat,
-    all: [(TorqueFormat, Rounded); TorqueFormat::ALL.len()],
+    all: [(TorqueFormat, RoundingErrors); TorqueFormat::ALL.len()],
 }
 
 impl Choice<'_> {
-    fn of(&self, format: TorqueFormat) -> Rounded {
-        self.all.iter().find(|(it, _)| *it == format).map_or_else(Rounded::default, |(_, rounded)| *rounded)
+    fn of(&self, format: TorqueFormat) -> RoundingErrors {
+        self.all.iter().find(|(it, _)| *it == format).map_or_else(RoundingErrors::default, |(_, rounded)| *rounded)
     }
 
     /// Returns the finest format that holds every torque; the widest one if none does.
     fn best(&self) -> TorqueFormat {
-        let holds = |(_, rounded): &&(TorqueFormat, Rounded)| rounded.beyond == 0;
+        let holds = |(_, rounded): &&(TorqueFormat, RoundingErrors)| rounded.beyond == 0;
         self.all.iter().find(holds).or_else(|| self.all.last()).map_or(self.used, |(format, _)| *format)
     }
 
@@ -52,7 +52,7 @@ impl Draft<'_> {
     /// Returns the comparison for each bus with compared torques.
     fn choices(&self) -> impl Iterator<Item = Choice<'_>> {
         let buses = self.run.bus_figures.iter().zip(&self.run.skin.buses);
-        buses.filter_map(|(LinkId { name, table, .. }, bus)| {
+        buses.filter_map(|(BusFigures { name, table, .. }, bus)| {
             let formats = table.accuracy().formats;
             let is_compared = formats.iter().any(|it| it.beyond + it.errors.count() > 0);
             let mut rounded = formats.into_iter();

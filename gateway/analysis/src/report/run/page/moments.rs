@@ -7,7 +7,7 @@ use super::Draft;
 use crate::report::figure::{Table, quantity};
 
 /// Maximum number of rows of a table of moments.
-const ROWS: usize = 25;
+const MAX_ROWS: usize = 25;
 
 /// The heading of such a table.
 const HEAD: [&str; 3] = ["at", "what", "command"];
@@ -21,7 +21,7 @@ struct Moment {
 
 impl Draft<'_> {
     /// Returns the command that shows the recording at a time, in s after its first message.
-    pub(super) fn look(&self, at: f64) -> String {
+    pub(super) fn view_command(&self, at: f64) -> String {
         let seconds = (at - self.run.zero.unwrap_or(0.0)).max(0.0);
         let files: Vec<_> = self.run.files.iter().map(|file| quoted(file)).collect();
         let skin = self.run.frames_only.as_ref().map(|it| format!(" --skin {}", quoted(&it.skin_file)));
@@ -34,7 +34,7 @@ impl Draft<'_> {
         let mut all = Vec::new();
         let mut further = 0;
         for (bus, bus_figures) in self.run.bus_figures.iter().enumerate() {
-            let nodes: Vec<_> = skin.cells_of(bus).map(|cell| cell.node).collect();
+            let nodes: Vec<_> = skin.cells_on_bus(bus).map(|cell| cell.node).collect();
             let chain = skin.buses.get(bus).map_or(0, |bus| bus.chain);
             further += bus_figures.touched.further;
             all.extend(bus_figures.touched.touches.iter().map(|touch| {
@@ -93,16 +93,16 @@ impl Draft<'_> {
             return None;
         }
         all.sort_by(|one, other| other.weight.total_cmp(&one.weight).then(one.at.total_cmp(&other.at)));
-        let out = all.len().saturating_sub(ROWS) as u64 + further;
-        all.truncate(ROWS);
+        let out = all.len().saturating_sub(MAX_ROWS) as u64 + further;
+        all.truncate(MAX_ROWS);
         all.sort_by(|one, other| one.at.total_cmp(&other.at));
         let title = if out > 0 {
-            format!("{title}: the {ROWS} largest, {out} more are left out")
+            format!("{title}: the {MAX_ROWS} largest, {out} more are left out")
         } else {
             title.to_owned()
         };
         let rows = all.into_iter().map(|Moment { at, what, .. }| {
-            vec![format!("{:.3}\u{a0}s", at - self.zero), what, self.look(at)]
+            vec![format!("{:.3}\u{a0}s", at - self.zero), what, self.view_command(at)]
         });
         Some(Table::new(title, HEAD, rows).of_commands())
     }

@@ -4,17 +4,17 @@ use std::collections::BTreeMap;
 
 use model::surface::lay_flat;
 
-use super::super::bus_figures::LinkId;
+use super::super::bus_figures::BusFigures;
 use super::Draft;
 use crate::report::figure::{
     Drawing, Legend, Map, Panel, Section, Spot, Strip, StripGroup, StripRow, quantity,
 };
 
 /// Maximum number of rows of the strip.
-const ROWS: usize = 40;
+const MAX_STRIP_ROWS: usize = 40;
 
 /// A link: a row of a chain, from 1.
-type Link = (usize, u8);
+type ChainRow = (usize, u8);
 
 impl Draft<'_> {
     /// Creates the section on touches, with their times and forces.
@@ -38,7 +38,7 @@ impl Draft<'_> {
                 .drawings([Drawing::Strip(strip), Drawing::Map(force)])
                 .tables(self.touches()),
             (..) if self.lacks_forces() => section.text(
-                self.lacks("stimuli or sensors of the cells that sent torques, and so the forces on them").unwrap_or_default(),
+                self.missing_sentence("stimuli or sensors of the cells that sent torques, and so the forces on them").unwrap_or_default(),
             ),
             (..) => section.text("The frames show no touch of a cell."),
         };
@@ -59,7 +59,7 @@ impl Draft<'_> {
     pub(super) fn lacks_forces(&self) -> bool {
         let lines = self.run.motion.distributed.iter();
         let is_loaded = lines.flat_map(|line| line.points()).any(|(_, torque)| torque != 0.0);
-        let is_untouched = |it: &LinkId| it.touched.cells().next().is_none();
+        let is_untouched = |it: &BusFigures| it.touched.cells().next().is_none();
         self.run.frames_only.is_some() && is_loaded && self.run.bus_figures.iter().all(is_untouched)
     }
 
@@ -67,7 +67,7 @@ impl Draft<'_> {
     fn strip(&self) -> Option<Strip> {
         let mut rows = Vec::new();
         for (bus, bus_figures) in self.run.bus_figures.iter().enumerate() {
-            let nodes: Vec<_> = self.run.skin.cells_of(bus).collect();
+            let nodes: Vec<_> = self.run.skin.cells_on_bus(bus).collect();
             for (place, values) in bus_figures.touched.cells() {
                 let Some(cell) = nodes.get(place) else { continue };
                 let max = values.iter().map(|value| value.2).fold(0.0, f64::max);
@@ -83,20 +83,20 @@ impl Draft<'_> {
             return None;
         }
         rows.sort_by(|one, other| other.1.total_cmp(&one.1).then(one.0.cmp(&other.0)));
-        let rest = rows.split_off(touched.min(ROWS));
-        let legend = Legend::of("force", "N", rows.iter().map(|(_, max, _)| *max));
+        let rest = rows.split_off(touched.min(MAX_STRIP_ROWS));
+        let legend = Legend::for_values("force", "N", rows.iter().map(|(_, max, _)| *max));
         let title = match rest.first() {
             None => {
                 format!("Force over time on the {touched} touched cells of {}", self.run.skin.cells.len())
             }
             Some((_, max, _)) => format!(
-                "Force over time on the {ROWS} cells with the largest forces; {} more were touched, with at most {}",
+                "Force over time on the {MAX_STRIP_ROWS} cells with the largest forces; {} more were touched, with at most {}",
                 rest.len(),
                 quantity(*max, "N")
             ),
         };
         rows.sort_by_key(|(key, ..)| *key);
-        let mut groups: Vec<((Link, usize), StripGroup)> = Vec::new();
+        let mut groups: Vec<((ChainRow, usize), StripGroup)> = Vec::new();
         for ((chain, row, bus, _), _, of_cell) in rows {
             let key = ((chain, row), bus);
             if groups.last().is_none_or(|(last, _)| *last != key) {
@@ -126,11 +126,11 @@ impl Draft<'_> {
     /// Creates a map of the cells with their values; `None` if all of them are 0.
     fn map(&self, name: &str, title: &str, caption: &str, unit: &str, values: &[Option<f64>]) -> Option<Map> {
         let skin = &self.run.skin;
-        let legend = Legend::of(caption, unit, values.iter().copied().flatten());
+        let legend = Legend::for_values(caption, unit, values.iter().copied().flatten());
         if legend.max <= 0.0 {
             return None;
         }
-        let mut links = BTreeMap::<Link, Vec<_>>::new();
+        let mut links = BTreeMap::<ChainRow, Vec<_>>::new();
         for (cell, value) in skin.cells.iter().zip(values) {
             let chain = skin.buses.get(cell.bus).map_or(0, |bus| bus.chain);
             links.entry((chain, cell.row)).or_default().push((cell, *value));
@@ -149,7 +149,7 @@ impl Draft<'_> {
     }
 
     /// Returns the direction from the previous link to this one, in this link's frame.
-    fn to_tip(&self, (chain, row): Link) -> [f64; 3] {
+    fn to_tip(&self, (chain, row): ChainRow) -> [f64; 3] {
         let rows = self.run.skin.robot.chains.get(chain).map(|chain| &chain.rows);
         let row = rows.and_then(|rows| rows.get(usize::from(row).saturating_sub(1)));
         row.map_or([0.0, 0.0, 1.0], |row| {
@@ -159,7 +159,7 @@ impl Draft<'_> {
     }
 
     /// Returns the name of a link, with its bus if there are several.
-    pub(super) fn link(&self, (chain, row): Link, bus: Option<usize>) -> String {
+    pub(super) fn link(&self, (chain, row): ChainRow, bus: Option<usize>) -> String {
         let skin = &self.run.skin;
         let chains = &skin.robot.chains;
         let of_chain = chains.get(chain).filter(|_| chains.len() > 1);

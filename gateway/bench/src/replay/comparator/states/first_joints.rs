@@ -13,7 +13,7 @@
 //! | `known` | `Taken` | `Sends` | unchanged | only its counters show a restart |
 
 use protocol::id::{CellId, Node};
-use protocol::message::{Heard, Message, NetworkPage};
+use protocol::message::{ReceivedCounts, Message, NetworkPage};
 use protocol::packet::Epoch;
 
 /// State of a cell by the joints since its start.
@@ -44,17 +44,17 @@ pub(in super::super) enum Input {
 
 impl Input {
     /// Returns a message's cell and the evidence about that cell's first joints.
-    pub(in super::super) const fn of(message: &Message) -> Option<(CellId, Self)> {
+    pub(in super::super) const fn from_message(message: &Message) -> Option<(CellId, Self)> {
         if let Message::Torque { from, .. } = *message {
             return Some((from, Self::Torque));
         }
         let Message::Network { from: Node::Cell(cell), epoch, page } = *message else { return None };
         let input = match page {
-            NetworkPage::Heard(Heard { joints: 0, joints_late: 0, .. }) => Self::CountsNone { epoch },
-            NetworkPage::Heard(_) => Self::CountsSome,
+            NetworkPage::Received(ReceivedCounts { joints: 0, joints_late: 0, .. }) => Self::CountsNone { epoch },
+            NetworkPage::Received(_) => Self::CountsSome,
             NetworkPage::Heartbeat(_)
             | NetworkPage::Tree(_)
-            | NetworkPage::Refused(_)
+            | NetworkPage::Rejected(_)
             | NetworkPage::Ports(_) => Self::Sends { epoch },
         };
         Some((cell, input))

@@ -7,7 +7,7 @@
 
 /// State of a bus by its last event.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub(in super::super) enum Line {
+pub(in super::super) enum BusCondition {
     #[default]
     Up,
     /// The bus was lost after the last message.
@@ -23,7 +23,7 @@ pub(in super::super) enum Input {
     Lost,
 }
 
-impl Line {
+impl BusCondition {
     /// Returns the state after an input.
     pub(in super::super) const fn next(self, input: Input) -> Self {
         match (self, input) {
@@ -37,7 +37,7 @@ impl Line {
 mod tests {
     use super::*;
     use crate::replay::comparator::states::check_table;
-    use Line::{Down, Up};
+    use BusCondition::{Down, Up};
 
     #[test]
     fn a_message_shows_that_the_bus_is_back() {
@@ -47,7 +47,7 @@ mod tests {
                 ("lost", &[Up, Down], &[Input::Lost], |_| Down),
                 ("back", &[Up, Down], &[Input::Message], |_| Up),
             ],
-            Line::next,
+            BusCondition::next,
         );
     }
 }

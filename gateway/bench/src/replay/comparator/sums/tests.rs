@@ -9,8 +9,8 @@ fn cell(node: u8) -> CellId {
 type Contact = Vec<Option<[i16; 6]>>;
 
 /// Builds the sums of a tree, given the parent of each cell, 0 for the gateway's side. Parents precede their children.
-fn sums(contact: &Contact, parents: &[u8]) -> (Sums, Trees) {
-    let (mut sums, mut trees) = (Sums::default(), Trees::default());
+fn sums(contact: &Contact, parents: &[u8]) -> (SumsByCell, Trees) {
+    let (mut sums, mut trees) = (SumsByCell::default(), Trees::default());
     let mut totals = vec![([0_i32; 6], 0_u8); contact.len()];
     for place in (0..contact.len()).rev() {
         if let Some(own) = contact[place] {
@@ -23,17 +23,17 @@ fn sums(contact: &Contact, parents: &[u8]) -> (Sums, Trees) {
             (0..6).for_each(|word| totals[above].0[word] += total[word]);
         }
         let id = cell(u8::try_from(place + 1).unwrap());
-        trees.say(id, Some(parents[place]), 0);
+        trees.set_parent(id, Some(parents[place]), 0);
         if count > 0 {
             let torque = total.map(|word| i16::try_from(word).unwrap()).into();
-            sums.take(id, Sum { torque, count });
+            sums.insert(id, CellSum { torque, count });
         }
     }
     (sums, trees)
 }
 
-fn outcomes(then: &(Sums, Trees), today: &(Sums, Trees), cells: usize) -> Vec<Outcome> {
-    let (then, today) = (Side::new(&then.0, &then.1, 5), Side::new(&today.0, &today.1, 5));
+fn outcomes(then: &(SumsByCell, Trees), today: &(SumsByCell, Trees), cells: usize) -> Vec<SumComparison> {
+    let (then, today) = (EpochSums::new(&then.0, &then.1, 5), EpochSums::new(&today.0, &today.1, 5));
     (1..=u8::try_from(cells).unwrap())
         .map(|node| compare(&then, &today, cell(node), 0, TorqueFormat::Q3_12))
         .collect()
@@ -48,9 +48,9 @@ fn the_same_contributions_are_equal_in_any_tree() {
     // Trees 1 - 2 - 3 and 1 - (2, 3); in the first, cell 2 only forwards.
     let contact = vec![words(10), None, words(30)];
     let both = (sums(&contact, &[0, 1, 2]), sums(&contact, &[0, 1, 1]));
-    assert_eq!(outcomes(&both.0, &both.1, 3), [Outcome::Equal, Outcome::Nothing, Outcome::Equal]);
-    let side = Side::new(&both.0.0, &both.0.1, 5);
-    let own = side.own(cell(1)).unwrap();
+    assert_eq!(outcomes(&both.0, &both.1, 3), [SumComparison::Equal, SumComparison::Nothing, SumComparison::Equal]);
+    let side = EpochSums::new(&both.0.0, &both.0.1, 5);
+    let own = side.own_term(cell(1)).unwrap();
     assert_eq!((own.steps[0], own.cells, own.children), (Some(10), 1, vec![cell(2)]));
     assert_eq!((own.sum.as_slice()[0], own.count), (40, 2));
 }
@@ -59,20 +59,20 @@ fn the_same_contributions_are_equal_in_any_tree() {
 fn one_step_is_rounding_and_two_are_a_difference() {
     let then = sums(&vec![words(10), words(20)], &[0, 1]);
     let today = sums(&vec![words(10), words(21)], &[0, 1]);
-    assert_eq!(outcomes(&then, &today, 2), [Outcome::Equal; 2]);
+    assert_eq!(outcomes(&then, &today, 2), [SumComparison::Equal; 2]);
     let today = sums(&vec![words(10), words(22)], &[0, 1]);
-    assert_eq!(outcomes(&then, &today, 2), [Outcome::Equal, Outcome::Different]);
+    assert_eq!(outcomes(&then, &today, 2), [SumComparison::Equal, SumComparison::Different]);
 }
 
 #[test]
 fn a_cell_without_contact_now_is_missing_and_one_without_contact_then_is_extra() {
     let then = sums(&vec![words(10), words(20), None], &[0, 0, 0]);
     let today = sums(&vec![words(10), None, words(1)], &[0, 0, 0]);
-    assert_eq!(outcomes(&then, &today, 3), [Outcome::Equal, Outcome::Missing, Outcome::Extra]);
+    assert_eq!(outcomes(&then, &today, 3), [SumComparison::Equal, SumComparison::Missing, SumComparison::Extra]);
     // A cell that only forwards still sends a sum; its own count shows it.
     let then = sums(&vec![words(10), words(20)], &[0, 1]);
     let today = sums(&vec![None, words(20)], &[0, 1]);
-    assert_eq!(outcomes(&then, &today, 2), [Outcome::Different, Outcome::Equal]);
+    assert_eq!(outcomes(&then, &today, 2), [SumComparison::Different, SumComparison::Equal]);
 }
 
 #[test]
@@ -83,9 +83,9 @@ fn a_forwarding_cell_must_not_add_anything() {
     let sum = today.0.0.get_mut(&cell(1)).unwrap();
     let [a, b, _, d, e, f] = sum.torque.six();
     sum.torque = [a, b, 9, d, e, f].into();
-    assert_eq!(outcomes(&then, &today, 2), [Outcome::Different, Outcome::Equal]);
-    assert_eq!(outcomes(&other, &today, 2), [Outcome::Different, Outcome::Equal]);
-    assert_eq!(outcomes(&today, &other, 2), [Outcome::Different, Outcome::Equal]);
+    assert_eq!(outcomes(&then, &today, 2), [SumComparison::Different, SumComparison::Equal]);
+    assert_eq!(outcomes(&other, &today, 2), [SumComparison::Different, SumComparison::Equal]);
+    assert_eq!(outcomes(&today, &other, 2), [SumComparison::Different, SumComparison::Equal]);
 }
 
 #[test]
@@ -93,13 +93,13 @@ fn a_cell_with_uncertain_children_is_omitted() {
     let contact = vec![words(10), words(20), words(30), words(40)];
     let then = sums(&contact, &[0, 0, 1, 0]);
     let mut today = sums(&contact, &[0, 0, 1, 0]);
-    today.1.say(cell(3), None, 6);
-    today.1.say(cell(3), Some(2), 6);
-    let changing = Outcome::Omitted(Why::Changing);
-    assert_eq!(outcomes(&then, &today, 4), [changing, changing, changing, Outcome::Equal]);
+    today.1.set_parent(cell(3), None, 6);
+    today.1.set_parent(cell(3), Some(2), 6);
+    let changing = SumComparison::Omitted(OmitReason::Changing);
+    assert_eq!(outcomes(&then, &today, 4), [changing, changing, changing, SumComparison::Equal]);
     // The third cell's parent is unknown.
     today.1.0.remove(&cell(3));
-    assert_eq!(outcomes(&then, &today, 4), [Outcome::Omitted(Why::Unknown); 4]);
+    assert_eq!(outcomes(&then, &today, 4), [SumComparison::Omitted(OmitReason::Unknown); 4]);
 }
 
 #[test]
@@ -109,19 +109,19 @@ fn a_child_with_a_late_page_is_no_difference_unless_it_is_counted_twice() {
     let then = sums(&contact, &[0, 1, 1, 0]);
     let mut today = sums(&contact, &[0, 1, 1, 0]);
     today.1.0.remove(&cell(3));
-    let omitted = Outcome::Omitted(Why::NotTaken);
+    let omitted = SumComparison::Omitted(OmitReason::NotTaken);
     for (parents, counted_twice, expected) in [
         (&[2, 1][..], false, omitted),
-        (&[2], false, Outcome::Different),
-        (&[2, 4], false, Outcome::Different),
-        (&[2, 1], true, Outcome::Different),
+        (&[2], false, SumComparison::Different),
+        (&[2, 4], false, SumComparison::Different),
+        (&[2, 1], true, SumComparison::Different),
     ] {
-        let mut today = (Sums(today.0.0.clone()), Trees::default());
+        let mut today = (SumsByCell(today.0.0.clone()), Trees::default());
         for node in 1..=4 {
-            today.1.say(cell(node), Some([0, 1, 2, 0][usize::from(node) - 1]), 0);
+            today.1.set_parent(cell(node), Some([0, 1, 2, 0][usize::from(node) - 1]), 0);
         }
         for (parent, since) in parents.iter().zip([0, 9]) {
-            today.1.say(cell(3), Some(*parent), since);
+            today.1.set_parent(cell(3), Some(*parent), since);
         }
         if counted_twice {
             for (node, count) in [(1, 3), (2, 2)] {
@@ -143,10 +143,10 @@ fn a_cell_between_two_parents_is_omitted_and_an_unreachable_one_is_not() {
     let contact = vec![words(10), words(20)];
     let then = sums(&contact, &[0, 1]);
     let mut today = sums(&vec![words(10), None], &[0, 1]);
-    today.1.say(cell(2), None, 2);
-    assert_eq!(outcomes(&then, &today, 2), [Outcome::Equal, Outcome::Missing]);
-    today.1.say(cell(2), Some(0), 9);
-    assert_eq!(outcomes(&then, &today, 2), [Outcome::Equal, Outcome::Omitted(Why::Changing)]);
+    today.1.set_parent(cell(2), None, 2);
+    assert_eq!(outcomes(&then, &today, 2), [SumComparison::Equal, SumComparison::Missing]);
+    today.1.set_parent(cell(2), Some(0), 9);
+    assert_eq!(outcomes(&then, &today, 2), [SumComparison::Equal, SumComparison::Omitted(OmitReason::Changing)]);
 }
 
 #[test]
@@ -154,23 +154,23 @@ fn a_sum_that_lacks_a_childs_is_omitted() {
     let contact = vec![words(10), words(20), None];
     let then = sums(&contact, &[0, 1, 0]);
     let mut today = sums(&contact, &[0, 1, 0]);
-    let alone = Sum { torque: words(10).unwrap().into(), count: 1 };
+    let alone = CellSum { torque: words(10).unwrap().into(), count: 1 };
     today.0.0.insert(cell(1), alone);
-    let torn = Outcome::Omitted(Why::NotTaken);
-    assert_eq!(outcomes(&then, &today, 2), [torn, Outcome::Equal]);
+    let torn = SumComparison::Omitted(OmitReason::NotTaken);
+    assert_eq!(outcomes(&then, &today, 2), [torn, SumComparison::Equal]);
     // The child's sum was lost on the way to the recording, but is in the parent's.
     let mut then = sums(&vec![None, words(20)], &[0, 1]);
     let today = sums(&vec![None, words(20)], &[0, 1]);
     then.0.0.remove(&cell(2));
-    assert_eq!(outcomes(&then, &today, 2), [torn, Outcome::Extra]);
+    assert_eq!(outcomes(&then, &today, 2), [torn, SumComparison::Extra]);
 }
 
 #[test]
 fn of_two_sums_the_one_with_more_cells_counts() {
-    let mut sums = Sums::default();
-    let sum = |word, count| Sum { torque: [word; 6].into(), count };
+    let mut sums = SumsByCell::default();
+    let sum = |word, count| CellSum { torque: [word; 6].into(), count };
     for next in [sum(1, 1), sum(5, 3), sum(4, 2), sum(6, 3)] {
-        sums.take(cell(1), next);
+        sums.insert(cell(1), next);
     }
     assert_eq!(sums.0[&cell(1)], sum(5, 3));
 }
@@ -178,7 +178,7 @@ fn of_two_sums_the_one_with_more_cells_counts() {
 #[test]
 fn saturated_words_are_compared_as_saturated() {
     let then = sums(&vec![words(10), words(20)], &[0, 1]);
-    let saturate = |mut side: (Sums, Trees), node| {
+    let saturate = |mut side: (SumsByCell, Trees), node| {
         let sum = side.0.0.get_mut(&cell(node)).unwrap();
         let [_, b, c, d, e, f] = sum.torque.six();
         sum.torque = [i16::MAX, b, c, d, e, f].into();
@@ -186,24 +186,24 @@ fn saturated_words_are_compared_as_saturated() {
     };
     let whole = |contact: &Contact, parents: &[u8]| saturate(sums(contact, parents), 1);
     let contact = vec![words(10), words(20)];
-    assert_eq!(outcomes(&whole(&contact, &[0, 1]), &whole(&contact, &[0, 1]), 2), [Outcome::Equal; 2]);
+    assert_eq!(outcomes(&whole(&contact, &[0, 1]), &whole(&contact, &[0, 1]), 2), [SumComparison::Equal; 2]);
     assert_eq!(
         outcomes(&then, &whole(&contact, &[0, 1]), 2),
-        [Outcome::Different, Outcome::Equal],
+        [SumComparison::Different, SumComparison::Equal],
         "the same cells are in it"
     );
     let other = sums(&contact, &[0, 0]);
-    assert_eq!(outcomes(&other, &whole(&contact, &[0, 1]), 2)[0], Outcome::Equal, "others are in it");
+    assert_eq!(outcomes(&other, &whole(&contact, &[0, 1]), 2)[0], SumComparison::Equal, "others are in it");
     // The other words are compared as usual.
     let contact = vec![Some([10, 9, 0, 0, 0, 0]), words(20)];
-    assert_eq!(outcomes(&whole(&contact, &[0, 1]), &then, 2)[0], Outcome::Different);
+    assert_eq!(outcomes(&whole(&contact, &[0, 1]), &then, 2)[0], SumComparison::Different);
 }
 
 #[test]
 fn trees_drop_past_rounds() {
     let mut trees = Trees::default();
     for round in 0..1_000_u64 {
-        trees.say(cell(1), Some((round % 2).to_le_bytes()[0]), round);
+        trees.set_parent(cell(1), Some((round % 2).to_le_bytes()[0]), round);
         trees.forget_before(round.saturating_sub(100));
         assert!(trees.0[&cell(1)].len() <= 104);
         assert_eq!(trees.parent(cell(1), round), Some(Some((round % 2).to_le_bytes()[0])));
@@ -227,9 +227,9 @@ proptest! {
         let all = outcomes(&recorded, &sums(&contact, &today), contact.len());
         for (place, outcome) in all.iter().enumerate() {
             let target = if contact[place].is_some() {
-                matches!(outcome, Outcome::Equal)
+                matches!(outcome, SumComparison::Equal)
             } else {
-                matches!(outcome, Outcome::Nothing | Outcome::Equal)
+                matches!(outcome, SumComparison::Nothing | SumComparison::Equal)
             };
             prop_assert!(target, "cell {}: {outcome:?}", place + 1);
         }
@@ -239,7 +239,7 @@ proptest! {
             words[3] = words[3].wrapping_add(odd.1 % 60 + 2 * odd.1.signum());
             let again = outcomes(&recorded, &sums(&other, &today), contact.len());
             for (place, outcome) in again.iter().enumerate() {
-                prop_assert_eq!(*outcome == Outcome::Different, place == at, "cell {}", place + 1);
+                prop_assert_eq!(*outcome == SumComparison::Different, place == at, "cell {}", place + 1);
             }
         }
     }

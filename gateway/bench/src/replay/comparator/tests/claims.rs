@@ -23,7 +23,7 @@ fn a_claim_of_a_taken_node_id_explains_nothing_and_leaves_the_cell_there() {
         assert_eq!(extra(&with_claim(at)), extra(&run()), "recorded after {at}");
         let comparator = rated(&run(), &with_claim(at));
         assert_eq!(counts(&comparator), [3, 0, 0, 0], "heard after {at}");
-        assert!(comparator.present(0).all(|(_, present)| present.claim.is_settled()), "heard after {at}");
+        assert!(comparator.present_cells(0).all(|(_, present)| present.claim.is_settled()), "heard after {at}");
     }
 }
 
@@ -50,11 +50,11 @@ fn a_claim_of_a_taken_node_id_leaves_the_tree_as_it_is() {
 #[test]
 fn a_claim_of_a_taken_node_id_is_no_packet_and_no_silence_of_its_owner() {
     let surveyed = |said: &[Message]| {
-        let mut survey = Survey::new(Part::default());
+        let mut survey = Survey::new(TimeRange::default());
         for (at, message) in (1_u64..).zip(said) {
             let time = Timestamp::six_digits(at * MS);
             for frame in message.encode().frames(Format::Fd) {
-                survey.take(&Record { time, interface: "vcan0", frame, direction: None });
+                survey.add_frame(&Record { time, interface: "vcan0", frame, direction: None });
             }
         }
         survey.finish();
@@ -77,8 +77,8 @@ fn a_claim_of_a_taken_node_id_is_no_packet_and_no_silence_of_its_owner() {
 fn another_sender_of_joints_is_another_gateway() {
     let mut comparator =
         Comparator::new([("a".to_owned(), BTreeMap::new()), ("b".to_owned(), BTreeMap::new())], 0, None);
-    comparator.hear(1, &Message::Resume);
+    comparator.observe(1, &Message::Resume);
     assert_eq!(comparator.other_gateway(), None, "anybody may resume");
-    comparator.hear(1, &joints(0));
+    comparator.observe(1, &joints(0));
     assert_eq!(comparator.other_gateway(), Some(1));
 }

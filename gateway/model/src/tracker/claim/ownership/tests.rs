@@ -3,10 +3,10 @@
 use protocol::message::{Heartbeat, State};
 use protocol::time::Micros;
 
-use super::{Evidence as E, Life, Ownership, Word};
+use super::{Evidence as E, Incarnation, Ownership, HeartbeatKind};
 use Sample::{Doubted, DoubtedLong, Free, Inherited, InheritedLong, Shared, Sole};
 
-const AGAIN: Word = Word::Started { again: true };
+const AGAIN: HeartbeatKind = HeartbeatKind::Started { again: true };
 
 /// A sample of each state; the two with a former life occur twice: it may go on, or not any more.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -79,7 +79,7 @@ use Whose::{Longer, New, Nobody, Owner, Same};
 
 /// Name, states and evidence, next state (`None` if it stays), meaning, and the origins of the next owner's and
 /// former's lives.
-type Row = (&'static str, &'static [Sample], &'static [E], Option<Sample>, Word, [Whose; 2]);
+type Row = (&'static str, &'static [Sample], &'static [E], Option<Sample>, HeartbeatKind, [Whose; 2]);
 
 const START: &[E] = &[E::Intrudes, E::Starts, E::Jumps, E::Succeeds];
 const OUTSIDE: &[E] = &[E::Intrudes, E::Starts, E::Jumps, E::Returns, E::Exceeds];
@@ -87,35 +87,35 @@ const COMPARED: &[E] = EVIDENCE.split_at(2).1;
 
 #[rustfmt::skip]
 const ROWS: [Row; 18] = [
-    ("first_claim", &[Free], &[E::Claims], Some(Sole), Word::Started { again: false }, [New, Nobody]),
-    ("found", &[Free], &[E::Settles], Some(Sole), Word::First, [New, Nobody]),
-    ("other_claim", &OWNED, &[E::Claims], None, Word::Claimant, [Same, Same]),
-    ("claimant_lost", &OWNED, &[E::Settles], None, Word::First, [New, Same]),
-    ("old", &OWNED, &[E::Repeats], None, Word::Overtaken, [Same, Same]),
-    ("next", &OWNED, &[E::Continues], None, Word::Known, [Longer, Same]),
-    ("away", &[Sole, Doubted, DoubtedLong], &[E::Returns], None, Word::Known, [Longer, Same]),
+    ("first_claim", &[Free], &[E::Claims], Some(Sole), HeartbeatKind::Started { again: false }, [New, Nobody]),
+    ("found", &[Free], &[E::Settles], Some(Sole), HeartbeatKind::First, [New, Nobody]),
+    ("other_claim", &OWNED, &[E::Claims], None, HeartbeatKind::Claimant, [Same, Same]),
+    ("claimant_lost", &OWNED, &[E::Settles], None, HeartbeatKind::First, [New, Same]),
+    ("old", &OWNED, &[E::Repeats], None, HeartbeatKind::Overtaken, [Same, Same]),
+    ("next", &OWNED, &[E::Continues], None, HeartbeatKind::Known, [Longer, Same]),
+    ("away", &[Sole, Doubted, DoubtedLong], &[E::Returns], None, HeartbeatKind::Known, [Longer, Same]),
     ("start", &[Sole], START, Some(Doubted), AGAIN, [New, Owner]),
     ("further_start", &[Doubted], START, Some(Doubted), AGAIN, [New, Same]),
     ("start_after_former", &[DoubtedLong], START, Some(Doubted), AGAIN, [New, Owner]),
-    ("impossible", &[Sole, Doubted, DoubtedLong], &[E::Exceeds], None, Word::Outsider, [Same, Same]),
-    ("taken_back", &[Doubted, DoubtedLong, Inherited, InheritedLong], &[E::FormerContinues], Some(Shared), Word::Shared, [New, Nobody]),
-    ("outsider", &[Shared, Inherited, InheritedLong], OUTSIDE, None, Word::Outsider, [Same, Same]),
+    ("impossible", &[Sole, Doubted, DoubtedLong], &[E::Exceeds], None, HeartbeatKind::Outsider, [Same, Same]),
+    ("taken_back", &[Doubted, DoubtedLong, Inherited, InheritedLong], &[E::FormerContinues], Some(Shared), HeartbeatKind::Shared, [New, Nobody]),
+    ("outsider", &[Shared, Inherited, InheritedLong], OUTSIDE, None, HeartbeatKind::Outsider, [Same, Same]),
     ("successor", &[Shared], &[E::Succeeds], Some(Inherited), AGAIN, [New, Owner]),
     ("further_successor", &[Inherited], &[E::Succeeds], Some(Inherited), AGAIN, [New, Same]),
     ("successor_after_former", &[InheritedLong], &[E::Succeeds], Some(Inherited), AGAIN, [New, Owner]),
-    ("incomparable", &[Free], COMPARED, None, Word::Overtaken, [Same, Same]),
-    ("incomparable", &[Sole, Shared], &[E::FormerContinues], None, Word::Overtaken, [Same, Same]),
+    ("incomparable", &[Free], COMPARED, None, HeartbeatKind::Overtaken, [Same, Same]),
+    ("incomparable", &[Sole, Shared], &[E::FormerContinues], None, HeartbeatKind::Overtaken, [Same, Same]),
 ];
 
-fn life(ms: u64, serial: u32, sent: u16, state: State) -> Life {
-    Life::new(Micros(ms * 1_000), &Heartbeat { serial, sent, state, ..Heartbeat::default() })
+fn life(ms: u64, serial: u32, sent: u16, state: State) -> Incarnation {
+    Incarnation::new(Micros(ms * 1_000), &Heartbeat { serial, sent, state, ..Heartbeat::default() })
 }
 
 const SETTLED: State = State(0);
 
 fn sample(sample: Sample) -> Ownership {
     // An owner whose claim was received, 20 s after a first life and 2 s after a second one.
-    let owner = Life { claimed: Some(Micros(19_000_000)), ..life(20_000, 7, 50, SETTLED) };
+    let owner = Incarnation { claimed: Some(Micros(19_000_000)), ..life(20_000, 7, 50, SETTLED) };
     let [former, gone] = [18_000, 0].map(|ms| life(ms, 7, 9_000, SETTLED));
     match sample {
         Free => Ownership::Free,
@@ -140,18 +140,18 @@ fn each_state_does_with_each_evidence_what_its_row_says() {
             let rows: Vec<_> = ROWS.iter().filter(is_of).collect();
             assert_eq!(rows.len(), 1, "rows of {from:?} and {evidence:?}: {rows:?}");
             let (name, _, _, to, word, whose) = *rows[0];
-            let lives = [ownership.owner(), ownership.former()].map(Option::<&Life>::copied);
+            let lives = [ownership.owner(), ownership.former()].map(Option::<&Incarnation>::copied);
             let [owner, former] = [0, 1].map(|place| match whose[place] {
                 Nobody => None,
                 Same => lives[place],
-                Longer => lives[place].map(|life| Life { claimed: life.claimed, ..new }),
+                Longer => lives[place].map(|life| Incarnation { claimed: life.claimed, ..new }),
                 New => Some(new),
                 Owner => lives[0],
             });
             let (next, means) = ownership.next(evidence, new);
             assert_eq!(means, word, "{name}: {from:?}, {evidence:?}");
             assert!(places(&next, evidence).0.contains(&to.unwrap_or(from)), "{name}: {next:?}");
-            let lives = [next.owner(), next.former()].map(Option::<&Life>::copied);
+            let lives = [next.owner(), next.former()].map(Option::<&Incarnation>::copied);
             assert_eq!(lives, [owner, former], "{name}: {from:?}, {evidence:?}");
         }
     }
@@ -212,7 +212,7 @@ fn of_two_lives_the_one_whose_counter_is_nearer_continues() {
     let doubted = |claimed: Option<u64>, own: u16, its: u16, ago: u64| {
         let claimed = claimed.map(|ms| Micros(ms * 1_000));
         let state = if claimed.is_some() { State::CLAIMING } else { SETTLED };
-        let owner = Life { claimed, ..life(20_000, 7, 10_000 - own, state) };
+        let owner = Incarnation { claimed, ..life(20_000, 7, 10_000 - own, state) };
         Ownership::Doubted { owner, former: life(20_250 - ago, 7, 10_000 - its, SETTLED) }
     };
     let shown = |ownership: Ownership| ownership.evidence(&life(20_250, 7, 10_000, SETTLED));
@@ -233,7 +233,7 @@ fn of_two_lives_the_one_whose_counter_is_nearer_continues() {
 #[test]
 fn an_owner_whose_claim_was_heard_has_no_old_heartbeats_of_the_former() {
     let doubted = |claimed: Option<u64>, ago: u64| Ownership::Doubted {
-        owner: Life { claimed: claimed.map(|ms| Micros(ms * 1_000)), ..life(20_000, 7, 100, SETTLED) },
+        owner: Incarnation { claimed: claimed.map(|ms| Micros(ms * 1_000)), ..life(20_000, 7, 100, SETTLED) },
         former: life(20_250 - ago, 7, 900, SETTLED),
     };
     let shown = |ownership: Ownership, sent| ownership.evidence(&life(20_250, 7, sent, SETTLED));
