@@ -24,12 +24,12 @@ mod setting;
 
 use setting::Setting;
 
-/// Creates the setting before the count begins, and never drops it.
+/// Creates the setting outside the counted part, and never drops it, so that neither is counted.
 fn cell() -> &'static Setting {
     Box::leak(Box::new(Setting::new()))
 }
 
-/// Combines the results of a function for all angles of the circle.
+/// Calls a function for all angles of the circle and combines the results into one word.
 fn circle(function: impl Fn(Q1_14) -> Q1_14) -> i16 {
     let word = |angle| function(black_box(Q1_14::from_bits(angle))).to_bits();
     // The rotation keeps a sine and its negative from cancelling out.

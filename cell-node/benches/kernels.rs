@@ -1,7 +1,7 @@
-//! Run time of one Jacobian and one sine: `cargo bench -p cell-node --bench kernels`
+//! Run time of one Jacobian and one sine in ns: `cargo bench -p cell-node --bench kernels`
 //!
-//! The results are for a processor with floating point; for a small one without it, `--bench instructions` is
-//! more meaningful.
+//! The results depend on the processor's floating-point unit. For a microcontroller without one, `--bench instructions`
+//! is more meaningful.
 
 use std::hint::black_box;
 use std::time::Duration;

@@ -1,4 +1,4 @@
-//! The baseline of the force sensor: its reading without a touch, the zero, which is subtracted from its
+//! The baseline of a cell's force sensor. The reading without a touch is the *zero*, and the cell subtracts it from all
 //! readings.
 //!
 //! ```text
@@ -7,45 +7,47 @@
 //!      └───── a write of parameter 5 or 11, or of parameter 12 with 0 ─────┘
 //! ```
 //!
-//! The code uses integers only and no division. The zero moves only when joints arrive, by the step of one
-//! period, so it is a function of the received frames, and a replay reproduces it. With the temperature it
-//! moves by the coefficient, also in contact, because nothing else shows the sensor's drift then.
+//! The code uses integers only and no division. The zero moves only when joints arrive, by at most the rate times one
+//! broadcast period. It is thus a function of the received frames, and a replay reproduces it. With the temperature the
+//! zero moves by the coefficient in N/°C, also during a touch, when the sensor's drift cannot be measured.
 
 use protocol::fixed::{Q1_14, Q5_10, Q9_6};
 use protocol::message::{BaselinePage, SkinSensors};
 use protocol::parameters::{Baseline as Rule, Tare, BaselineSettings};
 use protocol::touch::{Touch, contact_force};
 
-/// Number of joints with a steady reading before the first tare.
+/// Number of consecutive joints messages with a steady reading before the first tare.
 pub const STEADY_JOINTS: u8 = 32;
-/// Fraction bits of the zero, in N, beyond those of a contact word.
+/// Fraction bits that the zero has in addition to those of a contact word.
 const EXTRA_FRACTION_BITS: u32 = 12;
-/// Shift of the running mean, which is over 2^`MEAN` joints.
+/// Shift of the running mean of readings, which extends over about 2^`MEAN` joints messages.
 const MEAN_SHIFT: u32 = 3;
-/// Shift of the zero's approach: at each joints it moves by 2^-`NEARER` of the difference, limited by the
-/// rate.
+/// Shift of the zero's approach to the reading. With each joints message the zero moves by 2^-`NEARER` of the
+/// difference, limited by the rate.
 const APPROACH_SHIFT: u32 = 4;
-/// Maximum temperature difference that moves the zero: 64 °C.
+/// Maximum temperature difference that is compensated: 64 °C, in steps of 2^-6 °C.
 const MAX_DEGREES: i32 = 64 << 6;
-/// Temperature change over which the coefficient is learned: 2 °C.
+/// Temperature change after which the coefficient is corrected: 2 °C, in steps of 2^-6 °C.
 const LEARNING_SPAN: i32 = 2 << 6;
-/// Maximum temperature change for learning; after a faster one, the zero has not caught up.
+/// Maximum temperature change for a correction of the coefficient. After a faster change, the zero has not followed the
+/// reading yet.
 const MAX_LEARNING_SPAN: i32 = LEARNING_SPAN + (LEARNING_SPAN >> 2);
-/// Maximum number of joints for learning; over more, the zero may have drifted for another reason.
+/// Maximum number of joints messages for a correction of the coefficient. Over a longer time, the zero may have drifted
+/// for another reason.
 const MAX_LEARNING_JOINTS: u16 = 1 << 14;
 
-/// The reason of a refused tare.
+/// The reason for which a tare is refused.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum TareRefused {
     /// The baseline is off.
     Off,
-    /// The cell is touched, or has received no joints.
+    /// The cell is touched, or has not received any joints.
     Touched,
-    /// The reading exceeds the limit.
+    /// The reading exceeds the limit of the zero.
     Limit,
 }
 
-/// The baseline of one force sensor. Forces have 22 fraction bits, in N.
+/// The baseline of one force sensor. Forces are in N with 22 fraction bits.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Baseline {
     rule: Rule,
@@ -54,33 +56,33 @@ pub struct Baseline {
     /// The zero at the present temperature.
     zero: i32,
     reference: Q9_6,
-    /// The coefficient in use: the configured or the learned one.
+    /// Drift of the zero with temperature that is in use, in N/°C: configured, or learned.
     n_per_c: Q1_14,
-    /// True if the coefficient was configured or learned before; then only half of a correction is applied.
+    /// True if the coefficient was configured, or learned once. Further corrections are then applied only by half.
     is_n_per_c_known: bool,
-    /// The mean of the last readings; `None` before the first joints.
+    /// Running mean of the readings; `None` before the first joints.
     mean: Option<i32>,
     is_steady: bool,
-    /// Number of consecutive steady readings, until the first tare.
+    /// Number of consecutive steady readings, counted until the first tare.
     steady: u8,
     is_tared: bool,
     is_limited: bool,
     touch: Touch,
     refused: u16,
-    /// Number of tares and settings; a change is reported.
+    /// Number of tares and changes of the settings, modulo 2^8. A change of this number is reported.
     changes: u8,
     anchor: Option<Anchor>,
     pace: StepLimit,
 }
 
-/// The maximum movement of the zero per joints.
+/// The maximum movement of the zero, in steps of 2^-22 N per joint broadcast.
 #[derive(Clone, Copy, Debug, Default)]
 struct StepLimit {
     period_us: u16,
     step: i32,
 }
 
-/// The start of learning the coefficient.
+/// The start of a temperature change over which the coefficient is learned.
 #[derive(Clone, Copy, Debug)]
 struct Anchor {
     temperature: Q9_6,
@@ -89,14 +91,14 @@ struct Anchor {
 }
 
 impl Baseline {
-    /// Sets the rule and forgets the zero.
+    /// Sets the baseline mode and forgets the zero.
     pub fn set(&mut self, rule: Rule) {
         self.rule = rule;
         self.forget();
         self.pace = StepLimit::default();
     }
 
-    /// Returns the rule.
+    /// Returns the baseline mode.
     #[must_use]
     pub const fn rule(&self) -> Rule {
         self.rule
@@ -108,7 +110,7 @@ impl Baseline {
         self.is_tared
     }
 
-    /// Restores the state after a start, except for the rule and the count of refused tares.
+    /// Resets everything to the state after a start, except for the baseline mode and the count of refused tares.
     #[inline(never)]
     pub fn forget(&mut self) {
         let Self { rule, refused, changes, pace, .. } = *self;
@@ -118,7 +120,7 @@ impl Baseline {
         *self = Self { rule, refused, changes, pace, n_per_c, is_n_per_c_known, ..Self::default() };
     }
 
-    /// Processes the readings at joints; `period_us` is the broadcast period.
+    /// Updates the zero with the sensor readings, when joints arrive. `period_us` is the broadcast period in µs.
     #[inline(never)]
     pub fn process_joints(&mut self, raw: &SkinSensors, period_us: u16) {
         let Rule::On(rule) = self.rule else { return };
@@ -154,7 +156,7 @@ impl Baseline {
         }
     }
 
-    /// Returns the readings with the zero subtracted.
+    /// Returns the sensor readings with the zero subtracted from the contact force.
     #[must_use]
     pub fn subtract_zero(&self, raw: &SkinSensors) -> SkinSensors {
         let Rule::On(rule) = self.rule else { return *raw };
@@ -170,10 +172,10 @@ impl Baseline {
         SkinSensors { contact, ..*raw }
     }
 
-    /// Tares with the present readings, by command.
+    /// Takes the present readings as the zero, as a tare command requests.
     ///
     /// # Errors
-    /// Returns the reason if the tare is refused. Only the count of refused tares changes then.
+    /// Returns the reason if the tare is refused. The zero does not change then; the refusal is counted.
     pub fn tare(&mut self, raw: &SkinSensors, how: Tare) -> Result<(), TareRefused> {
         let done = self.try_tare(raw, how);
         if done.is_err() {
@@ -198,7 +200,7 @@ impl Baseline {
         Ok(())
     }
 
-    /// Returns page 3 of the sensors; `None` if the baseline is off.
+    /// Returns sensor page 3, which describes the zero; `None` if the baseline is off.
     #[must_use]
     pub fn page(&self) -> Option<BaselinePage> {
         let page = BaselinePage {
@@ -218,7 +220,7 @@ impl Baseline {
         self.rule != Rule::Off
     }
 
-    /// Returns the state whose changes are worth sending page 3.
+    /// Returns the part of the state whose changes are reported at once with page 3.
     #[must_use]
     pub fn status(&self) -> BaselineStatus {
         (self.is_tared, self.touch == Touch::Touched, self.is_limited, self.refused, self.changes)
@@ -230,7 +232,7 @@ impl Baseline {
         self.changes = self.changes.wrapping_add(1);
     }
 
-    /// Returns the shift of the zero at a temperature.
+    /// Returns the shift of the zero at a temperature, relative to the reference temperature.
     fn shift(&self, temperature: Q9_6) -> i32 {
         let degrees = i32::from(temperature.to_bits()) - i32::from(self.reference.to_bits());
         let degrees = degrees.clamp(-MAX_DEGREES, MAX_DEGREES);
@@ -243,7 +245,7 @@ impl Baseline {
         (self.zero + (1 << (EXTRA_FRACTION_BITS - 1))) >> EXTRA_FRACTION_BITS
     }
 
-    /// Moves the zero towards the reading of an untouched sensor.
+    /// Moves the zero towards the reading of an untouched sensor, by at most the rate and within `limit`.
     fn follow(&mut self, reading: i32, shift: i32, limit: i32) {
         let step = self.pace.step;
         let target = self.zero + ((reading - self.zero) >> APPROACH_SHIFT).clamp(-step, step);
@@ -252,7 +254,7 @@ impl Baseline {
         self.base = self.zero - shift;
     }
 
-    /// Corrects the coefficient by the drift of the zero during a temperature change.
+    /// Corrects the coefficient (N/°C) by the drift of the zero since the start of a temperature change.
     fn learn(&mut self, temperature: Q9_6) {
         let fresh = Anchor { temperature, base: self.base, joints: 0 };
         let anchor = self.anchor.get_or_insert(fresh);
@@ -275,10 +277,10 @@ impl Baseline {
     }
 }
 
-/// The state returned by [`Baseline::status`]: tared, touched, limited, refused tares, changes.
+/// The state that [`Baseline::status`] returns: tared, touched, limited, number of refused tares, number of changes.
 pub type BaselineStatus = (bool, bool, bool, u16, u8);
 
-/// Conversion to the fraction bits of a zero.
+/// Conversion of a number to the fraction bits of the zero.
 trait Finer {
     fn finer(self) -> i32;
 }
@@ -289,19 +291,19 @@ impl Finer for Q5_10 {
     }
 }
 
-/// Returns true if a reading of an untared sensor is within the limit and counts as zero.
+/// Returns true if the reading of a sensor without a zero is within the limit, so that it counts as no force.
 fn is_within_limit(sum: i32, rule: &BaselineSettings) -> bool {
     sum.abs() <= i32::from(rule.limit.to_bits())
 }
 
-/// Returns the maximum movement of the zero per period, in steps of 2^-22 N, rounded down.
+/// Returns the maximum movement of the zero per broadcast period, in steps of 2^-22 N, rounded down.
 fn step_per_period(rate_un_per_s: u16, period_us: u16) -> i32 {
     // 2^22 / 10^12 is 18 014.398 / 2^32.
     let rate = u64::from(u32::from(rate_un_per_s) * u32::from(period_us));
     i32::try_from((rate * 18_014) >> 32).unwrap_or(0)
 }
 
-/// Saturates a value to a word.
+/// Converts a value to a word. Values out of range saturate.
 fn saturate_word(value: i32) -> i16 {
     i16::try_from(value).unwrap_or(if value < 0 { i16::MIN } else { i16::MAX })
 }

@@ -1,27 +1,27 @@
 //! The path from a cell's sensor words to joint torques: the paper's Algorithm 1 and `tau = J F_z`.
 //!
-//! The code uses integers only, exact except for three named roundings: [`Force`] (16 fraction bits),
-//! [`Torque::words`] (Q3.12), and the rounding of a sum of [`Torque::exact`]. It never panics, and its work
-//! is bounded.
+//! The code uses integers only. It is exact except for three roundings: [`Force`] (16 fraction bits), [`Torque::words`]
+//! (the torque format), and the rounding of a sum of [`Torque::exact`]. It never panics, and its work is bounded.
 
 use protocol::fixed::{Acc, Q1_14, Q5_10, TorqueFormat};
 use protocol::parameters::{Contact, MAX_JOINTS};
 
-/// A normal force in N, in the range [0, 32 768) in steps of 2^-16. A push on the cell is positive.
+/// A contact force along the cell's normal, in the range [0, 32 768) N in steps of 2^-16 N. A push on the cell is
+/// positive.
 #[derive(Clone, Copy, Debug, Default, Eq, Ord, PartialEq, PartialOrd)]
 pub struct Force(i32);
 
 impl Force {
-    /// Zero: no contact.
+    /// The force without a contact.
     pub const ZERO: Self = Self(0);
 
     /// Computes F_z of Algorithm 1 from the three contact words in N and the proximity.
     ///
-    /// The contact force F_c is the exact sum of the three words. Contact and proximity below their
-    /// thresholds count as zero, as does a fused force below its own threshold. Comparisons are exact, and a
-    /// value equal to its threshold counts. The fused force `alpha_c F_c + alpha_p F_p` is exact with 24
-    /// fraction bits, and is rounded to 16 after the comparison, ties up. A contact cannot pull, so a
-    /// negative fused force is zero for every threshold.
+    /// The contact force F_c is the exact sum of the three words. Contact and proximity below their thresholds count as
+    /// zero, and so does a fused force below its own threshold. Comparisons are exact, and a value equal to its
+    /// threshold counts. The fused force `alpha_c F_c + alpha_p F_p` is exact with 24 fraction bits; after the
+    /// comparison it is rounded to 16, ties up. A contact cannot pull, so a negative fused force is zero whatever the
+    /// threshold.
     #[must_use]
     pub fn fuse(contact: [Q5_10; 3], proximity: Q1_14, rule: &Contact) -> Self {
         let touch = contact.into_iter().fold(Acc::<10>::ZERO, |sum, word| sum.plus(word.widen()));
@@ -37,7 +37,7 @@ impl Force {
         Self::from_steps((fused.steps() + (1 << 7)) >> 8)
     }
 
-    /// Creates a force from steps of 2^-16 N, clamped to its range.
+    /// Creates a force from steps of 2^-16 N, clamped to the range of a force.
     #[must_use]
     pub fn from_steps(steps: i64) -> Self {
         Self(i32::try_from(steps.max(0)).unwrap_or(i32::MAX))
@@ -49,14 +49,14 @@ impl Force {
         self.0
     }
 
-    /// Returns true if the force is not zero: the cell is active. Forces below 2^-17 N round to zero.
+    /// Returns true if the force is not zero, so that the cell is active. Forces below 2^-17 N round to zero.
     #[must_use]
     pub const fn is_active(self) -> bool {
         self.0 > 0
     }
 }
 
-/// The torques that one cell causes in the joints.
+/// The torques that the contact force on one cell causes in the joints.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Torque<'a> {
     jacobian: &'a [Q1_14],
@@ -64,14 +64,14 @@ pub struct Torque<'a> {
 }
 
 impl<'a> Torque<'a> {
-    /// Computes `tau_l = J_l F_z` (Eq. 8) exactly. J is in m, Q1.14, as returned by a
-    /// [`Kernel`](crate::kernel::Kernel), or its leading nonzero part.
+    /// Creates the torques `tau_l = J_l F_z` (Eq. 8), which are exact. J is in m in Q1.14, as a
+    /// [`Kernel`](crate::kernel::Kernel) returns it; trailing zeros may be omitted.
     #[must_use]
     pub const fn new(jacobian: &'a [Q1_14], force: Force) -> Self {
         Self { jacobian, force }
     }
 
-    /// Returns the torques in Nm at full width, as they enter a sum inside the cell.
+    /// Returns the exact torques in Nm, to be added to the sums of other cells.
     #[must_use]
     pub fn exact(&self) -> [Acc<30>; MAX_JOINTS] {
         let mut exact = [Acc::ZERO; MAX_JOINTS];
@@ -82,15 +82,15 @@ impl<'a> Torque<'a> {
         exact
     }
 
-    /// Returns the torques in Nm as words for the bus, rounded once, ties up. Torques outside the range
-    /// become the largest or smallest word, which mean *saturated*. The error of all others is at most half a
-    /// step, for Q3.12 1.3e-4 Nm.
+    /// Returns the torques as words for the bus, rounded once, ties up. Torques outside the range become the largest or
+    /// smallest word, which mean *saturated*. The error of all others is at most half a step, for Q3.12 1.3e-4 Nm.
     #[must_use]
     pub fn words(&self, format: TorqueFormat) -> [i16; MAX_JOINTS] {
         self.words_by(&TorqueRounding::new(format, MAX_J))
     }
 
-    /// Like [`Torque::words`], with a precomputed rounding whose bound J satisfies.
+    /// Like [`Torque::words`], with a rounding computed once per configuration. J must not exceed the bound for which
+    /// the rounding was created.
     #[must_use]
     #[inline]
     pub fn words_by(&self, rounding: &TorqueRounding) -> [i16; MAX_JOINTS] {
@@ -99,7 +99,7 @@ impl<'a> Torque<'a> {
         words
     }
 
-    /// Like [`Torque::words_by`], into an array; words beyond those of J do not change.
+    /// Like [`Torque::words_by`], but writes to an array. Words beyond the length of J do not change.
     #[inline]
     pub fn write_words(&self, rounding: &TorqueRounding, words: &mut [i16; MAX_JOINTS]) {
         if self.force.0 > rounding.max_unsaturated_force {
@@ -112,7 +112,7 @@ impl<'a> Torque<'a> {
         }
     }
 
-    /// Writes words of which some may saturate.
+    /// Writes the words with saturation, for forces at which a torque may be out of range.
     #[cold]
     #[inline(never)]
     fn write_saturating_words(&self, format: TorqueFormat, words: &mut [i16; MAX_JOINTS]) {
@@ -122,8 +122,8 @@ impl<'a> Torque<'a> {
         });
     }
 
-    /// Writes the word of each J, last joint first. `black_box` prevents unrolling, for which a Cortex-M0 has
-    /// too few registers.
+    /// Writes the word of each element of J, last joint first. `black_box` prevents loop unrolling, for which a
+    /// Cortex-M0 has too few registers.
     #[inline(always)]
     fn write_each(&self, words: &mut [i16; MAX_JOINTS], word_of: impl Fn(Q1_14) -> i16) {
         for index in (0..self.jacobian.len().min(MAX_JOINTS)).rev() {
@@ -134,7 +134,7 @@ impl<'a> Torque<'a> {
         }
     }
 
-    /// Returns one torque, rounded, in steps of 2^-`fraction`.
+    /// Returns the torque for one element of J, rounded to steps of 2^-`fraction`.
     #[inline(always)]
     fn steps(&self, row: Q1_14, fraction: u32) -> i32 {
         // A 16 by 32 bit product in 32 bits: (J high + (J low >> 16)) 2^16 is less than 2^16 below J F, which
@@ -147,20 +147,20 @@ impl<'a> Torque<'a> {
     }
 }
 
-/// Upper bound of |J| in steps of 2^-14.
+/// Largest possible |J| in steps of 2^-14.
 pub const MAX_J: u16 = 1 << 15;
 
 /// The conversion of torques to words, computed once per configuration.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct TorqueRounding {
     format: TorqueFormat,
-    /// The largest force, in steps of 2^-16 N, whose torques all fit a word without saturation.
+    /// The largest force, in steps of 2^-16 N, at which no torque saturates.
     max_unsaturated_force: i32,
 }
 
 impl TorqueRounding {
-    /// Creates the conversion for a J bounded by `bound`, in steps of 2^-14 ([`MAX_J`] if no better bound is
-    /// known).
+    /// Creates the conversion for |J| up to `bound`, in steps of 2^-14. `bound` is [`MAX_J`] if no lower bound is
+    /// known.
     #[must_use]
     pub fn new(format: TorqueFormat, bound: u16) -> Self {
         // J F is at most the largest word, so rounding cannot exceed it.
@@ -169,7 +169,7 @@ impl TorqueRounding {
     }
 }
 
-/// Converts steps that are known to fit a word.
+/// Converts steps to a word, without a check of the range.
 #[inline]
 fn low_word(steps: i32) -> i16 {
     debug_assert!(i16::try_from(steps).is_ok(), "{steps} is no word");
@@ -185,7 +185,7 @@ mod tests {
     use protocol::fixed::Q3_12;
 
     impl Force {
-        /// Converts to N, exactly.
+        /// Converts the force to N, exactly.
         fn to_f64(self) -> f64 {
             f64::from(self.0) / 65_536.0
         }

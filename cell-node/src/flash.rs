@@ -39,11 +39,11 @@ pub struct FlashContent {
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "a cell has no heap")]
 pub enum FlashState {
-    /// No image.
+    /// Flash contains no image.
     Empty,
-    /// An image with a wrong CRC.
+    /// Flash contains an image with a wrong CRC.
     Damaged,
-    /// Valid parameters.
+    /// Flash contains valid parameters.
     Valid(Parameters),
 }
 
@@ -51,16 +51,16 @@ pub enum FlashState {
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum FlashError {
-    /// The size is wrong.
+    /// The image has a size that no image can have.
     #[error("{got} bytes, not {BYTES} to {MAX_BYTES}")]
     Size {
-        /// The actual size in bytes.
+        /// Size of the image in bytes.
         got: usize,
     },
-    /// The CRC is wrong.
+    /// The CRC of the image is wrong.
     #[error("its CRC is wrong")]
     Damaged,
-    /// The version is unknown.
+    /// The version of the image is unknown.
     #[error("version {got}, not {VERSION}")]
     Version {
         /// The version of the image.
@@ -69,12 +69,12 @@ pub enum FlashError {
     /// The image belongs to another cell.
     #[error("it belongs to cell {cell} with serial number {serial}")]
     OtherCell {
-        /// Its node id, 0 for none.
+        /// Node id of the other cell, 0 for none.
         cell: u8,
-        /// Its serial number.
+        /// Serial number of the other cell.
         serial: u32,
     },
-    /// The parameters are invalid.
+    /// The parameters in the image are invalid.
     #[error("its parameters are invalid: {0}")]
     Parameters(#[from] protocol::parameters::ParameterError),
 }
@@ -87,7 +87,7 @@ pub fn encode(serial: u32, kept: &FlashContent) -> Bytes {
     bytes
 }
 
-/// Encodes a flash image into an empty buffer, so that a small stack holds only one copy.
+/// Encodes a flash image into an empty buffer. The image is not copied, which saves stack.
 pub fn encode_into(bytes: &mut Bytes, serial: u32, kept: &FlashContent) {
     let number = kept.number.map_or(0, CellId::get);
     let serial = serial.to_le_bytes();

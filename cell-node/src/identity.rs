@@ -1,8 +1,8 @@
-//! The identity of a cell, and the identifiers that it receives for it.
+//! The identity of a cell: its node id and serial number.
 
 use protocol::id::{CellId, Id};
 
-/// Number of identifiers that every cell with a node id receives.
+/// Number of identifiers that every cell receives because of its node id.
 pub const OWN_IDS: usize = 10;
 
 /// The identity of a cell.
@@ -15,8 +15,8 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// Returns the identifiers that this cell receives in every network state ([`Id::of_cell`]). A cell
-    /// without a node id receives only at its ports.
+    /// Returns the identifiers that this cell receives in every network state ([`Id::of_cell`]). A cell without a node
+    /// id receives no identifiers, only messages at its ports.
     #[must_use]
     pub fn received_ids(&self) -> [Option<Id>; OWN_IDS] {
         self.cell.map_or([None; OWN_IDS], |cell| Id::received_by_cell(cell).map(Some))

@@ -1,4 +1,5 @@
-//! Input and output for the cells of a process: clock, bus and flash files. The core makes all decisions.
+//! Input and output for the cells of one process: clock, bus and flash files. The modules of the core make all
+//! decisions.
 
 mod clock;
 mod flash_file;
@@ -28,39 +29,40 @@ pub use flash_file::FlashFile;
 pub use line::BusPort;
 pub use sockets::Sockets;
 
-/// Retry interval for opening a bus that is not there.
+/// Retry interval for opening a bus that does not exist yet.
 const RETRY_INTERVAL: Duration = Duration::from_millis(100);
-/// Retry interval while an interface is down.
+/// Retry interval while a network interface is down.
 const DOWN_RETRY_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Maximum age of unsent frames. Epochs count modulo 256, so older torques could be mistaken for newer ones.
+/// Maximum age of unsent frames. Older frames are dropped: epochs count modulo 256, so a receiver could take their
+/// torques for newer ones.
 const MAX_UNSENT_AGE: Duration = Duration::from_millis(250);
 
-/// Maximum number of cells in a process that may rest. With more, heartbeats wake the process as often as
-/// joints.
+/// Maximum number of cells in a process in which joints need not wake untouched cells. With more cells, heartbeats wake
+/// the process as often as joints do, so resting saves nothing.
 const MAX_RESTING_CELLS: usize = 8;
 
 /// The link ids that a cell sends with, by port; the last one is the uplink to the gateway's side.
 pub type LinkIds = [Option<LinkId>; PORTS + 1];
 
-/// Cells that share a process and a socket.
+/// The cells of one process, which share a socket.
 #[derive(Debug)]
 pub struct Cells {
     cells: Vec<HostedCell>,
     format: Format,
     clock: Clock,
     subscriptions: Subscriptions,
-    /// True if the subscriptions may have changed since the filters were set.
+    /// True if the identifiers that the cells receive may have changed since the filters were set.
     subscriptions_changed: bool,
-    /// True if pending frames have been received since a timer became due.
+    /// True if pending frames have been received since a timer became due. They are handled before the timer.
     received_first: bool,
     filters: ReceiveFilters,
     outbox: Outbox,
-    /// The time since which the bus has not accepted the outbox.
+    /// The time since which the bus has not accepted the pending frames.
     unsent_since: Option<Instant>,
 }
 
-/// A cell with its own resources. The alignment keeps data that is used together in the same cache lines.
+/// A cell with its own resources. The alignment keeps fields that are used together in the same cache lines.
 #[derive(Debug)]
 #[repr(align(64))]
 struct HostedCell {
@@ -69,23 +71,23 @@ struct HostedCell {
     link_ids: LinkIds,
 }
 
-/// The reason for which cells stop.
+/// The reason for which the cells of a process stop.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum StopReason {
-    /// Another cell has the node id.
+    /// Another cell uses the node id of a cell.
     #[error(
         "cell {cell} is on {bus} already, with serial number {serial}: stop that one or give this one another number"
     )]
     NodeIdTaken {
-        /// The bus.
+        /// The name of the bus.
         bus: String,
         /// The node id.
         cell: u8,
         /// The serial number of the other cell.
         serial: u32,
     },
-    /// Wires must be simulated, but the bus is real.
+    /// Wires between cells must be simulated, which is not allowed on a real bus.
     #[error(
         "{bus} is real hardware, but cells that answer with sums simulate their wires with frames that \
          must not be sent there: use a vcan or the embedded bus, or reply = \"torque\""
@@ -100,7 +102,7 @@ pub enum StopReason {
 }
 
 impl Cells {
-    /// Creates an empty set of cells for a bus of this format.
+    /// Creates an empty set of cells for a bus with this frame format.
     #[must_use]
     pub fn new(format: Format) -> Self {
         Self {
@@ -116,8 +118,8 @@ impl Cells {
         }
     }
 
-    /// Starts a cell with the contents of its flash and its wires. A simulated cell has no sensors, so it
-    /// uses stimuli.
+    /// Adds a cell that starts with the contents of its flash and has wires with these link ids. A simulated cell has
+    /// no sensors, so it uses stimuli.
     pub fn start(&mut self, identity: Identity, flash: &FlashState, file: FlashFile, link_ids: LinkIds) {
         let mut wired = 0;
         for (port, link_id) in
@@ -133,11 +135,11 @@ impl Cells {
 
     /// Opens the bus of the cells.
     ///
-    /// Cells that are wired to each other receive each other's sums and wire messages. If they share a
-    /// socket, it must return their own frames.
+    /// Cells that are wired to each other receive each other's sums and wire messages. If they share a socket, the
+    /// socket must also return the frames that it sends.
     ///
     /// # Errors
-    /// Returns an error if the bus cannot be used as requested.
+    /// Returns an error if the bus does not exist, is not accessible, or does not support the options.
     pub fn open(&mut self, line: &BusPort) -> Result<Sockets, StopReason> {
         self.update_subscriptions();
         let options = BusOptions {
@@ -149,10 +151,10 @@ impl Cells {
         Sockets::open(line, &options, &self.filters.deferred)
     }
 
-    /// Opens the bus as soon as it exists.
+    /// Waits until the bus exists, and opens it.
     ///
     /// # Errors
-    /// Returns an error if the bus cannot be used as requested and waiting would not help.
+    /// Returns an error if the bus cannot be used, and waiting would not help.
     pub fn open_again(&mut self, line: &BusPort) -> Result<Sockets, StopReason> {
         loop {
             std::thread::sleep(RETRY_INTERVAL);
@@ -163,8 +165,8 @@ impl Cells {
         }
     }
 
-    /// Updates the subscriptions if they may have changed. Returns the previous filters if the filters have
-    /// changed.
+    /// Updates the table of received identifiers if it may be out of date. Returns the previous filters if the filters
+    /// have changed.
     fn update_subscriptions(&mut self) -> Option<ReceiveFilters> {
         if !core::mem::take(&mut self.subscriptions_changed) {
             return None;
@@ -181,7 +183,7 @@ impl Cells {
     /// Runs the cells until the bus fails or another cell has one of their node ids.
     ///
     /// # Errors
-    /// Always returns the reason of the end.
+    /// Always returns the reason for which the cells stopped.
     pub fn run(&mut self, mut sockets: Sockets, line: &BusPort) -> Result<core::convert::Infallible, StopReason> {
         let mut now = self.clock.now();
         loop {
@@ -206,8 +208,8 @@ impl Cells {
         }
     }
 
-    /// Waits for a bus that does not work, or opens it again. Unsent frames are sent afterwards; those that
-    /// are too old are lost, as on a microcontroller without a bus.
+    /// Waits for a bus that does not work, or opens it again. Pending frames are sent afterwards. Frames that are too
+    /// old are lost, as on a microcontroller without a bus.
     fn recover(&mut self, error: BusError, sockets: &mut Sockets, line: &BusPort) -> Result<(), StopReason> {
         let since = *self.unsent_since.get_or_insert_with(Instant::now);
         if line.reconnect && error.is_closed() {
@@ -224,7 +226,7 @@ impl Cells {
         Ok(())
     }
 
-    /// Drops the unsent frames and subtracts them from the cells' counts of sent packets.
+    /// Drops the pending frames and subtracts their packets from the counters of sent packets.
     fn drop_outbox(&mut self) {
         for place in self.outbox.lose() {
             if let Some(hosted_cell) = self.cells.get_mut(place) {
@@ -233,7 +235,7 @@ impl Cells {
         }
     }
 
-    /// Handles due timers, sends, and waits for frames.
+    /// Runs one iteration: handles due timers, sends pending frames, and waits for frames.
     fn run_once(&mut self, sockets: &mut Sockets, now: Micros) -> Result<(), StopReason> {
         let timeouts = self.cells.iter().map(|hosted_cell| hosted_cell.node.poll_timeout());
         let due = timeouts.min().filter(|&due| due <= now);
@@ -271,7 +273,7 @@ impl Cells {
         Ok(sockets.wait(Duration::from_micros(next.elapsed_since(now).0))?)
     }
 
-    /// Passes a frame to the cells that receive it, and collects their answers at once.
+    /// Passes a frame to the cells that receive it, and collects the packets that they answer with.
     fn deliver(&mut self, received: &Received, age: Span, bus: &str, now: Micros) -> Result<(), StopReason> {
         let frame = &received.frame;
         if let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) {
@@ -307,8 +309,8 @@ impl Cells {
 }
 
 impl HostedCell {
-    /// Writes the cell's pending parameters to flash and collects its pending frames. Returns true if its
-    /// subscriptions have changed.
+    /// Writes the cell's pending parameters to flash and moves its pending packets to the outbox. Returns true if the
+    /// cell now receives other identifiers.
     fn collect(&mut self, place: usize, format: Format, outbox: &mut Outbox) -> bool {
         if let Some(kept) = self.node.poll_store() {
             self.node.handle_stored(self.file.store(&kept).is_ok());

@@ -1,4 +1,4 @@
-//! A process with one or several skin cells.
+//! A process that runs one or several skin cells.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -65,7 +65,7 @@ fn parse_range(text: &str) -> Result<(u8, u8), String> {
 }
 
 impl Arguments {
-    /// Returns the first and the last node id.
+    /// Returns the first and the last node id that the process runs; `None` if the network assigns it.
     fn nodes(&self) -> Option<(u8, u8)> {
         self.node.map(|node| (node, node)).or(self.nodes)
     }
@@ -82,7 +82,7 @@ impl Arguments {
     }
 }
 
-/// Writes a line to standard error in one write, because hundreds of cells may share it.
+/// Writes a line to standard error in one write, because hundreds of cell processes may share it.
 fn eprint_line(text: impl core::fmt::Display) {
     protocol::usage::eprint_line(&format!("cell-node: {text}"));
 }

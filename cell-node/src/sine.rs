@@ -1,9 +1,9 @@
 //! Sine and cosine of an angle in quarter turns, with integers only.
 //!
-//! An angle is a Q1.14 word in quarter turns (paper, Eq. 11), so 16 bits hold exactly one turn and wrap
-//! without further code; the period of the paper's Eq. 12 is 4 of these units, not 2. A polynomial is
-//! evaluated on [-1, 1] and continued by `sin(z) = sin(2 - z)` (Eq. 18), which in wrapping words also holds
-//! below -1. All products stay within 32 bits.
+//! An angle is a Q1.14 word in quarter turns (paper, Eq. 11), so that 16 bits hold exactly one turn and wrap without
+//! further code. The period of the paper's Eq. 12 is 4 of these units, not 2. A polynomial is evaluated on [-1, 1] and
+//! continued by `sin(z) = sin(2 - z)` (Eq. 18), which with words that wrap also holds below -1. All products fit 32
+//! bits.
 //!
 //! | function | order | mean error | max error |
 //! |---|---|---|---|
@@ -25,15 +25,15 @@ pub(crate) mod paper;
 #[cfg(feature = "oracle")]
 pub use paper::{paper_cosine, paper_sine};
 
-/// One, with the 16 fraction bits of the polynomials.
+/// The number one, with the 16 fraction bits of the polynomials.
 const ONE: i32 = 1 << 16;
 /// A quarter turn as a word.
 pub(crate) const QUARTER: Q1_14 = Q1_14::from_bits(1 << 14);
 
-/// The odd polynomial of seventh order for a quarter turn: coefficients of z, z^3, z^5, z^7.
+/// Coefficients of z, z^3, z^5 and z^7 in the polynomial of seventh order for the sine of z quarter turns.
 ///
-/// Of all integers whose sum is one (so that the sine of a quarter turn is one), these have the smallest mean
-/// error when every intermediate result is truncated; found by search.
+/// The coefficients were found by search. Among all integers whose sum is one (so that the sine of a quarter turn is
+/// one), they have the smallest mean error when every intermediate result is truncated.
 const SEVENTH: [i32; 4] = [ONE + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
 
 /// Returns the sine of an angle in quarter turns, in [-1, 1].
@@ -50,15 +50,16 @@ pub fn cosine(angle: Q1_14) -> Q1_14 {
     sine(angle.wrapping_add(QUARTER))
 }
 
-/// Returns [`sine`] and [`cosine`] of one angle in steps of 2^-14: bit for bit the same, in less time.
+/// Returns [`sine`] and [`cosine`] of one angle in steps of 2^-14. The results are identical to those of the two
+/// functions, but take less time.
 #[inline]
 pub(crate) fn sine_cosine(angle: Q1_14) -> [i32; 2] {
     both(angle, SEVENTH)
 }
 
-/// Returns sine and cosine, computed with the odd polynomial whose coefficients add up to one. With |z|
-/// folded into one quarter turn, |sin z| is the polynomial of that, and |cos z| the polynomial of the rest of
-/// the quarter. Only coefficients can make intermediate results negative.
+/// Returns sine and cosine, computed with an odd polynomial whose coefficients add up to one. The angle is folded to
+/// |z| within one quarter turn. |sin z| is the polynomial of |z|, and |cos z| is the polynomial of 1 - |z|.
+/// Intermediate results can be negative only because coefficients are.
 #[inline]
 fn both<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i32; 2] {
     let quarter = 1 << 14;
@@ -86,7 +87,7 @@ fn fold(angle: Q1_14) -> i32 {
     i32::from(folded)
 }
 
-/// Evaluates an odd polynomial of the folded angle whose coefficients add up to one.
+/// Evaluates an odd polynomial at the folded angle. Its coefficients must add up to one.
 fn odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> Q1_14 {
     let z = fold(angle);
     let square = product(z, z) >> 13; // 15 fraction bits, at most 2^15
@@ -98,8 +99,8 @@ fn odd_polynomial<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) 
     Q1_14::from_bits(i16::from_le_bytes([low, high]))
 }
 
-/// Returns a product that fits 32 bits for every angle. A release build does not check this, because the
-/// check would cost a small processor more than the product.
+/// Returns a product that is known to fit 32 bits. A release build does not check this, because on a small processor
+/// the check would take longer than the product.
 fn product(lhs: i32, rhs: i32) -> i32 {
     debug_assert!(lhs.checked_mul(rhs).is_some(), "{lhs} x {rhs} is wider than 32 bits");
     lhs.wrapping_mul(rhs)
@@ -108,8 +109,8 @@ fn product(lhs: i32, rhs: i32) -> i32 {
 /// Number of fraction bits of [`fine_sine_cosine`].
 pub(crate) const FINE: u32 = 28;
 
-/// Returns sine and cosine with 28 fraction bits, exact at the quarter turns, for constants that are computed
-/// once. No error exceeds 1e-8.
+/// Returns sine and cosine with 28 fraction bits, for constants that are computed once. They are exact at the quarter
+/// turns; elsewhere the error is at most 1e-8.
 pub(crate) fn fine_sine_cosine(angle: Q1_14) -> [i64; 2] {
     [angle, angle.wrapping_add(QUARTER)].map(|angle| {
         let z = i64::from(fold(angle));
@@ -119,7 +120,8 @@ pub(crate) fn fine_sine_cosine(angle: Q1_14) -> [i64; 2] {
     })
 }
 
-/// The series of the sine of a quarter turn with 32 fraction bits: (pi/2)^n / n!, n = 1, 3, 5 ... 15.
+/// Coefficients of the power series for the sine of a quarter turn, with 32 fraction bits: (pi/2)^n / n!, n = 1, 3, 5
+/// ... 15.
 #[expect(clippy::cast_possible_truncation, reason = "all below 2^33")]
 const TAYLOR: [i64; 8] = {
     let mut series = [0; 8];

@@ -6,9 +6,9 @@
 //!   state of a child ──> state               ┘                └─> missing: children whose sums did not come
 //! ```
 //!
-//! A child's sums are accepted while its *lease* runs: from the epoch in its state message on, without a
-//! missing epoch. A child that sent nothing for one epoch is therefore free to send its sums to another
-//! parent, and a child that is late loses only that epoch. A sum of no cells (count 0) ends the lease.
+//! The parent accepts a child's sums while the child's *lease* runs: from the epoch in the child's state message until
+//! an epoch without a sum. A child that has sent no sum for one epoch may therefore send to another parent, and a child
+//! that is late loses only that epoch. A sum with a count of 0 ends the lease.
 
 use protocol::fixed::{Acc, Q7_8};
 use protocol::packet::Epoch;
@@ -17,100 +17,100 @@ use protocol::parameters::Slots;
 use protocol::port::PORTS;
 use protocol::time::{Micros, Span};
 
-/// Number of epochs in which a missing sum is NACKed, because the child's reply may be lost too.
+/// Number of consecutive epochs in which a missing sum is NACKed, because the child's reply to a NACK may be lost too.
 const NACK_EPOCHS: u8 = 4;
-/// Number of fraction bits that rounding removes.
+/// Number of fraction bits that rounding to Q7.8 removes from an exact sum.
 const DROPPED_BITS: u32 = 30 - 8;
 
 /// A sum as it is sent on the bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct SumWords {
-    /// The sums in Nm.
+    /// Sum of torques of each joint in Nm.
     pub torque: [Q7_8; MAX_JOINTS],
-    /// Number of contributing cells.
+    /// Number of cells whose torque is in the sum.
     pub count: u8,
 }
 
 impl SumWords {
-    /// The sum that ends the lease.
+    /// The sum with which a cell ends its lease.
     const END: Self = Self { torque: [Q7_8::ZERO; MAX_JOINTS], count: 0 };
 
-    /// Returns true if the sum ends the lease.
+    /// Returns true if the sum ends the lease of its sender.
     #[must_use]
     pub const fn is_end(&self) -> bool {
         self.count == 0
     }
 }
 
-/// The state of one child's sums.
+/// The sums of one child, as its parent receives them.
 #[derive(Clone, Copy, Debug, Default)]
 struct Child {
-    /// The epoch of the last sum that arrived, while the lease runs.
+    /// Epoch of the last sum that arrived; `None` if the lease does not run.
     last: Option<Epoch>,
-    /// True if any sum arrived in the present epoch, of any epoch.
+    /// True if a sum of any epoch has arrived in the present epoch.
     received_any: bool,
-    /// The sum of the present epoch.
+    /// Sum of the present epoch, if it has arrived.
     taken: Option<SumWords>,
-    /// A sum that arrived before the child's state message.
+    /// Sum that arrived before the child's state message, and its epoch.
     waiting: Option<(Epoch, SumWords)>,
-    /// Number of further epochs in which a NACK is sent, unless a sum arrives.
+    /// Number of further epochs in which a NACK is sent if no sum arrives.
     missing: u8,
 }
 
-/// The sum of one cell and its children.
+/// The sum of a cell's own torque and the sums of its children, and the times to send it.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Sum {
     slots: Option<Slots>,
     /// The present epoch.
     pub(crate) epoch: Option<Epoch>,
-    /// The start of the present or last epoch.
+    /// The values at the start of the present or last epoch.
     begin: EpochStart,
-    /// The rounded own torque in steps of Q7.8, if it contributes to the sum.
+    /// The cell's own torque in steps of Q7.8; `None` if it does not contribute to the sum.
     own: Option<[i32; MAX_JOINTS]>,
-    /// True if a sum was sent in the previous epoch: without contributions, the cell then sends one end.
+    /// True if a sum was sent in the previous epoch. If nothing contributes in this one, the cell sends one end.
     ends: bool,
-    /// The rounding error in steps of 2^-30 Nm.
+    /// The rounding error that is carried into the next sum, in steps of 2^-30 Nm.
     carry: [i64; MAX_JOINTS],
     children: [Child; PORTS],
-    /// True if the sum waits for a sign of the parent.
+    /// True if the sum is held back until a message of the parent arrives.
     pub(crate) held: bool,
-    /// The time to send the sum.
+    /// The time at which the sum is to be sent.
     due: Option<Micros>,
-    /// The last sent sum, and its epoch.
+    /// The sum that was sent last, and its epoch.
     last_sent: Option<(Epoch, SumWords)>,
-    /// True if the parent did not accept the last sum: the state is resent with the next one.
+    /// True if the parent did not accept the last sum. The state message is then repeated before the next one.
     pub(crate) restate: bool,
-    /// True if missing sums of this epoch have been checked.
+    /// True if the check for missing sums of this epoch is done.
     is_checked: bool,
-    /// The time of that check, if it is not left to the next joints.
+    /// The time of the check for missing sums; `None` if the next joints trigger it.
     check: Option<Micros>,
-    /// Sums sent, including repetitions.
+    /// Number of sums sent, including repetitions.
     pub sent: u16,
-    /// Sums accepted from children.
+    /// Number of sums accepted from children.
     pub taken: u16,
-    /// Sums of children that were dropped.
+    /// Number of sums of children that were dropped.
     pub dropped: u16,
 }
 
-/// The start of an epoch.
+/// The values that are fixed at the start of an epoch.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct EpochStart {
-    /// The number of the epoch.
+    /// The epoch.
     pub epoch: Epoch,
-    /// The time at which its joints were on the bus.
+    /// The time at which the joints of the epoch were on the bus.
     pub at: Micros,
     /// The period of the joint broadcast.
     pub period: Span,
-    /// Number of wires to the root; `None` while it is unreachable.
+    /// Number of wires to the root; `None` while the cell is unreachable.
     pub depth: Option<u8>,
-    /// True if sums may be sent in this epoch.
+    /// True if the cell may send sums in this epoch.
     pub may_send: bool,
     /// Bit p is set if the cell at port p is a child.
     pub children: u8,
 }
 
 impl Sum {
-    /// Sets the slots of sums from the next joints on; `None` to send no sums.
+    /// Sets the schedule of sums, which applies from the next joints on. With `None` the cell sends no sums.
     pub fn set_slots(&mut self, slots: Option<Slots>) {
         if slots.is_none() {
             *self = Self { sent: self.sent, taken: self.taken, dropped: self.dropped, ..Self::default() };
@@ -118,12 +118,12 @@ impl Sum {
         self.slots = slots;
     }
 
-    /// Returns true if sums are sent.
+    /// Returns true if the cell sends sums.
     pub(crate) const fn is_on(&self) -> bool {
         self.slots.is_some()
     }
 
-    /// Starts an epoch. `own` is this cell's torque at full width, `None` without contact.
+    /// Starts an epoch. `own` is the exact torque of this cell; `None` if it is not in contact.
     pub fn begin(&mut self, begin: &EpochStart, own: Option<&[Acc<30>; MAX_JOINTS]>) {
         let Some(slots) = self.slots else { return };
         let before = self.epoch.replace(begin.epoch);
@@ -150,19 +150,19 @@ impl Sum {
         }
     }
 
-    /// Schedules the check for missing sums before the next joints, while there is time to react.
+    /// Schedules the check for missing sums at a time before the next joints at which lost sums can still be requested.
     pub(crate) fn schedule_check(&mut self) {
         if !self.is_checked && self.epoch.is_some() {
             self.check = Some(self.begin.at + self.settling_time());
         }
     }
 
-    /// Returns the time after joints by which all sums of an epoch have been sent.
+    /// Returns the time after the joints at which all sums of an epoch have been sent.
     const fn settling_time(&self) -> Span {
         Span(self.begin.period.0 * 7 / 8)
     }
 
-    /// Rounds to Q7.8. The rounding error is carried into the next value if `carries` is true.
+    /// Rounds exact torques to Q7.8. If `carries` is true, the rounding errors are added to the next torques.
     fn round(&mut self, exact: &[Acc<30>; MAX_JOINTS], carries: bool) -> [i32; MAX_JOINTS] {
         let mut words = [0; MAX_JOINTS];
         for ((word, carry), exact) in words.iter_mut().zip(&mut self.carry).zip(exact) {
@@ -174,7 +174,7 @@ impl Sum {
         words
     }
 
-    /// Handles a child's state message: its sums from this epoch on are for this cell.
+    /// Handles the state message of a child, which announces its sums from this epoch on.
     pub fn handle_state(&mut self, now: Micros, port: usize, epoch: Epoch) {
         let Some(child) = self.children.get_mut(port) else { return };
         child.last = Some(epoch.previous());
@@ -184,7 +184,7 @@ impl Sum {
         }
     }
 
-    /// Handles a child's sum. The one with the largest count is kept.
+    /// Handles a sum of a child. Among several sums of one epoch, the one with the largest count is kept.
     pub fn receive(&mut self, now: Micros, port: usize, epoch: Epoch, words: SumWords) {
         let present = self.epoch == Some(epoch);
         let Some(child) = self.children.get_mut(port) else { return };
@@ -205,9 +205,9 @@ impl Sum {
         self.schedule(now);
     }
 
-    /// Schedules sending: at once if the sum of every child has arrived, otherwise in this cell's slot. If a
-    /// child that sent in the previous epoch is late, the time is as late as is still useful. Later changes
-    /// are sent in the next slot.
+    /// Schedules the sum: at once if the sums of all children have arrived, otherwise in this cell's slot. If a child
+    /// that sent in the previous epoch is late, the sum waits as long as it is still useful to the parent. Later
+    /// changes are sent in the next slot.
     fn schedule(&mut self, now: Micros) {
         let Some(slots) = self.slots else { return };
         if self.count() == 0 && !self.ends {
@@ -234,29 +234,29 @@ impl Sum {
         self.due = Some(self.begin.at + Span(at));
     }
 
-    /// Returns the number of wires to the root; the maximum while it is unreachable.
+    /// Returns the number of wires to the root; the maximum depth while the cell is unreachable.
     fn depth(&self) -> u8 {
         self.begin.depth.or_else(|| self.slots.map(|slots| slots.deepest)).unwrap_or(0)
     }
 
-    /// Returns the time after joints by which a sum that waits for a late child is sent: half a slot earlier
-    /// for each wire to the root, so that the sum still reaches the cells above that wait for it.
+    /// Returns the time after the joints at which the sum is sent even if a child is late. It is half a slot earlier
+    /// for each wire to the root, so that the sum still reaches the waiting cells above.
     fn late_send_time(&self) -> Span {
         let width = self.slots.map_or(0, |slots| u64::from(slots.slot_us));
         Span(self.settling_time().0.saturating_sub(u64::from(self.depth()) * width / 2))
     }
 
-    /// Returns true if a child's sum is expected in each epoch: its lease runs.
+    /// Returns true if the lease of a child runs, so that its sum is expected in each epoch.
     pub(crate) fn awaits_children(&self) -> bool {
         self.children.iter().any(|child| child.last.is_some())
     }
 
-    /// Returns the time by which the sum of the next epoch must be sent if a child is late.
+    /// Returns the time at which the sum of the next epoch is sent even if a child is late.
     pub(crate) fn late_at_next(&self) -> Micros {
         self.begin.at + self.begin.period + self.late_send_time()
     }
 
-    /// Handles the loss of a child at a port.
+    /// Ends the lease of the child at a port, which is not a child any more.
     pub(crate) fn disown(&mut self, port: usize) {
         if let Some(child) = self.children.get_mut(port) {
             // A sum of this epoch is kept, because its sender sends no other one for it.
@@ -266,19 +266,19 @@ impl Sum {
         }
     }
 
-    /// Handles the loss of the parent: sends no more sums in this epoch.
+    /// Handles the loss of the parent: no more sums are sent in this epoch.
     pub(crate) const fn stop_sending(&mut self) {
         self.begin.may_send = false;
         self.due = None;
     }
 
-    /// Returns the time of the next action.
+    /// Returns the time at which a sum or a check is due; `None` if neither is.
     pub(crate) fn poll_timeout(&self) -> Option<Micros> {
         self.due.filter(|_| !self.held).into_iter().chain(self.check).min()
     }
 
-    /// Returns the sum to send if it is due, cumulative over all contributions of this epoch. The last value
-    /// is true if a state message must precede it.
+    /// Returns the sum if it is due to be sent. It contains all contributions of this epoch so far. The last value is
+    /// true if a state message must be sent before it.
     pub fn poll_sum(&mut self, now: Micros) -> Option<(Epoch, SumWords, bool)> {
         let epoch = self.epoch.filter(|_| !self.held)?;
         self.due.take_if(|due| *due <= now)?;
@@ -296,13 +296,13 @@ impl Sum {
         Some((epoch, words, !goes_on))
     }
 
-    /// Returns the number of cells that have contributed in this epoch.
+    /// Returns the number of cells whose torques have arrived in this epoch.
     fn count(&self) -> u32 {
         let children = self.children.iter().filter_map(|child| child.taken);
         u32::from(self.own.is_some()) + children.map(|words| u32::from(words.count)).sum::<u32>()
     }
 
-    /// Returns the sum of all contributions of this epoch; `None` if there is nothing to send.
+    /// Returns the sum of all contributions of this epoch; `None` if no sum needs to be sent.
     fn words(&self) -> Option<SumWords> {
         let count = self.count();
         if count == 0 {
@@ -322,7 +322,7 @@ impl Sum {
         Some(SumWords { torque, count: u8::try_from(count).unwrap_or(u8::MAX) })
     }
 
-    /// Returns true if the last sum was sent in this epoch.
+    /// Returns true if the latest sum was sent in this epoch.
     pub(crate) fn was_sent_in(&self, epoch: Epoch) -> bool {
         self.last_sent.is_some_and(|(of, _)| of == epoch)
     }
@@ -333,7 +333,7 @@ impl Sum {
         self.last_sent.is_some_and(|(of, words)| recent(of) && !words.is_end())
     }
 
-    /// Handles joints that are not answered: all leases end, and the children must send their states again.
+    /// Handles joints that the cell does not answer: all leases end, and the children must repeat their state messages.
     pub(crate) fn skip_epoch(&mut self) {
         self.epoch = None;
         self.children = Default::default();
@@ -342,8 +342,8 @@ impl Sum {
         self.is_checked = true;
     }
 
-    /// Records that a frame was received `age` after it was on the bus. If that exceeds a quarter of a
-    /// period, the machine itself is slow, and missing sums are not checked in this epoch.
+    /// Records that a frame was handled `age` after it was on the bus. If that exceeds a quarter of a period, this
+    /// machine is slow, and missing sums are not checked in this epoch.
     pub(crate) const fn note_delay(&mut self, age: Span) {
         if age.0 * 4 > self.begin.period.0 && self.begin.period.0 > 0 {
             self.is_checked = true;
@@ -356,13 +356,13 @@ impl Sum {
         self.epoch.is_none() || now >= self.begin.at + self.settling_time()
     }
 
-    /// Returns the lateness of the check before the next joints, if it is due.
+    /// Returns the lateness of the check for missing sums; `None` if the check is not due.
     pub(crate) fn check(&mut self, now: Micros) -> Option<Span> {
         self.check.take_if(|check| *check <= now).map(|check| now.elapsed_since(check))
     }
 
-    /// Returns the children whose sums are missing, once per epoch: bit p is set for the child at port p. The
-    /// lease of such a child ends.
+    /// Returns the children whose sums of this epoch are missing, once per epoch: bit p is set for the child at port p.
+    /// The lease of such a child ends.
     pub(crate) fn check_missing(&mut self) -> Option<(Epoch, u8)> {
         if core::mem::replace(&mut self.is_checked, true) {
             return None;

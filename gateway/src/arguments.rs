@@ -11,7 +11,7 @@ use protocol::usage::Failure;
 
 use super::print::comma_separated;
 
-/// A possible value of an option: its word, its help unless the word is plain, and its value.
+/// A possible value of an option: its name, its help text (empty if the name says enough), and the value.
 pub(crate) type OptionValue<T> = (&'static str, &'static str, T);
 
 /// Frame formats of a packet.
@@ -64,17 +64,18 @@ pub(crate) struct BusKinds {
 }
 
 impl BusKinds {
-    /// Kinds of any buses.
+    /// Returns the kinds that the option names, for any buses.
     pub(crate) fn of_any(&self) -> Result<KindChoices, Failure> {
         self.kinds_or(KindChoice::Auto)
     }
 
-    /// Kinds of any buses; `otherwise` is the kind of buses that the option does not name.
+    /// Returns the kinds that the option names, for any buses. `otherwise` is the kind of the buses that it does not
+    /// name.
     pub(crate) fn kinds_or(&self, otherwise: KindChoice) -> Result<KindChoices, Failure> {
         KindChoices::from_options(&self.bus_kind, otherwise).map_err(Failure::usage)
     }
 
-    /// Kinds of these buses. Fails if the option names another bus.
+    /// Returns the kinds of these buses, or an error if the option names another bus.
     pub(crate) fn kinds_of<'a>(&self, buses: impl IntoIterator<Item = &'a str>) -> Result<KindChoices, Failure> {
         self.of_any()?.restrict_to(buses).map_err(Failure::usage)
     }
@@ -90,7 +91,7 @@ pub(crate) fn of_environment(name: &str, allowed: RangeInclusive<u32>) -> Result
     })
 }
 
-/// Number of cells per process from the environment, for the few users who need it.
+/// Reads the number of cells per process from the environment, for the few users who need it.
 pub(crate) fn cells_per_process() -> Result<usize, Failure> {
     Ok(of_environment("SKINBUS_CELLS_PER_PROCESS", 1..=254)?.unwrap_or(1) as usize)
 }
@@ -103,12 +104,12 @@ pub(crate) struct Processes {
     pub(crate) cells_per_process: u8,
 }
 
-/// Names of a skin's buses.
+/// Returns the names of a skin's buses.
 pub(crate) fn bus_names(skin: &Skin) -> impl Iterator<Item = &str> {
     skin.buses.iter().map(|bus| bus.name.as_str())
 }
 
-/// Finds a bus by name in the skin that `file` describes. Returns its index.
+/// Returns the index of the bus with this name in the skin that `file` describes.
 pub(crate) fn bus_of(skin: &Skin, file: &str, name: &str) -> Result<usize, Failure> {
     skin.bus_named(name).ok_or_else(|| {
         let names = comma_separated(bus_names(skin));
@@ -116,7 +117,8 @@ pub(crate) fn bus_of(skin: &Skin, file: &str, name: &str) -> Result<usize, Failu
     })
 }
 
-/// Finds the only cell of a name. Returns its index into [`Skin::cells`]; `option` names the option in errors.
+/// Returns the index into [`Skin::cells`] of the cell with this name, if there is exactly one. `option` names the
+/// option in errors.
 pub(crate) fn cell_of(skin: &Skin, name: &CellName, option: &str) -> Result<usize, Failure> {
     let CellName { bus, node } = name;
     let names = || comma_separated(bus_names(skin));

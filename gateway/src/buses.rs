@@ -1,4 +1,4 @@
-//! Private directory for embedded buses.
+//! Private directory for the sockets of embedded buses.
 
 use std::fs::{File, Permissions};
 use std::os::unix::fs::PermissionsExt;
@@ -8,8 +8,8 @@ use protocol::bus::embedded::mark;
 use protocol::usage::Failure;
 use tempfile::{Builder, TempDir};
 
-/// Creates `skinbus-WHAT-` plus some letters in the directory for temporary files. Dropping it removes it with its
-/// content.
+/// Creates a directory `skinbus-WHAT-` plus some letters in the directory for temporary files. Dropping the returned
+/// value removes the directory with its content.
 pub(super) fn directory(what: &str) -> Result<TempDir, Failure> {
     // The path of a socket has at most 107 bytes, and a directory for temporary files may be longer.
     let fits = |folder: &PathBuf| folder.as_os_str().len() <= 50;
@@ -18,7 +18,7 @@ pub(super) fn directory(what: &str) -> Result<TempDir, Failure> {
     let made = Builder::new().prefix(&format!("skinbus-{what}-")).permissions(mine).tempdir_in(folder);
     let failed = |error| Failure::run(format!("{error}; set SKINBUS_DIR to a directory of your own"));
     let made = made.map_err(failed)?;
-    // If this program is killed, the last server removes the directory.
+    // If this program is killed, the last bus server removes the directory.
     let marked = File::open(made.path()).and_then(|directory| Ok(mark(directory)?));
     marked.map_err(failed)?;
     Ok(made)

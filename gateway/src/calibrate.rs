@@ -216,7 +216,7 @@ impl Calibrate {
         read(&[path], skin, settings)
     }
 
-    /// Options of a run in which each cell sends all accelerations.
+    /// Returns the options of a run in which each cell sends all its accelerations.
     fn options(
         &self,
         skin: &Skin,
@@ -303,7 +303,7 @@ fn read(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibrati
     calibrate(skin, &seen, settings).map_err(|refusal| Failure::run(format_args!("{name}: {refusal}")))
 }
 
-/// Text report of the result.
+/// Returns the result as text.
 fn report(skin: &Skin, calibration: &Calibration) -> String {
     let summary = &calibration.summary;
     let mut lines = vec![format!(

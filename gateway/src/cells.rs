@@ -105,7 +105,7 @@ impl Cells {
         print_text(&show(&watch)?)
     }
 
-    /// Finds this bus in the skin.
+    /// Returns this bus as the skin of `--skin` describes it, if there is one.
     fn known(&self) -> Result<Option<DescribedBus>, Failure> {
         let Some(path) = &self.skin else { return Ok(None) };
         let skin = Skin::read(path).map_err(Failure::usage)?;

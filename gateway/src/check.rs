@@ -41,7 +41,7 @@ pub(crate) struct Check {
     json: bool,
 }
 
-/// Content of a file.
+/// Content of a checked file: a skin, or the text of a scenario.
 enum Described {
     Skin(Box<Skin>),
     /// Text of the file, kept until its skin is known.

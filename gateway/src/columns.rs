@@ -5,7 +5,7 @@ use protocol::usage::Failure;
 
 use super::print::{count, comma_separated};
 
-/// Maximum number of characters of a first line that an error repeats.
+/// Maximum number of characters of a first line that an error quotes.
 const REPEATED: usize = 60;
 
 /// Columns of a file, in any order.
@@ -16,7 +16,7 @@ pub(crate) struct Columns {
 }
 
 impl Columns {
-    /// Returns true for a valid header: each needed column once, and no unknown column.
+    /// Returns true for a valid header, which has each needed column once and no unknown column.
     fn are(self, names: &StringRecord) -> bool {
         let is_known = |name: &str| self.needed.contains(&name) || self.optional.contains(&name);
         let once = |name: &str| names.iter().filter(|other| *other == name).count() == 1;
@@ -24,7 +24,7 @@ impl Columns {
     }
 }
 
-/// A file of rows. Empty lines and lines that begin with `#` are skipped.
+/// A CSV file that is read row by row. Empty lines and lines that begin with `#` are skipped.
 pub(crate) struct Table<'a> {
     file: String,
     names: StringRecord,
@@ -79,7 +79,7 @@ impl<'a> Table<'a> {
         if values.len() != self.names.len() {
             let (got, names) = (count(values.len(), "value"), comma_separated(&self.names));
             return Err(Failure::usage(format!(
-                "{file}: line {line}: {got}: one is needed for each of the columns {names}"
+                "{file}: line {line} has {got}: one is needed for each of the columns {names}"
             )));
         }
         Ok(Some(Row { file, names: &self.names, values, line }))
@@ -87,19 +87,19 @@ impl<'a> Table<'a> {
 }
 
 impl Row<'_> {
-    /// Text of a column; empty if the file does not have the column.
+    /// Returns the text in a column, or an empty text if the file does not have the column.
     pub(crate) fn text(&self, column: &str) -> &str {
         let place = self.names.iter().position(|name| name == column);
         place.and_then(|place| self.values.get(place)).unwrap_or_default()
     }
 
-    /// Number in a column.
+    /// Returns the number in a column.
     pub(crate) fn number(&self, column: &str) -> Result<f64, Failure> {
         let number = self.text(column).parse().ok().filter(|number: &f64| number.is_finite());
         number.ok_or_else(|| self.wrong(column, "a finite number is needed"))
     }
 
-    /// Error for a value.
+    /// Returns the error for a wrong value in a column; `needed` names the allowed values.
     pub(crate) fn wrong(&self, column: &str, needed: &str) -> Failure {
         let (file, line, value) = (self.file, self.line, self.text(column));
         Failure::usage(format!("{file}: line {line}: {column} = {value:?}: {needed}"))
@@ -114,7 +114,7 @@ struct Lines<'a> {
 }
 
 impl Lines<'_> {
-    /// Line number of the row at this byte, or after the empty lines and comments there.
+    /// Returns the line number of the row that begins at this byte, or after the empty lines and comments there.
     fn of(&mut self, byte: usize) -> usize {
         self.line += self.text.get(self.at..byte).unwrap_or_default().matches('\n').count();
         self.at = byte;
@@ -167,7 +167,7 @@ mod tests {
     fn values_are_named_with_their_line() {
         let mut table = Table::new("t.csv", "a,b\n1\n# x\n2,inf\n", COLUMNS).unwrap();
         let short = table.row().err().unwrap().to_string();
-        assert_eq!(short, "t.csv: line 2: 1 value: one is needed for each of the columns a, b");
+        assert_eq!(short, "t.csv: line 2 has 1 value: one is needed for each of the columns a, b");
         let row = table.row().unwrap().unwrap();
         let infinite = row.number("b").unwrap_err().to_string();
         assert_eq!(infinite, "t.csv: line 4: b = \"inf\": a finite number is needed");

@@ -70,13 +70,13 @@ impl Commission {
             None => (0..skin.buses.len()).collect(),
         };
         apart([("--node-ids", self.node_ids.as_deref())], [self.skin.as_path()])?;
-        // Opened before cells are written, so that an error of the file is reported first.
+        // Open the file before cells are written, so that an error of the file is reported first.
         let begun =
             self.node_ids.as_ref().map(|path| self.overwrite.create("--node-ids", path)).transpose()?;
         let wish = CommissionOptions { dry_run: self.dry_run, verify: self.verify };
         let stopped = input::stopped()?;
         let kinds = self.kinds.kinds_of(bus_names(&skin))?;
-        // All buses are opened before anything is sent.
+        // Open all buses before anything is sent.
         let benches = target.into_iter().map(|bus| open(&skin, bus, &kinds)).collect::<Result<Vec<_>, _>>();
         let benches = benches.map_err(Failure::usage)?;
         let began = Instant::now();
@@ -110,7 +110,7 @@ impl Commission {
     }
 }
 
-/// Progress of all buses in one line.
+/// Formats the progress of all buses in one line.
 fn how_far(all: &[Progress]) -> String {
     let sum = |part: fn(&Progress) -> usize| all.iter().map(part).sum::<usize>();
     let [cells, found] = [sum(|it| it.cells), sum(|it| it.found)];
@@ -121,7 +121,7 @@ fn how_far(all: &[Progress]) -> String {
     format!("{doing}: {found} of {cells} cells found, {done} done{failed}")
 }
 
-/// Returns an error with the reason if no cell was reached.
+/// Returns an error with the reason if no cell could be reached on any bus.
 fn check_begun(file: &str, done: &[CommissionedBus], interrupted: bool) -> Result<(), Failure> {
     let begun = done.iter().any(|done| {
         let is_well = |outcome| !matches!(outcome, Outcome::Failed(_));

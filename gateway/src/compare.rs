@@ -81,7 +81,7 @@ pub(crate) struct Compare {
     overwrite: Overwrite,
 }
 
-/// The printed result.
+/// Result of the comparison with its inputs, as JSON.
 #[derive(Serialize)]
 struct CompareOutput<'a> {
     a: &'a str,
@@ -94,7 +94,7 @@ struct CompareOutput<'a> {
     report: &'a Report,
 }
 
-/// One capture while it is read.
+/// A capture that is being read.
 struct Input {
     files: Vec<PathBuf>,
     name: String,
@@ -102,7 +102,7 @@ struct Input {
     decoder: Decoder,
     missing: input::LossCounts,
     has_frames: bool,
-    /// Error that ended it.
+    /// Error that ended the reading of the capture early, if any.
     damage: Option<Failure>,
 }
 
@@ -231,7 +231,7 @@ impl Compare {
         let named = self.skin.as_deref().map(input::read_skin).transpose()?;
         let (mut skin, mut name) = (named, self.skin.clone());
         for (path, files) in [(&self.a, &files.a), (&self.b, &files.b)] {
-            // A log has no skin; that of standard input is compared at the end.
+            // A log has no skin attached. Standard input can be read only once, so its skin is compared at the end.
             if !can_be_read_again(path)
                 || Reader::open_all(files).map_err(Failure::usage)?.format() == CaptureFormat::Candump
             {
@@ -249,7 +249,7 @@ impl Compare {
         if let Some(skin) = skin {
             return Ok(skin);
         }
-        // A capture without frames would be refused with a skin too.
+        // Report a capture without frames first, because naming a skin would not help.
         for (path, files) in [(&self.a, &files.a), (&self.b, &files.b)] {
             if can_be_read_again(path) {
                 needs_frames(files)?;
@@ -293,7 +293,7 @@ impl Compare {
     }
 }
 
-/// Refuses two different skins.
+/// Returns an error if the two captures are of different skins.
 fn same_skin(
     (one, skin): (impl AsRef<Path>, &Skin),
     (other, own): (impl AsRef<Path>, &Skin),

@@ -64,7 +64,7 @@ impl Man {
     }
 }
 
-/// Adds the page of a command and those of its subcommands: `skinbus-skin-import.1`.
+/// Adds the man page of a command and those of its subcommands: `skinbus-skin-import.1`.
 fn pages_of(command: &Command, pages: &mut Vec<(String, String)>) -> Result<(), Failure> {
     let mut page = Vec::new();
     clap_mangen::Man::new(command.clone()).render(&mut page).map_err(Failure::run)?;

@@ -22,7 +22,7 @@ use super::arguments::{BusKinds, FORMATS, one_of};
 use super::output::{Overwrite, print_beside};
 use super::{input, output};
 
-/// Maximum duration of a test, besides listening and restoring.
+/// Maximum duration of a test, without the time to listen at the start and to restore the cell at the end.
 const MAX_TEST_DURATION: Span = Span::from_millis(80_000);
 
 /// Test one cell of any make against the requirements of the documents
@@ -125,7 +125,7 @@ impl Conformance {
             session.findings.list(&only, stopped.as_ref()),
             stopped.as_ref(),
         );
-        // An error of one output does not keep the others from being written.
+        // If one output fails, the others are written nevertheless.
         let shown = super::print::json(&whole).and_then(|json| {
             let shown = if self.json { json } else { whole.text() };
             print_beside([self.junit.as_deref()], &shown)

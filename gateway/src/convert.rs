@@ -63,7 +63,8 @@ pub(crate) struct Convert {
     /// Digits of a second in a log [default: as many as IN has]
     #[arg(long, value_parser = one_of(DIGITS), value_name = "N")]
     digits: Option<Digits>,
-    /// Write T or R behind frames in a log, which Wireshark cannot read; logs that have them keep them
+    /// Write the direction, T or R, behind each frame of a log, which Wireshark cannot read. Without this option, only
+    /// a log that has directions keeps them
     #[arg(long, conflicts_with = "plain")]
     direction: bool,
     /// Write only what every tool reads: frames with 6 digits, without direction, raw DLC and comments
@@ -74,7 +75,7 @@ pub(crate) struct Convert {
     skin: Option<PathBuf>,
 }
 
-/// Hint for a refused capture that is truncated.
+/// Hint in the error for a capture that is truncated and was refused because of `--strict`.
 const WITHOUT_STRICT: &str = "without --strict the intact part would be written";
 
 const DIGITS: &[OptionValue<Digits>] = &[("6", "", Digits::Six), ("9", "", Digits::Nine)];
@@ -178,7 +179,7 @@ impl Convert {
         Ok(())
     }
 
-    /// Checks that files have a frame before their other lines are written to standard output.
+    /// Checks that the captures contain a frame, before any of their other lines is written to standard output.
     fn check_frames(&self) -> Result<(), Failure> {
         if !self.from.iter().all(|file| can_be_read_again(file)) {
             return Ok(());
@@ -201,13 +202,13 @@ impl Convert {
                     unreadable.iter().for_each(note);
                     return Err(no_frame(&reader));
                 }
-                // An error is reported when the file is read again.
+                // The error is reported when the file is read again.
                 Ok(_) | Err(_) => return Ok(()),
             }
         }
     }
 
-    /// Returns true for a new or regular file, false for a FIFO or a device, which is written to directly.
+    /// Returns true if OUT is new or a regular file, false if it is a FIFO or a device, which is written to directly.
     fn is_new(&self) -> bool {
         !is_standard_output(&self.to) && fs::metadata(&self.to).map_or(true, |there| there.is_file())
     }
@@ -255,7 +256,7 @@ impl Convert {
         Ok(())
     }
 
-    /// Opens the capture. Returns it with its progress bar, and true if it is a live pipe.
+    /// Opens the capture. Returns it with its progress bar, and true if it comes from a live pipe.
     fn open(&self) -> Result<(Reader, ProgressBar, bool), Failure> {
         let size = size(&self.from);
         let bar = bar(size);
@@ -264,7 +265,7 @@ impl Convert {
         Ok((reader, bar, size.is_none()))
     }
 
-    /// Opens the output; standard output is written to directly.
+    /// Opens the output. Standard output is written to directly.
     fn create(
         &self,
         stopped: &AtomicBool,
@@ -279,7 +280,7 @@ impl Convert {
         Ok((whole, BufWriter::with_capacity(WRITE_BYTES, InterruptibleWriter::new(file))))
     }
 
-    /// Format of OUT, by its name.
+    /// Returns the format of OUT, according to its name.
     fn format(&self) -> Result<CaptureFormat, Failure> {
         if is_standard_output(&self.to) && io::stdout().is_terminal() {
             let why = "standard output is a terminal, and a log may have anything in it";
@@ -301,14 +302,14 @@ impl Convert {
     }
 }
 
-/// Size of the input in bytes, if known.
+/// Returns the total size of the inputs in bytes, if known.
 fn size(from: &[PathBuf]) -> Option<u64> {
     let of = |path: &PathBuf| fs::metadata(path).ok().filter(fs::Metadata::is_file).map(|about| about.len());
     from.iter().map(of).sum()
 }
 
-/// Returns an error of the output with the state of the file. A closed pipe is no error: its reader may have ended, as
-/// `head` does.
+/// Returns the failure for an error of the output; `left` gives the state of the file. A closed pipe is not an error,
+/// because its reader may have read enough, as `head` does.
 fn written(to: &Path, left: &str, error: io::Error) -> Result<(), Failure> {
     if is_standard_output(to) {
         return protocol::usage::ignore_broken_pipe(Err(error));
@@ -316,14 +317,14 @@ fn written(to: &Path, left: &str, error: io::Error) -> Result<(), Failure> {
     Err(Failure::run(format!("{}: {error}; {left}", to.display())))
 }
 
-/// Destination of entries: a file that appears when it is complete, or one that grows.
+/// Destination of the converted entries: a file that appears when it is complete, or one that grows.
 enum Sink {
     Whole(Option<WholeFile>, CaptureWriter<BufWriter<InterruptibleWriter<File>>>),
     Live(GrowingCapture),
 }
 
 impl Sink {
-    /// Names the file that holds the frames after an error.
+    /// Returns text that names the file which holds the frames after an error.
     fn left(&self) -> String {
         match self {
             Self::Whole(..) => "no file was kept".to_owned(),
@@ -331,7 +332,7 @@ impl Sink {
         }
     }
 
-    /// Closes the output unfinished; entries written so far are kept.
+    /// Closes the unfinished output. The file keeps the entries written so far.
     fn close(self, why: Failure) -> Failure {
         match self {
             Self::Whole(..) => why,
@@ -343,7 +344,7 @@ impl Sink {
         }
     }
 
-    /// Removes the output.
+    /// Closes the output and removes its file.
     fn discard(self, why: Failure) -> Failure {
         if let Self::Live(live) = self {
             live.discard();
@@ -351,7 +352,7 @@ impl Sink {
         why
     }
 
-    /// Finishes the output; an error comes with the state of the file.
+    /// Finishes the output. An error comes with text on the state of the file.
     fn finish(self) -> Result<(), (String, io::Error)> {
         let left = self.left();
         let finished = match self {
@@ -380,7 +381,7 @@ impl EntrySink for Sink {
     }
 }
 
-/// Progress in bytes of the input, on a terminal.
+/// Creates a progress bar in bytes of the input, which only terminals show.
 fn bar(size: Option<u64>) -> ProgressBar {
     let Some(size) = size.filter(|_| io::stderr().is_terminal()) else { return ProgressBar::hidden() };
     let bar = ProgressBar::with_draw_target(Some(size), ProgressDrawTarget::stderr());
@@ -388,7 +389,7 @@ fn bar(size: Option<u64>) -> ProgressBar {
     bar.with_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
-/// Notes on a conversion, one per line.
+/// Returns the notes on a conversion, one per line.
 fn remarks(reader: &Reader, done: &ConversionCounts, style: &Style, text: bool) -> Vec<String> {
     let mut lines = reader.remarks();
     let how = if style.plain { "" } else { ", which not every tool reads; --direction writes it" };

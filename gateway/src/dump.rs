@@ -175,7 +175,7 @@ impl Dump {
             }
             (input::format(&reader), Some(reader.extras().clone()), done)
         } else {
-            // Catch signals before reporting that the dump listens.
+            // Signals must be caught before the dump reports that it listens.
             let stopped = stopped()?;
             let kinds = self.kinds.of_any()?;
             let until = self.wait.then_some(&*stopped);
@@ -187,7 +187,7 @@ impl Dump {
         let report = show.report();
         drop(show);
         if let Some(report) = report {
-            // The counts are shown however the dump ended.
+            // Show the counts even if the dump ended with an error.
             print_text(&match self.json {
                 true => as_json(&title, what, &report, extras.as_ref())?,
                 false => table::text(&title, what, &report, extras.as_ref()),
@@ -214,7 +214,7 @@ impl Dump {
     }
 }
 
-/// Statistics as JSON.
+/// Returns the statistics as JSON.
 fn as_json(source: &str, format: &str, report: &Report, extras: Option<&RecordingExtras>) -> Result<String, Failure> {
     #[derive(Serialize)]
     struct Whole<'a> {
@@ -231,7 +231,7 @@ fn as_json(source: &str, format: &str, report: &Report, extras: Option<&Recordin
     json(&whole)
 }
 
-/// Shows a capture.
+/// Shows the frames of a capture.
 fn captured(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Result<(), Failure> {
     let name = reader.name().to_owned();
     let (mut frames, mut missing) = (0_u64, LossCounts::default());
@@ -272,7 +272,7 @@ fn captured(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Result<(
     if !reader.has_times() {
         show.without_times();
     }
-    // The missing frames have been reported at their places.
+    // Missing frames have been reported at their places, so they are not reported again at the end.
     missing.frames = 0;
     missing.report(reader, "not shown");
     if frames == 0 && !stop::stop_flag().load(Ordering::Relaxed) {
@@ -281,7 +281,7 @@ fn captured(reader: &mut Reader, show: &mut FrameOutput<impl Write>) -> Result<(
     Ok(())
 }
 
-/// Interval between checks of waiting first segments for their timeout.
+/// Interval between checks whether frames that wait for the rest of their packet have timed out.
 const SETTLE_INTERVAL: Duration = Duration::from_millis(20);
 
 /// Shows buses until a signal, or until one is closed.
@@ -297,12 +297,12 @@ fn live(
             break Ok(());
         }
         match received(receive_ends, show) {
-            // Frames lost until then are reported all the same.
+            // Report the frames that were lost until then before returning the error.
             Err(failure) => break Err(failure),
-            // A reader that has read enough ends the dump without an error.
+            // If the reader of the output has read enough, end the dump without an error.
             Ok(Err(error)) => break ignore_broken_pipe(Err(error)),
             Ok(Ok(true)) => {
-                // The end also comes if no further frames arrive.
+                // The time of `--to` must also come if no further frames arrive.
                 end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
             }
             Ok(Ok(false)) => {}
@@ -320,13 +320,13 @@ fn live(
     done
 }
 
-/// Waits for frames and shows them. Returns true if there were any, or the error of the output.
+/// Waits for frames and shows them. Returns true if any arrived, or the error of the output.
 fn received(
     receive_ends: &mut [ReceiveEnd],
     show: &mut FrameOutput<impl Write>,
 ) -> Result<io::Result<bool>, Failure> {
     let wait = if show.is_waiting() { SETTLE_INTERVAL } else { POLL_TIMEOUT };
-    // A single bus is waited for where it is received from: one system call instead of two.
+    // With a single bus, the receiving call waits too, which takes one system call instead of two.
     let is_alone = receive_ends.len() == 1;
     if !is_alone {
         input::wait(receive_ends, wait)?;

@@ -61,7 +61,7 @@ pub(crate) struct Experiment {
     quiet: bool,
 }
 
-/// An argument: an experiment or a keyword.
+/// An argument of the command: an experiment, or one of the keywords.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum ExperimentArgument {
     All,
@@ -94,11 +94,11 @@ impl Experiment {
         };
         let named: Vec<Named> = Named::ALL.into_iter().filter(target).collect();
         let stop = stopped()?;
-        // Created before any measurement, so that an error of the directory is reported first.
+        // Create the directory before any measurement, so that an error of the directory is reported first.
         let folder = Folder::create(output, self.overwrite)?;
         let page = self.perform(&named, &folder, stop)?;
         keep(&page, &folder)?;
-        // The measured data stays if it cannot be drawn.
+        // Keep the measured data even if it cannot be drawn.
         draw(&page, folder).map_err(|failure| {
             failure.and(format_args!(
                 "{} has the results, the data of the figures and the recordings",
@@ -127,7 +127,7 @@ impl Experiment {
 
     fn page(&self, sections: Vec<Section>, idle: Option<String>) -> Page {
         let words = std::env::args_os().enumerate().map(|(place, word)| {
-            // Without the directory of the program.
+            // Leave out the directory of the program.
             let name = Path::new(&word).file_name().filter(|_| place == 0);
             shell_quoted_os(name.unwrap_or(&word))
         });
@@ -154,11 +154,11 @@ impl Experiment {
     }
 }
 
-/// The laboratory on this machine.
+/// Runs the measurements of experiments on this machine.
 struct Here {
     benches: Benches,
     stop: Arc<AtomicBool>,
-    /// Wake-up lateness of the idle machine before a bench.
+    /// Wake-up lateness of the idle machine before a bench, as text.
     idle: Option<String>,
 }
 
@@ -171,7 +171,7 @@ impl Lab for Here {
 
     fn bench(&mut self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
         let run = self.benches.run(reply, effort);
-        // A bench that the same signal has ended did not fail.
+        // If a signal has ended the bench, return that it was interrupted, not that it failed.
         self.go_on()?;
         let run = run?;
         let late = |key: &str| run.figure(&["loop", "idle_late_us", key]);
@@ -195,7 +195,7 @@ impl Lab for Here {
     }
 }
 
-/// Processor and kernel in one line.
+/// Returns the names of the processor and the kernel in one line.
 fn machine() -> String {
     let about = facts::machine(&Quantiles::default());
     let fact = |key: &str| about.get(key).cloned().unwrap_or_default();
@@ -225,7 +225,7 @@ fn keep(page: &Page, folder: &Folder) -> Result<(), Failure> {
     folder.publish()
 }
 
-/// Writes the page and the figures.
+/// Writes the HTML page and the figures.
 fn draw(page: &Page, folder: Folder) -> Result<(), Failure> {
     folder.write("report.html", &page::html(page))?;
     for figure in page.sections.iter().flat_map(|section| &section.figures) {

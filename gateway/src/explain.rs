@@ -71,7 +71,7 @@ pub(crate) struct Explain {
     json: bool,
 }
 
-/// The printed JSON object.
+/// An explanation with its source, as JSON.
 #[derive(Serialize)]
 struct ExplainOutput<'a> {
     source: String,
@@ -88,7 +88,7 @@ impl Explain {
         if let Some(bus) = self.files.iter().find(|file| !is_file(file) && !is_path(file)) {
             let bus = bus.display();
             return Err(Failure::usage(format!(
-                "there is no file {bus}; of a live bus record one first: `skinbus dump {bus} | cut -f1 > run.log`"
+                "there is no file {bus}; to explain a live bus, record it first: `skinbus dump {bus} | cut -f1 > run.log`"
             )));
         }
         let skin = match &self.skin {
@@ -115,7 +115,7 @@ impl Explain {
             return Err(no_frame(&reader));
         }
         let moments = found.moments.map_err(|error| Failure::run(format!("{name}: {error}")))?;
-        // If a different skin caused an error, that error has been reported.
+        // An error above, which may be due to a different skin, is returned without this note.
         if let Some(path) = &self.skin {
             remark_another(&self.files, path, &skin);
         }

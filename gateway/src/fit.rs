@@ -23,9 +23,9 @@ use super::print::comma_separated;
 /// frames that bit stuffing allows, all cells answering, and no errors. Heartbeats count; commands and bench-only
 /// frames do not. Default bit rates: those of the skin if it has them for all buses, else a table over common ones.
 ///
-/// For a capture (a candump log or an MCAP recording, of any CAN bus), or for live buses until Ctrl-C, computes the
-/// outcome for each frame on a bus with bit rates: exact stuff bits, arbitration by identifier, no frame interrupted. A
-/// frame's time stamp counts as the time of the request to send it. Leaves out bench-only frames, reports start-up
+/// For a capture (a candump log or an MCAP recording, of any CAN bus), or for live buses until Ctrl-C, computes when
+/// each frame would be sent on a bus with bit rates: exact stuff bits, arbitration by identifier, no frame interrupted.
+/// A frame's time stamp counts as the time of the request to send it. Leaves out bench-only frames, reports start-up
 /// separately, and adds the worst case when the skin is known. docs/how-to/size-a-bus.md explains both.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -109,7 +109,7 @@ impl Fit {
         self.of_skin(&skin)
     }
 
-    /// File of the skin, if the sources name one.
+    /// Returns the path of the skin's file, if the sources name one.
     fn skin_file(&self) -> Result<Option<&Path>, Failure> {
         let [source] = self.sources.as_slice() else { return Ok(None) };
         let is_text = source.extension().is_some_and(|end| end == "toml");
@@ -132,8 +132,8 @@ impl Fit {
     }
 }
 
-/// Returns true for a capture. Files that cannot be identified, and those that can be read only once, count as
-/// captures.
+/// Returns true if the file is a capture. A file that cannot be identified, or that can be read only once, counts as a
+/// capture.
 fn is_capture(file: &Path) -> bool {
     if !can_be_read_again(file) {
         return true;
@@ -151,7 +151,7 @@ fn rates_of_bus(text: &str) -> Result<(String, BitRates), String> {
     Ok((bus.to_owned(), rates))
 }
 
-/// Parses µs with up to three decimals, and returns ns.
+/// Parses a time in µs with up to three decimals, and returns it in ns.
 fn computation(text: &str) -> Result<u64, String> {
     let allowed = "0 to 65000 µs";
     let us: f64 = text.parse().map_err(|_| format!("not a number; allowed is {allowed}"))?;

@@ -1,7 +1,7 @@
-//! Former names of commands and options: refused with a line that gives the present name. They appear in no help,
-//! completion or man page.
+//! Former names of commands and options. They are refused with a line that gives the present name, and appear in no
+//! help, completion or man page.
 
-/// The line for a former command; `words` are the command line.
+/// Returns the line that gives the present name of a former command. `words` are the words of the command line.
 pub(crate) fn command(words: &[String], name: &str) -> Option<String> {
     let first = words.first().map(String::as_str).unwrap_or_default();
     let now = match (first, name) {
@@ -20,7 +20,7 @@ pub(crate) fn command(words: &[String], name: &str) -> Option<String> {
     Some(format!("there is no command {old}; use {now}"))
 }
 
-/// The line for a former option; `words` are the command line.
+/// Returns the line that gives the present name of a former option. `words` are the words of the command line.
 pub(crate) fn option(words: &[String], option: &str) -> Option<String> {
     let name = option.split([' ', '=']).next().unwrap_or_default();
     let command = words.first().map(String::as_str).unwrap_or_default();

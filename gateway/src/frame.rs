@@ -27,7 +27,7 @@ use super::print::comma_separated;
 use addressee::only_cell;
 use packets::PacketCommand;
 
-/// Time within which present cells send a heartbeat, and answers.
+/// Time within which present cells send a heartbeat and their answers.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Print a frame for cansend, with the right CRC; or send it
@@ -65,7 +65,7 @@ impl Frame {
         if targets.is_empty() {
             return print_text(&text(&message, self.format.unwrap_or(Format::Fd)));
         }
-        // All buses are opened before anything is sent.
+        // Open all buses before anything is sent.
         let open = |(name, format): &(String, Format)| {
             self.open(name, kinds.kind_of(name), *format).map_err(Failure::usage)
         };
@@ -77,7 +77,8 @@ impl Frame {
         failures.next().map_or(Ok(()), |first| Err(failures.fold(first, Failure::and)))
     }
 
-    /// Buses on which the frame is sent, with their formats, and their kinds; without buses it is printed.
+    /// Returns the buses on which the frame is sent, with their formats, and the kinds of the buses. Without buses, the
+    /// frame is printed.
     fn targets(&self) -> Result<(Vec<(String, Format)>, KindChoices), Failure> {
         let format = |of_skin: Format| self.format.unwrap_or(of_skin);
         let to = self.what.to();
@@ -87,7 +88,7 @@ impl Frame {
                 let skin = Skin::read(path).map_err(Failure::usage)?;
                 let file = path.display().to_string();
                 self.bus.iter().chain(of_cell).try_for_each(|name| bus_of(&skin, &file, name).map(drop))?;
-                // A node id on several buses belongs to several cells.
+                // A node id on several buses names several cells.
                 let only = match to.filter(|_| self.bus.is_empty() && of_cell.is_none()).and_then(only_cell) {
                     Some(node) => {
                         let index = cell_of(&skin, &CellName { bus: None, node }, "--cell")?;
@@ -121,7 +122,7 @@ impl Frame {
     /// Opens a bus for sending, and for receiving if answers are awaited.
     fn open(&self, name: &str, kind: KindChoice, format: Format) -> Result<Bus, BusError> {
         match self.what.to() {
-            // A send-only socket cannot tell whether a cell is present.
+            // A socket that only sends cannot show whether a cell is present.
             Some(_) => switching::open(name, kind, format),
             None => {
                 let nothing = BusOptions { filters: Vec::new(), ..BusOptions::default() };
@@ -150,7 +151,7 @@ impl Frame {
     }
 }
 
-/// Waits for answers. Only the time limit ends the wait for all cells, whose number is unknown.
+/// Waits for answers. A request to all cells waits for the whole time limit, because the number of cells is unknown.
 fn wait(mut listener: Listener, only: Option<CellId>, tag: Option<u8>) -> Result<Answers, BusError> {
     let mut answers = Answers::new(only, tag);
     let are_complete = |answers: &Answers| match (only, tag) {
@@ -195,13 +196,13 @@ fn verdict(
         )));
     }
     if tag.is_some() && lines.is_empty() {
-        let why = format!("{who} is on {bus} and did not answer for {waited} s: ask again");
+        let why = format!("{who} is on {bus} and did not answer for {waited} s: send it again");
         return Err(Failure::run(why));
     }
     Ok(())
 }
 
-/// Lines for cansend.
+/// Returns the lines for cansend.
 fn text(message: &Message, format: Format) -> String {
     let mut text = String::new();
     for frame in message.encode().frames(format) {

@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use clap::Command;
 
-/// The groups with their commands in order.
+/// The groups of commands, each with its commands in the order of the help.
 const GROUPS: [(&str, &[&str]); 7] = [
     ("Run", &["demo", "run", "view"]),
     ("Look", &["dump", "explain", "report", "cells", "compare"]),
@@ -15,7 +15,7 @@ const GROUPS: [(&str, &[&str]); 7] = [
     ("Shell", &["completions", "man"]),
 ];
 
-/// End of the help.
+/// Text at the end of the help.
 const AFTER: &str =
     "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
 `skinbus COMMAND -h` lists the options of a command, `--help` explains them.
@@ -45,14 +45,14 @@ fn list(program: &Command) -> String {
     text
 }
 
-/// Error for an unknown command: suggests a similar name, or lists all.
+/// Returns the error for an unknown command, which suggests a similar name or lists all commands.
 pub(crate) fn unknown(program: &Command, name: &str) -> String {
     let names: Vec<_> = program.get_subcommands().map(Command::get_name).collect();
     let likely = names.iter().map(|it| (strsim::jaro_winkler(name, it), it));
     let best = likely.max_by(|one, other| one.0.total_cmp(&other.0)).filter(|(likeness, _)| *likeness > 0.75);
     match best {
         Some((_, best)) => format!("there is no command {name}; did you mean {best}?"),
-        None => format!("there is no command {name}; there are {}", crate::print::comma_separated(names)),
+        None => format!("there is no command {name}; the commands are {}", crate::print::comma_separated(names)),
     }
 }
 
@@ -70,13 +70,13 @@ mod tests {
         program
     }
 
-    /// Collects a command and its subcommands.
+    /// Collects a command and all its subcommands.
     fn all<'a>(command: &'a Command, found: &mut Vec<&'a Command>) {
         found.push(command);
         command.get_subcommands().for_each(|it| all(it, found));
     }
 
-    /// Visible options of a command, without help and version.
+    /// Returns the visible options of a command, except help and version.
     fn options(command: &Command) -> impl Iterator<Item = &Arg> {
         let is_own = |arg: &&Arg| !matches!(arg.get_id().as_str(), "help" | "version");
         command.get_arguments().filter(is_own).filter(|arg| !arg.is_hide_set() && !arg.is_positional())
@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn there_are_at_most_210_options() {
-        // The program is not built: global options count once, where they are defined.
+        // The command is not built yet, so global options count once, where they are defined.
         let program = crate::Arguments::command();
         let mut commands = Vec::new();
         all(&program, &mut commands);
@@ -141,7 +141,7 @@ mod tests {
         assert_eq!(unknown(&program, "dmup"), "there is no command dmup; did you mean dump?");
         assert_eq!(unknown(&program, "reply"), "there is no command reply; did you mean replay?");
         assert!(
-            unknown(&program, "xyz").starts_with("there is no command xyz; there are demo, run, view, dump")
+            unknown(&program, "xyz").starts_with("there is no command xyz; the commands are demo, run, view")
         );
     }
 

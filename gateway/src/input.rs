@@ -1,4 +1,4 @@
-//! Inputs of commands, which a signal may stop.
+//! Inputs of commands, whose reading a signal can stop.
 
 use std::fs::File;
 use std::io::{self, Read};
@@ -27,7 +27,7 @@ use super::print::{count, abbreviated};
 /// Interval between attempts to open an awaited bus.
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
-/// Maximum delay of a signal while no frame arrives.
+/// Maximum time until a signal takes effect while no frame arrives.
 pub(crate) const POLL_TIMEOUT: Duration = Duration::from_millis(200);
 
 /// Catches SIGINT and SIGTERM, and returns the flag that they set.
@@ -45,7 +45,7 @@ pub(crate) fn is_path(name: &Path) -> bool {
     name.components().count() > 1 || name.extension().is_some()
 }
 
-/// The error for a source that is neither a file nor an openable bus.
+/// Returns the error for a source that is neither a file nor a bus that can be opened.
 pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
     let is_absent = matches!(
         error,
@@ -86,7 +86,7 @@ pub(crate) fn remark_another(files: &[PathBuf], path: &Path, skin: &Skin) {
     }
 }
 
-/// First difference between two skins, with the value of each.
+/// Returns the first difference between two skins: its name, and the value in each skin.
 pub(crate) fn difference(one: &Skin, other: &Skin) -> Option<(String, String, String)> {
     let buses = |skin: &Skin| skin.buses.iter().map(|bus| bus.name.clone()).collect::<Vec<_>>().join(", ");
     let joints = |skin: &Skin| skin.robot.joints.len().to_string();
@@ -112,9 +112,9 @@ pub(crate) fn difference(one: &Skin, other: &Skin) -> Option<(String, String, St
     ))
 }
 
-/// Reads the skin in a file, which is a skin or a recording with a skin.
+/// Reads the skin from a file, which is either a skin or a recording with a skin attached.
 pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
-    // The error for a file that is neither comes from reading it as a skin.
+    // If the file is neither, the error is that of reading it as a skin.
     let is_recording =
         can_be_read_again(file) && Reader::open(file).is_ok_and(|it| it.format() == CaptureFormat::Mcap);
     if !is_recording {
@@ -123,12 +123,13 @@ pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
     attached(&[file.to_owned()], "name the skin's own file", || Ok(()))
 }
 
-/// Reads a skin file. The error for other text identifies it as a capture if possible.
+/// Reads a skin file. If the file is a capture, the error says so, as far as that can be recognised.
 pub(crate) fn read_skin(file: &Path) -> Result<Skin, Failure> {
     Skin::read(file).map_err(|error| as_capture(file).unwrap_or_else(|| Failure::usage(error)))
 }
 
-/// The error for a capture or other text in place of a skin, or `None` for a skin, by its name or content.
+/// Returns the error for a file that is a capture or other text instead of a skin, by its name or content, or `None`
+/// for a skin.
 fn as_capture(file: &Path) -> Option<Failure> {
     if file.extension().is_some_and(|end| end == "toml") || !can_be_read_again(file) {
         return None;
@@ -164,10 +165,11 @@ pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
     attached(files, "name one with --skin", || needs_frames(files))
 }
 
-/// Returns the skin attached to a recording; `check` runs before the error for a recording without one.
+/// Returns the skin attached to a recording. For a recording without one, `check` runs first and may return another
+/// error; `hint` is part of the error.
 fn attached(files: &[PathBuf], hint: &str, check: impl Fn() -> Result<(), Failure>) -> Result<Skin, Failure> {
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
-    // The attachment may follow the frames.
+    // The attached skin may come after the frames, so read until it is found.
     while reader.format() == CaptureFormat::Mcap
         && reader.extras().skin().is_none()
         && reader.next().map_err(Failure::run)?.is_some()
@@ -185,20 +187,21 @@ fn attached(files: &[PathBuf], hint: &str, check: impl Fn() -> Result<(), Failur
     }
 }
 
-/// Refuses a capture without frames, for which no skin helps.
+/// Returns an error for a capture without frames, because naming a skin would not help.
 pub(crate) fn needs_frames(files: &[PathBuf]) -> Result<(), Failure> {
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
     if reader.has_frame().map_err(Failure::run)? { Ok(()) } else { Err(no_frame(&reader)) }
 }
 
-/// Returns the skin that a reader has found so far. If it is unreadable, prints a note that ends with `instead`.
+/// Returns the skin that a reader has found so far. If the skin is unreadable, prints a note that says what is used
+/// `instead`.
 pub(crate) fn skin_beside(reader: &Reader, instead: &str) -> Option<Skin> {
     let name = reader.name();
     let skin = reader.extras().skin()?;
     skin.inspect_err(|error| output::note(format_args!("{name}, {error}; {instead}"))).ok()
 }
 
-/// Format of a capture.
+/// Returns the name of a capture's format.
 pub(crate) fn format(reader: &Reader) -> &'static str {
     match reader.format() {
         CaptureFormat::Candump => "candump log",
@@ -206,12 +209,12 @@ pub(crate) fn format(reader: &Reader) -> &'static str {
     }
 }
 
-/// Location of an entry: the capture, and the line if it has lines.
+/// Returns the location of an entry as text: the capture, and the line if the capture has lines.
 pub(crate) fn place(name: &str, line: u64) -> String {
     if line > 0 { format!("{name}:{line}") } else { name.to_owned() }
 }
 
-/// The error for a capture without frames.
+/// Returns the error for a capture without frames.
 pub(crate) fn no_frame(reader: &Reader) -> Failure {
     let name = reader.name();
     if let Some((what, hint)) = reader.text_kind() {
@@ -232,7 +235,7 @@ pub(crate) fn no_frame(reader: &Reader) -> Failure {
     Failure::run(format!("{name}: {what}"))
 }
 
-/// Contents of a recording besides frames and notes.
+/// Describes the contents of a recording other than frames and notes.
 pub(crate) fn others(reader: &Reader) -> String {
     let extras = reader.extras();
     let topics = extras.topics.iter().filter(|topic| topic.messages > 0);
@@ -243,7 +246,7 @@ pub(crate) fn others(reader: &Reader) -> String {
     abbreviated(&topics.chain(attached).chain(facts).collect::<Vec<_>>())
 }
 
-/// Counts of what a capture lacks.
+/// Numbers of the items of a capture that were unreadable, lost or not supported.
 #[derive(Debug, Default)]
 pub(crate) struct LossCounts {
     /// Number of unreadable lines.
@@ -257,7 +260,7 @@ pub(crate) struct LossCounts {
 }
 
 impl LossCounts {
-    /// Counts an entry other than a frame.
+    /// Counts an entry that is not a frame.
     pub(crate) fn count(&mut self, note: &Note<'_>) {
         match note.kind {
             NoteKind::Text => {}
@@ -268,15 +271,15 @@ impl LossCounts {
         }
     }
 
-    /// Number of unreadable lines and messages.
+    /// Returns the number of unreadable lines and messages.
     pub(crate) const fn unreadable(&self) -> u64 {
         self.lines + self.messages
     }
 
-    /// Prints the counts at the end; `can_xl` names the handling of CAN XL frames.
+    /// Prints the counts at the end of a capture. `can_xl` says how CAN XL frames were handled.
     pub(crate) fn report(&self, reader: &Reader, can_xl: &str) {
         let name = reader.name();
-        // In a recording, the lines are notes.
+        // In a recording, candump lines are notes.
         let unread = match reader.lines() {
             0 => format!("{} of a log could not be read", count(self.lines, "line")),
             lines => format!("{} of {lines} lines could not be read", self.lines),
@@ -297,14 +300,15 @@ impl LossCounts {
     }
 }
 
-/// A live bus. Its loss is reported once, until it works again.
+/// A live bus from which a command receives. A loss of the bus is reported once, until the bus works again.
 #[derive(Debug)]
 pub(crate) struct ReceiveEnd {
     bus: Bus,
     follower: Follower,
 }
 
-/// Opens buses as [`ReceiveEnd::open`] does. With a flag, waits for absent buses until it is set.
+/// Opens buses as [`ReceiveEnd::open`] does. If `until` is given, waits for buses that do not exist, until that flag is
+/// set.
 pub(crate) fn receive_ends(
     sources: &[PathBuf],
     kinds: &KindChoices,
@@ -328,7 +332,8 @@ pub(crate) fn receive_ends(
 }
 
 impl ReceiveEnd {
-    /// Opens a bus to receive all its frames, and prints its kind; without a format also a classic interface.
+    /// Opens a bus to receive all its frames, and prints the kind of the bus. Without a format, also opens a classic
+    /// interface.
     fn open(
         name: &str,
         kind: KindChoice,
@@ -365,8 +370,8 @@ impl ReceiveEnd {
         &self.bus
     }
 
-    /// Prints and returns the number of frames lost because they arrived faster than they were processed; `done` names
-    /// the processing.
+    /// Prints and returns the number of frames lost because they arrived faster than they were processed. `done` says
+    /// in the note how they would have been processed.
     pub(crate) fn missing(&self, done: &str) -> u64 {
         let (name, missing) = (self.bus().name(), self.follower.dropped());
         if missing > 0 {
@@ -396,14 +401,14 @@ pub(crate) fn captures(
 ) -> Result<Reader, Failure> {
     let flag = OnceLock::new();
     let interruptible = move |file| {
-        // Once for all parts. If signals cannot be caught, they end the program at once.
+        // All parts share one flag. If signals cannot be caught, they end the program at once.
         let caught = || stopped().unwrap_or_else(|_| Arc::clone(stop::stop_flag()));
         through(Interruptible { file, stopped: Arc::clone(flag.get_or_init(caught)) })
     };
     Reader::open_through(sources, Box::new(interruptible)).map_err(Failure::usage)
 }
 
-/// A file whose reader can be stopped: it then reports the end of the file.
+/// A file whose reading can be stopped: it then reports the end of the file.
 pub(crate) struct Interruptible {
     pub(crate) file: File,
     pub(crate) stopped: Arc<AtomicBool>,

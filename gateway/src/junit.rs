@@ -13,7 +13,7 @@ pub(crate) struct Suite {
     pub(crate) cases: Vec<Case>,
 }
 
-/// A test case.
+/// A test case of a JUnit report.
 #[derive(Debug)]
 pub(crate) struct Case {
     pub(crate) class: String,

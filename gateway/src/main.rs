@@ -115,7 +115,7 @@ fn main() -> ExitCode {
     let parsed = program().try_get_matches().and_then(|matches| Arguments::from_arg_matches(&matches));
     let done = match parsed {
         Ok(arguments) => arguments.command.run(),
-        // Requested help and version are printed unchanged.
+        // Print requested help and version unchanged.
         Err(requested) if !requested.use_stderr() => requested.exit(),
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => Err(Failure::usage(refusal(&wrong))),
@@ -123,7 +123,7 @@ fn main() -> ExitCode {
     exit_code("skinbus", done)
 }
 
-/// Formats clap's error in one line, with a better text where clap's suggestion would mislead.
+/// Formats clap's error in one line. Replaces clap's suggestion where it would mislead.
 fn refusal(wrong: &clap::Error) -> String {
     let text = |kind| match wrong.get(kind) {
         Some(ContextValue::String(text)) => Some(text.as_str()),

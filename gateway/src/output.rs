@@ -1,4 +1,4 @@
-//! Outputs of commands besides standard output: standard error, and files that are complete or absent.
+//! Outputs of commands besides standard output: standard error, and files that exist only if they are complete.
 
 use std::fmt::Display;
 use std::fs::{self, File};
@@ -18,17 +18,17 @@ pub(crate) struct Overwrite {
 }
 
 impl Overwrite {
-    /// Creates a file that an option names, so that errors show up before there is anything to write.
+    /// Creates the file that an option names, so that errors show up before there is anything to write.
     pub(crate) fn create(self, option: &str, path: &Path) -> Result<(WholeFile, File), Failure> {
         WholeFile::create(path, self.overwrite).map_err(|error| refused(option, path, &error))
     }
 
-    /// Checks early that the file can be written.
+    /// Checks that the file which an option names can be written, before its content is computed.
     pub(crate) fn check(self, option: &str, path: &Path) -> Result<(), Failure> {
         check(path, self.overwrite).map_err(|error| refused(option, path, &error))
     }
 
-    /// Writes a whole file that an option names, or leaves the former file unchanged.
+    /// Writes the file that an option names. On an error, a former file stays unchanged.
     pub(crate) fn write(self, option: &str, path: &Path, text: &str) -> Result<(), Failure> {
         let (whole, file) = self.create(option, path)?;
         finish(option, whole, file, text)
@@ -40,7 +40,8 @@ pub(crate) fn is_standard_output(path: &Path) -> bool {
     path == Path::new(STANDARD_OUTPUT)
 }
 
-/// Prints a table; on standard error if one of these files is standard output, which then carries only that file.
+/// Prints a table. Prints it on standard error if one of these files is standard output, which then carries only that
+/// file.
 pub(crate) fn print_beside<'a>(
     files: impl IntoIterator<Item = Option<&'a Path>>,
     text: &str,
@@ -78,7 +79,7 @@ pub(crate) fn finish(option: &str, whole: WholeFile, mut file: File, text: &str)
     written.map_err(|error: io::Error| Failure::run(format!("{name}: {}", with_hint(error))))
 }
 
-/// The error for a file that cannot be written: wrong use.
+/// Returns the error for a file that cannot be written, which counts as wrong use.
 pub(crate) fn refused(option: &str, path: &Path, error: &io::Error) -> Failure {
     Failure::usage(format!("{}: {error}", named(option, path)))
 }
@@ -87,13 +88,13 @@ fn named(option: &str, path: &Path) -> String {
     format!("{option} {}", path.display()).trim_start().to_owned()
 }
 
-/// Checks that the written files differ from each other and from all files that the command reads, which `--overwrite`
-/// must not affect.
+/// Checks that the files to be written differ from each other and from all files that the command reads, because
+/// `--overwrite` must not replace those.
 pub(crate) fn apart<'a>(
     written: impl IntoIterator<Item = (&'a str, Option<&'a Path>)>,
     read: impl IntoIterator<Item = &'a Path>,
 ) -> Result<(), Failure> {
-    // Two names may be one terminal.
+    // Two of the names may be the same terminal.
     let is_stream = |path: &Path| fs::metadata(path).is_ok_and(|about| !about.is_file() && !about.is_dir());
     let read: Vec<_> = read.into_iter().filter(|path| !is_standard_output(path)).map(place).collect();
     let mut before = Vec::new();
@@ -114,7 +115,7 @@ pub(crate) fn apart<'a>(
     Ok(())
 }
 
-/// Absolute path of a file, existing or not: equal for two names of the same file.
+/// Returns the absolute path of a file, which need not exist. Two names of the same file give the same path.
 fn place(path: &Path) -> PathBuf {
     let inside = || Some(fs::canonicalize(folder_of(path)).ok()?.join(path.file_name()?));
     fs::canonicalize(path).ok().or_else(inside).unwrap_or_else(|| path.to_owned())

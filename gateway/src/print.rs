@@ -1,4 +1,4 @@
-//! Output of values: lists, rows, tables, JSON.
+//! Formatting of values for output: lists, rows, tables, JSON.
 
 use std::borrow::Cow;
 use std::fmt::Display;
@@ -20,7 +20,7 @@ const INDENT: &str = "\u{a0}";
 const WIDTH: u16 = 110;
 /// Maximum width of a row's name in one line.
 const NAME: u16 = 36;
-/// Maximum number of names in a line; of more names, the first few are shown with the total.
+/// Maximum number of names in a line. Of more names, the first few are shown with the total number.
 const NAMES: usize = 12;
 
 /// Formats a value as JSON in several lines.
@@ -33,9 +33,9 @@ pub(crate) fn json_line(value: &impl Serialize) -> Result<String, Failure> {
     serde_json::to_string(value).map(|text| harmless(text) + "\n").map_err(Failure::run)
 }
 
-/// Replaces terminal control characters in the strings of a JSON text by escapes such as `\u009b`.
+/// Replaces terminal control characters in the strings of a JSON text by JSON escapes such as `\u009b`.
 pub(crate) fn harmless(json: String) -> String {
-    // JSON itself has line feeds but no tabs.
+    // JSON text has line feeds of its own, but no tabs.
     if matches!(printable_lines(&json), Cow::Borrowed(_)) {
         return json;
     }
@@ -60,7 +60,7 @@ fn joined(between: &str, items: impl IntoIterator<Item: Display>) -> String {
     items.into_iter().map(|item| item.to_string()).collect::<Vec<_>>().join(between)
 }
 
-/// Lists all names, or the first of many with the total.
+/// Joins all names, or the first few of many names with the total number.
 pub(crate) fn abbreviated(names: &[String]) -> String {
     let few = names.get(..NAMES).filter(|_| names.len() > NAMES);
     few.map_or_else(|| comma_separated(names), |few| format!("{}, ... ({} in all)", comma_separated(few), names.len()))
@@ -86,7 +86,7 @@ pub(crate) fn decimals(value: Option<f64>, decimals: usize, none: &str) -> Strin
     or_else_text(value.map(|value| format!("{value:.decimals$}")), none)
 }
 
-/// Formats 50 %, 90 %, 99 % and the maximum.
+/// Formats the quantiles 50 %, 90 % and 99 %, and the maximum.
 pub(crate) fn quantiles(quantiles: &Quantiles) -> String {
     let Quantiles { p50, p90, p99, max, .. } = quantiles;
     format!("{p50:.0} / {p90:.0} / {p99:.0} / {max:.0}")
@@ -119,7 +119,7 @@ pub(crate) fn readable(mut table: Table) -> Table {
     table
 }
 
-/// Returns the columns that have values, and their texts in each row; `nothing` stands for an absent value.
+/// Returns the columns in which any row has a value, and the texts of each row; `nothing` stands for a missing value.
 pub(crate) fn drop_empty_columns<H, T, F: Fn(&T) -> Option<String>>(
     columns: impl IntoIterator<Item = (H, F)>,
     rows: &[T],
@@ -139,7 +139,7 @@ pub(crate) fn drop_empty_columns<H, T, F: Fn(&T) -> Option<String>>(
     (heads, lines)
 }
 
-/// A table of names, values and values for comparison.
+/// A table with three columns: names, values, and values for comparison.
 pub(crate) struct KeyValueTable {
     table: Table,
     /// Width of a name in one line.
@@ -227,7 +227,7 @@ impl KeyValueTable {
         self.table.add_row([name, Cell::new(value), Cell::new(beside).fg(colour)]);
     }
 
-    /// Adds a row whose last text is not broken.
+    /// Adds a row whose last text is kept in one line.
     pub(crate) fn row_in_one_line(&mut self, name: impl Display, value: impl Display, beside: &str) {
         self.row(name, value, beside);
         let width = u16::try_from(beside.chars().count() + 2).unwrap_or(WIDTH);
@@ -244,7 +244,7 @@ impl KeyValueTable {
     }
 }
 
-/// Texts of a row, [`shown`].
+/// Returns the texts of a row, made safe for terminals by [`shown`].
 fn line(name: impl Display, value: impl Display, beside: impl Display) -> [String; 3] {
     [name.to_string(), value.to_string(), beside.to_string()].map(|text| printable(&text).into_owned())
 }

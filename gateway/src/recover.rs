@@ -59,7 +59,7 @@ impl Recover {
                     recovered.messages
                 )
             }
-            None => return Err(Failure::run(format!("{name}: no message came back: {recovered}"))),
+            None => return Err(Failure::run(format!("{name}: no message could be recovered: {recovered}"))),
             Some(bytes) => format!("{out}, {bytes} bytes: {recovered}"),
         };
         if recovered.is_little() {

@@ -138,7 +138,7 @@ impl Replay {
         let options = self.options()?;
         let read = self.files.iter().chain(&self.skin).map(PathBuf::as_path);
         apart([("--summary", self.summary.as_deref())], read)?;
-        // Created before the replay, so that an error of the file is reported first.
+        // Create the file before the replay, so that an error of the file is reported first.
         let file = self.summary.as_ref().map(|path| self.overwrite.create("--summary", path)).transpose()?;
         let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
@@ -260,7 +260,8 @@ fn expectation(rows: &mut KeyValueTable, expect: &Expect) {
     rows.any("unknown configurations", expect.unchecked_cells, "not recorded before they were changed");
 }
 
-/// Rows on the words that differ by more than `usual` steps, if any: the number of words for each difference.
+/// Adds rows on words that differ by more than `usual` steps, if there are any: the number of words for each
+/// difference.
 fn off(rows: &mut KeyValueTable, what: &str, steps: &Steps, usual: usize) {
     let counts = steps.by_steps.iter().enumerate().skip(1);
     let found: Vec<_> = counts.filter(|(_, count)| **count > 0).collect();

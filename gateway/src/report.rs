@@ -64,7 +64,7 @@ impl Report {
         let options = run::Options { command, nominal: self.nominal, data: self.data, skin };
         let refused = |error| refused(error, options.skin.as_ref());
         if let Err(taken) = self.is_free(&output, "-o") {
-            // Errors of the input are reported before those of an existing output.
+            // Report errors of the input before those of an existing output.
             return Err(run::check(&self.files, &options).err().map_or(taken, refused));
         }
         let report = run::report(&self.files, &options).map_err(refused)?;
@@ -87,7 +87,7 @@ impl Report {
         let made = self.svg.as_deref().map(make).transpose()?.unwrap_or(false);
         if let Err(failure) = write(&files, self.overwrite) {
             if let Some(folder) = self.svg.filter(|_| made) {
-                // Fails unless the directory is empty.
+                // This call fails unless the directory is empty, as intended.
                 let _ = fs::remove_dir(folder);
             }
             return Err(failure);
@@ -118,8 +118,8 @@ impl Report {
     }
 }
 
-/// The failure for an error of a report: a file that is not a recording of a run is wrong use, an unreadable one is
-/// not.
+/// Converts an error of a report into a failure. A file that is not a recording of a run counts as wrong use; an
+/// unreadable file does not.
 fn refused(error: ReportError, skin: Option<&(String, Skin)>) -> Failure {
     match (error, skin) {
         (error @ (ReportError::Capture(_) | ReportError::Unfinished { .. }), _) => Failure::run(error),
@@ -135,7 +135,7 @@ fn refused(error: ReportError, skin: Option<&(String, Skin)>) -> Failure {
     }
 }
 
-/// File names and drawings of all figures.
+/// Returns the file names and SVG drawings of all figures.
 fn drawings(page: &Page) -> impl Iterator<Item = (String, String)> {
     page.sections.iter().flat_map(|section| {
         let cells = section.drawings.iter().map(|drawing| (drawing.name(), svg::draw_cells(drawing)));
@@ -144,7 +144,7 @@ fn drawings(page: &Page) -> impl Iterator<Item = (String, String)> {
     })
 }
 
-/// Creates a directory. Returns true if it did not exist.
+/// Creates a directory. Returns true if it is new.
 fn make(folder: &Path) -> Result<bool, Failure> {
     let new = !folder.is_dir();
     let made = fs::create_dir_all(folder).map(|()| new);

@@ -1,4 +1,4 @@
-//! URDF that a skin names, or that is written from its rows.
+//! The URDF of a skin's robot: read from the file that the skin names, or written from the skin's rows.
 
 use std::fmt::Display;
 use std::path::{Component, Path, PathBuf};
@@ -55,13 +55,13 @@ pub(crate) fn read_urdf(path: &Path) -> Result<(Urdf, String), String> {
     Ok((urdf, text))
 }
 
-/// Path of the URDF that a skin's file names.
+/// Returns the path of the URDF that a skin's file names.
 pub(crate) fn urdf_of(skin: &Path, urdf: &str) -> PathBuf {
     skin.parent().unwrap_or_else(|| Path::new("")).join(urdf)
 }
 
-/// Path of a file relative to the directory of another file, which need not exist. Returns `None` if a directory does
-/// not exist, or a name is not UTF-8.
+/// Returns the path of a file relative to the directory of another file, which need not exist. Returns `None` if a
+/// directory does not exist, or if a name is not UTF-8.
 pub(crate) fn path_from(file: &Path, to: &Path) -> Option<String> {
     let real = |path: &Path| {
         let folder = folder_of(path);

@@ -43,7 +43,7 @@ const UNTIL_STOPPED: f64 = 24.0 * 3600.0;
 /// Log of the demonstration's frames.
 const DEMO_LOG: &str = "skinbus-demo.log";
 
-/// Options of both commands.
+/// Options that `skinbus run` and `skinbus demo` share.
 #[derive(Args, Debug)]
 struct Common {
     /// End after this time: 10, 10s or 2min [default: the scenario's duration, or 10s]
@@ -69,7 +69,7 @@ struct Common {
     recording: Recording,
 }
 
-/// Unchanged texts of the files of a run.
+/// Texts of the skin and the scenario as they were read, and the robot of the skin.
 struct Files {
     skin: String,
     scenario: Option<String>,
@@ -87,7 +87,7 @@ struct Recording {
     overwrite: Overwrite,
 }
 
-/// Limit at which a new file of a recording is started.
+/// Limit of size or age at which a new file of a recording is started.
 #[derive(Clone, Copy, Debug)]
 enum Limit {
     Bytes(u64),
@@ -103,7 +103,7 @@ fn limit(text: &str) -> Result<Limit, String> {
     if let Some(bytes) = each.and_then(|each| number?.checked_mul(*each)).filter(|bytes| *bytes > 0) {
         return Ok(Limit::Bytes(bytes));
     }
-    // A number without a unit may mean either: refuse it.
+    // Refuse a number without a unit, because it may mean either.
     let age = time(text).filter(|seconds| *seconds >= 1.0 && !unit.is_empty());
     let age = age.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
     age.map(Limit::Age).ok_or_else(|| allowed.to_owned())
@@ -265,7 +265,7 @@ impl Run {
         };
         let read = [Some(self.skin.clone()), self.scenario.clone(), urdf];
         let read: Vec<_> = read.into_iter().flatten().collect();
-        // Cells read a skin that can be read only once from memory.
+        // If the skin can be read only once, cells read a copy of it in memory.
         let (_file, skin_file) = if can_be_read_again(&self.skin) {
             (None, self.skin)
         } else {
@@ -293,7 +293,7 @@ impl Run {
     }
 }
 
-/// The cells to emulate and their firmware.
+/// Returns the cells to emulate and their firmware, if any.
 fn emulated(firmware: Option<PathBuf>, named: &[CellName], skin: &Skin) -> Result<Option<Emulated>, Failure> {
     let Some(firmware) = firmware else { return Ok(None) };
     let mut cells = Vec::new();
@@ -346,7 +346,7 @@ fn bench(
         ("--summary", summary_file),
     ];
     apart(written, read.iter().map(PathBuf::as_path))?;
-    // Created before the run, so that an error of the file is reported first.
+    // Create the file before the run, so that an error of the file is reported first.
     let summary = summary_file.map(|path| overwrite.create("--summary", path)).transpose()?;
     // The summary reports a panic too.
     let (page, lines) = page.unzip();
@@ -365,7 +365,7 @@ fn bench(
     let files = written.map(|(_, path)| path);
     let table = |is_coloured| show::text(&ended, TableStyle { is_verbose, is_coloured, columns: None });
     let printed = if ended.control.ticks > 0 { print_table(files, table) } else { Ok(()) };
-    // The last line is the failure's own; each message is one line.
+    // The failure prints the last line itself; each other message is one line.
     let mut lines = ended.complaints(options.quiet);
     let lost: Vec<_> = unwritten.into_iter().chain(printed.err()).collect();
     let code = if lost.is_empty() { ended.outcome.exit_code() } else { 1 };

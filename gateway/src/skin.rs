@@ -53,10 +53,10 @@ struct Generate {
     /// Joint broadcasts per second; must divide the 500 Hz of the control loop
     #[arg(long, default_value_t = 62.5)]
     broadcast_hz: f64,
-    /// Reply of the cells
+    /// Kind of reply that the cells send
     #[arg(long, value_parser = one_of(REPLIES), default_value = "torque")]
     reply: Answers,
-    /// Frame format of their packets
+    /// Frame format of the cells' packets
     #[arg(long, value_parser = one_of(FORMATS), default_value = "fd")]
     format: Format,
     /// The file to write, completely or not at all [default: standard output]

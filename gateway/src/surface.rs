@@ -1,4 +1,4 @@
-//! Appearance of a skin's robot: its URDF's links on the rows of the skin's chains.
+//! Appearance of a skin's robot: the shapes of the URDF's links, placed on the rows of the skin's chains.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,18 +14,18 @@ use super::print::count;
 use super::robot_file::{read_urdf, urdf_of};
 use super::visuals::{Packages, Visuals};
 
-/// A part of a link on a row.
+/// A part of a link's shape, placed on a row of a chain.
 struct Placed {
-    /// Index of the skin's chain.
+    /// Index of the chain in the skin.
     chain: usize,
     /// Row in whose frame the part is, from 1; 0 is the start of the chain.
     row: usize,
-    /// The part; its pose is relative to that frame.
+    /// The part, whose pose is relative to the frame of the row.
     part: LinkMesh,
 }
 
-/// Returns the drawing of the robot of a skin's file: triangles for each row, simplified to at most `most` in all.
-/// Empty if the skin names no URDF. Prints a note on parts that cannot be drawn.
+/// Returns the drawing of the robot that a skin's file describes: triangles for each row, simplified to at most `most`
+/// in all. The list is empty if the skin names no URDF. Prints a note on parts that cannot be drawn.
 pub(crate) fn shells(file: &Path, skin: &Skin, packages: &Packages, most: usize) -> Vec<RowMesh> {
     let Some(path) = skin.robot.urdf.as_deref().map(|urdf| urdf_of(file, urdf)) else { return Vec::new() };
     let parts = read_urdf(&path).and_then(|(urdf, _)| parts(&urdf, &path, skin, packages));
@@ -71,9 +71,9 @@ fn parts(urdf: &Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<V
     Ok(parts)
 }
 
-/// Finds the URDF's chain with the same rows as a skin's chain.
+/// Finds the chain of the URDF that has the same rows as a skin's chain.
 fn chain_of(urdf: &Urdf, chain: &Chain) -> Option<robots::UrdfChain> {
-    // The skin does not name the link at which the chain begins.
+    // The skin does not say at which link of the URDF the chain begins.
     let mut roots = urdf.links().filter_map(|root| urdf.chain(Some(root), &chain.name).ok());
     roots.find(|found| {
         let same = |(one, other): (&ChainRow, &DhRow)| {
@@ -91,8 +91,8 @@ fn chain_of(urdf: &Urdf, chain: &Chain) -> Option<robots::UrdfChain> {
     })
 }
 
-/// Finds the chain and the row to which a link is fixed, and the link's frame relative to the row's. Joints outside all
-/// chains are at rest; links that no chain moves are fixed to the start of the first chain.
+/// Returns the index of the chain and the row to which a link is fixed, and the pose of the link in the row's frame.
+/// Joints outside all chains are at rest. Links that no chain moves are fixed to the start of the first chain.
 fn place(urdf: &Urdf, chains: &[robots::UrdfChain], link: &str) -> Option<(usize, usize, Isometry3<f64>)> {
     let pose = |link: &str| urdf.pose(link, &|joint| urdf.rest(joint)).ok();
     let at = pose(link)?;

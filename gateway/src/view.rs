@@ -103,11 +103,11 @@ pub(crate) struct PageOptions {
     token_file: Option<PathBuf>,
 }
 
-/// A page that is about to be served.
+/// The page to be served, and how.
 struct Served {
     listener: TcpListener,
     access: Access,
-    /// Address of the page, unless the run prints it.
+    /// Address of the page, if this program prints it; `None` if the run prints it.
     url: Option<String>,
 }
 
@@ -156,7 +156,7 @@ impl View {
         Ok(())
     }
 
-    /// Part of a skin on the named buses.
+    /// Returns the part of a skin that is on the named buses, with the meshes of its robot.
     fn on_buses(&self) -> Result<(Skin, Vec<RowMesh>), Failure> {
         let Some(file) = &self.skin else {
             let name = self.sources.first().map(|it| it.display().to_string()).unwrap_or_default();
@@ -202,7 +202,7 @@ impl View {
         Ok((skin, surface))
     }
 
-    /// Skin of a recording. The skin inside a recording has no URDF beside it.
+    /// Returns the skin of a recording. The skin inside a recording has no URDF beside it.
     fn recorded_skin(&self) -> Result<(Skin, Vec<RowMesh>), Failure> {
         match &self.skin {
             Some(path) => {
@@ -236,7 +236,7 @@ impl View {
         if reader.format() == CaptureFormat::Mcap || reader.has_frame().map_err(Failure::usage)? {
             return Ok(true);
         }
-        // A file given with --skin or --at is not a skin.
+        // A file named with --skin or --at is meant as a recording, unless it is a readable skin.
         if (self.skin.is_some() || self.at.is_some()) && Skin::read(first).is_err() {
             return Err(no_frame(&reader));
         }
@@ -244,7 +244,7 @@ impl View {
     }
 }
 
-/// Error for an address on which no page can be served.
+/// Returns the error for an address at which no page can be served.
 fn unbound(listen: SocketAddr, error: &io::Error) -> Failure {
     let is = |kind| error.kind() == kind;
     let hint = if is(io::ErrorKind::AddrNotAvailable) {
@@ -264,7 +264,7 @@ fn print_address(url: Option<String>) {
     url.iter().for_each(|url| note(format_args!("view: {url}")));
 }
 
-/// Returns the run that has started this program, at the other end of the socket that is its standard output.
+/// Returns the connection to the run that has started this program: a socket that is this program's standard output.
 fn run_of_this() -> io::Result<JsonPipe> {
     let socket = || io::stdout().as_fd().try_clone_to_owned();
     JsonPipe::new(socket()?, socket()?)
@@ -287,7 +287,8 @@ pub(crate) struct Page {
 }
 
 impl Page {
-    /// Serves the page of a run, whose buses open later. Returns it with the connection for its commands.
+    /// Starts a process that serves the page of a run, whose buses open later. Returns it with the connection for its
+    /// commands.
     pub(crate) fn of(
         run: &run::RunOptions,
         listen: Option<SocketAddr>,
@@ -306,7 +307,7 @@ impl Page {
         }
         let listen = listen.unwrap_or(DEFAULT_ADDRESS);
         let token = token::needed(token::chosen(options.token_file.as_deref())?, true, listen)?;
-        // Only this user can read the environment of a process; everyone can read its command line.
+        // Only this user can read the environment of a process, but everyone can read its command line.
         match &token {
             Some(token) => command.env(token::VARIABLE, token.as_str()),
             None => command.env_remove(token::VARIABLE),
@@ -319,7 +320,7 @@ impl Page {
         let (here, there) = UnixStream::pair().map_err(|error| failed(&error))?;
         let lines =
             here.try_clone().and_then(|input| JsonPipe::new(input, here)).map_err(|error| failed(&error))?;
-        // The page gets no signals of the terminal: the run ends it, also on Ctrl-C.
+        // Put the page into its own process group, so that Ctrl-C does not reach it: the run ends the page.
         command.process_group(0).stdin(OwnedFd::from(listener)).stdout(OwnedFd::from(there));
         let process = command.spawn().map_err(|error| failed(&error))?;
         print_address(Some(url));

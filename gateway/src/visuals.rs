@@ -8,20 +8,20 @@ use cover::mesh::{Mesh, MeshError, UpAxis};
 use robots::{Geometry, Shape, Urdf};
 use trace::files::folder_of;
 
-/// Directories of packages.
+/// Directories of the packages that a URDF refers to.
 #[derive(Args, Clone, Debug, Default)]
 pub(crate) struct Packages {
     /// Directory of the files that the URDF names as package://NAME/...; repeat the option for further packages.
     /// Default: search the directory of the URDF and those above it
     #[arg(long, value_name = "NAME=DIR", value_parser = package)]
     package: Vec<(String, PathBuf)>,
-    /// True for commands without this option.
+    /// True for commands that do not have this option.
     #[arg(skip)]
     only_beside: bool,
 }
 
 impl Packages {
-    /// Packages beside the URDF, for a command without the option.
+    /// Creates a search in the directory of the URDF and those above it, for commands without the option.
     pub(crate) fn beside() -> Self {
         Self { package: Vec::new(), only_beside: true }
     }
@@ -36,7 +36,7 @@ fn package(text: &str) -> Result<(String, PathBuf), String> {
     }
 }
 
-/// Shapes of a robot.
+/// Shapes of a robot's links, from a URDF and the mesh files that it names.
 pub(crate) struct Visuals<'a> {
     urdf: &'a Urdf,
     /// Directory of the URDF.
@@ -48,12 +48,12 @@ impl<'a> Visuals<'a> {
     /// Creates the shapes of the URDF in this file.
     pub(crate) fn new(urdf: &'a Urdf, file: &Path, packages: &'a Packages) -> Self {
         let folder = folder_of(file);
-        // `.` has no parent directories.
+        // Resolve the path, because `.` has no parent directories.
         let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
         Self { urdf, folder, packages }
     }
 
-    /// Parts of a link; empty if the URDF has no visual for it.
+    /// Returns the parts of a link's shape. The list is empty if the URDF has no visual for the link.
     pub(crate) fn parts(&self, link: &str) -> Result<Vec<LinkMesh>, String> {
         let shapes = self.urdf.visuals(link).map_err(|error| error.to_string())?;
         let part =
@@ -90,7 +90,7 @@ impl<'a> Visuals<'a> {
             let tried: Vec<_> = tried.collect();
             let shown = tried.first().map_or_else(String::new, |path| path.display().to_string());
             let found = tried.into_iter().find(|path| path.is_file());
-            return found.ok_or_else(|| format!("mesh {uri}: {shown} is no file: correct the path"));
+            return found.ok_or_else(|| format!("mesh {uri}: {shown} is not a file: correct the path"));
         };
         let rests: Vec<_> = spellings(rest, true).collect();
         let given = self.packages.package.iter().find(|(known, _)| known == name);
@@ -124,24 +124,24 @@ impl<'a> Visuals<'a> {
             Some((_, folder)) if folder.is_dir() => {
                 format!("{} is not the package, or lacks this file: correct one of them", folder.display())
             }
-            Some((_, folder)) => format!("{} is no folder: correct --package {name}=", folder.display()),
+            Some((_, folder)) => format!("{} is not a folder: correct --package {name}=", folder.display()),
             None if self.packages.only_beside => {
                 format!("put the folder of package {name} beside the URDF, or above it")
             }
             None => format!("name its directory with --package {name}=DIR"),
         };
-        Err(format!("mesh {uri}: {shown} is no file: {hint}"))
+        Err(format!("mesh {uri}: {shown} is not a file: {hint}"))
     }
 }
 
-/// Path of a `file:` URI; other texts are paths already.
+/// Returns the path of a `file:` URI; any other text is a path already.
 fn path_of_uri(uri: &str) -> &str {
     let Some(rest) = uri.strip_prefix("file:") else { return uri };
     let local = rest.strip_prefix("//localhost").filter(|path| path.starts_with('/'));
     local.or_else(|| rest.strip_prefix("//")).unwrap_or(rest)
 }
 
-/// A path as written; for a URI also with its escapes, such as `%20`, decoded.
+/// Returns a path as written and, for a URI, also with its escapes such as `%20` decoded.
 fn spellings(path: &str, is_uri: bool) -> impl Iterator<Item = String> {
     let decoded = is_uri.then(|| decoded(path)).flatten().filter(|decoded| decoded != path);
     core::iter::once(path.to_owned()).chain(decoded)

@@ -5,8 +5,8 @@
 //!   cargo run --release -p protocol --example false_packets [MILLION_FRAMES]
 //! ```
 //!
-//! Classic frames of random bytes, one per ms with one torque identifier, pass through reassembly: with one
-//! possible length, as for a known chain, and with all lengths.
+//! Classic frames of random bytes, one per ms with one torque identifier, pass through reassembly twice: once with the
+//! packet length of a known chain, once with all possible lengths.
 #![expect(clippy::print_stdout, reason = "the figures are its output")]
 #![expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
 
@@ -16,7 +16,7 @@ use protocol::time::Micros;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-/// Time between two frames.
+/// Time between two frames, in µs.
 const BETWEEN_US: u64 = 1_000;
 
 /// Prints the result for `frames` frames of `min` to 8 random bytes.

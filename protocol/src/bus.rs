@@ -59,8 +59,8 @@ pub use kinds::{BusKind, KindChoice, KindChoices, KindsError, KindOption, Unknow
 /// Options for opening a bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct BusOptions {
-    /// Filters for received frames, at most [`Filter::MAX`]. Without filters the socket receives nothing, as
-    /// a pure sender wants.
+    /// Filters for received frames, at most [`Filter::MAX`]. Without filters the socket receives nothing, which suits a
+    /// program that only sends.
     pub filters: Vec<Filter>,
     /// True to receive the frames that this socket sends, marked as own.
     pub own_frames: bool,
@@ -68,17 +68,17 @@ pub struct BusOptions {
     pub fd: bool,
     /// Error frames to receive, as a mask of the bits in `linux/can/error.h`.
     pub error_mask: u32,
-    /// Size of the receive buffer in bytes, as the kernel counts them: about 1 KiB per frame.
+    /// Size of the receive buffer in bytes as the kernel counts it: about 1 KiB per frame.
     pub receive_buffer: usize,
-    /// Maximum time that [`Bus::send`] waits for room.
+    /// Maximum time that [`Bus::send`] waits for room in the transmit queue.
     pub send_timeout: Duration,
     /// The directory of embedded buses; `None` for [`embedded::usual_directory`].
     pub directory: Option<PathBuf>,
 }
 
 impl Default for BusOptions {
-    /// Receives all data frames, classic and FD, except own ones, with room for four answers from each of 254
-    /// cells.
+    /// Returns options to receive all data frames, classic and FD, except those that this socket sends. The receive
+    /// buffer holds four answers from each of 254 cells.
     fn default() -> Self {
         Self {
             filters: vec![Filter::ALL],
@@ -95,8 +95,8 @@ impl Default for BusOptions {
 /// Sets the policy `SCHED_BATCH` for this thread and its future children, so that they do not preempt a
 /// running process when they wake up. Returns true if the system granted it.
 ///
-/// This is for the processes of a bench that wake each other by the hundreds: cells, and the server of their
-/// bus. A server that is preempted by every cell it sends a frame to switches processes once per frame.
+/// The processes of a bench wake each other hundreds of times a second: the cells, and the server of their bus. Without
+/// this policy, every cell that receives a frame preempts the server, at the cost of a context switch per frame.
 pub fn set_batch_scheduling() -> bool {
     calls::set_batch()
 }
@@ -127,10 +127,11 @@ impl Bus {
     /// The timeouts that [`Bus::wait_and_receive`] sets as `SO_RCVTIMEO`.
     const SOCKET_TIMEOUTS: [Duration; 2] = [Duration::from_millis(25), Duration::from_millis(100)];
 
-    /// Opens a bus. The filters are active when this returns.
+    /// Opens a bus. The filters are active when this function returns.
     ///
     /// # Errors
-    /// Returns an error, with a hint for the user, if the bus cannot be used as requested.
+    /// Returns an error, with a hint for the user, if the bus does not exist, is not accessible, or does not support
+    /// the options.
     pub fn open(name: &str, choice: KindChoice, options: &BusOptions) -> Result<Self, BusError> {
         check_name(name)?;
         check_filter_count(name, &options.filters)?;
@@ -178,7 +179,7 @@ impl Bus {
     /// Returns true if the bus has no hardware: an embedded bus, a vcan or a vxcan.
     ///
     /// # Errors
-    /// Returns an error if the kernel does not report it.
+    /// Returns an error if the kernel does not report the type of the interface.
     pub fn is_virtual(&self) -> Result<bool, BusError> {
         self.carrier().is_virtual(&self.name).map_err(|error| self.io_error("look at", error))
     }
@@ -194,11 +195,11 @@ impl Bus {
         self.receive_buffer
     }
 
-    /// Waits until a receive would return something; `None` waits without limit. Returns false after the
-    /// timeout or a signal.
+    /// Waits until [`Bus::receive`] has a frame or an error to return; `None` waits without limit. Returns false after
+    /// the timeout or a signal.
     ///
     /// # Errors
-    /// Returns an error if the system cannot wait.
+    /// Returns an error if the system call fails.
     pub fn wait(&self, timeout: Option<Duration>) -> Result<bool, BusError> {
         if self.has_error() {
             return Ok(true);
@@ -206,11 +207,11 @@ impl Bus {
         self.poll(PollFlags::IN, timeout).map_err(|errno| self.error("wait for", errno))
     }
 
-    /// Waits until a receive on this bus or on `other` would return something. Returns false after the
-    /// timeout or a signal.
+    /// Waits until [`Bus::receive`] has a frame or an error to return, on this bus or on `other`. Returns false after
+    /// the timeout or a signal.
     ///
     /// # Errors
-    /// Returns an error if the system cannot wait.
+    /// Returns an error if the system call fails.
     pub fn wait_with(&self, other: &Self, timeout: Duration) -> Result<bool, BusError> {
         if self.has_error() || other.has_error() {
             return Ok(true);
@@ -224,20 +225,20 @@ impl Bus {
         self.down.load(Ordering::Relaxed) || self.failed.load(Ordering::Relaxed)
     }
 
-    /// Receives up to 64 frames into `inbox`, replacing its contents, and returns their number: 0 if nothing
-    /// has arrived. Never waits and never allocates, except that it retries for up to 0.1 s while the system
-    /// lacks memory.
+    /// Receives up to 64 frames into `inbox`, replacing its contents. Returns the number of frames: 0 if nothing has
+    /// arrived. Never allocates, and does not wait for frames. If the system lacks memory, retries for up to 0.1 s.
     ///
     /// # Errors
-    /// Returns [`BusError::Down`] or [`BusError::Gone`] for an interface, [`BusError::Closed`] or
-    /// [`BusError::HungUp`] for an embedded bus. Frames that arrived before the error are returned first.
+    /// Returns [`BusError::Down`] or [`BusError::Gone`] for a kernel interface, [`BusError::Closed`] or
+    /// [`BusError::HungUp`] for an embedded bus. Frames that arrived before the error are returned first; the error
+    /// follows with the next call.
     pub fn receive(&self, inbox: &mut Inbox) -> Result<usize, BusError> {
         self.receive_with(inbox, |batch, socket| batch.receive(socket))
     }
 
-    /// Like [`Bus::receive`], but waits up to `timeout` for the first frame; may return early without one.
-    /// For timeouts of 25 ms and more this takes one system call instead of two, which returns a single
-    /// frame. It suits a receiver that has nothing else to do and wakes up for each frame.
+    /// Like [`Bus::receive`], but waits up to `timeout` for the first frame; may return early without one. With a
+    /// timeout of 25 ms or more, this takes one system call instead of two, and returns at most one frame. It suits a
+    /// receiver that wakes up for each frame.
     ///
     /// # Errors
     /// Returns the errors of [`Bus::wait`] and [`Bus::receive`].
@@ -295,11 +296,11 @@ impl Bus {
         }
     }
 
-    /// Sends frames in order. If the bus accepts no more, waits for room, at most [`Options::send_timeout`]
-    /// after the last accepted frame. Never allocates except on failure.
+    /// Sends frames in order. If the transmit queue is full, waits for room, at most [`Options::send_timeout`] after
+    /// the last accepted frame. Never allocates except on failure.
     ///
     /// # Errors
-    /// Returns the cause and the number of frames sent before it.
+    /// Returns the cause and the number of frames that were sent before the failure.
     pub fn send(&self, frames: &[Frame]) -> Result<(), SendError> {
         if !self.carries(frames) {
             let cause = BusError::FdFrame(self.name.clone());
@@ -308,13 +309,13 @@ impl Bus {
         self.send_all(frames.len(), |sent| self.send_batch(frames.get(sent..).unwrap_or_default()))
     }
 
-    /// Returns true if the bus was opened for frames of these formats.
+    /// Returns true if the bus was opened for the formats of all these frames: FD frames need [`Options::fd`].
     fn carries(&self, frames: &[Frame]) -> bool {
         self.fd || frames.iter().all(|frame| frame.format() == Format::Classic)
     }
 
-    /// Sends `target` items and waits for room in between. `some` sends from the given index on and returns
-    /// the number sent.
+    /// Sends `target` items, and waits for room whenever the socket accepts no more. `some` sends the items from the
+    /// given index on and returns the number that the socket accepted.
     fn send_all(&self, target: usize, some: impl Fn(usize) -> io::Result<usize>) -> Result<(), SendError> {
         let (mut sent, mut give_up) = (0, None);
         while sent < target {
@@ -332,7 +333,8 @@ impl Bus {
         Ok(())
     }
 
-    /// Waits for room if `error` means that there was none; fails after the send timeout.
+    /// Waits for room if `error` means that the transmit queue is full. Returns an error after the send timeout, or for
+    /// any other `error`.
     fn wait_for_room(&self, error: io::Error, give_up: &mut Option<Instant>) -> Result<(), BusError> {
         // The transmit queue of the interface is full, or there is no memory for the frame.
         let interface = batch::is_memory_shortage(&error);
@@ -353,9 +355,9 @@ impl Bus {
         waited.map(|_| ()).map_err(|errno| self.error("wait for", errno))
     }
 
-    /// Sends at most 64 frames if the bus accepts all of them at once. Returns true if it did. Never waits,
-    /// never allocates, and returns no cause: for a loop with its own deadline. The next [`Bus::receive`]
-    /// reports an interface that is down.
+    /// Sends at most 64 frames if the bus accepts all of them at once, and returns true if it did. Never waits or
+    /// allocates, and does not report the cause of a failure: for a loop with its own deadline. If the interface is
+    /// down, the next [`Bus::receive`] returns the error.
     #[must_use]
     pub fn try_send_all(&self, frames: &[Frame]) -> bool {
         if !self.carries(frames) {
@@ -368,8 +370,8 @@ impl Bus {
         sent.is_ok_and(|sent| sent == frames.len())
     }
 
-    /// Replaces the filters, at most [`Filter::MAX`]. Frames already received or sent by this socket are not
-    /// affected. Only one thread may call this at a time.
+    /// Replaces the receive filters, at most [`Filter::MAX`]. Frames that already wait in the receive buffer stay
+    /// there. Only one thread may call this at a time.
     ///
     /// # Errors
     /// Returns an error if there are too many filters, or the bus does not accept them.
@@ -405,7 +407,7 @@ impl Bus {
         wait_on(&mut [PollFd::new(&self.socket, what)], timeout)
     }
 
-    /// Returns the error for the end of the connection to an embedded bus.
+    /// Returns the error for a connection to an embedded bus that has ended.
     fn closed(&self) -> BusError {
         embedded::closed_error(&self.name, self.directory.as_deref())
     }
@@ -431,7 +433,7 @@ impl AsFd for Bus {
 
 /// Retry interval while a transmit queue is full: the duration of a few frames at 1 Mbit/s.
 const RETRY_INTERVAL: Duration = Duration::from_micros(500);
-/// Maximum time for which a shortage of memory is retried.
+/// Maximum time for which a call is retried when the system lacks memory.
 const MAX_SHORTAGE: Duration = Duration::from_millis(100);
 
 fn wait_on(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, Errno> {
@@ -447,7 +449,7 @@ fn wait_on(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, E
     }
 }
 
-/// Returns true until the deadline, which the first call sets to `after` from now.
+/// Returns true before a deadline. The first call sets the deadline to `after` from now.
 fn is_before_deadline(give_up: &mut Option<Instant>, after: Duration) -> bool {
     let now = Instant::now();
     now < *give_up.get_or_insert(now + after)
@@ -462,8 +464,8 @@ fn check_filter_count(name: &str, filters: &[Filter]) -> Result<(), BusError> {
     if got <= Filter::MAX { Ok(()) } else { Err(BusError::Filters { name: name.to_owned(), got }) }
 }
 
-/// Checks that a bus can have this name. The rule is that of network interfaces, so that a bench runs on
-/// either kind of bus.
+/// Checks that a name is valid for a bus. The rule is that of network interfaces, so that the same bench runs on either
+/// kind of bus.
 ///
 /// # Errors
 /// Returns an error if the name is invalid.

@@ -1,4 +1,4 @@
-//! The invariants of every run, with any faults.
+//! Checks of invariants that hold for every run, whatever faults it has: counters add up.
 
 use model::table::{Event, Replies, Uplink};
 use protocol::can::Format;
@@ -6,10 +6,10 @@ use protocol::id::Kind;
 
 use crate::bench::Bench;
 
-/// Asserts that every account of a finished run adds up.
+/// Checks that the counters of a finished run add up: of each cell, of torques, and of frames.
 ///
 /// # Panics
-/// Panics if an account does not add up; the message names the account and the cell.
+/// Panics if counters do not add up; the message names them and the cell.
 pub fn check(bench: &Bench) {
     cells(bench);
     torques(bench);
@@ -24,7 +24,7 @@ pub fn check(bench: &Bench) {
     assert_eq!(counters.epochs, bench.oracle.tally.broadcasts, "every broadcast is an epoch that ends");
 }
 
-/// Checks the two accounts of each cell.
+/// Checks the counters of each cell: those of its replies, and those of its packets.
 fn cells(bench: &Bench) {
     for (place, cell) in bench.gateway.table.cells().iter().enumerate() {
         let (uplink, replies, node) = (cell.uplink(), cell.replies, cell.node);

@@ -4,11 +4,11 @@ use std::collections::BTreeMap;
 
 use protocol::time::{Micros, Span};
 
-/// The future events, and the current time.
+/// A queue of future events, with the current time of the simulated clock.
 #[derive(Debug)]
 pub(crate) struct Agenda<E> {
     pub(crate) now: Micros,
-    /// The events by time, then by the order of entry; boxed, because a tree moves its values.
+    /// The events by time, then by the order in which they were entered; boxed, because a tree moves its values.
     events: BTreeMap<(Micros, u64), Box<E>>,
     entered: u64,
 }
@@ -20,7 +20,7 @@ impl<E> Default for Agenda<E> {
 }
 
 impl<E> Agenda<E> {
-    /// Enters an event at a time, or now if that has passed.
+    /// Enters an event at a time, or at the current time if that has passed.
     pub(crate) fn enter(&mut self, at: Micros, event: E) {
         self.entered += 1;
         self.events.insert((at.max(self.now), self.entered), Box::new(event));
@@ -36,7 +36,7 @@ impl<E> Agenda<E> {
         self.events.keys().next().map(|(at, _)| *at)
     }
 
-    /// Removes the next event up to a time, and advances the clock to it.
+    /// Removes and returns the next event if its time is at most `until`, and advances the clock to that event.
     pub(crate) fn take_until(&mut self, until: Micros) -> Option<E> {
         let entry = self.events.first_entry().filter(|entry| entry.key().0 <= until)?;
         let ((at, _), event) = entry.remove_entry();

@@ -1,4 +1,5 @@
-//! The allowed dependencies between crates: the graph of `docs/explanation/architecture.md`.
+//! Tests of the structure of the workspace: the dependencies between crates are those of the graph in
+//! `docs/explanation/architecture.md`.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -34,7 +35,7 @@ fn arrows() -> BTreeMap<&'static str, BTreeSet<&'static str>> {
     arrows
 }
 
-/// Returns everything that arrows lead to, directly or indirectly.
+/// Returns all crates that arrows from a crate lead to, directly or indirectly.
 fn reach<'a>(arrows: &'a BTreeMap<&str, BTreeSet<&str>>, from: &str) -> BTreeSet<&'a str> {
     let direct = arrows[from].iter();
     direct.flat_map(|&to| reach(arrows, to).into_iter().chain([to])).collect()
@@ -96,7 +97,7 @@ fn crates_use_what_the_documents_arrows_lead_to_only() {
     }
 }
 
-/// The feature `oracle` of `cell-node` is a reference for comparison; cells must not compute with it.
+/// The feature `oracle` of `cell-node` computes a reference for comparison, which cells must not use.
 #[test]
 fn only_the_papers_experiments_and_tests_have_the_cells_oracle() {
     let metadata = metadata();

@@ -1,4 +1,4 @@
-//! The bench: events in the order of time, on one clock.
+//! A bench in virtual time: cells, a gateway and a bus, whose events are processed in the order of one simulated clock.
 //!
 //! ```text
 //!   Send ─> wire faults ─> a place in the order ─┬─> faults of receiver 1 ─> Deliver ─> Send ...
@@ -40,25 +40,25 @@ use wire::{Delivery, Inlet, Sent};
 
 pub use wire::OnTheWire;
 
-/// The interval at which the gateway advances the time, and checks its script.
+/// The interval at which the gateway advances its time and sends the stimuli that its scenario schedules.
 const LOOK: Span = Span::from_millis(4);
 
-/// An action of a test at a time.
+/// An action that a test schedules.
 #[derive(Clone, Copy, Debug)]
 pub enum Act {
-    /// A cell loses its power.
+    /// The cell in this slot loses its power.
     Kill(usize),
-    /// A cell is switched on, or off and on.
+    /// The cell in this slot is switched on, or off and on.
     Start(usize),
-    /// A cell hangs.
+    /// The cell in this slot hangs.
     Hang(usize),
-    /// A hung cell continues.
+    /// The hung cell in this slot continues.
     GoOn(usize),
-    /// The gateway sends a message.
+    /// The gateway sends this message.
     Say(Message),
-    /// Another client sends a message.
+    /// Another client sends this message.
     Inject(Message),
-    /// Another client sends any frame.
+    /// Another client sends this frame, which need not be a packet.
     Babble(Frame),
 }
 
@@ -74,18 +74,18 @@ enum Event {
     Act(Box<Act>),
 }
 
-/// A complete bench.
+/// A complete bench: a gateway, cells and a bus, on one simulated clock.
 #[derive(Debug)]
 pub struct Bench {
-    /// The skin's description.
+    /// The skin of the bench.
     pub skin: Skin,
     /// The gateway.
     pub gateway: Gateway,
     /// The cells: first those of the skin, in its order, then those of [`Bench::add`].
     pub cell_slots: Vec<CellSlot>,
-    /// The faults.
+    /// The faults of the bus.
     pub faults: Faults,
-    /// A second, simpler gateway with the same input.
+    /// A second, simpler gateway with the same input, whose results must be equal.
     pub oracle: Oracle,
     /// All frames that were on the wire.
     pub wire: Vec<OnTheWire>,
@@ -94,7 +94,7 @@ pub struct Bench {
     packets: u64,
     free: Micros,
     held: Option<Sent>,
-    /// The cell slots that receive an identifier.
+    /// The indices of the cell slots that receive each identifier.
     hearers: HashMap<u32, Vec<usize>>,
     inlets: Vec<Inlet>,
     gateway_inlet: Inlet,
@@ -104,13 +104,13 @@ pub struct Bench {
 }
 
 impl Bench {
-    /// Creates a bench of a skin without touches; its cells are switched on at time 0.
+    /// Creates a bench for a skin, without touches. Its cells are switched on at time 0.
     #[must_use]
     pub fn new(skin: &Skin, seed: u64) -> Self {
         Self::with(skin, &Scenario::idle(Span::from_millis(0)), seed, |_| Micros(0))
     }
 
-    /// Creates a bench of a skin with a scenario; `start` returns the time at which each cell is switched on.
+    /// Creates a bench for a skin with a scenario; `start` returns the time at which each cell is switched on.
     ///
     /// # Panics
     /// Panics if the skin has no bus, or an external controller.
@@ -146,7 +146,7 @@ impl Bench {
         bench
     }
 
-    /// Puts the bench on a real bus with these bit rates, from now on.
+    /// Models a real bus with these bit rates, with arbitration and frame durations, from now on.
     #[must_use]
     pub fn on_a_bus(mut self, rates: BitRates) -> Self {
         self.real = Some(RealBus::new(rates));
@@ -165,7 +165,7 @@ impl Bench {
         self.real.as_ref().map_or(&[], |real| &real.attempts)
     }
 
-    /// Adds a cell, switched off, and returns its slot.
+    /// Adds a cell that is switched off, and returns the index of its slot.
     pub fn add(&mut self, identity: Identity, flash: FlashState) -> usize {
         let cell_slot = self.cell_slots.len();
         for id in identity.received_ids().into_iter().flatten() {
@@ -182,7 +182,7 @@ impl Bench {
         self.agenda.now
     }
 
-    /// Returns the interval of broadcasts.
+    /// Returns the interval between two broadcasts.
     #[must_use]
     pub fn epoch(&self) -> Span {
         Span(self.gateway.period().0 * u64::from(self.skin.timing.ticks_per_broadcast))
@@ -212,7 +212,7 @@ impl Bench {
         self.press_from(place, newtons, AppliesFrom::Next);
     }
 
-    /// Makes the gateway press a cell from given joints on.
+    /// Makes the gateway press a cell from the joints `from` on.
     ///
     /// # Panics
     /// Panics if the skin does not have the cell.
@@ -239,7 +239,7 @@ impl Bench {
         started && cells.all(|(cell_slot, cell)| !cell_slot.runs() || cell.is_ready())
     }
 
-    /// Starts the ticks of the loop.
+    /// Starts the ticks of the control loop.
     pub fn begin(&mut self) {
         if !self.ticking {
             self.ticking = true;
@@ -247,7 +247,7 @@ impl Bench {
         }
     }
 
-    /// Settles, begins, and runs for one epoch.
+    /// Waits until the cells are expected to answer, starts the loop, and runs for one epoch.
     pub fn started(mut self) -> Self {
         self.settle();
         self.begin();
@@ -255,12 +255,12 @@ impl Bench {
         self
     }
 
-    /// Runs for a number of epochs.
+    /// Runs the bench for this number of epochs.
     pub fn run_epochs(&mut self, epochs: u64) {
         self.run(Span(self.epoch().0 * epochs));
     }
 
-    /// Runs for a time.
+    /// Runs the bench for this time.
     pub fn run(&mut self, span: Span) {
         let until = self.agenda.now + span;
         while let Some(event) = self.agenda.take_until(until) {
@@ -269,7 +269,7 @@ impl Bench {
         self.agenda.now = until;
     }
 
-    /// Stops the loop; the cells send their last packets, as at the end of every run.
+    /// Stops the loop as at the end of every run, and lets the cells send their last packets.
     pub fn finish(&mut self) {
         self.ticking = false;
         self.run(Span(2 * self.epoch().0));
@@ -356,7 +356,7 @@ impl Bench {
         self.sends(cell_slot, &packets);
     }
 
-    /// Sends the packets of a cell after its thinking time, and sets its next timer.
+    /// Sends the packets of a cell after the time that it takes to answer, and sets its next timer.
     fn sends(&mut self, cell_slot: usize, packets: &[Packet]) {
         let Some(there) = self.cell_slots.get_mut(cell_slot) else { return };
         let (life, at) = (there.lives, self.agenda.now + there.thinks);
@@ -385,7 +385,7 @@ impl Bench {
         lines.chain([end]).collect()
     }
 
-    /// Returns the complete torques of one cell on the wire, in order: epoch and words.
+    /// Returns the epoch and the words of each torque of a cell that arrived complete, in order.
     #[must_use]
     pub fn torques(&self, place: usize) -> Vec<(u8, [i16; WORDS])> {
         self.oracle.torques(place)

@@ -3,7 +3,7 @@
 use protocol::bus::Filter;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, REMOTE};
 
-/// A client with subscriptions, a frame, and the expected result.
+/// A test case: a client with subscriptions, a frame, and whether the client receives it.
 #[derive(Clone, Debug)]
 pub struct Case {
     /// The rule, as a sentence.
@@ -18,7 +18,7 @@ pub struct Case {
     pub error_mask: u32,
     /// True if the client itself sends the frame, false if another client does.
     pub from_self: bool,
-    /// The frame.
+    /// The frame that is sent.
     pub frame: Frame,
     /// True if the client receives the frame: once, also if several filters match.
     pub received: bool,
@@ -27,11 +27,11 @@ pub struct Case {
 /// A datagram that a `CAN_RAW` socket must not send.
 #[derive(Clone, Debug)]
 pub struct Refused {
-    /// The defect.
+    /// The defect of the datagram.
     pub what: &'static str,
     /// True if the sender opened the bus for CAN FD.
     pub fd: bool,
-    /// The bytes.
+    /// The bytes that the socket must refuse.
     pub datagram: Vec<u8>,
 }
 
@@ -53,7 +53,7 @@ fn remote(id: u32) -> Frame {
     Frame::remote(id, 0).expect("nothing fits")
 }
 
-/// Returns all rules, each with frames that pass and frames that do not.
+/// Returns test cases for all rules, with frames that pass and frames that do not.
 pub fn cases() -> Vec<Case> {
     let exact = |id| Filter { id, mask: Filter::EXACT_MASK };
     let masked = |id, mask| Filter { id, mask };

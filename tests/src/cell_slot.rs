@@ -19,23 +19,23 @@ pub(crate) type Waiting = (Micros, Frame);
 /// A cell, or an empty slot for one.
 #[derive(Debug)]
 pub struct CellSlot {
-    /// Its identity.
+    /// The identity of the cell.
     pub identity: Identity,
-    /// The content of its flash.
+    /// The content of the cell's flash.
     pub flash: FlashState,
     /// The time from receiving a frame to answering it.
     pub thinks: Span,
-    /// The number of starts. Packets of an earlier life do not belong to the present one.
+    /// The number of starts of the cell, which tells its packets before a restart from those after it.
     pub lives: u32,
-    /// While true, each of its torques has the words of the first one.
+    /// True while the cell is stuck: each torque has the words of the first one.
     pub is_stuck: bool,
     first: Option<Words>,
     format: Format,
-    /// While the cell hangs, frames collect in its socket.
+    /// The power state of the cell; while it hangs, frames collect in its socket.
     life: Life<Waiting>,
-    /// The serial number of the cell to which it gave way.
+    /// The serial number of the cell to which this cell gave its node id.
     gave_up: Option<u32>,
-    /// The time of its next timer.
+    /// The time of the cell's next timer.
     pub(crate) wake: Option<Micros>,
 }
 
@@ -64,19 +64,19 @@ impl CellSlot {
         self.life.node()
     }
 
-    /// Returns the serial number of the cell that it gave way to.
+    /// Returns the serial number of the cell to which this cell gave its node id.
     #[must_use]
     pub const fn gave_up(&self) -> Option<u32> {
         self.gave_up
     }
 
-    /// Returns true if it works.
+    /// Returns true if the cell is on and does not hang.
     #[must_use]
     pub const fn runs(&self) -> bool {
         self.life.runs()
     }
 
-    /// Returns a packet as the cell sends it.
+    /// Returns the packet that the cell sends instead of this one: a stuck cell repeats the words of its first torque.
     pub(crate) fn sent(&mut self, packet: Packet) -> Packet {
         if !self.is_stuck || packet.id.kind != Kind::Torque {
             return packet;
@@ -84,14 +84,14 @@ impl CellSlot {
         Packet { words: *self.first.get_or_insert(packet.words), ..packet }
     }
 
-    /// Switches it on. A simulated cell obeys stimuli from the start.
+    /// Switches the cell on. A simulated cell obeys stimuli from the start.
     pub(crate) fn start(&mut self, now: Micros) {
         self.lives += 1;
         self.life = Life::Runs(Box::new(Node::new(self.identity, self.format, &self.flash, true, now)));
         (self.gave_up, self.wake) = (None, None);
     }
 
-    /// Switches it off. Only its flash remains.
+    /// Switches the cell off. Only its flash keeps its content.
     pub(crate) fn kill(&mut self) {
         (self.life, self.gave_up) = (Life::Off, None);
     }
@@ -100,7 +100,8 @@ impl CellSlot {
         self.life.hang();
     }
 
-    /// Continues after a hang, as the shell does: timers first, then the collected frames, batch by batch.
+    /// Continues after a hang in the order of the process: timers first, then the collected frames, batch by batch.
+    /// Returns the packets to send.
     pub(crate) fn go_on(&mut self, now: Micros) -> Vec<Packet> {
         let Some(mut waiting) = self.life.go_on() else { return Vec::new() };
         let mut packets = self.time(now);
@@ -111,7 +112,7 @@ impl CellSlot {
         packets
     }
 
-    /// Advances the time, and returns the packets to send.
+    /// Advances the cell's time, and returns the packets to send.
     pub(crate) fn time(&mut self, now: Micros) -> Vec<Packet> {
         if let Life::Runs(node) = &mut self.life {
             node.handle_timeout(now);

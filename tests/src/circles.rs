@@ -1,5 +1,5 @@
-//! Circular dependencies between files: files of one crate that use each other in a circle, so that none can be read or
-//! changed alone.
+//! A test that finds circular dependencies: files of one crate that use each other in a circle, so that none of them
+//! can be read or changed alone.
 //!
 //! ```text
 //!   files ─> tokens: paths, imports ─> modules: arrows to definitions ─> circles

@@ -1,4 +1,4 @@
-//! Doc comments begin with a noun or a verb, and say what there is: the share of those that do not stays small.
+//! A test of doc comments: nearly all begin with a noun or a verb, and state what a thing is instead of what it is not.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::path::{Path, PathBuf};
@@ -38,7 +38,7 @@ impl Counts {
     }
 }
 
-/// Returns the text of a line of a doc comment.
+/// Returns the text of a line if it is a doc comment.
 fn text_of(line: &str) -> Option<&str> {
     let line = line.trim_start();
     let text = line.strip_prefix("///").or_else(|| line.strip_prefix("//!"))?;

@@ -15,9 +15,9 @@ const NORMATIVE: [&str; 6] = [
     "docs/reference/sensing.md",
     "docs/reference/tree.md",
 ];
-/// The limit for all other pages together.
+/// The maximum number of words of all other pages together.
 const MAX_WORDS: usize = 40_000;
-/// The page whose blocks `process_readme` runs.
+/// The page whose blocks of commands the test `process_readme` runs.
 const RUN_AS_A_WHOLE: &str = "README.md";
 
 fn root() -> &'static Path {
@@ -55,7 +55,7 @@ fn pages() -> Vec<Page> {
     found.into_iter().map(read).collect()
 }
 
-/// A fenced block.
+/// A fenced block of a page.
 #[derive(Debug, Eq, PartialEq)]
 struct Block<'a> {
     language: &'a str,

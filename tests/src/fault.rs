@@ -1,4 +1,5 @@
-//! Faults of a bus: seeded, for all receivers or one, selected by sender, kind and time.
+//! Faults of a simulated bus, drawn at random from a seed: for all receivers or one, and limited by sender, kind of
+//! packet and time.
 
 use std::ops::Range;
 
@@ -8,7 +9,7 @@ use protocol::time::{Micros, Span};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-/// A sender or receiver.
+/// A sender or receiver of frames.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Party {
     /// The gateway; it also receives its own frames.
@@ -24,20 +25,20 @@ pub enum Party {
 pub enum Harm {
     /// The frame is lost.
     Lose,
-    /// The frame is late by up to this time, and others overtake it.
+    /// The frame is late by up to this time, and other frames may overtake it.
     Delay(Span),
     /// The frame arrives twice.
     Duplicate,
     /// The frame arrives after the next one.
     Reorder,
-    /// One to three of its bits are flipped, in the identifier, the data or the CRC.
+    /// One to three bits of the frame are flipped, in the identifier, the data or the CRC.
     Flip,
-    /// Its last bytes are missing.
+    /// The last bytes of the frame are missing.
     Truncate,
 }
 
 impl Harm {
-    /// One of each kind.
+    /// The harms of all kinds, one of each.
     pub const ALL: [Self; 6] = [
         Self::Lose,
         Self::Delay(Span::from_millis(20)),
@@ -51,11 +52,11 @@ impl Harm {
 /// The receivers that a fault affects.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Hits {
-    /// The frame on the wire: all receivers get the same.
+    /// The fault hits the frame on the wire, so all receivers get the same.
     Wire,
-    /// Each receiver, with its own chance.
+    /// The fault hits each receiver with its own chance.
     Each,
-    /// One receiver.
+    /// The fault hits one receiver.
     Only(Party),
 }
 
@@ -124,13 +125,13 @@ impl Fault {
 pub struct Effect {
     /// The frame that arrives.
     pub frame: Frame,
-    /// The number of times that it arrives.
+    /// The number of times that the frame arrives.
     pub times: u8,
-    /// The additional delay.
+    /// The additional delay of the frame.
     pub delay: Span,
-    /// True if it arrives after the next one.
+    /// True if the frame arrives after the next one.
     pub after_next: bool,
-    /// The damage, if there is any.
+    /// The damage to the frame, if it has any.
     pub damage: Option<Harm>,
 }
 
@@ -158,7 +159,8 @@ impl Faults {
         self.all.clear();
     }
 
-    /// Returns the effect on a frame on the wire (`to` is `None`), or on its way from there to a receiver.
+    /// Returns the effect of all faults on a frame: on the wire if `to` is `None`, else on its way from the wire to
+    /// that receiver.
     pub fn effect(&mut self, now: Micros, from: Party, to: Option<Party>, frame: Frame) -> Effect {
         let mut effect = Effect { frame, times: 1, delay: Span(0), after_next: false, damage: None };
         let kind = Id::from_bits(u16::try_from(frame.id()).unwrap_or(u16::MAX)).kind;
@@ -184,7 +186,7 @@ impl Faults {
     }
 }
 
-/// Flips one to three different bits; the CRC detects any three.
+/// Returns the frame with one to three different bits flipped, which the CRC always detects.
 fn flipped(frame: Frame, dice: &mut Pcg64Mcg) -> Frame {
     const ID_BITS: usize = 11;
     let (mut id, mut data) = (frame.raw_id(), frame.data().to_vec());

@@ -1,4 +1,5 @@
-//! The gateway of a bench: the real table and the real loop, with simulated threads and sockets around them.
+//! The gateway of a bench in virtual time: the real table and the real control loop, with simulated threads and sockets
+//! around them.
 
 use std::collections::VecDeque;
 
@@ -16,21 +17,21 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
-/// The number of epochs that a stimulus is sent before its first epoch.
+/// The number of epochs by which a stimulus is sent ahead of its first epoch.
 const LEAD: u64 = 5;
 
-/// Table, loop and script.
+/// A gateway: the table of its cells, its control loop, and the stimuli of its scenario.
 #[derive(Debug)]
 pub struct Gateway {
-    /// The state of its bus.
+    /// The gateway's table of the cells on its bus.
     pub table: Table,
     /// The records of all ticks.
     pub records: Vec<TickRecord>,
-    /// The notices, with their times.
+    /// The notices of the table, with their times.
     pub notices: Vec<(Micros, Notice)>,
-    /// The state of the bus, as the loop gets it: true if it works.
+    /// True if the loop is told that the bus works.
     pub works: bool,
-    /// True if a restarted cell gets its stimulus again.
+    /// True if the gateway sends a restarted cell its stimulus again.
     pub reminds: bool,
     /// The number of broadcasts skipped with their ticks.
     pub broadcasts_skipped: u64,
@@ -39,7 +40,7 @@ pub struct Gateway {
     positions: VecDeque<(Epoch, [f64; MAX_JOINTS])>,
     touches: Touches,
     script_epoch: u64,
-    /// The last stimulus of each cell from a test.
+    /// The last stimulus that a test sent to each cell.
     pressed: Vec<SkinSensors>,
     nodes: Vec<CellId>,
     began: Option<Micros>,
@@ -91,13 +92,13 @@ impl Gateway {
         self.cycle.broadcasts()
     }
 
-    /// Returns the last tick's record.
+    /// Returns the record of the last tick.
     #[must_use]
     pub fn last(&self) -> Option<&TickRecord> {
         self.records.last()
     }
 
-    /// Skips the next `ticks`.
+    /// Makes the loop skip the next `ticks` ticks.
     pub const fn skip_ticks(&mut self, ticks: u64) {
         self.skip += ticks;
     }
@@ -124,7 +125,7 @@ impl Gateway {
         self.table.handle_frame(stood, own, frame, &mut positions);
     }
 
-    /// Runs one tick, and returns the messages to send.
+    /// Runs one tick of the loop, and returns the messages to send.
     pub(crate) fn turn(&mut self, now: Micros) -> Vec<Message> {
         if self.skip > 0 {
             self.skip -= 1;
@@ -154,8 +155,8 @@ impl Gateway {
         messages
     }
 
-    /// Advances the table's time and collects its notices. Returns the messages of the script, and those for restarted
-    /// cells.
+    /// Advances the table's time and collects its notices. Returns the stimuli that are due, and the messages for
+    /// restarted cells.
     pub(crate) fn look(&mut self, now: Micros) -> Vec<Message> {
         self.table.handle_time(now);
         let mut messages = Vec::new();

@@ -4,14 +4,14 @@ use std::collections::VecDeque;
 
 use cell_node::node::Node;
 
-/// The state of a cell. While it hangs, its input collects.
+/// The power state of a cell. While the cell hangs, its input collects.
 #[derive(Debug)]
 pub(crate) enum Life<W> {
-    /// Without power.
+    /// The cell has no power.
     Off,
-    /// Working normally.
+    /// The cell works normally.
     Runs(Box<Node>),
-    /// Hung: it does nothing.
+    /// The cell hangs: it does nothing, and its input waits.
     Hangs(Box<Node>, VecDeque<W>),
 }
 

@@ -1,7 +1,8 @@
-//! Cells wired at random, in virtual time: they must become a tree, stay one, and never count a cell twice.
+//! A skin of cells that are wired at random, in virtual time: the cells must form a tree, keep it, and never count a
+//! cell twice in a sum.
 //!
-//! Every cell has a random torque of its own, so that a sum shows which cells are in it: a cell's sum must consist of
-//! its own torque and some of its neighbours' sums of that epoch, and only one choice fits.
+//! Every cell has a random torque, so that a sum shows which cells are in it: the sum that a cell sends must consist of
+//! its own torque and of sums that its neighbours sent in that epoch, and only one choice of these fits.
 
 #![expect(
     clippy::indexing_slicing,
@@ -40,11 +41,11 @@ use protocol::packet::padded;
 
 pub use place::Place;
 
-/// The interval of broadcasts.
+/// The interval between two broadcasts.
 pub const PERIOD: Span = Span(16_000);
-/// The minimum and the maximum time from sending to receiving.
+/// The minimum and the maximum time from sending a message to receiving it, in us.
 const LATENCY: (u64, u64) = (10, 60);
-/// The time from receiving a message to answering it.
+/// The time that a cell takes from receiving a message to answering it.
 const THINKS: Span = Span(30);
 /// Returns the joint positions in quarter turns, the same in every epoch.
 fn positions() -> [Q1_14; WORDS] {
@@ -52,12 +53,12 @@ fn positions() -> [Q1_14; WORDS] {
     std::array::from_fn(|joint| positions.get(joint).copied().unwrap_or_default())
 }
 
-/// The far end of a port.
+/// The far end of the wire at a cell's port.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum End {
-    /// A cell's port.
+    /// The port of a cell: the index of the cell, and that of the port.
     Cell(usize, usize),
-    /// The gateway's side; the index of the root.
+    /// The gateway's side, with the index of the root.
     Gateway(usize),
 }
 
@@ -73,9 +74,9 @@ enum Event {
 /// The sums of one epoch that the gateway received.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Took {
-    /// Bit i is set if the sums contain cell i.
+    /// The cells in the sums: bit i is set for cell i.
     pub cells: u128,
-    /// The number of sums.
+    /// The number of sums that were received.
     pub frames: u32,
 }
 
@@ -86,11 +87,11 @@ pub struct Wiring {
     pub cells: Vec<Place>,
     /// The cells that are wired to the gateway's side.
     pub roots: Vec<usize>,
-    /// The result of each broadcast.
+    /// The sums that the gateway received in the epoch of each broadcast.
     pub took: Vec<Took>,
-    /// The part of all messages over wires that is lost.
+    /// The probability that a message over a wire is lost.
     pub loss: f64,
-    /// The maximum depth for which cells have slots.
+    /// The maximum depth in the tree for which cells have a slot to send sums.
     pub deepest: u8,
     uplinks: Uplinks,
     root_sums: HashMap<usize, (SumWords, u128)>,
@@ -165,13 +166,13 @@ impl Wiring {
         }
     }
 
-    /// Adds a wire between two ports.
+    /// Adds a wire between port `p` of cell `a` and port `q` of cell `b`.
     pub fn wire(&mut self, a: usize, p: usize, b: usize, q: usize) {
         self.cells[a].wires[p] = Some(End::Cell(b, q));
         self.cells[b].wires[q] = Some(End::Cell(a, p));
     }
 
-    /// Adds a wire to the gateway's side.
+    /// Makes a cell a root: adds a wire from it to the gateway's side.
     pub fn add_root(&mut self, cell: usize) {
         self.cells[cell].wires[UPLINK] = Some(End::Gateway(self.roots.len()));
         self.roots.push(cell);
@@ -238,7 +239,7 @@ impl Wiring {
         }
     }
 
-    /// Runs for a time.
+    /// Runs the cells for this time.
     pub fn run(&mut self, span: Span) {
         let until = self.agenda.now + span;
         while let Some(event) = self.agenda.take_until(until) {
@@ -271,7 +272,7 @@ impl Wiring {
         }
     }
 
-    /// Delivers input to a cell; it collects while the cell hangs.
+    /// Delivers input to a cell, or collects it while the cell hangs.
     fn deliver(&mut self, cell: usize, inlet: Inlet) {
         let now = self.agenda.now;
         if let Life::Hangs(_, waiting) = &mut self.cells[cell].life {
@@ -290,7 +291,7 @@ impl Wiring {
         self.after(cell);
     }
 
-    /// Deferred frames are read when something else wakes the cell, before that.
+    /// Delivers the deferred frames of a cell, which it reads before the input that wakes it.
     fn receive_deferred(&mut self, cell: usize) {
         let now = self.agenda.now;
         loop {
@@ -323,7 +324,7 @@ impl Wiring {
         self.after(cell);
     }
 
-    /// Collects the messages of a cell, and its next timeout.
+    /// Sends the messages of a cell after an input, and schedules its next timeout.
     fn after(&mut self, cell: usize) {
         let place = &mut self.cells[cell];
         let Life::Runs(node) = &mut place.life else { return };
@@ -382,7 +383,7 @@ impl Wiring {
         }
     }
 
-    /// Returns the arrival time of a message that is sent now; messages keep their order.
+    /// Returns the arrival time of a message that is sent now, so that messages keep their order.
     fn arrival(&mut self, at: Option<usize>) -> Micros {
         let arrives = self.agenda.now + THINKS + Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
         let newest = at.map_or(&mut self.gateway_newest, |cell| &mut self.cells[cell].newest);
@@ -431,7 +432,7 @@ impl Wiring {
         self.ticking = false;
     }
 
-    /// Switches every cell to sums.
+    /// Makes every cell answer with sums, for trees of at most this depth.
     pub fn switch(&mut self, deepest: u8, carry: bool) {
         self.deepest = deepest;
         let slot_us = u16::try_from(12_000 / (u32::from(deepest) + 1)).expect("a slot");

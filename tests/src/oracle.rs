@@ -12,23 +12,23 @@ use protocol::time::Micros;
 
 use crate::fault::{Harm, Party};
 
-/// A torque may answer the newest broadcast or one of the three before it.
+/// The number of newest broadcasts that a torque may answer.
 const LATEST: usize = 4;
 
-/// The truth about a frame.
+/// The true origin, content and damage of a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Truth {
-    /// The sender.
+    /// The sender of the frame.
     pub from: Party,
-    /// The life of the cell in which it was sent.
+    /// The number of starts of the sending cell when it sent the frame.
     pub life: u32,
-    /// The packet that it carries completely or partly; `None` for a babbled frame.
+    /// The packet that the frame carries completely or partly; `None` for a babbled frame.
     pub packet: Option<Packet>,
     /// The number of the packet on this bench; 0 for frames that are not packets.
     pub number: u64,
-    /// The segment of the packet; 0 for a whole one.
+    /// The index of the frame among the segments of the packet; 0 for a packet in one frame.
     pub segment: usize,
-    /// The damage that was done to it.
+    /// The damage that was done to the frame.
     pub damage: Option<Harm>,
 }
 
@@ -40,23 +40,24 @@ impl Truth {
         Self { damage: if link_down { Some(Harm::Truncate) } else { self.damage.or(damage) }, ..self }
     }
 
-    /// Corrects the damage by the frame that arrived: bits that were flipped twice are right again.
+    /// Returns the truth with the damage corrected by the frame that arrived: bits that were flipped twice are right
+    /// again.
     fn on_arrival(self, frame: &Frame) -> Self {
         let meant = self.packet.and_then(|packet| packet.frames(frame.format()).nth(self.segment));
         if meant.is_some_and(|meant| meant == *frame) { Self { damage: None, ..self } } else { self }
     }
 }
 
-/// The frames delivered to the gateway, by their expected treatment.
+/// The numbers of frames that were delivered to the gateway, by the treatment that is expected of it.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Tally {
-    /// All frames.
+    /// All frames that were delivered.
     pub frames: u64,
     /// Whole packets of other senders.
     pub packets: u64,
-    /// Whole packets that are torques which count.
+    /// Whole torques that must enter the sum.
     pub used: u64,
-    /// Torques for an epoch that the same cell had answered already.
+    /// Torques of an epoch that the same cell had answered already.
     pub repeated: u64,
     /// Torques of an epoch that is over, or has not begun.
     pub stale: u64,
@@ -73,10 +74,10 @@ pub struct Tally {
 /// The oracle's state of a cell.
 #[derive(Clone, Debug, Default)]
 struct Mirror {
-    /// The broadcast that its newest torque answered.
+    /// The index of the broadcast that the cell's newest torque answered.
     answered: Option<usize>,
     held: Option<[i32; MAX_JOINTS]>,
-    /// The part of it that is in the sum.
+    /// The torque of the cell in the sum: the held torque, or what remains of it while it decays.
     value: [i32; MAX_JOINTS],
     torques: Vec<(u8, [i16; WORDS])>,
     arrived: u64,
@@ -84,17 +85,17 @@ struct Mirror {
     holder: Option<Party>,
 }
 
-/// The oracle of one bus.
+/// A simpler gateway for one bus, which knows the truth about frames.
 #[derive(Debug)]
 pub struct Oracle {
     /// The counts of frames.
     pub tally: Tally,
-    /// True if the sum is compared; several cells with one node id are not supported.
+    /// True if the sum of torques is compared, which is not possible while several cells have one node id.
     pub compares: bool,
     format: Format,
     safety: Safety,
     mirrors: Vec<Mirror>,
-    /// The index of each node id.
+    /// The index of the cell with each node id.
     places: [Option<usize>; 256],
     broadcasts: Vec<Epoch>,
     /// The last frame of each identifier, and its time on the wire.
@@ -261,7 +262,7 @@ impl Oracle {
         whole
     }
 
-    /// Handles a notice: the torque of a silent cell is released.
+    /// Handles a notice of the gateway: removes the torque of a dead or restarted cell.
     pub(crate) fn notice(&mut self, notice: Notice) {
         let (Notice::Dead(cell) | Notice::Restarted(cell)) = notice else { return };
         let place = self.places.get(usize::from(cell.get())).copied().flatten();
@@ -270,7 +271,7 @@ impl Oracle {
         }
     }
 
-    /// Checks that the sum of a tick equals the oracle's, to the last bit.
+    /// Checks that the gateway's sum of a tick equals the sum of the oracle, to the last bit.
     pub(crate) fn check_sum(&self, now: Micros, snapshot: &BusTotals) {
         if !self.compares {
             return;
@@ -301,7 +302,8 @@ impl Mirror {
         self.value = [0; MAX_JOINTS];
     }
 
-    /// Holds the torque, then decays it to zero in equal steps.
+    /// Updates the cell's torque in the sum: it is held for some epochs without an answer, then decays to zero in equal
+    /// steps.
     fn decay(&mut self, newest: usize, safety: &Safety) {
         let (Some(held), Some(answered)) = (self.held, self.answered) else { return };
         let (hold, decay) = (safety.hold_epochs as usize, safety.decay_epochs as usize);

@@ -1,4 +1,4 @@
-//! The wire of a bench as a real bus: with bit rates, arbitration and queues.
+//! A model of a real bus for the wire of a bench: with bit rates, arbitration and queues.
 
 use std::collections::BTreeMap;
 
@@ -15,7 +15,7 @@ pub type Requested = (Micros, Frame);
 pub(crate) struct RealBus<T> {
     model: BusModel,
     waiting: BTreeMap<u64, T>,
-    /// The time at which it is advanced next, if that has been entered.
+    /// The time at which the bus is advanced next, if that is scheduled.
     pub(crate) look: Option<Micros>,
     pub(crate) requested: Vec<Requested>,
     pub(crate) attempts: Vec<Attempt>,
@@ -42,7 +42,7 @@ impl<T> RealBus<T> {
         self.model.request(request);
     }
 
-    /// Returns the frames that have ended by now, with their times in whole µs, rounded up.
+    /// Returns the frames whose transmission has ended until now, with the times of their ends in whole µs, rounded up.
     pub(crate) fn ended(&mut self, now: Micros) -> Vec<(Micros, T)> {
         self.model.run_until(now.0 * 1_000);
         let mut ended = Vec::new();
@@ -54,7 +54,7 @@ impl<T> RealBus<T> {
         ended
     }
 
-    /// Returns the time at which it has to be advanced next.
+    /// Returns the time at which the bus must be advanced next.
     pub(crate) fn next(&self) -> Option<Micros> {
         self.model.poll_timeout().map(|nanos| Micros(nanos.div_ceil(1_000)))
     }

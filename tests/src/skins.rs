@@ -1,4 +1,4 @@
-//! Skins to test with.
+//! Skins for tests.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -6,8 +6,8 @@ use std::path::Path;
 use protocol::can::Format;
 use protocol::skin::Skin;
 
-/// Returns a UR5 with `cells` cells on one bus, spread over its joints, each with a different pose; thresholds of 0.1
-/// N, proximity not used; torques are held for 2 epochs, and decay over 4.
+/// Returns a UR5 with `cells` cells on one bus, spread over its joints, each with a different pose. The cells have
+/// thresholds of 0.1 N and do not use proximity. Torques are held for 2 epochs, and decay over 4.
 ///
 /// # Panics
 /// Panics if there are more cells than a bus has node ids.

@@ -1,5 +1,5 @@
-//! A workshop that commissions cells in virtual time: real [`Node`]s, a bus that loses, repeats and damages frames at
-//! random from a seed, and control over the power of cells and the end of the commissioning.
+//! A workshop that commissions cells in virtual time. It has real [`Node`]s, and a bus that loses, repeats and damages
+//! frames at random from a seed. A test controls the power of cells and the end of the commissioning.
 
 use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
@@ -26,16 +26,16 @@ const TIMEOUT: Span = Span::from_millis(60_000);
 /// A cell in the workshop.
 #[derive(Debug)]
 pub struct Piece {
-    /// Its identity.
+    /// The identity of the cell.
     pub identity: Identity,
-    /// The content of its flash.
+    /// The content of the cell's flash.
     pub flash: FlashState,
-    /// All contents that its flash has had, oldest first.
+    /// All contents that the cell's flash has had, oldest first.
     pub history: Vec<FlashState>,
-    /// True if its flash cannot be written.
+    /// True if the cell's flash cannot be written.
     pub worn: bool,
     node: Option<Node>,
-    /// The arrival time of the newest frame: frames keep their order.
+    /// The arrival time of the newest frame, which a later frame must not overtake.
     newest: Micros,
 }
 
@@ -47,7 +47,7 @@ impl Piece {
     }
 }
 
-/// An event at a time.
+/// A future event of the workshop.
 #[derive(Clone, Copy, Debug)]
 enum Event {
     ToCell(usize, Frame),
@@ -59,7 +59,7 @@ enum Event {
 /// A function that replaces packets on their way: for cells that send wrong values, and for damage that no CRC detects.
 pub type Forger = fn(Packet) -> Packet;
 
-/// The workshop.
+/// A workshop with its cells, bus and clock.
 #[derive(Debug)]
 pub struct Workshop {
     /// The cells.
@@ -70,7 +70,7 @@ pub struct Workshop {
     pub twice: f64,
     /// The probability that a bit of a frame is flipped.
     pub damage: f64,
-    /// The forgers of packets to cells, and of packets from cells.
+    /// The functions that replace packets to cells, and packets from cells.
     pub forgers: Option<(Forger, Forger)>,
     /// The number of messages that cells and the gateway's side have sent.
     pub said: u64,
@@ -154,10 +154,10 @@ impl Workshop {
         self.agenda.now = until;
     }
 
-    /// Commissions until the end, or until it is killed after a time.
+    /// Commissions a skin until the end, or until it is killed after a time, and returns the report.
     ///
     /// # Panics
-    /// Panics if it does not end.
+    /// Panics if the commissioning does not end within a time limit.
     pub fn commission(&mut self, skin: &Skin, wish: CommissionOptions, killed_after: Option<Span>) -> Report {
         let mut commission = Commission::new(skin, 0, wish, 1_000, self.agenda.now);
         let mut decoder = Decoder::new(Some(self.format));
@@ -256,7 +256,7 @@ impl Workshop {
         }
     }
 
-    /// Passes a frame from one party to all that receive it, each with its own chances.
+    /// Passes a frame from a cell, or from the gateway's side, to all receivers, each with its own chances of faults.
     fn pass(&mut self, frame: Frame, from: Option<usize>) {
         self.said += 1;
         let id = frame.id();
@@ -317,7 +317,7 @@ fn damaged(frame: Frame, bit: usize) -> Frame {
     Frame::with_data(frame.raw_id(), frame.format(), frame.flags(), &data).unwrap_or(frame)
 }
 
-/// Returns the node id of a number.
+/// Converts a number to a node id.
 ///
 /// # Panics
 /// Panics if it is not a valid node id.

@@ -4,7 +4,8 @@
 //! `cargo run --release -p vcan-setup --example skin_pattern [CELLS] [SECONDS] [CELLS_PER_CLIENT]`
 //!
 //! Almost all of the cost is the system's, which wakes one reader per delivery. Cells that share a client are woken
-//! together and cost a fraction.
+//! The system causes almost all of the cost, because it wakes one reader for each delivered frame. Cells that share a
+//! client are woken together, at a fraction of the cost.
 #![allow(clippy::print_stdout, reason = "an example that prints")]
 
 use std::error::Error;
@@ -39,7 +40,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let ids: Vec<_> = (1..=cells).map(|cell| 0x200 + cell).collect();
     for ids in ids.chunks(share.max(1)) {
         let (bus, ids) = (open(exact(0x001))?, ids.to_vec());
-        // The threads end with the process.
+        // The threads are not joined; they end with the process.
         Builder::new().stack_size(128 << 10).spawn(move || answer(&bus, &ids))?;
     }
     let gateway = open(vec![Filter { id: 0x200, mask: 0x700 }])?;
@@ -94,7 +95,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Answers every broadcast with its first bytes for some cells, until the bus is closed.
+/// Answers every broadcast once for each of some cells, with the first bytes of the broadcast, until the bus is closed.
 fn answer(bus: &Bus, ids: &[u32]) {
     let mut inbox = Inbox::new();
     let mut replies = Vec::new();

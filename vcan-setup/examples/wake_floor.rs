@@ -1,6 +1,6 @@
-//! Measures the cost of waking 253 processes 62.5 times a second, independent of what they compute and of what carries
-//! their frames. Each process waits in one call, and sends back the 72 bytes that it received. This is the lower bound
-//! of every bench of processes, to be measured beside one.
+//! Measures the cost of waking 253 processes 62.5 times a second, without any work or protocol: each process waits in
+//! one call, and sends back the 72 bytes that it received. This is the lower bound for every bench of processes, to be
+//! measured on the same machine.
 //!
 //! `cargo run --release -p vcan-setup --example wake_floor [PROCESSES] [SECONDS]`
 #![allow(clippy::print_stdout, reason = "an example that prints")]
@@ -52,7 +52,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Starts a process at the other end of a socket, which is its standard input.
+/// Starts a process whose standard input is one end of a socket pair. Returns the process and the other end.
 fn start() -> Result<(Child, OwnedFd), Box<dyn Error>> {
     let (near, far) = socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None)?;
     let child = Command::new(std::env::current_exe()?).arg("echo").stdin(Stdio::from(far)).spawn()?;
@@ -68,7 +68,7 @@ fn echo() -> rustix::io::Result<()> {
     Ok(())
 }
 
-/// Returns the processor time of a process so far, in s, as the scheduler counts it.
+/// Returns the processor time that a process has used so far, in s, as the scheduler counts it.
 fn processor_seconds(pid: u32) -> f64 {
     let text = std::fs::read_to_string(format!("/proc/{pid}/schedstat")).unwrap_or_default();
     let nanos = text.split_whitespace().next().and_then(|nanos| nanos.parse::<f64>().ok());

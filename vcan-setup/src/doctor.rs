@@ -21,9 +21,9 @@ mod interface;
 
 pub use facts::{BusFacts, Facts, ObservedTraffic, Program, User};
 
-/// The space of one frame in a receive buffer as the kernel accounts for it, in bytes.
+/// The size that the kernel counts for one frame in a receive buffer, in bytes.
 const FRAME: usize = 1_024;
-/// The number of answers of every cell that should fit into a receive buffer.
+/// The number of replies from every cell that a receive buffer should hold.
 const BUFFERED_ANSWERS: usize = 4;
 
 /// The severity of a finding.
@@ -34,7 +34,7 @@ pub enum Level {
     Ok,
     /// A bench runs, but the user should know this.
     Note,
-    /// A bench does not run, or its figures would be meaningless.
+    /// A bench does not run, or its measurements would be meaningless.
     Fault,
 }
 
@@ -50,14 +50,14 @@ impl Level {
     }
 }
 
-/// One finding.
+/// A result of the assessment, with ways to fix a fault.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Finding {
     /// The severity.
     pub level: Level,
-    /// The description.
+    /// The text that describes the finding.
     pub text: String,
-    /// Ways to fix it, one command each; any one is enough.
+    /// Shell commands, each of which fixes the fault.
     pub hints: Vec<String>,
 }
 
@@ -86,13 +86,13 @@ impl Finding {
     }
 }
 
-/// Returns true if a bench would run: the findings contain no fault.
+/// Returns true if none of the findings is a fault, so that a bench would run.
 #[must_use]
 pub fn would_run(findings: &[Finding]) -> bool {
     findings.iter().all(|finding| finding.level != Level::Fault)
 }
 
-/// Assesses the facts, the most basic ones first.
+/// Assesses the facts about a machine. The findings are sorted: causes come before their consequences.
 #[must_use]
 pub fn assess(facts: &Facts) -> Vec<Finding> {
     let mut findings = vec![facts.kind()];
@@ -104,7 +104,7 @@ pub fn assess(facts: &Facts) -> Vec<Finding> {
             findings.extend(facts.receive_buffer());
             findings.extend(facts.backlog());
         }
-        // Without CAN in the kernel there are no interfaces to check.
+        // Without CAN in the kernel, there can be no interfaces to check.
         BusKind::SocketCan => {}
         BusKind::Embedded => {
             findings.push(facts.embedded());
@@ -117,7 +117,7 @@ pub fn assess(facts: &Facts) -> Vec<Finding> {
 }
 
 impl Facts {
-    /// Returns the kind of bus that a bench would use.
+    /// Returns the kind of bus (SocketCAN or embedded) that a bench would use on this machine.
     #[must_use]
     pub fn bus_kind(&self) -> BusKind {
         match self.choice {
@@ -127,12 +127,12 @@ impl Facts {
         }
     }
 
-    /// Returns true if a named bus is an interface, or if no bus is named.
+    /// Returns true if one of the named buses is an interface, or if no bus is named.
     fn has_interface(&self) -> bool {
         self.buses.is_empty() || self.buses.iter().any(|bus| bus.interface.is_some())
     }
 
-    /// Returns a command line of this program, to be run as root.
+    /// Returns the text of a `vcan-setup` command that root has to run.
     fn own_command(&self, command: &str) -> String {
         self.sudo(&format!("{} {command}", self.program))
     }
@@ -141,7 +141,7 @@ impl Facts {
         if self.user.admin || self.user.root { command.to_owned() } else { format!("sudo {command}") }
     }
 
-    /// Returns the `vcan-setup up` command for a bus, with its skin or its name.
+    /// Returns the `vcan-setup up` command that makes a bus, named by its skin or by its own name.
     fn up(&self, target: &InterfaceTarget) -> String {
         let what = target.skin.as_ref().map_or(&target.name, |skin| &skin.file);
         self.own_command(&format!("up {what}"))
@@ -170,7 +170,7 @@ impl Facts {
         }
     }
 
-    /// Reports the nodes that are already on a bus.
+    /// Reports the gateway and the cells that already send on a bus.
     fn traffic(&self, bus: &BusFacts, on: &str) -> Vec<Finding> {
         let name = &bus.target.name;
         let heard = match &bus.traffic {
@@ -212,7 +212,7 @@ impl Facts {
         gateway.into_iter().chain(cells).collect()
     }
 
-    /// Checks that a burst of answers fits into the receive buffer of a socket.
+    /// Checks that the receive buffer of a socket can hold a burst of replies.
     fn receive_buffer(&self) -> Option<Finding> {
         let granted = self.receive_buffer?;
         let all = usize::from(CellId::MAX.get());
@@ -240,7 +240,7 @@ impl Facts {
         })
     }
 
-    /// Checks that one answer of every cell fits into the kernel's queue between sender and receiver.
+    /// Checks that the kernel's queue between sender and receiver can hold one reply of every cell.
     fn backlog(&self) -> Option<Finding> {
         let frames = |bus: &BusFacts| bus.cells.as_ref().map_or(0, BTreeSet::len) * frames_of(&bus.target);
         let frames: usize = self.buses.iter().map(frames).sum();
@@ -284,7 +284,7 @@ impl Facts {
     }
 }
 
-/// Returns the number of frames per packet.
+/// Returns the number of CAN frames that a packet takes on this bus.
 const fn frames_of(target: &InterfaceTarget) -> usize {
     match target.format {
         Format::Fd => 1,
@@ -292,7 +292,7 @@ const fn frames_of(target: &InterfaceTarget) -> usize {
     }
 }
 
-/// Lists node ids for people: `1, 2, 5`.
+/// Formats node ids as a list: `1, 2, 5`.
 fn nodes(cells: &BTreeSet<CellId>) -> String {
     let first: Vec<_> = cells.iter().take(12).map(ToString::to_string).collect();
     let more = if cells.len() > first.len() {

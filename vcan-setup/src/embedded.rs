@@ -5,9 +5,9 @@
 //!                          16 or 72 bytes       filters       bounded, counts drops
 //! ```
 //!
-//! Routing and queues are pure; [`Server`] is the shell around them: one thread, one `epoll`. Frames are forwarded in
-//! the order in which they are read, so all clients see the same order. The bus is private to the user, and it is not
-//! `AF_CAN`: `candump` cannot attach to it.
+//! Routing and queues are pure. [`Server`] does the input and output, with one thread and one `epoll`. Frames are
+//! forwarded in the order in which the server reads them, so all clients receive them in the same order. Only the user
+//! who serves the bus can connect. The bus is not an `AF_CAN` interface, so `candump` cannot attach to it.
 
 mod client;
 pub mod parcel;

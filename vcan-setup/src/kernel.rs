@@ -1,4 +1,4 @@
-//! CAN support of this machine's kernel, and ways to install missing modules.
+//! Finds out whether this machine's kernel supports CAN, and how missing modules can be installed.
 
 use std::fs;
 use std::path::Path;
@@ -12,9 +12,9 @@ pub enum ModuleState {
     There,
     /// The module is on the disk and can be loaded.
     Loadable,
-    /// The module does not belong to this kernel's modules.
+    /// The module is neither built in nor among the modules on the disk.
     Missing,
-    /// The state is unknown, because this kernel's modules are not on this disk.
+    /// The state is unknown, because the modules of the running kernel are not on this disk.
     Unknown,
 }
 
@@ -44,7 +44,7 @@ impl Kernel {
         let uname = rustix::system::uname();
         let release = uname.release().to_string_lossy().into_owned();
         let lists = Lists::read(&release);
-        // A request for such a socket makes the kernel load the module if it is available.
+        // Opening such a socket makes the kernel load the module, if it has one.
         let has_can = has_socketcan();
         let loaded = |name: &str| Path::new("/sys/module").join(name).exists();
         let os_release = fs::read_to_string("/etc/os-release").unwrap_or_default();
@@ -59,13 +59,14 @@ impl Kernel {
         }
     }
 
-    /// Returns the state of the module for a virtual kind, `vcan` or `vxcan`.
+    /// Returns the state of the module for a kind of virtual interface, `vcan` or `vxcan`.
     #[must_use]
     pub fn module(&self, kind: &str) -> ModuleState {
         if kind == "vxcan" { self.vxcan } else { self.vcan }
     }
 
-    /// Returns ways to get CAN or `vcan`: one shell command with a comment each, the simplest first.
+    /// Returns shell commands by which CAN or `vcan` can be made available, each with a comment; the simplest comes
+    /// first.
     #[must_use]
     pub fn hints(&self, module: ModuleState) -> Vec<String> {
         let modprobe = "sudo modprobe -a can_raw vcan vxcan";
@@ -89,7 +90,7 @@ impl Kernel {
             other => other,
         };
         let release = &self.release;
-        // The distribution's packages do not help on other kernels.
+        // The packages of a distribution contain modules only for the kernels of that distribution.
         if is("ubuntu")
             && ["-generic", "-virtual", "-kvm", "-aws", "-azure", "-gcp"]
                 .iter()
@@ -108,11 +109,11 @@ impl Kernel {
     }
 }
 
-/// The kernel's own lists of its modules.
+/// The lists in which the kernel names its modules.
 struct Lists {
     built_in: Option<String>,
     on_disk: Option<String>,
-    /// True if the kernel can load modules at all.
+    /// True if the kernel can load modules.
     takes_modules: bool,
 }
 
@@ -138,7 +139,8 @@ impl Lists {
     }
 }
 
-/// Returns true if a list of paths contains the module: `kernel/net/can/can-raw.ko.xz: kernel/net/can/can.ko.xz`.
+/// Returns true if a list of the kernel contains the module. A line is a path and its dependencies:
+/// `kernel/net/can/can-raw.ko.xz: kernel/net/can/can.ko.xz`.
 fn lists_module(list: &str, module: &str) -> bool {
     list.lines().any(|line| {
         let path = line.split(':').next().unwrap_or_default();
@@ -147,7 +149,7 @@ fn lists_module(list: &str, module: &str) -> bool {
     })
 }
 
-/// Returns the names that a distribution gives itself.
+/// Returns the values of `ID` and `ID_LIKE` in an os-release file.
 fn distribution(os_release: &str) -> String {
     let values = os_release.lines().filter_map(|line| {
         let (key, value) = line.split_once('=')?;

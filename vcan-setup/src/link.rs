@@ -1,17 +1,17 @@
-//! Interfaces of the kernel, with their properties as CAN buses.
+//! The network interfaces of the kernel, with the properties that matter for CAN.
 
 use core::fmt;
 
 use serde::Serialize;
 
-/// The alias that marks interfaces made by this program; `ip link show` prints it.
+/// The alias that marks the interfaces made by this program. `ip link show` prints it.
 pub const ALIAS_MARK: &str = "skinbus";
-/// The MTU of an interface that carries classic CAN only.
+/// The MTU in bytes of an interface that carries classic CAN only.
 pub const CLASSIC_MTU: u32 = 16;
-/// The MTU of an interface that carries CAN FD too.
+/// The MTU in bytes of an interface that carries classic CAN and CAN FD.
 pub const FD_MTU: u32 = 72;
 
-/// An interface.
+/// A network interface as the kernel reports it.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Interface {
     /// The index of the interface.
@@ -20,7 +20,7 @@ pub struct Interface {
     pub name: String,
     /// The kind of the interface.
     pub kind: InterfaceKind,
-    /// True if this program made the interface: it has the alias [`MARK`].
+    /// True if this program made the interface, which then has the alias [`MARK`].
     pub ours: bool,
     /// True if the interface is up.
     pub up: bool,
@@ -33,18 +33,18 @@ pub struct Interface {
 /// The kind of an interface.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum InterfaceKind {
-    /// A virtual bus in the kernel.
+    /// A virtual CAN bus inside of the kernel.
     Vcan,
-    /// One end of a pair, which may lead into another network namespace.
+    /// One end of a pair of virtual interfaces. The other end may be in another network namespace.
     Vxcan(Option<Peer>),
-    /// A CAN controller, or an adapter that looks like one.
+    /// A CAN controller, or an adapter with a CAN driver.
     Hardware(Hardware),
-    /// An interface without CAN, with a description.
+    /// An interface that does not carry CAN; the text describes it.
     Other(String),
 }
 
 impl InterfaceKind {
-    /// Returns the kind in one word.
+    /// Returns the kind of the interface in one word.
     #[must_use]
     pub const fn name(&self) -> &'static str {
         match self {
@@ -56,25 +56,26 @@ impl InterfaceKind {
     }
 }
 
-/// The other end of a pair.
+/// The other end of a pair of virtual interfaces.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Peer {
-    /// The index in its own namespace.
+    /// The index of the other end in its own network namespace.
     pub index: u32,
-    /// The name, if this user may read it.
+    /// The name of the other end; `None` if this user may not read it.
     pub name: Option<String>,
-    /// The name of its network namespace under /run/netns, if that is another one and has a name.
+    /// The name under /run/netns of the network namespace of the other end; `None` if that is this namespace or has no
+    /// name.
     pub namespace: Option<String>,
-    /// The id of its network namespace in this one; `None` if it is in this one.
+    /// The id by which this namespace knows that of the other end; `None` if both ends are in this one.
     pub namespace_id: Option<i32>,
 }
 
-/// A CAN controller.
+/// The properties of a CAN controller.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Hardware {
-    /// The driver.
+    /// The name of the driver.
     pub driver: Option<String>,
-    /// The error state.
+    /// The error state of the controller, by its error counters.
     pub state: Option<ControllerState>,
     /// The bit rate in bit/s; `None` if it is not set.
     pub bitrate: Option<u32>,
@@ -86,7 +87,7 @@ pub struct Hardware {
     pub listen_only: bool,
 }
 
-/// Bit rates of CAN hardware.
+/// The nominal and the data bit rate of CAN hardware.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct HardwareRates {
     /// The bit rate in bit/s; `None` if it is not set.
@@ -104,12 +105,12 @@ impl Hardware {
 }
 
 impl HardwareRates {
-    /// Returns true if the rates are within half a percent of the target's. A rate that the target does not give may
-    /// have any value.
+    /// Returns true if both rates are within half a percent of those of `target`. A rate that `target` does not have
+    /// may have any value.
     #[must_use]
     pub fn meet(self, target: Self) -> bool {
-        // A controller divides its clock by whole numbers. It may therefore miss the requested rate, by less than the
-        // nodes of a bus may differ.
+        // A controller derives bit rates from its clock by whole-number division, so the actual rate may differ a
+        // little from the requested one. The nodes of a bus tolerate more than this difference.
         let near = |target: Option<u32>, has: Option<u32>| {
             let near = |target: u32, has: u32| u64::from(target.abs_diff(has)) * 200 <= target.into();
             target.is_none_or(|target| has.is_some_and(|has| near(target, has)))
@@ -144,9 +145,9 @@ pub enum ControllerState {
     ErrorActive,
     /// More than 96 errors.
     ErrorWarning,
-    /// More than 127 errors: the controller no longer destroys others' frames.
+    /// More than 127 errors: the controller no longer signals errors by destroying the frames of others.
     ErrorPassive,
-    /// More than 255 errors: the controller no longer takes part in the bus.
+    /// More than 255 errors: the controller neither sends nor receives.
     BusOff,
     /// The interface is down.
     Stopped,
@@ -155,7 +156,7 @@ pub enum ControllerState {
 }
 
 impl ControllerState {
-    /// Returns the state for the kernel's number.
+    /// Returns the state that the kernel reports as this number; `None` if there is none.
     #[must_use]
     pub const fn from_number(number: u32) -> Option<Self> {
         Some(match number {
@@ -183,33 +184,33 @@ impl ControllerState {
     }
 }
 
-/// The traffic of an interface since it was made.
+/// Counts of the frames of an interface since it was made.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Counters {
-    /// Frames received.
+    /// Frames received by the interface.
     pub received: u64,
-    /// Frames sent.
+    /// Frames sent by the interface.
     pub sent: u64,
     /// Frames dropped by the interface in either direction.
     pub dropped: u64,
-    /// Damaged frames in either direction.
+    /// Frames in either direction that were damaged.
     pub errors: u64,
 }
 
 impl Interface {
-    /// Returns true if the interface is software only, so that it may be made and removed.
+    /// Returns true if the interface is virtual, so that this program may make and remove it.
     #[must_use]
     pub const fn is_virtual(&self) -> bool {
         matches!(self.kind, InterfaceKind::Vcan | InterfaceKind::Vxcan(_))
     }
 
-    /// Returns the other end if the interface belongs to a pair.
+    /// Returns the other end if the interface is one end of a pair.
     #[must_use]
     pub const fn peer(&self) -> Option<&Peer> {
         if let InterfaceKind::Vxcan(Some(peer)) = &self.kind { Some(peer) } else { None }
     }
 
-    /// Returns the controller if the interface is hardware.
+    /// Returns the properties of the controller if the interface is hardware.
     #[must_use]
     pub const fn hardware(&self) -> Option<&Hardware> {
         if let InterfaceKind::Hardware(hardware) = &self.kind { Some(hardware) } else { None }
@@ -221,7 +222,7 @@ impl Interface {
         !matches!(self.kind, InterfaceKind::Other(_))
     }
 
-    /// Describes the interface: `a vcan`, `CAN hardware (kvaser_pci)`, `an ethernet interface`.
+    /// Describes the interface in an error: `a vcan`, `CAN hardware (kvaser_pci)`, `an ethernet interface`.
     #[must_use]
     pub fn what(&self) -> String {
         match &self.kind {

@@ -1,4 +1,4 @@
-//! Collects the facts about this machine for the [`doctor`](crate::doctor), and changes nothing.
+//! Collects the facts about this machine that the [`doctor`](crate::doctor) assesses. Changes nothing.
 
 use std::fs;
 use std::io;
@@ -21,11 +21,12 @@ use crate::kernel::Kernel;
 use crate::link::Interface;
 use crate::plan::InterfaceTarget;
 
-/// The time for which a bus is observed. A gateway sends joints much more often, and a cell sends a heartbeat at least
-/// every half second.
+/// The time for which each bus is observed. It is long enough, because a gateway sends joints many times a second and a
+/// cell sends a heartbeat at least every half second.
 const OBSERVATION_TIME: Duration = Duration::from_millis(600);
 
-/// Collects all facts that affect a bench on these buses.
+/// Collects all facts that determine whether a bench would run on these buses. `present` are the interfaces of the
+/// machine.
 #[must_use]
 pub fn facts(mut buses: Vec<BusFacts>, choice: KindChoice, no_spawn: bool, present: &[Interface]) -> Facts {
     for bus in &mut buses {
@@ -58,7 +59,7 @@ fn usable(target: &InterfaceTarget, interface: &Interface) -> bool {
     interface.is_can() && interface.up && target.carried_by(interface.mtu)
 }
 
-/// Observes at the same time all buses that can be opened.
+/// Observes all buses that can be opened, at the same time. Returns the result for each bus, in their order.
 fn listen_to_all(buses: &[BusFacts], choice: KindChoice) -> Vec<Option<Result<Option<ObservedTraffic>, String>>> {
     let kind_of = |bus: &BusFacts| match (choice, &bus.interface) {
         (KindChoice::Only(kind), _) => kind,
@@ -83,7 +84,8 @@ fn listen_to_all(buses: &[BusFacts], choice: KindChoice) -> Vec<Option<Result<Op
     })
 }
 
-/// Observes a bus for other gateways and cells. Returns `None` if the bus is not served.
+/// Observes a bus and returns the gateway and the cells that send on it. Returns `None` if the embedded bus is not
+/// served.
 fn listen(target: &InterfaceTarget, kind: BusKind) -> Result<Option<ObservedTraffic>, String> {
     let options = BusOptions { fd: target.format == Format::Fd, ..BusOptions::default() };
     let until = Instant::now() + OBSERVATION_TIME;
@@ -109,11 +111,11 @@ fn listen(target: &InterfaceTarget, kind: BusKind) -> Result<Option<ObservedTraf
 }
 
 impl ObservedTraffic {
-    /// Records the sender of a frame with this identifier.
+    /// Records which node sent a frame with this identifier.
     pub fn record(&mut self, id: Id) {
         let node = Node::from_byte(id.node);
         match id.kind {
-            // The gateway's other commands may come from a user at a shell.
+            // Only joints show that a gateway runs. A user may send the other commands from a shell.
             Kind::Command => self.gateway |= Command::from_byte(id.node) == Some(Command::Joints),
             Kind::Network if node == Node::Gateway => self.gateway = true,
             Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Network | Kind::Configured => {
@@ -124,16 +126,16 @@ impl ObservedTraffic {
     }
 }
 
-/// Returns the receive buffer size that the kernel grants to a request like the gateway's. It is the same for all kinds
-/// of sockets.
+/// Returns the size of the receive buffer that the kernel grants if a gateway requests its usual size, in bytes. The
+/// kernel grants the same to all kinds of sockets.
 fn receive_buffer() -> io::Result<usize> {
     let socket =
         rustix::net::socket_with(AddressFamily::UNIX, SocketType::DGRAM, SocketFlags::CLOEXEC, None)?;
     bus::set_receive_buffer(&socket, GATEWAY_RECEIVE_BUFFER as usize)
 }
 
-/// Returns a name of this program under which `sudo` finds it, because `sudo` searches only the system's own
-/// directories.
+/// Returns a command by which `sudo` finds this program: its name, or its path if it is not in a folder of the system,
+/// because `sudo` searches only these.
 #[must_use]
 pub fn program() -> String {
     let own = std::env::current_exe().unwrap_or_default();
@@ -146,7 +148,7 @@ pub fn program() -> String {
     shell_quoted_os(&called.unwrap_or_else(|| own.into_os_string()))
 }
 
-/// Returns true if this process may change interfaces.
+/// Returns true if this process has the permission to change network interfaces.
 #[must_use]
 pub fn is_admin() -> bool {
     capabilities(None).is_ok_and(|sets| sets.effective.contains(CapabilitySet::NET_ADMIN))
@@ -163,13 +165,13 @@ fn cell_node() -> Program {
     Program { there: path.is_file(), path }
 }
 
-/// Returns the directory for embedded buses, or the reason why none can be served.
+/// Returns the directory for embedded buses, or an error text if no bus can be served in it.
 fn embedded() -> Result<PathBuf, String> {
     let directory = default_directory();
     address(&directory, "a23456789012345").map_err(|error| error.to_string())?;
     match open_directory(&directory) {
         Ok(_) => {}
-        // The directory is created when a bus is served.
+        // A missing directory is not an error, because it is created when a bus is served.
         Err(error) if error.is_absent() => {
             let parent = directory.parent().unwrap_or_else(|| Path::new("/"));
             rustix::fs::access(parent, Access::WRITE_OK | Access::EXEC_OK).map_err(|errno| {
@@ -189,11 +191,11 @@ pub struct EmbeddedBus {
     pub name: String,
     /// The path of its socket.
     pub path: String,
-    /// True if the bus is served; a killed server leaves its socket behind.
+    /// True if a server listens on the socket. A server that was killed leaves its socket behind.
     pub served: bool,
 }
 
-/// Returns the embedded buses of this user.
+/// Returns the embedded buses whose sockets are in this user's directory.
 #[must_use]
 pub fn embedded_buses() -> Vec<EmbeddedBus> {
     let directory = default_directory();
@@ -215,7 +217,7 @@ pub fn embedded_buses() -> Vec<EmbeddedBus> {
     buses
 }
 
-/// Returns true if the bus is served. Only a socket without a listener refuses connections.
+/// Returns true if a server listens on the socket of a bus. Connecting is refused only if none does.
 fn is_served(directory: &Path, name: &str) -> bool {
     let socket = seqpacket(SocketFlags::NONBLOCK);
     let (Ok(socket), Ok(address)) = (socket, address(directory, name)) else { return false };

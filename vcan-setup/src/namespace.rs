@@ -1,4 +1,4 @@
-//! Network namespaces, named by users.
+//! Network namespaces, as a user names them: by a name, a process id, or a path.
 
 use core::fmt;
 use std::ffi::OsStr;
@@ -8,7 +8,7 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// The directory in which `ip netns` keeps named namespaces.
+/// The directory in which `ip netns` keeps the namespaces that have names.
 pub const NAMESPACE_DIRECTORY: &str = "/run/netns";
 
 /// A network namespace as named by the user.
@@ -22,11 +22,11 @@ pub enum Namespace {
     Path(PathBuf),
 }
 
-/// The error of a namespace that does not exist or cannot be opened.
+/// The reason why a network namespace cannot be opened.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum NamespaceError {
-    /// The name does not exist.
+    /// There is no namespace of this name.
     #[error(
         "there is no network namespace {name} in {NAMESPACE_DIRECTORY}: `sudo ip netns add {name}` makes it, `ip netns` lists them; a process' number or a path is taken too"
     )]
@@ -34,7 +34,7 @@ pub enum NamespaceError {
         /// The name.
         name: String,
     },
-    /// The process does not exist.
+    /// There is neither a namespace nor a process with this number.
     #[error(
         "there is no network namespace {pid} in {NAMESPACE_DIRECTORY}, and no process {pid}: is it still running? `ip netns` lists names"
     )]
@@ -53,8 +53,8 @@ pub enum NamespaceError {
 }
 
 impl Namespace {
-    /// Parses a namespace. An argument with a `/` is a path, and a name takes precedence over a process of the same
-    /// number.
+    /// Parses an argument. If it contains a `/`, it is a path. A number is the name of a namespace if that exists, and
+    /// a process id otherwise.
     #[must_use]
     pub fn named(word: &OsStr) -> Self {
         let Some(word) = word.to_str().filter(|word| !word.contains('/')) else {
@@ -90,7 +90,7 @@ impl Namespace {
         })
     }
 
-    /// Returns the beginning of a command that runs `ip` in the namespace.
+    /// Returns the beginning of a shell command that runs `ip` in the namespace.
     #[must_use]
     pub fn ip(&self) -> String {
         match self {
@@ -101,7 +101,7 @@ impl Namespace {
     }
 }
 
-/// Formats the namespace as `ip link add ... netns` expects it.
+/// Formats the namespace for the option `netns` of `ip link add`.
 impl fmt::Display for Namespace {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {

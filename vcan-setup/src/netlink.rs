@@ -1,7 +1,7 @@
-//! Lists and changes the kernel's interfaces by rtnetlink.
+//! Lists and changes the network interfaces of the kernel by rtnetlink.
 //!
-//! All decisions are made in [`plan`](crate::plan). This module chooses the index of a new link itself, so that the
-//! following operations affect that link and no other one of the same name.
+//! The module [`plan`](crate::plan) makes all decisions. This module chooses the index of a new interface itself. Later
+//! operations use that index, so that they never affect another interface of the same name.
 
 use std::collections::HashMap;
 use std::fs::File;
@@ -28,9 +28,10 @@ mod reading;
 
 use reading::{driver, interface};
 
-/// The length of the header before a namespace's attributes, in bytes.
+/// The length in bytes of the header before the attributes of a namespace message.
 const NSID_HEADER: usize = 4;
-/// The maximum number of indices that are tried for a new link while other programs create theirs; a pair takes two.
+/// The maximum number of indices to try for a new interface if other programs take them at the same time. A pair takes
+/// two.
 const MAX_INDEX_ATTEMPTS: u32 = 64;
 
 /// A netlink socket for the interfaces of one network namespace.
@@ -43,13 +44,13 @@ impl Netlink {
     /// Opens a socket in the namespace of the calling thread.
     ///
     /// # Errors
-    /// Returns an error if the system provides no such socket.
+    /// Returns an error if the system does not provide netlink sockets.
     pub fn open() -> io::Result<Self> {
         RtnetlinkSocket::open().map(|exchange| Self { exchange })
     }
 
-    /// Opens a socket in another namespace. A socket stays in the namespace where it was opened, so a separate thread
-    /// enters the namespace and opens it.
+    /// Opens a socket in another network namespace. A socket stays in the namespace in which it was opened, so a
+    /// temporary thread enters the namespace and opens the socket there.
     ///
     /// # Errors
     /// Returns an error if the namespace may not be entered, or if the file is not a namespace.
@@ -62,7 +63,7 @@ impl Netlink {
             .unwrap_or_else(|_| Err(io::Error::other("the thread that entered it panicked")))
     }
 
-    /// Returns all interfaces, by index.
+    /// Returns all interfaces of the namespace, sorted by index.
     ///
     /// # Errors
     /// Returns an error if the kernel does not answer.
@@ -80,7 +81,7 @@ impl Netlink {
                 InterfaceKind::Vxcan(Some(Peer { index, name, namespace, namespace_id: Some(id) })) => {
                     let known = namespaces.get_or_insert_with(|| self.named_namespaces());
                     *namespace = known.get(id).cloned();
-                    // Only a user with access to that namespace gets an answer.
+                    // The kernel tells the name of the other end only to users with access to its namespace.
                     *name = self.name_in(*id, *index).ok().flatten();
                 }
                 InterfaceKind::Hardware(hardware) => hardware.driver = driver(&interface.name),
@@ -90,12 +91,12 @@ impl Netlink {
         Ok(interfaces)
     }
 
-    /// Returns each interface as the kernel reports it.
+    /// Returns the kernel's message about each interface.
     fn all(&mut self) -> io::Result<Vec<Vec<u8>>> {
         self.exchange.request(RouteNetlinkMessage::GetLink(LinkMessage::default()), NLM_F_DUMP)
     }
 
-    /// Returns the id that another namespace has in this one, if any.
+    /// Returns the id by which this namespace knows another one; `None` if it has no id.
     ///
     /// # Errors
     /// Returns an error if the kernel refuses.
@@ -112,7 +113,7 @@ impl Netlink {
             .filter(|&id| id >= 0))
     }
 
-    /// Returns the namespaces that have both an id here and a name.
+    /// Returns the names of the namespaces that have an id in this one.
     fn named_namespaces(&mut self) -> HashMap<i32, String> {
         let mut names = HashMap::new();
         for entry in std::fs::read_dir(NAMESPACE_DIRECTORY).into_iter().flatten().flatten() {
@@ -129,26 +130,27 @@ impl Netlink {
         Ok(self.query(queried)?.map(|interface| interface.name))
     }
 
-    /// Returns the interface that a message is about.
+    /// Queries the interface that a message identifies. Returns `None` if it does not exist.
     fn query(&mut self, about: LinkMessage) -> io::Result<Option<Interface>> {
         let answers = self.exchange.request(RouteNetlinkMessage::GetLink(about), 0)?;
         Ok(answers.iter().find_map(|answer| interface(answer)))
     }
 
-    /// Makes a vcan, marks it and brings it up. Returns its index.
+    /// Makes a vcan interface, marks it and brings it up. Returns its index.
     ///
     /// # Errors
-    /// Returns the kernel's error; the vcan was then not made, or was removed again.
+    /// Returns the kernel's error. The interface was then not made, or was removed again.
     pub fn make_vcan(&mut self, name: &str) -> io::Result<u32> {
         let index = self.add(name, |_| Ok(vec![LinkInfo::Kind(InfoKind::Vcan)]))?;
         let marked = self.mark(index);
         self.or_undo(marked, Undo::Remove { index }).map(|_| index)
     }
 
-    /// Makes a pair, marks both ends and brings them up. Returns the index of the end in this namespace.
+    /// Makes a pair of virtual interfaces, marks both ends and brings them up. Returns the index of the end in this
+    /// namespace.
     ///
     /// # Errors
-    /// Returns the kernel's error; the pair was then not made, or was removed again.
+    /// Returns the kernel's error. The pair was then not made, or was removed again.
     pub fn make_pair(
         &mut self,
         name: &str,
@@ -175,15 +177,16 @@ impl Netlink {
         self.or_undo(marked, Undo::Remove { index }).map(|_| index)
     }
 
-    /// Returns an index above those of all interfaces.
+    /// Returns an index that is higher than those of all interfaces.
     fn free_index(&mut self) -> io::Result<u32> {
         let links = self.all()?;
         let indices = links.iter().filter_map(|link| LinkHeader::parse(link).ok()).map(|header| header.index);
         Ok(indices.max().unwrap_or(0) + 1)
     }
 
-    /// Makes a link, which is down and has MTU 72. Returns its index, which is chosen here: the kernel would not report
-    /// its own choice, and the name may belong to another link before it is looked up.
+    /// Makes an interface with MTU 72, which is down. Returns its index. The index is chosen here, because the kernel
+    /// does not report the one that it would choose, and the name might belong to another interface before it can be
+    /// looked up.
     fn add(
         &mut self,
         name: &str,
@@ -199,9 +202,10 @@ impl Netlink {
             let flags = NLM_F_CREATE | NLM_F_EXCL;
             match self.exchange.request(RouteNetlinkMessage::NewLink(message), flags) {
                 Ok(_) => return Ok(index),
-                // Another program took the index of the other end meanwhile,
+                // Another program has taken the index of the other end in the meantime.
                 Err(error) if is(&error, Errno::BUSY) && number < MAX_INDEX_ATTEMPTS => number += 2,
-                // or that of this end: the kernel returns the same error for a name that is taken.
+                // Another program has taken the index of this end. The kernel returns the same error if the name is
+                // taken.
                 Err(error) if is(&error, Errno::EXIST) && number < MAX_INDEX_ATTEMPTS && self.free_index()? > index => {
                     number += 2;
                 }
@@ -211,7 +215,8 @@ impl Netlink {
     }
 
     fn mark(&mut self, index: u32) -> io::Result<()> {
-        // The mark comes first, so that the next command can remove the link if a later step fails.
+        // The alias is set first. If a later step fails, the next command then recognises the interface and can remove
+        // it.
         self.change(link(index, [LinkAttribute::IfAlias(ALIAS_MARK.to_owned())]))?;
         self.set_up(index, true)
     }
@@ -252,7 +257,8 @@ impl Netlink {
         self.change(link(index, [LinkAttribute::LinkInfo(info)]))
     }
 
-    /// Checks that the clock comes close enough to the requested rates, because drivers accept a rate up to 5 % off.
+    /// Checks that the actual bit rates are close enough to the requested ones, because drivers accept deviations of up
+    /// to 5 %.
     fn see_rates(&mut self, index: u32, target: HardwareRates) -> io::Result<()> {
         let nearest = self.query(link(index, []))?.and_then(|it| it.hardware().map(Hardware::rates));
         match nearest.filter(|nearest| !nearest.meet(target)) {
@@ -261,7 +267,7 @@ impl Netlink {
         }
     }
 
-    /// Removes an interface, and the other end of its pair with it.
+    /// Removes an interface. If it is one end of a pair, the kernel removes the other end too.
     ///
     /// # Errors
     /// Returns the kernel's error.
@@ -269,10 +275,10 @@ impl Netlink {
         self.exchange.request(RouteNetlinkMessage::DelLink(link(index, [])), 0).map(|_| ())
     }
 
-    /// Executes a step. Returns the action that undoes it, if there is one.
+    /// Executes a step of a plan. Returns the action that undoes the step, if there is one.
     ///
     /// # Errors
-    /// Returns the kernel's error; the completed part of the step was then undone.
+    /// Returns the kernel's error. The part of the step that was already executed is then undone.
     pub fn carry_out(&mut self, step: &Step, there: Option<(&File, &mut Self)>) -> io::Result<Option<Undo>> {
         let restore = |index, mtu, up| Undo::Restore { index, mtu, rates: None, up };
         let Step { name, action } = step;
@@ -302,13 +308,13 @@ impl Netlink {
 
     fn or_undo(&mut self, done: io::Result<()>, undo: Undo) -> io::Result<Undo> {
         if done.is_err() {
-            // The first error is the one to report.
+            // The error of the step is reported, not one of undoing it.
             let _ = self.undo(&undo);
         }
         done.map(|()| undo)
     }
 
-    /// Undoes a step.
+    /// Undoes a step that was executed.
     ///
     /// # Errors
     /// Returns the kernel's error.
@@ -320,7 +326,7 @@ impl Netlink {
                 if let Some(mtu) = mtu {
                     self.set_mtu(index, mtu)?;
                 }
-                // The kernel cannot unset a rate once it was set.
+                // The kernel cannot remove a bit rate that was set once.
                 if let Some(rates @ HardwareRates { bitrate: Some(_), .. }) = rates {
                     self.set_rates(index, rates)?;
                 }
@@ -333,14 +339,14 @@ impl Netlink {
 /// The action that undoes a step.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum Undo {
-    /// Removes the interface that was made.
+    /// Removes an interface, because the step made it.
     Remove {
         /// The index of the interface.
         index: u32,
     },
-    /// Restores the former settings of an interface.
+    /// Restores the settings of an interface, because the step changed them.
     Restore {
-        /// The index of the interface.
+        /// The index of the changed interface.
         index: u32,
         /// The former MTU, if it was changed.
         mtu: Option<u32>,
@@ -351,7 +357,7 @@ pub enum Undo {
     },
 }
 
-/// One attempt to make a link.
+/// The arguments of one attempt to make an interface.
 #[derive(Clone, Copy)]
 struct Attempt {
     index: u32,
@@ -362,7 +368,7 @@ fn is(error: &io::Error, errno: Errno) -> bool {
     error.raw_os_error() == Some(errno.raw_os_error())
 }
 
-/// Returns a message about the interface of this index.
+/// Returns a netlink message about the interface with this index.
 fn link(index: u32, attributes: impl IntoIterator<Item = LinkAttribute>) -> LinkMessage {
     let mut message = LinkMessage::default();
     message.header.index = index;

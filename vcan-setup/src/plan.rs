@@ -1,5 +1,5 @@
-//! Plans the changes to interfaces before any change is made: compares target interfaces with present ones, and returns
-//! steps or a refusal.
+//! Plans changes to interfaces before anything is changed: compares the interfaces that a user wants with those that
+//! exist, and returns steps, or the reason why nothing is done.
 //!
 //! ```text
 //!   target  --+
@@ -7,8 +7,8 @@
 //!   present --+            \--> or the reason why nothing is done
 //! ```
 //!
-//! A step makes an interface, or changes or removes one that this program made. The only exception is
-//! [`Action::SetRates`], which is planned only on request, and only for CAN hardware.
+//! A step makes an interface, or changes or removes one that this program has made. The only exception is
+//! [`Action::SetRates`], which changes CAN hardware and is planned only if the user requests it.
 
 use std::ffi::OsStr;
 
@@ -26,34 +26,34 @@ pub use refusal::Refusal;
 pub(crate) use step::widen;
 pub use step::{StepAction, Step};
 
-/// A requested interface.
+/// An interface that the user wants, by itself or as a bus of a skin.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct InterfaceTarget {
     /// The name.
     pub name: String,
     /// The format of the frames that it must carry.
     pub format: Format,
-    /// The skin that the bus belongs to; `None` if it was named on the command line.
+    /// The skin that contains the bus; `None` if the interface was named on the command line.
     pub skin: Option<SkinBus>,
 }
 
-/// A skin's values for a bus that may be hardware.
+/// What a skin states about a bus that may be hardware.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct SkinBus {
-    /// The skin's file, quoted for a shell.
+    /// The path of the skin, quoted for a shell.
     pub file: String,
-    /// The bit rates that the skin gives.
+    /// The bit rates of the bus, as far as the skin states them.
     pub rates: HardwareRates,
 }
 
 impl InterfaceTarget {
-    /// Returns the target for an interface that was named, for frames of both formats.
+    /// Returns the target for an interface that was named on the command line. It must carry frames of both formats.
     #[must_use]
     pub fn named(name: &str) -> Self {
         Self { name: name.to_owned(), format: Format::Fd, skin: None }
     }
 
-    /// Returns the targets for the buses of a skin.
+    /// Returns a target for each bus of a skin.
     #[must_use]
     pub fn of_skin(file: &OsStr, skin: &Skin) -> Vec<Self> {
         let target = |bus: &protocol::skin::SkinBus| Self {
@@ -67,7 +67,7 @@ impl InterfaceTarget {
         skin.buses.iter().map(target).collect()
     }
 
-    /// Takes over the format of hardware that was named without a skin.
+    /// Restricts a target without a skin to the frame format that the hardware of this name is set to.
     pub fn take_format_of_hardware(&mut self, present: &[Interface]) {
         let there = find(present, &self.name).filter(|it| it.hardware().is_some());
         if self.skin.is_none() && there.is_some_and(|it| it.mtu < FD_MTU) {
@@ -75,13 +75,13 @@ impl InterfaceTarget {
         }
     }
 
-    /// Returns the skin if it gives the bus a bit rate, which makes the bus hardware.
+    /// Returns the skin if it states a bit rate for the bus: the bus is then hardware.
     #[must_use]
     pub fn hardware(&self) -> Option<&SkinBus> {
         self.skin.as_ref().filter(|skin| skin.rates.bitrate.is_some())
     }
 
-    /// Returns a refusal if another skin gives the bus different bit rates.
+    /// Returns a refusal if another skin states different bit rates for the same bus.
     fn at_odds(&self, others: &[Self]) -> Option<Refusal> {
         let own = self.hardware()?;
         let mut skins = others.iter().filter(|other| other.name == self.name).filter_map(Self::hardware);
@@ -90,40 +90,40 @@ impl InterfaceTarget {
         Some(Refusal::AtOdds { name: self.name.clone(), one: says(other), other: says(own) })
     }
 
-    /// Returns true if an interface of this MTU carries the required frames.
+    /// Returns true if an interface with this MTU (in bytes) can carry the frames of the target.
     #[must_use]
     pub const fn carried_by(&self, mtu: u32) -> bool {
         matches!(self.format, Format::Classic) || mtu >= FD_MTU
     }
 }
 
-/// A requested pair, seen from its first end.
+/// A pair of virtual interfaces that the user wants.
 #[derive(Clone, Copy, Debug)]
 pub struct TargetPair<'a> {
-    /// The end in this network namespace.
+    /// The name of the end in this network namespace.
     pub name: &'a str,
-    /// The other end.
+    /// The name of the other end.
     pub peer: &'a str,
     /// The namespace of the other end; `None` for this namespace.
     pub there: Option<&'a OtherNamespace>,
 }
 
-/// Another network namespace.
+/// Another network namespace, with the interfaces in it.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct OtherNamespace {
     /// The namespace as named by the user.
     pub name: Namespace,
-    /// Its id in this namespace, if it has one.
+    /// The id by which this namespace knows the other one, if there is one.
     pub id: Option<i32>,
-    /// Its interfaces.
+    /// The interfaces that exist in the namespace.
     pub present: Vec<Interface>,
 }
-/// The planned changes.
+/// The result of planning: steps to be executed, and interfaces that need none.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct Plan {
-    /// The steps in their order.
+    /// The steps, in the order of execution.
     pub steps: Vec<Step>,
-    /// One line for each interface that is left unchanged.
+    /// A line of text for each interface that needs no change.
     pub unchanged: Vec<String>,
 }
 
@@ -134,7 +134,7 @@ fn find<'a>(present: &'a [Interface], name: &str) -> Option<&'a Interface> {
 /// Plans the steps after which every target interface exists, is up and carries the required frames.
 ///
 /// # Errors
-/// Returns [`Refusal`] if that requires a change to an interface that this program did not make.
+/// Returns [`Refusal`] if an interface would have to be changed that this program has not made.
 pub fn up(target: &[InterfaceTarget], present: &[Interface], set_bit_rates: bool) -> Result<Plan, Refusal> {
     let mut plan = Plan::default();
     if let Some(refusal) = target.iter().enumerate().find_map(|(at, it)| it.at_odds(target.get(..at)?)) {
@@ -165,7 +165,7 @@ pub fn up(target: &[InterfaceTarget], present: &[Interface], set_bit_rates: bool
 /// Plans the steps after which both ends of a pair exist and are up.
 ///
 /// # Errors
-/// Returns [`Refusal`] if that requires a change to an interface that this program did not make.
+/// Returns [`Refusal`] if an interface would have to be changed that this program has not made.
 pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, Refusal> {
     let TargetPair { name, peer, there } = *target;
     if there.is_none() && name == peer {
@@ -190,7 +190,7 @@ pub fn up_pair(target: &TargetPair<'_>, present: &[Interface]) -> Result<Plan, R
         plan.fit(&InterfaceTarget::named(peer), other)?;
         return Ok(plan);
     };
-    // Steps do not change interfaces in the other namespace, except for making a missing pair.
+    // In the other namespace, nothing is changed except that a missing pair is made.
     let ip = there.name.ip();
     let (what, command) = match (other.up, other.mtu >= FD_MTU) {
         (true, true) => return Ok(plan),
@@ -228,19 +228,19 @@ fn not_a_pair(in_the_way: &Interface, peer: &str, there: Option<&OtherNamespace>
 }
 
 impl Plan {
-    /// Returns true if a step already affects an interface of this name.
+    /// Returns true if the plan already has a step for the interface of this name.
     fn changes(&self, name: &str) -> bool {
         self.steps.iter().any(|step| step.name == name)
     }
 
-    /// Adds a line for an interface that is left unchanged, once.
+    /// Adds a line for an interface that needs no change, unless the plan already has it.
     fn leave(&mut self, line: String) {
         if !self.unchanged.contains(&line) {
             self.unchanged.push(line);
         }
     }
 
-    /// Brings an existing virtual interface into the target state, if this program made it.
+    /// Plans the steps by which an existing virtual interface fulfils its target, if this program has made it.
     fn fit(&mut self, target: &InterfaceTarget, interface: &Interface) -> Result<(), Refusal> {
         let Interface { index, mtu, .. } = *interface;
         let name = interface.name.clone();
@@ -260,7 +260,7 @@ impl Plan {
         Ok(())
     }
 
-    /// Compares hardware with the skin, and sets its rates on request.
+    /// Compares the bit rates of hardware with those of the skin. Plans to set them if the user requests it.
     fn hardware(
         &mut self,
         target: &InterfaceTarget,
@@ -299,7 +299,7 @@ impl Plan {
             return Err(Refusal::HardwareNarrow { name, what, mtu: interface.mtu, file });
         }
         match missing {
-            // The hardware has bit rates, but the skin gives none.
+            // The hardware is down and has bit rates, but the skin states none, so this program does not set it up.
             Some(_) if before.bitrate.is_some() => Err(Refusal::Down(name)),
             Some((key, example)) => Err(Refusal::NoRate { name, key, example, file }),
             None => Err(Refusal::HardwareDown { name, what, file }),
@@ -307,11 +307,11 @@ impl Plan {
     }
 }
 
-/// Plans the steps that remove those target interfaces that this program made.
+/// Plans the steps that remove the target interfaces, as far as this program has made them.
 ///
 /// # Errors
-/// Returns [`Refusal`] if an interface was named that this program did not make. Buses of a skin are left alone
-/// instead.
+/// Returns [`Refusal`] if an interface that this program has not made was named on the command line. If it was named by
+/// a skin, it is left as it is.
 pub fn down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Plan, Refusal> {
     let mut plan = Plan::default();
     for target in target {
@@ -343,7 +343,8 @@ pub fn down(target: &[InterfaceTarget], present: &[Interface]) -> Result<Plan, R
     Ok(plan)
 }
 
-/// Returns true if the other end of its pair, which takes this end with it, is already to be removed.
+/// Returns true if the plan already removes the other end of the interface's pair: the kernel then removes this end
+/// too.
 fn removed_with(plan: &Plan, interface: &Interface, present: &[Interface]) -> bool {
     let peer = interface.peer().filter(|peer| peer.namespace_id.is_none());
     let peer = peer.and_then(|peer| present.iter().find(|other| other.index == peer.index));

@@ -1,4 +1,4 @@
-//! Serial lines with the slcan protocol, each of which takes part in a bus.
+//! Connects serial lines with the slcan protocol to a bus. The adapter behind each line becomes a node of the bus.
 //!
 //! ```text
 //!              one client for each line, with its filters
@@ -7,8 +7,8 @@
 //! ```
 //!
 //! [`Outgoing`](outgoing::Outgoing), [`Incoming`](incoming::Incoming) and the account process bytes, frames and times
-//! without input or output. A [`Bridge`] is one thread around all lines of a bus. It never blocks on a line or on the
-//! bus: frames that do not fit into a queue are dropped, and counted by reason.
+//! without input or output. A [`Bridge`] is one thread that serves all lines of a bus. It never waits for a line or for
+//! the bus: frames that do not fit into a queue are dropped, and counted by reason.
 
 pub mod account;
 mod bridge;

@@ -1,4 +1,4 @@
-//! A cell on the last link of a UR5, for each way to compute its Jacobian.
+//! The setting of the benches: a cell on the last link of a UR5, with each kernel that computes its Jacobian.
 
 #[path = "../../src/tests/kernel/oracle.rs"]
 mod oracle;
@@ -12,7 +12,7 @@ use protocol::parameters::MAX_JOINTS;
 use oracle::Case;
 use peer::Peer;
 
-/// A cell moved by joint 6, with joint positions.
+/// The kernels of a cell moved by joint 6, and the joint positions as input.
 pub(crate) struct Setting {
     pub(crate) wrench: Wrench,
     pub(crate) projection: Projection,
@@ -22,12 +22,12 @@ pub(crate) struct Setting {
     pub(crate) words: [Q1_14; MAX_JOINTS],
     /// Joint positions in rad.
     pub(crate) radians: [f64; MAX_JOINTS],
-    /// Joint positions in rad.
+    /// Joint positions in rad, in single precision.
     pub(crate) radians_f32: [f32; MAX_JOINTS],
 }
 
 impl Setting {
-    /// Creates the setting from the first test case on joint 6.
+    /// Creates the setting from the first test vector whose cell is on joint 6.
     pub(crate) fn new() -> Self {
         let case = Case::all().into_iter().find(|case| case.joint == 6).expect("there are some");
         let parameters = case.parameters();
@@ -46,10 +46,10 @@ impl Setting {
         }
     }
 
-    /// Checks that all of them compute the same.
+    /// Checks that all kernels compute the same Jacobian.
     ///
     /// # Panics
-    /// Panics if one is more than 5e-4 m from the double precision, or f32 more than 1e-6 m.
+    /// Panics if a kernel differs by more than 5e-4 m from double precision, or the f32 kernel by more than 1e-6 m.
     pub(crate) fn check(&self) {
         let target = self.double.jacobian(&self.radians);
         let wrench = self.wrench.jacobian(&self.words).map(Q1_14::to_f64);

@@ -1,10 +1,10 @@
-//! The Jacobian of the benchmark, computed with a matrix library, for any real number type.
+//! The Jacobian for comparison in benches, computed with a matrix library in any real number type.
 
 use nalgebra::{IsometryMatrix3, Point3, RealField, Rotation3, Translation3, Vector3, convert};
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, Parameters, Row};
 
-/// One cell: Eq. 8 with frames multiplied from the base to the cell, without optimisations.
+/// The Jacobian of one cell by Eq. 8. The frames are multiplied from the base to the cell, without optimisations.
 #[derive(Debug)]
 pub(crate) struct Peer<T: RealField> {
     /// The constant part of each link's transform.
@@ -14,7 +14,7 @@ pub(crate) struct Peer<T: RealField> {
 }
 
 impl<T: RealField + Copy> Peer<T> {
-    /// Creates a cell that is pushed against its normal with one newton.
+    /// Creates the computation for a force of one newton against the normal of the cell.
     pub(crate) fn new(parameters: &Parameters) -> Self {
         let number = |word: Q1_14| convert::<f64, T>(word.to_f64());
         let link = |row: &Row| {
@@ -28,7 +28,7 @@ impl<T: RealField + Copy> Peer<T> {
         }
     }
 
-    /// Returns J_l in m for joint angles in rad.
+    /// Returns J_l in m for each joint l, at joint angles in rad.
     pub(crate) fn jacobian(&self, joints: &[T; MAX_JOINTS]) -> [T; MAX_JOINTS] {
         let mut frames = [IsometryMatrix3::identity(); MAX_JOINTS];
         let mut tip = IsometryMatrix3::identity();

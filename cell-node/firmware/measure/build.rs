@@ -1,4 +1,4 @@
-//! Converts the test vectors to tables of words, and writes the memory layout of the emulated machines.
+//! Converts the test vectors to tables of words, and writes the linker's memory layout for the emulated machines.
 
 #![allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "wrapped or held before")]
 #![allow(clippy::indexing_slicing, clippy::unwrap_used, clippy::panic, reason = "a build may stop")]
@@ -10,8 +10,7 @@ use std::{env, fs};
 
 const UR5: &str = "../../tests/vectors/ur5_torque.csv";
 const CHAINS: &str = "../../tests/vectors/chains.csv";
-/// Flash and RAM. The micro:bit's nRF51822 is the smallest; the boards of Arm's FPGA images have ample
-/// memory.
+/// Memory layout of the micro:bit, whose nRF51822 has the least flash and RAM of all emulated machines.
 const MICROBIT: &str =
     "MEMORY { FLASH : ORIGIN = 0, LENGTH = 256K  RAM : ORIGIN = 0x20000000, LENGTH = 16K }";
 const MPS2: &str = "MEMORY { FLASH : ORIGIN = 0, LENGTH = 4M  RAM : ORIGIN = 0x20000000, LENGTH = 4M }";
@@ -20,12 +19,12 @@ fn word(value: f64) -> i16 {
     (value * 16_384.0).round().clamp(-32_768.0, 32_767.0) as i16
 }
 
-/// Converts an angle to quarter turns, wrapped into one turn.
+/// Converts an angle in rad to a word in quarter turns, wrapped into one turn.
 fn angle(radians: f64) -> i16 {
     (radians / TAU % 1.0 * 65_536.0).round() as i32 as i16
 }
 
-/// Returns the UR5's table: a, d, alpha, theta offset, kind.
+/// Returns the rows of the UR5's table as words: a, d, alpha, theta offset, kind.
 fn ur5() -> Vec<[i16; 5]> {
     let d = [0.089_159, 0.0, 0.0, 0.109_15, 0.094_65, 0.082_3];
     let a = [0.0, -0.425, -0.392_25, 0.0, 0.0, 0.0];
@@ -33,7 +32,8 @@ fn ur5() -> Vec<[i16; 5]> {
     (0..6).map(|row| [word(a[row]), word(d[row]), angle(alpha[row]), 0, 0]).collect()
 }
 
-/// Returns a chain of `joints` joints: the repeated rows of a seven-joint arm, shortened to stay in reach.
+/// Returns a chain of `joints` joints: the rows of a seven-joint arm, repeated and shortened so that the reach stays
+/// below 2 m.
 fn repeated(rows: &[[i16; 5]], joints: usize) -> Vec<[i16; 5]> {
     let shorter = |[a, d, alpha, offset, kind]: [i16; 5]| [a / 3, d / 3, alpha, offset, kind];
     rows.iter().cycle().take(joints).copied().map(shorter).collect()

@@ -1,20 +1,20 @@
-//! The clock of the cells, and its relation to the wall clock.
+//! The clock of the cells, and its offset to the wall clock, which time stamps of frames use.
 
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
 use protocol::time::{Micros, Span};
 
-/// Interval between comparisons with the wall clock.
+/// Interval between measurements of the offset to the wall clock.
 const MEASURE_INTERVAL: Span = Span::from_millis(250);
 
 /// A monotonic clock with a known offset to the wall clock.
 #[derive(Debug)]
 pub(super) struct Clock {
     start: Instant,
-    /// The wall clock at the start, in µs since 1970. It is measured again from time to time, because the
-    /// wall clock may be set.
+    /// Wall clock time of this clock's origin, in µs since 1970. It is measured again at intervals, because the wall
+    /// clock may be set.
     wall: u64,
-    /// The time of the last measurement.
+    /// The time of the last measurement of the offset.
     measured: Micros,
 }
 
@@ -29,7 +29,7 @@ impl Clock {
         Micros::since_start(self.start.elapsed())
     }
 
-    /// Measures the offset to the wall clock if the interval has elapsed.
+    /// Measures the offset to the wall clock again if the interval between measurements has passed.
     pub(super) fn remeasure(&mut self, now: Micros) {
         if now.elapsed_since(self.measured) >= MEASURE_INTERVAL {
             self.set(now);
@@ -42,12 +42,12 @@ impl Clock {
         self.measured = now;
     }
 
-    /// Converts a time of this clock to the wall clock, in ns.
+    /// Converts a time of this clock to wall clock time in ns since 1970.
     pub(super) const fn wall_nanos(&self, at: Micros) -> u64 {
         (self.wall + at.0).saturating_mul(1_000)
     }
 
-    /// Returns the age at `now` of a wall clock time in ns.
+    /// Returns the time from a wall clock time in ns until `now`.
     pub(super) const fn age(&self, now: Micros, at_nanos: u64) -> Span {
         Span((self.wall + now.0).saturating_sub(at_nanos / 1_000))
     }

@@ -1,7 +1,7 @@
-//! Flash in a file, used by one process at a time.
+//! The flash of a cell in a file, which one process at a time can use.
 //!
-//! A lock on the file excludes other processes, and ends with the process. A file that replaces another is
-//! locked before the replacement.
+//! A lock on the file excludes other processes. The system removes it when the process ends. A new file is locked
+//! before it replaces the old one.
 
 use std::fs::{self, File};
 use std::io::{self, Write};
@@ -15,21 +15,21 @@ use rustix::io::Errno;
 use crate::flash::{self, FlashError, FlashContent};
 use crate::identity::Identity;
 
-/// Maximum number of bytes read from a file; a flash image is far smaller.
+/// Maximum number of bytes that are read from a file. A flash image is far smaller.
 const MAX_READ_BYTES: u64 = 64 << 10;
 
-/// The flash of a cell: a file, or memory only if there is no directory.
+/// The flash of a cell: a file, or no storage if no directory is given.
 #[derive(Debug)]
 pub struct FlashFile {
     identity: Identity,
     path: Option<PathBuf>,
-    /// The locked file at that path; `None` if there is none.
+    /// The locked file at the path; `None` if there is no file yet.
     held: Option<File>,
 }
 
 impl FlashFile {
-    /// Creates the flash `BUS-NODE.flash` in a directory, or `BUS-sSERIAL.flash` for a cell that started
-    /// without a node id.
+    /// Creates a handle for the file `BUS-NODE.flash` in a directory, or `BUS-sSERIAL.flash` for a cell that was
+    /// started without a node id.
     #[must_use]
     pub fn new(directory: Option<&Path>, bus: &str, identity: Identity) -> Self {
         let name = identity.cell.map_or_else(|| format!("s{}", identity.serial), |cell| cell.to_string());
@@ -37,7 +37,7 @@ impl FlashFile {
         Self { identity, path, held: None }
     }
 
-    /// Returns the name for messages: `flash of cell 12 (DIR/vcan0-12.flash)`.
+    /// Returns the name of the flash for messages: `flash of cell 12 (DIR/vcan0-12.flash)`.
     #[must_use]
     pub fn name(&self) -> String {
         let Identity { cell, serial } = self.identity;
@@ -48,8 +48,8 @@ impl FlashFile {
         )
     }
 
-    /// Locks and reads the file. Returns an empty content if there is no file, and an inner error if the
-    /// content cannot be used.
+    /// Locks and reads the file. The inner result is an error if the image is invalid. Without a file, the image is
+    /// empty.
     ///
     /// # Errors
     /// Returns an error if the file exists but cannot be read, or another process uses it.
@@ -62,7 +62,7 @@ impl FlashFile {
         Ok(flash::decode(self.identity, &input::read_bytes(path, MAX_READ_BYTES)?))
     }
 
-    /// Writes a node id and parameters. A complete new file replaces the old one, or nothing changes.
+    /// Writes a node id and parameters to a new file, which then replaces the old one. If that fails, nothing changes.
     ///
     /// # Errors
     /// Returns an error if writing fails, or another process uses the file.
@@ -99,7 +99,7 @@ impl FlashFile {
     }
 }
 
-/// Sets `held` to the locked file at this path.
+/// Opens and locks the file at this path, and stores it in `held`.
 fn lock_current(path: &Path, held: &mut Option<File>) -> io::Result<()> {
     loop {
         let file = match input::open(path) {
@@ -124,7 +124,7 @@ fn lock_current(path: &Path, held: &mut Option<File>) -> io::Result<()> {
     }
 }
 
-/// Locks a file. On a file system without locks, it stays unlocked.
+/// Locks a file. On a file system that does not support locks, the file stays unlocked.
 fn lock_file(file: &File) -> io::Result<()> {
     match flock(file, FlockOperation::NonBlockingLockExclusive) {
         Err(Errno::WOULDBLOCK) => {
@@ -136,13 +136,13 @@ fn lock_file(file: &File) -> io::Result<()> {
     }
 }
 
-/// Returns the device and inode of a file.
+/// Returns the device and inode numbers of a file.
 fn identity(file: &File) -> io::Result<(u64, u64)> {
     let about = file.metadata()?;
     Ok((about.dev(), about.ino()))
 }
 
-/// Returns the id and name of the process that has locked a file, from the kernel's list.
+/// Returns the id and name of the process that has locked a file, from the kernel's list of locks.
 fn holder(file: &File) -> Option<String> {
     let (device, inode) = identity(file).ok()?;
     let place = format!("{:02x}:{:02x}:{inode}", rustix::fs::major(device), rustix::fs::minor(device));

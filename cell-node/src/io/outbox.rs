@@ -1,17 +1,17 @@
-//! Frames to send, with the cells that count their packets.
+//! The frames that wait to be sent, each with the cell whose counter of sent packets includes it.
 
 use protocol::can::Frame;
 
-/// The frames of the cells of a process, in sending order.
+/// The frames that the cells of a process have to send, in order.
 #[derive(Debug, Default)]
 pub(super) struct Outbox {
     frames: Vec<Frame>,
-    /// For the last frame of each packet, the index of the cell that counts it.
+    /// For the last frame of each packet, the index of the cell that counts the packet; `None` for other frames.
     ends: Vec<Option<usize>>,
 }
 
 impl Outbox {
-    /// Appends a packet of the cell with this index.
+    /// Appends the frames of a packet of the cell with the index `place`.
     pub(super) fn push_packet(&mut self, place: usize, frames: impl IntoIterator<Item = Frame>) {
         self.frames.extend(frames);
         self.ends.resize(self.frames.len(), None);
@@ -20,7 +20,7 @@ impl Outbox {
         }
     }
 
-    /// Appends a frame that no cell counts.
+    /// Appends a frame that is not counted in any cell's number of sent packets, as those of wires.
     pub(super) fn push_uncounted(&mut self, frame: Frame) {
         self.frames.push(frame);
         self.ends.push(None);
@@ -31,13 +31,13 @@ impl Outbox {
         &self.frames
     }
 
-    /// Removes the first `count` frames after they were sent.
+    /// Removes the first `count` frames, which have been sent.
     pub(super) fn sent(&mut self, count: usize) {
         self.frames.drain(..count);
         self.ends.drain(..count);
     }
 
-    /// Removes all frames as lost. Returns the index of the counting cell for each packet.
+    /// Removes all frames, which are lost. Returns, for each packet among them, the index of the cell that counted it.
     pub(super) fn lose(&mut self) -> impl Iterator<Item = usize> {
         self.frames.clear();
         self.ends.drain(..).flatten()

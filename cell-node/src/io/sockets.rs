@@ -1,4 +1,5 @@
-//! The two sockets of a process: one wakes it, the other is read only while it is awake (deferred receive).
+//! The two sockets of a process: one whose frames wake the process, and one that is read only when the process is awake
+//! (deferred receive).
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -10,40 +11,40 @@ use protocol::can::Frame;
 use super::BusPort;
 use super::StopReason;
 
-/// The receive filters of a process.
+/// The receive filters of the two sockets.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub(super) struct ReceiveFilters {
-    /// Filters of the socket that wakes the process.
+    /// Filters of the socket whose frames wake the process.
     pub(super) at_once: Vec<Filter>,
-    /// Filters of the deferred socket, which is read before frames that woke the process.
+    /// Filters of the deferred socket. Its frames are handled before a frame that woke the process, if they are older.
     pub(super) deferred: Vec<Filter>,
 }
 
-/// Time for which frames may still arrive at the deferred socket after a filter was removed from it.
+/// Time for which frames may still arrive at the deferred socket after one of its filters was removed.
 const SETTLING_TIME: Duration = Duration::from_millis(50);
-/// Number of batches read from the deferred socket at once: the capacity of its buffer.
+/// Number of batches that are read from the deferred socket at once. They hold as many frames as its receive buffer.
 const MAX_DEFERRED_BATCHES: usize = 16;
 
 /// The open bus, and a second socket for deferred frames.
 ///
-/// Waking a process costs more than processing a frame. A frame that is only needed together with a later
-/// one, or is only counted, therefore does not wake it.
+/// Waking a process costs more than handling a frame. Some frames are only counted, or are needed only together with a
+/// later frame; they are received deferred and do not wake the process.
 #[derive(Debug)]
 pub struct Sockets {
     bus: Bus,
     deferred: Bus,
-    /// True for cells in a network, where a frame arrives before most timers are due; only timers wake a
-    /// resting cell.
+    /// True if the cells form a network. In a network a frame arrives before most timers are due, but a cell that
+    /// joints do not wake is woken by timers only.
     is_network: bool,
-    /// True if the deferred socket has filters.
+    /// True if the deferred socket has at least one filter.
     has_deferred_filters: bool,
-    /// Until this time, frames at the deferred socket may belong to the waking socket, because a filter was
-    /// moved.
+    /// Time until which the deferred socket may contain frames that should now wake the process, because their filter
+    /// was moved.
     settled: Option<Instant>,
-    /// Frames from the deferred socket that have not been processed yet.
+    /// Frames from the deferred socket that have not been handled yet.
     deferred_frames: VecDeque<Received>,
     inbox: Inbox,
-    /// Frames from the waking socket.
+    /// Frames from the socket that wakes the process.
     woke: Inbox,
     /// Frames from both sockets, in the order of the kernel's time stamps.
     arrived: Vec<Arrived>,
@@ -53,7 +54,7 @@ pub struct Sockets {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Arrived {
     pub(super) received: Received,
-    /// True if it was deferred and arrived before any frame that woke the process.
+    /// True if the frame was deferred and is older than all frames that woke the process.
     pub(super) waited: bool,
 }
 
@@ -61,7 +62,7 @@ impl Sockets {
     /// Opens both sockets.
     ///
     /// # Errors
-    /// Returns an error if the bus cannot be used as requested.
+    /// Returns an error if the bus does not exist, is not accessible, or does not support `options`.
     pub(super) fn open(line: &BusPort, options: &BusOptions, deferred: &[Filter]) -> Result<Self, StopReason> {
         let second = BusOptions { filters: deferred.to_vec(), own_frames: false, ..options.clone() };
         Ok(Self {
@@ -81,7 +82,7 @@ impl Sockets {
         self.bus.name()
     }
 
-    /// Replaces the filters `before` by `hearing`.
+    /// Sets the filters `hearing` on both sockets, given the present filters `before`.
     pub(super) fn set_filters(&mut self, hearing: &ReceiveFilters, before: &ReceiveFilters) -> Result<(), BusError> {
         // A filter that moves between the sockets is set on both for a moment, so that no frame is lost.
         let (update, old) =
@@ -104,8 +105,8 @@ impl Sockets {
         self.bus.send(frames)
     }
 
-    /// Receives pending frames without waiting, before a timer that was due at a wall clock time in ns.
-    /// Returns true if there are any.
+    /// Receives pending frames without waiting, before a timer is handled that was due at a wall clock time in ns.
+    /// Returns true if any frames were pending.
     pub(super) fn receive_pending(&mut self, due_nanos: u64) -> Result<bool, BusError> {
         self.clear();
         self.bus.receive(&mut self.woke)?;
@@ -115,7 +116,7 @@ impl Sockets {
         Ok(!self.arrived.is_empty())
     }
 
-    /// Waits for a frame that wakes the process, and receives it with the deferred ones.
+    /// Waits for a frame that wakes the process, and receives it together with the deferred frames.
     pub(super) fn wait(&mut self, wait: Duration) -> Result<(), BusError> {
         self.clear();
         if let Some(settled) = self.settled {
@@ -160,8 +161,8 @@ impl Sockets {
         Ok(())
     }
 
-    /// Merges the frames of both sockets in order. Deferred frames from before the first waking frame, and
-    /// before `until`, are marked as having waited.
+    /// Merges the frames of both sockets in the order of their time stamps. Deferred frames that are older than the
+    /// first waking frame and than `until` are marked as having waited.
     fn order(&mut self, until: u64) {
         let until = self.woke.frames().next().map_or(until, |first| first.at_nanos.min(until));
         let mut earlier = |than: u64, came: &mut Vec<Arrived>| {

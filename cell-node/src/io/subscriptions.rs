@@ -1,4 +1,4 @@
-//! Subscriptions: the frames that each cell of a process receives.
+//! Subscriptions: the cells of a process that receive each identifier and link id.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,31 +9,32 @@ use protocol::port::{WIRE_FLAG, LinkId};
 
 use super::sockets::ReceiveFilters;
 
-/// Passes the frames of all simulated wires of a bus.
+/// Filter that passes the frames of all simulated wires on a bus.
 const ALL_WIRES: Filter = Filter { id: EXTENDED | WIRE_FLAG, mask: EXTENDED | REMOTE | WIRE_FLAG };
 
-/// The receiving cells, as indices within the process, by identifier and by link id.
+/// For each identifier and link id, the cells that receive it, as indices within the process.
 #[derive(Debug, Default)]
 pub(super) struct Subscriptions {
     by_id: BTreeMap<Id, Subscribers>,
     by_link_id: BTreeMap<LinkId, (usize, usize)>,
 }
 
-/// The receivers of an identifier.
+/// The cells that receive one identifier.
 #[derive(Debug, Default)]
 struct Subscribers {
     by: Vec<usize>,
-    /// True if at least one receiver must be woken for it.
+    /// True if frames with this identifier must wake the process for at least one of the cells.
     wakes: bool,
 }
 
 impl Subscriptions {
-    /// Subscribes a cell's port to a link id, permanently.
+    /// Subscribes the port of a cell to a link id. The subscription is permanent.
     pub(super) fn wire(&mut self, link_id: LinkId, cell: usize, port: usize) {
         self.by_link_id.insert(link_id, (cell, port));
     }
 
-    /// Replaces all subscriptions to identifiers by these: cell, identifier, and true if it may be deferred.
+    /// Replaces all subscriptions to identifiers. Each item is a cell, an identifier, and true if the cell can receive
+    /// it deferred.
     pub(super) fn replace(&mut self, hears: impl Iterator<Item = (usize, Id, bool)>) {
         self.by_id.clear();
         for (cell, id, deferred) in hears {
@@ -48,13 +49,13 @@ impl Subscriptions {
         self.by_id.get(&id).map_or(&[], |heard| &heard.by)
     }
 
-    /// Returns the cell and port that receive a link id.
+    /// Returns the cell, and the port of the cell, that receive a link id.
     pub(super) fn port_for_link(&self, link_id: LinkId) -> Option<(usize, usize)> {
         self.by_link_id.get(&link_id).copied()
     }
 
-    /// Returns an exact filter for each identifier and link id. If these are too many for a socket, returns
-    /// one for each kind that is received, and one for all wires.
+    /// Returns the filters for all subscriptions: one exact filter for each identifier and link id. If these are more
+    /// than a socket accepts, returns one filter for each received kind, and one for all wires.
     pub(super) fn filters(&self) -> ReceiveFilters {
         let ids = |wakes| self.by_id.iter().filter(move |(_, heard)| heard.wakes == wakes).map(|(id, _)| *id);
         let link_ids = self.by_link_id.keys().copied();

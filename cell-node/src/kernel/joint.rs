@@ -1,8 +1,9 @@
-//! Joint indices that need no bounds checks.
+//! Joint numbers as an enumeration, with which arrays are indexed without bounds checks.
 
 use protocol::parameters::MAX_JOINTS;
 
-/// A joint. There are as many as elements of a joint array, so the compiler can omit bounds checks.
+/// A joint of a chain. The enumeration has as many values as a joint array has elements, so the compiler omits bounds
+/// checks.
 #[repr(u8)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Joint {
@@ -29,7 +30,7 @@ impl Joint {
         Self::J8, Self::J9, Self::J10, Self::J11, Self::J12, Self::J13, Self::J14,
     ];
 
-    /// Returns the element of this joint.
+    /// Returns the element of an array that belongs to this joint.
     #[inline(always)]
     pub(super) fn get<T>(self, joints: &[T; MAX_JOINTS]) -> Option<&T> {
         joints.get(self as usize)

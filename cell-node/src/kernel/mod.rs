@@ -1,4 +1,4 @@
-//! The cell's kernel: the effect of a one-newton force on the cell on each joint.
+//! The kernel of a cell: it computes the torque that a force of one newton on the cell causes in each joint.
 //!
 //! It computes the paper's Eq. 8 for a cell on the link that joint k moves,
 //!
@@ -39,21 +39,21 @@ use protocol::parameters::{MAX_JOINTS, Parameters, Row};
 
 use crate::sine::FINE;
 
-/// A method to compute the Jacobian of a cell's normal force.
+/// A method to compute the Jacobian J of the contact force on a cell.
 pub trait Kernel<S: Scalar = Q1_14>: Sized {
-    /// Prepares the part that does not depend on the joints, once per configuration.
+    /// Computes everything that does not depend on the joint positions, once per configuration.
     ///
-    /// Never panics, for any words.
+    /// Never panics, whatever the words of the parameters are.
     fn new(parameters: &Parameters) -> Self;
 
-    /// Writes J_l for the joints l = 1..=k that move the cell, and leaves the other elements unchanged.
-    /// `joints` are positions in quarter turns, or in m for prismatic joints. J_l is in m, in the range [-2,
-    /// 2), and dimensionless for prismatic joints.
+    /// Writes J_l for the joints l = 1..=k that move the cell, and leaves the other elements unchanged. `joints` are
+    /// positions in quarter turns, or in m for prismatic joints. J_l is in m and in the range [-2, 2); for prismatic
+    /// joints it is dimensionless.
     ///
     /// Never panics and never wraps: out-of-range values saturate. The work is bounded.
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]);
 
-    /// Returns J_l; zero for l > k.
+    /// Returns J_l for all joints l. It is zero for the joints after joint k, which do not move the cell.
     #[must_use]
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
         let mut jacobian = [S::from_number(S::Number::zero()); MAX_JOINTS];
@@ -62,15 +62,15 @@ pub trait Kernel<S: Scalar = Q1_14>: Sized {
     }
 }
 
-/// Returns the rows from the base to the cell. Returns no rows if their number of joints is inconsistent, as
-/// in parameters that [`Parameters::check`] refuses.
+/// Returns the rows from the base to the cell. Returns no rows if the number of rows with a joint is inconsistent, as
+/// in parameters that [`Parameters::check`] rejects.
 fn chain(parameters: &Parameters) -> &[Row] {
     let chain = parameters.chain();
     let joints = chain.iter().filter(|row| row.moves()).count();
     if joints == usize::from(parameters.joint) && joints <= MAX_JOINTS { chain } else { &[] }
 }
 
-/// Returns a length of the robot's table; `None` for zero, which then costs nothing.
+/// Returns a length of the robot's table; `None` for zero, for which the multiplications are omitted.
 fn length<N: Number>(word: Q1_14) -> Option<N> {
     (word != Q1_14::ZERO).then(|| N::word(word))
 }
@@ -86,18 +86,18 @@ fn settled_turn<N: Number>(angle: Q1_14) -> [N; 2] {
     [N::settle::<FINE>(sine), N::settle::<FINE>(cosine)]
 }
 
-/// The rotation of y and z by a link's twist alpha.
+/// The rotation of the y and z axes by the twist alpha of a link, by the operations that it needs.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Twist<N> {
     /// No rotation.
     None,
-    /// A quarter turn.
+    /// A rotation by a quarter turn.
     Ahead,
-    /// Half a turn.
+    /// A rotation by half a turn.
     Half,
-    /// A quarter turn backwards.
+    /// A rotation by a quarter turn backwards.
     Back,
-    /// Any other angle.
+    /// A rotation by any other angle.
     Other { sine: N, cosine: N },
 }
 

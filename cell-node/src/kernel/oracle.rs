@@ -1,5 +1,4 @@
-//! Alternatives to compare the cell's kernel with: the paper's method and sine, real numbers, and operation
-//! counts.
+//! References for comparison with the cell's kernel: the paper's method and sine, real numbers, and operation counts.
 //!
 //! Cells are built without this module (feature `oracle`). [`Projection`] computes the same Jacobian as
 //! [`Wrench`] with the paper's method: it carries the frames from the base up to the cell (Eq. 20 to 25).
@@ -30,7 +29,7 @@ use protocol::fixed::Q1_14;
 use super::Word;
 use crate::sine::paper::paper_sine_cosine;
 
-/// The cell's words, but with the paper's fifth-order sine (Eq. 17 to 19).
+/// A Q1.14 word, as on the cell, but with the paper's fifth-order sine (Eq. 17 to 19).
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct PaperWord(pub Q1_14);
 

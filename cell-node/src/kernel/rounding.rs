@@ -1,24 +1,24 @@
-//! Rounding of sums to words: with saturation, or without it where the range is known.
+//! Rounding of sums to words: with saturation, or without it where the range of the result is known.
 
 use super::Number;
 
-/// A way to round sums to words.
+/// A way to round sums to words, with saturation or without it.
 pub(super) trait Rounding {
-    /// Rounds the sum of two products, in each of which one factor is within [-1, 1].
+    /// Rounds the sum of two products. In each product one factor must be within [-1, 1].
     fn sum<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N;
-    /// Rounds the difference of two such products.
+    /// Rounds the difference of two products. In each product one factor must be within [-1, 1].
     fn difference<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N;
-    /// Rounds a number plus a product.
+    /// Rounds the sum of a number and a product.
     fn more<N: Number>(number: N, product: N::Wide) -> N;
-    /// Rounds a number minus a product.
+    /// Rounds the difference of a number and a product.
     fn less<N: Number>(number: N, product: N::Wide) -> N;
-    /// Rounds a number plus a product, minus another one.
+    /// Rounds a number plus the product `more` minus the product `less`.
     fn more_and_less<N: Number>(number: N, more: N::Wide, less: N::Wide) -> N;
     /// Negates a number.
     fn negative<N: Number>(number: N) -> N;
 }
 
-/// Rounding with saturation.
+/// Rounding with saturation, for sums that may leave the range of a word.
 pub(super) enum Saturating {}
 
 impl Rounding for Saturating {
@@ -53,7 +53,7 @@ impl Rounding for Saturating {
     }
 }
 
-/// Rounding of numbers that are known to fit.
+/// Rounding without saturation, for sums that are known to fit a word.
 pub(super) enum Bounded {}
 
 impl Rounding for Bounded {

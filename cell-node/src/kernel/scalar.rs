@@ -1,4 +1,4 @@
-//! The number type of a kernel: fixed point on the cell, other types for tests and operation counts.
+//! The number type of a kernel: fixed point on the cell, and other types for tests and operation counts.
 
 use core::fmt::Debug;
 use core::marker::PhantomData;
@@ -13,25 +13,25 @@ pub trait Scalar: Copy {
     /// The number type of the computation.
     type Number: Number;
 
-    /// Converts a result.
+    /// Converts a result of the computation to the result type.
     fn from_number(number: Self::Number) -> Self;
 }
 
 /// A number type for kernels, with the wider type of its sums of products.
 ///
-/// Words are rounded once per sum of products; no other operation loses bits.
+/// For words, each sum of products is rounded once; no other operation loses bits.
 pub trait Number: Copy + Debug + PartialEq {
     /// A sum of products before rounding.
     type Wide: Copy;
-    /// The type for constants, which are computed once when a kernel is created. For integers it counts
-    /// steps, whose size the code tracks; see [`Number::settle`].
+    /// The type for constants, which are computed once when a kernel is created. For integers a constant is a number of
+    /// steps; the size of a step is passed to [`Number::settle`].
     type Fine: Copy
         + Add<Output = Self::Fine>
         + Sub<Output = Self::Fine>
         + Mul<Output = Self::Fine>
         + Neg<Output = Self::Fine>;
 
-    /// Converts a parameter's word.
+    /// Converts a word of the parameters to a number.
     fn word(word: Q1_14) -> Self;
     /// Returns zero.
     #[must_use]
@@ -46,15 +46,15 @@ pub trait Number: Copy + Debug + PartialEq {
     fn plus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide;
     /// Subtracts two sums.
     fn minus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide;
-    /// Rounds a sum to the nearest word, ties up, and saturates.
+    /// Rounds a sum to the nearest number, ties up, with saturation.
     fn round(sum: Self::Wide) -> Self;
-    /// Adds two products, or a number and a product, and rounds; faster than [`Number::plus`] with
-    /// [`Number::round`]. In each of two products one factor must be within [-1, 1], as sines are.
+    /// Adds two products, or a number and a product, and rounds the sum. This is faster than [`Number::plus`] and
+    /// [`Number::round`]. If both terms are products, one factor of each must be within [-1, 1], as sines are.
     #[must_use]
     fn rounded_sum(lhs: Self::Wide, rhs: Self::Wide) -> Self {
         Self::round(Self::plus(lhs, rhs))
     }
-    /// Subtracts two such terms and rounds.
+    /// Subtracts two products, or a product from a number, and rounds. The rule of [`Number::rounded_sum`] applies.
     #[must_use]
     fn rounded_difference(lhs: Self::Wide, rhs: Self::Wide) -> Self {
         Self::round(Self::minus(lhs, rhs))
@@ -75,12 +75,12 @@ pub trait Number: Copy + Debug + PartialEq {
     fn bounded(sum: Self::Wide) -> Self {
         Self::round(sum)
     }
-    /// Adds a product and rounds, if the result is known to fit a word.
+    /// Adds a product to the number and rounds, if the result is known to fit a word.
     #[must_use]
     fn bounded_more(self, product: Self::Wide) -> Self {
         Self::round(Self::plus(self.widen(), product))
     }
-    /// Subtracts a product and rounds, if the result is known to fit a word.
+    /// Subtracts a product from the number and rounds, if the result is known to fit a word.
     #[must_use]
     fn bounded_less(self, product: Self::Wide) -> Self {
         Self::round(Self::minus(self.widen(), product))
@@ -94,17 +94,17 @@ pub trait Number: Copy + Debug + PartialEq {
     fn norm(vector: [Self; 3]) -> Option<u32>;
     /// Returns sine and cosine of an angle in quarter turns.
     fn sine_cosine(angle: Q1_14) -> [Self; 2];
-    /// Adds two angles, wrapped into one turn.
+    /// Adds two angles in quarter turns. The sum wraps into one turn.
     #[must_use]
     fn plus_angle(lhs: Q1_14, rhs: Q1_14) -> Q1_14 {
         lhs.wrapping_add(rhs)
     }
 
-    /// Converts a parameter's word for the computation of a constant.
+    /// Converts a word of the parameters for the computation of a constant.
     fn fine(word: Q1_14) -> Self::Fine;
-    /// Returns sine, cosine and one in the same steps: 2^-28 for integers.
+    /// Returns the sine and cosine of an angle in quarter turns, and one, all in the same steps: 2^-28 for integers.
     fn fine_turn(angle: Q1_14) -> [Self::Fine; 3];
-    /// Rounds a computed constant to a word. Integers are in steps of 2^-F.
+    /// Rounds a computed constant to a number. For integers, the constant is in steps of 2^-F.
     fn settle<const F: u32>(constant: Self::Fine) -> Self;
 }
 
@@ -120,26 +120,26 @@ pub trait Word: Copy + Debug + PartialEq {
     fn sine_cosine(angle: Q1_14) -> [i32; 2] {
         sine_cosine(angle)
     }
-    /// Records an operation, if this type counts operations.
+    /// Records an operation, if this type counts operations; else does nothing.
     fn note(_operation: impl FnOnce(&mut Operations)) {}
 }
 
-/// Operation counts of a computation.
+/// Numbers of operations in a computation.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Operations {
-    /// Multiplications of two words.
+    /// Number of multiplications of two words.
     pub multiplications: u32,
-    /// Additions and subtractions of sums.
+    /// Number of additions and subtractions of sums.
     pub additions: u32,
-    /// Sines.
+    /// Number of sines.
     pub sines: u32,
-    /// Cosines.
+    /// Number of cosines.
     pub cosines: u32,
-    /// Negations of a word.
+    /// Number of negations of a word.
     pub negations: u32,
-    /// Additions of angles, which wrap.
+    /// Number of additions of angles, which wrap.
     pub angle_additions: u32,
-    /// Sums rounded to a word.
+    /// Number of sums rounded to a word.
     pub roundings: u32,
 }
 
@@ -164,8 +164,8 @@ impl<W: Word> Scalar for W {
     }
 }
 
-/// Steps of 2^-14 within the range of a word, stored in 32 bits, the width of a register. Products and sums
-/// also take 32 bits.
+/// A number within the range of a word, in steps of 2^-14. It is stored in 32 bits, the width of a register. Products
+/// and sums also take 32 bits.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Steps<W> {
     steps: i32,
@@ -178,7 +178,8 @@ impl<W> Steps<W> {
         Self { steps, of: PhantomData }
     }
 
-    /// Converts steps of 2^-28, to which half a step of 2^-14 has been added, with saturation.
+    /// Converts a sum in steps of 2^-28 to steps of 2^-14, with saturation. The caller has added half a step of 2^-14
+    /// for rounding.
     #[inline]
     fn held(sum: i32) -> Self {
         let steps = sum >> 14;
@@ -188,8 +189,8 @@ impl<W> Steps<W> {
     }
 }
 
-/// Rounds steps of 2^-28 to steps of 2^-14, ties up. Shifting twice keeps the added half small enough for an
-/// immediate operand.
+/// Rounds steps of 2^-28 to steps of 2^-14, ties up. The shift is done in two parts, so that the added half is small
+/// enough for an immediate operand of the processor.
 #[inline]
 const fn to_steps(sum: i32) -> i32 {
     ((sum >> 13) + 1) >> 1
@@ -243,7 +244,7 @@ impl<W: Word> Number for Steps<W> {
         Self::held(sum.saturating_add(HALF))
     }
 
-    /// The sum is at most 2^29 + 2^30 steps of 2^-28.
+    /// The sum of a number and a product is at most 2^29 + 2^30 steps of 2^-28, so 32 bits suffice.
     #[inline]
     fn rounded_sum(lhs: i32, rhs: i32) -> Self {
         W::note(|done| (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1));
@@ -301,7 +302,7 @@ impl<W: Word> Number for Steps<W> {
         Some(square.isqrt() + 1)
     }
 
-    /// Negates; the smallest word becomes the largest.
+    /// Negates the number. The smallest word becomes the largest.
     #[inline]
     fn negative(self) -> Self {
         W::note(|done| done.negations += 1);

@@ -1,4 +1,4 @@
-//! The wrench kernel: carries the contact force and moment down the chain.
+//! The wrench kernel: it carries the force and the moment of the contact from the cell down to the base.
 //!
 //! Eq. 8 is a scalar triple product, and a contact on a link is a constant wrench in that link's frame: the
 //! force f and its moment m = t x f about the frame's origin. From frame l to frame l-1, whose transform is
@@ -36,63 +36,63 @@ use crate::contact::{MAX_J, TorqueRounding};
 /// cosines. Over 300 poses of a UR5 the mean torque error is 1.2e-4 Nm and the maximum 1.5e-3 Nm.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Wrench<S: Scalar = Q1_14> {
-    /// The joint that moves the cell; 0 if there is none.
+    /// Number of the joint that moves the cell; 0 if there is none.
     joint: usize,
-    /// The contact's wrench, twisted and shifted by the row of joint k.
+    /// Force and moment of the contact in the frame below the row of joint k, before the turn of that joint.
     contact: PerComponent<S::Number>,
-    /// The links from joint k's row down to the base; the first `rows` are in use.
+    /// The links from joint k's row down to the base. Only the first `rows` are in use.
     links: [Link<S::Number>; MAX_ROWS],
     rows: usize,
-    /// Upper bound of |J| in steps of 2^-14, for any joint positions. If it is below [`MAX_J`], no
-    /// intermediate number can leave the range of a word either, and saturation is omitted.
+    /// Upper bound of |J| in steps of 2^-14, for any joint positions. If it is below [`MAX_J`], no intermediate number
+    /// can leave the range of a word, and saturation is omitted.
     bound: u16,
-    /// The conversion of torques of this J to words.
+    /// The conversion of the torques for this J to words.
     rounding: TorqueRounding,
 }
 
-/// A force of one newton and its moment in m (Nm per N); or a property of each of their components.
+/// A force of one newton and its moment in m (Nm per N), or one property of each of their components.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct PerComponent<T> {
     force: [T; 3],
     moment: [T; 3],
 }
 
-/// The components of a wrench that are used.
+/// For each component of a wrench, true if it is used.
 type Live = PerComponent<bool>;
 
 impl Live {
     const NOTHING: Self = Self { force: [false; 3], moment: [false; 3] };
     const ALL: Self = Self { force: [true; 3], moment: [true; 3] };
 
-    /// Applies a function to force and moment.
+    /// Applies a function to the components of the force and to those of the moment.
     fn each(self, before: impl Fn([bool; 3]) -> [bool; 3]) -> Self {
         Self { force: before(self.force), moment: before(self.moment) }
     }
 }
 
-/// The steps from the frame of a row to the one below.
+/// The computation that carries a wrench from the frame of a row to the frame below.
 // In this order, the fields that are read first are in reach of a short instruction of a Cortex-M0.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Link<N> {
-    /// The values to compute: bits of [`due`].
+    /// The values to compute for this row: bits of [`due`].
     due: u32,
-    /// The joint of the row; for a fixed row, the joint above it.
+    /// The joint of the row; for a fixed row, the next joint above it.
     joint: Joint,
     kind: RowKind,
     a: Q1_14,
-    /// The offset without the position of a prismatic joint.
+    /// The offset d, without the position of a prismatic joint.
     d: Q1_14,
-    /// theta_offset.
+    /// The constant theta_offset of the row.
     offset: Q1_14,
     twist: Twist<N>,
-    /// Sine and cosine of theta_offset, if the row does not turn; `None` for an offset of zero.
+    /// Sine and cosine of theta_offset, if the row has no revolute joint; `None` for an offset of zero.
     constant: Option<[N; 2]>,
 }
 
-/// The values that are computed for a row, because its own element of J or a row further down reads them.
+/// Bits for the values to compute for a row, because its element of J or a row further down reads them.
 mod due {
-    /// Each result of the turn.
+    /// Single results of the turn: the x and y components of force and moment.
     pub(super) const FX: u32 = 1;
     pub(super) const FY: u32 = 2;
     pub(super) const MX: u32 = 4;
@@ -103,18 +103,18 @@ mod due {
     pub(super) const D: u32 = 16;
     /// The shift of moments by a.
     pub(super) const A: u32 = 32;
-    /// Each result of a twist that is not a multiple of quarter turns.
+    /// Single results of a twist that is not a multiple of quarter turns.
     pub(super) const TWISTED_FY: u32 = 64;
     pub(super) const TWISTED_FZ: u32 = 128;
     pub(super) const TWISTED_MY: u32 = 256;
     pub(super) const TWISTED_MZ: u32 = 512;
-    /// Twists by multiples of quarter turns.
+    /// Bits for twists by multiples of quarter turns.
     pub(super) const AHEAD: u32 = 1 << 11;
     pub(super) const BACK: u32 = 1 << 12;
     pub(super) const HALF: u32 = 1 << 13;
     /// The row has no joint.
     pub(super) const PASS: u32 = 1 << 14;
-    /// The turn has all results.
+    /// All results of the turn are read.
     pub(super) const ALL: u32 = 1 << 15;
     /// The row has a twist or no joint.
     pub(super) const MORE: u32 = 1 << 16;
@@ -133,7 +133,7 @@ impl<S: Scalar> Wrench<S> {
         &self.rounding
     }
 
-    /// Returns a kernel without a cell: every J is zero.
+    /// Returns a kernel without a cell, for which every J is zero.
     pub(crate) fn empty() -> Self {
         Self {
             joint: 0,
@@ -145,7 +145,8 @@ impl<S: Scalar> Wrench<S> {
         }
     }
 
-    /// Prepares the kernel for these parameters in place, because it is large for a stack.
+    /// Prepares the kernel for these parameters. This is done in place, because a kernel is too large for a small
+    /// stack.
     pub(crate) fn prepare(&mut self, parameters: &Parameters) {
         let chain = chain(parameters);
         let mut read = Live::NOTHING; // by the rows further down: nothing below joint 1
@@ -203,8 +204,8 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
     }
 }
 
-/// Carries the contact's wrench down to the base and writes J, for chains of revolute joints and fixed rows
-/// in which no number can leave its range.
+/// Carries the wrench of the contact down to the base and writes J, without saturation. It is for chains of revolute
+/// joints and fixed rows in which no number can leave the range of a word.
 #[inline(always)]
 fn down_bounded<S: Scalar>(
     mut wrench: PerComponent<S::Number>,
@@ -237,7 +238,7 @@ fn down_bounded<S: Scalar>(
     }
 }
 
-/// Like [`down_bounded`], for any chain, with saturation.
+/// Like [`down_bounded`], with saturation, for any chain.
 #[inline(never)]
 fn down<'a, S: Scalar + 'a>(
     mut wrench: PerComponent<S::Number>,
@@ -273,14 +274,14 @@ fn down<'a, S: Scalar + 'a>(
 }
 
 impl<N: Number> Link<N> {
-    /// An unused link.
+    /// The initial value of links that are not in use.
     const NOTHING: Self = {
         let (joint, kind, zero) = (Joint::J1, RowKind::Revolute, Q1_14::ZERO);
         Self { due: 0, joint, kind, a: zero, d: zero, offset: zero, twist: Twist::None, constant: None }
     };
 
-    /// Returns the link of a row whose results `read` the rows below read, and the components that the row
-    /// itself reads.
+    /// Creates the computation for a row, given the components that the rows below read. Also returns the components
+    /// that this row reads.
     fn new(row: &Row, read: Live) -> (Self, Live) {
         let twist = Twist::new(row.alpha);
         let (a, d) = (row.a != Q1_14::ZERO, row.d != Q1_14::ZERO);
@@ -327,26 +328,26 @@ impl<N: Number> Link<N> {
         self.due & bit != 0
     }
 
-    /// Returns d, if its shift is read and the row has no prismatic joint.
+    /// Returns the offset d; `None` if no row reads the shift by d, or if d includes the position of a prismatic joint.
     #[inline(always)]
     fn own_d(&self) -> Option<N> {
         self.is_due(due::D).then(|| N::word(self.d))
     }
 
-    /// Returns a, if its shift is read.
+    /// Returns the length a; `None` if no row reads the shift by a.
     #[inline(always)]
     fn own_a(&self) -> Option<N> {
         self.is_due(due::A).then(|| N::word(self.a))
     }
 
-    /// Applies `Tz(d) Tx(a) Rx(alpha)`.
+    /// Transforms the wrench by `Tz(d) Tx(a) Rx(alpha)`.
     #[inline(always)]
     fn twist_and_shift<R: Rounding>(&self, wrench: &mut PerComponent<N>, d: Option<N>) {
         self.twist_by_alpha::<R>(wrench);
         Self::shift::<R>(wrench, d, self.own_a());
     }
 
-    /// Applies `Rx(alpha)`.
+    /// Transforms the wrench by `Rx(alpha)`.
     #[inline(always)]
     fn twist_by_alpha<R: Rounding>(&self, wrench: &mut PerComponent<N>) {
         let PerComponent { force: [_, fy, fz], moment: [_, my, mz] } = wrench;
@@ -365,7 +366,8 @@ impl<N: Number> Link<N> {
         }
     }
 
-    /// Applies `Rx` with an angle that is not a multiple of quarter turns, computing only what is due.
+    /// Transforms the wrench by `Rx` with an angle that is not a multiple of quarter turns. Computes only the
+    /// components that are read later.
     #[inline(never)]
     fn twist_by(&self, [sine, cosine]: [N; 2], wrench: &mut PerComponent<N>) {
         let PerComponent { force: [_, fy, fz], moment: [_, my, mz] } = *wrench;
@@ -386,7 +388,7 @@ impl<N: Number> Link<N> {
         }
     }
 
-    /// Moves the reference point of the moment by (a, 0, d) towards the base.
+    /// Moves the point about which the moment is taken by (a, 0, d) towards the base.
     #[inline(always)]
     fn shift<R: Rounding>(wrench: &mut PerComponent<N>, d: Option<N>, a: Option<N>) {
         let PerComponent { force: [fx, fy, fz], moment: [mx, my, mz] } = wrench;
@@ -408,7 +410,8 @@ impl<N: Number> Link<N> {
         }
     }
 
-    /// Applies `Rz(theta)` of a revolute joint at this position, computing only what is due.
+    /// Transforms the wrench by `Rz(theta)` of a revolute joint at this position. Computes only the components that are
+    /// read later.
     #[inline(always)]
     fn turn<R: Rounding>(&self, wrench: &mut PerComponent<N>, position: Q1_14) {
         let turn = Rotation(N::sine_cosine(N::plus_angle(position, self.offset)));
@@ -419,7 +422,7 @@ impl<N: Number> Link<N> {
         }
     }
 
-    /// Applies `Rz(theta)` of a row that does not turn.
+    /// Transforms the wrench by `Rz(theta_offset)` of a row without a revolute joint.
     fn turn_by_offset(&self, wrench: &mut PerComponent<N>) {
         if let Some(turn) = self.constant
             && self.is_due(due::TURN)
@@ -428,7 +431,7 @@ impl<N: Number> Link<N> {
         }
     }
 
-    /// Applies a whole row without a joint.
+    /// Transforms the wrench by a whole row without a joint.
     #[inline(never)]
     fn apply_fixed(&self, wrench: &mut PerComponent<N>) {
         self.twist_and_shift::<Saturating>(wrench, self.own_d());
@@ -436,7 +439,7 @@ impl<N: Number> Link<N> {
     }
 }
 
-/// `Rz`, given by its sine and cosine.
+/// A rotation `Rz`, given by its sine and cosine.
 struct Rotation<N>([N; 2]);
 
 impl<N: Number> Rotation<N> {
@@ -458,7 +461,7 @@ impl<N: Number> Rotation<N> {
         (*mx, *my) = (self.x::<R>(*mx, *my), self.y::<R>(*mx, *my));
     }
 
-    /// Computes only what is due.
+    /// Computes only the results of the turn whose bits are set in `due`.
     #[inline(always)]
     fn some<R: Rounding>(&self, wrench: &mut PerComponent<N>, due: u32) {
         let PerComponent { force: [fx, fy, _], moment: [mx, my, _] } = *wrench;
@@ -478,7 +481,7 @@ impl<N: Number> Rotation<N> {
     }
 }
 
-/// Returns the components needed before a twist for these components after it.
+/// Returns the components before a twist that are needed to compute the given components after it.
 fn before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
     match twist {
         Twist::None | Twist::Half => [x, y, z],
@@ -487,7 +490,7 @@ fn before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
     }
 }
 
-/// Returns the components needed before a turn about z for these components after it.
+/// Returns the components before a turn about z that are needed to compute the given components after it.
 fn before_turn([x, y, z]: [bool; 3]) -> [bool; 3] {
     [x || y, x || y, z]
 }

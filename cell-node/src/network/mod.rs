@@ -31,42 +31,43 @@ use port::Port;
 
 /// Interval of hellos.
 const HELLO_INTERVAL: Span = Span::from_millis(250);
-/// Maximum time to wait for a grant before trying another port.
+/// Maximum time to wait for the answer to a join before another port is tried.
 const JOIN_TIMEOUT: Span = Span::from_millis(5);
-/// Interval of local repairs: the first, and the maximum.
+/// Intervals between local repairs: the first, and the maximum.
 const REPAIR_INTERVALS: (Span, Span) = (Span::from_millis(20), Span::from_millis(320));
-/// Interval of leaves to the gateway's side until it acknowledges; it accepts sums until then.
+/// Interval at which a leave to the gateway's side is repeated until it is acknowledged. The gateway's side accepts
+/// sums until then.
 const LEAVE_INTERVAL: Span = Span::from_millis(20);
 /// Number of ports, including a root's wire to the gateway's side.
 const ALL_PORTS: usize = PORTS + 1;
-/// Capacity for outgoing messages, which the shell collects after every call.
+/// Capacity for outgoing messages. The caller collects them after every call.
 const OUTBOX_CAPACITY: usize = 32;
 
-/// The reason for the loss of a parent, which determines whether the parent may still accept a sum.
+/// The reason for the loss of a parent. It determines whether the parent may still accept sums of this cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(crate) enum LossReason {
-    /// The parent did not accept the last sums, or refuses this child: it accepts no more.
+    /// The parent did not accept the last sums, or rejects this cell as its child. It accepts no more sums.
     Done,
-    /// The link is down in one direction, or the parent is unreachable itself: it may accept sums until it
+    /// The link fails in one direction, or the parent itself is unreachable. The parent may accept sums until it
     /// acknowledges the leave.
     Unsure,
 }
 
-/// The neighbour that receives this cell's sums.
+/// The neighbour to which this cell sends its sums.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 struct Parent {
     port: usize,
     rank: Rank,
 }
 
-/// A parent that this cell has left.
+/// A neighbour that was the parent until this cell left it.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 struct FormerParent {
     port: usize,
-    /// True after it acknowledged the leave: it accepts no more sums.
+    /// True if the former parent has acknowledged the leave, after which it accepts no more sums.
     acknowledged: bool,
     since: Micros,
-    /// The time to resend the leave.
+    /// The time at which the leave is repeated.
     resend_at: Micros,
 }
 
@@ -80,47 +81,47 @@ impl FormerParent {
     }
 }
 
-/// A cell's part of the network.
+/// The part of a cell that forms the tree with its neighbours.
 #[derive(Debug, Default)]
 pub(crate) struct Network {
     wired: u8,
-    /// Ports whose input is ignored (bit mask).
+    /// Ports whose messages are ignored; bit p stands for port p.
     pub(crate) ignored_ports: u8,
     node_ids: NodeIds,
     ports: [Port; ALL_PORTS],
     parent: Option<Parent>,
-    /// The best rank that this cell ever had; it follows only better ones.
+    /// The best rank that this cell has ever had. It accepts a parent only with a better rank.
     best: Option<Rank>,
-    /// The last announced rank.
+    /// The rank that this cell announced last.
     announced: Option<Rank>,
     joining: Option<(usize, Micros)>,
-    /// True while sums are sent: the parent is then not changed without need.
+    /// True while sums are sent. The cell then keeps its parent unless it loses it.
     pub(crate) busy: bool,
-    /// True if the parent itself is unreachable.
+    /// True if the parent has announced that it is itself unreachable.
     parent_unreachable: bool,
-    /// The time of the next local repair, and the interval after it.
+    /// The time of the next local repair, and the interval until the one after it.
     repair: Option<(Micros, Span)>,
-    /// The last forwarded repair: its round, true if it went to all ports instead of the parent only, and its
+    /// The last repair that was forwarded: its round, true if it went to all ports instead of the parent only, and the
     /// time.
     forwarded_repair: Option<(u8, bool, Micros)>,
-    /// The last parent that was left.
+    /// The parent that this cell left last, until it can accept no more sums.
     former_parent: Option<FormerParent>,
     reported: Option<[PortState; PORTS]>,
-    /// Number of changes of the parent.
+    /// Number of times that the parent has changed.
     pub(crate) changes: u16,
-    /// True if the place in the tree has changed since the last read.
+    /// True if parent, depth, round or children have changed since this flag was read.
     pub(crate) tree_changed: bool,
     next_hello: Micros,
     outbox: Deque<(usize, PortMessage), OUTBOX_CAPACITY>,
 }
 
 impl Network {
-    /// Creates the network of a cell without wires.
+    /// Creates the network part of a cell without wires.
     pub(crate) fn new(now: Micros) -> Self {
         Self { next_hello: now, ..Self::default() }
     }
 
-    /// Connects wires to the ports `wired`. The hellos of many cells are spread by serial number.
+    /// Sets the ports that have wires. The serial number spreads the hellos of many cells over time.
     pub(crate) fn wire(&mut self, wired: u8, number: Option<CellId>, serial: u32) {
         (self.wired, self.node_ids.own) = (wired, number);
         self.next_hello = self.next_hello + phase::by_serial(HELLO_INTERVAL, serial);
@@ -131,17 +132,17 @@ impl Network {
         self.wired != 0
     }
 
-    /// Returns true if a port receives: it is wired, and its link is not down.
+    /// Returns true if a port has a wire and its messages are not ignored.
     pub(crate) const fn receives(&self, port: usize) -> bool {
         self.wired & !self.ignored_ports & 1 << port != 0
     }
 
-    /// Returns the port of the parent.
+    /// Returns the port that leads to the parent; `None` without a parent.
     pub(crate) fn up(&self) -> Option<usize> {
         self.parent.map(|parent| parent.port)
     }
 
-    /// Returns the number of wires to the root of the tree; 0 for a root.
+    /// Returns the number of wires to the root of the tree, 0 for a root; `None` without a parent.
     pub(crate) fn depth(&self) -> Option<u8> {
         self.parent.map(|parent| parent.rank.depth)
     }
@@ -151,12 +152,12 @@ impl Network {
         self.parent.map(|parent| parent.rank.below())
     }
 
-    /// Returns the round of its rank.
+    /// Returns the round of the cell's rank.
     pub(crate) fn round(&self) -> u8 {
         self.best.map_or(0, |rank| rank.round)
     }
 
-    /// Returns the parent's node id; 0 for the gateway's side.
+    /// Returns the parent's node id, 0 for the gateway's side; `None` without a parent.
     pub(crate) fn parent_node(&self) -> Option<u8> {
         match self.up()? {
             UPLINK => Some(0),
@@ -164,7 +165,7 @@ impl Network {
         }
     }
 
-    /// Returns the node id of the cell at a port.
+    /// Returns the node id of the cell at a port; `None` if it is unknown.
     pub(crate) fn number_at(&self, port: usize) -> Option<CellId> {
         self.ports.get(port)?.number()
     }
@@ -179,24 +180,25 @@ impl Network {
         (0..PORTS).find(|&port| self.is_child(port) && self.number_at(port) == Some(number))
     }
 
-    /// Returns true if no former parent can accept a sum: it has acknowledged the leave, or does not exist.
+    /// Returns true if no former parent can accept sums of this cell any more: there is none, or it has acknowledged
+    /// the leave.
     pub(crate) fn is_released(&self) -> bool {
         self.former_parent.is_none_or(|former_parent| former_parent.acknowledged)
     }
 
-    /// Forgets a former parent after an epoch in which this cell sent no sum, so that the former parent
-    /// accepts no more. The gateway's side needs longer, because it relies on the messages of the wire.
+    /// Forgets the former parent after an epoch in which this cell sent no sum, because a cell then accepts no more
+    /// sums. The gateway's side is forgotten only one hello interval after it was left.
     pub(crate) fn forget_former_parent(&mut self, now: Micros) {
         self.former_parent
             .take_if(|former_parent| former_parent.port != UPLINK || now.elapsed_since(former_parent.since) >= HELLO_INTERVAL);
     }
 
-    /// Returns the children: bit p is set if the cell at port p is a child.
+    /// Returns a mask of the children: bit p is set if the cell at port p is a child.
     pub(crate) fn children(&self) -> u8 {
         self.bits(Port::is_child)
     }
 
-    /// Returns the working ports: bit p is set if port p works in both directions.
+    /// Returns a mask of the working ports: bit p is set if port p works in both directions.
     pub(crate) fn working(&self, now: Micros) -> u8 {
         self.bits(|port| port.works(now))
     }
@@ -206,28 +208,28 @@ impl Network {
         self.ports.iter().take(PORTS).enumerate().map(bit).sum()
     }
 
-    /// Returns the state of each port.
+    /// Returns the state of each port for network page 4.
     pub(crate) fn port_states(&self, now: Micros) -> [PortState; PORTS] {
         core::array::from_fn(|port| self.ports.get(port).map(|port| port.state(now)).unwrap_or_default())
     }
 
-    /// Returns true if the state of a port has changed since the last call.
+    /// Returns true if the state of any port has changed since the last call.
     pub(crate) fn ports_changed(&mut self, now: Micros) -> bool {
         let states = self.port_states(now);
         self.reported.replace(states) != Some(states)
     }
 
-    /// Returns a node id that a walk assigned to this cell, once.
+    /// Returns the node id that a walk has assigned to this cell, once; `None` afterwards.
     pub(crate) const fn take_assigned(&mut self) -> Option<CellId> {
         self.node_ids.given.take()
     }
 
-    /// Returns the next message for a port.
+    /// Returns the next message to send, and its port.
     pub(crate) fn poll_transmit(&mut self) -> Option<(usize, PortMessage)> {
         self.outbox.pop_front()
     }
 
-    /// Returns the time at which [`Network::handle_time`] must be called.
+    /// Returns the time at which [`Network::handle_time`] must be called next.
     pub(crate) fn poll_timeout(&self) -> Micros {
         if !self.exists() {
             return Micros(u64::MAX);
@@ -239,7 +241,7 @@ impl Network {
         [join, repair, silent, leave].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
 
-    /// Sends a message to the cell at a port.
+    /// Queues a message for the cell at a port.
     pub(crate) fn send(&mut self, port: usize, message: PortMessage) {
         if self.wired >> port & 1 != 0 {
             // The shell collects messages after every call; the next hello makes up for one that does not
@@ -272,7 +274,7 @@ impl Network {
         }
     }
 
-    /// Handles a message from a port that receives, except those about sums: `State` and `Nack`.
+    /// Handles a message that arrived at a port, except the messages `State` and `Nack` about sums.
     pub(crate) fn handle(&mut self, now: Micros, port: usize, message: PortMessage) {
         match message {
             PortMessage::Hello(hello) => self.handle_hello(now, port, hello),
@@ -333,7 +335,7 @@ impl Network {
         }
     }
 
-    /// Sends the hellos that are due by `until`, so that the cell need not wake up for them.
+    /// Sends now the hellos that would be due by the time `until`, so that the cell need not wake up for them.
     pub(crate) fn hello_by(&mut self, now: Micros, until: Micros) {
         if self.exists() && until >= self.next_hello {
             self.next_hello = phase::next(self.next_hello, HELLO_INTERVAL, now);
@@ -344,13 +346,13 @@ impl Network {
         }
     }
 
-    /// Returns a former parent that has not acknowledged the leave.
+    /// Returns the former parent if it has not acknowledged the leave.
     fn unacknowledged_former_parent(&self) -> Option<FormerParent> {
         self.former_parent
             .filter(|former_parent| !former_parent.acknowledged && self.up() != Some(former_parent.port))
     }
 
-    /// Handles timers that are due at `now`. An early call does nothing.
+    /// Handles timers that are due at `now`. Does nothing if called early.
     pub(crate) fn handle_time(&mut self, now: Micros) {
         if !self.exists() {
             return;
@@ -378,7 +380,7 @@ impl Network {
         self.report_unnumbered(now);
     }
 
-    /// Announces to the parent that the sums from this epoch on are for it.
+    /// Announces to the parent that it is to receive the sums from this epoch on.
     pub(crate) fn state(&mut self, epoch: Epoch) {
         if let Some(up) = self.up().filter(|up| *up != UPLINK) {
             self.send(up, PortMessage::State(epoch));

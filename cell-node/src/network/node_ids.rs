@@ -7,14 +7,14 @@ use protocol::time::Micros;
 use super::Network;
 use super::port::Port;
 
-/// The cell's node id, and the state of a walk in its subtree.
+/// The cell's node id, and the state of an assignment walk in the part of the tree below it.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct NodeIds {
     /// The cell's node id, if it has one.
     pub(super) own: Option<CellId>,
-    /// The node id that a walk assigned, until it is read.
+    /// The node id that a walk has assigned to this cell and that has not been read yet.
     pub(super) given: Option<CellId>,
-    /// The current walk in this subtree, and the port that it has gone to.
+    /// The walk in progress below this cell, and the port of the child that it is at.
     walking: Option<(Walk, usize)>,
     last_walk: Option<u8>,
     was_unnumbered: bool,
@@ -25,8 +25,8 @@ impl Network {
         self.node_ids.own.is_none() || self.ports.iter().any(Port::is_unnumbered)
     }
 
-    /// Starts a walk: this cell takes the first node id if it has none, then the walk goes to each child in
-    /// turn.
+    /// Starts a walk at this cell: the cell takes the first free node id if it has none. The walk then visits each
+    /// child in turn.
     pub(super) fn begin_walk(&mut self, now: Micros, mut walk: Walk) {
         if self.node_ids.last_walk.replace(walk.walk) == Some(walk.walk) {
             return;

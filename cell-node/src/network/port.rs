@@ -1,30 +1,30 @@
-//! The state of one port.
+//! The state of one port, and of the cell at its other end.
 
 use protocol::id::CellId;
 use protocol::message::{PortState, VERSION};
 use protocol::port::{Hello, Rank};
 use protocol::time::{Micros, Span};
 
-/// Time without a hello after which the port counts as disconnected: two hellos and some jitter.
+/// Time without a hello after which a port counts as disconnected: two hello intervals and some jitter.
 pub(super) const HELLO_TIMEOUT: Span = Span::from_millis(600);
-/// Time after its grant in which a child must name this cell as its parent in its hellos.
+/// Time after a grant within which the new child must name this cell as its parent in a hello.
 const GRANT_TIMEOUT: Span = Span::from_millis(300);
 
-/// A port.
+/// The state of a port.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Port {
-    /// The last hello, and its time.
+    /// The last hello received at this port, and its time of arrival.
     last_hello: Option<(Hello, Micros)>,
-    /// The time at which the cell there became a child.
+    /// The time at which the cell at the other end became a child; `None` if it is not a child.
     pub(super) child: Option<Micros>,
-    /// Set when the cell there was lost as parent: only later hellos count again.
+    /// Time at which the cell at the other end was lost as a parent. Only hellos after it are used.
     pub(super) distrusted: Option<Micros>,
-    /// True if the cell there requested a later round and has not received a rank since.
+    /// True if the cell at the other end has requested a later round, and no rank has been sent to it since.
     pub(super) round_requested: bool,
 }
 
 impl Port {
-    /// Records a hello. Returns true if it is the first after a silence.
+    /// Records a hello. Returns true if no hello arrived shortly before it.
     pub(super) fn record_hello(&mut self, now: Micros, hello: Hello) -> bool {
         let restarted = self.hello(now).is_none();
         self.last_hello = Some((hello, now));
@@ -36,34 +36,35 @@ impl Port {
         restarted
     }
 
-    /// Returns the last hello, unless it is too old.
+    /// Returns the last hello, unless it is so old that the port counts as disconnected.
     pub(super) fn hello(&self, now: Micros) -> Option<&Hello> {
         self.last_hello.as_ref().filter(|(_, at)| now.elapsed_since(*at) <= HELLO_TIMEOUT).map(|(hello, _)| hello)
     }
 
-    /// Returns true if the port works in both directions, and the other end uses this version.
+    /// Returns true if the port works in both directions, and the cell at the other end uses the same protocol version.
     pub(super) fn works(&self, now: Micros) -> bool {
         self.hello(now).is_some_and(|hello| hello.receives && hello.version == VERSION)
     }
 
-    /// Returns the rank of the cell at the other end, if sums could be sent to it.
+    /// Returns the rank of the cell at the other end; `None` if that cell cannot be a parent.
     pub(super) fn rank(&self, now: Micros) -> Option<Rank> {
         let at = self.last_hello.map(|(_, at)| at)?;
         let trusted = self.distrusted.is_none_or(|since| at > since);
         self.hello(now).filter(|_| trusted && self.works(now) && self.child.is_none()).and_then(|it| it.rank)
     }
 
-    /// Returns the node id of the cell at the other end, if it has one.
+    /// Returns the node id of the cell at the other end; `None` if it is unknown.
     pub(super) fn number(&self) -> Option<CellId> {
         CellId::new(self.last_hello?.0.number.into()).ok()
     }
 
-    /// Returns true if the cell there is a child without a node id, or has such a cell below it.
+    /// Returns true if the cell at the other end is a child that has no node id, or has a cell without one below it.
     pub(super) fn is_unnumbered(&self) -> bool {
         self.child.is_some() && self.last_hello.is_some_and(|(hello, _)| hello.unnumbered)
     }
 
-    /// Returns true if a later round must be announced there at once: to a child or an unreachable cell.
+    /// Returns true if a new round must be announced at this port at once, because a child or an unreachable cell is
+    /// there.
     pub(super) fn needs_round(&self, now: Micros) -> bool {
         self.child.is_some() || self.round_requested || self.hello(now).is_some_and(|hello| hello.rank.is_none())
     }
@@ -72,19 +73,19 @@ impl Port {
         self.child.is_some()
     }
 
-    /// Handles the passage of time: a silent child is no longer a child.
+    /// Ends the role of the other end as a child if its hellos have stopped.
     pub(super) fn expire(&mut self, now: Micros) {
         if self.hello(now).is_none() {
             self.child = None;
         }
     }
 
-    /// Returns the time at which the port counts as disconnected without a further hello.
+    /// Returns the time at which the port will count as disconnected if no further hello arrives.
     pub(super) fn silent_at(&self) -> Option<Micros> {
         self.last_hello.map(|(_, at)| at + HELLO_TIMEOUT + Span(1))
     }
 
-    /// Returns the state for reports.
+    /// Returns the state of the port for network page 4.
     pub(super) fn state(&self, now: Micros) -> PortState {
         let Some(hello) = self.hello(now) else { return PortState::default() };
         PortState {

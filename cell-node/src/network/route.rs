@@ -1,4 +1,4 @@
-//! The route to the root: joining, following and leaving a parent, and granting joins of children.
+//! The route to the root: how a cell joins, follows and leaves a parent, and accepts joins of children.
 
 use protocol::port::{PortMessage, Rank, UPLINK};
 use protocol::time::{Micros, Span};
@@ -7,12 +7,12 @@ use super::port::Port;
 use super::{ALL_PORTS, FormerParent, JOIN_TIMEOUT, LossReason, Network, Parent, REPAIR_INTERVALS};
 
 impl Network {
-    /// Returns true if moving loses no sums: none are sent, or the parent is unreachable itself.
+    /// Returns true if the cell can change its parent without losing sums: none are sent, or the parent is unreachable.
     const fn may_move(&self) -> bool {
         !self.busy || self.parent_unreachable
     }
 
-    /// Sends a join to a port that is nearer than the parent, if moving loses no sums.
+    /// Sends a join to a port whose depth is less than the parent's, if the change loses no sums.
     pub(super) fn improve(&mut self, now: Micros, port: usize, parent: Parent) {
         let rank = self.ports.get(port).and_then(|port| port.rank(now));
         let nearer = rank.is_some_and(|rank| rank.is_better_than(parent.rank));
@@ -22,8 +22,8 @@ impl Network {
         }
     }
 
-    /// Sets the parent and its rank. A new depth is announced on all ports, a new round only to children and
-    /// unreachable cells. A round therefore costs one message per cell, not one per port.
+    /// Sets the parent and its rank. The cell announces a new depth on all ports, but a new round only to children and
+    /// unreachable cells, so that a round costs one message per cell instead of one per port.
     pub(super) fn follow(&mut self, now: Micros, port: usize, rank: Rank) {
         let before = self.parent.replace(Parent { port, rank });
         if before == self.parent {
@@ -45,7 +45,7 @@ impl Network {
         }
     }
 
-    /// Handles a join: a cell requests to send its sums here.
+    /// Handles a join, in which the cell at a port requests to become a child.
     pub(super) fn handle_join(&mut self, now: Micros, port: usize) {
         let Some(rank) = self.rank().filter(|_| self.up() != Some(port)) else {
             return self.send(port, PortMessage::Refuse);
@@ -67,7 +67,7 @@ impl Network {
         self.best.is_none_or(|best| rank.is_better_than(best))
     }
 
-    /// Handles a grant of a neighbour.
+    /// Handles a grant, with which the cell at a port becomes the parent.
     pub(super) fn handle_grant(&mut self, now: Micros, port: usize, rank: Rank) {
         if self.up() == Some(port) {
             return;
@@ -105,7 +105,8 @@ impl Network {
         self.ports.get_mut(port).into_iter().for_each(|port| port.distrusted = Some(now));
     }
 
-    /// Sends a join to the nearest port that is good enough, or starts a local repair.
+    /// Sends a join to the port with the best rank, if it is better than any rank that this cell has had. Otherwise
+    /// starts a local repair.
     pub(super) fn search(&mut self, now: Micros) {
         if self.parent.is_some() {
             return;
@@ -138,8 +139,8 @@ impl Network {
         }
     }
 
-    /// Requests a round later than `round` on the ports that lead to the gateway, or on all working ports,
-    /// except `but`.
+    /// Requests a round later than `round`: on the ports that lead to the gateway, or on all working ports if `all` is
+    /// true. The port `but` is excluded.
     fn repair_at(&mut self, now: Micros, round: u8, but: Option<usize>, all: bool) {
         for port in (0..ALL_PORTS).filter(|port| Some(*port) != but) {
             let leads = |port: &Port| port.rank(now).is_some() || (all && port.works(now));
@@ -149,8 +150,9 @@ impl Network {
         }
     }
 
-    /// Handles a repair: a neighbour needs a round later than `round`. A child's repair is forwarded to the
-    /// parent; a parent's to all other ports, one of which may have another route.
+    /// Handles a repair, with which a neighbour requests a round later than `round`. The request of a child is
+    /// forwarded to the parent. The request of the parent is forwarded to all other ports, because another route may
+    /// exist there.
     pub(super) fn forward_repair(&mut self, now: Micros, port: usize, round: u8) {
         let Some(parent) = self.parent else { return };
         if parent.rank.round.wrapping_sub(round).cast_signed() > 0 {

@@ -3,7 +3,7 @@ use protocol::port::Walk;
 
 const MS: u64 = 1_000;
 
-/// Returns a cell with a node id and wires at these ports.
+/// Returns the network part of a cell with a node id and wires at the ports in this mask.
 fn network(wired: u8) -> Network {
     let mut network = Network::new(Micros(0));
     network.wire(wired, CellId::new(12).ok(), 0);
@@ -14,7 +14,7 @@ fn said(network: &mut Network) -> Vec<(usize, PortMessage)> {
     core::iter::from_fn(|| network.poll_transmit()).collect()
 }
 
-/// Returns the sent messages except hellos.
+/// Returns the messages that were sent, except hellos.
 fn asked(network: &mut Network) -> Vec<(usize, PortMessage)> {
     let mut messages = said(network);
     messages.retain(|(_, message)| !matches!(message, PortMessage::Hello(_)));
@@ -29,7 +29,7 @@ fn neighbour(number: u8, rank: Option<Rank>) -> Hello {
     Hello { version: VERSION, number, port: 3, receives: true, is_parent: false, unnumbered: false, rank }
 }
 
-/// Returns a cell whose parent at port 0 has this rank, at a time in ms.
+/// Returns a cell that has joined a parent of this rank at port 0, at a time in ms.
 fn below(at: u64, parent: Rank) -> Network {
     let mut network = network(0b1111);
     network.handle(Micros(at * MS), 0, PortMessage::Hello(neighbour(1, Some(parent))));
@@ -39,7 +39,7 @@ fn below(at: u64, parent: Rank) -> Network {
     network
 }
 
-/// Makes the cell at this port a child.
+/// Makes the cell at this port a child of the tested cell.
 fn adopt(network: &mut Network, now: Micros, port: usize, number: u8) {
     network.handle(now, port, PortMessage::Hello(neighbour(number, None)));
     network.handle(now, port, PortMessage::Join);

@@ -1,4 +1,4 @@
-//! The address claim of a cell: claimed at the start, defended, and stated in each heartbeat.
+//! The address claim of a cell: it claims its node id at the start, defends it, and repeats it in each heartbeat.
 
 use protocol::message::{Heartbeat, NetworkPage, RejectedCounts, State};
 use protocol::time::{Micros, Span};
@@ -9,10 +9,10 @@ use crate::phase;
 
 /// Interval of heartbeats.
 pub const HEARTBEAT_INTERVAL: Span = Span::from_millis(250);
-/// Minimum time for which a new cell checks for another one with its node id.
+/// Minimum time for which a new cell checks whether another cell uses its node id.
 pub const CLAIM_TIME: Span = Span::from_millis(250);
-/// Time over which first heartbeats are spread by serial number. Otherwise two cells with one node id that
-/// are switched on together would send different data with one identifier in the same bit time.
+/// Time over which the first heartbeats of cells are spread by serial number. Without it, two cells with one node id
+/// that are switched on together would send different data with one identifier in the same bit time.
 const FIRST_HEARTBEAT_SPREAD: Span = Span::from_millis(64);
 /// Minimum interval between two defences of the node id.
 const DEFENCE_INTERVAL: Span = Span::from_millis(10);
@@ -22,27 +22,27 @@ const DEFENCE_INTERVAL: Span = Span::from_millis(10);
 pub(super) enum ClaimStage {
     /// The claim has not been sent yet.
     Unsent,
-    /// The claim has been sent; the cell waits for objections of another owner.
+    /// The claim has been sent. The cell waits for objections of another cell with the node id.
     Sent,
     /// The cell owns the node id.
     Settled,
 }
 
-/// The address claim, and the heartbeats that carry it.
+/// The state of the address claim, and of the heartbeats that carry it.
 #[derive(Debug)]
 pub(super) struct AddressClaim {
     pub(super) stage: ClaimStage,
     pub(super) next_heartbeat: Micros,
-    /// True if a sync requested a heartbeat, which waits for the end of the present epoch.
+    /// True if a sync has requested a heartbeat, which is sent at the end of the present epoch.
     pub(super) sync_waits: bool,
     /// The time of the last defence of the node id.
     defended: Option<Micros>,
-    /// The serial number of another cell that owns the node id.
+    /// The serial number of another cell that owns this cell's node id.
     pub(super) other_owner: Option<u32>,
 }
 
 impl AddressClaim {
-    /// Starts a claim. Without a node id it never becomes due.
+    /// Starts a claim. Without a node id, the claim is never sent.
     pub(super) fn new(identity: Identity, now: Micros) -> Self {
         let wait = phase::by_serial(FIRST_HEARTBEAT_SPREAD, identity.serial);
         let next_heartbeat = identity.cell.map_or(Micros(u64::MAX), |_| now + wait);
@@ -56,8 +56,7 @@ impl AddressClaim {
 }
 
 impl Node {
-    /// Sends the heartbeat if it is due: the first one is the address claim, and with the second the cell
-    /// owns the node id.
+    /// Sends a heartbeat if it is due. The first one is the address claim; with the second the cell owns the node id.
     pub(super) fn send_due_heartbeat(&mut self, now: Micros) {
         let Some(cell) = self.identity.cell.filter(|_| now >= self.claim.next_heartbeat) else { return };
         if self.claim.stage == ClaimStage::Unsent {
@@ -69,7 +68,7 @@ impl Node {
         self.regular_heartbeat(now);
     }
 
-    /// Sends a regular heartbeat with all changed pages, four times a second.
+    /// Sends a heartbeat, and all pages that have changed, four times a second.
     pub(super) fn regular_heartbeat(&mut self, now: Micros) {
         self.push_heartbeat();
         self.report_with_heartbeat(now);
@@ -79,9 +78,9 @@ impl Node {
         self.claim.next_heartbeat = phase::next(self.claim.next_heartbeat, HEARTBEAT_INTERVAL, now);
     }
 
-    /// Handles a frame that another cell sent with our node id. While claiming it, this cell gives way,
-    /// unless the other one also claims it and has the larger serial number. Once it owns the node id, it
-    /// defends it, but only against claims: two settled cells would answer each other forever.
+    /// Handles a frame that another cell has sent with this cell's node id. During its claim, this cell gives way,
+    /// unless the other cell also claims the node id and has the larger serial number. Once this cell owns the node id,
+    /// it defends it, but only against claims: otherwise two cells that own it would answer each other forever.
     pub(super) fn handle_own_node_id(&mut self, now: Micros, page: &NetworkPage) {
         self.flags = self.flags.with(State::DUPLICATE, true);
         let other = if let NetworkPage::Heartbeat(other) = page { Some(other) } else { None };
@@ -95,7 +94,7 @@ impl Node {
         }
     }
 
-    /// Returns the state: the stored flags, and the derived ones.
+    /// Returns the state word: the stored flags and those that follow from other values.
     pub(super) fn state(&self) -> State {
         let in_use = self.configuration.in_use();
         self.flags

@@ -1,4 +1,4 @@
-//! The parameters in use, and the staged ones.
+//! The parameters in use by a cell, and the staged parameters.
 //!
 //! Writes go to a staged copy. A commit with the hash of the staged copy stores it in flash and then
 //! activates it, as a whole. A cell that is interrupted between two writes keeps its previous parameters.
@@ -10,7 +10,7 @@ use protocol::time::Span;
 
 use crate::kernel::Wrench;
 
-/// Parameters in use, with the kernel prepared from them.
+/// The parameters in use, with the kernel prepared from them.
 #[derive(Debug)]
 pub(super) struct InUse {
     /// The parameters.
@@ -24,8 +24,8 @@ pub(super) struct InUse {
 #[derive(Debug)]
 pub(super) struct Configuration {
     is_configured: bool,
-    /// Valid only if the cell is configured. Not an `Option`, because a new value would be built on the stack
-    /// and copied.
+    /// The parameters in use; valid only if the cell is configured. This is not an `Option`, because a new value of an
+    /// `Option` would be built on the stack and copied.
     in_use: InUse,
     staged: Parameters,
 }
@@ -39,14 +39,14 @@ impl Configuration {
         Self { is_configured: false, in_use, staged: parameters }
     }
 
-    /// Activates the parameters from flash; invalid ones are ignored.
+    /// Activates the parameters from flash, unless they are invalid.
     pub(super) fn start(&mut self, parameters: &Parameters) {
         if parameters.check().is_ok() {
             self.activate(parameters);
         }
     }
 
-    /// Returns the parameters in use, if the cell is configured.
+    /// Returns the parameters in use; `None` if the cell is not configured.
     pub(super) fn in_use(&self) -> Option<&InUse> {
         self.is_configured.then_some(&self.in_use)
     }
@@ -56,7 +56,7 @@ impl Configuration {
         self.in_use().map_or(0, |in_use| in_use.hash)
     }
 
-    /// Returns the words of a stored parameter: those in use, or the staged ones of an unconfigured cell.
+    /// Returns the words of a stored parameter: those in use, or if the cell is not configured the staged ones.
     pub(super) fn read(&self, parameter: Parameter) -> [i16; WORDS] {
         self.in_use().map_or(&self.staged, |in_use| &in_use.parameters).words(parameter)
     }
@@ -67,13 +67,14 @@ impl Configuration {
         Ok(self.staged.words(parameter))
     }
 
-    /// Returns the staged parameters if they are valid and have the hash of a commit; otherwise the reason.
+    /// Returns the staged parameters for a commit with this hash. Returns the reason of a refusal if they are invalid
+    /// or have another hash.
     pub(super) fn staged_with(&self, [hash, ..]: [i16; WORDS]) -> Result<&Parameters, i16> {
         self.staged.check().map_err(ParameterError::code)?;
         if self.staged.hash() == hash.cast_unsigned() { Ok(&self.staged) } else { Err(Answer::WRONG_HASH) }
     }
 
-    /// Activates parameters.
+    /// Activates these parameters and prepares the kernel.
     pub(super) fn activate(&mut self, parameters: &Parameters) {
         self.staged = *parameters;
         self.in_use.parameters = *parameters;
@@ -84,7 +85,7 @@ impl Configuration {
 }
 
 impl InUse {
-    /// Returns the packet length of joints, torques and sums.
+    /// Returns the packet length of joints, torques and sums for this chain.
     pub(super) fn length(&self) -> Length {
         Length::for_joints(self.parameters.joints.into())
     }

@@ -7,8 +7,8 @@
 //!                                                 └─> taken ─────────> who owns this node id already
 //! ```
 //!
-//! It never blocks, allocates or panics, and reads no clock. A frame that it cannot use is counted by its
-//! reason and otherwise ignored.
+//! A node never blocks, allocates or panics, and reads no clock. Frames that it cannot use are counted by reason and
+//! otherwise ignored.
 
 mod claim;
 mod configuration;
@@ -48,12 +48,12 @@ use zero::ReportedBaseline;
 pub use claim::{CLAIM_TIME, HEARTBEAT_INTERVAL};
 pub use stimuli::MAX_PENDING;
 
-/// Maximum number of identifiers that a cell receives: its own, and the sums of the cells at its ports.
+/// Maximum number of identifiers that a cell receives: those of its node id, and the sums of the cells at its ports.
 pub const MAX_RECEIVED_IDS: usize = OWN_IDS + PORTS;
-/// Capacity for outgoing packets, which the shell collects after every call.
+/// Capacity for outgoing packets. The caller collects them after every call.
 const OUTBOX_CAPACITY: usize = 16;
 
-/// A cell.
+/// A cell: the state machine without input and output.
 #[derive(Debug)]
 pub struct Node {
     identity: Identity,
@@ -67,9 +67,9 @@ pub struct Node {
     summing: Summing,
     receiver: Receiver,
     received: ReceivedCounts,
-    /// Stored flags such as halted and duplicate; derived flags are added in each heartbeat.
+    /// Stored flags of the state word, such as halted and duplicate. The other flags are added in each heartbeat.
     flags: State,
-    /// The epoch of the last accepted joints.
+    /// Epoch of the last joints that the cell accepted.
     epoch: Option<Epoch>,
     active: bool,
     rest: Rest,
@@ -79,8 +79,8 @@ pub struct Node {
 }
 
 impl Node {
-    /// Starts a cell. Its first heartbeat is its address claim. In `test_mode` it uses stimuli instead of
-    /// sensors.
+    /// Creates a cell that starts at `now`. The first heartbeat is the address claim. In `test_mode` the cell uses
+    /// stimuli instead of sensors.
     #[must_use]
     pub fn new(identity: Identity, format: Format, flash: &FlashState, test_mode: bool, now: Micros) -> Self {
         let mut node = Self::unconfigured(identity, format, test_mode, now);
@@ -88,7 +88,7 @@ impl Node {
         node
     }
 
-    /// Starts a cell without the contents of its flash. The caller must call [`Node::restore`] next.
+    /// Creates a cell without the contents of flash. The caller must call [`Node::restore`] next.
     #[must_use]
     // Not inlined, so that it is constructed in place instead of on the stack; the same holds for its large
     // parts.
@@ -116,7 +116,7 @@ impl Node {
         }
     }
 
-    /// Loads the contents of flash.
+    /// Loads the contents of flash, which contain the parameters.
     pub fn restore(&mut self, flash: &FlashState) {
         self.flags = self.flags.with(State::FLASH_DAMAGED, *flash == FlashState::Damaged);
         if let FlashState::Valid(parameters) = flash {
@@ -124,40 +124,42 @@ impl Node {
         }
     }
 
-    /// Connects the cell to a network: bit p is set if port p is wired, bit 4 for a wire to the gateway's
-    /// side.
+    /// Connects the ports of the cell to wires: bit p is set if port p has a wire, and bit 4 if the cell has a wire to
+    /// the gateway's side.
     #[must_use]
     pub fn with_ports(mut self, wired: u8) -> Self {
         self.wire(wired);
         self
     }
 
-    /// Like [`Node::with_ports`], without moving the node, which takes more than half of a small
-    /// microcontroller's memory. Must be called before anything else.
+    /// Like [`Node::with_ports`], without moving the node, which takes more than half of a small microcontroller's
+    /// memory. It must be called before any other method.
     pub fn wire(&mut self, wired: u8) {
         let Identity { cell, serial } = self.identity;
         self.summing.network.wire(wired, cell, serial);
     }
 
-    /// Returns the next message for a port. Must be sent before the packets of the same call.
+    /// Returns the next message for a port, and the port. Such messages must be sent before the packets that
+    /// [`Node::poll_transmit`] returns.
     pub fn poll_port_transmit(&mut self) -> Option<(usize, PortMessage)> {
         self.summing.network.poll_transmit()
     }
 
-    /// Returns true if the received identifiers, or those that wake the cell, have changed since the last
+    /// Returns true if the identifiers that the cell receives, or those that must wake it, have changed since the last
     /// call.
     pub fn poll_received_ids(&mut self) -> bool {
         let rest = self.rest.poll();
         self.summing.poll_received_ids() || rest
     }
 
-    /// Returns its identity.
+    /// Returns the identity of the cell.
     #[must_use]
     pub const fn identity(&self) -> Identity {
         self.identity
     }
 
-    /// Returns the serial number of another cell that owns this node id; this cell must then stop sending.
+    /// Returns the serial number of another cell that owns this node id, if there is one. This cell must then stop
+    /// sending.
     #[must_use]
     pub const fn other_owner(&self) -> Option<u32> {
         self.claim.other_owner
@@ -174,20 +176,20 @@ impl Node {
         Some(message.encode())
     }
 
-    /// Corrects the counter for a packet that was collected but not sent, because the shell has no bus. The
-    /// packets collected after it were not sent either.
+    /// Corrects the counter of sent packets for a packet that the caller collected but could not send. Packets that
+    /// were collected after it must not have been sent either.
     pub const fn handle_unsent(&mut self) {
         self.sent = self.sent.wrapping_sub(1);
     }
 
-    /// Returns the time at which [`Node::handle_timeout`] must be called; an earlier call is harmless.
+    /// Returns the time at which [`Node::handle_timeout`] must be called next. An earlier call does no harm.
     #[must_use]
     pub fn poll_timeout(&self) -> Micros {
         let next = self.claim.next_heartbeat.min(self.summing.poll_timeout());
         self.sensing_due().map_or(next, |due| next.min(due))
     }
 
-    /// Returns the contents to be written to flash. The shell answers with [`Node::handle_stored`].
+    /// Returns the contents to write to flash, if any. The caller reports the result with [`Node::handle_stored`].
     #[must_use]
     pub fn poll_store(&self) -> Option<FlashContent> {
         let parameters = match self.storing.as_ref()? {
@@ -197,16 +199,16 @@ impl Node {
         Some(FlashContent { number: self.identity.cell, parameters })
     }
 
-    /// Returns the identifiers that this cell receives now. The shell reads them again after
-    /// [`Node::poll_hears`].
+    /// Returns the identifiers that this cell receives in its present state. The caller reads them again whenever
+    /// [`Node::poll_hears`] returns true.
     pub fn received_ids(&self) -> impl Iterator<Item = Id> + use<'_> {
         self.slots().flatten()
     }
 
-    /// Returns true if an identifier need not wake the cell (deferred receive), as long as the cell gets its
-    /// frames before any later frame. This holds for the parent's sums, which only show that the parent is
-    /// alive; and for joints while the cell would only wait for its children's sums, which follow them, or
-    /// while nothing touches it.
+    /// Returns true if frames with an identifier need not wake the cell (deferred receive), provided that the cell gets
+    /// them before any later frame. This holds for the parent's sums, which only show that the parent is alive. It also
+    /// holds for joints, while the cell must wait for its children's sums after them anyway, or while it is not
+    /// touched.
     #[must_use]
     pub fn defers(&self, id: Id) -> bool {
         if id == Id::command(Command::Joints) {
@@ -215,18 +217,18 @@ impl Node {
         self.summing.received_parent().is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
     }
 
-    /// Returns the packet length of joints, torques and sums, if the cell is configured.
+    /// Returns the packet length of joints, torques and sums; `None` if the cell is not configured.
     fn length(&self) -> Option<Length> {
         self.configuration.in_use().map(InUse::length)
     }
 
-    /// Returns the identifier of each reassembly slot, [`HEARD`] of them.
+    /// Returns the identifier for each of the [`HEARD`] reassembly buffers.
     fn slots(&self) -> impl Iterator<Item = Option<Id>> + use<'_> {
         let sums = self.summing.received.iter().map(|cell| Some(Id::new(Kind::Sum, Address::Cell((*cell)?))));
         self.identity.received_ids().into_iter().chain(sums)
     }
 
-    /// Handles timers that are due at `now`. An early call does nothing.
+    /// Handles timers that are due at `now`. Does nothing if called early.
     pub fn handle_timeout(&mut self, now: Micros) {
         self.summing.handle_time(now);
         self.after_network(now);
@@ -235,7 +237,8 @@ impl Node {
         self.send_due_heartbeat(now);
     }
 
-    /// Handles a frame that arrived `age` ago. Identifiers that this cell does not receive are ignored.
+    /// Handles a frame that arrived `age` before `now`. Frames with identifiers that this cell does not receive are
+    /// ignored.
     pub fn handle_frame(&mut self, now: Micros, age: Span, frame: &Frame) {
         let Ok(id) = packet::data_id(frame) else {
             increment(&mut self.receiver.refused.foreign);
@@ -310,7 +313,7 @@ impl Node {
         }
     }
 
-    /// Computes the torques and answers: the paper's Eq. 8 and Algorithm 1.
+    /// Computes the torques for new joint positions by the paper's Eq. 8 and Algorithm 1, and replies with them.
     fn handle_joints(&mut self, now: Micros, age: Span, epoch: Epoch, joints: &Joints) {
         if self.epoch == Some(epoch) {
             increment(&mut self.received.joints_repeated);
@@ -356,7 +359,7 @@ impl Node {
         self.answer_joints(epoch, torque);
     }
 
-    /// Answers with its own torque. A single answer of zero marks the end of a contact.
+    /// Replies with the cell's own torque. A single reply of zero marks the end of a contact.
     fn answer_joints(&mut self, epoch: Epoch, torque: Option<Torque<'_>>) {
         let (Some(from), Some(in_use)) = (self.identity.cell, self.configuration.in_use()) else { return };
         let torque = match torque {
@@ -378,7 +381,8 @@ impl Node {
         self.push(Message::Torque { from, epoch, torque });
     }
 
-    /// Sends hellos and a heartbeat that are due before the next joints now, while the cell is awake.
+    /// Sends hellos and a heartbeat now if they are due before the next joints, so that the cell need not wake up
+    /// again.
     fn send_before_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use() else { return };
         let next_joints = now + in_use.period();
@@ -402,7 +406,7 @@ impl Node {
         }
     }
 
-    /// Sets the flag for the next heartbeat if a sent word is saturated.
+    /// Sets the *saturated* flag of the next heartbeat if a word that was sent is saturated.
     fn mark_saturated(&mut self, saturated: bool) {
         self.flags = self.flags.with(State::SATURATED, saturated || self.flags.has(State::SATURATED));
     }
@@ -413,8 +417,8 @@ impl Node {
         self.push(Message::Network { from, epoch: self.epoch.unwrap_or_default(), page });
     }
 
-    /// Queues a message. One frame causes at most four packets, and the shell collects them after each, so
-    /// there is room.
+    /// Queues a message. There is always room, because one frame causes at most four packets and the caller collects
+    /// them after each frame.
     fn push(&mut self, message: Message) {
         let fits = self.outbox.push_back(message).is_ok();
         debug_assert!(fits, "a shell takes what is to be sent after each call");

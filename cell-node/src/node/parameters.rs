@@ -1,4 +1,4 @@
-//! Reading and writing parameters over the bus.
+//! Reading and writing of a cell's parameters over the bus.
 
 use protocol::message::{Answer, Message, Request, State, VERSION};
 use protocol::packet::WORDS;
@@ -10,31 +10,31 @@ use protocol::time::Micros;
 use super::Node;
 use crate::baseline::TareRefused;
 
-/// Volatile parameters set at run time: 6 to 9.
+/// Volatile parameters that are set at run time: 6 to 9.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Switches {
-    /// The reply to joints.
+    /// The message with which the cell replies to joints.
     reply: Reply,
     /// The times at which the cell sends measurements.
     pub(super) sensing: Sensing,
     /// The thresholds of event mode.
     pub(super) events: Events,
-    /// Ports that receive nothing.
+    /// The ports whose messages and sums are ignored.
     links_down: LinksDown,
 }
 
-/// The contents being written to flash.
+/// The contents that are being written to flash.
 #[derive(Clone, Copy, Debug)]
 #[expect(clippy::large_enum_variant, reason = "a cell has no heap")]
 pub(super) enum PendingStore {
-    /// Committed parameters, with the request's tag.
+    /// Committed parameters, with the tag of the commit, which is answered after the write.
     Parameters(Parameters, u8),
     /// The node id that the network assigned.
     NodeId,
 }
 
 impl Node {
-    /// Reads or writes a parameter and answers. A commit is answered after the write to flash.
+    /// Handles a request to read or write a parameter, and answers it. A commit is answered after the write to flash.
     pub(super) fn configure(&mut self, now: Micros, tag: u8, request: Request) {
         let (written, number) = match request {
             Request::Read { number } => (false, number),
@@ -57,7 +57,7 @@ impl Node {
         self.answer(tag, number, written, words);
     }
 
-    /// Handles the result of a write to flash; `written` is true on success.
+    /// Handles the result of writing to flash. `written` is true if the write succeeded.
     pub fn handle_stored(&mut self, written: bool) {
         // A node id that could not be stored is assigned again after the next start.
         let Some(PendingStore::Parameters(parameters, tag)) = &self.storing else {
@@ -75,7 +75,7 @@ impl Node {
         self.answer(tag, Parameter::Commit.number(), true, words);
     }
 
-    /// Answers a request with the value or the reason of a refusal.
+    /// Answers a request with the words of the parameter, or with the reason of a refusal.
     fn answer(&mut self, tag: u8, number: u8, written: bool, words: Result<[i16; WORDS], i16>) {
         let Some(from) = self.identity.cell else { return };
         let answer = match words {
@@ -104,8 +104,8 @@ impl Node {
         }
     }
 
-    /// Sets a volatile parameter at once, or stages a stored one. Returns the new words, or the reason of a
-    /// refusal. Without ports there are neither sums nor links; links go down only in test mode.
+    /// Sets a volatile parameter at once, or stages a stored one. Returns the new words, or the reason of a refusal. A
+    /// cell without ports refuses sums and `links_down`; links can be interrupted only in test mode.
     fn write(&mut self, now: Micros, parameter: Parameter, words: [i16; WORDS]) -> Result<[i16; WORDS], i16> {
         let (switches, has_ports) = (&mut self.switches, self.summing.network.exists());
         let set = match parameter {

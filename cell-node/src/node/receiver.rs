@@ -12,7 +12,7 @@ use super::{MAX_RECEIVED_IDS, increment};
 #[derive(Debug)]
 pub(super) struct Receiver {
     format: Format,
-    /// One buffer per slot of the received identifiers.
+    /// The reassembly buffer of each received identifier.
     segments: [Reassembler; MAX_RECEIVED_IDS],
     /// Counters of rejected frames, by reason.
     pub(super) refused: RejectedCounts,
@@ -24,8 +24,7 @@ impl Receiver {
         Self { format, segments: [Reassembler::NONE; MAX_RECEIVED_IDS], refused: RejectedCounts::default() }
     }
 
-    /// Returns the packet that this frame contains or completes. Joints, torques and sums have one of
-    /// `lengths`.
+    /// Returns the packet that a frame contains or completes, if any. Joints, torques and sums have one of `lengths`.
     pub(super) fn receive(
         &mut self,
         arrived: Micros,

@@ -1,20 +1,20 @@
-//! Resting: joints need not wake a cell that nothing touches, because it would only count them.
+//! Resting: joints need not wake a cell that is not touched, because the cell would only count them.
 
-/// Number of consecutive joints without an answer before the cell rests, so that a flickering touch does not
-/// change filters.
+/// Number of consecutive joints without a reply before the cell rests, so that a flickering touch does not change the
+/// receive filters each time.
 const QUIET_JOINTS: u8 = 16;
 
-/// The state of resting.
+/// The state of a cell that may rest.
 #[derive(Debug, Default)]
 pub(super) struct Rest {
-    /// Number of consecutive joints without an answer, up to [`QUIET`].
+    /// Number of consecutive joints without a reply, at most [`QUIET`].
     quiet: u8,
-    /// The state at the last poll.
+    /// True if the cell rested at the last poll.
     rests: bool,
 }
 
 impl Rest {
-    /// Counts joints that were on time and needed no answer.
+    /// Counts joints that arrived in time and needed no reply.
     pub(super) fn count_quiet(&mut self) {
         self.quiet = self.quiet.saturating_add(1).min(QUIET_JOINTS);
     }
@@ -24,12 +24,12 @@ impl Rest {
         self.quiet = 0;
     }
 
-    /// Returns true if joints are received deferred.
+    /// Returns true if joints need not wake the cell (deferred receive).
     pub(super) const fn rests(&self) -> bool {
         self.rests
     }
 
-    /// Returns true if the state has changed since the last call.
+    /// Returns true if the cell has begun or ended to rest since the last call.
     pub(super) fn poll(&mut self) -> bool {
         let rests = self.quiet == QUIET_JOINTS;
         core::mem::replace(&mut self.rests, rests) != rests

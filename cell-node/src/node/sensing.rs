@@ -1,4 +1,4 @@
-//! Sending of the contact state without a request: continuously, on events, or not at all.
+//! Sending of measurements without a request: continuously, on events, or not at all.
 //!
 //! ```text
 //!   Off         silence, except for a report
@@ -6,10 +6,9 @@
 //!   Event       |s   s ss    s             s             s     on change, on release, with each heartbeat
 //! ```
 //!
-//! A change is measured relative to the last *sent* value instead of the last measurement, so that a slow
-//! drift is reported. Touch and release have two thresholds, so that noise near one of them does not cause a
-//! stream of events. The frames depend only on the contact state and the times: the same inputs give the same
-//! frames.
+//! A change is measured from the last *sent* value instead of the last measurement, so that a slow drift is also
+//! reported. Touch and release have different thresholds, so that noise near one of them does not cause a stream of
+//! events. The frames depend only on the sensor values and the times: the same inputs give the same frames.
 
 use protocol::fixed::Q;
 use protocol::id::CellId;
@@ -22,10 +21,10 @@ use super::stimuli::SensedValues;
 use super::{Node, Switches};
 use crate::phase;
 
-/// Number of heartbeats per acceleration page, which shows no touch and is rarely needed.
+/// Number of heartbeats per page with the acceleration, which does not show touches and is rarely needed.
 const BEATS_PER_ACCELERATION: u8 = 4;
 
-/// The pages to send.
+/// The sensor pages that are to be sent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) struct Pages {
     skin: bool,
@@ -37,24 +36,24 @@ impl Pages {
     pub(super) const BOTH: Self = Self { skin: true, acceleration: true };
 }
 
-/// The last sent values, and the time of the next page.
+/// The values that were sent last, and the time of the next page.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Sensing {
     mode: Mode,
     /// The time of the next page in continuous mode.
     due: Option<Micros>,
-    /// The last sent values, requested or not.
+    /// The values that were sent last, by request or without.
     sent: SensedValues,
-    /// The time of the last page 0 sent without a request.
+    /// The time at which page 0 was last sent without a request.
     last_sent_at: Option<Micros>,
     contact: Touch,
     proximity: Touch,
-    /// Number of heartbeats since the last one with the acceleration.
+    /// Number of heartbeats since the last page with the acceleration.
     beats: u8,
 }
 
 impl Sensing {
-    /// Returns the pages to send after sensor values or the mode may have changed.
+    /// Returns the pages to send, after sensor values or the mode may have changed.
     fn update(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &SensedValues) -> Pages {
         let Switches { sensing, events, .. } = switches;
         if *sensing != self.mode {
@@ -72,7 +71,7 @@ impl Sensing {
         self.mark_sent(now, pages)
     }
 
-    /// Switches to another mode, which starts with the present contact state.
+    /// Switches to another mode. Returns the pages with the present values, which are sent at once.
     fn switch(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &SensedValues) -> Pages {
         let mode = switches.sensing;
         *self = Self { mode, sent: self.sent, ..Self::default() };
@@ -89,7 +88,7 @@ impl Sensing {
         self.mark_sent(now, Pages::BOTH)
     }
 
-    /// Tracks contact and proximity. Returns true for an event: a touch or a release.
+    /// Updates the touch states of contact and proximity. Returns true if one of them was touched or released.
     fn follow(&mut self, skin: &SkinSensors, events: &Events) -> bool {
         let contact = self.contact.next(contact_force(skin), events.contact.to_bits(), events.hysteresis);
         let proximity = i32::from(skin.proximity.to_bits());
@@ -99,7 +98,7 @@ impl Sensing {
         before != (contact, proximity)
     }
 
-    /// Returns the pages to send with a regular heartbeat. A page sent at this very time is not repeated.
+    /// Returns the pages to send with a regular heartbeat. A page that was already sent at this time is not repeated.
     pub(super) fn heartbeat_pages(&mut self, now: Micros) -> Pages {
         if self.mode == Mode::Off {
             return Pages::NONE;
@@ -109,7 +108,8 @@ impl Sensing {
         self.mark_sent(now, Pages { skin, acceleration: self.beats == 0 })
     }
 
-    /// Returns the page that is due before `until`. Overdue periods are skipped; the phase is kept.
+    /// Returns the page that is due before `until` in continuous mode. Periods that have passed are skipped; the phase
+    /// remains.
     fn due_pages(&mut self, now: Micros, until: Micros) -> Pages {
         let (Mode::Continuous { period_ms }, Some(due)) = (self.mode, self.due) else { return Pages::NONE };
         if due >= until {
@@ -134,7 +134,8 @@ fn has_moved(now: &SkinSensors, sent: &SkinSensors, events: &Events) -> bool {
         || is_far(&[now.proximity], &[sent.proximity], events.proximity)
 }
 
-/// Returns true if a value differs by the threshold or more; a threshold of 0 means any difference.
+/// Returns true if a value differs from the sent one by at least the threshold. With a threshold of 0, any difference
+/// counts.
 fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
     let threshold = u32::from(threshold.to_bits().unsigned_abs().max(1));
     let far = |(now, sent): (&Q<F>, &Q<F>)| i32::from(now.to_bits()).abs_diff(sent.to_bits().into());
@@ -142,7 +143,7 @@ fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
 }
 
 impl Node {
-    /// Sends the pages that are due after sensor values or the mode may have changed.
+    /// Sends the pages that changed sensor values or a changed mode require.
     pub(super) fn sense(&mut self, now: Micros) {
         // Pages are sent only once the cell owns its node id. The comparison with the last sent values
         // ensures that no change is lost.
@@ -151,12 +152,12 @@ impl Node {
         self.push_sensors(pages);
     }
 
-    /// Returns the time of the next page in continuous mode, if the cell owns its node id.
+    /// Returns the time of the next page in continuous mode; `None` until the cell owns its node id.
     pub(super) fn sensing_due(&self) -> Option<Micros> {
         self.sensing.due.filter(|_| self.claim.is_settled())
     }
 
-    /// Sends the page that is due.
+    /// Sends the page of continuous mode if it is due.
     pub(super) fn sense_in_time(&mut self, now: Micros) {
         if self.sensing_due().is_some() {
             let pages = self.sensing.due_pages(now, now + Span(1));
@@ -164,8 +165,8 @@ impl Node {
         }
     }
 
-    /// Sends a page that is due before the next joints now, while the cell is awake. Not for periods up to
-    /// that of the joints: all cells would send at once, each time.
+    /// Sends a page now if it is due before the next joints, so that the cell need not wake up again. Does nothing if
+    /// the period is not longer than that of joints: otherwise all cells would send at the same time in each epoch.
     pub(super) fn sense_before_the_next_joints(&mut self, now: Micros) {
         let Some(in_use) = self.configuration.in_use() else { return };
         let joints = in_use.period();
@@ -177,7 +178,7 @@ impl Node {
         }
     }
 
-    /// Sends pages with the present contact state.
+    /// Sends the selected pages with the present sensor values.
     pub(super) fn push_sensors(&mut self, Pages { skin, acceleration }: Pages) {
         let Some(from) = self.identity.cell else { return };
         let net = self.net();

@@ -1,28 +1,28 @@
-//! The contact state of a cell, and stimuli that change it from a later epoch on.
+//! The sensor values of a cell, and stimuli that replace them from a later epoch on.
 //!
-//! A stimulus is not latched on arrival but with the joints of its epoch, so that a torque is a function of
-//! one joints frame and not of the order of frames on the bus.
+//! A stimulus is latched with the joints of its epoch instead of on arrival. A torque thus depends on the joints frame
+//! that it answers, and not on the order of other frames on the bus.
 
 use heapless::Vec;
 use protocol::fixed::Q3_12;
 use protocol::message::{AppliesFrom, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 
-/// Maximum number of pending stimuli.
+/// Maximum number of stimuli that wait for their epoch.
 pub const MAX_PENDING: usize = 8;
 
 /// The result of receiving a stimulus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Arrival {
-    /// It waits for its joints.
+    /// The stimulus waits for the joints of its epoch.
     InTime,
-    /// The joints of its epoch have already been accepted; it waits for the next ones.
+    /// The joints of its epoch have already been accepted. The stimulus waits for the next joints.
     Late,
-    /// The queue is full.
+    /// The queue is full, and the stimulus is dropped.
     Refused,
 }
 
-/// All sensor values of a cell: its contact state.
+/// All sensor values of a cell.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct SensedValues {
     pub(super) skin: SkinSensors,
@@ -45,12 +45,13 @@ impl SensedValues {
 #[derive(Debug, Default)]
 pub(super) struct Stimuli {
     pending: Vec<(AppliesFrom, SensorPage), MAX_PENDING>,
-    /// The present contact state.
+    /// The present sensor values.
     pub(super) sensed: SensedValues,
 }
 
 impl Stimuli {
-    /// Queues a stimulus that applies from some joints on; `last` is the epoch of the last accepted joints.
+    /// Queues a stimulus that applies from the given joints on. `last` is the epoch of the last joints that the cell
+    /// accepted.
     pub(super) fn push(&mut self, from: AppliesFrom, page: SensorPage, last: Option<Epoch>) -> Arrival {
         let (from, arrival) = match (from, last) {
             (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0 => (AppliesFrom::Next, Arrival::Late),
@@ -59,7 +60,7 @@ impl Stimuli {
         if self.pending.push((from, page)).is_ok() { arrival } else { Arrival::Refused }
     }
 
-    /// Latches all stimuli that apply from `epoch` or earlier, in order of arrival.
+    /// Applies all stimuli for `epoch` or earlier epochs, in order of arrival.
     pub(super) fn latch(&mut self, epoch: Epoch) {
         self.pending.retain(|(from, page)| {
             let waits = matches!(from, AppliesFrom::Epoch(first) if epoch.epochs_since(*first) < 0);
@@ -75,7 +76,7 @@ impl Stimuli {
         !self.pending.is_empty()
     }
 
-    /// Clears the queue and the contact state: nothing touches the cell.
+    /// Empties the queue and sets all sensor values to those of an untouched cell.
     pub(super) fn clear(&mut self) {
         *self = Self::default();
     }

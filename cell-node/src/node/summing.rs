@@ -1,4 +1,4 @@
-//! Summing in a network: the parent of each sum, and the time to send it.
+//! Summing in a network: which neighbour receives each sum, and when it is sent.
 
 use protocol::fixed::Q7_8;
 use protocol::id::CellId;
@@ -12,68 +12,69 @@ use crate::contact::Torque;
 use crate::network::{LossReason, Network};
 use crate::sum::{EpochStart, Sum, SumWords};
 
-/// Increase of the tolerance, in sixteenths of an epoch, each time a parent lost for lack of answers
-/// acknowledges the leave, and so was alive all the time.
+/// Increase of the tolerance, in sixteenths of an epoch. It is applied each time a parent that was lost for lack of
+/// answers acknowledges the leave, and so was alive all the time.
 const TOLERANCE_STEP: u16 = 2 * EPOCHS_PER_DECREASE;
-/// Maximum tolerance, in sixteenths of an epoch.
+/// Maximum of the tolerance, in sixteenths of an epoch.
 const MAX_TOLERANCE: u16 = 12 * EPOCHS_PER_DECREASE;
-/// Number of epochs with a sum of the parent after which the tolerance decreases by one epoch.
+/// Number of epochs with a sum of the parent after which the tolerance has decreased by one epoch.
 const EPOCHS_PER_DECREASE: u16 = 16;
-/// Number of consecutive complete epochs after which the children's sums instead of joints wake the cell.
+/// Number of consecutive complete epochs after which joints do not wake the cell any more, but the children's sums do.
 const STEADY_EPOCHS: u8 = 8;
-/// Maximum lateness of a check for missing sums. A later check is skipped, because the sums may still wait in
-/// the socket.
+/// Maximum lateness of a check for missing sums. A check that is later than this is skipped, because the sums may still
+/// be unread in the socket.
 const MAX_CHECK_LATENESS: Span = Span::from_millis(1);
-/// Minimum interval between reports of the place in the tree.
+/// Minimum interval between two reports of the place in the tree (network page 3).
 const TREE_REPORT_INTERVAL: Span = Span::from_millis(50);
 
-/// The parent that receives the sum of an epoch.
+/// The neighbour that receives the sum of an epoch.
 #[derive(Clone, Copy, Debug, Default)]
 enum EpochParent {
-    /// No parent.
+    /// There is no parent.
     #[default]
     None,
-    /// The gateway's side, which sends no sums.
+    /// The parent is the gateway's side, which sends no sums.
     Gateway,
-    /// The cell at a port, its node id if known, and true if one of its sums arrived in this epoch.
+    /// The parent is the cell at a port, with its node id if known. `heard` is true if a sum of it arrived in this
+    /// epoch.
     Cell { port: usize, number: Option<CellId>, heard: bool },
 }
 
-/// The schedule of reports of the place in the tree.
+/// The state of the reports of the place in the tree.
 #[derive(Debug, Default)]
 pub(super) struct TreeReport {
-    /// True if the place has changed.
+    /// True if the place in the tree has changed since the last report.
     pub(super) due: bool,
-    /// The earliest time of the next report.
+    /// The earliest time at which the next report may be sent.
     next: Micros,
-    /// The last reported round.
+    /// The round in the last report.
     pub(super) round: u8,
 }
 
-/// A cell's network, its sums, and the state that connects them.
+/// A cell's network part, its sums, and the state that connects the two.
 #[derive(Debug, Default)]
 pub(super) struct Summing {
     pub(super) network: Network,
     pub(super) sum: Sum,
-    /// The cell whose sums are received at each port.
+    /// For each port, the cell whose sums are received there.
     pub(super) received: [Option<CellId>; PORTS],
     received_changed: bool,
     parent: EpochParent,
-    /// True if a sum was sent in the previous epoch.
+    /// True if the cell sent a sum in the previous epoch.
     sent_before: bool,
-    /// Set while the parent may have missed a sum and is probed until it answers: the number of consecutive
-    /// epochs without an answer.
+    /// Number of consecutive epochs without an answer of the parent. It is set while the parent may have missed a sum
+    /// and is probed until it answers.
     unanswered: Option<u16>,
-    /// Tolerated epochs without an answer, in sixteenths. A cell that loses parents which are alive runs on a
-    /// slow machine, and would lose the next one as well.
+    /// Tolerated number of epochs without an answer, in sixteenths. It grows if this cell loses parents that are alive:
+    /// then the machine is slow, and the cell would also lose the next parent.
     tolerance: u16,
-    /// The port of a parent that was lost for lack of answers, but may have been alive.
+    /// The port of a parent that was lost for lack of answers, although it may have been alive.
     suspected: Option<usize>,
-    /// Number of consecutive complete epochs in which the cell waited for a child.
+    /// Number of consecutive epochs in which the cell waited for a child and the sum was complete.
     steady: u8,
-    /// True if joints are received deferred, because the children's sums wake this cell.
+    /// True if joints do not wake this cell, because the children's sums do.
     pub(super) waits_for_children: bool,
-    /// The number of parent changes at the last read.
+    /// Number of parent changes that the network had counted at the last read.
     changes: u16,
     pub(super) report: TreeReport,
 }
@@ -86,12 +87,12 @@ impl Summing {
         Self { network: Network::new(now), report, ..Self::default() }
     }
 
-    /// Returns the parent whose sums are received.
+    /// Returns the parent if its sums are received.
     pub(super) fn received_parent(&self) -> Option<CellId> {
         self.received.get(self.network.up()?).copied().flatten()
     }
 
-    /// Returns true if the received identifiers, or those that wake the cell, have changed since the last
+    /// Returns true if the identifiers that the cell receives, or those that must wake it, have changed since the last
     /// call.
     pub(super) fn poll_received_ids(&mut self) -> bool {
         let waits = self.steady == STEADY_EPOCHS && self.unanswered.is_none() && self.sum.awaits_children();
@@ -112,7 +113,7 @@ impl Summing {
         self.network.handle_time(now);
     }
 
-    /// Handles a message from a port that receives.
+    /// Handles a message from a port whose messages are not ignored.
     fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
         let is_parent = self.network.up() == Some(port);
         self.sum.note_delay(age);
@@ -141,7 +142,7 @@ impl Summing {
         self.network.handle(now, port, message);
     }
 
-    /// Applies changes of the network.
+    /// Applies changes of parent and children to the sums.
     fn follow_network(&mut self) {
         for port in (0..PORTS).filter(|&port| !self.network.is_child(port)) {
             self.sum.disown(port);
@@ -164,7 +165,8 @@ impl Summing {
         self.received_changed |= core::mem::replace(&mut self.received, heard) != heard;
     }
 
-    /// Starts an epoch with joints that were on the bus `age` ago. Its sums use the tree as it is now.
+    /// Starts an epoch with joints that were on the bus `age` before `now`. The sums of the epoch use the tree as it is
+    /// at this time.
     pub(super) fn begin(
         &mut self,
         now: Micros,
@@ -206,7 +208,7 @@ impl Summing {
         }
     }
 
-    /// Handles a neighbour's sum. Returns true if it is a child's.
+    /// Handles the sum of a neighbour. Returns true if the neighbour is a child.
     pub(super) fn handle_sum(&mut self, now: Micros, age: Span, from: CellId, epoch: Epoch, words: SumWords) -> bool {
         if let EpochParent::Cell { port, number, heard } = &mut self.parent
             && *number == Some(from)
@@ -224,8 +226,8 @@ impl Summing {
         true
     }
 
-    /// Sends a NACK to each child whose sum is missing in this epoch, once. Returns true if the parent is
-    /// lost.
+    /// Sends a NACK to each child whose sum of this epoch is missing, once per epoch. Returns true if the parent counts
+    /// as lost.
     fn check_missing(&mut self, now: Micros) -> bool {
         let Some((epoch, nack)) = self.sum.check_missing() else { return false };
         for port in (0..PORTS).filter(|port| nack >> port & 1 == 1) {
@@ -257,7 +259,8 @@ impl Summing {
         lost.is_some()
     }
 
-    /// Handles a NACK: resends the state, and probes whether the parent receives this cell at all.
+    /// Handles a NACK of the parent: resends the state message, and probes whether the parent receives this cell at
+    /// all.
     fn handle_nack(&mut self, epoch: Epoch) {
         self.sum.restate = true;
         let before = self.sum.epoch.is_some_and(|present| epoch.next() == present);
@@ -268,12 +271,12 @@ impl Summing {
         }
     }
 
-    /// Returns the tolerated number of consecutive epochs without an answer.
+    /// Returns the tolerated number of consecutive epochs without an answer of the parent.
     const fn tolerated(&self) -> u16 {
         self.tolerance.div_ceil(EPOCHS_PER_DECREASE)
     }
 
-    /// Probes the parent; the answer is checked before the next joints.
+    /// Sends a probe to the parent. Its answer is checked before the next joints.
     fn probe_parent(&mut self) {
         if let Some(up) = self.network.up() {
             self.network.send(up, PortMessage::Probe);
@@ -283,7 +286,7 @@ impl Summing {
 }
 
 impl Node {
-    /// Handles a message that arrived at a port `age` ago.
+    /// Handles a message that arrived at a port `age` before `now`.
     pub fn handle_port(&mut self, now: Micros, age: Span, port: usize, message: PortMessage) {
         if self.summing.network.receives(port) {
             self.summing.handle_port(now, age, port, message);
@@ -291,7 +294,7 @@ impl Node {
         }
     }
 
-    /// Applies changes of the network.
+    /// Applies changes of the network to sums and node id, and reports them.
     pub(super) fn after_network(&mut self, now: Micros) {
         if !self.summing.network.exists() {
             return;
@@ -306,7 +309,7 @@ impl Node {
         self.report_tree(now);
     }
 
-    /// Sends the sum that is due, and checks for missing ones.
+    /// Sends the cell's sum if it is due, and checks for missing sums of children.
     pub(super) fn handle_sums(&mut self, now: Micros) {
         let Some(from) = self.identity.cell else { return };
         let summing = &mut self.summing;
@@ -332,14 +335,14 @@ impl Node {
         }
     }
 
-    /// Checks for missing sums of this epoch, once.
+    /// Checks for missing sums of children in this epoch, once per epoch.
     pub(super) fn check_missing(&mut self, now: Micros) {
         if self.summing.check_missing(now) {
             self.after_network(now);
         }
     }
 
-    /// Reports the place in the tree if it has changed, at a limited rate.
+    /// Reports the place in the tree if it has changed, at most every 50 ms.
     pub(super) fn report_tree(&mut self, now: Micros) {
         let report = &mut self.summing.report;
         let may = self.summing.network.exists() && self.claim.is_settled();

@@ -34,7 +34,7 @@ fn identity() -> Identity {
     Identity { cell: Some(cell()), serial: 100_012 }
 }
 
-/// Returns a cell that owns its node id.
+/// Returns a cell that owns its node id, started with these contents of flash.
 fn settled(flash: FlashState) -> Node {
     settle(Node::new(identity(), Format::Fd, &flash, true, Micros(0)))
 }
@@ -47,7 +47,7 @@ fn settle(mut node: Node) -> Node {
     node
 }
 
-/// Returns a cell that has just sent its address claim, and the claim.
+/// Returns a cell that has just sent its address claim, together with that message.
 fn claiming(identity: Identity) -> (Node, Message) {
     let mut node = Node::new(identity, Format::Fd, &FlashState::Valid(wheel()), true, Micros(0));
     node.handle_timeout(node.poll_timeout());

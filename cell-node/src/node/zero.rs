@@ -1,4 +1,4 @@
-//! Reports of the force sensor's zero (sensors page 3): when its state changes, and once a second.
+//! Reports of the zero of the force sensor (sensor page 3), which are sent when its state changes and once a second.
 
 use protocol::message::{Message, SensorPage};
 
@@ -6,10 +6,10 @@ use super::Node;
 use super::stimuli::SensedValues;
 use crate::baseline::BaselineStatus;
 
-/// Number of heartbeats per page.
+/// Number of heartbeats per report.
 const HEARTBEATS_PER_PAGE: u8 = 4;
 
-/// The last reported state.
+/// The state of the zero in the last report.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct ReportedBaseline {
     status: BaselineStatus,
@@ -17,13 +17,13 @@ pub(super) struct ReportedBaseline {
 }
 
 impl Node {
-    /// Returns the sensor values with the zero subtracted.
+    /// Returns the sensor values with the zero subtracted from the contact force.
     pub(super) fn net(&self) -> SensedValues {
         let SensedValues { skin, acceleration } = self.stimuli.sensed;
         SensedValues { skin: self.baseline.subtract_zero(&skin), acceleration }
     }
 
-    /// Reports the zero if its state has changed and the cell owns its node id.
+    /// Reports the zero if its state has changed since the last report, and the cell owns its node id.
     pub(super) fn report_zero(&mut self) {
         if self.claim.is_settled() && self.reported.status != self.baseline.status() {
             self.push_zero();
@@ -38,7 +38,7 @@ impl Node {
         }
     }
 
-    /// Reports the zero, if there is a baseline.
+    /// Reports the zero, unless the baseline is off.
     #[inline(never)]
     pub(super) fn push_zero(&mut self) {
         self.reported.status = self.baseline.status();

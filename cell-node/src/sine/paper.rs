@@ -13,7 +13,7 @@ const FIFTH: [i32; 3] = {
     [a, ONE - a - c, c]
 };
 
-/// Converts a positive constant to 16 fraction bits.
+/// Rounds a positive constant to an integer with 16 fraction bits.
 #[expect(clippy::cast_possible_truncation, reason = "the constants above are below 2")]
 const fn nearest(constant: f64) -> i32 {
     (constant * 65_536.0 + 0.5) as i32

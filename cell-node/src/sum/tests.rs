@@ -13,7 +13,7 @@ fn begin(epoch: u8, depth: u8) -> EpochStart {
     EpochStart { epoch: Epoch(epoch), at, period: PERIOD, depth: Some(depth), may_send: true, children: 0b1111 }
 }
 
-/// Returns a torque in thousandths of a step of Q7.8.
+/// Returns a torque of this many thousandths of a Q7.8 step, the same for every joint.
 fn own(thousandths: i64) -> [Acc<30>; MAX_JOINTS] {
     [Acc::from_steps(thousandths * (1 << 22) / 1_000); MAX_JOINTS]
 }
@@ -26,7 +26,7 @@ fn at(epoch: u8, micros: u64) -> Micros {
     Micros(u64::from(epoch) * PERIOD.0 + micros)
 }
 
-/// Returns the sums sent until the end of the epoch, with their times.
+/// Returns the sums sent from now until the end of the epoch, each with its time.
 fn says(sum: &mut Sum, epoch: u8) -> Vec<(u64, i16, u8, bool)> {
     let mut said = Vec::new();
     for micros in (0..PERIOD.0).step_by(100) {

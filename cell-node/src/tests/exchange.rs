@@ -1,5 +1,6 @@
-//! Test of the cell with `protocol/tests/golden/exchange.log`, which another program wrote from the document.
-//! The cell receives the frames of the log, and must send the log's frames at the log's times, and no others.
+//! Test of the cell with `protocol/tests/golden/exchange.log`, which a Python program wrote from the protocol document.
+//! The cell receives the frames of the log. It must send exactly the frames that the log contains, at the times in the
+//! log.
 #![allow(clippy::indexing_slicing, clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 use std::collections::{BTreeMap, VecDeque};
@@ -17,10 +18,10 @@ use protocol::time::{Micros, Span};
 
 const EXCHANGE: &str = include_str!("../../../protocol/tests/golden/exchange.log");
 const SESSION: &str = include_str!("../../../protocol/tests/golden/session.log");
-/// Interval between the starts of exchanges.
+/// Interval in µs between the starts of two exchanges in the log.
 const APART: u64 = 10_000_000;
 
-/// A cell and the frames that it sent, with their times.
+/// A cell, with the frames that it has sent and their times.
 struct Cell {
     node: Node,
     format: Format,
@@ -50,7 +51,7 @@ impl Cell {
         }
     }
 
-    /// Advances the time. A cell that has given way does nothing more.
+    /// Advances the time of the cell. A cell that has given up its node id does nothing.
     fn until(&mut self, at: u64) {
         while self.node.other_owner().is_none() && self.node.poll_timeout() <= Micros(at) {
             let due = self.node.poll_timeout();
@@ -65,7 +66,7 @@ impl Cell {
     }
 }
 
-/// Returns the parameters that the writes of the session result in.
+/// Returns the parameters that result from the writes in the configuration session of the log.
 fn configuration() -> Parameters {
     let mut parameters = Parameters::default();
     for line in SESSION.lines() {

@@ -1,4 +1,4 @@
-//! Tests of the kernels with externally computed torques, with Eq. 8 in real numbers, and with each other.
+//! Tests that compare the kernels with torques of other programs, with Eq. 8 in real numbers, and with each other.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -206,7 +206,7 @@ fn any_chain() -> impl Strategy<Value = Parameters> {
         .prop_filter("a joint moves the cell", |parameters| parameters.joint > 0)
 }
 
-/// Generates such a chain whose rows, prismatic travel and cell position add up to less than 2 m, with joint
+/// Generates a chain whose rows, prismatic travel and cell position add up to less than 2 m, together with joint
 /// positions.
 fn chain_in_reach() -> impl Strategy<Value = (Parameters, [Q1_14; MAX_JOINTS])> {
     let positions = any::<[i16; MAX_JOINTS]>();
@@ -258,20 +258,20 @@ fn in_reach(any: impl Strategy<Value = Parameters>) -> impl Strategy<Value = Par
     })
 }
 
-/// Returns the largest difference of two Jacobians.
+/// Returns the largest absolute difference between the elements of two Jacobians.
 fn apart(lhs: [f64; MAX_JOINTS], rhs: [f64; MAX_JOINTS]) -> f64 {
     lhs.iter().zip(rhs).map(|(l, r)| (l - r).abs()).fold(0.0, f64::max)
 }
 
-/// J-3: maximum difference of a cell's J from the nearest word of the exact value, in steps of 2^-14 m; one
-/// more for each row beyond six.
+/// Requirement J-3: the maximum difference between a cell's J and the nearest word of the exact value, in steps of
+/// 2^-14 m. Each row beyond six allows one more step.
 const STEPS_OF_J: u32 = 8;
 
 fn steps_of_j(parameters: &Parameters) -> u32 {
     STEPS_OF_J + u32::try_from(parameters.chain().len().saturating_sub(6)).unwrap()
 }
 
-/// Returns the difference of a kernel's J from the nearest word of the exact value, in steps.
+/// Returns the largest difference between a kernel's J and the nearest word of the exact value, in steps of 2^-14.
 fn steps_apart<K: Kernel>(
     parameters: &Parameters,
     joints: &[Q1_14; MAX_JOINTS],

@@ -1,4 +1,4 @@
-//! Tests of the whole crate.
+//! Tests of the whole crate: exchanges of messages, kernels, ports and sums.
 
 mod exchange;
 mod kernel;

@@ -33,7 +33,7 @@ fn start_with(wired: u8, cell: Option<CellId>) -> Node {
     Node::new(identity, Format::Fd, &FlashState::Valid(parameters), true, Micros(0)).with_ports(wired)
 }
 
-/// Advances the time. Returns the messages sent over wires.
+/// Advances the time of a cell. Returns the messages that the cell sends over wires, each with its port.
 fn until(node: &mut Node, at: Micros) -> Vec<(usize, PortMessage)> {
     while node.poll_timeout() <= at {
         node.handle_timeout(node.poll_timeout());
@@ -103,7 +103,7 @@ fn a_root_sends_its_sums_to_the_gateways_side_without_a_state() {
     assert!(!said.iter().any(|(_, message)| matches!(message, PortMessage::State(_))), "{said:?}");
 }
 
-/// Makes the cell a root: the gateway's side grants its join.
+/// Makes the cell a root, by a grant from the gateway's side.
 fn join_gateway(node: &mut Node, now: Micros) {
     let rank = Rank { round: 1, depth: 0 };
     let hello =

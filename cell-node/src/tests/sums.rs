@@ -1,4 +1,4 @@
-//! Tests of late sums of children.
+//! Tests of children's sums that arrive late.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use crate::sum::{EpochStart, Sum, SumWords};
@@ -8,7 +8,7 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::Slots;
 use protocol::time::{Micros, Span};
 
-/// Starts an epoch of a parent without contact, at the root of a tree of two, with its child at port 0.
+/// Starts an epoch of a cell without contact. The cell is the root of a tree of two, with its child at port 0.
 fn begin(sum: &mut Sum, epoch: u8, at: u64) {
     let begin = EpochStart {
         epoch: Epoch(epoch),
@@ -25,7 +25,7 @@ fn words(bits: i16) -> SumWords {
     SumWords { torque: [Q7_8::from_bits(bits); MAX_JOINTS], count: 1 }
 }
 
-/// Returns the sum sent within half a period.
+/// Returns the sum that the cell sends within half a period after `after`; `None` if it sends none.
 fn said(sum: &mut Sum, after: u64) -> Option<SumWords> {
     sum.poll_sum(Micros(after + 8_000)).map(|(_, words, _)| words)
 }

@@ -4,7 +4,7 @@
 pub const SINGLE_NM: f64 = 0.0054;
 /// Mean error of summed torques, Q7.8, in Nm (Fig. 6).
 pub const SUMMED_NM: f64 = 0.0356;
-/// Duration of a cycle without the central computation, in s (Fig. 8).
+/// Duration of all work in a cycle except the central computation, in s (Fig. 8).
 pub const REST_S: f64 = 0.2e-3;
 /// Time of a cycle at 500 Hz, in s.
 pub const CYCLE_S: f64 = 2e-3;
@@ -12,27 +12,27 @@ pub const CYCLE_S: f64 = 2e-3;
 pub const CELL_S: f64 = 0.827e-6;
 /// Time of the central computation without cells, in s (Eq. 29).
 pub const FIXED_S: f64 = 0.010_73e-3;
-/// Goodness of fit of Eq. 29.
+/// Goodness of fit (R squared) of Eq. 29.
 pub const CELLS_QUALITY: f64 = 0.9995;
 /// Time of the central computation per active cell, in s (Eq. 30).
 pub const ACTIVE_S: f64 = 0.798e-6;
 /// Time of the central computation of 253 inactive cells, in s (Eq. 30).
 pub const NONE_ACTIVE_S: f64 = 0.2e-3;
-/// Goodness of fit of Eq. 30.
+/// Goodness of fit (R squared) of Eq. 30.
 pub const ACTIVE_QUALITY: f64 = 0.939;
 /// Maximum number of cells at 500 Hz, none of them active.
 pub const LIMIT: f64 = 2160.0;
 /// Maximum number of cells at 500 Hz, 100 of them active (Eq. 31).
 pub const LIMIT_ACTIVE: f64 = 2067.0;
-/// Number of active cells for the second limit.
+/// Number of active cells for which [`LIMIT_ACTIVE`] holds.
 pub const LIMIT_AT: f64 = 100.0;
-/// Mean error of the fifth-order sine.
+/// Mean error of the fifth-order approximation of the sine.
 pub const SINE: f64 = 6.7e-4;
 /// Numbers of multiplications, additions, sines and cosines in one cell's Jacobian on the last link of six (Eq. 27).
 pub const OPERATIONS: [u32; 4] = [103, 57, 6, 6];
 
-/// Returns the maximum number of cells for which a cycle holds the rest and the central computation (the paper's
-/// reasoning for its limits): `(cycle - rest - fixed - active · per active) / per cell`, all in s. Returns NaN if cells
+/// Returns the maximum number of cells whose central computation fits in a cycle beside the rest of the work, as the
+/// paper derives its limits: `(cycle - rest - fixed - active · per active) / per cell`, all in s. Returns NaN if cells
 /// cost nothing.
 #[must_use]
 pub fn most_cells(per_cell: f64, fixed: f64, per_active: f64, active: f64) -> f64 {

@@ -21,12 +21,12 @@ pub use self::foreign::{ForeignFrames, ForeignId, FrameType};
 
 mod foreign;
 
-/// Counts frames.
+/// Counts the frames of a capture by bus, kind and cell.
 #[derive(Debug, Default)]
 pub struct Stats {
-    /// Times of the earliest and the latest frame.
+    /// Times of the earliest and the latest frame, in ns.
     span: Option<(u64, u64)>,
-    /// The figures that grow with each frame.
+    /// The counts of the report that grow with each frame.
     counts: Report,
     bus_stats: Vec<BusStats>,
     is_untimed: bool,
@@ -35,20 +35,20 @@ pub struct Stats {
 /// The statistics of one bus.
 #[derive(Debug)]
 struct BusStats {
-    /// Time of the previous frame.
+    /// Time of the previous frame on the bus, in ns.
     last: u64,
     all: Count,
-    /// The figures that grow with each frame.
+    /// The counts of the bus that grow with each frame.
     counts: BusReport,
     kinds: [Count; NAMES.len()],
     wires: Count,
     foreign: ForeignCounter,
     joints: Option<Joints>,
-    /// By index of the cell.
+    /// The cells of the bus, by node id.
     cells: Vec<Option<Box<CellStats>>>,
 }
 
-/// The packet kinds that are counted, in display order.
+/// Names of the packet kinds that are counted, in the order of display.
 const NAMES: [&str; 12] = [
     "halt",
     "joints",
@@ -64,7 +64,7 @@ const NAMES: [&str; 12] = [
     "stimulus",
 ];
 
-/// Number of packets or frames of one kind, with the times of the first and the last.
+/// Number of packets or frames of one kind, and the times of the first and the last in ns.
 #[derive(Clone, Copy, Debug, Default)]
 struct Count {
     packets: u64,
@@ -81,44 +81,45 @@ impl Count {
         self.last = nanos;
     }
 
-    /// Returns the time from the first to the last, in ns.
+    /// Returns the time from the first to the last packet, in ns.
     const fn span(self) -> u64 {
         self.last.saturating_sub(self.first)
     }
 
-    /// Returns the rate per second, from the first to the last; `None` if they have the same time.
+    /// Returns the packets per second from the first to the last; `None` if these have the same time.
     fn per_s(self) -> Option<f64> {
         rate(self.packets.saturating_sub(1), self.span())
     }
 }
 
-/// The last joints.
+/// The last joints packet on a bus.
 #[derive(Clone, Copy, Debug)]
 struct Joints {
     epoch: Epoch,
-    /// Their number since the capture began, including missing ones.
+    /// The number of the joints since the capture began; missing joints are counted, too.
     number: u64,
 }
 
 impl Joints {
-    /// Returns the number of the joints of an epoch shortly before these.
+    /// Returns the number of the joints with this epoch, which were sent shortly before the last ones; `None` if there
+    /// are no such joints.
     fn of(self, epoch: Epoch) -> Option<u64> {
         let age = u64::try_from(self.epoch.epochs_since(epoch)).ok()?;
         self.number.checked_sub(age)
     }
 }
 
-/// The packets of one cell.
+/// Counts of the packets of one cell.
 #[derive(Debug, Default)]
 struct CellStats {
     tracked: CellTracker,
-    /// The figures that grow with each packet.
+    /// The counts of the cell that grow with each packet.
     counts: CellReport,
-    /// The epoch of the last sum.
+    /// The epoch of the cell's last sum.
     summed: Option<Epoch>,
-    /// Time and epoch of the first torque and of the last.
+    /// Time in ns and epoch of the cell's first torque and of its last.
     torque_span: Option<[(u64, Epoch); 2]>,
-    /// The number of the joints that the last torque answers, during a contact.
+    /// The number of the joints that the last torque answers, while the cell is in contact.
     touching: Option<u64>,
 }
 
@@ -129,11 +130,11 @@ pub struct Report {
     pub duration_s: f64,
     /// Frames of all buses.
     pub frames: u64,
-    /// Frames with an earlier time than the previous frame on their bus.
+    /// Frames with an earlier time than the frame before on their bus.
     pub times_backwards: u64,
-    /// Frames lost on an unknown bus, by the recorder's notes.
+    /// Frames that the recorder lost without noting the bus.
     pub dropped: u64,
-    /// Frames of buses beyond the first 64.
+    /// Frames of buses beyond the first 64. These buses are not counted.
     pub frames_of_other_buses: u64,
     /// The buses, in order of appearance.
     pub buses: Vec<BusReport>,
@@ -142,9 +143,9 @@ pub struct Report {
 /// The statistics of one bus.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct BusReport {
-    /// Its name.
+    /// Name of the bus.
     pub bus: String,
-    /// All frames except those of simulated wires, which real buses do not have.
+    /// Number of frames, without those of simulated wires, which real buses do not carry.
     pub frames: u64,
     /// Frames per second, over the whole capture; `None` if all have the same time.
     pub frames_per_s: Option<f64>,
@@ -152,15 +153,15 @@ pub struct BusReport {
     pub wires: u64,
     /// Frames of simulated wires per second, from the first to the last.
     pub wires_per_s: Option<f64>,
-    /// Time from the first to the last of them, in s.
+    /// Time from the first to the last frame of simulated wires, in s.
     pub wires_span_s: f64,
-    /// Packets by kind, for the kinds that occur.
+    /// Counts of packets by kind, for the kinds that occur.
     pub kinds: Vec<KindReport>,
-    /// Epochs of the joints.
+    /// Counts of joints by epoch.
     pub epochs: Epochs,
-    /// Damaged frames, and packets that cannot be decoded, by reason.
+    /// Counts of damaged frames and of packets that cannot be decoded, by reason.
     pub refused: RefusedFrames,
-    /// Frames that do not belong to this protocol.
+    /// Counts of frames that do not belong to this protocol.
     pub foreign: ForeignFrames,
     /// Frames that the recorder lost on this bus, by its own notes.
     pub dropped: u64,
@@ -171,37 +172,37 @@ pub struct BusReport {
 /// The statistics of one packet kind.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct KindReport {
-    /// Its name.
+    /// Name of the packet kind.
     pub kind: &'static str,
-    /// Packets.
+    /// Number of packets.
     pub packets: u64,
     /// Packets per second, from the first to the last.
     pub packets_per_s: Option<f64>,
-    /// Time from the first to the last, in s.
+    /// Time from the first to the last packet, in s.
     pub span_s: f64,
 }
 
-/// The epochs of joints.
+/// Counts of the joints on a bus by epoch.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Epochs {
     /// Epoch of the first joints.
     pub first: Option<u8>,
     /// Epoch of the last joints.
     pub last: Option<u8>,
-    /// Missing joints between two that are present.
+    /// Joints that are missing between two others, by their epochs.
     pub missing: u64,
     /// Joints with the same epoch as the previous ones.
     pub repeated: u64,
-    /// Steps back: the numbering restarted.
+    /// Steps back of the epoch, which show that the numbering restarted.
     pub jumps: u64,
 }
 
-/// Damaged frames with identifiers that carry packets, and packets that cannot be decoded, by reason.
+/// Counts of damaged frames with identifiers that carry packets, and of packets that cannot be decoded, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct RefusedFrames {
-    /// Wrong length.
+    /// Frames of a wrong length.
     pub length: u64,
-    /// Wrong CRC.
+    /// Packets with a wrong CRC.
     pub crc: u64,
     /// Packets that this version cannot decode.
     pub meaning: u64,
@@ -218,46 +219,46 @@ impl RefusedFrames {
     }
 }
 
-/// The statistics of one cell.
+/// Counts of the packets of one cell.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct CellReport {
-    /// Its node id.
+    /// Node id of the cell.
     pub node: u8,
-    /// All packets that it sent.
+    /// Number of packets that the cell sent.
     pub packets: u64,
-    /// Torques among them.
+    /// Number of torques that the cell sent.
     pub torques: u64,
     /// Torques per second, from the first to the last.
     pub torques_per_s: Option<f64>,
-    /// Time from the first to the last of them, in s.
+    /// Time from the first to the last torque, in s.
     pub torques_span_s: f64,
-    /// Sums of its own and its children's torques.
+    /// Number of sums that the cell sent: its torque and those of the cells below it in the tree.
     pub sums: u64,
-    /// Sums for the same epoch as the previous one, with more cells in them.
+    /// Number of sums for the same epoch as the cell's previous sum, with more cells in them.
     pub resent: u64,
-    /// Its parent, by its last tree page: a node id, or 0 for the gateway.
+    /// Node id of the cell's parent, or 0 for the gateway, by the last tree page.
     pub parent: Option<u8>,
-    /// Number of wires to the root of its tree, by the same page.
+    /// Number of wires to the root of the tree, by the last tree page.
     pub depth: Option<u8>,
-    /// The epoch that its first torque answers.
+    /// The epoch that the cell's first torque answers.
     pub first_epoch: Option<u8>,
-    /// The epoch that its last torque answers.
+    /// The epoch that the cell's last torque answers.
     pub last_epoch: Option<u8>,
-    /// Joints during a contact that it did not answer.
+    /// Number of joints that the cell did not answer although it was in contact.
     pub unanswered: u64,
-    /// Torques for the same epoch as the previous one.
+    /// Number of torques for the same epoch as the cell's previous torque.
     pub repeated: u64,
-    /// Torques and sums with a saturated word.
+    /// Number of torques and sums with a saturated word.
     pub saturated: u64,
-    /// Heartbeats.
+    /// Number of heartbeats.
     pub heartbeats: u64,
-    /// Frames that it refused, by its last heartbeat.
+    /// Number of frames that the cell refused, by its last heartbeat.
     pub refused: Option<u16>,
-    /// Packets that it counted between two heartbeats but that are not in the capture.
+    /// Packets sent between two heartbeats, by the cell's own counter, that are not in the capture.
     pub lost: u64,
-    /// Restarts.
+    /// Number of restarts of the cell.
     pub restarts: u64,
-    /// Its state in its last heartbeat.
+    /// State flags in the cell's last heartbeat.
     pub state: Vec<&'static str>,
 }
 
@@ -299,12 +300,12 @@ impl Stats {
         self.bus_stats.get_mut(at?)
     }
 
-    /// Declares that the frames have no times: their times only give the order, and rates are omitted.
+    /// Declares that the times of frames are meaningless and only give the order. Rates are then omitted.
     pub const fn without_times(&mut self) {
         self.is_untimed = true;
     }
 
-    /// Returns the result so far.
+    /// Returns the statistics of all frames so far.
     #[must_use]
     pub fn report(&self) -> Report {
         let mut report = self.timed();
@@ -334,7 +335,7 @@ fn seconds(nanos: u64) -> f64 {
     nanos as f64 / 1e9
 }
 
-/// Returns the rate per second of a count in a time in ns; `None` if either is zero.
+/// Returns the rate per second of `count` events in `nanos` ns; `None` if either number is zero.
 #[expect(clippy::cast_precision_loss, reason = "for display")]
 fn rate(count: u64, nanos: u64) -> Option<f64> {
     (count > 0 && nanos > 0).then(|| count as f64 * 1e9 / nanos as f64)

@@ -1,4 +1,4 @@
-//! The cells present on a running bench, and their answers to a request.
+//! Collects the answers of the cells on a running bench to one request.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use protocol::message::{Answer, Message, NetworkPage, State};
 
 use crate::bus::listen::Listener;
 
-/// Answers received from the cells that a packet addresses.
+/// Answers received from the cells that a request addresses, and the cells that are present.
 #[derive(Debug)]
 pub struct Answers {
     only: Option<CellId>,
@@ -41,7 +41,7 @@ impl Answers {
         Ok(())
     }
 
-    /// Records one packet.
+    /// Records the sender of a packet as present. Keeps the packet if it answers the request.
     pub fn record(&mut self, message: &Message) {
         let Some(from) = message.sender().filter(|&from| self.only.is_none_or(|only| only == from)) else {
             return;
@@ -49,7 +49,7 @@ impl Answers {
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message
             && heartbeat.state.has(State::CLAIMING)
         {
-            // A claiming cell does not own that node id yet.
+            // A claiming cell does not own its node id yet.
             return;
         }
         if let Message::Configured { tag, answer, .. } = *message
@@ -72,7 +72,7 @@ impl Answers {
         &self.received
     }
 
-    /// The cells that have not answered: those present, and the addressed cell.
+    /// Returns the cells that have not answered, out of the present cells and the addressed cell.
     #[must_use]
     pub fn missing(&self) -> BTreeSet<CellId> {
         let answered = |cell: &CellId| self.received.iter().any(|(from, _)| from == cell);

@@ -17,7 +17,7 @@ use crate::bus::listen::{self, Listener, passing, send};
 const FORMAT: Duration = Duration::from_millis(300);
 /// Interval between queries to all cells.
 const QUERY_INTERVAL: Duration = Duration::from_secs(2);
-/// Time that one poll of the bus waits for a frame.
+/// Maximum time that one poll of the bus waits for a frame.
 const POLL_TIMEOUT: Duration = Duration::from_millis(50);
 
 /// Reports received from the cells of a bus, and the time of the last query.
@@ -33,8 +33,8 @@ pub struct CellWatch {
 }
 
 impl CellWatch {
-    /// Opens a bus, also a classic interface, to receive from cells and gateways. Queries are sent in this format, or
-    /// else in the format of the cells.
+    /// Opens a bus, which may be a classic interface, to receive from cells and gateways. Queries are sent in `format`
+    /// or, if it is `None`, in the format of the received frames.
     ///
     /// # Errors
     /// Returns [`BusError`] if the bus cannot be opened.
@@ -61,7 +61,7 @@ impl CellWatch {
         &self.listing
     }
 
-    /// Number of frames that are not packets.
+    /// Number of received frames that are not packets of the protocol.
     #[must_use]
     pub const fn others(&self) -> u64 {
         self.others
@@ -79,7 +79,8 @@ impl CellWatch {
         Micros::since_start(self.began.elapsed())
     }
 
-    /// Queries the cells once the format of their frames is known; queries them repeatedly if `again`.
+    /// Queries the cells as soon as the format of their frames is known. If `again` is set, repeats the query at
+    /// intervals.
     ///
     /// # Errors
     /// Returns [`BusError`] if the bus is gone or closed.
@@ -99,7 +100,7 @@ impl CellWatch {
         }
     }
 
-    /// Receives for the time of one poll. Waits while the bus is down, unless `stopped`.
+    /// Receives frames for the time of one poll. While the bus is down, waits instead, unless `stopped` is set.
     ///
     /// # Errors
     /// Returns [`BusError`] if the bus is gone or closed.

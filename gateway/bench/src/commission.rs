@@ -17,7 +17,7 @@ use protocol::time::Micros;
 use crate::bus::listen::{self, Listener, passing, send};
 use crate::bus::roots::RootWires;
 
-/// Longest time without a check for a signal.
+/// Maximum time between two checks for a signal.
 const POLL_TIMEOUT: Duration = Duration::from_millis(50);
 /// Interval between progress reports.
 const PROGRESS_INTERVAL: Duration = Duration::from_millis(20);
@@ -59,7 +59,7 @@ pub fn open(skin: &Skin, index: usize, kinds: &KindChoices) -> Result<BusCommiss
     let described = skin.buses.get(index);
     let (name, format) = described.map_or(("", Format::Fd), |bus| (bus.name.as_str(), bus.format));
     let mut roots = RootWires::for_bus(skin, index);
-    // The roots' messages are received from the beginning.
+    // Start the wires before the first frame arrives, so that no message of a root is missed.
     roots.iter_mut().for_each(RootWires::explore);
     let mut filters = [Kind::Network, Kind::Configure, Kind::Configured].map(Filter::for_kind).to_vec();
     filters.push(Filter::exact(Id::command(Command::Joints)));
@@ -95,7 +95,7 @@ pub fn commission(
     thread::scope(|scope| {
         let start = |bench| thread::Builder::new().spawn_scoped(scope, move || work(bench)).ok();
         let started: Vec<_> = waiting.iter().enumerate().map(|bench| (bench, start(bench))).collect();
-        // If the system grants no thread, this thread commissions the bus.
+        // If the system grants no thread, commission the bus in this thread.
         let here = |(bench, thread)| match thread {
             Some(thread) => (Some(thread), None),
             None => (None, work(bench)),

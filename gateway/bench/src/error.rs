@@ -20,7 +20,7 @@ use crate::signals::SignalError;
 use crate::threads::ThreadError;
 use control::external::SocketError;
 
-/// The hint on how to separate benches on embedded buses.
+/// Hint on how to separate benches that use embedded buses of the same name.
 const ELSEWHERE: &str = "set SKINBUS_DIR to another directory for this run";
 
 /// An error that ended a run early.
@@ -153,7 +153,7 @@ pub enum RunError {
 }
 
 impl RunError {
-    /// The first bus fault in a scenario, if any.
+    /// Returns the error for the first bus fault in a scenario, if any.
     #[must_use]
     pub fn bus_fault(scenario: &Scenario, skin: &Skin) -> Option<Self> {
         scenario.faults.iter().find_map(|fault| match &fault.kind {
@@ -208,7 +208,8 @@ impl From<ServeError> for RunError {
     }
 }
 
-/// The reason that a process gave, as the end of a sentence, or a reference to its own message.
+/// Returns the end of a sentence that gives the reason why a process ended. Without a reason, it refers to the
+/// process's own message.
 pub(crate) fn why(said: Option<&str>) -> String {
     said.map_or_else(|| "; see the message above".to_owned(), |said| format!(": {said}"))
 }

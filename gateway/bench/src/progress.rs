@@ -20,14 +20,14 @@ pub struct Progress {
 }
 
 impl Progress {
-    /// Creates a line that has not been shown yet, and never is if `quiet`.
+    /// Creates a progress line. If `quiet` is set, the line is never shown.
     #[must_use]
     pub fn new(quiet: bool) -> Self {
         let terminal = std::io::stderr().is_terminal() && !quiet;
         Self { bar: if terminal { line() } else { ProgressBar::hidden() }, ..Self::lines(quiet) }
     }
 
-    /// Shows only notes until [`Progress::bar`] is called.
+    /// Creates a progress display that shows only notes until [`Progress::bar`] is called.
     #[must_use]
     pub fn lines(quiet: bool) -> Self {
         Self { bar: ProgressBar::hidden(), quiet, due: Instant::now() }
@@ -45,7 +45,8 @@ impl Progress {
         self.bar.clone()
     }
 
-    /// Shows the line if it is due. `text` gets the number of columns, or `None` without a terminal.
+    /// Shows the line if the interval since its last update is over. `text` gets the number of columns, or `None`
+    /// without a terminal.
     pub fn show(&mut self, text: impl FnOnce(Option<usize>) -> String) {
         let now = Instant::now();
         if self.quiet || now < self.due {

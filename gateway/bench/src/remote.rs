@@ -27,7 +27,7 @@ const MAX_LINE_BYTES: usize = 1 << 20;
 pub enum BenchCommand {
     /// Applies an action to the process of a cell, and so to all cells of that process.
     Process {
-        /// The action.
+        /// The action, such as kill, stop or restart.
         action: ProcessAction,
         /// Bus of the cell.
         bus: usize,
@@ -63,7 +63,7 @@ pub struct BenchState {
     pub buses: Vec<BusState>,
     /// Lateness of the ticks.
     pub lateness: Lateness,
-    /// Reason of the present halt, if any.
+    /// Reason for the present halt, if the robot is halted.
     #[serde(default)]
     pub halted: Option<String>,
     /// Latest answers to commands, oldest first.
@@ -71,7 +71,7 @@ pub struct BenchState {
 }
 
 impl BenchState {
-    /// Returns a copy that contains only the process of one cell, or no process.
+    /// Returns a copy of the state that contains only the process of one cell, or no process.
     #[must_use]
     pub fn seen_from(&self, cell: Option<(usize, u8)>) -> Self {
         let is_its = |process: &&ProcessState| cell.is_some_and(|(bus, node)| process.runs(bus, node));
@@ -85,7 +85,7 @@ impl BenchState {
 pub struct ProcessState {
     /// Bus of its cells.
     pub bus: usize,
-    /// Node ids of its first and last cell.
+    /// Node ids of the first and the last cell of the process.
     pub nodes: (u8, u8),
     /// State of the process.
     pub phase: Phase,
@@ -125,7 +125,7 @@ pub struct LinkDown {
 pub struct BusState {
     /// True if a command has taken the bus down.
     pub down: bool,
-    /// True if its cells have links that can be taken down: they answer with sums.
+    /// True if the links of its cells can be taken down, which is the case if they answer with sums.
     pub links: bool,
 }
 
@@ -181,7 +181,7 @@ impl JsonPipe {
         self.ended
     }
 
-    /// Sends a value as one line. Returns false, and drops the value, while the line before is not fully written.
+    /// Sends a value as one line. If the line before is not fully written, drops the value and returns false.
     pub fn send(&mut self, value: &impl Serialize) -> bool {
         self.flush();
         if self.ended || !self.unwritten.is_empty() {

@@ -15,13 +15,13 @@ use thiserror::Error;
 use crate::answers::Answers;
 use crate::bus::listen::{self, Listener, send};
 
-/// Time to find cells: two heartbeats and a margin.
+/// Time to find the cells on a bus: two heartbeats and a margin.
 const DISCOVERY_TIME: Duration = Duration::from_millis(600);
-/// Retry interval for a cell that does not answer.
+/// Interval after which a request is sent again to a cell that does not answer.
 const RETRY_INTERVAL: Span = Span::from_millis(250);
-/// Timeout of all answers.
+/// Maximum time until all cells have answered.
 const TIMEOUT: Duration = Duration::from_secs(3);
-/// Tag of the requests, which distinguishes their answers from those to other senders.
+/// Tag of the requests, by which their answers are told from answers to other senders.
 const TAG: u8 = 0x57;
 
 /// Opens a bus whose cells are to be switched and whose packets have this format.
@@ -40,14 +40,14 @@ pub enum SensingError {
     /// The bus failed.
     #[error(transparent)]
     Bus(#[from] BusError),
-    /// No cell answers.
+    /// No cell answered.
     #[error("{who} answers on {bus}: start it, or name the bus' format with --format {other}")]
     Nobody {
         /// Description of the addressed cells.
         who: String,
         /// Name of the bus.
         bus: String,
-        /// Format that the bus may have instead.
+        /// The other frame format, which the bus may have instead.
         other: &'static str,
     },
     /// Some cells refused.
@@ -60,7 +60,7 @@ pub enum SensingError {
         /// Reason of the first refusal.
         reason: i16,
     },
-    /// Some cells are present and do not answer.
+    /// Some cells are present but did not answer.
     #[error("{cells} on {bus} did not answer, {done} did: switch them again when they are back")]
     Silent {
         /// The cells as text.
@@ -72,7 +72,8 @@ pub enum SensingError {
     },
 }
 
-/// Switches one cell, or all cells that send, on a bus from [`open`]. Returns the names of the switched cells.
+/// Switches the sensor frames of one cell, or of all cells that send, on a bus from [`open`]. Returns the names of the
+/// switched cells.
 ///
 /// # Errors
 /// Returns [`SensingError`] if a cell does not confirm, or the bus fails.
@@ -96,7 +97,7 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
     verdict(&answers, only, listener.bus().name(), format)
 }
 
-/// Returns true if no cell is awaited; before `listened` is true, further cells may appear.
+/// Returns true if all expected cells have answered. Before `listened` is true, further cells may appear.
 fn are_complete(answers: &Answers, only: Option<CellId>, listened: bool) -> bool {
     answers.missing().is_empty() && (only.is_some() || (listened && !answers.present().is_empty()))
 }

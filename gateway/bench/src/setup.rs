@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use protocol::id::CellId;
 
-/// A timeout that restarts with each progress.
+/// A timeout that restarts with each progress of what is waited for.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Timeout {
     length: Duration,
@@ -13,12 +13,13 @@ pub(crate) struct Timeout {
 }
 
 impl Timeout {
-    /// Creates a timeout for this time without progress.
+    /// Creates a timeout that is over after `length` without progress.
     pub(crate) fn new(length: Duration) -> Self {
         Self { length, most: 0, since: Instant::now() }
     }
 
-    /// Updates the progress. Returns true after too long a time without any.
+    /// Takes the progress so far, as a number that grows. Returns true if it has not grown for the length of the
+    /// timeout.
     pub(crate) fn is_over(&mut self, far: usize) -> bool {
         if far > self.most {
             (self.most, self.since) = (far, Instant::now());
@@ -27,7 +28,7 @@ impl Timeout {
     }
 }
 
-/// Node ids of cells as text, followed by their place: `1, 2, 5 on vcan0`.
+/// Formats node ids and their place: `1, 2, 5 on vcan0`.
 pub(crate) fn names(cells: &[CellId], place: &str) -> String {
     let numbers: Vec<_> = cells.iter().map(ToString::to_string).collect();
     match numbers.len() {

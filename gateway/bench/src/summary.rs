@@ -26,9 +26,9 @@ mod verdict;
 pub struct Summary {
     /// Name of the skin.
     pub skin: String,
-    /// Verdict: all is well, or a list of findings.
+    /// Verdict on the run: all is well, or a list of findings.
     pub verdict: Verdict,
-    /// Summary of each cell of the skin.
+    /// Summary of each cell of the skin, in the order of the skin.
     pub cells: Vec<CellSummary>,
     /// Outcome of the run.
     pub outcome: Outcome,
@@ -38,7 +38,7 @@ pub struct Summary {
     pub duration_s: f64,
     /// True if a signal ended the run.
     pub interrupted: bool,
-    /// Reason of the halt at the end of the run, if any.
+    /// Reason for the halt that lasted to the end of the run, if any.
     pub halted: Option<String>,
     /// All halts, oldest first.
     pub halts: Vec<HaltSummary>,
@@ -46,7 +46,7 @@ pub struct Summary {
     pub further_halts: u64,
     /// Ticks up to the last halt, oldest first.
     pub before_halt: Vec<TickBefore>,
-    /// Reason why the external controller counts as absent, if it does; `None` for a halted robot.
+    /// Reason why the external controller counts as absent, if it does. It is `None` if the robot was halted.
     pub no_controller: Option<String>,
     /// Errors that ended processes of cells.
     pub cell_errors: Vec<CellError>,
@@ -72,7 +72,7 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// Creates the summary of a run that has not started.
+    /// Creates an empty summary, for a run that has not started.
     #[must_use]
     pub fn empty(skin: &Skin) -> Self {
         Self {
@@ -89,10 +89,11 @@ impl Summary {
         Self::empty(skin).with_verdict(Some(why))
     }
 
-    /// Sets the outcome and the verdict from the other figures; `failure` is the reason of an early end.
+    /// Sets the outcome and the verdict according to the other figures. `failure` is the reason why the run ended
+    /// early, if it did.
     #[must_use]
     pub fn with_verdict(mut self, failure: Option<String>) -> Self {
-        // A lost bus may have caused the halt, and the halt is the more precise outcome.
+        // A lost bus may have caused the halt, but the halt is the more precise outcome.
         let lost_buses = || self.lost_buses().filter(|_| self.halted.is_none());
         self.failure = failure.or_else(|| self.lost_frames()).or_else(lost_buses);
         self.outcome = match &self.failure {
@@ -107,8 +108,9 @@ impl Summary {
         self
     }
 
-    /// Messages about the end of the run, one line each; the reason of the exit code is last. Empty if all is well.
-    /// Reasons of cells' errors are repeated only if `quiet`.
+    /// Returns the messages about the end of the run, one line each, or none if all is well. The last one is the reason
+    /// of the exit code. Reasons of cells' errors are repeated only if `quiet`, because they have been printed
+    /// otherwise.
     #[must_use]
     pub fn complaints(&self, quiet: bool) -> Vec<String> {
         // The error of a failed run names the lost bus.
@@ -138,7 +140,7 @@ impl Summary {
         let RecordingAccount { errors, lost_write, files, .. } = self.recording.as_ref()?;
         let first = errors.first().map_or("", String::as_str);
         let parts = files.iter().map(|file| &file.path).filter(|path| path.ends_with(".part"));
-        // The error of such a file says how to recover it.
+        // The error of an unfinished file already says how to recover it.
         let hint = |path: &String| match errors.iter().find(|error| error.contains(path.as_str())) {
             Some(error) if error == first => String::new(),
             Some(error) => format!("; {error}"),
@@ -161,21 +163,21 @@ pub struct LoopSummary {
     pub ticks_skipped: u64,
     /// Number of broadcasts sent.
     pub broadcasts: u64,
-    /// Number of broadcasts skipped with their ticks.
+    /// Number of broadcasts that were skipped together with their ticks.
     pub broadcasts_skipped: u64,
     /// Number of bad cycles by reason.
     pub bad_cycles: BTreeMap<String, u64>,
     /// Counts of an external controller's datagrams by outcome; empty for other controllers.
     pub controller: BTreeMap<String, u64>,
-    /// Lateness of the ticks.
+    /// Lateness of the ticks in µs.
     pub late_us: Quantiles,
-    /// Wake-up lateness of the idle machine.
+    /// Wake-up lateness of the idle machine in µs.
     pub idle_late_us: Quantiles,
-    /// Duration of the ticks.
+    /// Duration of the ticks in µs.
     pub took_us: Quantiles,
-    /// Duration of the central computation in ticks that compared.
+    /// Duration of the central computation in µs, over ticks that compared it with the distributed torques.
     pub central_us: Quantiles,
-    /// Duration of ticks that did not compare.
+    /// Duration in µs of ticks without this comparison.
     pub took_distributed_us: Quantiles,
     /// True if the machine granted SCHED_FIFO.
     pub fifo: bool,
@@ -190,11 +192,11 @@ pub struct LoopSummary {
 /// Processor use during the loop in cores.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct ProcessorUse {
-    /// This program.
+    /// Processor use of this program.
     pub gateway: f64,
-    /// All cells together.
+    /// Processor use of all cell processes together.
     pub cells: f64,
-    /// Servers of embedded buses.
+    /// Processor use of all servers of embedded buses together.
     pub buses: f64,
 }
 
@@ -209,49 +211,51 @@ pub struct PrivateMemory {
     pub buses_private_kib: Option<u64>,
 }
 
-/// Packets from the cells: sent = delivered + rejected + unheard + lost, and lost = dropped + backlog + outage + hosts
-/// + unknown.
+/// Packets from the cells. They add up: sent = delivered + rejected + unheard + lost - surplus, and lost = dropped +
+/// backlog + outage + hosts + unknown.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct UplinkSummary {
-    /// Packets sent, by the cells' own count as of their last heartbeats.
+    /// Packets sent, according to the counts in the cells' last heartbeats.
     pub sent: u64,
     /// Packets that arrived and were decoded.
     pub delivered: u64,
     /// Packets that arrived and were rejected.
     pub rejected: u64,
-    /// Sums for another cell, which the gateway's filter excluded.
+    /// Sums for another cell, which the filter of the gateway's socket excluded.
     pub unheard: u64,
-    /// Packets lost because the bus dropped frames that were not read in time.
+    /// Packets lost because the bus dropped frames that this program did not read in time.
     pub dropped: u64,
-    /// Packets lost, as far as the kernel's backlog drops explain it.
+    /// Packets lost for which drops in the kernel's backlog are the likely reason.
     pub backlog: u64,
-    /// Packets lost while the bus was lost.
+    /// Packets lost during losses of the bus.
     pub outage: u64,
     /// Packets lost between hosts.
     pub hosts: u64,
     /// Packets lost for an unknown reason.
     pub unknown: u64,
-    /// Packets that arrived in excess of those sent.
+    /// Packets that arrived beyond the number sent.
     pub surplus: u64,
     /// Heartbeats of other senders under a cell's node id, included in the surplus.
     pub outsiders: u64,
-    /// Packets that arrived from between a cell's last heartbeat and its restart: the number sent then is unknown.
+    /// Packets that arrived and were sent after a cell's last heartbeat before its restart. The number of packets sent
+    /// in this time is unknown.
     pub in_doubt: u64,
-    /// Packets that arrived after a cell's last heartbeat, without a count to compare with.
+    /// Packets that arrived after a cell's last heartbeat, so that no count of the cell includes them.
     pub unsettled: u64,
     /// Number of restarts of cells.
     pub restarts: u32,
 }
 
 impl UplinkSummary {
-    /// Attributes up to `at_most` unknown losses to links between hosts.
+    /// Attributes up to `at_most` of the unknown losses to links between hosts.
     pub fn explain_by_hosts(&mut self, at_most: u64) {
         let explained = self.unknown.min(at_most);
         self.unknown -= explained;
         self.hosts += explained;
     }
 
-    /// Attributes up to `at_most` unknown losses to the kernel's backlog. Returns their number.
+    /// Attributes up to `at_most` of the unknown losses to the kernel's backlog. Returns the number of packets
+    /// attributed.
     pub fn explain_by_backlog(&mut self, at_most: u64) -> u64 {
         let explained = self.unknown.min(at_most);
         self.unknown -= explained;
@@ -260,15 +264,15 @@ impl UplinkSummary {
     }
 }
 
-/// Sums along the cells' tree.
+/// Sums that were received along the cells' tree.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct SumsSummary {
     /// Number of cells wired to the gateway's side.
     pub roots: usize,
-    /// Received sums by their use: received = first + resent + overheard + stale.
+    /// Received sums by what became of them: received = first + resent + overheard + stale.
     #[serde(flatten)]
     pub counts: SumCounts,
-    /// Contributions that were due in sums: due = in time + late + missing.
+    /// Contributions that cells in contact had to make to sums: due = in time + late + missing.
     pub contributions: Contributions,
 }
 
@@ -277,11 +281,11 @@ pub struct SumsSummary {
 pub struct OutagesSummary {
     /// Number of losses.
     pub times: u64,
-    /// Total duration in s, each loss from its detection to the first frame after it.
+    /// Total duration of the losses in s, each from its detection to the first frame after it.
     pub lost_s: f64,
-    /// True if the bus was lost at the end.
+    /// True if the bus was lost when the run ended.
     pub at_end: bool,
-    /// Number of ticks without the bus.
+    /// Number of ticks without data from the bus.
     pub ticks: u64,
 }
 
@@ -290,11 +294,11 @@ pub struct OutagesSummary {
 pub struct HostSummary {
     /// Name of the host.
     pub name: String,
-    /// Number of cells that sent from there.
+    /// Number of cells that sent from this host.
     pub cells: usize,
     /// Number of times that the host was gone or unreachable.
     pub gone: u64,
-    /// Total duration of that in s.
+    /// Total time in s for which the host was gone or unreachable.
     pub gone_s: f64,
     /// True if the host was reachable at the end.
     pub at_end: bool,
@@ -316,7 +320,7 @@ pub struct NetworkSummary {
     pub differences: Vec<String>,
     /// Cells that sent and had no route to a root at the end.
     pub unreachable: Vec<u8>,
-    /// Longest time in s that a cell sent without a route while the loop ran.
+    /// Longest time in s for which a cell sent but had no route to a root, while the loop ran.
     pub longest_unreachable_s: f64,
     /// Number of parent changes, by the cells' own count.
     pub parent_changes: u64,
@@ -327,16 +331,16 @@ pub struct NetworkSummary {
 pub struct SensorsSummary {
     /// Number of frames of both pages.
     pub frames: u64,
-    /// Number of touches in them.
+    /// Number of touches that the frames report.
     pub touches: u64,
-    /// Number of releases in them.
+    /// Number of releases that the frames report.
     pub releases: u64,
-    /// Frames per second of the slowest cell, without frames that a report requested, over cells that sent enough for a
-    /// rate.
+    /// Rate in Hz of the slowest cell. Frames that a report requested are not counted, and cells that sent too few
+    /// frames for a rate are left out.
     pub min_hz: Option<f64>,
-    /// Mean rate over these cells.
+    /// Mean rate of these cells in Hz.
     pub mean_hz: Option<f64>,
-    /// Rate of the fastest cell.
+    /// Rate in Hz of the fastest cell.
     pub max_hz: Option<f64>,
 }
 
@@ -369,21 +373,21 @@ pub struct BusSummary {
     pub sensors: SensorsSummary,
     /// Number of epochs that some cell had to answer.
     pub epochs_due: u64,
-    /// Number of those that all cells answered in time.
+    /// Number of epochs that all cells answered in time.
     pub epochs_complete: u64,
     /// Packets received from other senders, by kind.
     pub received: BTreeMap<&'static str, u64>,
     /// Packets sent by this gateway, as read back from the bus, by kind.
     pub sent: BTreeMap<&'static str, u64>,
-    /// Irregular events by reason, without zeros.
+    /// Number of irregular events by reason, without zeros.
     pub events: BTreeMap<&'static str, u64>,
     /// Number of frames that the bus dropped because they were not read in time.
     pub dropped_by_bus: u64,
-    /// Time from a broadcast to its last reply in time, by the kernel's time stamps.
+    /// Time in µs from a broadcast to its last reply in time, by the kernel's time stamps.
     pub last_reply_us: Quantiles,
-    /// Time from a broadcast to each reply, including late ones.
+    /// Time in µs from a broadcast to each of its replies, including late ones.
     pub reply_us: Quantiles,
-    /// At heartbeats, age of joints on the bus that the cell had not received.
+    /// Age in µs, at each heartbeat, of joints that were on the bus and that the cell had not received.
     pub joints_not_taken_us: Quantiles,
 }
 

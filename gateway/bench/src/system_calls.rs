@@ -1,4 +1,4 @@
-//! Three system calls that have no safe wrapper, without any logic.
+//! Wrappers of three system calls that have no safe wrapper elsewhere. They contain no other logic.
 
 use std::os::unix::process::CommandExt;
 use std::process::Command;
@@ -18,7 +18,7 @@ pub(crate) fn set_timer_slack(nanos: u64) {
     let _ = unsafe { libc::prctl(libc::PR_SET_TIMERSLACK, nanos) };
 }
 
-/// Lets the kernel kill a program when the thread that starts it ends. Programs of this project arrange that
+/// Makes the kernel kill a program when the thread that has started it ends. The programs of this project arrange this
 /// themselves.
 pub(crate) fn end_with_parent(command: &mut Command) {
     let parent = getpid();

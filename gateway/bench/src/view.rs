@@ -12,13 +12,14 @@ use model::table::{CellState, SWITCHES, Responded, Status, Switch};
 pub struct View {
     /// Cells in the order of the bus.
     pub cells: Vec<CellView>,
-    /// True if a cell has not confirmed a switch.
+    /// True if some cell has not confirmed a switch.
     pub lacking: bool,
-    /// True if a cell may hold stimuli that this gateway did not receive.
+    /// True if some cell may hold stimuli that this gateway did not receive.
     pub unclear: bool,
-    /// Number of the gateway's commands that were read back from the bus, or were lost with it.
+    /// Number of the gateway's commands that were read back from the bus, or were lost when the bus failed.
     pub commands: u64,
-    /// Cells of the network, including undescribed ones; empty if cells answer with their own torques.
+    /// Cells of the network, including those that the skin does not describe. Empty if cells answer with their own
+    /// torques.
     pub network: Vec<ObservedCell>,
 }
 
@@ -27,31 +28,31 @@ pub struct View {
 pub struct CellView {
     /// Node id of the cell.
     pub node: CellId,
-    /// True if a heartbeat was received from it.
+    /// True if a heartbeat was received from the cell.
     pub seen: bool,
-    /// True if it has fallen silent.
+    /// True if the cell has sent nothing for so long that it counts as dead.
     pub dead: bool,
-    /// True if it can be expected to answer, unless it is halted.
+    /// True if the cell answers joints, unless it is halted.
     pub ready: bool,
-    /// True if it waits for a resume.
+    /// True if the cell is halted and waits for a resume.
     pub halted: bool,
-    /// True if it owns its node id and has no parameters to compute with.
+    /// True if the cell owns its node id but has no parameters to compute with.
     pub unconfigured: bool,
-    /// True if it measures, so that stimuli do not touch it.
+    /// True if the cell measures, so that stimuli do not touch it.
     pub measures: bool,
-    /// True if its configuration is not the skin's.
+    /// True if the cell's configuration differs from the skin's.
     pub other: bool,
-    /// Epoch of the last joints that it received.
+    /// Epoch of the last joints that the cell received.
     pub last_joints: Epoch,
-    /// Reports that it has sent since it was queried.
+    /// Reports that the cell has sent since the last request for them.
     pub responded: Responded,
-    /// Reply mode by its last report, as the words of the parameter.
+    /// Reply mode of the cell by its last report, as the words of the parameter.
     pub reply: Option<[i16; WORDS]>,
-    /// Ports whose link it holds down, by its last report; one bit each.
+    /// Ports whose links the cell holds down, by its last report; one bit per port.
     pub deaf: u8,
-    /// Switches that it has not confirmed.
+    /// Switches that the cell has not confirmed.
     pub lacks: [Option<Switch>; SWITCHES],
-    /// True if it computes with stimuli that this gateway may not have received.
+    /// True if the cell computes with stimuli that this gateway may not have received.
     pub unclear: bool,
 }
 

@@ -1,5 +1,5 @@
-//! The calibration of a whole skin: estimates each cell by itself, improves positions by neighbours, and marks doubtful
-//! cells.
+//! The calibration of a whole skin: estimates each cell from its own readings, improves positions by the distances of
+//! neighbours, and marks doubtful cells.
 
 use nalgebra::Vector3;
 use protocol::parameters::MAX_JOINTS;
@@ -20,26 +20,26 @@ use model::accelerometer::sensor::{DataSheet, rotation};
 
 pub use crate::settings::Settings;
 
-/// A cell that sends less than this part of the expected readings is reported as silent.
+/// The fraction of the expected readings below which a cell is reported as silent.
 const SILENT: f64 = 0.5;
 /// The minimum number of readings for an estimate.
 const FEWEST: usize = 200;
-/// A cell is loose or damaged if its residuals exceed those of most cells, and the data sheet, by this factor.
+/// The factor by which the residuals of a loose or damaged cell exceed those of most cells and those of the data sheet.
 const ROUGH: f64 = 1.5;
-/// The recording is refused if the residuals of most cells exceed the data sheet by this factor.
+/// The factor by which the residuals of most cells may exceed the data sheet; above it, the recording is refused.
 const SCATTER: f64 = 1.3;
-/// The relative difference above which two rates count as different.
+/// The relative difference above which the recorded broadcast rate does not match that of the skin.
 const OTHER_RATE: f64 = 0.02;
-/// The maximum part of the time that may be shifted.
+/// The maximum difference between the lags of two stretches on a bus, as a fraction of the recording's duration.
 const MUCH_SHIFTED: f64 = 0.005;
-/// The number of rounds in which the shifts of stretches are improved.
+/// The number of rounds of estimates, each of which improves the shifts of stretches.
 const SHIFTS: usize = 5;
-/// The logarithm of the likelihood ratio above which one joint is preferred to the next.
+/// The logarithm of the likelihood ratio above which the best joint is certain, against the next best one.
 const SURE: f64 = 10.0;
-/// Another described place counts as nearer only if its distance is smaller by this factor.
+/// The factor by which a cell must be nearer to the described place of another cell than to its own, to be marked.
 const NEARER: f64 = 2.0;
 
-/// Estimates every cell.
+/// Estimates the pose and the sensor errors of every cell of a skin from a recording.
 ///
 /// # Errors
 /// Returns [`Refusal`] if the recording does not match the skin or its sensors, or is too disturbed; nothing is
@@ -72,16 +72,16 @@ pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Resul
     Ok(Calibration { summary, cells, zero_offsets })
 }
 
-/// The estimates of all cells, each by itself.
+/// The estimates of all cells, each from its own readings only.
 struct Seen {
-    /// The motions of each bus' links.
+    /// The motions of the links, by bus; `None` for a bus without a chain.
     tables: Vec<Option<Table>>,
     lags: Vec<Lags>,
     /// The estimate of each cell.
     estimates: Vec<Option<Estimate>>,
 }
 
-/// Estimates each cell by itself, including the shifts of stretches between gaps.
+/// Estimates each cell from its own readings, and the shifts of stretches between gaps from the cells of a bus.
 fn estimated(skin: &Skin, seen: &Observations, settings: &Settings) -> Result<(Seen, Disturbance), Refusal> {
     checked(skin, seen)?;
     let mut lags: Vec<_> = seen.buses.iter().map(Lags::none).collect();
@@ -130,8 +130,8 @@ fn shifted(
     Refusal::Shifted { bus: name(skin, bus), at_s, ms, disturbance }
 }
 
-/// Checks that shifts between stretches affect only a small part of the time: many large shifts cannot be estimated
-/// accurately.
+/// Checks that the lags of a bus' stretches differ by at most [`MUCH_SHIFTED`] of the duration, because many large
+/// shifts cannot be estimated accurately.
 fn much_shifted(
     skin: &Skin,
     seen: &Observations,
@@ -151,7 +151,7 @@ fn name(skin: &Skin, bus: usize) -> String {
     skin.buses.get(bus).map_or_else(String::new, |bus| bus.name.clone())
 }
 
-/// Checks that the joints of a recording match the skin, also in their rate.
+/// Checks that the number of joints in a recording and their broadcast rate match the skin.
 fn checked(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
     for (bus, observed) in
         seen.buses.iter().enumerate().filter(|(bus, _)| skin.cells_on_bus(*bus).next().is_some())
@@ -170,7 +170,7 @@ fn checked(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// Returns the disturbance of a recording, unless too little of it remains.
+/// Returns the gaps of a recording, or an error if the motion is known for too few of its broadcasts.
 fn disturbed(skin: &Skin, seen: &Observations, tables: &[Option<Table>]) -> Result<Disturbance, Refusal> {
     let mut all = Disturbance::default();
     for (bus, (observed, table)) in seen.buses.iter().zip(tables).enumerate() {
@@ -184,7 +184,7 @@ fn disturbed(skin: &Skin, seen: &Observations, tables: &[Option<Table>]) -> Resu
     Ok(all)
 }
 
-/// Checks that readings scatter as the data sheet says.
+/// Checks that readings do not scatter much more than the data sheet allows.
 fn fitting(
     estimates: &[Option<Estimate>],
     sheet: &DataSheet,
@@ -242,7 +242,7 @@ fn is_stuck(readings: &[Reading]) -> bool {
     readings.all(|reading| Some(reading) == first)
 }
 
-/// Returns the result for a cell by itself.
+/// Returns the result for one cell, from its own readings only.
 fn result(
     skin: &Skin,
     cell: &Cell,
@@ -288,7 +288,7 @@ fn result(
     result
 }
 
-/// Marks cells whose readings scatter much more than those of most cells, and than the data sheet says.
+/// Marks cells whose readings scatter much more than those of most cells and than the data sheet allows.
 fn rough(cells: &mut [CellResult], estimates: &[Option<Estimate>]) {
     let times = |(cell, estimate): (&CellResult, &Option<Estimate>)| {
         cell.pose.as_ref().and(estimate.as_ref()).map(|estimate| estimate.rough_times)
@@ -304,7 +304,7 @@ fn rough(cells: &mut [CellResult], estimates: &[Option<Estimate>]) {
     }
 }
 
-/// Improves positions link by link, and returns the number of wires used.
+/// Improves the positions of the cells by the lengths of wires, link by link, and returns the number of wires used.
 fn with_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settings) -> usize {
     let Some(spacing) = settings.spacing else { return 0 };
     let mut used = 0;
@@ -345,7 +345,7 @@ fn with_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settings) ->
     used
 }
 
-/// Marks cells that were found at the place of another cell.
+/// Marks cells that were found at the described place of another cell.
 fn confused(skin: &Skin, cells: &mut [CellResult]) {
     let found: Vec<_> =
         skin.cells.iter().zip(&*cells).map(|(cell, result)| place_of(skin, cell, result)).collect();
@@ -381,7 +381,7 @@ fn place_of(skin: &Skin, cell: &Cell, result: &CellResult) -> Option<usize> {
     (nearest * NEARER < own && nearest * NEARER < next + 2e-3 && own > certain).then_some(index)
 }
 
-/// Adds advice to the cells whose pose is not determined.
+/// Adds to each cell without a determined pose the motion that would help to determine it.
 fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult], settings: &Settings) {
     let mut known: Vec<((usize, u8), Help)> = Vec::new();
     for ((cell, estimate), result) in skin.cells.iter().zip(estimates).zip(cells) {

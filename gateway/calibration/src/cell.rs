@@ -1,10 +1,11 @@
 //! The model of a cell: its readings as a function of its unknowns.
 //!
 //! With `A = (I + gain + cross) R^T`, a reading is `A (force + gradient p) + bias`, where `force` and `gradient` are
-//! those of the cell's row. This is linear in the 12 numbers of the row's motion. Sums of their products therefore hold
-//! all information of a long recording, and least squares pass over the recording only once.
+//! those of the motion of the cell's row. This is linear in the 12 numbers of that motion. Sums of products of these
+//! numbers therefore hold all information of a long recording, and least squares pass over the recording only once.
 //!
-//! The age of readings enters by three such sets of numbers, at three ages, with a parabola between them.
+//! The age of a reading is the time from its measurement to its broadcast. It enters by three such sets of 12 numbers,
+//! for motions at three ages, with a parabola between them.
 
 #![expect(clippy::indexing_slicing, reason = "matrices of constant size, with indices below it")]
 
@@ -15,18 +16,18 @@ use nalgebra::{Matrix3, SMatrix, SVector, UnitQuaternion, Vector3};
 use model::accelerometer::kinematics::RowMotion;
 use model::accelerometer::sensor::DataSheet;
 
-/// The numbers of a row's motion: its force, and its gradient by columns.
+/// The count of the numbers that describe the motion of a row: the force (3), and the gradient by columns (9).
 pub(crate) const ROW: usize = 12;
-/// The number of ages for which motions are computed.
+/// The number of ages of readings for which motions are computed.
 pub(crate) const AGES: usize = 3;
-/// The interval between two of these ages, in s.
+/// The interval between two of the [`AGES`], in s.
 pub(crate) const AGE_STEP: f64 = 0.006;
-/// The numbers of a moment: motions at all ages, and 1.
+/// The count of the numbers of a [`Moment`].
 pub(crate) const MOMENT: usize = AGES * ROW + 1;
 /// The number of unknowns of a cell.
 pub(crate) const UNKNOWNS: usize = 19;
 
-/// The unknowns of the turn from the present orientation: a rotation vector in the frame of the cell.
+/// The unknowns of the orientation: a rotation vector, in the frame of the cell, from the present estimate.
 pub(crate) const TURN: Range<usize> = 0..3;
 /// The unknowns of the position in the frame of the row.
 pub(crate) const POSITION: Range<usize> = 3..6;
@@ -39,14 +40,14 @@ pub(crate) const AGE: usize = 18;
 /// Row and column of each element of [`CROSS`].
 const OFF_DIAGONAL: [(usize, usize); 6] = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)];
 
-/// The numbers of one moment.
+/// The input of the linear model at one moment: the motion of a row at all ages, and 1.
 pub(crate) type Moment = [f64; MOMENT];
-/// The coefficients of each axis for these numbers.
+/// The coefficients by which each axis of a sensor depends on the numbers of a [`Moment`].
 pub(crate) type Coefficients = SMatrix<f64, MOMENT, 3>;
 pub(crate) type Unknowns = SVector<f64, UNKNOWNS>;
 pub(crate) type Information = SMatrix<f64, UNKNOWNS, UNKNOWNS>;
 
-/// The assumed state of a cell.
+/// The pose, the sensor errors and the age of readings that are assumed for a cell.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct CellModel {
     pub(crate) rotation: UnitQuaternion<f64>,
@@ -54,7 +55,7 @@ pub(crate) struct CellModel {
     pub(crate) bias: Vector3<f64>,
     /// `I + gain + cross`.
     pub(crate) matrix: Matrix3<f64>,
-    /// The age of its readings minus the middle one of the ages, in s.
+    /// The age of the cell's readings minus the middle one of the ages, in s.
     pub(crate) age: f64,
 }
 
@@ -64,7 +65,7 @@ impl CellModel {
         Self { rotation, position, bias: Vector3::zeros(), matrix: Matrix3::identity(), age: 0.0 }
     }
 
-    /// Returns the coefficients of each axis for the numbers of a moment.
+    /// Returns the coefficients by which each axis depends on the numbers of a moment.
     pub(crate) fn coefficients(&self) -> Coefficients {
         let rotation = self.rotation.to_rotation_matrix().matrix().to_owned();
         let mut all =
@@ -73,7 +74,7 @@ impl CellModel {
         all
     }
 
-    /// Returns the derivatives of the coefficients by each unknown.
+    /// Returns the derivatives of the coefficients with respect to each unknown.
     pub(crate) fn derivatives(&self) -> [Coefficients; UNKNOWNS] {
         let turned = self.rotation.to_rotation_matrix().matrix().transpose();
         let axes = self.matrix * turned;
@@ -102,7 +103,7 @@ impl CellModel {
         })
     }
 
-    /// Returns the model after a step of the unknowns.
+    /// Returns the model with this step added to its unknowns.
     pub(crate) fn moved(&self, step: &Unknowns) -> Self {
         let part = |range: &Range<usize>| Vector3::from_fn(|at, _| step[range.start + at]);
         let mut matrix = self.matrix;
@@ -135,8 +136,8 @@ impl CellModel {
     }
 }
 
-/// Returns the prior of the unknowns by the data sheet, as inverse variances. For the pose it is very weak: it keeps
-/// the information regular in directions that no motion reveals.
+/// Returns the prior of the unknowns by the data sheet, as inverse variances. The prior of the pose is very weak: it
+/// only keeps the information matrix regular in directions that no motion reveals.
 pub(crate) fn expected(sheet: &DataSheet) -> Unknowns {
     // The standard deviation of a uniform distribution with this limit; never 0.
     let even = |limit: f64| (limit / 3.0_f64.sqrt()).max(1e-6);
@@ -163,13 +164,13 @@ pub(crate) const WEAK_TURN: f64 = 1.0;
 /// The prior standard deviation of the position, in m.
 pub(crate) const WEAK_POSITION: f64 = 0.5;
 
-/// Returns the numbers of a row's motion.
+/// Returns the 12 numbers of a row's motion: its force, and its gradient by columns.
 pub(crate) fn numbers(motion: &RowMotion) -> [f64; ROW] {
     let mut all = motion.force.iter().chain(motion.gradient.iter());
     core::array::from_fn(|_| all.next().copied().unwrap_or_default())
 }
 
-/// Returns the coefficients of the axes for a row's motion, at a position.
+/// Returns the coefficients by which the axes depend on a row's motion, for a sensor at a position on the row.
 fn row(axes: &Matrix3<f64>, position: &Vector3<f64>) -> SMatrix<f64, ROW, 3> {
     SMatrix::from_fn(|number, axis| {
         let (block, part) = (number / 3, number % 3);
@@ -202,13 +203,13 @@ fn within(range: &Range<usize>, unknown: usize) -> Option<usize> {
     range.contains(&unknown).then(|| unknown - range.start)
 }
 
-/// Returns the weights of the motions at the three ages.
+/// Returns the weights of the motions at the three ages that interpolate a motion at `age`.
 fn parabola(age: f64) -> [f64; AGES] {
     let x = age / AGE_STEP;
     [x * (x - 1.0) / 2.0, 1.0 - x * x, x * (x + 1.0) / 2.0]
 }
 
-/// Returns the derivatives of the weights by the age.
+/// Returns the derivatives of the weights of [`parabola`] with respect to the age, in 1/s.
 fn slope(age: f64) -> [f64; AGES] {
     let x = age / AGE_STEP;
     [(x - 0.5) / AGE_STEP, -2.0 * x / AGE_STEP, (x + 0.5) / AGE_STEP]

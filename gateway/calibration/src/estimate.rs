@@ -11,27 +11,27 @@ use crate::sums::{Fit, Free, Sums, at_middle_age};
 use crate::table::Table;
 use model::accelerometer::sensor::DataSheet;
 
-/// The number of readings in the first search for the joint.
+/// The number of readings that are used in the first search for the joint.
 const FIRST_LOOK: usize = 1_500;
-/// The number of joints that are then fitted completely.
+/// The number of joints that are fitted completely after the first search.
 const SHORTLIST: usize = 3;
-/// The number of times that the weights are recomputed.
+/// The number of times that the weights of readings are recomputed.
 const ROUNDS: usize = 2;
 /// Residuals beyond this many standard deviations get a lower weight; see [`weight`].
 const TOLERATED: f64 = 3.5;
-/// The number of broadcasts that are summed before their correlation is computed.
+/// The number of broadcasts in a batch, over which scores are summed before their correlation is computed.
 const BATCH: u32 = 4;
-/// The maximum distance of correlated batches, about 16 s.
+/// The maximum distance of batches whose correlation is included, about 16 s.
 const BATCHES: u32 = 256;
-/// The number of clock rates over which the correlation of ages is averaged.
+/// The number of assumed sensor clock rates over which the correlation of ages is averaged.
 const CLOCKS: u32 = 101;
 /// The minimum number of readings for an estimate.
 const FEWEST: f64 = 100.0;
 /// The median of the squared length of three standard normal numbers.
 const MEDIAN_SQUARE: f64 = 2.366;
-/// The 90 % quantile of the same.
+/// The 90 % quantile of the squared length of three standard normal numbers.
 const MOST_SQUARE: f64 = 6.251;
-/// The error of readings from rounding and smoothing of joints, in g.
+/// The error of predicted readings from the rounding and smoothing of joint positions, in g.
 const SMOOTHED_G: f64 = 1e-3;
 /// The standard deviation of a position along each axis from smoothed accelerations, in m.
 const SMOOTHED_M: f64 = 1e-4;
@@ -39,21 +39,21 @@ const SMOOTHED_M: f64 = 1e-4;
 /// The estimate of a cell from its readings.
 #[derive(Clone, Debug)]
 pub(crate) struct Estimate {
-    /// The joint that moves it, 0 for none.
+    /// The joint that moves the cell, or 0 for none.
     pub(crate) joint: u8,
-    /// The logarithm of the likelihood ratio to the next best joint.
+    /// The logarithm of the likelihood ratio between this joint and the next best one.
     pub(crate) margin: f64,
     pub(crate) model: CellModel,
-    /// The covariance of the unknowns.
+    /// The covariance of the unknowns of the cell's model, in the order of [`Unknowns`].
     pub(crate) covariance: Information,
     /// The root mean square of an axis' residuals, in g, derived from their median.
     pub(crate) noise_g: f64,
-    /// The same, derived from the 90 % quantile.
+    /// The root mean square of an axis' residuals, in g, derived from their 90 % quantile.
     pub(crate) rough_g: f64,
-    /// `noise_g` relative to the data sheet's value for each reading, which depends on the noise and on the reading's
-    /// rate of change.
+    /// `noise_g` as a multiple of the value that the data sheet predicts from the noise and from the readings' rate of
+    /// change.
     pub(crate) noise_times: f64,
-    /// `rough_g` in the same units.
+    /// `rough_g` as a multiple of the value that the data sheet predicts.
     pub(crate) rough_times: f64,
 }
 
@@ -65,7 +65,7 @@ impl Estimate {
         own + Matrix3::identity() * (SMOOTHED_M * SMOOTHED_M)
     }
 
-    /// Returns the covariance of the turn in the frame of the cell, in rad².
+    /// Returns the covariance of the orientation, as a rotation vector in the frame of the cell, in rad².
     pub(crate) fn turn_covariance(&self) -> Matrix3<f64> {
         self.covariance.fixed_view::<3, 3>(TURN.start, TURN.start).into_owned()
     }
@@ -122,7 +122,7 @@ pub(crate) fn estimate(
     Some(Estimate { joint, margin, model, covariance, noise_g, rough_g, noise_times, rough_times })
 }
 
-/// Finds the joint whose motion explains the readings best.
+/// Finds the joint whose motion explains the readings best, with its margin over the next best one and a fitted model.
 fn identify(
     table: &Table,
     readings: &[Reading],
@@ -169,7 +169,7 @@ fn identify(
     Some((joint, (next - best.cost) / 2.0, best.model))
 }
 
-/// Returns a model from the unconstrained fit.
+/// Returns the model that is nearest to an unconstrained fit.
 fn first(free: &Free) -> Option<CellModel> {
     let axes = Matrix3::from_fn(|axis, part| free[(part, axis)]);
     let parts = axes.svd(true, true);
@@ -194,7 +194,7 @@ fn first(free: &Free) -> Option<CellModel> {
     Some(CellModel::at(UnitQuaternion::from_rotation_matrix(&rotation), position))
 }
 
-/// Returns the readings for whose time the motion is known.
+/// Returns the readings at whose time the motion is known, each with that motion.
 pub(crate) fn paired<'a>(
     link: &'a [Option<Moment>],
     readings: &'a [Reading],
@@ -205,7 +205,7 @@ pub(crate) fn paired<'a>(
     })
 }
 
-/// Returns the difference between a reading and the model at its moment.
+/// Returns the difference between a reading and the reading that the coefficients predict, by axis in g.
 pub(crate) fn residual(coefficients: &Coefficients, moment: &Moment, shown: &[f64; 3]) -> [f64; 3] {
     let mut left = *shown;
     for (left, column) in left.iter_mut().zip(coefficients.column_iter()) {
@@ -218,15 +218,15 @@ fn square(of: &[f64; 3]) -> f64 {
     of.iter().map(|part| part * part).sum()
 }
 
-/// Returns the weight of a reading; readings beyond the noise get a lower one (Huber).
+/// Returns the weight of a reading by Huber: 1, or less if its residual exceeds [`TOLERATED`] standard deviations.
 pub(crate) fn weight(residual: &[f64; 3], variance: f64) -> f64 {
     let off = (square(residual) / variance).sqrt();
     if off <= TOLERATED { 1.0 } else { TOLERATED / off }
 }
 
-/// Returns the variance of the axes' residuals, once from the median of their squares and once from the 90 % quantile:
-/// single readings that were late or corrupted affect neither. With a data sheet, each residual is in units of its
-/// expected value.
+/// Returns the variance of the axes' residuals, once from the median of their squares and once from the 90 % quantile.
+/// Single readings that were late or corrupted affect neither. With a data sheet, each residual is in units of the
+/// value that the sheet predicts.
 fn spreads(
     link: &[Option<Moment>],
     readings: &[Reading],
@@ -312,7 +312,7 @@ fn covariance(
     Some(inverse * scatter * inverse)
 }
 
-/// Returns the change of each axis' reading with its age, in g/s.
+/// Returns the derivative of each axis' reading with respect to its age, in g/s.
 pub(crate) fn change(by_age: &Coefficients, moment: &Moment) -> [f64; 3] {
     let mut all = [0.0; 3];
     for (change, column) in all.iter_mut().zip(by_age.column_iter()) {
@@ -321,8 +321,8 @@ pub(crate) fn change(by_age: &Coefficients, moment: &Moment) -> [f64; 3] {
     all
 }
 
-/// The covariance of the ages of readings. Samples come at the rate of a clock with an unknown error, so that the age
-/// of the newest one runs through a period again and again.
+/// The covariance of the ages of readings. A sensor samples at the rate of a clock with an unknown error, so that the
+/// age of its newest sample runs through the sample period again and again.
 #[derive(Clone, Debug)]
 pub(crate) struct Ages {
     /// The covariance by distance in batches, in s².

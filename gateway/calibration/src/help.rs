@@ -36,10 +36,10 @@ impl core::fmt::Display for Help {
     }
 }
 
-/// A motion counts as a help if it reduces the uncertainty to this part.
+/// The fraction of the uncertainty that may remain after a motion that counts as a help.
 const HELP: f64 = 0.7;
 
-/// Finds the motion that would add most information on a cell.
+/// Finds the motion that would reduce the uncertainty of a cell's pose most.
 pub(crate) fn helpful(skin: &Skin, bus: usize, estimate: &Estimate, settings: &Settings) -> Help {
     let swings = Swings::new(skin, &settings.bounds);
     let arms = [(bus, Arm::new(skin, bus, settings.gravity))];
@@ -77,7 +77,7 @@ pub(crate) fn helpful(skin: &Skin, bus: usize, estimate: &Estimate, settings: &S
     best.1
 }
 
-/// Returns the uncertainty of a pose in its worst direction: a standard deviation, relative to the aim.
+/// Returns the standard deviation of a pose in its least certain direction, relative to [`AIM`](crate::plan::AIM).
 fn uncertain(information: &Information) -> f64 {
     let Some(covariance) = Cholesky::new(*information).map(|it| it.inverse()) else { return f64::INFINITY };
     let part = |start: usize, aim: f64| {

@@ -1,9 +1,10 @@
 //! Lags: the times of readings relative to those of their joints, for each stretch of a recording.
 //!
-//! Readings may be shifted after a broadcast that was not in time, because the sensors of simulated cells follow a plan
-//! while the loop counts broadcasts. All cells of a bus are shifted alike. The shift of each stretch between gaps is
-//! therefore well determined by all of them, and does not affect the individual age of a sensor. Long stretches are
-//! divided, because slightly late broadcasts and differing clocks shift readings without a gap.
+//! Readings may be shifted after a broadcast that was not in time, because the sensors of simulated cells follow the
+//! planned motion in time while the loop counts broadcasts. All cells of a bus are shifted alike. The shift of each
+//! stretch between gaps is therefore well determined by all of them, and does not affect the individual age of a
+//! sensor. Long stretches are divided, because slightly late broadcasts and differing clocks shift readings without a
+//! gap.
 
 use crate::observe::BusObservations;
 
@@ -21,7 +22,7 @@ pub(crate) struct Lags {
 }
 
 impl Lags {
-    /// Returns lags of zero.
+    /// Returns lags of zero for all stretches of a bus.
     pub(crate) fn none(bus: &BusObservations) -> Self {
         let mut starts = Vec::new();
         let mut begin = 0;
@@ -36,12 +37,12 @@ impl Lags {
         Self { by_stretch: none.clone(), deviations: none, starts }
     }
 
-    /// Returns the stretch of a broadcast.
+    /// Returns the index of the stretch that contains a broadcast.
     pub(crate) fn stretch(&self, index: usize) -> usize {
         self.starts.partition_point(|start| *start <= index)
     }
 
-    /// Returns the lag of a broadcast, in s.
+    /// Returns the lag of the stretch that contains a broadcast, in s.
     pub(crate) fn at(&self, index: usize) -> f64 {
         self.by_stretch.get(self.stretch(index)).copied().unwrap_or_default()
     }

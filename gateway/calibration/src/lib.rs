@@ -8,11 +8,11 @@
 //! |---|---|
 //! | [`plan`], [`motion`] | the choice of a motion, and the positions of the joints during it |
 //! | [`simulate`] | a skin of accelerometers in virtual time |
-//! | [`observe`] | the data that is kept of the messages of a bus |
+//! | [`observe`] | joint positions and readings, collected from the messages of a bus |
 //! | [`mod@calibrate`] | the estimate of every cell, and the marks on doubtful ones |
 //! | [`refusal`] | the reasons to refuse a recording |
 //! | [`zero`] | zero offsets of the robot's joints |
-//! | [`help`] | the motion that would determine a missing pose |
+//! | [`help`] | the motion that would determine a pose that the recorded motion did not |
 //! | [`neighbors`] | positions improved by the distance of neighbours |
 //! | [`result`], [`mod@write`] | the results, and a skin file with them |
 

@@ -5,7 +5,7 @@ use core::f64::consts::TAU;
 use model::accelerometer::RobotState;
 use serde::Serialize;
 
-/// The time in which a swing reaches its amplitude, and in which it ends, in s.
+/// The time in which a swing grows to its amplitude, and in which it dies down at its end, in s.
 const RAMP_S: f64 = 0.6;
 
 /// A step of a motion.
@@ -14,28 +14,28 @@ const RAMP_S: f64 = 0.6;
 pub enum Step {
     /// The robot stands still.
     Hold {
-        /// The pose.
+        /// The pose: the position of each joint, in rad or m.
         at: Vec<f64>,
     },
     /// The robot moves from one pose to another; speed, acceleration and jerk are zero at both ends.
     Move {
-        /// The first pose.
+        /// The pose at the start, in rad or m.
         from: Vec<f64>,
-        /// The last pose.
+        /// The pose at the end, in rad or m.
         to: Vec<f64>,
     },
     /// Joints swing about a pose.
     Swing {
-        /// The pose.
+        /// The pose in the middle of the swing, in rad or m.
         about: Vec<f64>,
-        /// The amplitude of each joint; 0 for joints that stand still.
+        /// The amplitude of each joint, in rad or m; 0 for joints that stand still.
         amplitude: Vec<f64>,
-        /// The frequency of each joint.
+        /// The frequency of each joint, in Hz.
         rate_hz: Vec<f64>,
     },
 }
 
-/// A step with its time.
+/// A step of a motion with its start time and its duration.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Timed {
     /// The start time in s.
@@ -55,7 +55,7 @@ pub struct Motion {
 }
 
 impl Motion {
-    /// Appends a step.
+    /// Appends a step that lasts `for_s` seconds.
     pub fn then(&mut self, for_s: f64, step: Step) {
         self.steps.push(Timed { at_s: self.length_s(), for_s, step });
     }
@@ -101,8 +101,8 @@ impl Motion {
     }
 }
 
-/// Rises from 0 to 1 within a time, with speed, acceleration and jerk zero at both ends; returns the value and two
-/// derivatives.
+/// Returns a curve that rises from 0 to 1 within `length`, with speed, acceleration and jerk zero at both ends: its
+/// value and its first two derivatives at `time`.
 fn rise(time: f64, length: f64) -> [f64; 3] {
     if length <= 0.0 {
         return [1.0, 0.0, 0.0];
@@ -116,10 +116,11 @@ fn rise(time: f64, length: f64) -> [f64; 3] {
     ]
 }
 
-/// The maximum speed and acceleration of a move of length 1 in 1 s.
+/// The maximum speed and acceleration of [`rise`] for a length of 1 s.
 pub(crate) const RISE_PEAKS: [f64; 2] = [2.187_5, 7.513_2];
 
-/// Rises from 0 to 1 and falls again; returns the value and two derivatives.
+/// Returns a curve that rises from 0 to 1 and falls to 0 within `length`: its value and its first two derivatives at
+/// `time`.
 fn envelope(time: f64, length: f64) -> [f64; 3] {
     let ramp = RAMP_S.min(length / 2.0);
     if time < length / 2.0 {
@@ -130,7 +131,7 @@ fn envelope(time: f64, length: f64) -> [f64; 3] {
     }
 }
 
-/// Returns a sine within an envelope: the value and two derivatives.
+/// Returns a sine that is multiplied by an envelope: its value and its first two derivatives at `time`.
 fn swing([value, first, second]: [f64; 3], rate: f64, time: f64) -> [f64; 3] {
     let (sin, cos) = (rate * time).sin_cos();
     [

@@ -1,13 +1,14 @@
-//! Positions improved by their neighbours: wired cells have a known distance, on a smooth surface.
+//! Improves the positions of cells by their neighbours: cells that are wired to each other have a known distance, and
+//! lie on a smooth surface.
 
 use nalgebra::{Cholesky, DMatrix, DVector, Matrix3, Vector3};
 
-/// The distance of wired cells.
+/// The distance of two cells that are wired to each other.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spacing {
-    /// The distance of their centres, in m.
+    /// The distance of the cells' centres, in m.
     pub distance: f64,
-    /// Its standard deviation, in m.
+    /// The standard deviation of the distance, in m.
     pub deviation: f64,
 }
 
@@ -19,7 +20,7 @@ impl Spacing {
     }
 }
 
-/// The estimated place of a cell.
+/// The estimated place of a cell, with its uncertainty.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Known {
     pub(crate) position: Vector3<f64>,
@@ -27,7 +28,8 @@ pub(crate) struct Known {
     pub(crate) covariance: Matrix3<f64>,
 }
 
-/// Wires whose length is off by more standard deviations than this are ignored: cables, and mistaken cells.
+/// The number of standard deviations by which the length of a wire may be off; longer ones are ignored, as they are
+/// cables or lead to mistaken cells.
 const OFF: f64 = 4.0;
 /// The number of times that the positions are recomputed.
 const ROUNDS: usize = 3;

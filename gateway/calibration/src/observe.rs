@@ -13,13 +13,13 @@ use protocol::parameters::{MAX_JOINTS, RowKind};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-/// Readings at this value are saturated.
+/// The word from which on a reading counts as saturated.
 const FULL: i16 = i16::MAX - 8;
-/// The allowed jitter of a broadcast's receive time, in periods.
+/// The allowed jitter of the receive time of a broadcast, in periods.
 const JITTER: f64 = 0.25;
-/// The number of broadcasts over which the period is measured.
+/// The number of consecutive broadcasts over which the period is measured.
 const SPAN: usize = 8;
-/// The maximum number of broadcasts between a reading's own broadcast and its arrival.
+/// The maximum number of later broadcasts before a reading arrives.
 const LATEST: u32 = 100;
 
 /// The observations on all buses of a skin.
@@ -31,7 +31,7 @@ pub struct Observations {
     pub cells: Vec<Vec<Reading>>,
 }
 
-/// The joints on one bus.
+/// The broadcasts of joints on one bus.
 #[derive(Clone, Debug)]
 pub struct BusObservations {
     /// The positions at each broadcast in rad or m; `None` for a missing broadcast and at irregular times.
@@ -54,23 +54,23 @@ pub struct BusObservations {
     last: Option<(Epoch, Micros)>,
 }
 
-/// A gap: a broadcast did not come in time.
+/// A gap in the broadcasts of a bus, after which the next one did not come in time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gap {
-    /// The time of the broadcast before it, in s since the first one.
+    /// The time of the broadcast before the gap, in s since the first broadcast.
     pub at_s: f64,
-    /// The time to the next one, in ms.
+    /// The time from that broadcast to the next one, in ms.
     pub took_ms: f64,
-    /// The entry without positions, as an index into [`BusObservations::joints`].
+    /// The entry without positions that stands for the gap, as an index into [`BusObservations::joints`].
     pub(crate) place: usize,
 }
 
 /// A reading of a cell.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reading {
-    /// The broadcast, as an index into [`BusObservations::joints`].
+    /// The broadcast that the reading answers, as an index into [`BusObservations::joints`].
     pub epoch: u32,
-    /// Its axes, in g.
+    /// The reading of each axis, in g.
     pub g: [f64; 3],
 }
 

@@ -22,19 +22,19 @@ use model::accelerometer::sensor::DataSheet;
 /// The limits of a plan.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Bounds {
-    /// The pose about which the robot moves, by joint; the motion begins and ends there.
+    /// The pose about which the robot moves, by joint in rad or m; the motion begins and ends at this pose.
     pub center: Vec<f64>,
-    /// The maximum distance of each joint from there, in rad or m.
+    /// The maximum distance of each joint from the center, in rad or m.
     pub within: f64,
     /// The maximum duration in s.
     pub length_s: f64,
-    /// The part of the joints' maximum speeds that is used.
+    /// The maximum speed, as a fraction of the joints' maximum speeds.
     pub speed: f64,
     /// The maximum acceleration of a joint, in rad/s² or m/s².
     pub acceleration: f64,
-    /// The maximum acceleration at any point of the robot by one swinging joint, in g.
+    /// The maximum acceleration that one swinging joint may cause at any point of the robot, in g.
     pub force_g: f64,
-    /// The seed for drawing poses.
+    /// The seed of the random poses.
     pub seed: u64,
 }
 
@@ -54,22 +54,22 @@ pub enum PlanError {
     Limits {
         /// The joint.
         name: String,
-        /// Its position.
+        /// The position of the joint.
         got: f64,
-        /// Its lower limit.
+        /// The lower limit of the joint.
         min: f64,
-        /// Its upper limit.
+        /// The upper limit of the joint.
         max: f64,
     },
     /// The duration is too short or too long.
-    #[error("a motion of {got} s: 20 to 3600 s are allowed")]
+    #[error("a motion of {got} s is too short or too long: choose 20 to 3600 s")]
     Length {
         /// The duration in s.
         got: f64,
     },
 }
 
-/// The number of poses to choose from.
+/// The number of candidate poses.
 const POSES: usize = 24;
 /// The time that the robot stands at a pose, in s.
 const HOLD_S: f64 = 0.6;
@@ -81,9 +81,9 @@ const MOVE_S: f64 = 1.6;
 const RATE_HZ: f64 = 1.1;
 /// The frequencies of joints that swing together; they differ, so that the joints can be separated.
 const RATES_HZ: [f64; 7] = [0.8, 1.3, 1.0, 1.5, 0.9, 1.2, 1.4];
-/// The interval of the moments that are evaluated, in s.
+/// The interval between the moments at which a candidate's information is computed, in s.
 const LOOK_S: f64 = 1.0 / 15.0;
-/// The aim of an estimate: the standard deviation of the position in m, and of the orientation in rad.
+/// The standard deviations at which an estimate counts as good: of the position in m, and of the orientation in rad.
 pub(crate) const AIM: [f64; 2] = [0.5e-3, 0.2 * TAU / 360.0];
 
 impl Bounds {
@@ -130,18 +130,18 @@ struct Candidate {
     pose: usize,
     step: Step,
     seconds: f64,
-    /// The information on each probe cell.
+    /// The information that the step adds on each assumed cell.
     information: Vec<Information>,
 }
 
-/// A cell that is assumed at some place of a link.
+/// A cell that the planner assumes at some place of a link, to rate candidates by it.
 pub(crate) struct Supposed {
     pub(crate) bus: usize,
     pub(crate) row: usize,
     pub(crate) model: CellModel,
 }
 
-/// Plans the motion with the most information within its bounds.
+/// Plans the motion that adds most information on the places of cells within the bounds.
 ///
 /// # Errors
 /// Returns [`PlanError`] if the bounds do not fit the robot.
@@ -164,7 +164,7 @@ pub fn plan(skin: &Skin, bounds: &Bounds, sheet: &DataSheet, gravity: [f64; 3]) 
     Ok(ordered(skin, bounds, &poses, &candidates, &chosen))
 }
 
-/// The swing amplitude of each joint.
+/// The amplitudes with which joints may swing.
 pub(crate) struct Swings {
     amplitudes: Vec<f64>,
 }
@@ -184,7 +184,7 @@ impl Swings {
         Self { amplitudes: amplitudes.collect() }
     }
 
-    /// Returns swings of each joint alone, and of all together.
+    /// Returns swings about a pose: of each joint alone, and of all joints together.
     pub(crate) fn about<'a>(&'a self, pose: &'a [f64]) -> impl Iterator<Item = Step> + 'a {
         let joints = self.amplitudes.len();
         let swing =
@@ -200,7 +200,8 @@ impl Swings {
     }
 }
 
-/// Returns the maximum distance of a point of the robot from a joint's axis, in m.
+/// Returns the total length of the links behind a joint, in m and at least 0.1: no point of the robot is farther from
+/// the joint's axis.
 fn reach(skin: &Skin, joint: usize) -> f64 {
     let of_chain = |chain: &protocol::skin::Chain| {
         let at = chain.joints.iter().position(|&it| it == joint)?;
@@ -211,7 +212,7 @@ fn reach(skin: &Skin, joint: usize) -> f64 {
     skin.robot.chains.iter().filter_map(of_chain).fold(0.1, f64::max)
 }
 
-/// Returns poses within the limits from which every swing stays within them too; the first one is the center.
+/// Returns the center and random poses, all of which leave room for every swing within the limits.
 pub(crate) fn poses(skin: &Skin, bounds: &Bounds, swings: &Swings) -> Vec<Vec<f64>> {
     let mut dice = Pcg64Mcg::seed_from_u64(bounds.seed);
     let ranges = skin.robot.joints.iter().zip(&bounds.center).zip(&swings.amplitudes);
@@ -232,7 +233,7 @@ pub(crate) fn poses(skin: &Skin, bounds: &Bounds, swings: &Swings) -> Vec<Vec<f6
     poses
 }
 
-/// Returns cells on each link: near its joint, in its middle, and at its end.
+/// Returns assumed cells on each link: near its joint, in its middle, and at its end.
 fn supposed(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<Supposed> {
     let mut all = Vec::new();
     for &(bus, _) in arms {
@@ -251,7 +252,7 @@ fn supposed(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<Supposed> {
     all
 }
 
-/// Returns the information of a step on each probe cell.
+/// Returns the information that a step adds on each assumed cell.
 pub(crate) fn informed(
     skin: &Skin,
     arms: &[(usize, Arm)],
@@ -328,7 +329,7 @@ fn choose(candidates: &[Candidate], supposed: &[Supposed], bounds: &Bounds, shee
     }
 }
 
-/// Returns the remaining uncertainty: 0 for a cell that is known exactly.
+/// Returns a measure of the uncertainty that remains with this information: 0 for a cell that is known exactly.
 fn score(information: &Information) -> f64 {
     let Some(covariance) = Cholesky::new(*information).map(|it| it.inverse()) else { return 1e3 };
     let part = |start: usize, aim: f64| {
@@ -338,7 +339,7 @@ fn score(information: &Information) -> f64 {
     part(POSITION.start, AIM[0]) + part(TURN.start, AIM[1])
 }
 
-/// Returns the chosen steps, pose by pose, each pose being the nearest to the previous one.
+/// Returns the motion of the chosen steps, pose by pose; each next pose is the nearest one to the previous pose.
 fn ordered(
     skin: &Skin,
     bounds: &Bounds,

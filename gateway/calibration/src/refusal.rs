@@ -1,4 +1,4 @@
-//! The reasons to refuse a recording.
+//! The reasons for which a calibration refuses a recording.
 
 use serde::Serialize;
 use thiserror::Error;
@@ -23,7 +23,7 @@ pub struct Disturbance {
 }
 
 impl Disturbance {
-    /// Returns the disturbance of a bus, from the number of broadcasts whose motion is known.
+    /// Returns the gaps of one bus; `known` is the number of broadcasts whose motion is known.
     pub(crate) fn of(bus: &BusObservations, known: usize) -> Self {
         let broadcasts = bus.joints.iter().flatten().count();
         let longest = bus.gaps.iter().max_by(|one, other| one.took_ms.total_cmp(&other.took_ms));
@@ -36,7 +36,7 @@ impl Disturbance {
         }
     }
 
-    /// Adds the disturbance of another bus.
+    /// Returns the sum of the gaps of this bus and of another one.
     pub(crate) fn and(self, other: Self) -> Self {
         let is_longer = other.longest_ms > self.longest_ms;
         let (longest_ms, longest_at_s) = if is_longer {
@@ -73,7 +73,7 @@ impl core::fmt::Display for Disturbance {
     }
 }
 
-/// The reason to refuse a recording.
+/// The reason for which a calibration refuses a recording.
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum Refusal {
     /// The joints on a bus are those of another robot.
@@ -95,9 +95,9 @@ pub enum Refusal {
     Rate {
         /// The bus.
         bus: String,
-        /// The rate in the recording.
+        /// The rate in the recording, in Hz.
         got: f64,
-        /// The rate of the skin.
+        /// The rate that the skin specifies, in Hz.
         hz: f64,
     },
     /// The motion is known for too few broadcasts.
@@ -107,20 +107,20 @@ pub enum Refusal {
     Disturbed {
         /// The bus.
         bus: String,
-        /// Its gaps.
+        /// The gaps in the broadcasts on the bus.
         disturbance: Disturbance,
     },
-    /// The readings do not fit such sensors on such a robot.
+    /// The readings scatter more than the data sheet allows for sensors on this robot.
     #[error(
         "readings scatter {times} times as much as the data sheet says ({noise_mg} mg; its noise is {sheet_mg} mg), so no pose can \
          be trusted; {disturbance}; record again with a loop that skips no ticks, or give the sensors' own --data-sheet"
     )]
     Scatter {
-        /// The ratio.
+        /// The ratio of the scatter to the value that the data sheet predicts.
         times: f64,
-        /// The scatter of readings.
+        /// The scatter of readings, in mg.
         noise_mg: f64,
-        /// The noise in the data sheet.
+        /// The noise in the data sheet, in mg.
         sheet_mg: f64,
         /// The gaps of the recording.
         disturbance: Disturbance,
@@ -135,7 +135,7 @@ pub enum Refusal {
         bus: String,
         /// The start of the shift, in s since the first broadcast.
         at_s: f64,
-        /// The shift.
+        /// The shift of readings against their joints, in ms.
         ms: f64,
         /// The gaps of the recording.
         disturbance: Disturbance,

@@ -1,4 +1,4 @@
-//! The results of a calibration, as they are printed and written.
+//! The results of a calibration, in the form in which they are printed and written to files.
 
 use nalgebra::{Matrix3, SymmetricEigen, UnitQuaternion, Vector3};
 use protocol::skin::{Cell, Skin};
@@ -10,10 +10,10 @@ use crate::rounded::rounded;
 use crate::zero::ZeroOffset;
 use model::accelerometer::kinematics::Arm;
 
-/// Poses that are less certain than this are not determined: in m, and in rad.
+/// The limits of the 95 % uncertainty of a determined pose: of the position in m, and of the orientation in rad.
 const ENOUGH: [f64; 2] = [0.02, 0.09];
 
-/// The results of a calibration.
+/// The results of the calibration of a skin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Calibration {
     /// The results for all cells together.
@@ -32,11 +32,11 @@ pub struct Summary {
     pub cells: usize,
     /// The number of cells with a pose that can be used.
     pub determined: usize,
-    /// The number of cells with a diagnosis.
+    /// The number of cells with a problem.
     pub troubled: usize,
     /// The median of the 95 % radius of positions, in mm; `None` without a pose that can be used.
     pub position_mm: Option<f64>,
-    /// The same for orientations, in degrees.
+    /// The median of the 95 % angle of orientations, in degrees; `None` without a pose that can be used.
     pub orientation_deg: Option<f64>,
     /// The median of the scatter of readings, in mg.
     pub noise_mg: Option<f64>,
@@ -49,23 +49,23 @@ pub struct Summary {
 /// The result for one cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CellResult {
-    /// The name of its bus.
+    /// The name of the cell's bus.
     pub bus: String,
-    /// Its node id.
+    /// The cell's node id.
     pub node: u8,
-    /// Its serial number.
+    /// The cell's serial number.
     pub serial: u32,
-    /// The number of its readings.
+    /// The number of readings of the cell.
     pub readings: usize,
     /// The problems with the cell; empty for most cells.
     pub troubles: Vec<Trouble>,
-    /// Its place, as it is written to a skin file.
+    /// The place of the cell, as it is written to a skin file.
     #[serde(flatten)]
     pub found: Option<Found>,
-    /// Its accelerometer.
+    /// The errors of the cell's accelerometer.
     #[serde(flatten)]
     pub sensor: SensorResult,
-    /// Its pose in the frame of the joint's row.
+    /// The pose of the cell in the frame of the joint's row.
     #[serde(skip)]
     pub pose: Option<Pose>,
 }
@@ -79,28 +79,28 @@ pub struct SensorResult {
     pub gain: Option<[f64; 3]>,
     /// The scatter of an axis' readings, in g, derived from the median.
     pub noise_g: Option<f64>,
-    /// The same, derived from the 90 % quantile.
+    /// The scatter of an axis' readings, in g, derived from the 90 % quantile.
     pub rough_g: Option<f64>,
 }
 
 /// The place of a cell, in the terms of a skin file.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Found {
-    /// The joint that moves it.
+    /// The joint that moves the cell.
     pub joint: u8,
-    /// The row in whose frame it is given.
+    /// The row in whose frame position and orientation are given.
     pub row: u8,
     /// The position in m.
     pub position: [f64; 3],
-    /// The quaternion x, y, z, w.
+    /// The orientation as a quaternion x, y, z, w.
     pub orientation: [f64; 4],
     /// The 95 % radius of the position, in mm.
     pub position_mm: f64,
     /// The 95 % angle of the orientation, in degrees.
     pub orientation_deg: f64,
-    /// The distance from the described position, in mm; `None` if that is on another link.
+    /// The distance from the position in the skin, in mm; `None` if that position is on another link.
     pub moved_mm: Option<f64>,
-    /// The angle between the normals, in degrees.
+    /// The angle between the estimated normal and that in the skin, in degrees.
     pub turned_deg: Option<f64>,
 }
 
@@ -125,23 +125,23 @@ pub struct Pose {
 pub enum Trouble {
     /// The cell sent nothing.
     Dead,
-    /// The cell sent only one value.
+    /// All readings of the cell have the same value.
     Stuck,
-    /// The cell sent few readings.
+    /// The cell sent much fewer readings than expected.
     Silent {
-        /// The part of the broadcasts that it answered.
+        /// The fraction of the expected readings that came.
         share: f64,
     },
     /// No joint moves the cell.
     Still,
-    /// Another joint explains its readings nearly as well.
+    /// Another joint explains the cell's readings nearly as well.
     Joint {
-        /// The better joint.
+        /// The joint that explains the readings slightly better.
         joint: u8,
     },
-    /// Its readings scatter.
+    /// The readings scatter more than those of most cells, so the cell is loose or damaged.
     Loose {
-        /// The ratio to the scatter of most cells.
+        /// The scatter, as a multiple of that of most cells.
         times: f64,
     },
     /// The cell and another one are at each other's described places.
@@ -154,13 +154,13 @@ pub enum Trouble {
         /// The node id of the other cell.
         node: u8,
     },
-    /// The motion did not determine its pose.
+    /// The motion did not determine the cell's pose.
     NotObservable {
         /// The 95 % radius of the position, in mm.
         position_mm: f64,
         /// The 95 % angle of the orientation, in degrees.
         orientation_deg: f64,
-        /// The motion that would help.
+        /// The motion that would help to determine the pose.
         help: Help,
     },
 }
@@ -212,7 +212,7 @@ impl CellResult {
         }
     }
 
-    /// Returns true if its pose goes into a new skin file.
+    /// Returns true if the cell's new pose is written to a skin file.
     #[must_use]
     pub fn is_written(&self) -> bool {
         let kept = |trouble: &Trouble| {
@@ -229,7 +229,7 @@ impl CellResult {
         self.found.is_some() && !self.troubles.iter().any(kept)
     }
 
-    /// Stores the pose as a skin file has it: in the frame of the row that carries the cell by its description, if that
+    /// Stores the pose in the terms of a skin file: in the frame of the row that carries the cell in the skin, if that
     /// row belongs to the same joint.
     pub(crate) fn settle(&mut self, skin: &Skin, cell: &Cell, arm: Option<&Arm>) {
         let sensor = &mut self.sensor;

@@ -14,18 +14,18 @@ pub struct Settings {
     pub sheet: DataSheet,
     /// Gravity in the frame of the robot's base, in m/s².
     pub gravity: [f64; 3],
-    /// The distance of wired cells, if known.
+    /// The distance of cells that are wired to each other, if it is known.
     pub spacing: Option<Spacing>,
     /// True to estimate zero offsets of the robot's joints too.
     pub zero_offsets: bool,
-    /// The number of threads.
+    /// The number of threads that estimate cells.
     pub threads: usize,
-    /// The limits for the robot's motion, for advice only.
+    /// The limits of the robot's motion, which are used only for advice on further motions.
     pub bounds: Bounds,
 }
 
 impl Settings {
-    /// Returns settings for sensors by the default data sheet, on a robot that stands upright.
+    /// Returns settings for sensors with the default data sheet, on a robot that stands upright.
     #[must_use]
     pub fn of(skin: &Skin) -> Self {
         Self {

@@ -6,16 +6,16 @@ use crate::lag::Lags;
 use crate::observe::Reading;
 use crate::table::Table;
 
-/// A stretch counts as shifted from this lag on, in s.
+/// The lag from which on a stretch counts as shifted, in s.
 const SHIFTED: f64 = 1e-3;
-/// The threshold in standard deviations.
+/// The number of standard deviations from which on a shift counts as certain.
 const CERTAIN: f64 = 5.0;
-/// Residuals beyond this value get a lower weight.
+/// The residual beyond which a reading gets a lower weight, in g.
 const CHANGING: f64 = 0.05;
 
 impl Lags {
-    /// Returns these lags with the remaining shifts added, or `None` if none of them is certain; `period` is that of
-    /// the sensors' samples.
+    /// Returns these lags plus the shifts that remain in the residuals, or `None` if no shift is certain; `period` is
+    /// the interval of the sensors' samples, in s.
     pub(crate) fn more<'a>(
         &self,
         table: &Table,

@@ -15,20 +15,21 @@ use crate::observe::Observations;
 /// The deviation of a cell from the skin's description.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Defect {
-    /// No deviation.
+    /// The cell works as the skin describes it.
     #[default]
     None,
     /// The cell sends nothing.
     Dead,
     /// The cell always sends the same value.
     Stuck,
-    /// The cell sends this part of its readings.
+    /// The cell sends only this fraction of its readings.
     Silent(f64),
     /// The cell tilts to and fro by this angle in rad, as the robot moves.
     Loose(f64),
 }
 
-/// Moves a skin in virtual time; values are rounded to words as in frames.
+/// Moves a simulated skin through a motion, and returns the observations of its bus; values are rounded to words as in
+/// frames.
 #[must_use]
 pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: &[Defect]) -> Observations {
     let mut seen = Observations::new(skin);

@@ -9,7 +9,7 @@ use protocol::parameters::MAX_JOINTS;
 
 use model::accelerometer::kinematics::JointState;
 
-/// The number of broadcasts on each side of the middle one.
+/// The number of broadcasts in a window on each side of the middle one.
 pub(crate) const HALF: usize = 10;
 const WINDOW: usize = 2 * HALF + 1;
 /// The number of coefficients of the polynomial.
@@ -23,14 +23,15 @@ pub(crate) const STEP_M: f64 = 1.0 / 16_384.0;
 /// The positions of the joints of a chain at one broadcast.
 pub(crate) type Positions = [f64; MAX_JOINTS];
 
-/// A fit of polynomials to windows of positions.
+/// A least-squares fit of polynomials to windows of consecutive positions.
 #[derive(Clone, Debug)]
 pub(crate) struct Smoother {
-    /// The map from positions in a window to coefficients, in units of [`HALF`] periods.
+    /// The matrix that maps the positions in a window to the polynomial's coefficients, with time in units of [`HALF`]
+    /// periods.
     fit: SMatrix<f64, TERMS, WINDOW>,
-    /// The map from positions in a window to the residuals of the polynomial.
+    /// The matrix that maps the positions in a window to the residuals of the polynomial.
     left: SMatrix<f64, WINDOW, WINDOW>,
-    /// Half a window, in s.
+    /// The duration of half a window, in s.
     half_s: f64,
 }
 

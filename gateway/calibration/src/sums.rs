@@ -9,28 +9,28 @@ use crate::cell::{CellModel, Coefficients, Information, MOMENT, Moment, ROW, UNK
 /// The maximum number of least-squares steps.
 const STEPS: usize = 60;
 
-/// The readings of a cell, as sums over them.
+/// Weighted sums over the readings of a cell, from which least squares compute residuals and derivatives.
 #[derive(Clone, Debug)]
 pub(crate) struct Sums {
-    /// The products of a moment's numbers.
+    /// The sums of products of two numbers of a moment.
     moments: SMatrix<f64, MOMENT, MOMENT>,
-    /// The products of a moment's numbers and the reading of each axis.
+    /// The sums of products of a number of a moment and the reading of each axis.
     shown: Coefficients,
-    /// The squares of the readings.
+    /// The sum of the squares of the readings.
     squares: f64,
-    /// The weights.
+    /// The sum of the weights.
     pub(crate) weight: f64,
 }
 
-/// Coefficients for a moment at the middle age, and for 1.
+/// The coefficients of the 12 numbers of a motion at the middle age, and of 1, without the constraints of a model.
 pub(crate) type Free = SMatrix<f64, 13, 3>;
 
-/// Returns the index of a number of the middle age among all numbers of a moment.
+/// Converts an index into [`Free`] to the index among all numbers of a moment.
 const fn place(number: usize) -> usize {
     if number < ROW { ROW + number } else { MOMENT - 1 }
 }
 
-/// Returns the same as coefficients for moments at all ages.
+/// Converts coefficients for the middle age to coefficients for all ages, with zeros for the others.
 pub(crate) fn at_middle_age(free: &Free) -> Coefficients {
     let mut all = Coefficients::zeros();
     for number in 0..=ROW {
@@ -43,7 +43,7 @@ pub(crate) fn at_middle_age(free: &Free) -> Coefficients {
 #[derive(Clone, Debug)]
 pub(crate) struct Fit {
     pub(crate) model: CellModel,
-    /// The squares of residuals in units of the noise, plus those of the deviations from the data sheet.
+    /// The sum of the squared residuals in units of the noise, plus that of the squared deviations from the data sheet.
     pub(crate) cost: f64,
 }
 
@@ -54,7 +54,7 @@ impl Default for Sums {
 }
 
 impl Sums {
-    /// Adds a reading.
+    /// Adds a reading at a moment, with a weight.
     pub(crate) fn add(&mut self, moment: &Moment, shown: &[f64; 3], weight: f64) {
         // Columns of static matrices are contiguous: both loops become vector instructions.
         for (column, number) in self.moments.as_mut_slice().chunks_exact_mut(MOMENT).zip(moment) {
@@ -69,7 +69,7 @@ impl Sums {
         self.weight += weight;
     }
 
-    /// Returns the sum of squared differences between the readings and a model.
+    /// Returns the weighted sum of squared differences between the readings and a model with these coefficients.
     pub(crate) fn residual(&self, coefficients: &Coefficients) -> f64 {
         let mut sum = self.squares;
         for (mine, shown) in coefficients.column_iter().zip(self.shown.column_iter()) {
@@ -78,8 +78,8 @@ impl Sums {
         sum.max(0.0)
     }
 
-    /// Returns the information of the readings on the unknowns, per variance of the noise, and the gradient of half of
-    /// the residual.
+    /// Returns the information of the readings on the unknowns, for noise of variance 1, and the gradient of half of
+    /// [`Self::residual`].
     pub(crate) fn information(&self, model: &CellModel) -> (Information, Unknowns) {
         let derivatives = model.derivatives();
         let coefficients = model.coefficients();
@@ -138,8 +138,8 @@ impl Sums {
         best
     }
 
-    /// Returns a start for least squares: the coefficients at the middle age without constraints between them. `ridge`
-    /// regularises the coefficients on which the readings have no information.
+    /// Returns the coefficients at the middle age that fit the readings best without constraints, as a start for least
+    /// squares. `ridge` regularises the coefficients on which the readings have no information.
     pub(crate) fn unconstrained(&self, ridge: f64) -> Option<Free> {
         let mut moments =
             SMatrix::<f64, 13, 13>::from_fn(|row, column| self.moments[(place(row), place(column))]);

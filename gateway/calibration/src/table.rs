@@ -1,4 +1,4 @@
-//! The motion of each link of a chain at each broadcast, as numbers for least squares.
+//! The motion of each link of a chain at each broadcast, in the form that least squares need.
 
 use protocol::parameters::{MAX_JOINTS, RowKind};
 use protocol::skin::{Chain, Skin};
@@ -16,19 +16,20 @@ pub(crate) struct Table {
     pub(crate) arm: Arm,
     /// The ages of readings relative to their joints.
     pub(crate) lags: Lags,
-    /// The motion by joint, where 0 is the base, then by broadcast; `None` where positions nearby are missing.
+    /// The motion by joint (0 is the base), then by broadcast; `None` where positions around the broadcast are missing.
     links: Vec<Vec<Option<Moment>>>,
 }
 
-/// Windows are left out if a joint is rougher than rounding allows, by this factor.
+/// The factor by which the roughness of a joint in a window may exceed that of rounding; rougher windows are left out.
 const ROUGH: f64 = 1.1;
-/// The same limit relative to the median window, because the positions of real joints scatter.
+/// The factor by which the roughness may exceed that of the median window, because the positions of real joints
+/// scatter.
 const ROUGHER: f64 = 4.0;
 
 /// Periods with a smaller relative difference than this count as equal.
 const EQUAL: f64 = 5e-4;
 
-/// Returns the maximum roughness of a smooth motion, by joint.
+/// Returns the roughness up to which a window counts as a smooth motion, by joint in rad or m.
 fn limits(chain: &Chain, roughness: &[Option<Positions>]) -> Positions {
     let mut limits = [f64::INFINITY; MAX_JOINTS];
     let kinds = chain.rows.iter().map(|row| row.kind).filter(|kind| *kind != RowKind::Fixed);
@@ -44,7 +45,7 @@ fn limits(chain: &Chain, roughness: &[Option<Positions>]) -> Positions {
 }
 
 impl Table {
-    /// Creates the table. `offsets` are added to the positions of joints; `lags` is the additional age of readings.
+    /// Computes the motions. `offsets` are added to the positions of joints; `lags` is the additional age of readings.
     pub(crate) fn new(
         skin: &Skin,
         bus: usize,
@@ -124,7 +125,7 @@ impl Table {
         u8::try_from(self.links.len()).unwrap_or_default().saturating_sub(1)
     }
 
-    /// Returns the motion that a joint makes at each broadcast.
+    /// Returns the motion of the link behind a joint, at each broadcast.
     pub(crate) fn link(&self, joint: u8) -> &[Option<Moment>] {
         self.links.get(usize::from(joint)).map_or(&[], Vec::as_slice)
     }
@@ -135,7 +136,7 @@ impl Table {
     }
 }
 
-/// Converts a small number of periods.
+/// Converts a small number of periods to an integer.
 #[expect(clippy::cast_possible_truncation, reason = "casts to integers saturate")]
 const fn whole(periods: f64) -> isize {
     periods as isize

@@ -6,16 +6,16 @@ use thiserror::Error;
 
 use crate::result::{Calibration, Found};
 
-/// The error for a text that cannot be written.
+/// The error for a skin whose text cannot be changed.
 #[derive(Debug, Error)]
 pub enum WriteError {
-    /// The text is not that of the skin that was read.
+    /// The text differs from that of the skin that was read.
     #[error("the skin's text is not that of the skin that was read: {0}; calibrate again")]
     Text(String),
 }
 
 /// Returns the text of a skin with the calibrated poses and everything else unchanged: comments, order, omitted keys.
-/// Cells without a determined pose keep theirs.
+/// Cells without a determined pose keep the pose that they have in the text.
 ///
 /// # Errors
 /// Returns [`WriteError`] if the text does not belong to the skin.
@@ -40,7 +40,7 @@ pub fn calibrated(skin: &Skin, text: &str, calibration: &Calibration) -> Result<
     Ok(edit.text())
 }
 
-/// Sets a value; inserts it after another key if the cell does not have it.
+/// Sets the value of a cell's key. Inserts the key after another one if the cell does not have it.
 fn put(edit: &mut Edit<'_>, cell: usize, key: &str, value: Value<'_>, after: &str) {
     if edit.has(cell, key) {
         edit.set(cell, key, value);

@@ -1,4 +1,4 @@
-//! Zero offsets of the robot's joints: the values to add to the positions on the bus.
+//! Estimates zero offsets of the robot's joints: values to add to the joint positions on the bus.
 //!
 //! An offset moves gravity and everything beyond the joint. Much of that looks like cells that are mounted differently,
 //! so offsets are estimated together with the unknowns of every cell. Only the part that the cells cannot explain
@@ -26,9 +26,10 @@ const SUPPOSED: f64 = 0.1;
 const OBSERVED: f64 = 0.0175;
 /// The step of numerical derivatives.
 const STEP: f64 = 1e-5;
-/// One of this many readings is used.
+/// The interval of the readings that are used: one of this many.
 const STRIDE: usize = 4;
-/// The errors of readings that are close in time are correlated: each counts as this part of an independent one.
+/// The fraction of an independent reading that each reading counts as, because errors of readings close in time are
+/// correlated.
 const SHARE: f64 = 0.5;
 
 /// The zero offset of a joint.
@@ -36,9 +37,9 @@ const SHARE: f64 = 0.5;
 pub struct ZeroOffset {
     /// The name of the joint.
     pub joint: String,
-    /// `rad` or `m`.
+    /// The unit of the offset: `rad` or `m`.
     pub unit: &'static str,
-    /// The value to add to its positions; `None` if it is not observable.
+    /// The value to add to the joint's positions; `None` if the offset is not observable.
     pub offset: Option<f64>,
     /// The standard deviation of the offset.
     pub deviation: f64,
@@ -57,7 +58,8 @@ impl core::fmt::Display for ZeroOffset {
     }
 }
 
-/// The part of a cell's readings that depends on offsets and cannot be explained by the cell.
+/// The information of a cell's readings on the offsets and the gradient, without the part that the cell's own unknowns
+/// explain.
 struct Remainder {
     information: DMatrix<f64>,
     gradient: DVector<f64>,
@@ -114,7 +116,7 @@ pub(crate) fn zero_offsets(
     of_joint.collect()
 }
 
-/// Returns the information of a cell's readings on the offsets.
+/// Returns the information of a cell's readings on the offsets that the cell's own unknowns cannot explain.
 fn left(
     table: &Table,
     moved: &[Table],

@@ -20,29 +20,29 @@ impl TestRandom {
         Self(Pcg64Mcg::seed_from_u64(seed))
     }
 
-    /// Returns any word.
+    /// Returns a random word, from the whole range.
     pub(crate) fn word(&mut self) -> i16 {
         self.0.random()
     }
 
-    /// Returns a number below a bound; 0 if the bound is 0.
+    /// Returns a random number below a bound, or 0 if the bound is 0.
     pub(crate) fn below(&mut self, bound: u32) -> u32 {
         self.0.random_range(0..bound.max(1))
     }
 
-    /// Returns a number in [-1, 1).
+    /// Returns a random number in [-1, 1).
     fn unit(&mut self) -> f64 {
         f64::from(self.word()) / 32_768.0
     }
 
-    /// Returns one element of a slice.
+    /// Returns a random element of a slice.
     pub(crate) fn choose<T: Copy + Default>(&mut self, of: &[T]) -> T {
         of.choose(&mut self.0).copied().unwrap_or_default()
     }
 }
 
-/// The period in the test configurations. A cell skips older joints, so it is long: a cell that is a process may wait
-/// for a processor.
+/// The period in the test configurations. A cell skips joints that are older than a period, and a cell that is a
+/// process may have to wait for a processor, so the period is long.
 const PERIOD_US: u16 = 60_000;
 
 /// Gain 1, no proximity, no thresholds: the force is the sum of the three contact words.
@@ -89,13 +89,13 @@ pub(crate) fn example_parameters(joint: u8) -> Parameters {
     }
 }
 
-/// Returns the same at 62.5 joints a second, for checks of times.
+/// Returns the configuration of [`document`] with a period of 16 ms (62.5 joints a second), for checks of times.
 pub(crate) fn fast_parameters(joint: u8) -> Parameters {
     Parameters { period_us: 16_000, ..example_parameters(joint) }
 }
 
-/// Returns a configuration as large as the cell accepts, with a different value in each word, so that no word can be
-/// lost in flash unnoticed.
+/// Returns a configuration of the maximum size that the cell accepts. Each word has a different value, so that a word
+/// lost in flash is noticed.
 pub(crate) fn distinct_parameters(abilities: Abilities) -> Parameters {
     let mut all = example_parameters(3);
     all.period_us = 55_500;
@@ -152,7 +152,7 @@ pub(crate) fn document_contact() -> Contact {
     }
 }
 
-/// The dimensions of a chain.
+/// The size of a chain: its joints and rows, and whether some joints are prismatic.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ChainShape {
     pub(crate) joints: usize,
@@ -210,7 +210,7 @@ pub(crate) fn random_parameters(dice: &mut TestRandom, shape: ChainShape) -> Par
     }
 }
 
-/// Returns a vector of length 1.
+/// Returns a random vector of length 1.
 fn normal(dice: &mut TestRandom) -> [Q1_14; 3] {
     loop {
         let any = [0; 3].map(|_| dice.unit());
@@ -274,7 +274,7 @@ pub(crate) fn format_page(page: SensorPage) -> String {
     text.split_once(": ").map_or_else(String::new, |(_, values)| values.to_owned())
 }
 
-/// Formats latched sensor values.
+/// Formats latched sensor values, or `nothing`.
 pub(crate) fn format_skin(skin: Option<SkinSensors>) -> String {
     skin.map_or_else(|| "nothing".to_owned(), |skin| format_page(SensorPage::Skin(skin)))
 }
@@ -301,7 +301,7 @@ pub(crate) fn steps_off(j: i16, exact: f64) -> u32 {
     i32::from(j).abs_diff(nearest.into())
 }
 
-/// Returns the allowed distance in steps (J-3): 8, and one more for each row after the sixth.
+/// Returns the distance from the exact value that J-3 allows, in steps: 8, and one more for each row after the sixth.
 pub(crate) fn tolerance(parameters: &Parameters) -> u32 {
     8 + u32::try_from(parameters.chain().len().saturating_sub(6)).unwrap_or(0)
 }

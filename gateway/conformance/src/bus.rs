@@ -7,17 +7,17 @@ use thiserror::Error;
 /// A frame seen on the bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct ObservedFrame {
-    /// Its time on the clock of [`Bus::now`].
+    /// The time at which the frame was on the bus, on the clock of [`Bus::now`].
     pub at: Micros,
     /// The frame.
     pub frame: Frame,
-    /// True if the bench sent it.
+    /// True if the bench sent the frame.
     pub own: bool,
 }
 
 /// A bus with the cell under test.
 pub trait TestBus {
-    /// Returns the time.
+    /// Returns the present time of the bus's clock.
     fn now(&self) -> Micros;
 
     /// Returns true if frames of this format can be sent, also if the cell uses the other format.
@@ -29,13 +29,14 @@ pub trait TestBus {
     /// Returns [`Stop`] if the bus does not accept the frames, or if the test is interrupted.
     fn send(&mut self, frames: &[Frame]) -> Result<(), StopReason>;
 
-    /// Returns the next frame, or `None` if no frame arrives by then.
+    /// Returns the next frame, or `None` if no frame arrives until then.
     ///
     /// # Errors
     /// Returns [`Stop`] if the bus is gone, or if the test is interrupted.
     fn receive(&mut self, until: Micros) -> Result<Option<ObservedFrame>, StopReason>;
 
-    /// Returns the maximum lateness of the bench itself since the last call; it does not count against the cell.
+    /// Returns the maximum lateness of the bench itself since the last call, so that it does not count against the
+    /// cell.
     fn lateness(&mut self) -> Span;
 
     /// Ignores signals from now on, so that the cell can be restored.
@@ -47,7 +48,7 @@ pub trait TestBus {
     /// Begins to switch the cell off and on.
     ///
     /// # Errors
-    /// Returns [`Stop`] if that is not possible.
+    /// Returns [`Stop`] if the restart cannot begin.
     fn begin_restart(&mut self) -> Result<(), StopReason>;
 
     /// Returns true while the restart is in progress.

@@ -14,7 +14,7 @@ const MAX_FAILURE_FRAMES: usize = 24;
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
 #[serde(tag = "verdict", rename_all = "kebab-case")]
 pub enum Verdict {
-    /// All checks of it passed.
+    /// All checks of the requirement passed.
     Passed {
         /// The number of checks.
         checks: usize,
@@ -22,9 +22,9 @@ pub enum Verdict {
         #[serde(skip_serializing_if = "Option::is_none")]
         but: Option<String>,
     },
-    /// A check of it failed.
+    /// A check of the requirement failed.
     Failed {
-        /// The expectation, and the observation.
+        /// A description of the failure: the expected behaviour, and the observed one.
         what: String,
         /// The number of failed checks.
         failures: usize,
@@ -41,7 +41,7 @@ pub enum Verdict {
         /// The reason.
         why: String,
     },
-    /// No result yet.
+    /// The requirement has no result yet.
     #[default]
     #[serde(skip)]
     Open,
@@ -109,7 +109,7 @@ impl Findings {
         self.0.iter().filter(|(_, tally)| tally.failed > 0).map(|(id, _)| *id).collect()
     }
 
-    /// Returns the ids with more failures than in `before`.
+    /// Returns the ids of the requirements with more failures than in `before`.
     pub(crate) fn failed_since(&self, before: &Self) -> impl Iterator<Item = &'static str> {
         let failed = |of: &Self, id| of.0.get(id).map_or(0, |tally| tally.failed);
         self.0.keys().copied().filter(move |id| failed(self, *id) > failed(before, *id))
@@ -149,7 +149,7 @@ impl Findings {
     }
 }
 
-/// The selection of requirements.
+/// A selection of requirements to test.
 #[derive(Clone, Debug, Default)]
 pub struct RequirementFilter(Vec<String>);
 

@@ -1,4 +1,4 @@
-//! Conformance tests: take one cell, of any author and on any hardware, through the requirements of its documents.
+//! Conformance tests: check one cell, of any author and on any hardware, against the requirements of the documents.
 //!
 //! ```text
 //!   checks ──> Session ──> Bus ─┬─ Live: a socket, the kernel's time stamps
@@ -6,8 +6,8 @@
 //!      '─ Findings: passed, failed with frames, not applicable, not tested
 //! ```
 //!
-//! Checks send packets and compare the cell's packets with expected values. Those come from the documents: torques bit
-//! for bit, J from a computation in floating point. This crate does not use any code of a cell.
+//! Checks send packets and compare the cell's packets with expected values. The expected values follow the documents:
+//! torques bit for bit, and J computed in floating point. This crate does not use any code of a cell.
 
 mod arm;
 pub mod bus;

@@ -1,4 +1,4 @@
-//! A real bus, and the command that switches the cell off and on.
+//! The bus of a conformance test outside virtual time, and the command that switches the cell off and on.
 
 mod probe;
 
@@ -22,7 +22,7 @@ const SIGNAL_POLL_INTERVAL: Span = Span::from_millis(50);
 /// The time limit for a restart.
 const RESTART_TIMEOUT: Span = Span::from_millis(15_000);
 
-/// An open bus.
+/// An open bus with the cell under test.
 #[derive(Debug)]
 pub struct SocketBus {
     socket: Socket,
@@ -41,7 +41,7 @@ impl SocketBus {
     /// Opens a bus. `stopped` interrupts the test; `command` switches the cell off and on.
     ///
     /// # Errors
-    /// Returns [`BusError`] if it cannot be used as requested.
+    /// Returns [`BusError`] if the bus cannot be used as requested.
     pub fn open(
         name: &str,
         kind: KindChoice,
@@ -130,7 +130,7 @@ impl TestBus for SocketBus {
     }
 
     fn begin_restart(&mut self) -> Result<(), StopReason> {
-        let Some(command) = &self.command else { return Err(StopReason::Restart("no command".to_owned())) };
+        let Some(command) = &self.command else { return Err(StopReason::Restart("a restart needs the option --restart".to_owned())) };
         let child = Command::new("sh")
             .args(["-c", command])
             .stdin(Stdio::null())

@@ -8,18 +8,18 @@ pub enum Document {
     /// The requirements of every cell.
     #[serde(rename = "cell.md")]
     Cell,
-    /// Sensor values and stimuli.
+    /// The requirements on sensor values and stimuli.
     #[serde(rename = "sensing.md")]
     Sensing,
-    /// Sums and wires.
+    /// The requirements on sums and wires.
     #[serde(rename = "tree.md")]
     Tree,
 }
 
-/// A requirement.
+/// A numbered requirement of a document.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 pub struct Requirement {
-    /// Its id.
+    /// The id, such as `CONF-7`.
     pub id: &'static str,
     /// The document that contains it.
     pub document: Document,

@@ -13,12 +13,12 @@ use crate::session::{Reply, Session};
 
 /// The time limit for restoring the state.
 const RESTORE_TIMEOUT: Span = Span::from_millis(8_000);
-/// The time after which all answers to the test have come.
+/// The time after which no more answers to requests of the test come.
 const SETTLE: Span = Span::from_millis(60);
 /// The number of attempts to restore a value.
 const ATTEMPTS: usize = 3;
 
-/// Volatile parameters.
+/// The volatile parameters, which are saved and restored.
 const SWITCHES: [Parameter; 6] = [
     Parameter::Reply,
     Parameter::Sensing,
@@ -28,25 +28,26 @@ const SWITCHES: [Parameter; 6] = [
     Parameter::Mode,
 ];
 
-/// The state of a cell.
+/// The state of a cell before the test.
 #[derive(Clone, Debug, Deserialize, Eq, PartialEq, Serialize)]
 pub struct SavedCell {
-    /// The name of its bus.
+    /// The name of the cell's bus.
     pub bus: String,
-    /// Its node id.
+    /// The cell's node id.
     pub node: u8,
-    /// Its serial number.
+    /// The cell's serial number.
     pub serial: u32,
-    /// The hash of its configuration; 0 for none.
+    /// The hash of the cell's configuration, or 0 without a configuration.
     pub hash: u16,
-    /// True if it was halted.
+    /// True if the cell was halted.
     pub halted: bool,
-    /// The words of its parameters, by number.
+    /// The words of the cell's parameters, by number.
     pub parameters: BTreeMap<u8, [i16; WORDS]>,
 }
 
 impl Session<'_> {
-    /// Reads the state of the cell. The inner error names a parameter that the cell does not answer.
+    /// Reads the state of the cell. The inner error is a text that names a parameter whose read the cell does not
+    /// answer.
     ///
     /// # Errors
     /// Returns [`Stop`] if the bus fails, or if the test is interrupted.
@@ -89,7 +90,7 @@ impl Session<'_> {
         self.begin_expected_exchange();
         self.send_messages(&[Message::Resume])?;
         if saved.hash == 0 {
-            left.push("it had no configuration, and cannot be made to forget the test's".to_owned());
+            left.push("its configuration: it had none, and the one of the test cannot be erased".to_owned());
         } else if !self.put_back_stored(saved)? {
             left.push(format!("its configuration {:04X}", saved.hash));
         }

@@ -1,5 +1,5 @@
-//! A conversation with the cell: sends packets, collects those of the cell, and checks the rules that hold for every
-//! packet.
+//! A conversation with the cell: sends packets to it, collects the packets that it sends, and checks the rules that
+//! hold for all of them.
 
 mod accounts;
 mod beats;
@@ -28,19 +28,19 @@ pub(crate) use known::{CellAbilities, TrackedState};
 use life::CellLife;
 pub(crate) use request::Reply;
 
-/// The time limit for an answer.
+/// The time limit for the answer to a request or a sync.
 pub(crate) const ANSWER_TIMEOUT: Span = Span::from_millis(300);
-/// The additional time that answers are awaited after a sync's heartbeat.
+/// The additional wait for answers after the heartbeat that answers a sync.
 pub(crate) const SYNC_GRACE: Span = Span::from_millis(5);
-/// The time after which a sent frame was on the bus, even on a busy computer.
+/// The time within which a sent frame appears on the bus, even on a busy computer.
 const SEND_TIMEOUT: Span = Span::from_millis(1_200);
-/// A cell that sends nothing for this time has fallen silent.
+/// The time without packets after which the cell counts as silent, which ends the test.
 const SILENCE_TIMEOUT: Span = Span::from_millis(3_000);
 
-/// A packet of the cell.
+/// A packet that the cell sent.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct CellPacket {
-    /// The time at which it, or its last segment, was on the bus.
+    /// The time at which the packet was on the bus; of several segments, the last one.
     pub(crate) at: Micros,
     pub(crate) message: Message,
 }
@@ -64,37 +64,37 @@ impl CellPacket {
     }
 }
 
-/// The times of the conversation.
+/// The times, delays and limits of the conversation.
 #[derive(Clone, Copy, Debug)]
 struct Clock {
     /// The time of the cell's last packet.
     last: Micros,
-    /// The time at which the time limit is reached.
+    /// The time at which the test must end.
     end: Micros,
     /// The maximum lateness of the bench since the exchange began.
     late: Span,
-    /// The same since a group of checks began, and since the test began.
+    /// The maximum lateness of the bench since a group of checks began, and since the test began.
     worst: Span,
     longest: Span,
     /// The number of packets whose segments came too late after each other.
     torn: usize,
-    /// True if heartbeats do not have the epoch of the last joints.
+    /// True if the cell's heartbeats were found not to have the epoch of the last joints.
     other_epochs: bool,
     /// True while the cell is being restored: other senders are then ignored.
     finishing: bool,
     /// True if the last joints were too old when the cell processed them.
     skipped: bool,
-    /// The time for a request and its answer.
+    /// The mean time from a request to its answer.
     round_trip: Span,
 }
 
-/// The frames of the cell and of the bench.
+/// The log of the frames that the cell and the bench sent.
 #[derive(Debug, Default)]
 struct Log {
     frames: Vec<ObservedFrame>,
-    /// The start of the present exchange; frames that were sent for it may come before it.
+    /// The index of the first frame of the present exchange.
     since: usize,
-    /// The end of the last exchange.
+    /// The index after the last frame of the previous exchange.
     ended: usize,
 }
 
@@ -112,7 +112,7 @@ pub struct Session<'a> {
     pub(crate) cell: CellId,
     pub(crate) format: Format,
     log: Log,
-    /// The packets of the cell.
+    /// The packets that the cell sent.
     pub(crate) packets: Vec<CellPacket>,
     /// The index in `heard` at which the present exchange begins.
     pub(crate) from: usize,
@@ -121,7 +121,8 @@ pub struct Session<'a> {
     /// The number of joints whose answers came so late that the cell may have skipped them.
     pub(crate) skips: u16,
     life: CellLife,
-    /// The frames of the cell since a restart began, while it is unknown to which life they belong.
+    /// The cell's frames since a restart began, held until it is known whether they are from before or after the
+    /// restart.
     held: Option<Vec<(ObservedFrame, Id)>>,
     /// The results.
     pub findings: Findings,
@@ -211,7 +212,7 @@ impl<'a> Session<'a> {
         self.bus.can_restart()
     }
 
-    /// Records the result of a check. Returns `is_so`.
+    /// Records the result of a check of requirement `id`; `what` describes a failure. Returns `is_so`.
     pub(crate) fn check(&mut self, id: &'static str, is_so: bool, what: impl FnOnce() -> String) -> bool {
         if is_so {
             self.findings.pass(id);
@@ -222,13 +223,14 @@ impl<'a> Session<'a> {
         is_so
     }
 
-    /// Begins a new exchange. Packets since the last one count as unexpected, unless a cell may send them by itself.
+    /// Begins a new exchange. Packets since the last exchange fail a requirement, unless a cell may send them
+    /// unrequested.
     pub(crate) fn begin_exchange(&mut self) {
         let strays: Vec<_> = self.packets.get(self.consumed..).unwrap_or_default().to_vec();
         for stray in strays {
             if let Some(id) = self.known.unexpected(&stray.message) {
                 let kind = stray.message.id().kind.name();
-                self.check(id, false, || format!("a {kind} packet that nothing asked for"));
+                self.check(id, false, || format!("the cell must not send a {kind} packet unrequested, but one came"));
             }
         }
         self.begin_expected_exchange();
@@ -259,7 +261,7 @@ impl<'a> Session<'a> {
         self.packets.get(self.from..).unwrap_or_default()
     }
 
-    /// Discards all assumptions about values that were written before.
+    /// Discards the known state of the cell, except its last epoch and its number of joints.
     pub(crate) fn forget_state(&mut self) {
         self.known = TrackedState {
             last_epoch: self.known.last_epoch,
@@ -291,7 +293,7 @@ impl<'a> Session<'a> {
                 return Ok(own);
             }
             if self.bus.now() >= give_up {
-                return Err(StopReason::Bus(format!("{}: {last} was sent and was not on the bus", self.name)));
+                return Err(StopReason::Bus(format!("{}: {last} was sent, but did not appear on the bus", self.name)));
             }
             self.process_next_frame(give_up)?;
         }
@@ -331,13 +333,13 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Receives for a time.
+    /// Receives packets for this time.
     pub(crate) fn idle(&mut self, span: Span) -> Result<(), StopReason> {
         let until = self.bus.now() + span;
         self.wait(until, |_| false).map(|_| ())
     }
 
-    /// Waits for late packets of the cell.
+    /// Waits 15 ms for late packets of the cell, and begins a new exchange.
     pub(crate) fn settle(&mut self) -> Result<(), StopReason> {
         self.idle(Span::from_millis(15))?;
         self.begin_exchange();
@@ -358,7 +360,8 @@ impl<'a> Session<'a> {
         core::mem::take(&mut self.clock.worst)
     }
 
-    /// Checks that segments followed each other; in a few packets they may be delayed by a busy processor.
+    /// Checks that the segments of packets followed each other in time; a busy processor may delay them in a few
+    /// packets.
     pub(crate) fn check_segments(&mut self) -> Result<(), StopReason> {
         const MAX_TORN_PACKETS: usize = 3;
         if self.format == Format::Classic {
@@ -367,13 +370,13 @@ impl<'a> Session<'a> {
             }
             let torn = self.clock.torn;
             self.check("SEND-1", torn <= MAX_TORN_PACKETS, || {
-                format!("of {torn} packets a segment came too late after the one before")
+                format!("segments of a packet must follow each other in time, but one came too late in {torn} packets")
             });
         }
         Ok(())
     }
 
-    /// Measures the time for an answer.
+    /// Measures the mean time from a request to its answer.
     pub(crate) fn measure(&mut self) -> Result<(), StopReason> {
         const TIMES: u64 = 8;
         let began = self.now();
@@ -389,23 +392,23 @@ impl<'a> Session<'a> {
         self.clock.round_trip > Span::from_millis(4)
     }
 
-    /// Returns the number of attempts; fewer with a slow cell.
+    /// Returns the number of attempts of a check: `many`, or a quarter of it if answers are slow.
     pub(crate) fn attempts(&self, many: usize) -> usize {
         if self.is_slow() { many.div_ceil(4) } else { many }
     }
 
-    /// Records the time of an answer, unless the bench itself was late.
+    /// Records the time from a request to its answer, with the lateness of the bench meanwhile.
     pub(crate) fn note_time(&mut self, what: &'static str, asked: Micros, answered: Micros) {
         let late = self.lateness();
         self.timings.note(what, answered.elapsed_since(asked), late);
     }
 
-    /// Returns joints of the chain in use.
+    /// Returns a joints message for the chain in use.
     pub(crate) fn joints(&self, epoch: u8, positions: &[i16; MAX_JOINTS]) -> Message {
         self.joints_of(epoch, positions, self.known.joints)
     }
 
-    /// Returns joints with this count; further words are 0.
+    /// Returns a joints message for a chain of `in_use` joints; further words are 0.
     pub(crate) fn joints_of(&self, epoch: u8, positions: &[i16; MAX_JOINTS], in_use: u8) -> Message {
         let mut words = *positions;
         words.iter_mut().skip(in_use.into()).for_each(|word| *word = 0);

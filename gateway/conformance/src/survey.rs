@@ -14,39 +14,39 @@ use crate::bus::{TestBus, StopReason};
 /// The listening time: more than two intervals of heartbeats.
 pub const LISTEN_TIME: Span = Span::from_millis(600);
 
-/// The result of a survey.
+/// The cells, gateways and damaged frames that a survey found.
 #[derive(Clone, Debug, Default)]
 pub struct Survey {
     /// The senders of each node id.
     pub cells: BTreeMap<CellId, NodeSenders>,
-    /// A frame that only gateways send.
+    /// The first frame that only a gateway sends, if one came.
     pub gateway: Option<String>,
     /// Frames under the identifiers of a node id that are not packets.
     damaged: BTreeMap<CellId, DamagedFrames>,
 }
 
-/// Frames that are not packets.
+/// Frames of one node id that are not packets.
 #[derive(Clone, Debug)]
 struct DamagedFrames {
     count: usize,
-    /// The identifier of the first one, and the first frames under it.
+    /// The identifier of the first such frame, and the first frames with that identifier.
     id: Id,
     frames: Vec<Frame>,
-    /// The reason why the first one is not a packet; `None` while further segments may come.
+    /// The reason why the first frame is not a packet; `None` while further segments may come.
     fault: Option<String>,
 }
 
 /// The senders that use a node id.
 #[derive(Clone, Debug, Default)]
 pub struct NodeSenders {
-    /// Serial numbers in heartbeats.
+    /// The serial numbers in the heartbeats of this node id.
     pub serials: BTreeSet<u32>,
-    /// The format of the frames.
+    /// The format of the frames; `None` before the first packet.
     pub format: Option<Format>,
 }
 
 impl Survey {
-    /// Listens for [`LISTEN`].
+    /// Listens on the bus for [`LISTEN`], and returns the cells and gateways that send.
     ///
     /// # Errors
     /// Returns [`Stop`] if the bus fails, or if the test is interrupted.
@@ -100,10 +100,11 @@ impl Survey {
         }
     }
 
-    /// Checks that the cell can be tested here; other cells are allowed if they are `tolerated`.
+    /// Checks that the cell can be tested on this bus, and returns the format to use. Other cells are allowed if they
+    /// are `tolerated`.
     ///
     /// # Errors
-    /// Returns the reason in one line, if it cannot be tested.
+    /// Returns the reason, in one line, why the cell cannot be tested.
     pub fn check(
         &self,
         cell: CellId,
@@ -159,7 +160,7 @@ impl Survey {
 }
 
 impl DamagedFrames {
-    /// Returns the usual implementation mistake that explains the frames, if one does.
+    /// Returns a description of the common implementation mistake that explains the frames, if there is one.
     fn mistake(&self) -> Option<&'static str> {
         let bytes = |frames: &[&Frame]| -> Vec<u8> {
             frames.iter().flat_map(|frame| frame.data()).copied().collect()

@@ -1,4 +1,4 @@
-//! Checks of answer times.
+//! Checks of the times that the cell takes to answer.
 
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Span;

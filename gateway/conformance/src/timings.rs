@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 
 use protocol::time::Span;
 
-/// Late answers do not count against the cell while the bench was late by more than this.
+/// The lateness of the bench above which late answers do not count against the cell.
 const LATE: Span = Span::from_millis(1);
 
-/// The answers that TIME-2 limits, with the limit in ms.
+/// The kinds of answers that TIME-2 limits, each with its limit in ms.
 pub(crate) const LIMITS: [(&str, u64); 6] = [
     ("torque", 4),
     ("heartbeat to sync", 10),
@@ -17,12 +17,12 @@ pub(crate) const LIMITS: [(&str, u64); 6] = [
     ("report", 100),
 ];
 
-/// The times of one kind of answer.
+/// The numbers of timely and late answers of one kind.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Times {
     pub(crate) in_time: usize,
     pub(crate) late: usize,
-    /// Late answers while the bench was late too.
+    /// The number of late answers while the bench was late too.
     pub(crate) blameless: usize,
     pub(crate) longest: Span,
 }

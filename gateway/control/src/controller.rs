@@ -6,7 +6,7 @@
 //! ```
 //!
 //! [`Kinesthetic`] moves the arm with the torque of a push. [`Planned`] follows a motion that is known in advance and
-//! ignores torques. [`crate::external::External`] queries another program.
+//! ignores torques. [`crate::external::External`] asks another program for each command.
 
 use protocol::packet::padded;
 use protocol::skin::{ControllerKind, MAX_ROBOT_JOINTS, Skin};
@@ -15,29 +15,29 @@ use thiserror::Error;
 
 use crate::external::Absence;
 
-/// Input of a controller in a tick. Values of joints that the robot does not have are zero.
+/// Input of a controller in one tick. The values of joints that the robot does not have are zero.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Input {
     /// Number of the tick.
     pub tick: u64,
     /// Nominal start of the tick since the start of the run.
     pub time: Micros,
-    /// Joint positions in rad.
+    /// Joint positions in rad, or in m for prismatic joints.
     pub q: [f64; MAX_ROBOT_JOINTS],
-    /// Joint velocities in rad/s.
+    /// Joint velocities in rad/s, or in m/s for prismatic joints.
     pub qdot: [f64; MAX_ROBOT_JOINTS],
-    /// Torque of the skin in Nm.
+    /// Torque of the skin in each joint in Nm, or force in N for prismatic joints.
     pub torque: [f64; MAX_ROBOT_JOINTS],
-    /// Age in epochs of the oldest contribution to the torque.
+    /// Number of epochs that the oldest contribution to the torque has missed.
     pub age: u32,
     /// Number of cells that contribute to the torque.
     pub contributing: u32,
-    /// True if the torque may be used.
+    /// True if the controller may use the torque.
     pub valid: bool,
-    /// Lost buses, whose cells are missing from the torque or decay in it: bit n is bus n of the skin, bit 31 stands
-    /// for all buses from there on.
+    /// Mask of lost buses, whose cells are missing from the torque or whose torques decay: bit n is bus n of the skin;
+    /// bit 31 stands for all buses from the 32nd on.
     pub missing: u32,
-    /// True if the robot is halted: a controller's commands have no effect.
+    /// True if the robot is halted. Commands of a controller then have no effect.
     pub halted: bool,
 }
 
@@ -45,22 +45,22 @@ pub struct Input {
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "one at a time, on the stack: the loop allocates nothing")]
 pub enum ControllerOutput {
-    /// Joint velocities in rad/s until the next tick; finite, and within the speed limits.
+    /// Joint velocities in rad/s until the next tick. They are finite and within the speed limits.
     Move([f64; MAX_ROBOT_JOINTS]),
-    /// A bad cycle: the controller has no answer. The caller decides how the robot then moves.
+    /// A bad cycle: the controller has no command. The caller decides how the robot then moves.
     Bad(BadCycle),
 }
 
 /// Reason of a bad cycle.
 #[derive(Clone, Copy, Debug, Eq, Error, Hash, Ord, PartialEq, PartialOrd)]
 pub enum BadCycle {
-    /// The torque must not be used, or is not a number.
+    /// The torque is invalid, or is not a number.
     #[error("the torque is not valid")]
     Torque,
     /// The external controller has not sent a hello yet, or has ended.
     #[error("no external controller is connected")]
     NoPeer,
-    /// The external controller's answer to the last tick is missing.
+    /// The external controller has not answered the last tick in time.
     #[error("the external controller's answer is missing")]
     NoAnswer,
     /// The external controller sent an invalid datagram.
@@ -70,26 +70,26 @@ pub enum BadCycle {
 
 /// A controller, which turns torques into joint velocities.
 pub trait Controller: Send {
-    /// Computes one tick. Must not block, allocate, lock or log.
+    /// Computes the command of one tick. Must not block, allocate, lock or log.
     fn step(&mut self, input: &Input) -> ControllerOutput;
 
-    /// Counters of the controller by name. Call it at the end of a run, not in the tick.
+    /// Returns the controller's counters, each with its name. To be called at the end of a run, not in a tick.
     fn counts(&self) -> Vec<(String, u64)> {
         Vec::new()
     }
 
-    /// Reason why the controller counts as absent at the end of a run, if it does. `silent` is the number of bad cycles
-    /// in a row before that, if it is large enough to halt a robot. Call it at the end, not in the tick. A controller
-    /// in this program is never absent.
+    /// Returns the reason for which the controller counts as absent at the end of a run; `None` if it does not.
+    /// `silent` is the number of consecutive bad cycles at the end, if these are enough to halt a robot. To be called
+    /// at the end of a run, not in a tick. A controller within this program is never absent.
     fn absence(&self, silent: Option<u32>) -> Option<Absence> {
         let _ = silent;
         None
     }
 }
 
-/// Admittance control `M q'' + D q' = tau` of each joint.
+/// Admittance control of each joint by `M q'' + D q' = tau`.
 ///
-/// The controller has no state of its own: it starts from the velocity that the robot reports, so that a joint at its
+/// The controller stores no state. It starts each tick from the velocity that the robot reports, so that a joint at its
 /// limit, or a halted robot, starts from rest.
 ///
 /// The equation is integrated exactly for a torque that is constant over the tick, which is stable for any M, D and
@@ -99,18 +99,18 @@ pub struct Kinesthetic {
     joints: [Admittance; MAX_ROBOT_JOINTS],
 }
 
-/// Admittance of one joint.
+/// Constants of the admittance of one joint.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Admittance {
     /// Mobility 1/D in rad/s per Nm.
     mobility: f64,
-    /// Fraction of a velocity that remains after a tick: `e^(-D/M T)`.
+    /// Fraction of the velocity that remains after one tick without torque: `e^(-D/M T)`.
     keep: f64,
     max_speed: f64,
 }
 
 impl Kinesthetic {
-    /// Creates the skin's controller, or `None` if the skin has another kind.
+    /// Creates the controller of the skin; `None` if the skin has a controller of another kind.
     #[must_use]
     pub fn new(skin: &Skin) -> Option<Self> {
         match &skin.controller.kind {
@@ -150,7 +150,7 @@ impl Controller for Kinesthetic {
     }
 }
 
-/// Follows positions that are known for all times, as quickly as the joints allow.
+/// A controller that follows positions known for all times, as fast as the speed limits allow.
 #[derive(Clone, Copy, Debug)]
 pub struct Planned<F> {
     at: F,
@@ -158,8 +158,8 @@ pub struct Planned<F> {
 }
 
 impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS]> Planned<F> {
-    /// Follows `at`, which returns positions in rad or m for a time in s since the start of the run. It must not block,
-    /// allocate, lock or log.
+    /// Creates a controller that follows the positions `at(t)` in rad or m, where t is the time in s since the start of
+    /// the run. `at` must not block, allocate, lock or log.
     #[must_use]
     pub fn new(skin: &Skin, at: F) -> Self {
         Self { at, pace: SpeedLimits::from_skin(skin) }
@@ -167,17 +167,18 @@ impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS]> Planned<F> {
 }
 
 impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS] + Send> Controller for Planned<F> {
-    /// Aims at the position for the start of the next tick, so that the robot neither lags nor drifts.
+    /// Computes the velocities that reach the position planned for the start of the next tick, so that the robot
+    /// neither lags nor drifts.
     fn step(&mut self, input: &Input) -> ControllerOutput {
         let next = (self.at)(seconds(input.time) + self.pace.tick);
         ControllerOutput::Move(self.pace.towards(&next, input))
     }
 }
 
-/// Speed limits of the joints, and the length of a tick.
+/// The speed limits of the joints and the duration of a tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct SpeedLimits {
-    /// Length of a tick in s.
+    /// Duration of a tick in s.
     tick: f64,
     max_speed: [f64; MAX_ROBOT_JOINTS],
 }
@@ -187,7 +188,8 @@ impl SpeedLimits {
         Self { tick: 1.0 / skin.timing.control_hz, max_speed: padded(&skin.controller.max_speed) }
     }
 
-    /// Velocities that bring the robot to `goal` by the next tick, within the speed limits; zero while it is halted.
+    /// Returns the joint velocities that bring the robot to `goal` by the next tick, as far as the speed limits allow;
+    /// zero while the robot is halted.
     pub(crate) fn towards(&self, goal: &[f64; MAX_ROBOT_JOINTS], input: &Input) -> [f64; MAX_ROBOT_JOINTS] {
         let mut velocity = *goal;
         for (velocity, q) in velocity.iter_mut().zip(input.q) {
@@ -196,7 +198,7 @@ impl SpeedLimits {
         self.limited(velocity, input)
     }
 
-    /// Velocities within the speed limits; zero while the robot is halted.
+    /// Returns the velocities clamped to the speed limits; zero while the robot is halted.
     pub(crate) fn limited(
         &self,
         mut velocity: [f64; MAX_ROBOT_JOINTS],
@@ -239,7 +241,7 @@ mod tests {
         Input { torque, valid: true, ..Input::default() }
     }
 
-    /// Runs the controller on a simulated arm and returns the arm.
+    /// Runs the controller on a simulated arm for `ticks` ticks with a constant torque. Returns the arm.
     fn run(controller: &mut impl Controller, start: [f64; 6], ticks: u64, torque: [f64; 6]) -> SimulatedArm {
         let mut arm = SimulatedArm::new(&skin(), padded(&start));
         for tick in 0..ticks {

@@ -1,5 +1,5 @@
-//! One tick of the control loop as a pure function: the state of the buses goes in, the messages to send and the record
-//! come out.
+//! One tick of the control loop, as a function without input and output: from the state of the buses it computes the
+//! messages to send and the record of the tick.
 //!
 //! ```text
 //!   Tick, BusInput ──> Cycle::tick ─┬─> TickOutcome::broadcast ──> a new epoch for every bus
@@ -7,11 +7,11 @@
 //!                                   └─> TickOutcome::record ─────> the record of this tick
 //! ```
 //!
-//! A lost bus does not affect others: the last torques of its cells decay to zero ([`carried`]), and the loop continues
-//! with the other buses.
+//! The loss of a bus does not affect the other buses: the last torques of the lost bus's cells decay to zero
+//! ([`carried`]), and the loop continues with the other buses.
 //!
-//! A tick does not allocate, lock or log, and its cost does not grow with the number of cells, unless it also computes
-//! centrally ([`Cycle::central`]).
+//! A tick does not allocate, lock or log. Its cost does not grow with the number of cells, unless torques are also
+//! computed centrally ([`Cycle::central`]).
 
 pub mod carried;
 mod chain;
@@ -32,104 +32,105 @@ use chain::Chain;
 use model::central::Central;
 use model::table::Snapshot;
 
-/// Number and time of a tick.
+/// Number and start time of a tick.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Tick {
-    /// Number since the start, including skipped ticks.
+    /// Number of ticks since the start, including skipped ticks.
     pub number: u64,
-    /// Nominal time since the start.
+    /// Nominal start of the tick since the start of the run.
     pub time: Micros,
 }
 
-/// Reason why the robot is halted.
+/// The reason for which the robot is halted.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Halt {
-    /// The limit of bad cycles in a row was reached.
+    /// The limit of consecutive bad cycles was reached. The value is the reason of the last one.
     BadCycles(BadCycle),
-    /// A halt frame was received.
+    /// A halt frame was received from a bus.
     Frame,
 }
 
-/// Record of a tick.
+/// The record of one tick: inputs, command and state.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TickRecord {
     /// Number and time of the tick.
     pub tick: Tick,
-    /// Number of ticks skipped just before, because the one before took too long or the machine was busy.
+    /// Number of ticks that were skipped before this one, because the tick before took too long or the machine was
+    /// busy.
     pub skipped: u64,
-    /// Joint positions in rad.
+    /// Joint positions in rad, or in m for prismatic joints.
     pub q: [f64; MAX_ROBOT_JOINTS],
-    /// Joint velocities in rad/s.
+    /// Joint velocities in rad/s, or in m/s for prismatic joints.
     pub qdot: [f64; MAX_ROBOT_JOINTS],
-    /// Torque of the cells in Nm.
+    /// Torque of the cells in each joint in Nm, or force in N for prismatic joints.
     pub torque: [f64; MAX_ROBOT_JOINTS],
-    /// True if the torque could be used.
+    /// True if the controller could use the torque.
     pub valid: bool,
-    /// Epoch of the last joints.
+    /// Epoch of the last broadcast of joints.
     pub epoch: Epoch,
     /// Commanded joint velocities in rad/s.
     pub command: [f64; MAX_ROBOT_JOINTS],
-    /// Number of cells in the torque.
+    /// Number of cells that contribute to the torque.
     pub contributing: u32,
-    /// Number of epochs that the oldest of them has missed.
+    /// Number of epochs that the oldest contribution to the torque has missed.
     pub age: u32,
-    /// Number of cells in contact that missed the last epoch.
+    /// Number of cells in contact from which no torque of the last epoch arrived.
     pub stale: u32,
     /// Number of dead cells.
     pub dead: u32,
-    /// Lost buses: bit n is bus n of the skin, bit 31 stands for all buses from there on.
+    /// Mask of lost buses: bit n is bus n of the skin; bit 31 stands for all buses from the 32nd on.
     pub missing: u32,
-    /// Reason of a bad cycle.
+    /// Reason of a bad cycle; `None` if the cycle was good.
     pub bad: Option<BadCycle>,
-    /// Reason of the halt while the robot is halted.
+    /// Reason of the halt; `None` if the robot is not halted.
     pub halted: Option<Halt>,
-    /// Joints at their limits, and refused commands.
+    /// Joints that stand at their limits, and true if a command was refused.
     pub moved: StepResult,
 }
 
-/// Torque of the whole skin, computed centrally.
+/// The torque of the whole skin, computed centrally for comparison.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct CentralTorque {
-    /// Sum of all cells' torques in Nm or N, by joint of the robot (paper, Eq. 1).
+    /// Sum of the torques of all cells in Nm or N, for each joint of the robot (paper, Eq. 1).
     pub torque: [f64; MAX_ROBOT_JOINTS],
-    /// Number of cells with a force above zero.
+    /// Number of cells with a contact force above zero.
     pub active: u32,
 }
 
-/// Outcome of a tick.
+/// The result of a tick: messages to send, and the record.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct TickOutcome {
-    /// Epoch of new joints for all buses ([`Cycle::joints`]).
+    /// Epoch of the new joints to send on all buses ([`Cycle::joints`]); `None` if none are due.
     pub broadcast: Option<Epoch>,
-    /// Number of earlier broadcasts that were skipped with their ticks.
+    /// Number of earlier broadcasts that were skipped because their ticks were skipped.
     pub broadcasts_skipped: u64,
-    /// A halt or a resume to send on all buses: the loop halts itself, or received the command on one bus and must
+    /// Halt or resume to send on all buses. The loop has halted by itself, or received the command on one bus and must
     /// repeat it on the others.
     pub command: Option<Command>,
     /// Record of the tick.
     pub record: TickRecord,
 }
 
-/// State of the control loop.
+/// The state of the control loop.
 pub struct Cycle {
     controller: Box<dyn Controller>,
     robot: Box<dyn Robot + Send>,
     central: Vec<Central>,
-    /// Distinct chains; several buses may share one.
+    /// The distinct chains of the skin. Several buses may share one.
     chains: Vec<Chain>,
-    /// Index of each bus's chain.
+    /// Index in `chains` of each bus's chain.
     chain_of: Vec<usize>,
     tick_seconds: f64,
     ticks_per_broadcast: u64,
     safety: Safety,
-    /// Number of broadcasts that each bus has carried.
+    /// The broadcasts that each bus has carried.
     carried: Vec<Carried>,
     epoch: Epoch,
     broadcasts: u64,
-    /// Position of the last broadcast in the schedule.
+    /// Index of the last broadcast in the schedule of broadcasts.
     slot: Option<u64>,
     bad_in_a_row: u32,
-    /// Deadline for the controller's start; `None` once it has started.
+    /// Deadline for the start of the external controller; `None` once it has started.
     starts: Option<Micros>,
     good_in_a_row: u32,
     halted: Option<Halt>,
@@ -147,7 +148,7 @@ impl core::fmt::Debug for Cycle {
 }
 
 impl Cycle {
-    /// Creates a loop that has not started; its first epoch is 0.
+    /// Creates a loop before its first tick. The first epoch is 0.
     #[must_use]
     pub fn new(skin: &Skin, controller: Box<dyn Controller>, robot: Box<dyn Robot + Send>) -> Self {
         let (mut chains, mut chain_of) = (Vec::<Chain>::new(), Vec::new());
@@ -183,25 +184,26 @@ impl Cycle {
         }
     }
 
-    /// Starts after this epoch: cells that were running before would take its joints for repeated ones.
+    /// Sets the epoch after which the loop starts. Cells that were already running would take joints with an epoch that
+    /// they know for repeated ones.
     pub const fn start_after(&mut self, epoch: Epoch) {
         self.epoch = epoch;
     }
 
-    /// Joint positions in rad.
+    /// Returns the joint positions of the robot in rad or m.
     #[must_use]
     pub fn positions(&self) -> [f64; MAX_ROBOT_JOINTS] {
         self.robot.positions()
     }
 
-    /// Counters of the controller by name.
+    /// Returns the controller's counters, each with its name.
     #[must_use]
     pub fn counts(&self) -> Vec<(String, u64)> {
         self.controller.counts()
     }
 
-    /// Reason why the controller counts as absent, if it does: the robot stands without a halt, because the controller
-    /// still has time to start, or never answered.
+    /// Returns the reason for which the controller counts as absent; `None` if it does not. The robot of an absent
+    /// controller stands still without a halt, because the controller still has time to start or has never answered.
     #[must_use]
     pub fn absence(&self) -> Option<Absence> {
         if self.bad_in_a_row == 0 || self.halted.is_some() {
@@ -211,14 +213,14 @@ impl Cycle {
         self.controller.absence(stands.then_some(self.bad_in_a_row))
     }
 
-    /// Number of broadcasts so far.
+    /// Returns the number of broadcasts so far.
     #[must_use]
     pub const fn broadcasts(&self) -> u64 {
         self.broadcasts
     }
 
-    /// Computes one tick after `skipped` skipped ones. The inputs are totals of the buses, in the skin's order, without
-    /// cells, so that the cost does not grow with the number of cells.
+    /// Computes one tick, before which `skipped` ticks were skipped. The inputs are the totals of each bus, in the
+    /// skin's order, and not its cells, so that the cost does not grow with the number of cells.
     pub fn tick<'a>(
         &mut self,
         tick: Tick,
@@ -301,8 +303,9 @@ impl Cycle {
         TickOutcome { broadcast, broadcasts_skipped, command, record }
     }
 
-    /// Computes the reference torque centrally, from the words of the last broadcast and the sensor values at it.
-    /// Distributed computation takes this work out of the tick. Its cost grows with the number of cells.
+    /// Computes the reference torque centrally, from the joint words of the last broadcast and the sensor values
+    /// latched at it. The cost grows with the number of cells; with distributed computation this work is not part of
+    /// the tick.
     #[must_use]
     pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> CentralTorque {
         let mut reference = CentralTorque::default();
@@ -315,26 +318,26 @@ impl Cycle {
         reference
     }
 
-    /// Index of a bus's chain. Buses with the same chain have the same joints.
+    /// Returns the index of a bus's chain. Buses with the same index have the same joints.
     #[must_use]
     pub fn chain_of(&self, bus: usize) -> usize {
         self.chain_of.get(bus).copied().unwrap_or(usize::MAX)
     }
 
-    /// Joints of a chain as last broadcast.
+    /// Returns the joints of a chain as in the last broadcast.
     #[must_use]
     pub fn joints(&self, chain: usize) -> Joints {
         self.chains.get(chain).map_or_else(Joints::default, Chain::broadcast_joints)
     }
 
-    /// Positions of a chain at the latest broadcast, before rounding to words.
+    /// Returns the joint positions of a chain at the last broadcast, in rad or m, before they were rounded to words.
     #[must_use]
     pub fn positions_of(&self, chain: usize) -> [f64; MAX_JOINTS] {
         self.chains.get(chain).map_or([0.0; MAX_JOINTS], |chain| chain.positions(&self.robot.positions()))
     }
 
-    /// Handles halts and resumes from other senders; a halt takes precedence over a resume. Returns the command to send
-    /// on the other buses.
+    /// Handles halts and resumes that other senders sent on a bus. A halt takes precedence over a resume. Returns the
+    /// command to send on the other buses.
     fn obey(&mut self, halts: u32, resumes: u32) -> Option<Command> {
         let mut heard = None;
         if resumes != self.resumes {
@@ -351,7 +354,7 @@ impl Cycle {
         heard
     }
 
-    /// Counts bad cycles. Returns true if this one halts the robot.
+    /// Counts consecutive bad cycles. Returns true if this cycle halts the robot.
     fn count(&mut self, bad: Option<BadCycle>, now: Micros) -> bool {
         let Some(why) = bad else {
             self.bad_in_a_row = 0;
@@ -371,7 +374,8 @@ impl Cycle {
         halt
     }
 
-    /// Broadcasts the joints when due: after a fixed number of ticks, also if ticks were skipped.
+    /// Starts a new epoch if a broadcast is due: after a fixed number of ticks, even if some were skipped. Returns the
+    /// epoch, and the number of broadcasts that were skipped.
     fn broadcast(&mut self, tick: Tick) -> (Option<Epoch>, u64) {
         let slot = tick.number / self.ticks_per_broadcast;
         if self.slot == Some(slot) {

@@ -1,4 +1,4 @@
-//! One tick of the control loop: the state of the buses goes in, the messages to send and the record come out.
+//! The control loop: each tick computes the messages to send and a record from the state of the buses.
 //!
 //! | module | what |
 //! |---|---|

@@ -1,4 +1,4 @@
-//! Selection of the controller for a scenario's motion.
+//! Selection of the controller for the motion of a scenario.
 
 use std::path::Path;
 
@@ -8,10 +8,10 @@ use crate::controller::{Controller, Kinesthetic, Planned};
 use crate::external::{External, SocketError};
 use model::scenario::{Motion, MotionKind};
 
-/// Creates the controller for a scenario's motion: hold, sine, or the skin's controller.
+/// Creates the controller for the motion of a scenario: hold, sine, or the skin's own controller.
 ///
 /// # Errors
-/// Returns [`SocketError`] if the skin's controller is another program and its socket cannot be opened.
+/// Returns [`SocketError`] if the skin's controller is an external program and the gateway cannot listen on its socket.
 pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>, SocketError> {
     let motion = *motion;
     Ok(match (motion.kind, &skin.controller.kind) {

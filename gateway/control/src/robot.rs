@@ -2,29 +2,29 @@
 
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 
-/// A robot that follows joint velocities. Joints that it does not have stand at zero.
+/// A robot that follows joint velocities. Array elements of joints that it does not have are zero.
 pub trait Robot {
-    /// Moves for `seconds` with these joint velocities in rad/s. Called once per tick: must not block, allocate, lock
-    /// or log.
+    /// Moves the joints for `seconds` with these velocities in rad/s or m/s. The loop calls this once per tick, so it
+    /// must not block, allocate, lock or log.
     fn step(&mut self, velocity: &[f64; MAX_ROBOT_JOINTS], seconds: f64) -> StepResult;
 
-    /// Joint positions in rad, counting full turns: they may exceed half a turn.
+    /// Returns the joint positions in rad or m. Full turns are counted, so a position may exceed half a turn.
     fn positions(&self) -> [f64; MAX_ROBOT_JOINTS];
 
-    /// Joint velocities in rad/s.
+    /// Returns the joint velocities in rad/s or m/s.
     fn velocities(&self) -> [f64; MAX_ROBOT_JOINTS];
 }
 
-/// Result of a step.
+/// The result of a step of a robot.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct StepResult {
-    /// Joints that stand at a limit and were commanded beyond it; one bit each, joint 1 lowest.
+    /// Mask of the joints that stand at a limit and were commanded beyond it: bit 0 is joint 1.
     pub at_limit: u32,
-    /// True if a velocity was not finite and was taken as zero.
+    /// True if a velocity was not finite and was replaced by zero.
     pub refused: bool,
 }
 
-/// An arm whose positions follow the commanded velocities exactly, up to its joints' limits.
+/// A simulated arm whose positions follow the commanded velocities exactly, up to the limits of its joints.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SimulatedArm {
     positions: [f64; MAX_ROBOT_JOINTS],
@@ -33,7 +33,7 @@ pub struct SimulatedArm {
 }
 
 impl SimulatedArm {
-    /// Creates the skin's robot, at rest at `start` (in rad), clamped to its limits.
+    /// Creates the robot of the skin, at rest at the positions `start` in rad or m, clamped to the joint limits.
     #[must_use]
     pub fn new(skin: &Skin, start: [f64; MAX_ROBOT_JOINTS]) -> Self {
         let mut limits = [[0.0; 2]; MAX_ROBOT_JOINTS];

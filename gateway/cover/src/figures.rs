@@ -1,17 +1,17 @@
-//! Measures how well a link is covered.
+//! Measures how well the cells cover a link.
 
 use crate::grid::Grid;
 use crate::place::{CellPosition, spacing};
 use crate::surface::{Sample, Surface, real};
 use crate::{LinkFigures, RobotLink};
 
-/// Computes the figures of a link.
+/// Computes how well the cells at `spots` cover a link.
 pub(crate) fn figures(link: &RobotLink, surface: &Surface<'_>, spots: &[CellPosition], pitch: f64) -> LinkFigures {
     let grid = Grid::with_points(pitch, spots.iter().map(|spot| &spot.point));
     let covered = |sample: &&Sample| {
         let mut near = grid.around(grid.cube(&sample.point)).filter_map(|index| spots.get(index));
         near.any(|spot| {
-            // A cell does not cover the other side of a thin wall.
+            // A cell covers only samples whose faces point to the same side, so not the other side of a thin wall.
             spot.normal.dot(&sample.face) > -0.5 && (spot.point - sample.point).norm() <= pitch
         })
     };

@@ -1,10 +1,10 @@
-//! A grid of cubes that finds points near to others.
+//! A grid of cubes by which the points near another point are found.
 
 use std::collections::BTreeMap;
 
 use nalgebra::Point3;
 
-/// Points by the cube that contains them.
+/// Indices of points, by the cube that contains the point.
 #[derive(Clone, Debug)]
 pub(crate) struct Grid {
     edge: f64,
@@ -12,12 +12,12 @@ pub(crate) struct Grid {
 }
 
 impl Grid {
-    /// Creates an empty grid of cubes with this edge, in m.
+    /// Creates an empty grid whose cubes have this edge length, in m.
     pub(crate) const fn new(edge: f64) -> Self {
         Self { edge, cubes: BTreeMap::new() }
     }
 
-    /// Creates a grid of these points, numbered from 0.
+    /// Creates a grid with the given points, whose indices are their positions in the sequence.
     pub(crate) fn with_points<'a>(edge: f64, points: impl IntoIterator<Item = &'a Point3<f64>>) -> Self {
         let mut grid = Self::new(edge);
         for (index, point) in points.into_iter().enumerate() {
@@ -30,19 +30,19 @@ impl Grid {
         self.cubes.entry(self.cube(point)).or_default().push(index);
     }
 
-    /// Returns the cube that contains a point.
+    /// Returns the coordinates of the cube that contains a point.
     #[expect(clippy::cast_possible_truncation, reason = "saturates far away, where nothing is near")]
     pub(crate) fn cube(&self, point: &Point3<f64>) -> [i64; 3] {
         [point.x, point.y, point.z].map(|coordinate| (coordinate / self.edge).floor() as i64)
     }
 
-    /// Returns all cubes that contain points.
+    /// Returns all cubes that contain points, each with the indices of its points.
     pub(crate) fn cubes(&self) -> impl Iterator<Item = ([i64; 3], &[usize])> {
         self.cubes.iter().map(|(&cube, points)| (cube, points.as_slice()))
     }
 
-    /// Returns the points of a cube and of the 26 around it. They include all points within an edge of any point in the
-    /// cube.
+    /// Returns the indices of the points in a cube and in the 26 cubes around it. They include all points that are
+    /// within an edge length of any point in the cube.
     pub(crate) fn around(&self, [x, y, z]: [i64; 3]) -> impl Iterator<Item = usize> {
         let near = |middle: i64| middle.saturating_sub(1)..=middle.saturating_add(1);
         near(x).flat_map(move |x| near(y).map(move |y| [x, y])).flat_map(move |[x, y]| {

@@ -1,8 +1,9 @@
 //! Covers robot links with hexagonal skin cells: places cells on the visual meshes, wires them, and assigns them to
 //! buses.
 //!
-//! Only the outer surface gets cells: a point belongs to it if rays from just above it escape. Meshes may have inner
-//! parts, double walls and triangles with the wrong winding. The result is the same for the same input and seed.
+//! Only the outer surface gets cells. A point is on the outer surface if rays that start just above it leave the link.
+//! Meshes may therefore have inner parts, double walls and triangles with the wrong winding. Equal input with an equal
+//! seed gives an equal result.
 //!
 //! ```
 //! use cover::mesh::Mesh;
@@ -36,10 +37,10 @@ use mesh::{Mesh, Triangle};
 use surface::Surface;
 pub use wire::{MAX_NODES, PORTS};
 
-/// The smallest pitch, in m.
+/// The smallest distance between neighbouring cells, in m.
 pub const MIN_PITCH: f64 = 1e-3;
 
-/// The largest pitch, in m.
+/// The largest distance between neighbouring cells, in m.
 pub const MAX_PITCH: f64 = 1.0;
 
 /// The maximum number of links, covered ones and obstacles together.
@@ -48,34 +49,35 @@ pub const MAX_LINKS: usize = 1000;
 /// A rigid body of a robot.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RobotLink {
-    /// The name, for errors.
+    /// The name of the link, which is used in errors.
     pub name: String,
-    /// The meshes; inner parts get no cells.
+    /// The meshes of the link. Those inside of others get no cells.
     pub parts: Vec<LinkMesh>,
-    /// The pose of its frame in a frame that all links share, in m, for the joint configuration at which it is covered.
-    /// Surfaces that links hide from each other in this configuration get no cells.
+    /// The pose of the link's frame in a frame that all links share, in m, for the joint configuration in which the
+    /// robot is covered. Surfaces that links hide from each other in this configuration get no cells.
     pub pose: Isometry3<f64>,
 }
 
-/// A mesh of a link.
+/// A mesh of a link, with its place on the link.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LinkMesh {
     /// The mesh.
     pub mesh: Mesh,
     /// The pose of the mesh's frame in the link's frame, in m.
     pub pose: Isometry3<f64>,
-    /// The factors by which the mesh's coordinates are multiplied first; negative ones mirror it.
+    /// The factors by which the coordinates of the mesh are multiplied before the pose is applied. Negative factors
+    /// mirror the mesh.
     pub scale: [f64; 3],
 }
 
 impl LinkMesh {
-    /// Creates an unscaled part at the origin of the link's frame.
+    /// Creates a part from a mesh that is not scaled and has the link's frame.
     #[must_use]
     pub fn new(mesh: Mesh) -> Self {
         Self { mesh, pose: Isometry3::identity(), scale: [1.0; 3] }
     }
 
-    /// Returns the triangles of the part if `frame` is the link's frame.
+    /// Returns the triangles of the part in a frame in which the link's frame has the pose `frame`.
     #[must_use]
     pub fn triangles(&self, frame: &Isometry3<f64>) -> Vec<Triangle> {
         let (pose, [x, y, z]) = (frame * self.pose, self.scale);
@@ -84,29 +86,29 @@ impl LinkMesh {
     }
 }
 
-/// A box that must not contain cells.
+/// A box on a link in which no cells are placed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KeepOut {
     /// The index of the covered link in whose frame the box is given.
     pub link: usize,
-    /// The smallest coordinates, in m.
+    /// The corner of the box with the smallest coordinates, in m.
     pub min: [f64; 3],
-    /// The largest coordinates, in m.
+    /// The corner of the box with the largest coordinates, in m.
     pub max: [f64; 3],
 }
 
-/// Options of the cover.
+/// Options for covering links with cells.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CoverOptions {
     /// The distance between the centers of neighbouring cells, in m.
     pub pitch: f64,
-    /// The seed of the random numbers.
+    /// The seed of the random numbers that place the cells.
     pub seed: u64,
-    /// Boxes that must not contain cells.
+    /// Boxes in which no cells are placed.
     pub keep_out: Vec<KeepOut>,
     /// The maximum number of cells per bus, 1 to [`MAX_NODES`].
     pub nodes_per_bus: usize,
-    /// The minimum distance of each cell's center from other links, in m.
+    /// The minimum distance from the center of a cell to other links, in m.
     pub clearance: f64,
 }
 
@@ -121,54 +123,55 @@ impl Default for CoverOptions {
 pub struct CoverCell {
     /// The index of the covered link.
     pub link: usize,
-    /// The center on the mesh, in the link's frame, in m.
+    /// The center of the cell on the mesh, in the link's frame, in m.
     pub position: [f64; 3],
-    /// The outward unit normal in the link's frame. It is the mean of the mesh's normals below the cell, and at most 9
-    /// degrees off the mesh's normal at `position`.
+    /// The outward unit normal of the cell in the link's frame. It is the mean normal of the mesh below the cell,
+    /// limited to 9 degrees from the mesh's normal at `position`.
     pub normal: [f64; 3],
-    /// The index of the bus.
+    /// The index of the cell's bus.
     pub bus: usize,
-    /// The node id on the bus, from 1.
+    /// The node id of the cell on its bus, from 1.
     pub node: u8,
-    /// By port: the node id of the wired cell, on the same bus and link. Ports are a quarter of a turn apart,
-    /// counterclockwise as seen from outside. Each wire uses the port nearest to its direction.
+    /// For each port, the node id of the cell that the port is wired to, on the same bus and link. The ports are a
+    /// quarter turn apart, counterclockwise as seen from outside. Each wire is at the port nearest to its direction.
     pub neighbors: [Option<u8>; PORTS],
-    /// True for one cell of each wired group, which is wired to the gateway.
+    /// True if the cell is wired to the gateway. This holds for one cell of each group of wired cells.
     pub root: bool,
 }
 
-/// The figures of a covered link.
+/// Measures of how well the cells cover a link.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LinkFigures {
     /// The name of the link.
     pub name: String,
     /// The number of cells.
     pub cells: usize,
-    /// The area of the outer surface, without parts that other links hide, in m².
+    /// The area of the outer surface that other links do not hide, in m².
     pub outer_area: f64,
-    /// The share of the outer surface in keep-out boxes, 0 to 1; 0 without an outer surface.
+    /// The share of the outer surface that is in keep-out boxes, 0 to 1; 0 for a link without an outer surface.
     pub kept_out: f64,
-    /// The share of the outer surface, including keep-out boxes, within one pitch of a cell on the same side, 0 to 1; 0
-    /// without an outer surface.
+    /// The share of the outer surface, including that in keep-out boxes, that is within one pitch of a cell on the same
+    /// side, 0 to 1; 0 for a link without an outer surface.
     pub covered: f64,
-    /// The median distance from a cell to the nearest one on the same side, in m; `None` for fewer than two cells.
+    /// The median distance from a cell to the nearest other cell on the same side, in m; `None` for fewer than two
+    /// cells.
     pub spacing: Option<f64>,
     /// The largest angle between a cell's normal and the mesh's normal at its center, in rad.
     pub tilt: f64,
 }
 
-/// A skin.
+/// The cells that cover the links of a robot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cover {
     /// The cells, ordered by bus and node id, and therefore by link.
     pub cells: Vec<CoverCell>,
     /// The number of buses.
     pub buses: usize,
-    /// The figures of each covered link.
+    /// Measures of how well each link is covered.
     pub links: Vec<LinkFigures>,
 }
 
-/// The error of links that cannot be covered.
+/// The reason why links cannot be covered.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum CoverError {
@@ -181,18 +184,18 @@ pub enum CoverError {
     /// The number of nodes per bus is out of range.
     #[error("{0} nodes per bus: it is 1 to {MAX_NODES}; correct it")]
     Nodes(usize),
-    /// There are too many links.
+    /// There are more links than [`MAX_LINKS`].
     #[error("{0} links, at most {MAX_LINKS}: add those far from the skin to --leave-out")]
     Links(usize),
-    /// A box belongs to no link, or its sides are invalid.
+    /// A keep-out box has no link or invalid sides.
     #[error("keep-out box {index}: {reason}; correct it")]
     KeepOut {
         /// The index of the box in the options.
         index: usize,
-        /// The problem.
+        /// A description of what is wrong with the box.
         reason: String,
     },
-    /// Scale and pose make a coordinate infinite or NaN.
+    /// A coordinate is infinite or NaN after the scale and the pose are applied.
     #[error(
         "link {link}, part {part}: coordinates are not finite after scale {scale:?} and its pose; correct them"
     )]
@@ -204,7 +207,7 @@ pub enum CoverError {
         /// The scale of the part.
         scale: [f64; 3],
     },
-    /// The parts of a link together have more triangles than a mesh may have.
+    /// The parts of a link have more triangles in total than a single mesh may have.
     #[error("link {link}: its parts have {count} triangles, at most {}; decimate them", mesh::MAX_TRIANGLES)]
     Triangles {
         /// The name of the link.
@@ -212,7 +215,7 @@ pub enum CoverError {
         /// The number of triangles.
         count: usize,
     },
-    /// The surface is too large for the pitch.
+    /// The surface of a link is too large for the pitch.
     #[error(
         "link {link}: {area:.3e} m² of triangles would take {cells:.0} cells at a pitch of {pitch} m, at most {most}; \
          correct the mesh's scale{}",
@@ -223,7 +226,7 @@ pub enum CoverError {
         link: String,
         /// The area of all triangles, including inner ones, in m².
         area: f64,
-        /// The number of cells for this area.
+        /// The number of cells that this area would take.
         cells: f64,
         /// The pitch, in m.
         pitch: f64,
@@ -232,7 +235,7 @@ pub enum CoverError {
     },
 }
 
-/// Covers `links` with cells, except where they or `others` hide the surface.
+/// Covers `links` with cells. Surfaces that `links` or `others` hide get no cells.
 ///
 /// # Errors
 /// Returns [`CoverError`] if an option is out of range, or if a link is too large for the pitch or not finite.
@@ -250,7 +253,7 @@ pub fn cover(links: &[RobotLink], others: &[RobotLink], options: &CoverOptions) 
     Ok(Cover { cells, buses, links: figures })
 }
 
-/// Formats the smallest sufficient pitch in m; empty if there is none in the allowed range.
+/// Returns a text with the smallest pitch that is large enough, in m. The text is empty if that exceeds [`MAX_PITCH`].
 fn raised(pitch: f64, cells: f64, most: usize) -> String {
     let most = u32::try_from(most).map_or(f64::INFINITY, f64::from);
     // The pitch is rounded up to whole mm.

@@ -1,4 +1,4 @@
-//! Places cells on a surface.
+//! Places cells on the surface of a link.
 
 use core::f64::consts::FRAC_PI_3;
 
@@ -12,39 +12,41 @@ use crate::grid::Grid;
 use crate::relax::{Field, Site};
 use crate::surface::{Sample, Surface, cell_area, real};
 
-/// The maximum angle between a cell's normal and the mesh's, in rad: 9 degrees.
+/// The maximum angle between the normal of a cell and that of the mesh at its center, in rad: 9 degrees.
 const MAX_TILT: f64 = 0.157;
 
-/// The initial distance between sites, in pitches: relaxation makes room for further ones between them.
+/// The distance between cells before relaxation, in pitches. It is larger than 1, because relaxation adds further cells
+/// between them.
 const INITIAL_SPACING: f64 = 1.15;
 
-/// The maximum number of attempts with other distances, until the spacing is the pitch.
+/// The maximum number of attempts to reach a median distance of one pitch, each with another initial distance.
 const MAX_ATTEMPTS: usize = 4;
 
-/// The relative difference between the median spacing and the pitch that ends the attempts.
+/// The relative difference between the median distance of cells and the pitch at which the attempts end.
 const SPACING_TOLERANCE: f64 = 0.015;
 
-/// The cost of tilt in the choice of a cell's position, per squared pitch and 1 minus the cosine: 9 degrees cost as
-/// much as a fifth of a pitch.
+/// The cost of tilting a cell, relative to that of moving it: 1 minus the cosine of the angle, times this factor, is
+/// compared with the square of the distance in pitches. A tilt of 9 degrees costs as much as moving the cell by a fifth
+/// of a pitch.
 const TILT_COST: f64 = 3.0;
 
-/// The minimum distance of two cells on the same side, in pitches. Relaxation leaves a few closer ones where a surface
-/// is folded or narrow.
+/// The minimum distance between two cells on the same side, in pitches. Relaxation leaves a few cells closer together
+/// where a surface is folded or narrow.
 const MIN_SPACING: f64 = 0.6;
 
-/// The minimum cosine of the angle between the normals of two cells on the same side.
+/// The cosine of the largest angle between the normals of two cells that count as being on the same side.
 const SAME_SIDE: f64 = 0.5;
 
-/// The position of a cell in the link's frame.
+/// The place of a cell, in the frame of its link.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct CellPosition {
     pub(crate) point: Point3<f64>,
     pub(crate) normal: Vector3<f64>,
-    /// The angle between the normal and the mesh's, in rad.
+    /// The angle between the normal of the cell and that of the mesh, in rad.
     pub(crate) tilt: f64,
 }
 
-/// Returns the positions of a link's cells.
+/// Returns the places of the cells on a link.
 pub(crate) fn place(surface: &Surface<'_>, options: &CoverOptions, link: usize) -> Vec<CellPosition> {
     let pitch = options.pitch;
     let field = Field::new(surface.samples.iter().filter(|sample| sample.free).collect(), 1.2 * pitch);
@@ -76,7 +78,7 @@ pub(crate) fn place(surface: &Surface<'_>, options: &CoverOptions, link: usize) 
     best.map_or_else(Vec::new, |(_, spots)| spots)
 }
 
-/// Removes positions that are closer than [`CLOSEST`] to an earlier one on the same side.
+/// Removes places that are closer than [`CLOSEST`] to an earlier place on the same side.
 fn thinned(spots: Vec<CellPosition>, pitch: f64) -> Vec<CellPosition> {
     let apart = MIN_SPACING * pitch;
     let mut grid = Grid::new(apart);
@@ -94,18 +96,18 @@ fn thinned(spots: Vec<CellPosition>, pitch: f64) -> Vec<CellPosition> {
     kept
 }
 
-/// Returns the median distance from a position to the nearest one that faces about the same way, in m.
+/// Returns the median distance from a place to the nearest other place on the same side, in m.
 pub(crate) fn spacing(spots: &[CellPosition], pitch: f64) -> Option<f64> {
     let nearest = |spot: &CellPosition| {
         let same = spots.iter().filter(|other| *other != spot && other.normal.dot(&spot.normal) > 0.0);
         same.map(|other| (other.point - spot.point).norm()).min_by(f64::total_cmp)
     };
-    // A cell that is alone on its side has no neighbours, and does not count.
+    // A cell without other cells on its side has no distance to them, and does not count.
     let nearest = spots.iter().filter_map(nearest).filter(|&distance| distance < 3.0 * pitch);
     median(&mut nearest.collect::<Vec<_>>())
 }
 
-/// Returns the median; the larger one of two middle values.
+/// Returns the median of the values. For an even number of values, returns the larger of the two in the middle.
 fn median(values: &mut [f64]) -> Option<f64> {
     let middle = values.len() / 2;
     if values.is_empty() {
@@ -115,7 +117,7 @@ fn median(values: &mut [f64]) -> Option<f64> {
     Some(*median)
 }
 
-/// Returns the positions on the mesh for relaxed sites.
+/// Returns the places of cells on the mesh, one for each site that relaxation has found.
 fn spots(surface: &Surface<'_>, field: &Field<'_>, sites: &[Site], pitch: f64) -> Vec<CellPosition> {
     let mut best: Vec<Option<(f64, &Sample)>> = vec![None; sites.len()];
     for (owner, sample) in field.owners(sites).into_iter().zip(&field.samples) {
@@ -140,13 +142,13 @@ fn spots(surface: &Surface<'_>, field: &Field<'_>, sites: &[Site], pitch: f64) -
     sites.iter().zip(best).filter_map(spot).collect()
 }
 
-/// Returns a unit vector towards `requested`, but at most [`MAX_TILT`] off `face`.
+/// Returns the unit vector that is nearest to `requested` and at most [`MAX_TILT`] away from `face`.
 fn limited(face: &Vector3<f64>, requested: &Vector3<f64>) -> Vector3<f64> {
     let angle = face.angle(requested);
     if angle <= MAX_TILT {
         return *requested;
     }
-    // Without an axis the two are opposite, which samples never are.
+    // Opposite vectors would have no rotation axis, but the vectors of samples are never opposite.
     let axis = Unit::try_new(face.cross(requested), 0.0);
     axis.map_or(*face, |axis| Rotation3::from_axis_angle(&axis, MAX_TILT) * face)
 }

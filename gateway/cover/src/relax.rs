@@ -1,5 +1,5 @@
-//! Lloyd's relaxation on the samples of a surface: every site moves to the mean of the samples nearest to it, until the
-//! sites form a honeycomb.
+//! Distributes sites evenly on the samples of a surface by Lloyd's relaxation: each site moves to the mean of the
+//! samples that are nearest to it, until the sites form a honeycomb.
 
 use core::f64::consts::FRAC_PI_3;
 use std::collections::VecDeque;
@@ -9,20 +9,21 @@ use nalgebra::{Point3, Rotation3, Unit, Vector3};
 use crate::grid::Grid;
 use crate::surface::{Sample, tangents};
 
-/// The minimum cosine between two normals for a sample to belong to a site. It separates the two sides of a thin wall
-/// and the faces at a sharp edge.
+/// The cosine of the largest angle between the normals of a site and of a sample that may belong to it. It separates
+/// the two sides of a thin wall, and the faces at a sharp edge.
 const MIN_NORMAL_COSINE: f64 = 0.3;
 
-/// The minimum distance of sites while they grow, in steps. It applies where a honeycomb meets itself behind a tube.
+/// The minimum distance between sites while they grow, in steps. It matters where a honeycomb that grows around a tube
+/// meets itself.
 const MIN_GROWTH_DISTANCE: f64 = 0.75;
 
-/// The number of rounds in which sites are moved.
+/// The number of rounds in which all sites are moved.
 const ROUNDS: usize = 60;
 
-/// The interval of rounds after which samples far from every site get new sites.
+/// The number of rounds after which new sites are added at samples that are far from every site.
 const ADDING: usize = 15;
 
-/// The center of a group of samples.
+/// A point that is the center of the samples nearest to it. A cell is placed there at the end.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Site {
     pub(crate) point: Point3<f64>,
@@ -30,13 +31,13 @@ pub(crate) struct Site {
 }
 
 impl Site {
-    /// Returns the squared distance to a sample, in m², if they face about the same way.
+    /// Returns the squared distance to a sample in m²; `None` if the sample faces another way.
     pub(crate) fn distance(&self, sample: &Sample) -> Option<f64> {
         (self.normal.dot(&sample.smooth) > MIN_NORMAL_COSINE).then(|| (self.point - sample.point).norm_squared())
     }
 }
 
-/// The samples where cells may be, and the maximum distance that a site serves.
+/// The samples at which cells may be placed, and the maximum distance from a site to its samples.
 #[derive(Debug)]
 pub(crate) struct Field<'a> {
     pub(crate) samples: Vec<&'a Sample>,
@@ -50,7 +51,7 @@ impl<'a> Field<'a> {
         Self { samples, grid, reach }
     }
 
-    /// Adds sites at samples, in the given order, that are `apart` from each other.
+    /// Adds a site at each sample, in the given order, that is farther than `apart` (in m) from all sites.
     pub(crate) fn apart(&self, order: &[usize], apart: f64, sites: &mut Vec<Site>) {
         let mut grid = Grid::with_points(apart, sites.iter().map(|site| &site.point));
         for sample in order.iter().filter_map(|&index| self.samples.get(index)) {
@@ -64,8 +65,8 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// Grows sites that are a `step` from each other like the cells of a honeycomb. Growth begins at samples in the
-    /// given order that have no site nearby. `turn` is the direction of the first row, in rad.
+    /// Grows a honeycomb of sites whose distance is `step`, in m. Growth begins at those samples, in the given order,
+    /// that have no site nearby. `turn` is the direction of the first row, in rad.
     pub(crate) fn grow(&self, order: &[usize], step: f64, turn: f64) -> Vec<Site> {
         let mut sites: Vec<Site> = Vec::new();
         let mut grid = Grid::new(step);
@@ -104,7 +105,7 @@ impl<'a> Field<'a> {
         sites
     }
 
-    /// Projects a site to the surface at the nearest sample, if one is near.
+    /// Moves a site onto the surface at the nearest sample; `None` if no sample is within `within`, in m.
     fn snapped(&self, site: &Site, within: f64) -> Option<Site> {
         let near = self.grid.around(self.grid.cube(&site.point)).filter_map(|index| self.samples.get(index));
         let near = near.filter_map(|sample| Some((site.distance(sample)?, sample)));
@@ -114,7 +115,7 @@ impl<'a> Field<'a> {
         (distance <= within * within).then_some(Site { point, normal: sample.smooth })
     }
 
-    /// Returns the nearest site of each sample, if one is within reach.
+    /// Returns the index of the nearest site for each sample; `None` if no site is near enough.
     pub(crate) fn owners(&self, sites: &[Site]) -> Vec<Option<usize>> {
         let mut owners = vec![None; self.samples.len()];
         let grid = Grid::with_points(self.reach, sites.iter().map(|site| &site.point));
@@ -139,7 +140,8 @@ impl<'a> Field<'a> {
         owners
     }
 
-    /// Moves sites until they are distributed evenly. Sites that are nearest to no sample are removed.
+    /// Moves the sites until they are distributed evenly. Removes those that have no samples. New sites are at least
+    /// `apart` (in m) from others.
     pub(crate) fn relax(&self, sites: &mut Vec<Site>, apart: f64) {
         for round in 1..=ROUNDS {
             let owners = self.owners(sites);

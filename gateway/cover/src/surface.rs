@@ -1,4 +1,4 @@
-//! The outer surface of a link, represented by samples.
+//! Finds the outer surface of a link, and represents it by samples.
 
 use core::f64::consts::{PI, TAU};
 
@@ -9,56 +9,56 @@ use crate::mesh::{Affine, MAX_TRIANGLES, Triangle};
 use crate::tree::{Ray, TriangleTree};
 use crate::{CoverError, KeepOut, RobotLink, CoverOptions};
 
-/// The number of samples per cell area.
+/// The number of samples on the area of a cell.
 const PER_CELL: f64 = 64.0;
 
-/// The maximum number of cells for the triangles of a link.
+/// The maximum number of cells whose area the triangles of a link may have.
 const MAX_CELLS: usize = 6000;
 
-/// The minimum number of samples, so that the figures of a small link are meaningful.
+/// The minimum number of samples, so that the measures of a small link are precise enough.
 const MIN_SAMPLES: f64 = 2000.0;
 
-/// The number of rays from a side of a sample. If the first [`FEW`] agree, no others are cast.
+/// The number of rays from a side of a sample. Further rays are not cast if the first [`FEW`] all agree.
 const RAYS: u32 = 32;
 const FIRST_RAYS: u32 = 8;
 
-/// The minimum share of rays that escape from a side of the outer surface: more than through a screw hole, and less
-/// than from between the arms of a fork.
+/// The minimum share of rays that leave the link from a side that is part of the outer surface. It is higher than
+/// through a screw hole, and lower than from between the arms of a fork.
 const MIN_ESCAPING_SHARE: f64 = 0.3;
 
-/// The maximum share of rays from inside another link that leave it through gaps of its mesh.
+/// The maximum share of rays that leave another link from its inside, through gaps of its mesh.
 const MAX_LEAKING_SHARE: f64 = 0.1;
 
-/// The minimum share of rays from a side that leave the robot, past all links. A smaller share comes only through the
-/// gap between two links, where nothing can touch a cell.
+/// The minimum share of rays that leave the whole robot from a side on which cells are placed. A smaller share leaves
+/// only through the gap between two links, where nothing can touch a cell.
 const MIN_REACHED_SHARE: f64 = 0.05;
 
-/// The number of rays for that share. If half of the first [`FEW`] leave, no others are cast.
+/// The number of rays by which [`REACHED`] is tested. Further rays are not cast if half of the first [`FEW`] leave.
 const REACH_RAYS: u32 = 128;
 
-/// The height above the surface at which rays start, in pitches.
+/// The height above the surface from which rays start, in pitches.
 const ABOVE: f64 = 1e-3;
 
-/// The distance up to which other links hide a surface, in pitches.
+/// The distance up to which other links hide a surface from rays, in pitches.
 const HIDING_DISTANCE: f64 = 2.0;
 
-/// The minimum share of the disc below a cell that is surface facing about the same way. It is about half at a straight
-/// edge, and near zero on the rim of a sheet.
+/// The minimum share of the disc below a cell that must be surface of a similar direction. The share is about a half at
+/// a straight edge, and near zero on the rim of a sheet.
 const MIN_SUPPORT: f64 = 0.4;
 
 /// A point of the outer surface. Each sample represents the same area.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sample {
     pub(crate) point: Point3<f64>,
-    /// The outward normal of the triangle.
+    /// The outward normal of the triangle on which the point is.
     pub(crate) face: Vector3<f64>,
-    /// The outward mean normal of the surface below a cell at the point.
+    /// The mean outward normal of the surface that a cell at this point would cover.
     pub(crate) smooth: Vector3<f64>,
-    /// True if a cell may be at the point.
+    /// True if a cell may be placed at the point.
     pub(crate) free: bool,
 }
 
-/// The outer surface of a link in its own frame.
+/// The outer surface of a link, in the frame of the link.
 #[derive(Debug)]
 pub(crate) struct Surface<'a> {
     own: TriangleTree,
@@ -77,7 +77,7 @@ pub(crate) fn cell_area(pitch: f64) -> f64 {
 }
 
 impl<'a> Surface<'a> {
-    /// Samples the outer surface of one of the links.
+    /// Finds the outer surface of one of the links, and samples it.
     pub(crate) fn new(
         index: usize,
         links: &[RobotLink],
@@ -118,10 +118,11 @@ impl<'a> Surface<'a> {
         Ok(surface)
     }
 
-    /// Samples all triangles evenly by area, and keeps the outer samples.
+    /// Samples all triangles with equal density, and keeps the samples on the outer surface.
     fn sample(&mut self, area: f64, count: f64) {
         self.share = area / count;
-        // Half of the first share is skipped, so that rounding errors do not add a sample.
+        // The first sample is placed in the middle of its share, so that rounding errors do not add a sample at the
+        // end.
         let mut due = -0.5;
         let mut taken = 0;
         for &triangle in self.own.triangles() {
@@ -144,11 +145,12 @@ impl<'a> Surface<'a> {
         }
     }
 
-    /// Returns the outward normal of a point on a triangle with this normal; `None` if the point is not on the outer
-    /// surface.
+    /// Returns the outward normal at a point of a triangle whose normal is `face`. Returns `None` if the point is not
+    /// on the outer surface.
     fn outward(&self, point: &Point3<f64>, face: &Vector3<f64>) -> Option<Vector3<f64>> {
         let front = self.escaping(point, face);
-        // Both sides of a sheet are outer sides. The more open one is chosen, and the front if they are equal.
+        // Both sides of a thin sheet are outer sides. The side from which more rays leave is chosen, and the front if
+        // both are equal.
         let back = if front < 0.95 { self.escaping(point, &-face) } else { 0.0 };
         let (side, share) = if back > front { (-face, back) } else { (*face, front) };
         let is_outer = share >= MIN_ESCAPING_SHARE
@@ -157,13 +159,14 @@ impl<'a> Surface<'a> {
         is_outer.then_some(side)
     }
 
-    /// Returns the share of rays from just above a point that escape, weighted by the cosine to the normal.
+    /// Returns the share of rays that leave the link from just above a point. Rays are weighted by the cosine of the
+    /// angle to the normal.
     fn escaping(&self, point: &Point3<f64>, side: &Vector3<f64>) -> f64 {
         let rays = self.rays(point, side);
         share(|ray| self.escapes(&rays(*ray), HIDING_DISTANCE * self.pitch))
     }
 
-    /// Returns true if something can touch the point from this side: enough rays leave the robot.
+    /// Returns true if something could touch the point from this side, because enough rays leave the robot.
     fn is_reached(&self, point: &Point3<f64>, side: &Vector3<f64>) -> bool {
         let rays = self.rays(point, side);
         let leaves = |ray: &u32| self.escapes(&rays(*ray), f64::INFINITY);
@@ -179,8 +182,8 @@ impl<'a> Surface<'a> {
         needed <= 0.0 || left.is_some()
     }
 
-    /// Returns rays by number, from just above a point to a side, with a density proportional to the cosine to the
-    /// normal.
+    /// Returns a function that creates a ray from its number. The rays start just above a point; their density is
+    /// proportional to the cosine of the angle to the normal.
     fn rays(&self, point: &Point3<f64>, side: &Vector3<f64>) -> impl Fn(u32) -> Ray {
         let origin = point + side * (ABOVE * self.pitch);
         let ((s, t), side) = (tangents(side), *side);
@@ -191,7 +194,7 @@ impl<'a> Surface<'a> {
         }
     }
 
-    /// Returns true if a ray meets neither its own link, nor another link within `until`.
+    /// Returns true if a ray hits neither the link itself nor, within the distance `until` in m, another link.
     fn escapes(&self, ray: &Ray, until: f64) -> bool {
         !self.own.blocks(ray, f64::INFINITY) && !self.others.blocks(ray, until)
     }
@@ -213,7 +216,7 @@ impl<'a> Surface<'a> {
         true
     }
 
-    /// Returns true if neither a box nor another link excludes cells at a point.
+    /// Returns true if cells are allowed at a point, because it is in no keep-out box and far enough from other links.
     fn allowed(&self, point: &Point3<f64>) -> bool {
         !self.keeps_out(point) && !self.others.near(point, self.clearance)
     }
@@ -227,7 +230,7 @@ impl<'a> Surface<'a> {
         self.keep_out.iter().any(inside)
     }
 
-    /// Computes the mean normal around each sample, and checks that there is enough surface below a cell.
+    /// Computes the mean normal around each sample, and checks that a cell there would have enough surface below it.
     fn smooth(&mut self) {
         let radius = self.pitch / 2.0;
         let grid = Grid::with_points(radius, self.samples.iter().map(|sample| &sample.point));
@@ -257,8 +260,8 @@ impl<'a> Surface<'a> {
         }
     }
 
-    /// Returns the point of the mesh above or below `point`, near a sample, with the mesh's outward normal there;
-    /// `None` if a cell may not be there.
+    /// Returns the point of the mesh directly above or below `point`, and the outward normal of the mesh there. Returns
+    /// `None` if no cell may be placed there.
     pub(crate) fn project(
         &self,
         point: &Point3<f64>,
@@ -274,7 +277,7 @@ impl<'a> Surface<'a> {
     }
 }
 
-/// Returns the share of rays that pass, from the first few if those agree.
+/// Returns the share of rays for which `escapes` is true. Only the first [`FEW`] rays are cast if they all agree.
 fn share(escapes: impl Fn(&u32) -> bool) -> f64 {
     let few = count((0..FIRST_RAYS).filter(&escapes));
     if few == 0 || few == FIRST_RAYS {
@@ -283,12 +286,13 @@ fn share(escapes: impl Fn(&u32) -> bool) -> f64 {
     f64::from(few + count((FIRST_RAYS..RAYS).filter(&escapes))) / f64::from(RAYS)
 }
 
-/// Counts rays.
+/// Counts the rays of an iterator.
 fn count(rays: impl Iterator<Item = u32>) -> u32 {
     rays.fold(0, |count, _| count + 1)
 }
 
-/// Returns points of the unit square that are distributed evenly for any number of points (a sequence of Roberts).
+/// Returns the point with this number of a sequence (by Roberts) whose beginnings are all distributed evenly over the
+/// unit square.
 fn scattered(index: u32) -> (f64, f64) {
     let at = f64::from(index);
     ((0.5 + at * 0.754_877_666_246_692_8).fract(), (0.5 + at * 0.569_840_290_998_053_3).fract())
@@ -309,12 +313,12 @@ pub(crate) fn area([a, b, c]: &Triangle) -> f64 {
     (b - a).cross(&(c - a)).norm() / 2.0
 }
 
-/// Returns the normal of a triangle, if it has an area.
+/// Returns the unit normal of a triangle; `None` for a triangle without an area.
 pub(crate) fn normal([a, b, c]: &Triangle) -> Option<Vector3<f64>> {
     Unit::try_new((b - a).cross(&(c - a)), 0.0).map(Unit::into_inner)
 }
 
-/// Collects the triangles of a link, in a frame in which its own is at `pose`.
+/// Adds the triangles of a link, in a frame in which the link has the pose `pose`.
 fn collect(link: &RobotLink, pose: &Isometry3<f64>, triangles: &mut Vec<Triangle>) -> Result<(), CoverError> {
     let count = link.parts.iter().map(|part| part.mesh.triangles().len()).sum();
     if count > MAX_TRIANGLES {
@@ -337,11 +341,11 @@ fn collect(link: &RobotLink, pose: &Isometry3<f64>, triangles: &mut Vec<Triangle
     Ok(())
 }
 
-/// Removes duplicate triangles, whatever the order of their corners.
+/// Removes repeated triangles, also those whose corners are in another order.
 fn once(triangles: &mut Vec<Triangle>) {
     let mut seen = std::collections::HashSet::with_capacity(triangles.len());
     triangles.retain(|triangle| {
-        // Adding zero converts -0 to 0.
+        // Adding zero turns -0 into 0, so that both compare as equal.
         let mut corners =
             triangle.map(|corner| [corner.x, corner.y, corner.z].map(|value| (value + 0.0).to_bits()));
         corners.sort_unstable();

@@ -1,6 +1,6 @@
 //! The central computation: the joint torques of every cell from joint positions and sensor words, in `f64` and by
-//! forward kinematics (paper, Algorithm 1 and Eq. 8). Distributed torques are compared with it, and its cost is what
-//! the distributed computation saves.
+//! forward kinematics (paper, Algorithm 1 and Eq. 8). The errors of the torques that cells compute are measured against
+//! it, and its running time is the time that the distributed computation saves the gateway.
 //!
 //! ```text
 //!   joint words ─> Central::frames ─> Frames ─┐
@@ -58,18 +58,18 @@ pub struct Frames {
     kinds: [RowKind; MAX_ROWS],
 }
 
-/// The torque of the whole skin.
+/// The reference for the summed torque of a whole skin, computed centrally.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ReferenceTorque {
     /// The sum of all cells' torques in Nm or N, by joint of the chain (paper, Eq. 1).
     pub torque: [f64; MAX_JOINTS],
-    /// Cells with a force above zero.
+    /// Number of cells with a force above zero.
     pub active: u32,
 }
 
 impl Central {
     /// Builds the reference from the quantised words that the cells compute with. All cells of the skin must sit on one
-    /// chain: for a skin with several buses, pass [`Skin::part_on`] of one bus.
+    /// chain; for a skin with several buses, pass [`Skin::part_on`] of one bus.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
         let mut links = Vec::new();
@@ -85,7 +85,8 @@ impl Central {
         Self { base: base(skin), links, cells }
     }
 
-    /// Builds the reference from the numbers of the skin's file, for a skin with one chain as in [`Self::new`].
+    /// Builds the reference from the unrounded numbers of the skin's file. All cells must sit on one chain, as in
+    /// [`Self::new`].
     #[must_use]
     pub fn unquantised(skin: &Skin) -> Self {
         let rows = |chain: &Chain| {
@@ -143,7 +144,8 @@ impl Central {
         positions
     }
 
-    /// Multiplies the transforms of the rows; `place` returns the angle and the displacement of a row.
+    /// Multiplies the transforms of the rows, base to tip. `place` returns the joint angle in rad and the displacement
+    /// in m of a row.
     fn chain<T>(&self, joints: &[T], place: impl Fn(&ChainLink, Option<&T>) -> (f64, f64)) -> Frames {
         let mut tip = self.base;
         let mut frames = Frames { frames: [tip; MAX_ROWS + 1], kinds: [RowKind::Fixed; MAX_ROWS] };
@@ -188,8 +190,8 @@ impl Central {
     }
 
     /// Returns the torque of the whole skin, summed cell by cell; `sensors` are in the order of [`Skin::cells`]. A
-    /// gateway without computing cells does this work in every tick. The work grows with the number of cells and with
-    /// the number of active ones. No allocation.
+    /// gateway whose cells do not compute torques must do this work in every tick. The work grows with the number of
+    /// cells and with the number of active ones. No allocation.
     #[must_use]
     pub fn total(&self, frames: &Frames, sensors: &[SkinSensors]) -> ReferenceTorque {
         let mut reference_torque = ReferenceTorque::default();
@@ -256,7 +258,7 @@ impl CellGeometry {
     }
 }
 
-/// Algorithm 1 of the paper. Every word, sum and product is exact in `f64`.
+/// Returns the force F_z in N by Algorithm 1 of the paper. Every word, sum and product is exact in `f64`.
 pub(crate) fn force(contact: &Contact, sensors: &SkinSensors) -> f64 {
     let above = |value: f64, threshold: f64| if value < threshold { 0.0 } else { value };
     let touch = sensors.contact.iter().map(|word| word.to_f64()).sum();

@@ -19,28 +19,28 @@ pub fn ranges(nodes: &[u8]) -> Vec<String> {
     in_a_row.flat_map(text).collect()
 }
 
-/// The reports of one cell.
+/// The last reports of one cell.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ListedCell {
-    /// Its identity and state.
+    /// The last heartbeat, with the identity and the state of the cell.
     pub heartbeat: Option<Heartbeat>,
-    /// Counters of what it received.
+    /// Counters of the packets that the cell received.
     pub heard: Option<ReceivedCounts>,
-    /// Counters of what the cell refused.
+    /// Counters of the packets that the cell refused.
     pub refused: Option<RejectedCounts>,
-    /// Its place in the tree.
+    /// The place of the cell in the tree.
     pub tree: Option<Tree>,
-    /// The neighbours at its ports.
+    /// The neighbours at the ports of the cell.
     pub ports: Option<Ports>,
     /// The serial number of another cell that claims this node id, or held it before.
     pub other: Option<u32>,
     claim: AddressClaim,
-    /// Arrival time of its last packet.
+    /// Arrival time of the last packet of the cell.
     last: Micros,
 }
 
 impl ListedCell {
-    /// Returns the time since its last packet.
+    /// Returns the time since the last packet of the cell.
     #[must_use]
     pub const fn age(&self, now: Micros) -> Span {
         now.elapsed_since(self.last)
@@ -81,7 +81,7 @@ impl Listing {
         Self::default()
     }
 
-    /// Records a message that arrived in frames of this format.
+    /// Records a message, which arrived in frames of this format.
     pub fn receive(&mut self, now: Micros, format: Format, message: &Message) {
         let Some(from) = message.sender() else {
             self.gateway |= matches!(message, Message::Joints { .. } | Message::Network { .. });

@@ -19,25 +19,25 @@ use protocol::time::Micros;
 /// The number of identifiers of 11 bits.
 const IDENTIFIER_COUNT: usize = 1 << 11;
 
-/// The number of joints in joints, torques and sums on a bus, and how it is known.
+/// The number of joints in the packets of a bus that contain joints, torques or sums.
 #[derive(Clone, Copy, Debug)]
 enum ChainLength {
-    /// Given by a skin.
+    /// The number is given by a skin.
     Described(Length),
-    /// Taken from the newest joints packet; `None` before the first.
+    /// The number is that of the newest joints packet; `None` before the first.
     FromJoints(Option<Length>),
 }
 
-/// A frame of a bus with its decoded content.
+/// A frame of a bus with its reassembled and decoded content.
 #[derive(Clone, Copy, Debug)]
 pub struct Received<'f> {
     /// The frame.
     pub frame: &'f Frame,
-    /// Its content.
+    /// Content of the frame.
     pub content: Content,
-    /// Number of segments of its identifier that were pending before it.
+    /// Number of segments with the same identifier that were pending before this frame.
     pub waited: usize,
-    /// Number of segments of its identifier that are pending after it.
+    /// Number of segments with the same identifier that are pending after this frame.
     pub waiting: usize,
 }
 
@@ -52,7 +52,8 @@ pub enum Content {
     Meaningless(Id, Packet, MessageError),
     /// A segment of a packet in classic frames; the packet needs more segments.
     Segment(Id),
-    /// A segment that does not belong to the pending ones, or arrived too late for them: their packet is lost.
+    /// A segment that does not continue the pending ones, or that arrived after their timeout: the pending packet is
+    /// lost.
     AfterLost(Id),
     /// Neither a packet nor a segment.
     Damaged(Id, PacketError),
@@ -69,10 +70,10 @@ impl Received<'_> {
 /// Reassembles and decodes the frames of one bus. Memory is bounded for any input.
 #[derive(Clone, Debug)]
 pub struct PacketReader {
-    /// With `None`, each frame is read in its own format.
+    /// Format of all frames; with `None`, the format of each frame is used.
     format: Option<Format>,
     length: ChainLength,
-    /// Reassembly state by identifier.
+    /// Reassembly state of each identifier.
     segments: Vec<Option<Box<Reassembler>>>,
 }
 
@@ -83,13 +84,14 @@ impl Default for PacketReader {
 }
 
 impl PacketReader {
-    /// Reads a bus with an unknown chain; with `None`, each frame is read in its own format.
+    /// Creates a reader for a bus with an unknown chain; with `None`, the format of each frame is used.
     #[must_use]
     pub const fn new(format: Option<Format>) -> Self {
         Self { format, length: ChainLength::FromJoints(None), segments: Vec::new() }
     }
 
-    /// Reads a bus of a skin: packets have its format; torques, joints and sums have its chain's length.
+    /// Creates a reader for a bus of a skin: packets have the format of the bus, and torques, joints and sums have the
+    /// length of its chain.
     #[must_use]
     pub fn of_skin(skin: &Skin, bus: usize) -> Self {
         Self {
@@ -115,7 +117,7 @@ impl PacketReader {
         Received { frame, content: self.content(id, packet), waited: 0, waiting: 0 }
     }
 
-    /// Refuses a packet whose length does not fit the described chain.
+    /// Checks that the length of a packet fits the described chain.
     fn of_described_length(&self, id: Id, packet: Packet) -> Result<Packet, PacketError> {
         match self.length {
             ChainLength::Described(length)
@@ -170,7 +172,7 @@ impl PacketReader {
         }
     }
 
-    /// Drops the pending segments of an identifier.
+    /// Drops the pending segments with this identifier.
     pub fn drop_segments(&mut self, id: Id) {
         if let Some(segments) = self.segments.get_mut(usize::from(id.to_bits())) {
             *segments = None;

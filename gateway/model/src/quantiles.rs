@@ -60,7 +60,7 @@ pub struct Quantiles {
 }
 
 impl Quantiles {
-    /// Computes the quantiles of a histogram that counts in units of `unit_us`.
+    /// Computes the quantiles of a histogram in µs; the histogram counts in units of `unit_us` µs.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
     pub fn from_histogram(histogram: &Histogram<u64>, unit_us: f64) -> Self {

@@ -1,6 +1,6 @@
-//! Requests that are repeated until they are confirmed: when each is due again, and when it fails.
+//! Timeouts and retry limits of requests that are repeated until they are confirmed.
 //!
-//! The caller keeps the open requests and asks here which of them to send now. This module has no clock.
+//! The caller keeps the pending requests, and asks this module which of them to send now. The module has no clock.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,7 @@ pub struct Limits {
     pub tries: u8,
 }
 
-/// A request that has not been answered yet.
+/// The retry state of one request that has not been answered yet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Attempt {
     limits: Limits,
@@ -25,37 +25,38 @@ pub struct Attempt {
     due: Micros,
 }
 
-/// The action for a request now.
+/// The next action for a pending request.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum RetryAction {
-    /// Nothing yet.
+    /// Wait: the timeout has not expired.
     Wait,
-    /// Send it again.
+    /// Send the request again.
     Again,
-    /// The retry limit is reached.
+    /// Fail the request: the retry limit is reached.
     GiveUp,
 }
 
 impl Attempt {
-    /// Starts with the first transmission at `now`.
+    /// Starts the timeout of a request whose first transmission is at `now`.
     #[must_use]
     pub fn new(now: Micros, limits: Limits) -> Self {
         Self { limits, tries: 1, due: now + limits.first }
     }
 
-    /// Returns the number of transmissions.
+    /// Returns the number of transmissions so far.
     #[must_use]
     pub const fn tries(&self) -> u8 {
         self.tries
     }
 
-    /// Returns the time when [`Attempt::turn`] is due.
+    /// Returns the time at which the timeout expires and [`Attempt::turn`] must be called.
     #[must_use]
     pub const fn due(&self) -> Micros {
         self.due
     }
 
-    /// Handles the timeout. [`Turn::Again`] counts as a transmission. Has no effect before the timeout.
+    /// Handles the timeout and returns the next action; [`Turn::Again`] counts as a transmission. A call before the
+    /// timeout has no effect.
     pub fn turn(&mut self, now: Micros) -> RetryAction {
         if now < self.due {
             return RetryAction::Wait;
@@ -68,30 +69,30 @@ impl Attempt {
         RetryAction::Again
     }
 
-    /// Restarts the timeout: a cell has answered, so others may still answer.
+    /// Restarts the timeout, because one cell has answered and others may still answer.
     pub fn extend(&mut self, now: Micros) {
         let doubled = self.limits.first.0.saturating_mul(1 << (self.tries - 1).min(32));
         self.due = now + Span(doubled.min(self.limits.longest.0));
     }
 }
 
-/// Requests to many cells that are repeated without a limit, each at most once per interval.
+/// Requests to many cells that are repeated without a limit. Each is sent at most once per interval.
 #[derive(Clone, Debug)]
 pub struct Repeats<K> {
     every: Span,
-    /// Last transmission by request, and of the last request to all.
+    /// Time of the last transmission of each request, and of the last message to all cells.
     sent: BTreeMap<K, Micros>,
     all: Option<Micros>,
 }
 
 impl<K: Copy + Ord> Repeats<K> {
-    /// Starts with no request sent.
+    /// Creates an empty set of requests with this repeat interval.
     #[must_use]
     pub const fn new(every: Span) -> Self {
         Self { every, sent: BTreeMap::new(), all: None }
     }
 
-    /// Returns those of the `open` requests that are due now, and counts them as sent.
+    /// Returns the requests among `open` whose interval has passed, and records them as sent.
     pub fn due(&mut self, now: Micros, open: impl IntoIterator<Item = K>) -> Vec<K> {
         let last = |key: &K| self.sent.get(key).copied().max(self.all);
         let is_due = |key: &K| last(key).is_none_or(|at| now.elapsed_since(at) >= self.every);
@@ -100,12 +101,12 @@ impl<K: Copy + Ord> Repeats<K> {
         due
     }
 
-    /// Records that all requests were sent in one message to all cells.
+    /// Records that one message to all cells contained all requests.
     pub const fn mark_all_sent(&mut self, now: Micros) {
         self.all = Some(now);
     }
 
-    /// Makes a changed request due at once.
+    /// Lets a changed request be sent without waiting for its interval.
     pub fn renew(&mut self, key: K) {
         self.sent.remove(&key);
     }

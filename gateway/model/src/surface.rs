@@ -15,16 +15,16 @@ pub struct Cylinder {
     pub middle: [f64; 3],
     /// The unit vector along its axis.
     pub axis: [f64; 3],
-    /// Its radius, 0.005 to 0.5.
+    /// Radius in m, 0.005 to 0.5.
     pub radius: f64,
     /// Positions of the first and the last cell along the axis, from `middle`.
     pub along: [f64; 2],
 }
 
 impl Cylinder {
-    /// Fits a cylinder to the cells. Its axis is perpendicular to their normals as well as possible, and each position
-    /// minus the radius along the normal lies on the axis (least squares). Returns `None` for fewer than 6 cells, and
-    /// for cells that face one way, as on a plate.
+    /// Fits a cylinder to the cells by least squares. The axis is perpendicular to the cells' normals as well as
+    /// possible, and passes through the points that lie one radius below the cells, along their normals. Returns `None`
+    /// for fewer than 6 cells, and for cells that face one way, as on a plate.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "a number of cells")]
     pub fn fit(cells: &[SurfaceCell]) -> Option<Self> {
@@ -64,26 +64,26 @@ impl Cylinder {
         Some(Self { middle: middle.into(), axis: axis.into(), radius, along: [from, to] })
     }
 
-    /// Returns the point of the axis at this distance along it.
+    /// Returns the point on the axis at the distance `along` in m from `middle`.
     #[must_use]
     pub fn at(&self, along: f64) -> [f64; 3] {
         (Vector3::from(self.middle) + Vector3::from(self.axis) * along).into()
     }
 }
 
-/// The cells of a link on a flat map, seen from outside.
+/// The cells of a link, laid flat and seen from outside.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Flat {
-    /// Position of each cell, to the right and down, in m. On a cylinder, 0 to the right is where the link's x axis (or
-    /// y axis, if the cylinder lies along x) passes through it.
+    /// Position of each cell, to the right and down, in m. On a cylinder, 0 to the right is where the link's x axis
+    /// passes through the surface (or its y axis, if the cylinder lies along x).
     pub places: Vec<[f64; 2]>,
     /// The radius in m of the unrolled cylinder; `None` for a plate.
     pub radius: Option<f64>,
 }
 
 /// Maps the cells of a link to a plane. A cylinder is unrolled, with the angle around its axis to the right; a plate is
-/// seen along its mean normal. `tip` is the direction along the link to its tip; its component in the surface points
-/// down.
+/// seen along its mean normal. `tip` is the direction from the link to the tip of the arm; its component in the surface
+/// points down.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "a number of cells")]
 pub fn lay_flat(cells: &[SurfaceCell], tip: [f64; 3]) -> Flat {

@@ -1,4 +1,4 @@
-//! Skins for the tests of these crates.
+//! Skins for the tests of this crate and of the crates that use it.
 
 use protocol::skin::Skin;
 
@@ -57,7 +57,7 @@ const LIFT: &str = include_str!("../tests/data/lift.toml");
 /// Returns the skin [`UR5`].
 ///
 /// # Panics
-/// Never: the skin is valid, as are the next two.
+/// Never: the skin is valid.
 #[must_use]
 pub fn ur5() -> Skin {
     Skin::parse("ur5-253.toml", UR5).expect("the tests' skin is valid")

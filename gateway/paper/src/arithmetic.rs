@@ -1,4 +1,5 @@
-//! The cells' arithmetic: the error of the sine over the whole circle, and the operations of one Jacobian.
+//! Experiments on the arithmetic of the cells: the error of the sine over the whole circle, and the operations that one
+//! Jacobian takes.
 
 use cell_node::kernel::oracle::{Counted, Projection};
 use cell_node::kernel::{Kernel, Operations, Wrench};
@@ -13,26 +14,26 @@ use super::ticks::POSE;
 use analysis::paper;
 use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table};
 
-/// The interval of drawn angles.
+/// The number of angles between two that are drawn.
 const DRAWN: usize = 16;
-/// The number of angles per drawn maximum error.
+/// The number of angles in each part of the circle for which a maximum error is drawn.
 const PART: usize = 256;
 
-/// The error of a sine function over all angles.
+/// The error of a fixed-point sine function over the whole circle.
 #[derive(Clone, Debug)]
 pub struct SineError {
-    /// The mean absolute error.
+    /// The mean absolute error over all angles.
     pub mean: f64,
-    /// The maximum absolute error.
+    /// The maximum absolute error over all angles.
     pub max: f64,
-    /// Angles in quarter turns, with signed errors.
+    /// The angles that are drawn, in quarter turns, with the signed error at each.
     pub points: Vec<(f64, f64)>,
-    /// The middle of each part of the circle in quarter turns, with the maximum absolute error in it.
+    /// For each part of the circle: the angle in its middle in quarter turns, and the maximum absolute error in it.
     pub parts: Vec<(f64, f64)>,
 }
 
 impl SineError {
-    /// Computes the error over all 65 536 words.
+    /// Computes the error of `function` for all 65 536 angles that a 16-bit number can hold.
     #[must_use]
     pub fn of_function(function: impl Fn(Q1_14) -> Q1_14) -> Self {
         let (mut sum, mut max) = (0.0, 0.0_f64);
@@ -54,7 +55,7 @@ impl SineError {
     }
 }
 
-/// Writes the section on the error of the sine over the whole circle.
+/// Writes the section on the error of the sine.
 #[must_use]
 pub fn sine_section() -> Section {
     let [fifth, seventh, rounded] = [
@@ -96,17 +97,18 @@ pub fn sine_section() -> Section {
         ])
 }
 
-/// The operations of a cell's Jacobian on each link of a robot.
+/// The operations that a cell needs to compute its Jacobian, by the link that the cell is on.
 #[derive(Clone, Debug)]
 pub struct JacobianCosts {
-    /// By the wrench kernel, for a cell on link 1, 2, ...
+    /// The operations of the wrench kernel, which the cells use, for a cell on link 1, 2, ...
     pub wrench: Vec<Operations>,
-    /// By the paper's projections.
+    /// The operations of the projections in the paper, for a cell on link 1, 2, ...
     pub projection: Vec<Operations>,
 }
 
 impl JacobianCosts {
-    /// Counts the operations for a skin's robot by running the kernels on counting numbers.
+    /// Counts the operations for a cell on each link of the skin's robot. Both kernels are run on numbers that count
+    /// operations.
     #[must_use]
     pub fn for_skin(skin: &Skin) -> Self {
         let joints = u8::try_from(skin.robot.joints.len()).unwrap_or(u8::MAX);
@@ -125,22 +127,22 @@ impl JacobianCosts {
     }
 }
 
-/// Counts the operations of one Jacobian.
+/// Counts the operations of one Jacobian at these joint positions.
 fn jacobian<K: Kernel<Counted>>(cell: &Parameters, words: &[Q1_14; MAX_JOINTS]) -> Operations {
     let kernel = K::new(cell);
     Operations::count(|| kernel.jacobian(words)).1
 }
 
-/// Returns operations by name, in the paper's order.
+/// Returns the counts of operations with their names, in the order of the paper.
 fn named(done: &Operations) -> [(&'static str, u32); 4] {
     let Operations { multiplications, additions, sines, cosines, .. } = *done;
     [("multiplications", multiplications), ("additions", additions), ("sines", sines), ("cosines", cosines)]
 }
 
-/// The maximum number of operations of the wrench kernel.
+/// The maximum number of operations of each kind that the wrench kernel may need, in the order of the paper.
 const WRENCH: [u32; 4] = [40, 24, 5, 5];
 
-/// Writes the section on the operations of both kernels.
+/// Writes the section that compares the operations of both kernels.
 #[must_use]
 pub fn kernels_section(robot: &str, costs: &JacobianCosts) -> Section {
     let links = |costs: &[Operations]| (1_u8..).zip(costs.to_vec()).collect::<Vec<_>>();

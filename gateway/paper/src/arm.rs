@@ -1,4 +1,4 @@
-//! The bench of Fig. 6 to 8: an arm with 253 cells that yields to touches.
+//! The bench for Fig. 6 to 8: an arm with 253 cells, which moves out of the way when it is touched.
 
 use protocol::skin::Skin;
 
@@ -7,7 +7,7 @@ use model::generate::{Target, generate};
 
 pub use model::generate::Reply;
 
-/// Returns the name of the files of a run with this kind of replies.
+/// Returns the name, without extension, of the files of a run in which cells reply in this way.
 #[must_use]
 pub const fn name(reply: Reply) -> &'static str {
     match reply {
@@ -16,13 +16,13 @@ pub const fn name(reply: Reply) -> &'static str {
     }
 }
 
-/// The number of cells of the paper's arm.
+/// The number of cells on the arm in the paper.
 const CELLS: usize = 253;
-/// The number of cells of a quick run.
+/// The number of cells on the arm in a quick run.
 const QUICK_CELLS: usize = 24;
-/// A scenario with strokes, palms, a grip and a poke; the central computation is off from 5.7 s on.
+/// A scenario with strokes, palms, a grip and a poke. The central computation is switched off at 5.7 s.
 const TOUCHES: &str = include_str!("../../examples/demo.toml");
-/// A scenario with a touch of all cells at once; the central computation is off from 1.2 s on.
+/// A scenario in which all cells are touched at once. The central computation is switched off at 1.2 s.
 const TOUCH: &str = "# A hand closes around the arm and opens again.
 version = 1
 duration_s = 2.4
@@ -48,10 +48,10 @@ force_n = 2.0
 profile = \"half-sine\"
 ";
 
-/// Returns the arm's `skin.toml`.
+/// Returns the text of the arm's `skin.toml`.
 ///
 /// # Panics
-/// Never: this number of cells fits.
+/// Never panics in practice, because this number of cells fits on the arm.
 #[must_use]
 pub fn skin(reply: Reply, effort: Effort) -> String {
     let cells = match effort {
@@ -61,16 +61,16 @@ pub fn skin(reply: Reply, effort: Effort) -> String {
     generate(&Target { cells, reply, ..Target::default() }).expect("so many cells fit on the arm")
 }
 
-/// Returns the paper's arm, whose cells reply with torques.
+/// Returns the skin of the paper's arm with 253 cells that reply with torques.
 ///
 /// # Panics
-/// Never: a generated skin can be parsed.
+/// Never panics in practice, because a generated skin is valid.
 #[must_use]
 pub fn paper() -> Skin {
     Skin::parse("skin.toml", &skin(Reply::Torque, Effort::Full)).expect("it has been generated")
 }
 
-/// Returns the arm's `scenario.toml`.
+/// Returns the text of the arm's `scenario.toml`.
 #[must_use]
 pub const fn scenario(effort: Effort) -> &'static str {
     match effort {

@@ -1,8 +1,8 @@
-//! Fig. 9 and 10: the cost of the central computation, over cells and over active cells.
+//! Fig. 9 and 10: the time of the central computation, as a function of the number of cells and of active cells.
 //!
-//! Timed are [`Central::frames`] and [`Central::total`], which a comparing tick runs for each bus, here over one list
-//! of cells. Every measurement covers several computations in a row, so that reading the clock does not count, and code
-//! and data are in the caches as far as possible.
+//! The functions [`Central::frames`] and [`Central::total`] are timed. In a bench, a tick that compares runs them for
+//! each bus; here they run for one list of cells. Each measurement covers several computations in a row, so that the
+//! time for reading the clock is negligible and code and data are mostly in the caches.
 
 use std::hint::black_box;
 
@@ -21,41 +21,42 @@ use model::central::Central;
 
 /// The number of computations between two readings of the clock.
 const IN_A_ROW: u32 = 16;
-/// The number of measurements of one touch, of which the minimum counts.
+/// The number of measurements of each touch. The shortest time is used.
 const LOOKS: usize = 5;
 
-/// The extent of the measurements.
+/// The number of measurements for Fig. 9 and 10.
 #[derive(Clone, Copy, Debug)]
 pub struct CentralExtent {
-    /// The step between two numbers of cells.
+    /// The difference between successive numbers of cells.
     pub step: usize,
-    /// The number of measurements of each number of cells.
+    /// The number of measurements for each number of cells.
     pub rounds: usize,
-    /// The number of touches, each of a random number of cells.
+    /// The number of different touches. Each is of a random number of cells.
     pub touches: usize,
 }
 
-/// T_skin over the number of cells, all of them inactive.
+/// The time T_skin of the central computation for different numbers of cells, none of which is active.
 #[derive(Clone, Debug)]
 pub struct OverCells {
-    /// The number of cells, and the median, 25th and 75th percentile in ns.
+    /// For each number of cells: that number, and the median, the 25th and the 75th percentile of T_skin in ns.
     pub points: Vec<[f64; 4]>,
-    /// The fit of T_skin in ns over the number of cells.
+    /// The line fitted to T_skin in ns as a function of the number of cells.
     pub line: LinearFit,
 }
 
-/// T_skin over the number of active cells of a skin.
+/// The time T_skin of the central computation for different numbers of active cells on one skin.
 #[derive(Clone, Debug)]
 pub struct OverActive {
     /// The number of cells of the skin.
     pub cells: usize,
-    /// The number of active cells, the median of T_skin in ns, and the number of touches as the weight.
+    /// For each number of active cells: that number, the median of T_skin in ns, and as weight the number of touches.
     pub points: Vec<WeightedPoint>,
-    /// The fit of T_skin in ns over active cells, weighted by the number of touches.
+    /// The line fitted to T_skin in ns as a function of the number of active cells. Points are weighted by the number
+    /// of touches.
     pub line: LinearFit,
 }
 
-/// Returns the time of one computation, averaged over several in a row, in ns.
+/// Returns the time of one computation in ns, as the mean over several in a row.
 fn timed(central: &Central, sensors: &[SkinSensors], now: &impl Fn() -> u64) -> f64 {
     let joints = POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default());
     let began = now();
@@ -66,8 +67,8 @@ fn timed(central: &Central, sensors: &[SkinSensors], now: &impl Fn() -> u64) -> 
     nanos(now().saturating_sub(began)) / f64::from(IN_A_ROW)
 }
 
-/// Measures T_skin over 0 to all cells of a skin, all inactive. Returns `None` for fewer than three numbers of
-/// cells.
+/// Measures T_skin for parts of a skin with 0 to all cells, none of which is active. Returns `None` for fewer than
+/// three different numbers of cells.
 #[must_use]
 pub fn over_cells(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) -> Option<OverCells> {
     let central = Central::new(skin);
@@ -87,8 +88,8 @@ pub fn over_cells(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) -> 
     Some(OverCells { points, line })
 }
 
-/// Measures T_skin over the number of active cells of a skin. A touch is a patch of consecutive cells in the skin's
-/// order, which are neighbours. Its first cell and its size are random.
+/// Measures T_skin for different numbers of active cells on a skin. A touch is of consecutive cells in the order of the
+/// skin, which are neighbours. Its first cell and its size are random.
 #[must_use]
 pub fn over_active(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) -> Option<OverActive> {
     let central = Central::new(skin);
@@ -110,7 +111,7 @@ pub fn over_active(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) ->
     Some(OverActive { cells, line: LinearFit::through(&points)?, points })
 }
 
-/// The minimum R² of a law.
+/// The minimum R² at which a fitted line counts as a good description.
 const QUALITY: f64 = 0.99;
 
 fn quality(line: &LinearFit, paper: f64) -> Finding {
@@ -118,7 +119,7 @@ fn quality(line: &LinearFit, paper: f64) -> Finding {
     finding.must(format!("at least {QUALITY}"), line.quality >= QUALITY)
 }
 
-/// Compares a slope or an intercept in ns with the paper's in s, as a value and as a ratio.
+/// Compares a slope or an intercept in ns with that of the paper in s: both values, and their ratio.
 fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
     let ours = ours.into();
     let ratio = ours.value / (paper_s * 1e9);
@@ -128,19 +129,19 @@ fn cost(what: &str, ours: impl Into<Quantity>, paper_s: f64) -> [Finding; 2] {
     ]
 }
 
-/// Compares the maximum number of cells in a cycle with the paper's.
+/// Compares the maximum number of cells for which one cycle is long enough with that in the paper.
 fn limit(active: &str, paper: f64, ours: f64) -> Finding {
     let what = format!("most cells at 500 Hz, {active} active, with 0.2 ms for the rest of a cycle");
     Finding::more_is_better(what, paper, (ours, "cells"))
 }
 
-/// Returns a figure of T_skin.
+/// Returns an empty figure for T_skin over the quantity `x`.
 fn figure(name: &str, title: impl Into<String>, x: &str) -> Figure {
     Figure::new(name, title, Axis::new(x, ""), Axis::new("T_skin", "µs"))
 }
 
-/// Returns the figure up to the largest x with a logarithmic axis, together with the paper's law in s. The law is a
-/// polyline that is smooth on this axis too.
+/// Returns a figure with a logarithmic axis that ends at the largest x, and with the paper's line, whose coefficients
+/// are in s. The line is drawn with many points, because it is curved on a logarithmic axis.
 fn beside(
     figure: &Figure,
     equation: &str,
@@ -156,12 +157,12 @@ fn beside(
         .draw("the paper's law", Shape::Dashed, law.collect())
 }
 
-/// Returns a law in ns as a line from 0 on, in µs.
+/// Returns two points that draw a line, from 0 to `most`. The line is in ns and the points are in µs.
 fn law(line: &LinearFit, most: f64) -> Vec<(f64, f64)> {
     [0.0, most].map(|x| (x, line.value_at(x) * 1e-3)).into()
 }
 
-/// Writes the section on Fig. 9 with Eq. 29.
+/// Writes the section on Fig. 9, with the line of Eq. 29.
 #[must_use]
 pub fn fig9(over: &OverCells) -> Section {
     let OverCells { points, line } = over;
@@ -201,7 +202,8 @@ pub fn fig9(over: &OverCells) -> Section {
         .findings([quality(line, paper::CELLS_QUALITY), limit("none", paper::LIMIT, cells)])
 }
 
-/// Writes the section on Fig. 10 with Eq. 30 and 31, and the limits of both laws.
+/// Writes the section on Fig. 10, with the lines of Eq. 30 and 31, and the number of cells at which each line reaches
+/// one cycle.
 #[must_use]
 pub fn fig10(over: &OverActive, cells: &OverCells) -> Section {
     let OverActive { points, line, cells: of } = over;
@@ -263,7 +265,7 @@ mod tests {
         LinearFit { slope, intercept, quality: 0.999, slope_half: 0.1 }
     }
 
-    /// The findings for the paper's own law, in ns.
+    /// The findings that result from the lines of the paper, converted to ns.
     #[test]
     fn the_papers_own_laws_lead_to_its_limits_and_to_no_verdict_but_the_same() {
         let law = line(paper::CELL_S * 1e9, paper::FIXED_S * 1e9);
@@ -291,7 +293,7 @@ mod tests {
         assert_eq!(worse, 3, "slope, quality and limit");
     }
 
-    /// On a clock that advances by 16 ns per reading, every computation takes 1 ns, whatever the number of cells.
+    /// The clock advances by 16 ns per reading, so each of the 16 computations between two readings takes 1 ns.
     #[test]
     fn every_number_of_cells_and_of_active_cells_is_measured() {
         let skin = ticks::skin(40, 1).unwrap();

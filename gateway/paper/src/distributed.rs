@@ -1,9 +1,10 @@
-//! The cost of the distributed computation: the loop's ticks over cells and over active cells, the central computation
-//! in the same ticks, and the cost of receiving, which no paper counts.
+//! The time of the distributed computation: of the control loop's ticks, as a function of the number of cells and of
+//! active cells. For comparison, also the time of the central computation in the same ticks, and the time for receiving
+//! a torque, which the paper leaves out.
 //!
-//! The skin is on a fixed number of buses, so that only the number of cells grows. The time of the distributed
-//! computation is that of the whole tick, not only of its part for the skin: reading the receivers' sums, controller,
-//! robot, encoding and sending the joints.
+//! The number of buses is fixed, so that only the number of cells grows. The time of the distributed computation is
+//! that of the whole tick, which includes more than the skin: it reads the sums of the receivers, runs the controller
+//! and the robot, and encodes and sends the joints.
 
 use std::hint::black_box;
 
@@ -20,55 +21,57 @@ use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, number};
 use model::scenario::Mode;
 use model::table::Table;
 
-/// The extent of the measurements.
+/// The number of measurements.
 #[derive(Clone, Copy, Debug)]
 pub struct DistributedExtent {
-    /// The number of steps of the number of cells after one per bus, and of active cells after 0.
+    /// The number of different numbers of cells besides one cell per bus, and of active cells besides 0.
     pub steps: usize,
-    /// The number of measurements of each.
+    /// The number of measurements for each of these numbers.
     pub rounds: usize,
 }
 
-/// Times of ticks over a number of cells, and their fits; all in ns.
+/// The times of ticks for different numbers of cells, and the lines fitted to them. All times are in ns.
 #[derive(Clone, Debug)]
 pub struct TickTimes {
-    /// The number, the time of a distributed tick, and that of the central computation in a comparing tick.
+    /// For each number of cells: that number, the time of a distributed tick, and the time of the central computation
+    /// in a tick that compares both.
     pub points: Vec<[f64; 3]>,
-    /// The fit of distributed ticks.
+    /// The line fitted to the times of distributed ticks.
     pub distributed: LinearFit,
-    /// The fit of central computations.
+    /// The line fitted to the times of central computations.
     pub central: LinearFit,
 }
 
 impl TickTimes {
-    /// Returns the upper end of the distributed slope's 95 % interval, relative to the central slope.
+    /// Returns the upper end of the 95 % interval of the distributed line's slope, divided by the slope of the central
+    /// line.
     #[must_use]
     pub fn share(&self) -> f64 {
         self.distributed.slope_at_most() / self.central.slope
     }
 }
 
-/// All measurements.
+/// All measurements of the experiment.
 #[derive(Clone, Debug)]
 pub struct Distributed {
-    /// Times over cells, all of them inactive.
+    /// Times for different numbers of cells, none of which is active.
     pub cells: TickTimes,
-    /// Times over active cells of the whole skin.
+    /// Times for different numbers of active cells on the whole skin.
     pub active: TickTimes,
-    /// The fit of distributed ticks over the number of buses, in ns.
+    /// The line fitted to the times of distributed ticks in ns as a function of the number of buses.
     pub buses: LinearFit,
     /// The number of cells of the whole skin.
     pub of: usize,
-    /// The time of the receiver's thread for a torque, from the frame to the sum, in ns.
+    /// The time that the thread of a receiver needs for a torque in ns, from the frame to the sum of the bus.
     pub receiving: f64,
 }
 
-/// Measures everything on parts of a skin. Returns `None` for fewer than two steps.
+/// Measures times on parts of a skin. Returns `None` if `extent` has fewer than two steps.
 #[must_use]
 pub fn measure(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + Copy) -> Option<Distributed> {
     let most = skin.cells.len();
     let step = |step| most * step / extent.steps.max(1);
-    // A bus without cells has no robot to compute, so each bus has at least one cell.
+    // Each bus has at least one cell, because a bus without cells has no chain to be computed.
     let min = skin.buses.len().min(most);
     let cells: Vec<usize> = (0..=extent.steps).map(|place| step(place).max(min)).collect();
     let active: Vec<usize> = (0..=extent.steps).map(step).collect();
@@ -86,8 +89,8 @@ pub fn measure(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + C
     })
 }
 
-/// Measures ticks of both computations over some numbers. `ticks` returns the loop for the index of a number and a
-/// mode.
+/// Measures ticks with and without the central computation for each of some numbers. `ticks` creates the loop for the
+/// number with this index and for a mode.
 pub(super) fn over(
     numbers: &[usize],
     rounds: usize,
@@ -100,7 +103,7 @@ pub(super) fn over(
     let mut loops: Vec<_> = things.map(|(place, mode)| (ticks(place, mode), mode)).collect();
     let measured = samples::interleaved(loops.len(), rounds, seed, |thing| {
         let Some((ticks, mode)) = loops.get_mut(thing) else { return f64::NAN };
-        // The first epoch fills the caches with code and data, as after the loop before it.
+        // The first epoch is not measured. It fills the caches with the code and data of this loop.
         ticks.epoch(now);
         let took = ticks.epoch(now);
         if *mode == distributed { took.tick } else { took.central }
@@ -114,7 +117,7 @@ pub(super) fn over(
     Some(TickTimes { distributed: line(|point| point[1])?, central: line(|point| point[2])?, points })
 }
 
-/// Measures distributed ticks over the first buses of a skin without cells.
+/// Measures distributed ticks of a skin without cells, for different numbers of buses.
 fn over_buses(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + Copy) -> Option<LinearFit> {
     let bare = |buses: usize| Skin {
         buses: skin.buses.iter().take(buses).cloned().collect(),
@@ -133,8 +136,8 @@ fn over_buses(skin: &Skin, extent: DistributedExtent, now: impl Fn() -> u64 + Co
     LinearFit::through_equals(&numbers.iter().map(|&buses| count(buses)).zip(medians).collect::<Vec<_>>())
 }
 
-/// Returns the time for handling a torque, in ns: its packet is checked and decoded, and its torque replaces the cell's
-/// previous one in the sum. Every cell of a bus replies in every epoch, each time with another torque.
+/// Measures the time for handling a torque, in ns: its packet is checked and decoded, and the torque replaces the
+/// previous one of the cell in the sum. Every cell of a bus replies in every epoch, each time with a different torque.
 fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
     let mut table = Table::new(skin, 0);
     let mut epoch = Epoch(0);
@@ -165,7 +168,7 @@ fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
     super::line::quantile(&mut took, 0.5)
 }
 
-/// The maximum distributed slope relative to the central one.
+/// The maximum slope of the distributed line, relative to that of the central line.
 const MAX_SLOPE_RATIO: f64 = 0.01;
 
 pub(super) fn of_share(what: &str, over: &TickTimes) -> [Finding; 3] {
@@ -181,7 +184,7 @@ pub(super) fn of_share(what: &str, over: &TickTimes) -> [Finding; 3] {
     ]
 }
 
-/// Writes the section on times over cells and over active cells.
+/// Writes the section on the times of the distributed computation.
 #[must_use]
 pub fn section(measured: &Distributed) -> Section {
     let Distributed { cells, active, buses, of, receiving } = measured;
@@ -237,7 +240,7 @@ mod tests {
     use super::*;
     use crate::ticks;
 
-    /// On a clock that advances by 1 ns per reading, a distributed tick reads it twice, whatever the number of cells.
+    /// The clock advances by 1 ns per reading. A distributed tick reads it twice, whatever the number of cells.
     #[test]
     fn both_ways_are_measured_over_both_numbers() {
         let skin = ticks::skin(48, BUSES).unwrap();

@@ -1,4 +1,4 @@
-//! Files of experiments beside their page: each figure's data as CSV, and all findings as JSON.
+//! The files beside the page of experiments: the data of each figure as CSV, and all findings as JSON.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -7,8 +7,9 @@ use serde_json::{Value, json};
 
 use analysis::report::figure::{Axis, Figure, Page, Series, Shape};
 
-/// Returns a figure's data: x, and y of each series, with units in the header. A value is blank where a series has no
-/// point. A band has two columns. Several values of a series at the same x are in several rows.
+/// Returns the data of a figure as CSV: a column for x and one for each series, with units in the header. A band has
+/// two columns. A value is empty where a series has no point. If a series has several values at one x, they are in
+/// several rows.
 #[must_use]
 pub fn csv(figure: &Figure) -> String {
     let columns: Vec<(String, &[(f64, f64)])> = figure.series.iter().flat_map(columns).collect();
@@ -45,7 +46,7 @@ pub fn csv(figure: &Figure) -> String {
     text
 }
 
-/// Returns the columns of a series: one, or the lower and upper edge of a band.
+/// Returns the columns of a series: a single one, or the lower and the upper edge of a band.
 fn columns(series: &Series) -> Vec<(String, &[(f64, f64)])> {
     if series.shape != Shape::Band {
         return vec![(series.caption.clone(), &series.points)];
@@ -54,7 +55,7 @@ fn columns(series: &Series) -> Vec<(String, &[(f64, f64)])> {
     vec![(format!("{}, lower", series.caption), lower), (format!("{}, upper", series.caption), upper)]
 }
 
-/// Maps a number to an integer with the same order.
+/// Maps a number to an integer, so that integers compare as the numbers do.
 fn ordered(x: f64) -> u64 {
     let bits = x.to_bits();
     if bits >> 63 == 0 { bits | 1 << 63 } else { !bits }
@@ -72,7 +73,7 @@ fn quoted(text: &str) -> String {
     }
 }
 
-/// Returns all findings of a page, by experiment, with the facts about the run.
+/// Returns the findings on a page as JSON, by experiment, with facts about the run such as the machine.
 #[must_use]
 pub fn results(page: &Page) -> Value {
     let facts: BTreeMap<_, _> = page.facts.iter().map(|(name, value)| (name, value)).collect();

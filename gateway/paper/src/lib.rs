@@ -1,4 +1,4 @@
-//! The paper's experiments, and some beyond them: measured, drawn and rated.
+//! The experiments of the paper, and further ones: measurements, figures, and verdicts on them.
 //!
 //! ```text
 //!   Lab (a clock, whole benches) ─┐
@@ -6,11 +6,12 @@
 //!   Effort (how much) ────────────┘                          └─> report::page, report::svg, files::csv, files::results
 //! ```
 //!
-//! Computations here are pure except for the clock. The implementation of [`Lab`] runs benches of processes. Verdicts
-//! are computed from the measurements, never stored.
+//! All computations here are pure, except that they read a clock. The implementation of [`Lab`] runs benches of
+//! processes. Each verdict is computed from the measurements of its run.
 //!
-//! Of all crates of the gateway, only this one calls the cells' code: to count its operations, and to sum without a
-//! bus. The gateway itself communicates with cells only over the bus, which `tests/cells.rs` enforces.
+//! Of all crates of the gateway, only this one uses the code of the cells: it counts the operations of that code, and
+//! computes sums along a tree without a bus. In every other crate the gateway communicates with cells only over the
+//! bus, which `tests/cells.rs` checks.
 
 pub mod arithmetic;
 pub mod arm;
@@ -37,35 +38,35 @@ use analysis::report::figure::Section;
 use arm::Reply;
 use moving::Run;
 
-/// An experiment.
+/// An experiment that can be performed.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
 pub enum Experiment {
-    /// Torques of the moving arm.
+    /// Fig. 6: the torques of the moving arm.
     Fig6,
-    /// Its velocities and active cells.
+    /// Fig. 7: the velocities and the active cells of the moving arm.
     Fig7,
-    /// Its cycle times.
+    /// Fig. 8: the cycle times of the moving arm.
     Fig8,
-    /// The central computation over cells.
+    /// Fig. 9: the time of the central computation over the number of cells.
     Fig9,
-    /// The central computation over active cells.
+    /// Fig. 10: the time of the central computation over the number of active cells.
     Fig10,
-    /// The distributed computation over both.
+    /// The time of the distributed computation over the numbers of cells and of active cells.
     Distributed,
-    /// Errors of sums.
+    /// The error of torque sums along a tree.
     Sums,
-    /// Errors of the sine.
+    /// The error of the cells' sine function.
     Sine,
-    /// Operations of a Jacobian.
+    /// The number of operations for a Jacobian.
     Kernels,
-    /// Bus load.
+    /// The load of a real bus.
     Load,
-    /// Whole benches over their cells.
+    /// Whole benches of up to ten thousand cells.
     Scale,
 }
 
 impl Experiment {
-    /// All experiments, in the order of a page.
+    /// All experiments, in the order of the page.
     pub const ALL: [Self; 11] = [
         Self::Fig6,
         Self::Fig7,
@@ -80,7 +81,8 @@ impl Experiment {
         Self::Scale,
     ];
 
-    /// Returns the name, the description, and the approximate duration in s, for a quick and a full measurement.
+    /// Returns the name and the description of the experiment, and its approximate duration in s for a quick and for a
+    /// full measurement.
     const fn about_it(self) -> (&'static str, &'static str, [u64; 2]) {
         match self {
             Self::Fig6 => (
@@ -119,19 +121,20 @@ impl Experiment {
         }
     }
 
-    /// Returns the name on the command line and in files.
+    /// Returns the name of the experiment, as used on the command line and in file names.
     #[must_use]
     pub const fn name(self) -> &'static str {
         self.about_it().0
     }
 
-    /// Returns the description, in one line.
+    /// Returns a description of the experiment, in one line.
     #[must_use]
     pub const fn about(self) -> &'static str {
         self.about_it().1
     }
 
-    /// Returns the approximate duration in s, in addition to measurements that earlier experiments share.
+    /// Returns the approximate duration in s, without the time for measurements that it shares with earlier
+    /// experiments.
     #[must_use]
     pub const fn seconds(self, effort: Effort) -> u64 {
         let [quick, full] = self.about_it().2;
@@ -160,16 +163,16 @@ impl FromStr for Experiment {
     }
 }
 
-/// The extent of the measurements.
+/// The number and the size of the measurements.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Effort {
-    /// Enough to check that everything works; laws and errors are less precise.
+    /// Enough measurements to check that an experiment works. Fitted lines and errors are less precise.
     Quick,
-    /// The extent of the paper.
+    /// As many measurements as in the paper.
     Full,
 }
 
-/// The environment of experiments.
+/// What experiments need from outside: a clock, and a way to run benches.
 pub trait Lab {
     /// The error of a bench that failed.
     type Error;
@@ -177,26 +180,26 @@ pub trait Lab {
     /// Returns the time of a monotonic clock, in ns.
     fn now(&self) -> u64;
 
-    /// Runs a whole bench, and reads its recording.
+    /// Runs a bench with the arm, and reads its recording.
     ///
     /// # Errors
     /// Returns an error if the bench failed, or if its recording is incomplete.
     fn bench(&mut self, reply: Reply, effort: Effort) -> Result<Run, Self::Error>;
 
-    /// Runs a bench of this size. Returns its summary as JSON, whatever its outcome.
+    /// Runs a bench with the given numbers of cells and buses. Returns its summary as JSON, even if the run failed.
     ///
     /// # Errors
-    /// Returns an error if the bench did not begin.
+    /// Returns an error if the bench could not be started.
     fn scaled(&mut self, bench: &scale::ScaleBench) -> Result<Value, Self::Error>;
 
-    /// Checks between two measurements that the experiments should continue.
+    /// Checks, between two measurements, that the experiments are to continue.
     ///
     /// # Errors
-    /// Returns an error if they should end.
+    /// Returns an error if the experiments are to end, for example because the user stopped them.
     fn go_on(&mut self) -> Result<(), Self::Error>;
 }
 
-/// A sequence of experiments; measurements that several of them need are made once.
+/// A sequence of experiments. Measurements that several experiments need are made only once.
 #[derive(Debug)]
 pub struct Session {
     effort: Effort,
@@ -212,13 +215,13 @@ impl Session {
         Self { effort, single: None, over_cells: None, large: None }
     }
 
-    /// Performs one experiment.
+    /// Performs one experiment, and writes a section on its results.
     ///
     /// # Errors
     /// Returns the error of the lab.
     ///
     /// # Panics
-    /// Never: the skins generated here fit, and fits have enough points.
+    /// Never panics in practice: generated skins are valid, and all lines are fitted to enough points.
     pub fn perform<L: Lab>(&mut self, experiment: Experiment, lab: &mut L) -> Result<Section, L::Error> {
         lab.go_on()?;
         Ok(match experiment {
@@ -278,12 +281,12 @@ impl Session {
         )
     }
 
-    /// Returns the paper's arm, or a small one for a quick measurement.
+    /// Returns the skin of the paper's arm, or of a smaller one for a quick measurement.
     fn arm(&self) -> Skin {
         ticks::skin(self.pick(24, 253), 1).expect("so many cells fit on the arm")
     }
 
-    /// Returns a skin with as many cells as in Fig. 9, or fewer for a quick measurement.
+    /// Returns a skin with the maximum number of cells in Fig. 9, or fewer for a quick measurement.
     fn large(&mut self) -> &Skin {
         let cells = self.pick(240, ticks::MAX_CELLS);
         self.large.get_or_insert_with(|| {

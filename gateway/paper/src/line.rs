@@ -1,4 +1,4 @@
-//! Linear regression: a line through points, with its quality and the confidence interval of its slope.
+//! Linear regression: the line that fits weighted points best, R², and the confidence interval of the slope.
 
 use analysis::report::figure::Quantity;
 
@@ -14,7 +14,7 @@ pub struct WeightedPoint {
 }
 
 impl WeightedPoint {
-    /// Returns the median of the measurements at x.
+    /// Returns a point at `x` whose y is the median of the measurements, weighted by their number.
     #[must_use]
     pub fn median(x: f64, measured: &mut [f64]) -> Self {
         Self { x, y: quantile(measured, 0.5), weight: count(measured.len()) }
@@ -30,15 +30,15 @@ pub struct LinearFit {
     pub intercept: f64,
     /// R²: the share of y's variance that the line explains, in [0, 1].
     pub quality: f64,
-    /// Half the width of the slope's 95 % confidence interval, in its unit.
+    /// Half the width of the slope's 95 % confidence interval, in the unit of the slope.
     pub slope_half: f64,
 }
 
 impl LinearFit {
-    /// Returns the line with the smallest weighted sum of squared distances along y. Returns `None` for fewer than
-    /// three points, or if all have the same x: the line or its interval is then undefined.
+    /// Returns the line for which the weighted sum of squared distances along y is smallest. Returns `None` if there
+    /// are fewer than three points or all have the same x, because the line or its interval is then undefined.
     ///
-    /// With weights w, means over w, and n points:
+    /// With weights w, means weighted by w, and n points:
     ///
     /// ```text
     ///   slope = Sxy / Sxx        R² = 1 - Σ w r² / Syy        s² = Σ w r² / (n - 2)
@@ -68,14 +68,14 @@ impl LinearFit {
         let intercept = y_mean - slope * x_mean;
         let left = |point: &WeightedPoint| point.weight * (point.y - slope * point.x - intercept).powi(2);
         let residual: f64 = points.iter().map(left).sum();
-        // A horizontal line explains no variance, because there is none.
+        // If all y are equal, there is no variance that the line could explain, so the quality is 0.
         let quality = if syy > 0.0 { (1.0 - residual / syy).max(0.0) } else { 0.0 };
         let freedom = count(points.len() - 2);
         let slope_half = student(freedom) * (residual / freedom / sxx).sqrt();
         Some(Self { slope, intercept, quality, slope_half })
     }
 
-    /// Returns the line through points of equal weight.
+    /// Returns the line that fits points of equal weight best.
     #[must_use]
     pub fn through_equals(points: &[(f64, f64)]) -> Option<Self> {
         let points: Vec<_> = points.iter().map(|&(x, y)| WeightedPoint { x, y, weight: 1.0 }).collect();
@@ -88,7 +88,7 @@ impl LinearFit {
         self.slope * x + self.intercept
     }
 
-    /// Returns the slope with its 95 % confidence interval, in this unit.
+    /// Returns the slope with its 95 % confidence interval as a quantity in `unit`, without conversion.
     #[must_use]
     pub fn slope_in(&self, unit: &str) -> Quantity {
         Quantity::new(self.slope, unit).plus_minus(self.slope_half)
@@ -100,22 +100,23 @@ impl LinearFit {
         self.slope + self.slope_half
     }
 
-    /// Returns the largest x at which the line is not above `y`; NaN for a line that does not rise.
+    /// Returns the x at which a rising line reaches `y`; NaN for a line that does not rise.
     #[must_use]
     pub fn reaches(&self, y: f64) -> f64 {
         if self.slope > 0.0 { (y - self.intercept) / self.slope } else { f64::NAN }
     }
 }
 
-/// Converts a count to a real number.
+/// Converts a count to a floating-point number.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "counts of what is in memory, below 2^53")]
 pub fn count(count: usize) -> f64 {
     count as f64
 }
 
-/// Returns Student's t at 97.5 %, by its expansion about the normal distribution (Abramowitz and Stegun 26.7.5). Below
-/// 10 degrees of freedom it is up to 5 % too small.
+/// Returns the 97.5 % quantile of Student's t distribution for `freedom` degrees of freedom. It is computed by an
+/// expansion about the normal distribution (Abramowitz and Stegun 26.7.5), which is up to 5 % too small below 10
+/// degrees of freedom.
 fn student(freedom: f64) -> f64 {
     const Z: f64 = 1.959_963_984_540_054;
     let z = |power: i32| Z.powi(power);
@@ -128,7 +129,8 @@ fn student(freedom: f64) -> f64 {
     terms.into_iter().zip(1..).fold(Z, |sum, (term, power)| sum + term / freedom.powi(power))
 }
 
-/// Returns the value below which the share `part` of the values lies, with `part` in [0, 1]; NaN without values.
+/// Returns the quantile of the values: the value below which the share `part`, in [0, 1], of them lies. Returns NaN if
+/// there are no values.
 #[must_use]
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a place within the values")]
 pub fn quantile(values: &mut [f64], part: f64) -> f64 {
@@ -151,8 +153,8 @@ mod tests {
         assert!((line.reaches(25.0) - 9.0).abs() < 1e-12 && (line.value_at(9.0) - 25.0).abs() < 1e-12);
     }
 
-    /// x 1 to 5, y 2, 4, 5, 4, 5: slope 0.6, intercept 2.2, R² 0.6, standard error of the slope 0.2828 (a common
-    /// textbook example), t(0.975, 3) = 3.182.
+    /// A common example in textbooks: x is 1 to 5 and y is 2, 4, 5, 4, 5. Slope 0.6, intercept 2.2, R² 0.6, standard
+    /// error of the slope 0.2828, t(0.975, 3) = 3.182.
     #[test]
     fn quality_and_interval_are_those_of_a_textbook() {
         let points = [(1.0, 2.0), (2.0, 4.0), (3.0, 5.0), (4.0, 4.0), (5.0, 5.0)];

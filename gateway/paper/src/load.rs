@@ -1,5 +1,5 @@
-//! The load that the paper's arm causes on a real bus, over the number of cells and by bit rate: the worst case of
-//! [`analysis::fit`].
+//! The load of a real bus by the paper's arm in the worst case, over the number of cells and for different bit rates.
+//! It is computed by [`analysis::fit`].
 
 use super::arm;
 use super::line::count;
@@ -11,7 +11,7 @@ use analysis::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Sha
 /// The maximum number of cells in the figure.
 const MAX_CELLS: u32 = 300;
 
-/// Writes the section on loads over cells.
+/// Writes the section on the load of a bus over the number of cells.
 #[must_use]
 pub fn section() -> Section {
     let skin = arm::paper();
@@ -23,7 +23,7 @@ pub fn section() -> Section {
         let points = (0..=MAX_CELLS).step_by(10).map(load).collect();
         Series::new(Answer::worst_case(rated).rates, Shape::Line, points)
     };
-    // These rates are defaults and not a choice of the user, so they get no verdict.
+    // The bit rates are defaults that no user has chosen, so the findings get no verdict.
     let finding = |row: &Row| {
         let Answer { load, rates, cells, verdict } = Answer::worst_case(&row.fullest.rated);
         let what = format!("worst case of one bus at {rates}: {verdict} ({cells})");

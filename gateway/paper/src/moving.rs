@@ -1,4 +1,4 @@
-//! Fig. 6, 7 and 8: the moving arm, from recorded runs of a whole bench.
+//! Fig. 6, 7 and 8: the moving arm, from recordings of a whole bench.
 
 use serde_json::Value;
 
@@ -9,19 +9,19 @@ use analysis::report::figure::{
     Axis, Figure, Finding, Mark, Quantity, Section, Series, Shape, Table, number,
 };
 
-/// A run: its ticks, and its summary (`bench::summary::Summary` as JSON).
+/// The recording of a bench: its ticks, and its summary (`bench::summary::Summary` as JSON).
 #[derive(Clone, Debug)]
 pub struct Run {
-    /// The ticks, in the order of time.
+    /// The ticks of the run, in the order of time.
     pub rows: Vec<TickRow>,
-    /// The summary.
+    /// The summary of the run as JSON.
     pub summary: Value,
     /// The number of joints of the robot.
     pub joints: usize,
 }
 
 impl Run {
-    /// Returns a figure of the summary by its keys; NaN if it does not exist.
+    /// Returns the number in the summary at this path of keys; NaN if there is none.
     #[must_use]
     pub fn figure(&self, keys: &[&str]) -> f64 {
         let value = keys.iter().try_fold(&self.summary, |value, key| match key.parse::<usize>() {
@@ -31,14 +31,13 @@ impl Run {
         value.and_then(Value::as_f64).unwrap_or(f64::NAN)
     }
 
-    /// Returns the number of cells.
+    /// Returns the number of cells of the bench.
     fn cells(&self) -> f64 {
         let cells = self.summary.get("cells").and_then(Value::as_array);
         cells.and_then(|cells| u32::try_from(cells.len()).ok()).map_or(f64::NAN, f64::from)
     }
 
-    /// Returns the time at which the central computation was switched off, in s; `None` for a run that compared to its
-    /// end.
+    /// Returns the time at which the central computation was switched off, in s; `None` if it ran until the end.
     fn switched_s(&self) -> Option<f64> {
         let last = self.rows.iter().rposition(|row| row.central.is_some())?;
         self.rows.get(last + 1).map(|row| row.time_s)
@@ -48,7 +47,7 @@ impl Run {
         self.rows.iter().map(|row| (row.time_s, value(row))).collect()
     }
 
-    /// Returns a figure over the time of this run.
+    /// Returns an empty figure whose x axis is the time of this run.
     fn drawn(&self, name: impl Into<String>, title: impl Into<String>, y: Axis) -> Figure {
         Figure::new(name, title, Axis::new("time", "s"), y).marks(self.switched())
     }
@@ -64,8 +63,8 @@ impl Run {
     }
 }
 
-/// Writes the section on Fig. 6: central against distributed torques of a run in which each cell replies itself, and
-/// the errors of this run and of one in which cells reply with sums.
+/// Writes the section on Fig. 6: the central and the distributed torques of a run in which each cell sends its own
+/// torque, the errors of that run, and the errors of a run in which cells send sums.
 #[must_use]
 pub fn fig6(single: &Run, summed: &Run) -> Section {
     let joint = |joint: usize| {
@@ -130,7 +129,7 @@ pub fn fig6(single: &Run, summed: &Run) -> Section {
         )])
 }
 
-/// Names the joints without a torque.
+/// Returns the names of the joints on which no torque acted.
 fn bare(run: &Run) -> String {
     let bears = |joint: usize| run.rows.iter().any(|row| joint_value(&row.distributed, joint).abs() > 0.0);
     let bare: Vec<_> =
@@ -146,7 +145,7 @@ fn joint_value(values: &[f64], joint: usize) -> f64 {
     values.get(joint).copied().unwrap_or(f64::NAN)
 }
 
-/// Writes the section on Fig. 7: joint velocities and active cells.
+/// Writes the section on Fig. 7: joint velocities and active cells of a run.
 #[must_use]
 pub fn fig7(run: &Run) -> Section {
     let velocity = |joint: usize| {
@@ -170,15 +169,15 @@ pub fn fig7(run: &Run) -> Section {
         ])
 }
 
-/// The number of cycles per drawn median.
+/// The number of cycles whose median is drawn as one point.
 const CYCLES_PER_MEDIAN: usize = 25;
 
-/// Returns the median of some ticks' times in µs.
+/// Returns the median of a time of some ticks, in µs.
 fn median<'a>(rows: impl Iterator<Item = &'a TickRow>, time: impl Fn(&TickRow) -> f64) -> f64 {
     quantile(&mut rows.map(time).collect::<Vec<_>>(), 0.5)
 }
 
-/// Writes the section on Fig. 8: cycle times, and the central computation in them until it is switched off.
+/// Writes the section on Fig. 8: the times of cycles, and of the central computation until it is switched off.
 #[must_use]
 pub fn fig8(run: &Run) -> Section {
     let cells = run.cells();
@@ -257,7 +256,7 @@ pub fn fig8(run: &Run) -> Section {
         ])
 }
 
-/// Fits the median times of ticks over active cells, weighted by the number of ticks.
+/// Fits a line to the median time of ticks over the number of active cells. Points are weighted by the number of ticks.
 fn over_active<'a>(rows: impl Iterator<Item = &'a TickRow>) -> Option<LinearFit> {
     let mut by_active = std::collections::BTreeMap::<u32, Vec<f64>>::new();
     for row in rows {
@@ -274,7 +273,7 @@ mod tests {
     use protocol::packet::padded;
     use serde_json::json;
 
-    /// Returns a second of ticks: the central computation takes 3 µs and is off from 0.5 s on.
+    /// Returns a run of one second in which the central computation takes 3 µs and is switched off at 0.5 s.
     fn run() -> Run {
         let row = |tick: u16| {
             let central = (tick < 250).then_some([1.0; 6]);

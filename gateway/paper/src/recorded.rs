@@ -1,4 +1,4 @@
-//! Reads the ticks of a recorded run.
+//! Reads the ticks of a run from its recording.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -13,22 +13,22 @@ use trace::ros2::read;
 use trace::ros2::skin::{LoopTiming, Torques};
 use trace::ros2::standard::JointState;
 
-/// A tick.
+/// The values that a recording holds of one tick.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TickRow {
-    /// The scheduled start, in s since the first tick.
+    /// The scheduled start of the tick, in s since the first tick.
     pub time_s: f64,
-    /// Joint velocities in rad/s.
+    /// The velocity of each joint in rad/s.
     pub velocity: [f64; MAX_ROBOT_JOINTS],
     /// The sum of the cells' joint torques, in Nm.
     pub distributed: [f64; MAX_ROBOT_JOINTS],
-    /// The central joint torques in Nm, in ticks that compared.
+    /// The joint torques by the central computation, in Nm; `None` in ticks without it.
     pub central: Option<[f64; MAX_ROBOT_JOINTS]>,
-    /// The number of cells in the cells' torque.
+    /// The number of cells whose torques are in `distributed`.
     pub contributing: u32,
     /// The duration of the tick, in µs.
     pub took_us: f64,
-    /// The part of the duration used by the central computation, in µs.
+    /// The part of the duration that the central computation took, in µs.
     pub central_us: f64,
 }
 
@@ -41,7 +41,7 @@ pub fn read(path: &Path) -> Result<Vec<TickRow>, CaptureError> {
     let mut rows: BTreeMap<u64, TickRow> = BTreeMap::new();
     while let Some(item) = items.next_item()? {
         if let Item::Other(other) = item {
-            // Another program may have written an unexpected message, so errors are ignored.
+            // Messages that cannot be decoded may come from another program, so they are ignored.
             let _ = store_message(&mut rows, other.topic, other.schema, other.nanos, other.message);
         }
     }
@@ -54,7 +54,7 @@ fn seconds(nanos: u64) -> f64 {
     nanos as f64 * 1e-9
 }
 
-/// Stores a message of a tick in its row; other messages are ignored.
+/// Stores the values of a message in the row of its tick. Ignores messages that do not belong to a tick.
 fn store_message(
     rows: &mut BTreeMap<u64, TickRow>,
     topic: &str,
@@ -80,7 +80,7 @@ fn store_message(
     Ok(())
 }
 
-/// Returns a number for each joint; 0 for joints that the robot does not have.
+/// Returns an array with the number for each joint, filled with 0.
 fn by_joint(numbers: &[f64]) -> [f64; MAX_ROBOT_JOINTS] {
     padded(numbers)
 }

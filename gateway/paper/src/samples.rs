@@ -1,7 +1,7 @@
-//! Measures many things on a machine that also does other work.
+//! Measures several quantities in turn, on a machine that also does other work.
 //!
-//! Every round measures each thing once, in a new random order. A stall affects one thing in one round, and a slow
-//! period affects all alike. The median of a thing's measurements counts.
+//! Each round measures every quantity once, in a new random order. A short disturbance then affects one quantity in one
+//! round, and a long one affects all quantities alike. The median of the measurements of a quantity is used.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -9,8 +9,8 @@ use rand_pcg::Pcg64Mcg;
 
 use super::line::quantile;
 
-/// Measures each of `things` things in each of `rounds` rounds; `once` measures the thing with this index. Returns the
-/// sorted measurements of each thing.
+/// Measures each of `things` quantities once in each of `rounds` rounds. `once` measures the quantity with the given
+/// index. Returns the sorted measurements of each quantity.
 pub fn interleaved(
     things: usize,
     rounds: usize,
@@ -35,7 +35,7 @@ pub fn interleaved(
     measured
 }
 
-/// Returns the median of each thing's measurements.
+/// Returns the median of the measurements of each quantity.
 #[must_use]
 pub fn medians(measured: &[Vec<f64>]) -> Vec<f64> {
     measured.iter().map(|values| quantile(&mut values.clone(), 0.5)).collect()

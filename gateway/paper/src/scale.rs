@@ -1,9 +1,9 @@
-//! Benches of up to ten thousand cells: the time to start, the cost, the lateness of the loop, and the replies in time
-//! at the highest rate that holds.
+//! Benches of up to ten thousand cells: the time to start, processor and memory use, the lateness of the loop, and the
+//! share of replies in time at the highest rate that the bench holds.
 //!
-//! Each number of cells is on the fewest buses with enough node ids, and the cells of each bus are one process. A rate
-//! holds if a share of [`HOLDS`] of the replies arrives in time while a share of [`ACTIVE`] of the cells is touched,
-//! and all losses have a known reason.
+//! A bench has the fewest buses that have enough node ids for its cells. The cells of each bus are one process. A bench
+//! holds a rate if the share [`HOLDS`] of the replies arrives in time while the share [`ACTIVE`] of the cells is
+//! touched, and if the reason for every loss is known.
 
 mod section;
 
@@ -21,42 +21,42 @@ use model::scenario::Mode;
 
 pub use section::section;
 
-/// The share of cells that are touched.
+/// The share of cells that are touched, 0 to 1.
 pub const ACTIVE_SHARE: f64 = 0.05;
-/// The share of replies that must be in time.
+/// The share of replies that must be in time, 0 to 1.
 pub const MIN_IN_TIME_SHARE: f64 = 0.99;
 /// The force on a touched cell, in N.
 const TOUCH_N: f64 = 0.5;
 /// The number of cells of the smallest bench in a full measurement: that of the paper's arm.
 const PAPER: usize = 253;
 
-/// A bench.
+/// The size and the load of a bench.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ScaleBench {
     /// The number of cells.
     pub cells: usize,
     /// The number of buses.
     pub buses: usize,
-    /// Joint broadcasts per second.
+    /// The number of joint broadcasts per second.
     pub hz: f64,
-    /// True if [`ACTIVE`] of its cells are touched.
+    /// True if the share [`ACTIVE`] of the cells is touched.
     pub active: bool,
     /// The duration of the run, in s.
     pub seconds: f64,
 }
 
 impl ScaleBench {
-    /// Returns the name of its files.
+    /// Returns the name of the bench's files, without extension.
     #[must_use]
     pub fn name(&self) -> String {
         let Self { cells, buses, hz, active, seconds: _ } = self;
         format!("scale-{cells}-on-{buses}-{hz}-hz-{}", if *active { "active" } else { "quiet" })
     }
 
-    /// Returns its `skin.toml`.
+    /// Returns the text of the bench's `skin.toml`.
     ///
     /// # Panics
-    /// Never: this number of cells fits.
+    /// Never panics in practice, because the buses have enough node ids.
     #[must_use]
     pub fn skin(&self) -> String {
         let Self { cells, buses, hz, .. } = *self;
@@ -64,8 +64,8 @@ impl ScaleBench {
         generate(&target).expect("so many cells fit on the arm")
     }
 
-    /// Returns its `scenario.toml`. The touched cells are the first ones of each bus; their numbers differ by at most
-    /// one between buses.
+    /// Returns the text of the bench's `scenario.toml`. The first cells of each bus are touched; their number differs
+    /// by at most one between buses.
     #[must_use]
     pub fn scenario(&self) -> String {
         let mut text = format!(
@@ -88,36 +88,36 @@ impl ScaleBench {
     }
 }
 
-/// Returns the number of touched cells.
+/// Returns the number of touched cells of a bench with this many cells.
 const fn share(cells: usize) -> usize {
     cells.div_ceil(20)
 }
 
-/// The figures of a bench's summary.
+/// The measurements of one bench, from its summary.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct BenchFigures {
-    /// The time from its start to the first joints, in s.
+    /// The time from the start of the bench to the first joints, in s.
     pub start_s: f64,
-    /// Processor use of the gateway, the buses and the cells, in cores.
+    /// The processor use of the gateway, of the buses and of the cells, in cores.
     pub cores: [f64; 3],
-    /// Memory of the gateway, of all bus servers, and of the largest cell process, in MB.
+    /// The memory of the gateway, of all bus servers together, and of the largest process of cells, in MB.
     pub memory_mb: [f64; 3],
     /// The median duration of a tick without a central computation, in µs.
     pub tick_us: f64,
-    /// The 99th percentile of the lateness of ticks, and that of an idle thread, in µs.
+    /// The 99th percentile of the lateness of ticks, and that of a thread that does nothing else, in µs.
     pub late_us: [f64; 2],
-    /// Replies that were due.
+    /// The number of replies that were due.
     pub due: f64,
-    /// Replies that arrived before the next joints.
+    /// The number of replies that arrived before the next joints.
     pub in_time: f64,
-    /// Replies and packets missing for no known reason.
+    /// The number of replies and packets that are missing for an unknown reason.
     pub unknown: f64,
-    /// True if the run was completed with the robot moving.
+    /// True if the run reached its end and the robot was not halted.
     pub done: bool,
 }
 
 impl BenchFigures {
-    /// Reads a summary (`bench::summary::Summary` as JSON).
+    /// Extracts the measurements from a summary (`bench::summary::Summary` as JSON).
     #[must_use]
     pub fn from_summary(summary: &Value) -> Self {
         let figure = |keys: &[&str]| {
@@ -143,62 +143,64 @@ impl BenchFigures {
         }
     }
 
-    /// Returns the share of due replies that arrived in time.
+    /// Returns the share of the replies due that arrived in time, 0 to 1.
     #[must_use]
     pub fn share(&self) -> f64 {
         if self.due > 0.0 { self.in_time / self.due } else { f64::NAN }
     }
 
-    /// Returns true if the rate holds.
+    /// Returns true if the bench holds its rate.
     fn holds(&self) -> bool {
         self.done && self.share() >= MIN_IN_TIME_SHARE && self.unknown <= 0.0
     }
 }
 
-/// The measurements of one number of cells, at the highest rate that holds, or else at the lowest.
+/// The measurements for one number of cells, at the highest rate that the bench holds. If it holds none, they are at
+/// the lowest rate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SizeFigures {
     /// The number of cells.
     pub cells: usize,
     /// The number of buses.
     pub buses: usize,
-    /// Joint broadcasts per second.
+    /// The number of joint broadcasts per second.
     pub hz: f64,
-    /// True if that rate holds.
+    /// True if the bench holds this rate.
     pub holds: bool,
-    /// The figures without touched cells.
+    /// The measurements while no cells are touched.
     pub quiet: BenchFigures,
-    /// The figures with [`ACTIVE`] of the cells touched.
+    /// The measurements while the share [`ACTIVE`] of the cells is touched.
     pub active: BenchFigures,
 }
 
-/// Times of ticks without threads, in ns: of the fewest cells, of the fewest cells on as many buses as the most, and of
-/// the most.
+/// The times of three kinds of ticks without threads, in ns: with the fewest cells, with the fewest cells on as many
+/// buses as the most cells need, and with the most cells.
 pub type ComparedTicks = [f64; 3];
 
-/// All measurements.
+/// All measurements of the experiment.
 #[derive(Clone, Debug)]
 pub struct Scale {
-    /// Ticks over cells, all of them active, on as many buses as the largest number needs.
+    /// The measurements for each number of cells.
     pub sizes: Vec<SizeFigures>,
-    /// Ticks over cells, all active, on as many buses as the most of them need.
+    /// The times of ticks without threads over the number of cells. All cells are active, on as many buses as the
+    /// largest number needs.
     pub ticks: TickTimes,
-    /// Times of the compared ticks, with all cells active.
+    /// The times of three ticks without threads that are compared. All cells are active.
     pub beside: ComparedTicks,
 }
 
-/// The extent of the measurements.
+/// The numbers of cells and rates to be measured.
 #[derive(Clone, Copy, Debug)]
 struct ScaleExtent {
-    /// Numbers of cells, in ascending order.
+    /// The numbers of cells, in ascending order.
     cells: &'static [usize],
-    /// Rates, in descending order.
+    /// The rates in Hz, in descending order.
     rates: &'static [f64],
     /// The duration of a bench, in s.
     seconds: f64,
-    /// The number of steps of the number of cells in ticks without threads, after one per bus.
+    /// The number of different numbers of cells in ticks without threads, besides one cell per bus.
     steps: usize,
-    /// The number of measurements of these ticks.
+    /// The number of measurements for each of these ticks.
     rounds: usize,
 }
 
@@ -212,13 +214,13 @@ const FULL: ScaleExtent = ScaleExtent {
 
 const QUICK: ScaleExtent = ScaleExtent { cells: &[24, 300], rates: &[62.5], seconds: 1.0, steps: 4, rounds: 5 };
 
-/// Measures everything.
+/// Runs all benches and measures all ticks.
 ///
 /// # Errors
 /// Returns the error of the lab.
 ///
 /// # Panics
-/// Never: the skins generated here fit, and fits have enough points.
+/// Never panics in practice: generated skins are valid, and all lines are fitted to enough points.
 pub fn measure<L: Lab>(lab: &mut L, effort: Effort) -> Result<Scale, L::Error> {
     let extent = match effort {
         Effort::Quick => QUICK,
@@ -234,7 +236,7 @@ pub fn measure<L: Lab>(lab: &mut L, effort: Effort) -> Result<Scale, L::Error> {
     Ok(Scale { sizes, ticks, beside })
 }
 
-/// Finds the highest rate that this number of cells holds, and measures at it.
+/// Finds the highest rate that a bench with this many cells holds, and measures at this rate.
 fn size<L: Lab>(lab: &mut L, cells: usize, extent: ScaleExtent) -> Result<SizeFigures, L::Error> {
     let buses = cells.div_ceil(CellId::COUNT);
     let of = |hz, active| ScaleBench { cells, buses, hz, active, seconds: extent.seconds };
@@ -252,12 +254,12 @@ fn size<L: Lab>(lab: &mut L, cells: usize, extent: ScaleExtent) -> Result<SizeFi
     Ok(SizeFigures { cells, buses, hz, holds: active.holds(), quiet, active })
 }
 
-/// Measures ticks without threads: over cells, and three of them for comparison.
+/// Measures ticks without threads: for different numbers of cells, and three for comparison.
 fn loops(fewest: usize, most: usize, extent: ScaleExtent, now: impl Fn() -> u64 + Copy) -> (TickTimes, ComparedTicks) {
     let skin = |cells, buses| ticks::skin(cells, buses).expect("so many cells fit on the arm");
     let buses = most.div_ceil(CellId::COUNT);
     let large = skin(most, buses);
-    // A bus without cells has no robot to compute, so each bus has at least one cell.
+    // Each bus has at least one cell, because a bus without cells has no chain to be computed.
     let numbers: Vec<usize> =
         (0..=extent.steps).map(|step| (most * step / extent.steps).max(buses)).collect();
     let parts: Vec<_> = numbers.iter().map(|&cells| spread(&large, cells)).collect();
@@ -278,7 +280,7 @@ fn loops(fewest: usize, most: usize, extent: ScaleExtent, now: impl Fn() -> u64 
     (over, std::array::from_fn(|place| medians.get(place).copied().unwrap_or(f64::NAN)))
 }
 
-/// Returns the number of cells for an axis.
+/// Returns the number of cells as the x of a figure.
 fn cells_of(size: &SizeFigures) -> f64 {
     count(size.cells)
 }

@@ -1,5 +1,6 @@
-//! The error of torque sums along a tree relative to the central computation, over the number of active cells: if each
-//! cell truncates, if it rounds, and if it carries the rounding error into its next value.
+//! The error of torque sums along a tree relative to the central computation, over the number of active cells. Three
+//! kinds of cells are compared: cells that truncate, cells that round, and cells that round and carry the rounding
+//! error into their next value.
 
 use protocol::fixed::Q5_10;
 use protocol::message::SkinSensors;
@@ -14,42 +15,42 @@ use super::tree::{EpochResult, SumTree};
 use analysis::paper;
 use analysis::report::figure::{Axis, Figure, Finding, Section, Series, Shape, Table, number};
 
-/// Numbers of active cells; the paper's arm had about twenty.
+/// The numbers of active cells that are measured. About twenty were active on the arm in the paper.
 const ACTIVE: [usize; 10] = [1, 2, 5, 10, 20, 40, 80, 120, 180, 253];
-/// The number of active cells for the findings.
+/// The number of active cells at which the findings are stated.
 const FOUND_AT: usize = 20;
-/// The number of epochs over which a constant touch is averaged.
+/// The number of epochs over which the sum of a constant touch is averaged.
 const AVERAGED: u32 = 32;
-/// The maximum torque; larger ones are outside Q7.8 and left out.
+/// The maximum torque in Nm. Touches that cause a larger torque are left out, because Q7.8 cannot hold it.
 const MOST_NM: f64 = 127.0;
 
-/// The extent of the measurements.
+/// The number of measurements.
 #[derive(Clone, Copy, Debug)]
 pub struct SumsExtent {
     /// The number of touches for each number of active cells.
     pub touches: usize,
-    /// The number of epochs of each touch while the arm moves.
+    /// The number of epochs for which each touch lasts while the arm moves.
     pub epochs: u32,
 }
 
-/// Mean absolute errors over loaded joints, in Nm.
+/// The mean absolute errors of the sums for the joints that the cells load, in Nm, by the kind of cells.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SumErrors {
     /// The number of active cells.
     pub active: usize,
-    /// Every cell's torque is truncated.
+    /// The error if each cell truncates its torque.
     pub truncated: f64,
-    /// Torques are rounded to the nearest value.
+    /// The error if each cell rounds its torque to the nearest value.
     pub rounded: f64,
-    /// Torques are rounded, and the rounding error is carried on.
+    /// The error if each cell rounds its torque and carries the rounding error into its next torque.
     pub carried: f64,
-    /// Torques are rounded and averaged over 32 epochs of a constant touch.
+    /// The error of the average over 32 epochs of a constant touch, if each cell rounds.
     pub rounded_average: f64,
-    /// Torques are carried and averaged over 32 epochs of a constant touch.
+    /// The error of the average over 32 epochs of a constant touch, if each cell rounds and carries the rounding error.
     pub carried_average: f64,
 }
 
-/// Returns random cells of a skin, each with a force of 0.6 to 6 N.
+/// Selects random cells of a skin, each with sensor values for a force of 0.6 to 6 N.
 fn touched(dice: &mut Pcg64Mcg, cells: usize, active: usize) -> Vec<(usize, SkinSensors)> {
     let mut places: Vec<usize> = (0..cells).collect();
     places.shuffle(dice);
@@ -68,7 +69,7 @@ struct Mean {
 }
 
 impl Mean {
-    /// Adds the errors of loaded joints.
+    /// Adds the absolute errors of the first `loaded` joints.
     fn add(&mut self, loaded: usize, got: &[f64; MAX_JOINTS], target: &[f64; MAX_JOINTS]) {
         for (got, target) in got.iter().zip(target).take(loaded).filter(|(_, target)| target.abs() < MOST_NM)
         {
@@ -82,13 +83,13 @@ impl Mean {
     }
 }
 
-/// Returns the numbers of active cells that a skin has enough cells for.
+/// Returns those numbers of active cells that a skin has enough cells for.
 pub fn numbers(skin: &Skin) -> impl Iterator<Item = usize> + use<> {
     let cells = skin.cells.len();
     ACTIVE.into_iter().filter(move |&active| active <= cells)
 }
 
-/// Measures the errors for a number of active cells. The result is deterministic.
+/// Measures the errors for a number of active cells. Equal arguments give equal results.
 #[must_use]
 pub fn errors(skin: &Skin, active: usize, extent: SumsExtent) -> SumErrors {
     let mut dice = Pcg64Mcg::seed_from_u64(active as u64);
@@ -106,7 +107,7 @@ pub fn errors(skin: &Skin, active: usize, extent: SumsExtent) -> SumErrors {
             carried.add(carry.loaded, &carry.sum, &carry.central);
         }
         let q = phase.map(|phase| 1.5 * phase.sin());
-        // A sum with carry begins without a carried error.
+        // Cells that carry begin each touch without a rounding error from the one before.
         let mut fresh = SumTree::new(skin, true);
         for (tree, average) in [(&mut rounding, &mut rounded_average), (&mut fresh, &mut carried_average)] {
             let (mean, last) = averaged(tree, &q, &touch);
@@ -123,7 +124,7 @@ pub fn errors(skin: &Skin, active: usize, extent: SumsExtent) -> SumErrors {
     }
 }
 
-/// Returns the average of the sums of a constant touch on an arm at rest.
+/// Returns the mean of the sums over the epochs of a constant touch, while the arm does not move.
 fn averaged(
     tree: &mut SumTree,
     q: &[f64; MAX_JOINTS],
@@ -139,10 +140,10 @@ fn averaged(
     (mean, last)
 }
 
-/// A column of [`Errors`]: its heading, the text of its finding, and its value.
+/// A kind of sum: its heading in a table, the text of its finding, and its value in [`Errors`].
 type SumMethod = (&'static str, &'static str, fn(&SumErrors) -> f64);
 
-/// All methods of summing.
+/// All kinds of sums that are compared.
 const WAYS: [SumMethod; 5] = [
     ("truncated", "each cut off, mean error", |at| at.truncated),
     ("rounded", "rounded, mean error", |at| at.rounded),
@@ -151,7 +152,7 @@ const WAYS: [SumMethod; 5] = [
     ("carried, average of 32", "carried, mean error of the average over 32 epochs", |at| at.carried_average),
 ];
 
-/// Writes the section on errors over the number of active cells.
+/// Writes the section on the error of sums over the number of active cells.
 #[must_use]
 pub fn section(skin: &Skin, errors: &[SumErrors]) -> Section {
     let of = skin.cells.len();
@@ -208,11 +209,13 @@ mod tests {
         let errors = measure();
         assert_eq!(errors.iter().map(|at| at.active).collect::<Vec<_>>(), [1, 2, 5, 10, 20, 40]);
         let (one, forty) = (errors[0], errors[5]);
-        // Each cell that loads a joint contributes half a step of 1/256 Nm; cells near the base load fewer joints.
+        // A cell that truncates is too low by half a step of 1/256 Nm on average. Cells near the base load fewer
+        // joints.
         let drift = |at: &SumErrors| at.truncated / (count(at.active) / 512.0);
         assert!((0.6..1.1).contains(&drift(&one)) && (0.6..1.0).contains(&drift(&forty)), "{errors:?}");
         assert!((25.0..45.0).contains(&(forty.truncated / one.truncated)), "{errors:?}");
-        // One cell contributes a quarter of a step; the error grows with the square root.
+        // A cell that rounds is off by a quarter of a step on average, and the error of the sum grows with the square
+        // root of the number of cells.
         assert!(forty.rounded < 0.012 && forty.truncated > 4.0 * forty.rounded, "{errors:?}");
         assert!(forty.carried_average < forty.rounded_average / 2.0, "{errors:?}");
         let section = section(&skin, &errors);

@@ -1,4 +1,4 @@
-//! Runs every experiment that needs no bench, in its quick form.
+//! Tests that perform every experiment that needs no bench, with few measurements.
 
 use super::*;
 use analysis::report::figure::{Figure, Shape, Verdict};
@@ -7,7 +7,7 @@ use std::time::Instant;
 
 static BEGAN: LazyLock<Instant> = LazyLock::new(Instant::now);
 
-/// A lab with a clock and without benches.
+/// A lab that has a clock but cannot run benches.
 struct Bare;
 
 impl Lab for Bare {
@@ -50,7 +50,7 @@ fn is_drawable(figure: &Figure) {
     }
 }
 
-/// Verdicts on times are not checked: a debug build on a busy machine may take any time.
+/// The test does not check verdicts on times, because a debug build on a busy machine may take any time.
 #[test]
 fn every_experiment_without_a_bench_has_figures_and_findings_of_its_own() {
     let mut session = Session::new(Effort::Quick);
@@ -82,8 +82,8 @@ fn every_experiment_without_a_bench_has_figures_and_findings_of_its_own() {
     assert_eq!(names.len(), all, "figures have names of their own");
 }
 
-/// Returns true if a finding without a limit is for information only. The verdict is decisive, because another
-/// comparison may yield one as well.
+/// Returns true if a finding has no value of the paper to be compared with, or if the comparison is for information
+/// only.
 fn is_stated(finding: &analysis::report::figure::Finding) -> bool {
     finding.paper.is_none() || finding.verdict == Verdict::Stated
 }

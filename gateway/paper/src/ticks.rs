@@ -1,5 +1,5 @@
-//! Skins with any number of cells, and the control loop's ticks over them without threads, sockets or waiting, for
-//! measuring times.
+//! Measures the ticks of the control loop for skins with any number of cells. The ticks run without threads, sockets or
+//! waiting.
 
 use std::sync::Arc;
 
@@ -18,20 +18,20 @@ use model::generate::{GenerateError, Target, generate};
 use model::scenario::{Mode, ModeChange, Scenario, contact_words};
 use model::table::{Snapshot, Table};
 
-/// The maximum number of cells in the paper's Fig. 9.
+/// The maximum number of cells in Fig. 9 of the paper.
 pub const MAX_CELLS: usize = 3_000;
-/// The number of buses for that many cells.
+/// The number of buses for [`MOST_CELLS`] cells.
 pub const BUSES: usize = 12;
-/// The position of the arm while times are measured, in rad.
+/// The joint positions of the arm while times are measured, in rad.
 pub const POSE: [f64; WORDS] = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
 /// The force on an active cell, in N.
 const TOUCH_N: f64 = 1.5;
-/// The number of ticks in an epoch, at 500 Hz and 62.5 Hz.
+/// The number of ticks in an epoch, with 500 ticks and 62.5 epochs per second.
 const TICKS: u64 = 8;
-/// The capacity for records and broadcasts between two epochs, far more than occur.
+/// The capacity of the queues for records and broadcasts between two epochs. It is much larger than needed.
 const QUEUE: usize = 64;
 
-/// Returns a UR5 with a skin of this many cells on this many buses.
+/// Returns the skin of a UR5 with this many cells on this many buses.
 ///
 /// # Errors
 /// Returns [`GenerateError`] if the cells do not fit on the buses.
@@ -40,8 +40,8 @@ pub fn skin(cells: usize, buses: usize) -> Result<Skin, GenerateError> {
     Ok(Skin::parse("generated skin", &text)?)
 }
 
-/// Reduces a skin to the first cells of each bus; their numbers differ by at most one between buses. All other parts of
-/// the skin stay the same.
+/// Returns a skin that has only `cells` of the cells: the first ones of each bus. Their number differs by at most one
+/// between buses.
 #[must_use]
 pub fn spread(skin: &Skin, cells: usize) -> Skin {
     let buses = skin.buses.len().max(1);
@@ -50,19 +50,19 @@ pub fn spread(skin: &Skin, cells: usize) -> Skin {
     Skin { cells: (0..buses).flat_map(of_bus).collect(), ..skin.clone() }
 }
 
-/// Returns the sensor values of a touched cell.
+/// Returns the sensor values of a cell that is touched.
 #[must_use]
 pub fn touch() -> SkinSensors {
     SkinSensors { contact: contact_words(TOUCH_N), ..SkinSensors::default() }
 }
 
-/// Returns the sensor values of each cell of a skin if the first `active` of them in the order of `spread` are touched.
+/// Returns the sensor values of all cells if the first `active` cells, in the order of `spread`, are touched.
 fn sensors(cells: usize, active: usize) -> Vec<SkinSensors> {
     (0..cells).map(|cell| if cell < active { touch() } else { SkinSensors::default() }).collect()
 }
 
-/// Returns the snapshot that the receiver of a bus passes to the loop after the first `active` cells have replied in an
-/// epoch. A real table computes it from real frames.
+/// Returns the snapshot that a bus receiver passes to the loop after the first `active` cells have replied. It is
+/// computed from frames by the same table as in a bench.
 fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
     let mut table = Table::new(skin, bus);
     let cells: Vec<&Cell> = skin.cells_on_bus(bus).collect();
@@ -74,14 +74,14 @@ fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
     };
     hear(true, Message::Joints { epoch, joints: Joints { in_use: 6, ..Joints::default() } });
     for cell in cells.iter().take(active) {
-        // The value of the torque does not affect the time.
+        // The time of a tick does not depend on the value of the torque.
         hear(false, Message::Torque { from: cell.node, epoch, torque: [409; WORDS].into() });
     }
     Snapshot { sums: table.snapshot().sums, sensors: sensors(cells.len(), active) }
 }
 
-/// A controller that computes everything that the kinesthetic controller computes, but holds the arm. If the robot
-/// moved to its limits, ticks of few cells would differ from those of many.
+/// A controller that computes what the kinesthetic controller computes, but does not move the arm. Otherwise the robot
+/// would move to its limits, faster with many cells than with few, and their ticks would not be comparable.
 struct HoldingController(Kinesthetic);
 
 impl Controller for HoldingController {
@@ -93,7 +93,7 @@ impl Controller for HoldingController {
     }
 }
 
-/// A control loop over buses whose receivers have passed on sums.
+/// A control loop, and the receiving ends of its buses, which pass sums to the loop.
 #[derive(Debug)]
 pub struct Ticks {
     turn: TickDriver,
@@ -103,7 +103,7 @@ pub struct Ticks {
     number: u64,
 }
 
-/// The receiver's ends of the channels to the loop.
+/// The ends of a bus receiver's channels to the loop.
 #[derive(Debug)]
 struct ReceiverEnds {
     snapshot: Snapshot,
@@ -111,20 +111,20 @@ struct ReceiverEnds {
     positions: rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
 }
 
-/// The average times of an epoch's ticks, in ns.
+/// The mean times of the ticks in an epoch, in ns.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TickCost {
-    /// The time of a whole tick, without the central computation.
+    /// The time of a tick without that of the central computation.
     pub tick: f64,
-    /// The time of the central computation in it; 0 without one.
+    /// The time of the central computation in a tick; 0 if there is none.
     pub central: f64,
 }
 
 impl Ticks {
-    /// Creates a loop over a skin of which the first `active` cells, distributed evenly over the buses, are touched.
+    /// Creates a loop over a skin. The first `active` cells are touched, distributed evenly over the buses.
     ///
     /// # Panics
-    /// If the skin has an external controller, which a generated one does not have.
+    /// Panics if the skin has an external controller, which a generated skin does not have.
     #[must_use]
     pub fn new(skin: &Skin, active: usize, mode: Mode) -> Self {
         let buses = skin.buses.len();
@@ -152,11 +152,11 @@ impl Ticks {
         Self { turn, buses: inlets, records, mode, number: 0 }
     }
 
-    /// Runs the ticks of one epoch, each on a new snapshot.
+    /// Runs the ticks of one epoch, each with a new snapshot. Returns their mean times.
     pub fn epoch(&mut self, now: impl Fn() -> u64 + Copy) -> TickCost {
         for _ in 0..TICKS {
             for ReceiverEnds { snapshot, to_loop, positions } in &mut self.buses {
-                // The read-back epoch is that of the previous broadcast, as on a working bus.
+                // The epoch that was read back is that of the previous broadcast, as on a bus that works.
                 let sent = self.number.checked_sub(1).map(|number| number / TICKS);
                 snapshot.sums.read_back = sent.map(|sent| Epoch(sent.to_le_bytes()[0]));
                 to_loop.input_buffer_mut().copy_from(snapshot, self.mode == Mode::Compare);
@@ -177,8 +177,8 @@ impl Ticks {
         took
     }
 
-    /// Returns the state after one more epoch: the number of cells in the torque, the number of active cells of the
-    /// central computation (`None` without one), and true if the robot is halted.
+    /// Runs one more epoch and returns the state after it: the number of cells in the torque, the number of active
+    /// cells in the central computation (`None` if there is none), and true if the robot is halted.
     pub fn known(&mut self, now: impl Fn() -> u64 + Copy) -> (u32, Option<u32>, bool) {
         self.epoch(now);
         let tick = Tick { number: self.number, time: Micros(self.number * 2_000) };
@@ -214,7 +214,8 @@ mod tests {
             assert!(counts.iter().max().unwrap() - counts.iter().min().unwrap() <= 1, "{counts:?}");
             let target = u32::try_from(active).unwrap();
             let mut compared = Ticks::new(&part, active, Mode::Compare);
-            // The loop runs for more than a hundred ticks, so a missing read-back would halt the robot.
+            // The loop runs for more than a hundred ticks. If the broadcasts were not read back, the robot would be
+            // halted.
             for _ in 0..20 {
                 compared.epoch(|| 0);
             }
@@ -224,7 +225,8 @@ mod tests {
         }
     }
 
-    /// On a clock that advances by 1 ns per reading: the start, before and after the central computation, and the end.
+    /// The clock advances by 1 ns per reading. A tick reads it at its start, before and after the central computation,
+    /// and at its end.
     #[test]
     fn a_tick_is_told_without_its_central_computation() {
         let part = spread(&skin(BUSES, BUSES).unwrap(), BUSES);

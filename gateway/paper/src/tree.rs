@@ -1,5 +1,5 @@
-//! Runs the cells' own arithmetic along a tree without a bus, and compares the sums at the roots with the central
-//! computation of the same touch.
+//! Computes torque sums along a tree with the cells' own arithmetic but without a bus, and compares the sums at the
+//! roots with the central computation for the same touch.
 
 use std::collections::VecDeque;
 
@@ -17,12 +17,12 @@ use protocol::time::{Micros, Span};
 
 use model::central::Central;
 
-/// The number of fraction bits between a cell's exact torque and Q7.8.
+/// The number of fraction bits of a cell's exact torque that Q7.8 does not have.
 const SHORTENED: u32 = 30 - 8;
 /// The interval between joint broadcasts, in µs.
 const PERIOD: u64 = 16_000;
 
-/// A cell, its depth, and its children with their ports.
+/// A cell, the number of wires from it to the root, and its children, each with the port to it.
 #[derive(Clone, Debug)]
 struct Branch {
     cell: usize,
@@ -30,36 +30,36 @@ struct Branch {
     children: Vec<(usize, usize)>,
 }
 
-/// A skin on one bus whose cells sum along the shortest routes to the nearest root.
+/// A skin on one bus whose cells send sums along the shortest paths to the nearest root.
 #[derive(Clone, Debug)]
 pub struct SumTree {
     skin: Skin,
     central: Central,
     sums: Vec<Sum>,
-    /// The cells in the order from the leaves to the roots.
+    /// The cells, sorted so that each comes after its children.
     order: Vec<Branch>,
     kernels: Vec<Wrench>,
     epoch: Epoch,
 }
 
-/// The result of one epoch, in Nm.
+/// The sums of one epoch and the torques to compare them with, in Nm.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct EpochResult {
-    /// The torque computed centrally in double precision.
+    /// The torque that the central computation yields in double precision.
     pub central: [f64; MAX_JOINTS],
-    /// The sum along the tree in Q7.8.
+    /// The sum that arrives at the roots, in Q7.8.
     pub sum: [f64; MAX_JOINTS],
-    /// The sum of each active cell's torque, truncated to Q7.8.
+    /// The sum of the torques of all active cells, each truncated to Q7.8.
     pub truncated: [f64; MAX_JOINTS],
-    /// The number of joints that active cells load.
+    /// The number of joints that active cells load, counted from the base.
     pub loaded: usize,
-    /// The number of cells in the sum.
+    /// The number of cells whose torques are in the sum.
     pub count: usize,
 }
 
 impl SumTree {
-    /// Creates a tree. `carry` is true to carry rounding errors into a cell's next value. Unreachable cells take no
-    /// part.
+    /// Creates a tree for a skin. With `carry`, each cell adds its rounding error to its next torque. Cells without a
+    /// path to a root are left out.
     #[must_use]
     pub fn new(skin: &Skin, carry: bool) -> Self {
         let place = |node: CellId| skin.cells.iter().position(|cell| cell.node == node);
@@ -94,13 +94,14 @@ impl SumTree {
         Self { central: Central::new(skin), skin: skin.clone(), sums, order, kernels, epoch: Epoch(0) }
     }
 
-    /// Returns the number of cells with a route to a root.
+    /// Returns the number of cells that have a path to a root.
     #[must_use]
     pub fn cells(&self) -> usize {
         self.order.len()
     }
 
-    /// Runs one epoch in which the cells with these indices are in contact while the joints are at `q` (rad).
+    /// Runs one epoch with the joint positions `q` in rad. `touch` are the cells in contact, by index, with their
+    /// sensor values.
     pub fn turn(&mut self, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> EpochResult {
         let words = q.map(|q| Q1_14::from_radians(q).unwrap_or_default());
         let frames = self.central.frames(&words);
@@ -164,7 +165,7 @@ fn add(sum: &mut [f64; MAX_JOINTS], more: [f64; MAX_JOINTS]) {
     }
 }
 
-/// Returns the value of a cell that drops the bits below Q7.8, in Nm.
+/// Returns the torque in Nm after the bits below those of Q7.8 were dropped.
 #[expect(clippy::cast_precision_loss, reason = "a torque has far fewer than 2^53 steps")]
 fn truncated(exact: Acc<30>) -> f64 {
     (exact.steps() >> SHORTENED) as f64 / 256.0

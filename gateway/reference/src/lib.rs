@@ -1,5 +1,5 @@
-//! Computes the replies of a cell with the cell's own code, for comparison, and for the test vectors for cells that are
-//! written elsewhere.
+//! Computes the torques of a cell with the cell's own code. The gateway compares replies with them, and the test
+//! vectors for cells by other authors contain them.
 
 use cell_node::contact::{Force, Torque};
 use cell_node::kernel::{Kernel, Wrench};
@@ -7,7 +7,7 @@ use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::message::SkinSensors;
 use protocol::parameters::{Contact, MAX_JOINTS, Parameters};
 
-/// A cell with a configuration, reduced to its arithmetic.
+/// The arithmetic of a cell with a configuration: its Jacobian, force and torques.
 #[derive(Clone, Debug)]
 pub struct ReferenceCell {
     kernel: Wrench,

@@ -1,4 +1,4 @@
-//! Writes the text of a `skin.toml` for chains of a robot and the cells on their links.
+//! Writes the text of a `skin.toml` for some chains of a robot and the cells on their links.
 //!
 //! ```text
 //!   Chain, .. ──┐
@@ -18,49 +18,49 @@ use thiserror::Error;
 use crate::chain::{UrdfChain, ChainJoint};
 use crate::error::RobotError;
 
-/// The default number of cells per bus: node ids 1 to 250, which leaves some for cells that are added later.
+/// Default number of cells per bus. With node ids 1 to 250, a few remain for cells that are added later.
 pub const DEFAULT_CELLS_PER_BUS: usize = 250;
 
-/// The maximum speed of a joint if the URDF gives none, in rad/s or m/s.
+/// Maximum speed of a joint for which the URDF gives none, in rad/s or m/s.
 const MAX_SPEED: f64 = 2.0;
 
-/// A cell with its position on a link.
+/// A cell that is placed on a link of the robot.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CellOnLink {
-    /// The link of the URDF.
+    /// Name of the link in the URDF.
     pub link: String,
     /// The position in the link's frame, in m.
     pub position: [f64; 3],
     /// The outward normal in the link's frame, of any length above zero.
     pub normal: [f64; 3],
-    /// The bus, if it is given.
+    /// Name of the cell's bus, if given.
     pub bus: Option<String>,
-    /// The node id, if it is given.
+    /// Node id of the cell, if given.
     pub node: Option<u8>,
-    /// The node ids that are wired to its ports, on its bus.
+    /// Node ids of the cells on the same bus that are wired to the ports of this cell.
     pub neighbors: [Option<u8>; 4],
     /// True if the cell is wired to the gateway's side.
     pub root: bool,
-    /// The line of the file that defines the cell, for errors.
+    /// Line that defines the cell in the file of cells, for errors.
     pub line: usize,
 }
 
-/// The input for a skin.
+/// The robot and the cells from which a skin file is written.
 #[derive(Debug)]
 pub struct SkinImport<'a> {
     /// The name of the robot.
     pub name: &'a str,
-    /// The command that made the skin, for the first line.
+    /// The command with which the user made the skin, for a comment in the first line.
     pub command: &'a str,
-    /// The path of the URDF relative to the skin's file, if it is known.
+    /// The path of the URDF relative to the skin file, if it is known.
     pub urdf: Option<&'a str>,
-    /// The chains. Those after the first have their own tip, and may share joints with earlier ones.
+    /// The chains of the skin. Each has its own tip, and may share joints with earlier chains.
     pub chains: &'a [UrdfChain],
-    /// The cells in their order. If there are none, each tip gets one.
+    /// The cells, in the order of their file. If there are none, the tip of each chain gets one.
     pub cells: &'a [CellOnLink],
 }
 
-/// The error of an import that yields no skin.
+/// The error for a robot and cells from which no skin can be made.
 #[derive(Debug, Error)]
 pub enum ImportError {
     /// The chains together have too many joints.
@@ -68,18 +68,18 @@ pub enum ImportError {
         "{count} joints move between the root and the tips; a robot has 1 to {MAX_ROBOT_JOINTS}: give fewer --tip"
     )]
     Joints {
-        /// The number of joints.
+        /// Number of joints of all chains together.
         count: usize,
     },
-    /// The link of a cell cannot carry it.
+    /// The link of a cell cannot carry cells.
     #[error("{}{error}", line_prefix(*line))]
     Link {
         /// The line of the file of cells.
         line: usize,
-        /// The error of the link.
+        /// The reason why the link cannot carry cells.
         error: RobotError,
     },
-    /// A normal has no direction.
+    /// The normal of a cell has no direction, because its length is zero or not finite.
     #[error("{}the normal nx,ny,nz = {x},{y},{z} has no direction: it must be longer than 0", line_prefix(*line))]
     Normal {
         /// The line of the file of cells.
@@ -91,7 +91,7 @@ pub enum ImportError {
         /// The z component.
         z: f64,
     },
-    /// Cells of two chains are on one bus.
+    /// Cells on two different chains are assigned to the same bus.
     #[error(
         "{}bus {bus:?} carries chain {first:?} already, and this cell sits on chain {second:?}: name another bus",
         line_prefix(*line)
@@ -99,42 +99,42 @@ pub enum ImportError {
     Bus {
         /// The line of the file of cells.
         line: usize,
-        /// The bus.
+        /// Name of the bus.
         bus: String,
-        /// The chain of its first cell.
+        /// The chain of the first cell on the bus.
         first: String,
-        /// The chain of this cell.
+        /// The chain of the cell in this line.
         second: String,
     },
-    /// A bus has no free node id.
+    /// A bus has no node id left for a cell.
     #[error("{}bus {bus:?} has no node id left: it has 254", line_prefix(*line))]
     Full {
         /// The line of the file of cells.
         line: usize,
-        /// The bus.
+        /// Name of the bus.
         bus: String,
     },
-    /// Two cells have the same node id.
+    /// Two cells on one bus have the same node id.
     #[error("{}node {node} of bus {bus:?} is that of line {first} already: give it another one, or none", line_prefix(*line))]
     Taken {
         /// The line of the file of cells.
         line: usize,
-        /// The bus.
+        /// Name of the bus.
         bus: String,
         /// The node id.
         node: u8,
-        /// The line of the cell that has it.
+        /// The line of the other cell with this node id.
         first: usize,
     },
-    /// The name of the bus is not possible for an interface.
+    /// The name of a bus is not valid for a network interface.
     #[error("{}bus {bus:?}: its name has 1 to 15 letters, digits, `-`, `_` or `.`, and does not begin with `.`", line_prefix(*line))]
     BusName {
         /// The line of the file of cells.
         line: usize,
-        /// The bus.
+        /// The rejected name.
         bus: String,
     },
-    /// A cell is too far away.
+    /// A cell is too far from the joints that move it.
     #[error(
         "{}position px,py,pz = {x},{y},{z} of link {link:?} can come {reach:.3} m from a frame of the rows below \
          it, if all joints turn freely; less than {REACH} m is possible: correct it, or choose a root nearer to the link",
@@ -143,18 +143,18 @@ pub enum ImportError {
     Reach {
         /// The line of the file of cells.
         line: usize,
-        /// The link.
+        /// Name of the link.
         link: String,
         /// The x coordinate in the link's frame, in m.
         x: f64,
-        /// The y coordinate.
+        /// The y coordinate in the link's frame, in m.
         y: f64,
-        /// The z coordinate.
+        /// The z coordinate in the link's frame, in m.
         z: f64,
-        /// The distance that the cell can reach, in m.
+        /// The reach of the cell in m: its maximum distance from the joints that move it.
         reach: f64,
     },
-    /// The check of the skin refuses cells or buses.
+    /// The check of the written skin found an error in a cell or a bus.
     #[error("{}{what}", line_prefix(*line))]
     Cells {
         /// The line of the file of cells; 0 for the whole file.
@@ -162,7 +162,7 @@ pub enum ImportError {
         /// The message of the check.
         what: String,
     },
-    /// The check of the skin refuses the robot.
+    /// The check of the written skin found an error in the robot.
     #[error("{what}")]
     Robot {
         /// The message of the check.
@@ -171,14 +171,14 @@ pub enum ImportError {
 }
 
 impl ImportError {
-    /// Returns true if the cells are wrong, rather than the robot.
+    /// Returns true if the error is in the cells, false if it is in the robot.
     #[must_use]
     pub const fn is_of_cells(&self) -> bool {
         !matches!(self, Self::Joints { .. } | Self::Robot { .. })
     }
 
-    /// Converts an error of the skin's check, and refers it to the lines of the cells, because the user does not see
-    /// the text of the skin.
+    /// Converts an error of the check of the written skin. The result refers to the lines of the file of cells, because
+    /// the user does not see the text of the skin.
     fn of_check(error: DocumentError, cells: &[CellOnLink], buses: &[BusAssignment]) -> Self {
         let DocumentError::InvalidValue { what, .. } = error else { return Self::Robot { what: error.to_string() } };
         let lines_of_buses = || buses.iter().map(|bus| bus.line);
@@ -194,18 +194,18 @@ impl ImportError {
     }
 }
 
-/// Splits `cell[3].node = 7: ...` into the number and the rest.
+/// Splits an error text such as `cell[3].node = 7: ...`, for the given table, into the number and the rest.
 fn numbered<'a>(what: &'a str, table: &str) -> Option<(usize, &'a str)> {
     let (number, rest) = what.strip_prefix(table)?.strip_prefix('[')?.split_once(']')?;
     Some((number.parse().ok()?, rest.trim_start_matches('.')))
 }
 
-/// Formats the line of a cell in an error; empty for cells without a file.
+/// Returns the prefix of an error with the line of a cell; empty for cells that are not from a file.
 fn line_prefix(line: usize) -> String {
     if line == 0 { String::new() } else { format!("line {line}: ") }
 }
 
-/// A cell with its position on a chain.
+/// A cell with its chain, bus and place on the chain.
 struct PlacedCell<'a> {
     cell: &'a CellOnLink,
     bus: usize,
@@ -217,24 +217,24 @@ struct PlacedCell<'a> {
     normal: [f64; 3],
 }
 
-/// A bus while cells are assigned to it.
+/// A bus to which cells are being assigned.
 struct BusAssignment {
     name: String,
     chain: usize,
-    /// The line of its first cell.
+    /// Line of the first cell on the bus.
     line: usize,
-    /// The used node ids, with the lines of their cells.
+    /// The node ids in use on the bus, each with the line of its cell.
     taken: Vec<(u8, usize)>,
-    /// True if a cell names the bus, false if the number of cells requires it.
+    /// True if a cell names the bus, false if it was added because of the number of cells.
     named: bool,
 }
 
 impl SkinImport<'_> {
-    /// Returns the text of the skin. The result is deterministic.
+    /// Returns the text of the skin. The same input always gives the same text.
     ///
     /// # Errors
-    /// Returns [`ImportError`] if a cell is on a link that no chain moves, if its normal has no direction, if its bus
-    /// is full, or if the result is not a valid skin.
+    /// Returns [`ImportError`] if a cell is on a link that no chain moves, its normal has no direction, its bus has no
+    /// free node id, or the written skin is not valid.
     pub fn toml(&self) -> Result<String, ImportError> {
         let count = self.joints().len();
         if count > MAX_ROBOT_JOINTS {
@@ -251,7 +251,7 @@ impl SkinImport<'_> {
         }
     }
 
-    /// Assigns a cell to the first chain that moves its link, and to a bus.
+    /// Assigns a cell to the first chain that moves its link, and to a bus with a node id.
     fn place<'a>(&self, cell: &'a CellOnLink, buses: &mut Vec<BusAssignment>) -> Result<PlacedCell<'a>, ImportError> {
         let line = cell.line;
         let mut found = None;
@@ -301,7 +301,8 @@ impl SkinImport<'_> {
         Ok(PlacedCell { cell, bus, node, chain, joint, row, position: position.into(), normal: normal.into() })
     }
 
-    /// Returns the bus of a cell: the one that it names, or the last one of its chain that has room.
+    /// Returns the index of a cell's bus: the bus that the cell names, or the last bus of its chain with a free node
+    /// id. Adds a bus if necessary.
     fn bus(&self, cell: &CellOnLink, chain: usize, buses: &mut Vec<BusAssignment>) -> Result<usize, ImportError> {
         let name = |chain: usize| self.chains.get(chain).map_or_else(String::new, |chain| chain.tip.clone());
         if let Some(named) = &cell.bus {
@@ -334,7 +335,7 @@ impl SkinImport<'_> {
         Ok(buses.len() - 1)
     }
 
-    /// Returns the joints of all chains, each once.
+    /// Returns the joints of all chains. A joint that several chains share occurs once.
     fn joints(&self) -> Vec<&ChainJoint> {
         let mut joints: Vec<&ChainJoint> = Vec::new();
         for joint in self.chains.iter().flat_map(|chain| &chain.joints) {
@@ -410,7 +411,7 @@ impl SkinImport<'_> {
     }
 }
 
-/// Adds a chain: its base and its rows.
+/// Writes a chain of the robot: its base and its rows.
 fn add_chain(draft: &mut Draft, chain: &UrdfChain) {
     draft.table("[[robot.chain]]", Some("standard Denavit-Hartenberg, base to tip; m, rad"));
     draft.set("name", Value::Text(&chain.tip));
@@ -429,18 +430,18 @@ fn add_chain(draft: &mut Draft, chain: &UrdfChain) {
     draft.set_rows("rows", None, rows);
 }
 
-/// Returns the row of a joint, both from 1.
+/// Returns the number of the row that a joint moves. Rows and joints are counted from 1.
 fn row_of(chain: &UrdfChain, joint: usize) -> Option<usize> {
     let moving = chain.rows.iter().enumerate().filter(|(_, row)| row.kind != RowKind::Fixed);
     moving.map(|(index, _)| index + 1).nth(joint.checked_sub(1)?)
 }
 
-/// Returns a cell at the origin of a chain's tip, which faces along z.
+/// Returns a cell at the origin of a chain's tip link, with its normal along the z axis of that link.
 fn on_tip(chain: &UrdfChain) -> CellOnLink {
     CellOnLink { link: chain.tip.clone(), normal: [0.0, 0.0, 1.0], ..CellOnLink::default() }
 }
 
-/// Removes rounding residues and negative zeros.
+/// Returns a value for output, without rounding residues and negative zeros.
 fn tidy(value: f64) -> f64 {
     if value.abs() < 1e-12 { 0.0 } else { value }
 }

@@ -1,4 +1,4 @@
-//! Errors in a robot's file, or in a requested chain.
+//! Errors in the file of a robot, or in a chain that a user requests from it.
 
 use thiserror::Error;
 
@@ -7,7 +7,7 @@ use protocol::skin::REACH;
 
 use crate::rows::{MAX_LENGTH_M, MAX_RESIDUAL};
 
-/// An error in a file, in one line.
+/// An error in the file of a robot. The message is one line.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[error("{file}{}: {problem}", line.map_or_else(String::new, |line| format!(":{line}")))]
 pub struct RobotError {
@@ -15,41 +15,41 @@ pub struct RobotError {
     pub file: String,
     /// The line, from 1, if it is known.
     pub line: Option<u32>,
-    /// The problem.
+    /// The kind of error, with its details.
     pub problem: Box<RobotProblem>,
 }
 
 impl RobotError {
-    /// Creates an error in a file.
+    /// Creates an error for a problem in a file, at a line if it is known.
     pub(crate) fn new(file: &str, line: Option<u32>, problem: RobotProblem) -> Self {
         Self { file: file.to_owned(), line, problem: Box::new(problem) }
     }
 }
 
-/// A problem in a robot's file, or in a chain of it.
+/// A problem in the file of a robot, or in a chain of the robot.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum RobotProblem {
     /// The file is empty.
     #[error("the file is empty; a URDF has a robot element with links and joints")]
     Empty,
-    /// The file does not begin as XML does.
+    /// The file does not begin like an XML file.
     #[error("not XML: a URDF begins with <?xml or <robot, and this does not; name the robot's URDF")]
     NotXml,
-    /// The file is not readable XML, with the fault and the action to take.
+    /// The file is not readable XML. The text says what is wrong and what to do.
     #[error("{0}")]
     Xml(String),
-    /// The file is a template of a URDF.
+    /// The file is a xacro template, from which a URDF must be generated first.
     #[error(
         "{what} is left: this is a xacro file, a template of a URDF. Make one with `xacrodoc {file} -o NEW.urdf` (pip install xacrodoc), and name that"
     )]
     Xacro {
-        /// The element or expression.
+        /// The xacro element or expression.
         what: String,
-        /// The file.
+        /// Name of the file.
         file: String,
     },
-    /// The file is XML of another kind.
+    /// The file is XML, but its root element is not that of a URDF.
     #[error("the outermost element is {0}; a URDF has `robot`: name the robot's URDF")]
     NotARobot(String),
     /// The file is an SRDF, which defines groups of a robot's joints.
@@ -63,39 +63,39 @@ pub enum RobotProblem {
     Missing {
         /// The element.
         thing: String,
-        /// The missing part.
+        /// The missing element or attribute.
         missing: &'static str,
     },
-    /// A value is not allowed.
+    /// The value of an attribute is not allowed.
     #[error("{thing}: {attribute} = {value:?}: {allowed}")]
     Value {
-        /// The element.
+        /// The element with the attribute.
         thing: String,
         /// The attribute.
         attribute: &'static str,
-        /// The value.
+        /// The rejected value.
         value: String,
         /// The allowed values.
         allowed: String,
     },
-    /// A name occurs twice.
+    /// Two links or two joints have the same name.
     #[error("two {what}s are named {name:?}; each needs a name of its own: rename one")]
     Duplicate {
-        /// `link` or `joint`.
+        /// Kind of the two elements: `link` or `joint`.
         what: &'static str,
-        /// The name.
+        /// The name that occurs twice.
         name: String,
     },
     /// A joint names a link that does not exist.
     #[error("joint {joint:?} has the {role} {link:?}, but there is no such link; the nearest are {nearest}")]
     JointWithoutLink {
-        /// The joint.
+        /// Name of the joint.
         joint: String,
-        /// `parent` or `child`.
+        /// Role of the link: `parent` or `child`.
         role: &'static str,
-        /// The name of the link.
+        /// Name of the missing link.
         link: String,
-        /// Similar names.
+        /// Names of existing links that are similar.
         nearest: String,
     },
     /// Two joints move the same link.
@@ -103,60 +103,60 @@ pub enum RobotProblem {
         "link {link:?} is the child of the joints {first:?} and {second:?}; one is allowed: remove the other"
     )]
     TwoParents {
-        /// The link.
+        /// Name of the link.
         link: String,
-        /// The first joint.
+        /// Name of the first joint.
         first: String,
-        /// The second joint.
+        /// Name of the second joint.
         second: String,
     },
-    /// A link is its own ancestor.
+    /// A link is its own ancestor. The text names the link.
     #[error("link {0:?} is above itself; links must be a tree: remove a joint of the cycle")]
     Cycle(String),
-    /// The links form two trees.
+    /// Two links have no parent, so that the links form more than one tree.
     #[error(
         "the links {first:?} and {second:?} have no parent; one root is allowed: connect them with a fixed joint"
     )]
     TwoRoots {
-        /// The first root.
+        /// Name of the first link without a parent.
         first: String,
-        /// The second root.
+        /// Name of the second link without a parent.
         second: String,
     },
-    /// A requested link does not exist.
+    /// The requested link does not exist.
     #[error("there is no link {link:?}; the nearest are {nearest}")]
     NoSuchLink {
         /// The requested name.
         link: String,
-        /// Similar names.
+        /// Names of existing links that are similar.
         nearest: String,
     },
-    /// A requested joint does not exist, or does not move by itself.
+    /// The requested joint does not exist, or does not move by itself.
     #[error("no joint {joint:?} moves; the nearest are {nearest}")]
     NoSuchJoint {
         /// The requested name.
         joint: String,
-        /// Similar names.
+        /// Names of existing joints that are similar.
         nearest: String,
     },
-    /// A chain of a skin differs from that of the file.
+    /// The rows of a chain in a skin differ from those of the same chain in the file.
     #[error(
         "behind joint {joint:?} it is not where chain {chain:?} of the skin has it: import the skin from this file again, or correct the rows"
     )]
     OtherRows {
-        /// The joint.
+        /// Name of the first joint that differs.
         joint: String,
-        /// The chain.
+        /// Name of the chain.
         chain: String,
     },
     /// The tip of the chain is not below its root.
     #[error("link {tip:?} is not below {root:?}; the path to it is {path}: choose a root on it")]
     NotBelow {
-        /// The tip.
+        /// Name of the tip link.
         tip: String,
-        /// The root.
+        /// Name of the root link.
         root: String,
-        /// The links above the tip, from the root.
+        /// Names of the links above the tip, beginning with the robot's root.
         path: String,
     },
     /// No joint of the chain moves.
@@ -164,9 +164,9 @@ pub enum RobotProblem {
         "no joint moves between {root:?} and {tip:?}; 1 to {MAX_JOINTS} are needed: choose a tip farther out, or a root nearer to the base"
     )]
     NoMovingJoint {
-        /// The root of the chain.
+        /// Name of the root link.
         root: String,
-        /// The tip of the chain.
+        /// Name of the tip link.
         tip: String,
     },
     /// The chain has too many joints.
@@ -174,11 +174,11 @@ pub enum RobotProblem {
         "{count} joints move between {root:?} and {tip:?}; {MAX_JOINTS} are possible: choose a root or a tip nearer to the other"
     )]
     TooManyJoints {
-        /// The number of joints.
+        /// Number of joints of the chain.
         count: usize,
-        /// The root of the chain.
+        /// Name of the root link.
         root: String,
-        /// The tip of the chain.
+        /// Name of the tip link.
         tip: String,
     },
     /// The chain needs too many rows.
@@ -186,117 +186,117 @@ pub enum RobotProblem {
         "the chain to {tip:?} needs {count} rows; {MAX_ROWS} are possible: choose a root or a tip nearer to the other"
     )]
     TooManyRows {
-        /// The number of rows.
+        /// Number of rows that the chain needs.
         count: usize,
-        /// The tip of the chain.
+        /// Name of the tip link.
         tip: String,
     },
-    /// A joint of the chain has several degrees of freedom.
+    /// A joint of the chain is of a type with several degrees of freedom.
     #[error(
         "joint {joint:?} is {kind}; a chain has revolute, continuous, prismatic and fixed joints: choose a root below it, or a tip above it"
     )]
     Kind {
-        /// The joint.
+        /// Name of the joint.
         joint: String,
-        /// Its type.
+        /// Type of the joint.
         kind: &'static str,
     },
-    /// A joint of the chain follows another one.
+    /// A joint of the chain mimics another joint.
     #[error(
         "joint {joint:?} mimics {of:?}; the joints of a chain move by themselves: choose a tip above it, or make it fixed"
     )]
     Mimic {
-        /// The joint.
+        /// Name of the joint.
         joint: String,
-        /// The joint that it follows.
+        /// Name of the joint that it mimics.
         of: String,
     },
-    /// A joint has no limits.
+    /// A revolute or prismatic joint has no limits.
     #[error(
         "joint {joint:?} has no limits: add <limit lower=\"..\" upper=\"..\"/>, or make the joint continuous or fixed"
     )]
     NoLimit {
-        /// The joint.
+        /// Name of the joint.
         joint: String,
     },
-    /// A joint cannot move within its limits.
+    /// The lower limit of a joint is not below the upper limit.
     #[error(
         "joint {joint:?} has the limits {lower} to {upper}; the lower must be below the upper, both finite: correct them, or make the joint fixed"
     )]
     Limits {
-        /// The joint.
+        /// Name of the joint.
         joint: String,
         /// The lower limit, in rad or m.
         lower: f64,
         /// The upper limit, in rad or m.
         upper: f64,
     },
-    /// A length exceeds the range of a cell's parameters.
+    /// A length of a row exceeds the range of a cell's parameters.
     #[error(
         "row {row}, to {to}: {what} = {value:.3} m; [-{MAX_LENGTH_M}, {MAX_LENGTH_M}) m is possible: {hint}"
     )]
     Length {
-        /// The row, from 1.
+        /// Number of the row, from 1.
         row: usize,
-        /// The next joint, or the tip.
+        /// Name of the next joint, or of the tip link.
         to: String,
-        /// `a` or `d`, or `d` with the joint at a limit.
+        /// The length: `a` or `d`, or `d` with the joint at a limit.
         what: &'static str,
         /// The length in m.
         value: f64,
-        /// The action to take.
+        /// Advice for the user.
         hint: &'static str,
     },
-    /// The chain is longer than a cell can compute.
+    /// A cell on the chain can be farther from a joint than a cell can compute.
     #[error(
         "link {link:?} can come {reach:.3} m from a frame of the rows below it, if all joints turn freely; less than {REACH} m is possible: choose a tip or a root nearer to the other"
     )]
     Reach {
-        /// The link.
+        /// Name of the link.
         link: String,
-        /// The reach in m.
+        /// The reach of the link's origin in m.
         reach: f64,
     },
-    /// Rows and URDF differ.
+    /// The kinematics of the rows differs from that of the URDF.
     #[error(
         "the rows differ by {residual:.1e} m or rad from the URDF at link {link:?}; {MAX_RESIDUAL:.0e} is allowed: please report this robot"
     )]
     Residual {
-        /// The link.
+        /// Name of the link with the largest difference.
         link: String,
         /// The difference in m or rad.
         residual: f64,
     },
-    /// A link does not move.
+    /// A requested link does not move, because it is before the first joint of the chain.
     #[error(
         "link {link:?} is before the chain's first joint {joint:?} and moves with none; a cell needs a link behind it"
     )]
     BeforeFirstJoint {
-        /// The link.
+        /// Name of the link.
         link: String,
-        /// The first joint of the chain.
+        /// Name of the first joint of the chain.
         joint: String,
     },
-    /// A link moves, but not with the chain.
+    /// A requested link is moved by a joint that is not in the chain.
     #[error(
         "link {link:?} is moved by joint {joint:?}, which is not between {root:?} and {tip:?}: choose another tip, or a link of the chain"
     )]
     OutsideChain {
-        /// The link.
+        /// Name of the link.
         link: String,
-        /// The joint.
+        /// Name of the joint that moves it.
         joint: String,
-        /// The root of the chain.
+        /// Name of the root link of the chain.
         root: String,
-        /// The tip of the chain.
+        /// Name of the tip link of the chain.
         tip: String,
     },
-    /// A link is not below the root of the chain.
+    /// A requested link is not below the root of the chain.
     #[error("link {link:?} is not below the chain's root {root:?}: choose a root above it")]
     AboveChain {
-        /// The link.
+        /// Name of the link.
         link: String,
-        /// The root of the chain.
+        /// Name of the root link of the chain.
         root: String,
     },
 }

@@ -1,5 +1,5 @@
-//! Reads robots from URDF text, and converts a chain of joints into standard Denavit-Hartenberg rows. This crate opens
-//! no files.
+//! Reads robots from the text of URDF files, and converts a chain of joints to standard Denavit-Hartenberg rows. This
+//! crate opens no files itself.
 //!
 //! ```
 //! # fn main() -> Result<(), robots::RobotError> {

@@ -1,4 +1,4 @@
-//! The poses of a robot's links on their parents, for given positions of some joints.
+//! The poses of a robot's links relative to their parent links, for given positions of some joints.
 
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
@@ -6,22 +6,22 @@ use crate::error::{RobotProblem, RobotError};
 use crate::nearest::nearest;
 use crate::urdf::{UrdfJointKind, Urdf, UrdfJoint};
 
-/// A link on its parent.
+/// The pose of a link relative to its parent link.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LinkPose {
-    /// The parent link.
+    /// Name of the parent link.
     pub parent: String,
-    /// The link.
+    /// Name of the link.
     pub child: String,
-    /// The transform from the parent to the link, with the joint at zero.
+    /// The transform from the parent to the link, with the joint at position zero.
     origin: Isometry3<f64>,
     motion: Option<LinkMotion>,
 }
 
-/// The motion of a link on its parent.
+/// The motion of a link relative to its parent, by a joint.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct LinkMotion {
-    /// The index of the joint that moves the link.
+    /// Index of the joint in the list of given joints.
     joint: usize,
     slides: bool,
     axis: Unit<Vector3<f64>>,
@@ -30,13 +30,13 @@ struct LinkMotion {
 }
 
 impl LinkPose {
-    /// Returns true if one of the joints moves the link.
+    /// Returns true if one of the given joints moves the link.
     #[must_use]
     pub const fn moves(&self) -> bool {
         self.motion.is_some()
     }
 
-    /// Returns the transform from the parent to the link, with the joints at these positions in rad or m.
+    /// Returns the transform from the parent to the link, with the given joints at these positions in rad or m.
     #[must_use]
     pub fn pose(&self, positions: &[f64]) -> Isometry3<f64> {
         let Some(LinkMotion { joint, slides, axis, multiplier, offset }) = self.motion else {
@@ -52,8 +52,8 @@ impl LinkPose {
 }
 
 impl Urdf {
-    /// Returns the poses of all links except the root on their parents. The given joints and those that mimic them
-    /// move; all others are at rest.
+    /// Returns the pose of each link except the root, relative to its parent. The given joints and those that mimic
+    /// them move; all others are at rest.
     ///
     /// # Errors
     /// Returns [`RobotError`] if one of the joints does not exist, or does not move by itself.
@@ -81,7 +81,7 @@ impl Urdf {
         Ok(self.joints().iter().map(pose).collect())
     }
 
-    /// Returns the link that a joint moves.
+    /// Returns the name of the link that a joint moves.
     ///
     /// # Errors
     /// Returns [`RobotError`] if the joint does not exist, or does not move by itself.

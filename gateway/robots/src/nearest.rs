@@ -1,9 +1,9 @@
-//! Suggestions for mistyped names.
+//! Suggestions of existing names for mistyped ones.
 
-/// The maximum number of suggested names.
+/// Maximum number of names in a suggestion.
 const MAX_SUGGESTIONS: usize = 3;
 
-/// Lists the names that are most similar to a mistyped one, nearest first, at most three.
+/// Returns a list of the names that are most similar to a mistyped name, at most three, the most similar first.
 pub(crate) fn nearest<'a>(target: &str, names: impl IntoIterator<Item = &'a str>) -> String {
     let target = target.to_lowercase();
     let mut found: Vec<_> =
@@ -17,7 +17,7 @@ pub(crate) fn nearest<'a>(target: &str, names: impl IntoIterator<Item = &'a str>
     }
 }
 
-/// Returns the smallest number of characters to insert, delete or replace that turns one word into the other.
+/// Returns the edit distance of two words: the minimum number of characters to insert, delete or replace.
 fn edits(from: &str, to: &str) -> usize {
     let to: Vec<_> = to.chars().collect();
     let mut row: Vec<_> = (0..=to.len()).collect();

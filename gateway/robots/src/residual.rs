@@ -1,4 +1,4 @@
-//! Compares rows with the URDF's own kinematics.
+//! Comparison of the rows' kinematics with the URDF's.
 
 use core::f64::consts::TAU;
 
@@ -9,19 +9,19 @@ use crate::chain::{CarriedLink, behind};
 use crate::urdf::UrdfJoint;
 use protocol::skin::JointKind;
 
-/// The number of random joint positions for the comparison, besides zero and the limits.
+/// Number of random joint positions in the comparison, in addition to zero and the limits.
 const RANDOM_POSITIONS: usize = 64;
 
-/// The largest difference, and the link where it occurs.
+/// The largest difference between rows and URDF, and the link at which it occurs.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Residual {
     /// The difference in m or rad.
     pub(crate) residual: f64,
-    /// The link.
+    /// Name of the link.
     pub(crate) link: String,
 }
 
-/// Compares all links that move with the chain.
+/// Compares the frames of all links that move with the chain, computed from the rows and from the URDF.
 pub(crate) fn residual(chain: &UrdfChain, path: &[&UrdfJoint], hanging: &[CarriedLink]) -> Residual {
     let mut worst = Residual::default();
     for positions in positions(chain) {
@@ -40,7 +40,7 @@ pub(crate) fn residual(chain: &UrdfChain, path: &[&UrdfJoint], hanging: &[Carrie
     worst
 }
 
-/// Returns the greater of the distance in m and the angle in rad between two frames.
+/// Returns the difference between two frames: the greater of the distance in m and the angle in rad.
 pub(crate) fn difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
     let turn = one.rotation.rotation_to(&other.rotation);
     // The cosine of a small angle would lose its digits.
@@ -48,7 +48,7 @@ pub(crate) fn difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
     (one.translation.vector - other.translation.vector).norm().max(angle)
 }
 
-/// Returns zero, the limits, and reproducible positions between them.
+/// Returns sets of joint positions: zero, the limits, and random positions between them that are the same in every run.
 fn positions(chain: &UrdfChain) -> Vec<Vec<f64>> {
     let limits = chain.joints.iter().map(|joint| match joint.kind {
         JointKind::Revolute => joint.limits.map(|limit| limit.clamp(-TAU, TAU)),

@@ -1,4 +1,4 @@
-//! Denavit-Hartenberg rows, and the computation of rows from one joint axis to the next.
+//! Denavit-Hartenberg rows, and their computation from the axes of the joints.
 
 use core::f64::consts::{FRAC_PI_2, PI};
 
@@ -6,49 +6,50 @@ use nalgebra::{Isometry3, Matrix4, Point3, Rotation3, Translation3, UnitQuaterni
 use protocol::parameters::RowKind;
 use protocol::skin::{ChainBase, ChainRow, DenavitHartenberg, JointKind};
 
-/// The bound of `a` and `d` of a row, in m: at least its negative, and less than it.
+/// Upper bound of `a` and `d` of a row, in m, exclusive. The lower bound is its negative, inclusive.
 pub const MAX_LENGTH_M: f64 = 2.0;
 
-/// The maximum difference between rows and URDF, in m or rad.
+/// Maximum difference between the kinematics of rows and URDF, in m or rad.
 pub const MAX_RESIDUAL: f64 = 1e-9;
 
-/// The tolerance of angles: axes whose angle has a smaller sine are parallel, and angles this close to a multiple of a
-/// quarter turn are rounded to it. Pi / 2 written with 12 digits leaves 5e-12.
+/// Tolerance of angles in rad. Axes are parallel if the sine of the angle between them is smaller. Angles this close to
+/// a multiple of a quarter turn are rounded to it; pi / 2 written with 12 digits is off by 5e-12.
 const ANGLE_TOLERANCE: f64 = 1e-11;
 
-/// Smaller lengths are rounded to zero, in m.
+/// Lengths below this value, in m, are rounded to zero.
 const LENGTH_TOLERANCE_M: f64 = 1e-12;
 
-/// Origins closer than this are the same, and paths whose lengths differ by less are equally long, in m.
+/// Distance in m below which two origins count as the same, and difference in m below which two paths count as equally
+/// long.
 const SAME_PLACE_M: f64 = 1e-9;
 
-/// If the sine of the angle between two axes is smaller, their common normal loses digits.
+/// Minimum sine of the angle between two axes. Below it, the common normal of the axes cannot be computed precisely.
 const WELL_KNOWN_SINE: f64 = 1e-3;
 
-/// The maximum distance of frame 0 from the first joint's origin, and of the last frame from its own, along their axes,
-/// in m.
+/// Maximum distance in m of frame 0 from the origin of the first joint, and of the last frame from the origin of the
+/// last joint, both along the joint's axis.
 const LONG_M: f64 = 1.0;
 
-/// The length that a fixed row must save, in m, because each row adds a rounding error to a cell's computation. The
-/// second value is for chains that are too long with the first.
+/// Lengths in m that a fixed row must save. A row has a cost because it adds a rounding error to a cell's computation.
+/// The second value is for chains whose rows are too long with the first.
 pub(crate) const ROW_COSTS_M: [f64; 2] = [0.2, 0.0];
 
-/// The cost of a length that exceeds the range of a row, in m.
+/// Cost in m of a length that exceeds the range of a row.
 const IMPOSSIBLE_M: f64 = 1e3;
 
 /// One row in standard Denavit-Hartenberg form, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`. It leads from frame l - 1, whose z
-/// axis is that of the row's joint, to frame l.
+/// axis is the axis of the row's joint, to frame l.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DhRow {
-    /// The kind of motion.
+    /// Kind of the row: the kind of its joint, or fixed.
     pub kind: RowKind,
     /// The length along the new x axis in m.
     pub a: f64,
     /// The twist about the new x axis in rad.
     pub alpha: f64,
-    /// The offset along the axis in m; the position of a prismatic joint is added.
+    /// The offset along the axis in m. For a prismatic joint, the joint position is added to it.
     pub d: f64,
-    /// The angle about the axis in rad; the position of a revolute joint is added.
+    /// The angle about the axis in rad. For a revolute joint, the joint position is added to it.
     pub theta_offset: f64,
 }
 
@@ -60,8 +61,8 @@ impl From<&ChainRow> for DhRow {
 }
 
 impl DhRow {
-    /// Returns the transform from frame l - 1 to frame l, with the joint at this position in rad or m. A fixed row
-    /// ignores the position.
+    /// Returns the transform from frame l - 1 to frame l, with the joint at this position in rad or m. In a fixed row
+    /// the position has no effect.
     #[must_use]
     pub fn transform(&self, position: f64) -> Isometry3<f64> {
         let (theta, d) = match self.kind {
@@ -75,20 +76,21 @@ impl DhRow {
         Isometry3::from_parts(Translation3::new(self.a * cosine, self.a * sine, d), turn * twist)
     }
 
-    /// Converts the row to one of a skin's chain, whose joint stays within these limits.
+    /// Converts the row to a row of a skin's chain, with the limits of its joint in rad or m.
     #[must_use]
     pub const fn with_limits(&self, limits: [f64; 2]) -> ChainRow {
         let Self { kind, a, alpha, d, theta_offset } = *self;
         ChainRow { kind, table: DenavitHartenberg { a, alpha, d, theta_offset }, limits }
     }
 
-    /// Returns the length of the row in m, with a high cost if it is out of range.
+    /// Returns |a| + |d| of the row in m. A value that is out of range counts as 1000 m.
     fn length(&self) -> f64 {
         let length = |value: f64| if value.abs() < MAX_LENGTH_M { value.abs() } else { IMPOSSIBLE_M };
         length(self.a) + length(self.d)
     }
 
-    /// Rounds values that are nearly zero, and angles that are nearly a multiple of a quarter turn.
+    /// Returns the row with lengths that are nearly zero set to zero, and angles that are nearly multiples of a quarter
+    /// turn rounded.
     fn tidy(self) -> Self {
         let length = |value: f64| if value.abs() < LENGTH_TOLERANCE_M { 0.0 } else { value };
         // Adding zero removes the sign of a negative zero.
@@ -103,8 +105,8 @@ impl DhRow {
     }
 }
 
-/// Returns the frames 0 to `rows.len()` in the coordinates in which `base` is frame 0, with the joints at `positions`
-/// in rad or m. Joints without a position are at zero.
+/// Returns the frames 0 to `rows.len()`, with the joints at `positions` in rad or m. `base` is frame 0. Joints without
+/// a value in `positions` are at zero.
 #[must_use]
 pub fn frames(base: &Isometry3<f64>, rows: &[DhRow], positions: &[f64]) -> Vec<Isometry3<f64>> {
     let mut positions = positions.iter();
@@ -118,24 +120,24 @@ pub fn frames(base: &Isometry3<f64>, rows: &[DhRow], positions: &[f64]) -> Vec<I
     all
 }
 
-/// The axis of a joint at position zero, in the root's coordinates.
+/// The axis of a joint, with all joints at position zero, in the coordinates of the root.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Axis {
-    /// The origin of the joint.
+    /// Origin of the joint.
     pub(crate) point: Point3<f64>,
-    /// The direction, of length 1.
+    /// Direction of the axis, a unit vector.
     pub(crate) direction: Vector3<f64>,
-    /// The kind of motion.
+    /// Kind of the joint.
     pub(crate) kind: JointKind,
 }
 
-/// A sequence of rows from frame 0 to an axis.
+/// A path: a sequence of rows from frame 0 to the axis of a joint.
 #[derive(Clone, Debug)]
 struct RowPath {
     rows: Vec<DhRow>,
-    /// The last frame, in the root's coordinates.
+    /// The last frame of the path, in the coordinates of the root.
     frame: Isometry3<f64>,
-    /// The length of the rows plus the cost of fixed rows, in m.
+    /// Sum of the lengths of the rows and the costs of fixed rows, in m.
     cost: f64,
 }
 
@@ -150,7 +152,7 @@ impl RowPath {
 }
 
 impl Axis {
-    /// Returns the point of this axis that is nearest to another axis; `None` if it cannot be computed precisely.
+    /// Returns the point of this axis that is nearest to the other axis; `None` if it cannot be computed precisely.
     fn foot(&self, other: &Self) -> Option<Point3<f64>> {
         let across = self.direction.cross(&other.direction);
         let between = other.point - self.point;
@@ -159,10 +161,10 @@ impl Axis {
     }
 }
 
-/// Computes frame 0 and the rows of a chain: one row for each axis, and fixed rows where necessary. Among the paths
-/// that lead from frame to frame along common normals or by way of joints, the shortest is chosen, so that rows do not
-/// fold back. The origin of the last row is the point of the last axis that is nearest to `tip`. `row_cost` is the
-/// length in m that a fixed row must save.
+/// Computes frame 0 and the rows of a chain: one row for each axis, and fixed rows where necessary. Paths may lead
+/// along the common normals of the axes or through the origins of the joints. The shortest path is chosen, so that rows
+/// do not fold back. The origin of the last row is the point of the last axis that is nearest to `tip`. `row_cost` is
+/// the length in m that a fixed row must save.
 pub(crate) fn chain(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometry3<f64>, Vec<DhRow>) {
     let Some(first) = axes.first() else { return (Isometry3::identity(), Vec::new()) };
     let base = base(first);
@@ -205,9 +207,9 @@ pub(crate) fn chain(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometr
     (base, shortest.map(|way| way.rows).unwrap_or_default())
 }
 
-/// Returns frame 0. Its z axis is the first joint's axis, and its x axis is as near to the root's as possible. Its
-/// origin is the point of the axis that is nearest to the root if that is near the joint. Frame 0 of most robots is
-/// therefore the root itself.
+/// Returns frame 0. Its z axis is the axis of the first joint, and its x axis is as close to the root's as possible.
+/// Its origin is the point of the axis that is nearest to the root, if that point is near the joint. For most robots,
+/// frame 0 is therefore the root frame itself.
 fn base(first: &Axis) -> Isometry3<f64> {
     let z = first.direction;
     let mut x = Vector3::x() - z * z.x;
@@ -222,8 +224,8 @@ fn base(first: &Axis) -> Isometry3<f64> {
     Isometry3::from_parts(origin.into(), UnitQuaternion::from_rotation_matrix(&turn))
 }
 
-/// Returns the possible rows from a frame whose z axis moves to one whose z axis is the line through the `places` along
-/// `direction`.
+/// Returns the possible sequences of rows from a frame whose z axis is a joint axis to the next axis, which has the
+/// direction `direction` and passes through the points `places`. Each sequence is one row, or one row and fixed rows.
 fn between(kind: RowKind, places: &[Vector3<f64>], direction: &Vector3<f64>) -> Vec<Vec<DhRow>> {
     let Some(point) = places.first() else { return Vec::new() };
     // The point of the axis that is nearest to the frame's origin.
@@ -237,7 +239,8 @@ fn between(kind: RowKind, places: &[Vector3<f64>], direction: &Vector3<f64>) -> 
     normal.into_iter().chain(places.map(|place| helper(kind, &place, direction).to_vec())).collect()
 }
 
-/// Returns the row to an axis parallel or opposite to z: d is free, and leads to the next joint's origin.
+/// Returns the row to an axis that is parallel or opposite to the z axis. Any d is possible; the one that leads to the
+/// next joint's origin is used.
 fn parallel(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> DhRow {
     let meets = point.xy().norm() < LENGTH_TOLERANCE_M;
     let theta_offset = if meets { 0.0 } else { upright(point.y.atan2(point.x)) };
@@ -245,7 +248,7 @@ fn parallel(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> Dh
     DhRow { kind, a: along_x(point, theta_offset), alpha, d: point.z, theta_offset }.tidy()
 }
 
-/// Returns the row along the common normal.
+/// Returns the row that leads along the common normal to an axis through `point`.
 fn common_normal(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> DhRow {
     let along = -point.xy().dot(&direction.xy()) / direction.xy().norm_squared();
     let theta_offset = upright(direction.x.atan2(-direction.y));
@@ -256,16 +259,17 @@ fn common_normal(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) 
     DhRow { kind, a: along_x(point, theta_offset), alpha, d, theta_offset }.tidy()
 }
 
-/// Returns the coordinate of a point along the x axis after a rotation by this angle about z. It replaces the length of
-/// the common normal: the angle may have been rounded to a quarter turn, and the row must lead to the point with the
+/// Returns the x coordinate of a point after a rotation of the axes by `theta` about z. It is used as the length of the
+/// common normal, because the angle may have been rounded to a quarter turn: the row must lead to the point with the
 /// rounded angle.
 fn along_x(point: &Vector3<f64>, theta: f64) -> f64 {
     let (sine, cosine) = theta.sin_cos();
     point.x * cosine + point.y * sine
 }
 
-/// Returns the rows by way of a helper axis, which passes through the point `at` of the next axis and is perpendicular
-/// to both axes. No digits are lost, however small the angle between them is.
+/// Returns the two rows to the next axis that lead along a helper axis. The helper axis passes through the point `at`
+/// of the next axis and is perpendicular to both axes. The result is precise even if the angle between the axes is
+/// small.
 fn helper(kind: RowKind, at: &Vector3<f64>, direction: &Vector3<f64>) -> [DhRow; 2] {
     let normal = Vector3::new(-direction.y, direction.x, 0.0).normalize();
     let row = common_normal(kind, at, &normal);
@@ -275,19 +279,19 @@ fn helper(kind: RowKind, at: &Vector3<f64>, direction: &Vector3<f64>) -> [DhRow;
     [row, back]
 }
 
-/// Returns an angle within [-pi/2, pi/2] with the same or the opposite direction.
+/// Returns an angle within [-pi/2, pi/2] in rad that describes the same or the opposite direction.
 fn upright(angle: f64) -> f64 {
     let angle = quarter(angle);
     if angle.abs() <= FRAC_PI_2 { angle } else { angle - PI.copysign(angle) }
 }
 
-/// Rounds an angle that is nearly a multiple of a quarter turn.
+/// Rounds an angle in rad to a multiple of a quarter turn if it is nearly one.
 fn quarter(angle: f64) -> f64 {
     let whole = (angle / FRAC_PI_2).round() * FRAC_PI_2;
     if (angle - whole).abs() < ANGLE_TOLERANCE { whole } else { angle }
 }
 
-/// Returns the base of a skin's chain as a pose.
+/// Returns the base of a skin's chain as an isometry.
 #[must_use]
 pub fn pose_of(base: &ChainBase) -> Isometry3<f64> {
     let turn = Matrix4::from(base.matrix()).fixed_view::<3, 3>(0, 0).into_owned();

@@ -1,23 +1,23 @@
-//! Unique names for output.
+//! Unique names for the links and joints of written files.
 
 use std::collections::BTreeSet;
 
 use protocol::skin::Skin;
 
-/// A set of used names.
+/// The set of names that are already in use.
 #[derive(Clone, Debug, Default)]
 pub struct UniqueNames(BTreeSet<String>);
 
 impl UniqueNames {
-    /// Returns unique names for the requested ones, in their order. A name that is already used, also by an earlier one
-    /// in the list, gets a number: `name_2`.
+    /// Returns a unique name for each requested one, in order. A name that is already in use, possibly by an earlier
+    /// name of the list, gets a number: `name_2`.
     pub fn give(&mut self, requested: Vec<String>) -> Vec<String> {
         let is_free: Vec<_> = requested.iter().map(|name| self.0.insert(name.clone())).collect();
         let numbered = requested.into_iter().zip(is_free);
         numbered.map(|(name, is_free)| if is_free { name } else { self.numbered(&name) }).collect()
     }
 
-    /// Returns a unique name for the requested one.
+    /// Returns a unique name for the requested name, and records it as used.
     pub fn give_one(&mut self, name: String) -> String {
         if self.0.insert(name.clone()) { name } else { self.numbered(&name) }
     }
@@ -34,13 +34,14 @@ impl UniqueNames {
     }
 }
 
-/// Replaces characters of a name that frames and topics do not allow.
+/// Replaces the characters of a name that are not allowed in names of frames and topics.
 #[must_use]
 pub fn word(name: &str) -> String {
     name.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '_' }).collect()
 }
 
-/// Returns unique words for the chains of a skin in the names of links; empty if there is only one chain.
+/// Returns a unique word for each chain of a skin, to be used in names of links. The words are empty if there is only
+/// one chain.
 #[must_use]
 pub fn chain_words(skin: &Skin) -> Vec<String> {
     let chains = &skin.robot.chains;

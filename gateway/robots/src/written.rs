@@ -1,9 +1,9 @@
-//! Writes a URDF for the chains of a skin that has none.
+//! Writes a URDF for the chains of a skin, for skins that do not name a URDF.
 //!
-//! Each row is one joint: its origin is the constant part of the row before it, `Rz(theta_offset) Tz(d) Tx(a)
-//! Rx(alpha)`, and its axis is z. After the last row there is a link `tip`. Chains that begin with the same joints and
-//! rows share their links. A joint that two chains have in different places is written for the second chain as one that
-//! mimics it.
+//! Each row becomes one joint. The origin of the joint is the constant part of the row before it, `Rz(theta_offset)
+//! Tz(d) Tx(a) Rx(alpha)`, and the axis is z. After the last row there is a link `tip`. Chains that begin with the same
+//! joints and rows share links. If two chains have a joint in different places, the joint of the second chain is
+//! written as another joint that mimics the first.
 
 use core::fmt::Write;
 
@@ -15,25 +15,25 @@ use protocol::xml::escaped;
 use crate::rows::{DhRow, pose_of};
 use crate::taken::chain_words;
 
-/// The link that all chains are on.
+/// Name of the link that is the base of all chains.
 const BASE: &str = "base";
-/// The radius of the drawn shapes, in m.
+/// Radius of the cylinders that stand for segments, in m.
 const RADIUS_M: f64 = 0.04;
-/// Shorter segments are not drawn, in m.
+/// Minimum length of a segment that is drawn, in m.
 const SHORTEST_M: f64 = 1e-3;
 /// The effort limit in Nm or N. URDF requires one, and a skin has none.
 const EFFORT: f64 = 1000.0;
 
-/// A URDF and the names of its links.
+/// A written URDF, and the names of its links.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WrittenUrdf {
-    /// The text.
+    /// The text of the URDF.
     pub xml: String,
-    /// By chain: the link that each of its joints moves.
+    /// For each chain, the names of the links that its joints move.
     pub links: Vec<Vec<String>>,
 }
 
-/// The transform from a link to a joint on it, as URDF has it: lengths in m; roll, pitch and yaw in rad.
+/// The origin of a URDF joint: the transform from the parent link, with lengths in m and roll, pitch and yaw in rad.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Origin {
     xyz: [f64; 3],
@@ -41,7 +41,7 @@ struct Origin {
 }
 
 impl Origin {
-    /// Returns the constant part of a row.
+    /// Returns the origin for the constant part of a row.
     fn of_row(row: &DhRow) -> Self {
         let (sine, cosine) = row.theta_offset.sin_cos();
         Self { xyz: [row.a * cosine, row.a * sine, row.d], rpy: [row.alpha, 0.0, row.theta_offset] }
@@ -62,14 +62,14 @@ fn three(numbers: [f64; 3]) -> String {
     numbers.map(|number| format!("{}", number + 0.0)).join(" ")
 }
 
-/// A joint and the link that it carries.
+/// A joint to write, and the link that it moves.
 struct WrittenJoint {
     parent: String,
     origin: Origin,
-    /// The index of the robot's joint, unless it is fixed.
+    /// Index of the robot's joint; `None` if the joint is fixed.
     moved: Option<usize>,
     link: String,
-    /// The attributes and contents of its element, without its origin and links.
+    /// The attributes and contents of the joint element, without origin and links.
     name: String,
     kind: &'static str,
     inner: String,
@@ -110,7 +110,7 @@ pub fn written(skin: &Skin) -> WrittenUrdf {
     WrittenUrdf { xml: xml(&robot.name, &joints), links }
 }
 
-/// Returns a joint between a link and a new one.
+/// Returns the joint to write between a link and a new link.
 fn joint(
     skin: &Skin,
     before: &[WrittenJoint],
@@ -173,7 +173,7 @@ fn xml(name: &str, joints: &[WrittenJoint]) -> String {
     out
 }
 
-/// Draws the segment between a link's origin and the next joint.
+/// Writes a shape for the segment between the origin of a link and the next joint.
 fn segment(out: &mut String, to: [f64; 3]) {
     let way = Vector3::from(to);
     let length = way.norm();

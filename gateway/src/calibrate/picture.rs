@@ -1,4 +1,4 @@
-//! 3D page of a calibration: the poses found beside the described ones.
+//! 3D page of a calibration, with the poses found beside those that the skin describes.
 
 use std::path::Path;
 
@@ -9,7 +9,8 @@ use view::{MovedCell, Scene};
 use crate::skin::still;
 use crate::visuals::Packages;
 
-/// Returns the page: cells at the positions found, each with a line from its described position.
+/// Returns the HTML page, which shows the cells at the positions found, each with a line from the position that the
+/// skin describes.
 pub(super) fn page(file: &Path, skin: &Skin, calibration: &Calibration) -> String {
     let mut found = skin.clone();
     for (cell, result) in found.cells.iter_mut().zip(&calibration.cells) {

@@ -3,8 +3,8 @@
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 
-/// Checks that a recording belongs to this skin: the same cells on the same buses, on the same robot, at the same rate.
-/// Poses of cells and zero offsets of joints may differ, because a calibration finds them.
+/// Checks that a recording belongs to this skin: the cells, buses, robot and rate are the same. Poses of cells and zero
+/// offsets of joints may differ, because a calibration finds them.
 pub(super) fn check(name: &str, skin: &Skin, recorded: &Skin) -> Result<(), Failure> {
     let Some((what, is, was)) = difference(skin, recorded) else { return Ok(()) };
     Err(Failure::usage(format!(
@@ -12,7 +12,7 @@ pub(super) fn check(name: &str, skin: &Skin, recorded: &Skin) -> Result<(), Fail
     )))
 }
 
-/// Returns the first difference, by name, with the two values.
+/// Returns the name of the first difference between two skins, with the two values.
 fn difference(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, String)> {
     type Pick = fn(&Skin) -> String;
     let all: [(&str, Pick); 6] = [
@@ -30,7 +30,7 @@ fn difference(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, Str
     all.iter().find_map(differing).or_else(|| rows(skin, recorded))
 }
 
-/// Returns the first items in which two lists differ.
+/// Returns the first items in which two lists differ, under the name `what`.
 fn first(what: &'static str, is: &str, was: &str) -> (&'static str, String, String) {
     let [mut left, mut right] = [is.split(", "), was.split(", ")];
     loop {
@@ -44,7 +44,7 @@ fn first(what: &'static str, is: &str, was: &str) -> (&'static str, String, Stri
     }
 }
 
-/// Returns the first table row that differs, apart from the zero offsets of joints.
+/// Returns the first row of the robot's table that differs, apart from the zero offsets of joints.
 fn rows(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, String)> {
     let all = |skin: &Skin| -> Vec<_> {
         let chains = skin.robot.chains.iter();

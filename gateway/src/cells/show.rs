@@ -16,11 +16,11 @@ use serde::Serialize;
 
 use crate::print::{drop_empty_columns, abbreviated, space_separated};
 
-/// A bus in a skin description.
+/// A bus as a skin describes it, for comparison with the cells found.
 pub(super) struct DescribedBus {
     file: String,
     pub(super) format: Format,
-    /// Node ids and configuration hashes by serial number.
+    /// Node ids and configuration hashes of the cells, by serial number.
     cells: BTreeMap<u32, (CellId, u16)>,
 }
 
@@ -40,7 +40,7 @@ const COLUMNS: [Column; 10] = [
     ("age", |it| Some(format!("{:.2}", it.age_s))),
 ];
 
-/// Columns for wide terminals only.
+/// Columns that are shown on wide terminals only.
 const COUNTERS: [Column; 9] = [
     ("sent", |it| text(it.sent)),
     ("refused", |it| text(it.refused)),
@@ -60,14 +60,14 @@ fn text(value: Option<impl Display>) -> Option<String> {
     value.map(|value| value.to_string())
 }
 
-/// A bus with the cells that send on it.
+/// A bus with the cells that send on it, as printed.
 #[derive(Serialize)]
 pub(super) struct CellList<'a> {
     bus: &'a str,
     kind: String,
     gateway_heard: bool,
     cells: Vec<CellShown>,
-    /// Cells of the skin that are missing.
+    /// Node ids of the skin's cells that are missing on the bus.
     #[serde(skip_serializing_if = "Option::is_none")]
     missing: Option<Vec<u8>>,
     #[serde(skip)]
@@ -75,7 +75,7 @@ pub(super) struct CellList<'a> {
 }
 
 impl<'a> CellList<'a> {
-    /// Collects the cells of the bus, compared with a skin.
+    /// Collects the cells of the bus, and compares them with those of a skin, if given.
     pub(super) fn of(watch: &'a CellWatch, known: Option<&'a DescribedBus>) -> Self {
         let (bus, listing, now) = (watch.bus(), watch.listing(), watch.now());
         let missing = |known: &DescribedBus| {
@@ -92,7 +92,8 @@ impl<'a> CellList<'a> {
         }
     }
 
-    /// Table with one line per cell, and anomalies; without counters if the terminal is too narrow.
+    /// Formats a table with one line per cell, and the anomalies below. The counters are left out if the terminal is
+    /// too narrow.
     pub(super) fn table(&self) -> String {
         let whole = self.lines(COLUMNS.into_iter().chain(COUNTERS));
         let text = match Table::new().width() {
@@ -102,7 +103,7 @@ impl<'a> CellList<'a> {
         text + &self.end()
     }
 
-    /// One line per cell, without empty columns.
+    /// Formats one line per cell, without empty columns.
     fn lines(&self, columns: impl IntoIterator<Item = Column>) -> String {
         let (heads, lines) = drop_empty_columns(columns, &self.cells, "-");
         let mut table = Table::new();
@@ -117,7 +118,7 @@ impl<'a> CellList<'a> {
         table.lines().map(|line| format!("{}\n", line.trim_end())).collect()
     }
 
-    /// Counts and anomalies below the table.
+    /// Formats the counts and anomalies below the table.
     fn end(&self) -> String {
         let mut text = format!("{} cells on {} ({})", self.cells.len(), self.bus, self.kind);
         let active = self.cells.iter().filter(|cell| cell.is("active")).count();
@@ -145,14 +146,14 @@ impl<'a> CellList<'a> {
 }
 
 impl DescribedBus {
-    /// Selects one bus of a skin that comes from this file.
+    /// Selects one bus of the skin that was read from `file`.
     pub(super) fn from_skin(skin: &Skin, bus: usize, file: String) -> Self {
         let format = skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format);
         let cells = skin.cells_on_bus(bus).map(|cell| (cell.serial, (cell.node, skin.parameters(cell).hash())));
         Self { file, format, cells: cells.collect() }
     }
 
-    /// Compares a cell with its description.
+    /// Returns how a cell differs from its description, or agrees with it, as text.
     fn compared(&self, node: u8, heartbeat: &Heartbeat) -> Option<String> {
         let Some((described, hash)) = self.cells.get(&heartbeat.serial) else {
             return Some("unknown".to_owned());
@@ -171,7 +172,7 @@ fn width(text: &str) -> usize {
     text.lines().map(|line| line.chars().count()).max().unwrap_or_default()
 }
 
-/// Text that redraws the terminal from the top; lines that do not fit are dropped.
+/// Returns the text that redraws the terminal from the top. Lines that do not fit are dropped.
 pub(super) fn screen(text: &str) -> String {
     let rows = tcgetwinsize(std::io::stdout()).map_or(0, |size| usize::from(size.ws_row));
     let all = text.lines().count();
@@ -233,12 +234,12 @@ impl CellShown {
         }
     }
 
-    /// Returns true if the cell reports this state.
+    /// Returns true if the cell has reported this state.
     fn is(&self, state: &str) -> bool {
         self.state.iter().flatten().any(|name| *name == state)
     }
 
-    /// State as text; "configured" appears only without any other state.
+    /// Formats the states of the cell. "configured" appears only if the cell reports no other state.
     fn state(&self) -> Option<String> {
         let bare = (self.configured == Some(false)).then_some(&"unconfigured");
         let others = self.state.as_ref()?.iter().filter(|name| **name != "configured");
@@ -264,7 +265,7 @@ impl TreeShown {
         Self { parent, depth, sums_sent: sent, sums_taken: taken, sums_dropped: dropped }
     }
 
-    /// Parent as text.
+    /// Formats the parent of the cell.
     fn up(&self) -> String {
         match self.parent {
             None => "none".to_owned(),
@@ -276,7 +277,7 @@ impl TreeShown {
 
 #[derive(Serialize)]
 struct PortShown {
-    /// Node id of the neighbour: null if the port receives nothing, 0 for a cell without a node id.
+    /// Node id of the neighbour: null if the port receives nothing, 0 for a neighbour without a node id.
     node: Option<u8>,
     port: Option<u8>,
     works: bool,
@@ -289,7 +290,7 @@ impl PortShown {
         Self { node: hears.then_some(number), port: hears.then_some(port), works, other_version }
     }
 
-    /// Neighbour as text: `?` follows a cell that receives nothing, `!` one with another protocol version.
+    /// Formats the neighbour: `?` follows one that receives nothing, `!` one with another protocol version.
     fn leads_to(&self) -> String {
         match (self.node, self.works, self.other_version) {
             (None, _, _) => ".".to_owned(),

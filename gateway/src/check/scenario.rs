@@ -15,7 +15,7 @@ use serde_json::{Map, Value, json};
 
 use crate::print::{count, decimals, json as pretty, comma_separated, or_else_text, table, space_separated};
 
-/// Maximum number of listed values.
+/// Maximum number of values listed one by one.
 const LISTED: usize = 8;
 
 /// Checks the text of a scenario file against a skin, and describes the scenario.
@@ -34,7 +34,7 @@ pub(super) fn plan(
     Ok((text, refused))
 }
 
-/// Content of a scenario.
+/// Content of a scenario, as printed.
 #[derive(Serialize)]
 struct Plan {
     skin: String,
@@ -45,17 +45,17 @@ struct Plan {
     seed: u64,
     motion: PlannedMotion,
     events: Vec<Event>,
-    /// Errors of the sensors.
+    /// Simulated errors of the sensors, by the file's keys.
     #[serde(skip_serializing_if = "Map::is_empty")]
     sensors: Map<String, Value>,
-    /// Parts of the scenario without effect.
+    /// Remarks on parts of the scenario that have no effect.
     remarks: Vec<String>,
 }
 
 #[derive(Serialize)]
 struct PlannedMotion {
     kind: &'static str,
-    /// Start position in the units of the joints.
+    /// Start position of each joint, in rad or m.
     start: Vec<f64>,
     /// Unit of each joint: rad, or m for prismatic joints.
     units: Vec<&'static str>,
@@ -66,7 +66,7 @@ struct PlannedMotion {
 #[derive(Serialize)]
 struct Event {
     at_s: f64,
-    /// Duration; null for instantaneous and permanent events.
+    /// Duration of the event in s; null for instantaneous and permanent events.
     for_s: Option<f64>,
     what: &'static str,
     bus: Option<String>,
@@ -192,7 +192,7 @@ impl Event {
     }
 }
 
-/// Creates the events of cells, one for each bus that has some of them.
+/// Creates the events of some cells: one event for each bus that has any of them.
 fn on_cells(
     skin: &Skin,
     at: Micros,
@@ -210,7 +210,7 @@ fn on_cells(
     skin.buses.iter().enumerate().filter_map(of_bus).collect()
 }
 
-/// Errors of the force sensors, by the file's keys.
+/// Returns the errors of the force sensors, by the file's keys.
 const fn errors(errors: &ForceErrors) -> [(&'static str, f64); 9] {
     [
         ("offset_n", errors.offset_n),
@@ -249,7 +249,7 @@ fn broken(skin: &Skin, at: Micros, kind: &FaultKind) -> Vec<Event> {
     }
 }
 
-/// Parameters of a bus fault, by the file's keys.
+/// Returns the parameters of a bus fault, by the file's keys.
 fn parameters(fault: &BusFault) -> Map<String, Value> {
     match *fault {
         BusFault::Drop { probability }
@@ -265,7 +265,7 @@ fn parameters(fault: &BusFault) -> Map<String, Value> {
     }
 }
 
-/// Formats the file's keys and their values.
+/// Formats keys of the file with their values.
 fn described(how: &Map<String, Value>) -> String {
     let words_of = |value: &Value| match value {
         Value::String(text) => text.clone(),
@@ -285,7 +285,7 @@ fn map<const N: usize>(pairs: [(&str, Value); N]) -> Map<String, Value> {
     pairs.into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
 }
 
-/// Duration in s, or `None` if it has no end.
+/// Returns a duration in s, or `None` if it has no end.
 fn length(span: Span) -> Option<f64> {
     (span != Span(u64::MAX)).then(|| span.seconds())
 }

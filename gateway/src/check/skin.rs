@@ -14,16 +14,16 @@ use crate::arguments::bus_names;
 use crate::print::{count, comma_separated, or_else_text, space_separated};
 use crate::robot_file::{RobotOfSkin, urdf_of};
 
-/// Cells listed beside the summary.
+/// Selection of the cells that are listed with or without the summary.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Listed<'a> {
     None,
     All,
-    /// This cell instead of the summary.
+    /// List this cell only, without the summary.
     Only(&'a CellName),
 }
 
-/// Checks a skin and its URDF as a recording run does, and summarises the skin.
+/// Checks a skin and its URDF as a run with a recording does. Returns the summary.
 pub(super) fn summary(
     file: &Path,
     skin: &Skin,
@@ -125,7 +125,7 @@ fn describe(skin: &Skin) -> String {
     text + &format!("hash: {:04X} over the parameters of all cells; --list lists each cell's\n", hash(skin))
 }
 
-/// Cells at the position of an earlier cell.
+/// Returns pairs of cells that have the same position.
 fn at_one_place(skin: &Skin) -> Vec<[&Cell; 2]> {
     let mut known = HashMap::new();
     let place = |cell: &Cell| {
@@ -164,18 +164,19 @@ fn line(skin: &Skin, cell: &Cell) -> String {
     )
 }
 
-/// Rounds a unit vector to four decimals, which can be measured: one from a quaternion has more.
+/// Rounds a unit vector to four decimals, which is as precise as can be measured. A vector computed from a quaternion
+/// has more.
 fn rounded(normal: &[f64; 3]) -> [f64; 3] {
     normal.map(|part| (part * 1e4).round() / 1e4 + 0.0)
 }
 
-/// Hash over the parameters of all cells.
+/// Returns a hash over the parameters of all cells.
 fn hash(skin: &Skin) -> u16 {
     let images: Vec<u8> = skin.cells.iter().flat_map(|cell| skin.parameters(cell).image()).collect();
     crc16(&images)
 }
 
-/// The skin as JSON.
+/// Returns the skin and these cells as JSON.
 fn values(file: &Path, skin: &Skin, cells: &[&Cell]) -> Value {
     let buses = skin.buses.iter().enumerate().map(|(index, bus)| {
         let roots = skin.cells_on_bus(index).filter(|cell| cell.root).map(|cell| cell.node.get());

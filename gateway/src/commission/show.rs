@@ -13,7 +13,7 @@ use crate::print::{KeyValueTable, count, abbreviated};
 /// Maximum number of cells with other node ids that get a line each.
 const LINES: usize = 8;
 
-/// The whole result.
+/// Result of a commissioning over all buses, as printed.
 #[derive(Debug, Serialize)]
 pub(super) struct CommissionResult<'a> {
     pub(super) skin: &'a str,
@@ -26,7 +26,7 @@ pub(super) struct CommissionResult<'a> {
     pub(super) buses: Vec<BusShown<'a>>,
 }
 
-/// Result of one bus.
+/// Result of commissioning the cells of one bus, as printed.
 #[derive(Debug, Serialize)]
 pub(super) struct BusShown<'a> {
     name: &'a str,
@@ -65,7 +65,7 @@ impl<'a> BusShown<'a> {
         }
     }
 
-    /// Cells whose node id differs from the description, with their present ids.
+    /// Returns the cells whose node id differs from the description, with their present ids.
     fn moved(&self) -> impl Iterator<Item = (CellId, &CellReport)> {
         self.cells.iter().filter_map(|it| Some((it.number.filter(|&node| node != it.described)?, it)))
     }
@@ -105,7 +105,7 @@ impl<'a> BusShown<'a> {
 }
 
 impl CommissionResult<'_> {
-    /// Notes beside the table.
+    /// Returns the notes that are printed beside the table.
     pub(super) fn notes(&self, has_copy: bool) -> Vec<String> {
         let file = self.file;
         let mut notes = Vec::new();
@@ -138,7 +138,7 @@ impl CommissionResult<'_> {
         notes
     }
 
-    /// Formats the table.
+    /// Formats the result as a table.
     pub(super) fn table(&self) -> String {
         let cells = self.buses.iter().map(|bus| bus.cells.len()).sum::<usize>();
         let ended = match (self.interrupted, self.dry_run) {
@@ -151,7 +151,7 @@ impl CommissionResult<'_> {
         rows.text()
     }
 
-    /// Result of the program, after all output.
+    /// Returns the failure with which the program ends if a cell is not commissioned. Call it after all output.
     pub(super) fn outcome(&self) -> Result<(), Failure> {
         let sum = |part: fn(&BusShown<'_>) -> usize| self.buses.iter().map(part).sum::<usize>();
         let (cells, failed) = (sum(|bus| bus.cells.len()), sum(|bus| bus.failed));

@@ -1,4 +1,4 @@
-//! Files of a capture, and its start within the run.
+//! Files of a capture, and the position of its first joints within the run.
 
 use std::path::{Path, PathBuf};
 
@@ -44,8 +44,8 @@ fn part(file: &Path) -> Option<(String, u32)> {
     Some((fact("program", "began_ns")?, fact("part", "number")?.parse().ok()?))
 }
 
-/// Returns the numbers of the first joints. Captures that start in the middle of a run are read for that, if they can
-/// be read twice.
+/// Returns for each capture the number of its first joints within the run. Reads a capture that starts in the middle of
+/// a run once more for that, if it can be read twice.
 pub(super) fn starts(files: &Both<Vec<PathBuf>>, skin: &Skin) -> Result<Both<Option<u64>>, Failure> {
     let unknown = Both { a: None, b: None };
     if ![&files.a, &files.b].iter().all(|files| files.iter().all(|file| can_be_read_again(file))) {

@@ -16,7 +16,7 @@ const WIDTH: u16 = 80;
 /// Maximum number of cells in the table.
 const CELLS: usize = 8;
 
-/// Names of a capture.
+/// Description of one of the compared captures: its name, its format and its files.
 #[derive(Debug)]
 pub(super) struct CaptureNames<'a> {
     pub(super) name: &'a str,
@@ -24,11 +24,11 @@ pub(super) struct CaptureNames<'a> {
     pub(super) files: &'a [PathBuf],
 }
 
-/// Result of a comparison with its inputs.
+/// Result of a comparison with its inputs, to be printed.
 #[derive(Debug)]
 pub(super) struct ComparisonText<'a> {
     pub(super) inputs: Both<CaptureNames<'a>>,
-    /// File of the option `--skin`.
+    /// Path given by the option `--skin`.
     pub(super) skin: Option<&'a Path>,
     pub(super) report: &'a Report,
 }
@@ -142,7 +142,7 @@ impl ComparisonText<'_> {
         format!("{table}\n")
     }
 
-    /// Table of cells that differ, and names of cells in only one capture.
+    /// Formats the table of cells that differ, and the names of cells that only one capture has.
     fn cells(&self) -> String {
         let differs = |row: &&CellRow| row.replies.different + row.replies.missing() > 0;
         let mut cells: Vec<_> = self.report.cells.iter().filter(differs).collect();
@@ -226,7 +226,7 @@ impl ComparisonText<'_> {
         text
     }
 
-    /// Options that accept such a difference.
+    /// Returns the options that would accept a difference like the first one, if any.
     fn tolerance(&self, first: &FirstDifference) -> Option<&'static str> {
         match (first.what, first.steps) {
             ("joints", Some(_)) => Some(
@@ -239,7 +239,7 @@ impl ComparisonText<'_> {
         }
     }
 
-    /// Command that shows more about some joints.
+    /// Returns the command that shows more about the joints of the first difference.
     fn explain(&self, first: &FirstDifference, which: CaptureSide) -> Option<String> {
         let occurrence = (*first.occurrence.get(which))?;
         let about = self.inputs.get(which);
@@ -260,7 +260,7 @@ impl ComparisonText<'_> {
         Some(line)
     }
 
-    /// JUnit report with a test case for each aspect.
+    /// Returns a JUnit report with a test case for each aspect of the comparison.
     pub(super) fn junit(&self, took: Duration) -> Suite {
         let first = self.report.first.as_ref().map(|first| self.first(first)).unwrap_or_default();
         let cases = ASPECTS.into_iter().map(|aspect| {
@@ -296,7 +296,7 @@ impl ComparisonText<'_> {
     }
 }
 
-/// Counts of equal and different replies.
+/// Formats the numbers of equal and different replies.
 fn replies_text(replies: &Replies) -> String {
     let Replies { equal, tolerated, different, open, max_steps, .. } = *replies;
     let mut all = vec![format!("{equal} equal")];

@@ -12,7 +12,7 @@ use serde::Serialize;
 use crate::junit::{Case, Outcome, Suite};
 use crate::print::{count, comma_separated, readable, table};
 
-/// The printed result.
+/// Result of a conformance test, as JSON.
 #[derive(Debug, Serialize)]
 pub(super) struct ConformanceResult {
     bus: String,
@@ -20,7 +20,7 @@ pub(super) struct ConformanceResult {
     serial: u32,
     format: &'static str,
     seconds: f64,
-    /// Reason of an early end.
+    /// Reason why the test ended early, if it did.
     stopped: Option<String>,
     passed: usize,
     failed: usize,
@@ -57,7 +57,8 @@ impl ConformanceResult {
         self.failed > 0
     }
 
-    /// Formats one line per requirement, the frames of failures, and the requirements that were not tested.
+    /// Formats a table with one line per requirement, then the frames that show failures, and the requirements that
+    /// were not tested.
     pub(super) fn text(&self) -> String {
         let rows = self.requirements.iter().map(|it| {
             let (verdict, more) = verdict_text(&it.verdict);
@@ -94,7 +95,7 @@ impl ConformanceResult {
         text
     }
 
-    /// JUnit report with a test case for each requirement.
+    /// Returns a JUnit report with a test case for each requirement.
     pub(super) fn junit(&self) -> String {
         let case = |Finding { requirement, verdict }: &Finding| {
             let document = serde_json::to_value(requirement.document).unwrap_or_default();
@@ -123,7 +124,7 @@ impl ConformanceResult {
     }
 }
 
-/// The verdict in words, and further details.
+/// Returns the word for a verdict, and the details of the verdict as text.
 fn verdict_text(verdict: &Verdict) -> (&'static str, String) {
     match verdict {
         Verdict::Passed { checks, but } => {

@@ -21,14 +21,14 @@ use trace::capture::{Entry, CaptureFormat};
 use trace::files::LogFile;
 use trace::recording::names::{self, PartFile};
 
-/// Time after which written entries are in the file.
+/// Maximum time after which written entries are in the file.
 const KEEP_INTERVAL: Duration = Duration::from_millis(50);
 /// Number of bytes written to a recording at once.
 const WRITE_BYTES: usize = 64 << 10;
-/// Stack size of the writing thread, which calls no deep functions.
+/// Stack size in bytes of the writing thread, which calls no deep functions.
 const STACK: usize = 256 << 10;
 
-/// A file that grows.
+/// A file that readers can read while it grows.
 enum Grown {
     Log(LogFile),
     Part(BufWriter<File>),
@@ -37,7 +37,7 @@ enum Grown {
 impl Write for Grown {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         match self {
-            // Write all bytes or none: they are whole lines.
+            // Write all bytes or none, because they are whole lines.
             Self::Log(log) => log.append_bytes(bytes).map(|()| bytes.len()),
             Self::Part(file) => file.write(bytes),
         }
@@ -51,7 +51,7 @@ impl Write for Grown {
     }
 }
 
-/// An output and its state since the last flush.
+/// An output, and what has happened since its last flush.
 struct State {
     output: CaptureWriter<Grown>,
     /// Set by each write, cleared when everything is in the file.
@@ -64,7 +64,7 @@ struct State {
 #[derive(Default)]
 struct Meeting {
     state: Mutex<Option<State>>,
-    /// Signalled at the end.
+    /// Condition that wakes the writing thread at the end.
     over: Condvar,
 }
 
@@ -78,7 +78,7 @@ impl Meeting {
         }
     }
 
-    /// Flushes written entries at intervals until the end.
+    /// Flushes written entries at intervals, until the output is finished or closed.
     fn keep(&self) {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         while let Some(State { output, is_dirty, failed, is_over: false }) = state.as_mut() {
@@ -91,7 +91,7 @@ impl Meeting {
     }
 }
 
-/// A capture that grows.
+/// An output file that grows while a capture is converted from a pipe.
 pub(super) struct GrowingCapture {
     meeting: Arc<Meeting>,
     keeper: Option<JoinHandle<()>>,
@@ -129,7 +129,7 @@ impl GrowingCapture {
         Ok(Self { meeting, keeper: Some(keeper), path: path.to_owned(), force, part })
     }
 
-    /// Names the file that holds the entries so far.
+    /// Returns text that names the file which holds the entries so far.
     pub(super) fn left(&self) -> String {
         match &self.part {
             Some(_) => {
@@ -155,25 +155,25 @@ impl GrowingCapture {
         Ok(())
     }
 
-    /// Closes the file unfinished; it keeps the entries written so far.
+    /// Closes the unfinished file, which keeps the entries written so far.
     pub(super) fn close(mut self) {
-        // The reason of the end has been reported already.
+        // The reason why the conversion ended has been reported already.
         let _ = self.end(|state| state.output.flush_all());
     }
 
-    /// Removes the file.
+    /// Closes the output, and removes its file unless it is a former file that was to be overwritten.
     pub(super) fn discard(mut self) {
         let is_there = self.part.is_some() || self.meeting.with(|_| Ok(())).is_ok();
         let _ = self.end(|_| Ok(()));
         match &self.part {
             Some((part, _)) => part.remove(),
-            // A file to be replaced exists until the first line is written.
+            // The former file is replaced only when the first line is written, so before that it must stay.
             None if is_there && !self.force => _ = std::fs::remove_file(&self.path),
             None => {}
         }
     }
 
-    /// Ends the thread, then the output.
+    /// Ends the writing thread, then the output by calling `end`.
     fn end(&mut self, end: impl FnOnce(&mut State) -> io::Result<()>) -> io::Result<()> {
         let ended = self.meeting.with(|state| {
             state.is_over = true;

@@ -16,7 +16,7 @@ pub(super) fn is_csv(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "csv")
 }
 
-/// Writes a row for each epoch. Returns the number of epochs, and what the capture lacks.
+/// Writes a row for each epoch. Returns the number of epochs, and the counts of unreadable and lost items.
 pub(super) fn write(
     reader: &mut Reader,
     skin: &Skin,
@@ -32,15 +32,15 @@ pub(super) fn write(
     Ok((epochs, missing))
 }
 
-/// Names of the buses whose cells answer with sums, which do not contain the torques of single cells; `None` without
-/// such buses.
+/// Returns the names of the buses whose cells answer with sums, which do not contain the torques of single cells.
+/// Returns `None` if there are no such buses.
 pub(super) fn summed(skin: &Skin) -> Option<String> {
     let summed = skin.buses.iter().filter(|bus| bus.reply != SkinReply::Torque).map(|bus| bus.name.clone());
     let summed: Vec<_> = summed.collect();
     (!summed.is_empty()).then(|| comma_separated(summed))
 }
 
-/// Column names with units.
+/// Returns the names of the columns, with units.
 fn header(skin: &Skin) -> Vec<String> {
     let joints = skin.robot.joints.iter().flat_map(|joint| {
         let (name, unit, torque) = (&joint.name, joint.kind.unit(), joint.kind.torque_unit());
@@ -55,19 +55,19 @@ fn header(skin: &Skin) -> Vec<String> {
     first.chain(joints).chain(["open_cells", "saturated_cells"].map(str::to_owned)).collect()
 }
 
-/// All digits of a number; small numbers with an exponent.
+/// Formats a number with all its digits, and with an exponent if it is small.
 fn digits(value: f64) -> String {
     format!("{value:?}")
 }
 
 struct Rows<W: Write> {
-    /// True for each joint whose torques come in sums.
+    /// True for each joint that a chain of a bus with sums moves.
     summed: Vec<bool>,
     out: Writer<W>,
 }
 
 impl<W: Write> Rows<W> {
-    /// Writes a row with the numbers of `skinbus explain`. Seconds count from `zero`, in ns since 1970.
+    /// Writes a row with the torques that `skinbus explain` shows. Seconds count from `zero`, in ns since 1970.
     fn write(&mut self, zero: u64, epoch: &EpochTorque) -> Result<(), csv::Error> {
         let EpochTorque { at_ns, epoch, positions, explanation } = epoch;
         let seconds = seconds_since(zero, *at_ns);

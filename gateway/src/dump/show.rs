@@ -40,7 +40,7 @@ pub(super) enum OutputStyle {
     Stats(Box<Stats>),
 }
 
-/// A frame whose meaning is not settled yet.
+/// A frame that waits for the rest of its packet before it can be decoded.
 struct Waiting {
     time: Timestamp,
     bus: Arc<str>,
@@ -59,14 +59,14 @@ pub(super) struct FrameOutput<W> {
     /// Buses that a skin describes, with their units and the numbers of their chains' joints.
     described: Vec<(String, Units, usize)>,
     pick: FrameFilter,
-    /// True to show only traffic of touches.
+    /// True if only traffic of touches is shown.
     contact: bool,
     how: OutputStyle,
-    /// Number of frames that may still be shown.
+    /// Number of frames that may still be shown before the dump ends.
     left: u64,
     /// Buses named by the filters from which no frame has come.
     absent: Vec<String>,
-    /// Time from which seconds count; `None` until it is known or the first frame comes.
+    /// Time in ns since 1970 from which seconds count; `None` until it is known or the first frame comes.
     zero: Option<u64>,
     raw: String,
 }
@@ -90,7 +90,7 @@ impl<W: Write> FrameOutput<W> {
         }
     }
 
-    /// Sets the time from which seconds count; call it before the first frame.
+    /// Sets the time in ns since 1970 from which seconds count. Call it before the first frame.
     pub(super) const fn count_from(&mut self, zero: u64) {
         self.zero = Some(zero);
     }
@@ -103,7 +103,8 @@ impl<W: Write> FrameOutput<W> {
         self.described = described.collect();
     }
 
-    /// Adds the next frame. It is shown once settled, if the filters select it.
+    /// Adds the next frame. It is shown as soon as its packet is complete or known to be incomplete, if the filters
+    /// select it.
     pub(super) fn frame(&mut self, record: &Record<'_>) -> io::Result<()> {
         let Record { time, interface, frame, direction } = *record;
         if *self.bus != *interface {
@@ -117,24 +118,25 @@ impl<W: Write> FrameOutput<W> {
         self.settled()
     }
 
-    /// Handles the passing of time without a frame.
+    /// Settles and shows frames whose packets have been incomplete for too long at `now`; call it when no frame
+    /// arrives.
     pub(super) fn handle_time(&mut self, now: Micros) -> io::Result<()> {
         self.settler.handle_time(now);
         self.settled()
     }
 
-    /// Settles all waiting frames at the end of the input.
+    /// Settles and shows all waiting frames at the end of the input.
     pub(super) fn finish(&mut self) -> io::Result<()> {
         self.settler.finish();
         self.settled()
     }
 
-    /// Returns true if frames wait that are not shown yet.
+    /// Returns true if any frame waits for the rest of its packet.
     pub(super) fn is_waiting(&self) -> bool {
         self.settler.is_waiting()
     }
 
-    /// Shows the frames that are settled.
+    /// Shows the frames whose meaning is settled.
     fn settled(&mut self) -> io::Result<()> {
         while self.left > 0
             && let Some((Waiting { time, bus, units, frame, direction }, decoded)) = self.settler.pop()
@@ -147,7 +149,7 @@ impl<W: Write> FrameOutput<W> {
         Ok(())
     }
 
-    /// Names of the buses that the options name and from which no frame came.
+    /// Returns the names of the buses that the options name but from which no frame came.
     pub(super) fn absent_buses(&self) -> Option<String> {
         (!self.absent.is_empty() && self.left > 0).then(|| comma_separated(&self.absent))
     }
@@ -157,7 +159,8 @@ impl<W: Write> FrameOutput<W> {
         self.left == 0
     }
 
-    /// Drops the description of a bus whose joints differ in number from the chain's: the skin is for another robot.
+    /// If a bus's joints differ in number from those of its chain in the skin, drops the bus's description, because the
+    /// skin is for another robot.
     fn check_robot(&mut self, bus: &str, decoded: &Decoded) {
         let Some(Message::Joints { joints, .. }) = decoded.message() else { return };
         let came = usize::from(joints.in_use);
@@ -231,7 +234,7 @@ impl<W: Write> FrameOutput<W> {
         }
     }
 
-    /// Notes that the frames have no valid times.
+    /// Notes that the frames have no valid times, so that statistics give no rates.
     pub(super) const fn without_times(&mut self) {
         if let OutputStyle::Stats(stats) = &mut self.how {
             stats.without_times();
@@ -251,7 +254,7 @@ impl<W: Write> FrameOutput<W> {
     }
 }
 
-/// Colour of a decoded frame.
+/// Returns the colour in which a decoded frame is shown.
 fn of(decoded: &Decoded) -> &'static str {
     match decoded {
         Decoded::Foreign(_) | Decoded::Wire(..) | Decoded::Segment { .. } => DIM,

@@ -74,7 +74,7 @@ fn numbers(rows: &mut KeyValueTable, bus: &BusReport, duration_s: f64) {
     rows.row("frames missing", bus.dropped, why);
 }
 
-/// Adds the contents of an MCAP recording besides frames.
+/// Adds rows on the contents of an MCAP recording other than frames.
 fn beside(rows: &mut KeyValueTable, extras: &RecordingExtras) {
     if !extras.topics.is_empty() {
         rows.section("other topics", "messages", "");
@@ -104,7 +104,7 @@ fn reported(foreign: &ForeignFrames) -> Vec<String> {
 /// Maximum number of foreign identifiers shown; --json has all.
 const FOREIGN: usize = 40;
 
-/// Table with one line per foreign identifier, the most frequent ones first.
+/// Formats a table with one line per foreign identifier, the most frequent ones first.
 fn foreign(bus: &BusReport) -> Table {
     let head = [
         &format!("{} foreign", printable(&bus.bus)),
@@ -145,7 +145,7 @@ fn foreign(bus: &BusReport) -> Table {
 /// A column: its header, and the text of a cell if it has a value.
 type Column<'a> = (&'a str, fn(&CellReport) -> Option<String>);
 
-/// Table with one line per cell, without empty columns (unanswered, lost, ...).
+/// Formats a table with one line per cell, without empty columns (unanswered, lost, ...).
 fn cells(bus: &BusReport) -> Table {
     // A zero is left blank.
     fn some(count: u64) -> Option<String> {

@@ -1,4 +1,4 @@
-//! Benches of experiments: this program, started again as from a shell.
+//! Benches of experiments: runs of this program, started again as from a shell.
 
 use std::fs;
 use std::io;
@@ -22,19 +22,19 @@ use trace::files::write_whole;
 
 use crate::buses;
 
-/// Settings of the benches.
+/// Settings that all benches share.
 #[derive(Debug)]
 pub(super) struct Benches {
-    /// Directory for their skins, scenarios, recordings and summaries.
+    /// Directory for the skins, scenarios, recordings and summaries of the benches.
     pub(super) folder: PathBuf,
-    /// Set to end the bench.
+    /// Flag that ends the bench.
     pub(super) stop: Arc<AtomicBool>,
 }
 
 /// Interval between checks whether a bench has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Files of one run.
+/// Paths of the files of one run.
 struct Files {
     skin: PathBuf,
     scenario: PathBuf,
@@ -71,12 +71,13 @@ impl Benches {
         Ok(Run { rows, summary, joints })
     }
 
-    /// Runs `skinbus run` on a bench, with each bus's cells in one process, and reads its summary. A bench that failed
-    /// or was halted because the machine cannot run it has a summary too; one whose cells failed measures nothing.
+    /// Runs `skinbus run` on a bench, with each bus's cells in one process, and returns its summary. Accepts the
+    /// summary of a run that failed or was halted because the machine is too slow for it, but returns an error if cells
+    /// failed.
     pub(super) fn scaled(&self, bench: &ScaleBench) -> Result<Value, Failure> {
         let what = format!("the bench of {} cells ({})", bench.cells, bench.name());
         let buses = buses::directory("experiment")?;
-        // Files that can be generated again are not kept.
+        // Files that can be generated again go into a temporary directory.
         let files = Files {
             skin: buses.path().join("skin.toml"),
             scenario: buses.path().join("scenario.toml"),
@@ -126,7 +127,7 @@ impl Benches {
         while child.try_wait()?.is_none() {
             if !stated && self.stop.load(Ordering::Relaxed) {
                 stated = true;
-                // If the bench has just ended, no process gets the signal.
+                // If the bench has just ended, the signal reaches no process, which is harmless.
                 let _ = kill_process(Pid::from_child(&child), Signal::INT);
             }
             std::thread::sleep(POLL_INTERVAL);
@@ -143,7 +144,7 @@ fn at(what: &str, path: &Path, error: &dyn std::fmt::Display) -> Failure {
     failed(what, &format_args!("{}: {error}", path.display()))
 }
 
-/// Last line that a run printed.
+/// Returns the last line that a run printed.
 fn last_words(ended: &Output) -> String {
     let said = String::from_utf8_lossy(&ended.stderr);
     let last = said.trim_end().lines().last().unwrap_or("it printed nothing").to_owned();

@@ -15,7 +15,7 @@ use crate::output::Overwrite;
 pub(super) struct Folder {
     path: PathBuf,
     inside: PathBuf,
-    /// True if the directory was created for this.
+    /// True if this program created the directory.
     made: bool,
     overwrite: Overwrite,
 }
@@ -45,7 +45,7 @@ impl Folder {
         Ok(folder)
     }
 
-    /// Directory of the files until they get their names.
+    /// Returns the hidden directory that contains the files until they get their names.
     pub(super) fn inside(&self) -> PathBuf {
         self.inside.clone()
     }
@@ -72,7 +72,7 @@ impl Folder {
         }
         sync_folder(&self.inside);
         if self.made {
-            // Directories above it may have been created too.
+            // The directories above it may be new too.
             self.path.ancestors().for_each(sync_folder);
         }
         Ok(())

@@ -1,4 +1,4 @@
-//! An explanation as tables.
+//! Tables of an explained torque.
 
 use std::collections::BTreeSet;
 
@@ -11,12 +11,12 @@ use trace::capture::seconds_since;
 
 use crate::print::{self, decimals, or_else_text};
 
-/// The part that is shown.
+/// Selection of the parts of an explanation that are shown.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum ExplainDetail {
-    /// One line per cell; all steps of a single cell.
+    /// One line per cell, or all steps if there is only one cell.
     All,
-    /// All steps of these cells.
+    /// All steps of the selected cells.
     Cells,
     /// One joint, cell by cell.
     Joint,
@@ -64,13 +64,13 @@ pub(super) fn text(
     text
 }
 
-/// Number of joints side by side.
+/// Maximum number of joints side by side in a table.
 const BESIDE: usize = 6;
 
-/// Positions that the cells of a bus received.
+/// Formats the joint positions that the cells of a bus received.
 fn positions(bus: &BusExplained) -> String {
     let unit = if bus.units.contains(&"m") { "rad, m" } else { "rad" };
-    // With seven joints, the last would stand alone.
+    // Put seven joints side by side, because the last would otherwise stand alone.
     let beside = if bus.joints.len() == BESIDE + 1 { BESIDE + 1 } else { BESIDE };
     let words = bus.position_words.chunks(beside).zip(bus.position_rad.chunks(beside));
     let tables = bus.joints.chunks(beside).zip(words).map(|(joints, (words, positions))| {
@@ -84,13 +84,13 @@ fn positions(bus: &BusExplained) -> String {
     tables.collect()
 }
 
-/// Table with right-aligned columns, except for the first column and, if it holds text, the last. Columns are close, so
-/// that the table fits on 80 columns.
+/// Formats a table with right-aligned columns, except for the first column and, if it holds text, the last. The columns
+/// are close together, so that the table fits on 80 columns.
 fn table(head: Vec<String>, rows: impl IntoIterator<Item = Vec<String>>, words_at_the_end: bool) -> String {
     spaced(head, rows, words_at_the_end, 1)
 }
 
-/// Formats such a table with `spaces` spaces before a number.
+/// Formats such a table with at least `spaces` spaces before each number.
 fn spaced(
     head: Vec<String>,
     rows: impl IntoIterator<Item = Vec<String>>,
@@ -112,7 +112,7 @@ fn millis(nanos: u64) -> String {
     format!("{:.3} ms", nanos as f64 / 1e6)
 }
 
-/// Tables with one line per cell: chain by chain, and several tables for chains with many joints.
+/// Formats tables with one line per cell, chain by chain. A chain with many joints gets several tables.
 fn one_line_each(cells: &[CellExplained], is_finest: bool) -> String {
     let turns = cells.iter().flat_map(|cell| &cell.rows).all(|row| row.unit == "Nm");
     let (unit, steps) =
@@ -125,9 +125,9 @@ fn one_line_each(cells: &[CellExplained], is_finest: bool) -> String {
     )
 }
 
-/// Torques of the cells of one chain.
+/// Formats the torques of the cells of one chain.
 fn torques(cells: &[CellExplained]) -> String {
-    // Joints after those that move any of the cells hold only zeros, if all is well.
+    // If all is well, the joints after those that move any of the cells have only zeros.
     let says = |cell: &CellExplained| {
         let moved = cell.rows.iter().position(|row| row.joint == cell.joint);
         let rows = cell.rows.iter().enumerate();
@@ -162,7 +162,7 @@ fn force_of(cell: &CellExplained) -> Option<f64> {
     cell.force.as_ref().map(|force| force.force_n)
 }
 
-/// Names of cells: their node ids, with the bus if there are several.
+/// Names of cells in tables: the node id, with the bus's name if there are several buses.
 struct Names(Option<String>);
 
 impl Names {
@@ -184,9 +184,9 @@ fn name(cell: &CellExplained) -> String {
     format!("{} {}", cell.bus, cell.node)
 }
 
-/// Largest difference of a cell's words from the nearest steps.
+/// Formats the largest difference between the words of a cell and the nearest steps.
 fn steps_off(rows: &[Row]) -> String {
-    // The last one of equally large differences.
+    // Take the last one of equally large differences.
     let most = rows.iter().filter_map(|row| row.difference_steps).max_by_key(|steps| steps.abs());
     or_else_text(most.map(sign), "?")
 }
@@ -195,7 +195,7 @@ fn sign(steps: i32) -> String {
     if steps == 0 { "0".to_owned() } else { format!("{steps:+}") }
 }
 
-/// Rank of a verdict by importance, its name, and an explanation if it needs one.
+/// Returns the rank of a verdict by importance, its name, and an explanation if it needs one.
 fn about(verdict: &Verdict) -> (u8, &'static str, Option<String>) {
     match verdict {
         Verdict::Nearest => (0, "nearest", None),
@@ -217,12 +217,12 @@ fn about(verdict: &Verdict) -> (u8, &'static str, Option<String>) {
     }
 }
 
-/// Name of the most important verdict.
+/// Returns the name of the most important verdict among these rows.
 fn worst(rows: &[Row]) -> String {
     or_else_text(rows.iter().map(|row| about(&row.verdict)).max().map(|(_, short, _)| short), "")
 }
 
-/// Name of a verdict, with the J that gives the word.
+/// Returns the name of a verdict, with the Jacobian J that gives the word if the verdict is about rounding.
 fn long(verdict: &Verdict) -> String {
     let (_, short, _) = about(verdict);
     match verdict {
@@ -231,7 +231,7 @@ fn long(verdict: &Verdict) -> String {
     }
 }
 
-/// Explanations of the verdicts that occur in the last column.
+/// Explains the verdicts that occur in the last column.
 fn legend(cells: &[CellExplained]) -> String {
     let said = cells.iter().flat_map(|cell| &cell.rows).map(|row| about(&row.verdict));
     let said: BTreeSet<_> = said.collect();
@@ -296,7 +296,7 @@ fn joint(cells: &[CellExplained]) -> String {
     format!("\n{}", rows(cells, true))
 }
 
-/// Table of the joints of cells, one line each.
+/// Formats a table with one line per joint of each cell.
 fn rows(cells: &[CellExplained], by_cell: bool) -> String {
     let names = Names::of(cells);
     let first = if by_cell { names.head() } else { "joint".to_owned() };
@@ -321,7 +321,8 @@ fn rows(cells: &[CellExplained], by_cell: bool) -> String {
     table(head, lines.map(|(cell, row)| line(cell, row)), true) + &legend(cells)
 }
 
-/// Number of a joint; with its unit if it is prismatic, because the column names the unit of the others.
+/// Returns the number of a joint, with its unit if the joint is prismatic: the column's head names the unit of the
+/// others.
 fn joint_name(joint: u8, unit: &str) -> String {
     if unit == "Nm" { joint.to_string() } else { format!("{joint} ({unit})") }
 }

@@ -1,4 +1,5 @@
-//! Torques of a force on a cell, computed both ways: `skinbus explain SKIN --force`.
+//! Torques that a force on a cell causes, computed centrally and as the cell computes them: `skinbus explain SKIN
+//! --force`.
 
 use core::f64::consts::TAU;
 use std::path::{Path, PathBuf};
@@ -19,7 +20,7 @@ use crate::columns::{Columns, Table};
 use crate::input::skin_in;
 use crate::print::{count, json_line, table};
 
-/// Maximum size of a file of rows in bytes.
+/// Maximum size in bytes of a file of rows.
 const BATCH: u64 = 256 << 20;
 
 /// Columns of a file of rows.
@@ -40,7 +41,7 @@ pub(super) struct Given {
     batch: Option<PathBuf>,
 }
 
-/// Result of a row in Nm, or N for prismatic joints.
+/// Torques of a row, computed both ways, in Nm (prismatic joints: N).
 #[derive(Serialize)]
 struct Row {
     cell: String,
@@ -82,7 +83,7 @@ impl Given {
     }
 }
 
-/// Both computations for one skin.
+/// Computes the torques of a force on a cell of one skin both ways: centrally, and as the cell does.
 struct Calculator<'a> {
     skin: &'a Skin,
     /// Central computation of each bus.
@@ -115,13 +116,14 @@ impl<'a> Calculator<'a> {
         Ok(rows)
     }
 
-    /// Computes one row both ways, or returns the reason why it cannot; `option` names the option of the cell.
+    /// Computes the torques of one row both ways. Returns the reason if this is not possible; `option` names the option
+    /// that gave the cell.
     fn row(&self, named: &CellName, option: &str, force: f64, positions: &str) -> Result<Row, String> {
         let index = cell_of(self.skin, named, option).map_err(|failure| failure.to_string())?;
         self.row_of(index, force, positions).map_err(|why| format!("{option} {named}: {why}"))
     }
 
-    /// Computes one row for the cell with this index.
+    /// Computes the torques of one row for the cell with this index.
     fn row_of(&self, index: usize, force: f64, positions: &str) -> Result<Row, String> {
         let skin = self.skin;
         let Some(cell) = skin.cells.get(index) else { return Err("no such cell".to_owned()) };
@@ -136,7 +138,7 @@ impl<'a> Calculator<'a> {
         if given.len() != joints.len() {
             let names = joints.iter().map(|joint| joint.name.as_str()).collect::<Vec<_>>().join(", ");
             let (got, needed) = (count(given.len(), "position"), count(joints.len(), "joint"));
-            return Err(format!("{got}: one is needed for each of the chain's {needed}, {names}"));
+            return Err(format!("{got} given: one is needed for each of the chain's {needed}, {names}"));
         }
         let mut q = Vec::with_capacity(given.len());
         let mut words = [Q1_14::ZERO; MAX_JOINTS];
@@ -150,7 +152,8 @@ impl<'a> Calculator<'a> {
                 ));
             };
             let ([min, max], unit) = (joint.limits, joint.kind.unit());
-            // Angles beyond the limits are still meaningful, but degrees are not.
+            // Angles beyond the limits are allowed, as they make sense, but not angles that are given in degrees by
+            // mistake.
             let [min, max] = match joint.kind {
                 JointKind::Prismatic => [min, max],
                 JointKind::Revolute => [min.min(-TAU), max.max(TAU)],
@@ -171,7 +174,7 @@ impl<'a> Calculator<'a> {
         let place = skin.cells_on_bus(cell.bus).position(|other| other.node == cell.node).unwrap_or_default();
         let central =
             self.central.get(cell.bus).map(|central| central.torque(place, &central.frames_at(&q), force));
-        // Adding 0.0 removes the sign of a zero.
+        // Adding 0.0 turns -0.0 into 0.0.
         let central: Vec<f64> =
             central.into_iter().flatten().take(joints.len()).map(|value| value + 0.0).collect();
         let words = words.get(..joints.len()).unwrap_or_default();

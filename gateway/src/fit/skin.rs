@@ -37,7 +37,8 @@ impl Fit {
         })
     }
 
-    /// Format and rates of each bus; `None` if neither the command line nor the skin has them for all.
+    /// Returns the format and the bit rates of each bus, or `None` if neither the command line nor the skin gives rates
+    /// for all buses.
     fn rates(&self, skin: &Skin) -> Result<Option<Vec<(Format, BitRates)>>, Failure> {
         let formats: Vec<_> = skin.buses.iter().map(|bus| self.format.unwrap_or(bus.format)).collect();
         let Some(nominal) = self.nominal else {
@@ -64,7 +65,7 @@ impl Fit {
     }
 }
 
-/// Rates of a bus in the skin.
+/// Returns the bit rates that the skin gives for a bus, with the format.
 fn described(bus: &SkinBus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
     let rates = rates::described(bus, format).transpose();
     let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?;

@@ -22,7 +22,7 @@ const HEAD: [&str; 8] = [
     "roots:\nlast ms",
 ];
 
-/// Table with a line for each pair of bit rates.
+/// Formats a table with one line for each pair of bit rates.
 pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
     let Some(first) = rows.first() else { return String::new() };
     let lines = rows.iter().map(|row| {
@@ -62,7 +62,7 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
     )
 }
 
-/// Buses at their bit rates: a section for each, and one for all cells of the skin.
+/// Formats the results of the buses at their bit rates: a section for each bus, and one for all cells of the skin.
 pub(super) fn buses(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>) -> String {
     let Some(first) = buses.first() else { return String::new() };
     let case = &first.rated.case;
@@ -142,7 +142,7 @@ const fn sensors(case: &Case) -> &'static str {
     }
 }
 
-/// Load and last answer.
+/// Formats the load of a bus and the time of the last answer.
 fn figures(rated: &AssessedBus) -> String {
     format!("{}, {}", percent(rated.load.total()), last(rated))
 }
@@ -156,7 +156,7 @@ fn last(rated: &AssessedBus) -> String {
     }
 }
 
-/// Last answer in ms for a column of numbers.
+/// Formats the time of the last answer in ms for a column of numbers.
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
 fn ms(rated: &AssessedBus) -> String {
     decimals(rated.times.last_ns().map(|ns| ns as f64 / 1e6), 2, "-")
@@ -178,7 +178,7 @@ fn each_need(need: &NeededBuses) -> String {
 
 #[expect(clippy::cast_precision_loss, reason = "printed with few digits")]
 fn millis(ns: u64) -> String {
-    // At most two decimals, without trailing zeros.
+    // Write at most two decimals, without trailing zeros.
     format!("{:.2}", ns as f64 / 1e6).trim_end_matches('0').trim_end_matches('.').to_owned()
 }
 
@@ -187,7 +187,7 @@ fn micros(ns: u64) -> String {
     format!("{:.1}", ns as f64 / 1e3)
 }
 
-/// A share in %, for a column or a list.
+/// Formats a share in %, for a column or a list.
 fn tenths(share: f64) -> String {
     format!("{:.1}", 100.0 * share)
 }

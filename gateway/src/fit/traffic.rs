@@ -22,12 +22,12 @@ use crate::input::{
 use crate::output;
 use crate::print::comma_separated;
 
-/// Receive buffer in bytes, for frames that wait while others are processed.
+/// Size of the receive buffer in bytes, for frames that wait while others are processed.
 const RECEIVE_BUFFER: usize = 8 << 20;
 
-/// Result of reading the traffic.
+/// Result of reading the traffic from a capture or from buses.
 struct Taken {
-    /// Kind of the source.
+    /// Name of the kind of source.
     what: &'static str,
     /// Number of frames that the recorder lost.
     missing: u64,
@@ -36,7 +36,7 @@ struct Taken {
 }
 
 impl Fit {
-    /// Computes and prints the outcome for each frame.
+    /// Computes and prints for each frame when it would be sent on a bus with bit rates.
     pub(super) fn of_traffic(&self) -> Result<(), Failure> {
         let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
         if let (Some(path), Some(skin)) = (&self.skin, &skin) {
@@ -86,7 +86,7 @@ impl Fit {
             0 => return Ok(false),
             files if files < self.sources.len() => {
                 return Err(Failure::usage(format!(
-                    "{name}: one file, the parts of one recording, or buses without a file"
+                    "{name}: name one file, the parts of one recording, or buses without a file"
                 )));
             }
             _ => {}
@@ -102,7 +102,8 @@ impl Fit {
         })
     }
 
-    /// Creates the model with the bit rates of the command line, else of the skin, else common ones.
+    /// Creates the model of the buses with the bit rates of the command line, or else those of the skin, or else common
+    /// ones.
     fn shadow(&self, skin: Option<Skin>) -> Result<Shadow, Failure> {
         let requested = RequestedRates { nominal: self.nominal, data: self.data };
         let mut of_bus = self.rates.clone();
@@ -123,7 +124,7 @@ impl Fit {
         Shadow::new(options).map_err(|error| Failure::usage(format!("--ber: {error}")))
     }
 
-    /// Receives from buses until a signal.
+    /// Receives from buses until a signal, and passes the frames to the model.
     fn live(
         &self,
         shadow: &mut Shadow,
@@ -169,7 +170,7 @@ fn take(receive_end: &mut ReceiveEnd, shadow: &mut Shadow) -> Result<(), BusErro
     Ok(())
 }
 
-/// Passes a capture to the model, and reports what it lacks.
+/// Passes the frames of a capture to the model, and reports unreadable and lost items.
 fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Result<Taken, Failure> {
     let name = reader.name().to_owned();
     let what = input::format(&reader);

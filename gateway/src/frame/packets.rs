@@ -1,4 +1,4 @@
-//! Messages of the packets that the user asks for.
+//! Messages that the subcommands of `skinbus frame` create.
 
 use clap::{Args, Subcommand};
 use model::decode::parameter;
@@ -158,7 +158,7 @@ impl PacketCommand {
         }
     }
 
-    /// Addressee of the packet, or `None` for all receivers.
+    /// Returns the addressee of the packet, or `None` if the packet is for all receivers.
     pub(super) const fn to(&self) -> Option<&Party> {
         match self {
             Self::Halt | Self::Resume | Self::Sync | Self::Report | Self::Joints(_) => None,
@@ -225,12 +225,12 @@ impl Configure {
     }
 }
 
-/// Reads the value of an option; an error names the option, the value and the allowed values.
+/// Parses the value of an option. An error names the option, the value and the allowed values.
 fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<T, String> {
     read(text).map_err(|allowed| format!("{option} {text}: {allowed}"))
 }
 
-/// Reads a value of a sensor field.
+/// Parses a value of a sensor field.
 fn contact_state<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
     let layouts =
         packets().iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| &schema.layouts);
@@ -240,7 +240,7 @@ fn contact_state<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q
     Ok(Q::from_bits(word))
 }
 
-/// Reads `N` numbers, or zeros if none are given.
+/// Parses `N` numbers, or returns zeros if none are given.
 fn several<const F: u32, const N: usize>(
     option: &str,
     name: &str,
@@ -253,7 +253,7 @@ fn several<const F: u32, const N: usize>(
     Ok(all)
 }
 
-/// Divides a force among the three contact words.
+/// Parses a force in N, and divides it among the three contact words.
 fn contact(text: &str) -> Result<[Q5_10; 3], String> {
     let force = value("--force", text, parameter::real)?;
     let words = contact_words(force);

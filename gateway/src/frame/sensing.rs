@@ -14,18 +14,18 @@ use super::addressee::{addressee, only_cell};
 use crate::arguments::{OptionValue, one_of};
 use model::decode::pick::Party;
 
-/// Set when cells send their sensors: never, at a rate, or on changes
+/// Set when cells send their sensor values: never, at a rate, or on changes
 ///
 /// With --bus or --skin, takes effect at once, waits until all cells have confirmed it, and lists those that have not.
-/// A gateway that runs on the bus overrides it: it switches a restarted cell to its last mode. Parameter 8, [events] in
-/// a skin, sets which changes count: `skinbus frame configure --write events`.
+/// A gateway that runs on the bus overrides it, because it switches a restarted cell back to the cell's last mode.
+/// Parameter 8, [events] in a skin, sets which changes count: `skinbus frame configure --write events`.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus frame sensing event --bus vcan0
   skinbus frame sensing continuous 62.5 --cell 12 --bus vcan0
   skinbus frame sensing off --skin skin.toml")]
 pub(super) struct SensingCommand {
-    /// When cells send their sensors
+    /// Times at which cells send their sensor values
     #[arg(value_parser = one_of(MODES))]
     mode: SensingMode,
     /// Rate in continuous mode: frames per second of each cell

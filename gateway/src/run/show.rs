@@ -1,4 +1,4 @@
-//! Table at the end of a run: the verdict and unusual values; all values if verbose.
+//! Table at the end of a run: the verdict and all unusual values; in verbose mode, all values.
 
 use std::cmp::Reverse;
 use std::fmt::Display;
@@ -14,11 +14,11 @@ use crate::print::{GREEN, PLAIN, RED, KeyValueTable, YELLOW, count, hanging, com
 
 /// Maximum number of halts listed one by one.
 const HALTS: usize = 10;
-/// Maximum number of a bus's conspicuous cells listed one by one.
+/// Maximum number of a bus's conspicuous cells that are listed one by one.
 const CELLS: usize = 5;
-/// Maximum number of lines of the verdict unless verbose.
+/// Maximum number of lines of the verdict, except in verbose mode.
 const LINES: usize = 6;
-/// Maximum width of a row's name unless verbose.
+/// Maximum width of a row's name in columns, except in verbose mode.
 const NAME: usize = 24;
 
 /// Display options of a run.
@@ -251,7 +251,7 @@ fn replies(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     }
 }
 
-/// Rows on sums, and the tree that carries them.
+/// Adds rows on sums, and on the tree that carries them.
 fn sums_on_the_bus(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     let Some(sums) = &bus.sums else { return };
     let counts = sums.counts;
@@ -289,7 +289,7 @@ fn unexplained(rows: &mut KeyValueTable, name: &str, value: impl Display, reason
     }
 }
 
-/// Rows on replies due, and on torques that were not due and so not compared, by reason.
+/// Adds rows on replies that were due, and on torques that were not due and so not compared, by reason.
 fn due(
     rows: &mut KeyValueTable,
     name: &str,
@@ -313,30 +313,30 @@ fn due(
     }
 }
 
-/// Row on the age of joints that cells have not received.
+/// Adds a row on the age of joints that cells have not received.
 fn joint_age_row(rows: &mut KeyValueTable, bus: &BusSummary) {
     let why = "large: busy machine; losses: see the bus";
     rows.row("joint age at heartbeat, µs", quantiles(&bus.joints_not_taken_us), why);
 }
 
-/// Formats a key of the summary as words.
+/// Converts a key of the summary to words.
 fn key_words(key: &str) -> String {
     key.replace('_', " ")
 }
 
-/// Formats the count of each kind.
+/// Formats the kinds with the count of each.
 fn each(kinds: impl IntoIterator<Item = (impl Display, impl Display)>) -> String {
     comma_separated(kinds.into_iter().map(|(kind, count)| format!("{count} {kind}")))
 }
 
-/// Formats the reasons that occurred, and always the number of unknown ones.
+/// Formats the counts of the reasons that occurred, and always the count of unknown ones.
 fn explained(reasons: &[(u64, impl Display)], unknown: u64) -> String {
     let known = reasons.iter().filter(|(count, _)| *count > 0);
     let known = known.map(|(count, why)| format!("{count} {why}"));
     comma_separated(known.chain([format!("{unknown} unknown")]))
 }
 
-/// Rows on the measuring cells of a bus, and on its most conspicuous cells.
+/// Adds rows on the measuring cells of a bus, and on its most conspicuous cells.
 fn noteworthy(rows: &mut KeyValueTable, bus: &BusSummary, all: &[CellSummary]) {
     let all = || all.iter().filter(|cell| cell.bus == bus.name);
     let measuring: Vec<_> = all().filter(|cell| cell.measures()).map(|cell| cell.node).collect();
@@ -397,7 +397,7 @@ fn frames(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
     }
 }
 
-/// Rows on the packets from the cells, by outcome.
+/// Adds rows on the packets from the cells, by what became of them.
 fn packets(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
     let up = &bus.uplink;
     rows.row("packets sent by cells", up.sent, "by their own count");
@@ -419,7 +419,7 @@ fn packets(rows: &mut KeyValueTable, bus: &BusSummary, lost: u64) {
 
 fn costs(rows: &mut KeyValueTable, summary: &Summary, is_verbose: bool) {
     let ProcessorUse { gateway, cells, buses } = summary.processor;
-    // Avoid -0.0.
+    // Adding 0.0 turns -0.0 into 0.0.
     let [gateway, cells, buses] = [gateway, cells, buses].map(|cores| cores.max(0.0) + 0.0);
     let cores = format!("{:.3}", gateway + cells + buses);
     if is_verbose {

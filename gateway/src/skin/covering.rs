@@ -1,4 +1,4 @@
-//! Cells on the visual meshes of links, for `skinbus skin import --cover`.
+//! Cells on the visual meshes of links: places them for `skinbus skin import --cover`.
 
 use std::ops::RangeInclusive;
 use std::path::Path;
@@ -42,7 +42,7 @@ struct KeptOut {
     link: String,
     min: [f64; 3],
     max: [f64; 3],
-    /// Original text of the option.
+    /// Text of the option that gave the box.
     text: String,
 }
 
@@ -53,7 +53,7 @@ fn pitch(text: &str) -> Result<f64, String> {
     pitch.ok_or_else(|| format!("a length from {MIN_PITCH} to {MAX_PITCH} m"))
 }
 
-/// Name of a link, without surrounding blanks.
+/// Parses the name of a link, and removes surrounding blanks.
 #[expect(clippy::unnecessary_wraps, reason = "a parser of clap's")]
 fn link(text: &str) -> Result<String, String> {
     Ok(text.trim().to_owned())
@@ -75,14 +75,14 @@ fn keep_out(text: &str) -> Result<KeptOut, String> {
     })
 }
 
-/// Result of the covering.
+/// Cells that cover the links, and figures about them.
 pub(super) struct Covered {
     pub(super) cells: Vec<CellOnLink>,
     pub(super) figures: Vec<LinkFigures>,
 }
 
 impl Covering {
-    /// Covers the links. A link belongs to the first chain that moves it, and each bus to one chain.
+    /// Covers the links with cells. A link belongs to the first chain that moves it, and each bus to one chain.
     pub(super) fn cells(&self, urdf: &Urdf, file: &Path, chains: &[UrdfChain]) -> Result<Covered, Failure> {
         let owners = self.owners(urdf, chains)?;
         let visuals = Visuals::new(urdf, file, &self.packages);
@@ -94,7 +94,7 @@ impl Covering {
                 let hint = if is_covered {
                     String::new()
                 } else {
-                    format!("; or take it as not there with --leave-out {name}")
+                    format!("; or treat it as absent with --leave-out {name}")
                 };
                 error + &hint
             })?;
@@ -156,7 +156,7 @@ impl Covering {
         Ok(covered)
     }
 
-    /// Chain of each covered link.
+    /// Returns for each covered link the index of its chain.
     fn owners(&self, urdf: &Urdf, chains: &[UrdfChain]) -> Result<Vec<usize>, Failure> {
         let moved = || {
             let on_path = urdf.links().filter(|link| chains.iter().any(|chain| chain.link(link).is_ok()));
@@ -205,7 +205,7 @@ impl Covering {
         }
     }
 
-    /// The options as given on the command line.
+    /// Returns the options as they were given on the command line.
     pub(super) fn command_options(&self) -> String {
         let Self { cover, pitch, leave_out, keep_out, seed, nodes_per_bus, packages: _ } = self;
         if cover.is_empty() {
@@ -222,18 +222,18 @@ impl Covering {
     }
 }
 
-/// Returns true if a link has a triangle with an area.
+/// Returns true if a link has any triangle that is not degenerate.
 fn has_area(link: &RobotLink) -> bool {
     let triangles = link.parts.iter().flat_map(|part| part.triangles(&Isometry3::identity()));
     triangles.into_iter().any(|[a, b, c]| (b - a).cross(&(c - a)).norm() > 0.0)
 }
 
-/// Reason why a link has no cell, in one line.
+/// Returns the reason why a link has no cell, in one line.
 fn without_cells(LinkFigures { name, outer_area, kept_out, .. }: &LinkFigures, is_flat: bool) -> String {
     let why = if is_flat {
         "its triangles have no area: correct its meshes, or take it out of --cover".to_owned()
     } else if *outer_area <= 0.0 {
-        "other links hide it all: take it out of --cover, or add those to --leave-out".to_owned()
+        "other links hide all of it: take it out of --cover, or add those to --leave-out".to_owned()
     } else if *kept_out >= 1.0 {
         "the boxes of --keep-out leave nothing of it: make them smaller, or take the link out of --cover"
             .to_owned()
@@ -245,7 +245,7 @@ fn without_cells(LinkFigures { name, outer_area, kept_out, .. }: &LinkFigures, i
     format!("--cover {name}: {why}")
 }
 
-/// Figures of a covered link, in one line.
+/// Returns the figures of a covered link, in one line.
 pub(super) fn reported(figures: &LinkFigures) -> String {
     let LinkFigures { name, cells, outer_area, kept_out: _, covered, spacing, tilt } = figures;
     let spacing =

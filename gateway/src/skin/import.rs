@@ -110,7 +110,7 @@ impl Import {
         Ok(())
     }
 
-    /// Command that made the skin, with file names but without directories.
+    /// Returns the command that creates the skin, with the names of files but without their directories.
     fn command(&self) -> String {
         let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let mut command = format!("skinbus skin import {}", name(&self.urdf));
@@ -138,10 +138,10 @@ fn reported(chain: &UrdfChain) -> String {
     )
 }
 
-/// Limit in rad, either way, above which an angle is probably in degrees.
+/// Limit in rad, in both directions, above which an angle is probably in degrees.
 const WIDE_RAD: f64 = 8.0 * core::f64::consts::PI;
 
-/// Joints whose limits are probably in degrees, one line each.
+/// Returns the joints whose limits are probably in degrees, one line each.
 fn wide(chain: &UrdfChain) -> impl Iterator<Item = String> {
     let turning = chain.joints.iter().filter(|joint| joint.kind == JointKind::Revolute);
     let wide = turning.filter(|joint| joint.limits.iter().any(|limit| limit.abs() > WIDE_RAD));
@@ -158,7 +158,7 @@ fn text(path: &Path) -> Result<String, Failure> {
     document::read_text(path).map_err(Failure::usage)
 }
 
-/// Reads the cells of a file.
+/// Reads the cells from a CSV file.
 fn cells(path: &Path) -> Result<Vec<CellOnLink>, Failure> {
     let file = path.display().to_string();
     let text = text(path)?;

@@ -14,7 +14,7 @@ use super::super::robot_file::urdf_of;
 use super::super::surface::shells;
 use super::super::visuals::Packages;
 
-/// Maximum number of triangles of a robot in a page; larger meshes are simplified.
+/// Maximum number of triangles of the robot in a page; larger meshes are simplified.
 const TRIANGLES: usize = 12_000;
 
 /// Draw a skin in 3D, as one self-contained HTML page
@@ -54,7 +54,7 @@ impl Show {
     }
 }
 
-/// Returns the skin of a file as a page shows it.
+/// Reads the meshes of a skin's robot, and returns the skin as a page shows it.
 pub(crate) fn still(file: &Path, skin: &Skin, packages: &Packages) -> Still {
     let position = |[min, max]: [f64; 2]| 0.0_f64.clamp(min, max);
     Still {

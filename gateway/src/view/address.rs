@@ -20,8 +20,8 @@ pub(super) struct AddressFile {
 }
 
 impl AddressFile {
-    /// Writes an address to a new file, or in place of the file of an earlier page. Writes to a pipe, a terminal, or
-    /// for `-` to standard output without creating a file.
+    /// Writes an address to a new file, or replaces the file that an earlier page left. Writes to a pipe, to a
+    /// terminal, or for `-` to standard output, without creating a file.
     pub(super) fn write(path: &Path, url: &str) -> Result<Option<Self>, Failure> {
         let text = format!("{url}\n");
         if path == Path::new("-") {
@@ -31,10 +31,10 @@ impl AddressFile {
             |error: io::Error| Failure::usage(format!("--address-file {}: {error}", path.display()));
         let is_file = fs::symlink_metadata(path).is_ok_and(|about| about.is_file());
         if is_file && !is_address(path) {
-            let why = "it exists, and is no page's address: name another file";
+            let why = "it exists and does not contain the address of a page: name another file";
             return Err(refused(io::Error::new(io::ErrorKind::AlreadyExists, why)));
         }
-        // For a symlink, the error would otherwise name an option that does not exist.
+        // Without this check, the error for a symlink would name an option that does not exist.
         let is_there = is_file || path.is_symlink();
         let (whole, mut file) = WholeFile::create(path, is_there).map_err(refused)?;
         let is_stream = whole.is_stream();
@@ -55,14 +55,14 @@ impl AddressFile {
 
 impl Drop for AddressFile {
     fn drop(&mut self) {
-        // Another page may have replaced the file.
+        // Remove the file only if no other page has replaced it.
         if start_of(&self.path).is_ok_and(|text| text == self.text) {
             let _ = fs::remove_file(&self.path);
         }
     }
 }
 
-/// Returns true if the file was left by an earlier page.
+/// Returns true if an earlier page left the file.
 fn is_address(path: &Path) -> bool {
     start_of(path).is_ok_and(|text| text.starts_with("http://") && text.lines().count() == 1)
 }

@@ -11,7 +11,8 @@ use view::Token;
 
 use crate::output::note;
 
-/// Environment variable of the token. A run passes its page's token in it, because only its user can read it there.
+/// Environment variable that holds the token. A run passes the token to its page in it, because only the same user can
+/// read it there.
 pub(super) const VARIABLE: &str = "SKINBUS_TOKEN";
 /// Maximum number of bytes read from a token file.
 const LONGEST_FILE: u64 = 4096;
@@ -24,7 +25,7 @@ pub(super) fn chosen(file: Option<&Path>) -> Result<Option<Token>, Failure> {
     }
 }
 
-/// Returns the token that a page must have: a page that acts, or that other machines can reach, always has one.
+/// Returns the token that a page must have. A page that can act, or that other machines can reach, always has one.
 pub(super) fn needed(
     chosen: Option<Token>,
     acts: bool,

@@ -284,7 +284,7 @@ fn wrong_use_is_one_line_and_exit_code_2() {
         assert!(said.starts_with(expected), "{said}");
     }
     let said = refusal("list", 2);
-    assert!(said.starts_with("skinbus: there is no command list; there are demo, run, "), "{said}");
+    assert!(said.starts_with("skinbus: there is no command list; the commands are demo, run, "), "{said}");
     assert!(said.contains(", cells, "), "{said}");
     let skin = format!("{}/Cargo.toml", env!("CARGO_MANIFEST_DIR"));
     let said = refusal(&format!("dump {skin}"), 1);

@@ -377,9 +377,9 @@ fn what_is_no_recording_is_named() {
     let says = |bytes: &[u8]| recovered(bytes).unwrap_err().to_string();
     assert_eq!(
         says(b"PK\x03\x04 and so on"),
-        "it is no MCAP file: it begins with 50 4b 03 04 20 61 6e 64, an MCAP file with 89 4d 43 41 50: name a recording"
+        "it is not an MCAP file: it begins with 50 4b 03 04 20 61 6e 64, but MCAP begins with 89 4d 43 41 50; name a recording"
     );
-    assert_eq!(says(b""), "it ends within its first 0 bytes: there is nothing in it");
+    assert_eq!(says(b""), "it ends after 0 bytes, before its first message, so nothing can be recovered");
 }
 
 fn gateway(folder: &Path, words: &str) -> Output {
@@ -422,7 +422,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     let begun = usize::try_from(Summary::read(&bytes).unwrap().unwrap().chunk_indexes[1].chunk_start_offset);
     fs::write(path("begun.mcap"), &bytes[..begun.unwrap() + 40]).unwrap();
     let said = says("recover begun.mcap", 1);
-    assert!(said.starts_with("skinbus: begun.mcap: no message came back: 0 messages"), "{said}");
+    assert!(said.starts_with("skinbus: begun.mcap: no message could be recovered: 0 messages"), "{said}");
     assert!(!path("begun-recovered.mcap").exists());
     let index = Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
     let [from, to] = [1, 4].map(|at| usize::try_from(index[at].chunk_start_offset).unwrap());
@@ -444,7 +444,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     assert_eq!(says("recover whole.mcap -o whole.mcap --overwrite", 2), itself);
     assert!(
         says("recover a.zip", 1)
-            .starts_with("skinbus: a.zip: it is no MCAP file: it begins with 50 4b 03 04")
+            .starts_with("skinbus: a.zip: it is not an MCAP file: it begins with 50 4b 03 04")
     );
     assert!(says("recover -", 2).ends_with("name one with -o"));
     assert!(says("recover gone.mcap", 2).contains("gone.mcap: No such file"));

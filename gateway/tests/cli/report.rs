@@ -147,7 +147,7 @@ fn a_log_gives_the_accounts_of_the_recording_of_the_same_run_and_names_what_it_l
     assert_eq!(replies(&of_log), replies(&of_run));
     for text in [
         format!("Not in a log: {lacks}."),
-        "Not in a log: joint velocities, as joints frames have positions.".to_owned(),
+        "Not in a log: joint velocities, because joints frames contain only positions.".to_owned(),
         "Not in a log: the durations of ticks and of the central computation".to_owned(),
         "Not in a log: skipped ticks and bad cycles.".to_owned(),
         "skinbus view classic.log --skin classic.toml --at ".to_owned(),

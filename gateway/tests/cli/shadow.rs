@@ -117,7 +117,7 @@ fn what_has_no_frame_and_what_is_no_capture_is_said_in_one_line() {
         ("fit .", 2, "skinbus: . is a directory"),
         ("fit nowhere", 2, "skinbus: there is no file nowhere, and as a bus: "),
         ("fit run.log notes.txt", 2, "skinbus: notes.txt contains no frames: name only captures"),
-        ("fit run.log vcan0", 2, "skinbus: run.log, vcan0: one file, the parts of one recording, or buses"),
+        ("fit run.log vcan0", 2, "skinbus: run.log, vcan0: name one file, the parts of one recording"),
         ("fit run.log --duration 3", 2, "skinbus: --duration is for live buses"),
         ("fit run.log --nominal 2M", 2, "skinbus: nominal bit rate 2000000 bit/s: CAN allows"),
         ("fit run.log --data 9M", 2, "skinbus: data bit rate 9000000 bit/s: CAN FD allows"),

@@ -1,4 +1,5 @@
-//! Files of the bench: captures in both formats, recordings of runs, and files that are replaced atomically.
+//! Reads and writes the files of the bench: captures in both formats, recordings of runs, and files that are replaced
+//! atomically.
 //!
 //! | module | what |
 //! |---|---|

@@ -1,26 +1,26 @@
-//! Notes between the frames of a capture: comments, lost frames, lines that are not frames.
+//! Notes of a capture: comments, reports of lost frames, and lines that are not frames.
 
-/// An entry between the frames of a capture.
+/// An entry of a capture that is not a frame but has a position between frames.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Note<'a> {
     /// The kind of the note.
     pub kind: NoteKind,
-    /// The time, in ns since 1970. In a log, the time of the frame before it, or 0 before the first frame.
+    /// The time, in ns since 1970. In a log this is the time of the preceding frame, or 0 before the first frame.
     pub nanos: u64,
-    /// The bus that the note is about, or empty.
+    /// The bus that the note is about; empty if it is about none.
     pub interface: &'a str,
     /// The line number in a log, from 1; 0 if the note does not come from a log.
     pub line: u64,
-    /// The line as it stands in the log, without its end; or a text of the recorder.
+    /// The line of the log without its line end, or the text that the recorder wrote.
     pub text: &'a [u8],
 }
 
 /// The kind of a note.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum NoteKind {
-    /// A comment, an empty line, or anything else that can-utils skip too.
+    /// A comment, an empty line, or another line that can-utils ignore too.
     Text,
-    /// The number of frames that the recorder of the capture lost here.
+    /// A report that the recorder lost this number of frames here.
     Dropped(u64),
     /// A CAN XL frame, which is not decoded.
     CanXl,
@@ -28,8 +28,8 @@ pub enum NoteKind {
     Unreadable(String),
 }
 
-/// A recorder's note on the state of a bus. Frames of the bus are missing between [`BusNote::Lost`] and
-/// [`BusNote::Back`].
+/// A change in the state of a bus, as noted by the recorder. The capture has no frames of the bus between
+/// [`BusNote::Lost`] and [`BusNote::Back`].
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum BusNote {
     /// The bus was lost.
@@ -54,7 +54,7 @@ impl BusNote {
         format!("{START}{bus}{}", self.end())
     }
 
-    /// Parses a note. Returns the bus and its new state, or `None` if the note is another one.
+    /// Parses a note. Returns the bus and its new state, or `None` if the note is not about the state of a bus.
     #[must_use]
     pub fn parse<'a>(note: &Note<'a>) -> Option<(&'a str, Self)> {
         let text = core::str::from_utf8(note.text).ok().filter(|_| note.kind == NoteKind::Text)?;

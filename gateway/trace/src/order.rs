@@ -11,19 +11,20 @@
 
 use std::collections::BTreeMap;
 
-/// The age at which a frame is released, in ns: a frame waits until one that is newer by this much has been read.
+/// The time for which a frame waits for older ones, in ns: it is released when a frame newer by this much has been
+/// read.
 pub const WINDOW_NS: u64 = 1_000_000_000;
 /// The maximum number of waiting frames.
 pub const WINDOW_FRAMES: usize = 8_192;
 
-/// The next frame to be sent.
+/// A frame that is released for sending.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct ReleasedFrame<T> {
-    /// The time to send it, by the capture's clock; never before that of the frame before it.
+    /// The time to send the frame, by the capture's clock. It is never before the time of the preceding frame.
     pub send_nanos: u64,
     /// The frame's own time.
     pub nanos: u64,
-    /// True if a newer frame was released before it; the frame is then sent at once.
+    /// True if a newer frame was already released, so that the frame is out of order and is sent at once.
     pub is_late: bool,
     /// The frame.
     pub item: T,
@@ -32,14 +33,14 @@ pub struct ReleasedFrame<T> {
 /// Merges buses by time.
 #[derive(Clone, Debug)]
 pub struct BusMerger<T> {
-    /// Waiting frames with their own times. The key is the time, or the latest time before it on the same bus, and the
-    /// position in the capture.
+    /// The waiting frames, each with its own time. A frame is sorted by its time, but never before an earlier frame of
+    /// its bus; frames with equal times are sorted by their position in the capture.
     waiting: BTreeMap<(u64, u64), (u64, T)>,
     /// The latest time so far on each bus.
     buses: Vec<u64>,
     places: u64,
     newest: u64,
-    /// The time of the last released frame.
+    /// The time of the frame that was released last.
     released: u64,
 }
 
@@ -64,7 +65,7 @@ impl<T> BusMerger<T> {
         self.newest = self.newest.max(nanos);
     }
 
-    /// Returns the next frame, if it need not wait longer.
+    /// Returns the next frame in order of time. Returns `None` if an older frame may still be read from the capture.
     pub fn pop(&mut self) -> Option<ReleasedFrame<T>> {
         let (&(key, _), _) = self.waiting.first_key_value()?;
         let waits = self.newest.saturating_sub(key) <= WINDOW_NS && self.waiting.len() <= WINDOW_FRAMES;
@@ -91,7 +92,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// Returns all released frames with their bus and position.
+    /// Returns all frames in the order of their release, each with its bus and its position in the capture.
     fn merged(frames: &[(usize, u64)]) -> Vec<ReleasedFrame<(usize, usize)>> {
         let mut order = BusMerger::default();
         let mut out = Vec::new();
@@ -162,7 +163,7 @@ mod tests {
         fn disorder_within_the_window_is_repaired(
             steps in proptest::collection::vec((0_usize..3, 1_u64..50, 0_u64..900), 1..200),
         ) {
-            // Each bus by itself is in order, and is read up to 0.9 s late.
+            // The frames of each bus are in order. Each bus is read up to 0.9 s late.
             let mut buses = [Vec::new(), Vec::new(), Vec::new()];
             let mut now = 0;
             for (bus, step, late) in steps {

@@ -4,11 +4,11 @@ use serde::Deserialize;
 
 use crate::tape::EventKind;
 
-/// A command of a page.
+/// A command that a page has sent to the server.
 #[derive(Clone, Debug, Deserialize, PartialEq)]
 #[serde(tag = "do", rename_all = "lowercase", deny_unknown_fields)]
 pub enum Command {
-    /// Presses this cell, and releases any other cell that this page presses.
+    /// Presses this cell. Releases the cell that the page pressed before.
     Press {
         /// The cell's bus, as an index into the skin's buses.
         bus: usize,
@@ -17,19 +17,19 @@ pub enum Command {
         /// The force in N.
         force_n: f64,
     },
-    /// Releases the cell that this page presses.
+    /// Releases the cell that the page presses.
     Release,
     /// Halts all cells.
     Halt,
-    /// Resumes all cells.
+    /// Lets all halted cells continue.
     Resume,
-    /// Requests the details of a cell with each status message.
+    /// Selects the cell whose details the page gets with each status message.
     Choose(SelectedCell),
-    /// Ends the request for details.
+    /// Ends the selection of a cell, so that status messages have no details.
     Unchoose,
-    /// A command to the run that the page belongs to.
+    /// A command to the bench that the page shows.
     Bench(bench::remote::BenchCommand),
-    /// Plays a recording.
+    /// Plays the recording from the present position on.
     Play {
         /// Playback speed: seconds of the recording per second.
         speed: f64,
@@ -38,7 +38,7 @@ pub enum Command {
     Pause,
     /// Seeks to a position.
     Seek {
-        /// Seconds of the run, or since the first frame if the recording has no run.
+        /// The position in s of the run, or in s since the first frame if the recording has no run.
         at_s: f64,
     },
     /// Steps by one epoch.
@@ -68,11 +68,11 @@ pub struct SelectedCell {
     pub frame: Option<u64>,
 }
 
-/// The maximum length of a page's message, in bytes.
+/// The maximum length of a message from a page, in bytes.
 pub const MAX_MESSAGE_BYTES: usize = 512;
 
 impl Command {
-    /// Parses a message; returns `None` if it is not a command.
+    /// Parses a message from a page. Returns `None` if it is not a command.
     #[must_use]
     pub fn parse(text: &str) -> Option<Self> {
         if text.len() > MAX_MESSAGE_BYTES {
@@ -81,13 +81,13 @@ impl Command {
         serde_json::from_str(text).ok()
     }
 
-    /// Returns true if the command changes what cells do.
+    /// Returns true if the command affects cells or the bench.
     #[must_use]
     pub const fn affects_cells(&self) -> bool {
         matches!(self, Self::Press { .. } | Self::Release | Self::Halt | Self::Resume | Self::Bench(_))
     }
 
-    /// Returns true if the command changes the position in a recording.
+    /// Returns true if the command controls the playback of a recording.
     #[must_use]
     pub const fn controls_playback(&self) -> bool {
         matches!(

@@ -1,8 +1,8 @@
-//! The index of a recording: snapshots of its state at intervals, and its events. One pass over the recording builds
-//! it.
+//! The index of a recording: the state of the skin at intervals, and the recording's events. It is built in one pass
+//! over the recording.
 //!
-//! A position is shown from the last [`Kept`] state before it. The counts at a position are exact only after the index
-//! has passed it.
+//! To show a position, the player continues from the last [`Kept`] state before it. Counts, such as those of losses,
+//! are exact only at positions that the index has already passed.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -13,20 +13,20 @@ use trace::capture::{CaptureError, SeekPoint, Reader};
 use crate::locked;
 use crate::tape::{Event, EventKind, TapeStep, Tape, EventDetector};
 
-/// The approximate memory limit for all kept states, in bytes.
+/// The approximate maximum memory for all stored states, in bytes.
 const MEMORY_LIMIT: usize = 256 << 20;
-/// The approximate size of a kept state per bus and per cell.
+/// The approximate size of a stored state in bytes: this much for each bus, and `CELL_BYTES` for each cell.
 const BUS_BYTES: usize = 1 << 20;
 const CELL_BYTES: usize = 4 << 10;
-/// The initial interval between kept states, in ns. It doubles whenever the limit is reached.
+/// The interval between stored states at first, in ns. It doubles whenever the memory limit is reached.
 const SPACING_NS: u64 = 2_000_000_000;
 
-/// The state of a recording at a position, and the place where reading continues.
+/// The state of the skin at a position of a recording, and the place in the file where reading continues.
 #[derive(Debug)]
 pub struct Checkpoint {
-    /// The state up to this position.
+    /// The tape with the state at this position.
     pub tape: Tape,
-    /// The place of the next entry.
+    /// The place in the file of the next entry.
     pub place: SeekPoint,
 }
 
@@ -45,25 +45,26 @@ struct Inner {
     others: u64,
 }
 
-/// The progress of an index.
+/// The progress of building an index.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Progress {
     /// The position up to which the recording is indexed, in ns since 1970.
     pub at: u64,
-    /// True if that is the end of the recording.
+    /// True if the whole recording is indexed.
     pub is_over: bool,
-    /// The error that ended the reading early.
+    /// The error because of which the index ends early.
     pub failed: Option<String>,
-    /// The part that is missing at the end of the recording.
+    /// A description of what is missing at the end of the recording, if it was never finished.
     pub unfinished: Option<String>,
     /// The number of frames on buses that the skin does not have.
     pub others: u64,
-    /// The number of events so far.
+    /// The number of events found so far.
     pub events: usize,
 }
 
 impl Index {
-    /// Indexes a recording from its first frame to its end, or until `stop`. Seconds count from `zero`.
+    /// Indexes a recording from its first frame to its end, or until `stop` is set. `first` is the time of the first
+    /// frame and `zero` the one from which seconds count, both in ns since 1970.
     pub fn build(&self, mut reader: Reader, skin: Skin, (first, zero): (u64, u64), stop: &AtomicBool) {
         let count = MEMORY_LIMIT / (skin.buses.len() * BUS_BYTES + skin.cells.len() * CELL_BYTES).max(1);
         let mut spacing = SPACING_NS;
@@ -114,7 +115,7 @@ impl Index {
         locked(&self.0).failed = Some(error.to_string());
     }
 
-    /// Returns the progress so far.
+    /// Returns how much of the recording is indexed, and what was found so far.
     #[must_use]
     pub fn progress(&self) -> Progress {
         let inner = locked(&self.0);
@@ -123,7 +124,7 @@ impl Index {
         Progress { at, is_over, failed, unfinished, others, events: inner.events.len() }
     }
 
-    /// Returns the last kept state at or before a moment.
+    /// Returns the last stored state at or before the time `at`, in ns since 1970.
     #[must_use]
     pub fn checkpoint_before(&self, at: u64) -> Option<Arc<Checkpoint>> {
         let inner = locked(&self.0);
@@ -131,7 +132,8 @@ impl Index {
         inner.checkpoints.get(place).cloned()
     }
 
-    /// Returns the time of the next event of a kind after a moment, or of the last one before it.
+    /// Returns the time of the first event of a kind after `from`, or with `forward` false that of the last one before
+    /// it.
     #[must_use]
     pub fn find_event(&self, kind: EventKind, from: u64, forward: bool) -> Option<u64> {
         let inner = locked(&self.0);
@@ -139,8 +141,8 @@ impl Index {
         if forward { of_kind.find(|at| *at > from) } else { of_kind.rev().find(|at| *at < from) }
     }
 
-    /// Divides the time between two moments into equal parts, and returns the numbers of the parts with events of a
-    /// kind.
+    /// Divides the time from `from` to `to` into `parts` equal parts. Returns the numbers of the parts in which events
+    /// of a kind occur.
     #[must_use]
     pub fn marks(&self, kind: EventKind, (from, to): (u64, u64), parts: u16) -> Vec<u16> {
         let inner = locked(&self.0);

@@ -6,16 +6,16 @@
 //!     └── stimuli ── Pressed <──────── commands ─────────────┘
 //! ```
 //!
-//! The view receives on the buses like any other node, so that it does not disturb a control loop beside it, and shows
-//! exactly what the buses carry. Touches are stimuli on the bus, which cells in test mode obey.
+//! The view only receives on the buses, like any other node. It therefore does not disturb a control loop, and shows
+//! what the buses actually carry. A touch on the page becomes a stimulus on the bus, which cells in test mode obey.
 //!
-//! Recordings use the same path: [`tape`] applies the frames up to a moment to [`Live`], [`index`] keeps intermediate
-//! states, and [`player`] continues from one of them to any moment.
+//! A recording is shown in the same way: [`tape`] applies its frames to [`Live`] up to a position in time, [`index`]
+//! stores the state at intervals, and [`player`] continues from a stored state to any position.
 //!
-//! A skin without its buses is a [`Still`]: one file with the same scene, drawn by the same modules of the page.
+//! A skin without buses is shown as a [`Still`]: one HTML file with the same scene, drawn by the same scripts.
 //!
-//! [`live`], [`pressed`], [`scene`], [`still`], [`surface`], [`command`] and [`tape`] use neither sockets nor clocks;
-//! [`server`], [`serve`] and [`play`] are the shell around them.
+//! [`live`], [`pressed`], [`scene`], [`still`], [`surface`], [`command`] and [`tape`] use neither sockets nor clocks.
+//! [`server`], [`serve`] and [`play`] do the input and output for them.
 
 pub mod command;
 pub mod index;
@@ -40,7 +40,7 @@ pub use still::{MovedCell, Still};
 pub use surface::RowMesh;
 pub use token::Token;
 
-/// Locks a mutex, also after a thread that held it has panicked.
+/// Locks a mutex, even if a thread has panicked while it held the lock.
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,4 +1,4 @@
-//! The state of a skin, built from the frames on its buses.
+//! The state of a skin and its cells, computed from the frames on the buses.
 
 mod bus;
 mod recent;
@@ -16,22 +16,22 @@ pub use self::said::{TorqueReply, BusStatus, DeadCell, CellDetail, Gains, Status
 use crate::pressed::{CellKey, TouchRegistry};
 use protocol::message::SkinSensors;
 
-/// The state of a skin, as seen on its buses.
+/// The state of a skin and its cells, as the frames on the buses show it.
 #[derive(Clone, Debug)]
 pub struct Live {
     skin: Skin,
     buses: Vec<LiveBus>,
-    /// For each cell of the skin: its bus, and its index on that bus.
+    /// For each cell of the skin: the index of its bus, and the index of the cell on that bus.
     places: Vec<(usize, usize)>,
     number: u32,
-    /// The time of the first frame.
+    /// The time of the first frame; `None` before it.
     began: Option<Micros>,
-    /// The bus whose joints count as epochs: the first bus that carries joints.
+    /// The index of the bus whose joints count as epochs: the first bus on which joints were received.
     clock: Option<usize>,
     recent: RecentFrames,
 }
 
-/// The flags of a cell in a snapshot.
+/// The bits that describe a cell in a snapshot.
 mod flag {
     pub(super) const UNCONFIGURED: u8 = 1;
     pub(super) const OTHER_CONFIGURATION: u8 = 2;
@@ -42,7 +42,7 @@ mod flag {
 }
 
 impl Live {
-    /// Creates the state before any frame.
+    /// Creates the state of a skin of which no frame has been received yet.
     #[must_use]
     pub fn new(skin: Skin) -> Self {
         let buses: Vec<_> = (0..skin.buses.len()).map(|bus| LiveBus::new(&skin, bus)).collect();
@@ -55,7 +55,7 @@ impl Live {
         Self { places: places.collect(), skin, buses, number: 0, began: None, clock: None, recent }
     }
 
-    /// Creates the state before any frame, with times that count from `began`.
+    /// Creates the state of a skin of which no frame has been received yet. Times count from `began`.
     #[must_use]
     pub fn with_start(skin: Skin, began: Micros) -> Self {
         Self { began: Some(began), ..Self::new(skin) }
@@ -67,7 +67,7 @@ impl Live {
         &self.skin
     }
 
-    /// Applies the frames that were latched when a recording began, each with its bus index. Counters start after them.
+    /// Applies frames that were latched when a recording began, each with the index of its bus. They are not counted.
     pub fn apply_latched<'a>(&mut self, at: Micros, latched: impl Iterator<Item = (usize, &'a Frame)>) {
         for (index, frame) in latched {
             if let Some(bus) = self.buses.get_mut(index) {
@@ -78,7 +78,7 @@ impl Live {
         self.buses.iter_mut().for_each(LiveBus::begin_accounts);
     }
 
-    /// Applies a frame of a bus. Returns true if an epoch begins with it.
+    /// Applies a frame of the bus with this index. Returns true if the frame begins an epoch.
     pub fn apply_frame(&mut self, bus: usize, at: Micros, frame: &Frame) -> bool {
         self.began.get_or_insert(at);
         let Some(of) = self.buses.get_mut(bus) else { return false };
@@ -90,18 +90,18 @@ impl Live {
         joints && self.clock == Some(bus)
     }
 
-    /// Drops the frames of the last seconds.
+    /// Drops the stored frames of the last seconds, which the page lists for a cell.
     pub fn forget_recent(&mut self) {
         self.recent.clear();
     }
 
-    /// Returns for each bus the total of all losses so far, and true if the bus is halted.
+    /// Returns for each bus the number of all losses so far, and true if the bus is halted.
     pub fn losses(&self) -> impl Iterator<Item = (u64, bool)> {
         self.buses.iter().map(|bus| (bus.losses(), bus.halted))
     }
 
-    /// Returns for each cell its bus, its node id, and two flags: touched (by its sensors, or by its torque if the
-    /// sensors are unknown), and dead.
+    /// Returns each cell by bus and node id, with two flags: touched and dead. A cell is touched if its sensors show
+    /// it, or if its torque does while the sensor values are unknown.
     pub fn touched(&self, now: Micros) -> impl Iterator<Item = (usize, CellId, [bool; 2])> {
         self.buses.iter().enumerate().flat_map(move |(index, bus)| {
             let cells = bus.table.cells().iter().zip(bus.table.sensors(now)).enumerate();
@@ -113,14 +113,14 @@ impl Live {
         })
     }
 
-    /// Returns the distributed and the central torque of each joint of the robot in the last completed epoch, in Nm or
-    /// N.
+    /// Returns two torques for each joint of the robot in the last completed epoch, in Nm or N: the distributed and the
+    /// central one.
     #[must_use]
     pub fn torques(&self) -> Vec<[f64; 2]> {
         self.joint_rows().into_iter().map(|[_, distributed, central]| [distributed, central]).collect()
     }
 
-    /// Returns the position, the distributed and the central torque of each joint of the robot.
+    /// Returns three values for each joint of the robot: position, distributed torque and central torque.
     fn joint_rows(&self) -> Vec<[f64; 3]> {
         let mut rows = vec![[0.0_f64; 3]; self.skin.robot.joints.len()];
         for (index, bus) in self.buses.iter().enumerate() {
@@ -134,19 +134,21 @@ impl Live {
         rows
     }
 
-    /// Sets the state of a bus: true if it is open and works, and the number of frames that were not received.
+    /// Sets the state of a bus: whether it is open and works, and the number of frames that this program did not
+    /// receive.
     pub fn set_bus(&mut self, bus: usize, is_up: bool, dropped: u64) {
         if let Some(bus) = self.buses.get_mut(bus) {
             bus.set_up(is_up, dropped);
         }
     }
 
-    /// Advances the time.
+    /// Sets the time, by which cells become silent and loads are measured.
     pub fn handle_time(&mut self, now: Micros) {
         self.buses.iter_mut().for_each(|bus| bus.handle_time(now));
     }
 
-    /// Returns the key of a cell if the skin has it and it may be pressed: it has reported test mode.
+    /// Returns the bus index and node id of a cell if it may be pressed: it belongs to the skin and has reported test
+    /// mode.
     #[must_use]
     pub fn pressable_cell(&self, bus: usize, node: u8) -> Option<CellKey> {
         let node = CellId::new(node.into()).ok()?;
@@ -154,13 +156,13 @@ impl Live {
         (cell.measures() == Some(false)).then_some((bus, node))
     }
 
-    /// Returns the sensor words that a cell has latched, as far as the bus shows them.
+    /// Returns the sensor values of the stimulus that a cell has latched, as far as the frames on the bus show it.
     #[must_use]
     pub fn latched(&self, (bus, node): CellKey, now: Micros) -> Option<SkinSensors> {
         self.buses.get(bus)?.sensors(node, now)
     }
 
-    /// Encodes the next snapshot: all values that change fast.
+    /// Encodes the next snapshot: the time, the state of each joint, and the state of each cell.
     ///
     /// | bytes | content |
     /// |---|---|

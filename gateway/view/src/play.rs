@@ -1,4 +1,4 @@
-//! The shell around a recording: its player, a thread for its index, and the server.
+//! Plays a recording to pages: runs the player, a thread that builds the index, and the server.
 
 use std::collections::BTreeMap;
 use std::net::TcpListener;
@@ -23,35 +23,35 @@ use crate::tape::EventKind;
 
 /// The interval between snapshots.
 const SNAPSHOT_INTERVAL: Duration = Duration::from_millis(33);
-/// The number of snapshots per status message.
+/// The number of snapshots between two status messages.
 const SNAPSHOTS_PER_STATUS: u64 = 6;
-/// The number of parts of the time line in which events are marked.
+/// The number of equal parts of the time line that are marked if they contain events.
 const TIMELINE_PARTS: u16 = 600;
 
-/// The recording to play, and the server's settings.
+/// The recording to be played, and the settings of the server.
 #[derive(Debug)]
 pub struct Options {
-    /// A candump log, or the parts of an MCAP recording.
+    /// A candump log, or all parts of an MCAP recording.
     pub paths: Vec<PathBuf>,
-    /// The skin that was recorded.
+    /// The skin whose buses were recorded.
     pub skin: Skin,
-    /// The robot's surface, if known.
+    /// The surface of the robot's links; empty if it is unknown.
     pub surface: Vec<RowMesh>,
     /// The socket that pages connect to.
     pub listener: TcpListener,
-    /// The pages' rights and token.
+    /// The rights of the pages, and the token that they need.
     pub access: Access,
-    /// The position at which to pause initially, in s of the run, or since the first frame. Without it, playback starts
-    /// at the beginning.
+    /// The position at which playback is paused at first, in s of the run or in s since the first frame. If it is
+    /// `None`, playback starts at the beginning.
     pub at_s: Option<f64>,
 }
 
-/// Plays a recording until `stop`. Calls `is_served` once the page is served, and `warns` with each defect of the
+/// Plays a recording until `stop` is set. Calls `is_served` once pages can connect, and `warns` with each defect of the
 /// recording when it is found.
 ///
 /// # Errors
-/// Returns an error if the system refuses a thread, or the recording cannot be read or is damaged. Of a damaged
-/// recording, the page shows the part before the damage.
+/// Returns an error if a thread cannot be started, or if the recording cannot be read or is damaged. The pages show the
+/// part before the damage.
 pub fn play(
     options: Options,
     stop: &AtomicBool,
@@ -86,7 +86,7 @@ pub fn play(
     index.progress().failed.map_or_else(|| Ok(server.counts()), |what| Err(PlayError::Damaged(what).into()))
 }
 
-/// Publishes the player's state to the pages, and carries out their commands.
+/// Sends the state of the player to the pages, and executes their commands.
 fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
     let nobody = TouchRegistry::default();
     let (mut next, mut before) = (Instant::now(), Instant::now());
@@ -97,7 +97,7 @@ fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
         let commands: Vec<_> = server.commands().map(|(_, command)| command).collect();
         let mut is_changed = !commands.is_empty();
         for (place, command) in commands.iter().enumerate() {
-            // A slider sends many positions: only the last of a series counts.
+            // A slider sends many positions. Only the last of consecutive ones is used.
             let is_passed = matches!(commands.get(place + 1), Some(Command::Seek { .. }));
             if matches!(command, Command::Seek { .. }) && is_passed {
                 continue;
@@ -145,7 +145,7 @@ fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
     }
 }
 
-/// Carries out a page's command.
+/// Executes a command of a page.
 fn execute(player: &mut Player, command: &Command) -> Result<(), String> {
     let done = match *command {
         Command::Play { speed } => {
@@ -159,7 +159,7 @@ fn execute(player: &mut Player, command: &Command) -> Result<(), String> {
         Command::Seek { at_s } => player.seek(at_s),
         Command::Step { forward } => player.step(forward),
         Command::Jump { to, forward } => player.jump(to, forward).map(|_| ()),
-        // A recording cannot be pressed or halted, and the server handles the other commands.
+        // The cells of a recording cannot be pressed or halted. The server handles the remaining commands.
         Command::Press { .. }
         | Command::Release
         | Command::Halt

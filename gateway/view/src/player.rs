@@ -1,4 +1,4 @@
-//! The player of a recording: a position in it, and the state there.
+//! The player of a recording: the present position, the state of the skin there, and moves to other positions.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::PathBuf;
@@ -14,19 +14,19 @@ use crate::index::{Index, Checkpoint};
 use crate::live::Live;
 use crate::tape::{EventKind, TapeStep, Tape};
 
-/// The time before a position for which the plots have values, in ns.
+/// The time before a position for which the plots get values, in ns.
 const HISTORY_NS: u64 = 10_000_000_000;
-/// The same where the index has not reached the position yet.
+/// The time before a position for which the plots get values if the index has not passed the position yet, in ns.
 const PREVIEW_NS: u64 = 3_000_000_000;
-/// The interval between two values of a plot, in ns.
+/// The time between two values of a plot, in ns.
 const SAMPLE_NS: u64 = 20_000_000;
-/// The minimum and the maximum speed.
+/// The minimum and the maximum playback speed, in s of the recording per s.
 const SPEED_RANGE: [f64; 2] = [0.01, 100.0];
 
-/// The time, and the distributed and the central torque of each joint.
+/// A time in ns since 1970, and the distributed and the central torque of each joint at that time.
 type Sample = (u64, Vec<[f64; 2]>);
 
-/// A recording at a position.
+/// A recording that is played, with its present position.
 #[derive(Debug)]
 pub struct Player {
     skin: Skin,
@@ -36,67 +36,67 @@ pub struct Player {
     tape: Tape,
     /// The time of the first frame, in ns since 1970.
     first: u64,
-    /// The time that seconds count from, in ns since 1970.
+    /// The time from which seconds count, in ns since 1970.
     zero: u64,
-    /// The position, in ns since 1970.
+    /// The present position, in ns since 1970.
     at: u64,
-    /// True if all counts start at the beginning of the recording.
+    /// True if the counts of the present state include everything since the beginning of the recording.
     is_exact: bool,
     playing: bool,
     speed: f64,
     history: VecDeque<Sample>,
-    /// The number of jumps so far; the page clears its plots after each one.
+    /// The number of jumps so far. After each jump the page clears its plots.
     jumps: u64,
-    /// The reason why the last position cannot be shown.
+    /// The error because of which the last requested position cannot be shown.
     failed: Option<String>,
 }
 
-/// The player's state, as a page shows it.
+/// The state of the player that pages show.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Playback {
-    /// The position, in s of the run, or since the first frame if there is no run.
+    /// The position in s of the run, or in s since the first frame if there is no run.
     pub at_s: f64,
     /// The position in ns since 1970.
     pub at_ns: String,
-    /// The time of the first frame on the same scale: negative if the control loop began later.
+    /// The time of the first frame, in the same s as the position. It is negative if the control loop began later.
     pub from_s: f64,
-    /// The time of the end on the same scale.
+    /// The time of the end of the recording, in the same s as the position.
     pub of_s: f64,
-    /// True while it plays.
+    /// True while the recording plays; false while it is paused.
     pub playing: bool,
-    /// Seconds of the recording per second.
+    /// The playback speed in s of the recording per s.
     pub speed: f64,
-    /// True if all counts start at the beginning of the recording.
+    /// True if the counts of the shown state include everything since the beginning of the recording.
     pub exact: bool,
     /// The share of the recording that is indexed, 0 to 1.
     pub read: f64,
-    /// The reason why the recording cannot be read further.
+    /// The error because of which the recording cannot be read further.
     pub failed: Option<String>,
-    /// The part that is missing at its end.
+    /// A description of what is missing at the end of the recording, if it was never finished.
     pub unfinished: Option<String>,
     /// The number of frames on buses that the skin does not have.
     pub others: u64,
-    /// The number of events so far.
+    /// The number of events found so far.
     pub events: usize,
-    /// For each kind of event, those of 600 equal parts of the recording that contain one.
+    /// By kind of event: the numbers of those of 600 equal parts of the recording in which such events occur.
     pub marks: BTreeMap<EventKind, Vec<u16>>,
 }
 
 impl Playback {
-    /// Returns the same state with these marks.
+    /// Returns the same playback state with these marks.
     #[must_use]
     pub fn with_marks(self, marks: BTreeMap<EventKind, Vec<u16>>) -> Self {
         Self { marks, ..self }
     }
 }
 
-/// The error for a recording that cannot be played.
+/// The reason why a recording cannot be played.
 #[derive(Debug, thiserror::Error)]
 pub enum PlayError {
     /// The capture cannot be read.
     #[error(transparent)]
     Capture(#[from] CaptureError),
-    /// The recording is damaged; the part before the damage was shown.
+    /// The recording is damaged. The part before the damage was shown.
     #[error("{0}")]
     Damaged(String),
     /// The recording has no frames.
@@ -105,10 +105,10 @@ pub enum PlayError {
 }
 
 impl Player {
-    /// Opens a recording at its first frame.
+    /// Opens a recording and moves to its first frame.
     ///
     /// # Errors
-    /// Returns [`PlayError`] if it cannot be read, does not support seeking, or has no frame.
+    /// Returns [`PlayError`] if the recording cannot be read, is not seekable, or has no frame.
     pub fn open(paths: &[PathBuf], skin: Skin) -> Result<Self, PlayError> {
         let mut beginning = Reader::open_all(paths)?;
         let first = loop {
@@ -141,7 +141,7 @@ impl Player {
         })
     }
 
-    /// Returns the index, which another thread builds.
+    /// Returns the index of the recording, which the caller builds in another thread.
     #[must_use]
     pub fn index(&self) -> Arc<Index> {
         Arc::clone(&self.index)
@@ -153,18 +153,18 @@ impl Player {
         self.first
     }
 
-    /// Returns the time that seconds count from, in ns since 1970.
+    /// Returns the time from which seconds count, in ns since 1970.
     #[must_use]
     pub const fn zero(&self) -> u64 {
         self.zero
     }
 
-    /// Returns the state at the position.
+    /// Returns the state of the skin at the present position.
     pub const fn live(&mut self) -> &mut Live {
         self.tape.live_mut()
     }
 
-    /// Returns the position.
+    /// Returns the present position.
     #[must_use]
     pub const fn now(&self) -> Micros {
         Micros(self.at / 1_000)
@@ -176,21 +176,22 @@ impl Player {
         self.jumps
     }
 
-    /// Returns the end, as far as it is known.
+    /// Returns the time of the recording's end in ns since 1970, as far as it is known.
     fn last(&self) -> u64 {
         let progress = self.index.progress();
         let last = if progress.is_over { progress.at } else { self.places.latest().max(progress.at) };
         last.max(self.first)
     }
 
-    /// Plays at a speed from now on, clamped to 0.01 to 100; 1 if it is not finite.
+    /// Plays the recording from now on. `speed` is in s of the recording per s, limited to 0.01 to 100; a speed that is
+    /// not finite counts as 1.
     pub fn play(&mut self, speed: f64) {
         let [min, max] = SPEED_RANGE;
         self.speed = if speed.is_finite() { speed.clamp(min, max) } else { 1.0 };
         self.playing = true;
     }
 
-    /// Pauses and reports why the recording cannot be read there.
+    /// Pauses, and stores the error because of which the recording cannot be read further.
     pub fn fail(&mut self, why: String) {
         self.playing = false;
         self.failed = Some(why);
@@ -201,7 +202,7 @@ impl Player {
         self.playing = false;
     }
 
-    /// Advances by the elapsed time. Returns true if the state has changed.
+    /// Advances the position by the elapsed time, if the recording plays. Returns true if the state has changed.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the recording cannot be read further.
@@ -222,7 +223,8 @@ impl Player {
         Ok(true)
     }
 
-    /// Seeks to a position, in s of the run, or since the first frame, clamped to the recording.
+    /// Moves to a position in s of the run, or in s since the first frame. Positions outside of the recording are moved
+    /// to its beginning or end.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the recording cannot be read there.
@@ -232,7 +234,7 @@ impl Player {
         self.go_to(self.zero.saturating_add_signed(since))
     }
 
-    /// Steps to the next or the previous epoch, and pauses.
+    /// Moves to the beginning of the next or the previous epoch, and pauses.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the recording cannot be read there.
@@ -242,14 +244,14 @@ impl Player {
             return self.advance(self.last(), true);
         }
         if self.tape.epoch_before(self.at).is_none() {
-            // Reads the time before the position, to find its epochs.
+            // The time before the position is read again, because only its epochs are known that were read.
             self.restart_before(self.at)?;
         }
         let before = self.tape.epoch_before(self.at);
         before.map_or(Ok(()), |before| self.go_to(before))
     }
 
-    /// Jumps to the next or the previous event of a kind, and pauses. Returns true if there is one.
+    /// Moves to the next or the previous event of a kind, and pauses. Returns false if there is none.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the recording cannot be read there.
@@ -274,7 +276,7 @@ impl Player {
         self.restart_before(at)
     }
 
-    /// Seeks to a position from the last kept state before it.
+    /// Moves to a position by reading on from the last stored state before it.
     fn restart_before(&mut self, at: u64) -> Result<(), CaptureError> {
         self.is_exact = self.is_indexed(at) || at <= self.first.saturating_add(HISTORY_NS);
         let kept = self.index.checkpoint_before(at.saturating_sub(HISTORY_NS)).filter(|_| self.is_exact);
@@ -301,7 +303,7 @@ impl Player {
         self.advance(at, false)
     }
 
-    /// Advances to a position, or to the first epoch before it.
+    /// Advances to a position, or with `to_epoch` only to the next epoch.
     fn advance(&mut self, until: u64, to_epoch: bool) -> Result<(), CaptureError> {
         loop {
             match self.tape.step(until) {
@@ -328,7 +330,7 @@ impl Player {
         Ok(())
     }
 
-    /// Encodes the torques of the last seconds, little-endian:
+    /// Encodes the torques of the last seconds for the plots, little-endian:
     ///
     /// | bytes | content |
     /// |---|---|
@@ -356,12 +358,12 @@ impl Player {
         bytes
     }
 
-    /// Converts a time to s of the run, or since the first frame.
+    /// Converts a time in ns since 1970 to s of the run, or to s since the first frame.
     fn seconds(&self, at: u64) -> f64 {
         seconds_since(self.zero, at)
     }
 
-    /// Returns the state for the page.
+    /// Returns the state of the player for the pages.
     #[must_use]
     pub fn playback(&self) -> Playback {
         let progress = self.index.progress();
@@ -383,7 +385,8 @@ impl Player {
         }
     }
 
-    /// Divides the recording into equal parts, and returns the numbers of the parts with events of a kind.
+    /// Divides the recording into `parts` equal parts. Returns the numbers of the parts in which events of a kind
+    /// occur.
     #[must_use]
     pub fn marks(&self, kind: EventKind, parts: u16) -> Vec<u16> {
         self.index.marks(kind, (self.first, self.last()), parts)

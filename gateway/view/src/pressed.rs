@@ -1,4 +1,4 @@
-//! The touches of all pages, and the stimuli that apply them.
+//! The cells that pages press, and the stimuli that apply these touches.
 
 use std::collections::BTreeMap;
 
@@ -7,35 +7,35 @@ use protocol::id::CellId;
 use protocol::message::SkinSensors;
 use protocol::time::Micros;
 
-/// The maximum force of a touch, in N.
+/// The maximum force of a touch by one page, in N.
 pub const MAX_FORCE_N: f64 = 90.0;
-/// The time after which a stimulus that the cell has not latched is sent again, in µs.
+/// The time after which a stimulus is sent again if the cell has not latched it, in µs.
 const RETRY_INTERVAL_US: u64 = 150_000;
-/// The maximum number of attempts to send a release: the cell may be gone.
+/// The maximum number of times that a release is sent, because the cell may no longer exist.
 const MAX_RELEASE_ATTEMPTS: u32 = 20;
 
-/// A cell: its bus index and its node id.
+/// A cell, by the index of its bus and its node id.
 pub type CellKey = (usize, CellId);
 
-/// The force to apply to a cell.
+/// A force that is to be applied to a cell.
 #[derive(Clone, Copy, Debug)]
 struct TargetForce {
     force_n: f64,
     sent: Option<Micros>,
-    /// The number of times that it was sent; this limits releases.
+    /// The number of times that the stimulus was sent. It limits how often a release is sent.
     attempts: u32,
 }
 
-/// The touches of all pages.
+/// The cells that pages press, and the force on each.
 #[derive(Clone, Debug, Default)]
 pub struct TouchRegistry {
-    /// The cell and the force of each page.
+    /// For each page, the cell that it presses and the force in N.
     pages: BTreeMap<u64, (CellKey, f64)>,
     targets: BTreeMap<CellKey, TargetForce>,
 }
 
 impl TouchRegistry {
-    /// Presses a cell for a page, and releases the cell that the page pressed before. The force is clamped to 0 to
+    /// Presses a cell for a page. Releases the cell that the page pressed before. Forces are limited to 0 to
     /// [`MAX_FORCE_N`]; NaN and infinity count as 0.
     pub fn press(&mut self, page: u64, cell: CellKey, force_n: f64) {
         let force_n = if force_n.is_finite() { force_n.clamp(0.0, MAX_FORCE_N) } else { 0.0 };
@@ -46,28 +46,28 @@ impl TouchRegistry {
         self.update_target(cell);
     }
 
-    /// Releases the cell of a page, also after the page has gone.
+    /// Releases the cell that a page presses, or pressed before it disconnected.
     pub fn release(&mut self, page: u64) {
         if let Some((cell, _)) = self.pages.remove(&page) {
             self.update_target(cell);
         }
     }
 
-    /// Sets the force on a cell: the sum of the forces of all pages.
+    /// Sets the force on a cell to the sum of the forces by which pages press it.
     fn update_target(&mut self, cell: CellKey) {
         let pages = self.pages.values().filter(|(of, _)| *of == cell);
         let force_n = pages.map(|(_, force_n)| force_n).sum::<f64>().min(MAX_FORCE_N);
         self.targets.insert(cell, TargetForce { force_n, sent: None, attempts: 0 });
     }
 
-    /// Returns true if a cell is pressed.
+    /// Returns true if any page presses the cell.
     #[must_use]
     pub fn is_pressed(&self, cell: CellKey) -> bool {
         self.targets.get(&cell).is_some_and(|target| target.force_n > 0.0)
     }
 
-    /// Returns the stimuli to send now. `latched` returns the sensor words that a cell has latched, as far as the bus
-    /// shows them.
+    /// Returns the stimuli to be sent now. `latched` returns the sensor values that a cell has latched, as far as the
+    /// bus shows them.
     pub fn due_stimuli(
         &mut self,
         now: Micros,
@@ -117,7 +117,7 @@ mod tests {
         let sensors = first[0].1;
         assert_eq!(pressed.due_stimuli(Micros(900_000), |_| Some(sensors)), []);
         assert!(pressed.is_pressed(cell(3)));
-        // The cell restarts.
+        // The cell restarts, and has no stimulus latched.
         assert_eq!(pressed.due_stimuli(Micros(1_900_000), |_| Some(SkinSensors::default())).len(), 1);
         pressed.release(1);
         let last = pressed.due_stimuli(Micros(2_000_000), |_| Some(sensors));

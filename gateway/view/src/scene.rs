@@ -1,4 +1,5 @@
-//! The scene: the parts of a skin that do not change while it is watched, its robot and the places of its cells.
+//! The scene that a page draws: the parts of a skin that do not change, such as the robot's links and the places of
+//! cells.
 
 use std::collections::BTreeMap;
 
@@ -10,96 +11,96 @@ use serde::Serialize;
 
 use crate::surface::SceneShell;
 
-/// The pitch is estimated from about this many cells.
+/// The number of cells from which the pitch is estimated.
 const PITCH_SAMPLES: usize = 200;
-/// The pitch of a skin whose cells have no neighbours, in m.
+/// The pitch that is assumed for a skin whose cells have no neighbours, in m.
 const DEFAULT_PITCH: f64 = 0.028;
 
 /// The scene that the page draws; lengths in m, angles in rad.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Scene {
-    /// The skin's name.
+    /// The name of the skin.
     pub name: String,
-    /// The robot's joints.
+    /// The joints of the robot.
     pub joints: Vec<SceneJoint>,
-    /// Its chains, base to tip.
+    /// The chains of the robot, from base to tip.
     pub chains: Vec<SceneChain>,
-    /// The buses, and the chain whose skin each carries.
+    /// The buses, each with the chain whose cells are on it.
     pub buses: Vec<SceneBus>,
     /// The cells, in the skin's order.
     pub cells: Vec<SceneCell>,
-    /// The distance between the centres of neighbouring cells.
+    /// The distance between the centres of neighbouring cells, in m.
     pub pitch: f64,
-    /// Links, drawn as tubes below their cells.
+    /// Cylinders that represent links. They are drawn below the cells.
     pub tubes: Vec<Tube>,
-    /// The robot's surface, if known; [`surface`](crate::surface) has its triangles.
+    /// The surface of the robot's links, if it is known. Its triangles are packed by [`surface`](crate::surface).
     pub shells: Vec<SceneShell>,
-    /// True if the page may press cells, halt and resume.
+    /// True if the page may press cells, and halt and resume the robot.
     pub may_press: bool,
 }
 
-/// A joint.
+/// A joint of the robot, with its units.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SceneJoint {
-    /// Its name.
+    /// The name of the joint.
     pub name: String,
-    /// `rad` or `m`.
+    /// The unit of the position: `rad` or `m`.
     pub unit: &'static str,
-    /// `Nm` or `N`.
+    /// The unit of the torque: `Nm`, or `N` for a prismatic joint.
     pub torque_unit: &'static str,
 }
 
 /// A chain of Denavit-Hartenberg rows.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SceneChain {
-    /// Its name.
+    /// The name of the chain.
     pub name: String,
     /// The pose of frame 0 in the robot's base: a 4 by 4 matrix in column order.
     pub base: Vec<f64>,
-    /// Its rows, base to tip.
+    /// The rows of the chain, from base to tip.
     pub rows: Vec<SceneRow>,
 }
 
-/// A Denavit-Hartenberg row.
+/// A row of a chain's Denavit-Hartenberg table.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SceneRow {
-    /// The joint that moves it, as an index into [`Scene::joints`]; absent for a fixed row.
+    /// The joint that moves the row, as an index into [`Scene::joints`]; absent for a fixed row.
     pub joint: Option<usize>,
-    /// True for a prismatic joint: the position is added to `d` instead of `theta`.
+    /// True for a prismatic joint, whose position is added to `d` and not to `theta`.
     pub slides: bool,
-    /// Length.
+    /// The link length a, in m.
     pub a: f64,
-    /// Twist.
+    /// The link twist α, in rad.
     pub alpha: f64,
-    /// Offset.
+    /// The link offset d, in m.
     pub d: f64,
-    /// The angle at position 0.
+    /// The joint angle θ at position 0, in rad.
     pub theta: f64,
 }
 
-/// A bus.
+/// A bus, and the chain whose cells are on it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SceneBus {
-    /// Its name.
+    /// The name of the bus.
     pub name: String,
-    /// The chain, as an index into [`Scene::chains`].
+    /// The index of the chain in [`Scene::chains`].
     pub chain: usize,
 }
 
-/// A cell.
+/// A cell, with its place on the robot.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SceneCell {
-    /// The cell's bus, as an index into [`Scene::buses`].
+    /// The index of the cell's bus in [`Scene::buses`].
     pub bus: usize,
-    /// Its node id.
+    /// The node id of the cell.
     pub node: u8,
-    /// The row in whose frame the cell is given, from 1.
+    /// The number of the row in whose frame the position is given, from 1.
     pub row: u8,
-    /// The joint of its chain that moves it, from 1.
+    /// The number of the joint of the chain that moves the cell, from 1.
     pub joint: u8,
-    /// The centre of the cell in that frame.
+    /// The centre of the cell in the frame of the row, in m.
     pub position: [f64; 3],
-    /// The outward normal in that frame.
+    /// The outward normal of the cell in the frame of the row.
     pub normal: [f64; 3],
     /// The node id of the neighbour at each port; 0 for a port without a wire.
     pub neighbors: Vec<u8>,
@@ -107,21 +108,21 @@ pub struct SceneCell {
     pub root: bool,
 }
 
-/// A cylinder in a row's frame.
+/// A cylinder that represents a link, in the frame of a row.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Tube {
-    /// The chain.
+    /// The index of the chain.
     pub chain: usize,
-    /// The row, from 1.
+    /// The number of the row, from 1.
     pub row: u8,
-    /// The centres of its two ends.
+    /// The centres of the cylinder's ends, in m.
     pub ends: [[f64; 3]; 2],
-    /// Its radius.
+    /// The radius of the cylinder, in m.
     pub radius: f64,
 }
 
 impl Scene {
-    /// Returns the scene of a skin.
+    /// Returns the scene that shows a skin.
     #[must_use]
     pub fn from_skin(skin: &Skin, may_press: bool) -> Self {
         let joints = skin.robot.joints.iter().map(|joint| SceneJoint {
@@ -169,7 +170,7 @@ fn chain(chain: &Chain) -> SceneChain {
     SceneChain { name: chain.name.clone(), base: chain.base.matrix().concat(), rows: rows.collect() }
 }
 
-/// Returns the median distance from a cell to its nearest neighbour on the same link.
+/// Returns the median distance from a cell to the nearest other cell on the same link, in m.
 fn pitch(cells: &[SceneCell]) -> f64 {
     let nearest = |cell: &SceneCell| {
         let same = cells.iter().filter(|other| (other.bus, other.row) == (cell.bus, cell.row));
@@ -183,7 +184,7 @@ fn pitch(cells: &[SceneCell]) -> f64 {
     all.get(all.len() / 2).copied().unwrap_or(DEFAULT_PITCH).min(0.1)
 }
 
-/// Returns tubes for the links with many cells.
+/// Returns a cylinder for each link that has enough cells to fit one.
 fn tubes(buses: &[SceneBus], cells: &[SceneCell]) -> Vec<Tube> {
     let mut links = BTreeMap::<(usize, u8), Vec<&SceneCell>>::new();
     for cell in cells {
@@ -193,7 +194,8 @@ fn tubes(buses: &[SceneBus], cells: &[SceneCell]) -> Vec<Tube> {
     links.into_iter().filter_map(|((chain, row), cells)| tube(chain, row, &cells)).collect()
 }
 
-/// Fits a cylinder to cells, and makes it a little longer and thinner, so that it lies below them.
+/// Fits a cylinder to the cells of a link. It is made a little longer and thinner than the fit, so that it lies below
+/// the cells.
 fn tube(chain: usize, row: u8, cells: &[&SceneCell]) -> Option<Tube> {
     let placed: Vec<_> = cells.iter().map(|cell| (cell.position, cell.normal)).collect();
     let cylinder = Cylinder::fit(&placed)?;

@@ -1,4 +1,4 @@
-//! The shell of the live view: buses, clock and server in one loop.
+//! Shows a bench to pages: receives on its buses, and runs the server.
 
 use std::collections::BTreeMap;
 use std::iter;
@@ -31,38 +31,38 @@ use crate::surface::{RowMesh, pack};
 
 /// The interval between snapshots.
 const SNAPSHOT_INTERVAL: Duration = Duration::from_millis(33);
-/// The number of snapshots per status message.
+/// The number of snapshots between two status messages.
 const SNAPSHOTS_PER_STATUS: u64 = 6;
-/// The receive timeout.
+/// The time for which a thread waits for frames before it checks whether it must stop.
 const RECEIVE_TIMEOUT: Duration = Duration::from_millis(50);
-/// The time that frames gather after the first one, so that one wake-up reads many.
+/// The time for which a thread lets frames accumulate after the first one, so that it wakes up less often.
 const GATHER_TIME: Duration = Duration::from_millis(8);
 
-/// The value of `read_to` while no frames are waiting.
+/// The value of `read_to` while no frames wait to be read.
 const UP_TO_DATE: u64 = u64::MAX;
 
-/// The skin to show, and the server's settings.
+/// The skin to be shown, and the settings of the server.
 #[derive(Debug)]
 pub struct Options {
-    /// The skin.
+    /// The skin to be shown.
     pub skin: Skin,
-    /// The robot's surface, if known.
+    /// The surface of the robot's links; empty if it is unknown.
     pub surface: Vec<RowMesh>,
     /// The kind of each bus.
     pub kinds: KindChoices,
-    /// The directory of embedded buses, if not the default one.
+    /// The directory of embedded buses; `None` for the default one.
     pub directory: Option<PathBuf>,
     /// The socket that pages connect to.
     pub listener: TcpListener,
-    /// The pages' rights and token.
+    /// The rights of the pages, and the token that they need.
     pub access: Access,
-    /// True to wait for a bus that does not exist at the start.
+    /// True to wait for buses that do not exist yet.
     pub waits_for_buses: bool,
-    /// The run that the pages command; the view ends with it.
+    /// The connection to the bench that the pages control. The view ends with the bench.
     pub bench: Option<JsonPipe>,
 }
 
-/// The error for a view that cannot be served.
+/// The reason why a skin cannot be shown.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
     /// A bus cannot be opened.
@@ -71,7 +71,7 @@ pub enum ServeError {
     /// The recording cannot be played.
     #[error(transparent)]
     Play(#[from] PlayError),
-    /// The system refuses a thread for a bus or for the recording.
+    /// A thread for a bus or for the recording cannot be started.
     #[error("cannot start a thread: {0}")]
     Thread(std::io::Error),
     /// The server cannot be started.
@@ -79,21 +79,21 @@ pub enum ServeError {
     Server(std::io::Error),
 }
 
-/// A bus, shared by its thread and the main one.
+/// The state that the thread of a bus shares with the main thread.
 #[derive(Debug)]
 struct SharedBus {
     name: String,
     format: Format,
     bus: Mutex<Option<Arc<Bus>>>,
-    /// While more frames wait, the time of the last one that was read, in µs; otherwise [`UP_TO_DATE`].
+    /// The time of the last frame that was read, in µs, while more frames wait to be read; otherwise [`UP_TO_DATE`].
     read_to: AtomicU64,
 }
 
-/// Shows a skin until `stop`. Calls `is_served` once the page is served.
+/// Shows a skin until `stop` is set. Calls `is_served` once pages can connect.
 ///
 /// # Errors
-/// Returns [`ServeError`] if a bus cannot be opened at the start and is not waited for, or if the system refuses a
-/// thread.
+/// Returns [`ServeError`] if a bus cannot be opened at the start and `patient` is false, or if a thread cannot be
+/// started.
 pub fn serve(options: Options, stop: &AtomicBool, is_served: impl FnOnce()) -> Result<ServerCounts, ServeError> {
     let Options { skin, surface, kinds, directory, listener, access, waits_for_buses: patient, bench } = options;
     let may_act = access.may_act;
@@ -137,7 +137,7 @@ pub fn serve(options: Options, stop: &AtomicBool, is_served: impl FnOnce()) -> R
     Ok(server.counts())
 }
 
-/// A bus that may appear later, and is reopened after it is lost.
+/// A bus that is opened when it appears, and opened again after it was lost.
 struct ReopeningBus<'a, O> {
     shared: &'a SharedBus,
     opened: &'a O,
@@ -157,7 +157,7 @@ impl<O: Fn(&str, Format) -> Result<Arc<Bus>, BusError>> Source for ReopeningBus<
     }
 }
 
-/// Receives on a bus until `stop`.
+/// Receives frames on a bus until `stop` is set.
 fn receive(
     index: usize,
     shared: &SharedBus,
@@ -171,7 +171,7 @@ fn receive(
         if let FollowStep::Gone(_) = follower.step(&mut source, RECEIVE_TIMEOUT) {
             *locked(&shared.bus) = None;
         }
-        // After a full batch more frames may be waiting.
+        // If the batch was full, more frames may be waiting to be read.
         let last = follower.frames().last().filter(|_| follower.frames().len() == BATCH);
         let read_to = last.map_or(UP_TO_DATE, |last| last.at_nanos / 1_000);
         shared.read_to.store(read_to, Ordering::Relaxed);
@@ -185,7 +185,7 @@ fn receive(
     }
 }
 
-/// Publishes snapshots to the pages, and passes their commands to the buses and to the run.
+/// Sends snapshots to the pages, and passes their commands to the buses and to the bench.
 fn publish(
     live: &Mutex<Live>,
     buses: &[SharedBus],
@@ -214,7 +214,7 @@ fn publish(
             }
         }
         server.take_gone_pages().into_iter().for_each(|page| pressed.release(page));
-        // Unread frames are pending: do not time cells out.
+        // While frames wait to be read, time ends at the last frame that was read, so that no cell seems silent.
         let read_to = buses.iter().map(|bus| Micros(bus.read_to.load(Ordering::Relaxed))).min();
         let now = read_to.map_or_else(now, |read_to| now().min(read_to));
         let due = {
@@ -263,7 +263,7 @@ fn execute(page: u64, command: &Command, live: &Live, pressed: &mut TouchRegistr
         Command::Release => pressed.release(page),
         Command::Halt => everywhere(&Message::Halt),
         Command::Resume => everywhere(&Message::Resume),
-        // The server handles the choices, the run handles its own commands, and there is no recording to play.
+        // The server handles selections, the bench handles its own commands, and there is no recording to be played.
         Command::Choose(_)
         | Command::Unchoose
         | Command::Bench(_)
@@ -275,7 +275,7 @@ fn execute(page: u64, command: &Command, live: &Live, pressed: &mut TouchRegistr
     }
 }
 
-/// Sends a message. A send error counts as a lost frame.
+/// Sends a message on a bus. A failure counts as a lost frame.
 fn send_message(shared: Option<&SharedBus>, message: &Message) {
     let bus = shared.and_then(|shared| Some((locked(&shared.bus).clone()?, shared.format)));
     if let Some((bus, format)) = bus {

@@ -1,8 +1,8 @@
-//! The server of the page: HTTP for its files, and a WebSocket for everything that changes.
+//! The server of the pages: HTTP for files, and a WebSocket for messages.
 //!
-//! The door (`door.rs`) reads all requests. It accepts those that ask for this host, come from a page of this server,
-//! and carry the token if there is one. Each page then has a thread, which sends the newest snapshot whenever the page
-//! can receive one; a slow or stalled page delays only itself.
+//! The door (`door.rs`) reads all requests. It accepts a request that is addressed to this host, comes from a page of
+//! this server, and carries the token if there is one. Each page then has a thread, which sends it the newest snapshot
+//! whenever the page can receive one. A slow page therefore delays no other.
 
 mod answer;
 mod door;
@@ -25,40 +25,41 @@ use crate::token::Token;
 
 /// The maximum number of pages at the same time.
 const MAX_PAGES: usize = 16;
-/// The capacity of the command queue; further commands are counted and dropped.
+/// The maximum number of commands that wait to be executed. Further ones are dropped and counted.
 const COMMAND_QUEUE_SIZE: usize = 256;
 
 /// The rights of the pages, and the token that they need.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Access {
-    /// True if pages may press cells, halt and resume, and command the bench.
+    /// True if pages may press cells, halt and resume the robot, and control the bench.
     pub may_act: bool,
-    /// True if there is a recording that pages may play.
+    /// True if pages may control the playback of a recording.
     pub may_play: bool,
-    /// The token that all requests need, except those for the page's code.
+    /// The token that every request must carry, except requests for scripts and styles.
     pub token: Option<Token>,
 }
 
-/// The counters of the server.
+/// Counts of the server's clients and their requests.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct ServerCounts {
-    /// Pages that were connected.
+    /// The number of pages that have connected.
     pub clients: u64,
-    /// Refused requests: another host or origin, no token, too slow or too many, no such file.
+    /// The number of refused requests: for another host, from another site, without the token, too slow, too many, or
+    /// for a missing file.
     pub refused: u64,
-    /// Messages of pages that were not commands, were not allowed, or did not fit into the queue.
+    /// The number of messages from pages that were not commands, were not allowed, or found the queue full.
     pub ignored: u64,
 }
 
-/// The newest messages to the pages.
+/// The newest messages for the pages.
 #[derive(Debug, Default)]
 struct LatestMessages {
     snapshot: Bytes,
     number: u64,
-    /// The torques before the first snapshot after a jump, and the number of jumps.
+    /// The torques before the first snapshot after a jump, for the plots; and the number of jumps so far.
     history: Bytes,
     jumps: u64,
-    /// The status for pages without a chosen cell, and for each page with one.
+    /// The status for pages that have selected no cell, and the status for each of the other pages.
     said: Utf8Bytes,
     own: BTreeMap<u64, Utf8Bytes>,
     said_number: u64,
@@ -68,7 +69,7 @@ struct LatestMessages {
 #[derive(Debug)]
 struct Shared {
     access: Access,
-    /// The address that the server listens on.
+    /// The address on which the server listens.
     address: SocketAddr,
     scene: String,
     /// The bytes served as `/surface`.
@@ -84,7 +85,7 @@ struct Shared {
     ignored: AtomicU64,
 }
 
-/// A running server; dropping it stops the server.
+/// A running server. Dropping it stops its threads.
 #[derive(Debug)]
 pub struct Server {
     shared: Arc<Shared>,
@@ -92,8 +93,8 @@ pub struct Server {
 }
 
 impl Server {
-    /// Serves all clients of `listener` from now on. `scene` is the first message to every page, `surface` the content
-    /// of `/surface`.
+    /// Serves all clients that connect to `listener`. `scene` is the first message to every page, and `surface` is the
+    /// file `/surface`.
     ///
     /// # Errors
     /// Returns an error if the listener cannot be set up, or if the system refuses a thread.
@@ -125,20 +126,21 @@ impl Server {
         Ok(server)
     }
 
-    /// Returns the address that the server listens on.
+    /// Returns the address on which the server listens.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.shared.address
     }
 
-    /// Publishes the torques before the next snapshot.
+    /// Sends the pages the torques before the next snapshot, for the plots.
     pub fn publish_history(&self, history: Vec<u8>) {
         let mut newest = locked(&self.shared.newest);
         newest.jumps += 1;
         newest.history = history.into();
     }
 
-    /// Publishes a snapshot, and optionally the status: for pages without a chosen cell, and for each of the others.
+    /// Sends the pages a snapshot, and the status if there is a new one. The status is given for pages that have
+    /// selected no cell, and for each of the other pages by its number.
     pub fn publish(&self, snapshot: Vec<u8>, said: Option<(String, BTreeMap<u64, String>)>) {
         let mut newest = locked(&self.shared.newest);
         newest.number += 1;
@@ -150,23 +152,23 @@ impl Server {
         }
     }
 
-    /// Returns the commands that pages have sent, each with the page's number.
+    /// Returns the commands that pages have sent since the last call, each with the number of the page.
     pub fn commands(&self) -> impl Iterator<Item = (u64, Command)> + '_ {
         self.commands.try_iter()
     }
 
-    /// Counts a command that is not carried out.
+    /// Counts a command that was not executed.
     pub fn count_ignored(&self) {
         self.shared.ignored.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Returns the pages that have gone since the last call.
+    /// Returns the numbers of the pages that have disconnected since the last call.
     #[must_use]
     pub fn take_gone_pages(&self) -> Vec<u64> {
         std::mem::take(&mut *locked(&self.shared.gone))
     }
 
-    /// Returns the cells that pages have chosen.
+    /// Returns the cell that each page has selected, by the number of the page.
     #[must_use]
     pub fn selected_cells(&self) -> BTreeMap<u64, SelectedCell> {
         locked(&self.shared.chosen).clone()
@@ -178,7 +180,7 @@ impl Server {
         self.shared.pages.load(Ordering::Relaxed)
     }
 
-    /// Returns the counters.
+    /// Returns the counts so far.
     #[must_use]
     pub fn counts(&self) -> ServerCounts {
         let count = |count: &AtomicU64| count.load(Ordering::Relaxed);
@@ -193,7 +195,7 @@ impl Drop for Server {
     }
 }
 
-/// Returns the page's address for a browser on the same machine.
+/// Returns the address by which a browser on the same machine opens the page.
 #[must_use]
 pub fn url(listen: SocketAddr, token: Option<&Token>) -> String {
     let ip = match listen.ip() {

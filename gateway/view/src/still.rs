@@ -1,8 +1,8 @@
-//! A skin at rest, as one self-contained HTML page: it needs no server, library or network.
+//! A picture of a skin without buses, as one HTML page that needs no server, library or network.
 //!
-//! The page draws the same [`Scene`] with the same modules as the live page. Cells are hexagons with their node ids,
-//! coloured by bus; a root has a second hexagon. The view turns and zooms, and shows a cell that is clicked, searched
-//! as `bus:node`, or named after `#` in the address.
+//! The page draws the same [`Scene`] with the same scripts as the live page. Cells are hexagons with their node ids,
+//! coloured by bus; a root has a second hexagon. The user can rotate and zoom the view. Details are shown of a cell
+//! that is clicked, searched for as `bus:node`, or given after `#` in the address.
 
 use data_encoding::BASE64;
 use protocol::xml::escaped;
@@ -12,37 +12,37 @@ use crate::scene::Scene;
 use crate::surface::{RowMesh, pack};
 use crate::web;
 
-/// A skin, as its page shows it.
+/// The contents of a page that shows a skin without buses.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Still {
     /// The scene to draw.
     pub scene: Scene,
-    /// The robot's surface, if known.
+    /// The surface of the robot's links; empty if it is unknown.
     pub surface: Vec<RowMesh>,
     /// The position of each joint of the robot, in rad or m.
     pub positions: Vec<f64>,
-    /// Further properties of each cell, as names and values, in the scene's order.
+    /// Further properties of each cell as names and values, in the order of [`Scene::cells`].
     pub details: Vec<Vec<(String, String)>>,
-    /// Cells that were elsewhere before; the page draws a line from the former place to each.
+    /// Cells that were at another place before. The page draws a line from the old place to the new one.
     pub moved: Vec<MovedCell>,
 }
 
-/// The former place of a cell.
+/// The place at which a cell was before.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct MovedCell {
-    /// The cell, as an index into [`Scene::cells`].
+    /// The index of the cell in [`Scene::cells`].
     pub cell: usize,
-    /// The chain of the frame.
+    /// The index of the chain to which the row belongs.
     pub chain: usize,
-    /// The row whose frame it is, from 1.
+    /// The number of the row in whose frame the place is given, from 1.
     pub row: u8,
-    /// The centre of the cell in that frame, in m.
+    /// The former centre of the cell in the frame of the row, in m.
     pub position: [f64; 3],
-    /// The normal in that frame.
+    /// The former normal of the cell in the frame of the row.
     pub normal: [f64; 3],
 }
 
-/// The data for the page's script.
+/// The data that the page's script reads.
 #[derive(Serialize)]
 struct PageData<'a> {
     scene: &'a Scene,
@@ -54,7 +54,7 @@ struct PageData<'a> {
 }
 
 impl Still {
-    /// Returns the page.
+    /// Returns the HTML text of the page.
     #[must_use]
     pub fn page(&self) -> String {
         let (shells, corners) = pack(&self.surface);
@@ -65,10 +65,10 @@ impl Still {
             moved: &self.moved,
             surface: BASE64.encode(&corners),
         };
-        // Strings and numbers always serialise. Without `<`, the data cannot end the script element.
+        // Serialising strings and numbers cannot fail. `<` is escaped, so that the data cannot end the script element.
         let data = serde_json::to_string(&data).unwrap_or_default().replace('<', "\\u003c");
         let mut text = String::new();
-        // The parts are inserted from left to right, so that inserted text is not searched for marks.
+        // The template is split at its marks first, so that marks in inserted text are not replaced.
         for (at, piece) in web::text("still.html").unwrap_or_default().split('@').enumerate() {
             match piece {
                 "NAME" => text.push_str(&escaped(&self.scene.name)),

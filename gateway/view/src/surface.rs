@@ -1,39 +1,39 @@
-//! The robot's surface in the page's format: corners with normals, by rows.
+//! Packs the surface of a robot for the page: the corners of all triangles, each with a normal.
 
 use std::collections::HashMap;
 
 use nalgebra::Vector3;
 use serde::Serialize;
 
-/// Edges between faces at a smaller angle than this are smoothed; the cosine of 40 degrees.
+/// The cosine of 40 degrees. An edge between two faces is drawn smooth if their normals differ by less than this angle.
 const SMOOTH_EDGE_COSINE: f64 = 0.77;
 
-/// A mesh that is fixed to a row of a chain.
+/// A mesh of the robot's surface, fixed to a row of a chain.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RowMesh {
-    /// The chain, as an index into the skin's chains.
+    /// The index of the chain in the skin.
     pub chain: usize,
     /// The row in whose frame the mesh is given, from 1; 0 is the base of the chain.
     pub row: usize,
-    /// Its triangles in that frame, in m.
+    /// The triangles in the frame of the row, in m.
     pub triangles: Vec<[[f64; 3]; 3]>,
 }
 
-/// The range of a shell's corners within the corners of all shells.
+/// A shell of the scene: the range of its corners among those of all shells.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct SceneShell {
-    /// The chain, as an index into [`Scene::chains`](crate::Scene::chains).
+    /// The index of the chain in [`Scene::chains`](crate::Scene::chains).
     pub chain: usize,
-    /// The row, from 1; 0 is the base of the chain.
+    /// The number of the row, from 1; 0 is the base of the chain.
     pub row: usize,
-    /// The index of the first corner.
+    /// The index of the shell's first corner.
     pub first: usize,
-    /// The number of corners: three for each triangle.
+    /// The number of corners, which is three for each triangle.
     pub count: usize,
 }
 
-/// Returns the shells in the page's format, and the bytes of all their corners: for each one position and normal, as 6
-/// little-endian f32.
+/// Returns the shells of the scene, and the corners of all shells as bytes. A corner has a position and a normal,
+/// together 6 little-endian f32.
 #[must_use]
 pub fn pack(shells: &[RowMesh]) -> (Vec<SceneShell>, Vec<u8>) {
     let (mut all, mut bytes) = (Vec::new(), Vec::new());
@@ -54,8 +54,8 @@ pub fn pack(shells: &[RowMesh]) -> (Vec<SceneShell>, Vec<u8>) {
     (all, bytes)
 }
 
-/// Returns the normal of each corner: the mean of the normals of the adjacent faces that deviate little from its own
-/// face.
+/// Returns the normal of each corner: the mean normal of those faces at the corner whose direction is similar to that
+/// of the corner's own face.
 fn normals(triangles: &[[[f64; 3]; 3]]) -> Vec<Vector3<f64>> {
     let key = |corner: &[f64; 3]| corner.map(f64::to_bits);
     let faces: Vec<_> = triangles

@@ -1,11 +1,11 @@
-//! The state of a recording at a moment.
+//! The state of a recorded skin at a position in time, computed from the frames of the recording up to there.
 //!
 //! ```text
 //!   entries of the capture ──> push ──> Order, by time ──> advance(until) ──> Live
 //! ```
 //!
-//! The state at a moment depends only on the frames up to it, however the reader got there: the same entries and the
-//! same moment give the same [`Live`].
+//! The state depends only on the position and on the entries of the recording, not on the way in which the player got
+//! there: the same entries up to the same position give the same [`Live`].
 
 mod events;
 
@@ -20,50 +20,51 @@ use trace::order::{BusMerger, ReleasedFrame};
 pub use self::events::{Event, EventKind, EventDetector};
 use crate::live::Live;
 
-/// The interval at which time-dependent state (silent cells, loads) is updated, in ns.
+/// The interval in ns at which the passing of time is applied to the state: cells become silent, and loads are
+/// measured.
 const UPDATE_INTERVAL_NS: u64 = 20_000_000;
-/// The part of a pause beyond this time is skipped, in ns.
+/// The time in ns after which the rest of a pause in the recording is skipped.
 const MAX_PAUSE_NS: u64 = 60_000_000_000;
-/// The number of epochs whose times are kept.
+/// The number of epochs whose times are stored.
 const MAX_EPOCHS: usize = 256;
 
-/// The result of a step.
+/// The result of a step on the tape.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum TapeStep {
     /// A frame was applied.
     Applied {
-        /// True if an epoch begins with the frame.
+        /// True if the frame begins an epoch.
         epoch: bool,
     },
-    /// Time-dependent state was updated.
+    /// The passing of time was applied to the state.
     Updated,
-    /// The tape needs more entries.
+    /// The tape needs more entries from the reader.
     NeedsEntries,
-    /// All frames up to the requested time are applied.
+    /// All frames up to the requested time were applied.
     Reached,
-    /// The recording is over.
+    /// All frames of the recording were applied.
     Over,
 }
 
-/// A recording up to a moment.
+/// The state of a recording up to a position, and the entries after it that were already read.
 #[derive(Clone, Debug)]
 pub struct Tape {
     live: Live,
     names: Vec<String>,
     order: BusMerger<TapeFrame>,
     next: Option<ReleasedFrame<TapeFrame>>,
-    /// True if the reader has no more entries.
+    /// True if the reader has reached the end of the recording.
     ended: bool,
-    /// The frames that were latched when the recording began; empty after its first frame.
+    /// The frames that were latched when the recording began. They are applied before the first frame and then removed.
     latched: Vec<TapeFrame>,
     /// The time of the first frame, in ns since 1970.
     first: Option<u64>,
-    /// The time up to which all frames are applied.
+    /// The position in ns since 1970: all frames up to it were applied.
     at: u64,
-    /// The time of the next update of time-dependent state.
+    /// The time in ns since 1970 at which the passing of time is applied to the state next.
     next_update: u64,
     epochs: VecDeque<u64>,
-    /// The number of frames that the recorder lost, by bus.
+    /// The number of frames that the recorder lost on each bus.
     dropped: Vec<u64>,
     /// The number of frames on buses that the skin does not have.
     foreign_frames: u64,
@@ -76,7 +77,7 @@ struct TapeFrame {
 }
 
 impl Tape {
-    /// Creates a tape before any entry. Seconds count from `zero`, in ns since 1970.
+    /// Creates a tape at the beginning of a recording. Seconds count from `zero`, in ns since 1970.
     #[must_use]
     pub fn new(skin: Skin, zero: u64) -> Self {
         let names: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
@@ -98,10 +99,10 @@ impl Tape {
         }
     }
 
-    /// Reads the next entry of the reader; at the end, marks the tape as ended.
+    /// Reads the next entry of the recording into the tape. At the end of the recording, marks the tape as ended.
     ///
     /// # Errors
-    /// Returns [`CaptureError`] if the capture cannot be read or is damaged; this also ends the tape.
+    /// Returns [`CaptureError`] if the capture cannot be read or is damaged. The tape then ends there.
     pub fn feed(&mut self, reader: &mut Reader) -> Result<(), CaptureError> {
         match reader.next() {
             Ok(Some(entry)) => self.push(&entry),
@@ -114,14 +115,14 @@ impl Tape {
         Ok(())
     }
 
-    /// Stores the state that was latched when the recording began; call it before the first entry.
+    /// Stores the frames that were latched when the recording began. Must be called before the first entry is added.
     pub fn begin(&mut self, extras: &RecordingExtras) {
         let latched = extras.latched.iter();
         self.latched =
             latched.filter_map(|it| Some(TapeFrame { bus: self.bus(&it.bus)?, frame: it.frame })).collect();
     }
 
-    /// Adds the next entry of the capture.
+    /// Adds the next entry of the recording.
     pub fn push(&mut self, entry: &Entry<'_>) {
         match entry {
             Entry::Frame(record) => {
@@ -145,7 +146,7 @@ impl Tape {
         }
     }
 
-    /// Advances by one frame or one update of time-dependent state, but not beyond `until`, in ns since 1970.
+    /// Advances by one frame, or by one interval of time without a frame, but not beyond `until`, in ns since 1970.
     pub fn step(&mut self, until: u64) -> TapeStep {
         if self.next.is_none() {
             self.next = if self.ended { self.order.pop_last() } else { self.order.pop() };
@@ -183,52 +184,53 @@ impl Tape {
         TapeStep::Applied { epoch }
     }
 
-    /// Updates time-dependent state, if that is due up to this time.
+    /// Applies the passing of time to the state, if the next time to do so is not after `until`.
     fn update_until(&mut self, until: u64) -> Option<TapeStep> {
-        // 64 bits of ns end in 2554: later updates do not exist.
+        // Times in 64 bits of ns end in the year 2554, so there is no later time.
         if self.next_update > until || self.next_update == u64::MAX {
             return None;
         }
         self.live.handle_time(Micros(self.next_update / 1_000));
         self.at = self.next_update;
         self.next_update = self.next_update.saturating_add(UPDATE_INTERVAL_NS);
-        // Nothing changes during the rest of a long pause.
+        // The rest of a long pause is skipped, because the state does not change any more.
         if until.saturating_sub(self.next_update) > MAX_PAUSE_NS {
             self.next_update = until - MAX_PAUSE_NS;
         }
         Some(TapeStep::Updated)
     }
 
-    /// Returns the state.
+    /// Returns the state at the position.
     #[must_use]
     pub const fn live(&self) -> &Live {
         &self.live
     }
 
-    /// Returns the state as mutable, to draw snapshots of it.
+    /// Returns the state at the position for changes, which snapshots need to count themselves.
     pub const fn live_mut(&mut self) -> &mut Live {
         &mut self.live
     }
 
-    /// Returns the time up to which all frames are applied, in ns since 1970.
+    /// Returns the position in ns since 1970: all frames up to it were applied.
     #[must_use]
     pub const fn position(&self) -> u64 {
         self.at
     }
 
-    /// Returns true if all frames of the capture are applied.
+    /// Returns true if all frames of the recording were applied.
     #[must_use]
     pub fn is_over(&self) -> bool {
         self.ended && self.next.is_none() && self.order.is_empty()
     }
 
-    /// Returns the start of the last epoch before this moment, if it is still kept.
+    /// Returns the time of the last epoch before `moment`, both in ns since 1970. Returns `None` if it is no longer
+    /// stored.
     #[must_use]
     pub fn epoch_before(&self, moment: u64) -> Option<u64> {
         self.epochs.iter().rev().copied().find(|&at| at < moment)
     }
 
-    /// Drops the frames of the last seconds, before the tape is kept in the index.
+    /// Drops the frames of the last seconds, so that the tape takes less memory in the index.
     pub fn forget_recent(&mut self) {
         self.live.forget_recent();
     }

@@ -1,19 +1,19 @@
-//! The secret in a page's address, without which its server reveals nothing about the bench.
+//! The secret in the address of a page. Without it, the server reveals nothing about the bench.
 
 use std::fmt;
 use std::hint::black_box;
 use std::io;
 
-/// The minimum length of a token: 16 letters and digits are 95 bits.
+/// The minimum length of a token in characters: 16 letters and digits have 95 bits.
 const MIN_TOKEN_CHARS: usize = 16;
-/// The maximum length of a token: it is a part of a request's first line.
+/// The maximum length of a token in characters, because the token is in the first line of a request.
 const MAX_TOKEN_CHARS: usize = 256;
 
 /// A secret that every request has to carry.
 #[derive(Clone, Eq, PartialEq)]
 pub struct Token(String);
 
-/// The error for a text that cannot be a token. It does not repeat the text.
+/// The error for a text that cannot be a token. Its message does not contain the text, which may be a secret.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, thiserror::Error)]
 #[error("a token must consist of 16 to 256 letters or digits")]
 pub struct TokenError;
@@ -22,17 +22,17 @@ impl Token {
     /// Checks a token that a user has chosen.
     ///
     /// # Errors
-    /// Returns [`TokenError`] if it is too short or too long, or has other characters than letters and digits.
+    /// Returns [`TokenError`] if the text is too short or too long, or has other characters than letters and digits.
     pub fn parse(text: &str) -> Result<Self, TokenError> {
         let is_plain = text.bytes().all(|byte| byte.is_ascii_alphanumeric());
         let fits = (MIN_TOKEN_CHARS..=MAX_TOKEN_CHARS).contains(&text.len());
         if fits && is_plain { Ok(Self(text.to_owned())) } else { Err(TokenError) }
     }
 
-    /// Draws a token of 128 bits from the kernel.
+    /// Generates a random token of 128 bits.
     ///
     /// # Errors
-    /// Returns an error if the kernel has no random bytes to give.
+    /// Returns an error if the kernel cannot provide random bytes.
     pub fn random() -> io::Result<Self> {
         let mut bytes = [0; 16];
         getrandom::fill(&mut bytes).map_err(io::Error::other)?;
@@ -45,7 +45,7 @@ impl Token {
         &self.0
     }
 
-    /// Compares the token with that of a request, in a time that does not depend on where they differ.
+    /// Returns true if a given text is the token. The time for this does not depend on where the two differ.
     #[must_use]
     pub fn matches(&self, given: &str) -> bool {
         let pairs = given.bytes().zip(self.0.bytes());

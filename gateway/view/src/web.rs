@@ -1,6 +1,6 @@
-//! The page's files: served one by one, or bundled as one script in a self-contained page.
+//! The files of the pages. They are served one by one, or bundled into one script for a page without a server.
 
-/// The files of the live page and of the page of a skin at rest.
+/// The files of the live page, and of the page that shows a skin without buses.
 const FILES: [(&str, &str); 25] = [
     ("index.html", include_str!("../web/index.html")),
     ("still.html", include_str!("../web/still.html")),
@@ -29,12 +29,12 @@ const FILES: [(&str, &str); 25] = [
     ("words.js", include_str!("../web/words.js")),
 ];
 
-/// Returns the text of a file.
+/// Returns the text of the file with this name.
 pub(crate) fn text(name: &str) -> Option<&'static str> {
     FILES.iter().find(|(known, _)| *known == name).map(|(_, text)| *text)
 }
 
-/// Returns the media type and the bytes of a path.
+/// Returns the media type and the contents of the file at a path of the server.
 pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
     let name = if path == "/" { "index.html" } else { path.strip_prefix('/')? };
     let kind = match name.rsplit_once('.')? {
@@ -46,14 +46,16 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
     text(name).map(|text| (kind, text.as_bytes()))
 }
 
-/// Returns true for a script or a style: those are the same for every client and reveal nothing about the bench.
+/// Returns true if the path is that of a script or a style. These are the same for every client and reveal nothing
+/// about the bench.
 pub(crate) fn is_code(path: &str) -> bool {
     path != "/" && file(path).is_some()
 }
 
-/// Bundles a module and all its imports into one script: each module becomes a function, after those that it imports.
+/// Bundles a module and all modules that it imports into one script. Each module becomes a function, defined after
+/// those that it imports.
 ///
-/// It supports only the syntax that the files here use: an import on one line, and declarations after `export`.
+/// Supports only the syntax of the files here: an import is on one line, and a declaration follows `export`.
 pub(crate) fn bundle(entry: &'static str) -> String {
     let mut script = String::from("\"use strict\";\nconst modules = {};\n");
     add(entry, &mut Vec::new(), &mut script);
@@ -85,7 +87,7 @@ fn add(name: &'static str, added: &mut Vec<&'static str>, script: &mut String) {
     script.push_str(&format!("modules[\"{name}\"] = (() => {{\n{body}return {{ {exported} }};\n}})();\n"));
 }
 
-/// Returns the names and the file of an import.
+/// Returns the imported names and the file of an import line; `None` for another line.
 fn import(line: &'static str) -> Option<(&'static str, &'static str)> {
     let (names, from) = line.strip_prefix("import ")?.split_once(" from \"./")?;
     Some((names, from.strip_suffix("\";")?))

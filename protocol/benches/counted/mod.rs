@@ -1,12 +1,13 @@
-//! The entry point of benches that count instructions. It checks for the required programs first.
+//! The entry point of the benches that count instructions. It first checks that valgrind and the runner of gungraun are
+//! installed.
 
 use std::process::{Command, Stdio, exit};
 
 /// The workspace's manifest, which pins the version of gungraun.
 const MANIFEST: &str = include_str!("../../../Cargo.toml");
 
-/// Runs `counted`, the benches under valgrind. Runs `once` instead, which needs no other programs, without
-/// `--bench` (which `cargo bench` passes and `cargo test` does not) or with `--test`.
+/// Runs the benches: under valgrind (`counted`) when `cargo bench` starts the program with `--bench`, else once each
+/// (`once`), which needs no other programs. `--test` also selects `once`.
 pub(crate) fn main(once: impl Fn(), counted: impl Fn()) {
     let said = |word: &str| std::env::args_os().any(|said| said == word);
     // The runner starts this program again for each benchmark, under valgrind.

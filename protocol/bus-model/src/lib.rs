@@ -7,13 +7,13 @@
 //!                                        └──────── damaged: again ────────┘
 //! ```
 //!
-//! A frame takes exactly the time of its bits ([`protocol::wire_time`]), including the intermission. When it
-//! ends, the waiting frames are arbitrated as on the wire; frames requested at that very instant take part.
-//! No frame is interrupted. With a bit-error rate, frames are damaged: a damaged frame costs the bits sent of
-//! it and an error frame, and takes part in arbitration again.
+//! A frame occupies the bus for exactly the duration of its bits ([`protocol::wire_time`]), including the intermission.
+//! When the frame ends, the waiting frames are arbitrated as on the wire; frames requested at that very instant take
+//! part. No frame is interrupted. With a bit-error rate, some frames are damaged: a damaged frame occupies the bus for
+//! the bits sent before the error and for an error frame, and then takes part in arbitration again.
 //!
-//! The same requests give the same attempts on every machine, however time is advanced. Times are in ns from
-//! any origin.
+//! The same requests give the same attempts on every machine, in whatever steps the time is advanced. Times are in ns
+//! from an arbitrary origin.
 //!
 //! The model does not include bus-off and its error counters, overload frames, clock differences, the
 //! propagation delay of the cable (which the bit rate must allow for), or two nodes that send with one
@@ -32,49 +32,50 @@ use protocol::wire_time::{BitRates, Bits};
 pub use noise::{BitErrors, BitErrorsError, ERROR_FRAME};
 pub use priority::Priority;
 
-/// A frame to send.
+/// A request to send a frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Request<T = u64> {
-    /// The earliest time to send it, in ns.
+    /// Earliest time at which the frame may be sent, in ns.
     pub at: u64,
-    /// Its priority in arbitration.
+    /// Priority of the frame in arbitration.
     pub priority: Priority,
-    /// Its number of bits.
+    /// Number of bits of the frame, by bit rate.
     pub bits: Bits,
-    /// The transmit queue in which it waits, any small number. The frames of a queue are sent in the order of
-    /// their requests, as by SocketCAN. Without a queue it takes part in every arbitration, as from a
-    /// controller with a buffer for each identifier.
+    /// Number of the transmit queue in which the frame waits, a small number that the caller chooses. The frames of a
+    /// queue are sent in the order of their requests, as SocketCAN does. `None` if the frame takes part in every
+    /// arbitration, as from a controller with a buffer for each identifier.
     pub queue: Option<u16>,
-    /// An arbitrary tag of the caller.
+    /// Tag of the caller, returned with each attempt to send the frame.
     pub tag: T,
 }
 
-/// A frame that was sent, successfully or not.
+/// One attempt to send a frame, successful or not.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Attempt<T = u64> {
-    /// The request's tag.
+    /// Tag of the request.
     pub tag: T,
-    /// Time of the request in ns, at least that of the previous request.
+    /// Time of the request in ns. Times never decrease: a request earlier than the previous one has the time of the
+    /// previous one.
     pub at: u64,
     /// Start of the first bit, in ns.
     pub start: u64,
     /// Time at which the bus was free again, in ns: the end of the intermission after the frame or the error
     /// frame.
     pub end: u64,
-    /// True if the frame was damaged. It then waits again.
+    /// True if the frame was damaged, so that it waits for another attempt.
     pub is_damaged: bool,
 }
 
-/// A bus whose frames each carry a tag `T` of the caller.
+/// A bus in virtual time; each frame carries a tag `T` of the caller.
 #[derive(Debug)]
 pub struct BusModel<T = u64> {
     rates: BitRates,
     errors: Option<BitErrors>,
-    /// Time of the newest request.
+    /// Time of the latest request, in ns.
     newest: u64,
-    /// All arbitration before this time is decided.
+    /// Time in ns before which all arbitration is decided.
     free_at: u64,
-    /// Time of the request that ended the last idle period.
+    /// Time of the request that ended the last idle period of the bus, in ns.
     ready_at: u64,
     on_wire: Option<(Waiting<T>, Attempt<T>)>,
     contenders: BinaryHeap<Waiting<T>>,
@@ -89,14 +90,14 @@ pub struct BusModel<T = u64> {
 #[derive(Clone, Copy, Debug)]
 struct Waiting<T> {
     request: Request<T>,
-    /// The number of the request. Of two frames with one identifier, the older goes first.
+    /// Sequence number of the request. Of two frames with one identifier, the one requested first is sent first.
     number: u64,
 }
 
-/// A transmit queue.
+/// A transmit queue, of whose frames only the first takes part in arbitration.
 #[derive(Debug)]
 struct Queue<T> {
-    /// True if one of its frames takes part in arbitration or is on the wire.
+    /// True if a frame of this queue takes part in arbitration or is on the wire.
     is_contending: bool,
     waiting_frames: VecDeque<Waiting<T>>,
 }
@@ -142,7 +143,7 @@ impl<T: Copy> BusModel<T> {
         }
     }
 
-    /// Adds bit errors from now on.
+    /// Returns the bus with bit errors from now on.
     #[must_use]
     pub fn with_errors(mut self, errors: BitErrors) -> Self {
         self.errors = Some(errors);
@@ -155,9 +156,10 @@ impl<T: Copy> BusModel<T> {
         self.rates
     }
 
-    /// Requests to send a frame. A time before the newest request counts as the time of that request.
+    /// Requests to send a frame. A request earlier than the previous one gets the time of the previous one.
     ///
-    /// Advances the time to the request, so that earlier attempts can be polled.
+    /// Advances the time of the model to that of the request. [`BusModel::poll`] then returns the attempts that ended
+    /// before it.
     pub fn request(&mut self, mut request: Request<T>) {
         request.at = request.at.max(self.newest);
         self.run_until(request.at);
@@ -177,8 +179,8 @@ impl<T: Copy> BusModel<T> {
         }
     }
 
-    /// Advances the time. Frames that wait at `until` are not arbitrated yet, because more requests may
-    /// follow for that instant.
+    /// Advances the time of the model to `until`, in ns. Frames that wait at `until` are not arbitrated yet, because
+    /// more requests may follow for that instant.
     pub fn run_until(&mut self, until: u64) {
         self.newest = self.newest.max(until);
         loop {
@@ -205,19 +207,19 @@ impl<T: Copy> BusModel<T> {
         }
     }
 
-    /// Advances the time until all waiting frames are sent.
+    /// Advances the time of the model until all waiting frames are sent.
     pub fn finish(&mut self) {
         while let Some(at) = self.poll_timeout() {
             self.run_until(at);
         }
     }
 
-    /// Returns the next completed attempt, in order of time.
+    /// Returns the next attempt that has ended, in order of time; `None` if there are no more.
     pub fn poll(&mut self) -> Option<Attempt<T>> {
         self.ended.pop_front()
     }
 
-    /// Returns the time to which the model must advance for the next event, if no further request is made;
+    /// Returns the time in ns to which the model must advance for the next attempt if no further request is made;
     /// `None` if no frame waits.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<u64> {
@@ -234,7 +236,7 @@ impl<T: Copy> BusModel<T> {
         self.waiting
     }
 
-    /// Returns the maximum number of frames that ever waited at the same time.
+    /// Returns the largest number of frames that have waited at the same time since the model was created.
     #[must_use]
     pub const fn max_waiting(&self) -> usize {
         self.most_waiting

@@ -5,19 +5,19 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use thiserror::Error;
 
-/// Number of bits of an error frame and the intermission after it, at the nominal bit rate: two consecutive
-/// flags of 6 bits, a delimiter of 8, and 3.
+/// Number of nominal bits of an error frame and the following intermission: two consecutive flags of 6 bits, a
+/// delimiter of 8 and an intermission of 3.
 pub const ERROR_FRAME: u32 = 12 + 8 + 3;
-/// Number of bits of the intermission, which cannot be damaged.
+/// Number of bits of the intermission. Errors in these bits do not damage a frame.
 const INTERMISSION: u32 = 3;
-/// Number of nominal bits at the end of an FD frame, including the intermission.
+/// Number of bits at the end of an FD frame that are sent at the nominal bit rate, including the intermission.
 const FD_TAIL: u32 = 12;
 
-/// The error for a bit-error rate that is out of range: not a number, or too high for frames to arrive.
+/// The error for a bit-error rate that is not a number, negative, or above [`BitErrors::MAX`].
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[error("bit-error rate {got}: 0 to {} are possible", BitErrors::MAX)]
 pub struct BitErrorsError {
-    /// The requested rate.
+    /// The rejected rate.
     pub got: f64,
 }
 
@@ -32,10 +32,10 @@ pub struct BitErrors {
 }
 
 impl BitErrors {
-    /// The maximum rate. A frame of 200 bits is then undamaged in one of seven attempts.
+    /// Maximum bit-error rate. At this rate, one of seven attempts to send a frame of 200 bits succeeds.
     pub const MAX: f64 = 0.01;
 
-    /// Creates errors with a rate in the range 0 to [`BitErrors::MAX`].
+    /// Creates bit errors with a rate (probability per bit) in the range 0 to [`BitErrors::MAX`].
     ///
     /// # Errors
     /// Returns an error if the rate is outside that range.
@@ -48,7 +48,7 @@ impl BitErrors {
         Ok(errors)
     }
 
-    /// Draws the distance to the next damaged bit, which is geometrically distributed.
+    /// Draws the number of undamaged bits before the next damaged one, from a geometric distribution.
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
@@ -60,8 +60,8 @@ impl BitErrors {
         self.undamaged_bits = if self.log_undamaged < 0.0 { ((1.0 - uniform).ln() / self.log_undamaged) as u64 } else { u64::MAX };
     }
 
-    /// Returns the bits that were sent of a damaged frame, including the error frame; `None` if the frame is
-    /// undamaged.
+    /// Counts the bits of one attempt to send a frame. Returns the bits sent up to the first damaged one, plus the
+    /// error frame; `None` if no bit is damaged.
     pub(super) fn damage(&mut self, bits: Bits) -> Option<Bits> {
         let exposed = bits.total().saturating_sub(INTERMISSION);
         if self.undamaged_bits >= u64::from(exposed) {

@@ -1,4 +1,4 @@
-//! Priorities in arbitration.
+//! Priorities of frames in arbitration.
 
 use protocol::can::{Format, Frame};
 
@@ -36,8 +36,8 @@ mod tests {
     use proptest::prelude::*;
     use protocol::can::{BIT_RATE_SWITCH, EXTENDED};
 
-    /// Returns the arbitration bits one by one: the first 11 of the identifier, RTR or SRR, IDE, and for 29
-    /// bits the other 18 and RTR.
+    /// Returns the arbitration bits in their order on the wire: the first 11 bits of the identifier, RTR or SRR, and
+    /// IDE; for a 29-bit identifier also its other 18 bits and RTR.
     fn bits(frame: &Frame) -> Vec<bool> {
         let (id, remote) = (frame.id(), frame.is_remote());
         let of = |word: u32, count: u32| (0..count).rev().map(move |place| word >> place & 1 == 1);
@@ -48,7 +48,7 @@ mod tests {
         }
     }
 
-    /// Returns true if `one` wins: at the first bit that differs, it sends the dominant 0.
+    /// Returns true if `one` wins the arbitration: at the first bit that differs, it sends the dominant 0.
     fn wins(one: &Frame, other: &Frame) -> bool {
         let unlike = bits(one).into_iter().zip(bits(other)).find(|(one, other)| one != other);
         unlike.is_some_and(|(one, _)| !one)

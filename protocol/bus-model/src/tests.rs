@@ -1,5 +1,5 @@
-//! Tests of the model against a simple one that examines all requests for each frame, and against results by
-//! hand.
+//! Tests of the model against results by hand, and against a simple second model that examines all requests for each
+//! frame.
 
 use super::*;
 use proptest::prelude::*;
@@ -14,7 +14,7 @@ fn request(at: u64, id: u32, nominal: u32, tag: u64) -> Request {
     Request { at, priority, bits: Bits { nominal, data: 0 }, queue: None, tag }
 }
 
-/// Returns all attempts of some requests.
+/// Returns all attempts that a bus makes for these requests.
 fn all(mut bus: BusModel, requests: &[Request]) -> Vec<Attempt> {
     requests.iter().for_each(|&request| bus.request(request));
     bus.finish();
@@ -22,7 +22,7 @@ fn all(mut bus: BusModel, requests: &[Request]) -> Vec<Attempt> {
     std::iter::from_fn(|| bus.poll()).collect()
 }
 
-/// Returns tag, start and end in µs.
+/// Returns the tag, start and end of each attempt, times in µs.
 fn times(attempts: &[Attempt]) -> Vec<(u64, u64, u64)> {
     attempts.iter().map(|it| (it.tag, it.start / 1_000, it.end / 1_000)).collect()
 }
@@ -132,7 +132,7 @@ fn a_damaged_frame_lets_a_more_urgent_one_go_first() {
     assert_eq!(all(bus, &requests).iter().map(|it| it.tag).collect::<Vec<_>>(), [1, 2, 1]);
 }
 
-/// The simple model: examines all remaining requests for each frame.
+/// A simple second model: for each frame, it examines all requests that are not sent yet.
 fn plain(requests: &[Request]) -> Vec<Attempt> {
     let mut left: Vec<_> = requests.iter().enumerate().collect();
     let (mut free, mut attempts) = (0, Vec::new());

@@ -1,6 +1,7 @@
-//! Batches of datagrams, received and sent with one system call. Both ends of a bus use them.
+//! Batches of datagrams, received and sent with one system call. Clients and servers of embedded buses use them, and
+//! SocketCAN.
 //!
-//! No function here waits, except those that say so, and nothing allocates after [`Batch::new`].
+//! Only functions whose documentation says so wait. Nothing allocates after [`Batch::new`].
 
 use std::io;
 use std::os::fd::AsFd;
@@ -19,14 +20,15 @@ pub const BATCH: usize = 64;
 /// Number of datagrams of the first receive call. Most calls return one or two, and preparing 64 slots costs
 /// more than receiving a datagram.
 const FIRST_BATCH: usize = 4;
-/// Capacity of the smaller send call, which suffices for most sends; see [`FEW`].
+/// Capacity of the smaller of the two send calls, which suffices for most sends. Preparing fewer slots is faster; see
+/// [`FEW`].
 pub(super) const SMALL_BATCH: usize = 8;
 
 /// A receive buffer for up to [`BATCH`] datagrams of at most 72 bytes.
 pub struct Batch {
     slots: Box<[Slot; BATCH]>,
     count: usize,
-    /// The error after the datagrams of the last receive, which the kernel reports only once.
+    /// The error that followed the datagrams of the last receive. It is stored because the kernel reports it only once.
     failure: Option<io::Error>,
 }
 
@@ -38,7 +40,8 @@ impl Batch {
         Self { slots: Box::new(std::array::from_fn(|_| slot())), count: 0, failure: None }
     }
 
-    /// Receives the pending datagrams of a socket, replacing the contents. Never waits.
+    /// Receives the pending datagrams of a socket, replacing the contents of the buffer, and returns their number.
+    /// Never waits.
     ///
     /// # Errors
     /// Returns the error of `recvmmsg`: [`io::ErrorKind::WouldBlock`] if nothing is pending.
@@ -56,7 +59,7 @@ impl Batch {
         Ok(self.count)
     }
 
-    /// Takes the error that followed the last received datagrams.
+    /// Removes and returns the error that followed the last received datagrams.
     pub(super) const fn take_failure(&mut self) -> Option<io::Error> {
         self.failure.take()
     }
@@ -66,7 +69,7 @@ impl Batch {
         self.failure = Some(error);
     }
 
-    /// Receives one datagram, waiting up to the socket's `SO_RCVTIMEO`. It does not look for a second one,
+    /// Receives one datagram, waiting up to the socket's `SO_RCVTIMEO`. It does not try to receive a second one,
     /// because a receiver that wakes up for each datagram rarely finds another.
     pub(super) fn receive_one(&mut self, fd: impl AsFd) -> io::Result<usize> {
         (self.count, self.failure) = (0, None);
@@ -75,7 +78,7 @@ impl Batch {
         Ok(self.count)
     }
 
-    /// Returns the datagrams of the last receive, in order.
+    /// Returns the datagrams of the last receive, in order of arrival.
     pub fn datagrams(&self) -> impl ExactSizeIterator<Item = Datagram<'_>> {
         self.slots.iter().take(self.count).map(Datagram)
     }
@@ -98,19 +101,20 @@ impl std::fmt::Debug for Batch {
 pub struct Datagram<'a>(&'a Slot);
 
 impl<'a> Datagram<'a> {
-    /// Returns its bytes; `None` if it was longer than 72 bytes and thus truncated.
+    /// Returns the bytes of the datagram; `None` if it was truncated because it is longer than 72 bytes.
     #[must_use]
     pub fn bytes(self) -> Option<&'a [u8]> {
         if self.0.flags & libc::MSG_TRUNC == 0 { self.0.bytes.get(..self.0.len) } else { None }
     }
 
-    /// Returns true if this socket sent it (`MSG_CONFIRM`).
+    /// Returns true if the datagram was sent by the receiving socket itself (`MSG_CONFIRM`).
     #[must_use]
     pub const fn is_own(self) -> bool {
         self.0.flags & libc::MSG_CONFIRM != 0
     }
 
-    /// Returns its time of arrival and the socket's drop count, each if the kernel reported it.
+    /// Returns the datagram's time of arrival and the socket's drop count. Each is `None` if the kernel did not report
+    /// it.
     #[must_use]
     pub fn notes(self) -> Notes {
         let words = self.0.control.map(u64::to_ne_bytes);
@@ -138,12 +142,12 @@ impl<const N: usize> Outgoing<N> {
         Self { bytes: [[0; FD_BYTES]; N], lens: [0; N], count: 0 }
     }
 
-    /// Removes all datagrams.
+    /// Removes all datagrams from the buffer.
     pub const fn clear(&mut self) {
         self.count = 0;
     }
 
-    /// Appends the first `len` of these bytes (at most 72). Returns false if the buffer is full.
+    /// Appends a datagram of the first `len` of these bytes (at most 72). Returns false if the buffer is full.
     pub fn push(&mut self, bytes: &[u8; FD_BYTES], len: usize) -> bool {
         let room = self.bytes.get_mut(self.count).zip(self.lens.get_mut(self.count));
         let Some((to, to_len)) = room else { return false };

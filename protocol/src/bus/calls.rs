@@ -1,5 +1,5 @@
-//! System calls without a safe wrapper: batches of datagrams, credentials of a peer, and scheduling. This
-//! module contains no policy.
+//! System calls without a safe wrapper: batches of datagrams, credentials of a peer, and scheduling. Callers decide
+//! what to do on errors.
 
 use std::io;
 use std::mem;
@@ -7,15 +7,15 @@ use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
 
 use super::slot::{Slot, for_each_descriptor};
 
-/// Requests `SCHED_BATCH` for this thread. Returns true if it was granted.
+/// Sets the scheduling policy `SCHED_BATCH` for this thread. Returns true if the system granted it.
 pub(super) fn set_batch() -> bool {
     let parameters = libc::sched_param { sched_priority: 0 };
     // SAFETY: the pointer is to a live, initialised struct, which the call only reads.
     unsafe { libc::sched_setscheduler(0, libc::SCHED_BATCH, &raw const parameters) == 0 }
 }
 
-/// Returns the id of the process that connected a socket (`SO_PEERCRED`); `None` if it is in another pid
-/// namespace, where the id is 0.
+/// Returns the id of the process at the other end of a socket, which connected it (`SO_PEERCRED`); `None` if the
+/// process is in another pid namespace, for which the kernel reports 0.
 pub(super) fn peer_process(fd: BorrowedFd<'_>) -> Option<u32> {
     let mut peer = libc::ucred { pid: 0, uid: 0, gid: 0 };
     let mut len = libc::socklen_t::try_from(size_of_val(&peer)).ok()?;
@@ -27,8 +27,8 @@ pub(super) fn peer_process(fd: BorrowedFd<'_>) -> Option<u32> {
     if result == 0 { u32::try_from(peer.pid).ok().filter(|pid| *pid > 0) } else { None }
 }
 
-/// Calls `recvmmsg` and returns the number of filled slots. If `wait` is true, it waits for the first
-/// datagram up to the socket's `SO_RCVTIMEO`. Passed file descriptors are closed.
+/// Calls `recvmmsg` and returns the number of filled slots. If `wait` is true, waits for the first datagram up to the
+/// socket's `SO_RCVTIMEO`. Closes file descriptors that come with a datagram.
 // Not inlined: a caller's stack frame would grow by the largest N, and all its pages would be touched.
 #[inline(never)]
 pub(super) fn receive<const N: usize>(
@@ -72,7 +72,7 @@ pub(super) fn receive<const N: usize>(
     Ok(count)
 }
 
-/// Calls `sendmmsg` without waiting, with at most N datagrams, and returns the number sent.
+/// Calls `sendmmsg` without waiting, with at most N datagrams. Returns the number of datagrams sent.
 // Not inlined, for the same reason as `receive`.
 #[inline(never)]
 pub(super) fn send<'a, const N: usize>(

@@ -26,6 +26,7 @@ pub(super) trait Carrier {
     /// Decodes a drop notice and returns the number of frames dropped so far; `None` for other datagrams.
     fn dropped(&self, notice: &[u8]) -> Option<u32>;
 
-    /// Returns the bus error that an error of an open socket stands for; `None` if it is not specific.
+    /// Converts a system error of an open socket to the bus error that it means on this kind of bus; `None` if the
+    /// error has no special meaning.
     fn bus_error(&self, errno: Errno) -> Option<fn(String) -> BusError>;
 }

@@ -1,6 +1,7 @@
-//! The client side of the embedded bus: its directory, and the control datagrams besides frames.
+//! The client side of the embedded bus: its directory, and the control datagrams that client and server exchange
+//! besides frames.
 //!
-//! docs/reference/embedded-bus.md describes each byte. A frame is a datagram of 16 or 72 bytes, exactly the
+//! docs/reference/embedded-bus.md describes each byte. A frame is a datagram of 16 or 72 bytes, identical to the
 //! kernel's struct; no control datagram has either length.
 
 use std::os::fd::AsFd;
@@ -17,29 +18,29 @@ pub use directory::{
 mod client;
 mod directory;
 
-/// The version of the control datagrams.
+/// The version of the protocol between client and server, which every hello contains.
 pub const VERSION: u8 = 2;
-/// Index of the byte that marks a frame as the receiver's own.
+/// Index of the byte in a frame that is 1 if the receiving client sent the frame itself.
 pub const OWN_BYTE: usize = 6;
-/// Maximum length of a hello in bytes.
+/// Maximum length of a client's hello in bytes.
 pub const MAX_HELLO_BYTES: usize = HELLO_HEAD + 8 * Filter::MAX;
 
 const MAGIC: &[u8; 7] = b"skinbus";
 const HELLO_HEAD: usize = 23;
 const ANSWER_LEN: usize = 17;
 
-/// Returns the id of the process that connected a socket; `None` if it is in another pid namespace.
+/// Returns the id of the process that connected a socket; `None` if the process is in another pid namespace.
 #[must_use]
 pub fn peer_process(socket: impl AsFd) -> Option<u32> {
     calls::peer_process(socket.as_fd())
 }
 
-/// The request of a connecting client.
+/// The first datagram of a client: its filters and options.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct ClientHello {
     /// Filters for received frames.
     pub filters: Vec<Filter>,
-    /// True to receive the client's own frames.
+    /// True to receive the frames that the client itself sends.
     pub own_frames: bool,
     /// True to receive CAN FD frames.
     pub fd: bool,
@@ -50,7 +51,7 @@ pub struct ClientHello {
 }
 
 impl ClientHello {
-    /// Encodes the datagram.
+    /// Encodes the hello as a datagram.
     #[must_use]
     pub fn encode(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(HELLO_HEAD + 8 * self.filters.len());
@@ -80,14 +81,14 @@ impl ClientHello {
     }
 }
 
-/// A part of a list of filters that replaces the present filters.
+/// A piece of a list of filters. The complete list replaces the present filters of a client.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct FilterPart {
-    /// True for the first part, which discards an unfinished list.
+    /// True for the first piece of a list. It discards a list that is not complete yet.
     pub first: bool,
-    /// True for the last part, which activates the list.
+    /// True for the last piece of a list. It activates the list.
     pub last: bool,
-    /// The filters of this part.
+    /// The filters of this piece.
     pub filters: Vec<Filter>,
 }
 
@@ -95,11 +96,11 @@ impl FilterPart {
     const HEAD: u8 = b'F';
     const FIRST: u8 = 1;
     const LAST: u8 = 2;
-    /// Maximum number of filters in a part. The datagram must not be longer than an FD frame, the longest
-    /// that a bus reads.
+    /// Maximum number of filters in a piece. The datagram must not be longer than an FD frame, because a server reads
+    /// no longer ones.
     const FILTERS: usize = 8;
 
-    /// Splits a list of filters into parts.
+    /// Splits a list of filters into pieces for one datagram each.
     pub fn split(filters: &[Filter]) -> impl Iterator<Item = Self> + use<'_> {
         let parts = filters.len().div_ceil(Self::FILTERS).max(1);
         (0..parts).map(move |part| Self {
@@ -109,7 +110,7 @@ impl FilterPart {
         })
     }
 
-    /// Encodes the datagram.
+    /// Encodes the piece as a datagram.
     #[must_use]
     pub fn encode(&self) -> Vec<u8> {
         let flag = |set, flag| if set { flag } else { 0 };
@@ -118,7 +119,7 @@ impl FilterPart {
         bytes
     }
 
-    /// Decodes a datagram. Returns `None` if it is not a part of filters. Never panics.
+    /// Decodes a datagram. Returns `None` if it is not a piece of a list of filters. Never panics.
     #[must_use]
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let &[Self::HEAD, flags @ 0..=3, ref rest @ ..] = bytes else { return None };
@@ -143,7 +144,7 @@ fn decode_filters(bytes: &[u8]) -> Option<Vec<Filter>> {
     Some(filters.iter().map(filter).collect())
 }
 
-/// The bus's answer to a hello.
+/// The server's answer to a client's hello.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum HelloReply {
     /// The client is connected and its filters are set.
@@ -151,15 +152,15 @@ pub enum HelloReply {
         /// Size of the client's receive buffer in bytes, as the kernel counts it.
         granted: u64,
     },
-    /// The hello was not understood.
+    /// The server did not understand the hello.
     Refused {
-        /// The version that the bus uses.
+        /// The version that the server uses.
         version: u8,
     },
 }
 
 impl HelloReply {
-    /// Encodes the datagram.
+    /// Encodes the answer as a datagram.
     #[must_use]
     pub fn encode(self) -> [u8; ANSWER_LEN] {
         let (code, version, granted) = match self {
@@ -195,7 +196,7 @@ pub const fn encode_dropped(total: u32) -> [u8; 5] {
     [b'D', a, b, c, d]
 }
 
-/// Decodes a drop notice.
+/// Decodes a drop notice. Returns the total number of dropped frames; `None` for any other datagram.
 #[must_use]
 pub const fn decode_dropped(bytes: &[u8]) -> Option<u32> {
     match *bytes {

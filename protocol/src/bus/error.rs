@@ -1,4 +1,5 @@
-//! Errors of a bus, in one line each: the bus, the value, what is allowed, and what to do.
+//! Errors of a bus. Each message is one line with the name of the bus, the invalid value, the allowed values and a
+//! remedy.
 
 use std::io;
 use std::path::PathBuf;
@@ -48,7 +49,7 @@ pub enum BusError {
     ClassicOnly {
         /// The interface.
         name: String,
-        /// Its MTU in bytes.
+        /// MTU of the interface in bytes.
         mtu: u32,
     },
     /// The interface was down when it was opened, or went down later. It may come up again.
@@ -64,7 +65,7 @@ pub enum BusError {
     Permission {
         /// The bus.
         name: String,
-        /// The attempted operation.
+        /// The attempted operation, as the object of "cannot".
         doing: &'static str,
         /// The system's error.
         source: io::Error,
@@ -80,8 +81,8 @@ pub enum BusError {
         /// The directory that was searched.
         directory: PathBuf,
     },
-    /// There is neither an interface nor an embedded bus of this name. Returned for
-    /// [`Choice::Auto`](super::Choice::Auto).
+    /// There is neither a kernel interface nor an embedded bus of this name. Only [`Choice::Auto`](super::Choice::Auto)
+    /// returns this.
     #[error(
         "there is no interface {name}, and no embedded bus of this name is served in {}: make the interface with \
          `vcan-setup up {name}`, or serve the bus with `vcan-setup serve {name}`", directory.display()
@@ -103,9 +104,9 @@ pub enum BusError {
     Refused {
         /// The bus.
         name: String,
-        /// The version of this program.
+        /// The protocol version of this program.
         ours: u8,
-        /// The version of the bus.
+        /// The protocol version of the server.
         theirs: u8,
     },
     /// The embedded bus did not answer in time.
@@ -116,7 +117,7 @@ pub enum BusError {
     NoAnswer {
         /// The bus.
         name: String,
-        /// The time waited.
+        /// Time for which the answer was awaited.
         waited: Duration,
     },
     /// The server of the embedded bus cannot accept another client.
@@ -134,7 +135,7 @@ pub enum BusError {
         "the embedded bus {0} was closed: its server hung up on this program alone and serves others still; attach again"
     )]
     HungUp(String),
-    /// The transmit queue stayed full.
+    /// The transmit queue of the bus stayed full until the send timeout.
     #[error(
         "{name} accepted no frame for {} ms: its queue is full; send less, or check that another node is on the bus",
         waited.as_millis()
@@ -142,7 +143,7 @@ pub enum BusError {
     Full {
         /// The bus.
         name: String,
-        /// The time waited.
+        /// Time for which room was awaited.
         waited: Duration,
     },
     /// An FD frame cannot be sent on a bus that was opened for classic frames only.
@@ -153,7 +154,7 @@ pub enum BusError {
     Io {
         /// The bus.
         name: String,
-        /// The attempted operation.
+        /// The attempted operation, as the object of "cannot".
         doing: &'static str,
         /// The system's error.
         source: io::Error,
@@ -161,7 +162,7 @@ pub enum BusError {
 }
 
 impl BusError {
-    /// Creates the error for a bus that the system does not open.
+    /// Converts an error of the system, returned when opening a bus, to the most specific bus error.
     pub(super) fn open_error(name: &str, doing: &'static str, source: impl Into<io::Error>) -> Self {
         let (name, source) = (name.to_owned(), source.into());
         if source.kind() == io::ErrorKind::PermissionDenied {
@@ -170,13 +171,14 @@ impl BusError {
         Self::Io { name, doing, source }
     }
 
-    /// Returns true if the bus may work again without being opened again: it is down, or its queue is full.
+    /// Returns true if the error may pass while the bus stays open: the interface is down, or the transmit queue is
+    /// full.
     #[must_use]
     pub const fn is_temporary(&self) -> bool {
         matches!(self, Self::Down(_) | Self::Full { .. })
     }
 
-    /// Returns true if opening the bus again later may succeed.
+    /// Returns true if a later attempt to open the bus may succeed.
     #[must_use]
     pub const fn may_open_later(&self) -> bool {
         matches!(
@@ -202,15 +204,15 @@ impl BusError {
     }
 }
 
-/// The error for frames that were not all sent.
+/// The error for a call that did not send all of its frames.
 #[derive(Debug, Error)]
 #[error("{cause} ({sent} of {total} frames sent)")]
 pub struct SendError {
-    /// Number of frames sent before the error.
+    /// Number of frames that were sent before the error.
     pub sent: usize,
-    /// Number of frames to send.
+    /// Number of frames that the call was to send.
     pub total: usize,
-    /// The cause.
+    /// The error that ended sending.
     #[source]
     pub cause: BusError,
 }

@@ -4,11 +4,12 @@ use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK};
 use crate::id::{Id, Kind};
 use crate::port::LinkId;
 
-/// A receive filter. A frame passes if `identifier & mask == id & mask`, or if not, when `id` contains
-/// [`Filter::INVERTED`].
+/// A receive filter. A frame passes if `identifier & mask == id & mask`. A filter whose `id` contains
+/// [`Filter::INVERTED`] passes all other frames instead.
 ///
-/// Both words hold the flags [`EXTENDED`] and [`REMOTE`] above the identifier. A socket receives a frame once
-/// if any of its filters passes it, and nothing without filters. The layout is that of `struct can_filter`.
+/// `id` and `mask` hold the flags [`EXTENDED`] and [`REMOTE`] above the identifier. A socket receives a frame once if
+/// at least one of its filters passes the frame; a socket without filters receives nothing. The layout is that of
+/// `struct can_filter`.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub struct Filter {
     /// The identifier to compare with.
@@ -18,12 +19,12 @@ pub struct Filter {
 }
 
 impl Filter {
-    /// Passes every data and remote frame.
+    /// The filter that passes every data and remote frame.
     pub const ALL: Self = Self { id: 0, mask: 0 };
     /// Flag in `id` that inverts the filter (`CAN_INV_FILTER`).
     pub const INVERTED: u32 = ERROR;
-    /// The mask for exactly one 11-bit identifier. The kernel looks such filters up in a table, without a
-    /// cost per filter.
+    /// The mask that selects exactly one 11-bit identifier. The kernel looks such filters up in a table, so their
+    /// number costs no time.
     pub const EXACT_MASK: u32 = STANDARD_MASK | EXTENDED | REMOTE;
     /// Maximum number of filters of a socket (the kernel's `CAN_RAW_FILTER_MAX`).
     pub const MAX: usize = 512;
@@ -34,19 +35,19 @@ impl Filter {
         Self { id: id.to_bits() as u32, mask: Self::EXACT_MASK }
     }
 
-    /// Creates a filter for the data frames of a kind, from or to any node.
+    /// Creates a filter for the data frames of a message kind, from or to any node.
     #[must_use]
     pub const fn for_kind(kind: Kind) -> Self {
         Self { id: Id { kind, node: 0 }.to_bits() as u32, mask: Self::EXACT_MASK & !0xFF }
     }
 
-    /// Creates a filter for the frames of one direction of a simulated wire.
+    /// Creates a filter for the data frames that one end of a simulated wire sends.
     #[must_use]
     pub const fn for_link(link_id: LinkId) -> Self {
         Self { id: link_id.raw_id(), mask: EXTENDED_MASK | EXTENDED | REMOTE }
     }
 
-    /// Returns the complement of the filter.
+    /// Returns the filter that passes exactly the frames that this one rejects.
     #[must_use]
     pub const fn inverted(self) -> Self {
         Self { id: self.id ^ Self::INVERTED, mask: self.mask }

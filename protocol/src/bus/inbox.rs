@@ -14,7 +14,7 @@ pub struct Received {
     /// Time of arrival at this socket, in nanoseconds of the wall clock (`SO_TIMESTAMPNS`); 0 if the kernel
     /// did not report it.
     pub at_nanos: u64,
-    /// True if this socket sent it.
+    /// True if the receiving socket itself sent the frame.
     pub own: bool,
 }
 
@@ -22,7 +22,7 @@ pub struct Received {
 #[derive(Debug)]
 pub struct Inbox {
     pub(super) batch: Batch,
-    /// The error after the frames, to be returned by the next receive.
+    /// The error that followed the frames of the last receive. The next receive returns it.
     pub(super) failure: Option<io::Error>,
     frames: Vec<Received>,
     dropped: u32,
@@ -47,27 +47,27 @@ impl Inbox {
         self.frames.iter().copied()
     }
 
-    /// Returns the number of frames that the kernel or the embedded bus has dropped for this socket because
-    /// it was not read in time: a running total that wraps (`SO_RXQ_OVFL`). The kernel reports it with the
-    /// next frame that arrives, the embedded bus also when the socket has been read empty.
+    /// Returns the number of frames that the kernel or the embedded bus has dropped for this socket because it was not
+    /// read fast enough: a running total that wraps (`SO_RXQ_OVFL`). The kernel reports a new total with the next frame
+    /// that arrives. The embedded bus also reports it when the socket has been read empty.
     #[must_use]
     pub const fn dropped(&self) -> u32 {
         self.dropped
     }
 
-    /// Returns the number of datagrams that were neither a frame nor a notice; 0 unless the other end is
+    /// Returns the number of received datagrams that were neither a frame nor a drop notice; 0 unless the other end is
     /// faulty.
     #[must_use]
     pub const fn unreadable(&self) -> u64 {
         self.unreadable
     }
 
-    /// Removes the frames.
+    /// Removes all frames from the buffer.
     pub fn clear(&mut self) {
         self.frames.clear();
     }
 
-    /// Decodes the datagrams of the batch. Returns true if the other end closed the connection after them.
+    /// Decodes the datagrams of the batch into frames. Returns true if the other end closed the connection after them.
     pub(super) fn decode(&mut self, carrier: &dyn Carrier) -> bool {
         let Self { batch, frames, dropped, unreadable, failure: _ } = self;
         frames.clear();

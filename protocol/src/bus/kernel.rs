@@ -15,8 +15,8 @@ use super::{Bus, BusError, Filter, BusOptions};
 /// The MTU of an interface that carries CAN FD.
 const FD_MTU: u32 = 72;
 
-/// Default receive buffer of a gateway for each bus, in bytes: room for the answers of all cells to a report
-/// at once.
+/// Default size in bytes of a gateway's receive buffer for each bus: room for the answers of all cells to a report at
+/// once.
 pub const GATEWAY_RECEIVE_BUFFER: u32 = 8 << 20;
 
 /// Returns true if the kernel has `CAN_RAW` sockets. Any error except "protocol not supported" counts as
@@ -128,7 +128,7 @@ pub fn set_receive_buffer(socket: impl AsFd, bytes: usize) -> io::Result<usize> 
     Ok(sockopt::socket_recv_buffer_size(&socket)?)
 }
 
-/// Discards frames that arrived before the filters were set: no more than a default buffer holds.
+/// Discards frames that arrived between the creation of the socket and the setting of its filters.
 fn discard(socket: &CanFdSocket) {
     let mut batch = Batch::new();
     for _ in 0..16 {

@@ -1,4 +1,4 @@
-//! Kinds of buses, and the kind of each of several buses: `--bus-kind embedded --bus-kind can0=socketcan`.
+//! Kinds of buses, and the choice of a kind for each bus of a bench: `--bus-kind embedded --bus-kind can0=socketcan`.
 //!
 //! A new kind is added here and implements [`Carrier`].
 
@@ -13,12 +13,12 @@ use super::check_name;
 use super::embedded::Embedded;
 use super::kernel::SocketCan;
 
-/// A kind of bus: the transport of its frames.
+/// A kind of bus, by the transport of its frames.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum BusKind {
     /// A network interface of the kernel: `can0`, `vcan0`.
     SocketCan,
-    /// A socket served by a process, for this user on this machine.
+    /// A bus served by another process of this user, through a socket in a private directory.
     Embedded,
 }
 
@@ -34,7 +34,7 @@ impl BusKind {
         }
     }
 
-    /// Returns the name of the kind in sentences.
+    /// Returns the name of the kind as used in sentences.
     #[must_use]
     pub const fn display_name(self) -> &'static str {
         match self {
@@ -43,7 +43,7 @@ impl BusKind {
         }
     }
 
-    /// Returns the name of the kind in tables and in `--bus-kind`.
+    /// Returns the name of the kind as used in tables and in `--bus-kind`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -70,8 +70,8 @@ pub enum KindChoice {
 }
 
 impl KindChoice {
-    /// Returns the kind of the bus of this name, which for [`Choice::Auto`] depends on the interfaces that
-    /// exist now.
+    /// Returns the kind for the bus of this name. For [`Choice::Auto`], the kind depends on the network interfaces that
+    /// exist at the time of the call.
     #[must_use]
     pub fn resolve(self, name: &str) -> BusKind {
         match self {
@@ -91,11 +91,11 @@ impl fmt::Display for KindChoice {
     }
 }
 
-/// The error for a word that is not a kind of bus.
+/// The error for a word that does not name a kind of bus.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[error("{got:?} is not a kind of bus: use auto, socketcan or embedded")]
 pub struct UnknownKind {
-    /// The word.
+    /// The rejected word.
     pub got: String,
 }
 
@@ -109,10 +109,10 @@ impl FromStr for KindChoice {
     }
 }
 
-/// The value of one `--bus-kind`: for one bus, or for all buses that are not named.
+/// The value of one option `--bus-kind`: a kind for one bus, or for all buses without an option of their own.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct KindOption {
-    /// The name of the bus; `None` for all others.
+    /// The name of the bus; `None` for all buses without an option of their own.
     pub bus: Option<String>,
     /// The requested kind.
     pub kind: KindChoice,
@@ -129,21 +129,21 @@ impl FromStr for KindOption {
     }
 }
 
-/// The requested kind of each bus.
+/// The requested kind of each bus of a bench.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct KindChoices {
     named: BTreeMap<String, KindChoice>,
     others: KindChoice,
 }
 
-/// The error for contradictory values of `--bus-kind`, or for an unknown bus.
+/// The error for options `--bus-kind` that contradict each other or name an unknown bus.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum KindsError {
-    /// `--bus-kind` is given twice for the same buses.
+    /// Two options `--bus-kind` are given for the same buses.
     #[error("--bus-kind is given twice for {what}: {first} and {second}; leave out one")]
     Duplicate {
-        /// The bus, or all other buses.
+        /// The name of the bus, or the words for all other buses.
         what: String,
         /// The first kind.
         first: KindChoice,
@@ -155,9 +155,9 @@ pub enum KindsError {
     Unknown {
         /// The bus.
         bus: String,
-        /// Its requested kind.
+        /// The kind requested for that bus.
         kind: KindChoice,
-        /// The existing buses.
+        /// The names of the existing buses.
         known: Vec<String>,
     },
 }
@@ -169,17 +169,17 @@ impl KindChoices {
         Self { named: BTreeMap::new(), others: kind }
     }
 
-    /// Requests these kinds for these buses, and [`Choice::Auto`] for others.
+    /// Requests the given kind for each of these buses, and [`Choice::Auto`] for others.
     #[must_use]
     pub fn exactly<'a>(buses: impl IntoIterator<Item = (&'a str, BusKind)>) -> Self {
         let named = buses.into_iter().map(|(name, kind)| (name.to_owned(), KindChoice::Only(kind)));
         Self { named: named.collect(), others: KindChoice::Auto }
     }
 
-    /// Combines values of `--bus-kind`; `otherwise` applies to buses without a value.
+    /// Combines the values of several options `--bus-kind`. Buses without a value get the kind `otherwise`.
     ///
     /// # Errors
-    /// Returns an error if two values are for the same bus, or both for all other buses.
+    /// Returns an error if two values are for the same bus, or if two values are for all other buses.
     pub fn from_options(words: &[KindOption], otherwise: KindChoice) -> Result<Self, KindsError> {
         let (mut named, mut others) = (BTreeMap::new(), None);
         for KindOption { bus, kind } in words {
@@ -195,10 +195,10 @@ impl KindChoices {
         Ok(Self { named, others: others.unwrap_or(otherwise) })
     }
 
-    /// Checks that all named buses are in `known`.
+    /// Checks that every bus named in an option is in the list `known`.
     ///
     /// # Errors
-    /// Returns an error if one is not.
+    /// Returns an error for the first bus that is not in the list.
     pub fn restrict_to<'a>(self, known: impl IntoIterator<Item = &'a str>) -> Result<Self, KindsError> {
         let known: Vec<_> = known.into_iter().map(str::to_owned).collect();
         match self.named.iter().find(|(bus, _)| !known.contains(bus)) {

@@ -1,4 +1,4 @@
-//! Network interfaces, queried over netlink, because `/sys` may show another network namespace.
+//! Network interfaces, queried over netlink. `/sys` is not used, because it may show another network namespace.
 
 use std::io;
 
@@ -13,14 +13,14 @@ pub(super) struct NetworkInterface {
     pub(super) index: u32,
     /// MTU in bytes: 16 for classic CAN, 72 for CAN FD.
     pub(super) mtu: u32,
-    /// True if it is up (`IFF_UP`).
+    /// True if the interface is up (`IFF_UP`).
     pub(super) up: bool,
     /// True if the kernel simulates the interface: a vcan, or an end of a vxcan.
     pub(super) is_virtual: bool,
 }
 
 impl NetworkInterface {
-    /// Queries the interface of this name.
+    /// Queries the kernel for the interface of this name.
     pub(super) fn query(name: &str) -> io::Result<Self> {
         let mut message = LinkMessage::default();
         message.attributes.push(LinkAttribute::IfName(name.to_owned()));

@@ -1,4 +1,4 @@
-//! Requests to the kernel's rtnetlink, with all their answers.
+//! Requests to the kernel over rtnetlink, and the complete lists of answers.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -16,7 +16,7 @@ use rustix::net::{RecvFlags, SendFlags, SocketFlags, SocketType};
 
 /// Maximum time to wait for the kernel, which normally answers at once.
 const TIMEOUT: Duration = Duration::from_secs(5);
-/// Maximum number of attempts to read a list that changes meanwhile.
+/// Maximum number of attempts to read a list that the kernel changes while it is read.
 const RETRIES: usize = 8;
 /// Size of `struct ifinfomsg` in bytes; the attributes follow it.
 const HEADER: usize = 16;
@@ -49,7 +49,7 @@ impl RtnetlinkSocket {
     /// Sends a request and returns all answers, each without its netlink header.
     ///
     /// # Errors
-    /// Returns the kernel's error, or a timeout.
+    /// Returns the error that the kernel answers, or a timeout.
     pub fn request(&mut self, payload: RouteNetlinkMessage, flags: u16) -> io::Result<Vec<Vec<u8>>> {
         for _ in 0..RETRIES {
             let (answers, interrupted) = self.query(payload.clone(), flags)?;

@@ -12,12 +12,12 @@ pub(super) struct Slot {
     pub(super) flags: i32,
 }
 
-/// The kernel's notes about a datagram.
+/// The kernel's control messages about a datagram, decoded.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Notes {
-    /// `SO_TIMESTAMPNS`: nanoseconds of the wall clock.
+    /// Time of arrival in nanoseconds of the wall clock (`SO_TIMESTAMPNS`).
     pub at_nanos: Option<u64>,
-    /// `SO_RXQ_OVFL`: number of datagrams that the socket has dropped so far.
+    /// Number of datagrams that the socket has dropped so far (`SO_RXQ_OVFL`).
     pub dropped: Option<u32>,
 }
 
@@ -42,7 +42,7 @@ struct ControlMessage<'a> {
     data: &'a [u8],
 }
 
-/// An iterator over control messages: length, level, type, then the data, each padded to a word.
+/// An iterator over control messages. Each consists of length, level, type and data, padded to a 64-bit word.
 struct ControlMessages<'a>(&'a [u8]);
 
 impl<'a> Iterator for ControlMessages<'a> {
@@ -67,7 +67,7 @@ impl<'a> Iterator for ControlMessages<'a> {
     }
 }
 
-/// Calls `take` with each file descriptor passed with a datagram (`SCM_RIGHTS`).
+/// Calls `take` with each file descriptor that came with a datagram (`SCM_RIGHTS`).
 pub(super) fn for_each_descriptor(slot: &Slot, mut take: impl FnMut(i32)) {
     let words = slot.control.map(u64::to_ne_bytes);
     let messages = ControlMessages(words.as_flattened().get(..slot.control_len).unwrap_or_default());

@@ -56,7 +56,7 @@ fn too_many_filters_are_refused_before_anything_is_opened() {
     assert_eq!(error.to_string(), "513 filters are too many for one socket on vcan0: at most 512");
 }
 
-/// Returns a bus, and the other end of its connection.
+/// Returns an embedded bus without a server, and the server's end of its connection.
 fn pair() -> (Bus, std::os::fd::OwnedFd) {
     use rustix::net::{AddressFamily, SocketFlags, SocketType, socketpair};
     let (near, far) =

@@ -1,5 +1,5 @@
-//! Input files. They must be regular files or pipes of the shell, because other files need not end: a named
-//! pipe may wait forever for a writer, and a device has no last byte.
+//! Input files. They must be regular files, or pipes that a shell opened for this process. Other files may never end: a
+//! named pipe can wait forever for a writer, and a device has no last byte.
 
 use std::fs::{self, File, FileType, OpenOptions};
 use std::io::{self, Read};
@@ -10,13 +10,13 @@ use std::sync::{Mutex, PoisonError};
 
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 
-/// The name of standard input. A file of this name is written as `./-`.
+/// The path that stands for standard input. A file of this name is written as `./-`.
 pub const STANDARD_INPUT: &str = "-";
 
-/// Descriptors already opened; their data can be read only once.
+/// The descriptors that [`open`] has already returned. Their data can be read only once.
 static OPENED: Mutex<Vec<u32>> = Mutex::new(Vec::new());
 
-/// Marks a descriptor as opened; fails the second time.
+/// Records that a descriptor is in use. Returns an error if it already is.
 fn claim_descriptor(descriptor: u32) -> io::Result<()> {
     let mut taken = OPENED.lock().unwrap_or_else(PoisonError::into_inner);
     if taken.contains(&descriptor) {
@@ -28,7 +28,7 @@ fn claim_descriptor(descriptor: u32) -> io::Result<()> {
     Ok(())
 }
 
-/// Returns true if `path` is `-`, the name of standard input.
+/// Returns true if `path` is `-`, which stands for standard input.
 #[must_use]
 pub fn is_standard_input(path: &Path) -> bool {
     path == Path::new(STANDARD_INPUT)
@@ -44,8 +44,8 @@ pub fn can_be_read_again(path: &Path) -> bool {
 /// of a shell) of any type, but only once. Does not block.
 ///
 /// # Errors
-/// Returns an error if it is a folder, a named pipe, a socket, a device, or a descriptor opened before, or if
-/// it cannot be opened.
+/// Returns an error if the path names a folder, a named pipe, a socket or a device, if it names a descriptor that was
+/// opened before, or if it cannot be opened.
 pub fn open(path: &Path) -> io::Result<File> {
     if is_standard_input(path) {
         claim_descriptor(0)?;
@@ -80,7 +80,7 @@ fn refused(kind: FileType) -> io::Error {
 /// Reads all bytes of a file, opened with [`open`].
 ///
 /// # Errors
-/// Returns the errors of [`open`], or an error if there are more than `longest` bytes.
+/// Returns the errors of [`open`], or an error if the file has more than `longest` bytes.
 pub fn read_bytes(path: &Path, longest: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(longest.saturating_add(1)).read_to_end(&mut bytes)?;
@@ -90,7 +90,8 @@ pub fn read_bytes(path: &Path, longest: u64) -> io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Returns the descriptor of this process that a path such as `/dev/stdout` names.
+/// Returns the number of the file descriptor of this process that a path such as `/dev/stdout` names; `None` for other
+/// paths.
 #[must_use]
 pub fn own_descriptor(path: &Path) -> Option<u32> {
     let own = fs::canonicalize("/proc/self/fd").ok()?;
@@ -106,7 +107,7 @@ pub fn own_descriptor(path: &Path) -> Option<u32> {
     None
 }
 
-/// Returns the folder of a file.
+/// Returns the folder that contains a file.
 #[must_use]
 pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."))

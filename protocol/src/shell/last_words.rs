@@ -1,9 +1,9 @@
-//! The reason for the end of a cell process: a line on its standard error, for people and for the parent
+//! The line that a cell process writes to its standard error when it ends: the reason, for people and for the parent
 //! process.
 
 use std::fmt::{self, Display, Formatter};
 
-/// The first and last cell of a process, displayed as `cell 3` or `cells 1 to 4`.
+/// The first and last cell of a process. It is displayed as `cell 3` or `cells 1 to 4`.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct CellRange(pub u8, pub u8);
 
@@ -28,9 +28,9 @@ impl Display for CellRange {
 /// ```
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct ExitReason {
-    /// The cells of the process.
+    /// The cells that the process ran.
     pub cells: CellRange,
-    /// The name of their bus.
+    /// The name of the bus of these cells.
     pub bus: String,
     /// The reason, in one line.
     pub why: String,
@@ -44,7 +44,7 @@ impl Display for ExitReason {
 }
 
 impl ExitReason {
-    /// Parses the line. Returns `None` for any other line.
+    /// Parses a line of standard error. Returns `None` for any line that does not have this form.
     #[must_use]
     pub fn parse(line: &str) -> Option<Self> {
         let (head, why) = line.split_once(": ")?;

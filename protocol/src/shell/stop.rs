@@ -1,4 +1,4 @@
-//! Requests to stop, and output that obeys them even if its reader does not read.
+//! Requests to stop, and a writer that obeys them even if the reader of the output blocks.
 
 use std::io::{self, Write};
 use std::os::fd::AsFd;
@@ -24,14 +24,14 @@ pub fn stop_flag() -> &'static Arc<AtomicBool> {
     &FLAG
 }
 
-/// A writer for pipes and terminals that does not block a stop. After a stop request it waits one second for
-/// the reader, then returns an error.
+/// A writer for pipes and terminals. A reader that does not read blocks the writer only until a stop request: one
+/// second later, the write returns an error.
 #[derive(Debug)]
 pub struct InterruptibleWriter<F> {
     file: F,
-    /// True if a write may block.
+    /// True if the file is a pipe or terminal, where a write may block.
     waits: bool,
-    /// Number of intervals left after a stop request.
+    /// Number of 100 ms intervals that remain after a stop request.
     polls_left: u32,
 }
 
@@ -43,7 +43,8 @@ impl<F: AsFd> InterruptibleWriter<F> {
         Self { file, waits, polls_left: MAX_STOP_POLLS }
     }
 
-    /// Waits until the file is writable or has an error.
+    /// Waits until the file is writable or has an error. Returns an error when the time after a stop request has
+    /// passed.
     fn wait(&mut self) -> io::Result<()> {
         let timeout = Timespec::try_from(POLL_INTERVAL).ok();
         loop {

@@ -1,5 +1,5 @@
-//! Command-line conventions: one-line errors with exit codes, output whose reader may leave, text that is
-//! safe to show on a terminal, and words quoted for a shell.
+//! Command-line conventions: errors of one line with an exit code, output to a reader that may close the pipe, text
+//! that is safe to show on a terminal, and words quoted for a shell.
 
 use std::borrow::Cow;
 use std::ffi::OsStr;
@@ -18,19 +18,20 @@ pub struct Failure {
 }
 
 impl Failure {
-    /// Creates an error for wrong usage or configuration: exit code 2.
+    /// Creates an error for wrong usage or an invalid configuration, with exit code 2.
     #[must_use]
     pub fn usage(text: impl Display) -> Self {
         Self::with_code(2, text)
     }
 
-    /// Creates an error for a failed or impossible operation: exit code 1.
+    /// Creates an error for an operation that failed, with exit code 1.
     #[must_use]
     pub fn run(text: impl Display) -> Self {
         Self::with_code(1, text)
     }
 
-    /// Creates an error without a message, for a failure that the output already reports: exit code 1.
+    /// Creates an error without a message, with exit code 1, for a failure that the program has already reported in its
+    /// output.
     #[must_use]
     pub const fn already_reported() -> Self {
         Self { text: String::new(), code: 1 }
@@ -42,7 +43,7 @@ impl Failure {
         Self { text: text.to_string(), code }
     }
 
-    /// Appends a further error to the message.
+    /// Appends the text of a further error to the message.
     #[must_use]
     pub fn and(mut self, more: impl Display) -> Self {
         self.text += &format!("; and {more}");
@@ -56,8 +57,8 @@ impl Display for Failure {
     }
 }
 
-/// Returns the exit code of a program. Prints the error, prefixed with the program's name, to standard error
-/// in one write.
+/// Prints the error, if any, prefixed with the program's name, to standard error in one write. Returns the exit code of
+/// the program.
 #[must_use]
 pub fn exit_code(program: &str, done: Result<(), Failure>) -> ExitCode {
     let Err(Failure { text, code }) = done else { return ExitCode::SUCCESS };
@@ -72,12 +73,12 @@ pub fn eprint_line(line: &str) {
     let _ = InterruptibleWriter::new(io::stderr()).write_all(format!("{}\n", printable(line)).as_bytes());
 }
 
-/// Writes lines to standard error in one write, made printable by [`shown_lines`]. Errors are ignored.
+/// Writes text of several lines to standard error in one write, made printable by [`shown_lines`]. Errors are ignored.
 pub fn eprint_lines(text: &str) {
     let _ = InterruptibleWriter::new(io::stderr()).write_all(printable_lines(text).as_bytes());
 }
 
-/// Writes text to standard output; on a terminal it is made printable by [`shown_lines`].
+/// Writes text to standard output. On a terminal, [`shown_lines`] makes the text printable first.
 ///
 /// # Errors
 /// Returns the errors of [`written`].
@@ -93,10 +94,10 @@ pub fn print_raw(text: &str) -> Result<(), Failure> {
     ignore_broken_pipe(write_stdout(text))
 }
 
-/// Writes text to standard output unchanged, for callers that stop when the reader leaves.
+/// Writes text to standard output unchanged, for callers that must notice when the reader closes the pipe.
 ///
 /// # Errors
-/// Returns an error if the text cannot be written, including when its reader has left.
+/// Returns an error if the text cannot be written, including when the reader has closed the pipe.
 pub fn write_stdout(text: &str) -> io::Result<()> {
     InterruptibleWriter::new(io::stdout()).write_all(text.as_bytes())
 }
@@ -151,7 +152,7 @@ fn escape_chars(text: &str, is_coded: impl Fn(char) -> bool) -> Cow<'_, str> {
     Cow::Owned(whole)
 }
 
-/// Converts the result of a write to standard output. A reader that left, as `head` does, is not an error.
+/// Converts the result of a write to standard output. A pipe closed by its reader, as `head` does, is not an error.
 ///
 /// # Errors
 /// Returns an error if the write failed for another reason.
@@ -164,7 +165,7 @@ pub fn ignore_broken_pipe(done: io::Result<()>) -> Result<(), Failure> {
     }
 }
 
-/// Shortens clap's error message to one line: the error and its tip, without the usage.
+/// Shortens clap's error message to one line. The line contains the error and clap's tip, but not the usage.
 #[must_use]
 pub fn one_line_error(text: &str) -> String {
     let text = text.strip_prefix("error: ").unwrap_or(text);
@@ -176,7 +177,7 @@ pub fn one_line_error(text: &str) -> String {
     format!("{lines}; try '--help'")
 }
 
-/// Quotes a word for a shell if necessary.
+/// Quotes a word for a shell if it contains characters with a special meaning there.
 #[must_use]
 pub fn shell_quoted(word: &str) -> Cow<'_, str> {
     let plain = |byte: u8| byte.is_ascii_alphanumeric() || b"_-./:=,@%+".contains(&byte);
@@ -187,7 +188,8 @@ pub fn shell_quoted(word: &str) -> Cow<'_, str> {
     Cow::Owned(format!("'{}'", word.replace('\'', quote)))
 }
 
-/// Quotes any word for a shell. A word that is not UTF-8 becomes `$'...'`, which bash and zsh support.
+/// Quotes a word that need not be UTF-8 for a shell. A word that is not UTF-8 becomes `$'...'`, which bash and zsh
+/// support.
 #[must_use]
 pub fn shell_quoted_os(word: &OsStr) -> String {
     if let Some(word) = word.to_str() {
@@ -204,8 +206,8 @@ pub fn shell_quoted_os(word: &OsStr) -> String {
     whole + "'"
 }
 
-/// Returns the path in an environment variable, if it is set. A bare name gets the prefix `./`, because it
-/// would otherwise be searched in `PATH`.
+/// Returns the path in an environment variable, if the variable is set. A bare file name gets the prefix `./`, because
+/// the system would otherwise search for it in `PATH`.
 #[must_use]
 pub fn path_from_env(variable: &str) -> Option<PathBuf> {
     let path = std::env::var_os(variable).filter(|path| !path.is_empty()).map(PathBuf::from)?;

@@ -1,9 +1,9 @@
-//! TOML files that users write, and their errors: one line with the file, line and column, key, value and
-//! what is allowed.
+//! TOML files that users write, and the errors in them. An error is one line with the file, line and column, key, value
+//! and allowed values.
 //!
-//! The file is deserialised into a plain struct (`serde`, unknown keys refused). A `check` function then
-//! converts it to checked types or returns a [`Fault`]. Deserialisation records no positions, which is fast;
-//! only after an error is the file parsed again with positions.
+//! The file is deserialised into a plain struct with `serde`, which refuses unknown keys. A `check` function then
+//! converts the struct to checked types or returns a [`Fault`]. Deserialisation records no positions, which makes it
+//! fast; after an error, the file is parsed again with positions.
 
 mod mistakes;
 
@@ -24,13 +24,13 @@ use crate::time::Span;
 /// A step of the path from the root of a file to a value.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum PathStep {
-    /// Into a table.
+    /// A key of a table.
     Key(&'static str),
-    /// Into an array, at an index counted from 0.
+    /// An index into an array, counted from 0.
     Index(usize),
 }
 
-/// An invalid value, with its path and the reason.
+/// The error for an invalid value: its path in the file, the value and the reason.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct DocumentFault {
     path: Vec<PathStep>,
@@ -38,10 +38,10 @@ pub struct DocumentFault {
     why: String,
 }
 
-/// The result of a check.
+/// The result of a check: the checked value, or the first fault.
 pub type Checked<T> = Result<T, DocumentFault>;
 
-/// The path of a value or table in a file. Its methods check values and create faults with this path.
+/// The path of a value or table in a file. Its methods check the value at that path and create faults about it.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct KeyPath(Vec<PathStep>);
 
@@ -70,16 +70,17 @@ impl KeyPath {
         Self([&self.0[..], &[PathStep::Index(index)]].concat())
     }
 
-    /// Creates a fault with this path. An empty value is not printed.
+    /// Creates a fault about the value at this path. If `value` is empty, the message contains only the path and the
+    /// reason.
     #[must_use]
     pub fn fault(&self, value: impl fmt::Display, why: impl fmt::Display) -> DocumentFault {
         DocumentFault { path: self.0.clone(), value: value.to_string(), why: why.to_string() }
     }
 
-    /// Converts one of a few words to its meaning.
+    /// Converts one of the allowed words to the value that it stands for.
     ///
     /// # Errors
-    /// Returns an error if it is not one of them.
+    /// Returns an error if the word is not one of them.
     pub fn choose<T: Copy>(&self, got: &str, words: &[(&str, T)]) -> Result<T, DocumentFault> {
         let found = words.iter().find(|(word, _)| *word == got);
         found.map(|&(_, meaning)| meaning).ok_or_else(|| {
@@ -103,7 +104,7 @@ impl KeyPath {
     /// Checks that a number is finite.
     ///
     /// # Errors
-    /// Returns an error if it is infinite or NaN.
+    /// Returns an error if the number is infinite or NaN.
     pub fn check_finite(&self, value: f64) -> Result<f64, DocumentFault> {
         if value.is_finite() { Ok(value) } else { Err(self.fault(value, "a finite number is needed")) }
     }
@@ -111,23 +112,23 @@ impl KeyPath {
     /// Checks that a number is finite and above 0.
     ///
     /// # Errors
-    /// Returns an error if it is not.
+    /// Returns an error if the number is not finite or not above 0.
     pub fn check_positive(&self, value: f64) -> Result<f64, DocumentFault> {
         let positive = value.is_finite() && value > 0.0;
         if positive { Ok(value) } else { Err(self.fault(value, "must be above 0")) }
     }
 
-    /// Converts a number to a word with the rounding of `fit`.
+    /// Converts a number to a fixed-point word with the rounding function `fit`.
     ///
     /// # Errors
-    /// Returns an error if it is outside the range of the word.
+    /// Returns an error if the number is outside the range of the word.
     pub fn to_fixed<const F: u32>(&self, value: f64, fit: RoundingFn<F>) -> Result<Q<F>, DocumentFault> {
         fit(value).map_err(|OutOfRange { min, bound, .. }| {
             self.fault(value, format_args!("the range is [{min}, {bound})"))
         })
     }
 
-    /// Sets a word from an optional number, which must not be negative.
+    /// Sets a fixed-point word to a number, if one is given. The number must not be negative.
     ///
     /// # Errors
     /// Returns an error if the number is negative, or outside the range of the word.
@@ -141,7 +142,7 @@ impl KeyPath {
     }
 }
 
-/// A rounding function from a number to a word.
+/// A function that rounds a number to a fixed-point word.
 pub type RoundingFn<const F: u32> = fn(f64) -> Result<Q<F>, OutOfRange>;
 
 impl fmt::Display for DocumentFault {
@@ -185,19 +186,19 @@ pub enum DocumentError {
         /// The key, the value, and what is allowed.
         what: String,
     },
-    /// The file is of another kind.
+    /// The file is valid, but of another kind, such as a scenario in place of a skin.
     #[error("{path}: {what}")]
     WrongKind {
         /// The file.
         path: String,
-        /// The kind of the file, and its proper use.
+        /// The kind of the file, and the option or command that it is for.
         what: &'static str,
     },
 }
 
 impl DocumentError {
-    /// Returns [`DocumentError::Mistaken`] with `what` if the text has one of the keys `has` and none of the
-    /// keys `lacks`: it is a file of another kind. Otherwise returns the error unchanged.
+    /// Returns [`DocumentError::Mistaken`] with `what` if the text is a file of another kind: it has one of the keys
+    /// `has` and none of the keys `lacks`. Otherwise returns the error unchanged.
     #[must_use]
     pub fn or_wrong_kind(self, text: &str, has: &[&str], lacks: &[&str], what: &'static str) -> Self {
         let Self::InvalidValue { path, .. } = &self else { return self };
@@ -207,15 +208,15 @@ impl DocumentError {
     }
 }
 
-/// Maximum size of a user-written file in bytes; a skin of 253 cells has 60 KB.
+/// Maximum size of a user-written file in bytes. For comparison: a skin of 253 cells has 60 KB.
 pub const MAX_FILE_BYTES: u64 = 16 << 20;
 
-/// Maximum number of keys, values and tables in a TOML file, estimated by their punctuation. A skin of 10 000
-/// cells has 280 000; this many take at most 0.5 GB of memory.
+/// Maximum number of keys, values and tables in a TOML file, estimated by the number of its punctuation characters. A
+/// skin of 10 000 cells has 280 000 of them; a file with the maximum takes up to 0.5 GB of memory to parse.
 const MAX_PUNCTUATION: usize = 500_000;
 
-/// Converts seconds to a duration. The caller checks that they are not negative and within the limits of the
-/// file.
+/// Converts seconds to a duration. The caller has checked that the seconds are not negative and within the limits of
+/// the file format.
 #[must_use]
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "bounded by whoever calls")]
 pub fn span_from_seconds(seconds: f64) -> Span {
@@ -225,7 +226,7 @@ pub fn span_from_seconds(seconds: f64) -> Span {
 /// Reads a file of at most [`LONGEST`] bytes.
 ///
 /// # Errors
-/// Returns an error if it is longer, or cannot be read as UTF-8.
+/// Returns an error if the file is longer, or cannot be read as UTF-8.
 pub fn read_text(path: &Path) -> Result<String, DocumentError> {
     read_text_within(path, MAX_FILE_BYTES)
 }
@@ -233,7 +234,7 @@ pub fn read_text(path: &Path) -> Result<String, DocumentError> {
 /// Reads a file of at most `longest` bytes.
 ///
 /// # Errors
-/// Returns an error if it is longer, or cannot be read as UTF-8.
+/// Returns an error if the file is longer, or cannot be read as UTF-8.
 pub fn read_text_within(path: &Path, longest: u64) -> Result<String, DocumentError> {
     let read =
         || String::from_utf8(input::read_bytes(path, longest)?).map_err(|_| io::Error::other("it is not UTF-8"));
@@ -243,7 +244,7 @@ pub fn read_text_within(path: &Path, longest: u64) -> Result<String, DocumentErr
     })
 }
 
-/// Parses a text and checks it. `path` is its name in errors.
+/// Parses a text and checks it. `path` names the text in errors.
 ///
 /// # Errors
 /// Returns the first error in the text.
@@ -266,7 +267,7 @@ pub fn parse<Raw: DeserializeOwned, T>(
     check(raw).map_err(|fault| wrong(offset_of(text, &fault.path), fault.to_string()))
 }
 
-/// Deserialises a document. The error is an offset in bytes and one line of text.
+/// Deserialises a document. An error consists of an offset in bytes and one line of text.
 fn deserialize<T: DeserializeOwned>(text: &str) -> Result<T, (usize, String)> {
     toml::from_str(text).map_err(|error| {
         let at = error.span().unwrap_or_default();
@@ -274,7 +275,8 @@ fn deserialize<T: DeserializeOwned>(text: &str) -> Result<T, (usize, String)> {
     })
 }
 
-/// Returns the offset of the value at a path, or of its nearest existing ancestor.
+/// Returns the byte offset of the value at a path. If the value does not exist, returns the offset of the innermost
+/// table or array on the path that does.
 fn offset_of(text: &str, path: &[PathStep]) -> usize {
     let Ok(root) = DeTable::parse(text) else { return 0 };
     let mut at = root.span().start;

@@ -1,5 +1,5 @@
-//! Skin files: TOML documents with errors by line and column, the XML of robot descriptions, and the skin
-//! itself.
+//! Skin files: TOML documents whose errors have a line and column, the XML of robot descriptions, and the checked skin
+//! description.
 
 pub mod document;
 pub mod skin;

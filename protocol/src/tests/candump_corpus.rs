@@ -13,14 +13,14 @@ use socketcan::{CanAnyFrame, EmbeddedFrame as _, Frame as _};
 
 const CORPUS: &str = include_str!("../../tests/golden/candump_corpus.log");
 
-/// The expected result of a line: a word, and fields.
+/// The expected result of a line: a word such as `frame`, and `key=value` fields.
 struct Expected<'a> {
     what: &'a str,
     fields: BTreeMap<&'a str, &'a str>,
 }
 
 impl<'a> Expected<'a> {
-    /// Parses an expectation. Returns `None` for a line of explanation.
+    /// Parses the expected result of a line. Returns `None` for a comment that explains the corpus.
     fn new(text: &'a str) -> Option<Self> {
         let mut words = text.split_whitespace();
         let what = words.next()?;
@@ -129,8 +129,8 @@ fn second_opinion(line: &str) -> Result<Option<CanDumpRecord>, dump::ParseError>
     Reader::from_reader(line.as_bytes()).next_record()
 }
 
-/// Returns true if the other parser found the same frame at the same time on the same bus. It sets FDF in
-/// every FD frame.
+/// Returns true if the crate `socketcan` parsed the same frame at the same time on the same bus. FDF is not compared,
+/// because the crate sets it in every FD frame.
 fn same(record: &Record<'_>, other: &CanDumpRecord) -> bool {
     let Record { time, interface, frame, direction } = record;
     let direction = direction.map(|direction| match direction {

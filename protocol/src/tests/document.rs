@@ -26,7 +26,7 @@ const TESTS: [&str; 4] = ["cell-node", "protocol", "gateway/reference/src/tests"
 
 const PATH: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/reference/protocol.md");
 
-/// Returns every table with its name.
+/// Returns the name and the text of every table in the document.
 fn tables() -> [(&'static str, String); 4] {
     let of = |kind| packets().iter().find(|schema| schema.kind == kind).unwrap();
     [
@@ -37,7 +37,7 @@ fn tables() -> [(&'static str, String); 4] {
     ]
 }
 
-/// Returns the table of kinds and commands, one per line.
+/// Returns the table of message kinds and commands, one per line.
 fn kinds() -> String {
     let head = "| identifier | name | from | node field | words | epoch byte | count byte |\n|---|---|---|---|---|---|---|\n";
     let mut out = head.to_owned();
@@ -83,7 +83,7 @@ fn kinds() -> String {
     out
 }
 
-/// Returns a table of fields, one per line.
+/// Returns the table of the fields in these layouts, one per line.
 fn fields(of: &str, layouts: &[Layout]) -> String {
     let mut out =
         format!("| {of} | word | field | format | unit | range | meaning |\n|---|---|---|---|---|---|---|\n");
@@ -132,12 +132,12 @@ fn range(field: &Field) -> String {
     }
 }
 
-/// Returns the unit on the wire, where angles are in quarter turns.
+/// Returns the unit of a field on the wire, where angles are in quarter turns.
 fn unit(field: &Field) -> &str {
     if matches!(field.format, FieldFormat::Angle | FieldFormat::Position) { "quarter turns" } else { &field.unit }
 }
 
-/// Formats the position of a field: `0`, `0 to 2`, `2, bits 8 to 15`.
+/// Formats the position of a field in words or bytes: `0`, `0 to 2`, `2, bits 8 to 15`.
 fn words(field: &Field, within: bool) -> String {
     let (word, bit, width) = (field.first_bit() / 16, field.first_bit() % 16, usize::from(field.width()));
     let bits = if width == 1 { format!("bit {bit}") } else { format!("bits {bit} to {}", bit + width - 1) };
@@ -226,7 +226,7 @@ fn requirements() -> Vec<(&'static str, u32)> {
     bold.flat_map(|(id, _)| ids(id)).collect()
 }
 
-/// Collects test sources, and the program that writes the golden logs.
+/// Appends the source text of tests in a folder, and of the program that writes the golden logs.
 fn test_sources(path: &Path, found: &mut String) {
     for entry in std::fs::read_dir(path).unwrap() {
         let path = entry.unwrap().path();

@@ -1,7 +1,8 @@
-//! Tests with the frames of `golden/*.log`, which another program wrote from the document: `golden/make.py`.
+//! Tests with the frames of `golden/*.log`, which the Python program `golden/make.py` wrote from the protocol document.
 //!
-//! A comment above each frame gives its meaning. The tests construct the message from the comment alone and
-//! compare in both directions, so that an error made in both `encode` and `decode` shows.
+//! A comment above each frame gives its meaning. The tests construct the message from this comment alone. They compare
+//! both the encoded message with the frame and the decoded frame with the message, so that the same error in `encode`
+//! and `decode` is found.
 
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a test may stop")]
 
@@ -144,8 +145,8 @@ fn bad_frames_are_refused_for_the_reason_given() {
     }
 }
 
-/// Returns the packet lengths of the log's bus: six words, except for the packets of eight words, all of
-/// which belong to epoch 1.
+/// Returns the packet lengths on the bus of the log. They have six words, except for the packets of eight words, which
+/// all belong to epoch 1.
 fn lengths_of(golden: &Golden<'_>) -> Lengths {
     let log = lines(CLASSIC);
     let at = log.iter().position(|it| it.micros == golden.micros).unwrap();
@@ -211,7 +212,7 @@ fn the_first_classic_frames_are_written_as_the_log_has_them() {
     assert!(pairs >= 10, "{pairs}");
 }
 
-/// Returns the parameters that the writes of a session leave behind, and its commits.
+/// Applies the writes of a session. Returns the resulting parameters, and the hash and outcome of each commit.
 fn staged(session: &str) -> (Parameters, Vec<(u16, bool)>) {
     let mut parameters = Parameters::default();
     let mut commits = Vec::new();

@@ -1,4 +1,4 @@
-//! Tests of the whole crate against documents, golden frames and other programs' values.
+//! Tests of the whole crate against its documents, golden frames and the values of other programs.
 
 mod candump_corpus;
 mod document;

@@ -13,11 +13,11 @@
 
 use thiserror::Error;
 
-/// Set in an identifier of 29 bits.
+/// Flag of a 29-bit identifier.
 pub const EXTENDED: u32 = 0x8000_0000;
-/// Set in a remote frame.
+/// Flag in the identifier of a remote frame.
 pub const REMOTE: u32 = 0x4000_0000;
-/// Set in an error frame: a report from the driver that was never on the wire.
+/// Flag in the identifier of an error frame, which a driver creates to report an error and never sends on the wire.
 pub const ERROR: u32 = 0x2000_0000;
 /// Mask of an 11-bit identifier.
 pub const STANDARD_MASK: u32 = 0x7FF;
@@ -28,25 +28,25 @@ pub const EXTENDED_MASK: u32 = 0x1FFF_FFFF;
 pub const BIT_RATE_SWITCH: u8 = 1;
 /// FD flag: the sender is error passive.
 pub const ERROR_STATE: u8 = 2;
-/// FD flag: marks an FD frame (`CANFD_FDF`). Kernels set it from version 6.1 on.
+/// FD flag: the frame is an FD frame (`CANFD_FDF`). Kernels set it from version 6.1 on.
 pub const FD_FORMAT: u8 = 4;
 
-/// FD flags that fit the one hexadecimal digit of a log; the kernel reserves the others.
+/// FD flags that fit the single hexadecimal digit in a log; the kernel reserves the other bits.
 const FD_FLAGS: u8 = 0xF;
 
-/// Bytes of `struct can_frame`.
+/// Size of `struct can_frame` in bytes.
 pub const CLASSIC_BYTES: usize = 16;
-/// Bytes of `struct canfd_frame`.
+/// Size of `struct canfd_frame` in bytes.
 pub const FD_BYTES: usize = 72;
 
-/// Returns the data length that carries `len` bytes in an FD frame: the next of 0 to 8, 12, 16, 20, 24, 32,
-/// 48 and 64.
+/// Returns the data length of an FD frame that carries `len` bytes: the smallest of 0 to 8, 12, 16, 20, 24, 32, 48 and
+/// 64 that is not less.
 #[must_use]
 pub const fn fd_len(len: usize) -> usize {
     dlc_len(fd_dlc(len))
 }
 
-/// Returns the DLC of an FD frame that carries `len` bytes, rounded up to the next length of CAN FD.
+/// Returns the DLC of an FD frame that carries `len` bytes, rounded up to a length that CAN FD allows.
 #[must_use]
 pub const fn fd_dlc(len: usize) -> u8 {
     match len {
@@ -76,19 +76,19 @@ pub const fn dlc_len(dlc: u8) -> usize {
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[error("{got:X} does not fit an identifier of {bits} bits: at most {max:X}")]
 pub struct IdentifierError {
-    /// The number.
+    /// The number that does not fit.
     pub got: u32,
-    /// Bits of the identifier: 11 or 29.
+    /// Number of bits of the identifier: 11 or 29.
     pub bits: u8,
     /// The largest identifier with that many bits.
     pub max: u32,
 }
 
-/// Checks an untrusted identifier and returns it with its flags, as [`Frame`] stores it. `flags` may contain
-/// [`EXTENDED`], [`REMOTE`] and [`ERROR`]; extended identifiers and error frames have 29 bits, all others 11.
+/// Checks an untrusted identifier and returns it combined with its flags, as [`Frame`] stores it. `flags` may contain
+/// [`EXTENDED`], [`REMOTE`] and [`ERROR`]. Extended identifiers and error frames have 29 bits, all others 11.
 ///
 /// # Errors
-/// Returns an error if the number has more bits than that.
+/// Returns an error if the number has more bits than the identifier.
 pub const fn check_identifier(number: u32, flags: u32) -> Result<u32, IdentifierError> {
     let (bits, max) = if flags & (EXTENDED | ERROR) == 0 { (11, STANDARD_MASK) } else { (29, EXTENDED_MASK) };
     if number > max {
@@ -154,35 +154,35 @@ pub struct Frame {
     data: [u8; 64],
 }
 
-/// The error for bytes that are not a CAN frame.
+/// The error for bytes that do not form a CAN frame.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum FrameError {
-    /// The size is neither that of `struct can_frame` nor that of `struct canfd_frame`.
+    /// The size is that of neither `struct can_frame` nor `struct canfd_frame`.
     #[error("{got} bytes are not a CAN frame: a classic frame has 16 bytes, an FD frame 72")]
     Size {
-        /// Bytes received.
+        /// Number of bytes received.
         got: usize,
     },
-    /// The format cannot carry that much data.
+    /// There is more data than the frame format can carry.
     #[error("{got} data bytes do not fit: at most {max}")]
     Length {
-        /// Bytes given.
+        /// Number of data bytes.
         got: usize,
-        /// The maximum of the format.
+        /// Maximum number of data bytes in this format.
         max: usize,
     },
 }
 
 impl Frame {
-    /// A classic frame with identifier 0 and no data; an initial value for buffers.
+    /// A classic frame with identifier 0 and no data, for initialising buffers.
     pub const EMPTY: Self =
         Self { id: 0, format: Format::Classic, flags: 0, raw_dlc: 0, len: 0, data: [0; 64] };
 
     /// Creates a classic data frame. For a 29-bit identifier, `id` includes the flag [`EXTENDED`].
     ///
     /// # Errors
-    /// Returns an error if there are more than 8 bytes.
+    /// Returns an error if `data` has more than 8 bytes.
     pub fn classic(id: u32, data: &[u8]) -> Result<Self, FrameError> {
         Self::with_data(id, Format::Classic, 0, data)
     }
@@ -190,7 +190,7 @@ impl Frame {
     /// Creates an FD data frame with the given FD flags, and sets [`FD_FORMAT`] as the kernel does.
     ///
     /// # Errors
-    /// Returns an error if there are more than 64 bytes.
+    /// Returns an error if `data` has more than 64 bytes.
     pub fn fd(id: u32, flags: u8, data: &[u8]) -> Result<Self, FrameError> {
         Self::with_data(id, Format::Fd, flags | FD_FORMAT, data)
     }
@@ -198,7 +198,7 @@ impl Frame {
     /// Creates a frame from all its fields, as read from a capture.
     ///
     /// # Errors
-    /// Returns an error if the data does not fit the format.
+    /// Returns an error if the format cannot carry this much data.
     pub fn with_data(id: u32, format: Format, flags: u8, data: &[u8]) -> Result<Self, FrameError> {
         let mut bytes = [0; 64];
         if let Some(bytes) = bytes.get_mut(..data.len()) {
@@ -207,7 +207,7 @@ impl Frame {
         Self::with_buffer(id, format, flags, bytes, data.len())
     }
 
-    /// Like [`Frame::with_data`], with the data already in a full-size buffer. Bytes after `len` must be 0.
+    /// Like [`Frame::with_data`], with the data in a buffer of full size. The bytes after `len` must be 0.
     #[inline(always)]
     pub(crate) fn with_buffer(
         id: u32,
@@ -235,14 +235,14 @@ impl Frame {
         Ok(frame)
     }
 
-    /// Sets the DLC as seen on the wire: 9 to 15 in a classic frame with 8 data bytes.
+    /// Sets the DLC that was on the wire: 9 to 15 in a classic frame with 8 data bytes.
     #[must_use]
     pub const fn with_raw_dlc(mut self, raw_dlc: u8) -> Self {
         self.raw_dlc = raw_dlc;
         self
     }
 
-    /// Returns identifier and flags in one word, as the kernel stores them.
+    /// Returns the identifier and its flags in one word, as the kernel stores them.
     #[must_use]
     pub const fn raw_id(&self) -> u32 {
         self.id
@@ -260,8 +260,8 @@ impl Frame {
         self.id & EXTENDED != 0
     }
 
-    /// Returns true if this is a remote frame, which requests data. CAN FD has no remote frames, so the flag
-    /// is ignored there.
+    /// Returns true if this is a remote frame, which requests data. CAN FD has no remote frames, so this returns false
+    /// for an FD frame with the flag [`REMOTE`].
     #[must_use]
     pub const fn is_remote(&self) -> bool {
         matches!(self.format, Format::Classic) && self.id & REMOTE != 0
@@ -285,7 +285,7 @@ impl Frame {
         self.flags
     }
 
-    /// Returns the DLC as seen on the wire if it was 9 to 15 (8 data bytes); otherwise 0.
+    /// Returns the DLC that was on the wire if it was 9 to 15 (with 8 data bytes), else 0.
     #[must_use]
     pub const fn raw_dlc(&self) -> u8 {
         self.raw_dlc
@@ -310,8 +310,8 @@ impl Frame {
         self.data.get(..len).unwrap_or_default()
     }
 
-    /// Returns the bytes between control field and checksum on the wire. An FD frame with a length that CAN
-    /// FD does not have is padded with zeros; its remote flag is ignored.
+    /// Returns the data bytes that are on the wire between control field and checksum. Data of a length that CAN FD
+    /// does not allow is padded with zeros. The remote flag of an FD frame is ignored.
     pub(crate) fn on_wire(&self) -> &[u8] {
         let len = match self.format {
             Format::Classic => self.data().len(),
@@ -320,7 +320,7 @@ impl Frame {
         self.data.get(..len).unwrap_or(&self.data)
     }
 
-    /// Returns the kernel's struct. Only the first [`Frame::byte_len`] bytes are valid.
+    /// Returns the frame as the kernel's struct. Only the first [`Frame::byte_len`] bytes are valid.
     #[must_use]
     pub fn to_bytes(&self) -> [u8; FD_BYTES] {
         let [a, b, c, d] = self.id.to_ne_bytes();
@@ -341,11 +341,10 @@ impl Frame {
         self.format.byte_len()
     }
 
-    /// Decodes the kernel's struct. Never panics.
+    /// Decodes the bytes of the kernel's struct. Never panics.
     ///
     /// # Errors
-    /// Returns an error if the size is that of neither struct, or the length byte is above what the format
-    /// carries.
+    /// Returns an error if the size is that of neither struct, or the length byte exceeds the maximum of the format.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, FrameError> {
         let format = match bytes.len() {
             CLASSIC_BYTES => Format::Classic,

@@ -1,5 +1,5 @@
-//! The text format of `candump -L`. The parser accepts many variants; the writer uses the subset that every
-//! tool reads.
+//! The text format of `candump -L`. The parser accepts many variants; the writer uses the subset that all tools can
+//! read.
 //!
 //! ```text
 //!   (1700000000.123456) vcan0 123#DEADBEEF       classic, 3 hex digits: 11-bit identifier
@@ -34,7 +34,7 @@ use read::{Cursor, is_blank};
 pub use read::{eight_digit_identifier, fraction};
 pub use write::{write_frame, write_record};
 
-/// The time of a frame, and how it is written.
+/// The time of a frame, and the number of digits with which it is written.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd)]
 pub struct Timestamp {
     /// Nanoseconds since 1970.
@@ -81,52 +81,52 @@ pub struct Record<'a> {
     pub direction: Option<Direction>,
 }
 
-/// The content of one line.
+/// The content of one line of a capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum CandumpLine<'a> {
     /// A frame.
     Frame(Record<'a>),
-    /// candump's report that it lost frames.
+    /// The line in which candump reports that it lost frames.
     Dropped {
         /// Number of lost frames.
         frames: u64,
     },
     /// A CAN XL frame, which is not decoded.
     CanXl,
-    /// A comment, an empty line, or other text that can-utils also skip.
+    /// A comment, an empty line, or other text, which can-utils also skip.
     Other,
 }
 
-/// The error for a line that begins like a frame but is not one.
+/// The error for a line that begins like a frame but does not contain a valid one.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[error("column {column}: {expected}")]
 pub struct LineError {
     /// Column of the error, counted from 1.
     pub column: usize,
-    /// The text that was expected there.
+    /// The text that was expected in that column.
     pub expected: &'static str,
 }
 
 /// Parses one line, with or without its line ending. Never panics.
 ///
 /// # Errors
-/// Returns an error if the line begins with a parenthesis, possibly after blanks and quotation marks, but is
-/// not a frame.
+/// Returns an error if the line begins with a parenthesis, possibly after blanks and quotation marks, but is not a
+/// valid frame.
 pub fn parse(line: &str) -> Result<CandumpLine<'_>, LineError> {
     parse_bytes(line.as_bytes())
 }
 
-/// Like [`parse`], for bytes that need not be UTF-8. Only the interface name must be. Never panics.
+/// Like [`parse`], for a line that need not be UTF-8; only the interface name must be. Never panics.
 ///
 /// # Errors
-/// Returns an error if the line begins with a parenthesis, possibly after blanks and quotation marks, but is
-/// not a frame.
+/// Returns an error if the line begins with a parenthesis, possibly after blanks and quotation marks, but is not a
+/// valid frame.
 #[inline]
 pub fn parse_bytes(line: &[u8]) -> Result<CandumpLine<'_>, LineError> {
     portable::parse_record(line).map_or_else(|| parse_general(line), |record| Ok(CandumpLine::Frame(record)))
 }
 
-/// Parses every accepted variant of a line.
+/// Parses a line in any of the accepted variants.
 fn parse_general(line: &[u8]) -> Result<CandumpLine<'_>, LineError> {
     let text = trim_end(line);
     // Blanks and quotation marks of e-mails and issue trackers.
@@ -139,7 +139,7 @@ fn parse_general(line: &[u8]) -> Result<CandumpLine<'_>, LineError> {
     }
 }
 
-/// Parses a line whose opening parenthesis is at `at`.
+/// Parses a line whose opening parenthesis is at index `at`.
 fn parse_at(text: &[u8], at: usize) -> Result<CandumpLine<'_>, LineError> {
     let mut cursor = Cursor::new(text, at + 1);
     let time = cursor.time()?;
@@ -154,7 +154,8 @@ fn parse_at(text: &[u8], at: usize) -> Result<CandumpLine<'_>, LineError> {
     Ok(CandumpLine::Frame(Record { time, interface, frame, direction }))
 }
 
-/// Finds a frame after a prefix such as journald's. A candidate that does not parse is part of the prefix.
+/// Finds a frame after a prefix such as journald's. If the text after a parenthesis is not a valid frame, it counts as
+/// part of the prefix.
 fn parse_after_prefix(text: &[u8]) -> Option<CandumpLine<'_>> {
     let begins = |pair: &[u8]| matches!(pair, [before, b'('] if is_blank(*before));
     let places = text.windows(2).enumerate().filter(|(_, pair)| begins(pair));
@@ -164,7 +165,7 @@ fn parse_after_prefix(text: &[u8]) -> Option<CandumpLine<'_>> {
 /// Parses a frame without time and interface, in the notation of cansend: `123#DEADBEEF`. Never panics.
 ///
 /// # Errors
-/// Returns an error if it is not a frame, is a CAN XL frame, or is followed by other text.
+/// Returns an error if the text is not a frame, is a CAN XL frame, or contains anything after the frame.
 pub fn parse_frame(text: &str) -> Result<Frame, LineError> {
     let mut cursor = Cursor::new(text.as_bytes(), 0);
     let frame =
@@ -184,7 +185,7 @@ impl fmt::Display for Record<'_> {
     }
 }
 
-/// Strips trailing white space and line endings, including those of Unicode.
+/// Strips trailing white space and line endings, including the white space of Unicode.
 fn trim_end(line: &[u8]) -> &[u8] {
     match line.last() {
         // Fast path: nearly every line ends in a digit.

@@ -1,5 +1,5 @@
-//! The factory record of a firmware cell: a section in its flash that the manufacturer writes into the
-//! program file before it is loaded.
+//! The factory record of a firmware cell: a section in flash with the node id, serial number and wires. The
+//! manufacturer writes it into the program file before the program is loaded into the microcontroller.
 //!
 //! ```text
 //!   byte 0..3  "CELL"                         4  version, 1       5  the node id, 0 for none
@@ -11,7 +11,7 @@
 //!        24..29 0                          30..31 CRC-16 over all bytes before it, little endian
 //! ```
 //!
-//! Only cells on a bench have wires here: the bench simulates them with frames ([`crate::port`]).
+//! Only cells on a bench have wires in this record, because the bench simulates wires with frames ([`crate::port`]).
 
 use crate::can::Format;
 use crate::id::CellId;
@@ -22,7 +22,7 @@ use crate::port::{LinkId, PORTS};
 pub const BYTES: usize = 32;
 /// The linker section that holds the record.
 pub const SECTION: &str = ".factory";
-/// An unwritten record: erased flash.
+/// The bytes of a record that was not written: erased flash.
 pub const ERASED: [u8; BYTES] = [0xFF; BYTES];
 
 const MAGIC: &[u8; 4] = b"CELL";
@@ -30,16 +30,16 @@ const VERSION: u8 = 1;
 const CLASSIC: u8 = 1;
 const HOSTED: u8 = 2;
 
-/// The factory settings of a cell.
+/// The settings of a cell that its manufacturer chooses.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Factory {
     /// The node id, if assigned at the factory.
     pub node: Option<CellId>,
     /// The serial number.
     pub serial: u32,
-    /// The frame format of its bus.
+    /// The frame format of the cell's bus.
     pub format: Format,
-    /// True if the cell runs in an emulator that keeps its flash in a file.
+    /// True if the cell runs in an emulator that keeps the flash in a file.
     pub hosted: bool,
     /// The link id that each port sends with. The last entry is the uplink to the gateway's side.
     pub link_ids: [Option<LinkId>; PORTS + 1],
@@ -71,7 +71,7 @@ impl Factory {
         bytes
     }
 
-    /// Decodes a record. Returns `None` for a blank or damaged record. Never panics.
+    /// Decodes a record. Returns `None` if it was not written or is damaged. Never panics.
     #[must_use]
     pub fn decode(bytes: &[u8; BYTES]) -> Option<Self> {
         let (body, crc) = bytes.split_last_chunk()?;

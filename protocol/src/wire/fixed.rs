@@ -3,9 +3,9 @@
 //! `Qm_n` has one sign bit, `m` integer bits and `n` fraction bits, as in the robot-skin literature: Q1.14
 //! spans [-2, 2). The crate `fixed` includes the sign bit in its count and calls the same format `I2F14`.
 //!
-//! A format is the resolution of a number, not its quantity: [`crate::message`] defines which word is a force
-//! and which a torque. Operators are not overloaded, so that every operation that can lose bits has a name:
-//! [`Acc::round`] and the saturating operations.
+//! A format defines the resolution of a number and not the quantity: [`crate::message`] defines which word is a force
+//! and which a torque. Operators are not overloaded, so that every operation that can lose bits is visible as a call of
+//! [`Acc::round`] or of a saturating function.
 
 use thiserror::Error;
 
@@ -31,7 +31,8 @@ pub const fn is_saturated(word: i16) -> bool {
     word == i16::MAX || word == i16::MIN
 }
 
-/// The format of a cell's own torques on a bus: a wider range has a coarser step. Sums are always Q7.8.
+/// The format of the torques that the cells of a bus send on their own. A wider range has a coarser step. Sums are
+/// always Q7.8.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub enum TorqueFormat {
     /// [-8, 8) Nm or N in steps of 2.4e-4.
@@ -44,7 +45,7 @@ pub enum TorqueFormat {
 }
 
 impl TorqueFormat {
-    /// All formats, the finest first. The index of a format is its number in a parameter.
+    /// All formats, the finest first. The index of a format is its number in parameter 1.
     pub const ALL: [Self; 3] = [Self::Q3_12, Self::Q5_10, Self::Q7_8];
 
     /// Returns the name of the format.
@@ -57,13 +58,13 @@ impl TorqueFormat {
         }
     }
 
-    /// Returns the number that stands for the format in a parameter.
+    /// Returns the number of the format in parameter 1.
     #[must_use]
     pub const fn number(self) -> u8 {
         self as u8
     }
 
-    /// Returns the format with this number, if it exists.
+    /// Returns the format with this number in parameter 1; `None` for other numbers.
     #[must_use]
     pub fn from_number(number: i16) -> Option<Self> {
         usize::try_from(number).ok().and_then(|number| Self::ALL.get(number)).copied()
@@ -91,7 +92,7 @@ impl TorqueFormat {
         f64::from(word) * self.step()
     }
 
-    /// Rounds a value to the nearest word, ties away from zero. Values out of range saturate; NaN becomes
+    /// Rounds a value in Nm or N to the nearest word, ties away from zero. Values out of range saturate; NaN becomes
     /// zero.
     #[must_use]
     pub fn nearest(self, value: f64) -> i16 {
@@ -108,13 +109,13 @@ impl TorqueFormat {
         i32::from(word) << (Self::Q3_12.fraction() - self.fraction())
     }
 
-    /// Returns the upper bound of the range, in Nm or N: the smallest positive torque that does not fit.
+    /// Returns the upper bound of the range in Nm or N, exclusive.
     #[must_use]
     pub fn bound(self) -> f64 {
         -self.real(i16::MIN)
     }
 
-    /// Rounds an exact torque to the nearest word, ties up, and saturates it.
+    /// Rounds an exact torque to the nearest word, ties up. Torques out of range saturate.
     #[must_use]
     pub fn round<const F: u32>(self, exact: Acc<F>) -> i16 {
         match self {
@@ -140,11 +141,11 @@ pub struct OutOfRange {
 impl<const F: u32> Q<F> {
     /// Zero.
     pub const ZERO: Self = Self(0);
-    /// The largest number; in a torque or a sum it means *saturated*.
+    /// The largest number. As a torque or a sum it means *saturated*.
     pub const MAX: Self = Self(i16::MAX);
-    /// The smallest number; in a torque or a sum it means *saturated*.
+    /// The smallest number. As a torque or a sum it means *saturated*.
     pub const MIN: Self = Self(i16::MIN);
-    /// Steps per unit.
+    /// Number of steps per unit.
     const SCALE: f64 = (1_u32 << F) as f64;
 
     /// Creates a number from its word on the wire.
@@ -183,8 +184,8 @@ impl<const F: u32> Q<F> {
         i16::try_from(round_half_away(value * Self::SCALE)).map(Self).map_err(|_| Self::out_of_range(value))
     }
 
-    /// Returns the smallest number of this format that is at least `value`. Thresholds are rounded this way,
-    /// so that no value below the requested threshold passes.
+    /// Returns the smallest number of this format that is not below `value`. Thresholds are rounded this way, so that
+    /// no sensor value below the requested threshold passes the rounded one.
     ///
     /// # Errors
     /// Returns an error if that number is outside the range, or `value` is NaN.
@@ -218,13 +219,13 @@ impl<const F: u32> Q<F> {
         Self(self.0.saturating_add(rhs.0))
     }
 
-    /// Adds two numbers and wraps: for angles, whose range is one turn.
+    /// Adds two numbers and wraps at the ends of the range. For angles, the range is one turn.
     #[must_use]
     pub const fn wrapping_add(self, rhs: Self) -> Self {
         Self(self.0.wrapping_add(rhs.0))
     }
 
-    /// Converts the number to an exact sum.
+    /// Converts the number to an exact sum with one term.
     #[must_use]
     pub fn widen(self) -> Acc<F> {
         Acc(i64::from(self.0))
@@ -247,8 +248,8 @@ impl Q1_14 {
     /// Converts an angle in radians to quarter turns, `z = angle / (pi/2)` wrapped into [-2, 2), rounded to
     /// the nearest step (ties away from zero). Returns `None` if the angle is not finite.
     ///
-    /// The range of Q1.14 is one whole turn, so 16-bit words wrap without further code (paper, Eq. 11; the
-    /// period of its Eq. 12 is 4, not 2).
+    /// The range of Q1.14 is one whole turn, so the addition of angles wraps correctly in 16-bit words (paper, Eq. 11;
+    /// the period of its Eq. 12 is 4, not 2).
     #[must_use]
     pub fn from_radians(angle: f64) -> Option<Self> {
         if !angle.is_finite() {
@@ -267,8 +268,8 @@ impl Q1_14 {
     }
 }
 
-/// An exact sum of products with `F` fraction bits. It holds at least 2^33 products of two words without
-/// overflow.
+/// An exact sum of products of fixed-point numbers, with `F` fraction bits. It holds at least 2^33 products of two
+/// words without overflow.
 #[derive(Clone, Copy, Debug, Default, Eq, Ord, PartialEq, PartialOrd)]
 pub struct Acc<const F: u32>(i64);
 
@@ -301,8 +302,7 @@ impl<const F: u32> Acc<F> {
         Acc(self.0.saturating_mul(1_i64 << (G - F)))
     }
 
-    /// Rounds to `G` fraction bits, ties up, and saturates at 16 bits. This is one of the few operations that
-    /// may lose bits.
+    /// Rounds to `G` fraction bits, ties up, and saturates at 16 bits, so that bits may be lost.
     ///
     /// The error is at most half a step of 2^-G unless the result saturates.
     #[must_use]

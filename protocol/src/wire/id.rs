@@ -1,4 +1,4 @@
-//! Identifiers: the kind of a packet and a node in eleven bits.
+//! Identifiers of eleven bits, which contain the kind of a packet and a node.
 //!
 //! ```text
 //!   bit   10 9 8 | 7 6 5 4 3 2 1 0
@@ -10,20 +10,21 @@
 
 use thiserror::Error;
 
-/// The node id of a cell on its bus, 1 to 254. 0 is the gateway and 255 is everyone.
+/// The node id of a cell on its bus, 1 to 254. In the node field of an identifier, 0 is the gateway and 255 is
+/// everyone.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 #[cfg_attr(feature = "host", derive(serde::Serialize))]
 pub struct CellId(u8);
 
-/// The error for a number that is not a cell's node id.
+/// The error for a number that is not the node id of a cell.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[error("{got} is not a node id: use 1 to {max} (0 is the gateway, 255 is everyone)", max = CellId::MAX.0)]
 pub struct CellIdOutOfRange {
-    /// The number that was requested.
+    /// The number outside the range 1 to 254.
     pub got: i64,
 }
 
-/// The error for a text that is not a cell's node id.
+/// The error for a text that is not the node id of a cell.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[error("a node id is needed, 1 to 254")]
 pub struct InvalidNodeId;
@@ -37,7 +38,7 @@ impl CellId {
     /// Creates a node id from a number.
     ///
     /// # Errors
-    /// Returns an error if the number is not in 1..=254.
+    /// Returns an error if the number is not in the range 1 to 254.
     pub fn new(number: i64) -> Result<Self, CellIdOutOfRange> {
         match u8::try_from(number) {
             Ok(number @ 1..=254) => Ok(Self(number)),
@@ -45,13 +46,13 @@ impl CellId {
         }
     }
 
-    /// Returns the number.
+    /// Returns the node id as a number.
     #[must_use]
     pub const fn get(self) -> u8 {
         self.0
     }
 
-    /// Returns the index of this cell in a table of all cells of a bus: 0 to 253.
+    /// Returns the index of the cell in an array with an element for every possible node id: 0 to 253.
     #[must_use]
     pub const fn index(self) -> usize {
         self.0 as usize - 1
@@ -81,11 +82,11 @@ impl core::fmt::Display for CellId {
 /// The sender or addressee in the node field of an identifier.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Node {
-    /// 0.
+    /// The gateway: 0.
     Gateway,
-    /// 1 to 254.
+    /// A cell: 1 to 254.
     Cell(CellId),
-    /// 255.
+    /// All cells: 255.
     Everyone,
 }
 
@@ -110,7 +111,7 @@ impl Node {
         }
     }
 
-    /// Returns true if `cell` is addressed, alone or with everyone.
+    /// Returns true if the node field addresses `cell`, either by its node id or as one of all cells.
     #[must_use]
     pub fn addresses(self, cell: CellId) -> bool {
         self == Self::Cell(cell) || self == Self::Everyone
@@ -127,21 +128,21 @@ impl core::fmt::Display for Node {
     }
 }
 
-/// The kind of a packet.
+/// The kind of a packet: bits 8 to 10 of an identifier.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 #[repr(u8)]
 pub enum Kind {
-    /// A command from the gateway's side to everyone; the node field is the [`Command`].
+    /// A command from the gateway's side to all cells; the node field is the [`Command`].
     Command = 0,
-    /// A partial sum of torques.
+    /// The sum of the torques of a cell and of all cells below it in the tree.
     Sum = 1,
-    /// The own torque of one cell.
+    /// The torque of one cell alone.
     Torque = 2,
     /// Measurements of a cell.
     Sensors = 3,
-    /// Heartbeat, counters, tree.
+    /// A status page: heartbeat, counters, or the cell's part of the tree.
     Network = 4,
-    /// Writes or reads a parameter of a cell.
+    /// A request to write or read a parameter of a cell.
     Configure = 5,
     /// A cell's reply to a configure request.
     Configured = 6,
@@ -162,7 +163,7 @@ impl Kind {
         Self::Stimulus,
     ];
 
-    /// Returns the name that tables and errors use.
+    /// Returns the name of the kind in tables and errors.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -204,7 +205,7 @@ impl Kind {
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 #[repr(u8)]
 pub enum Command {
-    /// Cells stop answering until [`Command::Resume`].
+    /// Cells stop sending torques and sums until [`Command::Resume`].
     Halt = 0,
     /// Joint positions of a new epoch.
     Joints = 1,
@@ -220,7 +221,7 @@ impl Command {
     /// All commands, in the order of their numbers.
     pub const ALL: [Self; 5] = [Self::Halt, Self::Joints, Self::Sync, Self::Resume, Self::Report];
 
-    /// Returns the command with this number, if it exists.
+    /// Returns the command with this number; `None` for other numbers.
     #[must_use]
     pub const fn from_byte(byte: u8) -> Option<Self> {
         match byte {
@@ -251,7 +252,7 @@ impl Command {
 pub struct Id {
     /// The kind of the packet.
     pub kind: Kind,
-    /// The node field; the number of the command for [`Kind::Command`].
+    /// The node field; for [`Kind::Command`] the number of the command.
     pub node: u8,
 }
 
@@ -268,9 +269,10 @@ impl Id {
         Self { kind, node: node.to_byte() }
     }
 
-    /// Returns the identifiers that every cell with a node id receives in every network state: halt, joints,
-    /// sync, resume and report; its own heartbeats (to detect another cell with its node id); configuration
-    /// and stimuli, addressed to it or to everyone. A cell also receives the sums of the cells at its ports.
+    /// Returns the identifiers of all frames that a cell with this node id receives, in every network state. They are
+    /// halt, joints, sync, resume and report; its own heartbeats, to detect another cell with its node id; and
+    /// configuration and stimuli, addressed to the cell or to everyone. A cell also receives the sums of the cells at
+    /// its ports, which are not listed here.
     #[must_use]
     pub const fn received_by_cell(cell: CellId) -> [Self; 10] {
         let cell = Node::Cell(cell);
@@ -288,7 +290,7 @@ impl Id {
         ]
     }
 
-    /// Returns the eleven bits.
+    /// Returns the identifier as eleven bits.
     #[must_use]
     pub const fn to_bits(self) -> u16 {
         ((self.kind as u16) << 8) | self.node as u16
@@ -310,7 +312,7 @@ impl Id {
         }
     }
 
-    /// Returns the name of the command, or of the kind for other packets.
+    /// Returns the name of the command, or for other packets the name of the kind.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match (self.kind, Command::from_byte(self.node)) {

@@ -1,5 +1,5 @@
-//! The wire format: frames, identifiers, packets, messages and their timing. These modules need neither an
-//! operating system nor a heap; cells, firmware and gateway share them. Only [`schema`] needs a host.
+//! The wire format: frames, identifiers, packets, messages and their timing. Cells, firmware and gateway share these
+//! modules, so all except [`schema`] need neither an operating system nor a heap.
 
 pub mod can;
 pub mod candump;

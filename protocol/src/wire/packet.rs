@@ -57,14 +57,14 @@ pub fn crc16(bytes: &[u8]) -> u16 {
     CRC.checksum(bytes)
 }
 
-/// Like [`crc16`], for bytes in several parts.
+/// Like [`crc16`], for bytes in several pieces.
 pub(crate) fn crc16_of_parts<const N: usize>(parts: impl Iterator<Item = [u8; N]>) -> u16 {
     let mut digest = CRC.digest();
     parts.for_each(|part| digest.update(&part));
     digest.finalize()
 }
 
-/// Returns the words of a packet that begins with `first`, padded with zeros.
+/// Returns the words of a packet: `first`, padded with zeros.
 #[must_use]
 pub fn padded_words<const N: usize>(first: [i16; N]) -> [i16; WORDS] {
     const { assert!(N <= WORDS, "a packet has no more words") }
@@ -81,7 +81,7 @@ pub fn padded<T: Copy + Default, const N: usize>(first: &[T]) -> [T; N] {
     core::array::from_fn(|index| first.get(index).copied().unwrap_or_default())
 }
 
-/// The number of a joint broadcast, modulo 256.
+/// An epoch: the number of a joint broadcast, modulo 256.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub struct Epoch(pub u8);
 
@@ -98,13 +98,13 @@ impl Epoch {
         Self(self.0.wrapping_sub(1))
     }
 
-    /// Returns the epoch `steps` later.
+    /// Returns the epoch that begins `steps` broadcasts later.
     #[must_use]
     pub const fn advanced_by(self, steps: u8) -> Self {
         Self(self.0.wrapping_add(steps))
     }
 
-    /// Returns the number of epochs since `earlier`, in [-128, 127].
+    /// Returns the number of epochs since `earlier`, modulo 256, in the range -128 to 127.
     #[must_use]
     pub const fn epochs_since(self, earlier: Self) -> i8 {
         self.0.wrapping_sub(earlier.0).cast_signed()
@@ -122,23 +122,23 @@ impl core::fmt::Display for Epoch {
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 #[repr(align(4))]
 pub struct Packet {
-    /// The identifier: kind and node.
+    /// The identifier of the packet: kind and node.
     pub id: Id,
-    /// The words.
+    /// The words of the packet.
     pub words: Words,
-    /// The epoch of the joint broadcast that it belongs to.
+    /// The epoch of the joint broadcast that the packet belongs to.
     pub epoch: Epoch,
-    /// The number of contributing cells, or another value that the kind defines.
+    /// The count byte: in a sum the number of contributing cells, in other kinds as defined in [`crate::message`].
     pub count: u8,
 }
 
-/// The error for a frame that is not a packet.
+/// The error for a frame that does not contain a packet.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 pub enum PacketError {
-    /// A 29-bit identifier, a remote frame or an error frame.
+    /// The frame has a 29-bit identifier, or is a remote or error frame.
     #[error("not a data frame with an 11-bit identifier")]
     Foreign,
-    /// The length is wrong.
+    /// The frame has another length than packets of its kind.
     #[error("{got} data bytes, not {expected}")]
     Length {
         /// The expected number of bytes.
@@ -154,16 +154,16 @@ pub enum PacketError {
         /// The CRC in the packet.
         got: u16,
     },
-    /// A classic frame that completes no packet with its neighbours.
+    /// A classic frame does not form a packet with the segments before and after it.
     #[error("no other segment")]
     Incomplete,
-    /// Classic frames that decode as packets of several lengths, at most one of which was sent.
+    /// Classic frames decode as packets of several lengths, although at most one of these was sent.
     #[error("packets of several lengths have a right CRC")]
     Ambiguous,
 }
 
 impl PacketError {
-    /// Returns a name of one word.
+    /// Returns the name of the error in one word.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -177,7 +177,7 @@ impl PacketError {
 }
 
 impl Packet {
-    /// Encodes the packet into a buffer. Returns the buffer and the number of bytes to send.
+    /// Encodes the packet into a buffer. Returns the buffer and the number of bytes in use.
     fn encode_all(&self) -> ([u8; MAX_BYTES], usize) {
         let mut bytes = [0; MAX_BYTES];
         let length = self.words.length();
@@ -192,8 +192,8 @@ impl Packet {
         (bytes, length.bytes())
     }
 
-    /// Returns the bytes that the fields of [`crate::schema`] refer to: the first six words, epoch and count
-    /// as in a packet of six words, then the other words.
+    /// Returns the bytes to which the fields of [`crate::schema`] refer: the first six words, epoch and count as in a
+    /// packet of six words, then the other words.
     #[must_use]
     pub fn fields(&self) -> Bytes {
         let (first, rest) = self.words.as_slice().split_at(WORDS);
@@ -202,14 +202,14 @@ impl Packet {
         bytes(first).into_iter().chain(end).chain(bytes(rest)).collect()
     }
 
-    /// Encodes the packet.
+    /// Encodes the packet to bytes.
     #[must_use]
     pub fn encode(&self) -> Bytes {
         let (bytes, sent) = self.encode_all();
         bytes.into_iter().take(sent).collect()
     }
 
-    /// Decodes the bytes received with identifier `id`. Never panics.
+    /// Decodes the bytes of a packet that was received with identifier `id`. Never panics.
     ///
     /// # Errors
     /// Returns an error if packets of this kind cannot have that length, or the CRC is wrong.
@@ -250,10 +250,10 @@ impl Packet {
         })
     }
 
-    /// Decodes an FD frame. Never panics.
+    /// Decodes the packet in an FD frame. Never panics.
     ///
     /// # Errors
-    /// Returns an error if it is not an FD data frame with an 11-bit identifier, or not a packet.
+    /// Returns an error if the frame is not an FD data frame with an 11-bit identifier, or does not contain a packet.
     pub fn from_fd(frame: &Frame) -> Result<Self, PacketError> {
         let id = data_id(frame)?;
         if frame.format() != Format::Fd {
@@ -263,10 +263,10 @@ impl Packet {
     }
 }
 
-/// Returns the identifier of a frame that may belong to this protocol.
+/// Returns the identifier of a data frame with an 11-bit identifier, which may contain a packet.
 ///
 /// # Errors
-/// Returns an error if it is a remote or error frame, or has a 29-bit identifier.
+/// Returns an error if the frame is a remote or error frame, or has a 29-bit identifier.
 pub fn data_id(frame: &Frame) -> Result<Id, PacketError> {
     if frame.raw_id() & (EXTENDED | REMOTE | ERROR) != 0 {
         return Err(PacketError::Foreign);
@@ -379,8 +379,8 @@ mod tests {
         assert_eq!(Packet::from_fd(&short), Err(PacketError::Length { expected: 16, got: 12 }));
     }
 
-    /// Returns the outcome of each frame, received `apart` µs after the previous one, with the given possible
-    /// lengths.
+    /// Returns the reassembly result of each frame. Each frame is received `apart` µs after the previous one, and
+    /// packets have one of `lengths`.
     fn pushed(id: Id, lengths: Lengths, apart: u64, frames: &[Frame]) -> Vec<Reassembly> {
         let mut segment = Reassembler::NONE;
         let times = (0..).map(|index| Micros(index * apart));

@@ -1,9 +1,9 @@
-//! Messages between two cells over the wire between their ports, and the simulation of such a wire on a
-//! bench.
+//! Messages that two neighbouring cells exchange over the wire between their ports, and the simulation of such wires on
+//! a bench.
 //!
-//! A wire leads from one port to another and belongs to no bus. The bench simulates it on the cells' bus with
-//! classic frames with 29-bit identifiers, which only the other end of the wire accepts. They are never sent
-//! to a real bus.
+//! A wire connects two ports and is not part of any bus. The bench simulates wires on the cells' bus with classic
+//! frames with 29-bit identifiers, which only the cell at the other end of the wire accepts. They are never sent to a
+//! real bus.
 //!
 //! ```text
 //!   identifier   28 | 27 ... 1 | 0                byte  0     1 ... 5     6  7
@@ -29,40 +29,40 @@
 use crate::can::{EXTENDED, EXTENDED_MASK, Frame, REMOTE};
 use crate::packet::{Epoch, crc16};
 
-/// The identifier flag of every simulated wire.
+/// Bit that is set in the identifiers of all simulated wires.
 pub const WIRE_FLAG: u32 = 0x1000_0000;
 /// Maximum number of wires that a bus can simulate.
 pub const MAX_WIRES: usize = 1 << 16;
 /// Number of ports of a cell.
 pub const PORTS: usize = 4;
-/// The index of the uplink, which connects a root to the gateway's side, after the ports.
+/// Index of the uplink, the wire of a root to the gateway's side. It follows the ports.
 pub const UPLINK: usize = PORTS;
 /// Size of a message with its CRC, in bytes.
 pub const BYTES: usize = 8;
 
-/// One direction of a simulated wire, identified by its sender.
+/// The identifier of one direction of a simulated wire: the frames that one end sends.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct LinkId {
     /// The number of the wire on its bus.
     pub wire: u16,
-    /// True for the second of its two directions.
+    /// True for the second of the two directions.
     pub back: bool,
 }
 
 /// The distance to the gateway, and the version of the tree to which it belongs.
 ///
-/// A rank only ever improves: a later round, or a smaller depth in the same round. A cell accepts a parent
-/// only if its rank is better than the cell's own, so that parents never form a loop.
+/// A cell's rank only ever improves: to a later round, or to a smaller depth in the same round. A cell accepts a parent
+/// only if the parent's rank is better than its own, so that parents never form a loop.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub struct Rank {
-    /// The round (version of the tree) of the depth, modulo 2^8.
+    /// Round of the exploration in which the depth was determined (the version of the tree), modulo 2^8.
     pub round: u8,
-    /// Number of wires to the gateway's side: 0 for the gateway, 1 for a root.
+    /// Number of wires between the sender and the gateway: 0 for the gateway, 1 for a root.
     pub depth: u8,
 }
 
 impl Rank {
-    /// Returns true if this rank is better: of a later round, or nearer in the same round.
+    /// Returns true if this rank is better than `other`: of a later round, or with a smaller depth in the same round.
     #[must_use]
     pub const fn is_better_than(self, other: Self) -> bool {
         match self.round.wrapping_sub(other.round).cast_signed() {
@@ -71,25 +71,25 @@ impl Rank {
         }
     }
 
-    /// Returns the rank of a child.
+    /// Returns the rank of a child, one wire deeper.
     #[must_use]
     pub const fn below(self) -> Self {
         Self { round: self.round, depth: self.depth.saturating_add(1) }
     }
 }
 
-/// The message that is sent periodically over every port.
+/// The hello: a message that a cell sends periodically over every port, with its state and rank.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Hello {
-    /// The protocol's version.
+    /// Protocol version of the sender.
     pub version: u8,
-    /// The node id; 0 for the gateway and for a cell without a node id.
+    /// Node id of the sender; 0 for the gateway and for a cell without a node id.
     pub number: u8,
-    /// The sending port.
+    /// Number of the port that sends the hello.
     pub port: u8,
-    /// True if the sender receives the other end.
+    /// True if the sender receives hellos over this wire.
     pub receives: bool,
-    /// True if the sender sends its sums over this port: the receiver is its parent.
+    /// True if the receiver is the parent, to which the sender sends its sums.
     pub is_parent: bool,
     /// True if the sender, or a cell below it, has no node id yet.
     pub unnumbered: bool,
@@ -102,38 +102,38 @@ pub struct Hello {
 pub enum PortMessage {
     /// The sender's state and rank.
     Hello(Hello),
-    /// Requests to send sums to the receiver.
+    /// Requests to become a child of the receiver and send it sums.
     Join,
     /// Accepts a join, with the sender's rank.
     Grant(Rank),
-    /// Rejects a join, or a hello from a cell that is not a child.
+    /// Rejects a join, or answers a hello of a cell that takes the sender for its parent but is not its child.
     Refuse,
-    /// Reports that the sender is no longer a child of the receiver.
+    /// Reports that the sender is not a child of the receiver any more.
     Leave,
     /// Acknowledges a leave.
     LeaveAck,
-    /// Announces that the sender's sums from this epoch on are for the receiver.
+    /// Announces that from this epoch on, the sender's sums are for the receiver.
     State(Epoch),
     /// Reports that the receiver's sum of this epoch was not accepted.
     Nack(Epoch),
-    /// Requests a round later than this one, because the sender is unreachable.
+    /// Reports that the sender is unreachable, and requests a round later than this one.
     Repair(u8),
-    /// Assigns node ids to the receiver and the cells below it.
+    /// Passes free node ids to the receiver, for itself and the cells below it.
     NodeId(Walk),
-    /// Reports that all cells below the sender have a node id, as far as there were enough.
+    /// Reports that all cells below the sender have a node id, or that there were not enough, and returns the rest.
     Return(Walk),
     /// Requests a hello.
     Probe,
 }
 
-/// Node ids to assign in a walk over the tree.
+/// The free node ids in a walk over the tree, which assigns one to each cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Walk {
-    /// The number of the walk.
+    /// Number of the walk.
     pub walk: u8,
-    /// The first free node id.
+    /// First free node id.
     pub first: u8,
-    /// The last free node id.
+    /// Last free node id.
     pub last: u8,
 }
 
@@ -143,7 +143,7 @@ const UNNUMBERED: u8 = 1 << 5;
 const HAS_RANK: u8 = 1 << 6;
 
 impl PortMessage {
-    /// Encodes the message without its CRC.
+    /// Encodes kind and content of the message, without the CRC.
     #[must_use]
     pub fn encode(self) -> [u8; 6] {
         match self {
@@ -200,13 +200,14 @@ impl PortMessage {
 }
 
 impl LinkId {
-    /// Returns the identifier of its frames, with the flag [`EXTENDED`].
+    /// Returns the identifier of frames with this link id, including the flag [`EXTENDED`].
     #[must_use]
     pub const fn raw_id(self) -> u32 {
         EXTENDED | WIRE_FLAG | ((self.wire as u32) << 1) | self.back as u32
     }
 
-    /// Returns the link id whose frames have this identifier. `raw_id` includes the flags.
+    /// Returns the link id for an identifier; `None` if the identifier is not that of a wire. `raw_id` includes the
+    /// flags.
     #[must_use]
     pub const fn from_raw_id(raw_id: u32) -> Option<Self> {
         let bits = raw_id & EXTENDED_MASK & !WIRE_FLAG;

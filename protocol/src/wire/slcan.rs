@@ -19,8 +19,8 @@
 //! The spaces are only for readability. Digits are hexadecimal; both cases are accepted, upper case is
 //! written.
 //!
-//! Dialects differ in their replies: some firmware acknowledges every line, some none. A writer therefore
-//! never waits for an acknowledgement, and a reader skips unknown lines.
+//! Dialects differ in their replies: some firmware acknowledges every line, some none. The writer therefore never waits
+//! for an acknowledgement, and the decoder skips unknown lines.
 
 mod decoder;
 #[cfg(feature = "host")]
@@ -34,12 +34,12 @@ pub use decoder::{Decoder, SlcanLine, Refusal, RejectedLines};
 #[cfg(feature = "host")]
 pub use report::{BusState, ErrorCounters, AdapterFault, AdapterReport};
 
-/// Maximum length of a line without its line ending: an FD frame with bit rate switch, 64 bytes, a 29-bit
-/// identifier, 8 digits of time and the state of its sender.
+/// Maximum length of a line in bytes without its line ending: an FD frame with bit rate switch, 64 data bytes, a 29-bit
+/// identifier, 8 digits of time and the state of the sender.
 pub const MAX_LINE: usize = 1 + 8 + 1 + 2 * 64 + 8 + 1;
 /// The line ending in both directions.
 pub const CR: u8 = b'\r';
-/// Sent by the adapter when it refuses a line.
+/// The byte with which an adapter reports that it refused a line.
 pub const BEL: u8 = 0x07;
 
 /// An encoded line with its line ending: 1 to [`MAX_LINE`] bytes.
@@ -78,8 +78,8 @@ impl EncodedLine {
 
 /// Encodes a frame as a line. Returns `None` for an error frame, which was never on the bus.
 ///
-/// The data of an FD frame is padded with zeros to a length that CAN FD has. The error state is dropped, and
-/// a raw DLC of 9 to 15 in a classic frame becomes 8.
+/// The data of an FD frame is padded with zeros to a length that CAN FD allows. The error state is not encoded, and a
+/// classic frame with a raw DLC of 9 to 15 is encoded with DLC 8.
 #[must_use]
 pub fn encode(frame: &Frame) -> Option<EncodedLine> {
     if frame.is_error() {
@@ -108,15 +108,15 @@ pub fn encode(frame: &Frame) -> Option<EncodedLine> {
     Some(text)
 }
 
-/// A command from a host to an adapter, other than sending a frame.
+/// A command from a host to an adapter, other than a frame to send.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 #[non_exhaustive]
 pub enum SlcanCommand {
-    /// `C`: leaves the bus. Bit rates are set before joining it.
+    /// `C`: leaves the bus. Bit rates can be set only while the adapter has left it.
     Close,
     /// `O`: joins the bus.
     Open,
-    /// `L`: joins the bus in listen-only mode, without acknowledging frames.
+    /// `L`: joins the bus in listen-only mode, in which the adapter does not acknowledge frames.
     Listen,
     /// `S0` to `S9`: the nominal bit rate, see [`Command::nominal`].
     BitRate(u8),
@@ -128,19 +128,19 @@ pub enum SlcanCommand {
     SerialNumber,
     /// `F`: requests the fault flags.
     Flags,
-    /// `Z0`, `Z1`: time stamps of 4 digits after received frames off, on.
+    /// `Z0` and `Z1`: turn off or on the time stamps of 4 digits after received frames.
     TimeStamps(bool),
     /// `M` and 8 digits: the acceptance code of an SJA1000.
     Code(u32),
-    /// `m` and 8 digits: the acceptance mask of an SJA1000; bits that are 1 are ignored.
+    /// `m` and 8 digits: the acceptance mask of an SJA1000. Identifier bits are ignored where the mask is 1.
     Mask(u32),
 }
 
 impl SlcanCommand {
-    /// Returns the command that sets this nominal bit rate, in bit/s; `None` if slcan has none.
+    /// Returns the command that sets this nominal bit rate, in bit/s; `None` if slcan has no command for it.
     ///
-    /// `S7` is 800 kbit/s in Lawicel's protocol and 750 kbit/s in CANable's and python-can; it is returned
-    /// for both.
+    /// `S7` is 800 kbit/s in Lawicel's protocol and 750 kbit/s in CANable's firmware and python-can, so this function
+    /// returns it for both rates.
     #[must_use]
     pub const fn nominal_bit_rate(bit_rate: u32) -> Option<Self> {
         Some(Self::BitRate(match bit_rate {
@@ -158,8 +158,8 @@ impl SlcanCommand {
         }))
     }
 
-    /// Returns the command that sets this data bit rate, in bit/s: 500 k, or 1 M to 8 M. Returns `None` if
-    /// slcan has none.
+    /// Returns the command that sets this data bit rate, in bit/s: 500 k, or 1 M to 8 M. Returns `None` if slcan has no
+    /// command for it.
     ///
     /// All CANable firmware supports 2 M and 5 M; the other rates depend on the firmware.
     #[must_use]
@@ -178,7 +178,7 @@ impl SlcanCommand {
         }))
     }
 
-    /// Encodes the command as a line.
+    /// Encodes the command as a line with its line ending.
     #[must_use]
     pub fn encode(self) -> EncodedLine {
         let mut text = EncodedLine::default();
@@ -209,7 +209,7 @@ impl SlcanCommand {
         text
     }
 
-    /// Decodes a line without its line ending.
+    /// Decodes a command from a line without its line ending; `None` for any other line.
     fn decode(line: &[u8]) -> Option<Self> {
         Some(match line {
             b"C" => Self::Close,
@@ -229,7 +229,7 @@ impl SlcanCommand {
     }
 }
 
-/// Returns the value of a hexadecimal digit.
+/// Returns the value of a hexadecimal digit; `None` for any other byte.
 fn digit(byte: u8) -> Option<u8> {
     match byte {
         b'0'..=b'9' => Some(byte - b'0'),
@@ -239,7 +239,7 @@ fn digit(byte: u8) -> Option<u8> {
     }
 }
 
-/// Returns the value of at most 8 hexadecimal digits.
+/// Returns the value of at most 8 hexadecimal digits; `None` for other text.
 fn number(digits: &[u8]) -> Option<u32> {
     digits.iter().try_fold(0, |number, &byte| Some((number << 4) | u32::from(digit(byte)?)))
 }

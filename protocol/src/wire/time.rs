@@ -1,12 +1,12 @@
 //! Points in time and durations in whole microseconds.
 //!
-//! The core modules never read a clock: callers pass the time in, which may be that of a test, a simulation
-//! or a microcontroller.
+//! The core modules never read a clock. The caller passes the current time, which can also come from a test, a
+//! simulation or a microcontroller.
 
 use core::ops::{Add, Sub};
 use core::time::Duration;
 
-/// A point in time: microseconds since a start that the caller chose.
+/// A point in time, in microseconds since an origin that the caller chooses.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct Micros(pub u64);
 
@@ -30,7 +30,7 @@ impl Span {
 }
 
 impl Micros {
-    /// Returns the point in time `start` after the origin; saturates.
+    /// Returns the point in time `start` after the origin. Saturates at the maximum of 64 bits.
     #[must_use]
     pub fn since_start(start: Duration) -> Self {
         Self(u64::try_from(start.as_micros()).unwrap_or(u64::MAX))

@@ -1,5 +1,5 @@
-//! Touch detection with hysteresis: two thresholds for one value, so that noise near one of them does not
-//! cause a stream of events.
+//! Touch detection with hysteresis: a threshold for touch and a lower one for release, so that noise near a threshold
+//! does not cause a stream of events.
 //!
 //! ```text
 //!   value   ──────── threshold ───────────────── touched from here on
@@ -7,8 +7,8 @@
 //!           ──────── 0 ───────────────────────── free
 //! ```
 //!
-//! A cell in event mode and the receivers of its events use the same rule. The cell reports every change, so
-//! their states agree.
+//! A cell in event mode and the programs that receive its measurements apply the same rule. The cell reports every
+//! change of the state, so that both have the same state.
 
 use crate::fixed::Q1_14;
 use crate::message::SkinSensors;
@@ -16,7 +16,7 @@ use crate::message::SkinSensors;
 /// The state of a value relative to its threshold.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Touch {
-    /// The value has not been touched, or has returned to zero after a release.
+    /// The value has never reached its threshold, or has returned to zero after a release.
     #[default]
     Free,
     /// The value has reached the threshold and has not fallen far enough below it since.
@@ -26,8 +26,8 @@ pub enum Touch {
 }
 
 impl Touch {
-    /// Returns the state after the next value, which may be a sum of several words. A threshold of 0 counts
-    /// as one step.
+    /// Returns the state after a new value, in the same steps as the threshold. The value may be a sum of several
+    /// words. A threshold of 0 counts as one step.
     #[must_use]
     pub fn next(self, value: i32, threshold: i16, hysteresis: Q1_14) -> Self {
         let threshold = i32::from(threshold).max(1);

@@ -26,25 +26,26 @@ pub use rates::{BitRates, BitRatesError, parse_bit_rate};
 use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Format, Frame, fd_dlc};
 use stuffing::Run;
 
-/// CRC-15/CAN: polynomial 0x4599, initial value 0. Leading zeros do not change it.
+/// CRC-15/CAN: polynomial 0x4599, initial value 0. Because of the initial value, leading zeros do not change the CRC.
 const CRC: crc::Crc<u16> = crc::Crc::<u16>::new(&crc::CRC_15_CAN);
 
-/// Unstuffed bits at the end of a classic frame: delimiters, ACK, end of frame, intermission.
+/// Number of bits at the end of a classic frame that are not stuffed: delimiters, ACK, end of frame, intermission.
 const CLASSIC_TAIL: u32 = 13;
-/// Nominal bits at the end of an FD frame: ACK and its delimiter, end of frame, intermission.
+/// Number of nominal bits at the end of an FD frame: ACK, ACK delimiter, end of frame, intermission.
 const FD_TAIL: u32 = 12;
-/// Bits of the check sequence of an FD frame with up to 16 bytes: stuff bit count, CRC of 17 bits, 6 fixed
-/// stuff bits, delimiter.
+/// Number of bits between data and ACK of an FD frame with up to 16 bytes: stuff bit count, CRC of 17 bits, 6 fixed
+/// stuff bits, CRC delimiter.
 const FD_CHECK: u32 = 28;
-/// Bits of the check sequence of an FD frame with more than 16 bytes: CRC of 21 bits and 7 fixed stuff bits.
+/// Number of bits between data and ACK of an FD frame with more than 16 bytes, with a CRC of 21 bits and 7 fixed stuff
+/// bits.
 const FD_LONG_CHECK: u32 = 33;
 
-/// The bits of a frame on the wire, including stuff bits and intermission.
+/// The number of bits of a frame on the wire, including stuff bits and intermission.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub struct Bits {
-    /// Bits at the nominal bit rate: all bits of a frame without bit rate switch.
+    /// Number of bits at the nominal bit rate. In a frame without bit rate switch, this is all bits.
     pub nominal: u32,
-    /// Bits at the data bit rate.
+    /// Number of bits at the data bit rate.
     pub data: u32,
 }
 
@@ -52,7 +53,7 @@ impl Bits {
     /// Counts the bits of a frame. Returns `None` for an error frame of the driver, which was never on the
     /// wire.
     ///
-    /// A length that CAN FD does not have is padded with zeros to the next one.
+    /// Data of a length that CAN FD does not allow is padded with zeros to the next length.
     #[must_use]
     pub fn from_frame(frame: &Frame) -> Option<Self> {
         match frame.format() {
@@ -62,7 +63,7 @@ impl Bits {
         }
     }
 
-    /// Returns the number of bits at both rates.
+    /// Returns the total number of bits, at both rates.
     #[must_use]
     pub const fn total(self) -> u32 {
         self.nominal + self.data
@@ -74,8 +75,8 @@ impl Bits {
         f64::from(self.nominal) / f64::from(rates.nominal()) + f64::from(self.data) / f64::from(rates.data())
     }
 
-    /// Returns the duration in ns. The nominal and the data part are each rounded up, so the sum is exact at
-    /// all rates that divide 1 GHz and never too short.
+    /// Returns the duration in ns. The nominal and the data part are each rounded up, so the duration is never too
+    /// short, and it is exact if both rates divide 1 GHz.
     #[must_use]
     pub const fn nanoseconds(self, rates: BitRates) -> u64 {
         const SECOND: u64 = 1_000_000_000;
@@ -131,8 +132,8 @@ fn fd(frame: &Frame) -> Bits {
     fd_bits(switched, len + head.stuffed, data.len(), stuffed)
 }
 
-/// Returns the bits of an FD frame with `head` bits up to BRS, `bytes` data bytes and `stuffed` stuff bits
-/// after BRS.
+/// Returns the bits of an FD frame. The frame has `head` bits up to BRS (with stuff bits), `bytes` data bytes, and
+/// `stuffed` stuff bits after BRS.
 fn fd_bits(switched: bool, head: u32, bytes: usize, stuffed: u32) -> Bits {
     let check = if bytes > 16 { FD_LONG_CHECK } else { FD_CHECK };
     let data = 5 + 8 * u32::try_from(bytes).unwrap_or(0) + check + stuffed;
@@ -140,7 +141,7 @@ fn fd_bits(switched: bool, head: u32, bytes: usize, stuffed: u32) -> Bits {
     if switched { Bits { nominal, data } } else { Bits { nominal: nominal + data, data: 0 } }
 }
 
-/// Returns SOF, the first 11 bits of the identifier, SRR and IDE, and the other 18 bits.
+/// Returns the bits of an extended identifier on the wire: SOF, the first 11 bits, SRR and IDE, and the other 18 bits.
 const fn extended(id: u64) -> u64 {
     ((id >> 18) << 20) | (0b11 << 18) | (id & 0x3_FFFF)
 }

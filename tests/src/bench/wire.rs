@@ -1,4 +1,4 @@
-//! The wire of a bench: from the sender of a frame to its receivers.
+//! The wire of a bench: carries frames from their sender to their receivers, with faults and latencies.
 
 use protocol::can::Frame;
 use protocol::packet::Packet;
@@ -17,15 +17,15 @@ const LATENCY: (u64, u64) = (10, 60);
 /// A frame that was on the wire.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct OnTheWire {
-    /// The time.
+    /// The time at which the frame was on the wire.
     pub at: Micros,
-    /// The sender.
+    /// The sender of the frame.
     pub from: Party,
     /// The frame before the faults of single receivers.
     pub frame: Frame,
 }
 
-/// A sent frame with the truth about it.
+/// A sent frame, with its sender, packet and damage.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Sent {
     pub(super) frame: Frame,
@@ -44,14 +44,14 @@ pub(super) struct Delivery {
 /// The delivery state of a receiver.
 #[derive(Debug, Default)]
 pub(super) struct Inlet {
-    /// The arrival time of its newest frame, so that a later one does not overtake it.
+    /// The arrival time of the receiver's newest frame, which a later one must not overtake.
     newest: Micros,
     /// A frame that is delivered after the next one.
     held: Option<Delivery>,
 }
 
 impl Bench {
-    /// Enters the next advance of the real bus.
+    /// Schedules the next time at which the model of the real bus is advanced.
     pub(super) fn look_at_the_bus(&mut self) {
         let Some(real) = &mut self.real else { return };
         if let Some(next) = real.next()
@@ -73,7 +73,7 @@ impl Bench {
         }
     }
 
-    /// Requests a place on the wire for a frame.
+    /// Sends a frame to the wire; `may_be_hit` allows faults on it.
     pub(super) fn send(&mut self, mut sent: Sent, may_be_hit: bool) {
         if may_be_hit {
             let effect = self.faults.effect(self.agenda.now, sent.truth.from, None, sent.frame);

@@ -15,13 +15,13 @@ use super::tokens::{Named, is_of_tests};
 struct Module {
     /// The module of the file that contains this module.
     file: Names,
-    /// The names of items, and of modules in it.
+    /// The names of the items and modules that this module defines.
     defined: BTreeSet<String>,
     /// Imported names with the paths that they stand for; several if functions import different ones.
     imported: BTreeMap<String, Vec<Names>>,
     /// Modules or enums whose names are all imported.
     globs: Vec<Names>,
-    /// Paths that are used, from the crate's root; a path of a single name may not exist there.
+    /// The paths that the module uses, from the crate's root; a path of a single name may not exist there.
     used: BTreeSet<Names>,
 }
 
@@ -29,7 +29,7 @@ struct Module {
 #[derive(Default)]
 pub(super) struct Modules {
     by_path: BTreeMap<Names, Module>,
-    /// The files of the modules that are files.
+    /// The files of those modules that have a file of their own.
     pub(super) files: BTreeMap<Names, PathBuf>,
     /// The modules that define macros by rules, which can be used without an import.
     macros: BTreeMap<String, Names>,
@@ -53,7 +53,7 @@ impl Modules {
         self.read_items(&parsed.items, (file, &folder), names, names);
     }
 
-    /// Reads the items of a module; `folder` contains the modules that are files of their own.
+    /// Reads the items of a module; `folder` contains the modules that have files of their own.
     fn read_items(
         &mut self,
         items: &[Item],
@@ -117,7 +117,7 @@ impl Modules {
         Some(&self.module_of(&home)?.1.file)
     }
 
-    /// Returns the innermost module on a path.
+    /// Returns the innermost module on a path, with its depth.
     fn module_of(&self, path: &[String]) -> Option<(usize, &Module)> {
         (0..=path.len()).rev().find_map(|length| Some((length, self.by_path.get(&path[..length])?)))
     }

@@ -1,4 +1,4 @@
-//! The search for circles, on small crates.
+//! Tests of the search for circles, on small crates.
 
 use std::fs;
 
@@ -7,7 +7,7 @@ use tempfile::TempDir;
 use super::circles;
 use super::modules::Modules;
 
-/// Returns the circles of a crate with these files.
+/// Returns the circles of a crate that has these files.
 fn found(files: &[(&str, &str)]) -> Vec<Vec<String>> {
     let folder = TempDir::new().unwrap();
     for (name, text) in files {

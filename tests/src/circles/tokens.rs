@@ -1,4 +1,4 @@
-//! The paths and the imports in a piece of a source file, by its tokens; those in macros and attributes are included.
+//! Finds the paths and the imports in a piece of a source file by its tokens, also those in macros and attributes.
 
 use std::collections::BTreeSet;
 
@@ -6,7 +6,7 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 use super::Names;
 
-/// The names in a source.
+/// The paths and imports that a source contains.
 #[derive(Default)]
 pub(super) struct Named {
     /// Paths as they are written. A single name is included if it is a type, a constant or a call, whose `use` may be a
@@ -65,7 +65,7 @@ impl Named {
         at
     }
 
-    /// Adds a tree of a `use`, after the names before it, and returns the index of its end.
+    /// Adds the tree of a `use` that follows the names `path`, and returns the index of its end.
     fn import(&mut self, tokens: &[TokenTree], mut at: usize, mut path: Names) -> usize {
         loop {
             match tokens.get(at) {

@@ -16,11 +16,11 @@ use protocol::time::{Micros, Span};
 use super::{frame, packet};
 use crate::network::Wiring;
 
-/// More packets than a cell may send after one event.
+/// The number of packets that a cell must not exceed after one event.
 const MANY: usize = 200;
 
-/// Gives a cell any frames, port messages, times and flash failures. Everything that it sends must be valid and its
-/// own, and its timeouts must lie in the future.
+/// Gives a cell any frames, port messages, times and flash failures. Every packet that it sends must be valid and have
+/// its node id, and its timeouts must lie in the future.
 pub(super) fn cell(data: &[u8]) {
     let _ = run_cell(&mut Unstructured::new(data));
 }
@@ -71,7 +71,7 @@ fn run_cell(from: &mut Unstructured<'_>) -> Result<()> {
     Ok(())
 }
 
-/// Returns an identifier; mostly one that the cell receives.
+/// Returns an identifier, mostly one that the cell receives.
 fn heard(from: &mut Unstructured<'_>, own: CellId) -> Result<Id> {
     let commands = [Command::Joints, Command::Halt, Command::Sync, Command::Resume, Command::Report];
     let ids: Vec<Id> = commands.into_iter().map(Id::command).chain(Id::received_by_cell(own)).collect();
@@ -105,7 +105,7 @@ fn drain(node: &mut Node, from: &mut Unstructured<'_>) -> Result<()> {
     }
 }
 
-/// Checks that the tracker of a cell never loses a received packet, and never counts one twice.
+/// Checks that the gateway's tracker of a cell counts every received packet exactly once, with any order of events.
 pub(super) fn tracker(data: &[u8]) {
     let _ = track(&mut Unstructured::new(data));
 }

@@ -1,4 +1,5 @@
-//! Fuzz targets for clients of the gateway's sockets: pages in a browser, external controllers. The sockets are real.
+//! Fuzz targets for the gateway's sockets, which take input from pages in a browser and from external controllers. The
+//! sockets are real.
 
 use std::cell::RefCell;
 use std::io::{Read as _, Write as _};
@@ -12,7 +13,7 @@ use protocol::skin::Skin;
 use tempfile::TempDir;
 use view::server::{Access, Server};
 
-/// Returns the request with which a client becomes a page.
+/// Returns the HTTP request that upgrades a connection to the WebSocket of a page.
 fn upgrade(port: u16) -> String {
     format!(
         "GET /live HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nOrigin: http://127.0.0.1:{port}\r\nConnection: Upgrade\r\n\
@@ -52,7 +53,7 @@ fn talk(server: &Server, pieces: &[&[u8]]) -> std::io::Result<Vec<u8>> {
     Ok(answer)
 }
 
-/// The state of an external controller during a tick.
+/// An external controller's socket and the gateway's side of it, with the number of the present tick.
 struct Listening {
     external: External,
     client: UnixDatagram,

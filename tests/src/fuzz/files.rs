@@ -37,7 +37,7 @@ pub(super) fn candump(data: &[u8]) {
     }
 }
 
-/// Reads everything in a capture, up to a limit, so that a small file that unpacks to a large one ends too.
+/// Reads a capture and returns its number of frames. A limit ends the reading of small files that unpack to large ones.
 fn read(reader: &mut Reader) -> u64 {
     let mut frames = 0;
     for _ in 0..100_000 {
@@ -77,7 +77,7 @@ pub(super) fn recover(data: &[u8]) {
     while reader.next_item().is_ok_and(|item| item.is_some()) {}
 }
 
-/// Reports a recording with any damage: there must be a report, or an error in one line.
+/// Makes a report of a recording with any damage: the result must be a report, or an error in one line.
 pub(super) fn report(data: &[u8]) {
     let file = file_of(data);
     let report = run::report(&[PathBuf::from(file.path())], &run::Options::default());
@@ -97,7 +97,7 @@ pub(super) fn flash(data: &[u8]) {
     assert_eq!(flash::decode(identity, &bytes), Ok(kept));
 }
 
-/// Parses a skin: it must be possible to compute with an accepted one.
+/// Parses a skin: if it is accepted, the parameters of its cells must be valid; otherwise the error must have one line.
 pub(super) fn skin(data: &[u8]) {
     let Ok(text) = std::str::from_utf8(data) else { return };
     let skin = match Skin::parse("skin.toml", text) {
@@ -110,7 +110,7 @@ pub(super) fn skin(data: &[u8]) {
     }
 }
 
-/// Parses a scenario: an accepted one must belong to its skin.
+/// Parses a scenario: if it is accepted, evaluating it must not panic; otherwise the error must have one line.
 pub(super) fn scenario(data: &[u8]) {
     let Ok(text) = std::str::from_utf8(data) else { return };
     match Scenario::parse("scenario.toml", text, &SKIN) {

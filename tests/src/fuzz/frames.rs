@@ -42,7 +42,7 @@ pub(super) fn packet(data: &[u8]) {
     }
 }
 
-/// Reassembles segments: a complete packet must be one of those that were sent, and no segment may be kept for ever.
+/// Reassembles segments: a complete packet must be one that was sent, and no segment may wait for ever.
 pub(super) fn reassembly(data: &[u8]) {
     let _ = reassemble(&mut Unstructured::new(data));
 }
@@ -153,7 +153,7 @@ fn again(frame: &protocol::can::Frame) {
     assert_eq!(read.data().len(), fd_len(frame.data().len()));
 }
 
-/// Generates frames with their times and buses.
+/// Generates frames, each with a time and a bus.
 fn traffic(
     from: &mut Unstructured<'_>,
     mut take: impl FnMut(&'static str, u64, protocol::can::Frame),
@@ -203,7 +203,7 @@ pub(super) fn decoder(data: &[u8]) {
     assert_eq!(stats.report().frames, sent);
 }
 
-/// Runs the model of a bus: it must end for any traffic, and contain each frame exactly once.
+/// Runs the model of a bus on any traffic: it must end, and transmit each frame exactly once.
 pub(super) fn shadow(data: &[u8]) {
     let options = Options { each_frame: true, ..Options::new(BitRates::new(1_000_000, 5_000_000).unwrap()) };
     let mut shadow = Shadow::new(options).unwrap();

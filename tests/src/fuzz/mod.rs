@@ -17,7 +17,7 @@ use protocol::can::{Format, Frame};
 use protocol::id::Id;
 use protocol::packet::{Epoch, Lengths, MAX_WORDS, Packet, Words};
 
-/// A function that takes any bytes.
+/// A fuzz target: a function that takes any bytes, and panics if an invariant is broken.
 pub type Target = fn(&[u8]);
 
 /// All targets by name, which is also the folder of their seeds.

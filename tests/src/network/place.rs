@@ -1,4 +1,4 @@
-//! One cell of a wiring, and its parameters.
+//! One cell of a [`Wiring`](super::Wiring), and its parameters.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -29,27 +29,27 @@ pub(super) enum Inlet {
 /// A cell of a wiring.
 #[derive(Debug)]
 pub struct Place {
-    /// Its node id, once it has one; kept over restarts as in flash.
+    /// The cell's node id, once it has one; it survives restarts, as in flash.
     pub node_id: Option<CellId>,
-    /// The far ends of its ports.
+    /// The far end of the wire at each port.
     pub wires: [Option<End>; PORTS + 1],
-    /// True for ports that receive nothing.
+    /// True for each port whose incoming direction is down.
     pub deaf: [bool; PORTS + 1],
-    /// The last page on its place in the tree.
+    /// The last network page by which the cell reported its place in the tree.
     pub tree: Option<Tree>,
-    /// The last page on its ports.
+    /// The last network page by which the cell reported its ports.
     pub ports: Option<Ports>,
-    /// Its own torque, as it enters sums.
+    /// The cell's own torque, as it enters sums.
     pub(super) own: [i32; MAX_JOINTS],
     pub(super) serial: u32,
     pub(super) parameters: Parameters,
     pub(super) force: Force,
     pub(super) life: Life<(Micros, Inlet)>,
     pub(super) wake: Option<Micros>,
-    /// Deferred frames, which do not wake it, with their times on the bus.
+    /// Deferred frames, which do not wake the cell, with their times on the bus.
     pub(super) deferred: VecDeque<(Micros, Frame)>,
     pub(super) newest: Micros,
-    /// Its sums in each of the last epochs: words, and the cells in them.
+    /// The sums that the cell sent in each of the last epochs: their words, and the cells in them.
     pub(super) said: HashMap<u8, Vec<(SumWords, u128)>>,
 }
 

@@ -1,4 +1,4 @@
-//! The cells in a sum, and its receivers.
+//! Finds the cells that a sum contains, and delivers the sum to its receivers.
 
 use std::collections::BTreeSet;
 
@@ -69,7 +69,7 @@ impl Wiring {
         }
     }
 
-    /// Returns the cells in a sum: its own torque or not, and some of its neighbours' sums.
+    /// Returns the cells in a sum: it may contain the sender's own torque, and sums of the sender's neighbours.
     fn decode(&self, cell: usize, epoch: Epoch, words: SumWords) -> u128 {
         let place = &self.cells[cell];
         let mut heard: Vec<Vec<(SumWords, u128)>> = Vec::new();
@@ -111,7 +111,7 @@ fn frame_id(from: CellId) -> protocol::id::Id {
     protocol::id::Id::new(protocol::id::Kind::Sum, protocol::id::Node::Cell(from))
 }
 
-/// Tries every choice of one sum, or none, of each neighbour.
+/// Tries every choice of at most one sum of each neighbour, and stores the cells of the choice that fits.
 fn choose(
     heard: &[Vec<(SumWords, u128)>],
     sum: [i32; MAX_JOINTS],

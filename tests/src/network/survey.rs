@@ -1,4 +1,4 @@
-//! The actual state of the cells and their wires, and the state that they report.
+//! Queries of a wiring: the actual state of cells and wires, and the routes that cells report.
 
 use std::collections::BTreeSet;
 
@@ -8,7 +8,7 @@ use super::{End, Wiring};
 use crate::life::Life;
 
 impl Wiring {
-    /// Returns true if a cell works.
+    /// Returns true if a cell is on and does not hang.
     #[must_use]
     pub fn runs(&self, cell: usize) -> bool {
         self.cells[cell].life.runs()
@@ -21,7 +21,7 @@ impl Wiring {
         matches!(&self.cells[cell].life, Life::Runs(node) if node.defers(joints))
     }
 
-    /// Returns the cells with a route to the gateway, over wires that work in both directions and running cells.
+    /// Returns the cells that have a route to the gateway over running cells and wires that work in both directions.
     #[must_use]
     pub fn reachable(&self) -> BTreeSet<usize> {
         let mut reached = BTreeSet::new();
@@ -75,7 +75,7 @@ impl Wiring {
         (0..self.cells.len()).map(route).collect::<Vec<_>>().join("; ")
     }
 
-    /// Returns the bits of some cells.
+    /// Returns a mask with bit i set for each cell i in a set.
     #[must_use]
     pub fn bits(cells: &BTreeSet<usize>) -> u128 {
         cells.iter().map(|cell| 1 << cell).sum()

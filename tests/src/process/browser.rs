@@ -19,7 +19,7 @@ use tungstenite::{Message, WebSocket, client};
 
 use crate::process::TIMEOUT;
 
-/// A page in a browser of its own.
+/// A page in a browser process of its own.
 pub struct Browser {
     _process: Process,
     _profile: TempDir,
@@ -29,7 +29,7 @@ pub struct Browser {
     pub events: Vec<Value>,
 }
 
-/// The browser's process, which ends when this is dropped.
+/// The browser's process, which ends when this value is dropped.
 struct Process(Child);
 
 impl Drop for Process {
@@ -94,7 +94,7 @@ impl Browser {
         self.call("Page.navigate", &json!({ "url": url }));
     }
 
-    /// Calls a method, and returns its result.
+    /// Calls a method of the DevTools protocol, and returns its result.
     pub fn call(&mut self, method: &str, parameters: &Value) -> Value {
         self.number += 1;
         let message = json!({ "id": self.number, "method": method, "params": parameters });
@@ -110,7 +110,7 @@ impl Browser {
         }
     }
 
-    /// Returns the value of an expression.
+    /// Returns the value of a JavaScript expression on the page.
     pub fn value(&mut self, expression: &str) -> Value {
         let result =
             self.call("Runtime.evaluate", &json!({ "expression": expression, "returnByValue": true }));
@@ -118,7 +118,7 @@ impl Browser {
         result["result"]["value"].clone()
     }
 
-    /// Waits until an expression is true or has a value, and returns it.
+    /// Waits until a JavaScript expression is true or has a value, and returns that value.
     pub fn until(&mut self, expression: &str) -> Value {
         let give_up = Instant::now() + TIMEOUT;
         loop {
@@ -143,7 +143,7 @@ impl Browser {
         self.call("Input.dispatchKeyEvent", &json!({ "type": kind, "key": key }));
     }
 
-    /// Returns exceptions and messages of the page, including violations of its policy.
+    /// Returns the exceptions and console messages of the page, including violations of its content security policy.
     pub fn complaints(&self) -> Vec<&Value> {
         let is_one = |event: &&Value| {
             event["method"] == "Runtime.exceptionThrown" || event["method"] == "Log.entryAdded"

@@ -1,8 +1,8 @@
-//! Benches whose loop is closed by another program.
+//! Benches whose control loop is closed by another program, an external controller.
 
 use super::{PRESSED, Place, skin};
 
-/// Creates a bench whose loop is closed by another program, and which halts after a number of consecutive bad cycles.
+/// Creates a directory for a bench with an external controller, which halts after a number of consecutive bad cycles.
 pub fn place(bad_cycles: u32) -> Place {
     let place = Place::new();
     let socket = place.path("controller.sock");
@@ -19,7 +19,7 @@ pub fn place(bad_cycles: u32) -> Place {
     place
 }
 
-/// Returns an answer to a tick, in rad/s.
+/// Returns the datagram by which a controller answers a tick with this velocity of all joints, in rad/s.
 pub fn answer(tick: u64, velocity: f64) -> Vec<u8> {
     let head = [b"SKBC".as_slice(), &1_u16.to_le_bytes(), &2_u16.to_le_bytes(), &tick.to_le_bytes()].concat();
     let numbers: Vec<u8> = [velocity; 6].iter().flat_map(|number| number.to_le_bytes()).collect();

@@ -11,7 +11,7 @@ use protocol::packet::{Epoch, Lengths, Packet, Reassembly, Reassembler, data_id}
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
 
-/// A whole log.
+/// A log of one bus: its frames, and the messages that they carry.
 pub struct Log {
     pub frames: Vec<Frame>,
     /// The decoded messages in the bus' order, each with its packet.
@@ -31,7 +31,7 @@ impl Log {
         Self::of(text.lines().filter(|line| !line.starts_with("# ")).map(frame).collect(), format)
     }
 
-    /// Reads frames of one bus.
+    /// Decodes the frames of one bus.
     pub fn of(frames: Vec<Frame>, format: Format) -> Self {
         let mut segments = BTreeMap::new();
         let packet = |frame: &Frame| match format {
@@ -74,8 +74,8 @@ impl Log {
         all
     }
 
-    /// Checks that each heartbeat counts exactly the packets of its cell before it in the log, which begins before the
-    /// cells do.
+    /// Checks that each heartbeat counts exactly the packets of its cell before it. The log must begin before the cells
+    /// start.
     pub fn heartbeats_count_what_came(&self) {
         let mut sent = BTreeMap::<u8, u16>::new();
         for (message, packet) in &self.messages {
@@ -91,7 +91,7 @@ impl Log {
         assert!(!sent.is_empty());
     }
 
-    /// Returns each broadcast's words.
+    /// Returns the words of each broadcast of joints.
     pub fn joints(&self) -> Vec<[i16; MAX_JOINTS]> {
         let joints = self.messages.iter().filter_map(|(message, _)| match message {
             Message::Joints { joints, .. } => Some(joints.positions.map(Q::to_bits)),

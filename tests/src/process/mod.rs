@@ -73,7 +73,7 @@ force_n = 1.5
 profile = "step"
 "#;
 
-/// Polls until `look` returns a value.
+/// Polls until `look` returns a value, and returns it; panics with `what` after [`TIMEOUT`].
 pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let give_up = Instant::now() + TIMEOUT;
     loop {
@@ -90,8 +90,8 @@ pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
 ///
 /// # Panics
 ///
-/// Panics if it is missing, or older than a source that it was built from; the message names the command that builds
-/// it.
+/// Panics if the program is missing, or older than a source that it was built from; the message names the command that
+/// builds it.
 pub fn program(name: &str) -> PathBuf {
     static CHECKED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
     let named = std::env::var_os("SKINBUS_PROGRAMS").map(PathBuf::from);
@@ -166,7 +166,7 @@ pub fn tells(text: &str, cell: u8, what: &str) -> bool {
     tells_on(text, "vcan0", cell, what)
 }
 
-/// The same for another bus.
+/// Returns true if a bench has reported an event of a cell on this bus, alone or with others.
 pub fn tells_on(text: &str, bus: &str, cell: u8, what: &str) -> bool {
     let on_bus = format!(" on {bus} ha");
     let names = |line: &str| {

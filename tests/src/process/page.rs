@@ -1,4 +1,4 @@
-//! The page of a run, without the browser: its WebSocket.
+//! A client of the live page's WebSocket, for tests without a browser.
 
 use std::net::TcpStream;
 use std::time::Instant;
@@ -13,32 +13,32 @@ use super::{Place, Running, TIMEOUT, skin, until};
 pub const QUIET: &str = "version = 1\nduration_s = 600.0\n\n[motion]\nkind = \"kinesthetic\"\n\
                      start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n";
 
-/// A page, without the browser.
+/// A connection to the WebSocket of a live page.
 pub struct Page {
     pub socket: WebSocket<TcpStream>,
     pub scene: Value,
 }
 
-/// A snapshot of six joints.
+/// A snapshot that the page shows: six joints, and all cells.
 pub struct Snapshot {
     pub time: f64,
-    /// Position, distributed and central torque.
+    /// The position, the distributed torque and the central torque of each joint.
     pub joints: Vec<[f32; 3]>,
-    /// Status, flags, force in mN.
+    /// The status, the flags and the force in mN of each cell.
     pub cells: Vec<(u8, u8, u16)>,
 }
 
 /// The address of a page.
 #[derive(Clone, Debug)]
 pub struct Address {
-    /// `127.0.0.1:8100`.
+    /// The host and port, such as `127.0.0.1:8100`.
     pub host: String,
-    /// `?token=...`, or empty.
+    /// The query with the token, such as `?token=...`, or an empty text.
     pub query: String,
 }
 
 impl Address {
-    /// Reads `http://127.0.0.1:8100/?token=...`.
+    /// Parses a URL such as `http://127.0.0.1:8100/?token=...`.
     pub fn parse(url: &str) -> Self {
         let (host, query) = url.strip_prefix("http://").unwrap().split_once('/').unwrap();
         Self { host: host.to_owned(), query: query.to_owned() }
@@ -99,7 +99,7 @@ impl Page {
         self.say(&format!(r#"{{"do":"press","bus":0,"node":{node},"force_n":{force_n}}}"#));
     }
 
-    /// Commands the bench: `"on":"bus","down":true,"bus":0`.
+    /// Sends a command to the bench, given as JSON fields such as `"on":"bus","down":true,"bus":0`.
     pub fn command(&mut self, command: &str) {
         self.say(&format!(r#"{{"do":"bench",{command}}}"#));
     }
@@ -174,7 +174,7 @@ pub fn watched(place: &Place, cells: usize, more: &str) -> (Running, Address) {
     watched_skin(place, more)
 }
 
-/// The same with the existing `skin.toml`.
+/// Starts a run of the existing `skin.toml` with a page, and returns both the run and the page's address.
 pub fn watched_skin(place: &Place, more: &str) -> (Running, Address) {
     place.scenario(QUIET);
     let words = format!(

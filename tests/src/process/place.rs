@@ -13,10 +13,10 @@ use tempfile::TempDir;
 use super::running::{Running, all_processes, command_line, proc};
 use super::{PRESSED, Summary, TIMEOUT, names, program, skin};
 
-/// A directory for one test, with its embedded buses.
+/// A temporary directory for one test, with its configuration files, results and embedded buses.
 pub struct Place {
     directory: TempDir,
-    /// The kind of bus for its benches.
+    /// The kind of bus on which the benches run.
     kind: BusKind,
 }
 
@@ -30,7 +30,7 @@ impl Place {
         Self { directory: TempDir::new().unwrap(), kind }
     }
 
-    /// Returns the kind of bus for its benches.
+    /// Returns the kind of bus on which the benches run.
     pub const fn kind(&self) -> BusKind {
         self.kind
     }
@@ -39,7 +39,7 @@ impl Place {
         self.directory.path().join(name)
     }
 
-    /// Returns the directory of its buses: `SKINBUS_DIR`.
+    /// Returns the directory of the embedded buses, the value of `SKINBUS_DIR`.
     pub fn buses(&self) -> PathBuf {
         self.path("buses")
     }
@@ -66,7 +66,7 @@ impl Place {
         fs::read_to_string(self.path(name)).unwrap()
     }
 
-    /// Returns the names of the files in it, in order.
+    /// Returns the names of the files in the directory, sorted.
     pub fn files(&self) -> Vec<String> {
         names(self.directory.path())
     }
@@ -92,7 +92,8 @@ impl Place {
         self.command_of(&program(name), words)
     }
 
-    /// The same for any program. Words such as `SKINBUS_TOKEN=x` go to its environment.
+    /// Returns a command that runs any program in this directory. Words such as `SKINBUS_TOKEN=x` go to its
+    /// environment.
     pub fn command_of(&self, program: &Path, words: &str) -> Command {
         let mut command = Command::new(program);
         for word in words.split(' ').filter(|word| !word.is_empty()) {
@@ -121,7 +122,7 @@ impl Place {
         )
     }
 
-    /// Starts the same bench, and waits until its loop runs.
+    /// Starts a bench like [`Self::bench`], and waits until its loop runs.
     pub fn running_bench(&self, seconds: f64, more: &str) -> Running {
         let bench = self.bench(seconds, more);
         bench.hears_the_loop();
@@ -143,7 +144,7 @@ impl Place {
         all_processes().into_iter().filter(ours).map(|pid| (pid, command_line(pid))).collect()
     }
 
-    /// Checks that soon no process and no socket of this directory remains.
+    /// Waits until no process and no socket of this directory remains; panics if that takes too long.
     pub fn is_left_clean(&self) {
         let left = || {
             let processes = self.processes();

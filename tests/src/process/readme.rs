@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use super::{Ended, Place, Running, program};
 
-/// README.md.
+/// The text of README.md.
 pub const README: &str = include_str!("../../../README.md");
 /// The programs that `cargo build --release` builds for the user. They are built already, so the build is replaced.
 pub const PROGRAMS: [&str; 3] = ["skinbus", "cell-node", "vcan-setup"];
@@ -16,7 +16,7 @@ const TOOLS: [&str; 6] = ["ln", "mkdir", "python3", "sed", "sleep", "tac"];
 /// The time limit for all commands; a shared machine takes a tenth of it.
 const LIMIT: Duration = Duration::from_secs(900);
 
-/// Returns the fenced blocks, each with its language.
+/// Returns the fenced blocks of a page, each with its language.
 pub fn blocks(text: &str) -> Vec<(&str, &str)> {
     let fenced = text.split("```").skip(1).step_by(2);
     fenced.map(|block| block.split_once('\n').unwrap()).collect()

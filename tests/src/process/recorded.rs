@@ -22,14 +22,14 @@ use crate::process::{PRESSED, Place};
 /// A message of a recording.
 pub struct Message {
     pub topic: String,
-    /// The time in its header.
+    /// The time in the message's header, in ns.
     pub nanos: u64,
-    /// The time in the file.
+    /// The time that the file gives for the message, in ns.
     pub log_nanos: u64,
     pub value: Value,
 }
 
-/// A whole recording.
+/// All messages of a recording.
 pub struct Recorded {
     pub messages: Vec<Message>,
     pub attachments: BTreeMap<String, Vec<u8>>,
@@ -37,7 +37,7 @@ pub struct Recorded {
 }
 
 impl Recorded {
-    /// Reads a complete file.
+    /// Reads a complete MCAP file, and panics if it is not valid.
     pub fn read(path: &Path) -> Self {
         let name = path.display();
         let bytes = std::fs::read(path).unwrap_or_else(|error| panic!("{name}: {error}"));
@@ -91,7 +91,7 @@ impl Recorded {
     }
 }
 
-/// Formats a frame as a line, from the message's fields alone.
+/// Formats a frame as a line of candump, from the fields of its message only.
 fn line(message: &Message) -> String {
     let frame = &message.value;
     let (seconds, micros) = (message.nanos / 1_000_000_000, message.nanos % 1_000_000_000 / 1_000);
@@ -176,7 +176,7 @@ impl Types {
     }
 }
 
-/// The bytes of a message, after its head.
+/// The bytes of a message that are still to be decoded.
 struct From<'a> {
     bytes: &'a [u8],
     at: usize,

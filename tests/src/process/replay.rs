@@ -1,4 +1,4 @@
-//! Runs that are recorded, and replayed to other cells.
+//! Recorded runs, and replays of them to other cells.
 
 use std::path::Path;
 use std::time::Duration;
@@ -16,7 +16,7 @@ use serde_json::Value;
 use super::test_client::TestClient;
 use super::{Ended, Place, Running};
 
-/// The options for new cells with the recording's skin.
+/// The options of a replay to new cells that are configured by the recording's skin.
 pub const FRESH: &str = "--expect --spawn --skin skin.toml";
 
 /// A scenario in which the arm swings, and touches come and go on several cells at once.
@@ -108,7 +108,7 @@ impl Place {
         self.records_with(&skin);
     }
 
-    /// The same with a given skin.
+    /// Records `run.log` with a given skin.
     pub fn records_with(&self, skin: &Path) {
         self.scenario(TOUCHED);
         let bench = self.running_bench(4.0, "");
@@ -126,7 +126,7 @@ impl Place {
         )
     }
 
-    /// Runs the same replay to its end, and returns its summary.
+    /// Runs a replay like [`Self::replay`] to its end, and returns its summary.
     pub fn replayed(&self, file: &str, more: &str) -> (Ended, Replayed) {
         let ended = self.replay(file, more).end_after(Duration::from_secs(60));
         let text = std::fs::read_to_string(self.path("replay.json"));
@@ -153,15 +153,15 @@ impl Replayed {
         ["equal", "different", "missing", "extra"].map(|what| self.number(&format!("/expect/{what}")))
     }
 
-    /// Checks that all replies came back, and no others; returns their number.
+    /// Checks that all recorded replies came again, and no others. Returns their number.
     pub fn all_came_back(&self, ended: &Ended) -> u64 {
         let [equal, rest @ ..] = self.replies();
         assert_eq!((rest, ended.code()), ([0, 0, 0], Some(0)), "{:#} {ended:#?}", self.0);
         equal
     }
 
-    /// The same at the recording's own times, which a busy machine misses: then missing replies are those to joints
-    /// that came too late.
+    /// Checks the replies of a replay at the recording's own times. A busy machine misses some: missing replies must
+    /// then be those to joints that came too late.
     pub fn all_came_back_in_time(&self, ended: &Ended) -> u64 {
         let late = self.number("/expect/joints_skipped");
         if late == 0 {

@@ -1,4 +1,4 @@
-//! Processes: their output, their ends, and the list of all.
+//! Processes that a test starts: their output, their end, and their child processes.
 
 use std::fs;
 use std::io::Read;
@@ -13,14 +13,14 @@ use rustix::process::{Pid, Signal};
 
 use super::{TIMEOUT, signal, tells, tells_on, until};
 
-/// A process whose output is read as it comes; it ends with the test.
+/// A running process whose output is collected; it is ended when this value is dropped.
 pub struct Running {
     child: Child,
     out: Output,
     err: Output,
 }
 
-/// The result of a process.
+/// The exit status and the complete output of a process.
 #[derive(Debug)]
 pub struct Ended {
     pub status: ExitStatus,
@@ -29,17 +29,17 @@ pub struct Ended {
 }
 
 impl Ended {
-    /// Returns its exit code.
+    /// Returns the exit code, if a signal did not end the process.
     pub fn code(&self) -> Option<i32> {
         self.status.code()
     }
 
-    /// Returns the signal that ended it.
+    /// Returns the signal that ended the process, if one did.
     pub fn signal(&self) -> Option<i32> {
         self.status.signal()
     }
 
-    /// Checks that it succeeded.
+    /// Checks that the process succeeded, and returns its result.
     pub fn well(self) -> Self {
         assert_eq!(self.code(), Some(0), "{self:#?}");
         self
@@ -51,7 +51,7 @@ impl Ended {
         table.nth(1).unwrap_or_else(|| panic!("no table: {self:#?}"))
     }
 
-    /// Checks that it ended with this code and one line, and returns that line.
+    /// Checks that the process ended with this exit code and one line on standard error, and returns that line.
     pub fn refusal(&self, code: i32) -> &str {
         assert_eq!((self.code(), self.stdout.as_str()), (Some(code), ""), "{self:#?}");
         let line = self.stderr.trim_end_matches('\n');
@@ -87,7 +87,7 @@ impl Running {
         self.err.wait_until(what, |text| tells(text, cell, what));
     }
 
-    /// The same for another bus.
+    /// Waits until a bench has reported an event of a cell on this bus.
     pub fn tells_on(&self, bus: &str, cell: u8, what: &str) {
         self.err.wait_until(what, |text| tells_on(text, bus, cell, what));
     }
@@ -107,12 +107,12 @@ impl Running {
         self.err.text.lock().unwrap().clone()
     }
 
-    /// Waits until it has ended.
+    /// Waits until the process has ended, and returns its result.
     pub fn end(self) -> Ended {
         self.end_after(Duration::ZERO)
     }
 
-    /// Waits until it has ended; by itself it takes the time `run`.
+    /// Waits until a process that takes the time `run` has ended, and returns its result.
     pub fn end_after(mut self, run: Duration) -> Ended {
         let give_up = Instant::now() + run + TIMEOUT;
         // Polling costs an emulated processor 2 % of its time.
@@ -127,7 +127,7 @@ impl Running {
         Ended { status, stdout: self.out.whole(), stderr: self.err.whole() }
     }
 
-    /// Returns the processes of its cells, with the node ids of each.
+    /// Returns the processes of the bench's cells, each with its node ids.
     pub fn cells(&self) -> Vec<(Pid, String)> {
         let mark = format!("--with-parent {}", self.pid().as_raw_nonzero());
         let cell = |pid| {
@@ -192,7 +192,7 @@ impl Output {
         }
     }
 
-    /// Returns the complete text, once the other end has closed it.
+    /// Waits until the process has closed the output, and returns its complete text.
     fn whole(&mut self) -> String {
         let reader = self.reader.take().unwrap();
         until("the end of an output: a process still has it open", || reader.is_finished().then_some(()));

@@ -4,11 +4,11 @@ use std::io::{BufRead, BufReader};
 use std::ops::{Deref, DerefMut};
 use std::process::{Child, Command, Stdio};
 
-/// A server, which ends with its test.
+/// A server process, which is ended when this value is dropped.
 pub struct Served(Child);
 
 impl Served {
-    /// Starts it, and returns it with the first line that it prints.
+    /// Starts a server, and returns it with the first line that it prints.
     pub fn start(command: &mut Command) -> (Self, String) {
         let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
         let mut line = String::new();

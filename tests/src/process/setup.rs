@@ -8,7 +8,7 @@ use protocol::bus::Bus;
 use protocol::can::Frame;
 use protocol::id::Id;
 
-/// The output of a command.
+/// The exit code and the output of a command.
 #[derive(Debug)]
 pub struct Said {
     pub code: i32,

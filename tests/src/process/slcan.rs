@@ -1,4 +1,4 @@
-//! Other ends of serial lines: pseudoterminals and sockets.
+//! Test ends of serial lines, which stand for adapters or cells: pseudoterminals and sockets.
 #![allow(
     dead_code,
     clippy::unwrap_used,
@@ -30,11 +30,11 @@ pub struct Peer {
     lines: Vec<SlcanLine>,
 }
 
-/// A pseudoterminal: the end that is opened by its path, and this one.
+/// A pseudoterminal: the path that a program opens, and the test's end.
 pub struct Pty {
     pub peer: Peer,
     pub path: PathBuf,
-    /// Kept open, so that this end can be read before the other one is opened, and after.
+    /// The program's end, kept open so that the test's end can be read also while no program has opened it.
     pub slave: OwnedFd,
 }
 
@@ -88,7 +88,7 @@ impl Peer {
         }
     }
 
-    /// Waits for this text.
+    /// Waits until this text has come over the line.
     pub fn hears(&mut self, text: &str) {
         until(text, || {
             self.look();
@@ -102,7 +102,7 @@ impl Peer {
         self.lines.iter().filter_map(frame).collect()
     }
 
-    /// Waits for a number of frames.
+    /// Waits until this number of frames has come over the line, and returns them.
     pub fn receives(&mut self, count: usize) -> Vec<Frame> {
         until("frames at the line", || {
             self.look();
@@ -111,7 +111,7 @@ impl Peer {
         self.frames()
     }
 
-    /// Writes bytes, however long that takes.
+    /// Writes all bytes, and waits while the line has no room.
     pub fn says(&mut self, bytes: &[u8]) {
         let mut rest = bytes;
         until("the line to take bytes", || {

@@ -1,4 +1,4 @@
-//! The summary that a run writes.
+//! The summary that a run writes as JSON.
 
 use serde_json::Value;
 
@@ -7,22 +7,22 @@ use serde_json::Value;
 pub struct Summary(pub Value);
 
 impl Summary {
-    /// Returns a number of the first bus: `/replies/due`.
+    /// Returns a number of the first bus by its pointer, such as `/replies/due`.
     pub fn of_bus(&self, pointer: &str) -> u64 {
         self.number(&format!("/buses/0{pointer}"))
     }
 
-    /// Returns a number.
+    /// Returns a whole number by its JSON pointer.
     pub fn number(&self, pointer: &str) -> u64 {
         self.0.pointer(pointer).and_then(Value::as_u64).unwrap_or_else(|| panic!("{pointer} in {:#}", self.0))
     }
 
-    /// Returns a number that is left out when it is zero.
+    /// Returns a number of a table, or 0 if the key is left out.
     pub fn count(&self, table: &str, key: &str) -> u64 {
         self.0.pointer(table).unwrap()[key].as_u64().unwrap_or(0)
     }
 
-    /// Returns a number with a fraction.
+    /// Returns a number with a fraction by its JSON pointer.
     pub fn figure(&self, pointer: &str) -> f64 {
         self.0.pointer(pointer).and_then(Value::as_f64).unwrap_or_else(|| panic!("{pointer} in {:#}", self.0))
     }
@@ -32,7 +32,7 @@ impl Summary {
         self.0.pointer(table).unwrap().as_object().unwrap().values().map(|it| it.as_u64().unwrap()).sum()
     }
 
-    /// Returns the number of irregular events on a bus, without late torques: those depend on the machine.
+    /// Returns the number of irregular events on a bus, without late torques, which depend on the machine.
     pub fn odd(&self, bus: usize) -> u64 {
         let table = format!("/buses/{bus}/events");
         self.total(&table) - self.count(&table, "stale torque")
@@ -51,12 +51,12 @@ impl Summary {
         cells.iter().map(|cell| cell.as_u64().unwrap()).collect()
     }
 
-    /// Returns each cell's figures.
+    /// Returns the table of each cell.
     pub fn cells(&self) -> &[Value] {
         self.0["cells"].as_array().unwrap()
     }
 
-    /// Checks that everything that was due, sent and written is accounted for on every bus.
+    /// Checks that the counts of replies, packets and frames add up on every bus.
     pub fn adds_up(&self) -> &Self {
         let buses = self.0["buses"].as_array().unwrap().len();
         for bus in 0..buses {

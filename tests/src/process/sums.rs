@@ -1,5 +1,5 @@
-//! Cells in a grid that answer with sums along their tree, on a bus of either format: complete, with links down, and up
-//! again.
+//! Benches of cells in a grid that answer with sums along a tree, on a bus of either format, with links that go down
+//! and come up again.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -74,7 +74,7 @@ pub fn unrecorded(place: &Place, seconds: f64, more: &str) -> Running {
     place.start("skinbus", &words)
 }
 
-/// Waits until the roots' sums of three consecutive epochs hold this number of cells.
+/// Waits until the sums of the roots contain this number of cells in three consecutive epochs.
 pub fn holds(test_client: &TestClient, expected: u32) {
     let (mut epoch, mut counts, mut row) = (None, BTreeMap::<u8, u8>::new(), 0);
     // A root that found another route is in another root's sum.
@@ -108,7 +108,7 @@ pub fn holds(test_client: &TestClient, expected: u32) {
     assert!(whole, "waited {TIMEOUT:?} for sums of {expected} cells; they were of {seen:?}");
 }
 
-/// Waits until, by the cells' reports, each of these has a route to a root over these cells only.
+/// Waits until each of these cells has a route to a root over these cells only, by the reports of the cells.
 fn have_ways(test_client: &TestClient, cells: &BTreeSet<u8>) {
     let mut parents = BTreeMap::new();
     let leads = |parents: &BTreeMap<u8, Option<u8>>, cell: u8| {
@@ -126,7 +126,7 @@ fn have_ways(test_client: &TestClient, cells: &BTreeSet<u8>) {
     assert!(all, "waited {TIMEOUT:?} for routes of {cells:?}: {parents:?}");
 }
 
-/// Ends a bench, and checks that everything is accounted for.
+/// Ends a bench, and checks that its counts add up.
 pub fn end(place: &Place, bench: Running) -> Ended {
     bench.signal(Signal::TERM);
     let ended = bench.end().well();
@@ -169,7 +169,7 @@ pub fn goes_round_a_cell(place: &Place, format: Format) {
     assert!(summary.of_bus("/sums/contributions/missing") > 0, "{:#}", summary.0);
 }
 
-/// Checks that without a touch, hellos show which cell is lost, and the rest finds another route.
+/// Checks that without a touch hellos show a lost cell, and that the other cells find another route.
 pub fn keeps_ways_without_a_touch(place: &Place, format: Format) {
     grid(place, format);
     place.scenario(PRESSED.split("[[touch]]").next().unwrap());
@@ -212,7 +212,7 @@ cells = [8, 4]
 for_s = 12.0
 "#;
 
-/// Checks that an unreachable cell is named, and the rest finds another route.
+/// Checks that a bench with links down names an unreachable cell, and that the other cells find another route.
 pub fn goes_on_without_a_wire(place: &Place, format: Format) {
     grid(place, format);
     place.scenario(&format!("{PRESSED}{LINKS_DOWN}"));

@@ -1,4 +1,4 @@
-//! A further client of a bench's bus, which receives and sends by the protocol.
+//! A client of a bench's bus beside gateway and cells, which decodes and sends messages.
 
 use std::cell::RefCell;
 use std::collections::BTreeSet;
@@ -14,7 +14,7 @@ use protocol::time::Micros;
 
 use super::{Place, TIMEOUT, until};
 
-/// A further client of a bus with a given format.
+/// A client of a bus with a given format.
 pub struct TestClient {
     pub bus: Bus,
     format: Format,
@@ -22,12 +22,12 @@ pub struct TestClient {
 }
 
 impl Place {
-    /// Opens a client of its bus.
+    /// Opens a client of the bus `vcan0` with CAN FD frames.
     pub fn test_client(&self) -> TestClient {
         self.test_client_of(Format::Fd)
     }
 
-    /// The same on a bus of another format.
+    /// Opens a client of the bus `vcan0` with frames of this format.
     pub fn test_client_of(&self, format: Format) -> TestClient {
         TestClient::on(self, "vcan0", format)
     }

@@ -1,4 +1,4 @@
-//! A real kernel's vcan, and the standard tools.
+//! Buses of the Linux kernel's vcan, and standard tools such as can-utils.
 //!
 //! `tests/vcan` runs the tests that need it, each in a network of its own with `lo` and `vcan0` (MTU 72, up).
 
@@ -57,14 +57,14 @@ pub fn own_network() {
     }
 }
 
-/// Runs another program, which must succeed: `ip link set vcan0 down`.
+/// Runs a command such as `ip link set vcan0 down`, and panics if it fails.
 pub fn tool(words: &str) -> Output {
     let output = command(words).output().unwrap_or_else(|error| missing(words, &error));
     assert!(output.status.success(), "{words}: {output:?}");
     output
 }
 
-/// Returns a command; spaces separate its arguments.
+/// Returns a command of which spaces separate the arguments.
 pub fn command(words: &str) -> Command {
     let mut words = words.split(' ');
     let mut command = Command::new(words.next().unwrap());
@@ -148,8 +148,8 @@ impl Vcan0 {
         tool("ip link set vcan0 up");
     }
 
-    /// Makes it accept no frame: a transmit queue without room, as a real controller's is without any acknowledge.
-    /// Senders get ENOBUFS.
+    /// Makes `vcan0` refuse all frames, so that senders get ENOBUFS: its transmit queue has no room, like that of a
+    /// real controller without any acknowledge.
     pub fn fill(&self) {
         tool("tc qdisc add dev vcan0 root pfifo limit 0");
     }
@@ -195,7 +195,7 @@ pub struct Candump {
 }
 
 impl Candump {
-    /// Starts it; it listens when this returns.
+    /// Starts candump, and returns once it listens.
     pub fn start(bus: &str, log: &Path) -> Self {
         // -d: frames that its socket drops are a line of the log, which fails every test that counts frames. The two
         // filters pass every frame and every error frame, which are otherwise left out.
@@ -212,7 +212,7 @@ impl Candump {
         candump
     }
 
-    /// Returns the end of its log, which may be long.
+    /// Returns the last part of candump's log, which may be long.
     fn tail(&self) -> String {
         let mut log = File::open(&self.log).unwrap();
         let len = log.metadata().unwrap().len();
@@ -222,8 +222,8 @@ impl Candump {
         tail
     }
 
-    /// Waits until it has seen all frames until now. This takes a frame of its own, which is foreign to all clients and
-    /// stays in its log.
+    /// Waits until candump has logged all frames until now. For this it sends a frame that is foreign to all clients
+    /// and stays in the log.
     pub fn catch_up(&mut self) {
         self.marks += 1;
         let mark = mark(self.marks);
@@ -231,7 +231,7 @@ impl Candump {
         until("candump to see a frame", || self.tail().contains(&mark).then_some(()));
     }
 
-    /// Returns all frames from its start until now.
+    /// Returns all frames that candump has logged from its start until now.
     pub fn frames(mut self) -> Vec<Frame> {
         self.catch_up();
         drop(self.child);
@@ -248,7 +248,7 @@ fn mark(number: u32) -> String {
     format!("1BADCAFE#{number:08X}")
 }
 
-/// Returns the frames of a log; every other line is an error, `DROPCOUNT` too.
+/// Returns the frames of a log, and panics if it has any other line, such as `DROPCOUNT`.
 pub fn frames_of(log: &Path) -> Vec<Frame> {
     let text = fs::read_to_string(log).unwrap();
     let frame = |line: &str| match parse(line) {

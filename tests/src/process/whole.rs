@@ -1,4 +1,5 @@
-//! The whole skin on a real kernel's vcan: 253 processes that all answer every broadcast, and `candump` beside them.
+//! A run of the largest skin on the kernel's vcan: 253 processes that all answer every broadcast, with `candump` on the
+//! same bus.
 
 use std::time::Duration;
 
@@ -12,8 +13,8 @@ use super::{Place, Running, Summary, program};
 const CELLS: u64 = 253;
 const SECONDS: u32 = 30;
 
-/// All cells are in contact all the time. The central computation is left out: under emulation it would take a fifth of
-/// the only processor.
+/// A scenario in which all cells are always in contact. The central torque is not computed, because under emulation it
+/// would take a fifth of the only processor.
 const SCENARIO: &str = r#"version = 1
 duration_s = 30.0
 
@@ -35,8 +36,8 @@ force_n = 1.5
 profile = "step"
 "#;
 
-/// Runs it for half a minute and checks that every broadcast was sent or counted as one for which the machine was too
-/// late, that no frame was lost, and that candump saw exactly the counted frames.
+/// Runs the bench for half a minute. Checks that every broadcast was sent, or counted as skipped because the machine
+/// was late, that no frame was lost, and that candump saw exactly the counted frames.
 pub fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summary {
     let broadcast_hz = f64::from(broadcasts) / f64::from(SECONDS);
     let place = Place::on_vcan();

@@ -112,7 +112,7 @@ fn a_cell_without_parameters_reports_it_and_sends_no_torque() {
                 && heartbeat.configuration == 0)
     });
     let bench = place.running_bench(600.0, "--no-spawn");
-    bench.hears("cells that have no parameters, the run goes on without them: 3 on vcan0");
+    bench.hears("cells that have no parameters; the run goes on without them: 3 on vcan0");
     place.test_client().waits_for_epoch(20);
     bench.signal(Signal::TERM);
     bench.end().well();

@@ -183,9 +183,9 @@ fn what_cannot_be_covered_is_said_in_a_line() {
     let with = "--package arm_parts=parts";
     for (words, expected) in [
         (cover("fore", ""), "link plate: mesh package://arm_parts/meshes/plate.stl: "),
-        (cover("fore", ""), "is no file: name its directory with --package arm_parts=DIR"),
-        (cover("fore", "--package arm_parts=nowhere"), "nowhere is no folder: correct --package arm_parts="),
-        (cover("fore", ""), "; or take it as not there with --leave-out plate"),
+        (cover("fore", ""), "is not a file: name its directory with --package arm_parts=DIR"),
+        (cover("fore", "--package arm_parts=nowhere"), "nowhere is not a folder: correct --package"),
+        (cover("fore", ""), "; or treat it as absent with --leave-out plate"),
         (cover("fore", "--package arm_parts=."), ". is not the package, or lacks this file"),
         (cover("fore", "--leave-out fore"), "--leave-out fore: --cover names this link"),
         (
@@ -250,7 +250,7 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
         (format!("{head}\nfore,0,0,0,0,0,0\n"), "line 2: the normal"),
         (
             format!("{head}\nfore,0,0\n"),
-            "cells.csv: line 2: 3 values: one is needed for each of the columns link, ",
+            "cells.csv: line 2 has 3 values: one is needed for each of the columns link, ",
         ),
         (head.to_owned(), "there is no cell in it"),
         // A defect that only the skin's check finds, reported with its line in the file.

@@ -108,7 +108,7 @@ fn invalid_input_is_refused_in_one_line() {
         ("none.log", 1, "skinbus: none.log: there is no frame in it"),
         ("nothing.log", 2, "skinbus: nothing.log: No such file"),
         ("some.zip", 2, "skinbus: some.zip is a zip"),
-        ("-", 2, "skinbus: a capture is read twice, which standard input cannot be"),
+        ("-", 2, "skinbus: a replay reads its capture twice, but standard input only once"),
         ("some.log --from 5", 2, "skinbus: nothing remains to be sent: some.log ends at 2.000 s"),
         ("some.log --map can0=can1", 2, "skinbus: --map can0=can1: some.log has no bus can0; it has vcan0"),
         ("some.log --bus can0", 2, "skinbus: --bus can0: some.log has no bus can0; it has vcan0"),

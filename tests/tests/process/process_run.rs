@@ -228,7 +228,7 @@ fn cells_that_measure_are_named_and_only_the_others_are_pressed() {
     test_client.waits_for("its answer", |message| matches!(message, Message::Configured { tag: 9, .. }));
 
     let ended = place.bench(1.5, "--no-spawn").end().well();
-    let said = "cells that measure, the scenario does not press them (`skinbus frame configure --cell N --write \
+    let said = "cells that measure, so the scenario does not press them (`skinbus frame configure --cell N --write \
                 mode 1` puts one into test mode): 3 on vcan0\n";
     assert!(ended.stderr.contains(said), "{ended:#?}");
     assert!(ended.stdout.contains("cells that measure"), "{}", ended.stdout);

@@ -319,7 +319,7 @@ fn a_cell_that_sends_one_torque_for_ever_is_named_in_the_table_the_summary_and_t
     place.start("skinbus", "report run.mcap -o run.html").end().well();
     let page = place.read("run.html");
     assert!(
-        page.contains("stuck cells, which sent constant words while others were due (vcan0 5: "),
+        page.contains("stuck cells, which sent constant words while the expected words changed (vcan0 5: "),
         "not in the report"
     );
 }

@@ -199,7 +199,7 @@ fn pages_that_may_only_look_press_nothing() {
             "--token-file skin.toml: a token must consist of 16 to 256 letters or digits",
         ),
         ("--token-file no-such-file", "--token-file no-such-file: No such file or directory"),
-        ("--address-file skin.toml", "--address-file skin.toml: it exists, and is no page's address: name"),
+        ("--address-file skin.toml", "--address-file skin.toml: it exists and does not contain the address"),
         ("--listen nowhere", "--listen"),
         ("", "vcan0"),
     ] {

@@ -147,7 +147,7 @@ fn unknown_causes_are_named_and_not_guessed() {
     let cell = explanation.cells.iter().find(|cell| cell.node == one).unwrap();
     assert!(cell.force.is_some() && cell.answered_after_ns.is_none());
     let said = explanation.missing.join("\n");
-    assert!(said.contains(&format!("vcan0 {one}: no torque of this epoch in time: lost, or")), "{said}");
+    assert!(said.contains(&format!("vcan0 {one}: no torque of this epoch arrived in time: it was")), "{said}");
     assert_eq!(explanation.total[0].open, 1);
 }
 
@@ -168,7 +168,7 @@ fn a_cell_that_has_just_started_sends_nothing_and_one_that_releases_sends_zeros(
     // Its stimulus was sent again, and it answers nothing during its address claim.
     assert!(cell(0).unwrap().answered_after_ns.is_some() && cell(2).unwrap().answered_after_ns.is_none());
     let why = format!(
-        "vcan0 {}: no torque of this epoch in time: it had just started and was claiming its node id; the sum of words lacks it",
+        "vcan0 {}: no torque of this epoch arrived in time: it had just started and was claiming its node id; the sum of words does not contain it",
         node(2)
     );
     assert_eq!(explanation.missing, [why]);

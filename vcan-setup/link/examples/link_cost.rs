@@ -22,7 +22,7 @@ type Outcome<T> = Result<T, Box<dyn Error>>;
 const BUS: &str = "vcan0";
 const PINGS: usize = 1_000;
 const PAUSE: Duration = Duration::from_millis(1);
-/// The number of frames that are sent at once, as the cells of a bus answer, and how often.
+/// The number of frames sent at once, like the replies of a bus's cells, and the number of repetitions.
 const CELLS: usize = 100;
 const EPOCHS: usize = 625;
 const EPOCH: Duration = Duration::from_millis(16);
@@ -42,7 +42,7 @@ fn main() -> Outcome<()> {
     let near = open(&here)?;
     let mut pings = 0..;
     let mut rounds = [Vec::new(), Vec::new()];
-    // Rounds on one bus and over the link alternate, so that a busy moment of the machine affects both.
+    // Rounds on one bus and rounds over the link alternate, so that other load on the machine affects both alike.
     for turn in 0..10 {
         for (far, rounds) in [&here, &there].into_iter().zip(&mut rounds) {
             let answers = Answers::start(open(far)?)?;
@@ -104,7 +104,7 @@ struct Links(Vec<Child>);
 
 impl Links {
     fn start(&mut self, folder: &Path, host: &str, how: &str) -> Outcome<()> {
-        // The program is beside the folder of the examples.
+        // The program is in the folder above that of the examples.
         let program: PathBuf =
             std::env::current_exe()?.parent().and_then(Path::parent).ok_or("no folder")?.join("vcan-link");
         let mut command = Command::new(program);
@@ -113,7 +113,7 @@ impl Links {
         Ok(())
     }
 
-    /// Returns the processor time of all their threads so far, in s, as the scheduler counts it.
+    /// Returns the processor time that all threads of both links have used so far, in s, as the scheduler counts it.
     fn processor(&self) -> f64 {
         let nanos = |path: PathBuf| {
             let text = std::fs::read_to_string(path).unwrap_or_default();
@@ -154,7 +154,8 @@ impl Answers {
                     return;
                 }
                 for ping in inbox.frames().filter(|received| received.frame.raw_id() == PING) {
-                    // Two answers with the same data would look like a circle to the link.
+                    // The answers differ in their data, because the link would take a repeated frame for one that went
+                    // around a circle.
                     let _ = Frame::fd(PONG, 1, ping.frame.data()).map(|pong| bus.send(&[pong]));
                 }
             }
@@ -168,7 +169,7 @@ impl Answers {
     }
 }
 
-/// Waits until the responder has opened the bus and the links have joined.
+/// Sends pings until one is answered: the responder has then opened its bus, and the links are connected.
 fn until_answered(near: &Bus, pings: &mut impl Iterator<Item = u32>) -> Outcome<()> {
     let began = Instant::now();
     while began.elapsed() < SOON {

@@ -7,25 +7,25 @@ use std::fmt;
 pub(crate) enum Event {
     /// Another host has linked the bus.
     Joined(String),
-    /// A host has left, or can no longer be reached.
+    /// A host has left or can no longer be reached; its name is given.
     Gone(String),
-    /// A connection failed or was refused.
+    /// A connection to another host failed or was refused; the error is given.
     Transport(String),
-    /// The local bus is unavailable, with the reason. It is reopened as soon as possible.
+    /// The local bus cannot be used; the reason is given. The link tries to open it again.
     BusAway(String),
     /// The local bus is available again.
     BusBack,
-    /// A host sent an invalid message: its name, and the error.
+    /// A host sent an invalid message. The fields are the name of the host and the error.
     Garbage(String, String),
-    /// Frames of other hosts came back from the local bus: the buses are joined in a circle.
+    /// Frames that the link put on the local bus came back from it: the buses are joined in a circle.
     Circle,
-    /// Two hosts have this name.
+    /// Two hosts use this name.
     SameName(String),
-    /// Frames were lost since the last report.
+    /// Frames were lost since the last event of this kind.
     Lost {
-        /// Frames of the local bus.
+        /// The number of lost frames from the local bus.
         from_here: u64,
-        /// Frames of other hosts.
+        /// The number of lost frames from other hosts.
         from_others: u64,
     },
 }

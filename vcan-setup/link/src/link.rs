@@ -1,4 +1,4 @@
-//! The link program around the pure core in `hosts`: a bus, a session of Zenoh, and one thread between them.
+//! Runs a link: one thread forwards frames between a bus and a Zenoh session. The rules are in the pure module `hosts`.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -31,21 +31,21 @@ use crate::watchers::Watchers;
 
 /// The requested receive buffer of the bus socket, in bytes.
 const RECEIVE_BUFFER: usize = 8 << 20;
-/// The interval between two attempts to send to a full bus.
+/// The interval between two attempts to send to a bus whose queue is full.
 const RETRY: Duration = Duration::from_millis(1);
 /// The interval between two attempts to open an unavailable bus.
 const AGAIN: Duration = Duration::from_millis(100);
-/// The minimum interval between two loss reports on standard error.
+/// The minimum interval between two messages about losses on standard error.
 const SAY: Duration = Duration::from_secs(1);
-/// The interval between two reports to other hosts and to local programs.
+/// The interval between two reports to other hosts and to programs on this machine.
 const TELL: Duration = Duration::from_millis(200);
-/// The maximum number of batches read from the bus before other work is done.
+/// The maximum number of batches read from the bus before the link sends and handles events again.
 const TURNS: usize = 4;
 
-/// The state that Zenoh's threads share with the link's thread.
+/// The state that the link's thread shares with the threads of Zenoh.
 struct Shared {
     incoming: Mutex<Incoming>,
-    /// The account of this host's frames that each other host has published.
+    /// By host: the counts that this host has published of the frames received from here.
     ours: Mutex<BTreeMap<String, Heard>>,
     wake: OwnedFd,
 }
@@ -60,22 +60,22 @@ impl Shared {
     }
 
     fn wake(&self) {
-        // The write fails only if the counter is full, and then it is readable.
+        // Writing fails only if the counter is at its maximum, and then the thread is woken anyway.
         let _ = rustix::io::write(&self.wake, &1_u64.to_ne_bytes());
     }
 }
 
-/// A linked bus.
+/// A link between a local bus and the buses of the same name on other hosts.
 pub(crate) struct Link {
     settings: Settings,
     kind: BusKind,
     session: Session,
     publisher: Publisher<'static>,
-    /// The publisher of the accounts of the other hosts' frames.
+    /// The publisher of the counts of frames received from the other hosts.
     accounts: Publisher<'static>,
     shared: Arc<Shared>,
     events: Receiver<Event>,
-    /// Subscriptions and tokens, which end when they are dropped.
+    /// Subscriptions and liveliness tokens. Dropping them ends them.
     declared: Vec<Box<dyn Send>>,
     bus: Option<Bus>,
     outgoing: Outgoing,
@@ -83,7 +83,7 @@ pub(crate) struct Link {
     began: Instant,
     missed_before: u64,
     there: BTreeSet<String>,
-    /// The local programs that receive reports. While it listens, no other process of this machine can link the bus.
+    /// The programs on this machine that receive reports. Its socket also prevents a second link of the same bus.
     watchers: Watchers,
     tell_at: Instant,
 }
@@ -95,7 +95,7 @@ impl fmt::Debug for Link {
 }
 
 impl Link {
-    /// Opens the bus and a session. Other hosts may be unreachable.
+    /// Opens the bus and a Zenoh session. The other hosts need not be reachable yet.
     ///
     /// # Errors
     /// Returns [`LinkError`] if the bus cannot be opened, if the configuration is wrong, or if another process links
@@ -152,7 +152,8 @@ impl Link {
         Ok(link)
     }
 
-    /// Subscribes to the other hosts: their frames, their accounts of this host's frames, and their presence.
+    /// Subscribes to what the other hosts publish: their frames, their counts of this host's frames, and their
+    /// presence.
     fn declare(&mut self, tell: &Sender<Event>) -> Result<(), LinkError> {
         let Settings { bus, host, .. } = self.settings.clone();
         let shared = Arc::clone(&self.shared);
@@ -187,7 +188,7 @@ impl Link {
         Ok(())
     }
 
-    /// Passes data of other hosts to `take`, and reports its errors.
+    /// Subscribes to a key. Passes received data to `take`, and reports the errors that it returns.
     fn subscribe(
         &mut self,
         what: &str,
@@ -219,7 +220,7 @@ impl Link {
         self.kind
     }
 
-    /// Forwards frames until `stop` is readable or hung up. Returns the accounts of all frames.
+    /// Forwards frames until `stop` is readable or hung up. Returns the final counts of all frames.
     ///
     /// # Errors
     /// Returns [`LinkError::Wait`] if the system cannot wait.
@@ -275,7 +276,7 @@ impl Link {
         Ok(report)
     }
 
-    /// Tracks the present hosts, and reports events.
+    /// Updates which hosts are present, and reports the events that have occurred.
     fn note_events(&mut self, report: &mut impl FnMut(Event)) {
         for event in self.events.try_iter() {
             if let Event::Joined(host) = &event
@@ -285,13 +286,13 @@ impl Link {
             } else if let Event::Gone(host) = &event {
                 self.there.remove(host);
             }
-            // Local programs receive the change at once.
+            // The report to programs on this machine is due at once, because a host has come or gone.
             self.tell_at = self.began;
             report(event);
         }
     }
 
-    /// Publishes the accounts of the other hosts' frames, and sends the report to local programs.
+    /// Publishes the counts of the other hosts' frames, and sends the report to the programs on this machine.
     fn tell(&mut self) {
         self.tell_at = Instant::now() + TELL;
         let report = self.report();
@@ -299,13 +300,13 @@ impl Link {
         if let Ok(bytes) = serde_json::to_vec(&heard)
             && !heard.is_empty()
         {
-            // Accounts are published five times a second, so a lost one does no harm.
+            // The counts are published five times a second, so a lost message does no harm.
             let _ = self.accounts.put(bytes).wait();
         }
         self.watchers.tell(&report);
     }
 
-    /// Reads frames from the bus.
+    /// Reads frames from the bus and queues them for the other hosts.
     fn read(&mut self, inbox: &mut Inbox) -> Result<(), BusError> {
         let Some(bus) = &self.bus else { return Ok(()) };
         let now = nanos(self.began.elapsed());
@@ -326,7 +327,7 @@ impl Link {
         Ok(())
     }
 
-    /// Sends waiting frames to the bus.
+    /// Sends the frames of other hosts that are queued to the bus.
     fn write(&mut self) -> Result<(), BusError> {
         let Some(bus) = &self.bus else { return Ok(()) };
         let now = nanos(self.began.elapsed());
@@ -357,8 +358,8 @@ impl Link {
         Ok(())
     }
 
-    /// Passes waiting frames to Zenoh, which never blocks. It drops frames that it has no room for, and the other hosts
-    /// count them as lost.
+    /// Passes queued frames to Zenoh, which never blocks. Zenoh drops frames that find no room; the other hosts count
+    /// these as lost.
     fn publish(&mut self, bytes: &mut Vec<u8>) {
         loop {
             let count = self.outgoing.message(bytes);
@@ -372,7 +373,7 @@ impl Link {
         }
     }
 
-    /// Waits until there is something to do. Returns false if the link should stop.
+    /// Waits for frames, for Zenoh, or for the next report. Returns false if the link should stop.
     fn wait(&self, stop: &impl AsFd) -> io::Result<bool> {
         let mut polled =
             vec![PollFd::new(stop, PollFlags::IN), PollFd::new(&self.shared.wake, PollFlags::IN)];
@@ -388,19 +389,19 @@ impl Link {
         };
         match poll(&mut polled, Timespec::try_from(timeout).ok().as_ref()) {
             Ok(_) | Err(Errno::INTR) => {}
-            // The kernel lacks memory for a moment: treat all sources as ready.
+            // The kernel lacks memory for a moment. All sources are then treated as ready.
             Err(Errno::NOMEM | Errno::AGAIN) => std::thread::sleep(RETRY),
             Err(errno) => return Err(errno.into()),
         }
         let came = |at: usize| polled.get(at).is_some_and(|polled| !polled.revents().is_empty());
         if came(1) {
-            // The value is irrelevant: all sources are treated as ready.
+            // The value of the counter does not matter, because all sources are treated as ready.
             let _ = rustix::io::read(&self.shared.wake, &mut [0; 8]);
         }
         Ok(!came(0))
     }
 
-    /// Returns the numbers of lost frames of the local bus and of other hosts.
+    /// Returns the number of lost frames from the local bus, and of those from other hosts.
     fn losses(&self) -> (u64, u64) {
         let Sent { dropped, missed, .. } = self.outgoing.account();
         let incoming = self.shared.incoming();

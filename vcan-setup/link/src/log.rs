@@ -15,23 +15,23 @@ use tracing::{Event as Entry, Level, Metadata, Subscriber};
 use crate::event::Event;
 use crate::session::plain;
 
-/// The log target of failed connections. Their level is debug, because they are retried.
+/// The log target under which Zenoh reports failed connections. Their level is debug, because Zenoh tries again.
 const CONNECTIONS: &str = "zenoh::net::runtime::orchestrator";
 const FAILED: &str = "Unable to connect to configured peer ";
-/// Warnings about intended behaviour: scouting is off, and a host may be alone at the start.
+/// The beginnings of warnings about intended behaviour: gossip is disabled, and a host may be the first one.
 const EXPECTED: [&str; 2] = ["Gossip is disabled", "Scouting delay elapsed"];
-/// The time for which a repeated text is reported only once.
+/// The time during which the same text is reported only once.
 const ONCE: Duration = Duration::from_secs(60);
-/// The maximum number of texts that are remembered.
+/// The maximum number of texts that are compared with new ones.
 const TEXTS: usize = 64;
 
-/// A subscriber that forwards log entries as events.
+/// A `tracing` subscriber that forwards log entries as events.
 struct Log {
     tell: Mutex<Sender<Event>>,
     said: Mutex<BTreeMap<String, Instant>>,
 }
 
-/// Forwards warnings, errors and failed connections to `tell`. Only the first call in a process has an effect.
+/// Forwards Zenoh's warnings, errors and failed connections to `tell`. Only the first call in a process has an effect.
 pub(crate) fn listen(tell: Sender<Event>) {
     let log = Log { tell: Mutex::new(tell), said: Mutex::default() };
     // If the process already has a subscriber, that one gets the entries.
@@ -49,7 +49,8 @@ impl Visit for Text {
     }
 }
 
-/// Returns the text of an entry; `None` for expected warnings and for attempts that have not failed.
+/// Returns the text to report for a log entry. Returns `None` for expected warnings, and for debug entries about
+/// anything but failures.
 fn said(is_warning: bool, text: &str) -> Option<String> {
     if let Some(failed) = text.strip_prefix(FAILED) {
         let failed = failed.split(". Retry in").next().unwrap_or(failed);

@@ -10,35 +10,37 @@ use thiserror::Error;
 use zenoh::Config;
 use zenoh::key_expr::KeyExpr;
 
-/// The key of a host's frames: `skinbus/frames/BUS/HOST`. Its liveliness token has the same key.
+/// The word for frames in a Zenoh key. The frames of a host have the key `skinbus/frames/BUS/HOST`, and so has its
+/// liveliness token.
 pub(crate) const FRAMES: &str = "frames";
-/// The key of a host's accounts of the other hosts' frames: `skinbus/heard/BUS/HOST`.
+/// The word for counts in a Zenoh key. A host's counts of the other hosts' frames have the key
+/// `skinbus/heard/BUS/HOST`.
 pub(crate) const HEARD: &str = "heard";
 
 /// The settings of a link.
 #[derive(Clone, Debug)]
 pub(crate) struct Settings {
-    /// The name of the bus, here and on the other hosts.
+    /// The name of the bus, which is the same on all hosts.
     pub(crate) bus: String,
     /// The kind of the local bus.
     pub(crate) choice: Choice,
-    /// The directory of embedded buses; `None` for the usual one.
+    /// The directory of embedded buses; `None` for the default one.
     pub(crate) directory: Option<PathBuf>,
-    /// The name of this host.
+    /// The name under which the other hosts know this host.
     pub(crate) host: String,
-    /// A configuration file of Zenoh.
+    /// The path of a configuration file of Zenoh.
     pub(crate) config: Option<PathBuf>,
     /// Endpoints to connect to, such as `tcp/192.168.1.7:7447`.
     pub(crate) connect: Vec<String>,
-    /// Endpoints to listen at.
+    /// Endpoints at which other hosts can connect.
     pub(crate) listen: Vec<String>,
 }
 
-/// The error of a bus that cannot be linked.
+/// The reason why a bus cannot be linked.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub(crate) enum LinkError {
-    /// The bus cannot be opened, or is lost for good.
+    /// The bus cannot be opened, or was lost and cannot be reopened.
     #[error(transparent)]
     Bus(#[from] BusError),
     /// The configuration is wrong, or Zenoh cannot start with it.
@@ -50,30 +52,30 @@ pub(crate) enum LinkError {
          file for --config"
     )]
     Alone,
-    /// An endpoint of an unsupported form: the option or file that contains it, and the endpoint.
+    /// An endpoint has an unsupported form. The fields are the option or file that contains it, and the endpoint.
     #[error("{0} {1}: an endpoint is tcp/HOST:PORT or tls/HOST:PORT")]
     Endpoint(String, String),
-    /// An endpoint without TLS is used beside one with TLS.
+    /// Some endpoints use TLS and others do not.
     #[error("{plain} would be open to everyone beside {secure}: make all endpoints tls/, or none of them")]
     PlainBesideTls {
-        /// The endpoint without TLS.
+        /// An endpoint without TLS.
         plain: String,
-        /// The endpoint with TLS.
+        /// An endpoint with TLS.
         secure: String,
     },
-    /// The name of the bus or the host cannot be part of a key.
+    /// The name of the bus or the host contains characters that a Zenoh key cannot have.
     #[error("'{0}' cannot be a part of a key of Zenoh: {1}")]
     Name(String, String),
-    /// Another process of this machine links the bus.
+    /// Another process of this machine already links the bus.
     #[error("the bus '{0}' is linked already by another process here: one link carries it to all hosts")]
     Twice(String),
-    /// The system cannot wait.
+    /// The system call that waits for frames failed.
     #[error("cannot wait for frames: {0}")]
     Wait(#[source] io::Error),
 }
 
 impl Settings {
-    /// Converts an error of Zenoh, and adds the name of the configuration file.
+    /// Converts an error of Zenoh, and adds the name of the configuration file if there is one.
     pub(crate) fn blame(&self, error: &str) -> LinkError {
         let of = self.config.as_ref().map_or_else(String::new, |path| format!("{}: ", path.display()));
         LinkError::Zenoh(format!("{of}{}", plain(error)))
@@ -81,7 +83,7 @@ impl Settings {
 }
 
 impl LinkError {
-    /// Returns true if the user requested something impossible.
+    /// Returns true if the options or the configuration are wrong, rather than the state of the machine.
     #[must_use]
     pub(crate) const fn is_usage(&self) -> bool {
         matches!(
@@ -95,17 +97,18 @@ impl LinkError {
     }
 }
 
-/// Returns the message of a Zenoh error without locations in its source.
+/// Returns the message of a Zenoh error without the source file positions in it.
 pub(crate) fn plain(error: &str) -> String {
     let message = error.split_once("msg: \"").and_then(|(_, rest)| rest.split_once("\", location"));
     let text = message.map_or(error, |(message, _)| message);
     text.split(" at /").next().unwrap_or(text).trim_end_matches('.').to_owned()
 }
 
-/// Builds the configuration of Zenoh: that of the file, with its endpoints replaced by those of the command line.
+/// Builds the configuration of Zenoh from the configuration file. Endpoints of the command line replace those of the
+/// file.
 ///
-/// By default Zenoh opens a listener without TLS, searches for other hosts by multicast, and introduces hosts to each
-/// other. All settings that decide who can reach the bus are set here.
+/// By default Zenoh listens without TLS, searches for other hosts by multicast, and introduces hosts to each other.
+/// This function sets all options that decide who can reach the bus.
 ///
 /// # Errors
 ///
@@ -138,11 +141,11 @@ pub(crate) fn config(settings: &Settings) -> Result<Config, LinkError> {
         set("connect/exit_on_failure", "false")?;
         set("connect/retry", "{ period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2 }")?;
     }
-    // Up to 16 batches of 64 KiB wait for the network. Data that finds no room within 1 ms is dropped.
+    // Up to 16 batches of 64 KiB wait for the network. Data that finds no room within 1 ms is dropped by Zenoh.
     set("transport/link/tx/queue/size/real_time", "16")?;
-    // A silent connection is closed after this time.
+    // The time without data after which a connection is closed, in ms.
     set("transport/link/tx/lease", "1000")?;
-    // A client that connects by TLS must authenticate itself, unless the file disables that.
+    // Programs that connect by TLS must authenticate themselves, unless the file sets this option.
     if endpoints.secure && !endpoints.listen.is_empty() {
         set_unless_given(&mut config, "transport/link/tls/enable_mtls")?;
     }
@@ -150,10 +153,10 @@ pub(crate) fn config(settings: &Settings) -> Result<Config, LinkError> {
     Ok(config)
 }
 
-/// The endpoints of a link.
+/// The endpoints of a link, checked and with their use of TLS.
 struct Endpoints {
     listen: Vec<String>,
-    /// True if all endpoints use TLS, false if none does.
+    /// True if all endpoints use TLS; false if none of them does.
     secure: bool,
 }
 
@@ -189,7 +192,8 @@ impl Endpoints {
     }
 }
 
-/// Returns the endpoints that the file gives for this mode; empty if they are Zenoh's defaults.
+/// Returns the endpoints that the configuration file gives under this key and mode. Returns none if they are Zenoh's
+/// defaults.
 fn configured(config: &Config, key: &str, mode: &str) -> Result<Vec<String>, LinkError> {
     let given = value(config, key)?;
     if given == value(&Config::default(), key)? {
@@ -200,7 +204,7 @@ fn configured(config: &Config, key: &str, mode: &str) -> Result<Vec<String>, Lin
     Ok(endpoints)
 }
 
-/// Collects the endpoints of a list and of its groups, each an object with `locators`.
+/// Collects the endpoints of a list, including those of its groups. A group is an object with `locators`.
 fn flatten(value: &Value, into: &mut Vec<String>) {
     match value {
         Value::String(endpoint) => into.push(endpoint.clone()),
@@ -219,7 +223,7 @@ fn list(endpoints: &[String]) -> String {
     serde_json::to_string(endpoints).unwrap_or_default()
 }
 
-/// Sets an option to true unless the file gives it.
+/// Sets an option to true, unless the configuration file sets it.
 fn set_unless_given(config: &mut Config, key: &str) -> Result<(), LinkError> {
     if value(config, key)?.is_null() {
         config.insert_json5(key, "true").map_err(LinkError::zenoh)?;
@@ -242,10 +246,10 @@ pub(crate) fn host_of(key: &str) -> &str {
     key.rsplit('/').next().unwrap_or(key)
 }
 
-/// Returns a random number that identifies this start of the link.
+/// Returns a random number that distinguishes this start of the link from others.
 pub(crate) fn life() -> u64 {
     let mut bytes = [0; 8];
-    // Early at boot the system may have no entropy.
+    // Early at boot the system may have no random bytes yet.
     match rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty()) {
         Ok(8) => u64::from_ne_bytes(bytes),
         _ => u64::from(std::process::id()) << 32 ^ u64::from(std::process::id()),
@@ -258,7 +262,7 @@ mod tests {
 
     use super::*;
 
-    /// Returns the configuration of a file's text and options, or its error.
+    /// Returns the configuration that results from a file with this text and from these options, or the error.
     fn configured_by(text: &str, connect: &[&str], listen: &[&str]) -> Result<Config, LinkError> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("link.json5");

@@ -1,4 +1,4 @@
-//! Sends the report of a link to local programs.
+//! Sends the reports of a link to programs on the same machine.
 
 use std::io::{ErrorKind, Write};
 use std::os::fd::{AsFd, BorrowedFd};
@@ -9,14 +9,14 @@ use vcan_setup::hosts::report::Report;
 /// The maximum number of connected programs; further ones are disconnected.
 const WATCHERS: usize = 64;
 
-/// The connected programs, and the listener for further ones.
+/// The connected programs, and the socket at which further ones connect.
 #[derive(Debug)]
 pub(crate) struct Watchers {
     listener: UnixListener,
     streams: Vec<UnixStream>,
-    /// The newest report that all of them have, as a line.
+    /// The line with the newest report, which all programs have received.
     line: Vec<u8>,
-    /// True while no connection can be accepted, because the process has no file descriptors left.
+    /// True while no connection can be accepted, because the process has no free file descriptor.
     is_full: bool,
 }
 
@@ -25,12 +25,12 @@ impl Watchers {
         Self { listener, streams: Vec::new(), line: Vec::new(), is_full: false }
     }
 
-    /// Returns the listener to poll; `None` while no connection can be accepted.
+    /// Returns the listening socket to poll; `None` while no connection can be accepted.
     pub(crate) fn listener(&self) -> Option<BorrowedFd<'_>> {
         (!self.is_full).then(|| self.listener.as_fd())
     }
 
-    /// Accepts connections, and sends them the newest report.
+    /// Accepts waiting connections, and sends the newest report to each.
     pub(crate) fn accept(&mut self) {
         loop {
             let mut stream = match self.listener.accept() {
@@ -50,8 +50,8 @@ impl Watchers {
         }
     }
 
-    /// Sends a changed report to all programs. A program that does not read is disconnected, because a partial line
-    /// would be worse.
+    /// Sends a report to all programs if it has changed. A program that does not read in time is disconnected, because
+    /// an incomplete line would be worse for it.
     pub(crate) fn tell(&mut self, report: &Report) {
         let Ok(mut line) = serde_json::to_vec(report) else { return };
         line.push(b'\n');

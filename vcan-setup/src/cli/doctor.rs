@@ -1,4 +1,4 @@
-//! `vcan-setup doctor`.
+//! The command `vcan-setup doctor`.
 
 use std::ffi::OsString;
 

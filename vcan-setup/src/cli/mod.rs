@@ -1,5 +1,5 @@
-//! The commands of `vcan-setup`. Each is a thin layer over the library. Errors are one line. Exit codes are 0 (done), 1
-//! (failed, or not possible on this machine) and 2 (wrong use or configuration).
+//! The commands of `vcan-setup`, which parse options and print results; the library does the work. An error is one
+//! line. Exit codes are 0 (done), 1 (failed, or not possible on this machine) and 2 (wrong use or configuration).
 
 mod doctor;
 mod serve;
@@ -90,7 +90,7 @@ fn bus_name(word: &str) -> Result<String, BusError> {
     check_name(word).map(|()| word.to_owned())
 }
 
-/// A positional argument: the file of a skin, which ends in `.toml` or contains a `/`, or a name.
+/// A positional argument: the path of a skin, which ends in `.toml` or contains a `/`, or the name of a bus.
 enum BusArgument {
     File(Box<Skin>),
     Name(String),
@@ -108,7 +108,7 @@ fn word(word: &OsStr) -> Result<BusArgument, Failure> {
     bus_name(name).map(BusArgument::Name).map_err(Failure::usage)
 }
 
-/// Converts positional arguments into the buses that they name.
+/// Returns the buses that positional arguments name, directly or by a skin.
 fn named<T>(
     words: &[OsString],
     of_skin: impl Fn(&OsStr, &Skin) -> Vec<T>,
@@ -124,12 +124,12 @@ fn named<T>(
     Ok(all)
 }
 
-/// Returns the interfaces that positional arguments name.
+/// Returns the interfaces that positional arguments name, directly or by a skin.
 fn targets(words: &[OsString]) -> Result<Vec<InterfaceTarget>, Failure> {
     named(words, InterfaceTarget::of_skin, InterfaceTarget::named)
 }
 
-/// Returns the present interfaces, and the socket that listed them.
+/// Returns the CAN interfaces of this machine, and the netlink socket that listed them.
 fn query() -> Result<(Netlink, Vec<Interface>), Failure> {
     let mut netlink = Netlink::open().map_err(unreadable)?;
     let present = netlink.interfaces().map_err(unreadable)?;

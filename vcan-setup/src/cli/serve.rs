@@ -1,4 +1,4 @@
-//! `vcan-setup serve`.
+//! The command `vcan-setup serve`.
 
 use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
@@ -12,7 +12,7 @@ use vcan_setup::embedded::{Server, BusTotals};
 
 use super::bus_name;
 
-/// The highest priority that niceness allows.
+/// The niceness of the server: the highest priority.
 const URGENT: i32 = -20;
 
 /// Serve an embedded bus, for machines whose kernel has no SocketCAN, until SIGINT or SIGTERM
@@ -38,7 +38,7 @@ impl Serve {
     }
 }
 
-/// Formats an error with its causes, each once, because some contain their cause already.
+/// Formats an error with its causes. A cause whose text is already contained in the error is left out.
 fn with_causes(error: &anyhow::Error) -> String {
     error.chain().skip(1).fold(error.to_string(), |text, cause| match cause.to_string() {
         cause if text.contains(&cause) => text,
@@ -53,7 +53,8 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
         signal_hook::low_level::pipe::register(signal, stop).context("cannot catch signals")?;
     }
     if until_eof {
-        // The system regards the thread that started this process as its parent.
+        // The signal is sent when the thread ends that started this process, because the system regards it as the
+        // parent.
         rustix::process::set_parent_process_death_signal(Some(Signal::TERM))
             .context("cannot follow the parent process")?;
         let follow = move || {
@@ -64,8 +65,8 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
             .spawn(follow)
             .context("cannot start a thread to follow standard input")?;
     }
-    // The kernel forwards frames at once, but a process may wait behind hundreds of cells for its turn. Without the
-    // permission to raise its priority the bus is only slower.
+    // The kernel delivers frames at once, but a server process may wait behind hundreds of cells for processor time. If
+    // this process may not raise its priority, the bus is only slower.
     let _ = rustix::process::setpriority_process(None, URGENT);
     protocol::bus::set_batch_scheduling();
     allow_files();
@@ -74,7 +75,7 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
         .and_then(|()| std::io::stdout().flush())
         .context("cannot write to standard output")?;
     let BusTotals { garbage, refused, turned_away, failed, failure, .. } = server.run(stopped)?;
-    // Only the server can report these: a client gets no error for an invalid datagram.
+    // Only the server can report these frames, because a client gets no error for an invalid datagram.
     if garbage > 0 || refused > 0 {
         print_to_stderr(&format!(
             "{name}: ignored {garbage} datagrams that were neither frames nor filters, and refused {refused} clients: \
@@ -95,14 +96,14 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Raises the limit of open files to the maximum that the system allows: each client needs one.
+/// Raises the limit of open files to the maximum that the system allows, because each client needs one.
 fn allow_files() {
     let Rlimit { maximum, .. } = getrlimit(Resource::Nofile);
-    // If this fails, fewer clients are accepted.
+    // With a lower limit the server accepts fewer clients.
     let _ = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum });
 }
 
-/// Prints to standard error. A failure is ignored, because nothing could report it.
+/// Prints a line to standard error. Ignores a failure, because it could not be reported.
 fn print_to_stderr(text: &str) {
     let _ = writeln!(std::io::stderr(), "vcan-setup: {text}");
 }

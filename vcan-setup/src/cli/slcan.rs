@@ -1,4 +1,4 @@
-//! `vcan-setup slcan`.
+//! The command `vcan-setup slcan`.
 
 use std::os::unix::net::UnixStream;
 use std::time::Duration;
@@ -112,7 +112,7 @@ impl Slcan {
         print_text(&accounts.iter().map(|account| format!("{account}\n")).collect::<String>())
     }
 
-    /// Returns the lines, each with the options that apply to all.
+    /// Returns the lines of the command line. The general options are added to those of each line.
     fn lines(&self) -> Result<Vec<LineOptions>, Failure> {
         let mut lines = self.lines.clone();
         if !self.cell.is_empty() && self.cell.len() != lines.len() {

@@ -1,4 +1,4 @@
-//! `vcan-setup status`.
+//! The command `vcan-setup status`.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;
@@ -15,7 +15,7 @@ use vcan_setup::look::{EmbeddedBus, embedded_buses};
 
 use super::{json, query, targets};
 
-/// The time for which a link may take to answer.
+/// The time within which a link must answer.
 const ANSWER_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// Show the CAN interfaces of this machine, and the embedded buses of this user
@@ -54,7 +54,7 @@ impl Status {
             }
             (false, false) => table(&interfaces, &embedded) + &joined(&links),
             (false, true) if target.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
-            // Named buses that are missing are reported below.
+            // If a named bus does not exist, an error reports it below.
             (false, true) => String::new(),
         };
         print_text(&text)?;
@@ -75,7 +75,7 @@ impl Status {
     }
 }
 
-/// Returns the reports of the links of these buses. A stopped link does not answer, and is left out.
+/// Returns the reports of the links of these buses. A link that does not answer in time is left out.
 fn links<'a>(buses: impl Iterator<Item = (&'a str, BusKind)>) -> BTreeMap<&'a str, hosts::LinkReport> {
     let report = |(bus, kind)| {
         let report = hosts::ReportReader::connect(bus, kind, None).and_then(|mut it| it.wait(ANSWER_TIMEOUT));
@@ -183,7 +183,7 @@ fn rates(interface: &Interface) -> String {
 struct StatusReport<'a> {
     interfaces: Vec<InterfaceReport<'a>>,
     embedded: &'a [EmbeddedBus],
-    /// Reports of buses that are joined with those of other hosts.
+    /// The reports of links to other hosts, by bus.
     links: &'a BTreeMap<&'a str, hosts::LinkReport>,
 }
 

@@ -1,4 +1,4 @@
-//! `vcan-setup up` and `vcan-setup down`.
+//! The commands `vcan-setup up` and `vcan-setup down`.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::File;
@@ -116,7 +116,7 @@ impl Down {
     }
 }
 
-/// Checks that a name is valid for the kernel and needs no quotes in a shell.
+/// Checks that a name is allowed by the kernel, and needs no quotes in a shell.
 fn plain(name: &str) -> Result<(), Failure> {
     super::bus_name(name).map_err(Failure::usage)?;
     if !is_plain_name(name) || name.starts_with(['-', '.']) {
@@ -127,7 +127,7 @@ fn plain(name: &str) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Opens a namespace; returns `None` for the current one.
+/// Opens the network namespace that an argument names. Returns `None` if that is the current one.
 fn enter(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
     let namespace = Namespace::named(word);
     let not_allowed = || not_allowed(&format!("look into the network namespace {namespace}"));
@@ -170,14 +170,14 @@ fn not_allowed(what: &str) -> Failure {
     Failure::run(format!("not allowed to {what}, which needs root: `sudo {again}`"))
 }
 
-/// Executes plans.
+/// Executes the steps of a plan, or prints them.
 struct Worker<'a> {
     netlink: &'a mut Netlink,
     there: Option<(&'a File, &'a mut Netlink)>,
 }
 
 impl Worker<'_> {
-    /// Prints the unchanged interfaces, and executes the plan or prints its steps.
+    /// Prints which interfaces stay unchanged, and executes the plan. With `dry_run`, prints its steps instead.
     fn finish(mut self, plan: &Plan, dry_run: bool) -> Result<(), Failure> {
         let mut text = String::new();
         for line in &plan.unchanged {
@@ -209,12 +209,12 @@ impl Worker<'_> {
                 }
             }
         }
-        // The steps are printed at the end, because a failure undoes the earlier ones.
+        // The steps are printed at the end, because they are undone if a later one fails.
         print_text(&plan.steps.iter().map(|step| format!("{}\n", step.done())).collect::<String>())
     }
 }
 
-/// Explains why a step failed, and how to fix it.
+/// Returns an error that explains why a step failed and how to fix the cause.
 fn explain(step: &Step, error: &io::Error) -> Failure {
     let kind = match step.action {
         StepAction::MakeVcan => Some("vcan"),
@@ -248,7 +248,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
         )),
         (Some(Errno::OPNOTSUPP), Some(kind)) => unknown(kind, &Kernel::detect()),
         (Some(Errno::PERM | Errno::ACCESS), kind) => {
-            // Even root would get this error.
+            // This error does not depend on permissions: root would get it too.
             let kernel = Kernel::detect();
             let missing = kind.filter(|kind| kernel.module(kind) == ModuleState::Missing);
             missing.map_or_else(|| not_allowed(&doing), |kind| unknown(kind, &kernel))

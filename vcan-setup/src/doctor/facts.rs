@@ -1,4 +1,4 @@
-//! The facts that the doctor assesses.
+//! The facts about a machine and its buses that the doctor assesses.
 
 use std::collections::BTreeSet;
 use std::ffi::OsStr;
@@ -12,30 +12,30 @@ use crate::kernel::Kernel;
 use crate::link::Interface;
 use crate::plan::InterfaceTarget;
 
-/// The facts that the doctor assesses.
+/// The facts about a machine and its buses that [`assess`](super::assess) needs.
 #[derive(Clone, Debug)]
 pub struct Facts {
-    /// The requested kind of bus.
+    /// The kind of bus that the user requested.
     pub choice: KindChoice,
-    /// True if the cells are already present, as with `skinbus run --no-spawn`.
+    /// True if the cells already run, as with `skinbus run --no-spawn`.
     pub no_spawn: bool,
-    /// The name of this program under which `sudo` finds it.
+    /// The path or name by which `sudo` finds this program.
     pub program: String,
-    /// The kernel.
+    /// The properties of the kernel that concern CAN.
     pub kernel: Kernel,
     /// The user who runs the doctor.
     pub user: User,
-    /// The size of a receive buffer that the kernel grants to a request like the gateway's, in bytes.
+    /// The size of the receive buffer that a gateway would get, in bytes.
     pub receive_buffer: Option<usize>,
-    /// The maximum number of frames that wait in the kernel's backlog; `None` if it is unknown.
+    /// The maximum number of frames in the kernel's backlog queue; `None` if it is unknown.
     pub backlog: Option<usize>,
-    /// The cell program.
+    /// The program that simulates a cell.
     pub cell_node: Program,
     /// The directory of this user's embedded buses, or the reason why it cannot be used.
     pub embedded: Result<PathBuf, String>,
-    /// The named buses.
+    /// The buses that the user named, directly or by a skin.
     pub buses: Vec<BusFacts>,
-    /// The present CAN interfaces.
+    /// The CAN interfaces that exist.
     pub present: Vec<Interface>,
 }
 
@@ -57,18 +57,19 @@ pub struct Program {
     pub there: bool,
 }
 
-/// A named bus.
+/// A bus that the user named, with what was found out about it.
 #[derive(Clone, Debug)]
 pub struct BusFacts {
-    /// The requirements.
+    /// The name of the interface, and what the bus requires of it.
     pub target: InterfaceTarget,
-    /// The expected cells; `None` without a skin.
+    /// The cells of the bus according to the skin; `None` without a skin.
     pub cells: Option<BTreeSet<CellId>>,
-    /// True if its cells answer with tree sums.
+    /// True if the cells send sums along a tree (`reply = "sum"`).
     pub sums: bool,
-    /// The interface of this name.
+    /// The interface of this name; `None` if it does not exist.
     pub interface: Option<Interface>,
-    /// The observed traffic; `None` if the bus was not opened, or the reason why it could not be.
+    /// The nodes that sent during the observation. `None` if the bus was not opened, or an error text if it could not
+    /// be.
     pub traffic: Result<Option<ObservedTraffic>, String>,
 }
 
@@ -84,19 +85,19 @@ impl BusFacts {
         InterfaceTarget::of_skin(file, skin).into_iter().enumerate().map(of).collect()
     }
 
-    /// Returns the bus of this name.
+    /// Returns a bus that was named without a skin.
     #[must_use]
     pub fn named(name: &str) -> Self {
         Self::new(InterfaceTarget::named(name))
     }
 
-    /// Returns a bus that has not been examined yet.
+    /// Returns a bus whose interface and traffic have not been examined yet.
     const fn new(target: InterfaceTarget) -> Self {
         Self { target, cells: None, sums: false, interface: None, traffic: Ok(None) }
     }
 }
 
-/// The traffic observed on a bus.
+/// The nodes that sent on a bus while it was observed.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct ObservedTraffic {
     /// True if another gateway sends on the bus.

@@ -1,4 +1,4 @@
-//! Assesses interfaces, and suggests how to fix them.
+//! Assesses the CAN interfaces of a machine, and suggests commands to fix them.
 
 use protocol::bus::KindChoice;
 use protocol::can::Format;
@@ -9,7 +9,7 @@ use crate::link::{FD_MTU, Hardware, Interface, InterfaceKind, ControllerState};
 use crate::plan::widen;
 
 impl Facts {
-    /// Reports whether missing interfaces can be created.
+    /// Reports whether interfaces that are missing can be created on this machine.
     pub(super) fn making(&self) -> Vec<Finding> {
         let missing = |bus: &&BusFacts| bus.interface.is_none() && bus.target.hardware().is_none();
         let mut findings = Vec::new();
@@ -47,7 +47,7 @@ impl Facts {
         findings
     }
 
-    /// Reports whether a usable interface exists, if no buses are named.
+    /// Reports whether any usable CAN interface exists. Does nothing if buses are named.
     pub(super) fn any_interface(&self) -> Option<Finding> {
         if !self.buses.is_empty() {
             return None;
@@ -61,7 +61,7 @@ impl Facts {
         })
     }
 
-    /// Reports the effect of a missing interface if either kind of bus is acceptable.
+    /// Reports what a bench does without the interface, if the user accepts either kind of bus.
     pub(super) fn absent(&self, bus: &BusFacts) -> Option<Finding> {
         if self.choice != KindChoice::Auto || !self.kernel.has_can {
             return None;
@@ -144,7 +144,7 @@ impl Facts {
         let Interface { name, mtu, up, .. } = interface;
         let what = interface.what();
         let skin = bus.target.skin.as_ref();
-        // Returns the command that sets the bit rates, or would if they were known.
+        // The command that sets the bit rates can be given only if the skin has them.
         let set = || match bus.target.hardware() {
             Some(skin) => self.own_command(&format!("up {} --set-bit-rates", skin.file)),
             None => {

@@ -67,7 +67,7 @@ fn complaints(facts: &Facts) -> Vec<String> {
     assess(facts).into_iter().filter_map(bad).collect()
 }
 
-/// Returns the findings after a change of the facts.
+/// Changes the facts of a machine without faults, and returns the findings.
 fn about(change: impl FnOnce(&mut Facts)) -> Vec<String> {
     let mut facts = good();
     change(&mut facts);

@@ -1,4 +1,4 @@
-//! One client of a bus: its socket, and its queue.
+//! A client of a bus, as the server sees it: its socket, and the queue of frames for it.
 
 use std::os::fd::OwnedFd;
 
@@ -14,10 +14,10 @@ use super::parcel::FrameDatagram;
 use super::queue::{QueueEntry, ClientQueue};
 use super::routing::ClientId;
 
-/// The maximum number of frames that wait for a client beyond those in its socket.
+/// The maximum number of frames in a client's queue, beyond those in its socket buffer.
 const QUEUE: usize = 256;
 
-/// The resources for sending to any client.
+/// The objects that are needed to send to any client.
 #[derive(Debug)]
 pub(super) struct SendContext {
     pub(super) epoll: OwnedFd,
@@ -25,12 +25,12 @@ pub(super) struct SendContext {
     pub(super) totals: BusTotals,
 }
 
-/// The outcome of sending a client's queue.
+/// The result of sending the frames in a client's queue.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum SendOutcome {
-    /// The queue is sent, or waits until the socket has room, which `epoll` reports.
+    /// The queue is empty, or the socket is full; in the latter case `epoll` reports when it has room.
     Done,
-    /// The system lacks memory; sending is retried soon.
+    /// The system lacks memory. Sending is tried again soon.
     Shortage,
     /// The client no longer reads.
     Gone,
@@ -42,21 +42,21 @@ pub(super) enum SendOutcome {
 pub(super) struct Client {
     pub(super) id: ClientId,
     pub(super) socket: OwnedFd,
-    /// The process at the other end, if it is in this pid namespace.
+    /// The id of the client's process, if that is in the same pid namespace.
     pub(super) process: Option<u32>,
-    /// The other client of that process, if there are two.
+    /// The other client of the same process, if the process has two.
     pub(super) sibling: Option<ClientId>,
     queue: ClientQueue,
-    /// True once its hello was received; frames are routed only afterwards.
+    /// True once the client's first message, the hello, was received. The client gets frames only afterwards.
     pub(super) greeted: bool,
     pub(super) fd: bool,
-    /// New filters of which some parts have arrived.
+    /// The new filters that have arrived so far; `None` if no change of filters is in progress.
     pub(super) filters: Option<Vec<Filter>>,
-    /// True while its socket is full; `epoll` reports when it has room.
+    /// True while the client's socket is full. `epoll` reports when it has room.
     blocked: bool,
-    /// True while it is in the list of clients with something to send.
+    /// True while the client is in the list of clients that have frames to be sent.
     dirty: bool,
-    /// The number of failed receptions in a row.
+    /// The number of failed receptions from the client since the last successful one.
     pub(super) failures: u32,
 }
 
@@ -78,22 +78,22 @@ impl Client {
         }
     }
 
-    /// Queues a frame. Returns true if the client needs to be flushed and did not before.
+    /// Queues a frame. Returns true if the client must be added to the list of clients to be flushed.
     pub(super) fn enqueue(&mut self, parcel: FrameDatagram, post: &mut SendContext) -> bool {
         post.totals.routed += 1;
         if !self.queue.push(parcel) {
             post.totals.dropped += 1;
             return false;
         }
-        // A client that no longer reads is detected again, and muted, at the end of the round.
+        // If the client no longer reads, sending fails again at the end of the round, and is handled there.
         if !self.blocked && self.queue.frames() >= BATCH {
             let _ = self.send(post);
         }
         !self.blocked && !std::mem::replace(&mut self.dirty, true)
     }
 
-    /// Sends the queue before the client's process gets a newer frame by another socket. Errors are detected again at
-    /// the end of the round.
+    /// Sends the queue at once, before the same process gets a newer frame by its other socket. Errors are ignored,
+    /// because they occur again at the end of the round.
     pub(super) fn send_early(&mut self, post: &mut SendContext) {
         if self.dirty && !self.blocked {
             let _ = self.send(post);
@@ -106,13 +106,13 @@ impl Client {
         if self.blocked { SendOutcome::Done } else { self.send(post) }
     }
 
-    /// Removes the socket from `epoll`, and sends nothing to it until it is resumed.
+    /// Excludes the socket from `epoll`, and sends nothing to it until it is resumed.
     pub(super) fn pause(&mut self, post: &SendContext) {
         self.blocked = true;
         let _ = epoll::delete(&post.epoll, &self.socket);
     }
 
-    /// Ends a pause. Returns true on success.
+    /// Includes the socket in `epoll` again. Returns true on success.
     pub(super) fn resume(&mut self, post: &SendContext) -> bool {
         let data = EventData::new_u64(self.id.0 as u64);
         let resumed = epoll::add(&post.epoll, &self.socket, data, EventFlags::IN).is_ok();
@@ -127,7 +127,7 @@ impl Client {
         free
     }
 
-    /// Drops the queue, and counts its frames as abandoned.
+    /// Drops the frames in the queue, and counts them as abandoned.
     pub(super) fn abandon(&mut self, post: &mut SendContext) {
         post.totals.abandoned += self.queue.frames() as u64;
         self.queue = ClientQueue::new(QUEUE);
@@ -156,7 +156,7 @@ impl Client {
             }
             match post.outgoing.send(&self.socket) {
                 Ok(count) => post.totals.delivered += self.queue.sent(count) as u64,
-                // The socket may have room, which `epoll` would report at once, again and again.
+                // The socket is not treated as full, because `epoll` would report room in it at once, again and again.
                 Err(error) if is_memory_shortage(&error) => return SendOutcome::Shortage,
                 Err(error) => match Errno::from_io_error(&error) {
                     Some(Errno::INTR) => {}

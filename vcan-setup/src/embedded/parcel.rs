@@ -1,4 +1,4 @@
-//! The datagram of a frame on its way through the bus.
+//! The datagrams by which clients and the server of a bus exchange frames.
 
 use protocol::bus::embedded::OWN_BYTE;
 use protocol::can::{FD_BYTES, FD_FORMAT, Format, Frame};
@@ -6,7 +6,7 @@ use protocol::can::{FD_BYTES, FD_FORMAT, Format, Frame};
 /// The index of the byte that holds the FD flags.
 const FLAGS_BYTE: usize = 5;
 
-/// A `struct can_frame` or `struct canfd_frame`, as the bus forwards it.
+/// A frame in the form in which the bus forwards it: a `struct can_frame` or `struct canfd_frame`.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct FrameDatagram {
     bytes: [u8; FD_BYTES],
@@ -15,11 +15,11 @@ pub struct FrameDatagram {
 }
 
 impl FrameDatagram {
-    /// Checks a client's datagram; returns `None` if it is not a frame that `CAN_RAW` would send.
+    /// Checks a client's datagram. Returns `None` if it is not a frame that `CAN_RAW` would send.
     ///
-    /// The size must be that of one of the structs, and the length at most the data that it holds. CAN FD requires that
-    /// the client enabled it (`fd`). As in kernels from 6.1 on, an FD frame gets its flag FDF. Otherwise the bytes are
-    /// forwarded unchanged, except the one that marks own frames. Never panics.
+    /// The datagram must have the size of one of the structs, and the length field must fit the struct. FD frames are
+    /// accepted only if the client has enabled CAN FD (`fd`). An FD frame gets the flag FDF, as in kernels from 6.1 on.
+    /// The mark for own frames is removed. All other bytes are forwarded unchanged. Never panics.
     #[must_use]
     pub fn accept(datagram: &[u8], fd: bool) -> Option<Self> {
         let frame = Frame::from_bytes(datagram).ok()?;
@@ -35,7 +35,7 @@ impl FrameDatagram {
         Some(Self { bytes, id: frame.raw_id(), format: frame.format() })
     }
 
-    /// Returns the frame, marked as the receiver's own or not.
+    /// Returns the frame with the mark that tells a client whether the frame is its own.
     #[must_use]
     pub fn marked(mut self, own: bool) -> Self {
         if let Some(byte) = self.bytes.get_mut(OWN_BYTE) {
@@ -44,7 +44,7 @@ impl FrameDatagram {
         self
     }
 
-    /// Returns the identifier with its flags.
+    /// Returns the identifier with its flag bits, as in `can_id`.
     #[must_use]
     pub const fn raw_id(&self) -> u32 {
         self.id
@@ -56,13 +56,13 @@ impl FrameDatagram {
         self.format
     }
 
-    /// Returns the bytes; the datagram is the first [`Parcel::byte_len`] of them.
+    /// Returns the bytes of the larger struct, of which the datagram is the first [`Parcel::byte_len`].
     #[must_use]
     pub const fn bytes(&self) -> &[u8; FD_BYTES] {
         &self.bytes
     }
 
-    /// Returns the length of the datagram: 16 or 72.
+    /// Returns the length of the datagram in bytes: 16 for a classic frame, 72 for an FD frame.
     #[must_use]
     pub const fn byte_len(&self) -> usize {
         self.format.byte_len()

@@ -1,8 +1,7 @@
-//! The socket of a bus in its directory, and the rules for creating and removing it.
+//! Creates and removes the socket of a bus in its directory.
 //!
-//! A process that creates or removes a socket or the directory holds a lock on the directory meanwhile. A socket that a
-//! killed server left behind is therefore distinguished from one that is served, and only one server can take its
-//! place.
+//! A process locks the directory while it creates or removes a socket or the directory itself. Under the lock, a socket
+//! that a killed server left behind can be distinguished from one that is served, and only one server can replace it.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -17,11 +16,11 @@ use rustix::io::Errno;
 use rustix::net::SocketFlags;
 use thiserror::Error;
 
-/// The error of a bus that cannot be served under a name.
+/// The reason why a bus cannot be served under a name.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum BusSocketError {
-    /// The name is not allowed.
+    /// The name is not allowed for a bus.
     #[error(transparent)]
     Name(BusError),
     /// The directory cannot be used.
@@ -35,7 +34,7 @@ pub enum BusSocketError {
         /// The path of its socket.
         path: PathBuf,
     },
-    /// A file that is not a socket has the path.
+    /// A file that is not a socket exists at the path.
     #[error("{} is in the way and is no socket: move it away", .0.display())]
     InTheWay(PathBuf),
     /// Another system error.
@@ -43,26 +42,26 @@ pub enum BusSocketError {
     Io {
         /// The path of the socket or the directory.
         path: PathBuf,
-        /// The failed operation.
+        /// A description of the failed operation.
         doing: &'static str,
         /// The system error.
         source: io::Error,
     },
 }
 
-/// A listening socket in its directory. Dropping it removes the socket, and the directory if a server created it and it
-/// is empty.
+/// A listening socket in the directory of embedded buses. Dropping it removes the socket. The directory is removed too
+/// if it is empty and was created by a server.
 #[derive(Debug)]
 pub(super) struct BusSocket {
     pub(super) listener: OwnedFd,
     pub(super) path: PathBuf,
     directory: PathBuf,
     file: String,
-    /// The device and inode of the socket file, so that only this server's file is removed.
+    /// The device and inode of the socket file, by which the server recognises its own file before it removes it.
     inode: (u64, u64),
 }
 
-/// The maximum number of clients waiting to be accepted; the kernel's own limit is often lower.
+/// The maximum number of clients that wait to be accepted. The kernel's own limit is often lower.
 const BACKLOG: i32 = 4096;
 
 impl BusSocket {
@@ -82,7 +81,7 @@ impl BusSocket {
             }
             Ok(_) => {
                 let probe = seqpacket(SocketFlags::NONBLOCK).map_err(failed("ask for"))?;
-                // Only a socket without a listener refuses; a full backlog does not.
+                // Connecting is refused only if the socket has no listener. A full backlog causes another error.
                 if rustix::net::connect(&probe, &address) != Err(Errno::CONNREFUSED) {
                     return Err(BusSocketError::Served { name: name.to_owned(), path });
                 }
@@ -113,24 +112,25 @@ impl BusSocket {
 
 impl Drop for BusSocket {
     fn drop(&mut self) {
-        // Nothing more can be done if another program removed the socket, or if the directory holds other buses or
-        // belongs to the user.
+        // An error is ignored: another program may have removed the socket, and the directory stays if it holds other
+        // buses or was created by the user.
         let _ = self.remove();
     }
 }
 
-/// The maximum number of attempts if the directory disappears again after it was created.
+/// The maximum number of attempts to lock the directory while other processes remove it.
 const MOST_ABSENT: u32 = 1_000;
 
-/// Creates the directory if necessary, and locks it.
+/// Creates the directory if it does not exist, and locks it.
 fn lock(path: &Path) -> Result<OwnedFd, BusSocketError> {
     let failed = |errno: Errno| BusSocketError::Io { path: path.to_owned(), doing: "lock", source: errno.into() };
     let mut absent = 0;
     loop {
         let directory = match make_directory(path) {
             Ok(directory) => directory,
-            // A server that ended may have removed the directory in between. But a missing parent stays missing, and on
-            // file systems without creatable directories, such as /proc, the directory stays absent.
+            // A server that ended may have removed the directory after it was created here, so this is repeated. The
+            // limit is needed for a missing parent folder, and for file systems in which no directory can be created,
+            // such as /proc.
             Err(error)
                 if error.is_absent() && absent < MOST_ABSENT && path.parent().is_some_and(Path::exists) =>
             {
@@ -142,7 +142,8 @@ fn lock(path: &Path) -> Result<OwnedFd, BusSocketError> {
         rustix::io::retry_on_intr(|| rustix::fs::flock(&directory, FlockOperation::LockExclusive))
             .map_err(failed)?;
         let locked = rustix::fs::fstat(&directory).map_err(failed)?;
-        // The previous holder of the lock may have removed the directory; this lock would then be useless.
+        // The previous holder of the lock may have removed the directory. A lock on the removed directory has no
+        // effect.
         if let Ok(present) = rustix::fs::lstat(path)
             && (present.st_dev, present.st_ino) == (locked.st_dev, locked.st_ino)
         {

@@ -1,20 +1,20 @@
-//! The queue of one client, and the count of frames that were dropped because it did not read.
+//! The queue of frames for one client. It counts the frames that were dropped because the client did not read.
 
 use std::collections::VecDeque;
 
 use super::parcel::FrameDatagram;
 
-/// An entry of the queue.
+/// An item of the queue.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum QueueEntry {
     /// A frame.
     Frame(FrameDatagram),
-    /// The number of frames dropped so far.
+    /// A report to the client: the total number of frames dropped for it so far.
     Dropped(u32),
 }
 
-/// A bounded queue. When it is full the newest frame is dropped, as in a socket's receive buffer, and the client gets
-/// the total before its next frame.
+/// A bounded queue. If it is full, new frames are dropped, as in the receive buffer of a socket. The client gets a
+/// report of the total number of dropped frames before the next frame that is not dropped.
 #[derive(Debug)]
 pub struct ClientQueue {
     entries: VecDeque<QueueEntry>,
@@ -43,8 +43,8 @@ impl ClientQueue {
         true
     }
 
-    /// Appends the total of dropped frames, unless it was already reported. Must also be called when the queue has run
-    /// empty, so that the report has the correct position in the sequence.
+    /// Appends a report of the dropped frames, if their number has changed since the last report. Must also be called
+    /// when the queue becomes empty, so that the report has its correct position among the frames.
     pub fn report_dropped(&mut self) {
         if self.reported != self.dropped {
             self.entries.push_back(QueueEntry::Dropped(self.dropped));
@@ -52,12 +52,12 @@ impl ClientQueue {
         }
     }
 
-    /// Returns the entries, oldest first.
+    /// Returns the queued items, oldest first.
     pub fn iter(&self) -> impl Iterator<Item = &QueueEntry> {
         self.entries.iter()
     }
 
-    /// Removes the oldest `count` entries, which were sent. Returns the number of frames among them.
+    /// Removes the oldest `count` items after they were sent. Returns the number of frames among them.
     pub fn sent(&mut self, count: usize) -> usize {
         let sent = self.entries.drain(..count.min(self.entries.len()));
         let frames = sent.filter(|entry| matches!(entry, QueueEntry::Frame(_))).count();
@@ -65,7 +65,7 @@ impl ClientQueue {
         frames
     }
 
-    /// Returns the number of waiting frames.
+    /// Returns the number of queued frames.
     #[must_use]
     pub const fn frames(&self) -> usize {
         self.frames
@@ -111,7 +111,7 @@ mod tests {
     }
 
     proptest! {
-        /// `true` pushes the next frame, `false` sends the oldest entry.
+        /// Each step is `true` to push the next frame or `false` to send the oldest item.
         #[test]
         fn a_reader_knows_at_every_frame_how_many_are_missing(limit in 0_usize..6, steps in proptest::collection::vec(any::<bool>(), 0..60)) {
             let mut queue = ClientQueue::new(limit);

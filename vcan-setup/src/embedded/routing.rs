@@ -1,7 +1,8 @@
-//! Selects the clients that get a frame, by the rules of the kernel's `CAN_RAW`.
+//! Selects the clients that receive a frame, by the rules of the kernel's `CAN_RAW`.
 //!
-//! As in the kernel (`net/can/af_can.c`), filters are sorted into classes once, so that a frame is compared only where
-//! it can match. An exact identifier is found in a table, whatever the number of clients.
+//! As in the kernel (`net/can/af_can.c`), filters are sorted into classes when they are set, so that a frame is
+//! compared only with those that can match. Filters for one exact identifier are found in a table, in a time that does
+//! not depend on the number of clients.
 
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
@@ -10,23 +11,24 @@ use protocol::bus::Filter;
 use protocol::bus::embedded::ClientHello;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, REMOTE, STANDARD_MASK};
 
-/// The index of a client in the server's table.
+/// The number of a client, an index into the server's table of clients.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct ClientId(pub usize);
 
-/// The class of a filter, which decides where it is looked up.
+/// The class of a filter. It determines the list in which the filter is stored.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Class {
-    /// Error frames of the classes in this mask.
+    /// A filter for error frames of the classes in this mask.
     Errors(u32),
-    /// Frames that match, or with `false` those that do not; never error frames.
+    /// A filter that is compared with every frame. With `true`, frames that match it pass; with `false`, frames that do
+    /// not match it. Error frames never pass.
     Masked(Filter, bool),
-    /// Data frames with this identifier, of 11 bits or with the flag of 29.
+    /// A filter for data frames with exactly this identifier; the flag for 29 bits is included.
     Exact(u32),
 }
 
 impl Class {
-    /// Classifies a filter as the kernel's `can_rcv_list_find` does.
+    /// Returns the class of a filter. Follows the kernel's `can_rcv_list_find`.
     fn from_filter(filter: Filter) -> Self {
         let Filter { id, mut mask } = filter;
         if mask & ERROR != 0 {
@@ -43,7 +45,7 @@ impl Class {
         }
     }
 
-    /// Returns true if a frame with this identifier and these flags passes.
+    /// Returns true if a frame passes the filter. `frame` is the identifier with its flags.
     const fn passes(self, frame: u32) -> bool {
         let error = frame & ERROR != 0;
         match self {
@@ -56,12 +58,12 @@ impl Class {
 
 #[derive(Clone, Debug)]
 struct Subscription {
-    /// The filters for which it is listed.
+    /// The filters under which the client is stored in the lists.
     filters: Vec<Filter>,
     own_frames: bool,
     fd: bool,
     error_mask: u32,
-    /// The number of the last delivered frame, so that a second match does not deliver it again.
+    /// The number of the frame that was delivered last, so that a frame that matches two filters is delivered once.
     last: u64,
 }
 
@@ -72,25 +74,25 @@ impl Subscription {
     }
 }
 
-/// The subscriptions of all clients.
+/// The filters of all clients.
 #[derive(Debug, Default)]
 pub struct Router {
     clients: Vec<Option<Subscription>>,
-    /// The clients that subscribe to exactly one data frame identifier.
+    /// The clients that have a filter for exactly one identifier, by the identifier.
     exact: HashMap<u32, Vec<ClientId>>,
-    /// The filters that are compared with every frame.
+    /// The filters that must be compared with every frame, each with its client.
     walked: Vec<(Class, ClientId)>,
     frames: u64,
 }
 
 impl Router {
-    /// Creates a router without subscriptions.
+    /// Creates a router without clients.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Replaces a client's subscription.
+    /// Adds a client, or replaces its filters and options.
     pub fn insert(&mut self, client: ClientId, hello: &ClientHello) {
         self.remove(client);
         if self.clients.len() <= client.0 {
@@ -104,7 +106,7 @@ impl Router {
         }
     }
 
-    /// Replaces the filters of a present client; the rest of its subscription stays.
+    /// Replaces the filters of a client. Its other options stay.
     pub fn set_filters(&mut self, client: ClientId, filters: Vec<Filter>) {
         let Some(mut wants) = self.clients.get_mut(client.0).and_then(Option::take) else { return };
         self.unlist(client, &wants);
@@ -131,8 +133,8 @@ impl Router {
         }
     }
 
-    /// Searches only the lists that contain the client: hundreds of clients change their filters while frames are
-    /// waiting.
+    /// Removes a client from the lists of its filters. Only these lists are searched, because hundreds of clients may
+    /// change their filters while frames are waiting.
     fn unlist(&mut self, client: ClientId, wants: &Subscription) {
         for class in wants.classes() {
             match class {
@@ -149,7 +151,8 @@ impl Router {
         }
     }
 
-    /// Calls `deliver` once for each client that gets a frame, with true if the frame is its own.
+    /// Calls `deliver` for each client that receives a frame. The second argument is true if the client has sent the
+    /// frame.
     pub fn route(
         &mut self,
         from: ClientId,
@@ -186,7 +189,7 @@ mod tests {
         ClientHello { filters: filters.to_vec(), own_frames: false, fd: true, error_mask: 0, buffer: 0 }
     }
 
-    /// Returns the receivers of a frame, in order of their numbers.
+    /// Returns the clients that receive a frame, in ascending order, each with true if the frame is its own.
     fn receivers(router: &mut Router, from: usize, id: u32, format: Format) -> Vec<(usize, bool)> {
         let mut receivers = Vec::new();
         router.route(ClientId(from), id, format, |client, own| receivers.push((client.0, own)));
@@ -240,7 +243,7 @@ mod tests {
         assert_eq!(receivers(&mut router, 300, 0x8000_0007, Format::Fd), [(7, false)]);
     }
 
-    /// The rule as the kernel's documentation states it, without classes.
+    /// Decides by the rule in the kernel's documentation, without the classes that the router uses.
     fn passes(filters: &[Filter], error_mask: u32, id: u32) -> bool {
         let errors = |filter: &&Filter| filter.mask & ERROR != 0;
         if id & ERROR != 0 {
@@ -268,7 +271,7 @@ mod tests {
         (word(), mask).prop_map(|(id, mask)| Filter { id, mask })
     }
 
-    /// Returns an identifier as drivers make it: 11 bits unless the flag for 29 is set.
+    /// Returns an identifier in the form that drivers produce: at most 11 bits, unless the flag for 29 bits is set.
     fn sound(id: u32) -> u32 {
         if id & (EXTENDED | ERROR) == 0 { id & (STANDARD_MASK | REMOTE) } else { id }
     }

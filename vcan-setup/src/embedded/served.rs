@@ -8,7 +8,7 @@ use protocol::bus::embedded::default_directory;
 
 use super::{ServeError, Server, BusTotals};
 
-/// A bus that a thread of this process serves until this is dropped.
+/// A bus that is served by a thread of this process. Dropping it stops the thread.
 #[derive(Debug)]
 pub struct ServerThread {
     path: PathBuf,
@@ -17,7 +17,7 @@ pub struct ServerThread {
 }
 
 impl ServerThread {
-    /// Serves a bus in the usual directory.
+    /// Serves a bus in the default directory.
     ///
     /// # Errors
     /// Returns [`ServeError`] as [`Server::bind`] does.
@@ -65,7 +65,7 @@ impl Drop for ServerThread {
     fn drop(&mut self) {
         drop(self.stop.take());
         if let Some(thread) = self.thread.take() {
-            // The outcome is returned by `stop`.
+            // Only `stop` returns the result of the thread.
             let _ = thread.join();
         }
     }

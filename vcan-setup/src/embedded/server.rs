@@ -1,4 +1,4 @@
-//! The server around routing and queues: one thread, one `epoll`, many datagrams per system call.
+//! The server of an embedded bus: one thread, one `epoll`, and many datagrams per system call.
 
 use std::collections::VecDeque;
 use std::io;
@@ -27,20 +27,22 @@ mod admission;
 #[cfg(test)]
 mod tests;
 
-/// The maximum number of batches read from one client before the next one's turn: more than its send buffer holds.
+/// The maximum number of batches read from one client before the next client is served. It is more than a send buffer
+/// holds.
 const MAX_BATCHES_PER_CLIENT: usize = 16;
-/// The time for which a socket is left alone after an error that may last, such as a lack of memory or files.
+/// The time for which a socket is not polled after an error that may persist, such as a lack of memory or file
+/// descriptors.
 const PAUSE: Duration = Duration::from_millis(1);
-/// The number of failed receptions in a row after which a client is given up; this takes a second.
+/// The number of consecutive failed receptions after which a client is disconnected. They take a second.
 const MAX_FAILURES: u32 = 1_000;
 const LISTENER: u64 = u64::MAX;
 const STOP: u64 = u64::MAX - 1;
 
-/// The error that ends the serving of a bus.
+/// The reason why a bus cannot be served any longer.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ServeError {
-    /// The server could not begin.
+    /// The socket of the bus cannot be created.
     #[error(transparent)]
     Place(#[from] BusSocketError),
     /// A system call failed.
@@ -48,35 +50,36 @@ pub enum ServeError {
     Io {
         /// The name of the bus.
         name: String,
-        /// The failed operation.
+        /// A description of the failed operation.
         doing: &'static str,
         /// The system error.
         source: io::Error,
     },
 }
 
-/// An embedded bus that can be served.
+/// An embedded bus whose name is bound and which [`Server::run`] serves.
 #[derive(Debug)]
 pub struct Server {
     name: String,
     place: BusSocket,
-    /// A reserved file descriptor, which is released for a moment to turn a client away when no others are left.
+    /// A reserved file descriptor. If no others are free, it is released for a moment to accept a client and disconnect
+    /// it.
     spare: Option<OwnedFd>,
-    /// A client that is turned away and has not sent its hello.
+    /// A client that is being disconnected for lack of file descriptors, and whose hello has not arrived yet.
     parting: Option<OwnedFd>,
     clients: Vec<Option<Client>>,
-    /// Clients with something to send at the end of the round.
+    /// The clients that have queued frames, which are sent at the end of the round.
     dirty: VecDeque<ClientId>,
     router: Router,
     post: SendContext,
-    /// Tokens of sockets that are left alone until `resume_at`.
+    /// The `epoll` tokens of sockets that are not polled until `resume_at`.
     paused: Vec<u64>,
     resume_at: Option<Instant>,
 }
 
-/// The source of received datagrams.
+/// A source of datagrams. Tests replace it to simulate errors.
 trait Receive {
-    /// Receives datagrams as [`Batch::receive`] does.
+    /// Receives datagrams from a socket, as [`Batch::receive`] does.
     fn receive(&mut self, socket: &OwnedFd) -> io::Result<usize>;
     /// Returns the datagrams as [`Batch::datagrams`] does.
     fn datagrams(&self) -> impl ExactSizeIterator<Item = Datagram<'_>>;
@@ -93,7 +96,7 @@ impl Receive for Batch {
 }
 
 impl Server {
-    /// Binds a name in the usual directory. Clients can connect from now on; [`Server::run`] accepts them.
+    /// Binds the name of a bus in the default directory. Clients can connect from now on; [`Server::run`] accepts them.
     ///
     /// # Errors
     /// Returns [`ServeError`] if the name is already served, or if the directory is accessible to other users.
@@ -101,7 +104,7 @@ impl Server {
         Self::bind_in(&default_directory(), name)
     }
 
-    /// Binds a name in another directory.
+    /// Binds the name of a bus in another directory.
     ///
     /// # Errors
     /// Returns [`ServeError`] as [`Server::bind`] does.
@@ -138,7 +141,8 @@ impl Server {
         &self.name
     }
 
-    /// Serves until `stop` is readable or hung up. Returns the counts of the bus. Clients then see a closed bus.
+    /// Serves the bus until `stop` is readable or hung up, and then closes it. Returns the counts of frames and
+    /// clients.
     ///
     /// # Errors
     /// Returns [`ServeError`] if a system call fails, which no client can cause.
@@ -181,7 +185,7 @@ impl Server {
         }
     }
 
-    /// Leaves a socket alone for a while: the error is a state that `epoll` would report again at once.
+    /// Stops polling a socket for a while. `epoll` would report the error again at once, because it is a lasting state.
     fn pause(&mut self, token: u64) {
         let Self { post, place, .. } = self;
         if token == LISTENER {
@@ -198,7 +202,7 @@ impl Server {
         self.resume_at.get_or_insert_with(|| Instant::now() + PAUSE);
     }
 
-    /// Ends all pauses.
+    /// Polls all paused sockets again.
     fn resume(&mut self) {
         self.resume_at = None;
         for token in std::mem::take(&mut self.paused) {
@@ -248,15 +252,17 @@ impl Server {
         client(&mut self.clients, id.0)
     }
 
-    /// Routes the datagrams of a client. All data that a client can have in flight is read at once, so that it comes
-    /// before data that another client sent later. More data waits, so that no client delays the others.
+    /// Routes the datagrams that a client has sent. All data that can be in flight from the client is read, so that it
+    /// is routed before data that another client sent later. Data beyond that waits, so that no client delays the
+    /// others.
     fn drain(&mut self, id: ClientId, batch: &mut impl Receive) {
         for _ in 0..MAX_BATCHES_PER_CLIENT {
             let Some(client) = self.client(id) else { return };
             let fd = client.fd;
             match batch.receive(&client.socket) {
                 Ok(_) => client.failures = 0,
-                // The client disconnected with unread frames; the data that it sent can still be read.
+                // The client disconnected without reading all its frames. The frames that it sent before can still be
+                // read.
                 Err(error) if error.raw_os_error() == Some(Errno::CONNRESET.raw_os_error()) => continue,
                 Err(error)
                     if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) =>
@@ -270,7 +276,7 @@ impl Server {
             let mut failure = None;
             for datagram in batch.datagrams() {
                 let bytes = datagram.bytes();
-                // A closed socket returns empty datagrams without end.
+                // Empty datagrams are received from a closed socket, without end.
                 if bytes.is_some_and(<[u8]>::is_empty) {
                     match self.is_hung_up(id) {
                         Ok(true) => return self.forget(id),
@@ -293,7 +299,7 @@ impl Server {
         }
     }
 
-    /// Adds a part of a client's new filters. Returns false if the datagram is not one.
+    /// Adds a datagram with some of a client's new filters. Returns false if the datagram holds no filters.
     fn refilter(&mut self, id: ClientId, bytes: &[u8]) -> bool {
         let Some(mut part) = FilterPart::decode(bytes) else { return false };
         let Some(client) = self.client(id) else { return false };
@@ -318,7 +324,7 @@ impl Server {
         Ok(ready > 0)
     }
 
-    /// Pauses a client whose reception failed, and gives it up after too many failures.
+    /// Stops polling a client whose reception failed. Disconnects it after [`FAILURES`] consecutive failures.
     fn fails(&mut self, id: ClientId, errno: Errno) {
         let Some(client) = self.client(id) else { return };
         client.failures += 1;
@@ -329,7 +335,7 @@ impl Server {
         self.forget(id);
     }
 
-    /// Counts a client whose socket fails.
+    /// Disconnects a client whose socket failed, and counts it.
     fn give_up(&mut self, id: ClientId, errno: Errno) {
         if self.client(id).is_some() {
             self.post.totals.failed += 1;
@@ -341,8 +347,8 @@ impl Server {
         let Self { router, clients, dirty, post, .. } = self;
         post.totals.frames += 1;
         router.route(from, parcel.raw_id(), parcel.format(), |to, own| {
-            // The kernel stamps frames when they are sent; sending the other socket's queue first keeps the time stamps
-            // of a process with two sockets in order.
+            // The kernel stamps a frame when it is sent to the client. If the process has a second socket, its queue is
+            // therefore sent first, so that the time stamps of both sockets are in order.
             let sibling = client(clients, to.0).and_then(|client| client.sibling);
             if let Some(sibling) = sibling.and_then(|sibling| client(clients, sibling.0)) {
                 sibling.send_early(post);
@@ -368,7 +374,8 @@ impl Server {
         }
     }
 
-    /// Ends sending to a client: the client detects that and may reconnect. Its frames are received until it hangs up.
+    /// Closes the sending side of a client's socket, so that the client notices and may reconnect. Frames from the
+    /// client are received until it closes its side.
     fn release(&mut self, id: ClientId) {
         if let Some(client) = self.client(id) {
             let _ = shutdown(&client.socket, Shutdown::Write);
@@ -384,7 +391,7 @@ impl Server {
         }
     }
 
-    /// Stops sending to a client that does not read. Its frames are still received.
+    /// Stops sending to a client that does not read. Frames from the client are still received.
     fn silence(&mut self, id: ClientId) {
         self.router.remove(id);
         let Self { clients, post, .. } = self;

@@ -1,31 +1,31 @@
-//! The counts of a bus.
+//! Counts of the frames and clients of an embedded bus.
 
 use rustix::io::Errno;
 
-/// The counts of a bus. `routed` equals `delivered + dropped + abandoned` when no frames wait.
+/// Counts of a bus. `routed` equals `delivered + dropped + abandoned` if no frames are queued.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 #[non_exhaustive]
 pub struct BusTotals {
     /// Accepted clients.
     pub clients: u64,
-    /// Refused connections: no hello, or one of another version.
+    /// Connections that were refused, because the hello was missing or had another version.
     pub refused: u64,
-    /// Connections turned away for lack of files or memory.
+    /// Connections that were closed for lack of file descriptors or memory.
     pub turned_away: u64,
-    /// Clients given up because their socket failed.
+    /// Clients that were disconnected because their sockets failed.
     pub failed: u64,
-    /// The last reason why a client was given up.
+    /// The error for which a client was last disconnected.
     pub failure: Option<Errno>,
     /// Frames received from clients.
     pub frames: u64,
-    /// Datagrams of clients that were neither a frame nor filters.
+    /// Datagrams from clients that were neither frames nor filters.
     pub garbage: u64,
-    /// Deliveries to be made: frames times their receivers.
+    /// The number of deliveries: each frame is counted once for each of its receivers.
     pub routed: u64,
-    /// Frames written to clients' sockets.
+    /// Frames that were written to the sockets of clients.
     pub delivered: u64,
-    /// Frames dropped because a client did not read; the client gets a report.
+    /// Frames that were dropped because the client did not read. The client is told their number.
     pub dropped: u64,
-    /// Frames that waited for a client that disconnected.
+    /// Frames that were queued for clients when these disconnected.
     pub abandoned: u64,
 }

@@ -1,4 +1,4 @@
-//! Frames from other hosts to the local bus: the account of each source, and the frames that wait for the bus.
+//! Frames from other hosts to the local bus: counts of the frames of each host, and the queue to the bus.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -8,18 +8,19 @@ use serde::{Deserialize, Serialize};
 
 use super::message::{MessageHeader, MessageError, Stamped, decode};
 
-/// The maximum number of frames that wait for the bus.
+/// The maximum number of frames in the queue to the bus.
 pub const MAX_WAITING_FRAMES: usize = 8_192;
-/// The maximum number of sources. Without a limit, a host that changes its name each time would fill the memory.
+/// The maximum number of hosts. Without a limit, a host that changes its name again and again would use up the memory.
 pub const MAX_SOURCES: usize = 256;
 
-/// The account of the frames of one source. `numbered` equals `before + dropped_there + lost + taken`; `taken` equals
-/// `sent + copies + dropped_here + refused` plus the frames that wait.
+/// Counts of the frames that were received from one other host, the source.
+/// `numbered` equals `before + dropped_there + lost + taken`.
+/// `taken` equals `sent + copies + dropped_here + refused` plus the frames in the queue.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
 pub struct SourceAccount {
-    /// Numbers that the source has assigned, over all its starts.
+    /// Frames that the source has numbered since its first start that this host knows of.
     pub numbered: u64,
-    /// Numbers from before this link first received from the source, or before a restart of the source.
+    /// Frames that the source numbered before this link first received from it, or before it restarted.
     pub before: u64,
     /// Frames dropped by the source because its queue was full.
     pub dropped_there: u64,
@@ -27,29 +28,29 @@ pub struct SourceAccount {
     pub lost: u64,
     /// Frames received here.
     pub taken: u64,
-    /// Frames sent to the local bus.
+    /// Frames that were sent to the local bus.
     pub sent: u64,
-    /// Frames not sent to the bus, because they are copies that went around a circle.
+    /// Frames that were not sent to the bus, because they had gone around a circle of joined buses.
     #[serde(default)]
     pub copies: u64,
-    /// Frames dropped here because the queue to the bus was full.
+    /// Frames that were dropped here, because the queue to the bus was full.
     pub dropped_here: u64,
-    /// Frames refused by the bus.
+    /// Frames that the bus refused.
     pub refused: u64,
-    /// Frames received again, and ignored.
+    /// Frames that were received a second time, and ignored.
     pub repeated: u64,
     /// Frames that the source's bus dropped before the source read them; they have no numbers.
     pub missed_there: u64,
-    /// Invalid messages.
+    /// Messages from the source that could not be decoded.
     pub garbage: u64,
-    /// Starts of the source.
+    /// The number of starts of the source that were observed.
     pub lives: u64,
-    /// Returns of the previous start among these, which mean that two hosts have the same name.
+    /// The number of these starts that returned to the previous one: two hosts then have the same name.
     pub shared: u64,
 }
 
 impl SourceAccount {
-    /// Returns the number of frames that did not get through, wherever they were lost.
+    /// Returns the number of frames that were not sent to the local bus, wherever they were lost.
     #[must_use]
     pub fn missing(&self) -> u64 {
         [self.dropped_there, self.lost, self.missed_there, self.dropped_here, self.refused]
@@ -58,7 +59,7 @@ impl SourceAccount {
     }
 }
 
-/// The node ids of the cells whose frames came from a host.
+/// A set of node ids: the cells whose frames came from a host.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct NodeSet([u64; 4]);
 
@@ -81,7 +82,7 @@ impl NodeSet {
     }
 }
 
-/// Adds a number that a host sent, which may have any value, without overflow.
+/// Adds to a counter without overflow. The number comes from another host and may have any value.
 const fn add(counter: &mut u64, more: u64) {
     *counter = counter.saturating_add(more);
 }
@@ -89,16 +90,16 @@ const fn add(counter: &mut u64, more: u64) {
 #[derive(Debug, Default)]
 struct Source {
     head: MessageHeader,
-    /// The number of its next frame.
+    /// The number that the source's next frame should have.
     next: u64,
-    /// The random number of its previous start.
+    /// The random number of the source's previous start.
     before: Option<u64>,
     account: SourceAccount,
     nodes: NodeSet,
 }
 
 impl Source {
-    /// Accounts for the numbers of a message. Returns the number of its frames that were received before.
+    /// Counts the frames of a message with this header. Returns how many of its first frames were received before.
     fn account_for(&mut self, head: &MessageHeader, count: u64) -> u64 {
         let account = &mut self.account;
         if account.lives == 0 || self.head.life != head.life {
@@ -127,21 +128,21 @@ impl Source {
     }
 }
 
-/// The frames of all other hosts.
+/// Counts and queued frames of all other hosts.
 #[derive(Debug, Default)]
 pub struct Incoming {
-    /// The sources by host.
+    /// The counts of each host, by its name.
     sources: BTreeMap<String, Source>,
     waiting: VecDeque<Frame>,
-    /// The hosts of the waiting frames, in runs.
+    /// The hosts that the queued frames came from: each entry is a host and the number of consecutive frames.
     runs: VecDeque<(String, usize)>,
-    /// Messages of hosts beyond [`SOURCES`].
+    /// The number of messages from hosts beyond [`SOURCES`].
     unknown_hosts: u64,
     frames: Vec<Stamped>,
 }
 
 impl Incoming {
-    /// Processes a message of a host.
+    /// Decodes a message of a host, counts its frames, and queues them for the bus.
     ///
     /// # Errors
     /// Returns [`MessageError`] if the message is invalid; it is counted.
@@ -172,7 +173,7 @@ impl Incoming {
         Ok(())
     }
 
-    /// Returns frames for the bus, the oldest first; only a part of them if the buffer wraps.
+    /// Returns the oldest frames in the queue. The queue is a ring buffer, so these may not be all frames.
     #[must_use]
     pub fn waiting(&self) -> &[Frame] {
         self.waiting.as_slices().0
@@ -183,7 +184,7 @@ impl Incoming {
         self.gone(count, |account, count| account.sent += count);
     }
 
-    /// Removes the first `count` frames, which are copies and not sent to the bus.
+    /// Removes the first `count` frames. They are copies that went around a circle, and are not sent.
     pub fn copies(&mut self, count: usize) {
         self.gone(count, |account, count| account.copies += count);
     }
@@ -209,17 +210,17 @@ impl Incoming {
         }
     }
 
-    /// Returns the account of each host's frames, and the cells that sent them.
+    /// Returns for each host its name, the counts of its frames, and the cells that sent them.
     pub fn accounts(&self) -> impl Iterator<Item = (&str, SourceAccount, NodeSet)> {
         self.sources.iter().map(|(host, source)| (host.as_str(), source.account, source.nodes))
     }
 
-    /// Returns the names that more than one host has.
+    /// Returns the names that several hosts use at the same time.
     pub fn shared(&self) -> impl Iterator<Item = &str> {
         self.sources.iter().filter(|(_, source)| source.account.shared > 0).map(|(host, _)| host.as_str())
     }
 
-    /// Returns the number of messages of hosts beyond the limit.
+    /// Returns the number of messages from hosts beyond [`SOURCES`].
     #[must_use]
     pub const fn unknown_hosts(&self) -> u64 {
         self.unknown_hosts

@@ -16,7 +16,7 @@
 use protocol::can::{Format, Frame, FrameError};
 use thiserror::Error;
 
-/// The only version.
+/// The version of the message format.
 pub const VERSION: u8 = 1;
 /// The maximum number of frames in a message.
 pub const MAX_FRAMES: usize = 256;
@@ -25,50 +25,51 @@ const HEADER_BYTES: usize = 42;
 /// The length of a frame before its data, in bytes.
 const FRAME_HEAD: usize = 16;
 
-/// A frame with its time on the bus.
+/// A frame with the time at which it was on the bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Stamped {
-    /// The time in ns since 1970, by its host's clock.
+    /// The time in ns since 1970, by the clock of the host whose bus it is.
     pub at_nanos: u64,
     /// The frame.
     pub frame: Frame,
 }
 
-/// The header of a message.
+/// The header of a message of one source.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct MessageHeader {
     /// A random number that identifies this start of the source.
     pub life: u64,
-    /// The number of the first frame.
+    /// The number of the first frame in the message.
     pub first: u64,
-    /// The number of frames before that which the source dropped.
+    /// The number of frames before `first` that the source dropped since its start.
     pub dropped: u64,
-    /// Frames that the source's bus dropped before the source received them.
+    /// The number of frames that the source's bus dropped before the source received them. They have no numbers.
     pub missed: u64,
 }
 
-/// The error of an invalid message.
+/// The reason why a message is invalid.
 #[derive(Clone, Copy, Debug, Error, Eq, PartialEq)]
 #[non_exhaustive]
 pub enum MessageError {
-    /// The message has another version.
+    /// The message has another version of the format.
     #[error(
-        "a message of version {0}, and {VERSION} is understood: use the same release of skinbus on all hosts"
+        "a message has version {0}, but only version {VERSION} is supported: use the same release of skinbus on all hosts"
     )]
     Version(u8),
-    /// The message is truncated, or longer than its frames.
+    /// The message is shorter or longer than its frames require. The field is its length in bytes.
     #[error("a message of {0} bytes does not hold the frames that it names")]
     Length(usize),
     /// A frame is invalid.
     #[error("frame {index} of a message: {error}")]
     Frame {
-        /// Its index in the message.
+        /// The index of the frame in the message.
         index: usize,
         /// The error of the frame.
         error: FrameError,
     },
-    /// The numbers of its frames would exceed 2^64, or more frames were dropped than have numbers.
-    #[error("a message with the numbers {first} and {dropped}, which no source has")]
+    /// The numbers in the header are impossible: a frame number would exceed 2^64, or more frames were dropped than
+    /// numbered.
+    #[error("a message has impossible numbers: {first} for its first frame, and {dropped} frames dropped before it")]
     Numbers {
         /// The number of the first frame.
         first: u64,
@@ -77,7 +78,7 @@ pub enum MessageError {
     },
 }
 
-/// Encodes a message of at most [`FRAMES`] frames; further ones are left out.
+/// Encodes a message with at most [`FRAMES`] of the given frames.
 pub fn encode<'a>(head: &MessageHeader, frames: impl IntoIterator<Item = &'a Stamped>, bytes: &mut Vec<u8>) {
     bytes.clear();
     bytes.extend([VERSION, 0, 0, 0, 0, 0, 0, 0]);
@@ -100,7 +101,7 @@ pub fn encode<'a>(head: &MessageHeader, frames: impl IntoIterator<Item = &'a Sta
     }
 }
 
-/// Decodes a message, and appends its frames. Appends nothing if the message is invalid. Never panics.
+/// Decodes a message and appends its frames to `frames`. Appends none if the message is invalid. Never panics.
 ///
 /// # Errors
 /// Returns [`MessageError`] if the message has another version, is incomplete, or contains an invalid frame.

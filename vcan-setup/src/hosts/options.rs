@@ -1,4 +1,4 @@
-//! The command line of `vcan-setup link`. Both `vcan-setup` and `vcan-link`, which it runs, parse it.
+//! The command line of `vcan-setup link`, which runs the program `vcan-link`. Both programs parse it.
 
 use std::path::PathBuf;
 

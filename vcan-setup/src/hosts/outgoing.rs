@@ -1,4 +1,5 @@
-//! Frames from the local bus to the other hosts: numbers them, and drops those that find no room.
+//! Frames from the local bus to the other hosts: numbers them, queues them, and drops those that do not fit into the
+//! queue.
 
 use std::collections::VecDeque;
 
@@ -6,17 +7,17 @@ use serde::{Deserialize, Serialize};
 
 use super::message::{MAX_FRAMES, MessageHeader, Stamped, encode};
 
-/// The maximum number of waiting frames: 100 ms of a full bus.
+/// The maximum number of queued frames: those of a fully loaded bus in 100 ms.
 pub const MAX_WAITING_FRAMES: usize = 4_096;
 
-/// The account of the frames of a bus. `taken` equals `sent + dropped` plus the frames that wait.
+/// Counts of the frames from the local bus. `taken` equals `sent + dropped` plus the frames in the queue.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
 pub struct BusAccount {
     /// Frames received from the bus.
     pub taken: u64,
     /// Frames passed to the transport.
     pub sent: u64,
-    /// Messages that contained them.
+    /// Messages that were passed to the transport, each with several frames.
     pub messages: u64,
     /// Frames dropped because the queue was full or the transport refused them.
     pub dropped: u64,
@@ -24,25 +25,25 @@ pub struct BusAccount {
     pub missed: u64,
 }
 
-/// The frames of a bus that wait for the transport.
+/// The queue of frames from the local bus to the transport.
 #[derive(Debug)]
 pub struct Outgoing {
     life: u64,
-    /// Waiting frames with their numbers. A gap in the numbers ends a message.
+    /// The queued frames with their numbers. Frames of one message have consecutive numbers.
     waiting: VecDeque<(u64, Stamped)>,
-    /// The number of the next frame.
+    /// The number that the next frame from the bus gets.
     next: u64,
     account: BusAccount,
 }
 
 impl Outgoing {
-    /// Creates an empty queue; `life` is a random number that identifies this start.
+    /// Creates an empty queue. `life` is a random number that identifies this start of the link.
     #[must_use]
     pub fn new(life: u64) -> Self {
         Self { life, waiting: VecDeque::with_capacity(MAX_WAITING_FRAMES), next: 0, account: BusAccount::default() }
     }
 
-    /// Queues a frame of the bus, or drops it if the queue is full.
+    /// Numbers a frame from the bus and queues it, or drops it if the queue is full.
     pub fn push(&mut self, stamped: Stamped) {
         let number = self.next;
         self.next += 1;
@@ -54,18 +55,18 @@ impl Outgoing {
         }
     }
 
-    /// Sets the number of frames that the bus has dropped so far.
+    /// Sets the total number of frames that the bus has dropped before this process could read them.
     pub const fn miss(&mut self, so_far: u64) {
         self.account.missed = so_far;
     }
 
-    /// Encodes the next message, and returns the number of its frames. They stay in the queue until [`Outgoing::sent`]
-    /// or [`Outgoing::refused`].
+    /// Encodes the next message from the oldest frames. Returns their number. The frames stay in the queue until
+    /// [`Outgoing::sent`] or [`Outgoing::refused`] is called.
     pub fn message(&self, bytes: &mut Vec<u8>) -> usize {
         let Some(&(first, _)) = self.waiting.front() else { return 0 };
         let run = self.waiting.iter().zip(first..).take(MAX_FRAMES);
         let count = run.take_while(|((number, _), expected)| number == expected).count();
-        // All earlier frames were sent or dropped.
+        // All frames before `first` were either sent or dropped.
         let dropped = first - self.account.sent;
         let head = MessageHeader { life: self.life, first, dropped, missed: self.account.missed };
         encode(&head, self.waiting.iter().take(count).map(|(_, stamped)| stamped), bytes);
@@ -141,7 +142,7 @@ mod tests {
         outgoing.refused(256); // frames 256 to 511
         let mut last = None;
         while let Some(message) = next(&mut outgoing) {
-            // A gap ends a message.
+            // A gap in the numbers of the frames ends a message.
             last = Some(message);
         }
         assert_eq!(last, Some((all + 7, 7 + 256, vec![9_000])));

@@ -1,8 +1,8 @@
-//! Finds and runs the program `vcan-link`, which joins a bus with those of other hosts and replaces the process of
+//! Finds and runs the program `vcan-link`, which joins a bus with those of other hosts. It replaces the process of
 //! `vcan-setup link`.
 //!
-//! It is a workspace of its own because of its dependency Zenoh, and is installed separately. Both programs must have
-//! the same version.
+//! The program depends on Zenoh. It is therefore a workspace of its own, and is installed separately. Both programs
+//! must have the same version.
 
 use std::env;
 use std::ffi::{OsStr, OsString};
@@ -17,18 +17,19 @@ use thiserror::Error;
 
 /// The name of the program.
 pub const PROGRAM: &str = "vcan-link";
-/// The environment variable for the program's path, if it is neither beside `vcan-setup` nor on `PATH`.
+/// The environment variable for the path of `vcan-link`. It is needed if the program is neither beside `vcan-setup` nor
+/// on `PATH`.
 pub const VARIABLE: &str = "SKINBUS_VCAN_LINK";
-/// The environment variable in which `vcan-setup` passes its version to the program.
+/// The environment variable by which `vcan-setup` tells `vcan-link` its version.
 const CALLER: &str = "VCAN_SETUP_VERSION";
-/// The version of this crate, which both programs are built with.
+/// The version of this crate, which is part of both programs.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// The error of a program that cannot be run.
+/// The reason why `vcan-link` cannot be run.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ProgramError {
-    /// The program was not found.
+    /// `vcan-link` was not found.
     #[error(
         "vcan-link was found neither beside vcan-setup nor on PATH; to install it, in the project's folder: \
          `cargo install --locked --path vcan-setup/link`"
@@ -50,7 +51,7 @@ pub enum ProgramError {
         /// The system error.
         source: io::Error,
     },
-    /// The program and the `vcan-setup` that runs it have different versions.
+    /// `vcan-link` and the `vcan-setup` that runs it have different versions.
     #[error(
         "vcan-link {VERSION} was run by vcan-setup {0}: both have to be of one version; in the project's folder: \
          `cargo install --locked --path vcan-setup/link`"
@@ -58,8 +59,8 @@ pub enum ProgramError {
     Version(String),
 }
 
-/// Replaces this process by the program, which keeps the process id, so that exit code and signals are the program's.
-/// Returns only on failure.
+/// Replaces this process by `vcan-link`, with the same process id, so that signals and the exit code are those of
+/// `vcan-link`. Returns only if that fails.
 pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ProgramError {
     let start = |path: &Path| Command::new(path).args(arguments).env(CALLER, VERSION).exec();
     if let Some(path) = path_from_env(VARIABLE) {
@@ -76,20 +77,19 @@ pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ProgramError {
     }
 }
 
-/// Finds the program beside `vcan-setup`, or in the folders of `PATH`. Returns the first file that is executable, or
-/// else the first file, so that the error can name it.
+/// Finds `vcan-link` beside `vcan-setup`, or else in the folders of `PATH`. Returns the first file that is executable.
+/// If none is, returns the first file, so that an error can name it.
 fn find(beside: Option<&Path>, path: Option<&OsStr>) -> Option<PathBuf> {
     let folders = beside.map(Path::to_owned).into_iter();
     let folders = folders.chain(path.into_iter().flat_map(env::split_paths));
-    // An empty folder in PATH would be the current one.
+    // An empty entry in PATH means the current folder, which is not searched.
     let folders = folders.filter(|folder| !folder.as_os_str().is_empty());
     let files: Vec<_> = folders.map(|folder| folder.join(PROGRAM)).filter(|file| file.is_file()).collect();
     let executable = files.iter().find(|file| access(file.as_path(), Access::EXEC_OK).is_ok());
     executable.or_else(|| files.first()).cloned()
 }
 
-/// Compares the version of the `vcan-setup` that ran this program with its own. Accepts a program that was run
-/// directly.
+/// Checks that the `vcan-setup` that ran this program has the same version. Succeeds if the program was run directly.
 ///
 /// # Errors
 ///

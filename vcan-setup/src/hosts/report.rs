@@ -1,7 +1,7 @@
 //! Reports of a link to local programs, and the address of the link.
 //!
-//! A link listens at an abstract address, one for each bus in a network namespace. A program that connects receives a
-//! [`Report`] at once and after each change, as a line of JSON, and sends nothing.
+//! A link listens at an abstract Unix address, which is unique to the bus and the network namespace. A program that
+//! connects receives a [`Report`] at once and after each change, as a line of JSON. It need not send anything.
 
 use std::collections::BTreeMap;
 use std::io::{self, ErrorKind, Read};
@@ -17,23 +17,24 @@ use serde::{Deserialize, Serialize};
 use super::incoming::SourceAccount;
 use super::outgoing::BusAccount;
 
-/// The maximum length of a line in bytes. A report of 256 hosts is shorter.
+/// The maximum length of a report as a line, in bytes. A report of 256 hosts is shorter.
 const MAX_LINE_BYTES: usize = 1 << 20;
 /// The maximum length of an abstract address, in bytes.
 const NAME: usize = 107;
 
-/// The state of a link.
+/// The state of a link: the other hosts, and counts of frames.
 #[derive(Clone, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
 pub struct LinkReport {
     /// The name of this host.
     pub host: String,
-    /// The account of frames from this bus to the other hosts.
+    /// Counts of the frames from the local bus to the other hosts.
     pub sent: BusAccount,
-    /// The other hosts by name.
+    /// The other hosts, by name.
     pub hosts: BTreeMap<String, HostReport>,
-    /// Frames that came back from this bus or repeated in a circle, and were not sent again.
+    /// Frames received from the local bus that the link had put there, or that went around a circle. They are not sent
+    /// to other hosts again.
     pub returned: u64,
-    /// Messages of hosts beyond the limit.
+    /// The number of messages from hosts beyond the limit of [`SOURCES`](super::incoming::SOURCES).
     pub unknown_hosts: u64,
 }
 
@@ -44,13 +45,14 @@ pub struct HostReport {
     pub is_there: bool,
     /// The node ids of the cells whose frames came from the host.
     pub nodes: Vec<u8>,
-    /// The account of the host's frames here.
+    /// Counts of the frames that were received from the host.
     pub heard: SourceAccount,
-    /// The host's account of this host's frames; null until it has sent one.
+    /// The host's own counts of the frames that it received from here; null until it has sent them.
     pub ours: Option<SourceAccount>,
 }
 
-/// Returns the address of the link of a bus. `directory` is that of embedded buses, `None` the usual one.
+/// Returns the address at which the link of a bus listens. `directory` is that of embedded buses, `None` for the
+/// default.
 fn address(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<SocketAddr> {
     let place = match kind {
         BusKind::Embedded => directory.map_or_else(default_directory, Path::to_owned),
@@ -63,7 +65,7 @@ fn address(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<Soc
     SocketAddr::from_abstract_name(name)
 }
 
-/// Binds the address of the link of a bus.
+/// Listens at the address of the link of a bus.
 ///
 /// # Errors
 /// Returns an error of the kind [`ErrorKind::AddrInUse`] if another process links the bus.
@@ -91,10 +93,10 @@ impl ReportReader {
         Ok(Self { stream, buffer: Vec::new() })
     }
 
-    /// Waits for a report.
+    /// Waits for the next report of the link.
     ///
     /// # Errors
-    /// Returns an error if none arrives in time, or if the link has ended.
+    /// Returns an error if no report arrives in time, or if the link has ended.
     pub fn wait(&mut self, timeout: Duration) -> io::Result<LinkReport> {
         let until = Instant::now() + timeout;
         loop {
@@ -111,7 +113,7 @@ impl ReportReader {
     /// Returns the reports that have arrived, in order. Does not block.
     ///
     /// # Errors
-    /// Returns an error if the link has ended, or if it sends anything but reports.
+    /// Returns an error if the link has ended, or if its data is not a report.
     pub fn take(&mut self) -> io::Result<Vec<LinkReport>> {
         let mut piece = [0; 4_096];
         loop {

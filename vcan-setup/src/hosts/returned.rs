@@ -1,51 +1,52 @@
-//! Detects frames of other hosts that come back: from a second link of the bus, or from an adapter or a bridge that
-//! makes a circle.
+//! Detects frames of other hosts that come back from the local bus, because a second link, an adapter or a bridge joins
+//! the buses in a circle.
 //!
-//! A bus delivers a sender's frames to all others. If this link receives a frame from the bus that it has put there
-//! itself, another program sent it again: there is a circle. The link of the other side would never see a frame of its
-//! own in it. For a second after that, a frame therefore passes this link in either direction only once in 100 ms.
+//! A bus delivers a frame to all clients except the sender. If this link receives a frame that it has itself put on the
+//! bus, another program must have sent it again: there is a circle. The link at the other end of the circle does not
+//! see such a frame. Therefore, for a second after a frame has returned, equal frames pass this link only once in 100
+//! ms in each direction.
 
 use std::collections::{HashMap, VecDeque};
 use std::hash::{BuildHasher, RandomState};
 
 use protocol::can::Frame;
 
-/// The time after a frame has passed during which the same frame counts as returned, in ns.
+/// The time after a frame has passed in which an equal frame counts as returned, in ns.
 pub const RETURN_WINDOW_NS: u64 = 100_000_000;
-/// The time after a frame of this link has returned during which a circle is assumed, in ns.
+/// The time after a frame has returned for which a circle is assumed, in ns.
 const CIRCLE_NS: u64 = 1_000_000_000;
-/// The maximum number of frames that are remembered in each direction.
+/// The maximum number of frames that are stored for comparison in each direction.
 const REMEMBERED: usize = 16_384;
 
-/// The frames that passed recently.
+/// The frames that passed the link recently, by direction.
 #[derive(Debug, Default)]
 pub struct CircleDetector {
     hasher: RandomState,
     put: Recent,
-    /// Frames received from the bus. Recorded only while a circle is assumed.
+    /// Frames that were received from the bus. They are stored only while a circle is assumed.
     taken: Recent,
-    /// The time at which a frame of this link last returned.
+    /// The time at which a frame that this link had put on the bus last returned.
     noticed: Option<u64>,
     count: u64,
 }
 
 impl CircleDetector {
-    /// Records a frame that was put on the bus, at a time of a monotonic clock.
+    /// Stores a frame that the link puts on the bus. `now` is the time of a monotonic clock in ns.
     pub fn put(&mut self, now: u64, frame: &Frame) {
         let hash = self.hash(frame);
         self.put.insert(now, hash);
     }
 
-    /// Returns true if a frame that is to be put on the bus is a copy that went around a circle.
+    /// Returns true if a frame from another host must not be put on the bus, because it has gone around a circle.
     pub fn is_copy(&mut self, now: u64, frame: &Frame) -> bool {
         self.is_circle(now) && self.put.contains(now, self.hash(frame))
     }
 
-    /// Returns true if a frame from the bus is one that this link put there, or in a circle one that was received
-    /// before.
+    /// Returns true if the link put this frame from the bus there itself, or, while a circle is assumed, if an equal
+    /// frame was received before.
     pub fn is_returned(&mut self, now: u64, frame: &Frame) -> bool {
         let is_circle = self.is_circle(now);
-        // Usually no frames are remembered, if the bus only sends.
+        // Usually there is nothing to compare, namely if this link puts no frames on the bus.
         if self.put.is_empty(now) && !is_circle {
             return false;
         }
@@ -62,7 +63,7 @@ impl CircleDetector {
         is_returned
     }
 
-    /// Returns the number of frames from the bus that had returned.
+    /// Returns the number of frames from the bus that were recognised as returned.
     #[must_use]
     pub const fn count(&self) -> u64 {
         self.count
@@ -77,10 +78,10 @@ impl CircleDetector {
     }
 }
 
-/// Frames of the last 100 ms, by their hashes.
+/// Hashes of the frames that passed in the last 100 ms.
 #[derive(Debug, Default)]
 struct Recent {
-    /// Times and hashes in order.
+    /// The time and the hash of each frame, oldest first.
     order: VecDeque<(u64, u64)>,
     /// The number of occurrences of each hash.
     times: HashMap<u64, u32>,
@@ -160,8 +161,8 @@ mod tests {
         assert_eq!(sum as usize, REMEMBERED);
     }
 
-    /// A bridge sends on the first bus what arrives on the second. Frames of the first bus go around a circle in which
-    /// no link sees a frame that it has put on its bus, until a frame of the second bus goes around.
+    /// A bridge copies frames from the second bus to the first. Frames of the first bus go around the circle unnoticed,
+    /// because no link receives a frame that it has put on its bus itself, until a frame of the second bus goes around.
     #[test]
     fn in_a_circle_that_was_noticed_a_frame_passes_once_in_100_ms() {
         let (it, other) = (frame(0x201, &[1]), frame(0x202, &[2]));

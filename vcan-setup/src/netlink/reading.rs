@@ -1,4 +1,4 @@
-//! Parses the kernel's description of an interface.
+//! Decodes the kernel's message about an interface.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use protocol::bus::netlink::attributes;
 
 use crate::link::{Counters, Hardware, Interface, InterfaceKind, ALIAS_MARK, Peer, ControllerState};
 
-/// Parses the kernel's description of one interface.
+/// Decodes the kernel's message about an interface. Returns `None` if it is incomplete.
 pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {
     let header = LinkHeader::parse(bytes).ok()?;
     let is_can = header.link_layer_type == LinkLayerType::Can;
@@ -83,7 +83,7 @@ fn hardware(data: &[InfoCan]) -> Hardware {
     hardware
 }
 
-/// Describes an interface without CAN.
+/// Describes an interface that does not carry CAN, for errors.
 fn description(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
     if layer == LinkLayerType::Loopback {
         return "the loopback interface".to_owned();
@@ -94,7 +94,7 @@ fn description(layer: LinkLayerType, kind: Option<&InfoKind>) -> String {
     }
 }
 
-/// Returns the driver of hardware according to sysfs.
+/// Returns the name of the driver of an interface, as sysfs has it.
 pub(super) fn driver(name: &str) -> Option<String> {
     let link = std::fs::read_link(Path::new("/sys/class/net").join(name).join("device/driver")).ok()?;
     Some(link.file_name()?.to_string_lossy().into_owned())

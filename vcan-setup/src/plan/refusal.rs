@@ -6,105 +6,105 @@ use thiserror::Error;
 use super::widen;
 use crate::link::{FD_MTU, Interface, HardwareRates};
 
-/// The reason why a plan is refused: one line, with the command that fixes it.
+/// The reason why a plan is refused. Its text is one line that contains a command to fix the cause.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum Refusal {
     /// The interface does not carry CAN.
     #[error("{name} is real, {what}, and is left alone: choose another name, as `vcan-setup up vcan0` does")]
     NotCan {
-        /// The name.
+        /// The name of the interface.
         name: String,
         /// A description of the interface.
         what: String,
     },
-    /// CAN hardware was named where a virtual interface is made.
+    /// The named interface is CAN hardware, but the command makes virtual interfaces.
     #[error(
         "{name} is real, {what}, and is left alone: to check its bit rates put it into a skin and run `vcan-setup up SKIN.toml`, to see it `vcan-setup status {name}`"
     )]
     Hardware {
-        /// The name.
+        /// The name of the interface.
         name: String,
         /// A description of the interface.
         what: String,
     },
-    /// An interface of another program has too small an MTU.
+    /// The interface has too small an MTU, and another program has made it.
     #[error(
         "{name} has MTU {mtu} and CAN FD needs {FD_MTU}; vcan-setup has not made it and leaves it alone: `sudo sh -c '{}'` fixes it",
         widen("ip", name)
     )]
     Narrow {
-        /// The name.
+        /// The name of the interface.
         name: String,
-        /// The MTU.
+        /// The MTU of the interface, in bytes.
         mtu: u32,
     },
-    /// An interface of another program is down.
+    /// The interface is down, and another program has made it.
     #[error(
         "{0} is down; vcan-setup has not made it and leaves it alone: `sudo ip link set {0} up` fixes it"
     )]
     Down(String),
-    /// An interface that is not an end of the requested pair has its name.
+    /// The name belongs to an interface that is not an end of the requested pair.
     #[error("{name} is there already and is {what}, not one end of a pair with {peer}: {hint}")]
     OtherPair {
-        /// The name.
+        /// The name of the interface.
         name: String,
         /// A description of the interface.
         what: String,
-        /// The requested other end.
+        /// The name of the other end that was requested.
         peer: String,
-        /// The action to take.
+        /// Advice to the user.
         hint: String,
     },
-    /// The other end of an existing pair does not work.
+    /// The other end of an existing pair is down or has too small an MTU, and is in another namespace.
     #[error(
         "the other end of {name}, {end}, and vcan-setup changes nothing there: `sudo {command}` fixes it"
     )]
     OtherEnd {
-        /// The name.
+        /// The name of the end in this namespace.
         name: String,
-        /// The other end and its fault.
+        /// The name of the other end, and what is wrong with it.
         end: String,
-        /// The command to run.
+        /// The command that fixes it.
         command: String,
     },
-    /// Both ends of a pair in one namespace have the same name.
+    /// The same name was given for both ends of a pair in one namespace.
     #[error(
         "{0} cannot be both ends of a pair in one network namespace: give --peer another name, or --namespace"
     )]
     OneName(String),
-    /// Hardware is missing: the skin gives the bus a bit rate.
+    /// The interface does not exist. It is hardware, because the skin states a bit rate for it.
     #[error(
         "there is no interface {name}, and {file} gives it a bitrate, so it is hardware: plug it in and load its driver, or leave out bitrate and it will be a vcan"
     )]
     Absent {
-        /// The name.
+        /// The name of the interface.
         name: String,
-        /// The skin's file.
+        /// The path of the skin.
         file: String,
     },
-    /// Two skins give one bus different bit rates.
+    /// Two skins state different bit rates for the same bus.
     #[error("of {name} {one} and {other}: run `vcan-setup up` with one of them, or make them agree")]
     AtOdds {
-        /// The name.
+        /// The name of the bus.
         name: String,
-        /// The first skin and its rates.
+        /// The first skin, and the bit rates in it.
         one: String,
-        /// The second skin and its rates.
+        /// The second skin, and the bit rates in it.
         other: String,
     },
-    /// The hardware has other bit rates.
+    /// The hardware has other bit rates than the skin states.
     #[error(
         "{name} is at {has} and {file} says {wants}: `sudo vcan-setup up {file} --set-bit-rates` sets them, or change {file}"
     )]
     Rates {
-        /// The name.
+        /// The name of the interface.
         name: String,
-        /// The present rates.
+        /// The bit rates of the hardware.
         has: HardwareRates,
-        /// The rates of the skin.
+        /// The bit rates in the skin.
         wants: HardwareRates,
-        /// The skin's file.
+        /// The path of the skin.
         file: String,
     },
     /// The hardware is down.
@@ -112,59 +112,59 @@ pub enum Refusal {
         "{name} is {what}, and down: `sudo vcan-setup up {file} --set-bit-rates` sets its bit rates and brings it up"
     )]
     HardwareDown {
-        /// The name.
+        /// The name of the interface.
         name: String,
         /// A description of the interface.
         what: String,
-        /// The skin's file.
+        /// The path of the skin.
         file: String,
     },
-    /// The hardware is in classic mode, but the skin requires CAN FD.
+    /// The hardware is set to classic CAN, but the skin requires CAN FD.
     #[error(
         "{name} is {what} with MTU {mtu}, and {file} says format = \"fd\", which needs {FD_MTU}: `sudo vcan-setup up {file} --set-bit-rates` switches it to CAN FD if it can, or use \"classic\""
     )]
     HardwareNarrow {
-        /// The name.
+        /// The name of the interface.
         name: String,
         /// A description of the interface.
         what: String,
-        /// The MTU.
+        /// The MTU of the interface, in bytes.
         mtu: u32,
-        /// The skin's file.
+        /// The path of the skin.
         file: String,
     },
-    /// Bit rates are to be set, but the skin gives none.
+    /// The user requests that bit rates be set, but the skin states none.
     #[error("{file} has no {key} for {name}: put `{key} = {example}` under its [[bus]], then try again")]
     NoRate {
-        /// The name.
+        /// The name of the bus.
         name: String,
-        /// The missing key.
+        /// The key that is missing in the skin.
         key: &'static str,
-        /// A common value.
+        /// A common value of the key.
         example: u32,
-        /// The skin's file.
+        /// The path of the skin.
         file: String,
     },
-    /// The interface to be removed was not made by this program.
+    /// The interface is to be removed, but another program has made it.
     #[error("{name} is {what} that vcan-setup has not made, and is left alone{hint}")]
     NotOurs {
-        /// The name.
+        /// The name of the interface.
         name: String,
         /// A description of the interface.
         what: String,
-        /// The action to take.
+        /// Advice to the user.
         hint: String,
     },
 }
 
 impl Refusal {
-    /// Returns the refusal for an interface that is not virtual.
+    /// Returns the refusal to make or remove an interface that is not virtual.
     pub(super) fn real(interface: &Interface) -> Self {
         let (name, what) = (interface.name.clone(), interface.what());
         if interface.is_can() { Self::Hardware { name, what } } else { Self::NotCan { name, what } }
     }
 
-    /// Returns true if the command line or the skin is wrong, rather than the state of the machine.
+    /// Returns true if the command line or a skin is wrong; false if the state of the machine is the reason.
     #[must_use]
     pub const fn is_usage(&self) -> bool {
         match self {

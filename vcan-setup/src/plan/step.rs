@@ -5,7 +5,7 @@ use core::fmt;
 use crate::link::{FD_MTU, ALIAS_MARK, HardwareRates};
 use crate::namespace::Namespace;
 
-/// One step.
+/// A step of a plan: an action on one interface.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Step {
     /// The name of the interface.
@@ -26,32 +26,32 @@ pub enum StepAction {
         /// The network namespace of the other end.
         namespace: Option<Namespace>,
     },
-    /// Brings up an interface that this program made.
+    /// Brings up an interface that this program has made.
     BringUp {
         /// The index of the interface.
         index: u32,
     },
-    /// Takes down an interface that this program made, gives it MTU 72, and brings it up.
+    /// Gives an interface that this program has made MTU 72. It is taken down for this, and brought up again.
     Widen {
         /// The index of the interface.
         index: u32,
-        /// The former MTU in bytes.
+        /// The MTU before the step, in bytes.
         from: u32,
-        /// True if the interface was up.
+        /// True if the interface was up before the step.
         was_up: bool,
     },
-    /// Takes CAN hardware down, sets its bit rates, and brings it up.
+    /// Sets the bit rates of CAN hardware. It is taken down for this, and brought up again.
     SetRates {
         /// The index of the interface.
         index: u32,
         /// The rates to be set.
         rates: HardwareRates,
-        /// The former rates.
+        /// The bit rates before the step.
         before: HardwareRates,
-        /// True if the interface was up.
+        /// True if the interface was up before the step.
         was_up: bool,
     },
-    /// Removes an interface that this program made, and the other end of its pair with it.
+    /// Removes an interface that this program has made. If it is one end of a pair, the other end is removed too.
     Remove {
         /// The index of the interface.
         index: u32,
@@ -59,7 +59,7 @@ pub enum StepAction {
 }
 
 impl Step {
-    /// Returns a short form such as `make vcan0`.
+    /// Returns the step in a short form, such as `make vcan0`.
     #[must_use]
     pub fn doing(&self) -> String {
         let name = &self.name;
@@ -73,7 +73,7 @@ impl Step {
         }
     }
 
-    /// Returns the text that is printed after the step.
+    /// Returns the line that is printed when the step is done.
     #[must_use]
     pub fn done(&self) -> String {
         let name = &self.name;
@@ -92,7 +92,7 @@ impl Step {
         }
     }
 
-    /// Returns the equivalent `ip` command.
+    /// Returns the `ip` command that has the same effect.
     #[must_use]
     pub fn command(&self) -> String {
         let name = &self.name;
@@ -126,7 +126,7 @@ impl Step {
     }
 }
 
-/// Returns the command that gives an interface MTU 72; `ip` is the beginning of the command.
+/// Returns the command that gives an interface MTU 72. The command begins with `ip`, which may select a namespace.
 pub(crate) fn widen(ip: &str, name: &str) -> String {
     format!("{ip} link set {name} down && {ip} link set {name} mtu {FD_MTU} up")
 }

@@ -6,48 +6,50 @@ use std::fmt;
 use protocol::slcan::RejectedLines;
 use serde::Serialize;
 
-/// Counts of frames from the bus to the line. `received` equals `sent` plus the sum of `dropped` if no frames wait.
+/// Counts of frames from the bus to the line. `received` equals `sent` plus the sum of `dropped` if no frames are
+/// queued.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct ToLineCounts {
     /// Frames received from the bus.
     pub received: u64,
-    /// Frames written to the line completely.
+    /// Frames that were written to the line completely.
     pub sent: u64,
     /// Frames that were not sent, by reason.
     pub dropped: ToLineDropped,
-    /// Frames that the bus dropped because this process did not read in time; not in `received`.
+    /// Frames that the bus dropped because this process did not read in time. They are not counted in `received`.
     pub dropped_by_bus: u64,
 }
 
 /// Counts of frames that were not sent to the line, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct ToLineDropped {
-    /// The queue was full: the line, or the adapter's bus at its bit rates, is too slow.
+    /// Frames that did not fit into the queue, because the line or the bus behind the adapter is too slow.
     pub queue_full: u64,
-    /// The line was unavailable, or became unavailable before the frame was written completely.
+    /// Frames for a line that was unavailable, or became so before the frame was written completely.
     pub line_away: u64,
-    /// An FD frame for a line with `classic`.
+    /// FD frames for a line that is set to classic CAN (`classic`).
     pub not_classic: u64,
-    /// An error frame, which slcan does not have.
+    /// Error frames, for which slcan has no form.
     pub error_frame: u64,
-    /// The adapter refused the frame (BEL).
+    /// Frames that the adapter refused (it answered BEL).
     pub refused: u64,
-    /// The program ended before the frame was sent.
+    /// Frames that were not sent before the program ended.
     pub ended: u64,
 }
 
-/// Counts of frames from the line to the bus. `received` equals `sent` plus the sum of `dropped` if no frames wait.
+/// Counts of frames from the line to the bus. `received` equals `sent` plus the sum of `dropped` if no frames are
+/// queued.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct ToBusCounts {
-    /// Frames received from the line, and error frames made of the adapter's faults.
+    /// Frames received from the line, and error frames that were made from faults that the adapter reported.
     pub received: u64,
     /// Frames sent to the bus.
     pub sent: u64,
     /// Frames that were not sent, by reason.
     pub dropped: ToBusDropped,
-    /// Invalid lines, by reason; not in `received`.
+    /// Lines that could not be decoded, by reason. They are not counted in `received`.
     pub refused: RefusedLines,
-    /// BEL: lines that the adapter refused.
+    /// The number of times that the adapter refused a line (it sent BEL).
     pub bells: u64,
     /// Lines that are neither frames nor acknowledgements, such as a version.
     pub other_lines: u64,
@@ -56,26 +58,26 @@ pub struct ToBusCounts {
 /// Counts of frames that were not sent to the bus, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct ToBusDropped {
-    /// The queue was full: the bus is too slow.
+    /// Frames that did not fit into the queue, because the bus is too slow.
     pub queue_full: u64,
-    /// The bus was down or unavailable.
+    /// Frames for a bus that was down or unavailable.
     pub bus_away: u64,
-    /// An FD frame for a bus that carries classic frames only.
+    /// FD frames for a bus that carries classic frames only.
     pub not_classic: u64,
-    /// The program ended before the frame was sent.
+    /// Frames that were not sent before the program ended.
     pub ended: u64,
 }
 
-/// Counts of invalid lines.
+/// Counts of lines that could not be decoded, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct RefusedLines {
     /// Lines with bytes that slcan does not use.
     pub garbage: u32,
-    /// Lines longer than their DLC requires, or longer than any line.
+    /// Lines with more characters than the DLC requires, or than any line may have.
     pub long: u32,
-    /// Lines shorter than their DLC requires.
+    /// Lines with fewer characters than the DLC requires.
     pub short: u32,
-    /// Lines with a DLC that the format does not have.
+    /// Lines with a DLC that their frame format does not have.
     pub dlc: u32,
     /// Lines with an identifier beyond 11 or 29 bits.
     pub identifier: u32,
@@ -88,29 +90,29 @@ impl From<RejectedLines> for RefusedLines {
     }
 }
 
-/// The account of a line.
+/// The counts of a line, in both directions.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct LineAccount {
-    /// The address of the line.
+    /// The address of the line, as on the command line.
     pub line: String,
     /// The number of times the line was opened.
     pub opened: u64,
     /// The number of times the line was lost.
     pub lost: u64,
-    /// The number of times the adapter was reopened because it refused frames.
+    /// The number of times the adapter was closed and opened again because it refused frames.
     pub reopened: u64,
     /// Frames from the bus to the line.
     pub to_line: ToLineCounts,
     /// Frames from the line to the bus.
     pub to_bus: ToBusCounts,
-    /// Faults and states that the adapter reported, by name.
+    /// Faults and changes of state that the adapter reported, by name.
     pub faults: Faults,
 }
 
 /// Counts of the faults and changes of state that an adapter reported, by name.
 pub type Faults = BTreeMap<&'static str, u64>;
 
-/// Lists the faults since `before`; empty if there are none.
+/// Lists the faults that were counted after `before`. The text is empty if there are none.
 pub(super) fn faults_since(before: &Faults, now: &Faults) -> String {
     let more = now.iter().map(|(name, count)| (name, count - before.get(name).copied().unwrap_or(0)));
     let words = more.filter(|(_, count)| *count > 0).map(|(name, count)| match count {
@@ -121,7 +123,7 @@ pub(super) fn faults_since(before: &Faults, now: &Faults) -> String {
 }
 
 impl ToLineDropped {
-    /// Returns the total.
+    /// Returns the total number of dropped frames.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.named().into_iter().map(|(count, _)| count).sum()
@@ -140,7 +142,7 @@ impl ToLineDropped {
 }
 
 impl ToBusDropped {
-    /// Returns the total.
+    /// Returns the total number of dropped frames.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.named().into_iter().map(|(count, _)| count).sum()
@@ -157,7 +159,7 @@ impl ToBusDropped {
 }
 
 impl RefusedLines {
-    /// Returns the total.
+    /// Returns the total number of lines that could not be decoded.
     #[must_use]
     pub fn total(&self) -> u64 {
         self.named().into_iter().map(|(count, _)| count).sum()
@@ -183,7 +185,7 @@ impl ToLineCounts {
 }
 
 impl ToBusCounts {
-    /// Formats the losses on the way to the bus.
+    /// Formats the losses on the way to the bus, including lines that could not be decoded.
     pub(super) fn losses(&self) -> String {
         losses("dropped", &self.dropped.named()) + &losses("lines refused", &self.refused.named())
     }

@@ -15,12 +15,12 @@ use super::options::LineOptions;
 use super::participant::{Participant, Ready};
 use super::settings::{BridgeSettings, open};
 
-/// The time at the end for finishing a line that was begun and for closing its adapter.
+/// The time that the program takes at its end to complete a line of text and to close the adapters.
 const CLOSING: Duration = Duration::from_millis(500);
-/// The interval between two attempts at the start.
+/// The interval between two attempts to open a line at the start.
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);
 
-/// The error of lines that cannot be joined to a bus.
+/// The reason why lines cannot be connected to a bus.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum BridgeError {
@@ -37,15 +37,15 @@ pub enum BridgeError {
         line: String,
         /// The cause.
         source: io::Error,
-        /// The action to take, unless the cause contains it.
+        /// Advice to the user; empty if the cause contains it.
         hint: &'static str,
     },
-    /// The system cannot wait.
+    /// The system call that waits for data failed.
     #[error("cannot wait for lines: {0}")]
     Wait(#[source] io::Error),
 }
 
-/// The lines of a bus.
+/// The lines that are connected to a bus, and one client of the bus for each.
 #[derive(Debug)]
 pub struct Bridge {
     settings: BridgeSettings,
@@ -54,7 +54,7 @@ pub struct Bridge {
 }
 
 impl Bridge {
-    /// Opens the bus once for each line, and the lines. With [`Settings::wait`] lines may be unavailable.
+    /// Opens the lines, and one client of the bus for each. With [`Settings::wait`], lines may be unavailable at first.
     ///
     /// # Errors
     /// Returns [`BridgeError`] if the bus or a line cannot be opened.
@@ -80,7 +80,7 @@ impl Bridge {
                 if let Some(error) = participant.take_reason() {
                     return Err(refused(participant.name(), error));
                 }
-                // A TCP connection reports in time whether it is established.
+                // A TCP connection is established in the background, so its state is queried until it is known.
                 std::thread::sleep(RETRY_INTERVAL);
             }
         }
@@ -93,7 +93,7 @@ impl Bridge {
         self.kind
     }
 
-    /// Returns the unavailable lines, each with the reason if it is known.
+    /// Returns the lines that are not open, each with the reason if it is known.
     #[must_use]
     pub fn away(&self) -> Vec<String> {
         let away = self.participants.iter().filter(|it| !it.is_up());
@@ -103,9 +103,9 @@ impl Bridge {
         away.map(words).collect()
     }
 
-    /// Forwards frames until `stop` is readable or hung up, and then closes the adapters. Returns the accounts in the
-    /// order of the lines. `report` is called when a line or a bus is lost or returns, and for losses at most once a
-    /// second for each line.
+    /// Forwards frames until `stop` is readable or hung up, and then closes the adapters. Returns the counts of each
+    /// line, in their order. Calls `report` when a line or a bus is lost or available again, and for lost frames at
+    /// most once a second for each line.
     ///
     /// # Errors
     /// Returns [`BridgeError::Wait`] if the system cannot wait.
@@ -128,7 +128,7 @@ impl Bridge {
         let until = Instant::now() + CLOSING;
         self.participants.iter_mut().for_each(Participant::end);
         loop {
-            // All participants must be polled, not only those before the first unfinished one.
+            // `count` visits all participants; `any` would stop at the first that is not finished.
             let left = self.participants.iter_mut().filter_map(|it| (!it.finish()).then_some(())).count();
             if left == 0 || Instant::now() >= until {
                 break;
@@ -143,8 +143,8 @@ impl Bridge {
         Ok(self.participants.iter().map(Participant::account).collect())
     }
 
-    /// Waits until there is something to do. Returns the readable ends of each line, or `None` if the bridge should
-    /// stop.
+    /// Waits for data or for the next time at which there is something to do. Returns which ends of each line are
+    /// readable, or `None` if the bridge should stop.
     fn wait(
         &mut self,
         stop: Option<BorrowedFd<'_>>,
@@ -169,7 +169,7 @@ impl Bridge {
         let timeout = next.and_then(|next| Timespec::try_from(next.saturating_duration_since(now)).ok());
         match poll(&mut polled, timeout.as_ref()) {
             Ok(_) | Err(Errno::INTR) => {}
-            // The kernel lacks memory for a moment: treat all ends as ready.
+            // The kernel lacks memory for a moment. All ends are then treated as ready.
             Err(Errno::NOMEM | Errno::AGAIN) => std::thread::sleep(RETRY_INTERVAL),
             Err(errno) => return Err(errno.into()),
         }
@@ -187,7 +187,7 @@ impl Bridge {
 }
 
 fn refused(line: String, source: io::Error) -> BridgeError {
-    // Errors about the kind of the file or about its use by others contain the action.
+    // The texts of these errors already contain advice.
     let says_it = matches!(source.kind(), io::ErrorKind::InvalidInput | io::ErrorKind::ResourceBusy);
     let hint = if says_it {
         ""

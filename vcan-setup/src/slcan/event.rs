@@ -9,26 +9,26 @@ use super::account::LineAccount;
 pub enum LineEvent {
     /// The line is open.
     LineUp,
-    /// The line was lost or cannot be opened, with the reason; it is retried.
+    /// The line was lost or cannot be opened; the reason is given. The program tries again.
     LineAway(String),
-    /// The bus is open again.
+    /// The line's client of the bus is open again.
     BusUp,
-    /// The bus was lost, with the reason; it is retried.
+    /// The line's client of the bus was lost; the reason is given. The program tries again.
     BusAway(String),
-    /// Frames were lost since the last report.
+    /// Frames were lost since the last event of this kind.
     Lost {
-        /// Frames from the bus.
+        /// The number of lost frames from the bus.
         to_line: u64,
-        /// Frames from the line, and invalid lines.
+        /// The number of lost frames from the line, including lines that could not be decoded.
         to_bus: u64,
-        /// The account so far.
+        /// The counts of the line so far.
         account: Box<LineAccount>,
     },
-    /// The adapter refused some of these commands during its setup.
+    /// The adapter refused some of its setup commands; the text lists what they set.
     SettingRefused(String),
-    /// The adapter refused lines, and is reopened.
+    /// The adapter refused lines, and is closed and opened again.
     Reopened,
-    /// The adapter reported these faults and states since the last report.
+    /// The adapter reported faults or changes of state since the last event of this kind; the text lists them.
     Reported(String),
     /// The adapter was not closed, because the line was blocked at the end.
     NotClosed,

@@ -1,4 +1,4 @@
-//! Frames from a line to the bus: decodes bytes into frames, which wait until the bus accepts them.
+//! Frames from a line to the bus: decodes the bytes of the line, and queues the frames until the bus accepts them.
 
 use std::collections::VecDeque;
 
@@ -7,32 +7,32 @@ use protocol::slcan::{BusState, Decoder, AdapterFault, SlcanLine, AdapterReport}
 
 use super::account::{Faults, ToBusCounts};
 
-/// The maximum number of frames that wait for the bus.
+/// The maximum number of frames queued for the bus.
 pub const MAX_WAITING_FRAMES: usize = 1_024;
 
-/// The path of frames from a line to the bus.
+/// The decoder of a line and the queue of its frames to the bus.
 #[derive(Debug, Default)]
 pub struct Incoming {
     decoder: Decoder,
     /// True if the bus carries classic frames only.
     classic: bool,
     is_up: bool,
-    /// True if the bus is virtual. Hardware would send an error frame as a data frame.
+    /// True if the bus is virtual. Only then are error frames sent, because hardware would send them as data frames.
     is_virtual: bool,
     frames: VecDeque<Frame>,
     account: ToBusCounts,
     replies: Replies,
-    /// The adapter's state, as last reported.
+    /// The last error state that the adapter reported for its bus.
     state: BusState,
     faults: Faults,
 }
 
-/// Replies of an adapter since it was opened.
+/// The replies of an adapter since it was last opened.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Replies {
-    /// True if the adapter acknowledged a line or sent a frame.
+    /// True if the adapter acknowledged a line or sent a frame since then.
     pub accepted: bool,
-    /// The number of refusals in a row.
+    /// The number of refusals since the last acknowledgement.
     pub refusals: u64,
 }
 
@@ -41,29 +41,31 @@ impl Replies {
 }
 
 impl Incoming {
-    /// Creates the path to a bus that is not open yet.
+    /// Creates an empty queue to a bus that is not open yet.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Records that the bus is open. `classic` drops FD frames, and only a bus that `is_virtual` gets error frames.
+    /// Records that the bus is open. With `classic`, FD frames are dropped. Error frames are sent only if `is_virtual`
+    /// is true.
     pub const fn up(&mut self, classic: bool, is_virtual: bool) {
         (self.is_up, self.classic, self.is_virtual) = (true, classic, is_virtual);
     }
 
-    /// Records that the adapter was opened: replies belong to later lines, and its bus has no error.
+    /// Records that the adapter was opened. Counting of its replies begins anew, and its bus is taken to be without
+    /// errors.
     pub fn opened(&mut self) {
         (self.replies, self.state) = (Replies::default(), BusState::Active);
     }
 
-    /// Records that the bus was lost, and drops the waiting frames.
+    /// Records that the bus was lost, and drops the frames that are queued for it.
     pub fn down(&mut self) {
         self.is_up = false;
         self.account.dropped.bus_away += self.clear();
     }
 
-    /// Decodes bytes of the line.
+    /// Decodes bytes of the line, and queues the frames in them.
     pub fn receive(&mut self, bytes: &[u8]) {
         for &byte in bytes {
             match self.decoder.push(byte) {
@@ -83,7 +85,7 @@ impl Incoming {
         }
     }
 
-    /// Returns the adapter's replies since it was opened.
+    /// Returns the adapter's replies since it was last opened.
     #[must_use]
     pub const fn replies(&self) -> Replies {
         self.replies
@@ -95,7 +97,7 @@ impl Incoming {
         &self.faults
     }
 
-    /// Counts the faults of a report, and forwards them as an error frame.
+    /// Counts the faults that the adapter reports, and queues an error frame for them.
     fn report(&mut self, report: AdapterReport) {
         let before = self.state;
         self.state = report.state().unwrap_or(before);
@@ -111,23 +113,23 @@ impl Incoming {
         self.account.other_lines += u64::from(is_empty);
     }
 
-    /// Records that the line was lost, and drops an incomplete line.
+    /// Records that the line was lost, and discards the incomplete text at its end.
     pub fn line_lost(&mut self) {
         self.decoder.restart();
     }
 
-    /// Returns the frames that wait for the bus, oldest first.
+    /// Returns the queued frames, oldest first.
     pub fn waiting(&mut self) -> &[Frame] {
         self.frames.make_contiguous()
     }
 
-    /// Removes the first `count` frames, which were sent.
+    /// Removes the first `count` frames from the queue after they were sent.
     pub fn sent(&mut self, count: usize) {
         let count = self.frames.drain(..count.min(self.frames.len())).count();
         self.account.sent += count as u64;
     }
 
-    /// Drops the waiting frames at the end of the program.
+    /// Drops the queued frames, because the program ends.
     pub fn end(&mut self) {
         self.account.dropped.ended += self.clear();
     }

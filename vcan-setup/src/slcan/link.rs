@@ -14,19 +14,19 @@ use rustix::termios::{self, ControlModes, InputModes, OptionalActions, QueueSele
 
 use super::options::{Address, LineOptions};
 
-/// The time for which a TCP connection may take.
+/// The time within which a TCP connection must be established.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(3);
-/// The send buffer of a socket in bytes. A larger one would only delay frames, and hide that the peer is too slow.
+/// The send buffer of a socket in bytes. A larger buffer would delay frames and hide that the other side is too slow.
 const SEND_BUFFER: usize = 16 << 10;
-/// The time after which a silent TCP peer is probed, three times a second apart.
+/// The time without data after which a TCP connection is probed, with three probes a second apart.
 const KEEPALIVE_IDLE: Duration = Duration::from_secs(5);
 
-/// An open line.
+/// A line that is open or is being opened.
 #[derive(Debug)]
 pub(super) struct Port {
     fd: OwnedFd,
     is_tty: bool,
-    /// The time at which a pending connection is given up.
+    /// The time at which an attempt to connect is given up; `None` if the line is open.
     connecting: Option<Instant>,
 }
 
@@ -36,11 +36,11 @@ impl AsFd for Port {
     }
 }
 
-/// Opens a line repeatedly.
+/// Opens a line, and opens it again whenever it was lost.
 #[derive(Debug)]
 pub(super) struct Opener {
     options: LineOptions,
-    /// The addresses of a TCP line's host, resolved once, because resolving may take long.
+    /// The addresses of the host of a TCP line. They are resolved once, because that may take long.
     hosts: Vec<SocketAddr>,
     next: usize,
 }
@@ -86,12 +86,12 @@ impl Opener {
 }
 
 impl Port {
-    /// Returns true if the connection is pending.
+    /// Returns true if the connection is not established yet.
     pub(super) const fn is_connecting(&self) -> bool {
         self.connecting.is_some()
     }
 
-    /// Returns true if the connection is established.
+    /// Checks a connection that was being established. Returns true once it is.
     pub(super) fn connected(&mut self) -> io::Result<bool> {
         let Some(until) = self.connecting else { return Ok(true) };
         let mut polled = [PollFd::new(&self.fd, PollFlags::OUT)];
@@ -99,8 +99,8 @@ impl Port {
             return if Instant::now() < until { Ok(false) } else { Err(Errno::TIMEDOUT.into()) };
         }
         sockopt::socket_error(&self.fd)??;
-        // If no program listens on a port of the ephemeral range, a socket sooner or later connects to itself, and
-        // every frame would come back.
+        // If no program listens on a port of the ephemeral range, repeated attempts sooner or later connect the socket
+        // to itself, and every frame would come back.
         if Some(rustix::net::getsockname(&self.fd)?) == rustix::net::getpeername(&self.fd)? {
             return Err(Errno::CONNREFUSED.into());
         }
@@ -108,7 +108,7 @@ impl Port {
         Ok(true)
     }
 
-    /// Reads bytes, and returns their number; 0 if none are available yet.
+    /// Reads available bytes. Returns their number, which is 0 if none are available yet.
     pub(super) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match rustix::io::read(&self.fd, buffer) {
             Ok(0) => Err(io::Error::new(io::ErrorKind::UnexpectedEof, "it was closed")),
@@ -118,7 +118,7 @@ impl Port {
         }
     }
 
-    /// Writes bytes, and returns the number accepted.
+    /// Writes as many bytes as the line accepts at once. Returns their number.
     pub(super) fn write(&self, bytes: &[u8]) -> io::Result<usize> {
         let done = if self.is_tty {
             rustix::io::write(&self.fd, bytes)
@@ -132,7 +132,8 @@ impl Port {
         }
     }
 
-    /// Discards unsent output of a terminal, so that closing it does not wait for an adapter that accepts nothing.
+    /// Discards the output of a terminal that is not sent yet. Otherwise closing it would wait for an adapter that
+    /// accepts nothing.
     pub(super) fn discard(&self) {
         if self.is_tty {
             let _ = termios::tcflush(&self.fd, QueueSelector::OFlush);
@@ -155,7 +156,7 @@ fn connect(
     Ok(Port { fd, is_tty: false, connecting })
 }
 
-/// Opens a terminal in raw mode in both directions, and locks it against programs that respect the lock.
+/// Opens a terminal in raw mode for reading and writing, and locks it against other programs that use such locks.
 fn open_tty(path: &Path, baud: Option<u32>) -> io::Result<OwnedFd> {
     let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
     let other = |hint: String| Err(io::Error::new(io::ErrorKind::InvalidInput, hint));
@@ -166,7 +167,7 @@ fn open_tty(path: &Path, baud: Option<u32>) -> io::Result<OwnedFd> {
         }
         Err(errno) => return Err(errno.into()),
     };
-    // A lock is used instead of TIOCEXCL, which does not exclude root and outlives a process that is killed.
+    // TIOCEXCL is not used, because it does not keep root out and stays set if the program is killed.
     match flock(&fd, FlockOperation::NonBlockingLockExclusive) {
         Ok(()) => {}
         Err(Errno::WOULDBLOCK) => {

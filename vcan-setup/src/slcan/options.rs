@@ -1,4 +1,4 @@
-//! The options of a line on the command line: its address, and its use.
+//! The options of a line on the command line: its address, the frames it gets, and the setup of its adapter.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -28,28 +28,29 @@ pub enum Address {
     },
 }
 
-/// The options of a line.
+/// The address of a line, the frames it gets, and the setup of its adapter.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct LineOptions {
     /// The address.
     pub address: Address,
-    /// Filters for frames from the bus to the line. A frame passes if any filter matches, or if there are none.
+    /// Filters for frames from the bus to the line. A frame passes if it matches any of them, or if there are none.
     pub filters: Vec<Filter>,
-    /// The bit rates to be set in the adapter; `None` keeps its own.
+    /// The bit rates to set in the adapter; `None` leaves them as they are.
     pub bit_rates: Option<BitRates>,
-    /// The speed of a terminal in bit/s; `None` keeps its own.
+    /// The speed to set for the terminal in bit/s; `None` leaves it as it is.
     pub baud: Option<u32>,
-    /// True if the adapter has no CAN FD: FD frames are dropped.
+    /// True if the adapter does not support CAN FD. FD frames for it are dropped.
     pub classic: bool,
-    /// The time from opening the line until the adapter accepts commands, for boards that are reset by opening.
+    /// The time from opening the line until the adapter accepts commands. Some boards are reset when the line is
+    /// opened.
     pub settle: Duration,
 }
 
-/// The error of an invalid line argument.
+/// The reason why a line argument is invalid.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum LineError {
-    /// The address has no known form.
+    /// The address has none of the supported forms.
     #[error("{0:?} is no line: /dev/ttyACM0, unix:/path/to/socket and tcp:localhost:3333 are")]
     Address(String),
     /// The option is unknown.
@@ -57,65 +58,65 @@ pub enum LineError {
         "{line}: {got:?} is no option of a line: cell=12, cell=1-8, filter=100:700, rates=1M/5M, baud=115200, settle=2 and classic are"
     )]
     Unknown {
-        /// The address.
+        /// The address of the line.
         line: String,
-        /// The option.
+        /// The unknown option.
         got: String,
     },
     /// The value of an option is invalid.
     #[error("{line}: {got:?}: {expected}")]
     Value {
-        /// The address.
+        /// The address of the line.
         line: String,
-        /// The option.
+        /// The option with the invalid value.
         got: String,
-        /// The allowed values.
+        /// A description of the allowed values.
         expected: String,
     },
 }
 
-/// The maximum time for which a board may start, in s.
+/// The maximum value of [`LineOptions::settle`], in s.
 const MAX_SETTLE: f64 = 60.0;
-/// The time between two commands of the opening. Adapters process one command per USB packet, and answer within this
-/// time.
+/// The time between two commands that open an adapter. Adapters process one command per USB packet, and answer within
+/// this time.
 const COMMAND_GAP: Duration = Duration::from_millis(10);
-/// The time after closing the adapter. Its answer, a refusal if it was already closed, must arrive before any other
-/// command.
+/// The time after the command that closes the adapter. Its answer, which is a refusal if the adapter was already
+/// closed, must arrive before the next command is sent.
 const CLOSE_GAP: Duration = Duration::from_millis(30);
 
-/// A command of the opening.
+/// One of the commands that open an adapter.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct OpeningStep {
     /// The bytes of the command.
     pub bytes: Vec<u8>,
-    /// The time until the next command.
+    /// The minimum time from this command to the next one.
     pub gap: Duration,
-    /// The stage of the adapter after the command.
+    /// The stage of opening that begins with the command.
     pub stage: OpeningStage,
 }
 
-/// The stage of opening an adapter.
+/// The stage that the opening of an adapter has reached.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum OpeningStage {
     /// No command was sent yet.
     #[default]
     Away,
-    /// The adapter was closed, which it refuses if it was already closed.
+    /// The command to close the adapter was sent. The adapter refuses it if it was already closed.
     Closed,
-    /// The bit rates are being set.
+    /// Commands to set the bit rates were sent.
     Setting,
-    /// The adapter takes part in its bus.
+    /// The command to open the adapter was sent: it takes part in its bus.
     Open,
 }
 
-/// The allowed bit rates of a line, for an error.
+/// A description of the bit rates that slcan supports, for an error.
 const RATES: &str = "slcan has the bit rates 10k, 20k, 50k, 83.3k, 100k, 125k, 250k, 500k, 750k or 800k, and 1M; \
                      for data 500k and whole Mbit/s up to 8M";
 
-/// The allowed values of [`LineOptions::settle`], for an error.
+/// A description of the allowed values of [`LineOptions::settle`], for an error.
 pub const ALLOWED_SETTLE: &str = "seconds from 0 to 60, such as 2 or 0.5";
 
-/// Parses [`LineOptions::settle`].
+/// Parses a value of [`LineOptions::settle`], given in s.
 #[must_use]
 pub fn settle_time(word: &str) -> Option<Duration> {
     let seconds = word.parse().ok().filter(|seconds| (0.0..=MAX_SETTLE).contains(seconds))?;
@@ -123,7 +124,7 @@ pub fn settle_time(word: &str) -> Option<Duration> {
 }
 
 impl LineOptions {
-    /// Returns the options of a line that gets all frames, and keeps its own speed and bit rates.
+    /// Returns the options of a line that gets all frames and whose speed and bit rates are left as they are.
     #[must_use]
     pub const fn new(address: Address) -> Self {
         Self {
@@ -136,8 +137,8 @@ impl LineOptions {
         }
     }
 
-    /// Adds the filters for the frames that a cell receives. The line gets only these frames, besides those that match
-    /// its other filters.
+    /// Adds filters for the frames that a cell receives. The line then gets only these frames and those of its other
+    /// filters.
     pub fn add_cell(&mut self, cell: CellId) {
         for filter in Id::received_by_cell(cell).map(Filter::exact) {
             if !self.filters.contains(&filter) {
@@ -146,10 +147,10 @@ impl LineOptions {
         }
     }
 
-    /// Sets the adapter's bit rates.
+    /// Sets the bit rates that the adapter is to use.
     ///
     /// # Errors
-    /// Returns an error text if slcan has no command for one of the rates.
+    /// Returns an error text if slcan has no command for one of the bit rates.
     pub fn set_bit_rates(&mut self, rates: BitRates) -> Result<(), String> {
         let data = rates.data();
         if SlcanCommand::nominal_bit_rate(rates.nominal()).is_none()
@@ -161,8 +162,9 @@ impl LineOptions {
         Ok(())
     }
 
-    /// Returns the commands that open the adapter: they end an incomplete line, leave the bus, set the bit rates, and
-    /// join the bus. The data bit rate is set even if it equals the nominal one, because adapters have another default.
+    /// Returns the commands that open the adapter: they end an incomplete line, close the adapter, set the bit rates,
+    /// and open the adapter again. The data bit rate is set even if it equals the nominal one, because adapters have
+    /// other defaults.
     #[must_use]
     pub fn opening(&self) -> Vec<OpeningStep> {
         let rates = self.bit_rates;
@@ -182,8 +184,8 @@ impl LineOptions {
         .collect()
     }
 
-    /// Returns true if frames may switch to the data bit rate. If it equals the nominal one, switching gains nothing,
-    /// and would fail on an adapter without the command for it.
+    /// Returns true if FD frames may use the data bit rate. If the data bit rate equals the nominal one, switching has
+    /// no benefit, and it fails on adapters without a command for the data bit rate.
     #[must_use]
     pub fn switches_bit_rate(&self) -> bool {
         self.bit_rates.is_none_or(|rates| rates.data() != rates.nominal())
@@ -245,7 +247,7 @@ impl LineOptions {
     }
 }
 
-/// Parses identifier and mask: 3 digits for data frames of 11 bits, 8 for those of 29.
+/// Parses a filter: identifier and mask, with 3 digits for frames of 11 bits and 8 digits for frames of 29 bits.
 fn filter(text: &str) -> Option<Filter> {
     let (id, mask) = text.split_once(':')?;
     let (max, flag) = match id.len() {
@@ -344,7 +346,7 @@ mod tests {
             assert!(!passes(&one, id), "{id:X}");
         }
         assert_eq!(one.filters.len(), 10);
-        // The filters that all cells share are added once.
+        // Some filters are the same for all cells. They are added once.
         let three = line("/dev/ttyACM0,cell=12-13,cell=40");
         assert_eq!(three.filters.len(), 7 + 3 * 3);
         assert!(passes(&three, 0x50D) && passes(&three, 0x728));

@@ -1,5 +1,5 @@
-//! Frames from the bus to a line: encodes them as text, queues them, and releases them no faster than the line carries
-//! them.
+//! Frames from the bus to a line: encodes them as text, and queues them until the line and the bus behind the adapter
+//! have had time to carry the frames before.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -11,22 +11,22 @@ use protocol::wire_time::{BitRates, Bits};
 use super::account::ToLineCounts;
 use super::options::{LineOptions, OpeningStep, OpeningStage};
 
-/// The maximum number of waiting frames: a tenth of a second of a line at 1 Mbaud.
+/// The maximum number of queued frames: those that a line at 1 Mbaud carries in a tenth of a second.
 pub const MAX_WAITING_FRAMES: usize = 256;
-/// The time by which the line may be ahead of its bus or its wire, which is what an adapter buffers.
+/// The time by which writing may be ahead of the computed pace. It corresponds to what an adapter buffers.
 pub const MAX_AHEAD: Duration = Duration::from_millis(2);
 
-/// The rates from which the duration of a frame on the line is computed.
+/// The rates from which the time for a frame is computed.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Pace {
-    /// The bit rates of the adapter's bus.
+    /// The bit rates of the bus behind the adapter.
     pub bit_rates: Option<BitRates>,
-    /// The speed of the wire between the host and the adapter in bit/s; a byte has ten bits.
+    /// The speed of the serial line in bit/s. A byte takes ten bits.
     pub baud: Option<u32>,
 }
 
 impl Pace {
-    /// Returns the pace of a line and of the bus behind it.
+    /// Returns the rates of a line and of the bus behind its adapter.
     #[must_use]
     pub const fn from_options(options: &LineOptions) -> Self {
         Self { bit_rates: options.bit_rates, baud: options.baud }
@@ -39,7 +39,7 @@ impl Pace {
     }
 }
 
-/// A text that waits or is being written.
+/// A frame or command as text that is queued or being written.
 #[derive(Debug)]
 struct Entry {
     bytes: usize,
@@ -47,11 +47,11 @@ struct Entry {
     kind: EntryKind,
 }
 
-/// The kind of a text.
+/// The kind of text in an entry.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum EntryKind {
     Frame,
-    /// A command, which is not counted. Once it is written the adapter is in this stage.
+    /// A command, which is not counted as a frame. The adapter is in this stage once the command is written.
     Command(OpeningStage),
 }
 
@@ -61,52 +61,53 @@ impl Entry {
     }
 }
 
-/// The path of frames from the bus to a line.
+/// The queue of frames from the bus to a line.
 #[derive(Debug, Default)]
 pub struct Outgoing {
     classic: bool,
-    /// True if frames are sent without their bit rate switch.
+    /// True if frames must not switch to the data bit rate.
     one_rate: bool,
     pace: Pace,
-    /// The text of all entries, from the first byte that is not written.
+    /// The text of all entries that is not written yet.
     text: VecDeque<u8>,
     entries: VecDeque<Entry>,
-    /// The number of bytes of the first entry that are written.
+    /// The number of bytes of the first entry that are already written.
     written: usize,
-    /// The number of entries that may be written by now, and that of their unwritten bytes.
+    /// The number of entries that may be written by now, and the number of their bytes that are not written yet.
     released: usize,
     released_bytes: usize,
     busy_until: Duration,
     is_up: bool,
     stage: OpeningStage,
-    /// Frames sent since the adapter was opened, without those that it refused.
+    /// The number of frames sent since the adapter was opened. Frames that it refused are subtracted.
     since_open: u64,
     /// The counts of the frames.
     pub account: ToLineCounts,
 }
 
 impl Outgoing {
-    /// Creates the path to a line that is not open yet; `classic` drops FD frames.
+    /// Creates an empty queue to a line that is not open yet. With `classic`, FD frames are dropped.
     #[must_use]
     pub fn new(classic: bool, pace: Pace) -> Self {
         Self { classic, pace, ..Self::default() }
     }
 
-    /// Creates the path to a line with these options.
+    /// Creates an empty queue to a line with these options.
     #[must_use]
     pub fn from_options(options: &LineOptions) -> Self {
         let one_rate = !options.switches_bit_rate();
         Self { one_rate, ..Self::new(options.classic, Pace::from_options(options)) }
     }
 
-    /// Records that the line is open. `opening` is written first.
+    /// Records that the line is open. The commands `opening` are written before any frame.
     pub fn up(&mut self, opening: &[OpeningStep]) {
         self.down();
         self.is_up = true;
         opening.iter().for_each(|step| self.push_step(step));
     }
 
-    /// Reopens the adapter, after a line that was begun and before the frames that wait.
+    /// Queues the commands `opening` to open the adapter again. They are written after a frame that is being written,
+    /// and before all others.
     pub fn reopen(&mut self, opening: &[OpeningStep]) {
         let begun = usize::from(self.written > 0);
         let rest = self.entries.front().filter(|_| begun > 0).map_or(0, |entry| entry.bytes - self.written);
@@ -119,13 +120,13 @@ impl Outgoing {
         self.entries.extend(entries);
     }
 
-    /// Returns the stage of opening the adapter.
+    /// Returns the stage that the opening of the adapter has reached.
     #[must_use]
     pub const fn stage(&self) -> OpeningStage {
         self.stage
     }
 
-    /// Records that the adapter refused lines. Those that were frames count as refused instead of sent.
+    /// Records that the adapter refused `lines` lines. As many sent frames are counted as refused instead of sent.
     pub fn refused(&mut self, lines: u64) {
         let frames = lines.min(self.since_open);
         self.since_open -= frames;
@@ -133,14 +134,14 @@ impl Outgoing {
         self.account.dropped.refused += frames;
     }
 
-    /// Records that the line was lost, and drops the waiting frames.
+    /// Records that the line was lost, and drops the queued frames.
     pub fn down(&mut self) {
         let waiting = self.clear();
         self.account.dropped.line_away += waiting;
         self.is_up = false;
     }
 
-    /// Queues a frame of the bus, or drops it.
+    /// Queues a frame of the bus, or drops it if the line cannot carry it or the queue is full.
     pub fn push_frame(&mut self, frame: &Frame) {
         self.account.received += 1;
         let dropped = &mut self.account.dropped;
@@ -164,7 +165,8 @@ impl Outgoing {
         *reason += 1;
     }
 
-    /// Returns the bytes that may be written now, and the time at which more may be written if entries wait.
+    /// Returns the bytes that may be written now. If entries remain, also returns the time at which more may be
+    /// written.
     pub fn ready(&mut self, now: Duration) -> (&[u8], Option<Duration>) {
         while let Some(entry) = self.entries.get(self.released) {
             if self.busy_until > now + MAX_AHEAD {
@@ -179,7 +181,7 @@ impl Outgoing {
         (text.get(..self.released_bytes.min(text.len())).unwrap_or_default(), again)
     }
 
-    /// Removes `bytes` bytes, which were written to the line.
+    /// Removes the first `bytes` bytes after they were written to the line.
     pub fn wrote(&mut self, bytes: usize) {
         let bytes = bytes.min(self.released_bytes);
         self.text.drain(..bytes);
@@ -204,7 +206,7 @@ impl Outgoing {
         }
     }
 
-    /// Drops the frames that were not begun, and appends `closing` after one that was.
+    /// Drops the queued frames, except one that is being written, and queues the bytes `closing`.
     pub fn end(&mut self, closing: &[u8]) {
         let begun = usize::from(self.written > 0);
         let dropped = self.entries.iter().skip(begun).filter(|entry| entry.is_frame()).count();
@@ -220,20 +222,20 @@ impl Outgoing {
         }
     }
 
-    /// Drops a frame that was begun and not written completely.
+    /// Drops the frame that is being written, because the line is closed before its end.
     pub fn give_up(&mut self) {
         self.account.dropped.ended += self.clear();
         self.is_up = false;
     }
 
-    /// Returns true if no entries wait.
+    /// Returns true if nothing is queued.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.entries.is_empty()
     }
 
     fn push_step(&mut self, step: &OpeningStep) {
-        // Writing ahead of time must not shorten a gap.
+        // Writing ahead of the computed pace must not shorten the gap between commands, so the gap is extended.
         self.push(&step.bytes, step.gap + MAX_AHEAD, EntryKind::Command(step.stage));
     }
 
@@ -242,7 +244,7 @@ impl Outgoing {
         self.entries.push_back(Entry { bytes: text.len(), cost, kind });
     }
 
-    /// Clears the queue. Returns the number of frames in it.
+    /// Empties the queue. Returns the number of frames that were in it.
     fn clear(&mut self) -> u64 {
         let frames = self.entries.iter().filter(|entry| entry.is_frame()).count();
         let Self { classic, one_rate, pace, account, .. } = *self;
@@ -251,7 +253,7 @@ impl Outgoing {
     }
 }
 
-/// Returns an FD frame without its bit rate switch.
+/// Returns a copy of an FD frame without the flag that switches to the data bit rate.
 fn unswitched(frame: &Frame) -> Option<Frame> {
     let flags = frame.flags() & !BIT_RATE_SWITCH;
     Frame::with_data(frame.raw_id(), frame.format(), flags, frame.data()).ok()
@@ -282,7 +284,7 @@ mod tests {
         vec![OpeningStep { bytes: text.to_vec(), gap: Duration::ZERO, stage: OpeningStage::Open }]
     }
 
-    /// Writes until the queue is empty or has to wait.
+    /// Writes as much as may be written at the time `now`. Returns the written bytes.
     fn drain(outgoing: &mut Outgoing, now: Duration) -> Vec<u8> {
         let mut all = Vec::new();
         loop {
@@ -364,7 +366,7 @@ mod tests {
         drain(&mut outgoing, NOW);
         outgoing.refused(2);
         assert_eq!((outgoing.account.sent, outgoing.account.dropped.refused), (3, 2));
-        // A line that was begun is finished before the adapter is reopened, and waiting frames follow.
+        // A frame that is being written is completed before the adapter is opened again. The queued frames follow.
         (5..7).for_each(|number| outgoing.push_frame(&frame(number)));
         outgoing.ready(NOW);
         outgoing.wrote(3);
@@ -372,7 +374,7 @@ mod tests {
         assert_eq!(outgoing.stage(), OpeningStage::Away);
         assert_eq!(drain(&mut outgoing, NOW + MAX_AHEAD), b"3105\rC\rO\rt123106\r");
         assert_eq!(outgoing.stage(), OpeningStage::Open);
-        // Refusals beyond the frames since then are of commands.
+        // If more lines are refused than frames were sent since the opening, the others were commands.
         outgoing.refused(9);
         let ToLineCounts { received, sent, dropped, .. } = outgoing.account;
         assert_eq!((received, sent, dropped.refused, dropped.total()), (7, 4, 3, 3));
@@ -416,7 +418,7 @@ mod tests {
         outgoing.end(&closing());
         assert_eq!(drain(&mut outgoing, NOW), b"3101\rC\r");
         assert_eq!((outgoing.account.sent, outgoing.account.dropped.ended), (1, 1));
-        // A frame that was never written completely is not sent.
+        // A frame of which only a part was written is not counted as sent.
         let mut stuck = Outgoing::new(false, Pace::default());
         stuck.up(&[]);
         stuck.push_frame(&frame(1));
@@ -425,7 +427,7 @@ mod tests {
         stuck.end(&closing());
         stuck.give_up();
         assert_eq!((stuck.account.sent, stuck.account.dropped.ended, stuck.is_empty()), (0, 1, true));
-        // A line that is not open is not closed.
+        // A line that is not open gets no command to close its adapter.
         let mut away = Outgoing::new(false, Pace::default());
         away.end(&closing());
         assert!(away.is_empty());
@@ -436,7 +438,7 @@ mod tests {
         let pace = Pace { bit_rates: Some("125k".parse().unwrap()), baud: None };
         let mut outgoing = Outgoing::new(true, pace);
         outgoing.up(&[]);
-        // The frame has 34 + 8 + 13 bits, and stuff bits.
+        // The frame has 34 + 8 + 13 bits, and stuff bits in addition.
         let cost = Duration::from_nanos(Bits::from_frame(&frame(0xAA)).unwrap().nanoseconds("125k".parse().unwrap()));
         let (mut now, mut sent) = (NOW, 0);
         while now < NOW + Duration::from_secs(1) {

@@ -1,4 +1,4 @@
-//! One line and its client of the bus.
+//! A serial line and the client by which it takes part in the bus.
 
 use std::io;
 use std::time::{Duration, Instant};
@@ -17,41 +17,41 @@ use super::settings::{BridgeSettings, open};
 
 /// The interval between two attempts to open an unavailable line or bus.
 const REOPEN_INTERVAL: Duration = Duration::from_millis(100);
-/// The interval between two attempts to send to a full bus.
+/// The interval between two attempts to send to a bus whose queue is full.
 const SEND_RETRY_INTERVAL: Duration = Duration::from_millis(1);
-/// The minimum interval between two loss reports of a line.
+/// The minimum interval between two reports of lost frames on a line.
 const REPORT: Duration = Duration::from_secs(1);
-/// The maximum number of batches read from a bus or from a line before the next line's turn.
+/// The maximum number of batches read from a bus or a line before the next line is served.
 const MAX_BATCHES: usize = 4;
 
-/// The readable ends.
+/// Flags for the ends of a participant from which data can be read.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Ready {
     pub(super) line: bool,
     pub(super) bus: bool,
 }
 
-/// The events to poll for at an open line; the client is polled for reading only.
+/// The events to poll for at an open line. The client of the bus is only polled for readability.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Interest {
     pub(super) line: Option<PollFlags>,
 }
 
-/// The state of a line.
+/// The connection to a line.
 #[derive(Debug)]
 enum LineState {
     Away(Instant),
     Open(Port),
 }
 
-/// The state of the line's client.
+/// The connection to the bus.
 #[derive(Debug)]
 enum ClientState {
     Away(Instant),
     Open(Box<Bus>),
 }
 
-/// One line and its client of the bus.
+/// A serial line, its client of the bus, and the queues between them.
 #[derive(Debug)]
 pub(super) struct Participant {
     opener: Opener,
@@ -67,9 +67,9 @@ pub(super) struct Participant {
     reported_faults: Faults,
     report_at: Instant,
     refusals: Refusals,
-    /// The time at which the adapter is set up, if opening its line resets it.
+    /// The time at which the adapter is set up; `None` if that need not wait for a board to start.
     settled_at: Option<Instant>,
-    /// The last reported reason why the line is unavailable.
+    /// The reason that was last reported why the line is not open.
     reason: Option<io::Error>,
     began: Instant,
 }
@@ -135,7 +135,7 @@ impl Participant {
         Interest { line }
     }
 
-    /// Returns the line and the client to poll.
+    /// Returns the line and the client to be polled, as far as they are open.
     pub(super) const fn ends(&self) -> (Option<&Port>, Option<&Bus>) {
         let port = match &self.line {
             LineState::Open(port) => Some(port),
@@ -147,7 +147,7 @@ impl Participant {
         }
     }
 
-    /// Returns the time at which there is something to do, whatever arrives.
+    /// Returns the time at which there is something to do even if no data arrives.
     pub(super) fn timeout(&mut self, now: Instant) -> Option<Instant> {
         let elapsed = now - self.began;
         let line = match &self.line {
@@ -164,7 +164,7 @@ impl Participant {
         [line, client, report, self.settled_at].into_iter().flatten().min()
     }
 
-    /// Forwards all available data.
+    /// Forwards all data that is available at either end.
     pub(super) fn work(&mut self, settings: &BridgeSettings, ready: Ready, report: &mut impl FnMut(LineEvent)) {
         let now = Instant::now();
         self.open_line(now, report);
@@ -193,12 +193,12 @@ impl Participant {
         self.losses() != self.reported || *self.incoming.faults() != self.reported_faults
     }
 
-    /// Returns true if there is a fault that was never reported before. It is reported at once.
+    /// Returns true if the adapter has reported a kind of fault for the first time. Such a fault is reported at once.
     fn has_new_fault(&self) -> bool {
         self.incoming.faults().len() > self.reported_faults.len()
     }
 
-    /// Reports losses and faults since the last report.
+    /// Reports the lost frames and faults since the last report.
     fn report(&mut self, report: &mut impl FnMut(LineEvent)) {
         let faults = faults_since(&self.reported_faults, self.incoming.faults());
         if !faults.is_empty() {
@@ -213,7 +213,7 @@ impl Participant {
         }
     }
 
-    /// Opens the line if it is time, and reports the reason if it cannot be opened.
+    /// Opens the line if the time for the next attempt has come. Reports the reason if it cannot be opened.
     pub(super) fn open_line(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         let opened = match &mut self.line {
             LineState::Away(at) if *at <= now => self.opener.open(),
@@ -242,12 +242,12 @@ impl Participant {
         }
     }
 
-    /// Returns the reason why the line is unavailable; `None` if it is not known yet.
+    /// Returns the reason why the line is not open; `None` if it is not known yet.
     pub(super) const fn reason(&self) -> Option<&io::Error> {
         self.reason.as_ref()
     }
 
-    /// Returns and clears the reason.
+    /// Returns the reason why the line is not open, and forgets it.
     pub(super) const fn take_reason(&mut self) -> Option<io::Error> {
         self.reason.take()
     }
@@ -264,13 +264,13 @@ impl Participant {
         report(LineEvent::LineUp);
     }
 
-    /// Opens the adapter, and lets frames follow.
+    /// Queues the commands that open the adapter. Frames follow them.
     fn set_adapter(&mut self) {
         self.settled_at = None;
         self.outgoing.up(&self.opener.options().opening());
     }
 
-    /// Reacts to an adapter's refusals.
+    /// Handles lines that the adapter refused.
     fn heed_refusals(&mut self, now: Instant, report: &mut impl FnMut(LineEvent)) {
         let (bells, replies) = (self.incoming.account().bells, self.incoming.replies());
         match self.refusals.evaluate(now - self.began, self.outgoing.stage(), bells, replies) {
@@ -384,7 +384,7 @@ impl Participant {
         }
     }
 
-    /// Handles an interface that went down or a bus that ended: frames waiting for it are lost.
+    /// Handles an interface that went down or a bus that ended. The frames queued for it are lost.
     fn bus_failed(&mut self, error: &BusError, now: Instant, report: &mut impl FnMut(LineEvent)) {
         self.incoming.down();
         self.dropped_before += u64::from(self.inbox.dropped());
@@ -411,7 +411,7 @@ impl Participant {
         (to_line.dropped.total() + by_bus, to_bus.dropped.total() + to_bus.refused.total())
     }
 
-    /// Reads the remaining input, and closes the adapter after a line that was begun. The bus is not read afterwards.
+    /// Reads the remaining input, and queues the command that closes the adapter. The bus is not read any more.
     pub(super) fn end(&mut self) {
         let now = Instant::now();
         self.read_line(now, &mut |_| {});
@@ -422,13 +422,13 @@ impl Participant {
         self.outgoing.end(&closing());
     }
 
-    /// Writes the remaining output. Returns true when it is done.
+    /// Writes the remaining output. Returns true when everything is written.
     pub(super) fn finish(&mut self) -> bool {
         self.write_line(Instant::now(), &mut |_| {});
         !self.is_up() || self.outgoing.is_empty()
     }
 
-    /// Gives up at the timeout. Returns true if the adapter was closed.
+    /// Gives up the remaining output at the end of the time for it. Returns true if the adapter was closed.
     pub(super) fn give_up(&mut self) -> bool {
         let closed = self.finish();
         if let LineState::Open(port) = &self.line

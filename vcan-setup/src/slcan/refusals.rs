@@ -1,32 +1,32 @@
-//! Decides when an adapter that refuses lines is reopened.
+//! Decides when an adapter that refuses lines is closed and opened again.
 
 use std::time::Duration;
 
 use super::incoming::Replies;
 use super::options::OpeningStage;
 
-/// The minimum time between two reopenings, which take the adapter off its bus for a moment.
+/// The minimum time between two reopenings of an adapter. Each takes the adapter off its bus for a moment.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// The maximum time between two reopenings that do not help.
+/// The maximum time between two reopenings if they have no effect.
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
-/// The number of refusals in a row after which an adapter that accepted lines before is reopened: its queue may be full
-/// for a moment.
+/// The number of consecutive refusals after which an adapter that accepted lines before is reopened. Fewer are ignored,
+/// because the queue of the adapter may be full for a moment.
 const REFUSAL_THRESHOLD: u64 = 8;
 
-/// The reaction to refused lines.
+/// The reaction to lines that an adapter refused.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum RefusalAction {
-    /// Ignore them: there are none, or they are expected.
+    /// Do nothing: no lines were refused, or the refusals are expected.
     Nothing,
-    /// Report that the adapter does not support a setting.
+    /// Report that the adapter refused a setup command.
     ReportSettings,
-    /// Count these refused lines of an open adapter.
+    /// Count this number of lines that an open adapter refused.
     Count(u64),
-    /// Count them, and reopen the adapter, which is closed or was reset.
+    /// Count this number of lines, and reopen the adapter, which was closed or reset.
     Reopen(u64),
 }
 
-/// The history of an adapter's refusals. It processes counts and times without input or output.
+/// The history of an adapter's refusals. It is updated with counts and times, and does no input or output.
 #[derive(Debug)]
 pub struct Refusals {
     seen: u64,
@@ -42,13 +42,14 @@ impl Refusals {
         Self { seen: 0, next: Duration::ZERO, pause: FIRST_PAUSE, reopened: 0 }
     }
 
-    /// Returns the number of reopenings.
+    /// Returns the number of times that the adapter was reopened.
     #[must_use]
     pub const fn reopened(&self) -> u64 {
         self.reopened
     }
 
-    /// Evaluates the refusals so far, for an adapter in this stage with these replies since it was opened.
+    /// Evaluates the refusals so far. `bells` is their number since the start; `replies` are those since the adapter
+    /// was opened.
     pub fn evaluate(&mut self, now: Duration, stage: OpeningStage, bells: u64, replies: Replies) -> RefusalAction {
         let more = bells - std::mem::replace(&mut self.seen, bells);
         if replies.accepted && replies.refusals == 0 {
@@ -56,7 +57,8 @@ impl Refusals {
         }
         match stage {
             _ if more == 0 => RefusalAction::Nothing,
-            // These refusals are of frames before a reopening, or of an incomplete line or of closing a closed adapter.
+            // These refusals are answers to frames before the adapter was reopened, to an incomplete line, or to
+            // closing an adapter that was closed already.
             OpeningStage::Away | OpeningStage::Closed => RefusalAction::Count(more),
             OpeningStage::Setting => RefusalAction::ReportSettings,
             OpeningStage::Open if now < self.next || (replies.accepted && replies.refusals < REFUSAL_THRESHOLD) => {
@@ -98,7 +100,7 @@ mod tests {
         }
         assert_eq!(times, [1, 1_001, 3_001, 7_001, 15_001, 31_001, 61_001, 91_001]);
         assert_eq!(refusals.reopened(), 8);
-        // Once the adapter has accepted a line, the history starts anew.
+        // Once the adapter has accepted a line, earlier refusals no longer count.
         refusals.evaluate(at(200_000), OpeningStage::Open, 100_000, Replies { accepted: true, refusals: 0 });
         for (now, expected) in [(200_001, true), (200_900, false), (201_001, true)] {
             let action = refusals.evaluate(at(now), OpeningStage::Open, 100_000 + now, replies(1));

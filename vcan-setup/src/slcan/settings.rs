@@ -1,4 +1,4 @@
-//! The bus of the lines, and the opening of each line's client.
+//! The settings that all lines of a bus share, and the opening of a line's client of the bus.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -7,20 +7,20 @@ use protocol::bus::{Bus, BusError, KindChoice, Filter, BusOptions};
 
 use super::options::LineOptions;
 
-/// The bus of the lines.
+/// The bus to which the lines are connected, and how it is opened.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct BridgeSettings {
     /// The name of the bus.
     pub bus: String,
     /// The kind of the bus.
     pub choice: KindChoice,
-    /// The directory of embedded buses; `None` for the usual one.
+    /// The directory of embedded buses; `None` for the default one.
     pub directory: Option<PathBuf>,
-    /// True to begin without unavailable lines, and to open them later.
+    /// True to begin even if lines are unavailable, and to open them later.
     pub wait: bool,
 }
 
-/// Opens the client of a line.
+/// Opens the client by which a line takes part in the bus.
 pub(super) fn open(settings: &BridgeSettings, line: &LineOptions) -> Result<Bus, BusError> {
     let filters = if line.filters.is_empty() { vec![Filter::ALL] } else { line.filters.clone() };
     let mut options = BusOptions {

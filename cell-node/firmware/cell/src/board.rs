@@ -1,4 +1,4 @@
-//! The interface between the cell and a board.
+//! The interface between the firmware of a cell and a board.
 
 use cell_node::node::Node;
 use protocol::can::Frame;
@@ -12,33 +12,32 @@ pub trait Board {
     /// The flash for parameters.
     type Flash: Flash;
 
-    /// Returns the factory record; `None` if it is blank. Called once, at the start.
+    /// Returns the factory record; `None` if it is blank. The firmware calls this once, at the start.
     fn factory(&mut self) -> Option<Factory>;
 
-    /// Opens the bus. Nothing is received before.
+    /// Opens the bus. No frames are received before.
     fn open(&mut self, factory: &Factory);
 
-    /// Returns the time since the start, which never decreases. Called at least once a second.
+    /// Returns the time since the start, which never decreases. The firmware calls this at least once a second.
     fn now(&mut self) -> Micros;
 
-    /// Returns the next received frame and its time of arrival. After `None`, the cell calls
-    /// [`Board::sleep_until`].
+    /// Returns the next received frame and its time of arrival; `None` if no frame is pending.
     fn receive(&mut self) -> Option<(Frame, Micros)>;
 
-    /// Passes a frame to the CAN controller, waiting while that has no room. A frame that cannot be sent is
+    /// Passes a frame to the CAN controller. Waits while the controller has no room. A frame that cannot be sent is
     /// lost.
     fn send(&mut self, frame: &Frame);
 
-    /// Sets the receive filters to the identifiers that the cell receives now. Passing additional frames is
-    /// allowed.
+    /// Sets the receive filters to the identifiers that the cell receives in its present state. A board may pass other
+    /// frames too, because the node ignores them.
     fn filter(&mut self, node: &Node, factory: &Factory) {
         let _ = (node, factory);
     }
 
-    /// Sleeps until `due` or until a frame arrives, at most [`LONGEST_SLEEP`]. May return early.
+    /// Sleeps until the time `due` or until a frame arrives, but at most [`LONGEST_SLEEP`]. May return early.
     fn sleep_until(&mut self, due: Micros);
 
-    /// Idles until another program is loaded.
+    /// Stops forever, until another program is loaded into the microcontroller.
     fn rest(&mut self) -> ! {
         loop {
             self.feed();
@@ -47,29 +46,29 @@ pub trait Board {
         }
     }
 
-    /// Feeds the watchdog, which must reset the processor after 2 s without.
+    /// Feeds the watchdog, which must reset the processor if it is not fed for 2 s.
     fn feed(&mut self);
 
     /// Returns the flash for parameters.
     fn flash(&mut self) -> &mut Self::Flash;
 
-    /// Reads the parameters of this cell from an external copy, which takes precedence over flash. Returns
-    /// the number of bytes written to `into`. Boards have no such copy; an emulator does, because its flash
-    /// does not persist.
+    /// Reads the flash image of this cell from a copy outside the microcontroller, which takes precedence over flash.
+    /// Returns the number of bytes written to `into`; `None` without such a copy. Only an emulator has a copy, because
+    /// the emulated flash does not persist.
     fn kept_elsewhere(&mut self, into: &mut [u8]) -> Option<usize> {
         let _ = into;
         None
     }
 
-    /// Writes the image that flash holds now to the external copy. Returns true on success.
+    /// Writes an image, which flash already holds, to the copy outside the microcontroller. Returns true on success.
     fn keep_elsewhere(&mut self, image: &[u8]) -> bool {
         let _ = image;
         true
     }
 }
 
-/// Maximum sleep in µs. It is short enough to feed the watchdog, and for the clock to notice each wrap of its
-/// counter.
+/// Maximum duration of a sleep in µs. It is short enough to feed the watchdog in time, and to detect every wrap of the
+/// clock's counter.
 pub const LONGEST_SLEEP: u64 = 500_000;
 
 /// A clock that does not wrap, from a 32-bit counter with 1 MHz.
@@ -80,7 +79,8 @@ pub struct Clock {
 }
 
 impl Clock {
-    /// Returns the time for the present counter value. Must be called at least every 71 minutes.
+    /// Returns the time for the present counter value. It must be called at least every 71 minutes, the period of the
+    /// counter.
     pub fn at(&mut self, counter: u32) -> Micros {
         if counter < self.last {
             self.wraps += 1 << 32;
@@ -89,14 +89,14 @@ impl Clock {
         Micros(self.wraps | u64::from(counter))
     }
 
-    /// Returns the time at which the counter had this value, less than 71 minutes before `now`.
+    /// Returns the time at which the counter had this value. It must be less than 71 minutes before `now`.
     #[must_use]
     pub fn before(now: Micros, counter: u32) -> Micros {
         Micros(now.0 - u64::from(low(now).wrapping_sub(counter)))
     }
 }
 
-/// Returns the counter value at a time.
+/// Returns the counter value at a time: the lower 32 bits.
 #[must_use]
 pub const fn low(at: Micros) -> u32 {
     let [a, b, c, d, ..] = at.0.to_le_bytes();

@@ -1,4 +1,4 @@
-//! A skin cell as firmware: the core of `cell-node`, the main loop, and the boards.
+//! A skin cell as firmware for microcontrollers: the main loop around the core of `cell-node`, and the boards.
 //!
 //! | module | content |
 //! |---|---|

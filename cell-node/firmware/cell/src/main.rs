@@ -1,4 +1,4 @@
-//! The program of a cell's microcontroller.
+//! The program of the microcontroller in a cell.
 
 #![cfg_attr(target_os = "none", no_std)]
 #![cfg_attr(target_os = "none", no_main)]
@@ -27,7 +27,7 @@ mod start {
         match Cell::start(board, factory, node).run() {}
     }
 
-    /// Returns the factory record and the initial node.
+    /// Returns the factory record, and the node before its flash contents are restored.
     // Not inlined, so that the contents of flash are off the stack when the cell runs.
     #[inline(never)]
     fn begin<'a>(board: &mut Chosen, place: &'a mut MaybeUninit<Node>) -> Option<(Factory, &'a mut Node)> {
@@ -38,7 +38,7 @@ mod start {
         Some((*beginning.factory(), node))
     }
 
-    /// Restarts the cell with the contents of flash.
+    /// Resets the processor, so that the cell restarts with the contents of flash.
     #[panic_handler]
     fn panic(_: &PanicInfo<'_>) -> ! {
         SCB::sys_reset()
@@ -50,7 +50,7 @@ mod start {
     }
 }
 
-/// Explains that this program is for microcontrollers.
+/// Prints that this program is for microcontrollers.
 #[cfg(not(target_os = "none"))]
 fn main() {
     eprintln!("cell: built for this machine, where it does nothing: docs/how-to/firmware.md");

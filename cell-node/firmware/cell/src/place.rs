@@ -1,4 +1,4 @@
-//! Construction of a node in place.
+//! Construction of a node in place, without a copy on the stack.
 //!
 //! A node takes more than a third of a small microcontroller's memory. An assignment to a static first builds
 //! the value on the stack and then copies it, so the node would exist twice for a moment.
@@ -11,13 +11,13 @@ use protocol::time::Micros;
 
 use crate::run::Beginning;
 
-/// Returns the node, with the calling convention of C.
+/// Creates a node. The calling convention of C makes the caller pass the address at which it is built.
 #[expect(improper_ctypes_definitions, reason = "both sides are Rust, of one program")]
 extern "C" fn built(beginning: &Beginning, now: &Micros) -> Node {
     beginning.node(*now)
 }
 
-/// Builds the initial node in `place`.
+/// Builds the node in the memory `place`, and returns a reference to it.
 pub fn build<'a>(place: &'a mut MaybeUninit<Node>, beginning: &Beginning, now: Micros) -> &'a mut Node {
     const { assert!(size_of::<Node>() > 4) };
     // SAFETY: by the procedure call standard of 32-bit Arm (AAPCS32, 6.4 and 6.5), a function that returns a

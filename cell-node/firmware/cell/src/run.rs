@@ -1,5 +1,5 @@
-//! The main loop of a cell: passes frames and times to the node, sends its packets and writes its parameters
-//! to flash. `cell_node::node` makes all decisions.
+//! The main loop of a cell. It passes frames and times to the node, sends the node's packets and writes the node's
+//! parameters to flash. All decisions are in `cell_node::node`.
 
 use core::convert::Infallible;
 
@@ -15,7 +15,7 @@ use protocol::port::LinkId;
 use crate::board::{Board, LONGEST_SLEEP};
 use crate::store::{self, Found};
 
-/// A cell on its board.
+/// A cell that runs on a board.
 #[derive(Debug)]
 pub struct Cell<'a, B> {
     board: B,
@@ -32,7 +32,8 @@ pub struct Beginning {
 }
 
 impl Beginning {
-    /// Reads it. Returns `None` for a blank factory record: the cell must not send.
+    /// Reads the factory record and flash of a board. Returns `None` for a blank factory record, without which a cell
+    /// must not send.
     // Not inlined, so that its buffers are off the stack when the cell runs.
     #[inline(never)]
     pub fn read<B: Board>(board: &mut B) -> Option<Self> {
@@ -50,7 +51,8 @@ impl Beginning {
         &self.factory
     }
 
-    /// Returns the initial node. The caller must [`restore`](Self::restore) the contents of flash.
+    /// Returns the node of the cell as it starts, without the contents of flash. The caller must call
+    /// [`restore`](Self::restore) next.
     #[must_use]
     pub fn node(&self, now: Micros) -> Node {
         // These boards have no sensors: contacts come as stimuli.
@@ -76,15 +78,15 @@ impl<'a, B: Board> Cell<'a, B> {
         Self { board, factory, node }
     }
 
-    /// Runs forever.
+    /// Runs the loop forever.
     pub fn run(&mut self) -> Infallible {
         loop {
             self.turn();
         }
     }
 
-    /// Runs one iteration of the loop: received frames, due timers, then sleep. A cell that lost its node id
-    /// to another cell only receives.
+    /// Runs one iteration of the loop: handles received frames and due timers, then sleeps. A cell that lost its node
+    /// id to another cell receives but does not send.
     pub fn turn(&mut self) {
         self.board.feed();
         while let Some((frame, at)) = self.board.receive() {
@@ -108,7 +110,7 @@ impl<'a, B: Board> Cell<'a, B> {
         self.board.sleep_until(self.node.poll_timeout().min(longest));
     }
 
-    /// Passes a frame to the node; a frame of a simulated wire goes to the port at its end.
+    /// Passes a frame to the node. A frame of a simulated wire goes to the port at the end of that wire.
     fn take(&mut self, now: Micros, age: Span, frame: &Frame) {
         let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) else {
             return self.node.handle_frame(now, age, frame);
@@ -127,7 +129,7 @@ impl<'a, B: Board> Cell<'a, B> {
         }
     }
 
-    /// Encodes the node's pending parameters. Returns false if there are none.
+    /// Encodes the node's pending parameters as a flash image. Returns false if there are none.
     // Not inlined, so that the parameters are off the stack when the image is written.
     #[inline(never)]
     fn image(&self, into: &mut flash::Bytes) -> bool {
@@ -136,7 +138,8 @@ impl<'a, B: Board> Cell<'a, B> {
         true
     }
 
-    /// Writes the node's pending parameters to flash. Returns true on success, `None` if there are none.
+    /// Writes the node's pending parameters to flash. Returns true on success, false on failure, and `None` if there
+    /// are none.
     // Not inlined, so that the image is off the stack when the node activates its parameters.
     #[inline(never)]
     fn write(&mut self) -> Option<bool> {
@@ -169,7 +172,7 @@ impl<'a, B: Board> Cell<'a, B> {
     }
 }
 
-/// Copies the external image to flash if they differ.
+/// Copies the image outside the microcontroller, if there is one, to flash if they differ.
 #[inline(never)]
 fn restore<B: Board>(board: &mut B) {
     let mut theirs = [0; flash::MAX_BYTES];
@@ -184,7 +187,7 @@ fn restore<B: Board>(board: &mut B) {
     }
 }
 
-/// Reads the node id assigned by the network, if any, and the parameters.
+/// Reads from flash the node id that the network assigned, if any, and the parameters.
 #[inline(never)]
 fn read<B: Board>(board: &mut B, identity: Identity) -> (Option<CellId>, Held) {
     let mut image = [0; flash::MAX_BYTES];

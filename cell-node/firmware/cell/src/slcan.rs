@@ -1,5 +1,5 @@
-//! Frames over a serial line, for a board without a CAN controller. The other end connects the line to a bus
-//! (`vcan-setup slcan`).
+//! Frames over a serial line, for a board without a CAN controller. The program `vcan-setup slcan` at the other end
+//! connects the line to a bus.
 
 use core::fmt::Debug;
 
@@ -7,16 +7,16 @@ use heapless::Deque;
 use protocol::can::Frame;
 use protocol::slcan::{self, Decoder, Line};
 
-/// Size of the receive buffer in bytes: at least five FD frames of joints, or 40 ms at 115 200 baud.
+/// Size of the receive buffer in bytes. It holds at least five FD frames of joints, or 40 ms at 115 200 baud.
 const BYTES: usize = 512;
-/// Maximum number of complete lines in the buffer.
+/// Maximum number of complete lines in the receive buffer.
 const LINES: usize = 32;
 
 /// The receive buffer of the serial line. An interrupt handler writes to it and the main loop reads from it.
 #[derive(Debug)]
 pub struct Waiting {
     bytes: Deque<u8, BYTES>,
-    /// Time of arrival of the end of each line.
+    /// Counter value at the arrival of the end of each line, in µs.
     ends: Deque<u32, LINES>,
 }
 
@@ -27,8 +27,8 @@ impl Waiting {
         Self { bytes: Deque::new(), ends: Deque::new() }
     }
 
-    /// Appends a received byte. If the buffer is full the byte is lost, and with it the line, whose length is
-    /// then wrong.
+    /// Appends a received byte. If the buffer is full, the byte is lost. The decoder then refuses the line, because its
+    /// length is wrong.
     pub fn push(&mut self, byte: u8, now: u32) {
         let ends_line = byte == slcan::CR;
         if ends_line && self.ends.is_full() || self.bytes.push_back(byte).is_err() {
@@ -45,7 +45,7 @@ impl Waiting {
         self.ends.is_empty()
     }
 
-    /// Decodes the next line. Returns it with the time of arrival of its end.
+    /// Removes and decodes the next complete line. Returns it with the time of arrival of its end.
     pub fn take(&mut self, decoder: &mut Decoder) -> Option<(Line, u32)> {
         let at = self.ends.pop_front()?;
         loop {

@@ -1,5 +1,5 @@
-//! Parameters in two pages of flash. A new image is written to the page without the present one and marked as
-//! complete last, so that a loss of power at any moment leaves either the old or the new image.
+//! Parameters in two pages of flash. A new image is written to the page that does not hold the newest image, and marked
+//! as complete last. A loss of power at any moment thus leaves either the old or the new image.
 //!
 //! ```text
 //!   byte 0..3  which image this is: the higher number is the newer one      4..7  bytes of the image
@@ -9,7 +9,7 @@
 //!
 //! Flash is written in units of 8 bytes, each at most once after its page was erased, as an STM32 requires.
 
-/// Size of a write in bytes.
+/// Size in bytes of the unit in which flash is written.
 pub const UNIT: usize = 8;
 /// Maximum size of an image in bytes.
 pub const MAX_IMAGE: usize = 496;
@@ -21,12 +21,12 @@ const ERASED: [u8; UNIT] = [0xFF; UNIT];
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct NotWritten;
 
-/// One of the two pages.
+/// One of the two flash pages for parameters.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Page {
-    /// The first.
+    /// The first page.
     A,
-    /// The second.
+    /// The second page.
     B,
 }
 
@@ -43,30 +43,30 @@ impl Page {
 
 /// Two pages of flash of at least 512 bytes.
 pub trait Flash {
-    /// Reads the unit at this offset, a multiple of 8.
+    /// Reads the unit of 8 bytes at this offset, a multiple of 8.
     fn unit(&self, page: Page, at: usize) -> [u8; UNIT];
 
-    /// Sets all bytes of a page to 0xFF. The processor may stall meanwhile.
+    /// Erases a page: sets all of its bytes to 0xFF. The processor may stall until this is done.
     ///
     /// # Errors
-    /// Returns an error if the controller reports one.
+    /// Returns an error if the flash controller reports a failure.
     fn erase(&mut self, page: Page) -> Result<(), NotWritten>;
 
-    /// Writes an erased unit.
+    /// Writes a unit of 8 bytes that is erased.
     ///
     /// # Errors
-    /// Returns an error if the controller reports one.
+    /// Returns an error if the flash controller reports a failure.
     fn program(&mut self, page: Page, at: usize, unit: [u8; UNIT]) -> Result<(), NotWritten>;
 }
 
-/// The content of the pages.
+/// The content found in the two pages.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Found {
-    /// No image: the pages are erased, or the first image was never completed.
+    /// There is no image: the pages are erased, or the first image was never completed.
     Nothing,
-    /// An image with this many bytes.
+    /// The newest image, with this many bytes.
     Image(usize),
-    /// A page contains something else than an image.
+    /// A page contains neither an image nor erased flash.
     Damaged,
 }
 
@@ -78,7 +78,7 @@ struct Head {
 }
 
 impl Head {
-    /// Returns the offset of the mark.
+    /// Returns the offset of the mark "COMPLETE" in the page.
     const fn mark(&self) -> usize {
         UNIT + self.len.next_multiple_of(UNIT)
     }
@@ -104,7 +104,7 @@ fn head(flash: &impl Flash, page: Page) -> Result<Option<Head>, NotWritten> {
     }
 }
 
-/// Returns the page with the newest image, and true if a page is damaged.
+/// Returns the page with the newest image and its header, and true if a page is damaged.
 fn newest(flash: &impl Flash) -> (Option<(Page, Head)>, bool) {
     let (a, b) = (head(flash, Page::A), head(flash, Page::B));
     let damaged = a.is_err() || b.is_err();
@@ -116,8 +116,8 @@ fn newest(flash: &impl Flash) -> (Option<(Page, Head)>, bool) {
     (newest, damaged)
 }
 
-/// Reads the newest image. A damaged page may have held a newer image, so the result is then
-/// [`Found::Damaged`].
+/// Reads the newest image into `into`. If a page is damaged, returns [`Found::Damaged`], because that page may have
+/// held a newer image.
 pub fn read(flash: &impl Flash, into: &mut [u8]) -> Found {
     let (newest, damaged) = newest(flash);
     if damaged {
@@ -132,11 +132,11 @@ pub fn read(flash: &impl Flash, into: &mut [u8]) -> Found {
     Found::Image(len)
 }
 
-/// Writes an image to the page without the newest one, and verifies it.
+/// Writes an image to the page that does not hold the newest image, and verifies it.
 ///
 /// # Errors
-/// Returns an error if the image is too long, or flash does not hold it afterwards. The old image stays valid
-/// then.
+/// Returns an error if the image is too long, or if flash does not hold the image afterwards. The old image remains
+/// valid then.
 pub fn write(flash: &mut impl Flash, image: &[u8]) -> Result<(), NotWritten> {
     let (newest, damaged) = newest(flash);
     let (page, number) = match newest {
@@ -160,8 +160,8 @@ pub fn write(flash: &mut impl Flash, image: &[u8]) -> Result<(), NotWritten> {
     if damaged { flash.erase(page.other()) } else { Ok(()) }
 }
 
-/// Writes a unit and verifies it. Units of 0xFF stay erased, because some flash cannot be written again after
-/// that.
+/// Writes a unit and verifies it. A unit of 0xFF bytes is left erased, because some flash cannot be written again after
+/// a write of 0xFF.
 fn program(flash: &mut impl Flash, page: Page, at: usize, unit: [u8; UNIT]) -> Result<(), NotWritten> {
     if unit != ERASED {
         flash.program(page, at, unit)?;

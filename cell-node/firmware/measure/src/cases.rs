@@ -1,23 +1,23 @@
-//! The cases of the test vectors, as words.
+//! The test vectors as words: robots, cells, joint positions and forces.
 
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::parameters::{Contact, MAX_JOINTS, Parameters, Pose, Row, RowKind};
 
-/// A robot's table.
+/// The Denavit-Hartenberg table of a robot.
 pub(crate) struct Chain {
     pub(crate) name: &'static str,
-    /// a, d, alpha, theta offset, kind.
+    /// Rows as words: a, d, alpha, theta offset, kind.
     pub(crate) rows: &'static [[i16; 5]],
 }
 
-/// A cell with joint positions and a force.
+/// A test case: a cell, the joint positions of its robot, and a force on the cell.
 pub(crate) struct Case {
     pub(crate) chain: u8,
     pub(crate) joint: u8,
     row: u8,
     pose: [i16; 6],
     joints: [i16; MAX_JOINTS],
-    /// Force in steps of 2^-16 N.
+    /// Force on the cell in steps of 2^-16 N.
     pub(crate) force: i32,
 }
 
@@ -27,7 +27,7 @@ include!(concat!(env!("OUT_DIR"), "/cases.rs"));
 static NOTHING: Chain = Chain { name: "", rows: &[] };
 
 impl Chain {
-    /// Returns the number of joints.
+    /// Returns the number of joints of the chain.
     pub(crate) fn joints(&self) -> u8 {
         self.rows.iter().map(|row| u8::from(row[4] != 2)).sum()
     }
@@ -38,7 +38,7 @@ impl Case {
         CHAINS.get(usize::from(self.chain)).unwrap_or(&NOTHING)
     }
 
-    /// Returns true for a chain whose instructions are counted: the UR5 and the long chains.
+    /// Returns true if the instructions of this case are counted: those on the UR5 and on the long chains.
     pub(crate) fn is_counted(&self) -> bool {
         self.chain().name == "ur5" || self.chain().name.starts_with("chain-")
     }

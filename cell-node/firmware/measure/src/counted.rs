@@ -1,4 +1,4 @@
-//! The measured functions, each with an exported name.
+//! The functions whose instructions are counted. Each has an exported name, by which the emulator finds it.
 
 use cell_node::contact::{Force, Torque, TorqueRounding};
 use cell_node::flash::Flash;
@@ -14,7 +14,7 @@ use protocol::packet::Epoch;
 use protocol::parameters::{MAX_JOINTS, Parameters};
 use protocol::time::{Micros, Span};
 
-/// Computes J with the wrench kernel.
+/// Computes the Jacobian J with the wrench kernel.
 #[inline(never)]
 #[unsafe(export_name = "measure_wrench")]
 pub(crate) extern "C" fn wrench(
@@ -25,7 +25,7 @@ pub(crate) extern "C" fn wrench(
     kernel.write_jacobian(joints, out);
 }
 
-/// Computes J with the projection kernel.
+/// Computes the Jacobian J with the projection kernel.
 #[inline(never)]
 #[unsafe(export_name = "measure_projection")]
 pub(crate) extern "C" fn projection(
@@ -36,8 +36,8 @@ pub(crate) extern "C" fn projection(
     kernel.write_jacobian(joints, out);
 }
 
-/// Computes the torque words from J, for a cell moved by `joints` joints and a force in steps of 2^-16 N,
-/// with the rounding of its configuration.
+/// Computes the torque words from the Jacobian J for a force in steps of 2^-16 N. The cell is moved by `joints` joints;
+/// `rounding` is prepared from its configuration.
 #[inline(never)]
 #[unsafe(export_name = "measure_torque_words")]
 pub(crate) extern "C" fn torque_words(
@@ -51,8 +51,8 @@ pub(crate) extern "C" fn torque_words(
     Torque::new(moved, Force::from_steps(force.into())).write_words(rounding, out);
 }
 
-/// Returns a cell with a node id; [`configure`] follows. They are separate because a microcontroller has no
-/// memory for two nodes.
+/// Creates a cell with a node id but without parameters. [`configure`] sets them in place, because a microcontroller
+/// has no memory for two nodes.
 pub(crate) fn node() -> Node {
     let identity = Identity { cell: CellId::new(12).ok(), serial: 100_012 };
     Node::unconfigured(identity, Format::Fd, true, Micros(0))
@@ -64,7 +64,8 @@ pub(crate) fn configure(node: &mut Node, parameters: &Parameters) {
     node.restore(&Flash::Sound(*parameters));
 }
 
-/// Waits until the cell owns its node id, and presses it with 3 N. Returns the joints to answer.
+/// Runs a cell until it owns its node id, and applies a force of 3 N. Returns the frame with the joints for it to
+/// answer.
 pub(crate) fn pressed(node: &mut Node, joints: Joints) -> Option<Frame> {
     let mut now = Micros(0);
     for _ in 0..2 {
@@ -80,10 +81,10 @@ pub(crate) fn pressed(node: &mut Node, joints: Joints) -> Option<Frame> {
     frame(&Message::Joints { epoch: Epoch(1), joints })
 }
 
-/// The time of the answer, after the address claim and before the next heartbeat.
+/// The time at which joints are answered: after the address claim and before the next heartbeat.
 const AT: Micros = Micros(600_000);
 
-/// Passes a frame to the node and returns the frame of its answer in `answer`.
+/// Passes a joints frame to the node, and writes the frame of the node's reply to `answer`.
 #[inline(never)]
 #[unsafe(export_name = "measure_reply")]
 pub(crate) extern "C" fn reply(node: &mut Node, joints: &Frame, answer: &mut Frame) {

@@ -1,9 +1,9 @@
-//! Input and output: semihosting on the emulator, standard output and arguments on the host.
+//! Input and output of the measurement: by semihosting on the emulator, by standard output and arguments on the host.
 
-/// Maximum length of a line: four times fourteen words.
+/// Maximum length of an output line in bytes: four times fourteen words of four digits, and a name.
 const LINE: usize = 4 * 14 * 4 + 64;
 
-/// The buffer of an output line.
+/// The buffer of the current output line.
 pub(crate) struct Machine {
     line: [u8; LINE],
     filled: usize,
@@ -38,20 +38,20 @@ impl Machine {
         text.bytes().chain([b' ']).for_each(|byte| self.byte(byte));
     }
 
-    /// Appends a number as two words.
+    /// Appends a 32-bit number as two words.
     pub(crate) fn number(&mut self, number: u32) {
         let [a, b, c, d] = number.to_be_bytes();
         self.words([[a, b], [c, d]].into_iter().map(i16::from_be_bytes));
     }
 
-    /// Ends and writes the line.
+    /// Writes the line with a line feed, and empties the buffer.
     pub(crate) fn line(&mut self) {
         self.byte(b'\n');
         put(self.line.get(..self.filled).unwrap_or_default());
         self.filled = 0;
     }
 
-    /// Returns the first letter of the requested task; `w` by default.
+    /// Returns the first letter of the task on the command line; `w` without one.
     pub(crate) fn task(&self) -> u8 {
         task().unwrap_or(b'w')
     }
@@ -67,10 +67,10 @@ mod emulated {
 
     /// The semihosting call that returns the command line.
     const GET_CMDLINE: usize = 0x15;
-    /// The fill pattern for unused stack.
+    /// The pattern that fills unused stack, to detect later how much was used.
     const PAINT: u32 = 0xCCCC_CCCC;
 
-    /// Distance from the stack pointer that is not painted: more than the registers that a function saves.
+    /// Number of bytes below the stack pointer that are not painted: more than the registers that a function saves.
     const OWN: usize = 64;
 
     unsafe extern "C" {
@@ -102,7 +102,7 @@ mod emulated {
         pointer
     }
 
-    /// Paints the free stack, and returns the address at which the caller's frame ends.
+    /// Fills the free stack with the pattern. Returns the address at which the caller's stack frame ends.
     // Inlined, to read the caller's stack pointer.
     #[inline(always)]
     pub(crate) fn painted_stack() -> usize {
@@ -123,7 +123,7 @@ mod emulated {
         }
     }
 
-    /// Returns the number of bytes of stack below this address that have been used since it was painted.
+    /// Returns the number of bytes of stack below the address `top` that have been used since the stack was painted.
     pub(crate) fn used_stack(top: usize) -> u32 {
         let mut place = &raw const _stack_end;
         // SAFETY: all words from the stack's end to its start are readable memory.
@@ -164,7 +164,7 @@ fn task() -> Option<u8> {
     std::env::args_os().nth(1)?.as_encoded_bytes().first().copied()
 }
 
-/// Returns 0: the stack is not measured on the host.
+/// Returns 0, because the stack is not measured on the host.
 #[cfg(not(target_os = "none"))]
 pub(crate) fn painted_stack() -> usize {
     0

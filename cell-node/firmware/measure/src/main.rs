@@ -1,8 +1,8 @@
-//! The cell's arithmetic on emulated microcontrollers and on the host, run by `tests/firmware/count`.
+//! Measurement of the cell's arithmetic on emulated microcontrollers and on the host. `tests/firmware/count` runs it.
 //!
-//! It prints the words of J and of the torques from both kernels for each case, for comparison. Alternatively
-//! it computes each once while the emulator counts the instructions of the functions `measure_...`. The host
-//! prints the same words.
+//! The first task prints, for each case, the words of J and of the torques from both kernels; the words must be the
+//! same on all machines. The second task runs each kernel once per case, while the emulator counts the instructions of
+//! the functions `measure_...`.
 #![cfg_attr(target_os = "none", no_std, no_main)]
 
 mod cases;
@@ -19,7 +19,7 @@ use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::message::Joints;
 use protocol::parameters::MAX_JOINTS;
 
-/// Number of counted cases per joint of a chain.
+/// Number of cases that are counted for each joint of a chain.
 const COUNTED: usize = 10;
 
 /// Runs the task requested on the command line.
@@ -31,7 +31,7 @@ fn run(machine: &mut Machine) {
     }
 }
 
-/// Prints a line for each case: the words of J and of the torques from the wrench kernel, then from the
+/// Prints a line for each case: the words of J and of the torques, first from the wrench kernel, then from the
 /// projection kernel.
 fn words(machine: &mut Machine) {
     for case in CASES {
@@ -56,7 +56,7 @@ fn projection_words(machine: &mut Machine, case: &cases::Case) {
     torque_words(machine, case, &jacobian, &TorqueRounding::new(TorqueFormat::Q3_12, MAX_J));
 }
 
-/// Appends the words of J and of its torques.
+/// Appends the words of J, and of the torques that follow from J.
 fn torque_words(
     machine: &mut Machine,
     case: &cases::Case,
@@ -70,7 +70,7 @@ fn torque_words(
     machine.words(torque.iter().take(count).copied());
 }
 
-/// Runs the counted cases and prints a line for each: chain, joint.
+/// Runs the kernels for each counted case, and prints the chain and the joint of the case in a line.
 fn count(machine: &mut Machine) {
     let mut done = [[0; MAX_JOINTS + 1]; 8];
     for case in CASES.iter().filter(|case| case.is_counted()) {
@@ -88,7 +88,7 @@ fn count(machine: &mut Machine) {
     }
 }
 
-/// Prints the stack used by one reply, and the size of a node, which need not be on the stack.
+/// Prints the number of bytes of stack that one reply uses, and the size of a node, which can be kept in a static.
 fn stack(machine: &mut Machine) {
     let case = CASES.iter().rfind(|case| case.is_counted());
     machine.number(case.map_or(0, |case| reply(case, true)));

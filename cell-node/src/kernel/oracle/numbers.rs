@@ -14,7 +14,7 @@ impl Scalar for f64 {
     }
 }
 
-/// The oracle: real numbers, the library's sine and cosine, no rounding.
+/// Real numbers as reference: the library's sine and cosine, and no rounding to words.
 impl Number for f64 {
     type Wide = Self;
     type Fine = Self;

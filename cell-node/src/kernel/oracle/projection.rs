@@ -31,7 +31,7 @@ use crate::kernel::rounding::{Bounded, Saturating};
 use crate::kernel::{Kernel, Number, Scalar, Twist, chain, cold_path};
 use crate::sine::QUARTER;
 
-/// The projection kernel of one cell.
+/// The projection kernel of one cell, for comparison.
 ///
 /// For a UR5 and a cell on its last link: 103 multiplications, 56 additions or subtractions, 6 sines and 6
 /// cosines; the paper counts 103, 57, 6 and 6 (Eq. 27).
@@ -39,59 +39,59 @@ use crate::sine::QUARTER;
 pub struct Projection<S: Scalar = Q1_14> {
     /// The direction of the contact force, in the frame of joint k.
     force: Vector<S::Number>,
-    /// The cell's position in the same frame.
+    /// The position of the cell, in the frame of joint k.
     position: Vector<S::Number>,
-    /// The transform of a vector from this frame to the base.
+    /// The transform of a vector from the frame of joint k to the base.
     to_base: ToBase,
-    /// True if no number can leave the range of a word; then saturation is omitted.
+    /// True if no number can leave the range of a word. Saturation is then omitted.
     bounded: bool,
-    /// The links from the first row up; the first `rows` are in use.
+    /// The links from the first row up to the cell. Only the first `rows` are in use.
     links: [Link<S::Number>; MAX_ROWS],
     rows: usize,
 }
 
-/// A row of the robot's table.
+/// The computation for one row of the robot's table.
 // In this order, the fields that are read first are in reach of a short instruction of a Cortex-M0.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Link<N> {
-    /// The values to compute: bits of [`due`].
+    /// The values to compute for this row: bits of [`due`].
     due: u32,
-    /// The joint of the row; unused for a fixed row.
+    /// The joint of the row; without meaning for a fixed row.
     joint: Joint,
-    /// The mixes of x and y by its turn, and of the other two axes by its twist.
+    /// The products needed to rotate x and y by the turn, and the other two axes by the twist.
     mixes: [Mix; 2],
-    /// The known components of z_(l-1).
+    /// The components of z_(l-1) that are known for all joint positions.
     axis: Axis,
     kind: RowKind,
     a: Q1_14,
-    /// The offset without the position of a prismatic joint. It is zero for the first row, whose offset is
-    /// along the axis of joint 1 and has no moment about it.
+    /// The offset d, without the position of a prismatic joint. It is zero for the first row, because an offset along
+    /// the axis of joint 1 does not change any moment about that axis.
     d: Q1_14,
-    /// theta_offset.
+    /// The constant theta_offset of the row.
     offset: Q1_14,
     twist: Twist<N>,
 }
 
-/// The values that are computed for a row.
+/// Bits for the values that are computed for a row.
 mod due {
-    /// x_l, which requires a sine.
+    /// Axis x_l, which requires a sine.
     pub(super) const X: u32 = 1;
-    /// All axes: the row ends a group of parallel axes.
+    /// All three axes, because the row ends a group of parallel axes.
     pub(super) const ENDS: u32 = 2;
-    /// z_(l-1), stored for the joints of this group.
+    /// Axis z_(l-1), stored for the joints of this group of parallel axes.
     pub(super) const Z: u32 = 4;
-    /// The length a, for which x_l is stored.
+    /// The shift by the length a, for which x_l is stored.
     pub(super) const A: u32 = 8;
-    /// The offset d.
+    /// The shift by the offset d.
     pub(super) const D: u32 = 16;
     /// The row has a revolute joint.
     pub(super) const TURNS: u32 = 32;
-    /// The row continues a group of parallel axes, and turns from the axes before the group.
+    /// The row continues a group of parallel axes. Its turn starts from the axes before the group.
     pub(super) const CONTINUES: u32 = 64;
 }
 
-/// The axes that the steps down need: z_(l-1) of each group of parallel axes, then x_l of its rows.
+/// The axes that are stored for the way down: z_(l-1) of each group of parallel axes, and x_l of its rows.
 type KeptAxes<N> = heapless::Vec<Vector<N>, { 2 * MAX_ROWS }>;
 
 impl<S: Scalar> Kernel<S> for Projection<S> {
@@ -151,7 +151,7 @@ impl<S: Scalar> Projection<S> {
         self.links.get(..self.rows).unwrap_or_default()
     }
 
-    /// Computes the axes x, y, z of the cell's frame, from the base up.
+    /// Computes the axes x, y, z of the cell's frame in base coordinates, from the base up.
     #[inline(always)]
     fn axes<'a>(
         &self,
@@ -184,7 +184,7 @@ impl<S: Scalar> Projection<S> {
         [x, y, z]
     }
 
-    /// Computes J from the cell down to the base. `slides` are the joint positions if the chain may have
+    /// Computes J, from the cell down to the base. `slides` are the joint positions, or `None` if the chain has no
     /// prismatic joints.
     #[inline(always)]
     fn down<R: Sums>(
@@ -219,7 +219,7 @@ impl<S: Scalar> Projection<S> {
         }
     }
 
-    /// Like `down`, for any chain, with saturation.
+    /// Like `down`, with saturation, for chains in which numbers may leave the range of a word.
     #[inline(never)]
     fn down_held(
         &self,
@@ -262,7 +262,7 @@ impl<S: Scalar> Projection<S> {
 }
 
 impl<N: Number> Link<N> {
-    /// Creates the link of a row that follows `frame`. `last` is true for the last row.
+    /// Creates the computation for a row above `frame`. `last` is true for the row that carries the cell.
     fn new(row: &Row, joint: Joint, frame: Frame, last: bool) -> Self {
         let ends = last || row.alpha != Q1_14::ZERO;
         let (a, d) = (row.a != Q1_14::ZERO, row.d != Q1_14::ZERO);
@@ -294,8 +294,8 @@ impl<N: Number> Link<N> {
         self.due & bit != 0
     }
 
-    /// Returns the angle from the axes before the group of parallel joints to this joint, given that of the
-    /// previous joint.
+    /// Returns the angle between the axes before the group of parallel joints and those after this joint. `group` is
+    /// that angle for the previous joint.
     #[inline(always)]
     fn angle(&self, group: Q1_14, joints: &[Q1_14; MAX_JOINTS]) -> Q1_14 {
         let mut angle = self.offset;
@@ -307,7 +307,8 @@ impl<N: Number> Link<N> {
         if self.is_due(due::CONTINUES) { N::plus_angle(group, angle) } else { angle }
     }
 
-    /// Computes y_l and z_l from v_l and the previous z, in place; y and z are swapped if necessary.
+    /// Computes y_l and z_l from v_l and the previous z axis, in place. For quarter turns the references y and z are
+    /// swapped.
     #[inline(always)]
     fn twist_by_alpha<'a>(&self, y: &mut &'a mut Vector<N>, z: &mut &'a mut Vector<N>) {
         match self.twist {
@@ -415,7 +416,7 @@ impl<N: Number> Link<N> {
     }
 }
 
-/// Adds the product of a, and that of d, to a component of the position.
+/// Adds the products with the length a and the offset d to a component of the position.
 #[inline(always)]
 fn shift<R: Sums, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N) {
     *position = match d {
@@ -424,7 +425,7 @@ fn shift<R: Sums, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N
     };
 }
 
-/// Applies a twist that is not a multiple of quarter turns.
+/// Rotates y and z by a twist that is not a multiple of quarter turns.
 #[inline(never)]
 fn twist_by<N: Number>(turn: Rotation<N>, [_, mix]: [Mix; 2], y: &mut Vector<N>, z: &mut Vector<N>) {
     turn.both(mix, y, z);

@@ -1,4 +1,4 @@
-//! The constant part of the wrench, computed once per configuration.
+//! The part of the wrench computation that is constant, computed once per configuration.
 
 use core::ops::{Add, Mul, Neg, Sub};
 
@@ -6,7 +6,7 @@ use protocol::parameters::{Pose, Row};
 
 use super::{Number, PerComponent};
 
-/// Returns the contact's wrench, twisted and shifted by joint k's row, rounded once.
+/// Returns the wrench of the contact, twisted and shifted by joint k's row, and rounded once.
 pub(super) fn fold<N: Number>(pose: &Pose, row: &Row) -> PerComponent<N> {
     let (force, moment) = folded(
         pose.normal.map(N::fine),
@@ -18,7 +18,7 @@ pub(super) fn fold<N: Number>(pose: &Pose, row: &Row) -> PerComponent<N> {
     PerComponent { force: force.map(N::settle::<42>), moment: moment.map(N::settle::<56>) }
 }
 
-/// Returns the wrench before rounding. Words of 16 bits give no number above 2^61.
+/// Returns the same wrench before rounding. With words of 16 bits, no intermediate number exceeds 2^61.
 fn folded<N: Copy + Add<Output = N> + Sub<Output = N> + Mul<Output = N> + Neg<Output = N>>(
     [nx, ny, nz]: [N; 3],
     [tx, ty, tz]: [N; 3],

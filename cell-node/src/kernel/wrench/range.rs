@@ -1,4 +1,4 @@
-//! Bounds of the wrench kernel: the range of force and moment on their way down.
+//! Bounds for the wrench kernel: the ranges of force and moment at all rows down to the base.
 
 use protocol::parameters::Row;
 
@@ -6,13 +6,12 @@ use super::PerComponent;
 use crate::contact::MAX_J;
 use crate::kernel::Number;
 
-/// Returns an upper bound of the moments of a wrench on its way down these rows, in steps of 2^-14, for any
-/// joint positions; `None` if a moment or force may exceed the range of a word. The joint above the rows
-/// turns the wrench first.
+/// Returns an upper bound of the moments of a wrench at all of these rows, in steps of 2^-14, for any joint positions.
+/// Returns `None` if a moment or force may exceed the range of a word. The joint above the rows turns the wrench first.
 ///
-/// With |f| and |m| at most F and M: a twist or a turn with words for sine and cosine, each at most 5e-4 off,
-/// lengthens a vector by a factor of at most 1 + 2^-10, and rounding its components adds less than one step.
-/// A shift adds at most |(a, d)| F to M, and its rounding less than one step.
+/// The bound is computed from F and M, the maxima of |f| and |m|. A twist or a turn with words for sine and cosine,
+/// each at most 5e-4 off, lengthens a vector by a factor of at most 1 + 2^-10, and rounding its components adds less
+/// than one step. A shift adds at most |(a, d)| F to M, and its rounding adds less than one step.
 pub(super) fn bound<N: Number>(contact: &PerComponent<N>, rows: &[Row]) -> Option<u16> {
     let turned = |norm: u32| norm + (norm >> 10) + 2;
     let (mut force, mut moment) = (turned(N::norm(contact.force)?), turned(N::norm(contact.moment)?));

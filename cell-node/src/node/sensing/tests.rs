@@ -12,11 +12,11 @@ use crate::node::claim::ClaimStage;
 use crate::node::{HEARTBEAT_INTERVAL, Node};
 
 const NODE: u8 = 51;
-/// The period; node 51 sends after one fifth of it.
+/// Period of continuous mode. Node 51 sends after one fifth of it.
 const PERIOD: Span = Span::from_millis(10);
 const JOINTS: Span = Span::from_millis(16);
 
-/// A cell with its own clock.
+/// A cell in a test, with the present time.
 struct Cell {
     node: Node,
     format: Format,
@@ -25,7 +25,7 @@ struct Cell {
 }
 
 impl Cell {
-    /// Creates a settled cell in this mode.
+    /// Creates a cell that owns its node id and uses this sensing mode.
     fn new(mode: Mode) -> Self {
         Self::of(Format::Fd, mode)
     }
@@ -51,7 +51,7 @@ impl Cell {
         cell
     }
 
-    /// Returns the sensor pages that it sends.
+    /// Returns the sensor pages that the cell has sent.
     fn sends(&mut self) -> Vec<SensorPage> {
         let packets = core::iter::from_fn(|| self.node.poll_transmit());
         let page = |packet| {
@@ -80,7 +80,8 @@ impl Cell {
         self.write(Parameter::Sensing, mode.words())
     }
 
-    /// Sends the next joints at the present time. Only joints and stimuli change the cell's state.
+    /// Sends the next joints to the cell at the present time and returns its sensor pages. Sensor values change only
+    /// with joints.
     fn joints(&mut self) -> Vec<SensorPage> {
         self.joints_aged(Span(0))
     }
@@ -91,14 +92,14 @@ impl Cell {
         self.hears(&Message::Joints { epoch: self.epoch, joints }, age)
     }
 
-    /// Applies a stimulus with the next joints, and sends them.
+    /// Sends a stimulus and then joints, which apply it. Returns the sensor pages that the cell sends.
     fn feels(&mut self, page: SensorPage) -> Vec<SensorPage> {
         let to = Address::Everyone;
         assert_eq!(self.hears(&Message::Stimulus { to, from: AppliesFrom::Next, page }, Span(0)), []);
         self.joints()
     }
 
-    /// Sets one contact word. Returns true if the cell sends exactly that page.
+    /// Sets one contact word by a stimulus. Returns true if the cell sends exactly a page with this word.
     fn says(&mut self, bits: i16) -> bool {
         let page = pressed(bits);
         match self.feels(page).as_slice() {
@@ -108,14 +109,14 @@ impl Cell {
         }
     }
 
-    /// Advances the time to its next timer.
+    /// Advances the time to the cell's next timer. Returns the time, and the sensor pages that the cell sends.
     fn waits(&mut self) -> (Micros, Vec<SensorPage>) {
         self.now = self.node.poll_timeout();
         self.node.handle_timeout(self.now);
         (self.now, self.sends())
     }
 
-    /// Returns the times of the next `count` pages 0 that it sends unrequested.
+    /// Returns the times of the next `count` pages 0 that the cell sends without a request.
     fn times(&mut self, count: usize) -> Vec<u64> {
         let mut times = Vec::new();
         while times.len() < count {
@@ -133,7 +134,7 @@ fn pressed(bits: i16) -> SensorPage {
 
 const NOTHING: SensorPage = SensorPage::Acceleration([Q3_12::ZERO; 3]);
 
-/// Returns thresholds of 100 steps, with a release below 50.
+/// Returns thresholds of 100 steps, with release below 50 steps.
 fn events() -> Events {
     Events {
         contact: Q5_10::from_bits(100),

@@ -1,4 +1,4 @@
-//! References for the kernels: the UR5, externally computed torques, and Eq. 8 in real numbers.
+//! References for the kernels: the UR5's table, torques from other programs, and Eq. 8 in real numbers.
 
 #![allow(
     dead_code,
@@ -13,25 +13,25 @@ use cell_node::contact::{Force, Torque};
 use protocol::fixed::{Q1_14, Q3_12, TorqueFormat};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 
-/// A line of `vectors/ur5_torque.csv`, computed from Eq. 8 in double precision. It agrees with a rigid-body
+/// A line of `vectors/ur5_torque.csv`: torques computed from Eq. 8 in double precision, which agree with a rigid-body
 /// library and the robot's URDF to 1e-11 Nm.
 pub(crate) struct Case {
-    /// The joint that moves the cell, 1 to 6.
+    /// Number of the joint that moves the cell, 1 to 6.
     pub(crate) joint: u8,
     /// Joint positions in rad.
     pub(crate) positions: [f64; MAX_JOINTS],
-    /// The cell's position in the frame of that joint, in m.
+    /// Position of the cell in the frame of that joint, in m.
     pub(crate) position: [f64; 3],
-    /// The direction of the force in the same frame.
+    /// Direction of the force in the same frame, a unit vector.
     pub(crate) direction: [f64; 3],
-    /// The force in N.
+    /// Force on the cell in N.
     pub(crate) force: f64,
-    /// The torques in Nm.
+    /// Torque in each joint in Nm.
     pub(crate) torques: [f64; MAX_JOINTS],
 }
 
 impl Case {
-    /// Returns all cases.
+    /// Returns all cases of the file.
     pub(crate) fn all() -> Vec<Self> {
         include_str!("../../../tests/vectors/ur5_torque.csv").lines().skip(1).map(Self::read).collect()
     }
@@ -49,7 +49,7 @@ impl Case {
         }
     }
 
-    /// Returns the cell's parameters; its outward normal is opposite to the force.
+    /// Returns the parameters of the cell in this case. The outward normal is opposite to the force.
     pub(crate) fn parameters(&self) -> Parameters {
         let pose = Pose {
             position: self.position.map(Q1_14::nearest),
@@ -64,21 +64,21 @@ impl Case {
     }
 }
 
-/// Errors of torques relative to the cases, in Nm.
+/// Errors of computed torques relative to those of the cases, in Nm.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Errors {
-    /// The mean of the absolute errors.
+    /// Mean of the absolute errors in Nm.
     pub(crate) mean: f64,
-    /// The largest absolute error.
+    /// Largest absolute error in Nm.
     pub(crate) max: f64,
-    /// Number of compared torques: those of loaded joints.
+    /// Number of compared torques. Only the torques of loaded joints are compared.
     pub(crate) torques: usize,
-    /// Number of cases left out because a torque exceeds Q3.12.
+    /// Number of cases that are left out because a torque exceeds the range of Q3.12.
     pub(crate) omitted: usize,
 }
 
 impl Errors {
-    /// Compares the result of `torques` for each case.
+    /// Compares the torques of each case with those that `torques` returns for it, in Nm.
     pub(crate) fn of(torques: impl Fn(&Case) -> [f64; MAX_JOINTS]) -> Self {
         let cases = Case::all();
         let fits = |case: &&Case| case.torques.iter().all(|torque| torque.abs() < Q3_12::MAX.to_f64());
@@ -100,7 +100,7 @@ impl Errors {
         }
     }
 
-    /// Compares the words that a cell would send.
+    /// Compares the torques of each case with the words that a cell would send.
     pub(crate) fn of_words(
         jacobian: impl Fn(&Parameters, &[Q1_14; MAX_JOINTS]) -> [Q1_14; MAX_JOINTS],
     ) -> Self {
@@ -126,7 +126,7 @@ pub(crate) fn ur5() -> [Row; MAX_ROWS] {
     rows
 }
 
-/// Returns one value per joint, with defaults for joints that the robot does not have.
+/// Returns an array with one value per joint, filled with defaults for joints that the robot does not have.
 pub(crate) fn per_joint<T: Copy + Default>(values: &[T]) -> [T; MAX_JOINTS] {
     std::array::from_fn(|joint| values.get(joint).copied().unwrap_or_default())
 }
@@ -141,7 +141,7 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// Returns Rz(theta) Tz(d) Tx(a) Rx(alpha), multiplied out one by one.
+/// Returns the matrix Rz(theta) Tz(d) Tx(a) Rx(alpha), as the product of four matrices.
 fn transform(row: &Row, position: Q1_14) -> Transform {
     let (theta, d) = match row.kind {
         RowKind::Revolute => (position.wrapping_add(row.theta_offset), row.d),

@@ -1,7 +1,7 @@
 //! Aligns captures that did not begin with their run.
 //!
-//! A capture that begins in the middle of a run has the epochs of its joints only modulo 256. Their numbers follow from
-//! the joints themselves: the alignment at which most of them equal those of the other capture.
+//! The joints of a capture that begins in the middle of a run have epochs that are known only modulo 256. Their numbers
+//! follow from comparing joints: the alignment is the one at which most joints equal those of the other capture.
 
 use protocol::message::{Joints, Message};
 use protocol::packet::Epoch;
@@ -10,11 +10,11 @@ use protocol::skin::Skin;
 use super::Both;
 use super::numbering::Numbering;
 
-/// Maximum number of joints that are kept, from the start; at 62.5 Hz a day has 5.4 million.
+/// Maximum number of joints of a capture that are kept, counted from its start; a day at 62.5 Hz has 5.4 million.
 const MAX_JOINTS_KEPT: usize = 6_000_000;
-/// Number of joints that are compared for each alignment.
+/// Number of joints that are compared to rate an alignment.
 const MAX_SAMPLES: usize = 512;
-/// Minimum number of common epochs of two captures that are aligned by their joints.
+/// Minimum number of epochs that two captures must have in common to be aligned by their joints.
 const MIN_COMMON_EPOCHS: usize = 8;
 
 /// The joints of a capture, each as a hash.
@@ -23,12 +23,12 @@ pub struct Trace {
     bus: Option<String>,
     numbering: Numbering,
     first: Option<Epoch>,
-    /// Hashes by number since the first joints; `None` for missing joints.
+    /// Hash of each joints packet, by its number since the first one; `None` for missing joints.
     joints: Vec<Option<u32>>,
 }
 
 impl Trace {
-    /// Follows the joints of the first bus with cells.
+    /// Creates an empty trace, which records the joints of the skin's first bus with cells.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
         let bus = skin.cells.first().and_then(|cell| skin.buses.get(cell.bus));
@@ -40,13 +40,13 @@ impl Trace {
         }
     }
 
-    /// Returns the epoch of the first joints.
+    /// Returns the epoch of the first joints in the capture; `None` before these.
     #[must_use]
     pub fn first(&self) -> Option<u8> {
         self.first.map(|first| first.0)
     }
 
-    /// Records the next message of a bus.
+    /// Records the next message; ignores messages other than joints, and other buses than the traced one.
     pub fn take(&mut self, nanos: u64, bus: &str, message: &Message) {
         let Message::Joints { epoch, joints } = message else { return };
         if self.bus.as_deref() != Some(bus) {
@@ -65,13 +65,13 @@ impl Trace {
     }
 }
 
-/// Hashes the words with FNV-1a.
+/// Returns the FNV-1a hash of the joint words.
 fn number_of(joints: &Joints) -> u32 {
     let words = joints.positions.iter().flat_map(|word| word.to_bits().to_le_bytes());
     words.fold(0x811C_9DC5, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193))
 }
 
-/// Returns the numbers of the first joints of two captures of one skin.
+/// Returns for each of two captures of one skin the number of its first joints since the run began; `None` if unknown.
 #[must_use]
 pub fn starts(a: &Trace, b: &Trace) -> Both<Option<u64>> {
     let (Some(first_a), Some(first_b)) = (a.first, b.first) else { return Both { a: None, b: None } };
@@ -89,7 +89,8 @@ pub fn starts(a: &Trace, b: &Trace) -> Both<Option<u64>> {
     Both { a: Some(of(first_a, best.1)), b: Some(of(first_b, best.2)) }
 }
 
-/// Returns the share of equal joints if two captures begin with these numbers; `None` if they have too few in common.
+/// Returns the share of joints that are equal if the captures begin with the numbers `start_a` and `start_b`; `None` if
+/// they then have too few epochs in common.
 fn share(a: &Trace, b: &Trace, start_a: u64, start_b: u64) -> Option<f64> {
     let begin = start_a.max(start_b);
     let [skip_a, skip_b] =

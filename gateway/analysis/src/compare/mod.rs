@@ -31,7 +31,7 @@ pub use self::report::{
     ASPECTS, CellRow, Contacts, Epochs, ExtraCell, FirstDifference, Joints, Losses, UnpairedCounts, Replies, Report, Source,
 };
 
-/// One of the two captures.
+/// One of the two captures that are compared.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum CaptureSide {
     /// The first one.
@@ -46,12 +46,12 @@ impl CaptureSide {
     }
 }
 
-/// A value for each capture.
+/// A pair of values, one for each capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Both<T> {
-    /// The value of the first one.
+    /// The value of capture A.
     pub a: T,
-    /// The value of the second one.
+    /// The value of capture B.
     pub b: T,
 }
 
@@ -74,14 +74,14 @@ impl<T> Both<T> {
     }
 }
 
-/// The tolerances of a comparison.
+/// The tolerances of a comparison, above which two captures count as different.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Options {
     /// Tolerance for words of torques (in 1/4096 Nm) and sums (in 1/256 Nm).
     pub tolerance: u32,
     /// Tolerance for words of joints, in steps of 2^-14 quarter turns, or m for prismatic joints.
     pub joints_tolerance: u32,
-    /// Number of replies and joints that may be missing from one capture.
+    /// Number of replies and joints that may be missing from one of the captures.
     pub missing: u64,
 }
 
@@ -93,7 +93,7 @@ pub struct Comparison<'a> {
     sides: Both<Side<'a>>,
     tallies: Vec<Tally>,
     epochs: Epochs,
-    /// The first difference that always counts, and the first missing item; with joints and bus.
+    /// The first difference that counts in any case, and the first missing item, each with its joints and bus.
     first: Option<(Key, usize, FirstDifference)>,
     first_missing: Option<(Key, usize, FirstDifference)>,
 }
@@ -104,8 +104,8 @@ fn period_ns(skin: &Skin) -> u64 {
 }
 
 impl<'a> Comparison<'a> {
-    /// Creates a comparison before the first frames. The first joints have the numbers in `starts`, or else their
-    /// epochs.
+    /// Creates a comparison of two captures that have not been read yet. The first joints of each capture get the
+    /// number in `starts`, or else the number of their epoch.
     #[must_use]
     pub fn new(skin: &'a Skin, options: Options, starts: Both<Option<u64>>) -> Self {
         let period = period_ns(skin);
@@ -121,7 +121,8 @@ impl<'a> Comparison<'a> {
         }
     }
 
-    /// Returns the capture to read from next, which is the one behind; `None` when both have ended.
+    /// Returns the capture whose next frame must be read: the one that is behind in the run. Returns `None` when both
+    /// have ended.
     #[must_use]
     pub fn next(&self) -> Option<CaptureSide> {
         let Both { a, b } = &self.sides;
@@ -133,12 +134,12 @@ impl<'a> Comparison<'a> {
         }
     }
 
-    /// Handles a frame that was latched before the start of a capture.
+    /// Handles a packet from before the start of a capture, which still has an effect: a recording begins with these.
     pub fn begin(&mut self, which: CaptureSide, nanos: u64, bus: &str, message: &Message) {
         self.sides.of_mut(which).begin(nanos, bus, message);
     }
 
-    /// Handles the next frame of a capture; `message` is its meaning, if it has one.
+    /// Handles the next frame of a capture; `message` is the decoded message, if the frame completes one.
     pub fn receive(&mut self, which: CaptureSide, nanos: u64, bus: &str, message: Option<&Message>) {
         if self.sides.of_mut(which).take(nanos, bus, message) {
             self.pair();
@@ -151,7 +152,7 @@ impl<'a> Comparison<'a> {
         *dropped = dropped.saturating_add(frames);
     }
 
-    /// Declares that the times of a capture are meaningless.
+    /// Declares that the time stamps of a capture are meaningless.
     pub fn without_times(&mut self, which: CaptureSide) {
         self.sides.of_mut(which).has_times = false;
     }
@@ -164,13 +165,13 @@ impl<'a> Comparison<'a> {
         self.pair();
     }
 
-    /// Returns the reason why a complete capture has no joints of the skin; `None` if it has some.
+    /// Returns the reason why a capture that has been read to its end has no joints of the skin; `None` if it has some.
     pub fn not_found(&mut self, which: CaptureSide) -> Option<NotFound> {
         self.sides.of_mut(which).not_found()
     }
 
-    /// Returns the number of cells that reported a configuration, and of those among them with the skin's, if these are
-    /// fewer than half.
+    /// Returns two numbers of cells: those that reported a configuration, and those of them that have the skin's.
+    /// Returns `None` if these are at least half.
     #[must_use]
     pub fn other_configurations(&self, which: CaptureSide) -> Option<(usize, usize)> {
         let hash = |bus: usize, node| {
@@ -184,14 +185,14 @@ impl<'a> Comparison<'a> {
         (same * 2 < all).then_some((all, same))
     }
 
-    /// Compares all complete joints.
+    /// Compares the next joints of all buses, as long as their answers are complete in both captures.
     fn pair(&mut self) {
         for bus in 0..self.skin.buses.len() {
             while self.pair_on(bus).is_some() {}
         }
     }
 
-    /// Compares the next joints of a bus; `None` if they are not complete.
+    /// Compares the next joints of one bus; `None` if their answers may not be complete.
     fn pair_on(&mut self, bus: usize) -> Option<()> {
         let front = |side: &Side<'_>| side.buses.get(bus).and_then(|it| it.ready.front()).map(|it| it.key);
         let both = (front(&self.sides.a), front(&self.sides.b));
@@ -248,7 +249,8 @@ impl<'a> Comparison<'a> {
         }
     }
 
-    /// Keeps differences if they are the earliest so far: buses are not compared in order of time.
+    /// Keeps the first differences of these joints if they are the earliest so far; buses are not compared in order of
+    /// time.
     fn note(&mut self, bus: usize, moments: Both<Option<&Moment>>, firsts: FirstDifferences) {
         let Some(key) = moments.a.or(moments.b).map(|moment| moment.key) else { return };
         let is_first = |kept: &Option<(Key, usize, FirstDifference)>| {
@@ -281,7 +283,7 @@ impl<'a> Comparison<'a> {
         cell.map_or(0, |cell| cell.tracked.account.uplink().restarts)
     }
 
-    /// Returns the number of joints that are held.
+    /// Returns the number of joints that wait in memory to be compared.
     #[cfg(test)]
     fn held(&self) -> usize {
         self.sides.a.held() + self.sides.b.held()

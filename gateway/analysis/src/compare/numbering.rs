@@ -6,18 +6,18 @@
 
 use protocol::packet::Epoch;
 
-/// The position of a joints packet among all of a capture: its run and its number there.
+/// The position of a joints packet in a capture: a run of epochs, and a number in that run.
 #[derive(Clone, Copy, Debug, Default, Eq, Ord, PartialEq, PartialOrd)]
 pub(super) struct Key {
     /// Number of earlier restarts of the numbering.
     pub(super) run: u32,
-    /// The number since the start of that run.
+    /// The number of the joints since the start of the run.
     pub(super) number: u64,
 }
 
 /// Maximum number of epochs by which one bus may lag another.
 const MAX_BUS_LAG: u64 = 16;
-/// Tolerance for the elapsed time, in epochs.
+/// Maximum deviation of the elapsed time from the number of epochs, in epochs.
 const ELAPSED_TOLERANCE: u64 = 4;
 
 /// Numbers the joints of all buses of a capture, which share one counter.
@@ -25,7 +25,7 @@ const ELAPSED_TOLERANCE: u64 = 4;
 pub(super) struct Numbering {
     /// Period of epochs in ns, at least 1.
     period_ns: u64,
-    /// The number of the first joints, if known.
+    /// The number of the first joints in the capture, if known.
     start: Option<u64>,
     newest: Option<Newest>,
 }
@@ -38,7 +38,8 @@ struct Newest {
 }
 
 impl Numbering {
-    /// Creates a numbering; the first joints get the number `start`, or else their epoch.
+    /// Creates a numbering for joints that are `period_ns` apart. The first joints get the number `start`, or else the
+    /// number of their epoch.
     pub(super) const fn new(period_ns: u64, start: Option<u64>) -> Self {
         Self { period_ns: if period_ns == 0 { 1 } else { period_ns }, start, newest: None }
     }
@@ -48,7 +49,8 @@ impl Numbering {
         self.newest.map(|newest| newest.key)
     }
 
-    /// Returns the key of joints that follow `last` on their bus; `None` if they do not follow it.
+    /// Returns the key of joints that arrive after those with the key `last` on their bus; `None` if they are repeated
+    /// or out of order.
     pub(super) fn take(&mut self, nanos: u64, epoch: Epoch, last: Option<Key>) -> Option<Key> {
         let Some(newest) = self.newest else {
             let key = Key { run: 0, number: self.start.unwrap_or_else(|| epoch.0.into()) };
@@ -71,8 +73,8 @@ impl Numbering {
         last.is_none_or(|last| last < key).then_some(key)
     }
 
-    /// Returns the number of steps from the newest joints to those of an epoch after this number of periods; `None` if
-    /// the numbering restarted.
+    /// Returns the number of epochs from the newest joints to those of `epoch`, which arrive `elapsed` periods later;
+    /// `None` if the numbering restarted.
     fn steps(&self, newest: Newest, epoch: Epoch, elapsed: u64) -> Option<u64> {
         let modulo = u64::from(epoch.0.wrapping_sub(newest.epoch.0));
         let laps = (elapsed + 128).saturating_sub(modulo) / 256;
@@ -101,7 +103,7 @@ mod tests {
         Some(Key { run: 0, number })
     }
 
-    /// Numbers joints, given as number and period, on one bus.
+    /// Numbers the joints of one bus, each given as its number in the test and its time in periods.
     fn numbers(joints: &[(u64, u64)]) -> Vec<Option<Key>> {
         let (mut numbering, mut last) = (Numbering::new(PERIOD, None), None);
         let each = joints.iter().map(|&(number, period)| {

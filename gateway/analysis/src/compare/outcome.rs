@@ -1,4 +1,4 @@
-//! Sums the results of a comparison over all epochs and cells.
+//! Adds up the results of a comparison over all epochs and cells, into its report.
 
 use model::quantiles::Quantiles;
 use protocol::id::CellId;
@@ -9,7 +9,7 @@ use super::side::{ComparedCell, Side};
 use super::{ASPECTS, Both, Comparison, CaptureSide};
 
 impl Comparison<'_> {
-    /// Returns the outcome, once both captures have ended.
+    /// Returns the report; call it after both captures have ended.
     #[must_use]
     pub fn report(self) -> Report {
         let captures = Both { a: source(&self.sides.a), b: source(&self.sides.b) };
@@ -73,7 +73,7 @@ impl Comparison<'_> {
         self.sides.get(which).buses.get(bus)?.cells.get(node)
     }
 
-    /// Returns the cells that occur in one capture only, within the common time.
+    /// Returns the cells that send packets in only one of the captures, although both cover the time.
     fn extra_cells(&self) -> Vec<ExtraCell> {
         let range = |which| {
             let side = self.sides.get(which);
@@ -99,7 +99,7 @@ impl Comparison<'_> {
     }
 }
 
-/// Returns the aspects that differ.
+/// Returns the names of the aspects in which the captures differ.
 fn differs(report: &Report, lost: u64, are_missing: bool) -> Vec<&'static str> {
     let Report { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = report;
     let replies = |it: &Replies| it.different > 0 || are_missing && it.missing() > 0;

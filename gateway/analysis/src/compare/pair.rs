@@ -1,4 +1,4 @@
-//! Compares the same joints of both captures.
+//! Compares the joints packet with one number in both captures: its words, and the cells' answers to it.
 
 use model::tracker::PerCell;
 use protocol::fixed::{Q1_14, TorqueFormat};
@@ -13,7 +13,7 @@ use super::side::Moment;
 use super::{Both, Options};
 use crate::explain::CellMoment;
 
-/// The figures of one bus.
+/// The counts of a comparison for one bus.
 #[derive(Debug, Default)]
 pub(super) struct Tally {
     pub(super) joints: Joints,
@@ -24,19 +24,19 @@ pub(super) struct Tally {
     pub(super) cells: PerCell<Replies>,
 }
 
-/// A difference, before it is described.
+/// A difference that has been found, not yet described in words.
 #[derive(Debug, Default)]
 pub(super) struct FoundDifference {
     what: &'static str,
     how: &'static str,
     cell: Option<CellId>,
-    /// The words that differ most.
+    /// The pair of words that differ most.
     word: Option<Differing>,
     pub(super) inputs: Vec<&'static str>,
     unknown: Vec<&'static str>,
 }
 
-/// The first differences at an epoch. Missing items may be within the tolerance, so they are kept apart.
+/// The first differences at one joints packet. Missing items are kept apart, because they may be within the tolerance.
 #[derive(Debug, Default)]
 pub(super) struct FirstDifferences {
     pub(super) missing: Option<FoundDifference>,
@@ -65,12 +65,12 @@ impl FoundDifference {
         FirstDifferences { missing: Some(found), other: None }
     }
 
-    /// Returns the cell, if the difference belongs to one.
+    /// Returns the cell in which the captures differ; `None` for joints and halts.
     pub(super) const fn cell(&self) -> Option<CellId> {
         self.cell
     }
 
-    /// Describes the difference; `moments` are those of the two captures, if present.
+    /// Describes the difference for the report; `moments` are the joints and answers in both captures, if present.
     pub(super) fn describe(
         self,
         (skin, bus): (&Skin, usize),
@@ -111,7 +111,7 @@ const fn missing(in_a: bool) -> &'static str {
     if in_a { "missing in a" } else { "missing in b" }
 }
 
-/// Compares joints that both captures have. Returns the first differences.
+/// Compares a joints packet that both captures have, and the answers to it. Returns the first differences.
 pub(super) fn compare(
     tally: &mut Tally,
     (skin, bus): (&Skin, usize),
@@ -202,13 +202,13 @@ fn sums(
     }
 }
 
-/// A cell's reply in the two captures.
+/// A cell's reply to one joints packet, in both captures.
 struct Reply {
     what: &'static str,
     cell: CellId,
     words: [Option<Words>; 2],
     format: TorqueFormat,
-    /// Number of cells in each sum.
+    /// For sums, the number of cells in the sum of each capture.
     cells_in: Option<[u8; 2]>,
 }
 
@@ -263,7 +263,7 @@ impl Reply {
         }
     }
 
-    /// Returns the word with the largest difference.
+    /// Returns the pair of words of two replies with the largest difference; `None` if the words are equal.
     fn largest(&self, a: &Words, b: &Words, units: Units) -> Option<Differing> {
         // Tolerances are in steps of 1/4096, for sums in steps of 1/256.
         let fine =
@@ -347,7 +347,7 @@ fn contact(
     }
 }
 
-/// Returns the inputs of a cell that differ, and those that are unknown.
+/// Returns the names of a cell's inputs that differ between the captures, and of those that are unknown in one of them.
 fn inputs(
     Both { a, b }: Both<&Moment>,
     same_joints: bool,

@@ -8,51 +8,51 @@ use super::Both;
 /// The outcome of a comparison.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
-    /// True without relevant differences.
+    /// True if the captures have no difference beyond the tolerances.
     pub equal: bool,
     /// The aspects that differ, in the order of [`ASPECTS`].
     pub differs: Vec<&'static str>,
     /// The two captures.
     pub captures: Both<Source>,
-    /// Counts of joints that are in both captures or missing from one.
+    /// Counts of joints packets that are in both captures or missing from one.
     pub epochs: Epochs,
-    /// Words of joints.
+    /// Comparison of the words of joints.
     pub joints: Joints,
-    /// Epochs at which only one run was halted.
+    /// Epochs at which only one capture was halted.
     pub halts: UnpairedCounts,
-    /// Touches, by cell and epoch.
+    /// Comparison of touches, counted by cell and epoch.
     pub contacts: Contacts,
-    /// Torques of single cells.
+    /// Comparison of the torques of single cells.
     pub torques: Replies,
-    /// Sums of roots.
+    /// Comparison of the sums of roots.
     pub sums: Replies,
     /// Cells with differences or losses, by bus and node id.
     pub cells: Vec<CellRow>,
-    /// Cells without packets in one of the captures.
+    /// Cells that send packets in only one of the captures.
     pub extra_cells: Vec<ExtraCell>,
-    /// The first difference.
+    /// The first difference; `None` if the captures are equal.
     pub first: Option<FirstDifference>,
 }
 
 /// The compared aspects.
 pub const ASPECTS: [&str; 7] = ["epochs", "joints", "halts", "contacts", "torques", "sums", "cells"];
 
-/// The figures of one capture.
+/// Counts and times of one of the two captures.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Source {
-    /// Frames.
+    /// Number of frames.
     pub frames: u64,
-    /// Joints on all buses.
+    /// Number of joints packets on all buses.
     pub epochs: u64,
     /// The number of the first joints since the run began.
     pub first: Option<u64>,
     /// The number of the last joints.
     pub last: Option<u64>,
-    /// The time of the last joints in s of the run; absent if the log has no times.
+    /// The time of the last joints in s since the run began; absent if the log has no times.
     pub last_s: Option<f64>,
-    /// Number of runs, each with epochs from 0.
+    /// Number of times that the epochs began anew at 0, counted as runs.
     pub countings: u32,
-    /// Number of joints out of order, which are skipped.
+    /// Number of joints packets out of order, which are skipped.
     pub out_of_order: u64,
     /// Frames that the recorder lost.
     pub dropped: u64,
@@ -62,11 +62,11 @@ pub struct Source {
     pub torques: u64,
     /// Sums of roots that arrived in time to be used.
     pub sums: u64,
-    /// Replies after the next joints.
+    /// Replies that arrived after the next joints.
     pub late: u64,
-    /// Late replies that were too late to be used.
+    /// Late replies that arrived too late to be used for their epoch; `late` includes them.
     pub too_late: u64,
-    /// Packets that cells counted but that are not in the capture.
+    /// Packets that cells sent by their own counters but that are not in the capture.
     pub lost: u64,
     /// Restarts of cells.
     pub restarts: u64,
@@ -74,27 +74,27 @@ pub struct Source {
     pub reply_us: Option<Quantiles>,
 }
 
-/// Counts of joints by number, over all buses.
+/// Counts of joints packets by their number in the run, over all buses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Epochs {
-    /// Joints in both captures.
+    /// Joints packets that are in both captures.
     pub compared: u64,
-    /// Joints missing from A, but in B within the common time.
+    /// Joints packets that B has and A lacks, at times that both captures cover.
     pub missing_in_a: u64,
-    /// Joints missing from B, but in A within the common time.
+    /// Joints packets that A has and B lacks, at times that both captures cover.
     pub missing_in_b: u64,
-    /// Joints in one capture before the start of the other.
+    /// Joints packets of one capture from before the start of the other.
     pub before: UnpairedCounts,
-    /// Joints in one capture after the end of the other.
+    /// Joints packets of one capture from after the end of the other.
     pub after: UnpairedCounts,
 }
 
 /// Counts of items that only one capture has.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct UnpairedCounts {
-    /// Items in A only.
+    /// Number of items in A only.
     pub only_a: u64,
-    /// Items in B only.
+    /// Number of items in B only.
     pub only_b: u64,
 }
 
@@ -110,20 +110,20 @@ impl UnpairedCounts {
     }
 }
 
-/// Words of joints in epochs that both captures have.
+/// Comparison of the words of joints in epochs that both captures have.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Joints {
-    /// Epochs with equal words.
+    /// Epochs whose words are equal.
     pub equal: u64,
-    /// Epochs with differences within the tolerance.
+    /// Epochs whose words differ within the tolerance.
     pub tolerated: u64,
-    /// Epochs with larger differences.
+    /// Epochs whose words differ by more than the tolerance.
     pub different: u64,
-    /// The largest difference of a word.
+    /// The largest difference of a joint word, in steps of 2^-14.
     pub max_steps: u32,
 }
 
-/// Touches; each counts a cell in an epoch.
+/// Counts of touches; a touch of one cell counts once in each epoch.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Contacts {
     /// Touches in both captures.
@@ -133,24 +133,24 @@ pub struct Contacts {
     pub only: UnpairedCounts,
 }
 
-/// Replies in epochs that both captures have.
+/// Comparison of replies in epochs that both captures have.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Replies {
-    /// Replies with equal words.
+    /// Replies whose words are equal.
     pub equal: u64,
-    /// Replies with differences within the tolerance.
+    /// Replies whose words differ within the tolerance.
     pub tolerated: u64,
-    /// Replies with larger differences.
+    /// Replies whose words differ by more than the tolerance.
     pub different: u64,
-    /// Different replies despite the same joints, contact state and configuration.
+    /// Different replies of a cell that has the same joints, contact state and configuration in both captures.
     pub different_with_same_inputs: u64,
     /// Replies in B only.
     pub missing_in_a: u64,
     /// Replies in A only.
     pub missing_in_b: u64,
-    /// Replies in one capture only, at the last joints of the other, which ended before the reply.
+    /// Replies in one capture only, where the other capture ended before the reply was due.
     pub open: u64,
-    /// The largest difference of a word.
+    /// The largest difference of a word, in steps of the tolerance.
     pub max_steps: u32,
 }
 
@@ -162,75 +162,76 @@ impl Replies {
     }
 }
 
-/// The figures of one cell.
+/// The comparison of one cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CellRow {
-    /// Its bus.
+    /// Name of the cell's bus.
     pub bus: String,
-    /// Its node id.
+    /// Node id of the cell.
     pub node: u8,
-    /// Its torques or sums.
+    /// Comparison of the cell's torques or sums.
     #[serde(flatten)]
     pub replies: Replies,
-    /// Its losses in each capture.
+    /// Losses of the cell in each capture.
     pub losses: Both<Losses>,
 }
 
 /// Losses of a cell in one capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Losses {
-    /// Replies after the next joints.
+    /// Replies that arrived after the next joints.
     pub late: u64,
-    /// Late replies that were too late to be used.
+    /// Late replies that arrived too late to be used; `late` includes them.
     pub too_late: u64,
-    /// Packets that it counted but that are not in the capture.
+    /// Packets that the cell sent by its own counter but that are not in the capture.
     pub lost: u64,
-    /// Restarts.
+    /// Restarts of the cell.
     pub restarts: u64,
 }
 
-/// A cell that occurs in one capture only.
+/// A cell that sends packets in only one of the captures.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct ExtraCell {
-    /// Its bus.
+    /// Name of the cell's bus.
     pub bus: String,
-    /// Its node id.
+    /// Node id of the cell.
     pub node: u8,
-    /// The capture that has it: `a` or `b`.
+    /// The capture in which the cell sends: `a` or `b`.
     pub only_in: &'static str,
 }
 
-/// The first difference.
+/// The first difference between the captures.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct FirstDifference {
-    /// The item: `epoch`, `joints`, `halt`, `contact`, `torque` or `sum`.
+    /// The item that differs: `epoch`, `joints`, `halt`, `contact`, `torque` or `sum`.
     pub what: &'static str,
-    /// The difference: `different`, `missing in a` or `missing in b`.
+    /// The kind of difference: `different`, `missing in a` or `missing in b`.
     pub how: &'static str,
-    /// The bus.
+    /// Name of the bus.
     pub bus: String,
-    /// The cell, if the difference belongs to one.
+    /// Node id of the cell; `None` for a difference of joints or halts.
     pub cell: Option<u8>,
-    /// The robot's joint, from 1, if words differ.
+    /// The robot's joint whose words differ most, from 1; `None` if words do not differ.
     pub joint: Option<u8>,
-    /// The epoch.
+    /// The epoch of the difference.
     pub epoch: u8,
-    /// The number of its joints since the run began.
+    /// The number of that epoch's joints since the run began.
     pub number: u64,
-    /// The time of the joints in s of each run; absent without joints, and if a log has no times.
+    /// The time of the joints in s of each run; absent if a capture lacks the joints or has no times.
     pub time_s: Both<Option<f64>>,
-    /// The words.
+    /// The differing words in each capture.
     pub words: Both<Option<i16>>,
-    /// The values of the words, in [`First::unit`].
+    /// The values of the differing words, in [`First::unit`].
     pub values: Both<Option<f64>>,
-    /// Nm, N, rad or m; absent without words.
+    /// Unit of `values`: Nm, N, rad or m; absent without words.
     pub unit: Option<&'static str>,
     /// The difference in steps of the tolerance; absent without words.
     pub steps: Option<u32>,
-    /// The inputs of the cell that differ: `joints`, `halt`, `stimulus`, `configuration`, `restart`, `cells`.
+    /// The inputs of the cell that differ between the captures: `joints`, `halt`, `stimulus`, `configuration`,
+    /// `restart`, `cells`.
     pub inputs: Vec<&'static str>,
-    /// The inputs that are unknown in at least one capture.
+    /// The inputs of the cell that are unknown in at least one capture.
     pub unknown_inputs: Vec<&'static str>,
-    /// The occurrence of this epoch in each capture, as counted by `skinbus explain --occurrence`.
+    /// The number of the epoch's occurrence in each capture, from 1, for `skinbus explain --occurrence`.
     pub occurrence: Both<Option<u32>>,
 }

@@ -14,21 +14,21 @@ use super::numbering::{Key, Numbering};
 use super::report::Source;
 use crate::explain::{self, NotFound, Watch};
 
-/// Number of epochs by which other buses must be ahead before a silent bus is skipped.
+/// Number of epochs after which a silent bus is no longer waited for, while other buses continue.
 const SILENT_BUS_EPOCHS: u64 = 64;
 
-/// A joints packet of one bus, and its answers.
+/// A joints packet on one bus of a capture, and the answers to it.
 #[derive(Debug)]
 pub(super) struct Moment {
     pub(super) key: Key,
     pub(super) epoch: Epoch,
     /// The occurrence of this epoch on its bus, from 1, as counted by `skinbus explain`.
     pub(super) occurrence: u32,
-    /// The joints, the cells' contact states and torques.
+    /// The joints, and each cell's contact state and torque.
     pub(super) watched: explain::Moment,
     /// The sums of roots.
     pub(super) sums: Vec<(CellId, Sum)>,
-    /// True if enough joints followed that no answer is outstanding.
+    /// True if enough joints have followed that no more answers can arrive.
     pub(super) is_settled: bool,
 }
 
@@ -40,10 +40,10 @@ pub(super) struct Sum {
     nanos: u64,
 }
 
-/// A joints packet with outstanding answers.
+/// A joints packet whose answers may still arrive.
 #[derive(Debug)]
 struct Pending {
-    /// `None` for joints out of order, which are skipped.
+    /// Position of the joints in the run; `None` for joints out of order, which are skipped.
     key: Option<Key>,
     epoch: Epoch,
     occurrence: u32,
@@ -52,20 +52,20 @@ struct Pending {
     sums: Vec<(CellId, Sum)>,
 }
 
-/// A cell of one capture.
+/// The packets of one cell in a capture.
 #[derive(Clone, Debug, Default)]
 pub(super) struct ComparedCell {
     pub(super) tracked: CellTracker,
-    /// Answers after the next joints, and those of them that were too late to be used.
+    /// Number of answers that arrived after the next joints, and of those among them that were too late to be used.
     pub(super) late: u64,
     pub(super) too_late: u64,
-    /// The keys of the joints before its first and its last packet.
+    /// The keys of the last joints before the cell's first packet, and before its last packet.
     pub(super) active_range: Option<(Key, Key)>,
 }
 
 #[derive(Debug, Default)]
 pub(super) struct BusSide {
-    /// Number of joints of the chain.
+    /// Number of joints of the bus's chain.
     chain: usize,
     roots: Vec<CellId>,
     last: Option<Epoch>,
@@ -73,17 +73,17 @@ pub(super) struct BusSide {
     occurrences: Vec<u32>,
     joints: u64,
     pending: VecDeque<Pending>,
-    /// Joints with complete answers.
+    /// Joints packets with complete answers, ready to be compared.
     pub(super) ready: VecDeque<Moment>,
     pub(super) cells: PerCell<ComparedCell>,
 }
 
-/// Returns true if joints are so far behind that no more of their bus can arrive before the newest ones.
+/// Returns true if the joints at `key` are so far behind the newest ones that nothing for them can arrive any more.
 const fn is_far(newest: Key, key: Key) -> bool {
     newest.run > key.run || newest.run == key.run && newest.number > key.number + SILENT_BUS_EPOCHS
 }
 
-/// Reads one capture.
+/// One capture of a comparison, as far as it has been read.
 #[derive(Debug)]
 pub(super) struct Side<'a> {
     skin: &'a Skin,
@@ -91,14 +91,14 @@ pub(super) struct Side<'a> {
     numbering: Numbering,
     period_ns: u64,
     pub(super) buses: Vec<BusSide>,
-    /// The first joints and their time.
+    /// The first joints packet and its time in ns.
     pub(super) first: Option<(Key, u64)>,
-    /// The time of the last joints.
+    /// The time of the last joints packet in ns.
     last_nanos: Option<u64>,
     pub(super) is_ended: bool,
     pub(super) has_times: bool,
     reply: Times,
-    /// The figures that grow with each frame.
+    /// The counts of the report that grow with each frame.
     pub(super) counts: Source,
 }
 
@@ -125,7 +125,7 @@ impl<'a> Side<'a> {
         }
     }
 
-    /// Handles a frame that was latched before the start of the capture.
+    /// Handles a packet from before the start of the capture, which still has an effect.
     pub(super) fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
         self.watch.begin(nanos, bus, message);
         if let Message::Joints { epoch, joints } = message
@@ -140,7 +140,8 @@ impl<'a> Side<'a> {
         self.buses.get_mut(at)
     }
 
-    /// Handles the next frame; `message` is its meaning, if it has one. Returns true if joints may now be complete.
+    /// Handles the next frame; `message` is the decoded message, if the frame completes one. Returns true if the
+    /// answers to some joints may be complete now.
     pub(super) fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         self.counts.frames += 1;
         let at = self.skin.bus_named(bus);
@@ -159,7 +160,7 @@ impl<'a> Side<'a> {
         is_new
     }
 
-    /// Handles joints by the same rules as [`Watch`]. Returns true if they are new.
+    /// Handles a joints packet by the same rules as [`Watch`]. Returns true if it begins a new epoch.
     fn joints(&mut self, at: usize, nanos: u64, epoch: Epoch, joints: &Joints) -> bool {
         let Some(bus) = self.buses.get_mut(at) else { return false };
         if usize::from(joints.in_use) != bus.chain || bus.last == Some(epoch) {
@@ -217,7 +218,7 @@ impl<'a> Side<'a> {
         }
     }
 
-    /// Ends the capture.
+    /// Ends the capture: all answers count as complete.
     pub(super) fn end(&mut self) {
         self.collect(true);
         self.is_ended = true;
@@ -257,7 +258,7 @@ impl<'a> Side<'a> {
         self.numbering.newest()
     }
 
-    /// Returns true if joints of a bus that are not ready by now cannot arrive any more.
+    /// Returns true if the joints at `key` are not ready on a bus and can no longer arrive there.
     pub(super) fn is_past(&self, bus: usize, key: Key) -> bool {
         let Some(side) = self.buses.get(bus) else { return true };
         let is_pending = side.pending.iter().any(|pending| pending.key.is_some_and(|it| it <= key));
@@ -265,7 +266,7 @@ impl<'a> Side<'a> {
         !is_pending && (self.is_ended || is_behind || self.newest().is_some_and(|it| is_far(it, key)))
     }
 
-    /// Returns the time of joints in s of the run; `None` if the capture has no times.
+    /// Converts a time in ns to s of the run; `None` if the capture has no times.
     #[expect(clippy::cast_precision_loss, reason = "for display")]
     pub(super) fn seconds(&self, nanos: u64) -> Option<f64> {
         let (first, began) = self.first.filter(|_| self.has_times)?;
@@ -283,7 +284,7 @@ impl<'a> Side<'a> {
         &self.reply
     }
 
-    /// Returns the number of joints that are held.
+    /// Returns the number of joints packets in memory.
     #[cfg(test)]
     pub(super) fn held(&self) -> usize {
         self.buses.iter().map(|bus| bus.ready.len() + bus.pending.len()).sum()

@@ -109,7 +109,7 @@ fn equal(skin: &Skin, a: &Frames, b: &Frames) -> Report {
     compared(skin, Options::default(), a, b)
 }
 
-/// Returns the frames with the first matching message changed.
+/// Returns the frames with the first message that satisfies `is` replaced by `to`, or removed.
 fn changed(frames: &Frames, is: impl Fn(&Message) -> bool, to: Option<Message>) -> Frames {
     let mut frames = frames.clone();
     let at = frames.iter().position(|(_, _, message)| is(message)).unwrap();

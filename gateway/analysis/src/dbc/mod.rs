@@ -44,29 +44,29 @@ pub fn dbc(skin: &Skin, bus: usize) -> String {
     out
 }
 
-/// A sender or receiver.
+/// A sender or receiver of a message.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum DbcNode {
     Gateway,
     Cell(u8),
     /// All cells of the bus.
     Cells,
-    /// A node that is not in the skin.
+    /// A node that the skin does not contain.
     Unnamed,
 }
 
-/// The send schedule of a message.
+/// The times at which a message is sent.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum SendSchedule {
-    /// On events.
+    /// The message is sent on events.
     Seldom,
-    /// Periodic, with the period in ms.
+    /// The message is periodic, with the period in ms.
     Every(u32),
-    /// Periodic while the cell is in contact, with the period in ms.
+    /// The message is periodic while the cell is in contact, with the period in ms.
     WhileActive(u32),
 }
 
-/// The message of one identifier.
+/// The DBC message of one identifier: its sender, receivers, schedule and signals.
 #[derive(Clone, Debug, PartialEq)]
 struct Message {
     id: Id,
@@ -75,7 +75,7 @@ struct Message {
     to: DbcNode,
     rhythm: SendSchedule,
     comment: &'static str,
-    /// Its length.
+    /// Length of the message's data.
     length: Length,
     signals: Vec<Signal>,
 }
@@ -106,7 +106,7 @@ fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
     packets().iter().flat_map(of).collect()
 }
 
-/// Returns the message of this kind from a cell or to it, or a command.
+/// Returns the DBC message for a kind of packet that a cell sends or receives, or for a command to all cells.
 fn message(schema: &'static PacketSchema, node: Node, period_ms: u32, chain: &signal::Chain) -> Message {
     let PacketSchema { kind, command, meaning, .. } = schema;
     let cell = if command.is_some() { DbcNode::Cells } else { DbcNode::Cell(node.to_byte()) };

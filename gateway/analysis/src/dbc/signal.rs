@@ -8,23 +8,23 @@ use protocol::packet::{Length, WORDS};
 use protocol::parameters::Parameter;
 use protocol::schema::{Field, FieldFormat, Layout, PacketSchema, FieldRange, Units, parameters, reasons};
 
-/// The end of the words in a packet of six words, in bits.
+/// Position after the last word in a packet of six words, in bits.
 const END: usize = WORDS * 16;
 
-/// The joints, torques and sums of a bus.
+/// The units and lengths of the joints, torques and sums on a bus.
 #[derive(Debug)]
 pub(super) struct Chain {
-    /// Their length.
+    /// Number of words in a joints, torque or sum packet.
     pub(super) length: Length,
-    /// Their units.
+    /// Units of joints, torques and sums.
     pub(super) units: Units,
     /// Number of rows of the chain's table.
     pub(super) rows: usize,
 }
 
 impl Chain {
-    /// Returns true if packets of a kind have this page on the bus: cells have no more rows than the chain, or than the
-    /// minimum of an image.
+    /// Returns true if packets of this kind can have the page `layout` on the bus. A page for a row of the chain exists
+    /// only up to the number of rows of the chain, or the minimum of a firmware image.
     fn has(&self, kind: Kind, layout: &Layout) -> bool {
         let is_parameter = matches!(kind, Kind::Configure | Kind::Configured);
         match Parameter::from_number(layout.number) {
@@ -36,14 +36,14 @@ impl Chain {
     }
 }
 
-/// The presence of a signal.
+/// The packets of a message in which a signal is present.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Page {
-    /// In every packet of the message.
+    /// The signal is in every packet of the message.
     Every,
-    /// In every packet; it is the number of the page.
+    /// The signal is in every packet, and is the page number that selects the others.
     Number,
-    /// On one page.
+    /// The signal is only in packets with this page number.
     Only(u8),
 }
 
@@ -52,20 +52,20 @@ pub(super) enum Page {
 pub(super) struct Signal {
     pub(super) name: String,
     pub(super) page: Page,
-    /// The first bit; bit 0 is the least significant bit of byte 0.
+    /// The first bit of the signal; bit 0 is the least significant bit of byte 0.
     pub(super) start: usize,
     pub(super) bits: u8,
     pub(super) signed: bool,
-    /// The value of one step, in the unit.
+    /// The value of one step, in the unit of the signal.
     pub(super) factor: f64,
     /// The smallest and the largest valid value.
     pub(super) range: [f64; 2],
     pub(super) unit: &'static str,
-    /// Named values.
+    /// Names of some values, for the section `VAL_`.
     pub(super) names: Vec<(i64, &'static str)>,
 }
 
-/// Returns the signals of a kind of packet: those of its pages, of bytes 12 and 13, and the CRC.
+/// Returns the signals of a kind of packet: the fields of its pages, the fields in bytes 12 and 13, and the CRC.
 pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) -> Vec<Signal> {
     let one_page = schema.layouts.len() == 1;
     // The fields after the words are further back in a longer packet.
@@ -100,7 +100,7 @@ pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) 
     signals
 }
 
-/// Returns the names of page or parameter numbers.
+/// Returns the numbers of pages or parameters, each with its name.
 fn numbers(layouts: impl IntoIterator<Item = &'static Layout>) -> Vec<(i64, &'static str)> {
     layouts.into_iter().map(|layout| (i64::from(layout.number), layout.name.as_str())).collect()
 }
@@ -121,7 +121,7 @@ fn bits(name: String, start: usize, bits: u8) -> Signal {
     }
 }
 
-/// Returns the signals of one field: one per element, and one per bit with its own meaning.
+/// Returns the signals of a field: one for each element, or for a field of flags one for each named bit.
 fn of(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
     let at = field.first_bit();
     let named = |label: &str| field.signal_name(prefix, label);

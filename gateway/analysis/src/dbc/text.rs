@@ -10,7 +10,7 @@ use super::{Message, DbcNode, SendSchedule, are_packets};
 
 /// The format's placeholder for an unnamed sender or receiver.
 const UNNAMED: &str = "Vector__XXX";
-/// The sections that may occur.
+/// The sections of the DBC format that the text may contain.
 const SECTIONS: [&str; 6] = ["CM_", "BA_DEF_", "BA_", "VAL_", "BA_DEF_DEF_", "SIG_VALTYPE_"];
 /// The values of `VFrameFormat`; the last but one is an FD frame with an 11-bit identifier.
 const FRAME_FORMATS: [&str; 16] = [
@@ -117,7 +117,7 @@ fn parties(out: &mut impl Write, party: DbcNode, everyone: &[u8]) -> fmt::Result
     }
 }
 
-/// Writes the comment about the whole file.
+/// Writes the comment on the whole file: its skin, bus and limits.
 fn about(out: &mut impl Write, skin: &Skin, bus: &SkinBus) -> fmt::Result {
     // A quotation mark would end the comment.
     let [skin, bus_name] = [&skin.name, &bus.name].map(|name| name.replace('"', "'"));

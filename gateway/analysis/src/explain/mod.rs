@@ -30,10 +30,10 @@ use serde::Serialize;
 use self::row::{jacobian_steps, number, row};
 use model::central::Central;
 
-/// The explanation of one epoch.
+/// The derivation of all torques of one epoch.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Explanation {
-    /// The joints of each bus.
+    /// The joints on each bus that has them.
     pub buses: Vec<BusExplained>,
     /// Cells that were in contact or answered, by bus and node id.
     pub cells: Vec<CellExplained>,
@@ -43,48 +43,48 @@ pub struct Explanation {
     pub missing: Vec<String>,
 }
 
-/// The joints that were sent on a bus.
+/// The joints that were sent on a bus in the epoch.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BusExplained {
-    /// Its name.
+    /// Name of the bus.
     pub bus: String,
-    /// Time of the joints.
+    /// Time of the joints in ns since 1970.
     pub at_ns: u64,
-    /// The joints of its chain, by their number in the robot, from 1.
+    /// The numbers of the chain's joints in the robot, from 1.
     pub joints: Vec<u8>,
-    /// The words of these joints.
+    /// The joint words, in the order of `joints`.
     pub position_words: Vec<i16>,
-    /// The positions in rad, or m for prismatic joints.
+    /// The positions of these joints, in rad, or m for prismatic joints.
     pub position_rad: Vec<f64>,
     /// The units of the positions.
     pub units: Vec<&'static str>,
-    /// The format of its cells' torque words.
+    /// Torque format of the bus, such as `Q3.12`.
     pub torque_format: &'static str,
-    /// True if it was halted.
+    /// True if the bus was halted.
     pub halted: bool,
 }
 
-/// The explanation of one cell.
+/// The derivation of one cell's torque.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CellExplained {
-    /// Its bus.
+    /// Name of the cell's bus.
     pub bus: String,
-    /// Its node id.
+    /// Node id of the cell.
     pub node: u8,
-    /// The robot's joint that moves it, from 1.
+    /// The robot's joint that moves the cell, from 1.
     pub joint: u8,
-    /// Its contact state and the force computed from it; absent if unknown.
+    /// The contact state of the cell, and the force computed from it; absent if unknown.
     pub force: Option<Force>,
-    /// The time from the joints to its torque; absent if none arrived.
+    /// Time in ns from the joints to the torque of the cell; absent if none arrived.
     pub answered_after_ns: Option<u64>,
-    /// The rows, one per joint.
+    /// The derivation of the torque on each joint.
     pub rows: Vec<Row>,
 }
 
-/// The steps of Algorithm 1.
+/// The steps of Algorithm 1 from a cell's sensor words to the force F_z.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Force {
-    /// The source of its contact state.
+    /// The packet from which the cell's contact state is known.
     pub origin: Origin,
     /// The three contact words in N.
     pub contact_n: [f64; 3],
@@ -92,17 +92,17 @@ pub struct Force {
     pub proximity: f64,
     /// The sum of the contact words in N, F_c.
     pub touch_n: f64,
-    /// Below this threshold, F_c counts as zero.
+    /// Threshold in N: below it, F_c counts as zero.
     pub contact_threshold_n: f64,
-    /// Below this threshold, the proximity counts as zero.
+    /// Threshold of the proximity: below it, the proximity counts as zero.
     pub proximity_threshold: f64,
-    /// Weight of F_c.
+    /// Weight alpha_c of F_c.
     pub alpha_c: f64,
-    /// Weight of the proximity in N.
+    /// Weight alpha_p of the proximity, in N.
     pub alpha_p_n: f64,
-    /// The fused force in N: alpha_c F_c + alpha_p F_p, each above its threshold.
+    /// The fused force in N: alpha_c F_c + alpha_p F_p, where each term counts only above its threshold.
     pub fused_n: f64,
-    /// Below this threshold, the fused force counts as zero.
+    /// Threshold in N: below it, the fused force counts as zero.
     pub force_threshold_n: f64,
     /// F_z in steps of 2^-16 N, as used by the cell.
     pub force_steps: i64,
@@ -110,47 +110,49 @@ pub struct Force {
     pub force_n: f64,
 }
 
-/// The totals at one joint of the whole skin.
+/// The torque of the whole skin on one joint, as sent and as computed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Total {
-    /// The joint, from 1.
+    /// Number of the joint in the robot, from 1.
     pub joint: u8,
-    /// The unit of its torques; N for a prismatic joint.
+    /// Unit of the torques on the joint: Nm, or N for a prismatic joint.
     pub unit: &'static str,
-    /// The sum of the frames' words in steps of 2^-12 Nm.
+    /// The sum of all received words in steps of 2^-12 Nm.
     pub word_steps: i64,
-    /// The sum of the words in Nm.
+    /// The sum of all received words in Nm.
     pub words_nm: f64,
-    /// The sum of the exact products of the cells that answered, in Nm.
+    /// The sum of the exact products J F_z of the cells that answered, in Nm.
     pub products_nm: f64,
-    /// The central computation on all known contact states, in Nm.
+    /// The central computation over all cells with a known contact state, in Nm.
     pub central_nm: f64,
-    /// The central computation with the unrounded values of the skin's file.
+    /// The central computation as in `central_nm`, but with the unrounded values of the skin's file.
     pub unrounded_nm: f64,
     /// Words minus central computation, in Nm.
     pub difference_nm: f64,
     /// Number of cells with a saturated word, which make the sum inexact.
     pub saturated: u32,
-    /// Number of cells without a known word or a known force, so that the sums are not comparable.
+    /// Number of cells with an unknown word or force. If above zero, the sums cannot be compared.
     pub open: u32,
 }
 
-/// Explains the joints found on each of the skin's buses.
+/// Derives the torques for these joints; `moments` has the joints and answers of each bus of the skin, `None` if
+/// missing.
 #[must_use]
 pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
     Explainer::new(skin).explain(moments)
 }
 
-/// The precomputed data for explaining any epoch of a skin.
+/// The data of a skin that are computed once to explain any number of epochs.
 #[derive(Debug)]
 pub struct Explainer<'a> {
     skin: &'a Skin,
-    /// For each bus: its part of the skin, and the central computation with words and with the file's numbers.
+    /// For each bus, the skin reduced to that bus, and two central computations: with the cells' words, and with the
+    /// file's numbers.
     buses: Vec<(Skin, [Central; 2])>,
 }
 
 impl<'a> Explainer<'a> {
-    /// Prepares the explanation of a skin's epochs.
+    /// Prepares a skin for explanations.
     #[must_use]
     pub fn new(skin: &'a Skin) -> Self {
         let parts = (0..skin.buses.len()).map(|bus| {
@@ -161,7 +163,8 @@ impl<'a> Explainer<'a> {
         Self { skin, buses: parts.collect() }
     }
 
-    /// Explains the joints found on each of the skin's buses.
+    /// Derives the torques for these joints; `moments` has the joints and answers of each bus of the skin, `None` if
+    /// missing.
     #[must_use]
     pub fn explain(&self, moments: &[Option<Moment>]) -> Explanation {
         explain_with(self.skin, &self.buses, moments)
@@ -222,7 +225,7 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
                 };
                 let node = cell.node;
                 explanation.missing.push(format!(
-                    "{name} {node}: no torque of this epoch in time: {why}; the sum of words lacks it"
+                    "{name} {node}: no torque of this epoch arrived in time: {why}; the sum of words does not contain it"
                 ));
             }
             let newtons = force.map_or(0.0, |force| force.fused_or_none());
@@ -319,12 +322,12 @@ fn silence(halted: bool, state: Option<State>) -> &'static str {
     } else if state.is_some_and(|state| !state.has(State::CONFIGURED)) {
         "it had no configuration"
     } else {
-        "lost, or the cell was not there"
+        "it was lost, or the cell was not on the bus"
     }
 }
 
-/// Returns the contact state of a cell, if its torque can be computed from it; otherwise adds the reason to `missing`,
-/// if it matters.
+/// Returns the contact state of a cell, if its torque can be computed from that state. Otherwise adds the reason to
+/// `missing`, if the cell answered or may be in contact.
 fn known(
     skin: &Skin,
     bus: &str,
@@ -365,13 +368,13 @@ fn known(
 }
 
 impl Force {
-    /// Returns the fused force above the threshold, in N: exact, before the cell rounds it.
+    /// Returns the fused force in N, exact and before the cell rounds it; 0 below the threshold.
     const fn fused_or_none(&self) -> f64 {
         if self.force_steps > 0 { self.fused_n } else { 0.0 }
     }
 }
 
-/// Algorithm 1 in `f64`, in which every word, sum and product of it is exact.
+/// Computes Algorithm 1 in `f64`, in which every word, sum and product is exact.
 #[expect(clippy::cast_possible_truncation, reason = "at most 2^36 steps of 2^-24: exact")]
 fn force(cell: &Cell, sensors: &SkinSensors, origin: Origin) -> Force {
     let rule = &cell.contact;

@@ -1,46 +1,46 @@
-//! The errors of a capture that has nothing to explain.
+//! The errors for a capture that does not contain the joints to explain.
 
 use thiserror::Error;
 
-/// The reason why there is nothing to explain.
+/// The reason why the joints to explain were not found.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum NotFound {
     /// The capture has none of the skin's buses.
     #[error("none of its buses ({capture}) is one of the skin's ({skin})")]
     Buses {
-        /// The buses of the capture.
+        /// Names of the buses in the capture.
         capture: String,
-        /// The buses of the skin.
+        /// Names of the skin's buses.
         skin: String,
     },
-    /// The capture has no joints.
+    /// The capture has no joints on the skin's buses.
     #[error("there are no joints on {buses}, and cells answer only joints")]
     Joints {
-        /// The skin's buses that are in the capture.
+        /// Names of the skin's buses that are in the capture.
         buses: String,
     },
     /// The joints belong to another robot.
     #[error("{}", another_robot(bus, *came, *chain))]
     Robot {
-        /// The bus.
+        /// Name of the bus.
         bus: String,
         /// Number of joints in the packet.
         came: usize,
         /// Number of joints of the skin's chain.
         chain: usize,
     },
-    /// The requested epoch does not occur, or not often or late enough.
+    /// The requested epoch does not occur, occurs less often than requested, or occurs only before the requested time.
     #[error("there are no joints {requested}; there are {runs}")]
     Epoch {
-        /// The requested joints.
+        /// Description of the requested joints.
         requested: String,
-        /// The epochs that occur, in order, with their times.
+        /// The runs of epochs in the capture, in order, with their times.
         runs: String,
     },
 }
 
-/// Returns the text for a skin and a bus' joints that belong to different robots.
+/// Returns the text of the error for joints of `came` values, on a bus whose chain has `chain` joints.
 #[must_use]
 pub fn another_robot(bus: &str, came: usize, chain: usize) -> String {
     format!(

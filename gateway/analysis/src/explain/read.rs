@@ -11,13 +11,14 @@ use super::watch::{Moment, RequestedJoints, Watch};
 /// The content of a capture up to the requested joints.
 #[derive(Debug)]
 pub struct FoundJoints {
-    /// The joints and answers on each bus.
+    /// The joints and answers on each bus of the skin, `None` for a bus without these joints; or the reason why no bus
+    /// has them.
     pub moments: Result<Vec<Option<Moment>>, NotFound>,
-    /// The origin of times in s, in ns since 1970.
+    /// Time that counts as 0 s, in ns since 1970.
     pub zero_ns: u64,
-    /// True if the origin is the first tick of the run, false if it is the first frame.
+    /// True if `zero_ns` is the first tick of the run, false if it is the first frame.
     pub is_of_run: bool,
-    /// Number of frames before the joints that the recorder lost.
+    /// Number of frames before the joints that the recorder of the capture lost.
     pub dropped: u64,
     /// Number of unreadable lines before the joints.
     pub unreadable: u64,

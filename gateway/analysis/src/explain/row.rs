@@ -1,4 +1,4 @@
-//! One word of a cell's torque: its expected value, and the cause of a difference.
+//! One word of a cell's torque: its expected value, and the cause if it differs.
 
 use protocol::fixed::{Acc, TorqueFormat, is_saturated};
 use protocol::packet::Words;
@@ -12,47 +12,47 @@ use super::Force;
 /// arms of any shape. Each row of the chain after the sixth, up to the cell's, adds one.
 pub const JACOBIAN_STEPS: i64 = 8;
 
-/// One joint of one cell's torque.
+/// The torque of one cell on one joint: as sent, and as computed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Row {
-    /// The joint, from 1.
+    /// Number of the joint in the robot, from 1.
     pub joint: u8,
-    /// The unit of its torques; N for a prismatic joint.
+    /// Unit of the torques on the joint: Nm, or N for a prismatic joint.
     pub unit: &'static str,
-    /// The exact J of the quantised parameters in m; absent if unknown.
+    /// The exact element J of the Jacobian with the quantised parameters, in m; absent if unknown.
     pub jacobian_m: Option<f64>,
-    /// J F_z in f64, in Nm.
+    /// The product J F_z in double precision, in Nm.
     pub product_nm: Option<f64>,
-    /// The product, rounded to a step of 2^-12 Nm and clamped to the word.
+    /// The product J F_z, rounded to a step of 2^-12 Nm and clamped to the range of a word.
     pub nearest_word: Option<i16>,
-    /// The word of the frame.
+    /// The word in the cell's torque.
     pub word: Option<i16>,
-    /// The word's value in Nm.
+    /// The value of that word in Nm.
     pub word_nm: Option<f64>,
-    /// The word minus the nearest word.
+    /// The sent word minus the nearest word, in steps of 2^-12 Nm.
     pub difference_steps: Option<i32>,
-    /// The cause of the difference.
+    /// The cause of the difference, if there is one.
     pub verdict: Verdict,
 }
 
-/// The assessment of a word.
+/// The cause of a difference between a sent word and the exact product.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case", tag = "is")]
 pub enum Verdict {
-    /// The word is nearest to the exact product.
+    /// The word is the step nearest to the exact product.
     Nearest,
-    /// Out of range: the word is saturated, as required.
+    /// The product is out of the range of a word, and the word is saturated as required.
     Saturated,
-    /// Rounding in 16 bits: this J, near the exact one, gives this word.
+    /// The cell's 16-bit arithmetic: a J near the exact one gives this word.
     Rounded {
-        /// The J in m.
+        /// The J that gives the word, in m.
         jacobian_m: f64,
-        /// Its distance from the exact J, in steps of 2^-14 m.
+        /// The distance of that J from the exact one, in steps of 2^-14 m.
         jacobian_steps: f64,
     },
     /// No J near the exact one gives this word.
     Unexplained,
-    /// The word or its expected value is unknown.
+    /// The word or its expected value is unknown, so that they cannot be compared.
     Open,
 }
 
@@ -96,13 +96,13 @@ pub(super) fn row(
     }
 }
 
-/// Returns the maximum error of J, in steps, for a cell on this number of rows.
+/// Returns the maximum error of J in steps of 2^-14 m, for a cell on the row with this number.
 pub(super) fn jacobian_steps(rows: usize) -> i64 {
     JACOBIAN_STEPS + i64::try_from(rows.saturating_sub(6)).unwrap_or(i64::MAX - JACOBIAN_STEPS)
 }
 
-/// Assesses a word whose expected value is `nearest`. A joint that does not move the cell has an exact J of zero
-/// (`steps` is `None`).
+/// Returns the cause of the difference between a word and its expected value `nearest`. For a joint that does not move
+/// the cell, J is exactly zero and `steps` is `None`.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_precision_loss,

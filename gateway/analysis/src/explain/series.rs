@@ -1,6 +1,6 @@
-//! The torque of every epoch of a capture, each as [`explain`](super::explain) computes it.
+//! The torques of every epoch of a capture, each computed as in [`explain`](super::explain).
 //!
-//! Buses carry the joints of an epoch one after the other. They are joined by epoch, with the count continued beyond
+//! Buses carry the joints of an epoch one after the other. They are joined by epoch number, which is continued beyond
 //! 255.
 
 use std::collections::BTreeMap;
@@ -15,23 +15,23 @@ use trace::capture::{CaptureError, Entry, Note, Reader};
 use super::watch::{Moment, Watch};
 use super::{Explainer, Explanation, NotFound};
 
-/// Maximum number of epochs that a bus may lag before it is no longer waited for.
+/// Number of epochs that a bus may be behind the others before they no longer wait for it.
 const MAX_BUS_LAG: i64 = 64;
 
 /// The torques of one epoch.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EpochTorque {
-    /// Time of its first joints, in ns since 1970.
+    /// Time of the first joints of the epoch, in ns since 1970.
     pub at_ns: u64,
-    /// Its number, modulo 256.
+    /// The epoch, modulo 256.
     pub epoch: u8,
-    /// The position of each joint of the robot in rad or m; `None` if its bus has no such joints.
+    /// The position of each joint of the robot in rad or m; `None` for a joint whose bus sent no joints in this epoch.
     pub positions: Vec<Option<f64>>,
-    /// Its explanation.
+    /// The derivation of the torques.
     pub explanation: Explanation,
 }
 
-/// The error of a series.
+/// The error of reading a capture epoch by epoch.
 #[derive(Debug, Error)]
 pub enum SeriesError<E> {
     /// The capture cannot be read, or is damaged.
@@ -40,30 +40,31 @@ pub enum SeriesError<E> {
     /// The capture has no joints of this skin.
     #[error("{name}: {source}")]
     NotFound {
-        /// The capture.
+        /// Name of the capture.
         name: String,
         /// The reason.
         source: NotFound,
     },
-    /// The consumer of the epochs has failed.
+    /// The function that receives the epochs has failed.
     #[error("{0}")]
     Taken(E),
 }
 
-/// The totals of a series.
+/// The extent of a capture that was read epoch by epoch.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct SeriesTotals {
-    /// Number of epochs.
+    /// Number of epochs that were passed on.
     pub epochs: u64,
-    /// The origin of times in s, in ns since 1970: the first tick of the run, or else the first frame.
+    /// Time that counts as 0 s, in ns since 1970: the first tick of the run, or else the first frame.
     pub zero_ns: u64,
 }
 
-/// Reads a capture to its end, and passes each complete epoch to `take`, with the origin of times. Memory is bounded.
+/// Reads a capture to its end. Each complete epoch is passed to `take`, with the time that counts as 0 s in ns since
+/// 1970. Memory is bounded.
 ///
 /// # Errors
-/// Returns [`SeriesError`] if the capture cannot be read or has no joints of the skin, or with the first error of
-/// `take`.
+/// Returns [`SeriesError`] if the capture cannot be read or has no joints of the skin, or with the first error that
+/// `take` returns.
 pub fn each_epoch<E>(
     reader: &mut Reader,
     skin: &Skin,
@@ -112,7 +113,7 @@ pub fn each_epoch<E>(
     Ok(counted)
 }
 
-/// Returns true if a joint's torques arrive in sums, which do not contain the torques of single cells.
+/// Returns true if the torques on a joint arrive in sums, so that the torques of single cells are not in the capture.
 #[must_use]
 pub fn is_summed(skin: &Skin, joint: usize) -> bool {
     let mut buses = skin.buses.iter().enumerate();
@@ -124,9 +125,9 @@ struct Series<'a> {
     skin: &'a Skin,
     watch: Watch<'a>,
     explainer: Explainer<'a>,
-    /// Incomplete epochs: by number, then by bus.
+    /// Epochs for which joints of some buses are still missing, by their number and then by bus.
     waiting: BTreeMap<i64, (Epoch, Vec<Option<Moment>>)>,
-    /// The newest number of each bus that has cells.
+    /// The newest epoch number of each bus that has cells.
     last: Vec<(usize, Option<i64>)>,
     newest: Option<(i64, Epoch)>,
 }
@@ -144,7 +145,7 @@ impl<'a> Series<'a> {
         }
     }
 
-    /// Collects the complete joints, or all of them at the end.
+    /// Collects the joints of each bus whose answers are complete; at the end of the capture, all joints.
     fn collect(&mut self, is_end: bool) {
         for (bus, last) in &mut self.last {
             while let Some((epoch, moment)) = self.watch.pop(*bus, is_end) {
@@ -166,7 +167,7 @@ impl<'a> Series<'a> {
         }
     }
 
-    /// Returns the next epoch, once no bus can add to it.
+    /// Removes and returns the oldest epoch, once no bus can add joints to it.
     fn next(&mut self, is_end: bool) -> Option<EpochTorque> {
         let (number, _) = self.waiting.first_key_value()?;
         let newest = self.newest.map_or(*number, |(newest, _)| newest);

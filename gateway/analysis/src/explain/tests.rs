@@ -8,8 +8,8 @@ use protocol::packet::padded;
 use protocol::packet::{self, Epoch};
 use protocol::parameters::Parameter;
 
-/// Returns a skin with the document's cell 12 on the second link of a UR5; the next functions give its joints, its
-/// touch and its torque.
+/// Returns a skin with cell 12 of the protocol document on the second link of a UR5. The next functions return the
+/// joints, the touch and the torque of that document.
 fn skin() -> Skin {
     let cell = "node = 12\njoint = 2\nposition = [0.1, 0.05, 0.06]";
     let text = model::testing::SKIN.replace("node = 1\njoint = 3\nposition = [0.2, 0.01, 0.15]", cell);
@@ -49,7 +49,7 @@ fn heartbeat(configuration: u16) -> Message {
     Message::Network { from: Node::Cell(cell()), epoch: Epoch(0), page }
 }
 
-/// Explains these messages, which are a millisecond apart.
+/// Derives the torques at the requested joints from these messages, which are sent 1 ms apart.
 fn explained(skin: &Skin, messages: &[Message], requested: RequestedJoints) -> Result<Explanation, NotFound> {
     let mut watch = Watch::new(skin, requested);
     for (at, message) in (1..).zip(messages) {
@@ -226,8 +226,8 @@ fn a_torque_after_four_more_joints_is_named_and_not_used() {
     let in_time = explained(&skin, &said(3), first(7)).unwrap();
     assert_eq!((in_time.cells[0].answered_after_ns, in_time.missing), (Some(4_000_000), Vec::new()));
     let late = explained(&skin, &said(4), first(7)).unwrap();
-    let expected = "vcan0 12: no torque of this epoch in time: it came 5.000 ms after the joints, after four more \
-                    joints, and is not used; the sum of words lacks it";
+    let expected = "vcan0 12: no torque of this epoch arrived in time: it came 5.000 ms after the joints, \
+                    after four more joints, and is not used; the sum of words does not contain it";
     assert_eq!((late.cells[0].answered_after_ns, late.missing), (None, vec![expected.to_owned()]));
 }
 

@@ -1,4 +1,4 @@
-//! Finds the requested joints, with the contact state and the answer of each cell.
+//! Finds the requested joints in a capture, with the contact state and the answer of each cell.
 
 use std::collections::VecDeque;
 
@@ -16,101 +16,102 @@ use trace::capture::seconds_since;
 
 use super::not_found::NotFound;
 
-/// Number of joints to wait after them for late torques and for the configurations of cells.
+/// Number of joints that must follow the requested ones, so that late torques and the configurations of cells have
+/// arrived.
 const MAX_WAIT_EPOCHS: u32 = 32;
-/// Maximum number of runs of epochs in an error.
+/// Maximum number of runs of epochs that an error lists.
 const MAX_LISTED_RUNS: usize = 8;
 
-/// The source of a cell's known contact state.
+/// The packet from which a cell's contact state is known.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case", tag = "by")]
 pub enum Origin {
-    /// A start of the cell, which clears its contact state.
+    /// A start of the cell, which ends its contact.
     Start {
         /// Time of the report of the start.
         at_ns: u64,
     },
-    /// A write of its mode, which clears its contact state.
+    /// A write of the cell's mode, which ends its contact.
     Mode {
-        /// The time.
+        /// Time of the write in ns since 1970.
         at_ns: u64,
     },
-    /// A stimulus.
+    /// A stimulus that set the cell's sensors.
     Stimulus {
         /// Time of the stimulus.
         at_ns: u64,
-        /// The epoch from which it applies; `None` for the next joints.
+        /// The epoch from which the stimulus applies; `None` for the next joints.
         from_epoch: Option<u8>,
-        /// True if it came after the joints of that epoch.
+        /// True if the stimulus came after the joints of that epoch.
         late: bool,
     },
-    /// The cell's own report of its contact state.
+    /// A sensors page that the cell sent.
     Said {
-        /// The time.
+        /// Time of the page in ns since 1970.
         at_ns: u64,
     },
 }
 
-/// The requested joints.
+/// A request for the joints of one epoch.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct RequestedJoints {
-    /// Their epoch.
+    /// The epoch of the joints.
     pub epoch: Epoch,
-    /// Earliest time of the joints in ns, from the origin of times.
+    /// Earliest time of the joints, in ns after the time that counts as 0 s.
     pub from_ns: u64,
-    /// The occurrence among them, from 1.
+    /// The number of the occurrence at or after that time, from 1.
     pub occurrence: u32,
 }
 
-/// A joints packet on one bus, and the cells' answers.
+/// A joints packet on one bus, and the state and the answer of each cell.
 #[derive(Clone, Debug)]
 pub struct Moment {
-    /// Time of the joints.
+    /// Time of the joints in ns since 1970.
     pub at_ns: u64,
     /// The joints.
     pub joints: Joints,
-    /// True if the bus was halted.
+    /// True if the bus was halted at these joints.
     pub halted: bool,
-    /// By index of the cell.
+    /// The cells, by their index on the bus.
     pub cells: Vec<CellMoment>,
 }
 
-/// The state of one cell at these joints.
+/// The state of one cell at a joints packet.
 #[derive(Clone, Debug, Default)]
 pub struct CellMoment {
-    /// Its contact state and the source of it.
+    /// The contact state of the cell, and the packet from which it is known; `None` if unknown.
     pub contact_state: Option<(SkinSensors, Origin)>,
-    /// True if it obeys stimuli; `None` if not reported.
+    /// True if the cell is in test mode and obeys stimuli; `None` if it has not reported its mode.
     pub test_mode: Option<bool>,
-    /// Its state in its last heartbeat.
+    /// The state flags in the cell's last heartbeat.
     pub state: Option<State>,
-    /// Hash of its configuration; `None` if not reported.
+    /// Hash of the cell's configuration; `None` if the cell has not reported it.
     pub hash: Option<u16>,
-    /// The torque of its answer, and the time.
+    /// The torque with which the cell answered, with its time in ns since 1970.
     pub answer: Option<(u64, Words)>,
-    /// Time of its torque, if that was too late to be used.
+    /// Time of the cell's torque in ns since 1970, if it arrived too late to be used.
     pub too_late: Option<u64>,
-    /// Further torques of this epoch, which are not used.
+    /// Number of further torques of the cell for this epoch, which are not used.
     pub repeated: u32,
 }
 
-/// Follows a capture up to the requested joints.
+/// Reads a capture up to the requested joints, and follows the state of each cell.
 #[derive(Debug)]
 pub struct Watch<'a> {
     skin: &'a Skin,
     /// The requested joints; `None` for all joints.
     requested: Option<RequestedJoints>,
-    /// The origin of times in s; the first frame if not set.
+    /// Time that counts as 0 s, in ns since 1970; `None` for the time of the first frame.
     zero: Option<u64>,
-    /// By index of the bus in the skin.
+    /// The buses of the skin, by their index in it.
     bus_watches: Vec<BusWatch>,
-    /// Buses that are not in the skin.
+    /// Names of the buses in the capture that are not in the skin.
     others: Vec<String>,
 }
 
 #[derive(Debug, Default)]
 struct BusWatch {
-    /// True if the capture has the bus.
+    /// True if the capture has frames of the bus.
     is_in_capture: bool,
     /// True if the skin has cells on the bus.
     cells_here: bool,
@@ -118,22 +119,22 @@ struct BusWatch {
     halted: bool,
     /// Number of occurrences of the requested joints so far.
     occurrences: u32,
-    /// Joints with incomplete answers, oldest first.
+    /// Joints whose answers may still arrive, oldest first.
     open: VecDeque<OpenJoints>,
     cells: PerCell<WatchedCell>,
     runs: Vec<Run>,
-    /// The number of joints in packets that do not fit the chain.
+    /// The number of values in a joints packet whose length does not fit the chain.
     other_joints: Option<usize>,
-    /// Number of runs beyond those that are kept.
+    /// Number of runs of epochs that are not kept.
     further_runs: u64,
 }
 
-/// Joints that may still be answered.
+/// Joints that cells may still answer.
 #[derive(Debug)]
 struct OpenJoints {
     epoch: Epoch,
     moment: Moment,
-    /// Number of joints since then.
+    /// Number of joints packets since these joints.
     since: u32,
 }
 
@@ -144,7 +145,7 @@ struct WatchedCell {
     hash: Option<u16>,
 }
 
-/// Joints with consecutive epochs.
+/// A run of joints whose epochs follow each other.
 #[derive(Clone, Copy, Debug)]
 struct Run {
     first: (Epoch, u64),
@@ -153,13 +154,13 @@ struct Run {
 }
 
 impl<'a> Watch<'a> {
-    /// Starts before the first frame.
+    /// Creates a watch that finds the requested joints.
     #[must_use]
     pub fn new(skin: &'a Skin, requested: RequestedJoints) -> Self {
         Self::of(skin, Some(requested))
     }
 
-    /// Starts before the first frame, for all joints; [`Watch::pop`] returns them.
+    /// Creates a watch that returns all joints, by [`Watch::pop`].
     #[must_use]
     pub fn all(skin: &'a Skin) -> Self {
         Self::of(skin, None)
@@ -171,12 +172,12 @@ impl<'a> Watch<'a> {
         Self { skin, requested, zero: None, bus_watches, others: Vec::new() }
     }
 
-    /// Sets the origin of times in s, in ns since 1970; the default is the first frame.
+    /// Sets the time that counts as 0 s, in ns since 1970; the default is the time of the first frame.
     pub const fn count_from(&mut self, zero: u64) {
         self.zero = Some(zero);
     }
 
-    /// Handles a frame that was latched before the start of the capture.
+    /// Handles a packet from before the start of the capture, which still has an effect.
     pub fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
         let at = self.skin.bus_named(bus);
         let joints = at.map_or(0, |at| self.skin.joints_on_bus(at).len());
@@ -191,7 +192,8 @@ impl<'a> Watch<'a> {
         }
     }
 
-    /// Handles the next frame; `message` is its meaning, if it has one. Returns true if everything requested is known.
+    /// Handles the next frame; `message` is the decoded message, if the frame completes one. Returns true if the
+    /// requested joints and all answers to them are known.
     pub fn receive(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         let zero = *self.zero.get_or_insert(nanos);
         let at = self.skin.bus_named(bus);
@@ -214,20 +216,21 @@ impl<'a> Watch<'a> {
         self.is_complete()
     }
 
-    /// Removes and returns the oldest joints of a bus, if their answers are complete or the capture is at its end.
+    /// Removes and returns the oldest joints of a bus, if their answers are complete. At the end of the capture
+    /// (`is_end`), all answers count as complete.
     pub fn pop(&mut self, bus: usize, is_end: bool) -> Option<(Epoch, Moment)> {
         let moments = &mut self.bus_watches.get_mut(bus)?.open;
         moments.front().filter(|open| is_end || open.is_complete())?;
         moments.pop_front().map(|open| (open.epoch, open.moment))
     }
 
-    /// Returns true if everything requested is known.
+    /// Returns true if the requested joints and all answers to them are known on all buses.
     fn is_complete(&self) -> bool {
         self.bus_watches.iter().filter(|bus_watch| bus_watch.cells_here).all(BusWatch::is_complete)
     }
 
     /// Returns the requested joints on each of the skin's buses; `None` for a bus that does not have them. Call it at
-    /// the end of the capture, or once everything is known.
+    /// the end of the capture, or once [`Watch::take`] has returned true.
     ///
     /// # Errors
     /// Returns [`NotFound`] if no bus has these joints.
@@ -307,14 +310,14 @@ impl OpenJoints {
         self.since >= MAX_WAIT_EPOCHS || self.is_too_late() && self.moment.cells.iter().all(settled)
     }
 
-    /// Returns true if enough joints have followed that answers are too late to be used.
+    /// Returns true if so many joints have followed these that an answer is too late to be used.
     const fn is_too_late(&self) -> bool {
         self.since as usize > MAX_LATE_EPOCHS
     }
 }
 
 impl BusWatch {
-    /// Returns true if everything about the requested joints is known.
+    /// Returns true if all answers to these joints have arrived, with the configuration of each cell that matters.
     fn is_complete(&self) -> bool {
         self.open.front().is_some_and(OpenJoints::is_complete)
     }
@@ -434,7 +437,7 @@ impl BusWatch {
         self.cells.iter_mut().for_each(|(_, cell)| cell.contact.latch(epoch, |_| {}));
     }
 
-    /// Records the epoch in the list of runs.
+    /// Adds the epoch of new joints to the list of runs.
     fn run(&mut self, nanos: u64, epoch: Epoch) {
         let follows = !self.runs.is_empty() && self.last.is_some_and(|last| last.next() == epoch);
         if !follows && self.runs.len() == MAX_LISTED_RUNS {
@@ -447,14 +450,15 @@ impl BusWatch {
         }
     }
 
-    /// Returns the cell at the newest joints of this epoch, and whether an answer is in time.
+    /// Returns the cell as of the newest joints of this epoch, and true if an answer to them is still in time.
     fn answering(&mut self, from: CellId, epoch: Epoch) -> Option<(&mut CellMoment, bool)> {
         let open = self.open.iter_mut().rev().find(|open| open.epoch == epoch)?;
         let in_time = !open.is_too_late();
         Some((open.moment.cells.get_mut(from.index())?, in_time))
     }
 
-    /// Applies a configuration that was reported after the joints; it was the same then.
+    /// Sets the configuration hash of a cell at all joints that are still open: it was the same then, but is reported
+    /// only now.
     fn apply_hash(&mut self, from: CellId, hash: u16) {
         for open in &mut self.open {
             if let Some(cell) = open.moment.cells.get_mut(from.index()) {
@@ -465,7 +469,7 @@ impl BusWatch {
 }
 
 impl WatchedCell {
-    /// Handles a heartbeat with the cell's node id; returns true if it is from the cell.
+    /// Handles a heartbeat with the node id of the cell. Returns true if the cell itself sent it.
     fn heartbeat(&mut self, at_ns: u64, heartbeat: &Heartbeat) -> bool {
         let obeys = heartbeat.state.has(State::TEST_MODE);
         match self.claim.receive(Micros(at_ns / 1_000), heartbeat) {
@@ -481,8 +485,8 @@ impl WatchedCell {
         true
     }
 
-    /// Sets the mode: a cell that obeys stimuli is free at first; a cell that measures has a contact state that is not
-    /// on the bus.
+    /// Sets the mode of the cell. In test mode it starts without contact; a cell that measures has a contact state that
+    /// the bus does not show.
     fn mode(&mut self, obeys: bool, origin: Origin) {
         if obeys {
             self.contact.start(origin);

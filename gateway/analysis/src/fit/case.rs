@@ -1,4 +1,5 @@
-//! One bus, the frames of its cells, and their worst-case times.
+//! The inputs of a timing analysis of one bus (rates, cells, answers), and the worst-case load and times computed from
+//! them.
 
 use protocol::can::Format;
 use protocol::packet::Length;
@@ -12,24 +13,25 @@ use super::response::{Response, Stream, response};
 const HEARTBEAT_NS: u64 = 250_000_000;
 /// With sensors on, an acceleration frame follows every fourth heartbeat.
 const ACCELERATION_NS: u64 = 4 * HEARTBEAT_NS;
-/// Share of the period that `skinbus skin generate` gives to slots, in percent.
+/// Share of the broadcast period that `skinbus skin generate` gives to the slots of sums, in percent.
 const SLOTS_SHARE: u64 = 75;
 
-/// The cells' answers to joints, with all cells in contact.
+/// The answers of a bus's cells to joints, if all cells are in contact.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum Answers {
     /// Each cell sends its own torque.
     Torques {
-        /// Number of cells.
+        /// Number of cells on the bus.
         cells: u32,
     },
     /// Each cell on the bus sends one sum.
     Sums {
-        /// Number of cells by their distance from a root in wires; roots first.
+        /// Number of cells at each distance from a root, in wires; roots first.
         by_depth: Vec<u32>,
-        /// Width of a slot in ns.
+        /// Duration of a slot in ns: the time that each level of the tree has to send its sums.
         slot_ns: u64,
-        /// True if cells below the roots are on the bus, too; otherwise they send over their own wires.
+        /// True if cells below the roots send their sums on this bus, too; false if they send them over wires of their
+        /// own.
         shared: bool,
     },
 }
@@ -45,7 +47,7 @@ impl Answers {
         }
     }
 
-    /// Returns the answers of another number of cells; for sums, the tree keeps its shape.
+    /// Returns the same kind of answers for another number of cells; the tree of sums keeps its shape.
     #[must_use]
     pub fn with_cells(&self, cells: u32) -> Self {
         match self {
@@ -65,62 +67,63 @@ impl Answers {
     }
 }
 
-/// One bus with its rates and its cells.
+/// A bus with its rates and cells, as the input of a timing analysis.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Case {
     /// The frame format: one FD frame per packet, or several classic ones.
     pub format: Format,
     /// The length of joints and answers.
     pub length: Length,
-    /// Its bit rates.
+    /// Bit rates of the bus.
     pub rates: BitRates,
-    /// Period of joints in ns.
+    /// Period of the joint broadcast in ns.
     pub period_ns: u64,
-    /// The longest time of a cell from the end of the joints to its answer, in ns.
+    /// The longest time that a cell needs from the end of the joints to its answer, in ns.
     pub computation_ns: u64,
-    /// The schedule of sensors frames without a request.
+    /// The rates at which cells send sensors frames on their own.
     pub sensing: Sensing,
     /// The answers of the cells.
     pub answers: Answers,
 }
 
-/// Shares of a bus' time, with all frames as long as possible.
+/// Shares of a bus's time by kind of frame, if each frame has its maximum length.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Load {
-    /// Joints.
+    /// Share of joints.
     pub joints: f64,
-    /// Torques or sums.
+    /// Share of torques or sums.
     pub answers: f64,
-    /// Sensors frames.
+    /// Share of sensors frames.
     pub sensors: f64,
-    /// Heartbeats.
+    /// Share of heartbeats.
     pub heartbeats: f64,
 }
 
 impl Load {
-    /// Returns the total share.
+    /// Returns the sum of all shares.
     #[must_use]
     pub fn total(&self) -> f64 {
         self.joints + self.answers + self.sensors + self.heartbeats
     }
 }
 
-/// Upper bounds of times on a bus; `None` if there is no bound.
+/// Upper bounds of times on a bus; `None` if a time is unbounded.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Times {
-    /// From the due time of the broadcast to its end, in ns.
+    /// From the time at which the joints should be sent to their end on the bus, in ns.
     pub joints_ns: Option<u64>,
-    /// From the due time of the broadcast to the end of the last answer in ns, as a sum: blocking, joints, computation,
-    /// blocking, and all answers.
+    /// From the time at which the joints should be sent to the end of the last answer, in ns: the sum of blocking,
+    /// joints, computation, blocking, and all answers.
     pub chain_ns: Option<u64>,
-    /// The time of `chain_ns` by response-time analysis, for torques.
+    /// Bound of the same time as in `chain_ns`, by response-time analysis; only for torques.
     pub response_ns: Option<Response>,
-    /// From the due time of a heartbeat to its end, in ns; it may be sent a period early.
+    /// From the time at which a heartbeat should be sent to its end, in ns. Cells may send it up to a period of the
+    /// joints early.
     pub heartbeat_ns: Option<u64>,
 }
 
 impl Times {
-    /// Returns the time of the last answer by the smaller bound.
+    /// Returns the smaller of the two bounds of the last answer, in ns.
     #[must_use]
     pub fn last_ns(&self) -> Option<u64> {
         self.chain_ns.into_iter().chain(self.response_ns.map(|it| it.worst_ns)).min()
@@ -128,7 +131,8 @@ impl Times {
 }
 
 impl Case {
-    /// Returns the case of one bus of a skin as described, at these rates.
+    /// Returns the timing inputs of one bus as the skin describes it, with these rates; `None` if a cell that answers
+    /// with sums is unreachable.
     #[must_use]
     pub fn from_skin(skin: &Skin, bus: usize, format: Format, rates: BitRates, computation_ns: u64) -> Option<Self> {
         let described = skin.buses.get(bus)?;
@@ -162,7 +166,7 @@ impl Case {
         Shape { coding, extended: false, len }.worst().nanoseconds(self.rates)
     }
 
-    /// Returns the number of frames of a packet.
+    /// Returns the number of frames that a packet of this length takes.
     fn frames_of(&self, length: Length) -> u32 {
         match self.format {
             Format::Fd => 1,
@@ -177,7 +181,7 @@ impl Case {
         u64::from(self.frames_of(self.length)) * self.frame_ns()
     }
 
-    /// Returns the time of the answers of this number of cells, in ns.
+    /// Returns the time that the answers of this number of cells take on the bus, in ns.
     fn packets_ns(&self, cells: u32) -> u64 {
         self.packet_ns().saturating_mul(u64::from(cells))
     }
@@ -187,7 +191,8 @@ impl Case {
         1_000_000_000_u64.div_ceil(u64::from(self.rates.nominal()))
     }
 
-    /// Returns the streams on the bus, highest priority first: joints, answers, sensors (page 0, page 1), heartbeats.
+    /// Returns the periodic streams on the bus, highest priority first: joints, answers, sensors (page 0, page 1),
+    /// heartbeats.
     ///
     /// Heartbeats, and pages that follow them, may be sent up to a period of the joints early.
     fn streams(&self, answers_jitter_ns: u64) -> [Stream; 5] {
@@ -217,7 +222,8 @@ impl Case {
         ]
     }
 
-    /// Returns the load of the bus. Event-driven sensors count with their rate without changes.
+    /// Returns the load of the bus. Sensors that send on changes count with the rate at which they send without
+    /// changes.
     #[must_use]
     pub fn load(&self) -> Load {
         let [joints, answers, page_0, page_1, heartbeats] = self.streams(0).map(|it| it.load());
@@ -251,7 +257,7 @@ impl Case {
         response(&self.streams(0), 0, self.bit_ns()).map(|it| it.worst_ns)
     }
 
-    /// Returns the release jitter of answers relative to the due time of the joints.
+    /// Returns the maximum delay in ns of the time at which cells begin to answer, after the joints should be sent.
     fn jitter_ns(&self, joints_ns: Option<u64>) -> u64 {
         joints_ns.unwrap_or(0).saturating_add(self.computation_ns)
     }
@@ -264,7 +270,7 @@ impl Case {
         }
     }
 
-    /// Returns the time from the due time of the broadcast to the end of the last answer in ns, as a sum.
+    /// Returns the time from when the joints should be sent to the end of the last answer in ns, as a sum of terms:
     ///
     /// ```text
     ///   torques         blocking + joints + computation + blocking + N * reply
@@ -305,7 +311,7 @@ impl Case {
         }
     }
 
-    /// Returns the same bus with another number of cells.
+    /// Returns the same bus with this number of cells.
     #[must_use]
     pub fn with_cells(&self, cells: u32) -> Self {
         Self { answers: self.answers.with_cells(cells), ..self.clone() }
@@ -316,8 +322,8 @@ fn torques(skin: &Skin, bus: usize) -> Answers {
     Answers::Torques { cells: u32::try_from(skin.cells_on_bus(bus).count()).unwrap_or(u32::MAX) }
 }
 
-/// Returns the sums of the tree that the wires of a bus allow; `None` if a cell is unreachable. Without a described
-/// slot, the slot is that of `skinbus skin generate`.
+/// Returns the sums for the tree that the wires of a bus allow; `None` if a cell is unreachable. If the skin gives no
+/// slot duration, that of `skinbus skin generate` is used.
 pub(super) fn sums(
     skin: &Skin,
     bus: usize,

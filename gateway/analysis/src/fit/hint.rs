@@ -12,17 +12,17 @@ use super::{COMMON_RATES, AssessedBus};
 /// The longest period of joints that the wire protocol can express, in ns.
 const MAX_PERIOD_NS: u64 = 65_535_000;
 
-/// A change and the bus after it.
+/// A change that a hint suggests, and the bus as it would be after the change.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Hint {
-    /// The change.
+    /// The suggested change, as text.
     pub change: String,
-    /// The result; for several buses, that of the fullest.
+    /// The bus after the change; for several buses, the one with the highest load.
     #[serde(flatten)]
     pub after: AssessedBus,
 }
 
-/// Returns the hints for a bus; empty if it keeps all limits.
+/// Returns the changes with which a bus would keep all limits; empty if it already does.
 #[must_use]
 pub fn hints(skin: &Skin, case: &Case) -> Vec<Hint> {
     let exceeded = exceeded(case);
@@ -43,7 +43,7 @@ fn hint(change: String, case: &Case) -> Hint {
     Hint { change, after: AssessedBus::assess(case) }
 }
 
-/// Returns the numbers of buses that are needed for timing, and for transceivers.
+/// Returns two hints: the number of buses that the timing needs, and the number that the transceivers need.
 fn more_buses(case: &Case) -> Vec<Hint> {
     let cells = case.answers.cells();
     let need = NeededBuses::for_cells(&MaxCells::for_case(case), cells);
@@ -57,7 +57,8 @@ fn more_buses(case: &Case) -> Vec<Hint> {
     numbers.into_iter().map(spread).collect()
 }
 
-/// Returns the slowest common rates that are in time: in the same format, and in CAN FD instead of classic CAN.
+/// Returns the slowest common rates that meet the timing limits: one hint for the same format, and for a classic bus
+/// one in CAN FD.
 fn faster(case: &Case) -> Vec<Hint> {
     let at = |format: Format| {
         let rates = COMMON_RATES.iter().filter(|it| it.0 == format).filter_map(|it| it.rates());
@@ -77,7 +78,7 @@ fn is_in_time(case: &Case) -> bool {
     exceeded(case).iter().all(|&limit| limit == Limit::Nodes)
 }
 
-/// Returns the shortest period of whole ticks that is in time.
+/// Returns the hint of a slower broadcast: the shortest period in whole ticks that meets the timing limits.
 fn slower_joints(skin: &Skin, case: &Case) -> Option<Hint> {
     let tick_ns = skin.timing.tick_nanos();
     let periods = (1_u64..).map(|ticks| case.period_ns + ticks * tick_ns).take_while(|&it| it <= MAX_PERIOD_NS);
@@ -90,7 +91,7 @@ fn hertz(period_ns: u64) -> f64 {
     (1e9 / period_ns as f64 * 1e6).round() / 1e6
 }
 
-/// Returns the hint of sensors that send on changes only.
+/// Returns the hint of cells that send sensors frames on changes only.
 fn events(case: &Case) -> Option<Hint> {
     match case.sensing {
         Sensing::Off | Sensing::Event => None,
@@ -101,8 +102,8 @@ fn events(case: &Case) -> Option<Hint> {
     }
 }
 
-/// Returns the alternatives to the answers of a bus: torques, sums with all cells on the bus, and sums with only the
-/// roots on it; sums only if the wires reach all cells.
+/// Returns the bus with each other kind of answers: torques, sums with all cells on the bus, and sums with only the
+/// roots on it. Sums are omitted if the wires do not reach all cells.
 #[must_use]
 pub fn other_answers(skin: &Skin, bus: usize, case: &Case) -> Vec<Hint> {
     let slot_us = match skin.buses.get(bus).map(|it| it.reply) {

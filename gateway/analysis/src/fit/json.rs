@@ -21,8 +21,8 @@ struct Document<'a> {
     table: Vec<BusFit>,
 }
 
-/// Returns the results of single buses and all of them together, or for common rates; times in µs, loads as shares of
-/// 1, and null for missing bounds.
+/// Returns the results as JSON: for each bus and for all cells together, or at common rates. Times are in µs, loads are
+/// shares of 1, and an unbounded time is null.
 #[must_use]
 pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>, table: &[Row]) -> Value {
     // The number of buses in a row is that for all cells of the skin.
@@ -31,7 +31,7 @@ pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&SkinFit>, table: &[Row
     json!(Document { skin: &skin.name, cells, buses, whole, table: table.collect() })
 }
 
-/// Serialises the number of buses, and the limits that require it.
+/// Serialises the number of buses that cells need, and the limits that require it.
 pub(super) fn needed<S: Serializer>(need: &NeededBuses, serializer: S) -> Result<S::Ok, S::Error> {
     let NeededBuses { bandwidth, deadline, nodes } = need;
     json!({

@@ -7,23 +7,23 @@ use super::case::Case;
 /// The approximate number of nodes that common transceivers can drive on one bus, including the gateway.
 pub const MAX_NODES: u32 = 110;
 
-/// Maximum number of cells in the search.
+/// Upper end of the search for the maximum number of cells.
 const MAX_SEARCHED_CELLS: u32 = 1 << 20;
 
 /// A limit on the number of cells on a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Limit {
-    /// All frames together take longer than the available time.
+    /// All frames together take longer than the time of the bus.
     Bandwidth,
-    /// The last answer comes after the next joints.
+    /// The last answer may end after its deadline, the next joints; for sums, after 7/8 of the period.
     Deadline,
-    /// Transceivers cannot drive more nodes.
+    /// The bus has more nodes than transceivers can drive.
     Nodes,
 }
 
 impl Limit {
-    /// Returns its name in texts.
+    /// Returns the name of the limit in texts.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -34,19 +34,19 @@ impl Limit {
     }
 }
 
-/// A value for each limit.
+/// One value for each limit.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 pub struct ByLimit<T> {
-    /// Bandwidth: at most 100 % load, including heartbeats.
+    /// Bandwidth: the load, including heartbeats, is at most 100 %.
     pub bandwidth: T,
-    /// Deadline: the last answer is in time.
+    /// Deadline: the last answer always ends in time.
     pub deadline: T,
-    /// Number of nodes, electrically.
+    /// Number of nodes that transceivers can drive.
     pub nodes: T,
 }
 
 impl<T> ByLimit<T> {
-    /// Returns the limits for which a condition holds, in this order.
+    /// Returns the limits whose value satisfies a condition, in this order.
     fn which(self, holds: impl Fn(T) -> bool) -> Vec<Limit> {
         let Self { bandwidth, deadline, nodes } = self;
         let all = [(Limit::Bandwidth, bandwidth), (Limit::Deadline, deadline), (Limit::Nodes, nodes)];
@@ -55,7 +55,7 @@ impl<T> ByLimit<T> {
 }
 
 impl ByLimit<bool> {
-    /// Returns the limits that are exceeded.
+    /// Returns the limits whose value is false: the bus does not keep them.
     #[must_use]
     pub fn broken(self) -> Vec<Limit> {
         self.which(|holds| !holds)
@@ -66,7 +66,7 @@ impl ByLimit<bool> {
 pub type MaxCells = ByLimit<u32>;
 
 impl MaxCells {
-    /// Computes the maxima for a bus like this one.
+    /// Computes the maximum number of cells by each limit, for a bus like this one.
     #[must_use]
     pub fn for_case(case: &Case) -> Self {
         Self {
@@ -76,7 +76,7 @@ impl MaxCells {
         }
     }
 
-    /// Returns the maximum for timing: the smaller of bandwidth and deadline.
+    /// Returns the maximum number of cells for which the bus is fast enough: the smaller of bandwidth and deadline.
     #[must_use]
     pub fn in_time(&self) -> u32 {
         self.bandwidth.min(self.deadline)
@@ -99,7 +99,7 @@ pub fn exceeded(case: &Case) -> Vec<Limit> {
     holds.broken()
 }
 
-/// Returns the largest number up to which a condition holds; 0 if it does not hold for 1.
+/// Returns the largest number of cells up to which a condition holds; 0 if it does not hold for 1.
 fn max(holds: impl Fn(u32) -> bool) -> u32 {
     let mut beyond = 1;
     while beyond < MAX_SEARCHED_CELLS && holds(beyond) {
@@ -121,14 +121,14 @@ fn max(holds: impl Fn(u32) -> bool) -> u32 {
 pub type NeededBuses = ByLimit<Option<u32>>;
 
 impl NeededBuses {
-    /// Computes the number of buses for cells that are spread evenly.
+    /// Computes the number of buses by each limit, for cells that are spread evenly.
     #[must_use]
     pub fn for_cells(most: &MaxCells, cells: u32) -> Self {
         let buses = |most: u32| (most > 0).then(|| cells.div_ceil(most));
         Self { bandwidth: buses(most.bandwidth), deadline: buses(most.deadline), nodes: buses(most.nodes) }
     }
 
-    /// Adds the needs of two chains, which share no bus.
+    /// Adds up the numbers of buses of two chains, which cannot share a bus.
     #[must_use]
     pub fn with(self, other: Self) -> Self {
         let sum = |one: Option<u32>, other: Option<u32>| Some(one? + other?);
@@ -149,19 +149,19 @@ impl NeededBuses {
         both
     }
 
-    /// Returns the number of buses needed for timing alone.
+    /// Returns the number of buses that bandwidth and deadline require; `None` if not even one cell is in time.
     #[must_use]
     pub fn in_time(&self) -> Option<u32> {
         Some(self.bandwidth?.max(self.deadline?))
     }
 
-    /// Returns the number of buses needed by all limits.
+    /// Returns the number of buses that all limits together require.
     #[must_use]
     pub fn buses(&self) -> Option<u32> {
         Some(self.in_time()?.max(self.nodes?))
     }
 
-    /// Returns the limits that require this number.
+    /// Returns the limits that require the largest number of buses.
     #[must_use]
     pub fn binding(&self) -> Vec<Limit> {
         // `None` counts as more than any number.
@@ -170,8 +170,8 @@ impl NeededBuses {
         self.which(|buses| Some(key(buses)) == most)
     }
 
-    /// Returns the number of buses and the limits that require it, in short: `3 nodes`. Bandwidth and deadline are both
-    /// called time.
+    /// Returns the number of buses and the limits that require it, as a short text such as `3 nodes`. Bandwidth and
+    /// deadline are both called time.
     #[must_use]
     pub fn in_short(&self) -> String {
         let word = |limit| match limit {

@@ -48,12 +48,12 @@ pub const COMMON_RATES: [Common; 7] = [
     Common(Format::Fd, 1_000_000, 8_000_000),
 ];
 
-/// A format and its bit rates, nominal and data in bit/s.
+/// A frame format with its nominal and data bit rates in bit/s.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Common(pub Format, pub u32, pub u32);
 
 impl Common {
-    /// Returns the rates, if valid.
+    /// Returns the bit rates; `None` if CAN does not allow them.
     #[must_use]
     pub fn rates(&self) -> Option<BitRates> {
         BitRates::new(self.1, self.2).ok()
@@ -69,57 +69,57 @@ pub fn name(format: Format, rates: BitRates) -> String {
     }
 }
 
-/// A bus with rates and cells, and its assessment.
+/// A bus with its load, worst-case times and exceeded limits.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AssessedBus {
-    /// The assessed case.
+    /// The bus, with its rates and cells.
     pub case: Case,
-    /// Shares of its time.
+    /// Shares of the bus's time, by kind of frame.
     pub load: Load,
-    /// Worst-case times.
+    /// Worst-case times on the bus.
     pub times: Times,
-    /// The exceeded limits.
+    /// The limits that the bus exceeds.
     pub exceeded: Vec<Limit>,
 }
 
 impl AssessedBus {
-    /// Assesses a bus.
+    /// Computes load, times and exceeded limits of a bus.
     #[must_use]
     pub fn assess(case: &Case) -> Self {
         Self { case: case.clone(), load: case.load(), times: case.times(), exceeded: exceeded(case) }
     }
 
-    /// Returns the verdict.
+    /// Returns the verdict: the bus fits, or the limit that it exceeds.
     #[must_use]
     pub fn verdict(&self) -> Verdict {
         Verdict::from_limits(&self.exceeded, self.case.answers.cells())
     }
 }
 
-/// The fit of one bus of a skin.
+/// The result of `skinbus fit` for one bus of a skin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BusFit {
-    /// Its name.
+    /// Name of the bus.
     #[serde(rename = "bus")]
     pub name: String,
-    /// The bus as described.
+    /// Load, times and limits of the bus as described.
     #[serde(flatten)]
     pub rated: AssessedBus,
-    /// The maximum number of cells on it.
+    /// The maximum number of cells on the bus, by each limit.
     #[serde(rename = "most_cells")]
     pub most: MaxCells,
-    /// The number of buses that its cells need.
+    /// The number of buses that the cells of this bus need, by each limit.
     #[serde(rename = "buses_needed", serialize_with = "json::needed")]
     pub need: NeededBuses,
-    /// Alternatives to the answers of its cells.
+    /// The bus with each other kind of answers.
     #[serde(rename = "other_answers")]
     pub answers: Vec<Hint>,
-    /// Other hints, if it exceeds a limit.
+    /// Changes with which the bus would keep all limits, if it exceeds one.
     #[serde(rename = "changes")]
     pub hints: Vec<Hint>,
 }
 
-/// Assesses one bus of a skin, given as an index into [`Skin::buses`]; `None` if it does not exist.
+/// Computes the fit of one bus of a skin, given as an index into [`Skin::buses`]; `None` if the bus does not exist.
 #[must_use]
 pub fn bus(
     skin: &Skin,
@@ -141,8 +141,8 @@ pub fn bus(
     })
 }
 
-/// Assesses one bus of a skin as described, at these rates, with all cells answering; `None` if a cell that answers
-/// with sums is unreachable.
+/// Computes the worst case of one bus of a skin at these rates, with all cells answering. Returns `None` if a cell that
+/// answers with sums is unreachable.
 #[must_use]
 pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<AssessedBus> {
     let format = skin.buses.get(index)?.format;
@@ -153,29 +153,30 @@ pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Assessed
     Some(AssessedBus::assess(&Case::from_skin(skin, index, format, rates, COMPUTATION_NS)?))
 }
 
-/// All cells of a skin, spread evenly over several buses.
+/// The fit of all cells of a skin, if they are spread evenly over several buses.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SkinFit {
-    /// Number of cells.
+    /// Number of cells of the skin.
     pub cells: u32,
-    /// The number of buses that they need.
+    /// The number of buses that these cells need, by each limit.
     #[serde(rename = "buses_needed", serialize_with = "json::needed")]
     pub need: NeededBuses,
-    /// The results for increasing numbers of buses.
+    /// The fit for increasing numbers of buses.
     pub spread: Vec<Spread>,
 }
 
-/// Cells that are spread over several buses.
+/// The fit of all cells on one number of buses.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Spread {
     /// Number of buses.
     pub buses: u32,
-    /// The fullest one.
+    /// The bus with the most cells.
     pub fullest: AssessedBus,
 }
 
-/// Spreads all cells of a skin over increasing numbers of buses like its fullest one. For several chains, only the
-/// number of buses is computed. Returns `None` without a bus.
+/// Computes the fit of all cells of a skin, spread over increasing numbers of buses that are like the one with the
+/// highest load. For a skin with several chains, only the number of buses is computed. Returns `None` for a skin
+/// without buses.
 #[must_use]
 pub fn whole(skin: &Skin, buses: &[BusFit]) -> Option<SkinFit> {
     let cells = u32::try_from(skin.cells.len()).unwrap_or(u32::MAX);
@@ -193,7 +194,7 @@ pub fn whole(skin: &Skin, buses: &[BusFit]) -> Option<SkinFit> {
     Some(SkinFit { cells, need, spread: spread.collect() })
 }
 
-/// Returns the chains with cells, each with its number of cells.
+/// Returns the chains that carry cells, each with its number of cells.
 fn carried(skin: &Skin) -> impl Iterator<Item = (usize, u32)> {
     let on = |cell: &protocol::skin::Cell| skin.buses.get(cell.bus).map(|bus| bus.chain);
     let count = move |chain: usize| skin.cells.iter().filter(|cell| on(cell) == Some(chain)).count();
@@ -203,8 +204,8 @@ fn carried(skin: &Skin) -> impl Iterator<Item = (usize, u32)> {
         .map(|(chain, cells)| (chain, u32::try_from(cells).unwrap_or(u32::MAX)))
 }
 
-/// Returns the number of buses that all cells of a skin need. Each chain needs its own, like its fullest bus, because a
-/// bus carries one chain.
+/// Returns the number of buses that all cells of a skin need. A bus carries one chain, so each chain needs buses of its
+/// own, like its bus with the highest load.
 fn need(skin: &Skin, buses: &[BusFit]) -> NeededBuses {
     let of_chain = |(chain, cells)| {
         let chain_of = |bus: &&BusFit| {
@@ -218,16 +219,16 @@ fn need(skin: &Skin, buses: &[BusFit]) -> NeededBuses {
     carried(skin).filter_map(of_chain).reduce(NeededBuses::with).unwrap_or(none)
 }
 
-/// The skin with one format and its rates.
+/// The fit of a skin at one pair of common bit rates.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Row {
-    /// The fullest bus as described.
+    /// The bus with the highest load at these rates.
     pub fullest: BusFit,
-    /// The number of buses that all cells of the skin need.
+    /// The number of buses that all cells of the skin need at these rates.
     pub need: NeededBuses,
 }
 
-/// Assesses the fullest bus of a skin at all common rates, or those of one format.
+/// Computes the fit of the bus with the highest load at each of the common bit rates, of all formats or of one.
 #[must_use]
 pub fn table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<Row> {
     let rows = COMMON_RATES.iter().filter(|it| format.is_none_or(|format| format == it.0));

@@ -1,4 +1,4 @@
-//! The bit rates of a bus: the requested ones, or else the skin's, or else common ones.
+//! The bit rates of a bus: the requested ones, or else those in the skin, or else common ones.
 
 use protocol::can::Format;
 use protocol::skin::SkinBus;
@@ -9,7 +9,7 @@ const NOMINAL: u32 = 1_000_000;
 /// The default data bit rate of FD frames, in bit/s.
 const DATA: u32 = 5_000_000;
 
-/// Requested bit rates, for all buses.
+/// Bit rates that the caller requests for all buses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct RequestedRates {
     /// Rate of the arbitration phase, and of all of a classic frame.
@@ -18,12 +18,12 @@ pub struct RequestedRates {
     pub data: Option<u32>,
 }
 
-/// The rates of a bus.
+/// The bit rates of a bus, and where they come from.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct ChosenRates {
     /// The rates.
     pub rates: BitRates,
-    /// True if the skin or the caller gave the rates, false for defaults.
+    /// True if the skin or the caller gives the rates; false if they are defaults.
     pub is_chosen: bool,
 }
 
@@ -58,7 +58,8 @@ impl RequestedRates {
     }
 }
 
-/// Returns the described rates of a bus in a format; the data bit rate defaults to the nominal one.
+/// Returns the rates that the skin describes for a bus; the data bit rate defaults to the nominal one. Returns `None`
+/// if the skin gives no rate.
 #[must_use]
 pub fn described(bus: &SkinBus, format: Format) -> Option<Result<BitRates, BitRatesError>> {
     let nominal = bus.bitrate?;

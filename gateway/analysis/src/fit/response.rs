@@ -13,13 +13,13 @@
 //!
 //! All instances of the busy period are examined: the first one is not always the slowest.
 
-/// Busy periods longer than this count as unbounded, in ns.
+/// A busy period longer than this, in ns, counts as unbounded.
 const HORIZON_NS: u64 = 60_000_000_000;
 
 /// Periodic frames of one priority class.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Stream {
-    /// Number of such streams, each with its own priority, in sequence.
+    /// Number of streams with these figures; each has its own priority, and they follow each other.
     pub count: u32,
     /// The minimum time between releases in ns, above 0, without the jitter.
     pub period_ns: u64,
@@ -30,33 +30,34 @@ pub struct Stream {
 }
 
 impl Stream {
-    /// Returns the share of the bus' time that all of them take.
+    /// Returns the share of the bus's time that the frames of all these streams take.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "a share, to fifteen digits")]
     pub fn load(&self) -> f64 {
         f64::from(self.count) * self.frame_ns as f64 / self.period_ns as f64
     }
 
-    /// Returns the time of all frames of `count` of these streams that can be released within `window_ns`.
+    /// Returns the time on the bus in ns of all frames that `count` of these streams can release within `window_ns`.
     fn demand_ns(&self, count: u32, window_ns: u64) -> u64 {
         let releases = window_ns.saturating_add(self.jitter_ns).div_ceil(self.period_ns);
         releases.saturating_mul(self.frame_ns).saturating_mul(u64::from(count))
     }
 }
 
-/// The worst-case response of the slowest of some streams.
+/// The worst-case response time of a stream.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Response {
-    /// From the event of a release (including its jitter) to the end of the intermission, in ns.
+    /// Time in ns from the event that releases a frame (jitter included) to the end of the frame's intermission.
     pub worst_ns: u64,
-    /// The index of that instance in the busy period, from 0.
+    /// The index in the busy period of the frame with that time, from 0.
     pub instance: u64,
-    /// Number of instances in the busy period.
+    /// Number of frames of the stream in the busy period.
     pub instances: u64,
 }
 
-/// Returns the longest response of the last (slowest) stream at position `at` of a list in order of priority, highest
-/// first. `bit_ns` is the duration of an arbitration bit: a frame that is released up to one bit late still takes part.
+/// Returns the longest response time of the stream at position `at` of a list in order of priority, highest first; if
+/// the entry stands for several streams, of the last one. `bit_ns` is the duration of an arbitration bit: a frame that
+/// is released up to one bit late still takes part.
 ///
 /// Returns `None` if there is no such stream, or no bound: streams of the same or a higher priority fill the bus, or
 /// the busy period exceeds a minute.
@@ -95,7 +96,8 @@ pub fn response(streams: &[Stream], at: usize, bit_ns: u64) -> Option<Response> 
     Some(worst)
 }
 
-/// Returns the lowest fixed point of an increasing function, from below; `None` beyond the horizon.
+/// Returns the lowest fixed point of an increasing function, found by iterating from below; `None` if it exceeds
+/// [`HORIZON_NS`].
 fn settle(from_ns: u64, next_ns: impl Fn(u64) -> u64) -> Option<u64> {
     let mut at_ns = from_ns;
     while at_ns <= HORIZON_NS {
@@ -172,7 +174,7 @@ mod tests {
         assert_eq!(worst(&streams, 1)[0], Some(9 * MS + 2 * MS));
     }
 
-    /// Returns the longest time from release to end, if each of the streams' frames is released at the given times.
+    /// Returns the longest time from release to end for each stream, if it releases its first frame at the given phase.
     fn simulated(streams: &[Stream], phases: &[u64], until_ns: u64) -> Vec<u64> {
         let mut releases: Vec<(u64, usize)> = Vec::new();
         for (priority, (stream, phase)) in streams.iter().zip(phases).enumerate() {

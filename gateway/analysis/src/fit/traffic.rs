@@ -13,7 +13,7 @@ use serde::Serialize;
 use model::decode::wired;
 use model::packets::{Content, PacketReader};
 
-/// The kinds of frames that only a bench sends.
+/// The kinds of frames that only a bench sends, and a real robot does not.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum BenchFrame {
     /// Stimuli.
@@ -22,7 +22,7 @@ pub enum BenchFrame {
     Sync,
     /// Report, and the pages that answer it.
     Report,
-    /// A simulated wire between cells.
+    /// A message over a simulated wire between cells.
     Wire,
 }
 
@@ -40,7 +40,7 @@ pub struct BenchFrames {
 }
 
 impl BenchFrames {
-    /// Adds frames of a kind.
+    /// Adds a number of frames of one kind.
     pub const fn count(&mut self, what: BenchFrame, frames: u64) {
         match what {
             BenchFrame::Stimulus => self.stimuli += frames,
@@ -57,33 +57,34 @@ impl BenchFrames {
     }
 }
 
-/// The meaning of a frame for the course of a run.
+/// The role of a frame in the course of a run.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum RunEvent {
-    /// No effect.
+    /// The frame has no effect on the course of the run.
     Other,
-    /// Joints.
+    /// Joints with this epoch.
     Joints(Epoch),
-    /// A torque or a sum, for these joints.
+    /// A torque or a sum that answers the joints of this epoch.
     Answer(Epoch),
-    /// Cells stop answering.
+    /// A command by which cells stop answering.
     Halt,
-    /// Cells answer again.
+    /// A command by which cells answer again.
     Resume,
     /// A frame from before the first joints: address claims, parameter writes and reads, report commands.
     Preparation,
 }
 
-/// A classified frame.
+/// A frame, sorted into bench traffic and the traffic of a real bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct ClassifiedFrame {
-    /// Its meaning.
+    /// The role of the frame in the run.
     pub says: RunEvent,
-    /// The kind, if only a bench sends it.
+    /// The kind of bench frame; `None` if a real bus carries the frame, too.
     pub bench: Option<BenchFrame>,
     /// The sending cell, if the frame ends a packet.
     pub from: Option<CellId>,
-    /// True if it ends a packet of classic frames: the previous frame with its identifier belongs to the same class.
+    /// True if the frame ends a packet of two classic frames: the previous frame with its identifier belongs to the
+    /// same class.
     pub ends_pair: bool,
 }
 
@@ -94,22 +95,22 @@ impl ClassifiedFrame {
 /// Classifies the frames of one bus in order, with bounded memory.
 #[derive(Debug, Default)]
 pub struct Traffic {
-    /// Number of frames of valid packets, and of 11-bit data frames that were not packets.
+    /// Number of frames in valid packets, and of 11-bit data frames that are not packets.
     ours: u64,
     others: u64,
     packets: PacketReader,
-    /// Outstanding replies to the bench, by cell.
+    /// Answers that each cell still owes to the bench's sync and report commands.
     owed: Vec<PendingReplies>,
 }
 
-/// Outstanding replies of a cell to sync and report: a heartbeat; sensors 0, sensors 1, the tree.
+/// Answers that a cell still owes to sync and report: a heartbeat, sensors page 0, sensors page 1, the tree page.
 type PendingReplies = [bool; 4];
-/// The index of the tree page.
+/// The index of the tree page in [`Owed`].
 const TREE: usize = 3;
 
 impl Traffic {
-    /// Returns true if most candidate frames were packets of this protocol; a random frame is one with probability 1/65
-    /// 536.
+    /// Returns true if most of the frames that may be packets are packets of this protocol; a random frame is one with
+    /// probability 1/65 536.
     #[must_use]
     pub const fn is_ours(&self) -> bool {
         self.ours > self.others
@@ -183,14 +184,14 @@ impl Traffic {
         }
     }
 
-    /// Classifies a page that a cell sends on a report command and also at other times.
+    /// Sorts a page that a cell sends in answer to a report command and also at other times.
     fn page(&mut self, from: CellId, page: usize) -> ClassifiedFrame {
         let owed = self.cells().get_mut(from.index()).and_then(|owed| owed.get_mut(page));
         let owed = owed.map(std::mem::take).unwrap_or(false);
         ClassifiedFrame { bench: owed.then_some(BenchFrame::Report), ..ClassifiedFrame::OTHER }
     }
 
-    /// Removes and returns the outstanding replies of a cell.
+    /// Returns the answers that a cell still owes, and clears them.
     fn take(&mut self, from: CellId) -> PendingReplies {
         self.cells().get_mut(from.index()).map(std::mem::take).unwrap_or_default()
     }

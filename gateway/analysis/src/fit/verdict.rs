@@ -1,4 +1,4 @@
-//! The verdict whether a bus carries its traffic, in the wording of all commands.
+//! The verdict on a bus: whether it can carry its traffic, in the wording that all commands share.
 
 use std::fmt::{self, Display, Formatter};
 
@@ -7,21 +7,21 @@ use serde::{Serialize, Serializer};
 use super::AssessedBus;
 use super::limits::{ByLimit, Limit, MAX_NODES};
 
-/// The verdict on a bus.
+/// The verdict on a bus: it fits, or the limit that it exceeds.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Verdict {
     /// Bandwidth, deadline and number of nodes fit.
     Fits,
-    /// Bandwidth and deadline fit, but this number of nodes exceeds the transceivers' limit.
+    /// Bandwidth and deadline fit, but the bus has this number of nodes, more than transceivers can drive.
     Nodes(u32),
-    /// The load is higher than the bus can carry.
+    /// The load exceeds what the bus can carry.
     Bandwidth,
-    /// An answer comes after the next joints.
+    /// An answer ends after the next joints.
     Deadline,
 }
 
 impl Verdict {
-    /// Returns the verdict from the exceeded limits of a bus with this number of cells, see [`ByLimit::broken`].
+    /// Returns the verdict for a bus with this number of cells that exceeds these limits, see [`ByLimit::broken`].
     #[must_use]
     pub fn from_limits(exceeded: &[Limit], cells: u32) -> Self {
         match exceeded.first() {
@@ -32,7 +32,7 @@ impl Verdict {
         }
     }
 
-    /// Returns true if all limits hold.
+    /// Returns true if the bus keeps all limits.
     #[must_use]
     pub const fn fits(self) -> bool {
         matches!(self, Self::Fits)
@@ -56,25 +56,25 @@ impl Serialize for Verdict {
     }
 }
 
-/// The cells that answer joints.
+/// The cells whose answers a verdict includes.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 #[serde(tag = "answering", rename_all = "lowercase")]
 pub enum Cells {
-    /// All of them.
+    /// All cells of the bus.
     All {
         /// Number of cells.
         cells: u32,
     },
-    /// Those that answered in a run.
+    /// The cells that answered in a run.
     Some {
-        /// Number of answers in the epoch with most of them.
+        /// Largest number of answers in one epoch.
         most: u32,
         /// Number of cells on the bus.
         cells: u32,
         /// True if `cells` is from the skin, false if it was observed.
         described: bool,
     },
-    /// The bus carries another protocol.
+    /// The bus carries another protocol, without cells.
     Foreign,
 }
 
@@ -119,18 +119,18 @@ impl Display for Cells {
 /// ```
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Answer {
-    /// The load; for a run, that of the second with the highest load.
+    /// The load of the bus; for a run, in the second with the highest load.
     pub load: f64,
-    /// The bus' format and rates.
+    /// The format and the bit rates of the bus, as text.
     pub rates: String,
-    /// The answering cells.
+    /// The cells whose answers the load includes.
     pub cells: Cells,
-    /// The verdict.
+    /// The verdict on the bus.
     pub verdict: Verdict,
 }
 
 impl Answer {
-    /// Returns the assessment of a bus with all cells answering.
+    /// Returns the load and the verdict of a bus if all cells answer.
     #[must_use]
     pub fn worst_case(rated: &AssessedBus) -> Self {
         Self {
@@ -141,8 +141,8 @@ impl Answer {
         }
     }
 
-    /// Returns the assessment of a run, from the load of its fullest second and the number of answers that ended after
-    /// the next joints.
+    /// Returns the load and the verdict of a run. `load` is that of its busiest second, and `late` is the number of
+    /// answers that ended after the next joints.
     #[must_use]
     pub fn this_run(load: f64, late: u64, rates: String, cells: Cells) -> Self {
         let on_the_bus = cells.on_the_bus();
@@ -150,7 +150,7 @@ impl Answer {
         Self { load, rates, cells, verdict: Verdict::from_limits(&holds.broken(), on_the_bus) }
     }
 
-    /// Returns the name of the case.
+    /// Returns the name of the case: the worst case, or this run.
     #[must_use]
     pub const fn case(&self) -> &'static str {
         match self.cells {

@@ -8,35 +8,36 @@ pub use super::finding::{Finding, Quantity, Verdict};
 pub use super::number::{number, quantity};
 pub use super::skin::{Drawing, Legend, Map, Panel, Spot, Strip, StripGroup, StripRow};
 
-/// A whole page.
+/// The contents of an HTML page: a title, facts, and sections with figures and tables.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Page {
-    /// Its heading, in one line.
+    /// Heading of the page, in one line.
     pub title: String,
-    /// Its subject, in one or two sentences.
+    /// Subject of the page, in one or two sentences.
     pub intro: String,
-    /// Facts by name: machine, command, revision.
+    /// Facts with their names, such as machine, command and revision.
     pub facts: Vec<(String, String)>,
-    /// Its sections, in order.
+    /// Sections of the page, in order.
     pub sections: Vec<Section>,
 }
 
-/// One section of a page.
+/// One section of a page, with text, figures, findings and tables.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Section {
-    /// The link to it, of letters, digits and `-`; the prefix of its files' names: `fig6`.
+    /// Name of the section, of letters, digits and `-`, such as `fig6`: the anchor of links to it, and the prefix of
+    /// its figures' file names.
     pub name: String,
-    /// Its heading.
+    /// Heading of the section.
     pub title: String,
     /// Paragraphs before the figures.
     pub text: Vec<String>,
     /// Drawings of cells, shown before the figures.
     pub drawings: Vec<Drawing>,
-    /// Its figures.
+    /// Figures of the section.
     pub figures: Vec<Figure>,
-    /// Numbers compared with the paper's.
+    /// Measured numbers, compared with the paper's.
     pub findings: Vec<Finding>,
-    /// Tables with everything else.
+    /// Tables of the section, shown last.
     pub tables: Vec<Table>,
 }
 
@@ -83,40 +84,41 @@ impl Section {
     }
 }
 
-/// One diagram.
+/// A diagram with axes and series, and optionally a second one below.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Figure {
-    /// A unique name in the page, of letters, digits and `-`; also that of its file: `fig6-joint2`.
+    /// Name of the figure, unique on the page, of letters, digits and `-`, such as `fig6-joint2`; also the name of its
+    /// file.
     pub name: String,
-    /// Its caption.
+    /// Caption of the figure.
     pub title: String,
-    /// Its width on the page.
+    /// Width of the figure on the page.
     pub size: Size,
     /// The horizontal axis.
     pub x: Axis,
     /// The vertical axis.
     pub y: Axis,
-    /// The series, in drawing order. Their colours follow the order and repeat after [`Figure::COLOURS`].
+    /// The series in drawing order. Their colours follow this order, and repeat after [`Figure::COLOURS`].
     pub series: Vec<Series>,
-    /// Marked positions.
+    /// Lines across the diagram at given positions, such as limits.
     pub marks: Vec<Mark>,
-    /// A second diagram below it, with the same horizontal axis.
+    /// A second diagram below this one, with the same horizontal axis.
     pub below: Option<LowerDiagram>,
 }
 
-/// A lower diagram, for series with a scale of their own.
+/// The lower diagram of a figure, for series with a vertical scale of their own.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct LowerDiagram {
-    /// The vertical axis.
+    /// The vertical axis of the lower diagram.
     pub y: Axis,
     /// The series, as in a [`Figure`].
     pub series: Vec<Series>,
-    /// Marked positions.
+    /// Lines across the lower diagram at given positions.
     pub marks: Vec<Mark>,
 }
 
 impl Figure {
-    /// Number of distinguishable colours; further series start again with the first.
+    /// Number of distinguishable colours; further series repeat them from the first.
     pub const COLOURS: usize = 7;
 
     /// Creates an empty figure of full width.
@@ -125,7 +127,7 @@ impl Figure {
         Self { name: name.into(), title: title.into(), x, y, ..Self::default() }
     }
 
-    /// Sets half the width.
+    /// Makes the figure half as wide as the page.
     #[must_use]
     pub const fn half(mut self) -> Self {
         self.size = Size::Half;
@@ -146,14 +148,14 @@ impl Figure {
         self
     }
 
-    /// Adds marks.
+    /// Adds lines across the diagram.
     #[must_use]
     pub fn marks(mut self, marks: impl IntoIterator<Item = Mark>) -> Self {
         self.marks.extend(marks);
         self
     }
 
-    /// Adds a diagram below.
+    /// Adds a second diagram below this one.
     #[must_use]
     pub fn below(mut self, below: LowerDiagram) -> Self {
         self.below = Some(below);
@@ -178,9 +180,10 @@ pub struct Axis {
     pub caption: String,
     /// Unit of the quantity; empty for counts.
     pub unit: String,
-    /// The mapping from values to positions.
+    /// Linear or logarithmic mapping of values to positions.
     pub scale: Scale,
-    /// The ends; by default those of the data plus a margin. On a logarithmic axis both must be above 0.
+    /// The first and the last value of the axis; by default those of the data plus a margin. On a logarithmic axis both
+    /// must be above 0.
     pub range: Option<(f64, f64)>,
 }
 
@@ -191,7 +194,7 @@ impl Axis {
         Self { caption: caption.into(), unit: unit.into(), scale: Scale::Linear, range: None }
     }
 
-    /// Sets the ends.
+    /// Sets the first and the last value of the axis.
     #[must_use]
     pub const fn between(mut self, from: f64, to: f64) -> Self {
         self.range = Some((from, to));
@@ -216,7 +219,7 @@ impl fmt::Display for Axis {
     }
 }
 
-/// The mapping from values to positions.
+/// The mapping from values to positions along an axis.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub enum Scale {
     /// Linear.
@@ -229,11 +232,11 @@ pub enum Scale {
 /// One series of a diagram.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Series {
-    /// The name in the legend; empty to omit it there.
+    /// Name of the series in the legend; empty to omit it there.
     pub caption: String,
-    /// The way of drawing.
+    /// Form in which the series is drawn.
     pub shape: Shape,
-    /// x and y, by increasing x for all shapes except points. Values that are not finite make a gap.
+    /// The points x and y. For all shapes except points and bands, x increases. Values that are not finite make a gap.
     pub points: Vec<(f64, f64)>,
 }
 
@@ -245,7 +248,7 @@ impl Series {
     }
 }
 
-/// The way of drawing a series.
+/// The form in which a series is drawn.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub enum Shape {
     /// Straight lines between the points.
@@ -264,29 +267,29 @@ pub enum Shape {
 /// A line across a whole diagram.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Mark {
-    /// The axis of `at`.
+    /// The axis on which the line has its position.
     pub on: MarkAxis,
-    /// The position.
+    /// The position of the line on that axis.
     pub at: f64,
-    /// The text.
+    /// The text beside the line.
     pub caption: String,
 }
 
 impl Mark {
-    /// Creates a vertical line.
+    /// Creates a vertical line at a position on the horizontal axis.
     #[must_use]
     pub fn x(at: f64, caption: impl Into<String>) -> Self {
         Self { on: MarkAxis::X, at, caption: caption.into() }
     }
 
-    /// Creates a horizontal line.
+    /// Creates a horizontal line at a position on the vertical axis.
     #[must_use]
     pub fn y(at: f64, caption: impl Into<String>) -> Self {
         Self { on: MarkAxis::Y, at, caption: caption.into() }
     }
 }
 
-/// An axis.
+/// The axis on which a line across the diagram has its position.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 pub enum MarkAxis {
     /// The horizontal axis: the line is vertical.
@@ -295,7 +298,7 @@ pub enum MarkAxis {
     Y,
 }
 
-/// Rows below headings.
+/// A table of texts: rows below headings.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Table {
     /// The title.
@@ -304,7 +307,7 @@ pub struct Table {
     pub head: Vec<String>,
     /// The rows, each with as many cells as there are headings. Columns of numbers are right-aligned.
     pub rows: Vec<Vec<String>>,
-    /// True if the last column holds commands.
+    /// True if the last column holds commands for a shell.
     pub commands: bool,
 }
 

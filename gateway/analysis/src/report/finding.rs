@@ -1,4 +1,4 @@
-//! Findings: measured numbers and their comparison.
+//! Findings: measured numbers, compared with the paper's or with a requirement.
 
 use std::fmt;
 
@@ -9,33 +9,36 @@ use super::number::{interval, quantity};
 /// A result compared with the paper's number or with a limit.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Finding {
-    /// The quantity, with the method of measurement.
+    /// The measured quantity, and how it was measured.
     pub what: String,
     /// The paper's value, if it has one.
     pub paper: Option<Quantity>,
-    /// The measured value.
+    /// The value that was measured here.
     pub ours: Quantity,
     /// The requirement as text: `at most 0.005 Nm`.
     pub bar: Option<String>,
-    /// The reference of the rating if there is no requirement, or the reason why it is not rated: `below the paper's`.
+    /// Text shown if there is no requirement: the reference of the rating, such as `below the paper's`, or the
+    /// reason why it was not rated.
     pub against: Option<String>,
-    /// The source of the requirement: an option, the skin's file, a default.
+    /// Where the requirement comes from: an option, the skin's file, a default.
     pub origin: Option<String>,
     /// A command that shows the details.
     pub command: Option<String>,
-    /// The result of the comparison.
+    /// The result of comparing the measured value.
     pub verdict: Verdict,
 }
 
 impl Finding {
-    /// Creates a finding for which less is better than the paper; within 5 % the two are the same.
+    /// Creates a finding that is rated against the paper's value: less is better, and within 5 % of it the two count as
+    /// the same.
     #[must_use]
     pub fn less_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
         let finding = Self::stated(what, ours).beside(paper).against("below the paper's");
         Self { verdict: Verdict::less_is_better(paper, finding.ours.value), ..finding }
     }
 
-    /// Creates a finding for which more is better than the paper; within 5 % the two are the same.
+    /// Creates a finding that is rated against the paper's value: more is better, and within 5 % of it the two count as
+    /// the same.
     #[must_use]
     pub fn more_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
         let finding = Self::stated(what, ours).beside(paper).against("above the paper's");
@@ -64,14 +67,14 @@ impl Finding {
         self
     }
 
-    /// Sets the reference of the rating, or the reason why it is not rated.
+    /// Sets the text shown without a requirement: the reference of the rating, or why there is no rating.
     #[must_use]
     pub fn against(mut self, what: impl Into<String>) -> Self {
         self.against = Some(what.into());
         self
     }
 
-    /// Sets the source of the requirement.
+    /// Sets where the requirement comes from.
     #[must_use]
     pub fn from(mut self, origin: impl Into<String>) -> Self {
         self.origin = Some(origin.into());
@@ -85,7 +88,7 @@ impl Finding {
         self
     }
 
-    /// Rates the value by an upper limit in its own unit.
+    /// Rates the value by an upper limit, which has the same unit.
     #[must_use]
     pub fn at_most(self, limit: f64) -> Self {
         let kept = self.ours.value <= limit;
@@ -93,7 +96,7 @@ impl Finding {
         self.must(bar, kept)
     }
 
-    /// Rates the value by a requirement; if it is met, the verdict is [`Verdict::Better`].
+    /// Rates the value by a requirement, given as text; `kept` is true if the value meets it.
     #[must_use]
     pub fn must(mut self, bar: impl Into<String>, kept: bool) -> Self {
         self.bar = Some(bar.into());
@@ -105,19 +108,19 @@ impl Finding {
 /// The result of a comparison with the paper or with a requirement.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub enum Verdict {
-    /// Better than the paper, or meets the requirement.
+    /// The value is better than the paper's, or meets the requirement.
     Better,
-    /// Within 5 % of the paper.
+    /// The value is within 5 % of the paper's.
     Same,
-    /// Worse than the paper, or violates the requirement.
+    /// The value is worse than the paper's, or violates the requirement.
     Worse,
-    /// Not rated.
+    /// The value is stated without a rating.
     #[default]
     Stated,
 }
 
 impl Verdict {
-    /// Compares numbers for which less is better; within 5 % of `paper` they are the same.
+    /// Compares two values for which less is better; within 5 % of `paper` they count as the same.
     #[must_use]
     pub fn less_is_better(paper: f64, ours: f64) -> Self {
         if !(paper.is_finite() && ours.is_finite()) {
@@ -150,7 +153,7 @@ pub struct Quantity {
     pub value: f64,
     /// The unit; empty for counts.
     pub unit: String,
-    /// Half the width of its 95 % interval, if known.
+    /// Half the width of the value's 95 % confidence interval, if known.
     pub plus_minus: Option<f64>,
 }
 
@@ -161,7 +164,7 @@ impl Quantity {
         Self { value, unit: unit.into(), plus_minus: None }
     }
 
-    /// Sets half the width of its 95 % interval.
+    /// Sets half the width of the value's 95 % confidence interval.
     #[must_use]
     pub const fn plus_minus(mut self, half: f64) -> Self {
         self.plus_minus = Some(half);
@@ -176,7 +179,7 @@ impl<T: Into<String>> From<(f64, T)> for Quantity {
 }
 
 impl From<f64> for Quantity {
-    /// Creates a count.
+    /// Creates a quantity without a unit.
     fn from(value: f64) -> Self {
         Self::new(value, "")
     }

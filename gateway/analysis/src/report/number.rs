@@ -1,11 +1,11 @@
 //! Formats the numbers of a report, by one rule: three significant digits without trailing zeros, and for a unit the SI
 //! prefix that leaves 1 to 999. Counts are whole numbers.
 
-/// Prefixes by their powers of a thousand.
+/// SI prefixes with their powers of a thousand.
 const PREFIXES: [(i32, &str); 7] = [(-4, "p"), (-3, "n"), (-2, "µ"), (-1, "m"), (0, ""), (1, "k"), (2, "M")];
 
-/// Units that take prefixes: the unit, its size in the base unit, the base unit, and its highest usual power of a
-/// thousand.
+/// Units that take prefixes: name, size in the base unit, base unit, and the highest power of a thousand that is in
+/// use.
 const UNITS: [(&str, f64, &str, i32); 8] = [
     ("Nm", 1.0, "Nm", 1),
     ("N", 1.0, "N", 1),
@@ -17,21 +17,21 @@ const UNITS: [(&str, f64, &str, i32); 8] = [
     ("µs", 1e-6, "s", 0),
 ];
 
-/// A unit with the prefix that fits a size.
+/// A unit with an SI prefix, and the factor to convert to it.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Fitted {
-    /// The factor from the given unit to this one.
+    /// The factor that converts a value from the original unit to this one.
     pub(super) factor: f64,
     /// The unit with its prefix.
     pub(super) unit: String,
 }
 
-/// Returns the static name of a unit that takes prefixes.
+/// Returns the unit as a static text if it takes prefixes.
 pub(super) fn known(unit: &str) -> Option<&'static str> {
     UNITS.iter().find(|(name, ..)| *name == unit).map(|(name, ..)| *name)
 }
 
-/// Returns the unit with the prefix that leaves 1 to 999 of a size; `None` for a unit without prefixes.
+/// Returns the unit with the prefix by which a value of this size becomes 1 to 999; `None` for a unit without prefixes.
 pub(super) fn fitted(size: f64, unit: &str) -> Option<Fitted> {
     let (_, scale, base, most) = *UNITS.iter().find(|(name, ..)| *name == unit)?;
     let size = rounded(size.abs() * scale);
@@ -44,7 +44,7 @@ pub(super) fn fitted(size: f64, unit: &str) -> Option<Fitted> {
     Some(Fitted { factor: scale / 1_000_f64.powi(power), unit: format!("{prefix}{base}") })
 }
 
-/// Rounds to the three significant digits of the text.
+/// Rounds a value to three significant digits, as its text shows it.
 fn rounded(value: f64) -> f64 {
     format!("{value:.2e}").parse().unwrap_or(value)
 }
@@ -64,8 +64,8 @@ pub fn quantity(value: f64, unit: &str) -> String {
     interval(value, None, unit)
 }
 
-/// Formats a number and half the width of its 95 % interval: two digits of the width, and the number to the same
-/// decimal place.
+/// Formats a number and half the width of its 95 % confidence interval: the half width with two digits, and the number
+/// to the same decimal place.
 pub(super) fn interval(value: f64, half: Option<f64>, unit: &str) -> String {
     let size = value.abs().max(half.unwrap_or(0.0));
     if !value.is_finite() || unit.is_empty() && half.is_none() {
@@ -94,7 +94,7 @@ fn second_digit(value: f64) -> Option<usize> {
     is_plain.then(|| usize::try_from(1 - power).unwrap_or(0))
 }
 
-/// Formats a number with at most this number of decimals.
+/// Formats a number with at most this number of decimals, without trailing zeros.
 fn trimmed(value: f64, digits: usize) -> String {
     let text = format!("{:.digits$}", value + 0.0);
     if digits == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }

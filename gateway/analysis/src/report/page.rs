@@ -10,7 +10,7 @@ use super::svg;
 /// The style of all pages: light, dark on dark screens, and black on white for paper.
 const STYLE: &str = include_str!("page.css");
 
-/// Renders a whole page.
+/// Renders a page, from its title to its last section, as the text of an HTML file.
 #[must_use]
 pub fn html(page: &Page) -> String {
     let mut out = String::new();
@@ -173,12 +173,12 @@ fn command(text: &str) -> String {
     format!("<code>{}</code>", text.split(' ').map(word).collect::<Vec<_>>().join(" "))
 }
 
-/// Returns the cells of the shown columns.
+/// Returns those of the cells whose column is shown.
 fn some<T, const N: usize>(cells: [T; N], shown: [bool; N]) -> impl Iterator<Item = T> {
     cells.into_iter().zip(shown).filter(|(_, shown)| *shown).map(|(cell, _)| cell)
 }
 
-/// Writes a row of a table, given the text and the attributes of each cell.
+/// Writes a row of an HTML table; `cells` gives the text and the attributes of each cell.
 fn row<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, &'a str)>) {
     out.push_str("<tr>");
     self::cells(out, tag, cells);
@@ -191,7 +191,7 @@ fn cells<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, 
     }
 }
 
-/// Returns true if a column holds numbers, and so is right-aligned.
+/// Returns true if a column contains numbers, so that it is right-aligned.
 fn numbers(table: &Table, column: usize) -> bool {
     let mut cells =
         table.rows.iter().filter_map(|row| row.get(column)).filter(|cell| !cell.is_empty()).peekable();

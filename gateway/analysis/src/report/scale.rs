@@ -1,4 +1,4 @@
-//! Maps values to positions and back, and chooses the round numbers beside an axis.
+//! Maps values of an axis to positions and back, and chooses the round numbers for its ticks.
 
 use std::ops::Range;
 
@@ -7,18 +7,18 @@ use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 use super::figure::{Axis, Scale, quantity};
 use super::number::{Fitted, fitted, known};
 
-/// An axis with its ends.
+/// The range of an axis, with its mapping and unit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Span {
     from: f64,
     to: f64,
     scale: Scale,
-    /// The axis' unit, if it takes prefixes.
+    /// Unit of the axis, if it takes SI prefixes.
     unit: Option<&'static str>,
 }
 
 impl Span {
-    /// Creates the axis with its own ends, or with those of the data plus a margin.
+    /// Creates the range of an axis: the given one, or that of the data plus a margin of the share `room`.
     pub(crate) fn new(axis: &Axis, values: impl Iterator<Item = f64>, room: f64) -> Self {
         let scale = axis.scale;
         let usable = |value: &f64| value.is_finite() && (scale == Scale::Linear || *value > 0.0);
@@ -33,7 +33,7 @@ impl Span {
         Self { from, to, scale, unit: known(&axis.unit) }
     }
 
-    /// Returns the unit of a linear axis with the prefix for its ends.
+    /// Returns the unit of a linear axis with the SI prefix that fits its ends.
     fn fitted(&self) -> Option<Fitted> {
         let unit = self.unit.filter(|_| self.scale == Scale::Linear)?;
         fitted(self.from.abs().max(self.to.abs()), unit)
@@ -49,7 +49,7 @@ impl Span {
         Axis { unit, ..Axis::new(&axis.caption, "") }.to_string()
     }
 
-    /// Returns the position of a value: 0 at the axis' start, 1 at its end, NaN if it has none.
+    /// Returns the position of a value: 0 at the start of the axis, 1 at its end, NaN for a value that has no position.
     pub(crate) fn place(&self, value: f64) -> f64 {
         match self.scale {
             Scale::Linear => (value - self.from) / (self.to - self.from),
@@ -58,7 +58,7 @@ impl Span {
         }
     }
 
-    /// Returns the value at a position.
+    /// Returns the value at a position from 0 to 1.
     pub(crate) fn value(&self, place: f64) -> f64 {
         match self.scale {
             Scale::Linear => self.from + place * (self.to - self.from),
@@ -66,7 +66,7 @@ impl Span {
         }
     }
 
-    /// Returns round numbers along the axis, at most `most`, in steps of 1, 2 or 5 times a power of ten.
+    /// Returns at most `most` round numbers along the axis for ticks, in steps of 1, 2 or 5 times a power of ten.
     pub(crate) fn ticks(&self, most: usize) -> Vec<f64> {
         match self.scale {
             Scale::Linear => linear_ticks(self.from, self.to, most),
@@ -74,7 +74,7 @@ impl Span {
         }
     }
 
-    /// Formats a tick, with enough digits to distinguish neighbours.
+    /// Formats the number at a tick, with enough digits to differ from its neighbours.
     pub(crate) fn caption(&self, tick: f64, most: usize) -> String {
         let factor = self.fitted().map_or(1.0, |fitted| fitted.factor);
         let size = self.from.abs().max(self.to.abs()) * factor;
@@ -113,7 +113,7 @@ impl Ranged for Span {
     }
 }
 
-/// Returns ends with a margin, and a default range without data.
+/// Returns the ends of the data with a margin; a default range if there are no data.
 fn wider((from, to): (f64, f64), scale: Scale, room: f64) -> (f64, f64) {
     let nothing = !(from.is_finite() && to.is_finite() && from <= to);
     match scale {
@@ -176,7 +176,7 @@ fn log_ticks(from: f64, to: f64, most: usize) -> Vec<f64> {
     ticks.into_iter().step_by(skip).collect()
 }
 
-/// Removes the last digits, which are rounding errors.
+/// Removes the last digits of a tick, which are rounding errors.
 fn round(tick: f64) -> f64 {
     format!("{tick:.9}").parse().unwrap_or(tick)
 }

@@ -2,17 +2,17 @@
 
 use serde::Serialize;
 
-/// A drawing of cells.
+/// A drawing of the cells of a skin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub enum Drawing {
-    /// Values over time.
+    /// The cells' values over time.
     Strip(Strip),
-    /// Values by position.
+    /// The cells' values at their positions on the links.
     Map(Map),
 }
 
 impl Drawing {
-    /// Returns the unique name in the page, of letters, digits and `-`.
+    /// Returns the name of the drawing, unique on the page, of letters, digits and `-`.
     #[must_use]
     pub fn name(&self) -> &str {
         match self {
@@ -21,7 +21,7 @@ impl Drawing {
         }
     }
 
-    /// Returns its caption.
+    /// Returns the caption of the drawing.
     #[must_use]
     pub fn title(&self) -> &str {
         match self {
@@ -31,60 +31,60 @@ impl Drawing {
     }
 }
 
-/// A chart with time to the right, one row per cell, and values as colours.
+/// A chart of cells over time: time to the right, one row for each cell, and values as colours.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Strip {
-    /// A unique name in the page, of letters, digits and `-`.
+    /// Name of the drawing, unique on the page, of letters, digits and `-`.
     pub name: String,
-    /// Its caption.
+    /// Caption of the drawing.
     pub title: String,
     /// The ends of the time axis in s.
     pub seconds: (f64, f64),
     /// The legend of the colours.
     pub legend: Legend,
-    /// Groups of rows.
+    /// Groups of rows, such as the cells of a link.
     pub groups: Vec<StripGroup>,
 }
 
-/// Rows under a heading.
+/// A group of rows of a strip, under a heading.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct StripGroup {
     /// The heading.
     pub title: String,
-    /// The rows, the first one highest.
+    /// The rows, from top to bottom.
     pub rows: Vec<StripRow>,
 }
 
-/// One cell over time.
+/// One row of a strip: the values of a cell over time.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct StripRow {
     /// The text to the left of the row.
     pub caption: String,
-    /// Start and end in s, and the value in between, above 0; by increasing time. The rest of the row stays empty.
+    /// Start and end in s, and the value in between (above 0), in order of time. The row is empty at other times.
     pub values: Vec<(f64, f64, f64)>,
 }
 
 /// A map of the cells at their positions on the links, with values as colours.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Map {
-    /// A unique name in the page, of letters, digits and `-`.
+    /// Name of the drawing, unique on the page, of letters, digits and `-`.
     pub name: String,
-    /// Its caption.
+    /// Caption of the drawing.
     pub title: String,
     /// The legend of the colours.
     pub legend: Legend,
-    /// The links.
+    /// The links, each with its cells.
     pub panels: Vec<Panel>,
 }
 
-/// The cells of a link, mapped to a plane.
+/// One link on a map: its cells, mapped to a plane.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Panel {
-    /// The link.
+    /// Name of the link.
     pub title: String,
     /// The radius in m of the unrolled cylinder; `None` for a plate.
     pub radius: Option<f64>,
-    /// Its cells.
+    /// The cells on the link.
     pub cells: Vec<Spot>,
 }
 
@@ -93,25 +93,25 @@ pub struct Panel {
 pub struct Spot {
     /// Position to the right and down, in m.
     pub at: [f64; 2],
-    /// Its value; 0 has no colour, and `None` is unknown.
+    /// Value of the cell; 0 is drawn without colour, and `None` stands for unknown.
     pub value: Option<f64>,
-    /// Its name.
+    /// Name of the cell.
     pub caption: String,
 }
 
 /// The legend of colours, from 0 to a maximum.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Legend {
-    /// The quantity.
+    /// The quantity that the colours show.
     pub caption: String,
-    /// The unit; empty for counts.
+    /// Unit of the quantity; empty for counts.
     pub unit: String,
-    /// The value of the last colour.
+    /// The value at the last colour.
     pub max: f64,
 }
 
 impl Legend {
-    /// Creates a legend from 0 to the largest of some values.
+    /// Creates a legend from 0 to the largest of these values.
     #[must_use]
     pub fn for_values(caption: &str, unit: &str, values: impl Iterator<Item = f64>) -> Self {
         Self { caption: caption.to_owned(), unit: unit.to_owned(), max: values.fold(0.0, f64::max) }

@@ -24,22 +24,22 @@ use super::figure::{Axis, Figure, Mark, MarkAxis, Series, Shape, Size};
 use super::scale::Span;
 use super::thin::thinned;
 
-/// Number of drawing units per pixel of the natural size: positions are whole units.
+/// Number of drawing units per pixel, so that positions are whole numbers.
 const UNIT: i32 = 8;
 /// Height of a diagram below another one, in pixels.
 const BELOW: u32 = 170;
 /// Size of letters, in pixels.
 const LETTERS: f64 = 13.0;
-/// The widths of lines in units. Plotters would draw each dash as its own line, of which a noisy curve has thousands.
-/// So dashed lines have unique widths, and are dashed by an attribute.
+/// Widths of lines in drawing units. The plotting library would draw each dash as a line of its own, of which a noisy
+/// curve has thousands. So dashed lines have unique widths, by which they are found and given a dash attribute.
 const LINE: u32 = 13;
 const DASHED: u32 = 14;
 const DOTTED: u32 = 9;
 const DASHES: [(u32, &str); 2] = [(DASHED, "56 36"), (DOTTED, "16 24")];
 
-/// Colour, class, and colour on a dark screen: of text, of faint text, of the grid, and of series. On paper, those of
-/// series are Okabe and Ito's, which colour-blind readers can distinguish, without the yellow, which is invisible on
-/// white.
+/// Colour on paper, CSS class, and colour on a dark screen: for text, faint text, the grid, and each series. The series
+/// have Okabe and Ito's colours, which colour-blind readers can distinguish; their yellow is omitted because it is
+/// invisible on white.
 const CLASSES: [(RGBColor, &str, &str); 3 + Figure::COLOURS] = [
     (INK, "ink", "#E4E4E4"),
     (FAINT, "faint", "#A6A6A6"),
@@ -56,7 +56,7 @@ const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
 const FAINT: RGBColor = RGBColor(0x6B, 0x6B, 0x6B);
 const GRID: RGBColor = RGBColor(0xDD, 0xDD, 0xDD);
 
-/// Returns the colours of series, repeating from the first.
+/// Returns the colours of the series in order, repeated without end.
 fn colours() -> impl Iterator<Item = RGBColor> {
     CLASSES.iter().skip(3).cycle().map(|(colour, ..)| *colour)
 }
@@ -73,7 +73,7 @@ pub fn dark() -> String {
     rules
 }
 
-/// Returns a figure's natural width and height in pixels.
+/// Returns the width and the height of a figure in pixels, before scaling.
 #[must_use]
 pub const fn natural(size: Size) -> (u32, u32) {
     match size {
@@ -82,7 +82,7 @@ pub const fn natural(size: Size) -> (u32, u32) {
     }
 }
 
-/// Returns the natural size including a diagram below.
+/// Returns the width and the height of a figure in pixels, including a diagram below it.
 #[must_use]
 pub(crate) const fn height(figure: &Figure, size: Size) -> (u32, u32) {
     let (width, height) = natural(size);
@@ -98,7 +98,8 @@ pub fn draw(figure: &Figure) -> String {
     document(figure, (width, height), &attributes, &style)
 }
 
-/// Draws a part of a page that contains the rules of [`dark()`]; `size` is the natural size in pixels.
+/// Draws a figure as an element of a page that contains the CSS rules of [`dark()`]; `size` is the size in pixels
+/// before scaling.
 #[must_use]
 pub fn inline(figure: &Figure, size: (u32, u32), class: &str) -> String {
     document(figure, size, &format!("class=\"{class}\""), "")
@@ -122,7 +123,7 @@ fn document(figure: &Figure, (width, height): (u32, u32), attributes: &str, styl
     )
 }
 
-/// Adds the class to every colour.
+/// Adds the CSS class to every colour of an SVG text.
 fn classed(body: &str) -> String {
     let mut body = body.replace(" opacity=\"1\"", "").replace(" font-family=\"sans-serif\"", "");
     for (RGBColor(r, g, b), class, _) in CLASSES {
@@ -142,7 +143,7 @@ type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Chart<'a, 'b> = ChartContext<'b, SVGBackend<'a>, Cartesian2d<Span, Span>>;
 type Drawn = Result<(), DrawingAreaErrorKind<std::io::Error>>;
 
-/// One of a figure's diagrams.
+/// One of the diagrams of a figure.
 #[derive(Clone, Copy)]
 struct Diagram<'a> {
     axes: (&'a Axis, &'a Axis),
@@ -151,7 +152,7 @@ struct Diagram<'a> {
     y: Span,
     series: &'a [Series],
     marks: &'a [Mark],
-    /// True if the horizontal axis is labelled.
+    /// True if the labels of the horizontal axis belong below this diagram.
     is_lowest: bool,
 }
 
@@ -174,14 +175,14 @@ impl<'a> Diagram<'a> {
         diagrams.collect()
     }
 
-    /// Returns the maximum number of vertical ticks for a height in units.
+    /// Returns the maximum number of ticks of the vertical axis, for a height in drawing units.
     const fn ticks(height: u32) -> usize {
         // A low diagram needs closer ticks.
         let distance = if height > pixels(BELOW) { 42 } else { 32 };
         (height / pixels(distance)) as usize
     }
 
-    /// Returns the number of letters of the widest vertical caption.
+    /// Returns the number of letters of the longest label on the vertical axis.
     fn letters(&self, height: u32) -> usize {
         let most = Self::ticks(height);
         let ticks = self.y.ticks(most).into_iter();
@@ -297,7 +298,7 @@ fn series_of(
     Ok(())
 }
 
-/// Returns true if a point is in the picture, which is from 0 to 1 in both directions.
+/// Returns true if a point, given as positions from 0 to 1, is inside the diagram.
 fn is_inside(point: &(f64, f64)) -> bool {
     (0.0..=1.0).contains(&point.0) && (0.0..=1.0).contains(&point.1)
 }
@@ -306,12 +307,12 @@ fn is_finite(point: &(f64, f64)) -> bool {
     point.0.is_finite() && point.1.is_finite()
 }
 
-/// Returns the pieces of a line between its gaps.
+/// Returns the pieces of a line between gaps, which are points with values that are not finite.
 fn runs(points: &[(f64, f64)]) -> impl Iterator<Item = &[(f64, f64)]> {
     points.split(|point| !is_finite(point)).filter(|run| !run.is_empty())
 }
 
-/// Returns a line that holds each value until the next one.
+/// Returns the points of a line that holds each value until the next one, in steps.
 pub(crate) fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let mut stairs = Vec::with_capacity(points.len() * 2);
     for point in points {
@@ -323,7 +324,7 @@ pub(crate) fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     stairs
 }
 
-/// Returns the pieces of a line inside the picture.
+/// Returns the pieces of a line that are inside the diagram, cut at its edges.
 fn clipped(points: &[(f64, f64)]) -> Vec<Vec<(f64, f64)>> {
     if let [point] = points {
         // A single point would be an invisible line of no length.
@@ -380,7 +381,7 @@ fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Dr
     Ok(())
 }
 
-/// Returns the rows of the legend: the start of each entry, its series and its colour.
+/// Returns the rows of the legend. Each entry has its horizontal start, its series, and the colour of the series.
 fn legend(series: &[Series], width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
     let named = series.iter().zip(colours()).filter(|(series, _)| !series.caption.is_empty());
     let mut rows: Vec<Vec<_>> = Vec::new();
@@ -423,7 +424,8 @@ fn entry_of(area: &Area<'_>, series: &Series, colour: RGBColor, (at, row): (i32,
     area.draw(&Text::new(series.caption.clone(), (end + in_pixels(6.0), middle), style))
 }
 
-/// Returns the style of letters of a size in pixels; the backend shrinks them by 1.24.
+/// Returns the text style for letters of a size in pixels. The plotting library draws them smaller by a factor of 1.24,
+/// which is corrected here.
 fn letters<'a>(colour: &RGBColor, size: f64) -> TextStyle<'a> {
     ("sans-serif", size * 1.24 * f64::from(UNIT)).into_font().color(colour)
 }

@@ -2,7 +2,7 @@
 //! kept: a line through them covers the same pixels as a line through all points (Jugel, Jerzak, Hackenbroich and
 //! Markl, *M4: A Visualization-Oriented Time Series Data Aggregation*, 2014).
 
-/// A column's first, minimum, maximum and last point.
+/// The first, minimum, maximum and last point of a column of a picture.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Column {
     first: (f64, f64),
@@ -26,7 +26,7 @@ impl Column {
         self.last = later.last;
     }
 
-    /// Returns the different points, in order.
+    /// Returns the points of the column without repetitions, in order.
     fn points(&self) -> impl Iterator<Item = (f64, f64)> + use<> {
         let (a, b) = if self.min.0 <= self.max.0 { (self.min, self.max) } else { (self.max, self.min) };
         let mut before = None;
@@ -34,32 +34,32 @@ impl Column {
     }
 }
 
-/// A line of any length in bounded memory. Points arrive by increasing x; when there are too many columns, pairs of
-/// columns are merged.
+/// A line with any number of points, reduced to bounded memory. Points arrive by increasing x. When there are too many
+/// columns, pairs of columns are merged.
 #[derive(Clone, Debug)]
 pub struct ThinnedLine {
     most: usize,
-    /// Width of a column; it doubles with each merge.
+    /// Width of a column in units of x; it doubles with each merge.
     width: f64,
-    /// Start of the first column.
+    /// Start of the first column, in units of x.
     from: Option<f64>,
-    /// By position, with a flag for a gap in the line before the column.
+    /// Columns by their index, each with true if the line has a gap before it.
     columns: Vec<(u64, bool, Column)>,
-    /// Number of points, without gaps.
+    /// Number of points that were added, without gaps.
     count: u64,
     /// True if a gap follows the last point.
     gap: bool,
 }
 
 impl Default for ThinnedLine {
-    /// Creates a line with the number of columns of a page, 2 ms wide at first.
+    /// Creates a line with as many columns as a page can show, each 2 ms wide at first.
     fn default() -> Self {
         Self::new(1_000, 0.002)
     }
 }
 
 impl ThinnedLine {
-    /// Creates an empty line with at most `most` columns (at least 2), which are at least `width` wide.
+    /// Creates an empty line with at most `most` columns (at least 2). The columns are `width` wide at first.
     #[must_use]
     pub fn new(most: usize, width: f64) -> Self {
         Self { most: most.max(2), width, from: None, columns: Vec::new(), count: 0, gap: false }
@@ -71,7 +71,8 @@ impl ThinnedLine {
         self.count
     }
 
-    /// Adds the next point. A value that is not a number makes a gap; points before the first one are skipped.
+    /// Adds the next point. A value that is not a number makes a gap in the line. Points to the left of the first one
+    /// are skipped.
     pub fn push(&mut self, x: f64, y: f64) {
         if !(x.is_finite() && y.is_finite()) {
             self.gap = !self.columns.is_empty();
@@ -110,8 +111,8 @@ impl ThinnedLine {
         self.columns = merged;
     }
 
-    /// Returns the remaining points: at most four per column, by increasing x, with points that are not numbers at
-    /// gaps.
+    /// Returns the points that are kept: at most four for each column, by increasing x. A gap is a point whose value is
+    /// not a number.
     #[must_use]
     pub fn points(&self) -> Vec<(f64, f64)> {
         let mut points = Vec::with_capacity(self.columns.len() * 4);
@@ -123,7 +124,8 @@ impl ThinnedLine {
     }
 }
 
-/// Appends a column, or merges it into the last one: a point that arrives slightly late counts to the newest column.
+/// Appends a column, or merges it into the last one if it is not to the right of it: a late point counts to the newest
+/// column.
 fn join(columns: &mut Vec<(u64, bool, Column)>, (at, gap, column): (u64, bool, Column)) {
     match columns.last_mut() {
         Some((last, before, joined)) if *last >= at => {
@@ -134,7 +136,7 @@ fn join(columns: &mut Vec<(u64, bool, Column)>, (at, gap, column): (u64, bool, C
     }
 }
 
-/// Thins existing points: at most four for each of `columns` equal parts of 0 to 1 in x.
+/// Reduces a list of points: at most four are kept for each of `columns` equal parts of the range 0 to 1 in x.
 #[must_use]
 pub fn thinned(points: &[(f64, f64)], columns: u32) -> Vec<(f64, f64)> {
     if points.len() <= 4 * columns as usize {
@@ -153,7 +155,7 @@ pub fn thinned(points: &[(f64, f64)], columns: u32) -> Vec<(f64, f64)> {
         .collect()
 }
 
-/// Sums over equal bins in bounded memory; when there are too many bins, pairs are merged.
+/// Sums of amounts over equal bins of x, in bounded memory. When there are too many bins, pairs of bins are merged.
 #[derive(Clone, Debug)]
 pub struct BinnedSums {
     most: usize,
@@ -170,13 +172,13 @@ impl Default for BinnedSums {
 }
 
 impl BinnedSums {
-    /// Creates at most `most` empty bins (at least 2), `width` wide at first.
+    /// Creates at most `most` empty bins (at least 2), each `width` wide at first.
     #[must_use]
     pub fn new(most: usize, width: f64) -> Self {
         Self { most: most.max(2), width, from: None, bins: Vec::new() }
     }
 
-    /// Adds `amount` at `x`; positions before the first one count to its bin.
+    /// Adds `amount` to the bin at `x`. A position to the left of the first bin counts to the first one.
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
@@ -200,13 +202,13 @@ impl BinnedSums {
         }
     }
 
-    /// Returns the current width of the bins.
+    /// Returns the present width of a bin, in units of x.
     #[must_use]
     pub const fn width(&self) -> f64 {
         self.width
     }
 
-    /// Returns the start of each bin and its sum divided by its width. The last bin, which may be incomplete, is
+    /// Returns the start of each bin, and the sum in it divided by its width. The last bin may be incomplete, and is
     /// omitted unless it is the only one.
     #[must_use]
     pub fn rates(&self) -> Vec<(f64, f64)> {
@@ -274,7 +276,7 @@ mod tests {
     }
 
     proptest! {
-        /// Checks by brute force: each column's extremes are kept, and no new points appear.
+        /// The reduction keeps the extremes of every column and adds no new points; checked by brute force.
         #[test]
         fn thinning_keeps_the_extremes_of_every_column(
             ys in proptest::collection::vec(-100..100_i32, 1..4_000), columns in 2_u32..40,

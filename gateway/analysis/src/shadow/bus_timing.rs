@@ -1,4 +1,4 @@
-//! One bus: its frames in order, its model, and its figures.
+//! Models one bus: sorts the frames by time, simulates their transmission, and computes the figures of the bus.
 
 use std::collections::VecDeque;
 
@@ -16,43 +16,43 @@ use crate::fit::traffic::{RunEvent, ClassifiedFrame, Traffic};
 use crate::fit::verdict::{Answer, Cells};
 use bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 
-/// Maximum number of waiting frames on a bus: some minutes of a full bus. Further frames are refused, as by a full
-/// transmit queue.
+/// Maximum number of frames that wait to be sent on a bus: some minutes of a bus at full load. Further frames are
+/// refused, as a full transmit queue would.
 pub const MAX_QUEUE: usize = 1 << 22;
 /// The number of identifiers of 11 bits.
 const IDENTIFIER_COUNT: usize = 0x800;
 
-/// The data of a frame in the model.
+/// The data that the model keeps with a frame until it is sent.
 #[derive(Clone, Copy, Debug)]
 struct Tag {
-    /// Its index in the file.
+    /// Index of the frame in the capture.
     place: u64,
-    /// `None` for a 29-bit identifier.
+    /// Identifier of the frame; `None` for one of 29 bits.
     id: Option<u16>,
     phase: Phase,
-    /// The joints that it answers, and whether later joints had been sent before it.
+    /// The epoch that the frame answers, and true if later joints had been sent before it; `None` for other frames.
     answer: Option<(Epoch, bool)>,
 }
 
-/// A frame that waits for possible earlier frames.
+/// A frame that waits until no frame with an earlier time can follow.
 #[derive(Clone, Copy, Debug)]
 struct Pending {
     at: u64,
     priority: Priority,
     bits: Bits,
     place: u64,
-    /// `None` for a 29-bit identifier.
+    /// Identifier of the frame; `None` for one of 29 bits.
     id: Option<u16>,
     sorted: ClassifiedFrame,
 }
 
-/// The given properties of a bus.
+/// Properties of a bus that the caller gives.
 #[derive(Clone, Debug)]
 pub(super) struct BusProperties {
     pub(super) rates: BitRates,
-    /// Number of the skin's cells on it.
+    /// Number of the skin's cells on the bus; `None` without a skin.
     pub(super) cells: Option<u32>,
-    /// The worst case, with all of them answering.
+    /// The worst case of the bus, with all these cells answering.
     pub(super) worst_case: Option<Answer>,
     /// True to include frames that only a bench sends.
     pub(super) bench_traffic: bool,
@@ -67,11 +67,11 @@ pub(super) struct BusTiming {
     model: BusModel<Tag>,
     pending: VecDeque<Pending>,
     frames: u64,
-    /// The first and the last time in the capture.
+    /// Earliest and latest time of a frame in the capture, in ns.
     span: Option<(u64, u64)>,
-    /// The time of the newest frame in the model.
+    /// The time in ns of the newest frame that was passed to the model.
     released: u64,
-    /// The end of the last transmission.
+    /// The end of the last transmission, in ns.
     wire_end: u64,
     traffic: Traffic,
     has_fd: bool,
@@ -103,7 +103,7 @@ impl BusTiming {
         }
     }
 
-    /// Handles a frame that was latched before the start of the capture.
+    /// Handles a packet from before the start of the capture, which still has an effect.
     pub(super) fn latched(&mut self, nanos: u64, frame: &Frame) {
         match self.traffic.sort(nanos, frame).says {
             RunEvent::Joints(_) => self.phases.beginning.in_the_middle = true,
@@ -112,14 +112,14 @@ impl BusTiming {
         }
     }
 
-    /// Counts a frame of any kind.
+    /// Counts a frame of any kind and its time.
     pub(super) fn count(&mut self, nanos: u64) {
         self.frames += 1;
         let (first, last) = self.span.unwrap_or((nanos, nanos));
         self.span = Some((first.min(nanos), last.max(nanos)));
     }
 
-    /// Handles a frame that real CAN could carry.
+    /// Handles a frame that a real CAN bus could carry.
     pub(super) fn take(
         &mut self,
         nanos: u64,
@@ -160,7 +160,7 @@ impl BusTiming {
         }
     }
 
-    /// Ends the input.
+    /// Ends the input: all waiting frames are sent.
     pub(super) fn finish(&mut self, mut reported: Option<&mut FrameTimings>) {
         while let Some(first) = self.pending.pop_front() {
             self.enter(first, reported.as_deref_mut());
@@ -169,7 +169,7 @@ impl BusTiming {
         self.drain(reported);
     }
 
-    /// Requests the transmission of the next frame in order of time.
+    /// Passes the next frame in order of time to the model, which requests its transmission.
     fn enter(&mut self, pending: Pending, mut reported: Option<&mut FrameTimings>) {
         let Pending { at, priority, bits, place, id, sorted } = pending;
         let ClassifiedFrame { says, bench, from, .. } = sorted;
@@ -205,7 +205,7 @@ impl BusTiming {
         figures.queue(at, self.model.waiting(), of_one);
     }
 
-    /// Handles completed transmissions.
+    /// Takes completed transmissions from the model and records them.
     fn drain(&mut self, mut reported: Option<&mut FrameTimings>) {
         while let Some(attempt) = self.model.poll() {
             let Attempt { tag: Tag { place, id, phase, answer }, at, start, end, is_damaged } = attempt;
@@ -228,7 +228,7 @@ impl BusTiming {
         }
     }
 
-    /// Returns format and rates, from the skin or else from the frames.
+    /// Returns the format and the bit rates of the bus as text. The format is the skin's, or else that of the frames.
     fn named_rates(&self) -> String {
         if let Some(worst) = &self.known.worst_case {
             return worst.rates.clone();

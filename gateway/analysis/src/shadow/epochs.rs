@@ -1,4 +1,4 @@
-//! The number of cells that answered joints, and their reply times.
+//! Counts the cells that answered each epoch's joints, and measures the times of their replies.
 
 use model::quantiles::Times;
 use protocol::id::CellId;
@@ -22,20 +22,20 @@ impl Set {
     }
 }
 
-/// The joints of one epoch.
+/// The joints of one epoch, and the cells that answered them.
 #[derive(Clone, Copy, Debug, Default)]
 struct EpochAnswers {
-    /// The time at which they were to be sent.
+    /// Time in ns at which the joints should be sent, by the capture.
     at: u64,
-    /// The cells that answered them, if they were sent while cells were not halted.
+    /// The cells that answered; `None` if cells were halted when the joints were sent.
     answered: Option<Set>,
 }
 
-/// Follows joints and their answers, in bounded memory.
+/// Follows joints and the answers to them, in bounded memory.
 #[derive(Debug, Default)]
 pub(super) struct Epochs {
     senders: Set,
-    /// By epoch.
+    /// The newest joints of each epoch number.
     numbered: Vec<EpochAnswers>,
     newest: Option<Epoch>,
     halted: bool,
@@ -45,7 +45,7 @@ pub(super) struct Epochs {
     after_joints: Times,
 }
 
-/// Totals over epochs.
+/// Counts over all epochs.
 #[derive(Clone, Copy, Debug, Default)]
 struct Counts {
     epochs: u64,
@@ -62,7 +62,8 @@ impl Counts {
 }
 
 impl Epochs {
-    /// Handles a frame's meaning for joints and answers. Returns the joints that it answers, and whether it is late.
+    /// Records the role of a frame at the time `at` in ns. For an answer, returns the epoch that it answers, and true
+    /// if later joints have been sent before it.
     pub(super) fn receive(&mut self, at: u64, says: RunEvent, from: Option<CellId>) -> Option<(Epoch, bool)> {
         from.into_iter().for_each(|cell| self.senders.insert(cell));
         match says {
@@ -79,7 +80,7 @@ impl Epochs {
         None
     }
 
-    /// Records new joints; repeated joints count once.
+    /// Records joints at the time `at` in ns; joints that repeat an epoch count once.
     fn joints(&mut self, at: u64, epoch: Epoch) {
         let halted = self.halted;
         let numbered = self.numbered(epoch);
@@ -98,7 +99,8 @@ impl Epochs {
         self.numbered.get_mut(usize::from(epoch.0)).expect("an epoch is one byte")
     }
 
-    /// Records the end of an answer that was to be sent at `at`.
+    /// Records the transmission of an answer, which should be sent at `at` and ended at `end`, in ns. `was_late` is
+    /// true if the answer came after the next joints in the capture itself.
     pub(super) fn record_answer(&mut self, epoch: Epoch, was_late: bool, (at, end): (u64, u64)) {
         let Some(newest) = self.newest else { return };
         self.replies.count += 1;
@@ -117,12 +119,13 @@ impl Epochs {
         self.after_joints.record(end.saturating_sub(joints));
     }
 
-    /// Returns the answers to joints, by their times.
+    /// Returns the counts and times of the answers to joints.
     pub(super) fn replies(&self) -> Replies {
         Replies { after_joints_us: Delays::from_times(&self.after_joints), ..self.replies }
     }
 
-    /// Returns the figures of answering cells; the number of cells is the skin's if known.
+    /// Returns the numbers of cells that answered, over all epochs. The number of cells on the bus is the skin's if
+    /// given, else that of the cells that sent something.
     pub(super) fn answering(&self, described: Option<u32>) -> Answering {
         let mut all = self.closed;
         self.numbered.iter().filter_map(|it| it.answered).for_each(|answered| all.close(answered));

@@ -1,24 +1,24 @@
-//! The highest load of a bus within any time window, and its busy stretches without a pause.
+//! Measures the highest load of a bus in any time window, and the stretches in which the bus has no pause.
 
 use std::collections::VecDeque;
 
 use super::report::{Peak, Stretches};
 
-/// Maximum number of distinct times within a window; further ones count to the last.
+/// Maximum number of different times within a window; requests beyond that count to the last of them.
 const MAX_WINDOW_TIMES: usize = 1 << 16;
 
-/// The highest load within any window of `SPAN` ns, with any start.
+/// Finds the highest load in any window of `SPAN` ns, wherever it starts.
 #[derive(Debug, Default)]
 pub(super) struct Window<const SPAN: u64> {
-    /// Time and duration of requests.
+    /// Time in ns of each request within the window, and the transmission time in ns that it requests.
     requested: VecDeque<(u64, u64)>,
     sum: u64,
-    /// The highest share of a window, and its start.
+    /// The highest load of a window as a share of `SPAN`, and the start of that window.
     pub(super) most: Peak,
 }
 
 impl<const SPAN: u64> Window<SPAN> {
-    /// Records a request for `nanos` ns of the bus; times never decrease.
+    /// Records a request at `at` for `nanos` ns of transmission; times never decrease.
     pub(super) fn request(&mut self, at: u64, nanos: u64) {
         while let Some(&(then, gone)) = self.requested.front().filter(|(then, _)| then + SPAN <= at) {
             self.requested.pop_front();
@@ -36,10 +36,10 @@ impl<const SPAN: u64> Window<SPAN> {
     }
 }
 
-/// Stretches without a pause on the wire.
+/// Stretches of time in which the bus carries frames without a pause.
 #[derive(Debug, Default)]
 pub(super) struct Busy {
-    /// The total busy time, in ns.
+    /// Time in which the bus was busy, in ns.
     pub(super) total: u64,
     begin: u64,
     end: u64,
@@ -47,7 +47,8 @@ pub(super) struct Busy {
 }
 
 impl Busy {
-    /// Records a transmission, in order of time.
+    /// Records a transmission from `start` to `end`, in order of time. A stretch of at least `saturated` ns counts as
+    /// saturated.
     pub(super) fn record(&mut self, start: u64, end: u64, saturated: u64) {
         self.total += end - start;
         if start > self.end {
@@ -66,7 +67,7 @@ impl Busy {
         self.stretches.longest_s.raise(length as f64 / 1e9, self.begin);
     }
 
-    /// Returns all stretches; those of at least `saturated` ns count as saturated.
+    /// Returns the number, total and longest of the stretches. Those of at least `saturated` ns count as saturated.
     pub(super) fn stretches(&self, saturated: u64) -> Stretches {
         let mut last = Self { stretches: self.stretches, ..Self::default() };
         (last.begin, last.end) = (self.begin, self.end);

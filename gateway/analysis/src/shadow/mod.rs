@@ -1,5 +1,5 @@
-//! Models the timing of given traffic on a real bus: the bits of each frame, its transmission time, and the resulting
-//! figures.
+//! Models the timing of captured traffic on a real bus: the bits of each frame, the time at which the frame is sent,
+//! and the loads and delays that result.
 //!
 //! ```text
 //!   capture or live bus ──> frame ──> [ window ] ──> [ BusModel ] ──┬──> poll: Shaded, one a frame, in the file's order
@@ -39,35 +39,35 @@ pub use report::{
 pub use reported::FrameTiming;
 pub use trace::order::{WINDOW_FRAMES, WINDOW_NS};
 
-/// Duration without a pause, in ns, from which a bus counts as saturated: the most common period of joints.
+/// Duration without a pause from which a bus counts as saturated, in ns: the most common period of joints.
 pub const SATURATED_NS: u64 = 16_000_000;
-/// The longer window for the load, in ns.
+/// Length of the longer window in which the load is measured, in ns.
 const SECOND_NS: u64 = 1_000_000_000;
 
 /// Maximum number of modelled buses.
 pub const MAX_BUSES: usize = 64;
 
-/// Properties of the buses.
+/// Properties of the modelled buses.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Bit rates of buses that are not in `of_bus`.
+    /// Bit rates of the buses that `of_bus` does not name.
     pub rates: BitRates,
-    /// Bit rates by the name of the bus.
+    /// Bit rates of single buses, by name.
     pub of_bus: Vec<(String, BitRates)>,
-    /// Share of damaged bits, in [0, [`BitErrors::MAX`]].
+    /// Share of bits that the model damages, in [0, [`BitErrors::MAX`]].
     pub bit_errors: f64,
-    /// Seed of the errors; each bus has its own.
+    /// Seed of the random bit errors; each bus derives its own.
     pub seed: u64,
-    /// True if [`Shadow::poll`] returns each frame.
+    /// True if [`Shadow::poll`] returns the transmission of each frame.
     pub each_frame: bool,
     /// True to include frames that only a bench sends.
     pub bench_traffic: bool,
-    /// The skin, for the worst case beside the capture.
+    /// The skin, from which the worst case is computed for comparison with the capture.
     pub skin: Option<Skin>,
 }
 
 impl Options {
-    /// All buses at these rates, with defaults for everything else.
+    /// Returns options with these bit rates for all buses, and defaults for everything else.
     #[must_use]
     pub const fn new(rates: BitRates) -> Self {
         Self {
@@ -81,7 +81,7 @@ impl Options {
         }
     }
 
-    /// Returns the properties of a bus.
+    /// Returns the given properties of a bus.
     fn of(&self, bus: &str) -> BusProperties {
         let named = self.of_bus.iter().find(|(name, _)| name == bus);
         let rates = named.map_or(self.rates, |(_, rates)| *rates);
@@ -97,7 +97,7 @@ impl Options {
 /// The latest time of a frame, in ns since 1970.
 const MAX_TIME_NS: u64 = u64::MAX / 2;
 
-/// The model of the buses' traffic.
+/// The model of all buses of a capture.
 #[derive(Debug)]
 pub struct Shadow {
     options: Options,
@@ -109,7 +109,7 @@ pub struct Shadow {
 }
 
 impl Shadow {
-    /// Creates a model without traffic.
+    /// Creates a model before any traffic.
     ///
     /// # Errors
     /// Returns [`BitErrorsError`] if the bit-error rate is outside its range.
@@ -119,8 +119,8 @@ impl Shadow {
         Ok(Self { options, bus_timings: Vec::new(), reported, frames: 0, further: 0, has_times: true })
     }
 
-    /// Handles the next frame of a bus, with its time in ns. Times after the year 2262 are set to its end, because the
-    /// transmission comes even later and must fit, too.
+    /// Handles the next frame of a bus, at a time in ns since 1970. A time after the year 2262 is set to the end of
+    /// that year, so that the later time of its transmission can still be represented.
     pub fn frame(&mut self, bus: &str, nanos: u64, frame: &Frame) {
         let nanos = nanos.min(MAX_TIME_NS);
         let place = self.frames;
@@ -143,13 +143,13 @@ impl Shadow {
         }
     }
 
-    /// Handles a frame that was latched before the start of the capture.
+    /// Handles a packet from before the start of the capture, which still has an effect.
     pub fn latched(&mut self, bus: &str, nanos: u64, frame: &Frame) {
         let bus_timing = self.bus_timing(bus).and_then(|bus_timing| self.bus_timings.get_mut(bus_timing));
         bus_timing.into_iter().for_each(|bus_timing| bus_timing.latched(nanos, frame));
     }
 
-    /// Records frames that the recorder lost.
+    /// Records a number of frames that the recorder lost on a bus.
     pub fn missing(&mut self, bus: &str, frames: u64) {
         if let Some(bus_timing) =
             self.bus_timing(bus).and_then(|bus_timing| self.bus_timings.get_mut(bus_timing))
@@ -158,7 +158,7 @@ impl Shadow {
         }
     }
 
-    /// Declares that the frames have no times: their times only give the order, and loads and delays are omitted.
+    /// Declares that the times of frames are meaningless and only give the order. Loads and delays are then omitted.
     pub const fn without_times(&mut self) {
         self.has_times = false;
     }
@@ -174,13 +174,13 @@ impl Shadow {
         self.reported.as_mut()?.poll()
     }
 
-    /// Returns the name of a bus, given [`Shaded::bus`].
+    /// Returns the name of a bus, given its number in [`Shaded::bus`].
     #[must_use]
     pub fn bus(&self, bus: usize) -> &str {
         self.bus_timings.get(bus).map_or("", |bus_timing| &bus_timing.name)
     }
 
-    /// Returns the result.
+    /// Returns the figures of all buses.
     #[must_use]
     pub fn report(&self) -> Report {
         Report {
@@ -207,7 +207,7 @@ impl Shadow {
     }
 }
 
-/// An identifier, formatted as by candump, and whether it has more than 11 bits.
+/// An identifier, and true if it has 29 bits; formatted as by candump.
 #[derive(Clone, Copy, Debug)]
 pub struct Identifier(pub u32, pub bool);
 

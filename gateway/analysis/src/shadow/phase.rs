@@ -1,4 +1,4 @@
-//! The phases start-up and operation, and their figures.
+//! Splits the traffic of a bus into start-up and operation, and keeps the figures of each phase.
 
 use model::quantiles::Times;
 use protocol::id::{Id, Kind};
@@ -8,23 +8,23 @@ use super::report::{Delays, KindDelays, Loads, Peak, StartUp};
 use super::{SATURATED_NS, SECOND_NS};
 use crate::fit::traffic::RunEvent;
 
-/// Time without joints, in ns, after which operation ends.
+/// Time without joints after which operation ends, in ns.
 pub const PAUSE_NS: u64 = SECOND_NS;
-/// Maximum time, in ns, to the first joints in a capture that begins in the middle of a run: some periods, and less
-/// than a start takes.
+/// Maximum time to the first joints of a capture that begins in the middle of a run, in ns: some periods of joints, and
+/// less than cells need to start.
 const MAX_FIRST_JOINTS_NS: u64 = 100_000_000;
 
-/// The phase of a bus.
+/// The phase in which a bus is.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Phase {
-    /// Cells claim node ids, are configured and build the tree: before joints, and when no joints were sent for
-    /// [`PAUSE_NS`].
+    /// Cells claim node ids, are configured and build the tree. This phase lasts until the first joints, and begins
+    /// again when no joints were sent for [`PAUSE_NS`].
     StartUp,
     /// Joints are sent, or the bus carries another protocol.
     Operation,
 }
 
-/// A value for each phase.
+/// One value for each phase.
 #[derive(Debug, Default)]
 pub(super) struct ByPhase<T> {
     pub(super) start_up: T,
@@ -40,7 +40,7 @@ impl<T> ByPhase<T> {
     }
 }
 
-/// The start of a capture: observations before the first frame enters the model.
+/// The traffic at the start of a capture, which decides whether the capture begins in the middle of a run.
 #[derive(Debug, Default)]
 pub(super) struct CaptureStart {
     first: Option<u64>,
@@ -73,20 +73,20 @@ impl CaptureStart {
     }
 }
 
-/// The current phase, and the durations of both.
+/// The present phase of a bus, and the duration of each phase so far.
 #[derive(Debug, Default)]
 pub(super) struct Phases {
     pub(super) beginning: CaptureStart,
     now: Option<Phase>,
-    /// The time up to which durations are counted, in ns.
+    /// The time in ns up to which the durations are counted.
     until: u64,
     joints: Option<u64>,
-    /// Durations in ns.
+    /// Duration of each phase in ns.
     pub(super) spans: ByPhase<u64>,
 }
 
 impl Phases {
-    /// Returns the phase of a frame at a time; times never decrease.
+    /// Returns the phase to which a frame belongs; `says` is the role of the frame in the run. Times never decrease.
     pub(super) fn at(&mut self, at: u64, says: RunEvent, is_ours: bool) -> Phase {
         let mut now = *self.now.get_or_insert_with(|| {
             self.until = at;
@@ -116,7 +116,7 @@ impl Phases {
     }
 }
 
-/// The figures of one phase.
+/// The load, delays and queues in one phase.
 #[derive(Debug, Default)]
 pub(super) struct Figures {
     pub(super) frames: u64,
@@ -126,14 +126,14 @@ pub(super) struct Figures {
     pub(super) busy: Busy,
     pub(super) all: Times,
     kinds: [Times; 8],
-    /// The largest number of waiting frames, of all identifiers and of one.
+    /// The largest number of waiting frames in all; in the next field, of one identifier.
     pub(super) queue: Peak,
     pub(super) queue_of_one: Peak,
     pub(super) queue_of_one_id: u16,
 }
 
 impl Figures {
-    /// Records a frame that needs `took` ns of the bus.
+    /// Records a frame that is requested at `at` and takes `took` ns of the bus.
     pub(super) fn request(&mut self, at: u64, took: u64) {
         self.frames += 1;
         self.requested += took;
@@ -141,7 +141,7 @@ impl Figures {
         self.in_1_s.request(at, took);
     }
 
-    /// Records the number of waiting frames, in total and of one identifier.
+    /// Records the number of frames that wait at `at`, in all and of one identifier.
     pub(super) fn queue(&mut self, at: u64, waiting: usize, of_one: Option<(u32, u16)>) {
         self.queue.raise(waiting as f64, at);
         if let Some((queued, id)) = of_one.filter(|(queued, _)| f64::from(*queued) > self.queue_of_one.value)
@@ -151,7 +151,7 @@ impl Figures {
         }
     }
 
-    /// Records a sent frame and its delay.
+    /// Records a frame that was sent `nanos` ns after its request.
     pub(super) fn sent(&mut self, id: Option<u16>, nanos: u64) {
         self.all.record(nanos);
         let kind = id.and_then(|id| self.kinds.get_mut(Id::from_bits(id).kind as usize));
@@ -163,7 +163,7 @@ impl Figures {
         kinds.map(|(kind, delay)| KindDelays { kind: kind.name(), delay_us: Delays::from_times(delay) }).collect()
     }
 
-    /// Returns the load of a phase with this duration, and with transmissions beyond its end.
+    /// Returns the loads of a phase that lasted `span` ns; transmissions continued for `overrun` ns after its end.
     pub(super) fn loads(&self, span: u64, overrun: u64) -> Loads {
         let share = |part: u64, whole: u64| (whole > 0).then(|| part as f64 / whole as f64);
         let worst_1_s = self.in_1_s.most;
@@ -181,7 +181,7 @@ impl Figures {
         Loads { mean, worst_16_ms: self.in_16_ms.most, worst_1_s, busy }
     }
 
-    /// Returns the figures of a start-up with this duration; `None` without frames.
+    /// Returns the figures of the start-up, which lasted `span` ns; `None` if it had no frames.
     pub(super) fn start_up(&self, span: u64) -> Option<StartUp> {
         (self.frames > 0).then(|| StartUp {
             frames: self.frames,

@@ -1,4 +1,4 @@
-//! The result of the model.
+//! The figures of a timing model: loads, delays, replies and queues of each bus.
 
 use model::quantiles::Times;
 use protocol::wire_time::BitRates;
@@ -7,14 +7,14 @@ use serde::{Serialize, Serializer};
 use crate::fit::traffic::BenchFrames;
 use crate::fit::verdict::{Answer, Cells};
 
-/// The result for all buses.
+/// The figures of all buses of a capture.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
     /// Frames of any kind, on all buses.
     pub frames: u64,
-    /// Frames of buses beyond the first 64, which are not modelled.
+    /// Frames of buses beyond the first 64. These buses are not modelled.
     pub frames_of_other_buses: u64,
-    /// Share of bits that were damaged on purpose.
+    /// Share of bits that the model damaged on purpose.
     pub bit_error_rate: f64,
     /// True if the frames have times; otherwise loads and delays are unknown.
     pub has_times: bool,
@@ -22,99 +22,99 @@ pub struct Report {
     pub buses: Vec<BusShadow>,
 }
 
-/// The result for one bus.
+/// The figures of one bus.
 #[derive(Clone, Debug, Serialize)]
 pub struct BusShadow {
-    /// Its name.
+    /// Name of the bus.
     pub bus: String,
-    /// Its format and bit rates, as text.
+    /// Format and bit rates of the bus, as text.
     pub name: String,
-    /// Its bit rates.
+    /// Bit rates of the bus.
     #[serde(serialize_with = "as_text")]
     pub rates: BitRates,
     /// Frames of any kind.
     pub frames: u64,
     /// The time of the first frame, in ns of the capture's clock.
     pub first_ns: u64,
-    /// The origin of times in s, in ns of the same clock; by default the first frame.
+    /// The time that counts as 0 s, in ns of the capture's clock; by default that of the first frame.
     #[serde(skip)]
     pub zero_ns: u64,
-    /// The time from the first frame to the last.
+    /// The time from the first frame to the last, in s.
     pub duration_s: f64,
-    /// The duration of operation, for which load, stretches, delays and queues are computed.
+    /// The duration of operation in s. Load, stretches, delays and queues are computed for this phase.
     pub operation_s: f64,
-    /// The fit in the worst case, with all cells of the skin answering; `None` without a skin.
+    /// Load and verdict of the worst case, with all cells of the skin answering; `None` without a skin.
     pub worst_case: Option<Answer>,
-    /// The fit of the captured traffic; `None` without operation.
+    /// Load and verdict of the captured traffic; `None` without operation.
     pub this_run: Option<Answer>,
-    /// The answering cells, if the bus carries this project's protocol.
+    /// The numbers of cells that answered, if the bus carries this project's protocol.
     pub answering: Option<Answering>,
-    /// The traffic before the first joints, and without joints for a second.
+    /// The figures of the start-up: the traffic before the first joints, and after a second without joints.
     pub start_up: Option<StartUp>,
     /// The counts of frames.
     #[serde(flatten)]
     pub counts: Counts,
     /// The requested load of the bus.
     pub load: Loads,
-    /// Stretches without a pause.
+    /// Stretches in which the bus carries frames without a pause.
     pub stretches: Stretches,
     /// Delays from the request of a frame to the end of its intermission, in µs, over all frames.
     pub delay_us: Delays,
     /// Delays by kind; empty if the bus carries another protocol.
     pub kinds: Vec<KindDelays>,
-    /// Answers to joints, if the bus carries this project's protocol.
+    /// Counts and times of answers to joints, if the bus carries this project's protocol.
     pub replies: Option<Replies>,
-    /// The largest number of waiting frames.
+    /// The largest number of frames that waited to be sent.
     pub queue: Peak,
-    /// The largest number of waiting frames of one 11-bit identifier.
+    /// The largest number of frames of one 11-bit identifier that waited to be sent.
     pub queue_of_one: Peak,
-    /// That identifier.
+    /// The identifier of which the most frames waited.
     pub queue_of_one_id: u32,
 }
 
-/// Counts of a bus' frames.
+/// Counts of the frames of a bus.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Counts {
     /// Frames that were sent in the model.
     pub sent: u64,
-    /// Frames that only a bench sends.
+    /// Frames that only a bench sends, by kind.
     pub bench: BenchFrames,
-    /// True if these are omitted.
+    /// True if the frames that only a bench sends are omitted from the model.
     pub bench_omitted: bool,
     /// The driver's error frames, which were never on a wire.
     pub error_frames: u64,
-    /// Frames that the recorder lost: the load is too low by these.
+    /// Frames that the recorder lost. The real load is higher by these frames.
     pub missing: u64,
-    /// Frames with an earlier time than the previous one, which were sorted.
+    /// Frames with an earlier time than the frame before, which were sorted in.
     pub out_of_order: u64,
-    /// Frames that were so far out of order that they count at a later time.
+    /// Frames so far out of order that they could not be sorted in, and count at a later time.
     pub too_late_to_sort: u64,
-    /// Frames that were refused because the queue was full.
+    /// Frames that were refused because the transmit queue was full.
     pub no_room: u64,
-    /// Damaged transmissions.
+    /// Transmissions that the model damaged; each is repeated.
     pub damaged: u64,
 }
 
-/// The start-up, in which cells claim node ids, are configured and build the tree.
+/// The figures of a bus's start-up, in which cells claim node ids, are configured and build the tree.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct StartUp {
-    /// Frames.
+    /// Number of frames in the start-up.
     pub frames: u64,
-    /// Its duration.
+    /// Duration of the start-up in s.
     pub duration_s: f64,
     /// The requested load of the bus.
     pub load: Loads,
-    /// Stretches without a pause.
+    /// Stretches in which the bus carries frames without a pause.
     pub stretches: Stretches,
     /// Delays from the request of a frame to the end of its intermission, in µs.
     pub delay_us: Delays,
 }
 
-/// The shares of the bus' time that frames request, including stuff bits and intermissions; above 1 the bus cannot
-/// carry them.
+/// The shares of the bus's time that frames request, including stuff bits and intermissions. A bus cannot carry a load
+/// above 1.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Loads {
-    /// Mean over the whole time; `None` with fewer than two different times.
+    /// Mean load over the whole time; `None` with fewer than two different times.
     pub mean: Option<f64>,
     /// The highest load within any 16 ms.
     pub worst_16_ms: Peak,
@@ -129,12 +129,12 @@ pub struct Loads {
 pub struct Peak {
     /// The maximum.
     pub value: f64,
-    /// The time or the start of the maximum, in ns of the capture's clock.
+    /// The time at which the maximum occurred, or the window with it begins, in ns of the capture's clock.
     pub at_ns: u64,
 }
 
 impl Peak {
-    /// Records a value if it exceeds the maximum.
+    /// Replaces the maximum if a value exceeds it.
     pub(super) fn raise(&mut self, value: f64, at_ns: u64) {
         if value > self.value {
             *self = Self { value, at_ns };
@@ -142,12 +142,12 @@ impl Peak {
     }
 }
 
-/// Stretches in which the bus had no pause.
+/// Counts and times of stretches in which the bus had no pause.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Stretches {
     /// Number of stretches of at least 16 ms.
     pub count: u64,
-    /// Their total duration.
+    /// Total duration of these stretches in s.
     pub total_s: f64,
     /// The longest stretch of all.
     pub longest_s: Peak,
@@ -166,16 +166,16 @@ pub struct Delays {
     pub max: f64,
 }
 
-/// The delays of one kind.
+/// The delays of one kind of frame.
 #[derive(Clone, Debug, Serialize)]
 pub struct KindDelays {
-    /// Its name.
+    /// Name of the kind.
     pub kind: &'static str,
-    /// The delays.
+    /// Delays of its frames from request to end, in µs.
     pub delay_us: Delays,
 }
 
-/// The number of cells that answered, over epochs.
+/// The number of cells that answered joints, over all epochs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Answering {
     /// Number of joints that were sent while cells were not halted.
@@ -184,32 +184,33 @@ pub struct Answering {
     pub epochs_halted: u64,
     /// The mean number of cells that answered joints; absent without joints.
     pub mean: Option<f64>,
-    /// The largest number of cells that answered the same joints.
+    /// The largest number of cells that answered the same joints packet.
     pub most: u32,
     /// Number of cells on the bus: the skin's, or else those that sent something.
     pub cells: u32,
-    /// True if that number is the skin's.
+    /// True if `cells` is the number in the skin.
     pub described: bool,
 }
 
 impl Answering {
-    /// Returns the figures in the form of [`crate::fit::verdict`].
+    /// Returns the numbers in the form that a verdict uses.
     #[must_use]
     pub const fn cells(&self) -> Cells {
         Cells::Some { most: self.most, cells: self.cells, described: self.described }
     }
 }
 
-/// Answers to joints.
+/// Counts and times of answers to joints.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Replies {
     /// Number of answers.
     pub count: u64,
-    /// Answers that were already later than the next joints in the recording.
+    /// Answers that came after the next joints in the recording itself.
     pub late_before: u64,
-    /// Answers that ended after the next joints were to be sent, without being late in the recording.
+    /// Answers that the model sent too late: they ended after the next joints should have been sent. Answers in
+    /// `late_before` do not count.
     pub late: u64,
-    /// Late answers that were ready only in the last eighth of the period: the bus is not the cause.
+    /// Late answers that cells began to send only in the last eighth of the period, so that the bus is not the cause.
     pub late_when_ready: u64,
     /// Times from the request of joints to the end of each answer, in µs.
     pub after_joints_us: Delays,

@@ -1,4 +1,4 @@
-//! The result for each frame, in input order.
+//! The transmission of each frame, returned in the order of the input.
 
 use std::collections::VecDeque;
 
@@ -7,19 +7,19 @@ use protocol::wire_time::Bits;
 /// The transmission of a frame on a real bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct FrameTiming {
-    /// Its time in the capture, in ns.
+    /// Time of the frame in the capture, in ns.
     pub nanos: u64,
-    /// Its bus, for [`super::Shadow::bus`]; `None` for buses that are not modelled.
+    /// Number of the frame's bus, for [`super::Shadow::bus`]; `None` for a bus that is not modelled.
     pub bus: Option<usize>,
-    /// Its identifier; with the error flag for a driver's error frame.
+    /// Identifier of the frame; with the error flag for a driver's error frame.
     pub id: u32,
     /// True if the identifier has more than 11 bits.
     pub extended: bool,
-    /// Its bits, including the intermission; `None` for frames that real buses do not carry: frames that only a bench
-    /// sends, and the driver's error frames.
+    /// Bits of the frame, including the intermission. `None` for a frame that real buses do not carry: one that only a
+    /// bench sends, or the driver's error frame.
     pub bits: Option<Bits>,
-    /// The first bit and the end of the intermission of the successful attempt, in ns of the capture's clock; `None` if
-    /// it was not sent.
+    /// Start of the first bit and end of the intermission of the successful transmission, in ns of the capture's clock;
+    /// `None` if the frame was not sent.
     pub sent: Option<(u64, u64)>,
 }
 
@@ -29,26 +29,26 @@ struct Entry {
     is_open: bool,
 }
 
-/// Frames that wait for earlier ones.
+/// Frames whose transmission, or that of an earlier frame, is still unknown.
 #[derive(Debug, Default)]
 pub(super) struct FrameTimings {
     entries: VecDeque<Entry>,
-    /// The index of the first entry.
+    /// Index in the input of the first entry.
     first: u64,
 }
 
 impl FrameTimings {
-    /// Adds a frame; with bits, its transmission is still unknown.
+    /// Adds a frame. If it has bits, its transmission is still unknown.
     pub(super) fn enter(&mut self, shaded: FrameTiming) {
         self.entries.push_back(Entry { shaded, is_open: shaded.bits.is_some() });
     }
 
-    /// Marks a frame as not carried by a real bus.
+    /// Marks a frame as one that a real bus does not carry.
     pub(super) fn omitted(&mut self, place: u64) {
         self.settle(place, |shaded| shaded.bits = None);
     }
 
-    /// Records the transmission of a frame; `None` if it was not sent.
+    /// Records when a frame was sent; `None` if it was not sent.
     pub(super) fn sent(&mut self, place: u64, sent: Option<(u64, u64)>) {
         self.settle(place, |shaded| shaded.sent = sent);
     }

@@ -10,10 +10,10 @@ use super::{Count, seconds};
 use model::decode::Foreign;
 use protocol::packet::{Length, Lengths, PacketError, data_id};
 
-/// Maximum number of identifiers of a bus that are counted separately; frames of others share one count.
+/// Maximum number of identifiers of a bus that are counted separately. Frames with further identifiers share one count.
 const IDENTIFIERS: usize = 4096;
 
-/// The type of a frame.
+/// The type of a foreign frame.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FrameType {
@@ -21,7 +21,7 @@ pub enum FrameType {
     Data,
     /// A remote frame.
     Remote,
-    /// The driver's error report; the identifier contains its kind.
+    /// The driver's error report; its identifier contains the kind of error.
     Error,
 }
 
@@ -29,10 +29,10 @@ pub enum FrameType {
 #[derive(Debug, Default)]
 pub(super) struct ForeignCounter {
     identifiers: BTreeMap<(FrameType, u32), IdentifierCounts>,
-    /// Number of frames with identifiers beyond those that are counted separately.
+    /// Number of frames with identifiers that are not counted separately.
     others: u64,
-    /// Number of groups of frames with a checked CRC: a single frame, or one with those before it that complete a
-    /// length.
+    /// Number of frames, or groups of frames, whose CRC was checked: a frame by itself, or together with the frames
+    /// before it that could be segments of the same packet.
     tried: u64,
 }
 
@@ -43,10 +43,10 @@ struct IdentifierCounts {
     wrong_crc: u64,
 }
 
-/// Frames that do not belong to this protocol.
+/// Counts of the frames that do not belong to this protocol.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ForeignFrames {
-    /// Total number.
+    /// Total number of frames.
     pub frames: u64,
     /// Data frames with an 11-bit identifier.
     pub standard: u64,
@@ -56,35 +56,35 @@ pub struct ForeignFrames {
     pub remote: u64,
     /// The driver's error frames.
     pub error: u64,
-    /// Expected number of packets by chance, for an unknown chain: one in 65 536 groups of frames has a valid CRC. They
-    /// count as packets.
+    /// Number of packets that are expected by chance if the chain is unknown: one in 65 536 of the checked groups of
+    /// frames has a valid CRC. Such frames count as packets.
     pub packets_by_chance: f64,
-    /// The identifiers, by decreasing number of frames.
+    /// Counts by identifier, largest first.
     pub identifiers: Vec<ForeignId>,
-    /// Frames with identifiers beyond the first 4096.
+    /// Frames with identifiers beyond the 4096 that are counted separately.
     pub frames_of_other_identifiers: u64,
 }
 
-/// The foreign frames of one identifier.
+/// Counts of the foreign frames with one identifier.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ForeignId {
-    /// The identifier in hexadecimal, as candump prints it, with 3 or 8 digits; for an error frame, the bits of the
-    /// kind of error.
+    /// The identifier in hexadecimal with 3 or 8 digits, as candump prints it. For an error frame, the bits are those
+    /// of the kind of error.
     pub id: String,
     /// The type of the frames.
     #[serde(rename = "type")]
     pub of: FrameType,
-    /// Frames.
+    /// Number of frames.
     pub frames: u64,
-    /// Frames per second, from the first to the last.
+    /// Frames per second, from the first frame to the last.
     pub frames_per_s: Option<f64>,
-    /// Time of the first, in s after the first frame of the capture.
+    /// Time of the first frame with the identifier, in s after the first frame of the capture.
     pub first_s: f64,
-    /// Time of the last, in s after the first frame of the capture.
+    /// Time of the last frame with the identifier, in s after the first frame of the capture.
     pub last_s: f64,
-    /// Smallest number of data bytes; for a remote frame, of requested bytes.
+    /// Smallest number of data bytes; for remote frames, of requested bytes.
     pub bytes_min: u8,
-    /// Largest number of data bytes.
+    /// Largest number of data bytes; for remote frames, of requested bytes.
     pub bytes_max: u8,
     /// Frames with the length of a packet but a wrong CRC.
     pub wrong_crc: u64,
@@ -144,7 +144,7 @@ impl ForeignCounter {
     }
 }
 
-/// Returns the number of packet lengths that a classic frame can complete.
+/// Returns the number of different packet lengths that a classic frame can be the last segment of.
 fn groups(frame: &Frame) -> u64 {
     let ends = |length: &Length| length.last_segment() == frame.data().len();
     data_id(frame).map_or(0, |id| Lengths::for_id(id).iter().filter(ends).count() as u64)

@@ -28,7 +28,7 @@ const DOWN_PAUSE: Duration = Duration::from_millis(50);
 /// Interval between attempts to reopen a bus that is gone.
 const REOPEN_INTERVAL: Duration = Duration::from_millis(100);
 
-/// A receiving end of a bus.
+/// Provides the open bus to a [`Follower`], and opens the bus again after a loss.
 pub trait Source {
     /// The open bus, or `None` before it was opened for the first time.
     fn bus(&self) -> Option<&Bus>;
@@ -40,7 +40,7 @@ pub trait Source {
     fn reopen(&mut self) -> Result<(), BusError>;
 }
 
-/// A bus that is never reopened: its follower ends when the bus is gone.
+/// A source that never reopens its bus: its follower ends when the bus is gone.
 #[derive(Debug)]
 pub struct OpenedOnce<'a>(pub &'a Bus);
 
@@ -57,15 +57,15 @@ impl Source for OpenedOnce<'_> {
 /// The outcome of one [`Follower::step`].
 #[derive(Debug)]
 pub enum FollowStep {
-    /// Frames arrived; holds the number of frames in the inbox.
+    /// Frames arrived; holds the number of received frames.
     Frames(usize),
     /// No frame arrived before the timeout.
     Nothing,
     /// The bus is down for now.
     Down(BusError),
-    /// Frames from before the loss arrived; holds the number of frames in the inbox.
+    /// Frames from before the loss of the bus arrived; holds their number.
     Leftover(usize),
-    /// All frames from before the loss are read: later frames show that the bus works again.
+    /// All frames from before the loss are read. A frame that arrives later shows that the bus works again.
     Drained,
     /// The bus is gone and must be reopened.
     Gone(BusError),
@@ -73,7 +73,7 @@ pub enum FollowStep {
     Refused(BusError),
 }
 
-/// One item received in a step.
+/// An item received in a step: a frame, or a change of a root.
 #[derive(Debug)]
 pub enum FollowedItem {
     /// A frame from a cell, from the gateway or from another program.
@@ -93,16 +93,16 @@ enum FollowState {
     },
 }
 
-/// Follows a bus: holds its state and the frames received last.
+/// State of following a bus, with the frames received last.
 #[derive(Debug, Default)]
 pub struct Follower {
     /// The gateway's ends of the wires to the roots, on buses where cells reply with sums.
     pub roots: Option<RootWires>,
-    /// Time to wait after frames arrive, so that one wake-up reads many.
+    /// Time to wait for more frames after the first ones arrived, so that one wake-up reads many.
     gather: Duration,
     inbox: Inbox,
     state: FollowState,
-    /// Frames dropped on earlier sockets of this bus.
+    /// Number of frames dropped on earlier sockets of this bus.
     dropped_before: u64,
     /// Last reported reason why the bus does not open.
     refused: String,
@@ -119,14 +119,15 @@ pub fn fill(bus: &Bus, inbox: &mut Inbox, wait: Duration) -> Result<usize, BusEr
 }
 
 impl Follower {
-    /// Follows a bus that has these wires to roots. `gather` is the time to wait for more frames after some arrived.
+    /// Creates the follower of a bus. `roots` holds the gateway's ends of the wires to the roots, if the cells answer
+    /// with sums. `gather` is the time to wait for more frames after some have arrived.
     #[must_use]
     pub fn new(roots: Option<RootWires>, gather: Duration) -> Self {
         Self { roots, gather, ..Self::default() }
     }
 
-    /// Sends due messages on the wires to the roots, then receives or handles a loss. Returns after about `wait` plus
-    /// the time to gather at the latest.
+    /// Sends the messages that are due on the wires to the roots, then receives frames or handles a loss. Returns after
+    /// about `wait` plus the time to gather frames, or earlier.
     pub fn step(&mut self, source: &mut impl Source, wait: Duration) -> FollowStep {
         let bus = match source.bus() {
             Some(bus) if !matches!(self.state, FollowState::Gone { .. }) => bus,
@@ -147,8 +148,8 @@ impl Follower {
         self.receive(|inbox| fill(bus, inbox, timeout))
     }
 
-    /// Passes each item of the last step to `each`, in order of arrival. Frames on the wires to the roots are handled
-    /// here.
+    /// Passes each item of the last step to `each`, in order of arrival. Frames on the wires to the roots are not
+    /// passed on: the follower handles them.
     pub fn parts(&mut self, mut each: impl FnMut(FollowedItem)) {
         for received in self.inbox.frames() {
             if let Some(roots) = &mut self.roots
@@ -198,9 +199,9 @@ impl Follower {
         }
     }
 
-    /// Reads frames received before a loss. They do not show that the bus works again.
+    /// Reads frames that were received before the loss of the bus. They do not show that the bus works again.
     fn drain(&mut self, receive: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> FollowStep {
-        // Pause before the first read, so that frames in flight have arrived.
+        // Pause before the first read, so that frames that are under way arrive.
         if self.inbox.frames().len() == 0 {
             thread::sleep(DOWN_PAUSE);
         }

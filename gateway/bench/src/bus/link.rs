@@ -22,11 +22,11 @@ pub struct SharedBus {
     pub name: String,
     /// Transport of the frames.
     pub kind: BusKind,
-    /// Bytes that may wait unread, as granted when the bus was first opened.
+    /// Size of the receive buffer in bytes that the kernel granted when the bus was first opened.
     pub receive_buffer: usize,
-    /// State shared with the control loop.
+    /// State of the bus that the control loop reads too.
     pub state: Arc<BusState>,
-    /// Options with which the bus was opened, and is reopened.
+    /// Options with which the bus is opened, also when it is reopened.
     target: BusOptions,
     bus: Mutex<Arc<Bus>>,
     gone: AtomicBool,
@@ -35,12 +35,12 @@ pub struct SharedBus {
 /// The control loop's end of the triple buffer that holds the open bus.
 pub type Slot = triple_buffer::Output<Arc<Bus>>;
 
-/// The receiver's end of a link.
+/// The end of a [`Link`] that the receiver's thread holds.
 #[derive(Debug)]
 pub struct ReceiveEnd {
     /// The link shared with the other threads.
     pub link: Arc<SharedBus>,
-    /// The bus as opened last.
+    /// The bus that was opened last.
     pub bus: Arc<Bus>,
     slot: triple_buffer::Input<Arc<Bus>>,
 }
@@ -69,15 +69,15 @@ impl SharedBus {
         self.gone.load(Ordering::Relaxed)
     }
 
-    /// Connects to the program that joins this bus with buses of other hosts.
+    /// Connects to the `vcan-setup link` process that joins this bus with buses of other hosts.
     ///
     /// # Errors
-    /// Returns [`io::Error`] if no such program runs.
+    /// Returns [`io::Error`] if no such process runs.
     pub fn reports(&self) -> io::Result<ReportReader> {
         ReportReader::connect(&self.name, self.kind, self.target.directory.as_deref())
     }
 
-    /// Sends frames. Not for the control loop: it waits while the bus is being exchanged.
+    /// Sends frames. Blocks while the receiver replaces the bus, so the control loop must not call it.
     ///
     /// # Errors
     /// Returns [`SendError`] with the reason and the number of frames sent before it.
@@ -94,13 +94,13 @@ pub const fn may_return(error: &BusError) -> bool {
 }
 
 impl ReceiveEnd {
-    /// Marks the bus as not working, and as gone if it must be reopened. Returns true if that is a change.
+    /// Marks the bus as not working, and as `gone` if it must be reopened. Returns true if the state changed.
     pub fn lose(&self, gone: bool) -> bool {
         let bus_event = gone && !self.link.gone.swap(true, Ordering::Relaxed);
         self.link.state.works.swap(false, Ordering::Relaxed) || bus_event
     }
 
-    /// Marks the bus as working. Returns true if that is a change.
+    /// Marks the bus as working. Returns true if the state changed.
     pub fn regain(&self) -> bool {
         !self.link.state.works.swap(true, Ordering::Relaxed)
     }
@@ -127,14 +127,14 @@ impl Source for ReceiveEnd {
 pub struct Outages {
     /// Number of losses.
     pub times: u64,
-    /// Total duration without the present outage.
+    /// Total duration of the outages that have ended.
     lost: Duration,
-    /// Start of the present outage.
+    /// Start of the present outage, if the bus is lost.
     since: Option<Instant>,
 }
 
 impl Outages {
-    /// Begins an outage unless one lasts.
+    /// Starts an outage at `now`, unless one has started already.
     pub fn begin(&mut self, now: Instant) {
         if self.since.is_none() {
             self.times += 1;
@@ -142,7 +142,7 @@ impl Outages {
         }
     }
 
-    /// Ends the present outage.
+    /// Ends the present outage at `now`.
     pub fn end(&mut self, now: Instant) {
         self.lost += self.since.take().map_or(Duration::ZERO, |since| now.saturating_duration_since(since));
     }
@@ -155,7 +155,7 @@ impl Outages {
         until_now.lost
     }
 
-    /// Returns true during an outage.
+    /// Returns true while the bus is lost.
     #[must_use]
     pub const fn lasts(&self) -> bool {
         self.since.is_some()

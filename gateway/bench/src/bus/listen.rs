@@ -26,7 +26,7 @@ pub fn open(name: &str, kind: KindChoice, format: Option<Format>, options: BusOp
     }
 }
 
-/// The present time on the clock of received frames.
+/// Returns the present time on the clock that stamps received frames.
 #[must_use]
 pub fn now() -> Micros {
     Micros(wall() / 1_000)
@@ -62,7 +62,7 @@ impl Listener {
         &self.bus
     }
 
-    /// Number of frames that were lost because they arrived faster than they were read.
+    /// Number of frames lost because they arrived faster than this program read them.
     #[must_use]
     pub const fn dropped(&self) -> u32 {
         self.inbox.dropped()
@@ -91,7 +91,8 @@ impl Listener {
     }
 }
 
-/// Turns the error of a bus that is down or full into `None` after `pause`, because the bus may soon be usable again.
+/// Turns the error of a bus that is down or full into `None` after a pause of `pause`, because the bus may soon be
+/// usable again.
 ///
 /// # Errors
 /// Returns all other errors.

@@ -24,7 +24,7 @@ const RECEIVER_PRIORITY: i32 = 30;
 /// Number of wake-ups measured on the idle machine.
 const IDLE_WAKEUPS: u32 = 100;
 
-/// Privileges that the machine granted.
+/// Privileges that the machine granted to a thread.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Granted {
     /// True if the thread runs with `SCHED_FIFO`.
@@ -33,7 +33,8 @@ pub struct Granted {
     pub locked: bool,
 }
 
-/// Gives the calling thread the most punctual scheduling that the machine grants.
+/// Requests `SCHED_FIFO`, locked memory and punctual wake-ups for the calling thread. Returns the privileges that the
+/// machine granted.
 pub fn prepare() -> Granted {
     let granted = Granted {
         fifo: system_calls::set_fifo(PRIORITY),
@@ -44,7 +45,7 @@ pub fn prepare() -> Granted {
     granted
 }
 
-/// Gives a receiver's thread real-time scheduling, below that of the loop.
+/// Requests `SCHED_FIFO` for a receiver's thread, with a priority below that of the control loop.
 pub(crate) fn prepare_receiver() {
     system_calls::set_fifo(RECEIVER_PRIORITY);
 }

@@ -1,4 +1,4 @@
-//! The gateway's end of the wires between the roots of a bus and the gateway.
+//! The gateway's ends of the wires that connect it to the roots of a bus.
 
 use std::time::{Duration, Instant};
 
@@ -16,32 +16,33 @@ use model::network::Uplinks;
 #[derive(Debug)]
 pub struct RootWires {
     uplinks: Uplinks,
-    /// Each root, the link on which the gateway sends to it, and true if its sums are for the gateway.
+    /// Each root, the link on which the gateway sends to it, and true while its sums are for the gateway.
     roots: Vec<(CellId, LinkId, bool)>,
     began: Instant,
-    /// True once the gateway sends. If it starts before all its cells are present, the first cells build a tree deeper
-    /// than necessary.
+    /// True once the gateway sends on the wires. If it sends before all cells are present, the first cells build a tree
+    /// that is deeper than necessary.
     explores: bool,
 }
 
-/// The roots of a bus and the links on which the gateway sends to them. Empty if cells answer with their own torques.
+/// Returns the roots of a bus and the links on which the gateway sends to them. The list is empty if cells answer with
+/// their own torques.
 fn root_links(skin: &Skin, bus: usize) -> Vec<(CellId, LinkId)> {
     let sums = skin.buses.get(bus).is_some_and(|bus| bus.reply != SkinReply::Torque);
     if sums { skin.wires(bus).roots().collect() } else { Vec::new() }
 }
 
-/// Frames that a gateway receives from a bus.
+/// Selection of the frames that a gateway receives from a bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct ReceiveFilter {
     /// Filters of the gateway's socket.
     pub filters: Vec<Filter>,
-    /// True if sums of cells that are not roots pass.
+    /// True if sums of cells other than roots pass.
     pub all_sums: bool,
 }
 
 impl ReceiveFilter {
-    /// The filter of a bus: all frames, except that of simulated wires only those to the gateway pass, and of sums only
-    /// those of roots unless `everything` is set.
+    /// Creates the filter of a bus. It passes all frames, with two exceptions: of simulated wires, only frames to the
+    /// gateway pass; of sums, only those of roots pass, unless `everything` is set.
     #[must_use]
     pub fn for_bus(skin: &Skin, bus: usize, everything: bool) -> Self {
         let roots = root_links(skin, bus);
@@ -73,8 +74,8 @@ impl RootWires {
     pub fn for_bus(skin: &Skin, bus: usize) -> Option<Self> {
         let roots: Vec<_> =
             root_links(skin, bus).into_iter().map(|(root, link_id)| (root, link_id, false)).collect();
-        // An earlier gateway counted its walks too, up to an unknown number, and process ids are often adjacent: spread
-        // the start.
+        // An earlier gateway may have used any walk number, and successive process ids are often adjacent. The factor
+        // spreads the first number.
         let walk = std::process::id().wrapping_mul(37).to_le_bytes()[0];
         (!roots.is_empty()).then(|| Self {
             uplinks: Uplinks::new(roots.len(), walk, Micros(0)),
@@ -127,7 +128,7 @@ impl RootWires {
         true
     }
 
-    /// Sends all due messages.
+    /// Sends the messages that are due on the wires to the roots.
     pub fn send_due(&mut self, bus: &Bus) {
         if !self.explores {
             return;
@@ -136,13 +137,13 @@ impl RootWires {
         self.uplinks.handle_time(now);
         while let Some((root, message)) = self.uplinks.poll_transmit() {
             if let Some((_, link_id, _)) = self.roots.get(root) {
-                // A message that the bus refuses is requested again.
+                // If the bus refuses a message, the root asks for it again.
                 let _ = bus.try_send_all(&[link_id.encode_frame(message)]);
             }
         }
     }
 
-    /// Time until the next message is due if no frame arrives.
+    /// Returns the time in which the next message on the wires becomes due, if no frame arrives before.
     #[must_use]
     pub fn timeout(&self) -> Duration {
         if !self.explores {

@@ -60,9 +60,9 @@ impl ServedBus {
         &self.bus
     }
 
-    /// Ends the server process, which removes its socket; clients find a closed connection.
+    /// Ends the server process. The process removes its socket, and clients find a closed connection.
     pub fn stop(&mut self) {
-        // The server ends when its standard input does.
+        // The server ends when its standard input is closed.
         drop(self.child.stdin.take());
         wait_or_kill(&mut [&mut self.child]);
     }
@@ -88,13 +88,12 @@ pub enum ServeError {
 /// A bus to open: its name, its kind and its options.
 pub type BusTarget<'a> = (&'a str, KindChoice, BusOptions);
 
-/// Handling of a bus that exists neither as an interface nor as an embedded bus, if either kind would do
-/// ([`Choice::Auto`]).
+/// Action for a bus that exists neither as an interface nor as an embedded bus, if its kind is [`Choice::Auto`].
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum IfAbsent {
-    /// Create an embedded bus: all its cells are started here.
+    /// Serve a new embedded bus, because this program starts all its cells.
     Made,
-    /// Return an error: the cells would not be on a new, empty bus.
+    /// Return an error, because the cells are expected on a bus that exists already.
     Refused,
 }
 
@@ -113,7 +112,7 @@ pub fn open_or_serve(
     Ok((bus, served.pop()))
 }
 
-/// Opens buses in this order. Serves embedded buses that have no server; all their servers start at once.
+/// Opens buses in the given order. Serves embedded buses that have no server; all servers start at once.
 ///
 /// # Errors
 /// Returns [`ServeError`] if a bus does not open or cannot be served.
@@ -142,7 +141,7 @@ pub fn open_or_serve_all(
             Err((program, mut served)) => {
                 served.wait(&program)?;
                 all_served.push(served);
-                // Not by the user's choice: an interface of this name may have appeared meanwhile.
+                // Name the kind, because an interface of this name may have appeared since.
                 Bus::open(name, KindChoice::Only(BusKind::Embedded), target)?
             }
         });

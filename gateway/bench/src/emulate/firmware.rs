@@ -51,7 +51,7 @@ pub enum FirmwareError {
 #[derive(Clone, Debug)]
 pub struct Firmware {
     bytes: Vec<u8>,
-    /// Offset of the factory's record in the image.
+    /// Offset of the factory's record in the image in bytes.
     record: usize,
 }
 

@@ -1,4 +1,4 @@
-//! slcan lines of emulated cells: one thread per bus, in which each line is a participant of the bus.
+//! slcan lines of emulated cells. One thread per bus joins the lines to it as participants.
 
 use std::collections::BTreeMap;
 use std::io::{PipeWriter, pipe};
@@ -10,21 +10,21 @@ use vcan_setup::slcan::{Address, Bridge, LineOptions, BridgeSettings};
 
 use super::EmulateError;
 
-/// The lines of some buses; dropping it ends them.
+/// Running slcan lines of emulated cells. Dropping this value ends their threads.
 #[derive(Debug, Default)]
 pub(super) struct SlcanLines {
     buses: Vec<LineThread>,
 }
 
-/// The thread that serves the lines of a bus.
+/// The thread that serves the slcan lines of one bus.
 #[derive(Debug)]
 struct LineThread {
-    /// Closing this end of the pipe ends the thread.
+    /// Write end of a pipe; closing it ends the thread.
     stop: Option<PipeWriter>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// Lines to be joined to buses.
+/// slcan lines that are yet to be joined to their buses.
 #[derive(Debug, Default)]
 pub(super) struct PlannedLines {
     by_bus: BTreeMap<String, (KindChoice, Vec<LineOptions>)>,
@@ -48,7 +48,7 @@ impl PlannedLines {
             let (stopped, stop) = pipe().map_err(EmulateError::Lines)?;
             let bridge = Bridge::open(settings, options)?;
             let work = move || {
-                // A line ends with its emulator, whose exit is reported elsewhere.
+                // A line ends when its emulator exits, which is reported elsewhere.
                 drop(bridge.run(stopped, |_, _| {}));
             };
             let thread = std::thread::Builder::new().name("slcan".to_owned()).spawn(work);

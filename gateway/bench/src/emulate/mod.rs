@@ -32,7 +32,7 @@ use crate::setup::Timeout;
 pub use firmware::{Firmware, FirmwareError};
 use line::{SlcanLines, PlannedLines};
 
-/// Program name of the emulator.
+/// Name of the emulator's program.
 const QEMU: &str = "qemu-system-arm";
 
 /// The cells to emulate.
@@ -55,10 +55,10 @@ pub enum EmulateError {
     #[error("{QEMU} is not in PATH, and --emulate needs it: apt-get install {QEMU}")]
     NoEmulator,
     /// Files cannot be written.
-    #[error("files of emulated cells: {0}; set TMPDIR to a folder with room")]
+    #[error("cannot write the files of emulated cells: {0}; set TMPDIR to a folder with room")]
     Files(#[source] std::io::Error),
     /// The path contains characters that the emulator's command line cannot carry, or is too long.
-    #[error("--flash {0}: paths of emulated cells have at most 240 bytes, UTF-8 and no spaces")]
+    #[error("--flash {0}: paths of emulated cells must be UTF-8 without spaces, and at most 240 bytes")]
     Path(PathBuf),
     /// Cells of another run keep their flash in this directory.
     #[error(
@@ -72,7 +72,7 @@ pub enum EmulateError {
     #[error(transparent)]
     Bridge(#[from] BridgeError),
     /// The system grants no thread or no pipe.
-    #[error("lines of emulated cells: {0}")]
+    #[error("cannot set up the serial lines of emulated cells: {0}")]
     Lines(#[source] std::io::Error),
     /// A bus does not open.
     #[error(transparent)]
@@ -80,7 +80,7 @@ pub enum EmulateError {
     /// A cell was not commissioned.
     #[error("the emulated {cell} was not commissioned: it {why}")]
     NotCommissioned {
-        /// The cell and its bus.
+        /// Name of the cell and its bus.
         cell: String,
         /// Cause.
         why: String,
@@ -91,7 +91,7 @@ pub enum EmulateError {
     /// An emulator ended.
     #[error("the emulator of {cells} ended before its cell was commissioned ({how})")]
     Ended {
-        /// The cell and its bus.
+        /// Names of the cells and their bus.
         cells: String,
         /// Exit status or reason.
         how: String,
@@ -131,13 +131,13 @@ pub(crate) struct Emulator<'a> {
     cells: &'a [usize],
 }
 
-/// Files and lines of emulated cells. End their processes, which are among the others, before dropping it.
+/// Files and slcan lines of emulated cells. End the cells' processes before dropping this value, because they use both.
 #[derive(Debug)]
 pub(crate) struct Emulation {
-    /// Dropped first: the lines hang up before their sockets are removed.
+    /// Dropped first, so that the slcan lines are closed before their sockets are removed.
     _lines: SlcanLines,
     _files: TempDir,
-    /// Locked as long as it is open.
+    /// The open file holds the lock on the directory of flash files.
     _flash: Option<File>,
 }
 
@@ -162,10 +162,10 @@ impl<'a> Emulator<'a> {
         Ok(Self { firmware, qemu: qemu.ok_or(EmulateError::NoEmulator)?, cells: &emulated.cells })
     }
 
-    /// Starts the cells, adds their processes to the others, and joins them to their buses, which must exist.
+    /// Starts an emulator for each cell, adds it to the other processes, and joins it to its bus, which must exist.
     ///
     /// # Errors
-    /// Returns [`EmulateError`] if something does not start.
+    /// Returns [`EmulateError`] if an emulator or its slcan line does not start.
     pub(crate) fn start(
         &self,
         bench: &EmulationSetup<'_>,
@@ -188,7 +188,7 @@ impl<'a> Emulator<'a> {
         Ok(Emulation { _lines, _files: files, _flash })
     }
 
-    /// The command of an emulator, which waits for its line.
+    /// Returns the command that starts an emulator. The emulator then waits for its slcan line.
     fn command(&self, place: &CellFiles, log: File) -> Command {
         let mut command = Command::new(&self.qemu);
         command.args(["-M", "microbit", "-display", "none", "-monitor", "none", "-serial", "chardev:line"]);
@@ -201,7 +201,7 @@ impl<'a> Emulator<'a> {
         command
     }
 
-    /// Commissions the cells as real ones would be. They must be the only cells on their buses.
+    /// Commissions the emulated cells like real ones. They must be the only cells on their buses.
     ///
     /// # Errors
     /// Returns [`EmulateError`] if a cell refuses its parameters or an emulator ends.
@@ -226,7 +226,7 @@ impl<'a> Emulator<'a> {
         let wish = CommissionOptions { dry_run: false, verify: false };
         let done = commission::commission(benches, &skin, wish, &stop, |far| {
             ended = ended.take().or_else(|| processes.ended().into_iter().next());
-            // A cell that restarts again and again would be written for ever.
+            // The timeout also ends the commissioning of a cell that restarts again and again.
             is_over |= timeout.is_over(far.iter().map(|far| far.found + far.done).sum());
             if ended.is_some() || is_over || signalled.load(Ordering::Relaxed) {
                 stop.store(true, Ordering::Relaxed);
@@ -258,7 +258,7 @@ impl<'a> Emulator<'a> {
     }
 }
 
-/// Files of one cell.
+/// Paths of the files of one emulated cell.
 struct CellFiles {
     program: PathBuf,
     socket: PathBuf,
@@ -283,7 +283,7 @@ impl CellFiles {
     }
 }
 
-/// Locks a directory of flash files; without a lock if the file system has none.
+/// Opens a directory of flash files and locks it. On a file system without locks, the directory stays unlocked.
 fn hold(directory: &Path) -> Result<File, EmulateError> {
     let opened = File::open(directory).map_err(EmulateError::Files)?;
     match flock(&opened, FlockOperation::NonBlockingLockExclusive) {

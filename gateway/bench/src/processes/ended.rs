@@ -1,5 +1,5 @@
-//! Cell processes that ended during a run or a replay: groups them into notes, and keeps the reasons of those that
-//! failed for the summary.
+//! Cell processes that ended during a run or a replay. Groups them into notes for the user, and keeps the reasons of
+//! failed processes for the summary.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::Ended;
 use crate::summary::{CellError, ErrorCells};
 
-/// Processes that end within this time share a note.
+/// Time within which processes must end to be reported in the same note.
 const TOGETHER: Duration = Duration::from_millis(50);
 /// Maximum number of processes named in one note.
 const NAMED: usize = 6;
@@ -15,16 +15,17 @@ const NAMED: usize = 6;
 /// The processes that ended so far.
 #[derive(Debug, Default)]
 pub(crate) struct EndedProcesses {
-    /// Processes without a note yet.
+    /// Ended processes that no note has reported yet.
     new: Vec<Ended>,
-    /// Time at which the last of them was found.
+    /// Time at which the last end of a process was found.
     found: Option<Instant>,
     /// Cells whose processes failed, by reason and by bus.
     errors: BTreeMap<String, BTreeMap<String, BTreeSet<u8>>>,
 }
 
 impl EndedProcesses {
-    /// Adds processes that ended and returns the notes that are due; with `last`, all notes.
+    /// Adds processes that ended. Once no process has ended for 50 ms, or if `last` is set, returns notes on all that
+    /// have not been reported.
     pub(crate) fn add_ended(&mut self, ended: Vec<Ended>, last: bool) -> Vec<String> {
         if !ended.is_empty() {
             self.found = Some(Instant::now());
@@ -40,7 +41,8 @@ impl EndedProcesses {
         groups.into_iter().map(|((bus, how), group)| self.note((&bus, &how), &group)).collect()
     }
 
-    /// The note for processes of one bus that ended in the same way. Each reason is given once.
+    /// Returns the note on processes of one bus that ended in the same way. A reason that an earlier note gave is not
+    /// repeated.
     fn note(&mut self, (bus, how): (&str, &str), group: &[Ended]) -> String {
         let error = group.first().and_then(|ended| Some((ended.status, ended.error()?)));
         let how = error.map_or_else(
@@ -63,7 +65,7 @@ impl EndedProcesses {
         }
     }
 
-    /// The errors that ended processes, each once.
+    /// Returns the errors that ended processes, each once with all cells that it ended.
     pub(crate) fn errors(&self) -> Vec<CellError> {
         let cells = |(bus, nodes): (&String, &BTreeSet<u8>)| ErrorCells {
             bus: bus.clone(),

@@ -28,15 +28,15 @@ use crate::remote::{Phase, ProcessState};
 use crate::system_calls::end_with_parent;
 use model::scenario::ProcessAction;
 
-/// Time in which two gateways on one bus detect each other.
+/// Time that two gateways on one bus need to detect each other.
 pub const GATEWAY_DETECTION_TIME: Duration = Duration::from_millis(500);
-/// Timeout of started cells without progress.
+/// Maximum time without progress while started cells become ready.
 pub const STARTING: Duration = Duration::from_secs(15);
-/// Open files of a gateway or a bus server, besides its buses and clients.
+/// Number of files that a gateway or a bus server opens besides its buses and clients.
 const OTHER_FILES: usize = 26;
-/// Open files of a gateway for each bus.
+/// Number of files that a gateway opens for each bus.
 const FILES_OF_A_BUS: usize = 4;
-/// Time that processes get to end after SIGTERM.
+/// Time that processes have to end after SIGTERM.
 const TIMEOUT: Duration = Duration::from_secs(2);
 
 /// An error that keeps a process from starting.
@@ -93,8 +93,8 @@ pub enum LaunchError {
 #[error("cannot create a file in memory: {0}")]
 pub struct MemoryError(#[source] std::io::Error);
 
-/// Raises the limit of open files, for this process and all that it starts, to what a gateway needs for `buses` buses
-/// and a bus server for `clients` clients.
+/// Raises the limit of open files for this process and all processes that it starts, so that a gateway can use `buses`
+/// buses and a bus server can serve `clients` clients.
 ///
 /// # Errors
 /// Returns [`LaunchError::Files`] if the system forbids it.
@@ -106,7 +106,7 @@ pub fn allow_files(buses: usize, clients: usize) -> Result<(), LaunchError> {
         .map_err(|_| LaunchError::Files { limit, needed })
 }
 
-/// Name of the environment variable for the path of a program of this project.
+/// Returns the name of the environment variable that overrides the path of a program of this project.
 fn variable(name: &str) -> String {
     format!("SKINBUS_{}", name.to_ascii_uppercase().replace('-', "_"))
 }
@@ -122,10 +122,11 @@ pub fn program(name: &'static str) -> Result<PathBuf, LaunchError> {
     if path.is_file() { Ok(path) } else { Err(LaunchError::Missing { name, path }) }
 }
 
-/// Creates a file in memory, which exists as long as this program holds it open, and the path by which cells open it.
+/// Creates a file in memory that contains `bytes`. Returns it with the path by which cells open it. The file exists as
+/// long as this program holds it open.
 ///
 /// # Errors
-/// Returns [`MemoryError`] if the system grants none.
+/// Returns [`MemoryError`] if the system grants no file in memory.
 pub fn in_memory(bytes: &[u8]) -> Result<(File, PathBuf), MemoryError> {
     let memory = || {
         let mut file = File::from(memfd_create("skin.toml", MemfdFlags::CLOEXEC)?);
@@ -136,7 +137,7 @@ pub fn in_memory(bytes: &[u8]) -> Result<(File, PathBuf), MemoryError> {
     Ok((file, path))
 }
 
-/// The process of one or several cells.
+/// A process that runs one or several cells.
 #[derive(Debug)]
 struct Process {
     /// Command that started the process, kept for a restart.
@@ -170,7 +171,7 @@ impl Ended {
         CellRange(self.nodes.0, self.nodes.1)
     }
 
-    /// Exit status, with the reason that the process gave, if any.
+    /// Returns the exit status, with the reason that the process gave, if any.
     #[must_use]
     pub fn how(&self) -> String {
         let status = self.status;
@@ -195,11 +196,11 @@ impl Display for Ended {
 #[derive(Debug, Default)]
 pub struct Processes {
     all: Vec<Process>,
-    /// Set by SIGCHLD, so that hundreds of processes are polled only after one has changed.
+    /// Flag that SIGCHLD sets, so that hundreds of processes are polled only after one of them has changed.
     changed: Arc<AtomicBool>,
     /// Standard error of the processes; `None` before the first start.
     error: Option<StandardError>,
-    /// Processes that had ended by themselves, discovered at their restart.
+    /// Processes that had already ended by themselves when they were to be restarted.
     found: Vec<Ended>,
 }
 
@@ -212,7 +213,7 @@ pub struct CellLaunch<'a> {
     pub skin_file: &'a Path,
     /// The skin.
     pub skin: &'a Skin,
-    /// Kind of each bus.
+    /// Kind of each bus: an interface of the kernel or an embedded bus.
     pub kinds: &'a KindChoices,
     /// Directory of embedded buses; `None` for the usual one.
     pub directory: Option<&'a Path>,
@@ -223,10 +224,10 @@ pub struct CellLaunch<'a> {
 }
 
 impl Processes {
-    /// Creates an empty set.
+    /// Creates an empty set of processes.
     ///
     /// # Errors
-    /// Returns [`LaunchError`] if the ends of processes cannot be noticed.
+    /// Returns [`LaunchError`] if SIGCHLD cannot be caught.
     pub fn new() -> Result<Self, LaunchError> {
         let mut processes = Self::default();
         processes.error = Some(StandardError::new().map_err(LaunchError::Pipe)?);
@@ -286,12 +287,13 @@ impl Processes {
         self.all.iter().filter(|process| process.lives()).map(|process| process.child.id())
     }
 
-    /// State of each process.
+    /// Returns the state of each process.
     pub fn states(&self) -> impl Iterator<Item = ProcessState> {
         self.all.iter().map(Process::state)
     }
 
-    /// Processes that have ended since the last call. Passes on what others have written to standard error.
+    /// Returns the processes that have ended since the last call. Prints what the other processes have written to their
+    /// standard error.
     pub fn ended(&mut self) -> Vec<Ended> {
         self.error.iter_mut().for_each(StandardError::read);
         let mut ended = std::mem::take(&mut self.found);
@@ -321,7 +323,7 @@ impl Processes {
             ProcessAction::Restart => {
                 let lived = process.lives();
                 process.signal(Signal::KILL, Phase::Ended);
-                // Report a process that had ended by itself: only a killed one has a signal status.
+                // A process with an exit code had ended by itself before; a killed one has a signal status.
                 let status = process.child.wait().ok().filter(|status| lived && status.signal().is_none());
                 self.found.extend(status.map(|status| process.ended(status, self.error.as_mut())));
                 process.child = match &process.log {
@@ -344,12 +346,12 @@ impl Process {
         self.phase != Phase::Ended
     }
 
-    /// The record of an ended process.
+    /// Creates the record of a process that ended with `status`.
     fn ended(&self, status: ExitStatus, error: Option<&mut StandardError>) -> Ended {
         let said = match (&self.log, error) {
             (Some(log), _) => last_line(log),
             (None, Some(error)) => {
-                // The ended process has written everything by now.
+                // The process has ended, so it has written everything.
                 error.read();
                 error.take_reason(&self.bus_name, self.nodes)
             }
@@ -389,7 +391,7 @@ impl CellLaunch<'_> {
         } else {
             command.args(["--nodes", &format!("{first}-{last}")]);
         }
-        // A lost bus is served or made again, and its cells stay the same.
+        // After the loss of a bus, a new server or interface replaces it while its cells keep running.
         command.arg("--skin").arg(self.skin_file).arg("--reconnect");
         command.args(["--bus-kind", &self.kinds.kind_of(bus).to_string()]);
         command.args(["--with-parent", &std::process::id().to_string()]);
@@ -412,7 +414,7 @@ fn start(command: &mut Command, error: Option<&StandardError>) -> Result<Child, 
         error.give(command).map_err(LaunchError::Pipe)?;
     }
     let child = spawn(command);
-    // Drop the pipe's end: each command would keep a file open.
+    // The command is kept for a restart, and would keep the pipe's end open.
     command.stderr(Stdio::inherit());
     child
 }

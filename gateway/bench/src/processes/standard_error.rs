@@ -1,6 +1,7 @@
-//! Standard error of the cells' processes: one pipe for all of them, read where their ends are noticed.
+//! Standard error of the cells' processes: one pipe for all of them, which is read when the end of a process is
+//! noticed.
 //!
-//! A process writes before it ends, so its reason has arrived when its end is noticed.
+//! A process writes its reason before it ends, so the reason has arrived by then.
 
 use std::io::{self, ErrorKind, PipeReader, PipeWriter, Read, pipe};
 use std::process::Command;
@@ -22,7 +23,7 @@ pub(super) struct StandardError {
     write: PipeWriter,
     /// Beginning of a line whose end has not arrived.
     unread: Vec<u8>,
-    /// Reasons that have not been fetched.
+    /// Reasons that processes gave before they ended and that have not been fetched.
     words: Vec<ExitReason>,
 }
 
@@ -73,7 +74,7 @@ impl StandardError {
         }
     }
 
-    /// Removes and returns the reason that a process of cells gave.
+    /// Removes the reason that a process of cells gave, and returns it.
     pub(super) fn take_reason(&mut self, bus: &str, (first, last): (u8, u8)) -> Option<String> {
         let cells = CellRange(first, last);
         let at = self.words.iter().position(|words| words.cells == cells && words.bus == bus)?;

@@ -10,7 +10,8 @@ pub(crate) fn dropped() -> Option<u64> {
     read(&fs::read_to_string("/proc/net/softnet_stat").ok()?)
 }
 
-/// Sum over the processors of the second column, which is hexadecimal modulo 2^32.
+/// Returns the sum of the second column over all processors. The column is a hexadecimal count modulo 2
+/// 32.
 fn read(text: &str) -> Option<u64> {
     text.lines().map(|line| u64::from_str_radix(line.split_whitespace().nth(1)?, 16).ok()).sum()
 }

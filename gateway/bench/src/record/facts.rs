@@ -67,7 +67,7 @@ pub fn realtime_minus_monotonic() -> i64 {
     (0..3).map(reading).min().map_or(0, |(_, offset)| offset)
 }
 
-/// Metadata of the skin and its effective timing, joined with `run`.
+/// Metadata of the skin and its effective timing, together with the metadata in `run`.
 #[must_use]
 pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)>) -> Metadata {
     let mut all = facts([
@@ -91,7 +91,7 @@ pub fn configuration(skin: &Skin, run: impl IntoIterator<Item = (String, String)
     all
 }
 
-/// Expected configuration hash of each cell, keyed by bus and node id.
+/// Expected configuration hash of each cell, by bus and node id.
 #[must_use]
 pub fn hashes(skin: &Skin) -> Metadata {
     let of_cell = |cell: &protocol::skin::Cell| {

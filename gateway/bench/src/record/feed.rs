@@ -11,21 +11,21 @@ use model::latched::ReceivedFrame;
 use model::table::Status;
 use trace::capture::BusNote;
 
-/// Queue length for the frames of a bus. Many buses together get at most four times this, which limits memory; each
-/// gets at least [`FRAMES_OF_MANY`], more than a second of a full bus.
+/// Queue length in frames for a bus. The queues of many buses together have at most four times this length, which
+/// limits memory. The queue of each bus has at least [`FRAMES_OF_MANY`] frames, more than a second of a full bus.
 const FRAMES: usize = 65_536;
-/// Minimum queue length of each of many buses.
+/// Minimum queue length in frames for a bus, if there are many buses.
 const FRAMES_OF_MANY: usize = 16_384;
 
-/// Queue length in frames of each of `buses` buses.
+/// Returns the queue length in frames for each of `buses` buses.
 #[must_use]
 pub fn frames(buses: usize) -> usize {
     (4 * FRAMES / buses.max(1)).clamp(FRAMES_OF_MANY, FRAMES)
 }
 
-/// Queue length for ticks: more than a second.
+/// Queue length in ticks: more than a second of the control loop.
 pub const TICKS: usize = 1_024;
-/// Queue length for the epochs of a bus: more than a second.
+/// Queue length in epochs for a bus: more than a second of broadcasts.
 pub const EPOCHS: usize = 128;
 
 /// An item from the receiver of a bus, in order of arrival.
@@ -67,16 +67,16 @@ pub struct EpochContacts {
     pub cells: Box<[(Option<SkinSensors>, Status)]>,
 }
 
-/// The receiver's end of its queues.
+/// The receiver's end of the queues to the recorder.
 #[derive(Debug)]
 pub struct Outlet {
     frames: rtrb::Producer<Captured>,
     touched: Option<rtrb::Producer<EpochContacts>>,
-    /// Total number of frames that did not fit.
+    /// Total number of frames that did not fit into the queue.
     unrecorded: u64,
-    /// Number of those that have not been reported yet.
+    /// Number of frames that did not fit and have not been reported to the recorder.
     unreported: u64,
-    /// Number of epochs that did not fit.
+    /// Number of epochs whose contact states did not fit into the queue.
     untouched: u64,
 }
 
@@ -101,7 +101,7 @@ impl Outlet {
         }
     }
 
-    /// Number of frames that fit into the queue now.
+    /// Returns the number of frames for which the queue has room.
     #[must_use]
     pub fn free(&self) -> usize {
         self.frames.slots()
@@ -134,7 +134,8 @@ impl Outlet {
         }
     }
 
-    /// Queues a report of frames that did not fit, if it has room. Returns true if no report remains.
+    /// Queues a report of the frames that did not fit, if the queue has room. Returns true if all such frames have been
+    /// reported.
     pub fn report_unrecorded(&mut self, at_nanos: u64) -> bool {
         let frames = self.unreported;
         if frames > 0 && self.frames.push(Captured::Unrecorded { at_nanos, frames }).is_ok() {
@@ -143,7 +144,7 @@ impl Outlet {
         self.unreported == 0
     }
 
-    /// Counts of the items that did not fit.
+    /// Returns the numbers of items that did not fit into the queues.
     #[must_use]
     pub const fn unrecorded(&self) -> Unrecorded {
         Unrecorded { frames: self.unrecorded, epochs: self.untouched }
@@ -161,7 +162,8 @@ pub struct BusFeed {
     pub(super) state: Arc<BusState>,
 }
 
-/// Creates the queues of one of `buses` buses and returns both ends; `all` if more than frames is recorded.
+/// Creates the queues for one bus out of `buses`, and returns both ends. `all` is true if contact states are recorded,
+/// not only frames.
 #[must_use]
 pub fn bus_feed(buses: usize, all: bool, view: Arc<Mutex<View>>, state: Arc<BusState>) -> (Outlet, BusFeed) {
     let (frames, taken) = rtrb::RingBuffer::new(frames(buses));

@@ -52,7 +52,7 @@ pub struct RecordOptions {
 pub struct Candump {
     /// Path of the log.
     pub path: PathBuf,
-    /// True if the name gets a number when the file exists.
+    /// True if a number is added to the file's name when the file exists.
     pub numbered: bool,
 }
 
@@ -96,7 +96,7 @@ pub enum OutputError {
     Name(PathBuf),
 }
 
-/// Reserved output files, not yet begun.
+/// Output files that are open but contain no data yet.
 #[derive(Debug)]
 pub struct Outputs {
     text: Option<Text>,
@@ -169,7 +169,7 @@ impl Outputs {
 struct Stop {
     /// Ends the recording.
     now: AtomicBool,
-    /// Discards the recording, as if the run had not happened.
+    /// Removes the recording, as if the run had not happened.
     discard: AtomicBool,
 }
 
@@ -183,7 +183,7 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// Messages for the user since the last call.
+    /// Returns the messages for the user that have arrived since the last call.
     pub fn messages(&self) -> impl Iterator<Item = String> + '_ {
         self.said.try_iter()
     }
@@ -194,7 +194,7 @@ impl Recorder {
         let _ = self.notes.send((wall(), text.to_owned()));
     }
 
-    /// Ends the recording of a run that never began. Leaves only a log of received frames.
+    /// Ends the recording of a run that never began. Removes all outputs except a candump log that contains frames.
     #[must_use]
     pub fn discard(self) -> RecordingAccount {
         self.stop.discard.store(true, Ordering::Relaxed);
@@ -203,8 +203,8 @@ impl Recorder {
         self.thread.join().unwrap_or_default()
     }
 
-    /// Records all queued items and ends the files. Call it when no thread queues more. `unrecorded` counts items that
-    /// did not fit into the receivers' queues; `ticks` counts ticks that did not fit.
+    /// Records all queued items and ends the files. Call it after all threads have stopped queuing. `unrecorded` counts
+    /// items that did not fit into the receivers' queues; `ticks` counts ticks that did not fit into theirs.
     #[must_use]
     pub fn finish(self, unrecorded: Unrecorded, ticks: u64) -> RecordingAccount {
         self.stop.now.store(true, Ordering::Release);

@@ -26,7 +26,7 @@ pub struct Text {
     failed: bool,
     /// True if another program moved or changed the file.
     moved: bool,
-    /// Time of the last such check.
+    /// Time of the last check that the log still has its name.
     looked: Instant,
     /// Lines not yet written.
     lines: String,
@@ -34,7 +34,7 @@ pub struct Text {
     waiting: u64,
     /// Number of frames in the file.
     frames: u64,
-    /// Number of frames that were not written.
+    /// Number of frames that could not be written.
     lost: u64,
 }
 
@@ -155,7 +155,8 @@ impl Text {
         (file, lost + (written - frames), put.and(looked).and(finished))
     }
 
-    /// Ends the log of a run that never began. Returns the file, or `None` if no frame was received.
+    /// Ends the log of a run that never began. Returns the file, or removes it and returns `None` if no frame was
+    /// received.
     pub fn discard(mut self) -> Option<WrittenFile> {
         // The reason why the run did not begin is the error to report.
         let _ = self.flush();

@@ -35,7 +35,7 @@ const BACKLOG_INTERVAL: Duration = Duration::from_millis(100);
 /// Interval between diagnostics messages.
 const DIAGNOSE: Duration = Duration::from_millis(500);
 
-/// The recorder's state of a bus.
+/// Figures that the recorder keeps for one bus.
 #[derive(Default)]
 struct Seen {
     latched: LatchedPackets,
@@ -45,7 +45,7 @@ struct Seen {
     dropped: u64,
     /// Number of frames that did not fit into the queue.
     unrecorded: u64,
-    /// Number of frames not written since the last file ended.
+    /// Number of frames that arrived between two files of the recording and were not written.
     missing: u64,
     /// Number of epochs recorded.
     epochs: u64,
@@ -80,7 +80,7 @@ pub(super) struct RecorderThread {
     scratch: (Vec<ContactState>, Vec<Point>),
 }
 
-/// A period and the time at which it last elapsed.
+/// A period, and the time at which it was over the last time.
 struct Every(Duration, Instant);
 
 impl Every {
@@ -160,7 +160,7 @@ impl RecorderThread {
         self.finish()
     }
 
-    /// Writes all queued items. Returns the length of the longest queue.
+    /// Writes the items that are queued now. Returns the length of the longest queue.
     fn take(&mut self) -> usize {
         let offset = realtime_minus_monotonic();
         if let Some(series) = &mut self.files.series {
@@ -184,7 +184,7 @@ impl RecorderThread {
         else {
             return 0;
         };
-        // Items that arrive meanwhile are left to the next round, so that the other queues are served.
+        // Leave items that arrive meanwhile to the next round, so that the other queues are served.
         let waiting = bus_feed.frames.slots();
         let Ok(waiting) = bus_feed.frames.read_chunk(waiting) else { return 0 };
         let taken = waiting.len();
@@ -304,14 +304,14 @@ impl RecorderThread {
     fn flush(&mut self) {
         self.files.text(Text::flush);
         let Some(series) = &mut self.files.series else { return };
-        // Both segments of a packet to the cells belong in one file.
+        // Both segments of a packet to the cells must be in one file.
         let now = wall();
         let holds = self.buses.iter().any(|bus| bus.latched.is_within_a_packet(now));
         if !series.flush(holds) || !series.next(|writer| Topics::new(writer, &self.layout)) {
             return;
         }
-        // Each file must be readable without the one before it. These come first: queued items went into the former
-        // file.
+        // Each file must be readable without the one before it, so it begins with these frames. Items queued before
+        // went into the former file.
         let began = now.saturating_sub(WINDOW_NS);
         robot(series, &self.layout, began);
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
@@ -344,7 +344,7 @@ impl RecorderThread {
         self.reported = errors.len();
     }
 
-    /// Leaves only a log of received frames.
+    /// Ends the recording of a run that never began. Removes all outputs except a candump log that contains frames.
     fn discard(mut self) -> RecordingAccount {
         if let Some(series) = &mut self.files.series {
             series.discard();
@@ -394,7 +394,7 @@ impl Files {
         self.series.as_ref().is_some_and(|series| !series.is_open())
     }
 
-    /// Writes to the log, if any.
+    /// Writes to the candump log, if there is one.
     fn text(&mut self, write: impl FnOnce(&mut Text) -> io::Result<()>) {
         if let Some(text) = &mut self.text
             && let Err(error) = write(text)
@@ -404,21 +404,22 @@ impl Files {
         }
     }
 
-    /// Writes to the recording, if any.
+    /// Writes to the MCAP recording, if there is one.
     fn put(&mut self, count: MessageCount, write: impl FnOnce(&mut ReorderWindow, &mut Topics)) {
         if let Some(series) = &mut self.series {
             series.put(count, write);
         }
     }
 
-    /// Notes in all outputs that frames are missing from here on, and where; `bus` if it is known.
+    /// Notes in all outputs that `frames` frames are missing at this point. `place` says where they were lost, `total`
+    /// is the number of frames lost there so far, and `bus` is their bus, if known.
     fn dropped(&mut self, nanos: u64, bus: Option<(usize, &str)>, frames: u64, place: &str, total: u64) {
         let line = dropped(frames, place, total);
         self.text(|text| text.note(&line));
         self.note(nanos, bus, NoteKind::Dropped(frames), &line);
     }
 
-    /// Adds a note to the recording only.
+    /// Adds a note to the MCAP recording only.
     fn note(&mut self, nanos: u64, bus: Option<(usize, &str)>, kind: NoteKind, line: &str) {
         let (bus, interface) = bus.unzip();
         let interface = interface.unwrap_or_default();
@@ -438,7 +439,7 @@ fn dropped(frames: u64, place: &str, total: u64) -> String {
     format!("DROPCOUNT: dropped {frames} {place} (total drops {total})")
 }
 
-/// Diagnosis of a bus.
+/// Returns the diagnosis of a bus for the diagnostics topic.
 fn bus(bus_feed: &BusFeed, name: &str, seen: &Seen) -> Diagnosis {
     let works = bus_feed.state.is_there();
     let (mut cells, mut silent) = (0, 0);

@@ -21,7 +21,7 @@ use trace::ros2::robot::{Text, Transforms};
 use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
 
-/// QoS that bag tools write for latched topics: readers that join later get the last message.
+/// QoS profile that bag tools store for latched topics: readers that join later get the last message.
 const LATCHED: (&str, &str) = (
     "offered_qos_profiles",
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: 9223372036\n    \
@@ -109,15 +109,15 @@ impl Topics {
         }
     }
 
-    /// Writes a frame that was latched when the file begins, at `nanos`: its own time may be much earlier, and viewers
-    /// would start there.
+    /// Writes a frame that was latched when the file began, under the time `nanos`, at which the file begins. Its own
+    /// time may be much earlier, and viewers would start there.
     pub fn latched(&mut self, window: &mut ReorderWindow, nanos: u64, (bus, name): (usize, &str), seen: &ReceivedFrame) {
         if let Some(channel) = self.state.get_mut(bus) {
             window.write_at(channel, nanos, seen.at_nanos, &message(name, seen));
         }
     }
 
-    /// Writes a note between frames; a note about a bus follows the frames recorded from it.
+    /// Writes a note between frames. A note about a bus comes after the frames recorded from that bus.
     pub fn note(&mut self, window: &mut ReorderWindow, bus: Option<usize>, note: &Note<'_>) {
         let channel = bus.and_then(|bus| self.can.get(bus));
         let heard = channel.map(|channel| window.latest(channel)).filter(|heard| *heard > 0);

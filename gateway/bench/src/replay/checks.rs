@@ -1,4 +1,4 @@
-//! Conditions that the cells must meet before they can be compared with a recording.
+//! Checks that the cells on the buses match a recording before their replies are compared with it.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,7 +12,7 @@ use super::start::Routes;
 use super::survey::{SurveyedBus, SurveyedCell, KnownValue, Survey};
 use crate::setup::names;
 
-/// The replayed part, and the conditions on the cells.
+/// Checks of the cells before a replay: the options, the survey of the capture and the routes of its buses.
 #[derive(Debug)]
 pub(super) struct Checks {
     pub(super) options: ReplayOptions,
@@ -23,39 +23,39 @@ pub(super) struct Checks {
 }
 
 impl Checks {
-    /// Present name of a bus.
+    /// Returns the name that a bus has in this replay.
     pub(super) fn bus_link(&self, bus_link: usize) -> &str {
         self.routes.names.get(bus_link).map_or("", |(_, name)| name)
     }
 
-    /// Present name and recorded state of each bus.
+    /// Returns the name that each bus has in this replay, and the survey of the recorded bus.
     pub(super) fn bus_links(&self) -> impl Iterator<Item = (&str, &SurveyedBus)> {
         let buses = &self.survey.buses;
         self.routes.names.iter().filter_map(|(bus, name)| Some((name.as_str(), buses.get(*bus)?)))
     }
 
-    /// Recorded cells of a bus in the replayed part.
+    /// Returns the cells that sent on a bus in the replayed part of the recording.
     fn cells<'a>(&self, bus: &'a SurveyedBus) -> impl Iterator<Item = (CellId, &'a SurveyedCell)> + use<'a> {
         bus.cells_in(self.survey.bounds())
     }
 
-    /// Recorded cells of each bus in the replayed part.
+    /// Returns the cells that sent on each bus in the replayed part of the recording.
     pub(super) fn recorded(&self) -> Vec<BTreeSet<CellId>> {
         self.bus_links().map(|(_, bus)| self.cells(bus).map(|(cell, _)| cell).collect()).collect()
     }
 
-    /// Returns true if the state at the start of the replay includes parameters: then the cells have their recorded
+    /// Returns true if the replay begins with a state that includes parameters. The cells then have their recorded
     /// configuration only after that state is restored.
     pub(super) fn configures(&self) -> bool {
         self.bus_links().any(|(_, bus)| bus.state.configures())
     }
 
-    /// Returns true if newly started cells already are in the state in which the replay begins.
+    /// Returns true if newly started cells are already in the state in which the replay begins.
     pub(super) fn are_fresh(&self) -> bool {
         self.options.spawn.is_some() && self.bus_links().all(|(_, bus)| bus.state.is_fresh())
     }
 
-    /// Number of cells whose recorded configuration is unknown.
+    /// Returns the number of cells whose recorded configuration is unknown.
     pub(super) fn unchecked(&self) -> u64 {
         let unknown = |bus| self.cells(bus).filter(|(_, cell)| hash(cell).is_none()).count() as u64;
         self.bus_links().map(|(_, bus)| unknown(bus)).sum()
@@ -107,7 +107,7 @@ impl Checks {
         if equal == 0 { Err(Mismatch::Unknown) } else { Ok(()) }
     }
 
-    /// Cells of each bus that measure now, although they obeyed stimuli in the recording.
+    /// Returns the cells of each bus that measure now, although they obeyed stimuli in the recording.
     pub(super) fn measuring(&self, comparator: &Comparator) -> Vec<Vec<CellId>> {
         let measures = |(bus_link, (_, bus)): (usize, (&str, &SurveyedBus))| {
             let obeyed = |cell: &CellId| bus.cells.get(cell).is_some_and(|cell| !cell.measured);
@@ -119,7 +119,7 @@ impl Checks {
     }
 }
 
-/// Hash of a cell's recorded configuration, if known.
+/// Returns the hash of a cell's recorded configuration, if known.
 const fn hash(cell: &SurveyedCell) -> Option<u16> {
     if let KnownValue::Yes(hash) = cell.hash { Some(hash) } else { None }
 }

@@ -1,4 +1,4 @@
-//! The text of one reply that differs from the recorded one.
+//! A reply that differs from the recorded one, described as text.
 
 use core::fmt::{self, Display, Formatter};
 
@@ -29,7 +29,7 @@ pub enum ReplyKind {
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum DifferenceKind {
-    /// The words differ.
+    /// The words of the reply differ from the recorded ones.
     Different,
     /// The reply did not come.
     Missing,
@@ -37,12 +37,12 @@ pub enum DifferenceKind {
     Extra,
 }
 
-/// A value that a cell sent.
+/// A value that a cell sent: the words of a reply, a sum, or an answer.
 #[derive(Clone, Debug, PartialEq)]
 pub enum SentValue {
     /// Words of a reply to joints.
     Words(ReplyKind, Words),
-    /// A sum, with the remainder without the children's sums.
+    /// A sum, with the cell's own contribution to it.
     Sum(OwnTerm),
     /// An answer to `configure`, with its tag.
     Answer(u8, Answer),
@@ -51,11 +51,11 @@ pub enum SentValue {
 /// Position of joints in a recording.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Position {
-    /// Number among the replayed joints of the bus, from 0.
+    /// Number of the joints among the replayed joints of the bus, from 0.
     pub joints: u64,
     /// Epoch of the joints.
     pub epoch: u8,
-    /// Time in s after the recording's first frame.
+    /// Time of the joints in s after the recording's first frame.
     pub at_s: f64,
 }
 
@@ -68,7 +68,7 @@ pub struct Difference {
     pub bus: String,
     /// Node id of the cell.
     pub cell: u8,
-    /// Joints that the reply answers, if any.
+    /// Position of the joints that the reply answers, if it answers any.
     #[serde(flatten)]
     pub when: Option<Position>,
     /// Text for people, in several lines.
@@ -76,7 +76,7 @@ pub struct Difference {
 }
 
 impl Difference {
-    /// Describes the difference between a cell's recorded and present values.
+    /// Describes the difference between the values that a cell sent in the recording and in this replay.
     #[must_use]
     pub fn new(
         how: DifferenceKind,
@@ -131,7 +131,7 @@ impl SentValue {
         }
     }
 
-    /// Torques in steps, `None` for saturated ones, and their format.
+    /// Returns the torques in steps, with `None` for saturated words, and their format.
     fn steps(&self, units: Units) -> Option<([Option<i32>; MAX_JOINTS], TorqueFormat)> {
         match self {
             Self::Words(ReplyKind::Torque, words) => {
@@ -143,7 +143,7 @@ impl SentValue {
     }
 }
 
-/// Formats a sum, its children, and the cell's own contribution.
+/// Formats a sum, the children whose sums it contains, and the cell's own contribution.
 fn summed(cell: CellId, epoch: Epoch, own: &OwnTerm, units: Units) -> String {
     let sum = Message::Sum { from: cell, epoch, torque: own.sum, count: own.count };
     let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
@@ -167,7 +167,7 @@ fn summed(cell: CellId, epoch: Epoch, own: &OwnTerm, units: Units) -> String {
     format!("{}; {less}:{words} Nm", meaning(sum, units))
 }
 
-/// Formats a message as text, without the verdict.
+/// Formats a message as text, without the verdict on its frame.
 fn meaning(message: Message, units: Units) -> String {
     let text = Decoded::Message(message).in_units(units).to_string();
     text.split_once(' ').map_or(String::new(), |(_, text)| text.trim_start().to_owned())

@@ -10,7 +10,7 @@ use crate::error::{RunError, why};
 use model::decode::MAX_BUSES;
 use trace::capture::CaptureError;
 
-/// An error of cells that are not as they were in the recording.
+/// An error of cells that are not in the state of the recording.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 pub enum Mismatch {
     /// All cells differ.
@@ -21,7 +21,7 @@ pub enum Mismatch {
     Skin {
         /// Number of cells.
         count: usize,
-        /// The cells with their configurations.
+        /// Names of the cells, with their configurations.
         cells: String,
         /// True if this replay started the cells.
         spawned: bool,
@@ -29,7 +29,7 @@ pub enum Mismatch {
     /// Some cells differ.
     #[error("cells have another configuration than in the recording: {cells}; {}", hint(*.spawned))]
     Cells {
-        /// The cells with their configurations.
+        /// Names of the cells, with their configurations.
         cells: String,
         /// True if this replay started the cells.
         spawned: bool,
@@ -57,17 +57,17 @@ fn hint(spawned: bool) -> &'static str {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ReplayError {
-    /// An error that a run can have too: of a skin, a bus, a program or a thread.
+    /// An error that runs can have too: of a skin, a bus, a program or a thread.
     #[error(transparent)]
     Run(RunError),
     /// A bus cannot have the kind that is named for it.
     #[error(transparent)]
     Kinds(#[from] KindsError),
     /// Standard input cannot be read twice.
-    #[error("a capture is read twice, which standard input cannot be: write it to a file, and name that")]
+    #[error("a replay reads its capture twice, but standard input only once: write it to a file, and name that")]
     StandardInput,
     /// A pipe cannot be read twice.
-    #[error("{} is not a regular file, and a capture is read twice: write it to a file, and name that", .0.display())]
+    #[error("{} is not a regular file, but a replay reads its capture twice: write it to a file, and name that", .0.display())]
     Pipe(PathBuf),
     /// The capture does not open.
     #[error(transparent)]
@@ -84,7 +84,7 @@ pub enum ReplayError {
     /// The capture has nothing to send.
     #[error("{0}: there is no frame in it")]
     Empty(String),
-    /// The bus whose cells are to answer does not exist.
+    /// The bus does not exist, so no cell on it can answer.
     #[error("{0}; or start fresh cells on an embedded bus with --spawn")]
     NotThere(BusError),
     /// The requested part has nothing to send.
@@ -92,10 +92,10 @@ pub enum ReplayError {
     NothingLeft {
         /// Display name of the capture.
         name: String,
-        /// Time of the last frame, in s of the run, or after its first frame.
+        /// Time of the last frame in s, from the start of the run or, without a run, from the first frame.
         ends_s: f64,
     },
-    /// An option names a bus that the capture does not have.
+    /// An option names a bus that is not in the capture.
     #[error("{option}: {capture} has no bus {bus}; it has {buses}")]
     NoBus {
         /// The option and its value.
@@ -155,10 +155,10 @@ pub enum ReplayError {
     /// No cell is on the buses.
     #[error("no cell answers on {0}: start them with cell-node, or with --spawn")]
     NoCell(String),
-    /// The cells are not as they were.
+    /// The cells are not in the state of the recording.
     #[error(transparent)]
     Mismatch(#[from] Mismatch),
-    /// Cells do not confirm test mode.
+    /// Cells do not confirm that they are in test mode.
     #[error("cells do not go into test mode: {0}")]
     NoTestMode(String),
     /// Cells measure and ignore stimuli.

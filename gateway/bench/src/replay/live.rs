@@ -1,4 +1,4 @@
-//! The stage of a real replay: the machine's clock and open buses.
+//! The player's stage in a real replay, with the machine's clock and open buses.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -20,25 +20,26 @@ use super::{ReplayOptions, ReplayError};
 use crate::bus::realtime;
 use crate::setup::names;
 
-/// Interval between readings of the stop flag, in ns.
+/// Interval in ns between checks of the stop flag.
 const LOOK_NS: u64 = 100_000_000;
-/// Pause before the next step.
+/// Pause while the queue of steps is empty.
 const STEP_PAUSE: Duration = Duration::from_micros(100);
 const DOWN_PAUSE: Duration = Duration::from_millis(50);
-/// Time without any answer after which cells are queried again, as a frame may have been lost, and after which they are
-/// given up.
+/// Time without any answer after which cells are queried again, because a frame may have been lost. After [`TIMEOUT`]
+/// they are given up.
 const REMIND: Duration = Duration::from_millis(500);
 const TIMEOUT: Duration = Duration::from_secs(3);
-/// Maximum number of times that joints are resent when cells were too late for them.
+/// Maximum number of times that joints are resent when cells processed them too late to answer.
 const REQUEST_AGAIN: u32 = 16;
-/// The same maximum after joints for which resending did not help: lateness is hardly the reason then.
+/// Maximum number of times that joints are resent on a bus on which resending did not help the last time. The cells are
+/// then probably not late but absent.
 const REQUEST_AGAIN_IN_VAIN: u32 = 2;
-/// First wait for answers to resent joints, before cells must send a heartbeat too.
+/// Time to wait for answers to resent joints, before cells must also send a heartbeat.
 const FIRST_ANSWER_WAIT: Duration = Duration::from_millis(100);
-/// Maximum of the factor on the wait.
+/// Maximum factor by which the wait for answers is extended from try to try.
 const MAX_WAIT_FACTOR: u32 = 4;
 
-/// The stage of a real replay.
+/// The player's stage in a real replay.
 #[derive(Debug)]
 pub(super) struct LiveStage {
     pub(super) bus_links: Arc<Vec<ReplayBus>>,
@@ -98,7 +99,7 @@ impl Stage for LiveStage {
                 self.shared_state.comparator().mark_down(index);
                 self.notify(format!("{error}; frames due meanwhile are lost, and counted"));
             }
-            // At a timed pace, waiting would lose frames.
+            // At a timed pace, waiting for answers would delay the next frames.
             let ReplayOptions { pace, lockstep, .. } = self.shared_state.checks.options;
             if pace == Pace::Max || lockstep {
                 std::thread::sleep(DOWN_PAUSE);
@@ -116,9 +117,9 @@ impl Stage for LiveStage {
         let Some(round) = open.round.filter(|_| self.shared_state.checks.options.expect.is_some()) else {
             return;
         };
-        // On a slow machine a cell skips joints that it processes more than one period late, and does not answer. They
-        // are resent under the epoch before, and then under their own. The sync follows later, because on such a
-        // machine the heartbeats of some cells delay others.
+        // On a slow machine, a cell skips joints that it processes more than one period late, and does not answer them.
+        // Such joints are resent under the epoch before, and then under their own epoch. The sync follows later,
+        // because on such a machine the heartbeats of some cells delay others.
         let tries = if self.in_vain.contains(&bus_index) { REQUEST_AGAIN_IN_VAIN } else { REQUEST_AGAIN };
         for again in 0.. {
             if self.shared_state.is_over() {
@@ -181,7 +182,7 @@ impl Stage for LiveStage {
 }
 
 impl LiveStage {
-    /// Messages that reset the contact state of the cells on a bus that are in test mode.
+    /// Returns the messages that reset the contact state of those cells on a bus that are in test mode.
     fn forgetting(&self, bus_index: usize) -> Vec<Message> {
         let comparator = self.shared_state.comparator();
         let obeying = comparator.settled_cells(bus_index).filter(|(_, cell)| cell.claim.has_state(Flags::TEST_MODE));
@@ -197,7 +198,7 @@ impl LiveStage {
         let _ = self.log_sender.send(text);
     }
 
-    /// Waits until the cells of a bus have processed all that was sent so far, and `last`.
+    /// Sends `last` on a bus, and waits until its cells have processed all messages sent so far.
     fn finish(&mut self, bus_index: usize, last: &[Message]) -> Result<(), BusError> {
         self.shared_state.comparator().announce_sync(bus_index);
         self.send_messages(bus_index, last)?;
@@ -205,7 +206,7 @@ impl LiveStage {
         Ok(())
     }
 
-    /// Requests counters and waits for them.
+    /// Requests the counters of the cells on a bus, and waits for them.
     pub(super) fn report(&mut self, bus_index: usize) -> Result<(), BusError> {
         self.finish(bus_index, &[Message::Report, Message::Sync])
     }
@@ -220,7 +221,7 @@ impl LiveStage {
             }
             if reminded.elapsed() > REMIND {
                 reminded = Instant::now();
-                // The next frame reports a bus that refuses messages.
+                // If the bus refuses messages, the next frame reports it.
                 let _ = self.send_messages(bus_index, &[Message::Sync]);
             }
             if progress.elapsed() > TIMEOUT {

@@ -17,9 +17,10 @@ use crate::error::RunError;
 use crate::processes::STARTING;
 use crate::setup::{Timeout, names};
 
-/// Time within which cells already present send at least one heartbeat.
+/// Time within which each running cell sends at least one heartbeat.
 const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(1);
-/// Time without a newly reachable cell after which the rest counts as unreachable: two hellos and a search.
+/// Time after which the remaining cells count as unreachable if no other cell has become reachable: two hellos and a
+/// search.
 const ORGANISING: Duration = Duration::from_secs(2);
 /// Interval between polls.
 const POLL_INTERVAL: Duration = Duration::from_millis(5);
@@ -90,13 +91,13 @@ impl Session {
         self.signalled.load(Ordering::Relaxed)
     }
 
-    /// Waits until the required cells have answered, or no further cell does.
+    /// Waits until the required cells have answered, or until no further cell answers.
     fn wait_for_cells(&mut self, target: &[BTreeSet<CellId>]) -> Result<(), ReplayError> {
         let spawned = self.buses.processes.pids().next().is_some();
         for bus_link in self.buses.bus_links.iter() {
             bus_link.send(&[Message::Sync])?;
         }
-        // All cells answer: after the first pause they are known even if none is required.
+        // Cells answer at once, so that after the first pause they are known even if none is required.
         thread::sleep(POLL_INTERVAL);
         let all = target.iter().map(BTreeSet::len).sum::<usize>();
         let mut timeout = Timeout::new(if spawned { STARTING } else { DISCOVERY_TIMEOUT });
@@ -121,7 +122,7 @@ impl Session {
         })
     }
 
-    /// Waits until all cells that reply with sums have a route to the gateway, or no further cell finds one.
+    /// Waits until all cells that reply with sums have a route to the gateway, or until no further cell finds one.
     fn wait_for_tree(&mut self) -> Result<(), ReplayError> {
         for bus_link in self.buses.bus_links.iter().filter(|bus_link| bus_link.wired) {
             bus_link.send(&[Message::Report])?;
@@ -168,7 +169,7 @@ impl Session {
         self.tell_mode(&self.measuring, false)
     }
 
-    /// Switches cells to obey stimuli and report it at once, or to measure.
+    /// Switches cells to test mode and reports it at once, or switches them to measuring.
     fn tell_mode(&self, cells: &[Vec<CellId>], obey: bool) -> Result<(), ReplayError> {
         for (bus_link, cells) in self.buses.bus_links.iter().zip(cells).filter(|(_, cells)| !cells.is_empty())
         {

@@ -65,7 +65,7 @@ const NAMED_LINES: u64 = 5;
 /// Cells to start for a replay.
 #[derive(Clone, Debug)]
 pub struct SpawnOptions {
-    /// Path of their skin; `None` for the skin attached to the recording.
+    /// Path of the skin file for the cells; `None` for the skin attached to the recording.
     pub skin: Option<PathBuf>,
     /// Maximum number of cells per process.
     pub cells_per_process: usize,
@@ -78,23 +78,23 @@ pub struct ReplayOptions {
     pub files: Vec<PathBuf>,
     /// Kind of each bus.
     pub kinds: KindChoices,
-    /// Filter by sender.
+    /// Selection of the frames by their sender.
     pub only: SenderFilter,
     /// Buses of the capture whose frames are sent; empty for all.
     pub buses: Vec<String>,
     /// Pairs of a bus of the capture and the bus that receives its frames.
     pub map: Vec<(String, String)>,
-    /// Part of the capture.
+    /// Part of the capture that is replayed.
     pub part: TimeRange,
-    /// Number of passes, or `None` for no end.
+    /// Number of passes over the capture, or `None` to repeat without end.
     pub passes: Option<u32>,
     /// Speed of the replay.
     pub pace: Pace,
-    /// Time before a frame is due during which the thread spins.
+    /// Time before a frame is due during which the thread polls the clock instead of sleeping.
     pub spin: Duration,
-    /// True if joints wait until all cells have answered the joints before.
+    /// True if joints are sent only after all cells have answered the joints before.
     pub lockstep: bool,
-    /// Tolerance in steps of torques for the comparison with recorded replies, or `None` for no comparison.
+    /// Tolerance in steps of torques for the comparison with recorded replies, or `None` to compare nothing.
     pub expect: Option<u16>,
     /// Cells to start, if any.
     pub spawn: Option<SpawnOptions>,
@@ -120,7 +120,7 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
     let skin_override =
         options.spawn.as_ref().map(|spawn| start::skin_override(spawn, &routes, &extras, &name));
     let skin_override = skin_override.transpose()?;
-    // Up to here there is nothing to clean up after a signal.
+    // Until here, a signal may end the program, because there is nothing to clean up.
     let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
     // In lockstep, frames are sent when cells have answered, not at a time.
     let timed = matches!(options.pace, Pace::Timed(_)) && !options.lockstep;
@@ -144,7 +144,7 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
         .run(idle.as_ref(), skin_override.as_ref())
 }
 
-/// Reads the capture once from end to end. Returns its survey, its extras and its display name.
+/// Reads the whole capture once. Returns its survey, its contents other than frames, and its display name.
 fn look_through(options: &ReplayOptions, progress: &Progress) -> Result<(Survey, RecordingExtras, String), ReplayError> {
     if options.files.iter().any(|file| is_standard_input(file)) {
         return Err(ReplayError::StandardInput);
@@ -222,7 +222,7 @@ fn look_through(options: &ReplayOptions, progress: &Progress) -> Result<(Survey,
     Ok((survey, reader.extras().clone(), name))
 }
 
-/// Warns that cells which are on the bus already will receive their own recorded messages.
+/// Warns that cells which are already on the bus will receive copies of the messages that they sent in the recording.
 fn warn_of_doubles(checks: &Checks, heard: &[BTreeSet<CellId>], progress: &Progress) {
     for ((name, bus), heard) in checks.bus_links().zip(heard) {
         let both: Vec<_> = heard.iter().copied().filter(|cell| bus.cells.contains_key(cell)).collect();

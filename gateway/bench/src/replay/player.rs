@@ -21,28 +21,28 @@ use model::quantiles::histogram;
 /// Time in ns from the decision to start to the first frame.
 const LEAD_NS: u64 = 1_000_000;
 
-/// The clock, the buses and the output of a player.
+/// Interface of a player to its clock, its buses and its output.
 pub trait Stage {
     /// Monotonic clock in ns.
     fn now(&self) -> u64;
     /// Waits until the clock reads `at`, or the replay is stopped.
     fn wait_until(&mut self, at: u64);
-    /// Pauses while the queue is empty and more steps will come.
+    /// Pauses briefly, because the queue of steps is empty and more steps will come.
     fn pause(&mut self);
     /// Returns true if the replay was stopped.
     fn is_over(&self) -> bool;
-    /// Notes that joints are about to be sent.
+    /// Tells the comparison that joints are about to be sent.
     fn announce(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch);
     /// Sends frames; waits for room up to the timeout.
     ///
     /// # Errors
     /// Returns [`SendError`] if the bus stays full, is down or has ended.
     fn send(&mut self, bus_index: usize, frames: &[Frame]) -> Result<(), SendError>;
-    /// Notes that a bus refused the joints of a round.
+    /// Tells the comparison that a bus refused the joints of a round.
     fn mark_unsent(&mut self, bus_index: usize, round: u64);
     /// Waits until the cells of a bus have answered.
     fn wait_for_answers(&mut self, bus_link: usize, open: &OpenJoints);
-    /// Restores a state, bus by bus.
+    /// Restores a latched state on each bus.
     ///
     /// # Errors
     /// Returns [`ReplayError`] if the cells then differ from the recording, or a bus has ended.
@@ -51,7 +51,7 @@ pub trait Stage {
     fn show(&mut self, at: u64);
 }
 
-/// Speed of a replay.
+/// Speed at which a capture is replayed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Pace {
     /// The capture's own times divided by this factor.
@@ -60,7 +60,7 @@ pub enum Pace {
     Max,
 }
 
-/// Counts of one bus's frames.
+/// Counts of the frames that were to be sent on one bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct BusLinkTally {
     /// Frames that the bus accepted.
@@ -73,12 +73,12 @@ pub struct BusLinkTally {
     pub outages: u64,
 }
 
-/// Result of a player.
+/// Result of playing a capture.
 #[derive(Debug)]
 pub struct PlayerResult {
     /// Counts of each bus.
     pub bus_links: Vec<BusLinkTally>,
-    /// Lateness of the frames in ns, without frames that were due at once.
+    /// Lateness of the frames in ns. Frames that were to be sent at once are not included.
     pub late: Histogram<u64>,
     /// True if the replay was stopped before its end.
     pub was_stopped: bool,
@@ -90,16 +90,16 @@ pub struct PlayerResult {
 #[derive(Debug)]
 pub struct Player {
     pace: Pace,
-    /// Frames of a sync on each bus, in lockstep.
+    /// Frames of a sync message for each bus; `None` unless the replay is in lockstep.
     syncs: Option<Vec<Vec<Frame>>>,
     /// Joints of each bus whose answers are awaited.
     open: Vec<Option<OpenJoints>>,
     down: Vec<bool>,
-    /// The clock's time and the capture's time of the same moment.
+    /// A time of the clock and the time of the capture that corresponds to it, both in ns.
     origin: Option<(u64, u64)>,
     played: PlayerResult,
     batch: Vec<Frame>,
-    /// Rounds of joints in the batch, with their positions.
+    /// Position in the batch and round of each joint packet in the batch.
     rounds: Vec<(usize, u64)>,
 }
 
@@ -165,7 +165,7 @@ impl Player {
         }
     }
 
-    /// Time at which a frame is due by the clock, or `None` to send it at once.
+    /// Returns the clock's time in ns at which a frame is due, or `None` to send it at once.
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
@@ -181,7 +181,7 @@ impl Player {
         Some(clock + (due.at.saturating_sub(at) as f64 / speed) as u64)
     }
 
-    /// Sends a frame when it is due, with the following frames of the same bus that are due by then.
+    /// Sends a frame when it is due, in one batch with the following frames of the same bus that are due by then.
     fn frames_from(&mut self, first: &DueFrame, steps: &mut rtrb::Consumer<PlayerStep>, stage: &mut impl Stage) {
         let bus_link = first.bus_index;
         if self.syncs.is_some() && is_joints(first) {
@@ -190,7 +190,7 @@ impl Player {
         self.batch.clear();
         self.rounds.clear();
         let deadline = self.deadline(first, stage.now());
-        // The receiver of the answer must know the request, and later there is no time for that.
+        // Announce the joints before they are sent, because the answers may arrive before the send call returns.
         let mut open = self.push(first, stage);
         let _ = steps.pop();
         if let Some(deadline) = deadline {
@@ -251,7 +251,7 @@ impl Player {
         else {
             return;
         };
-        // A sync may follow the frames.
+        // The last frame may be a sync, which does not count.
         let taken = sent.as_ref().map_or_else(|error| error.sent.min(frames), |()| frames);
         let rest = (frames - taken) as u64;
         tally.sent += taken as u64;

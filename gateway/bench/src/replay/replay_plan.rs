@@ -21,7 +21,8 @@ use model::decode::Decoded;
 use model::decode::settle::Settler;
 use trace::order::{BusMerger, ReleasedFrame};
 
-/// Time in ns after the end of the part during which recorded replies are still read, because they answer joints in it.
+/// Time in ns after the end of the replayed part during which recorded replies are still read, because they answer
+/// joints in the part.
 const LATE_REPLIES_NS: u64 = 1_000_000_000;
 /// Minimum time in ns between two passes.
 const MIN_GAP_NS: u64 = 1_000_000;
@@ -34,18 +35,18 @@ pub enum SenderFilter {
     All,
     /// Commands, configuration and stimuli.
     Inputs,
-    /// Frames from cells.
+    /// Replies of cells: all frames from cells.
     Replies,
 }
 
 /// Selection of the frames to send.
 #[derive(Clone, Debug)]
 pub struct Selection {
-    /// Filter by sender.
+    /// Selection of the frames by their sender.
     pub only: SenderFilter,
     /// Destination of each bus of the capture; `None` for a bus that is not replayed.
     pub destinations: Vec<Option<usize>>,
-    /// True if packets are decoded: joints are numbered, and replies compared.
+    /// True if packets are decoded, so that joints are numbered and replies compared.
     pub reads: bool,
 }
 
@@ -58,10 +59,10 @@ pub enum PlayerStep {
     Restore(Vec<(usize, Vec<Message>)>),
 }
 
-/// A frame with its time.
+/// A frame that is due at a certain time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DueFrame {
-    /// Time in ns after the first frame, by the capture's clock and over all passes.
+    /// Time in ns at which the frame is due, after the first frame, by the capture's clock and over all passes.
     pub at: u64,
     /// Index of the bus.
     pub bus_index: usize,
@@ -69,33 +70,33 @@ pub struct DueFrame {
     pub frame: Frame,
     /// Role of the frame in lockstep and comparison.
     pub role: FrameRole,
-    /// True if the frame is older than a frame sent before it, and is sent at once.
+    /// True if the frame is older than a frame sent before it. It is sent at once.
     pub is_late: bool,
 }
 
 /// Role of a frame in lockstep and comparison.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FrameRole {
-    /// A frame without a role.
+    /// The frame has no effect on lockstep or comparison.
     Plain,
-    /// First segment of a joint packet.
+    /// The frame is the first segment of a joint packet.
     SegmentOfJoints,
-    /// Completes a joint packet.
+    /// The frame completes a joint packet.
     Joints(OpenJoints),
 }
 
-/// Joints that cells answer.
+/// Joints whose answers from the cells are awaited or compared.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OpenJoints {
     /// Epoch of the joints.
     pub epoch: Epoch,
     /// Positions of the joints.
     pub joints: Joints,
-    /// Number of their round on the bus, if they are compared.
+    /// Number of the joints' round on the bus, if replies to them are compared.
     pub round: Option<u64>,
 }
 
-/// Counts of a replay plan.
+/// Counts over all passes of a replay plan.
 #[derive(Clone, Debug, Default)]
 pub struct PlanSummary {
     /// Number of frames that were not sent, by reason.
@@ -139,7 +140,8 @@ impl<'a> ReplayPlan<'a> {
         }
     }
 
-    /// Adds the capture's next frame. Breaks once all later frames are past the part.
+    /// Adds the capture's next frame. Returns [`ControlFlow::Break`] as soon as all later frames are after the replayed
+    /// part.
     pub fn add_frame(&mut self, record: &Record<'_>, comparator: &mut Comparator) -> ControlFlow<()> {
         let Some(bus) = self.survey.bus_named(record.interface) else {
             self.skip(reason::NEW);
@@ -153,7 +155,7 @@ impl<'a> ReplayPlan<'a> {
         ControlFlow::Continue(())
     }
 
-    /// Next planned step, if any.
+    /// Returns the next planned step, if any.
     pub fn next_step(&mut self) -> Option<PlayerStep> {
         self.steps.pop_front()
     }
@@ -191,7 +193,7 @@ impl<'a> ReplayPlan<'a> {
         self.counts = (0, 0);
     }
 
-    /// The step that restores the state at the start of the part.
+    /// Returns the step that restores the state at the start of the replayed part.
     #[must_use]
     pub fn restoring(&self) -> PlayerStep {
         let bounds = self.survey.bounds();
@@ -202,18 +204,18 @@ impl<'a> ReplayPlan<'a> {
         PlayerStep::Restore(self.survey.buses.iter().zip(&self.selection.destinations).filter_map(of).collect())
     }
 
-    /// Returns the counts.
+    /// Ends the plan, and returns the counts of all passes.
     #[must_use]
     pub fn into_summary(self) -> PlanSummary {
         self.plan_summary
     }
 
-    /// Counts an item that is not sent.
+    /// Counts a frame or note that is not sent.
     pub fn skip(&mut self, reason: &'static str) {
         *self.plan_summary.skipped.entry(reason).or_default() += 1;
     }
 
-    /// Plans a frame: sends it or counts it as skipped.
+    /// Plans one frame: sends it, or counts it as skipped.
     fn place(
         &mut self,
         next: &ReleasedFrame<(usize, Frame)>,
@@ -252,12 +254,12 @@ impl<'a> ReplayPlan<'a> {
         ControlFlow::Continue(())
     }
 
-    /// Destination of a bus's frames.
+    /// Returns the index of the bus that receives the frames of a bus of the capture, if any.
     fn bus_link(&self, bus: usize) -> Option<usize> {
         self.selection.destinations.get(bus).copied().flatten()
     }
 
-    /// Reason why a frame of the part is not sent, if any.
+    /// Returns the reason why a frame in the replayed part is not sent, or `None` if it is sent.
     fn unwanted(&self, bus: usize, frame: &Frame, decoded: &Decoded) -> Option<&'static str> {
         let picked = self.bus_link(bus).is_some();
         if frame.is_error() {
@@ -266,7 +268,7 @@ impl<'a> ReplayPlan<'a> {
         if matches!(decoded, Decoded::Wire(..)) {
             return Some(reason::WIRE);
         }
-        // Cells received damaged frames as well.
+        // Damaged frames are sent too, because the cells received them in the recording.
         let id = data_id(frame).ok().filter(|_| !matches!(decoded, Decoded::Foreign(_)));
         match self.selection.only {
             _ if !picked => Some(reason::NOT_PICKED),

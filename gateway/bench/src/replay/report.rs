@@ -29,13 +29,13 @@ pub struct Summary {
     pub lost: u64,
     /// Number of frames that were not sent, by reason.
     pub skipped: BTreeMap<&'static str, u64>,
-    /// Number of frames sent at once, because newer ones had been sent before them.
+    /// Number of frames that were sent at once because newer frames had been sent before them.
     pub sent_at_once: u64,
     /// Summary of each bus.
     pub buses: Vec<BusSummary>,
-    /// Lateness of the frames; `None` at full pace and in lockstep.
+    /// Lateness of the frames in µs; `None` at full pace and in lockstep.
     pub late_us: Option<Quantiles>,
-    /// Lateness of the wake-ups of the idle machine.
+    /// Lateness of the wake-ups of the idle machine in µs.
     pub idle_late_us: Option<Quantiles>,
     /// Time in µs before a frame is due during which the thread spins.
     pub spin_us: f64,
@@ -58,14 +58,14 @@ pub struct Summary {
 pub struct BusSummary {
     /// Name in the capture.
     pub capture: String,
-    /// Present name.
+    /// Name of the bus in this replay.
     pub name: String,
     /// Transport of the frames.
     pub kind: String,
     /// Counts of sent and refused frames.
     #[serde(flatten)]
     pub frames: BusLinkTally,
-    /// Number of replies lost because they arrived faster than they were read.
+    /// Number of replies lost because they arrived faster than this program read them.
     pub unheard: u64,
 }
 
@@ -74,7 +74,7 @@ pub struct BusSummary {
 pub struct Lockstep {
     /// Cells that did not answer in time, as text.
     pub silent_cells: Vec<String>,
-    /// Number of joints that were resent because a cell was too late for them.
+    /// Number of joints that were resent because a cell processed them too late to answer.
     pub retried: u64,
 }
 
@@ -86,9 +86,9 @@ pub struct Expect {
     /// Counts of the comparison.
     #[serde(flatten)]
     pub tally: Tally,
-    /// Number of joints that cells processed too late, by their own counters: their replies are missing.
+    /// Number of joints that cells processed too late to reply, by their own counters.
     pub joints_skipped: u64,
-    /// Number of frames that the recorder reported as lost: inputs among them cannot be sent.
+    /// Number of frames that the recorder reported as lost. Inputs among them cannot be sent.
     pub recording_dropped: u64,
     /// Number of cells whose recorded configuration is unknown and was not compared.
     pub unchecked_cells: u64,
@@ -97,7 +97,7 @@ pub struct Expect {
 }
 
 impl Uncompared {
-    /// Reasons that occurred, with their counts.
+    /// Returns the reasons why replies lack a recorded counterpart, with their counts, without zeros.
     #[must_use]
     pub fn reasons(&self) -> Vec<(&'static str, u64)> {
         nonzero([
@@ -120,14 +120,14 @@ impl Uncompared {
     }
 }
 
-/// Drops counts of 0.
+/// Returns the counts other than 0.
 fn nonzero<const N: usize>(counts: [(&'static str, u64); N]) -> Vec<(&'static str, u64)> {
     counts.into_iter().filter(|(_, count)| *count > 0).collect()
 }
 
 impl Summary {
-    /// Reason why the replay failed, in one line, or `None` for success. Reasons of cells' errors are repeated only if
-    /// `quiet`.
+    /// Returns the reason why the replay failed, in one line, or `None` for success. Reasons that processes gave for
+    /// errors of cells are repeated only if `quiet`, because they have been printed otherwise.
     #[must_use]
     pub fn verdict(&self, quiet: bool) -> Option<String> {
         if let Some(failure) = &self.failure {
@@ -180,7 +180,8 @@ impl Summary {
         (!wrong.is_empty()).then(|| wrong.join("; "))
     }
 
-    /// Returns the result in one line, and true if everything was sent, compared and equal.
+    /// Returns the result in one line, and true if everything was sent, everything was compared, and all replies are
+    /// equal.
     #[must_use]
     pub fn first_line(&self) -> (bool, String) {
         let until = if self.interrupted { " until it was interrupted" } else { "" };

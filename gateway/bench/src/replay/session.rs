@@ -1,4 +1,4 @@
-//! A replay from the first message to its cells to its summary.
+//! A replay, from the first message to the cells to the summary.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -28,7 +28,7 @@ use crate::progress::Progress;
 use crate::threads::spawn;
 use model::quantiles::Quantiles;
 
-/// Interval between rounds of the main thread.
+/// Interval between two checks of the main thread.
 const ROUND_PAUSE: Duration = Duration::from_millis(20);
 
 /// A replay that is ready to start.
@@ -37,7 +37,7 @@ pub(super) struct Session {
     pub(super) buses: Buses,
     pub(super) signalled: Arc<AtomicBool>,
     pub(super) progress: Progress,
-    /// Cells that were put into test mode, by bus.
+    /// Cells that were put into test mode, by bus. They measure again after the replay.
     pub(super) measuring: Vec<Vec<CellId>>,
     /// Processes of cells that have ended.
     pub(super) ended: EndedProcesses,
@@ -78,7 +78,7 @@ impl Session {
         outcome
     }
 
-    /// Sends everything. The summary lacks the number of unread frames, which the receivers report later.
+    /// Sends all steps. The returned summary lacks the number of unread frames, which the receivers report later.
     fn play(&mut self, idle: Option<&Histogram<u64>>) -> Result<Summary, ReplayError> {
         let (queue, mut steps) = rtrb::RingBuffer::new(AHEAD);
         let shared_state = Arc::clone(&self.shared_state);
@@ -106,7 +106,7 @@ impl Session {
             let granted = realtime::prepare();
             if hears {
                 for bus_link in 0..live.bus_links.len() {
-                    // Starting values of the counters; the first frame reports a bus that is down.
+                    // Request the initial values of the counters. If the bus is down, the first frame reports it.
                     let _ = live.report(bus_link);
                 }
                 live.shared_state.comparator().mute(false);
@@ -124,7 +124,7 @@ impl Session {
         let bus_links = self.shared_state.checks.bus_links().enumerate();
         for (bus_link, (name, _)) in bus_links.filter(|_| hears && played.failure.is_none()) {
             if let Err(why) = live.report(bus_link) {
-                self.progress.note(&format!("{name}: no final report of its cells: {why}"));
+                self.progress.note(&format!("{name}: its cells were not asked for a final report: {why}"));
             }
         }
         self.shared_state.comparator().finish(!played.was_stopped && played.failure.is_none());
@@ -174,7 +174,7 @@ impl Session {
         other_gateway
     }
 
-    /// Length in ms of the capture, or `None` if the replay has no end.
+    /// Returns the length of the capture in ms, or `None` if the replay has no end.
     fn length(&self) -> Option<u64> {
         let Checks { survey, options, .. } = &self.shared_state.checks;
         let (from, to) = survey.bounds();

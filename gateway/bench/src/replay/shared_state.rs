@@ -24,7 +24,7 @@ pub(super) struct SharedState {
     heard: Condvar,
     /// Set once, to stop sending.
     pub(super) over: AtomicBool,
-    /// Set when the queue of steps is full for the first time, or everything has been read.
+    /// Set when the queue of steps is full for the first time, or when the whole capture has been read.
     pub(super) ready: AtomicBool,
     /// Set once at the end, to stop receiving.
     pub(super) deaf: AtomicBool,
@@ -80,12 +80,12 @@ impl SharedState {
         self.has_heard();
     }
 
-    /// Receives on a bus until the end, as the gateway's side of the wires to its roots. Returns the number of frames
-    /// lost because they arrived faster than they were read.
+    /// Receives on a bus until the end of the replay, and acts as the gateway's side of the wires to the roots. Returns
+    /// the number of frames lost because they arrived faster than they were read.
     pub(super) fn receive(&self, index: usize, bus_link: &ReplayBus, mut roots: Option<RootWires>) -> u64 {
         realtime::prepare_receiver();
         let mut decoder = Decoder::new(Some(bus_link.format));
-        // The cells may be present already, and organise themselves as they start.
+        // Start the wires at once: the cells may be present already, and cells that start build their tree at once.
         roots.iter_mut().for_each(RootWires::explore);
         let (mut follower, mut end) = (Follower::new(roots, Duration::ZERO), OpenedOnce(&bus_link.bus));
         while !self.deaf.load(Ordering::Relaxed) {
@@ -98,7 +98,7 @@ impl SharedState {
                 }
                 FollowStep::Gone(_) => {
                     self.mark_down(index);
-                    // The next sender gets the same error, and reports it.
+                    // The next thread that sends on this bus gets the same error, and reports it.
                     break;
                 }
             }

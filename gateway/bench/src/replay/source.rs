@@ -8,9 +8,9 @@ use super::replay_plan::{PlanSummary, ReplayPlan, Selection, PlayerStep, reason}
 use super::shared_state::SharedState;
 use trace::capture::{CaptureError, Entry, Reader};
 
-/// Number of steps read ahead: some tenths of a second of a full bus.
+/// Number of steps read ahead: some tenths of a second of traffic on a full bus.
 pub(super) const AHEAD: usize = 16_384;
-/// Pause while the queue is full; the steps in it last far longer.
+/// Pause while the queue is full. The steps in the queue last much longer than the pause.
 const FULL_QUEUE_PAUSE: Duration = Duration::from_millis(2);
 
 /// Reads a capture once per pass and queues the steps.
@@ -20,7 +20,7 @@ struct Source<'a> {
     queue: rtrb::Producer<PlayerStep>,
 }
 
-/// Reads to the end, or until the player has ended.
+/// Reads the capture to its end, or until the player has ended.
 pub(super) fn read_capture(
     shared_state: &SharedState,
     queue: rtrb::Producer<PlayerStep>,

@@ -32,7 +32,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(5);
 pub(super) struct Routes {
     /// Destination index of each bus of the capture; `None` if it is not replayed.
     pub(super) bus_links: Vec<Option<usize>>,
-    /// Index in the capture and present name of each destination.
+    /// Index of each destination's bus in the capture, and name of the destination in this replay.
     pub(super) names: Vec<(usize, String)>,
 }
 
@@ -84,7 +84,7 @@ pub(super) struct ReplayBus {
     pub(super) format: Format,
     /// True if this replay serves the bus.
     own: bool,
-    /// True if its cells reply with sums over simulated wires.
+    /// True if the cells of the bus reply with sums over simulated wires.
     pub(super) wired: bool,
 }
 
@@ -93,20 +93,20 @@ impl ReplayBus {
         message.encode().frames(self.format)
     }
 
-    /// Sends this replay's own messages.
+    /// Sends messages of this replay itself, which are not from the capture.
     pub(super) fn send(&self, messages: &[Message]) -> Result<(), BusError> {
         let frames: Vec<_> = messages.iter().flat_map(|message| self.frames(message)).collect();
         Ok(self.bus.send(&frames)?)
     }
 }
 
-/// Buses, and the processes started for them.
+/// Open buses of a replay, and the processes that the replay has started for them.
 #[derive(Debug)]
 pub(super) struct Buses {
     pub(super) bus_links: Arc<Vec<ReplayBus>>,
     /// The gateway's ends of the wires to the roots, until the receiver takes them.
     pub(super) roots: Vec<Option<RootWires>>,
-    // Dropped in this order: the cells before their buses.
+    // The order of the fields matters: the cells are dropped before their buses.
     pub(super) processes: Processes,
     _served: Vec<ServedBus>,
 }
@@ -120,7 +120,7 @@ pub(super) struct SkinOverride {
     _memory: Option<std::fs::File>,
 }
 
-/// Returns the skin of the cells to start: the named skin, or the recording's.
+/// Returns the skin of the cells to start: the skin of the options, or else that of the recording.
 pub(super) fn skin_override(
     spawn: &SpawnOptions,
     routes: &Routes,
@@ -147,7 +147,7 @@ pub(super) fn skin_override(
             return Err(ReplayError::NotOfSkin { bus, skin, buses });
         }
     }
-    // Cells on other buses would receive nothing.
+    // The replay has only these buses: cells on others would receive no frames.
     let buses = skin_override.skin.buses.clone();
     let goes =
         |bus: usize| buses.get(bus).is_some_and(|bus| routes.names.iter().any(|(_, name)| *name == bus.name));
@@ -155,12 +155,12 @@ pub(super) fn skin_override(
     Ok(skin_override)
 }
 
-/// Skin of a recording, if it has a readable one.
+/// Returns the skin attached to a recording, if it is readable.
 pub(super) fn recorded_skin(extras: &RecordingExtras) -> Option<Skin> {
     extras.skin()?.ok()
 }
 
-/// Opens all buses. `recorded` is the skin of cells that are already present, if known.
+/// Opens all buses. `recorded` is the skin of cells that are already on the buses, if known.
 pub(super) fn open(
     options: &ReplayOptions,
     survey: &Survey,
@@ -196,7 +196,7 @@ pub(super) fn open(
                 opened => (opened?, None),
             },
         };
-        // Real buses have real wires.
+        // Wires are simulated by frames on virtual buses only.
         let has_wires = options.hears() && (bus.kind() == BusKind::Embedded || bus.is_virtual()?);
         let root = spawned_skin.filter(|_| has_wires).and_then(|(skin, bus)| RootWires::for_bus(skin, bus));
         let (own, wired) = (of_ours.is_some(), root.is_some());
@@ -208,8 +208,8 @@ pub(super) fn open(
 }
 
 impl Buses {
-    /// Receives on the buses that existed before, for as long as two gateways need to detect each other. Returns the
-    /// cells found.
+    /// Receives on the buses that existed before this replay, for as long as two gateways need to detect each other.
+    /// Returns the cells found, by bus.
     pub(super) fn listen(&self) -> Result<Vec<BTreeSet<CellId>>, ReplayError> {
         let mut heard = vec![BTreeSet::new(); self.bus_links.len()];
         let filters = vec![Filter::exact(Id::command(Command::Joints)), Filter::for_kind(Kind::Network)];
@@ -282,13 +282,13 @@ const fn speaker(decoded: &Decoded) -> Option<Node> {
 }
 
 impl ReplayOptions {
-    /// Returns true if messages of cells are received.
+    /// Returns true if the replay receives messages of cells.
     pub(super) fn hears(&self) -> bool {
         self.expect.is_some() || self.lockstep || self.only == SenderFilter::Inputs
     }
 }
 
-/// Returns the message that makes a cell obey stimuli, or measure; in both cases the cell drops all stimuli.
+/// Returns the message that makes a cell obey stimuli, or measure. In both cases, the cell then drops all stimuli.
 pub(super) fn mode(cell: CellId, obeys: bool) -> Message {
     let words = core::array::from_fn(|place| i16::from(obeys && place == 0));
     let request = Request::Write { number: Parameter::Mode.number(), words };

@@ -1,5 +1,5 @@
-//! Survey of a capture from a first reading: its buses and their cells, the losses by the cells' own counters, and the
-//! state where the replay begins.
+//! Survey of a capture from a first reading: the buses, the cells, the losses by the cells' own counters, and the state
+//! where the replayed part begins.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -19,13 +19,14 @@ use trace::capture::{BusNote, LatchedFrame, Note};
 /// Silence in ns after which a cell counts as absent.
 const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
 
-/// Maximum time in ns from a starting cell's first joints to its first heartbeat.
+/// Maximum time in ns from the first joints after a cell's start to the cell's first heartbeat.
 const STARTS_NS: u64 = 100_000_000;
 
-/// Maximum number of joints during which a page of counters is under way.
+/// Maximum number of joint broadcasts between the sending and the recording of a page of counters.
 const PASSED: usize = 64;
 
-/// A part of a capture, in ns of its run, or after its first frame if there is no run.
+/// A part of a capture. Bounds are in ns since the start of the run or, if the capture has no run, since its first
+/// frame.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct TimeRange {
     /// Start; `None` for the beginning.
@@ -68,20 +69,20 @@ pub struct SurveyedBus {
     pub joints: u64,
     /// Latest joint broadcasts, oldest first.
     recent_joints: VecDeque<Broadcast>,
-    /// True if a cell reported its counters or a message was latched at the start of the capture: a part of a
-    /// recording, or a truncated one, may lack messages that its counters account for.
+    /// True if a cell reported its counters, or a message was latched at the start of the capture. A part of a
+    /// recording, or a truncated one, may lack messages that the counters account for.
     is_accounted: bool,
-    /// Messages from before the capture that it holds as latched at its start.
+    /// Messages from before the capture. The capture holds them as latched at its start.
     pub latched: Vec<Message>,
-    /// State where the part begins.
+    /// State where the replayed part begins.
     pub state: State,
-    /// First joints in the part.
+    /// First joints in the replayed part.
     pub first_joints: Option<(Epoch, Joints)>,
     /// Number of sums that cells sent.
     pub sums: u64,
     /// Cells of the bus.
     pub cells: BTreeMap<CellId, SurveyedCell>,
-    /// Cells by messages from before the capture.
+    /// State of cells according to messages from before the capture.
     before: BTreeMap<CellId, Before>,
 }
 
@@ -89,7 +90,7 @@ pub struct SurveyedBus {
 #[derive(Clone, Copy, Debug)]
 struct Broadcast {
     epoch: Epoch,
-    /// Number of joints up to this broadcast, including it.
+    /// Number of joint broadcasts up to and including this one.
     number: u64,
     /// Time in ns since 1970.
     nanos: u64,
@@ -99,7 +100,7 @@ struct Broadcast {
 #[derive(Clone, Debug, Default)]
 struct Before {
     tracked: CellTracker,
-    /// Time of its last message in ns since 1970.
+    /// Time of the cell's last message in ns since 1970.
     heard: u64,
     hash: KnownValue<u16>,
     measures: bool,
@@ -108,28 +109,31 @@ struct Before {
 /// Survey of one cell.
 #[derive(Clone, Debug)]
 pub struct SurveyedCell {
-    /// Hash of its configuration where the part begins, if known.
+    /// Hash of the cell's configuration where the replayed part begins, if known.
     pub hash: KnownValue<u16>,
-    /// True if it measured in the part: its torques cannot be reproduced.
+    /// True if the cell measured in the replayed part, so that its torques cannot be reproduced.
     pub measured: bool,
-    /// Times of its first and last message in ns since 1970.
+    /// Times of the cell's first and last message in ns since 1970.
     pub active: (u64, u64),
-    /// Starts and ends of its long silences in ns since 1970.
+    /// Starts and ends of the cell's long silences in ns since 1970.
     pub silences: Vec<(u64, u64)>,
-    /// Number of packets that it sent and the capture lacks.
+    /// Number of packets that the cell sent but the capture lacks.
     pub unrecorded: u64,
-    /// Number of joints that it missed or processed too late.
+    /// Number of joint broadcasts that the cell missed or processed too late.
     pub untaken: u64,
-    /// Time ranges in ns since 1970 whose joints its counters account for: start exclusive, end inclusive.
+    /// Time ranges in ns since 1970 in which the cell's counters account for all joints: start exclusive, end
+    /// inclusive.
     accounted: Vec<(u64, u64)>,
-    /// True if counters account for anything in the capture; otherwise everything missing is a difference.
+    /// True if the capture contains counters that account for any joints. Otherwise each missing message is a
+    /// difference.
     is_accounted: bool,
     tracked: CellTracker,
-    /// Time since which it claims its node id, as it does after each start.
+    /// Start of the cell's present claim of its node id in ns since 1970. A cell claims its id after each start.
     claims: Option<u64>,
-    /// Time since which its bus is lost.
+    /// Time in ns since 1970 at which the cell's bus was lost; `None` once the cell sends again.
     away: Option<u64>,
-    /// Counters of its last report, the number of joints until then, and the time of the last of them.
+    /// Counters of the cell's last report, the number of joint broadcasts before it, and the time of the last of them
+    /// in ns since 1970.
     report: Option<(ReceivedCounts, u64, u64)>,
 }
 
@@ -142,13 +146,13 @@ enum PartPosition {
     After,
 }
 
-/// A value that may become known too late.
+/// A value at the start of the replayed part. It is known if a cell reports it later, before the value changes.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum KnownValue<T> {
     /// The value has not been reported.
     #[default]
     No,
-    /// The value changed before it was reported.
+    /// The value had changed before a cell reported it.
     TooLate,
     /// The value.
     Yes(T),
@@ -185,7 +189,7 @@ impl Survey {
         }
     }
 
-    /// Adds the next frame.
+    /// Adds the next frame or note.
     pub fn add_frame(&mut self, record: &Record<'_>) {
         let nanos = record.time.nanos;
         self.first.get_or_insert(nanos);
@@ -213,10 +217,11 @@ impl Survey {
         }
     }
 
-    /// Ends the survey.
+    /// Ends the survey after the last frame.
     pub fn finish(&mut self) {
         let last = self.last;
-        // Counters on one bus suffice: the recording bench has counters, and a part may lack those of other buses.
+        // Counters on one bus suffice, because they show that the cells of the recorded bench have counters. A part of
+        // the capture may lack those of the other buses.
         let is_accounted = self.buses.iter().any(|bus| bus.is_accounted);
         for cell in self.buses.iter_mut().flat_map(|bus| bus.cells.values_mut()) {
             cell.end(last);
@@ -229,7 +234,7 @@ impl Survey {
     pub fn note(&mut self, note: &Note<'_>) {
         let Some((name, BusNote::Lost)) = BusNote::parse(note) else { return };
         let Some(bus) = self.bus_named(name).and_then(|at| self.buses.get_mut(at)) else { return };
-        // Joints that may still be answered.
+        // These joints may still be answered.
         let recent = bus.recent_joints.iter().rev().take(MAX_LATE_EPOCHS + 1);
         let since = recent.map(|joints| joints.nanos).min().unwrap_or(note.nanos);
         for cell in bus.cells.values_mut() {
@@ -237,27 +242,27 @@ impl Survey {
         }
     }
 
-    /// Time from which seconds count, in ns since 1970.
+    /// Returns the time in ns since 1970 from which seconds count: the start of the run, or the first frame.
     #[must_use]
     pub fn zero(&self) -> u64 {
         self.run_began.or(self.first).unwrap_or(0)
     }
 
-    /// Bounds of the part in ns since 1970, end exclusive. Without a start, the part includes frames older than the
-    /// first one.
+    /// Returns the bounds of the replayed part in ns since 1970, end exclusive. If the part has no start, it includes
+    /// frames older than the first one.
     #[must_use]
     pub fn bounds(&self) -> (u64, u64) {
         let end = self.part.to.map_or(u64::MAX, |to| self.zero().saturating_add(to));
         (self.part.from.map_or(0, |from| self.zero().saturating_add(from)), end)
     }
 
-    /// Index of a bus, by its name in the capture.
+    /// Returns the index of a bus, by its name in the capture.
     #[must_use]
     pub fn bus_named(&self, name: &str) -> Option<usize> {
         self.buses.iter().position(|bus| bus.name == name)
     }
 
-    /// Names of the buses, joined for display.
+    /// Returns the names of the buses, joined for display.
     #[must_use]
     pub fn names(&self) -> String {
         self.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ")
@@ -321,7 +326,7 @@ impl SurveyedBus {
         }
     }
 
-    /// Cells that send in a part of the capture.
+    /// Returns the cells that send between two times, in ns since 1970.
     pub fn cells_in(&self, (from, to): (u64, u64)) -> impl Iterator<Item = (CellId, &SurveyedCell)> {
         let speaks = move |cell: &SurveyedCell| cell.active.1 >= from && cell.active.0 < to;
         self.cells.iter().map(|(cell, it)| (*cell, it)).filter(move |(_, cell)| speaks(cell))
@@ -334,7 +339,7 @@ impl SurveyedCell {
         let first =
             before.map(|before| before.heard).filter(|heard| nanos <= heard.saturating_add(SILENT_NS));
         let mut tracked = before.map(|before| before.tracked.clone()).unwrap_or_default();
-        // Its messages between the two times are not known to be lost.
+        // It is not known that messages of the cell between the two times are lost.
         tracked.account = Account::default();
         Self {
             hash: before.map_or(KnownValue::No, |before| before.hash),
@@ -363,7 +368,7 @@ impl SurveyedCell {
         }
     }
 
-    /// Ends the survey of the cell at the end of the capture.
+    /// Ends the survey of the cell at the end of the capture, `nanos` in ns since 1970.
     fn end(&mut self, nanos: u64) {
         self.unrecorded = self.tracked.account.uplink().lost;
         if let Some(away) = self.away {
@@ -375,13 +380,13 @@ impl SurveyedCell {
         }
     }
 
-    /// Handles a message of the cell that followed these joints.
+    /// Handles a message that the cell sent after these joints.
     fn take(&mut self, message: &Message, nanos: u64, place: PartPosition, joints: &VecDeque<Broadcast>) {
         let word = self.tracked.receive(Micros(nanos / 1_000), message, None).word;
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             match word {
                 Some(HeartbeatKind::Claimant | HeartbeatKind::Outsider | HeartbeatKind::Overtaken) | None => return,
-                // A restart resets its counters, which then include joints from before this heartbeat.
+                // A restart sets the counters to 0. They then count joints from before this heartbeat.
                 Some(HeartbeatKind::Started { .. }) => {
                     let last = joints.back().map(|last| (last.number, last.nanos)).unwrap_or_default();
                     let may_count = |joints: &&Broadcast| nanos <= joints.nanos.saturating_add(STARTS_NS);
@@ -392,14 +397,14 @@ impl SurveyedCell {
             }
             self.heartbeat(heartbeat, nanos, place);
         } else if let Message::Network { page: NetworkPage::Received(heard), epoch, .. } = *message {
-            // The page carries the epoch of the last joints in its counters.
+            // The page carries the epoch of the last joints that its counters include.
             let at = joints.iter().rev().find(|joints| joints.epoch == epoch);
             self.report(heard, at.map(|joints| (joints.number, joints.nanos)));
         } else if let Message::Configured { answer: Answer::Value { number, written: true, .. }, .. } =
             *message
             && number == Parameter::Commit.number()
         {
-            // Configured again before its first heartbeat: its former configuration is unknown.
+            // The cell was configured again before its first heartbeat, so its former configuration is unknown.
             self.hash = match self.hash {
                 _ if place == PartPosition::Before => KnownValue::No,
                 KnownValue::No => KnownValue::TooLate,
@@ -423,8 +428,8 @@ impl SurveyedCell {
         self.measured |= place == PartPosition::In && !heartbeat.state.has(Flags::TEST_MODE);
     }
 
-    /// Handles counters up to some joints. Joints from before the capture leave it unknown which joints the counters
-    /// cover.
+    /// Handles a report of counters. `at` is the number and time of the last joints that they cover; it is `None` if
+    /// those joints came before the capture, so that it is unknown which joints the counters cover.
     fn report(&mut self, heard: ReceivedCounts, at: Option<(u64, u64)>) {
         let Some((joints, last)) = at else { return };
         if let Some((before, joints_before, from)) = self.report {
@@ -432,7 +437,7 @@ impl SurveyedCell {
             let repeated = heard.joints_repeated.wrapping_sub(before.joints_repeated);
             let known = u64::from(taken) + u64::from(repeated);
             let between = joints.saturating_sub(joints_before);
-            // More joints than were broadcast cannot belong to one incarnation: the apparent restart was none.
+            // A cell cannot receive more joints than were broadcast since its start, so it had not restarted.
             if known <= between + PASSED as u64 {
                 self.untaken += between.saturating_sub(known);
                 match self.accounted.last_mut() {
@@ -444,14 +449,15 @@ impl SurveyedCell {
         self.report = Some((heard, joints, last));
     }
 
-    /// Returns true if counters reported before and after this time, in ns since 1970, account for its joints, or if no
-    /// counters in the capture account for any: then they explain no deviation.
+    /// Returns true if counters account for the joints at this time, in ns since 1970, because the cell reported them
+    /// before and after it. Also returns true if the capture contains no counters that account for any joints: they
+    /// then explain no deviation.
     #[must_use]
     pub fn is_counted_at(&self, nanos: u64) -> bool {
         !self.is_accounted || self.accounted.iter().any(|&(from, until)| from < nanos && nanos <= until)
     }
 
-    /// Returns true during a long silence of the cell; `nanos` is in ns since 1970.
+    /// Returns true if the cell was in a long silence at `nanos`, in ns since 1970.
     #[must_use]
     pub fn is_silent_at(&self, nanos: u64) -> bool {
         nanos < self.active.0 || self.silences.iter().any(|&(from, to)| (from..to).contains(&nanos))

@@ -24,7 +24,7 @@ pub(super) struct Moved {
 }
 
 impl Moved {
-    /// State of the robot up to 0.1 s before, extrapolated.
+    /// Returns the state of the robot `seconds` before the tick (at most 0.1 s), at constant acceleration.
     fn before(&self, seconds: f64) -> RobotState {
         let mut state = self.state;
         let dt = (seconds - self.at_s).clamp(-0.1, 0.0);
@@ -41,7 +41,7 @@ impl Moved {
 #[derive(Debug)]
 pub(super) struct Accelerations {
     sensors: Accelerometers,
-    /// Number of broadcasts when the last tick's motion was sent.
+    /// Number of broadcasts so far when the last tick's motion was sent.
     broadcasts: u64,
 }
 
@@ -53,7 +53,8 @@ impl Accelerations {
         Some(Self { sensors, broadcasts: 0 })
     }
 
-    /// Stimuli of a future epoch, `now` s after the start of the loop, for each bus. Empty if the motion is unknown.
+    /// Returns the stimuli of a future epoch for each bus, or an empty list if the motion is not known in advance.
+    /// `now` is the time in s since the start of the loop.
     pub(super) fn ahead(
         &self,
         options: &RunOptions,
@@ -75,7 +76,8 @@ impl Accelerations {
         }
     }
 
-    /// Stimuli after the latest broadcast, once per broadcast. Empty if they were sent ahead.
+    /// Returns the stimuli that follow the latest broadcast, once per broadcast, or an empty list if they were sent
+    /// ahead.
     pub(super) fn latest(
         &mut self,
         options: &RunOptions,

@@ -22,12 +22,12 @@ use crate::view::View;
 use model::repeat::Repeats;
 use model::table::{Notice, Switch};
 
-/// Time that running cells get to show up, and all cells to confirm their switches.
+/// Time within which running cells must send a heartbeat, and all cells must confirm their switches.
 pub(super) const DISCOVERY_TIMEOUT: Duration = Duration::from_secs(2);
-/// Retry interval for a cell that does not confirm its switches.
+/// Interval after which switches are sent again to a cell that does not confirm them.
 pub(super) const SWITCH_AGAIN: Span = Span::from_millis(250);
 
-/// Cells to which switches were sent, by bus and node id.
+/// Cells, by bus and node id, to which switches were sent, with the times.
 pub(super) type Announced = Repeats<(usize, CellId)>;
 
 impl Bench<'_> {
@@ -57,14 +57,14 @@ impl Bench<'_> {
             // Cells without parameters will not become ready.
             let ready = bench.count(|cell| cell.ready || cell.unconfigured);
             let is_over = timeout.is_over(ready);
-            // After a busy moment of the machine, ready cells may seem dead: they will send again.
+            // After a moment without processor time, ready cells may count as dead until they send again.
             Ok(Instant::now() >= listened && (ready == cells || is_over))
         })?;
         self.check_cells()?;
         self.wake_up()?;
         self.go_on_after_others();
         self.switch_cells()?;
-        // Requests their counters, contact states and positions in their networks.
+        // Requests the counters, contact states and network positions of the cells.
         self.send_to_all(&Message::Report)?;
         if self.bus_links.iter().any(|bus_link| bus_link.network.is_some()) {
             self.organise()
@@ -73,7 +73,7 @@ impl Bench<'_> {
         }
     }
 
-    /// Prints the announcements of the run.
+    /// Prints the lines that the options give for the start of the loop.
     pub(super) fn announce(&self) {
         if self.options.quiet {
             return;
@@ -84,7 +84,7 @@ impl Bench<'_> {
         }
     }
 
-    /// Maximum time without progress of the cells.
+    /// Returns the maximum time without progress of the cells.
     pub(super) const fn timeout(&self) -> Duration {
         if self.options.spawn { STARTING } else { DISCOVERY_TIMEOUT }
     }
@@ -110,13 +110,13 @@ impl Bench<'_> {
         if halted(self) == 0 {
             return Ok(());
         }
-        // Their next heartbeats show their state.
+        // The next heartbeats show the state of the cells.
         self.send_to_all(&Message::Sync)?;
         self.wait(DISCOVERY_TIMEOUT, |bench, timeout| Ok(halted(bench) == 0 || timeout.is_over(0)))
     }
 
-    /// Checks that a bus that existed before has neither a gateway nor cells with the same node ids; listening disturbs
-    /// neither.
+    /// Checks that a bus that existed before has neither a gateway nor cells with the same node ids. Listening disturbs
+    /// neither of them.
     fn find_alone(&mut self, until: Instant) -> Result<(), RunError> {
         self.wait(GATEWAY_DETECTION_TIME, |_, _| Ok(Instant::now() >= until))?;
         // Emulated cells are present already, and belong to this run.
@@ -134,7 +134,8 @@ impl Bench<'_> {
         Err(RunError::CellsThere { cells, embedded })
     }
 
-    /// Continues the epochs of a former gateway, whose joints cells that run already have received.
+    /// Sets the first epoch to follow those of a former gateway, because cells that were running before have received
+    /// its joints.
     fn go_on_after_others(&mut self) {
         if self.options.spawn {
             return;
@@ -166,11 +167,11 @@ impl Bench<'_> {
         }
         let measuring = self.names(|cell| cell.measures);
         for (what, who) in [
-            ("do not answer, the run goes on without them", silent),
-            ("have no parameters, the run goes on without them", unconfigured),
+            ("do not answer; the run goes on without them", silent),
+            ("have no parameters; the run goes on without them", unconfigured),
             (
-                "measure, the scenario does not press them (`skinbus frame configure --cell N --write mode 1` puts one \
-                 into test mode)",
+                "measure, so the scenario does not press them (`skinbus frame configure --cell N --write mode 1` puts \
+                 one into test mode)",
                 measuring,
             ),
         ] {
@@ -181,7 +182,8 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Ends the start on an error: another gateway, an ended process or a lost bus.
+    /// Handles events while the bench starts. Returns an error if another gateway is found, a process ended, or a bus
+    /// was lost.
     fn hear_while_starting(&mut self) -> Result<(), RunError> {
         if self.signalled.load(Ordering::Relaxed) {
             return Err(RunError::Interrupted);
@@ -219,7 +221,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Sends all cells, before the first joints, the switches that they lose at each start.
+    /// Sends all cells, before the first joints, the switches that a cell loses when it restarts.
     fn switch_cells(&mut self) -> Result<(), RunError> {
         let mut announced = Announced::new(SWITCH_AGAIN);
         let lacking = self.lacking();
@@ -235,12 +237,13 @@ impl Bench<'_> {
         announced.mark_all_sent(self.now());
         self.wait(DISCOVERY_TIMEOUT, |bench, timeout| {
             bench.switch_again(&mut announced)?;
-            // Cells that have not answered by then are switched later.
+            // Cells that have not confirmed by then get their switches again while the loop runs.
             Ok(bench.lacking().is_empty() || timeout.is_over(0))
         })
     }
 
-    /// Sends the switches again to cells that have not confirmed them in time: they restarted, or a message was lost.
+    /// Sends switches again to cells that have not confirmed them in time, because the cell restarted or a message was
+    /// lost.
     pub(super) fn switch_again(&self, announced: &mut Announced) -> Result<(), RunError> {
         let lacking = self.lacking();
         let due = announced.due(self.now(), lacking.iter().map(|(cell, _)| *cell));
@@ -253,7 +256,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Reachable cells with unconfirmed switches, and those switches.
+    /// Returns the reachable cells with unconfirmed switches, and those switches.
     fn lacking(&self) -> Vec<((usize, CellId), Vec<Switch>)> {
         let mut lacking = Vec::new();
         for (bus, bus_link) in
@@ -270,8 +273,9 @@ impl Bench<'_> {
     }
 }
 
-/// Returns the epoch after which to start on cells that received `taken` last, preferably the first cell's: joints of a
-/// cell's last epoch count as repeated. Buses may have had different epochs.
+/// Returns the epoch after which this run starts its own, such that no cell takes the first joints as repeated: the
+/// next epoch must not be one of `taken`, the last epochs that the cells received. The search starts at the first
+/// cell's epoch, because buses may have had different ones.
 fn after(taken: &[Epoch]) -> Epoch {
     let mut last = taken.first().copied().unwrap_or_default();
     for _ in 0..u8::MAX {

@@ -36,7 +36,7 @@ use model::table::Switch;
 /// Interval between polls until the loop starts.
 pub(super) const POLL_INTERVAL: Duration = Duration::from_millis(5);
 
-/// Tag of requests that switch cells.
+/// Tag of `configure` requests that set switches of cells.
 const SWITCH: u8 = 0x5E;
 
 /// One bus of a bench.
@@ -44,7 +44,7 @@ const SWITCH: u8 = 0x5E;
 pub(super) struct RunBus {
     pub(super) link: Arc<SharedBus>,
     pub(super) format: Format,
-    /// The loop's end of the bus, until the loop starts.
+    /// The control loop's end of the bus; `None` once the loop has started.
     pub(super) line: Option<(BusPort, Slot)>,
     pub(super) view: Arc<Mutex<View>>,
     pub(super) receiver: Option<JoinHandle<ReceiverResult>>,
@@ -70,7 +70,7 @@ impl RunBus {
         }
     }
 
-    /// Switches a cell or all cells; the caller repeats it for cells that do not confirm.
+    /// Sends a switch to one cell or to all cells. The caller repeats it for cells that do not confirm.
     pub(super) fn switch(&self, to: Node, (number, words): Switch) -> Result<bool, BusError> {
         self.send(&Message::Configure { to, tag: SWITCH, request: Request::Write { number, words } })
     }
@@ -96,15 +96,15 @@ pub(super) struct Bench<'a> {
     pub(super) recorded: Option<rtrb::Producer<TimedRecord>>,
     /// Remote control, if any.
     pub(super) remote: Option<RemoteControl>,
-    /// Buses that a command has taken down and not yet brought back.
+    /// Buses that a command has taken down and that have not worked since.
     pub(super) commanded: SwitchedBuses,
     /// Processes of cells that have ended.
     pub(super) ended: EndedProcesses,
-    /// Path of the frame log, if the user does not know it.
+    /// Path of the frame log, if this program chose it and must report it.
     pub(super) log: Option<PathBuf>,
-    // Dropped in this order: the cells before their buses.
+    // The order of the fields matters: the cells are dropped before their buses.
     pub(super) processes: Processes,
-    /// Kept alive for its lines and files.
+    /// Keeps the slcan lines and the files of emulated cells in existence.
     pub(super) _emulation: Option<Emulation>,
     pub(super) served: Vec<ServedBus>,
 }
@@ -115,29 +115,29 @@ impl Bench<'_> {
         Micros::since_start(self.began.elapsed())
     }
 
-    /// Name of a bus of the skin.
+    /// Returns the name of a bus of the skin.
     pub(super) fn name(&self, bus: usize) -> &str {
         self.options.skin.buses.get(bus).map_or("", |bus| bus.name.as_str())
     }
 
-    /// View of each receiver.
+    /// Returns each bus with the view that its receiver maintains.
     pub(super) fn views(&self) -> impl Iterator<Item = (&RunBus, MutexGuard<'_, View>)> {
         self.bus_links.iter().filter_map(|bus_link| Some((bus_link, bus_link.view.lock().ok()?)))
     }
 
-    /// Networks of the cells that answer with sums, with the views of their receivers.
+    /// Returns the networks of cells that answer with sums, with the views of their receivers.
     pub(super) fn networks(&mut self) -> impl Iterator<Item = (&mut Network, MutexGuard<'_, View>)> {
         self.bus_links
             .iter_mut()
             .filter_map(|RunBus { network, view, .. }| Some((network.as_mut()?, view.lock().ok()?)))
     }
 
-    /// Number of cells that satisfy a predicate.
+    /// Returns the number of cells that satisfy a predicate.
     pub(super) fn count(&self, is: impl Fn(&CellView) -> bool) -> usize {
         self.views().map(|(_, view)| view.cells.iter().filter(|cell| is(cell)).count()).sum()
     }
 
-    /// Names of the selected cells as text: `1, 2, 5 on vcan0`.
+    /// Returns the selected cells as text: `1, 2, 5 on vcan0`.
     pub(super) fn names(&self, target: impl Fn(&CellView) -> bool) -> String {
         let names = self.views().filter_map(|(bus_link, view)| {
             let nodes: Vec<_> = view.cells.iter().filter(|cell| target(cell)).map(|cell| cell.node).collect();

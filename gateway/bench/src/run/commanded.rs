@@ -18,14 +18,14 @@ use crate::progress::Progress;
 use crate::remote::{BusState, BenchCommand, LinkDown, Phase, ProcessState, BenchState};
 use model::scenario::ProcessAction;
 
-/// Maximum number of commands carried out at once, so that stimuli are not late.
+/// Maximum number of commands carried out in one round, so that stimuli are not delayed.
 const MAX_COMMANDS_PER_ROUND: usize = 4;
-/// Interval between states.
+/// Interval between two states sent to the other side.
 const STATE_INTERVAL: Duration = Duration::from_millis(200);
 
 impl Bench<'_> {
-    /// Carries out received commands, and sends the state when due. If the other side has ended, the remote control
-    /// ends, and buses that it has taken down come back.
+    /// Carries out received commands, and sends the state if the interval is over. If the other side has ended, ends
+    /// the remote control and brings back the buses that it has taken down.
     pub(super) fn obey(&mut self, measured: &LoopTotals, progress: &Progress) {
         let links = &self.bus_links;
         self.commanded.settle(|bus| {
@@ -65,7 +65,7 @@ impl Bench<'_> {
         self.remote = Some(remote);
     }
 
-    /// Formats a command as text.
+    /// Describes a command in words.
     fn command_text(&self, command: BenchCommand) -> String {
         let switched = |down: bool| if down { "down" } else { "up" };
         match command {
@@ -98,7 +98,7 @@ impl Bench<'_> {
         }
     }
 
-    /// Process of a cell.
+    /// Returns the process of a cell, if it has one.
     fn process(&self, bus: usize, node: u8) -> Option<ProcessState> {
         self.processes.states().find(|process| process.runs(bus, node))
     }
@@ -169,12 +169,12 @@ impl Bench<'_> {
     }
 }
 
-/// Number of commands sent on a bus.
+/// Returns the number of commands that this run has sent on a bus.
 fn commands(links: &[RunBus], bus: usize) -> u64 {
     links.get(bus).map_or(0, |bus_link| bus_link.link.state.commands.load(Ordering::Relaxed))
 }
 
-/// Serves an embedded bus.
+/// Starts a server for an embedded bus.
 pub(super) fn serve(options: &RunOptions, bus: &str) -> Result<ServedBus, LaunchError> {
     let program = program("vcan-setup")?;
     ServedBus::start(&program, bus, options.directory.as_deref())

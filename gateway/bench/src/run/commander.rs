@@ -12,12 +12,12 @@ use crate::remote::{CommandReply, JsonPipe, Phase};
 /// Maximum number of kept replies.
 const MAX_REPLIES: usize = 8;
 
-/// The remote control of a run and its latest replies.
+/// The remote control of a run, with its latest replies to commands.
 #[derive(Debug)]
 pub(super) struct RemoteControl {
     pub(super) lines: JsonPipe,
     pub(super) answers: Vec<CommandReply>,
-    /// Total number of replies.
+    /// Total number of replies so far.
     count: u64,
     pub(super) due: Instant,
 }
@@ -30,9 +30,9 @@ pub(super) struct SwitchedBuses(BTreeMap<usize, Switched>);
 /// State of a bus that a command has taken down.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Switched {
-    /// The bus stays down.
+    /// The bus was taken down and must stay down.
     Down,
-    /// The bus was taken up, or released, when it had taken this number of the run's commands.
+    /// The bus was brought up, or released, after it had accepted `commands` commands of this run.
     Up { commands: u64 },
 }
 
@@ -42,8 +42,8 @@ impl SwitchedBuses {
         self.0.get(&bus) == Some(&Switched::Down)
     }
 
-    /// Returns true if a command caused the loss of a bus, which does not end the run: the bus is down, or has not
-    /// worked since it was taken up.
+    /// Returns true if a command caused the loss of a bus: the bus is down, or has not worked since it was brought up.
+    /// Such a loss does not end the run.
     pub(super) fn is_expected(&self, bus: usize) -> bool {
         self.0.contains_key(&bus)
     }
@@ -51,7 +51,8 @@ impl SwitchedBuses {
     /// Checks that a command may take a bus down, or bring it up.
     ///
     /// # Errors
-    /// Returns [`Refused`] if the bus is in that state already, or soon will be.
+    /// Returns [`Refused`] if the bus is in the requested state already, or will be as soon as its receiver has noticed
+    /// the last change.
     pub(super) fn check(&self, down: bool, bus: usize) -> Result<(), CommandError> {
         match (down, self.0.get(&bus)) {
             (true, Some(Switched::Down)) => Err(CommandError::Already("up")),
@@ -61,21 +62,22 @@ impl SwitchedBuses {
         }
     }
 
-    /// Notes that a bus was switched when it had taken this number of commands.
+    /// Notes that a bus was taken down or brought up after it had accepted this number of commands.
     pub(super) fn switched(&mut self, down: bool, bus: usize, commands: u64) {
         self.0.insert(bus, if down { Switched::Down } else { Switched::Up { commands } });
     }
 
-    /// Releases the buses that are down, because no other command will take them up. `commands` returns the number that
-    /// each has taken.
+    /// Releases the buses that are down, because no later command will bring them up. `commands` returns the number of
+    /// commands that a bus has accepted.
     pub(super) fn release(&mut self, commands: impl Fn(usize) -> u64) {
         for (bus, switched) in self.0.iter_mut().filter(|(_, switched)| **switched == Switched::Down) {
             *switched = Switched::Up { commands: commands(*bus) };
         }
     }
 
-    /// Forgets the buses that work again: they exist and have taken a command since. A bus takes none until its
-    /// receiver has noticed the loss and reopened it.
+    /// Forgets the buses that work again, which have accepted a command since they were brought up. A bus accepts none
+    /// until its receiver has noticed the loss and reopened it. `taken` returns the number of accepted commands, or
+    /// `None` for a bus that is lost.
     pub(super) fn settle(&mut self, taken: impl Fn(usize) -> Option<u64>) {
         self.0.retain(|bus, switched| match switched {
             Switched::Down => true,
@@ -97,11 +99,11 @@ pub(super) enum CommandError {
     Phase(Phase),
     #[error("the skin has no wire between them")]
     NoWire,
-    #[error("cells of this bus answer with their own torques: no link carries anything")]
+    #[error("cells of this bus answer with their own torques, so their links carry nothing")]
     NoLinks,
     #[error("it is not {0} by a command")]
     Already(&'static str),
-    #[error("it was taken up, and does not work yet")]
+    #[error("it was brought up, but does not work yet")]
     ComesUp,
     #[error("another program serves it: end that one")]
     NotServed,
@@ -154,7 +156,7 @@ mod tests {
         assert!(matches!(buses.check(true, 0), Err(CommandError::Already("up"))));
         buses.settle(|_| Some(105));
         assert!(buses.is_down(0) && buses.is_expected(0), "what works there is of before");
-        // Down and up at once: the receiver has not noticed the change yet.
+        // The bus was taken down and up at once, so that its receiver has not noticed the change.
         buses.check(false, 0).unwrap();
         buses.switched(false, 0, 105);
         buses.settle(|_| Some(105));
@@ -162,7 +164,7 @@ mod tests {
         assert!(matches!(buses.check(false, 0), Err(CommandError::ComesUp)));
         buses.settle(|_| None);
         assert!(buses.is_expected(0), "the receiver has noticed it");
-        // Taken down again before it has worked.
+        // The bus was taken down again before it worked.
         buses.check(true, 0).unwrap();
         buses.switched(true, 0, 105);
         buses.switched(false, 0, 105);

@@ -1,4 +1,5 @@
-//! Contact of cells that were running before: they may still hold a stimulus that came before this run received.
+//! Contact state of cells that were running before this run. They may hold stimuli that were sent before this run
+//! received on their bus.
 
 use std::time::Duration;
 
@@ -12,14 +13,14 @@ use super::watch::Script;
 use crate::error::RunError;
 use crate::view::CellView;
 
-/// Time that cells get to report their counters and to clear their contact; they need milliseconds.
+/// Time that cells have to report their counters and to clear their contact state; they need some milliseconds.
 const ANSWERING: Duration = Duration::from_millis(500);
 /// Value of the mode in which cells obey stimuli.
 const TEST_MODE: i16 = 1;
 
 impl Bench<'_> {
-    /// Waits briefly until the contact of all cells in test mode is known: the reported counters show whether a cell
-    /// has received stimuli before. If the scenario touches the skin, clears the cells' contact.
+    /// Waits briefly until the contact state of all cells in test mode is known; their counters show whether they have
+    /// received stimuli before. If the scenario touches the skin, clears the contact state of the cells.
     pub(super) fn know_contacts(&mut self, script: &mut Script) -> Result<(), RunError> {
         let unreported = |cell: &CellView| cell.unclear && !cell.responded.counters;
         self.wait(ANSWERING, |bench, timeout| Ok(bench.count(unreported) == 0 || timeout.is_over(0)))?;
@@ -39,8 +40,8 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Clears the contact of cells in test mode that may have received stimuli from others, or missed some of this run,
-    /// and sends them the scenario's stimuli. Does nothing if the scenario does not touch the skin.
+    /// Clears the contact state of cells in test mode that may have received stimuli from others, or may have missed
+    /// some of this run, and sends them the scenario's stimuli. Does nothing if the scenario does not touch the skin.
     pub(super) fn clear_contacts(&self, script: &mut Script) -> Result<(), RunError> {
         if script.touches.cells().next().is_none() {
             return Ok(());
@@ -58,7 +59,7 @@ impl Bench<'_> {
         self.remind(script, |it| due.contains(&(it.bus, it.node)))
     }
 
-    /// Cells on working buses that may hold stimuli unknown to this run.
+    /// Returns the cells on working buses that may hold stimuli which this run has not received.
     fn unclear(&self) -> Vec<(usize, CellId)> {
         let mut unclear = Vec::new();
         for (bus, bus_link) in

@@ -22,11 +22,11 @@ use model::quantiles::Quantiles;
 use model::table::{Accuracy, Responded};
 use trace::recording::account::RecordingAccount;
 
-/// Time that cells get to send their final reports; an overloaded machine needs it.
+/// Time that cells have to send their final reports; an overloaded machine needs it.
 const FINAL_REPORT_TIMEOUT: Duration = Duration::from_secs(3);
 
 impl Bench<'_> {
-    /// Runs the loop to its end or to its failure, and returns the summary.
+    /// Runs the control loop to its end or to its failure. Returns the summary.
     pub(super) fn watch(mut self) -> Summary {
         let mut summary = Summary::empty(&self.options.skin);
         let mut measured = LoopTotals::new();
@@ -51,7 +51,7 @@ impl Bench<'_> {
         Ok(self.summarise(summary, &LoopTotals::new(), &received).with_verdict(Some(error.to_string())))
     }
 
-    /// Reports the files with the frames received before a failure.
+    /// Prints the paths of the files that contain the frames received before a failure.
     fn say_what_is_kept(&self, recording: Option<&RecordingAccount>) {
         if self.options.quiet {
             return;
@@ -61,7 +61,7 @@ impl Bench<'_> {
         }
     }
 
-    /// Waits for late replies, and requests all cells' counters and a last heartbeat.
+    /// Waits for late replies, and requests the counters and a last heartbeat of all cells.
     pub(super) fn last_words(&self, interrupted: bool) -> Result<(), RunError> {
         let two_periods = Duration::try_from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz());
         thread::sleep(two_periods.unwrap_or_default());
@@ -71,14 +71,14 @@ impl Bench<'_> {
         if interrupted {
             self.send_to_all(&Message::Halt)?;
         }
-        // Sent last, so that each cell's own count covers everything else that it has sent.
+        // Send the sync last, so that the count in each cell's heartbeat covers all other packets of the cell.
         self.send_to_all(&Message::Sync)?;
         self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.heartbeat));
         Ok(())
     }
 
-    /// Returns true if the receivers have read back all commands, and so everything before them. Lost buses do not
-    /// count.
+    /// Returns true if the receivers have read back all commands that this run has sent, and so all earlier frames.
+    /// Lost buses are not considered.
     fn has_caught_up(&self) -> bool {
         self.bus_links.iter().all(|bus_link| {
             let read = bus_link.view.lock().map_or(u64::MAX, |view| view.commands);
@@ -86,7 +86,7 @@ impl Bench<'_> {
         })
     }
 
-    /// Returns true if all ready cells on working buses have sent the requested report.
+    /// Returns true if all ready cells on working buses have sent a report for which `said` is true.
     fn all_have(&self, said: impl Fn(&Responded) -> bool) -> bool {
         self.bus_links.iter().filter(|bus_link| bus_link.link.state.is_there()).all(|bus_link| {
             let all = |view: &View| view.cells.iter().all(|cell| !cell.ready || said(&cell.responded));
@@ -94,7 +94,8 @@ impl Bench<'_> {
         })
     }
 
-    /// Waits until a condition holds, up to the timeout; the accounts show what is missing then.
+    /// Waits until a condition holds, but not longer than the timeout. After a timeout, the summary shows what is
+    /// missing.
     fn wait_until(&self, done: impl Fn(&Self) -> bool) {
         let give_up = Instant::now() + FINAL_REPORT_TIMEOUT;
         while !done(self) && Instant::now() < give_up {
@@ -102,7 +103,7 @@ impl Bench<'_> {
         }
     }
 
-    /// Stops the receivers and returns their results.
+    /// Stops the receivers and returns their results, with `None` for a receiver that panicked.
     fn stop_receivers(&mut self) -> Vec<Option<ReceiverResult>> {
         self.shared.stop.store(true, Ordering::Relaxed);
         let end = |bus_link: &mut RunBus| bus_link.receiver.take().and_then(|thread| thread.join().ok());
@@ -205,7 +206,7 @@ impl Bench<'_> {
         };
         let mut summaries: Vec<_> =
             self.bus_links.iter().zip(received).enumerate().filter_map(summary).collect();
-        // The dropped packets belong to unknown buses of the kernel.
+        // The buses of the dropped packets are unknown.
         let mut backlog = backlog_dropped.unwrap_or(0);
         for summary in summaries.iter_mut().filter(|summary| summary.kind == BusKind::SocketCan.name()) {
             backlog -= summary.uplink.explain_by_backlog(backlog);

@@ -1,6 +1,6 @@
-//! Halts of the robot with their reasons, and the ticks before the last one.
+//! Halts of the robot with their reasons, and the ticks before the last halt.
 //!
-//! The main thread fills the ring from the loop's records, so that the loop does no extra work.
+//! The main thread fills the ring of ticks from the loop's records, so that the loop itself has no extra work.
 
 use std::collections::VecDeque;
 
@@ -20,19 +20,19 @@ const HALTS: usize = 100;
 /// Halts of a run.
 #[derive(Debug, Default)]
 pub(super) struct Halts {
-    /// Latest ticks.
+    /// Latest ticks, at most [`TICKS`].
     ring: VecDeque<TimedRecord>,
-    /// Ticks up to the last halt.
+    /// Ticks up to the last halt, at most [`TICKS`].
     before: Vec<TimedRecord>,
     halts: Vec<HaltSummary>,
-    /// Number of halts beyond those listed one by one.
+    /// Number of ended halts that are not listed one by one.
     pub(super) further: u64,
     /// The present halt, if any.
     lasting: Option<HaltSummary>,
 }
 
 impl Halts {
-    /// Adds the next tick.
+    /// Adds the next tick, and the begin or end of a halt.
     pub(super) fn add_tick(&mut self, timed: &TimedRecord) {
         if self.ring.len() == TICKS {
             self.ring.pop_front();
@@ -133,7 +133,7 @@ mod tests {
     use model::testing;
     use protocol::packet::padded;
 
-    /// Moves up to a tick, then gives no answer.
+    /// A controller that moves until a tick, and gives no answer after that.
     struct Until(u64);
 
     impl Controller for Until {
@@ -142,7 +142,7 @@ mod tests {
         }
     }
 
-    /// A loop without a machine, whose records go to the tested code.
+    /// A control loop without a machine. Its records go to the code under test.
     struct Bench {
         cycle: Cycle,
         sums: BusTotals,

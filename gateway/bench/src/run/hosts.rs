@@ -22,18 +22,18 @@ pub(super) struct Hosts {
     known: KnownHosts,
 }
 
-/// Consequences of a link's reports.
+/// Changes that the reports of a link show.
 #[derive(Debug, Default, Eq, PartialEq)]
 pub(super) struct HostChanges {
     /// Messages for the user.
     pub(super) notes: Vec<String>,
-    /// Cells whose packets, or whose stimuli, may be lost.
+    /// Cells whose packets or stimuli may be lost.
     pub(super) in_doubt: BTreeSet<CellId>,
-    /// Cells among these whose hosts are reachable.
+    /// Cells in doubt whose hosts are reachable.
     pub(super) reached: BTreeSet<CellId>,
 }
 
-/// State of the hosts, over all of a run.
+/// State of the other hosts, over the whole run.
 #[derive(Debug, Default)]
 struct KnownHosts {
     hosts: BTreeMap<String, HostState>,
@@ -46,7 +46,7 @@ struct KnownHosts {
 struct HostState {
     newest: HostReport,
     outages: Outages,
-    /// Numbers of frames lost from the host and to the host.
+    /// Numbers of frames lost from the host, and to the host.
     lost: [u64; 2],
 }
 
@@ -55,7 +55,7 @@ impl Hosts {
         Self { reports: None, look_at: Instant::now(), known: KnownHosts::default() }
     }
 
-    /// Reads the reports of the bus's link without waiting.
+    /// Reads the reports of the bus's link without waiting for them.
     pub(super) fn read_reports(&mut self, link: &SharedBus) -> HostChanges {
         let (now, mut changes) = (Instant::now(), HostChanges::default());
         if self.reports.is_none() && self.look_at <= now {
@@ -77,7 +77,8 @@ impl Hosts {
         changes
     }
 
-    /// Returns true if a cell is on an unreachable host: its remaining frames were under way.
+    /// Returns true if a cell is on an unreachable host. Frames that still arrive from it were under way when the host
+    /// was lost.
     pub(super) fn is_away(&self, cell: CellId) -> bool {
         let mut away = self.known.hosts.values().filter(|of| !of.newest.is_there);
         away.any(|of| of.newest.nodes.contains(&cell.get()))
@@ -147,7 +148,7 @@ impl KnownHosts {
         }
     }
 
-    /// Handles the end of the local link. The next link counts from zero.
+    /// Handles the end of the link process on this machine. The next link process counts from zero.
     fn end(&mut self, bus: &str, why: &str, now: Instant, changes: &mut HostChanges) {
         changes.notes.push(format!("the link of {bus} to other hosts has ended ({why})"));
         for known in self.hosts.values_mut() {

@@ -1,4 +1,4 @@
-//! Totals of the loop's records.
+//! Totals over the tick records of the control loop.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -16,7 +16,7 @@ use model::accelerometer::RobotState;
 use model::quantiles::{Quantiles, histogram};
 use model::scenario::Mode;
 
-/// Totals of the loop's records.
+/// Totals over the tick records of the control loop.
 #[derive(Debug)]
 pub(super) struct LoopTotals {
     pub(super) late: Histogram<u64>,
@@ -26,15 +26,15 @@ pub(super) struct LoopTotals {
     pub(super) ticks: u64,
     pub(super) skipped: u64,
     pub(super) bad: BTreeMap<String, u64>,
-    /// Number of ticks without each bus, indexed as the bits of [`control::cycle::Record::missing`].
+    /// Number of ticks without data from a bus, by the bus's bit in [`control::cycle::Record::missing`].
     pub(super) missing: [u64; 32],
     pub(super) halts: Halts,
     last: Option<TimedRecord>,
     before: Option<TimedRecord>,
-    /// Start of the interval that `recent` covers.
+    /// Start of the interval for which `recent` holds values.
     since: Instant,
     recent: Histogram<u64>,
-    /// Lateness figures, renewed once a second.
+    /// Figures of the ticks' lateness, updated once a second.
     pub(super) lateness: Lateness,
     pub(super) first_broadcast_s: Option<f64>,
 }
@@ -91,7 +91,7 @@ impl LoopTotals {
         }
     }
 
-    /// Motion of the robot in the last tick.
+    /// Returns the motion of the robot in the last tick.
     pub(super) fn moved(&self) -> Option<Moved> {
         let [before, last] = [self.before?, self.last?].map(|timed| timed.record);
         let [began, at_s] = [before, last].map(|record| Span(record.tick.time.0).seconds());
@@ -103,7 +103,7 @@ impl LoopTotals {
         Some(Moved { at_s, state, is_halted: last.halted.is_some() })
     }
 
-    /// Progress text for a line of `width` columns.
+    /// Returns the text of the progress line for `width` columns.
     pub(super) fn line(
         &self,
         elapsed: Duration,

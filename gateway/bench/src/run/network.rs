@@ -1,4 +1,5 @@
-//! Networks of a run's cells, as the main thread sees them: unreachable cells, and cells that need their slots.
+//! Networks of the cells of a run, as the main thread checks them: it reports unreachable cells, and sends slots to
+//! cells.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -17,9 +18,9 @@ use model::repeat::Repeats;
 
 use crate::view::View;
 
-/// Retry interval for a cell that does not answer.
+/// Interval after which a message is sent again to a cell that does not answer.
 const RETRY_INTERVAL: Span = Span::from_millis(200);
-/// Time that cells get to find another route before they are reported.
+/// Time that cells have to find another route before they are reported as unreachable.
 const REROUTE_TIMEOUT: Span = Span::from_millis(300);
 
 /// The network of one bus.
@@ -29,21 +30,21 @@ pub(super) struct Network {
     wires: Wires,
     slots: Slots,
     period_us: u16,
-    /// Cells to which their slots were sent.
+    /// Cells to which their slots were sent, with the times.
     announced: Repeats<CellId>,
-    /// Ports whose links are to be down, one bit each.
+    /// Ports of each cell whose links must be down, one bit per port.
     deaf: BTreeMap<CellId, u8>,
     reported_links_down: Repeats<CellId>,
-    /// Cells that send but are unreachable, with the start of that state.
+    /// Cells that send but have no route to a root, with the time at which this began.
     without: BTreeMap<CellId, Micros>,
-    /// Cells reported as unreachable, with the start of that state, until they have a route again.
+    /// Cells that were reported as unreachable and still have no route, with the time at which this began.
     reported: BTreeMap<CellId, Micros>,
     said_too_deep: bool,
-    /// Longest time that a cell was unreachable.
+    /// Longest time for which any cell was unreachable.
     pub(super) longest: Span,
     /// Time from the moment when all cells were ready until all had a route.
     pub(super) tree_ready: Option<Span>,
-    /// Differences from the description at the start.
+    /// Differences between the tree at the start and its description.
     pub(super) differences: Vec<Difference>,
 }
 
@@ -59,7 +60,7 @@ pub(super) struct Network {
 pub struct TooDeep {
     /// Name of the bus.
     pub bus: String,
-    /// Depth of its deepest cell.
+    /// Depth of the deepest cell of the tree, in wires from its root.
     pub deepest: u8,
     /// Number of slots for that depth.
     pub slots: u32,
@@ -69,10 +70,10 @@ pub struct TooDeep {
     pub period_us: u32,
 }
 
-/// Result of a check of a network.
+/// Messages that result from a check of a network.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct NetworkCheck {
-    /// Messages for cells.
+    /// Messages that must be sent to cells.
     pub(super) messages: Vec<Message>,
     /// Messages for the user.
     pub(super) notes: Vec<String>,
@@ -100,7 +101,7 @@ impl Network {
         })
     }
 
-    /// Largest depth that has a slot.
+    /// Returns the largest depth that has a slot.
     pub(super) const fn deepest(&self) -> u8 {
         self.slots.deepest
     }
@@ -110,7 +111,7 @@ impl Network {
         &self.name
     }
 
-    /// Cells that sent but were unreachable at the last check.
+    /// Returns the cells that sent but were unreachable at the last check.
     pub(super) fn unreachable(&self) -> impl Iterator<Item = u8> {
         self.without.keys().map(|cell| cell.get())
     }
@@ -119,13 +120,14 @@ impl Network {
         places(view.network.iter().map(|cell| (cell.node, cell.alive && cell.serial.is_some(), cell.tree)))
     }
 
-    /// Number of cells with a route, and true if all that send have one and their pages agree.
+    /// Returns the number of cells with a route to a root, and true if all cells that send have one and their pages
+    /// agree.
     pub(super) fn progress(view: &View) -> (usize, bool) {
         let places = Self::places(view);
         (places.depths.len(), places.unreachable.is_empty() && places.agree)
     }
 
-    /// Differences from the description.
+    /// Returns the differences between the present tree and the description.
     pub(super) fn check(&self, view: &View) -> Vec<Difference> {
         check::differences(&self.wires, &view.network)
     }
@@ -133,7 +135,7 @@ impl Network {
     /// Adapts the number of slots to the present tree.
     ///
     /// # Errors
-    /// Returns [`TooDeep`] if the slots do not fit between two joint broadcasts; it names values that would.
+    /// Returns [`TooDeep`] if the slots do not fit between two joint broadcasts. The error names values that would fit.
     pub(super) fn fit(&mut self, view: &View) -> Result<(), TooDeep> {
         let deepest = Self::places(view).deepest().unwrap_or(0);
         let slots = u32::from(deepest) + 1;
@@ -160,14 +162,14 @@ impl Network {
         self.reply_message(Node::Everyone)
     }
 
-    /// Ready cells that have not confirmed the slots of this tree.
+    /// Returns the ready cells that have not confirmed the slots of the present tree.
     pub(super) fn unconfirmed(&self, view: &View) -> Vec<CellId> {
         let words = Some(self.reply_words());
         let unconfirmed = view.cells.iter().filter(|cell| cell.ready && cell.reply != words);
         unconfirmed.map(|cell| cell.node).collect()
     }
 
-    /// Messages for cells that have not answered in time.
+    /// Returns the messages for cells that have not answered in time.
     pub(super) fn tell_again(&mut self, now: Micros, view: &View) -> Vec<Message> {
         let due = self.announced.due(now, self.unconfirmed(view));
         due.into_iter().map(|cell| self.reply_message(Node::Cell(cell))).collect()
@@ -184,7 +186,7 @@ impl Network {
         self.reported_links_down.renew(to);
     }
 
-    /// Links that are to be down in one or both directions, each once, with the smaller node id first.
+    /// Returns the links that must be down in one or both directions, each once, with the smaller node id first.
     pub(super) fn links_down(&self) -> BTreeSet<[CellId; 2]> {
         let ports = |(&to, &bits): (&CellId, &u8)| {
             let down = (0..PORTS).filter(move |port| bits >> port & 1 == 1);
@@ -193,7 +195,7 @@ impl Network {
         self.deaf.iter().flat_map(ports).map(|(from, to)| [from.min(to), from.max(to)]).collect()
     }
 
-    /// Messages for cells whose links are to go down, or up again.
+    /// Returns the messages for cells whose links must go down, or up again.
     fn report_links_down(&mut self, now: Micros, view: &View) -> Vec<Message> {
         let target = |node: &CellId| self.deaf.get(node).copied();
         let ready = view.cells.iter().filter(|cell| cell.ready);
@@ -337,7 +339,7 @@ mod tests {
         let everyone = |message: &Message| matches!(message, Message::Configure { to: Node::Everyone, .. });
         assert!(look.messages.iter().all(everyone) && look.messages.len() == 1, "{look:?}");
         assert_eq!(network.deepest(), 2);
-        // A cell that has not answered is notified alone, and not at once.
+        // A cell that has not answered gets its own message, after an interval.
         assert_eq!(network.check_running(now, &view(&deep, words)), NetworkCheck::default());
         let look = network.check_running(at(2), &view(&deep, words));
         assert_eq!(look.messages.len(), 3, "{look:?}");

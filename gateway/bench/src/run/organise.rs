@@ -14,7 +14,7 @@ use super::network::Network;
 use crate::error::RunError;
 use crate::view::View;
 
-/// Time after which a difference counts as real: hellos and heartbeats come four times a second.
+/// Time after which a difference from the description counts as real: hellos and heartbeats come four times a second.
 const SETTLING: Duration = Duration::from_millis(1_500);
 
 impl Bench<'_> {
@@ -108,7 +108,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Passes each network with its receiver's view to `messages`, and sends the messages that it returns.
+    /// Calls `messages` with each network and the view of its receiver, and sends the messages that it returns.
     fn send_to_networks(
         &mut self,
         mut messages: impl FnMut(&mut Network, Micros, &View) -> Vec<Message>,

@@ -1,4 +1,5 @@
-//! The thread that receives on one bus: it maintains the table, and publishes snapshots for the tick.
+//! The thread that receives on one bus. It maintains the table of the bus's cells, and publishes snapshots for the
+//! control loop.
 
 use std::collections::BTreeSet;
 use std::sync::atomic::Ordering;
@@ -25,14 +26,14 @@ use trace::capture::BusNote;
 
 /// Interval between checks of timeouts and updates of the view, if no frame arrives.
 const CHECK_INTERVAL: Duration = Duration::from_millis(20);
-/// Number of cells on all buses up to which [`LOOK`] holds. With more cells the interval grows proportionally, up to
-/// [`LONGEST_LOOK`].
+/// Maximum total number of cells for which the interval is [`LOOK`]. With more cells the interval grows proportionally,
+/// up to [`LONGEST_LOOK`].
 const CELLS_A_LOOK: usize = 1_000;
-/// Maximum of that interval; a cell counts as dead after 600 ms.
+/// Maximum interval between checks of timeouts; a cell counts as dead after 600 ms.
 const LONGEST_LOOK: Duration = Duration::from_millis(100);
 
-/// Interval between checks of the timeouts of a skin with `cells` cells while the loop runs, so that the checks cost
-/// the same for all skins.
+/// Returns the interval between checks of the timeouts while the loop runs, for a skin of `cells` cells. It grows with
+/// their number, so that the checks take the same share of time for all skins.
 #[must_use]
 pub fn look_at(cells: usize) -> Duration {
     let times = u32::try_from(cells / CELLS_A_LOOK).unwrap_or(u32::MAX);
@@ -59,9 +60,9 @@ pub enum BusEvent {
 pub struct Receiver {
     /// Index of the bus in the skin.
     pub index: usize,
-    /// The receiver's end of the bus.
+    /// The end of the bus that the receiver holds.
     pub receive_end: ReceiveEnd,
-    /// Follower of the bus: frames gather for a tick, because the loop reads no more often.
+    /// Follower of the bus. It gathers frames for the time of a tick, because the loop reads no more often.
     pub follower: Follower,
     /// Interval between checks of timeouts and updates of the view while the loop runs.
     pub check_interval: Duration,
@@ -69,7 +70,7 @@ pub struct Receiver {
     pub table: Table,
     /// Snapshots for the control loop.
     pub snapshots: triple_buffer::Input<Snapshot>,
-    /// Unrounded positions of the broadcasts.
+    /// Joint positions of each broadcast before they are rounded to words.
     pub positions: rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
     /// Queues to the recorder, if the run is recorded.
     pub outlet: Option<Outlet>,
@@ -79,7 +80,8 @@ pub struct Receiver {
     pub view: Arc<Mutex<View>>,
     /// Events for the main thread.
     pub bus_event: Sender<(usize, BusEvent)>,
-    /// Cells that, as the main thread reports, may have missed messages; sent before it sends them anything again.
+    /// Cells that, as the main thread has found, may have missed messages. They arrive here before the main thread
+    /// sends those cells any further message.
     pub in_doubt: mpsc::Receiver<BTreeSet<CellId>>,
 }
 
@@ -94,24 +96,25 @@ pub struct ReceiverResult {
     pub unrecorded: Unrecorded,
     /// Number and total duration of the bus's losses.
     pub outages: Outages,
-    /// End time of the receiver: its cells' states are of this time, however long the recorder takes to finish.
+    /// Time at which the receiver ended, for which the states of the cells hold, however long the recorder takes to
+    /// finish.
     pub ended: Micros,
 }
 
-/// Reports about a bus so far.
+/// State of a receiver's reports to the recorder and the main thread.
 #[derive(Debug, Default)]
 struct ReportedState {
-    /// Number of dropped frames that the recorder knows of.
+    /// Number of dropped frames that have been reported to the recorder.
     announced: u64,
-    /// Latest joints whose contact states the recorder has.
+    /// Number of the latest joints whose contact states have been recorded.
     newest: Option<u64>,
     outages: Outages,
-    /// Number of commands that the bus accepted but lost when it failed.
+    /// Number of commands that the bus accepted before it failed, and that were not read back.
     unread: u64,
 }
 
 impl Receiver {
-    /// Receives until stopped. Waits for a lost bus, and reopens it if it is gone.
+    /// Receives until stopped. Waits while the bus is lost, and reopens it if it is gone.
     #[must_use]
     pub fn run(mut self) -> ReceiverResult {
         crate::bus::realtime::prepare_receiver();
@@ -142,12 +145,13 @@ impl Receiver {
         ReceiverResult { table: self.table, dropped, unrecorded, outages: account.outages, ended }
     }
 
-    /// Present interval between checks: short until the loop starts, because the main thread waits for the cells.
+    /// Returns the present interval between checks of timeouts. It is short until the loop starts, because the main
+    /// thread waits for the cells.
     fn look_now(&self) -> Duration {
         if self.shared.broadcasts.load(Ordering::Relaxed) == 0 { CHECK_INTERVAL } else { self.check_interval }
     }
 
-    /// Handles the outcome of a step that concerns the bus itself.
+    /// Handles an outcome of a step other than frames: a change of the bus's state.
     fn take(&mut self, step: FollowStep, account: &mut ReportedState) {
         match step {
             FollowStep::Frames(_) => {
@@ -233,7 +237,7 @@ impl Receiver {
         let cells = self.table.statuses(now).map(|(cell, status)| CellView::new(cell, status));
         let (cells, read) = (cells.collect(), self.table.counters().sent(Kind::Command));
         if !self.receive_end.link.state.is_there() {
-            // The lost bus will not carry commands that it has accepted.
+            // The lost bus will not deliver the commands that it has accepted.
             account.unread =
                 self.receive_end.link.state.commands.load(Ordering::Relaxed).saturating_sub(read);
         }
@@ -251,7 +255,7 @@ impl Receiver {
     }
 }
 
-/// Reports items that did not fit; the recorder makes room as long as a receiver runs.
+/// Reports the items that did not fit into the queues, waiting up to 1 s until the queue has room for the report.
 fn last_words(outlet: &mut Outlet) -> Unrecorded {
     let give_up = Instant::now() + Duration::from_secs(1);
     while !outlet.report_unrecorded(wall()) && Instant::now() < give_up {
@@ -260,7 +264,7 @@ fn last_words(outlet: &mut Outlet) -> Unrecorded {
     outlet.unrecorded()
 }
 
-/// Positions of an epoch. Drops those of earlier epochs, whose broadcast was not read back.
+/// Returns the positions of an epoch's joints. Drops positions of earlier epochs, whose broadcasts were not read back.
 fn positions_of(
     queue: &mut rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
     epoch: Epoch,

@@ -45,11 +45,11 @@ use model::table::Table;
 use trace::recording::layout::Layout;
 use trace::recording::series::FileHead;
 
-/// Time that stimuli and commands may wait for a full bus; the loop's own frames never wait.
+/// Maximum time for which the sending of stimuli and commands waits for a full bus. The loop's own frames never wait.
 const SEND_TIMEOUT: Duration = Duration::from_millis(10);
-/// Maximum time for which frames gather; otherwise they gather for a tick.
+/// Maximum time for which a receiver gathers frames; it normally gathers for the time of a tick.
 const GATHER: Duration = Duration::from_millis(10);
-/// Remark on a receive buffer that is smaller than requested.
+/// Remark on a receive buffer that is smaller than the requested size.
 const LIMITED: &str = ", all that net.core.rmem_max allows: a burst of frames may be lost (and is counted)";
 
 /// Claims files and opens buses; [`Bench::begin`] starts the cells.
@@ -58,7 +58,7 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     let emulator = refuse(options)?;
     let skin = &options.skin;
     let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
-    // A file at its size limit is an ordinary error, not a signal.
+    // Ignore the signal, so that a file at its size limit is an ordinary write error.
     signal_hook::flag::register(SIGXFSZ, Arc::new(AtomicBool::new(false)))
         .map_err(|source| SignalError { signal: SIGXFSZ, source })?;
     let outputs = Outputs::claim(&options.record, &signalled, eprint_line).map_err(|refused| {
@@ -66,7 +66,7 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     })?;
     let numbered = options.record.candump.as_ref().is_some_and(|candump| candump.numbered);
     let log = outputs.log().filter(|_| numbered).map(Path::to_owned);
-    // From now on an external controller can connect, so that it is ready when the loop starts.
+    // From here on an external controller can connect, so that it is ready when the loop starts.
     let controller: Box<dyn Controller> = match &options.planned {
         Some(motion) => {
             let motion = motion.clone();
@@ -79,7 +79,8 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     let idle = realtime::idle_lateness(skin.timing.tick_nanos());
     let backlog_dropped = backlog::dropped();
     let (mut served, mut processes) = (Vec::new(), Processes::new()?);
-    // Before this run opens the buses: it would take a commissioning tool for another gateway.
+    // Commission the cells before this run opens its buses, because the run would take the commissioning for another
+    // gateway.
     let emulation =
         emulator.map(|emulator| emulate(options, &emulator, &mut served, &mut processes, &signalled));
     let emulation = emulation.transpose()?;
@@ -134,7 +135,8 @@ pub(super) fn start(options: &RunOptions) -> Result<Bench<'_>, RunError> {
     })
 }
 
-/// Checks for valid descriptions that this program cannot run, and for missing programs and directories.
+/// Returns an error if this program cannot run a valid description, or if a program or directory is missing. Otherwise
+/// returns the emulator, if cells are to be emulated.
 fn refuse(options: &RunOptions) -> Result<Option<Emulator<'_>>, RunError> {
     if options.spawn {
         program("cell-node")?;
@@ -152,7 +154,7 @@ fn refuse(options: &RunOptions) -> Result<Option<Emulator<'_>>, RunError> {
     Ok(options.emulated.as_ref().map(Emulator::new).transpose()?)
 }
 
-/// Starts the emulated cells and commissions them, on buses that are served for that.
+/// Starts emulated cells and commissions them, on buses that are served meanwhile.
 fn emulate(
     options: &RunOptions,
     emulator: &Emulator<'_>,
@@ -177,12 +179,13 @@ fn emulate(
     Ok(emulation)
 }
 
-/// Other programs may use the bus of emulated cells, and cells that are not started here need an existing bus.
+/// Returns the action for a bus that does not exist. It is refused if other programs use it: with emulated cells, or
+/// with cells that are not started here.
 const fn absent(options: &RunOptions) -> IfAbsent {
     if options.spawn && options.emulated.is_none() { IfAbsent::Made } else { IfAbsent::Refused }
 }
 
-/// Options for opening a bus.
+/// Returns the options for opening a bus.
 fn target_of<'a>(options: &RunOptions, described: &'a skin::SkinBus, filters: Vec<Filter>) -> BusTarget<'a> {
     let name = &described.name;
     let target = BusOptions {
@@ -243,7 +246,7 @@ fn record(
     Ok((Some(outputs.start(feed, layout, head)?), recorded))
 }
 
-/// Head of each file of a recording.
+/// Returns the head that each file of a recording begins with.
 fn head(options: &RunOptions, mcap: &Mcap, bus_links: &[RunBus], idle: &Histogram<u64>) -> FileHead {
     let nanos = realtime::wall();
     let mut run = vec![

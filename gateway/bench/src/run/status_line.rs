@@ -32,7 +32,7 @@ pub(super) struct StatusLine<'a> {
     pub(super) torque_nm: &'a [f64],
 }
 
-/// Level of detail of each part of a line: 0 omits the part or selects its shortest form.
+/// Level of detail of each part of a progress line: 0 omits the part or selects its shortest form.
 #[derive(Clone, Copy)]
 struct Detail {
     time: u8,
@@ -103,7 +103,7 @@ impl StatusLine<'_> {
         Some(if detail > 0 { format!("HALTED: {}", printable(why)) } else { "HALTED".to_owned() })
     }
 
-    /// Formats the cells in contact. Stale and dead cells appear at full detail, or if there are any.
+    /// Formats the number of cells in contact. Stale and dead cells appear at full detail, or if their number is not 0.
     fn contact(&self, detail: u8) -> Option<String> {
         let (contributing, cells) = (self.contributing, self.cells);
         let width = cells.to_string().len();

@@ -25,7 +25,7 @@ fn processor_seconds(pid: u32) -> Option<f64> {
         let text = fs::read_to_string(thread.path().join("schedstat")).ok()?;
         text.split_whitespace().next()?.parse::<f64>().ok()
     });
-    // A process that has ended and was not waited for still has a directory, without a time in it.
+    // A process that has ended but was not waited for still has a directory, without a time in it.
     nanos.reduce(|all, one| all + one).filter(|nanos| *nanos > 0.0).map(|nanos| nanos * 1e-9)
 }
 
@@ -37,7 +37,7 @@ pub(super) fn private_kib(pid: u32) -> Option<u64> {
     Some(map.lines().filter(|line| line.starts_with("Private_")).filter_map(kib).sum())
 }
 
-/// Processor times so far in s.
+/// Processor times so far in s: of this program, of the cell processes and of the bus servers.
 pub(super) struct Spent {
     gateway: f64,
     /// Time of each cell process.
@@ -57,10 +57,10 @@ impl Spent {
         }
     }
 
-    /// Processor use since `before` in cores, over the processes that still run.
+    /// Returns the processor use in cores since `before`, over the processes that still run.
     pub(super) fn cores_since(&self, before: &Self, seconds: f64) -> ProcessorUse {
         let since = |now: &HashMap<u32, f64>, before: &HashMap<u32, f64>| {
-            // A thread that has ended takes its time with it.
+            // When a thread ends, its time is no longer counted, so the difference may be negative.
             let one = |(pid, spent): (&u32, &f64)| (spent - before.get(pid).unwrap_or(&0.0)).max(0.0);
             // Not `sum()`, which returns -0.0 without processes.
             now.iter().map(one).fold(0.0, |all, one| all + one) / seconds

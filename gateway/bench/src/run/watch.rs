@@ -1,5 +1,5 @@
-//! The main thread while the loop runs: sends stimuli ahead of their epochs, injects faults at their times, shows
-//! events and progress, and logs frames.
+//! The main thread while the loop runs. It sends stimuli ahead of their epochs, injects faults at their times, carries
+//! out remote commands, and shows events and progress.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -33,14 +33,14 @@ use control::external::Absence;
 use model::scenario::{FaultKind, Stimulus, Touches};
 use model::table::Notice;
 
-/// Number of epochs by which stimuli are sent before the epoch that latches them; cells queue 8.
+/// Number of epochs by which stimuli are sent ahead of the epoch that latches them; a cell queues at most 8.
 const LEAD_EPOCHS: u64 = 5;
-/// Interval between rounds of the main thread.
+/// Interval between two rounds of the main thread.
 pub(super) const ROUND_PAUSE: Duration = Duration::from_millis(10);
 /// Queue length for the loop's records: more than a second of ticks.
 const RECORDS: usize = 1_024;
 
-/// Result of the loop's thread.
+/// Result of the thread that runs the control loop.
 struct LoopEnd {
     /// Privileges that the machine granted to the thread.
     granted: Granted,
@@ -50,19 +50,19 @@ struct LoopEnd {
     absence: Option<Absence>,
 }
 
-/// Pending faults and touches of the scenario.
+/// Progress of the main thread through the faults and touches of the scenario.
 pub(super) struct Script {
     pub(super) touches: Touches,
     accelerations: Option<Accelerations>,
     /// Next epoch whose stimuli are to be sent.
     epoch: u64,
-    /// Index of the next fault.
+    /// Index of the scenario's next fault.
     fault: usize,
-    /// Cells that were switched again.
+    /// Cells to which switches were sent again, with the times.
     announced: Announced,
-    /// Cells whose contact was cleared.
+    /// Cells whose contact state was cleared, with the times.
     pub(super) cleared: Announced,
-    /// Start of the loop.
+    /// Time at which the loop started.
     started: Instant,
 }
 
@@ -74,7 +74,7 @@ impl Script {
 }
 
 impl Bench<'_> {
-    /// Runs the loop to its end or to its failure, and fills in the summary.
+    /// Runs the control loop to its end or to its failure, and fills in the summary.
     pub(super) fn drive(&mut self, summary: &mut Summary, measured: &mut LoopTotals) -> Result<(), RunError> {
         let options = self.options;
         let (records, mut inlet) = rtrb::RingBuffer::new(RECORDS);
@@ -119,7 +119,7 @@ impl Bench<'_> {
             buses_private_kib: of_buses.reduce(|all, one| all + one),
         };
         if failure.is_some() || ended.is_err() {
-            // The cells get no further commands.
+            // The halt is the last command that the cells get.
             let _ = self.send_to_all(&Message::Halt);
         }
         let LoopEnd { granted, counts, absence } = ended.map_err(|_| RunError::Panicked("control loop"))?;
@@ -152,7 +152,7 @@ impl Bench<'_> {
         })
     }
 
-    /// Runs one round of all checks.
+    /// Runs all checks of the main thread once.
     fn step(
         &mut self,
         script: &mut Script,
@@ -166,7 +166,8 @@ impl Bench<'_> {
             .iter()
             .any(|bus_link| bus_link.receiver.as_ref().is_some_and(JoinHandle::is_finished))
         {
-            // A receiver that loses its bus keeps running; one that has ended without a message must be noticed.
+            // A receiver that loses its bus keeps running. A receiver that has ended without a message would otherwise
+            // go unnoticed.
             return Err(RunError::ReceiverEnded);
         }
         self.inject_faults(script, progress)?;
@@ -184,7 +185,7 @@ impl Bench<'_> {
         measured.add_records(records, self.began);
         match (was_halted, measured.halts.why()) {
             (false, Some(why)) => {
-                // One bus is enough: the loop repeats on the others what is received on it.
+                // One bus is enough, because the loop repeats on the other buses what is received on it.
                 let bus_link = self
                     .bus_links
                     .iter()
@@ -215,11 +216,11 @@ impl Bench<'_> {
     /// Sends the stimuli of all epochs up to [`LEAD`] ahead.
     fn press(&self, script: &mut Script, moved: Option<Moved>) -> Result<(), RunError> {
         let broadcasts = self.shared.broadcasts.load(Ordering::Acquire);
-        // Skipped broadcasts have no epoch, but their time has passed.
+        // Skipped broadcasts have no epoch, but the scenario's time continues.
         let skipped = self.shared.broadcasts_skipped.load(Ordering::Relaxed);
         let seconds = |touches: &Touches, epoch: u64| Span(touches.time_of(epoch + skipped).0).seconds();
         while script.epoch < broadcasts + LEAD_EPOCHS {
-            // Epochs that passed while this thread was delayed cannot be made up for one by one.
+            // If this thread was delayed, skip the epochs that have passed.
             let epoch = script.epoch.max(broadcasts);
             let numbered = self.first_epoch.advanced_by(epoch.to_le_bytes()[0]);
             for stimulus in script.touches.changes(script.epoch.checked_sub(1), epoch) {
@@ -246,7 +247,7 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Resends the scenario's stimuli to the selected cells. Leaves stimuli from other senders alone.
+    /// Resends the scenario's stimuli to the selected cells. Does not change stimuli from other senders.
     pub(super) fn remind(&self, script: &Script, selects: impl Fn(&Cell) -> bool) -> Result<(), RunError> {
         let touched =
             script.touches.cells().filter_map(|place| Some((place, self.options.skin.cells.get(place)?)));
@@ -260,7 +261,7 @@ impl Bench<'_> {
     fn stimulate(&self, stimulus: &Stimulus, from: AppliesFrom) -> Result<(), RunError> {
         let page = SensorPage::Skin(stimulus.sensors);
         let message = Message::Stimulus { to: Node::Cell(stimulus.node), from, page };
-        // The cells' contact state follows the frames that the bus carried.
+        // The receiver tracks the cells' contact states from the frames that the bus carried, including these.
         self.send_all(&[(stimulus.bus, message)])
     }
 
@@ -286,7 +287,8 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Takes the links between two cells down, or brings them up again; the next check of their network sends it.
+    /// Takes the links between two cells down, or brings them up again. The next check of the cells' network sends the
+    /// change to the cells.
     fn switch_link(
         &mut self,
         link_down: bool,
@@ -334,8 +336,8 @@ impl Bench<'_> {
                     self.remind(script, |it| it.bus == bus && it.node == cell)?;
                 }
                 BusEvent::Notice(Notice::Returned(cell)) => {
-                    // A heartbeat that was under way when its host was lost is no return: the cell gets no messages
-                    // until the host is reachable.
+                    // A heartbeat that was under way when its host was lost does not mean that the cell is back: it
+                    // gets no messages until the host is reachable.
                     let is_away = self.bus_links.get(bus).is_some_and(|it| it.hosts.is_away(cell));
                     if !is_away {
                         returned.insert((bus, cell));
@@ -349,7 +351,7 @@ impl Bench<'_> {
                 }
                 BusEvent::Down(why) => progress.note(&why.to_string()),
                 BusEvent::Up => progress.note(&format!("{} works again", self.name(bus))),
-                // Without any bus there is no torque, unless a bus is to come back.
+                // Without any bus there is no torque, so the run ends, unless a bus is to come back.
                 BusEvent::Lost(why) if self.has_no_bus() => return Err(RunError::Lost(why)),
                 BusEvent::Lost(why) => {
                     progress
@@ -391,7 +393,7 @@ impl Bench<'_> {
             changes.notes.iter().for_each(|note| progress.note(note));
             reached.extend(changes.reached.into_iter().map(|cell| (bus, cell)));
             if !changes.in_doubt.is_empty() {
-                // Before its cells get any further messages.
+                // The receiver must know these cells before any further messages are sent to them.
                 let _ = bus_link.in_doubt.send(changes.in_doubt);
             }
         }
@@ -401,7 +403,7 @@ impl Bench<'_> {
         self.tell_again(script, &reached)
     }
 
-    /// Resends stimuli and commands to cells that missed changes during their absence.
+    /// Resends stimuli and commands to cells that may have missed changes while they were absent.
     fn tell_again(&self, script: &Script, cells: &BTreeSet<(usize, CellId)>) -> Result<(), RunError> {
         self.remind(script, |it| cells.contains(&(it.bus, it.node)))?;
         for bus_link in cells.iter().filter_map(|&(bus, _)| self.bus_links.get(bus)) {
@@ -410,7 +412,8 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Restarts the servers of this run's embedded buses that have ended, unless a command has taken them down.
+    /// Starts new servers for this run's embedded buses whose servers have ended, unless a command has taken the bus
+    /// down.
     fn serve_again(&mut self, progress: &Progress) {
         let gone = self.bus_links.iter().enumerate();
         let gone = gone.filter(|&(bus, bus_link)| bus_link.link.is_gone() && !self.commanded.is_down(bus));

@@ -6,37 +6,38 @@ use model::table::{CellState, Errors, Replies};
 use protocol::skin::{self, Skin};
 use serde::Serialize;
 
-/// Replies: due = in time + late + missing; missing = too late + skipped + not heard + lost + in doubt + unknown.
+/// Replies of cells that answer with their own torques. They add up: due = in time + late + missing; missing = too late
+/// + skipped + not heard + lost + in doubt + unknown.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct RepliesSummary {
-    /// Epochs that cells had to answer.
+    /// Number of epochs that cells had to answer, added up over the cells.
     pub due: u64,
     /// Replies before the next broadcast.
     pub in_time: u64,
     /// Replies after the next broadcast.
     pub late: u64,
-    /// Replies that were dropped because their epoch was long over.
+    /// Replies that arrived and were dropped because their epoch was long over.
     pub too_late: u64,
     /// Replies that the cell skipped because it processed the joints more than one period late.
     pub skipped: u64,
     /// Replies missing because the cell did not receive the joints.
     pub not_heard: u64,
-    /// Replies that the cell sent and that were lost or damaged.
+    /// Replies that the cell sent and that were lost or damaged on the way.
     pub lost: u64,
     /// Missing replies of cells that were dead or restarted, or whose bus was lost.
     pub in_doubt: u64,
     /// Missing replies without a known reason.
     pub unknown: u64,
-    /// Torques that were not due: ends of contacts, and the next two kinds.
+    /// Torques that were not due: ends of contacts, and those in the next two fields.
     pub unasked: u64,
-    /// Torques of cells whose contact was unknown.
+    /// Torques of cells whose contact state was unknown.
     pub contact_unknown: u64,
-    /// Torques other than zero of cells whose contact was known.
+    /// Torques other than zero of cells that were known not to be in contact.
     pub unexpected: u64,
 }
 
 impl RepliesSummary {
-    /// Adds the replies of a cell, and explains missing ones as far as reasons are known.
+    /// Adds the replies of a cell, and attributes missing ones to reasons as far as these are known.
     pub(super) fn add(&mut self, cell: &CellState) {
         let Replies { due, in_time, late, missing, in_doubt, unasked, contact_unknown, unexpected, too_late } =
             cell.replies;
@@ -61,7 +62,7 @@ impl RepliesSummary {
         self.unexpected += unexpected;
     }
 
-    /// Missing replies by reason; unknown reasons are last.
+    /// Returns the numbers of missing replies by reason; unknown reasons are last.
     #[must_use]
     pub const fn missing(&self) -> [(&'static str, u64); 6] {
         [
@@ -82,7 +83,7 @@ pub struct CellSummary {
     pub node: u8,
     /// Name of its bus.
     pub bus: String,
-    /// Mode by its last heartbeat, `test` or `measure`; `None` if none was received.
+    /// Mode of the cell by its last heartbeat, `test` or `measure`; `None` if no heartbeat was received.
     pub mode: Option<&'static str>,
     /// Number of replies due.
     pub due: u64,
@@ -92,19 +93,20 @@ pub struct CellSummary {
     pub late: u64,
     /// Number of missing replies by reason, without zeros.
     pub missing: BTreeMap<&'static str, u64>,
-    /// Number of torques that were not due because the contact was unknown.
+    /// Number of torques that were not due, because the cell's contact state was unknown.
     pub contact_unknown: u64,
-    /// Errors of its torques against the central ones, in the joints that move it.
+    /// Errors of the cell's torques against the central ones, in the joints that move the cell.
     pub error: Errors,
-    /// Longest run of equal words of each kind while the cell should have sent others; kinds without such a run are
-    /// absent.
+    /// Largest number of equal words in succession, by kind, while the cell should have sent changing ones. Kinds
+    /// without such a succession are absent.
     pub stuck: BTreeMap<&'static str, u64>,
     /// Number of restarts.
     pub restarts: u32,
 }
 
 impl CellSummary {
-    /// Creates the summary of a cell of the skin; `known` is its table entry if its bus was opened.
+    /// Creates the summary of a cell of the skin. `known` is the table entry of the cell, or `None` if its bus was not
+    /// opened.
     #[must_use]
     pub fn new(skin: &Skin, described: &skin::Cell, known: Option<&CellState>) -> Self {
         let mut replies = RepliesSummary::default();

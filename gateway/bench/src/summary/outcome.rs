@@ -6,7 +6,8 @@ use serde::Serialize;
 /// Maximum number of cell errors given one by one.
 const REASONS: usize = 4;
 
-/// Outcome of a run. The last variant that applies counts; but a halt takes precedence over a lost bus.
+/// Outcome of a run. If several variants apply, the last of them is the outcome; but a halt takes precedence over a
+/// lost bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Outcome {
@@ -17,7 +18,7 @@ pub enum Outcome {
     Interrupted,
     /// Processes of cells failed.
     CellError,
-    /// The external controller that the skin requires never answered, or was absent at the end.
+    /// The external controller that the skin requires did not answer during the run, or was absent at the end.
     NoController,
     /// The robot was halted when the run ended.
     Halted,
@@ -70,7 +71,7 @@ pub struct CellError {
 pub struct ErrorCells {
     /// Name of the bus.
     pub bus: String,
-    /// Node ids in ascending order.
+    /// Node ids of the cells, in ascending order.
     pub nodes: Vec<u8>,
 }
 
@@ -81,7 +82,7 @@ impl CellError {
         self.cells.iter().map(|cells| cells.nodes.len()).sum()
     }
 
-    /// The cells as text: `1-6, 9 on vcan0; 1 on vcan1`.
+    /// Returns the cells as text: `1-6, 9 on vcan0; 1 on vcan1`.
     #[must_use]
     pub fn names(&self) -> String {
         let of_bus =
@@ -90,7 +91,7 @@ impl CellError {
     }
 }
 
-/// Formats the cells that failed in one line, with the first few reasons if `with_reasons`. Returns `None` if no cell
+/// Describes the cells that failed in one line, with the first few reasons if `with_reasons`. Returns `None` if no cell
 /// failed.
 #[must_use]
 pub fn cells_in_error(errors: &[CellError], with_reasons: bool) -> Option<String> {
@@ -132,13 +133,13 @@ pub struct HaltSummary {
 pub struct TickBefore {
     /// Number of the tick.
     pub tick: u64,
-    /// Due time in s since the start of the loop.
+    /// Time at which the tick was due, in s since the start of the loop.
     pub time_s: f64,
-    /// Lateness in µs.
+    /// Lateness of the tick in µs.
     pub late_us: f64,
-    /// Duration in µs.
+    /// Duration of the tick in µs.
     pub took_us: f64,
-    /// Number of ticks skipped just before.
+    /// Number of ticks skipped just before this one.
     pub skipped: u64,
     /// Epoch of the last joints.
     pub epoch: u8,
@@ -146,13 +147,13 @@ pub struct TickBefore {
     pub q_rad: Vec<f64>,
     /// Joint velocities in rad/s (prismatic joints: m/s).
     pub qdot_rad_s: Vec<f64>,
-    /// Torque of the cells in Nm (prismatic joints: N).
+    /// Torque on each joint from all cells in Nm (prismatic joints: N).
     pub torque_nm: Vec<f64>,
-    /// True if the torque could be used.
+    /// True if the torque was valid, so that the controller could use it.
     pub valid: bool,
-    /// Number of cells in the torque.
+    /// Number of cells that contribute to the torque.
     pub contributing: u32,
-    /// Number of epochs that the oldest of them has missed.
+    /// Number of epochs missed by the contributing cell whose torque is the oldest.
     pub age: u32,
     /// Number of cells in contact that missed the last epoch.
     pub stale: u32,
@@ -178,7 +179,8 @@ mod tests {
         CellError { reason: reason.to_owned(), cells }
     }
 
-    /// Creates a summary with the flagged conditions: controller absent, errors of cells, a halt, an interruption.
+    /// Creates a summary in which the flagged conditions hold: controller absent, errors of cells, a halt, an
+    /// interruption.
     fn summary([absent, errors, halted, interrupted]: [bool; 4]) -> Summary {
         let halt = HaltSummary { at_s: 1.0, tick: 500, epoch: 62, reason: "no answer".to_owned(), until_s: None };
         Summary {

@@ -12,14 +12,14 @@ use serde::Serialize;
 use super::{BusSummary, CellSummary, Outcome, RepliesSummary, Summary, cells_in_error};
 
 /// Maximum mean error of one cell's torques in Nm that rounding explains: four steps of a torque's word. A correct cell
-/// has about a tenth of it.
+/// has a tenth of this error.
 pub const CELL_ERROR_NM: f64 = 4.0 / 4_096.0;
 /// Maximum mean error of sums along a tree in Nm that rounding explains: four steps of a sum's word.
 const SUM_ERROR_NM: f64 = 4.0 / 256.0;
-/// Summary names of events with a line of their own.
+/// Names under which the summary counts events that have a finding of their own.
 const SATURATED: &str = Event::Saturated.name();
 const STALE: &str = Event::StaleTorque.name();
-/// Maximum number of listed groups of node ids; more are counted.
+/// Maximum number of groups of node ids in a list; further groups are only counted.
 const RANGES: usize = 12;
 
 /// Verdict on a run.
@@ -32,7 +32,7 @@ pub struct Verdict {
 }
 
 impl Verdict {
-    /// Returns the verdict on a run from the other figures of its summary.
+    /// Returns the verdict on a run, computed from the other figures of its summary.
     #[must_use]
     pub fn new(summary: &Summary) -> Self {
         let mut look_at = Vec::new();
@@ -88,18 +88,18 @@ impl Summary {
     }
 }
 
-/// Formats a count with its noun.
+/// Formats a count with its noun in the singular or plural.
 pub(crate) fn many(count: impl TryInto<u64>, one: &str, more: &str) -> String {
     let count = count.try_into().unwrap_or(u64::MAX);
     format!("{count} {}", if count == 1 { one } else { more })
 }
 
-/// Formats the number of times that an event happened.
+/// Formats the number of times that an event happened: `once`, `3 times`.
 fn times(count: u64) -> String {
     if count == 1 { "once".to_owned() } else { format!("{count} times") }
 }
 
-/// Names cells of a bus: `cell 3 on vcan0`, `cells 1-4, 6 on vcan0`.
+/// Formats cells of a bus: `cell 3 on vcan0`, `cells 1-4, 6 on vcan0`.
 fn named(nodes: &[u8], bus: &str) -> String {
     let all = ranges(nodes);
     let noun = if nodes.len() == 1 { "cell" } else { "cells" };
@@ -109,7 +109,7 @@ fn named(nodes: &[u8], bus: &str) -> String {
     }
 }
 
-/// Names the cells for which a condition holds, by bus.
+/// Lists the cells for which a condition holds, by bus.
 fn cells_that(summary: &Summary, holds: impl Fn(&CellSummary) -> bool) -> Vec<String> {
     let mut buses = BTreeMap::<&str, Vec<u8>>::new();
     for cell in summary.cells.iter().filter(|cell| holds(cell)) {
@@ -121,7 +121,7 @@ fn cells_that(summary: &Summary, holds: impl Fn(&CellSummary) -> bool) -> Vec<St
     buses.into_iter().map(|(bus, nodes)| named(&nodes, bus)).collect()
 }
 
-/// Lists counts with their nouns, without zeros.
+/// Lists counts with their nouns, without counts of 0.
 fn nonzero<'a>(counts: impl IntoIterator<Item = (u64, &'a str)>) -> Vec<String> {
     let counts = counts.into_iter().filter(|(count, _)| *count > 0);
     counts.map(|(count, what)| format!("{count} {what}")).collect()
@@ -132,7 +132,7 @@ fn is_above(value: f64, limit: f64) -> bool {
     value.is_nan() || value > limit
 }
 
-/// Finds runs that ended early or badly.
+/// Adds findings on a run that ended early or badly.
 fn ending(look_at: &mut Vec<String>, summary: &Summary) {
     look_at.extend(summary.failure.as_ref().map(|failure| format!("the run failed: {failure}")));
     if let Some(why) = &summary.halted {
@@ -145,7 +145,7 @@ fn ending(look_at: &mut Vec<String>, summary: &Summary) {
     look_at.extend(cells_in_error(&summary.cell_errors, true));
 }
 
-/// Finds buses that were lost, and cells that were silent at the end.
+/// Adds findings on buses that were lost, and on cells that were silent at the end.
 fn absent(look_at: &mut Vec<String>, summary: &Summary) {
     for bus in summary.buses.iter().filter(|bus| bus.outages.times > 0) {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
@@ -162,7 +162,7 @@ fn absent(look_at: &mut Vec<String>, summary: &Summary) {
             named(&bus.silent_cells, &bus.name)
         ));
     }
-    // The receiver of such a bus has left no figures.
+    // A receiver that panicked has left no figures of its bus.
     let is_known = |cell: &CellSummary| summary.buses.iter().any(|bus| bus.name == cell.bus);
     if summary.failure.is_none() {
         let unknown = cells_that(summary, |cell| !is_known(cell));
@@ -186,7 +186,7 @@ fn absent(look_at: &mut Vec<String>, summary: &Summary) {
     }
 }
 
-/// Finds replies and packets that are missing without a known reason.
+/// Adds findings on replies and packets that are missing for an unknown reason.
 fn unknown(look_at: &mut Vec<String>, bus: &BusSummary) {
     let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
     if replies.unknown > 0 {
@@ -210,7 +210,7 @@ fn unknown(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
 }
 
-/// Finds trees that differ from the description.
+/// Adds findings on trees that differ from the description.
 fn network(look_at: &mut Vec<String>, bus: &BusSummary) {
     let Some(network) = &bus.network else { return };
     if !network.unreachable.is_empty() {
@@ -226,7 +226,7 @@ fn network(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
 }
 
-/// Finds torques that are wrong.
+/// Adds findings on wrong torques.
 fn wrong_torques(look_at: &mut Vec<String>, summary: &Summary) {
     let accuracy = &summary.accuracy;
     let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| is_above(mean, CELL_ERROR_NM));
@@ -269,7 +269,7 @@ fn wrong_torques(look_at: &mut Vec<String>, summary: &Summary) {
     }
 }
 
-/// Finds restarts of cells, and halts that have ended.
+/// Adds findings on restarts of cells, and on halts that have ended.
 fn restarts(look_at: &mut Vec<String>, summary: &Summary) {
     for cells in cells_that(summary, |cell| cell.restarts > 0) {
         look_at.push(format!("{cells}: restarted; what was due then is in doubt"));
@@ -296,7 +296,7 @@ fn restarts(look_at: &mut Vec<String>, summary: &Summary) {
 fn recording(look_at: &mut Vec<String>, summary: &Summary) {
     let Some(recording) = &summary.recording else { return };
     let messages = recording.messages_lost.values().sum::<u64>();
-    // A failure names the file that could not be written.
+    // If the run failed, its error already names the file that could not be written.
     if recording.lost + messages > 0 && summary.failure.is_none() {
         look_at.push(format!(
             "the recording is incomplete, without {} and {}: this machine was busy, or its disk is slow",
@@ -306,7 +306,7 @@ fn recording(look_at: &mut Vec<String>, summary: &Summary) {
     }
 }
 
-/// Finds losses with a known reason.
+/// Adds findings on losses whose reason is known.
 fn lost(look_at: &mut Vec<String>, bus: &BusSummary) {
     let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
     let reasons = [
@@ -358,7 +358,7 @@ fn control(look_at: &mut Vec<String>, summary: &Summary) {
     }
 }
 
-/// Finds skipped ticks.
+/// Adds a finding on skipped ticks.
 fn ticks(look_at: &mut Vec<String>, summary: &Summary) {
     let control = &summary.control;
     if control.ticks_skipped > 0 {
@@ -375,7 +375,7 @@ fn ticks(look_at: &mut Vec<String>, summary: &Summary) {
     }
 }
 
-/// Finds late replies, and replies of cells that received the joints too late.
+/// Adds findings on late replies, and on replies of cells that received the joints too late.
 fn late(look_at: &mut Vec<String>, bus: &BusSummary) {
     let RepliesSummary { due, late, too_late, skipped, .. } = bus.replies;
     let parts =
@@ -398,7 +398,7 @@ fn late(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
 }
 
-/// Finds incomplete epochs without late or missing replies.
+/// Adds a finding on incomplete epochs that late or missing replies do not explain.
 fn incomplete(look_at: &mut Vec<String>, bus: &BusSummary) {
     let parts = bus.sums.map(|sums| sums.contributions);
     let explained =
@@ -414,7 +414,7 @@ fn incomplete(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
 }
 
-/// Finds irregular frames, except those reported above: saturated torques and torques that came too late.
+/// Adds a finding on irregular frames, except those reported above: saturated torques and torques that came too late.
 fn anomalies(look_at: &mut Vec<String>, bus: &BusSummary) {
     let odd = bus.events.iter().map(|(name, count)| match *name {
         SATURATED => (0, SATURATED),
@@ -427,7 +427,7 @@ fn anomalies(look_at: &mut Vec<String>, bus: &BusSummary) {
     }
 }
 
-/// Finds parts that the run could not check.
+/// Adds findings on everything that the run could not check.
 fn unchecked(look_at: &mut Vec<String>, summary: &Summary) {
     for cells in cells_that(summary, |cell| cell.contact_unknown > 0 && !cell.measures()) {
         look_at.push(format!(
@@ -438,7 +438,7 @@ fn unchecked(look_at: &mut Vec<String>, summary: &Summary) {
         look_at
             .push(format!("{cells}: in mode \"measure\", not pressed by the scenario, torques not compared"));
     }
-    // A run that failed early has its reason above.
+    // If the run failed early, its error is already in the list.
     if summary.failure.is_some() {
         return;
     }

@@ -171,7 +171,7 @@ fn maps() -> BTreeSet<String> {
     rows().filter(|(_, _, kind)| *kind == "map").map(|(_, key, _)| key.to_owned()).collect()
 }
 
-/// Summaries of all cells.
+/// Returns the summaries of all cells of a skin.
 fn of_each(skin: &Skin, table: &Table) -> Vec<CellSummary> {
     let both = skin.cells.iter().zip(table.cells());
     both.map(|(described, cell)| CellSummary::new(skin, described, Some(cell))).collect()

@@ -59,13 +59,13 @@ fn moved(skin: &Skin, bounds: &Bounds, seed: u64, defects: &[Defect]) -> Observa
 struct Errors {
     position_mm: Vec<f64>,
     orientation_deg: Vec<f64>,
-    /// The number of cells whose truth is within the stated uncertainty.
+    /// The number of cells whose true place is within the stated uncertainty: by position, and by orientation.
     covered: [usize; 2],
     wrong_joint: usize,
 }
 
 impl Errors {
-    /// Adds the cells that `count` accepts; the skin has their true places.
+    /// Adds the errors of the cells that `count` accepts; `skin` has their true places.
     fn add(&mut self, skin: &Skin, calibration: &Calibration, count: impl Fn(usize, &CellResult) -> bool) {
         for (index, (cell, result)) in skin.cells.iter().zip(&calibration.cells).enumerate() {
             if !count(index, result) {

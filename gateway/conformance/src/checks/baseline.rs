@@ -12,16 +12,18 @@ use crate::session::{CellPacket, Reply, Session, JointsResult};
 
 const BASELINE: u8 = 11;
 const TARE: u8 = 12;
-/// A touch begins at 0.1 N and ends at half of it; the zero is held, within 0.5 N.
+/// The words of parameter 11 for a zero that is held: a touch begins at 0.1 N and ends at half of that, and the zero is
+/// at most 0.5 N.
 pub(super) const HOLD: [i16; WORDS] = [1, 102, 8_192, 0, LIMIT, 0];
 const LIMIT: i16 = 512;
-/// The highest rate: the zero moves by 1.07 steps of a contact word at each joints message.
+/// The words of parameter 11 for a zero that tracks the reading at the highest rate: by 1.07 steps of a contact word at
+/// each joints message.
 const FOLLOW: [i16; WORDS] = [2, 102, 8_192, -1, LIMIT, 0];
-/// 0.02 N/°C.
+/// The temperature slope of the zero: 0.02 N/°C.
 const SLOPE: i16 = 328;
-/// The number of joints messages before the first tare, with some margin.
+/// The number of joints messages after which the first tare is done, with some margin.
 const JOINTS_BEFORE_TARE: usize = 40;
-/// 25 °C.
+/// A temperature of 25 °C, as a sensor word.
 const TEMPERATURE_25_C: i16 = 25 << 6;
 const TOUCH: i32 = 1_024;
 const REASON_TOUCHED: i16 = 20;
@@ -49,7 +51,7 @@ fn reading(sum: i32, temperature: i16) -> SkinSensors {
     SkinSensors { temperature: [Q9_6::from_bits(temperature); 2], ..arm::press(sum) }
 }
 
-/// Sends a number of joints messages with this reading, and returns the last step.
+/// Sends joints messages with this sum of contact words and this temperature, and returns the result of the last one.
 fn send_reading(session: &mut Session<'_>, sum: i32, temperature: i16, joints: usize) -> Result<JointsResult, StopReason> {
     session.press(reading(sum, temperature))?;
     let mut step = session.step(&[0x0321; MAX_JOINTS])?;
@@ -67,7 +69,7 @@ fn report(session: &mut Session<'_>) -> Result<Option<(i32, BaselinePage, SkinSe
     let skin =
         pages.iter().find_map(|page| if let SensorPage::Skin(skin) = page { Some(*skin) } else { None });
     let zero = pages.iter().find_map(zero_of);
-    session.check("BASE-7", zero.is_some(), || "no sensors page 3 came to a report".to_owned());
+    session.check("BASE-7", zero.is_some(), || "a report must be answered with sensors page 3, but that page did not come".to_owned());
     let sum = |skin: SkinSensors| skin.contact.iter().map(|word| i32::from(word.to_bits())).sum();
     Ok(skin.zip(zero).map(|(skin, zero)| (sum(skin), zero, skin)))
 }
@@ -76,16 +78,16 @@ const fn zero_of(page: &SensorPage) -> Option<BaselinePage> {
     if let SensorPage::Baseline(page) = page { Some(*page) } else { None }
 }
 
-/// Writes another rule, which makes the cell find its zero again.
+/// Writes parameter 11 with words other than the present ones, so that the cell searches for its zero again.
 fn set(session: &mut Session<'_>, rule: [i16; WORDS]) -> Result<(), StopReason> {
     let reply = session.write(BASELINE, rule)?;
     session.check("BASE-1", reply == Reply::Value(rule), || {
-        format!("parameter 11 was written with {}: {reply}", Reply::Value(rule))
+        format!("a write of {} to parameter 11 must be accepted, but the answer was {reply}", Reply::Value(rule))
     });
     Ok(())
 }
 
-/// Writes another rule, and waits for a first tare at this reading.
+/// Writes parameter 11, and sends joints with this sum of contact words until the first tare is done.
 fn tared(session: &mut Session<'_>, rule: [i16; WORDS], sum: i32) -> Result<(), StopReason> {
     set(session, rule)?;
     send_reading(session, sum, TEMPERATURE_25_C, JOINTS_BEFORE_TARE)?;
@@ -112,18 +114,18 @@ fn ranges(session: &mut Session<'_>) -> Result<(), StopReason> {
     for (number, bad) in cases.chain([3, -1, 1, 2].map(|word| (TARE, padded_words([word])))) {
         let reply = session.write(number, bad)?;
         session.check("BASE-1", reply == Reply::Refused(19), || {
-            format!("parameter {number} was written with {}, without a baseline: {reply}", Reply::Value(bad))
+            format!("parameter {number} must refuse {} with reason 19 while the baseline is off, but the answer was {reply}", Reply::Value(bad))
         });
     }
     for (written, expected) in [([0, 9, 9, 9, 9, 9], [0; WORDS]), ([1, 102, 8_192, 77, LIMIT, 0], HOLD)] {
         let reply = session.write(BASELINE, written)?;
         session.check("CONF-3", reply == Reply::Value(expected), || {
-            format!("parameter 11 was written with {}: {reply}", Reply::Value(written))
+            format!("parameter 11 was written with {}, whose unused words must become 0, but the answer was {reply}", Reply::Value(written))
         });
     }
     set(session, [0; WORDS])?;
     let step = send_reading(session, 307, TEMPERATURE_25_C, 1)?;
-    session.check("BASE-1", step.torque.is_some(), || "without a baseline 0.3 N made no torque".to_owned());
+    session.check("BASE-1", step.torque.is_some(), || "while the baseline is off, 0.3 N must give a torque, but none came".to_owned());
     send_reading(session, 0, TEMPERATURE_25_C, 2)?;
     Ok(())
 }
@@ -132,18 +134,18 @@ fn start(session: &mut Session<'_>) -> Result<(), StopReason> {
     set(session, HOLD)?;
     let first = send_reading(session, 307, TEMPERATURE_25_C, 1)?;
     session.check("BASE-2", first.torque.is_none_or(|torque| torque.is_zero()), || {
-        "0.3 N before the first tare, within the limit of 0.5 N: a torque came".to_owned()
+        "0.3 N before the first tare is within the limit of 0.5 N and must not give a torque, but one came".to_owned()
     });
     send_reading(session, 307, TEMPERATURE_25_C, JOINTS_BEFORE_TARE)?;
     if let Some((sum, zero, _)) = report(session)? {
         let is_so = zero.tared && near(zero.zero.to_bits().into(), 307, 1) && near(sum, 0, 1);
         session.check("BASE-2", is_so, || {
-            format!("after {JOINTS_BEFORE_TARE} joints with 0.3 N: {}, page 0 adds up to {sum}", text(zero))
+            format!("after {JOINTS_BEFORE_TARE} joints with 0.3 N, page 3 must have a zero of 307 steps, tared, and page 0 must add up to 0, but page 3 is {}, and page 0 adds up to {sum}", text(zero))
         });
     }
     let raw = reading(307 + TOUCH, TEMPERATURE_25_C);
     let step = send_reading(session, 307 + TOUCH, TEMPERATURE_25_C, 1)?;
-    session.check("BASE-8", step.torque.is_some(), || "1 N above the zero: no torque came".to_owned());
+    session.check("BASE-8", step.torque.is_some(), || "1 N above the zero must give a torque, but none came".to_owned());
     if let Some((_, zero, skin)) = report(session)? {
         let zero = i32::from(zero.zero.to_bits());
         let third = (zero * 21_845) >> 16;
@@ -155,18 +157,18 @@ fn start(session: &mut Session<'_>) -> Result<(), StopReason> {
             .collect();
         let got: Vec<_> = skin.contact.iter().map(|word| i32::from(word.to_bits())).collect();
         session.check("BASE-8", got == expected, || {
-            format!("contact words {got:?} of page 0 with a zero of {zero}, not {expected:?}")
+            format!("with a zero of {zero} steps page 0 must have the contact words {expected:?}, but has {got:?}")
         });
     }
     // A reading beyond the limit is a touch from the start.
     set(session, HOLD)?;
     let step = send_reading(session, 700, TEMPERATURE_25_C, JOINTS_BEFORE_TARE)?;
     session.check("BASE-2", step.torque.is_some(), || {
-        "0.68 N from the start, beyond the limit of 0.5 N: no torque came".to_owned()
+        "0.68 N from the start is beyond the limit of 0.5 N and must give a torque, but none came".to_owned()
     });
     if let Some((sum, zero, _)) = report(session)? {
         session.check("BASE-2", !zero.tared && sum == 700, || {
-            format!("0.68 N from the start: {}, page 0 adds up to {sum}", text(zero))
+            format!("0.68 N from the start must not be tared, and page 0 must add up to 700, but page 3 is {}, and page 0 adds up to {sum}", text(zero))
         });
     }
     Ok(())
@@ -182,7 +184,7 @@ fn holds(session: &mut Session<'_>) -> Result<(), StopReason> {
         send_reading(session, TOUCH, TEMPERATURE_25_C, joints)?;
         if let Some((sum, zero, _)) = report(session)? {
             session.check("BASE-3", near(sum, TOUCH, 1) && near(zero.zero.to_bits().into(), 0, 1), || {
-                format!("{joints} joints under 1 N: {}, page 0 adds up to {sum}, not {TOUCH}", text(zero))
+                format!("after {joints} joints under 1 N the zero must be 0, and page 0 must add up to {TOUCH}, but page 3 is {}, and page 0 adds up to {sum}", text(zero))
             });
         }
     }
@@ -203,7 +205,7 @@ fn follows(session: &mut Session<'_>) -> Result<(), StopReason> {
         let is_so = (min..=max).contains(&steps) || skips != session.skips;
         session.check("BASE-4", is_so, || {
             format!(
-                "{JOINTS} joints with 80 steps at {} uN/s: the zero is {steps} steps, not {min} to {max}",
+                "after {JOINTS} joints with a reading of 80 steps, at a rate of {} uN/s, the zero must be {min} to {max} steps, but is {steps}",
                 rate.cast_unsigned()
             )
         });
@@ -221,7 +223,7 @@ fn temperature(session: &mut Session<'_>) -> Result<(), StopReason> {
         if let Some((sum, zero, _)) = report(session)? {
             session.check("BASE-5", near(sum, TOUCH - expected, 2), || {
                 format!(
-                    "{degrees} °C more with 0.02 N/°C: {}, page 0 adds up to {sum}, not {}",
+                    "{degrees} °C more with a slope of 0.02 N/°C: page 3 is {}, and page 0 adds up to {sum}, but must add up to {}",
                     text(zero),
                     TOUCH - expected
                 )
@@ -237,7 +239,7 @@ fn tares(session: &mut Session<'_>) -> Result<(), StopReason> {
     let tare = |session: &mut Session<'_>, word: i16, expected: Reply, what: &str| {
         let reply = session.write_first_words(TARE, [word])?;
         session.check("BASE-6", reply == expected, || {
-            format!("parameter 12 was written with {word}, {what}: {reply}")
+            format!("a write of {word} to parameter 12 ({what}) must be answered with {expected}, but the answer was {reply}")
         });
         Ok::<_, StopReason>(())
     };
@@ -245,7 +247,7 @@ fn tares(session: &mut Session<'_>) -> Result<(), StopReason> {
         if let Some((_, zero, _)) = report(session)? {
             let is_counted = refused.is_none_or(|refused| zero.refused == refused);
             let is_so = near(zero.zero.to_bits().into(), expected, 2) && is_counted;
-            session.check("BASE-6", is_so, || format!("{what}: {}", text(zero)));
+            session.check("BASE-6", is_so, || format!("{what} page 3 must have a zero of {expected} steps and count refused tares, but is {}", text(zero)));
         }
         Ok::<_, StopReason>(())
     };
@@ -264,7 +266,7 @@ fn tares(session: &mut Session<'_>) -> Result<(), StopReason> {
     tare(session, 0, Reply::Value([0; WORDS]), "to forget the zero")?;
     let reply = session.read(TARE)?;
     session.check("BASE-6", reply == Reply::Value([0; WORDS]), || {
-        format!("parameter 12 is read as {reply} without a zero")
+        format!("without a zero parameter 12 must be read as 0, but is read as {reply}")
     });
     Ok(())
 }
@@ -278,7 +280,7 @@ fn pages(session: &mut Session<'_>) -> Result<(), StopReason> {
         let came = pages.find_map(|(_, page)| zero_of(page));
         session.check("BASE-7", came.is_some_and(|page| page.touched == touched), || {
             let came = came.map_or_else(|| "none".to_owned(), text);
-            format!("a touch or its end must send page 3; {came} came")
+            format!("a touch or its end must send page 3 with the new state of the touch, but {came} came")
         });
     }
     session.wait_for_quiet(Span::from_millis(60))?;
@@ -290,7 +292,7 @@ fn pages(session: &mut Session<'_>) -> Result<(), StopReason> {
     let count = pages.filter(|(_, page)| zero_of(page).is_some()).count();
     session.consume();
     session.check("BASE-7", count >= beats / 4 && count <= beats / 4 + 1, || {
-        format!("page 3 came {count} times with {beats} heartbeats, not with each fourth one")
+        format!("page 3 must come with every fourth heartbeat, but came {count} times with {beats} heartbeats")
     });
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! The times of heartbeats.
+//! Checks of the times at which heartbeats come.
 
 use protocol::message::{Message, State};
 use protocol::packet::Epoch;
@@ -13,7 +13,7 @@ use crate::session::{CellPacket, Session};
 const HEARTBEAT_INTERVAL_US: u64 = 250_000;
 /// The allowed lateness of a heartbeat, in us.
 const MAX_LATENESS_US: u64 = 20_000;
-/// The allowed error of a clock and of time stamps in one of these checks, in us.
+/// The allowed error of the cell's clock and of the bench's time stamps, in us.
 const CLOCK_TOLERANCE_US: u64 = 3_000;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
@@ -36,9 +36,9 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
 /// The regular heartbeats of an interval.
 #[derive(Clone, Copy, Debug)]
 struct Grid {
-    /// The time at which the first one was due at the latest, in us.
+    /// The latest time at which the first heartbeat was due, in us.
     due: u64,
-    /// The mean interval, in us.
+    /// The mean interval between two heartbeats, in us.
     each: u64,
 }
 
@@ -47,7 +47,7 @@ pub(super) fn format_ms(times: impl Iterator<Item = u64>) -> String {
     times.map(|us| (us / 1_000).to_string()).collect::<Vec<_>>().join(", ")
 }
 
-/// Returns the times of the heartbeats since the exchange began.
+/// Returns the times of the heartbeats since the exchange began, in us.
 fn times(session: &Session<'_>) -> Vec<u64> {
     session.answers().iter().filter(|it| it.beat().is_some()).map(|it| it.at.0).collect()
 }
@@ -64,20 +64,21 @@ fn held(session: &mut Session<'_>) -> Result<Option<Grid>, StopReason> {
     let grid = regular(session, 2_300)?;
     let beats = session.packets.get(first..).unwrap_or_default().iter().filter_map(CellPacket::beat);
     let is_halted = beats.clone().all(|(beat, _)| beat.state.has(State::HALTED));
-    session.check("CMD-1", is_halted, || "HALTED is not set any more, without a resume".to_owned());
+    session.check("CMD-1", is_halted, || "HALTED must stay set until a resume, but a heartbeat came without it".to_owned());
     session.step(&[0; MAX_JOINTS])?;
     session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);
     if presses {
         let step = session.step(&[0; MAX_JOINTS])?;
         let is_there = step.torque.is_some();
-        session.check("STIM-7", is_there, || "a stimulus does not hold for more than 2 s".to_owned());
+        session.check("STIM-7", is_there, || "a latched stimulus must hold for more than 2 s, but no torque came after that time".to_owned());
         session.press_and_step(&[0; MAX_JOINTS], arm::press(0))?;
     }
     Ok(grid)
 }
 
-/// Checks that without any request a heartbeat comes every 250 ms, at most 20 ms late.
+/// Checks that without any request a heartbeat comes every 250 ms, at most 20 ms late. Returns the measured times if
+/// that is so.
 fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, StopReason> {
     let due = usize::try_from(ms * 1_000 / HEARTBEAT_INTERVAL_US).unwrap_or_default();
     for attempt in 0..3 {
@@ -92,7 +93,7 @@ fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, StopReaso
             (due..=due + 1).contains(&times.len()) && apart.iter().all(|span| (from..=to).contains(span));
         if is_so || attempt == 2 || late.0 < 1_000 {
             session.check("BEAT-1", is_so, || {
-                format!("{} heartbeats in {ms} ms, {} ms apart", times.len(), format_ms(apart.iter().copied()))
+                format!("a heartbeat is due every 250 ms, at most 20 ms late, but {} came in {ms} ms, {} ms apart", times.len(), format_ms(apart.iter().copied()))
             });
             let due = times.iter().zip(0..).map(|(at, place)| at.saturating_sub(place * HEARTBEAT_INTERVAL_US)).min();
             let each = apart.iter().sum::<u64>().checked_div(apart.len() as u64);
@@ -131,8 +132,8 @@ fn shifted(session: &mut Session<'_>) -> Result<(), StopReason> {
                 session.check("BEAT-3", is_so, || {
                     let times = format_ms(times.iter().map(|at| at - grid.0));
                     format!(
-                        "{what} {offset} ms after a regular heartbeat: heartbeats came {times} ms after it, and \
-                         {offset}, 250 and 500 are right"
+                        "with {what} {offset} ms after a regular heartbeat, heartbeats must come {offset}, 250 and 500 ms \
+                         after it, but came {times} ms after it"
                     )
                 });
                 break;
@@ -142,19 +143,18 @@ fn shifted(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// Waits for the next regular heartbeat.
+/// Waits for the next regular heartbeat, and returns its time.
 fn next_beat(session: &mut Session<'_>) -> Result<Option<Micros>, StopReason> {
     session.settle()?;
     let until = session.now() + Span(HEARTBEAT_INTERVAL_US + MAX_LATENESS_US + 50_000);
     let came = session.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
-    session.check("BEAT-1", came, || "no heartbeat came for 320 ms".to_owned());
+    session.check("BEAT-1", came, || "a heartbeat is due every 250 ms, but none came for 320 ms".to_owned());
     let at = session.answers().iter().rev().find(|it| it.beat().is_some()).map(|it| it.at);
     session.consume();
     Ok(at)
 }
 
-/// Checks that while joints come, a heartbeat is early only as far as allowed: right after the answer to the last
-/// joints before it.
+/// Checks the heartbeats while joints come every 16 ms: each may be early by at most that period.
 fn early(session: &mut Session<'_>) -> Result<(), StopReason> {
     const PERIOD: u64 = 16_000;
     for press in [4_096, 0] {
@@ -196,8 +196,8 @@ fn early(session: &mut Session<'_>) -> Result<(), StopReason> {
                 session.check("BEAT-2", is_so, || {
                     let times = format_ms(times.iter().map(|at| at.saturating_sub(grid.0)));
                     format!(
-                        "with joints every 16 ms heartbeats came {times} ms after a regular one; 250, 500, 750 and \
-                         1000 are right, and up to a period before"
+                        "with joints every 16 ms, heartbeats must come 250, 500, 750 and 1000 ms after a regular one, or up to \
+                         16 ms earlier, but came {times} ms after it"
                     )
                 });
                 break;
@@ -208,8 +208,8 @@ fn early(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// Checks that a heartbeat that is early, or due at that moment, follows the torque of its epoch. One exception is
-/// allowed: the cell may send a heartbeat between receiving joints and answering them.
+/// Checks that a regular heartbeat follows the torque of its epoch. One exception is allowed: the cell may send a
+/// heartbeat between receiving joints and answering them.
 fn check_order(session: &mut Session<'_>) {
     let before = |place: usize, of: Epoch| {
         let later = session.answers().get(place..).unwrap_or_default();
@@ -219,11 +219,11 @@ fn check_order(session: &mut Session<'_>) {
     let first =
         answers.filter(|(place, it)| it.beat().is_some_and(|(_, epoch)| before(*place, epoch))).count();
     session.check("TIME-3", first <= 1, || {
-        format!("{first} regular heartbeats came before the torque of their epoch")
+        format!("a regular heartbeat must follow the torque of its epoch, but {first} came before it")
     });
 }
 
-/// Checks the cell's clock by its heartbeats, over several seconds.
+/// Checks the cell's clock by two groups of regular heartbeats, which are several seconds apart.
 fn clock(session: &mut Session<'_>, first: Grid, last: Grid) {
     let span = last.due.saturating_sub(first.due);
     let each = ((first.each + last.each) / 2).max(1);
@@ -234,7 +234,7 @@ fn clock(session: &mut Session<'_>, first: Grid, last: Grid) {
     session.begin_expected_exchange();
     session.check("TIME-1", off <= allowed, || {
         format!(
-            "{beats} heartbeats in {} ms: its clock is off by {} us; {allowed} us are allowed",
+            "by {beats} heartbeats in {} ms, the cell's clock is off by {} us, but only {allowed} us are allowed",
             span / 1_000,
             off
         )

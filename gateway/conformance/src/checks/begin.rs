@@ -1,4 +1,4 @@
-//! The first group: the identity of the cell and its options.
+//! The checks that run first: the identity of the cell, and the options that it has.
 
 use protocol::message::{Message, VERSION};
 use protocol::parameters::Parameter;
@@ -26,7 +26,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     if session.known.hash == Some(0) {
         unconfigured::run(session)?;
     } else {
-        let why = "what a cell without a configuration does: it had one";
+        let why = "joints without a configuration: the cell had a configuration";
         session.findings.not_tested("JOINTS-2", why);
     }
     let document = arm::example_parameters(2);
@@ -39,19 +39,19 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
 fn identity(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.read(Parameter::Identity.number())?;
     let Reply::Value([.., version, hash, state, _]) = reply else {
-        session.check("CONF-1", false, || format!("the identity was answered with {reply}"));
+        session.check("CONF-1", false, || format!("a read of the identity (parameter 0) must return its words, but the answer was {reply}"));
         return Ok(());
     };
     session.check("CONF-1", version == i16::from(VERSION), || {
-        format!("version {version} in the identity, not 1")
+        format!("the identity must have version 1, but has {version}")
     });
     let exchange = session.exchange_all(&[])?;
     let Some((beat, _)) = exchange.beat else { return Ok(()) };
     session.check("CONF-1", hash.cast_unsigned() == beat.configuration, || {
-        format!("configuration {hash:04X} in the identity, {:04X} in a heartbeat", beat.configuration)
+        format!("identity and heartbeat must have the same configuration, but have {hash:04X} and {:04X}", beat.configuration)
     });
     session.check("CONF-1", state.cast_unsigned() == beat.state.0, || {
-        format!("state {state:04X} in the identity, {:04X} in a heartbeat", beat.state.0)
+        format!("identity and heartbeat must have the same state, but have {state:04X} and {:04X}", beat.state.0)
     });
     session.known.hash = Some(beat.configuration);
     Ok(())
@@ -63,7 +63,7 @@ fn options(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.about.test_mode = words == Some(1);
     session.known.test_mode = Some(words == Some(1));
     let is_known = words == Some(1) || reply == Reply::Refused(19);
-    session.check("OPT-1", is_known, || format!("a write of parameter 5 with 1 was answered with {reply}"));
+    session.check("OPT-1", is_known, || format!("a write of 1 to parameter 5 must be accepted, or refused with reason 19, but the answer was {reply}"));
     if session.about.test_mode {
         session.test_mode(true)?;
     }
@@ -71,14 +71,14 @@ fn options(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.write_first_words(Parameter::Sensing.number(), [2])?;
     session.about.sensing = reply.words().is_some();
     session.check("OPT-1", session.about.sensing || reply == Reply::Refused(19), || {
-        format!("a write of parameter 7 with 2 was answered with {reply}")
+        format!("a write of 2 to parameter 7 must be accepted, or refused with reason 19, but the answer was {reply}")
     });
     session.write_first_words(Parameter::Sensing.number(), [0])?;
     let reply = session.write(Parameter::Baseline.number(), baseline::HOLD)?;
     session.about.baseline = reply.words().is_some();
     // A cell that implements the protocol without baselines refuses with 18.
     let is_known = session.about.baseline || matches!(reply, Reply::Refused(18 | 19));
-    session.check("OPT-1", is_known, || format!("a write of parameter 11 was answered with {reply}"));
+    session.check("OPT-1", is_known, || format!("a write of parameter 11 must be accepted, or refused with reason 18 or 19, but the answer was {reply}"));
     session.write_first_words(Parameter::Baseline.number(), [0])?;
     session.settle()?;
     session.known.senses = false;

@@ -1,4 +1,4 @@
-//! Claims of the node id of a settled cell: it receives its own `4nn`.
+//! Checks of a settled cell whose node id another sender claims or uses, in packets `4nn` with that id.
 
 use protocol::id::Node;
 use protocol::message::{ReceivedCounts as HeardPage, Heartbeat, Message, NetworkPage, Ports, RejectedCounts, State, Tree};
@@ -10,17 +10,17 @@ use crate::arm;
 use crate::bus::StopReason;
 use crate::session::Session;
 
-/// The minimum time between two answered claims.
+/// The minimum time between two claims that a cell answers.
 const DEFENCE_INTERVAL: Span = Span::from_millis(10);
 
-/// Returns a heartbeat of another cell with this node id.
+/// Returns a heartbeat of another cell with the node id of the cell under test.
 pub(super) fn twin_heartbeat(session: &Session<'_>, serial: u32, claiming: bool) -> Message {
     let state = State::default().with(State::CLAIMING, claiming).with_joint(0);
     let beat = Heartbeat { serial, state, ..Heartbeat::default() };
     Message::Network { from: Node::Cell(session.cell), epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
 }
 
-/// Returns a page, other than a heartbeat, of another cell with this node id.
+/// Returns a network page, other than a heartbeat, of another cell with the node id of the cell under test.
 pub(super) fn page(session: &Session<'_>, page: NetworkPage) -> Message {
     Message::Network { from: Node::Cell(session.cell), epoch: Epoch(0), page }
 }
@@ -71,24 +71,25 @@ fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), StopReason> {
     let at = session.send_messages(&[claim])?;
     let came =
         session.wait(at + Span::from_millis(120), |heard| heard.iter().any(|it| it.beat().is_some()))?;
-    session.check("CLAIM-6", came, || format!("a claim with serial number {serial} was not answered"));
+    session.check("CLAIM-6", came, || format!("a claim of the cell's node id with serial number {serial} must be answered with a heartbeat, but none came"));
     if let Some((answered, state)) = beats(session).first().copied() {
         session.note_time("heartbeat to a claimant", at, answered);
         session.check("CLAIM-7", state.has(State::DUPLICATE), || {
-            format!("DUPLICATE is not set in the answer to a claim: {:04X}", state.0)
+            format!("DUPLICATE must be set in the answer to a claim, but the state is {:04X}", state.0)
         });
-        session.check("CLAIM-6", !state.has(State::CLAIMING), || "a settled cell sends CLAIMING".to_owned());
+        session.check("CLAIM-6", !state.has(State::CLAIMING), || "CLAIMING must be clear in the answer of a settled cell to a claim, but is set".to_owned());
     }
     session.idle(Span::from_millis(5))?;
     let count = beats(session).len();
-    session.check("CLAIM-6", count <= 1, || format!("a claim was answered with {count} heartbeats"));
+    session.check("CLAIM-6", count <= 1, || format!("a claim must be answered with one heartbeat, but {count} came"));
     session.consume();
     // The heartbeat that answers the sync is checked as usual.
     session.exchange_all(&[])?;
     session.idle(DEFENCE_INTERVAL)
 }
 
-/// Checks that of two claims within 10 ms one is answered, and so is the next one after that time.
+/// Checks that of three claims within 10 ms only one is answered, and that DUPLICATE in the next heartbeat shows the
+/// others.
 fn twice(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
     if session.is_slow() {
         session.findings.not_tested("CLAIM-6", "claims within 10 ms: the connection to the cell is too slow");
@@ -109,7 +110,7 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
             continue;
         }
         session.check("CLAIM-6", count == 1, || {
-            format!("three claims within {} us were answered with {count} heartbeats", apart.0)
+            format!("three claims within {} us must be answered with one heartbeat, but {count} came", apart.0)
         });
         // The next heartbeat shows the later claims.
         session.begin_exchange();
@@ -117,7 +118,7 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
         session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
         let is_set = beats(session).first().is_some_and(|(_, state)| state.has(State::DUPLICATE));
         session.check("CLAIM-7", is_set, || {
-            "DUPLICATE is not set in the heartbeat after a claim that was not answered".to_owned()
+            "DUPLICATE must be set in the heartbeat after a claim that was not answered, but is clear".to_owned()
         });
         session.consume();
         session.exchange_all(&[])?;
@@ -134,21 +135,21 @@ fn not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), StopRe
     session.send_messages(&[*other])?;
     session.idle(Span::from_millis(25))?;
     let count = beats(session).len();
-    session.check("CLAIM-6", count == 0, || "a 4nn that is not a claim was answered".to_owned());
+    session.check("CLAIM-6", count == 0, || "a 4nn that is not a claim must not be answered, but a heartbeat came".to_owned());
     session.consume();
     // A read of the identity shows DUPLICATE, and does not clear it.
     let reply = session.read(Parameter::Identity.number())?;
     let shown = reply.words().map(|[.., state, _]| State(state.cast_unsigned())).unwrap_or_default();
     let is_set = shown.has(State::DUPLICATE);
     session.check("CONF-1", is_set, || {
-        format!("DUPLICATE is not set in the identity after a 4nn of another cell: {:04X}", shown.0)
+        format!("DUPLICATE must be set in the identity after a 4nn of another cell, but the state is {:04X}", shown.0)
     });
     session.begin_exchange();
     let at = session.send_messages(&[Message::Sync])?;
     session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
     let state = beats(session).last().map(|(_, state)| *state).unwrap_or_default();
     session.check("CLAIM-7", state.has(State::DUPLICATE), || {
-        format!("DUPLICATE is not set after a 4nn of another cell: {:04X}", state.0)
+        format!("DUPLICATE must be set in the heartbeat after a 4nn of another cell, but the state is {:04X}", state.0)
     });
     session.consume();
     session.exchange_all(&[])?;

@@ -31,16 +31,16 @@ fn command(session: &mut Session<'_>, command: Message, id: &'static str) -> Res
         session.known.active = Some(false);
     }
     let exchange = session.exchange_all(&[command])?;
-    session.check(id, exchange.is_silent(), || "it was answered by itself".to_owned());
+    session.check(id, exchange.is_silent(), || "the command must not be answered, but packets came besides the heartbeat to the sync after it".to_owned());
     let is_set = exchange.state().has(State::HALTED);
     session.check(id, is_set == is_halt, || {
-        format!("HALTED is {}set after it", if is_set { "" } else { "not " })
+        format!("a halt must set HALTED and a resume must clear it, but HALTED is {}set after the command", if is_set { "" } else { "not " })
     });
     Ok(exchange)
 }
 
-/// Checks that a halt or a resume is not answered, and that a halted cell answers a sync with one heartbeat. No regular
-/// heartbeat is due meanwhile.
+/// Checks that a halt or a resume is not answered, and that a halted cell answers a sync with one heartbeat. Commands
+/// are sent at times when no regular heartbeat is due.
 fn alone(session: &mut Session<'_>) -> Result<(), StopReason> {
     const ATTEMPTS: usize = 3;
     let cases = [
@@ -61,8 +61,8 @@ fn alone(session: &mut Session<'_>) -> Result<(), StopReason> {
             session.consume();
             if came == expected || attempt == ATTEMPTS {
                 session.check(id, came == expected, || {
-                    let halted = if expected > 0 { " of a halted cell" } else { "" };
-                    format!("{what}{halted} was answered with {came} packets, not {expected}")
+                    let halted = if expected > 0 { " to a halted cell" } else { "" };
+                    format!("{what}{halted} must be answered with {expected} packets, but {came} came")
                 });
                 break;
             }
@@ -81,7 +81,7 @@ fn halt(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.press_and_step(&HERE, unit)?;
         let exchange = command(session, Message::Halt, "CMD-1")?;
         session
-            .check("STATE-1", !exchange.state().has(State::ACTIVE), || "ACTIVE is set after halt".to_owned());
+            .check("STATE-1", !exchange.state().has(State::ACTIVE), || "ACTIVE must be clear after a halt, but is set".to_owned());
         if round == 1 {
             command(session, Message::Halt, "CMD-1")?;
         } else {
@@ -99,9 +99,9 @@ fn halt(session: &mut Session<'_>) -> Result<(), StopReason> {
         let taken = |of: &protocol::message::ReceivedCounts| of.joints.wrapping_add(of.joints_late);
         let counted = taken(&after).wrapping_sub(taken(&before));
         session
-            .check("CMD-1", counted == 5, || format!("5 joints were counted as {counted} by a halted cell"));
+            .check("CMD-1", counted == 5, || format!("a halted cell must count 5 joints, but counted {counted}"));
         session.check("CMD-1", after.torques == before.torques, || {
-            "torques were counted while halted".to_owned()
+            "a halted cell must not count torques, but its count changed".to_owned()
         });
         command(session, Message::Resume, "CMD-2")?;
         let step = session.step(&THERE)?;
@@ -109,14 +109,14 @@ fn halt(session: &mut Session<'_>) -> Result<(), StopReason> {
         let off =
             step.words().iter().zip(exact).map(|(word, exact)| arm::steps_off(*word, exact)).max().unwrap_or(0);
         session.check("CMD-2", off <= 8, || {
-            format!("the first torque after a resume is not of the new joints: {}", arm::format_words(&step.words()))
+            format!("the first torque after a resume must be that of the new joints, but is {}", arm::format_words(&step.words()))
         });
         // A release while halted clears ACTIVE, so no torque of zeros is due.
         command(session, Message::Halt, "CMD-1")?;
         session.press_and_step(&HERE, arm::press(0))?;
         command(session, Message::Resume, "CMD-2")?;
         let step = session.step(&THERE)?;
-        session.check("CMD-1", step.torque.is_none(), || "released while halted: a torque came".to_owned());
+        session.check("CMD-1", step.torque.is_none(), || "after a release while halted no torque must come, but one came".to_owned());
     }
     // A resume does not change a cell that is not halted.
     session.press_and_step(&HERE, unit)?;
@@ -143,7 +143,7 @@ fn syncs(session: &mut Session<'_>) -> Result<(), StopReason> {
     // Regular heartbeats may come between.
     let regular = 1 + usize::try_from(session.now().elapsed_since(began).0 / 250_000).unwrap_or(0);
     session.check("CMD-3", (SYNCS..=SYNCS + regular).contains(&beats), || {
-        format!("{SYNCS} syncs were answered with {beats} heartbeats")
+        format!("{SYNCS} syncs must be answered with one heartbeat each, but {beats} heartbeats came")
     });
     Ok(())
 }
@@ -171,17 +171,17 @@ fn report(session: &mut Session<'_>) -> Result<(), StopReason> {
         }
         let epochs_right =
             answers.iter().all(|heard| heard.message.epoch().map(|it| it.0) == session.known.epoch);
-        session.check("JOINTS-3", epochs_right, || "a page of a report has another epoch".to_owned());
+        session.check("JOINTS-3", epochs_right, || "the pages of a report must have the epoch of the last joints, but one has another epoch".to_owned());
         let sent: Vec<_> =
             answers.iter().filter_map(|heard| heard.sensors().map(|(_, page)| *page)).collect();
         let latched = [SensorPage::Skin(skin), SensorPage::Acceleration(acceleration)];
         session
-            .check("SENSE-1", sent.len() == 2, || format!("{} sensors pages came to a report", sent.len()));
+            .check("SENSE-1", sent.len() == 2, || format!("a report must be answered with 2 sensors pages, but {} came", sent.len()));
         session.check("SENSE-2", sent == latched, || {
             let text = |pages: &[SensorPage]| {
                 pages.iter().map(|page| arm::format_page(*page)).collect::<Vec<_>>().join("; ")
             };
-            format!("{} was reported, and {} is latched", text(&sent), text(&latched))
+            format!("a report must have the latched values, but has {}, and {} is latched", text(&sent), text(&latched))
         });
     }
     session.press_and_step(&HERE, arm::press(0))?;

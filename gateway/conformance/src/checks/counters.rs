@@ -1,4 +1,4 @@
-//! Unusable packets: the cell drops them, counts them by reason, and does nothing else.
+//! Checks that the cell drops unusable packets, counts them by reason, and does nothing else.
 
 use protocol::can::{BIT_RATE_SWITCH, EXTENDED, Format, Frame};
 use protocol::id::{Command, Id, Kind, Node};
@@ -10,7 +10,7 @@ use crate::arm;
 use crate::bus::StopReason;
 use crate::session::Session;
 
-/// The reason under which page 2 counts a packet.
+/// The counter of network page 2 that must count an unusable packet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Reason {
     Length,
@@ -25,17 +25,17 @@ enum Reason {
 impl Reason {
     const fn text(self) -> &'static str {
         match self {
-            Self::Length => "as length",
-            Self::Crc => "as CRC",
-            Self::MaybeForeign => "as foreign",
-            Self::Meaning => "as meaning",
-            Self::Incomplete => "as incomplete",
-            Self::None => "nowhere,",
+            Self::Length => "only as length",
+            Self::Crc => "only as CRC",
+            Self::MaybeForeign => "only as foreign",
+            Self::Meaning => "only as meaning",
+            Self::Incomplete => "only as incomplete",
+            Self::None => "nowhere",
         }
     }
 }
 
-/// The number of attempts, to tell an answer from a regular heartbeat.
+/// The number of attempts, so that a regular heartbeat is not taken for an answer.
 const ATTEMPTS: usize = 3;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
@@ -45,10 +45,10 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         let mut beats = usize::MAX;
         for _ in 0..ATTEMPTS {
             let exchange = session.exchange(&frames)?;
-            session.check("COUNT-1", exchange.is_silent(), || format!("{what} was answered"));
+            session.check("COUNT-1", exchange.is_silent(), || format!("{what} must be dropped, but was answered"));
             let has_effect = exchange.state().has(State::HALTED) || exchange.state().has(State::DUPLICATE);
             session.check("COUNT-1", !has_effect, || {
-                format!("{what} had an effect: state {:04X}", exchange.state().0)
+                format!("{what} must have no effect, but the state after it is {:04X}", exchange.state().0)
             });
             if has_effect {
                 session.send_messages(&[protocol::message::Message::Resume])?;
@@ -56,7 +56,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
             let after = session.counters()?;
             let is_so = is_counted(before.refused, after.refused, reason) && before.heard == after.heard;
             session.check("COUNT-1", is_so, || {
-                format!("{what} must be counted only {}: {after}; before: {before}", reason.text())
+                format!("{what} must be counted {}, but the counters are {after}; before: {before}", reason.text())
             });
             before = after;
             // A regular heartbeat may have come beside the one to the sync, but not in each attempt.
@@ -65,7 +65,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
                 break;
             }
         }
-        session.check("COUNT-1", beats <= 1, || format!("{what} was answered with a heartbeat"));
+        session.check("COUNT-1", beats <= 1, || format!("{what} must be dropped, but was answered with a heartbeat"));
     }
     Ok(())
 }
@@ -172,7 +172,7 @@ fn frames(format: Format, id: u32, bytes: &[u8]) -> Vec<Frame> {
     }
 }
 
-/// Adds lengths that this kind of packet cannot have, with a correct CRC if there is room for one.
+/// Adds FD frames with lengths that this kind of packet cannot have, with a correct CRC if there is room for one.
 fn fd_lengths(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, packet: &Packet) {
     let id = u32::from(packet.id.to_bits());
     let has_long = packet.id == Id::command(Command::Joints);
@@ -201,7 +201,7 @@ fn fd_lengths(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, packet:
     cases.push((format!("{name} in a classic frame"), classic.into_iter().collect(), Reason::Length));
 }
 
-/// Adds frames that only resemble packets.
+/// Adds frames that resemble a packet, but have an identifier of 29 bits or are remote frames.
 fn foreign(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, format: Format, id: u32, bytes: &[u8]) {
     // On a classic bus, only the first segment.
     let whole = frames(format, id | EXTENDED, bytes).into_iter().take(1).collect();
@@ -215,7 +215,8 @@ fn foreign(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, format: Fo
     cases.push((format!("a remote frame of {name}"), remote, Reason::MaybeForeign));
 }
 
-/// Adds pages and counts that do not exist, and identifiers that are undefined or belong to other nodes.
+/// Adds packets with pages and counts that do not exist, and with identifiers that are undefined or belong to other
+/// nodes.
 fn pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Reason)>) {
     let own = Node::Cell(session.cell);
     let packet =

@@ -1,4 +1,5 @@
-//! Algorithm 1 and torque words, bit for bit. J is measured first, with a force for which the torque words equal J.
+//! Checks of Algorithm 1 and of torque words, bit for bit. J is measured first, with a force for which the torque words
+//! equal J.
 
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, TorqueFormat};
 use protocol::message::SkinSensors;
@@ -11,13 +12,13 @@ use crate::session::Session;
 
 /// The number of random forces for each of several rules.
 const RANDOM: usize = 40;
-/// The number of forces that reveal a rounding error.
+/// The number of forces that are sent to reveal a rounding error.
 const SHOWN: usize = 12;
 
-/// The three contact words, and the proximity.
+/// The sensor words of a press: three of contact, and one of proximity.
 type Sensed = ([i16; 3], i16);
 
-/// Joint positions with a known J.
+/// Joint positions, and the words of J that were measured at them.
 struct Known {
     positions: [i16; MAX_JOINTS],
     j: [i16; MAX_JOINTS],
@@ -71,7 +72,7 @@ fn press(
     };
     session.check(id, is_there == (force > 0), || {
         let came = if is_there { "a torque came" } else { "no torque came" };
-        format!("{}: F_z is {force} steps of 2^-16 N, and {came}", sensed())
+        format!("with {}, F_z must be {force} steps of 2^-16 N, but {came}", sensed())
     });
     if is_there {
         look_at_words(session, parameters, &known.j, force, &step.words(), id);
@@ -230,7 +231,7 @@ fn rule(
     Ok(())
 }
 
-/// Returns true if the last step of F_z comes from rounding.
+/// Returns true if F_z is rounded up, so that truncating it would give one step of 2^-16 N less.
 fn is_rounded_up(contact: &Contact, skin: &SkinSensors) -> bool {
     let bits = |word: i16| i64::from(word);
     let sum: i64 = skin.contact.iter().map(|word| bits(word.to_bits())).sum();

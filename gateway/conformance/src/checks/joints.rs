@@ -1,4 +1,4 @@
-//! Joints: which ones the cell accepts, and how it counts and answers them.
+//! Checks of joints: the epochs and counts that the cell accepts, its counters, and its answers.
 
 use protocol::can::Frame;
 use protocol::packet::{Epoch, Length, Packet, Words};
@@ -23,7 +23,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     contacts(session)
 }
 
-/// Checks that each epoch other than the last one is accepted, at any distance; more than 256 in a row.
+/// Checks that joints of any epoch other than the last one are accepted, at any distance from it, and more than 256 in
+/// a row.
 fn epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
     let before = session.counters()?.heard;
     let mut torque: Option<Words> = None;
@@ -33,12 +34,12 @@ fn epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
         epoch = epoch.wrapping_add(step);
         let came = session.step_at(epoch, &POSITIONS)?.torque;
         session.check("JOINTS-1", came.is_some(), || {
-            format!("joints {epoch}, {} epochs after the last ones, were not answered", step.cast_signed())
+            format!("joints {epoch}, {} epochs after the last ones, must be answered with a torque, but none came", step.cast_signed())
         });
         if let (Some(came), Some(before)) = (came, torque) {
             let words = |words: &Words| arm::format_words(words.as_slice());
             session.check("TORQUE-1", came == before, || {
-                format!("the same joints gave {} and {}", words(&came), words(&before))
+                format!("the same joints must give the same torque, but gave {}, and {} before", words(&came), words(&before))
             });
         }
         torque = came.or(torque);
@@ -48,7 +49,7 @@ fn epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
     let skipped = after.joints_late.wrapping_sub(before.joints_late);
     let late = session.skips;
     session.check("JOINTS-5", skipped <= late, || {
-        format!("{skipped} joints were counted as skipped; only {late} were answered late enough for that")
+        format!("{skipped} joints were counted as skipped, but only {late} were answered late enough for that")
     });
     Ok(())
 }
@@ -63,7 +64,7 @@ fn repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
         for positions in [POSITIONS, [0x1234; MAX_JOINTS]] {
             let joints = session.joints(first, &positions);
             let exchange = session.exchange_all(&[joints])?;
-            session.check("JOINTS-1", exchange.is_silent(), || format!("joints {first} were answered again"));
+            session.check("JOINTS-1", exchange.is_silent(), || format!("repeated joints {first} must not be answered, but were"));
         }
         // A pending stimulus must not be latched by repeated joints.
         session.press(arm::press(2_000))?;
@@ -71,7 +72,7 @@ fn repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.exchange_all(&[joints])?;
         let skin = session.latched()?;
         session.check("JOINTS-1", skin == Some(arm::press(4_096)), || {
-            format!("repeated joints latched a stimulus: {}", arm::format_skin(skin))
+            format!("repeated joints must not latch a stimulus, but {} is latched", arm::format_skin(format_skin))
         });
         let second = session.next_epoch();
         session.step_at(second, &POSITIONS)?;
@@ -80,12 +81,12 @@ fn repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.step_at(second, &POSITIONS)?;
         let after = session.counters()?.heard;
         let counted = after.joints_repeated.wrapping_sub(before.joints_repeated);
-        session.check("JOINTS-1", counted == 3, || format!("3 repeated joints were counted as {counted}"));
+        session.check("JOINTS-1", counted == 3, || format!("3 repeated joints must be counted as repeated, but {counted} were"));
     }
     Ok(())
 }
 
-/// Checks joints whose count is not that of the chain, or is impossible.
+/// Checks that joints are dropped if their count is not that of the chain, or is impossible.
 fn counts(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.press_and_step(&POSITIONS, arm::press(4_096))?;
     let mut before = session.counters()?;
@@ -100,22 +101,22 @@ fn counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let exchange = session.exchange(&frames)?;
         let skin = session.latched()?;
         session.check("JOINTS-2", skin == before_press, || {
-            format!("joints with count {count} latched a stimulus: {}", arm::format_skin(skin))
+            format!("joints with count {count} must not latch a stimulus, but {} is latched", arm::format_skin(format_skin))
         });
         session.check("JOINTS-2", exchange.is_silent(), || {
-            format!("joints with count {count} were answered; the chain has 6")
+            format!("joints with count {count} must not be answered, because the chain has 6, but were")
         });
         let after = session.counters()?;
         let is_so =
             after.refused.meaning == before.refused.meaning.wrapping_add(1) && after.heard == before.heard;
         let id = if (1..=6).contains(&count) { "JOINTS-2" } else { "COUNT-1" };
         session.check(id, is_so, || {
-            format!("joints with count {count} were not counted as meaning alone: {after}; before: {before}")
+            format!("joints with count {count} must be counted only as meaning, but the counters are {after}; before: {before}")
         });
         // The epoch of the dropped joints does not become the last one.
         let step = session.step_at(epoch, &POSITIONS)?;
         session.check("JOINTS-2", step.torque.is_some(), || {
-            format!("after joints {epoch} with a wrong count those with the right one were not answered")
+            format!("joints {epoch} with the right count must be answered after those with a wrong one, but were not")
         });
         before = session.counters()?;
     }
@@ -131,7 +132,7 @@ fn counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.check(id, (repeated, meaning) == (is_repeated.into(), (!is_repeated).into()), || {
             format!(
                 "joints of the last epoch with count {count} were counted {repeated} times as repeated and {meaning} \
-                 times as meaning"
+                 times as meaning; count 5 must be counted once as repeated, and count 0 once as meaning"
             )
         });
         before = after;
@@ -144,20 +145,21 @@ fn counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let is_so = after.refused.meaning == before.refused.meaning.wrapping_add(1)
             && after.refused.length == before.refused.length;
         session.check("JOINTS-2", is_so, || {
-            format!("joints of 7 in 20 bytes must be counted as meaning: {after}; before: {before}")
+            format!("joints of 7 in 20 bytes must be counted as meaning, but the counters are {after}; before: {before}")
         });
     }
     Ok(())
 }
 
-/// Returns frames of joints with any count.
+/// Returns the frames of joints with this count, which need not match the chain.
 fn raw(session: &Session<'_>, epoch: u8, count: u8, length: Length) -> Vec<Frame> {
     let id = session.joints(epoch, &POSITIONS).id();
     let packet = Packet { id, words: Words::new(length, POSITIONS), epoch: Epoch(epoch), count };
     packet.frames(session.format).collect()
 }
 
-/// Checks touches and releases: a torque for each joints message, zeros once, then nothing.
+/// Checks touches and releases: in contact each joints message is answered with a torque, a release with one torque of
+/// zeros, and later joints with nothing.
 fn contacts(session: &mut Session<'_>) -> Result<(), StopReason> {
     for round in 0..4 {
         for sum in [3_000, 3_000, 0, 0, 0, 9_000, 0, 0] {
@@ -192,7 +194,7 @@ pub(super) fn old(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// The results of the bursts of joints.
+/// The results of the bursts of joints so far.
 #[derive(Debug, Default)]
 struct Old {
     /// The number of bursts in which old joints were answered.
@@ -200,7 +202,7 @@ struct Old {
     any: bool,
 }
 
-/// The number of bursts of joints.
+/// The number of bursts of joints; JOINTS-4 fails if old joints are answered in all of them.
 const BURSTS: usize = 4;
 
 fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), StopReason> {
@@ -246,7 +248,7 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
     let is_so = taken <= u16::from(BURST) && usize::from(torques) == answers.len() && joints >= torques;
     session.check("JOINTS-4", is_so, || {
         format!(
-            "of {BURST} joints {joints} were counted as joints and {skipped} as skipped; {} were answered",
+            "the counters must match the {BURST} joints sent and the torques that came, but {joints} were counted as joints, {skipped} as skipped and {torques} as torques, and {} were answered",
             answers.len()
         )
     });
@@ -255,7 +257,7 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
         // Skipped joints still count as the last ones, latch stimuli and leave ACTIVE unchanged.
         let page = session.latched()?;
         session.check("STIM-8", page == Some(arm::press(press)), || {
-            format!("skipped joints did not latch a stimulus: {}", arm::format_skin(page))
+            format!("skipped joints must latch a stimulus, but {} is latched", arm::format_skin(page))
         });
         session.known.epoch = Some(session.known.last_epoch);
         session.known.active = Some(true);
@@ -264,14 +266,14 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
         session.exchange_all(&[joints])?;
         let again = session.counters()?.heard.joints_repeated.wrapping_sub(after.heard.joints_repeated);
         session.check("JOINTS-3", again == 1, || {
-            "joints of the epoch of skipped ones were not counted as repeated".to_owned()
+            "joints with the epoch of skipped ones must be counted as repeated, but were not".to_owned()
         });
     }
     Ok(())
 }
 
-/// Describes joints that were answered although they were too old. A cell that sends the answer to one joints message
-/// after the next one has come, and answers that one too, was late for it.
+/// Returns a description of joints that were answered although they were too old, if there are any. A cell that answers
+/// one joints message after the next one has come is too late for that next one, and must not answer it.
 fn look_at_old(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<String> {
     const MARGIN: Span = Span(100);
     let late = answers.windows(2).find(|pair| match pair {
@@ -280,12 +282,12 @@ fn look_at_old(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<String
     });
     let Some([(before, first), (_, epoch)]) = late else { return None };
     Some(format!(
-        "with a period of 1 us joints {epoch} were answered, which had come before the answer to joints {first} at {} us",
+        "with a period of 1 us, joints {epoch} must be skipped as too old, but were answered; they had come before the answer to joints {first} at {} us",
         before.0
     ))
 }
 
-/// Checks that joints that wait behind others are accepted too: the counters add up to the number sent.
+/// Checks that joints that wait in the cell's receive queue are accepted too: the counters add up to the number sent.
 fn none_is_lost(session: &mut Session<'_>) -> Result<(), StopReason> {
     const WAIT: usize = 3;
     session.commit(&arm::example_parameters(6))?;

@@ -1,4 +1,4 @@
-//! J of arms of many shapes, and torque words bit for bit.
+//! Checks of J for arms of many shapes, and of torque words bit for bit.
 
 use model::central::Central;
 use protocol::fixed::{Q1_14, TorqueFormat};
@@ -10,7 +10,7 @@ use crate::session::Session;
 
 /// The number of joint positions per arm.
 const POSES: usize = 20;
-/// The same for arms that differ only in their number of joints.
+/// The number of joint positions per arm, for arms that differ only in their number of joints.
 const FEW: usize = 4;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
@@ -58,7 +58,7 @@ fn arms(dice: &mut TestRandom, abilities: Abilities) -> Vec<Parameters> {
     arms
 }
 
-/// Returns a UR5 with half turns, whose word is the lowest one: in two twists, and in two joints.
+/// Returns two UR5s with angles of half a turn, which is the lowest word: in two twists, and in two joint offsets.
 fn half_turns() -> [Parameters; 2] {
     let half = |places: [usize; 2], turn: fn(&mut Row)| {
         let mut parameters = arm::example_parameters(6);
@@ -122,7 +122,7 @@ fn look_at_j(
     session.check("J-3", off <= most, || {
         let nearest = exact.map(|x| Q1_14::nearest(x).to_bits());
         format!(
-            "J is {}, {off} steps off {}; {most} are allowed",
+            "J is {}, which is {off} steps off the expected {}, but at most {most} are allowed",
             arm::format_words(j.get(..joints).unwrap_or_default()),
             arm::format_words(nearest.get(..joints).unwrap_or_default())
         )
@@ -142,7 +142,7 @@ pub(super) fn look_at_words(
     let joints = usize::from(parameters.joints);
     session.check(id, expected == *words, || {
         format!(
-            "the torque of {force} steps of 2^-16 N is {}, not {}; J is {}",
+            "the torque of a force of {force} steps of 2^-16 N is {}, but must be {}, because J is {}",
             arm::format_words(words.get(..joints).unwrap_or_default()),
             arm::format_words(expected.get(..joints).unwrap_or_default()),
             arm::format_words(j.get(..joints).unwrap_or_default())
@@ -150,7 +150,8 @@ pub(super) fn look_at_words(
     });
 }
 
-/// Checks levers of 3.8 m: one of a link, and one of a prismatic joint that slides beyond the range of a word.
+/// Checks that J saturates with levers of 3.8 m: one of a link, and one of a prismatic joint that slides beyond the
+/// range of a word.
 fn out_of_reach(session: &mut Session<'_>) -> Result<(), StopReason> {
     let far = Q1_14::from_bits(31_000);
     let mut long = Parameters { joint: 1, joints: 1, ..arm::example_parameters(1) };
@@ -173,8 +174,8 @@ fn out_of_reach(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// Checks that J of the first joint saturates at its lowest word with this normal, and at its highest word with the
-/// opposite one.
+/// Checks that J of the first joint saturates: at its lowest word with this normal of the cell, and at its highest word
+/// with the opposite normal.
 fn held(
     session: &mut Session<'_>,
     arm: &Parameters,
@@ -193,7 +194,7 @@ fn held(
         session.check("J-2", is_held, || {
             let word = if sign > 0 { "8000" } else { "7FFF" };
             format!(
-                "a lever of {:.1} m: J is {first:04X}, and must saturate at {word}",
+                "with a lever of {:.1} m, J must saturate at {word}, but is {first:04X}",
                 -3.78 * f64::from(sign)
             )
         });

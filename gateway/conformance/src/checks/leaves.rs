@@ -1,4 +1,4 @@
-//! The state that a commit, a resume and a write of the mode leave unchanged.
+//! Checks that a commit, a resume and a write of the mode leave the rest of the cell's state unchanged.
 
 use protocol::id::Node;
 use protocol::message::{AppliesFrom, Message, SensorPage};
@@ -35,15 +35,15 @@ fn touched(session: &mut Session<'_>) -> Result<u8, StopReason> {
     Ok(later)
 }
 
-/// Checks that the latched and the pending stimulus are still there.
+/// Checks that the latched stimulus and the one pending for epoch `later` still exist.
 fn is_touched(session: &mut Session<'_>, later: u8, id: &'static str, what: &str) -> Result<(), StopReason> {
     let is_there = session.step(&POSITIONS)?.torque.is_some();
-    session.check(id, is_there, || format!("{what} forgot the stimulus that was latched"));
+    session.check(id, is_there, || format!("{what} must keep the latched stimulus, but no torque came after it"));
     session.known.skin = Some(arm::press(LATER));
     session.step_at(later, &POSITIONS)?;
     let skin = session.latched()?;
     session.check(id, skin == Some(arm::press(LATER)), || {
-        format!("{what} forgot a stimulus that was pending: {} is latched", arm::format_skin(skin))
+        format!("{what} must keep a pending stimulus, but at its epoch {} is latched", arm::format_skin(format_skin))
     });
     Ok(())
 }
@@ -65,12 +65,12 @@ fn commit(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.exchange_all(&[])?;
     let after = session.counters()?;
     session
-        .check("CONF-7", before == after, || format!("a commit changed counters: {after}; before: {before}"));
+        .check("CONF-7", before == after, || format!("a commit must not change the counters, but they are {after}; before: {before}"));
     if session.about.sensing {
         for (number, expected) in [(thresholds, events), (sensing, padded_words([1, i16::MAX]))] {
             let reply = session.read(number)?;
             session.check("CONF-7", reply == Reply::Value(expected), || {
-                format!("a commit changed parameter {number} to {reply}")
+                format!("a commit must not change parameter {number}, but it is read as {reply}")
             });
         }
         session.write_first_words(sensing, [0])?;
@@ -82,7 +82,7 @@ fn commit(session: &mut Session<'_>) -> Result<(), StopReason> {
     let joints = session.joints(session.known.last_epoch, &POSITIONS);
     let again = session.exchange_all(&[joints])?;
     session.check("CONF-7", again.is_silent(), || {
-        "after a commit the last joints are answered again".to_owned()
+        "joints repeated after a commit must not be answered, but were".to_owned()
     });
     is_touched(session, later, "CONF-7", "a commit")?;
     // A halted cell stays halted.
@@ -109,7 +109,7 @@ fn resume(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// Checks that a write of parameter 5 forgets stimuli and changes nothing else, also when it is sent to everyone.
+/// Checks that a write of parameter 5 clears stimuli and changes nothing else, also if it is sent to everyone.
 fn mode(session: &mut Session<'_>) -> Result<(), StopReason> {
     for to in [Node::Cell(session.cell), Node::Everyone] {
         touched(session)?;
@@ -119,7 +119,7 @@ fn mode(session: &mut Session<'_>) -> Result<(), StopReason> {
             session.set_test_mode(to, on != 0)?;
             let is_on = session.exchange_all(&[])?.state().has(protocol::message::State::TEST_MODE);
             session.check("CONF-11", is_on == (on != 0), || {
-                format!("a write of parameter 5 with {on} to {to} had no effect")
+                format!("a write of {on} to parameter 5, sent to {to}, must switch TEST_MODE, but did not")
             });
         }
         let joints = session.joints(session.known.last_epoch, &POSITIONS);
@@ -128,7 +128,7 @@ fn mode(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.known.halted = Some(false);
         let step = session.step(&POSITIONS)?;
         session.check("STIM-2", step.torque.is_none(), || {
-            format!("a write of parameter 5 to {to} forgot no stimulus")
+            format!("a write of parameter 5, sent to {to}, must clear stimuli, but a torque came after it")
         });
     }
     Ok(())

@@ -1,4 +1,5 @@
-//! A cell that measures: the bench does not know its sensor values, but its answers must agree with ACTIVE.
+//! Checks of a cell outside test mode: the bench does not know the cell's sensor values, but the cell's answers must
+//! agree with its ACTIVE bit.
 
 use protocol::message::State;
 use protocol::parameters::MAX_JOINTS;
@@ -7,7 +8,7 @@ use crate::arm;
 use crate::bus::StopReason;
 use crate::session::Session;
 
-/// The number of joints messages.
+/// The number of joints messages that are sent.
 const JOINTS: i16 = 12;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
@@ -28,18 +29,18 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         };
         let is_active = beat.state.has(State::ACTIVE);
         let wrong = match (step.torque, is_active, before) {
-            (None, true, _) => Some("ACTIVE is set, and no torque came"),
-            (None, false, Some(true)) => Some("ACTIVE went, and no torque of zeros came"),
+            (None, true, _) => Some("ACTIVE is set, but no torque came"),
+            (None, false, Some(true)) => Some("ACTIVE was cleared, but no torque of zeros came"),
             (Some(_), false, Some(false)) => {
-                Some("a torque came, and ACTIVE was set neither before nor after it")
+                Some("a torque came, but ACTIVE was set neither before nor after it")
             }
             (Some(torque), false, _) if !torque.is_zero() => {
-                Some("a torque that is not of zeros came, and ACTIVE is not set")
+                Some("a torque that is not of zeros came, but ACTIVE is not set")
             }
             (Some(_), ..) | (None, false, Some(false) | None) => None,
         };
         session.check("JOINTS-6", wrong.is_none(), || {
-            format!("a cell that measures: {}", wrong.unwrap_or_default())
+            format!("answers to joints must agree with ACTIVE outside test mode: {}", wrong.unwrap_or_default())
         });
         before = Some(is_active);
     }

@@ -30,25 +30,25 @@ use crate::bus::StopReason;
 use crate::findings::RequirementFilter;
 use crate::session::Session;
 
-/// The precondition of a group of checks.
+/// The ability of the cell or of the bus that a group of checks needs.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Precondition {
     Nothing,
     /// Test mode, and a configuration that can be committed.
     Press,
-    /// The restart command.
+    /// The option --restart, so that the cell can be switched off and on.
     Restart,
-    /// Sensor values without a request.
+    /// A cell that sends sensor values without a request.
     Sensing,
-    /// A baseline, which the cell subtracts.
+    /// A cell that subtracts a baseline from its force readings.
     Baseline,
-    /// Classic frames.
+    /// A bus with classic frames.
     Classic,
 }
 
-/// A group of checks.
+/// A group of checks that are run, and repeated, together.
 struct Group {
-    /// The requirements that the group covers.
+    /// The ids of the requirements that the group covers.
     about: &'static [&'static str],
     needs: Precondition,
     run: fn(&mut Session<'_>) -> Result<(), StopReason>,
@@ -108,7 +108,7 @@ const GROUPS: &[Group] = &[
     ),
 ];
 
-/// The time that the groups after a repeated one need.
+/// The time to leave for the other groups when a group is repeated.
 const RESERVE: Span = Span::from_millis(20_000);
 
 /// The parts of requirements that cannot be tested from the bus of any cell, with the reason.
@@ -225,7 +225,7 @@ fn check_needs(session: &Session<'_>, needs: Precondition) -> Result<(), (bool, 
     }
 }
 
-/// Marks the requirements that need wires.
+/// Marks the requirements that need wires as not tested, or as not applicable to a cell without ports.
 fn mark_tree_requirements(session: &mut Session<'_>) {
     use crate::requirements::{Document, REQUIREMENTS};
     let ids = REQUIREMENTS.iter().filter(|it| it.document == Document::Tree && it.id != "LINK-1");

@@ -42,7 +42,7 @@ fn expect(
 ) -> Result<(), StopReason> {
     let reply = session.write(number, written)?;
     session.check(id, reply == expected, || {
-        format!("parameter {number} was written with {}: {reply}, not {expected}", Reply::Value(written))
+        format!("a write of {} to parameter {number} must be answered with {expected}, but the answer was {reply}", Reply::Value(written))
     });
     Ok(())
 }
@@ -58,12 +58,12 @@ fn refuse(
     expect(session, id, number, written, Reply::Refused(19))?;
     let after = session.read(number)?;
     session.check("CONF-5", before == after, || {
-        format!("a refused write of parameter {number} changed it from {before} to {after}")
+        format!("a refused write must not change parameter {number}, but changed it from {before} to {after}")
     });
     Ok(())
 }
 
-/// Checks that test mode is on after 1 and off after every other value, at once.
+/// Checks that a write of 1 to parameter 5 switches test mode on at once, and that every other value switches it off.
 fn mode(session: &mut Session<'_>) -> Result<(), StopReason> {
     if !session.about.test_mode {
         expect(session, "OPT-1", 5, [0; WORDS], Reply::Value([0; WORDS]))?;
@@ -78,11 +78,11 @@ fn mode(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.known.skin = on.then(Default::default);
         let reply = session.read(5)?;
         session.check("CONF-9", reply == Reply::Value(padded_words([on.into()])), || {
-            format!("mode is read as {reply}")
+            format!("only 1 must switch test mode on, but after a write of {written} parameter 5 is read as {reply}")
         });
         let state = session.exchange_all(&[])?.state();
         session.check("CONF-9", state.has(State::TEST_MODE) == on, || {
-            format!("parameter 5 was written with {written}, and the state is {:04X}", state.0)
+            format!("only 1 must set TEST_MODE, but after a write of {written} to parameter 5 the state is {:04X}", state.0)
         });
     }
     Ok(())
@@ -103,7 +103,7 @@ fn reply_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
     }
     expect(session, "CONF-3", REPLY, [0, 5, 6, 7, 8, 9], Reply::Value([0; WORDS]))?;
     let reply = session.read(REPLY)?;
-    session.check("CONF-9", reply == Reply::Value([0; WORDS]), || format!("parameter 6 is read as {reply}"));
+    session.check("CONF-9", reply == Reply::Value([0; WORDS]), || format!("parameter 6 must be read as 0 after a write of 0, but is read as {reply}"));
     Ok(())
 }
 
@@ -113,7 +113,7 @@ fn sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
             expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
             let reply = session.read(number)?;
             session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
-                format!("parameter {number} of an option that it does not have is read as {reply}")
+                format!("parameter {number} of an option that the cell lacks must be read as 0, but is read as {reply}")
             });
             refuse(session, "OPT-1", number, padded_words([1, 50]))?;
         }
@@ -141,12 +141,12 @@ fn sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
         let [a, b, c, d, e, _] = good;
         expect(session, "SENSE-3", EVENTS, [a, b, c, d, e, 77], Reply::Value(good))?;
         let reply = session.read(EVENTS)?;
-        session.check("CONF-9", reply == Reply::Value(good), || format!("parameter 8 is read as {reply}"));
+        session.check("CONF-9", reply == Reply::Value(good), || format!("parameter 8 must be read as it was written, but is read as {reply}"));
     }
     Ok(())
 }
 
-/// Checks that a cell without a baseline accepts only zeros in its parameters.
+/// Checks that a cell without a baseline accepts only zeros in parameters 11 and 12.
 fn no_baseline(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.read(BASELINE)?;
     if session.about.baseline || reply == Reply::Refused(18) {
@@ -179,7 +179,7 @@ fn links(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// Checks rows that the cell cannot have.
+/// Checks the first row that the cell cannot have: it reads as 0, and accepts only 0.
 fn rows(session: &mut Session<'_>) -> Result<(), StopReason> {
     let most = session.about.abilities.rows();
     let Some(number) = u8::try_from(most).ok().filter(|most| *most < 32).map(|most| 16 + most) else {
@@ -187,13 +187,13 @@ fn rows(session: &mut Session<'_>) -> Result<(), StopReason> {
     };
     let reply = session.read(number)?;
     session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
-        format!("row {} of a cell that can have {most} is read as {reply}", most + 1)
+        format!("row {} of a cell that can have {most} rows must be read as 0, but is read as {reply}", most + 1)
     });
     expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
     refuse(session, "OPT-1", number, padded_words([1, 2, 3, 4]))
 }
 
-/// Checks that unused words, bytes and bits are ignored.
+/// Checks that the cell ignores words, bytes and bits that a packet does not use.
 pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.ready(&arm::example_parameters(2))?;
     let junk = |command| Packet {
@@ -207,24 +207,24 @@ pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.known.halted = Some(true);
     let halted = session.exchange(&frames(session, junk(Command::Halt)))?;
     session.check("OPT-2", halted.state().has(State::HALTED), || {
-        "a halt with words, epoch and count that mean nothing had no effect".to_owned()
+        "unused words, epoch and count of a halt must be ignored, but the halt had no effect".to_owned()
     });
     session.known.halted = Some(false);
     let resumed = session.exchange(&frames(session, junk(Command::Resume)))?;
     session.check("OPT-2", !resumed.state().has(State::HALTED), || {
-        "a resume with words, epoch and count that mean nothing had no effect".to_owned()
+        "unused words, epoch and count of a resume must be ignored, but the resume had no effect".to_owned()
     });
     session.begin_exchange();
     let asked = session.send(&frames(session, junk(Command::Report)))?;
     let pages = session.pages(asked)?;
     session
-        .check("OPT-2", !pages.is_empty(), || "a report with words that mean nothing was ignored".to_owned());
+        .check("OPT-2", !pages.is_empty(), || "unused words of a report must be ignored, but it was not answered".to_owned());
     let frames_of_sync = frames(session, junk(Command::Sync));
     session.begin_exchange();
     let at = session.send(&frames_of_sync)?;
     let is_there =
         session.wait(at + crate::session::ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
-    session.check("OPT-2", is_there, || "a sync with words that mean nothing was ignored".to_owned());
+    session.check("OPT-2", is_there, || "unused words of a sync must be ignored, but it was not answered".to_owned());
     read_with_words(session)?;
     if session.format == Format::Fd {
         // A frame without the bit-rate switch.
@@ -235,7 +235,7 @@ pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
         let at = session.send(&frames)?;
         let is_there =
             session.wait(at + crate::session::ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
-        session.check("OPT-2", is_there, || "a frame without bit-rate switch was ignored".to_owned());
+        session.check("OPT-2", is_there, || "a sync in a frame without bit-rate switch must be answered, but was not".to_owned());
     }
     if session.about.test_mode && session.about.committed {
         words_beyond(session)?;
@@ -253,11 +253,12 @@ fn read_with_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     let answer = protocol::message::Answer::Value { number: 2, written: false, words: expected };
     let answer = Message::Configured { from: session.cell, tag: 3, answer };
     let is_so = exchange.answers.iter().any(|heard| heard.message == answer);
-    session.check("OPT-2", is_so, || "a read with words that mean nothing was answered otherwise".to_owned());
+    session.check("OPT-2", is_so, || "unused words of a read must be ignored, but the answer was not the value of parameter 2".to_owned());
     Ok(())
 }
 
-/// Checks joints of a shorter chain with further words, and a stimulus with words that its page does not have.
+/// Checks that further words do not change the torque: after the joints of a shorter chain, and in a stimulus whose
+/// page has fewer words.
 fn words_beyond(session: &mut Session<'_>) -> Result<(), StopReason> {
     let short = protocol::parameters::Parameters { joints: 3, ..arm::example_parameters(2) };
     if !session.ready(&short)? {
@@ -276,7 +277,7 @@ fn words_beyond(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.check("OPT-2", got == Some(expected), || {
         let got = got.map_or_else(|| "nothing".to_owned(), |got| arm::format_words(&got));
         format!(
-            "words behind the joints of the chain changed the torque from {} to {got}",
+            "words after the joints of the chain must be ignored, but changed the torque from {} to {got}",
             arm::format_words(&expected)
         )
     });
@@ -288,7 +289,7 @@ fn words_beyond(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.send(&frames)?;
     let after = session.step(&positions)?.words();
     session.check("OPT-2", after == expected, || {
-        "a stimulus of the acceleration with words that it does not use changed the torque".to_owned()
+        "unused words of a stimulus of the acceleration must be ignored, but changed the torque".to_owned()
     });
     session.press_and_step(&[0; MAX_JOINTS], arm::press(0))?;
     Ok(())

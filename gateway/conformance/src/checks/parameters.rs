@@ -10,7 +10,7 @@ use crate::arm;
 use crate::bus::StopReason;
 use crate::session::{Reply, Session};
 
-/// Returns a configuration that differs in each parameter.
+/// Returns a configuration that differs from `arm::document` in each parameter.
 fn other() -> Parameters {
     let mut other = Parameters { joint: 6, period_us: 50_000, ..arm::example_parameters(6) };
     other.contact.alpha_c = Q3_12::from_bits(5_000);
@@ -37,7 +37,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.stage(&Parameters { joints: 3, joint: 3, ..other })?;
         let step = session.press_and_step(&[0x0222; MAX_JOINTS], arm::press(4_096))?;
         session.check("JOINTS-2", step.torque.is_some(), || {
-            "joints of the chain in use were not answered while a shorter one was staged".to_owned()
+            "joints of the chain in use must be answered while a shorter chain is staged, but were not".to_owned()
         });
         session.press_and_step(&[0x0222; MAX_JOINTS], arm::press(0))?;
         session.stage(&other)?;
@@ -46,7 +46,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         let hash = other.hash() ^ wrong;
         let reply = session.write_first_words(Parameter::Commit.number(), [hash.cast_signed()])?;
         session.check("CONF-7", reply == Reply::Refused(16), || {
-            format!("commit with hash {hash:04X} of {:04X} staged was answered with {reply}", other.hash())
+            format!("a commit with hash {hash:04X} while {:04X} is staged must be refused with reason 16, but the answer was {reply}", other.hash())
         });
     }
     reads(session, &one, "CONF-5")?;
@@ -56,7 +56,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.exchange_all(&[])?;
     computes(session, &other, &one, "CONF-7")?;
     let reply = session.read(Parameter::Commit.number())?;
-    session.check("CONF-1", reply == Reply::Value([0; WORDS]), || format!("commit was read as {reply}"));
+    session.check("CONF-1", reply == Reply::Value([0; WORDS]), || format!("the commit parameter must be read as 0, but is read as {reply}"));
     unused(session)?;
     tags(session)
 }
@@ -67,13 +67,13 @@ fn reads(session: &mut Session<'_>, expected: &Parameters, id: &'static str) -> 
         let reply = session.read(parameter.number())?;
         let words = expected.words(parameter);
         session.check(id, reply == Reply::Value(words), || {
-            format!("parameter {} is read as {reply}, not {}", parameter.number(), Reply::Value(words))
+            format!("parameter {} is read as {reply}, but must be read as {}", parameter.number(), Reply::Value(words))
         });
     }
     Ok(())
 }
 
-/// Checks that the torque follows from one set of parameters, and not from the other.
+/// Checks that the torque follows from the parameters `expected`, and not from `not`.
 fn computes(
     session: &mut Session<'_>,
     expected: &Parameters,
@@ -97,13 +97,13 @@ fn computes(
     };
     debug_assert!(!near(expected) || !near(not), "they are apart");
     session.check(id, near(expected), || {
-        format!("the torque {} does not follow from the parameters in use", arm::format_words(&step.words()))
+        format!("the torque must follow from the parameters in use, but is {}", arm::format_words(&step.words()))
     });
     session.press_and_step(&positions, arm::press(0))?;
     Ok(())
 }
 
-/// Checks words that a parameter does not use.
+/// Checks that words which a parameter does not use become 0, in the answer to a write and in the hash.
 fn unused(session: &mut Session<'_>) -> Result<(), StopReason> {
     let expected = Parameters { period_us: 57_001, ..arm::example_parameters(3) };
     session.stage(&expected)?;
@@ -120,7 +120,7 @@ fn unused(session: &mut Session<'_>) -> Result<(), StopReason> {
         let reply = session.write(parameter.number(), dirty)?;
         session.check("CONF-3", reply == Reply::Value(clean), || {
             format!(
-                "parameter {} was written with unused words, and answered with {reply}",
+                "parameter {} was written with unused words, which must become 0, but the answer was {reply}",
                 parameter.number()
             )
         });
@@ -129,7 +129,7 @@ fn unused(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.write(Parameter::Commit.number(), [hash.cast_signed(), 1, 2, 3, 4, 5])?;
     let is_so = reply == Reply::Value(padded_words([hash.cast_signed()]));
     session.check("CONF-3", is_so, || {
-        format!("unused words must be hashed as 0: commit {hash:04X} was answered with {reply}")
+        format!("unused words must be hashed as 0, but a commit with that hash ({hash:04X}) was answered with {reply}")
     });
     if is_so {
         session.known.parameters = Some(expected);
@@ -168,7 +168,7 @@ fn tags(session: &mut Session<'_>) -> Result<(), StopReason> {
         let replies = [session.request_with(own, 0x2A, request)?, session.request_with(own, 0x2A, request)?];
         let [first, second] = replies;
         session.check(id, first == second, || {
-            format!("the same request again was answered with {second}, and with {first} before")
+            format!("the same request must get the same answer, but was answered with {second}, and with {first} before")
         });
     }
     session.known.staged = staged.map(|staged| Parameters { pose: arm::example_parameters(3).pose, ..staged });
@@ -177,25 +177,25 @@ fn tags(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// Checks requests to everyone and to other cells, and parameters that do not exist.
+/// Checks the answers to requests to everyone and to other cells, and to requests for parameters that do not exist.
 pub(super) fn others(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.ready(&arm::example_parameters(2))?;
     let reply = session.request(Node::Everyone, Request::Read { number: 2 })?;
     let expected = arm::example_parameters(2).words(Parameter::Pose);
     session.check("CONF-11", reply == Reply::Value(expected), || {
-        format!("a read of everyone was answered with {reply}")
+        format!("a read sent to everyone must return the value in use, but the answer was {reply}")
     });
     let number = Parameter::Pose.number();
     let pose = other().words(Parameter::Pose);
     let reply = session.request(Node::Everyone, Request::Write { number, words: pose })?;
     session.check("CONF-11", reply == Reply::Value(pose), || {
-        format!("a write to everyone was answered with {reply}")
+        format!("a write sent to everyone must be answered with its words, but the answer was {reply}")
     });
     let on = [i16::from(session.about.test_mode), 0, 0, 0, 0, 0];
     let mode = Request::Write { number: Parameter::Mode.number(), words: on };
     let reply = session.request(Node::Everyone, mode)?;
     session.check("CONF-11", reply == Reply::Value(on), || {
-        format!("test mode of everyone was answered with {reply}")
+        format!("a write of the mode sent to everyone must be answered with its words, but the answer was {reply}")
     });
     let staged = Parameters { pose: other().pose, ..arm::example_parameters(2) };
     session.known.staged = Some(staged);
@@ -204,7 +204,7 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), StopReason> {
     let commit = Request::Write { number: Parameter::Commit.number(), words: hash };
     let reply = session.request(Node::Everyone, commit)?;
     session.check("CONF-11", reply == Reply::Value(hash), || {
-        format!("a commit of everyone was answered with {reply}")
+        format!("a commit sent to everyone must be answered with the hash, but the answer was {reply}")
     });
     session.known.active = None;
     let done = reply == Reply::Value(hash);
@@ -221,14 +221,14 @@ fn unknown(session: &mut Session<'_>) -> Result<(), StopReason> {
         // Reads and writes alternate.
         let reply = if number % 2 == 0 { session.read(number)? } else { session.write_first_words(number, [1, 2, 3])? };
         session.check("CONF-13", reply == Reply::Refused(18), || {
-            format!("parameter {number} does not exist, and was answered with {reply}")
+            format!("parameter {number} does not exist and must be refused with reason 18, but the answer was {reply}")
         });
     }
     for number in [10, 15, 48, 126] {
         let replies = [session.read(number)?, session.write_first_words(number, [0])?];
         session.check("CONF-13", replies == [Reply::Refused(18); 2], || {
             let [read, write] = replies;
-            format!("parameter {number} does not exist, and was answered with {read} and {write}")
+            format!("parameter {number} does not exist and must be refused with reason 18, but the answers were {read} and {write}")
         });
     }
     Ok(())
@@ -246,12 +246,12 @@ fn not_its_own(session: &mut Session<'_>) -> Result<(), StopReason> {
         let press = protocol::message::SensorPage::Skin(arm::press(4_096));
         let press = Message::Stimulus { to, from: protocol::message::AppliesFrom::Next, page: press };
         let exchange = session.exchange_all(&[read, press])?;
-        session.check("ID-2", exchange.is_silent(), || format!("a request to cell {cell} was answered"));
+        session.check("ID-2", exchange.is_silent(), || format!("a request to cell {cell} must not be answered by this cell, but was"));
         session.step(&[0; MAX_JOINTS])?;
     }
     let after = session.counters()?;
     session.check("COUNT-1", before.refused == after.refused, || {
-        format!("packets for other cells were counted: {after}; before: {before}")
+        format!("packets for other cells must not be counted, but the counters are {after}; before: {before}")
     });
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! Refused writes and commits: the reason, and that nothing changes.
+//! Checks of refused writes and commits: the cell gives the right reason, and changes nothing.
 
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 
@@ -21,7 +21,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.write_first_words(Parameter::Commit.number(), [hash])?;
     let is_so = reply.words().is_some_and(|words| words.first() == Some(&hash));
     session.check("CONF-5", is_so, || {
-        format!("after refused writes the staged copy has another hash: commit {hash:04X} was answered with {reply}")
+        format!("refused writes must not change the staged copy, but a commit with its hash {hash:04X} was answered with {reply}")
     });
     if is_so {
         session.known.parameters = Some(staged);
@@ -35,17 +35,17 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.stage(&staged)?;
     let reply = session.read(Parameter::Timing.number())?;
     session.check("CONF-5", reply == Reply::Value(staged.words(Parameter::Timing)), || {
-        format!("after refused commits the period in use is {reply}")
+        format!("refused commits must not change the period in use, but it is read as {reply}")
     });
     session.exchange_all(&[])?;
     let after = session.counters()?;
     session.check("COUNT-2", before.refused == after.refused, || {
-        format!("refusals were counted: {after}; before: {before}")
+        format!("refusals must not be counted, but the counters are {after}; before: {before}")
     });
     Ok(())
 }
 
-/// Checks writes that are refused at once. Of several bad words, the lowest reason is reported.
+/// Checks writes that are refused at once. If several words are bad, the refusal gives the lowest of their reasons.
 fn writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), StopReason> {
     let mount = |words: [i16; 5], reason| (Parameter::Mount, words, reason);
     let row = |kind: i16| (Parameter::Row(1), [1, 2, 3, 4, kind], 9);
@@ -80,7 +80,7 @@ fn writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), StopReason
         let reply = session.write_first_words(parameter.number(), words)?;
         session.check("CONF-6", reply == Reply::Refused(reason), || {
             format!(
-                "parameter {} with {} must be refused with {reason}: {reply}",
+                "parameter {} with {} must be refused with reason {reason}, but the answer was {reply}",
                 parameter.number(),
                 arm::format_words(&words)
             )
@@ -124,7 +124,7 @@ const MORE: &[Flaw] = &[
     (16, |it| it.joint = 6),
 ];
 
-/// Defects of tables of rows.
+/// Defects of a configuration's table of rows.
 const ROWS: &[Flaw] = &[
     (7, |it| (it.table_rows, it.row) = (5, 2)),
     (7, |it| it.table_rows = 255),
@@ -167,7 +167,7 @@ fn commits(session: &mut Session<'_>) -> Result<(), StopReason> {
     refused(session, &all, 2)
 }
 
-/// Checks 33 rows with any joints.
+/// Checks that a table of 33 rows, one more than possible, is refused with reason 7, whatever the number of joints.
 fn one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), StopReason> {
     let mut full = Parameters { table_rows: 32, row: 6, joint: 6, ..*base };
     for (place, row) in full.rows.iter_mut().enumerate().skip(6) {
@@ -180,7 +180,7 @@ fn one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), Stop
         session.write(Parameter::Mount.number(), over.words(Parameter::Mount))?;
         let reply = session.write_first_words(Parameter::Commit.number(), [1])?;
         session.check("CONF-6", reply == Reply::Refused(7), || {
-            format!("a commit of 33 rows with {joints} joints must be refused with 7: {reply}")
+            format!("a commit of 33 rows with {joints} joints must be refused with reason 7, but the answer was {reply}")
         });
     }
     session.known.staged = None;
@@ -194,8 +194,8 @@ fn refused(session: &mut Session<'_>, parameters: &Parameters, reason: i16) -> R
     session.check("CONF-6", reply == Reply::Refused(reason), || {
         let words = |parameter| Reply::Value(parameters.words(parameter));
         format!(
-            "a commit with a wrong hash must be refused with {reason}: {reply}; staged are mount {}, pose {}, \
-             contact {}, timing {}",
+            "a commit with a wrong hash must be refused with reason {reason}, but the answer was {reply}; staged are \
+             mount {}, pose {}, contact {}, timing {}",
             words(Parameter::Mount),
             words(Parameter::Pose),
             words(Parameter::Contact),

@@ -1,4 +1,4 @@
-//! Requirements that show only at a start: the address claim, and the state that survives.
+//! Checks of requirements that need a restart of the cell: the address claim, and the values that survive.
 
 mod claiming;
 #[cfg(test)]
@@ -58,13 +58,14 @@ fn claim(session: &Session<'_>) -> Span {
 fn restart(session: &mut Session<'_>) -> Result<Micros, StopReason> {
     let came = restart_with(session, BOOT, |_| Ok(()))?;
     came.ok_or_else(|| {
-        let what = "no heartbeat with CLAIMING within 8 s after a restart";
+        let what = "a heartbeat with CLAIMING must come within 8 s after a restart, but none came";
         session.check("CLAIM-1", false, || what.to_owned());
         StopReason::Restart(what.to_owned())
     })
 }
 
-/// The same with a time limit; `meanwhile` is called repeatedly until that packet.
+/// Switches the cell off and on, and returns the time of its first packet, or `None` if none comes within a time limit.
+/// Calls `meanwhile` repeatedly until then.
 fn restart_with(
     session: &mut Session<'_>,
     longest: Span,
@@ -88,7 +89,7 @@ fn restart_with(
     };
     let stray = session.answers().iter().take_while(|it| it.at < came).any(|it| !is_old(it));
     session.check("CLAIM-1", !stray, || {
-        "its first packet after a restart is not a heartbeat with CLAIMING".to_owned()
+        "the first packet after a restart must be a heartbeat with CLAIMING, but another one came before it".to_owned()
     });
     session.known.parameters = parameters;
     session.known.staged = None;
@@ -140,14 +141,15 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
     session.consume();
     let expected = claim(session);
     session.check("CLAIM-5", at.is_some(), || {
-        format!("no heartbeat without CLAIMING {} ms after the first one", expected.0 / 1_000)
+        format!("a heartbeat without CLAIMING is due {} ms after the first one, but none came", expected.0 / 1_000)
     });
     session.known.may_be_silent = false;
     session.extend_life();
     Ok(at)
 }
 
-/// Checks a plain restart: the values that are kept, lost and counted.
+/// Checks the values that a restart keeps, discards and sets to 0. Returns true if test mode is on in the first
+/// heartbeat.
 fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     let kept = arm::distinct_parameters(session.about.abilities);
     session.ready(&kept)?;
@@ -171,14 +173,14 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     let is_new = (first.0.sent, first.0.rejected, first.1.0) == (0, 0, 0);
     session.check("CLAIM-1", is_new, || {
         format!(
-            "the first heartbeat after a restart has sent {}, refused {} and epoch {}",
+            "the first heartbeat after a restart must have 0 as sent, refused and epoch, but has {}, {} and {}",
             first.0.sent, first.0.rejected, first.1
         )
     });
     session
-        .check("STATE-3", !first.0.state.has(State::HALTED), || "HALTED is set after a restart".to_owned());
+        .check("STATE-3", !first.0.state.has(State::HALTED), || "HALTED must be clear after a restart, but is set".to_owned());
     session
-        .check("STATE-1", !first.0.state.has(State::ACTIVE), || "ACTIVE is set after a restart".to_owned());
+        .check("STATE-1", !first.0.state.has(State::ACTIVE), || "ACTIVE must be clear after a restart, but is set".to_owned());
     let others = session.answers().iter().filter(|it| it.at >= claimed).count();
     let at = settled(session, claimed)?;
     if let Some(at) = at {
@@ -186,33 +188,33 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
         let late = session.lateness().0;
         let range = expected - expected / 100 - 2_000..=expected + expected / 100 + 22_000 + late;
         session.check("CLAIM-5", range.contains(&took), || {
-            format!("claiming ended after {:.1} ms, not {:.1}", took as f64 / 1e3, expected as f64 / 1e3)
+            format!("claiming ended after {:.1} ms, but must end after {:.1} ms", took as f64 / 1e3, expected as f64 / 1e3)
         });
     }
-    session.check("CLAIM-1", others >= 1, || "no heartbeat".to_owned());
+    session.check("CLAIM-1", others >= 1, || "a heartbeat must come after a restart, but none came".to_owned());
     let same = first.0.configuration == kept.hash() && first.0.state.has(State::CONFIGURED);
     session.check("CONF-8", same, || {
         format!(
-            "after a restart the configuration is {:04X}, and {:04X} was committed",
+            "after a restart the configuration is {:04X}, but {:04X} was committed and must be in use",
             first.0.configuration,
             kept.hash()
         )
     });
-    session.check("ID-3", at.is_some(), || "it does not send under its node id after a restart".to_owned());
+    session.check("ID-3", at.is_some(), || "after a restart the cell must send under its node id, but did not".to_owned());
     session.known.hash = Some(kept.hash());
     (session.known.halted, session.known.epoch) = (Some(false), Some(0));
     session.exchange_all(&[])?;
     for parameter in Parameter::stored(kept.table().len()) {
         let reply = session.read(parameter.number())?;
         session.check("CONF-8", reply == Reply::Value(kept.words(parameter)), || {
-            format!("after a restart parameter {} is {reply}", parameter.number())
+            format!("after a restart parameter {} must be read as it was committed, but is read as {reply}", parameter.number())
         });
     }
     // Values that were only staged are gone.
     let hash = staged.hash().cast_signed();
     let reply = session.write_first_words(Parameter::Commit.number(), [hash])?;
     session.check("CONF-2", reply == Reply::Refused(16), || {
-        format!("after a restart a commit of what was only staged was answered with {reply}")
+        format!("a restart must discard staged values and their commit be refused with reason 16, but it was answered with {reply}")
     });
     volatile(session)?;
     (session.known.parameters, session.known.staged) = (Some(kept), Some(kept));
@@ -221,30 +223,30 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     session.known.active = None;
     let done = session.commit(&next)?;
     session.test_mode(session.about.test_mode)?;
-    session.check("CONF-2", done, || "after a restart the staged copy is not what is in use".to_owned());
+    session.check("CONF-2", done, || "after a restart the staged copy must equal the values in use, but a commit on top of it failed".to_owned());
     let after = if session.known.test_mode == Some(true) { touched(session)? } else { None };
     session.check("CONF-8", after.is_none() || before.is_none() || before == after, || {
         let words = |words: Option<Words>| words.map_or_else(String::new, |it| arm::format_words(it.as_slice()));
         format!(
-            "the same press gave a torque of {} before a restart, and {} after it",
+            "the same press must give the same torque, but gave {} before a restart, and {} after it",
             words(before),
             words(after)
         )
     });
     let counters = session.counters()?;
     session.check("BEAT-4", counters.refused == protocol::message::RejectedCounts::default(), || {
-        format!("counters do not begin with 0 after a restart: {counters}")
+        format!("counters must begin with 0 after a restart, but are {counters}")
     });
     Ok(first.0.state.has(State::TEST_MODE))
 }
 
-/// Checks that volatile parameters have their initial values.
+/// Checks that volatile parameters have their initial values after a restart.
 fn volatile(session: &mut Session<'_>) -> Result<(), StopReason> {
     let events = if session.about.sensing { Events::default().words() } else { [0; WORDS] };
     for (number, expected) in [(6, [0; WORDS]), (7, [0; WORDS]), (8, events), (9, [0; WORDS])] {
         let reply = session.read(number)?;
         session.check("CONF-9", reply == Reply::Value(expected), || {
-            format!("after a restart parameter {number} is {reply}, not {}", Reply::Value(expected))
+            format!("after a restart parameter {number} is {reply}, but must be {}", Reply::Value(expected))
         });
     }
     // A simulated cell may be started with test mode on.
@@ -253,7 +255,7 @@ fn volatile(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// Returns the torque of a press at some joints.
+/// Presses the cell at fixed joint positions, and returns its torque, if the cell has test mode.
 fn touched(session: &mut Session<'_>) -> Result<Option<Words>, StopReason> {
     if !session.about.test_mode {
         return Ok(None);
@@ -264,8 +266,8 @@ fn touched(session: &mut Session<'_>) -> Result<Option<Words>, StopReason> {
     Ok(session.press_and_step(&positions, arm::press(9_000))?.torque)
 }
 
-/// Checks a reset just after a commit was requested: flash has the old or the new configuration, or the cell reports
-/// that it is damaged.
+/// Checks a reset just after a commit was requested: the cell uses the old or the new configuration, or reports that
+/// its flash is damaged.
 fn in_the_middle(session: &mut Session<'_>) -> Result<(), StopReason> {
     let claimed = restart(session)?;
     settled(session, claimed)?;
@@ -290,7 +292,7 @@ fn in_the_middle(session: &mut Session<'_>) -> Result<(), StopReason> {
     let is_noticed = !beat.state.has(State::CONFIGURED) && beat.state.has(State::FLASH_DAMAGED);
     session.check("CONF-8", is_whole || is_noticed, || {
         format!(
-            "after a reset during a commit the configuration is {:04X}, the state {:04X}",
+            "after a reset during a commit the old or the new configuration must be in use, or FLASH_DAMAGED be set, but the configuration is {:04X}, and the state {:04X}",
             beat.configuration, beat.state.0
         )
     });

@@ -1,4 +1,4 @@
-//! Reassembly on a classic bus: the table of the protocol, row by row.
+//! Checks of reassembly on a classic bus, row by row of the protocol's table.
 
 use protocol::can::{Format, Frame, FrameError};
 use protocol::id::Node;
@@ -10,7 +10,7 @@ use crate::arm;
 use crate::bus::StopReason;
 use crate::session::Session;
 
-/// Both segments of a packet.
+/// The two segments of a packet.
 type Two = [Frame; 2];
 
 /// A step of a series: a segment, or a pause in ms.
@@ -26,7 +26,7 @@ use Act::{Send, Wait};
 struct Series {
     what: &'static str,
     acts: Vec<Act>,
-    /// The number of answers.
+    /// The expected number of answers.
     packets: usize,
     incomplete: u16,
 }
@@ -56,7 +56,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// Checks three segments. The first is too old for the last one, though each comes in time after the one before.
+/// Checks joints of three segments: each comes in time after the one before, but the first is too old for the last.
 fn three(session: &mut Session<'_>) -> Result<(), StopReason> {
     let mut dice = arm::TestRandom::new(7);
     let parameters = arm::random_parameters(&mut dice, arm::ChainShape { joints: 8, rows: 8, prismatic: false });
@@ -75,7 +75,7 @@ fn three(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.consume();
     let came = session.answers().iter().any(|it| it.torque().is_some());
     session.check("COUNT-3", !came, || {
-        "joints of three segments, 9 ms after each other, were answered; the first is too old for the last".to_owned()
+        "joints of three segments 9 ms apart must not be answered, because the first is too old for the last, but were".to_owned()
     });
     session.step(&[0x0111; MAX_JOINTS])?;
     session.forget_counters();
@@ -183,7 +183,7 @@ fn one(session: &mut Session<'_>, series: &Series) -> Result<(), StopReason> {
             after.length == before.length && after.meaning == before.meaning && after.crc == before.crc;
         session.check("COUNT-3", (answers, counted) == expected && others, || {
             format!(
-                "{}: {answers} packets were answered and {counted} counted as incomplete, not {} and {}",
+                "{}: {answers} packets were answered and {counted} counted as incomplete, but must be {} and {}",
                 series.what, series.packets, series.incomplete
             )
         });
@@ -242,7 +242,7 @@ fn between(
         exchange.answers.len() == 1 && is_counted && after.refused.incomplete == before.refused.incomplete;
     session.check("COUNT-3", is_so, || {
         format!(
-            "{what} between two segments of a read: {} answers; {after}; before: {before}",
+            "{what} between two segments must not disturb the read: one answer must come, and {} came; the counters are {after}; before: {before}",
             exchange.answers.len()
         )
     });
@@ -281,7 +281,7 @@ fn joints(session: &mut Session<'_>) -> Result<(), StopReason> {
             let is_so = came == arrives && counted == u16::from(!arrives) && step.torque.is_some();
             session.check("COUNT-3", is_so, || {
                 format!(
-                    "segments of joints {} us apart were {}answered, and {counted} counted as incomplete",
+                    "segments of joints must wait 15 ms for each other, but those {} us apart were {}answered, and {counted} counted as incomplete",
                     apart.0,
                     if came { "" } else { "not " }
                 )

@@ -1,4 +1,5 @@
-//! Sensor values without a request: switches, event mode, continuous mode.
+//! Checks of sensor values that a cell sends without a request: in event mode, in continuous mode, and at switches
+//! between modes.
 
 use protocol::fixed::{Q, Q1_14, Q3_12};
 use protocol::id::Node;
@@ -38,7 +39,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// Returns thresholds for which every change is an event, and a release happens at the threshold itself.
+/// Returns thresholds for which every change except that of proximity is an event, without hysteresis.
 fn fine() -> Events {
     let [contact, proximity, temperature, acceleration, hysteresis] = [0, 700, 0, 0, 0];
     Events {
@@ -50,7 +51,7 @@ fn fine() -> Events {
     }
 }
 
-/// Returns the page numbers since the exchange began.
+/// Returns the numbers of the sensors pages among these packets.
 fn pages(heard: &[CellPacket]) -> Vec<u8> {
     let number = |page: &SensorPage| u8::from(matches!(page, SensorPage::Acceleration(_)));
     heard.iter().filter_map(|it| Some(number(it.sensors()?.1))).collect()
@@ -71,7 +72,7 @@ fn switched(session: &mut Session<'_>, mode: [i16; 2], expected: &[u8], what: &s
     session.idle(Span::from_millis(8))?;
     let pages = pages(session.answers());
     session.check("SENSE-4", pages == expected, || {
-        format!("{what}: sensors pages {} came after it, not {}", list(&pages), list(expected))
+        format!("after {what} sensors pages {} came, but must be {}", list(&pages), list(expected))
     });
     session.consume();
     Ok(())
@@ -89,7 +90,7 @@ fn switches(session: &mut Session<'_>) -> Result<(), StopReason> {
     switched(session, [2, 0], &[0, 1], "a switch to event mode")
 }
 
-/// Checks that the torque of a touch is sent before the page.
+/// Checks that the torque of a touch is sent before its sensors page.
 fn order(session: &mut Session<'_>) -> Result<(), StopReason> {
     for sum in [4_096, 0] {
         session.wait_for_quiet(Span::from_millis(60))?;
@@ -98,7 +99,7 @@ fn order(session: &mut Session<'_>) -> Result<(), StopReason> {
         let kinds: Vec<_> = step.exchange.answers.iter().map(|it| it.message.id().kind.name()).collect();
         session.check("TIME-3", kinds == ["torque", "sensors"], || {
             let kinds = kinds.join(", ");
-            format!("a touch or its end in event mode: {kinds} came, not a torque and then a page")
+            format!("a touch or its end in event mode must give a torque and then a sensors page, but {kinds} came")
         });
     }
     Ok(())
@@ -156,7 +157,7 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
                 let moved =
                     acceleration.map_or_else(String::new, |it| arm::format_page(SensorPage::Acceleration(it)));
                 format!(
-                    "{} {moved} is latched, at step {}, {turned}: pages {} came, not {}",
+                    "{} {moved} is latched at step {} (before: {turned}): pages {} came, but must be {}",
                     arm::format_skin(Some(skin)),
                     step + 1,
                     list(&numbers),
@@ -170,7 +171,7 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
         let is_latched = pages.all(|(_, page)| model.has(page));
         session.check("SENSE-7", is_latched, || {
             let sent: Vec<_> = sent.iter().map(|page| arm::format_page(*page)).collect();
-            format!("{} was sent, but is not latched", sent.join("; "))
+            format!("sensors pages must have the latched values, but {} was sent and is not latched", sent.join("; "))
         });
         if step % 40 == 39 {
             // The pages of a report count as sent, too.
@@ -184,7 +185,7 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
     Ok(())
 }
 
-/// The number of values that random ones may miss.
+/// The number of crafted values, for cases that random values may miss.
 const CRAFTED: usize = 6;
 
 /// Returns a touch whose sum exceeds a word, and one that fades. Each ends so softly that only the end of the contact
@@ -262,12 +263,12 @@ fn after_beats(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.check("SENSE-10", is_so, || {
         let all: Vec<_> = beats.iter().map(|pages| list(pages)).collect();
         let count = beats.len();
-        format!("pages after each of {count} heartbeats in event mode: {}; expected are page 0, and page 1 after each fourth", all.join(", "))
+        format!("in event mode page 0 must follow each heartbeat, and page 1 each fourth one, but after {count} heartbeats came {}", all.join(", "))
     });
     // Other heartbeats are not followed by pages.
     session.wait_for_quiet(Span::from_millis(60))?;
     let sync = session.exchange_all(&[])?;
-    session.check("SENSE-10", sync.is_silent(), || "a page came with the heartbeat to a sync".to_owned());
+    session.check("SENSE-10", sync.is_silent(), || "no page must follow the heartbeat to a sync, but one came".to_owned());
     Ok(())
 }
 
@@ -282,7 +283,7 @@ fn halted(session: &mut Session<'_>) -> Result<(), StopReason> {
         let pages = pages(&step.exchange.answers);
         session.check("SENSE-11", pages == [0], || {
             let pages = list(&pages);
-            format!("halted, in event mode: pages {pages} came at a touch or its end, not 0")
+            format!("a halted cell in event mode must send page 0 at a touch or its end, but sent {pages}")
         });
     }
     session.send_messages(&[Message::Resume])?;
@@ -303,8 +304,8 @@ fn continuous(session: &mut Session<'_>) -> Result<(), StopReason> {
     Ok(())
 }
 
-/// Checks the times of page 0: `t + P + P n / 255 + i P`. With joints and a longer P, a page may be earlier by up to
-/// the joints' period.
+/// Checks that page 0 comes at the times `t + P + P n / 255 + i P`, with the switch at t, the period P, the node id n
+/// and i = 0, 1, ... If joints come and P is longer than their period, a page may be earlier by up to that period.
 fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(), StopReason> {
     const JOINTS: u64 = 16_000;
     const LATE: u64 = 20_000;
@@ -348,8 +349,8 @@ fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(),
             session.check(id, is_so, || {
                 let times = format_ms(times.iter().copied());
                 format!(
-                    "every {period} ms{}: page 0 came {times} ms after the switch; {} ms and then every {period} ms \
-                     are right",
+                    "every {period} ms{}: page 0 came {times} ms after the switch, but must come after {} ms and then \
+                     every {period} ms",
                     if with_joints { ", joints every 16 ms" } else { "" },
                     first / 1_000
                 )

@@ -1,10 +1,10 @@
-//! A model of event mode by the document: SENSE-7, SENSE-8 and SENSE-9.
+//! A model of event mode (SENSE-7, SENSE-8 and SENSE-9), which predicts the sensors pages that a cell must send.
 
 use protocol::fixed::{Q, Q3_12};
 use protocol::message::{SensorPage, SkinSensors};
 use protocol::parameters::Events;
 
-/// The state of contact or proximity.
+/// The state of contact or of proximity in event mode.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 enum Touch {
     #[default]
@@ -14,7 +14,8 @@ enum Touch {
 }
 
 impl Touch {
-    /// Returns the next state, by the table of SENSE-9.
+    /// Returns the state after a value `v`, by the table of SENSE-9. The hysteresis is in steps of 2^-14 of the
+    /// threshold.
     const fn next(self, v: i64, threshold: i64, hysteresis: i64) -> Self {
         // A threshold of 0 counts as one step.
         let threshold = if threshold < 1 { 1 } else { threshold };
@@ -34,7 +35,7 @@ impl Touch {
     }
 }
 
-/// The latched values, the last sent values, and the states.
+/// The state of a cell in event mode: its latched values, the last values that it sent, and its contact and proximity.
 #[derive(Clone, Debug)]
 pub(super) struct Model {
     events: Events,
@@ -45,7 +46,7 @@ pub(super) struct Model {
 }
 
 impl Model {
-    /// Creates the state at a switch to event mode with nothing latched.
+    /// Creates the state at a switch to event mode, if all latched values are 0.
     pub(super) fn new(events: Events) -> Self {
         let nothing = (SkinSensors::default(), [Q3_12::ZERO; 3]);
         let mut model =
@@ -62,7 +63,7 @@ impl Model {
         self.sent.1
     }
 
-    /// Describes the states before a latch, for a message.
+    /// Returns a description of the states of contact and proximity, for a message.
     pub(super) fn turned(&self) -> String {
         let name = |touch| match touch {
             Touch::Free => "free",
@@ -72,7 +73,7 @@ impl Model {
         format!("contact {}, proximity {}", name(self.contact), name(self.proximity))
     }
 
-    /// Notes that a page was sent.
+    /// Takes the values of a page that the cell sent as its last sent ones.
     pub(super) const fn sends(&mut self, page: &SensorPage) {
         match *page {
             SensorPage::Skin(skin) => self.sent.0 = skin,
@@ -91,7 +92,7 @@ impl Model {
         }
     }
 
-    /// Returns true if the state of contact or proximity has changed.
+    /// Updates the states of contact and proximity from the latched values, and returns true if one has changed.
     fn follow(&mut self) -> bool {
         let before = (self.contact, self.proximity);
         let hysteresis = i64::from(self.events.hysteresis.to_bits());
@@ -103,7 +104,7 @@ impl Model {
         before != (self.contact, self.proximity)
     }
 
-    /// Latches values, and returns the pages that must follow, with the requirement behind them.
+    /// Latches values, and returns the pages that must follow and the requirement that demands them.
     pub(super) fn latch(
         &mut self,
         skin: SkinSensors,
@@ -138,7 +139,8 @@ impl Model {
     }
 }
 
-/// Returns true if a value has moved by the threshold or more; 0 counts as one step.
+/// Returns true if a value differs from the last sent one by the threshold or more; a threshold of 0 counts as one
+/// step.
 fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
     let threshold = i32::from(threshold.to_bits()).max(1);
     now.iter()

@@ -1,4 +1,4 @@
-//! Stimuli: the joints that latch them, the number that can be pending, and the events that clear them.
+//! Checks of stimuli: the joints that latch them, the number that can be pending, and the events that clear them.
 
 use protocol::id::Node;
 use protocol::message::{AppliesFrom, Message, SensorPage};
@@ -34,18 +34,18 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     count += order(session, &cell)?;
     let after = session.counters()?;
     let counted = after.heard.stimuli.wrapping_sub(before.heard.stimuli);
-    session.check("STIM-3", counted == count, || format!("{count} stimuli were counted as {counted}"));
+    session.check("STIM-3", counted == count, || format!("{count} stimuli were sent, but {counted} were counted"));
     let counted = after.heard.stimuli_late.wrapping_sub(before.heard.stimuli_late);
-    session.check("STIM-5", counted == late, || format!("{late} late stimuli were counted as {counted}"));
+    session.check("STIM-5", counted == late, || format!("{late} stimuli were sent too late, but {counted} were counted as late"));
     let is_same = after.refused == before.refused;
-    session.check("STIM-6", is_same, || format!("stimuli that had room were refused: {after}"));
+    session.check("STIM-6", is_same, || format!("stimuli must not be refused while fewer than 8 are pending, but the counters are {after}"));
     pending(session, &cell)?;
     forgotten(session, &cell)?;
     measuring(session)?;
     halted(session, &cell)
 }
 
-/// Sends joints of an epoch, and checks that this force is latched.
+/// Sends joints of an epoch, and checks by the torque that a press with this sum of contact words is latched.
 fn latched(
     session: &mut Session<'_>,
     cell: &Pressed,
@@ -61,7 +61,7 @@ fn latched(
     let is_there = step.torque.is_some_and(|words| !words.is_zero());
     session.check(id, is_there == (sum > 0), || {
         format!(
-            "at joints {epoch} {} N are latched, and the torque is {}",
+            "at joints {epoch} {} N must be latched, but the torque is {}",
             f64::from(sum) / 1024.0,
             arm::format_words(&step.words())
         )
@@ -101,7 +101,7 @@ fn next(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
     Ok(count)
 }
 
-/// Checks first epochs that are near, far, or past the wrap-around.
+/// Checks stimuli whose first epoch is near, far, or past the wrap-around, and returns the number of stimuli sent.
 fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, StopReason> {
     let mut held = 4_000;
     let mut count = 1;
@@ -208,7 +208,7 @@ fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), StopReason> 
         after.refused.stimuli.wrapping_sub(before.refused.stimuli),
     );
     session.check("STIM-6", counted == (8, 2), || {
-        format!("of 10 stimuli {} were accepted and {} refused; 8 can be pending", counted.0, counted.1)
+        format!("of 10 stimuli 8 must be accepted and 2 refused, but {} were accepted and {} refused", counted.0, counted.1)
     });
     for ahead in [1, 2, 3, 5, 6, 7, 8, 9, 10, 11] {
         let expected = if ahead < 8 { 1_000 * i32::from(ahead) } else { 7_000 };
@@ -248,14 +248,14 @@ fn measuring(session: &mut Session<'_>) -> Result<(), StopReason> {
     let after = session.counters()?;
     let counted = after.refused.stimuli.wrapping_sub(before.refused.stimuli);
     session.check("STIM-1", counted == 2 && after.heard.stimuli == before.heard.stimuli, || {
-        format!("outside test mode 2 stimuli were counted as {counted} refused: {after}")
+        format!("outside test mode 2 stimuli must be counted as refused, but {counted} were: {after}")
     });
     session.test_mode(true)?;
     session.known.active = None;
     session.step(&POSITIONS)?;
     let step = session.step(&POSITIONS)?;
     session.check("STIM-1", step.torque.is_none(), || {
-        "a stimulus sent outside test mode was latched".to_owned()
+        "a stimulus sent outside test mode must not be latched, but a torque came".to_owned()
     });
     Ok(())
 }
@@ -272,7 +272,7 @@ fn halted(session: &mut Session<'_>, cell: &Pressed) -> Result<(), StopReason> {
     session.step_at(epoch.wrapping_add(1), &POSITIONS)?;
     let skin = session.latched()?;
     session.check("STIM-8", skin == Some(arm::press(2_222)), || {
-        format!("a halted cell did not latch a stimulus: {}", arm::format_skin(skin))
+        format!("a halted cell must latch a stimulus, but {} is latched", arm::format_skin(format_skin))
     });
     session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);

@@ -1,4 +1,4 @@
-//! A cell without a configuration, as it leaves the factory. A configured cell cannot return to this state.
+//! Checks of a cell without a configuration, as it leaves the factory. A configured cell cannot return to this state.
 
 use protocol::message::Message;
 use protocol::packet::{Epoch, Length, Packet, WORDS, Words};
@@ -24,7 +24,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         let latched = session.latched()?;
         session.check("JOINTS-3", latched == Some(skin), || {
             format!(
-                "a cell without a configuration latched {}, not {}",
+                "a cell without a configuration latched {}, but must latch {}",
                 arm::format_skin(latched),
                 arm::format_skin(Some(skin))
             )
@@ -44,7 +44,7 @@ fn staged(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.read(number)?;
     session.check("CONF-1", reply == Reply::Value(pose), || {
         format!(
-            "without a configuration parameter {number} was written with {}, and is read as {reply}",
+            "without a configuration parameter {number} must be read as the staged {}, but is read as {reply}",
             Reply::Value(pose)
         )
     });
@@ -52,7 +52,7 @@ fn staged(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.write_first_words(Parameter::Commit.number(), [0])?;
     let is_refused = matches!(reply, Reply::Refused(_));
     session.check("CONF-7", is_refused, || {
-        format!("a commit without a configuration was answered with {reply}")
+        format!("a commit with hash 0 must be refused without a configuration, but the answer was {reply}")
     });
     Ok(())
 }
@@ -68,20 +68,20 @@ fn joints(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.known.epoch = Some(epoch);
         let exchange = session.exchange_all(&[joints])?;
         session.check("JOINTS-5", exchange.is_silent(), || {
-            format!("joints of a chain of {count} were answered by a cell without a configuration")
+            format!("a cell without a configuration must not answer joints, but answered those of a chain of {count}")
         });
         session.exchange_all(&[joints])?;
     }
     let after = session.counters()?;
     let skipped = after.heard.joints_late.wrapping_sub(before.heard.joints_late);
-    session.check("JOINTS-4", skipped == 0, || format!("a cell without a period skipped {skipped} joints"));
+    session.check("JOINTS-4", skipped == 0, || format!("a cell without a configuration must not skip joints, but skipped {skipped}"));
     let counted = after.heard.joints.wrapping_sub(before.heard.joints);
     session.check("JOINTS-2", counted == u16::from(most), || {
-        format!("of joints of {most} chains a cell without a configuration took {counted}")
+        format!("a cell without a configuration must count joints of {most} chain lengths, but counted {counted}")
     });
     let repeated = after.heard.joints_repeated.wrapping_sub(before.heard.joints_repeated);
     session.check("JOINTS-3", repeated == u16::from(most), || {
-        format!("{most} joints came twice to a cell without a configuration, and {repeated} were counted as repeated")
+        format!("{most} joints were sent twice to a cell without a configuration, but {repeated} were counted as repeated")
     });
     let wrong = [
         (7, Length::Six),
@@ -103,7 +103,7 @@ fn joints(session: &mut Session<'_>) -> Result<(), StopReason> {
     let expected = can.count();
     session.check("COUNT-1", usize::from(counted) == expected, || {
         format!(
-            "{expected} joints whose count does not match their length were counted {counted} times as meaning"
+            "{expected} joints whose count does not match their length must be counted as meaning, but {counted} were"
         )
     });
     session.exchange_all(&[Message::Resume])?;

@@ -10,19 +10,19 @@ use std::time::Duration;
 use bench::bus::listen::now;
 use protocol::time::Span;
 
-/// The sleep time.
+/// The time that the thread sleeps before each measurement.
 const SLEEP: Duration = Duration::from_millis(1);
 
 #[derive(Debug, Default)]
 struct Shared {
-    /// The time at which it should be woken, in us.
+    /// The time at which the thread should be woken, in us.
     due: AtomicU64,
     /// The maximum lateness, in us.
     late: AtomicU64,
     over: AtomicBool,
 }
 
-/// The thread; it ends when this value is dropped.
+/// A handle of the thread, which ends when this handle is dropped.
 #[derive(Debug)]
 pub(super) struct Probe(Arc<Shared>);
 
@@ -44,7 +44,7 @@ impl Probe {
         Ok(Self(shared))
     }
 
-    /// Returns the maximum lateness since the last call, including the present one.
+    /// Returns the maximum lateness since the last call, including the lateness of a present wait.
     pub(super) fn lateness(&self) -> Span {
         let waits = now().0.saturating_sub(self.0.due.load(Ordering::Relaxed));
         Span(self.0.late.swap(0, Ordering::Relaxed).max(waits))

@@ -1,4 +1,4 @@
-//! The accounts of the bus: counts of packets, which the cell's own counters and its heartbeats must match.
+//! The bench's own counts of packets on the bus, which the cell's counters and the number of its heartbeats must match.
 
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id};
@@ -10,30 +10,30 @@ use crate::bus::ObservedFrame;
 
 /// The interval of regular heartbeats.
 pub(crate) const HEARTBEAT_INTERVAL: Span = Span::from_millis(250);
-/// A claim within this time after an answered one may be answered or not.
+/// The time after an answered claim within which the cell may answer the next one or not.
 const DEFENCE_MARGIN: Span = Span::from_millis(40);
 
-/// The packets that a cell counts, modulo 2^16.
+/// The numbers of packets that a cell counts too, modulo 2^16.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) struct PacketCounts {
-    /// Joints that it must accept.
+    /// Joints that the cell must accept.
     taken: u16,
-    /// Joints with the epoch of the last ones.
+    /// Joints that repeat the epoch of the last ones.
     repeated: u16,
     stimuli: u16,
-    /// Torques that it sent.
+    /// Torques that the cell sent.
     torques: u16,
 }
 
-/// The heartbeats up to some time.
+/// The numbers of heartbeats up to some time.
 #[derive(Clone, Copy, Debug, Default)]
 struct Beats {
     came: u64,
-    /// The heartbeats that were requested: minimum and maximum.
+    /// The minimum and maximum number of heartbeats that syncs and claims requested.
     asked: (u64, u64),
 }
 
-/// The accounts of one life of the cell.
+/// The counts of packets from one start of the cell to the next.
 #[derive(Debug, Default)]
 pub(super) struct Accounts {
     /// Segments of the test's own packets.
@@ -41,15 +41,15 @@ pub(super) struct Accounts {
     /// The epoch of the last accepted joints.
     last: Option<Epoch>,
     counts: PacketCounts,
-    /// The last counters of the cell, with the accounts at that time.
+    /// The last counters that the cell reported, with the bench's counts at that time.
     compared: Option<(HeardPage, RejectedCounts, PacketCounts)>,
     beats: Beats,
     defended: Option<Micros>,
-    /// The time of a regular heartbeat, and the heartbeats until then.
+    /// The time of the last regular heartbeat, and the numbers of heartbeats until then.
     anchor: Option<(Micros, Beats)>,
-    /// The minimum and the maximum number of surplus heartbeats, over all such intervals.
+    /// The minimum and maximum number of surplus heartbeats, over all intervals between regular heartbeats.
     surplus: (i64, i64),
-    /// The number of missing heartbeats since then that are not awaited any more.
+    /// The number of missing heartbeats, since the last regular one, that are not awaited any more.
     given_up: u64,
 }
 
@@ -57,7 +57,8 @@ pub(super) struct Accounts {
 pub(super) type Discrepancy = (&'static str, String);
 
 impl Accounts {
-    /// Accounts for a frame of the test; `joints` is the number of joints of the chain, if the cell has one.
+    /// Counts the packet that a frame of the bench completes; `joints` is the number of joints of the chain, if the
+    /// cell has a configuration.
     pub(super) fn count_own_frame(&mut self, seen: &ObservedFrame, cell: CellId, format: Format, joints: Option<u8>) {
         let Some(message) = self.message(seen, format) else { return };
         if let Message::Joints { epoch, joints: came } = message {
@@ -83,7 +84,7 @@ impl Accounts {
         }
     }
 
-    /// Returns the message that a frame of the test completes, as the cell decodes it.
+    /// Returns the message that a frame of the bench completes, as the cell decodes it.
     fn message(&mut self, seen: &ObservedFrame, format: Format) -> Option<Message> {
         let ObservedFrame { at, frame, .. } = seen;
         let id = data_id(frame).ok().filter(|_| frame.format() == format)?;
@@ -106,7 +107,7 @@ impl Accounts {
         }
     }
 
-    /// Accounts for a packet of the cell.
+    /// Counts a packet that the cell sent.
     pub(super) fn count_cell_packet(&mut self, message: &Message) {
         if matches!(message, Message::Network { page: NetworkPage::Heartbeat(_), .. }) {
             self.beats.came += 1;
@@ -115,17 +116,17 @@ impl Accounts {
         }
     }
 
-    /// Returns the accounts after a restart of the cell, with all its counts at 0.
+    /// Returns the counts after a restart of the cell: all are 0, and the bench's waiting segments are kept.
     pub(super) fn restarted(self) -> Self {
         Self { segments: self.segments, ..Self::default() }
     }
 
-    /// Restarts the comparison: the cell may have lost packets.
+    /// Skips the next comparison, because the cell may have lost packets.
     pub(super) const fn forget_counters(&mut self) {
         self.compared = None;
     }
 
-    /// Compares the cell's counters with the accounts, and returns the discrepancies since the last comparison.
+    /// Compares the cell's counters with the bench's counts, and returns the discrepancies since the last comparison.
     pub(super) fn compare(&mut self, heard: HeardPage, refused: RejectedCounts) -> Vec<Discrepancy> {
         let now = self.counts;
         let Some((heard_before, refused_before, before)) = self.compared.replace((heard, refused, now))
@@ -165,13 +166,13 @@ impl Accounts {
         ];
         let differs = |(id, name, what, counted, now, before): (_, _, _, u16, u16, u16)| {
             let expected = now.wrapping_sub(before);
-            let text = || format!("{name} went up by {counted} with {expected} {what}");
+            let text = || format!("{name} must go up by {expected}, the number of {what}, but went up by {counted}");
             (counted != expected).then(|| (id, text()))
         };
         all.into_iter().filter_map(differs).collect()
     }
 
-    /// Returns true if fewer heartbeats came than were requested or regularly due.
+    /// Returns true if fewer heartbeats came than were requested or regularly due, apart from those given up.
     pub(super) fn is_one_missing(&self, now: Micros) -> bool {
         self.missing(now) > self.given_up
     }
@@ -188,8 +189,8 @@ impl Accounts {
         self.given_up = self.missing(now);
     }
 
-    /// Notes a regular heartbeat. Returns the number of heartbeats since the last one, and the minimum and the maximum
-    /// that were due.
+    /// Notes a regular heartbeat. Returns the number of heartbeats since the last regular one, and the minimum and
+    /// maximum number that were due.
     pub(super) fn regular(&mut self, at: Micros) -> Option<(u64, u64, u64)> {
         self.given_up = 0;
         let (before_at, before) = self.anchor.replace((at, self.beats))?;

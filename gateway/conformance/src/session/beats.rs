@@ -1,4 +1,4 @@
-//! Regular heartbeats: their number must match exactly.
+//! Checks of the number of regular heartbeats, which must match exactly.
 
 use protocol::time::Span;
 
@@ -6,7 +6,7 @@ use super::Session;
 use super::accounts::HEARTBEAT_INTERVAL;
 use crate::bus::StopReason;
 
-/// No request is sent within this time of a regular heartbeat.
+/// The time before and after a regular heartbeat in which no request is sent.
 const QUIET_MARGIN: Span = Span::from_millis(25);
 
 impl Session<'_> {
@@ -18,12 +18,12 @@ impl Session<'_> {
         let until = self.now() + HEARTBEAT_INTERVAL + QUIET_MARGIN + QUIET_MARGIN;
         let came = self.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
         let at = self.answers().iter().find(|it| it.beat().is_some()).map(|it| it.at);
-        self.check("BEAT-1", came, || "no heartbeat came for 300 ms".to_owned());
+        self.check("BEAT-1", came, || "a heartbeat is due every 250 ms, but none came for 300 ms".to_owned());
         self.life.regular = at;
         if let Some((came, min, max)) = at.and_then(|at| self.life.accounts.regular(at)) {
             self.check("BEAT-1", (min..=max).contains(&came), || {
                 let due = if min == max { min.to_string() } else { format!("{min} to {max}") };
-                format!("{came} heartbeats came; {due} were due, every 250 ms and to each sync and claim")
+                format!("{came} heartbeats came, but {due} were due: one every 250 ms, and one to each sync and claim")
             });
         }
         self.idle(QUIET_MARGIN)?;
@@ -31,8 +31,8 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Checks the total number of heartbeats in the test: a late cell omits none, unless it was late for a whole 250
-    /// ms.
+    /// Checks the total number of heartbeats in the test, unless the bench was late by 250 ms: a shorter delay makes
+    /// the cell omit no heartbeat.
     pub(crate) fn check_all_beats(&mut self) {
         let surplus = self.life.accounts.surplus();
         if self.clock.longest < HEARTBEAT_INTERVAL {
@@ -44,7 +44,7 @@ impl Session<'_> {
         }
     }
 
-    /// Waits until no regular heartbeat is due within a time, which must be less than 200 ms.
+    /// Waits until no regular heartbeat is due during the next `span`, which must be less than 200 ms.
     pub(crate) fn wait_for_quiet(&mut self, span: Span) -> Result<(), StopReason> {
         let now = self.now();
         let is_free = self.life.regular.is_some_and(|at| {

@@ -8,14 +8,14 @@ use protocol::time::{Micros, Span};
 use super::{CellPacket, SYNC_GRACE, ANSWER_TIMEOUT, Session};
 use crate::bus::StopReason;
 
-/// The result of an exchange.
+/// The packets and heartbeats that a cell sent during an exchange.
 #[derive(Clone, Debug)]
 pub(crate) struct Exchange {
     /// The time at which the bench's first packet was completely on the bus.
     pub(crate) at: Micros,
     /// The cell's packets, without heartbeats.
     pub(crate) answers: Vec<CellPacket>,
-    /// The number of heartbeats.
+    /// The number of heartbeats that came.
     pub(crate) beats: usize,
     /// The heartbeat that answers the sync, and its epoch byte.
     pub(crate) beat: Option<(Heartbeat, Epoch)>,
@@ -52,7 +52,7 @@ impl Session<'_> {
         let sync = self.send_messages(&[Message::Sync])?;
         let is_answer = |heard: &CellPacket| heard.beat().is_some() && heard.at >= sync;
         let answered = self.wait_for_answer(sync)?;
-        self.check("CMD-3", answered, || "no heartbeat after a sync".to_owned());
+        self.check("CMD-3", answered, || "a sync must be answered with a heartbeat, but none came".to_owned());
         let beats = |it: &Self| it.answers().iter().filter(|heard| heard.beat().is_some()).count();
         if self.answers().len() == beats(self) || self.known.senses {
             // A regular heartbeat may have come between, and a faulty cell may answer later.
@@ -69,7 +69,7 @@ impl Session<'_> {
                 self.idle(Span::from_millis(20))?;
             }
             let is_after = after(self);
-            self.check("CMD-3", is_after, || "the heartbeat to a sync came before the torque".to_owned());
+            self.check("CMD-3", is_after, || "the heartbeat to a sync must follow the torque, but came before it".to_owned());
         }
         let beat =
             self.answers().iter().rev().find_map(|heard| heard.beat().map(|(beat, epoch)| (*beat, epoch)));
@@ -81,7 +81,8 @@ impl Session<'_> {
         Ok(exchange)
     }
 
-    /// Returns true if a heartbeat comes after a sync; waits for another one if a regular one may have come instead.
+    /// Waits for the heartbeat that answers a sync, and returns true if one comes. Waits for another one if the first
+    /// may be a regular one.
     fn wait_for_answer(&mut self, sync: Micros) -> Result<bool, StopReason> {
         let until = sync + ANSWER_TIMEOUT;
         loop {

@@ -1,4 +1,4 @@
-//! Joints, and the answers that a cell owes to them.
+//! Sends joints and stimuli, and checks the answers of the cell.
 
 use protocol::id::Node;
 use protocol::message::{AppliesFrom, Message, Request, SensorPage, SkinSensors, State};
@@ -9,7 +9,7 @@ use super::{Exchange, CellPacket, Session};
 use crate::arm;
 use crate::bus::StopReason;
 
-/// The result of joints.
+/// The result of one joints message.
 #[derive(Clone, Debug)]
 pub(crate) struct JointsResult {
     pub(crate) exchange: Exchange,
@@ -18,13 +18,13 @@ pub(crate) struct JointsResult {
 }
 
 impl JointsResult {
-    /// Returns the torque's words; zeros if none came.
+    /// Returns the words of the torque, or zeros if no torque came.
     pub(crate) fn words(&self) -> [i16; MAX_JOINTS] {
         self.torque.map_or([0; MAX_JOINTS], |torque| torque.padded())
     }
 }
 
-/// The expected answer.
+/// The expected answer to joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum ExpectedAnswer {
     Torque,
@@ -33,7 +33,7 @@ enum ExpectedAnswer {
 }
 
 impl Session<'_> {
-    /// Returns the epoch after the last one.
+    /// Advances the epoch by one, and returns it.
     pub(crate) fn next_epoch(&mut self) -> u8 {
         self.known.last_epoch = self.known.last_epoch.wrapping_add(1);
         self.known.last_epoch
@@ -68,13 +68,13 @@ impl Session<'_> {
         }
     }
 
-    /// Sends a press for the next joints, and those joints.
+    /// Sends a stimulus for the next joints, then sends those joints, and returns their result.
     pub(crate) fn press_and_step(&mut self, positions: &[i16; MAX_JOINTS], skin: SkinSensors) -> Result<JointsResult, StopReason> {
         self.press(skin)?;
         self.step(positions)
     }
 
-    /// Sends joints of an epoch other than the last one.
+    /// Sends joints of an epoch other than the last one, and checks the answers.
     pub(crate) fn step_at(&mut self, epoch: u8, positions: &[i16; MAX_JOINTS]) -> Result<JointsResult, StopReason> {
         let joints = self.joints(epoch, positions);
         if let Some(skin) = self.known.pending.take() {
@@ -124,11 +124,11 @@ impl Session<'_> {
         let torques: Vec<_> =
             exchange.answers.iter().filter(|heard| heard.torque().is_some()).copied().collect();
         let count = torques.len();
-        self.check("JOINTS-6", count <= 1, || format!("{count} torques to joints {epoch}"));
+        self.check("JOINTS-6", count <= 1, || format!("joints {epoch} must be answered with at most one torque, but {count} came"));
         for other in exchange.answers.iter().filter(|heard| heard.torque().is_none()) {
             if let Some(id) = self.known.unexpected(&other.message) {
                 let kind = other.message.id().kind.name();
-                self.check(id, false, || format!("a {kind} packet came to joints"));
+                self.check(id, false, || format!("joints must not be answered with a {kind} packet, but one came"));
             }
         }
         let first = torques.first().and_then(|heard| Some((heard.at, heard.torque()?.0, *heard.torque()?.1)));
@@ -145,10 +145,10 @@ impl Session<'_> {
             let id = if halted { "CMD-1" } else { "JOINTS-6" };
             self.check(id, first.is_some() == expected, || {
                 let what = match due {
-                    Some(ExpectedAnswer::Torque) => "in contact: a torque was due, and none came",
-                    Some(ExpectedAnswer::Zeros) => "released: one torque of zeros was due, and none came",
-                    _ if halted => "halted: a torque came",
-                    _ => "not in contact: nothing was due, and a torque came",
+                    Some(ExpectedAnswer::Torque) => "in contact: a torque was due, but none came",
+                    Some(ExpectedAnswer::Zeros) => "released: one torque of zeros was due, but none came",
+                    _ if halted => "halted: no torque was due, but one came",
+                    _ => "not in contact: nothing was due, but a torque came",
                 };
                 format!("joints {epoch}, {what}")
             });
@@ -158,9 +158,9 @@ impl Session<'_> {
             if self.known.parameters.is_some_and(|it| it.period_us == arm::fast_parameters(1).period_us) {
                 self.note_time("torque", exchange.at, at);
             }
-            self.check("JOINTS-6", of.0 == epoch, || format!("a torque of epoch {of} to joints {epoch}"));
+            self.check("JOINTS-6", of.0 == epoch, || format!("the torque that answers joints {epoch} must have their epoch, but has {of}"));
             if due == Some(ExpectedAnswer::Zeros) {
-                self.check("JOINTS-6", words.is_zero(), || "released: the torque is not of zeros".to_owned());
+                self.check("JOINTS-6", words.is_zero(), || "after a release the torque must be of zeros, but is not".to_owned());
             }
             self.check_words(&words);
             self.check_saturation(&words);
@@ -182,11 +182,11 @@ impl Session<'_> {
         let Some(parameters) = self.known.parameters else { return };
         let length = Length::for_joints(parameters.joints.into());
         self.check("SEND-1", words.length() == length, || {
-            format!("a torque of {} words, not {}", words.length().words(), length.words())
+            format!("a torque has {} words, but must have {}", words.length().words(), length.words())
         });
         let beyond = words.padded().iter().skip(parameters.joint.into()).all(|word| *word == 0);
         self.check("J-1", beyond, || {
-            format!("a word beyond joint {} is not 0: {}", parameters.joint, arm::format_words(words.as_slice()))
+            format!("torque words beyond joint {} must be 0, but the torque is {}", parameters.joint, arm::format_words(words.as_slice()))
         });
     }
 
@@ -204,15 +204,15 @@ impl Session<'_> {
             let stays = *first && !expected && self.life.saturated;
             self.check(if stays { "STATE-2" } else { "TORQUE-2" }, *first == expected, || {
                 let (set, words) = (if *first { "" } else { "not " }, arm::format_words(words.as_slice()));
-                format!("SATURATED is {set}set after a torque of {words}")
+                format!("SATURATED must be set only after a torque at a limit of its range, but is {set}set after {words}")
             });
             let again = expected && rest.contains(&true);
-            self.check("STATE-2", !again, || "SATURATED is set in two heartbeats".to_owned());
+            self.check("STATE-2", !again, || "SATURATED must be set in one heartbeat only, but is set in two".to_owned());
             self.life.saturated = expected;
         }
     }
 
-    /// Returns the skin page of a report.
+    /// Requests a report, and returns its skin page, which has the latched values.
     pub(crate) fn latched(&mut self) -> Result<Option<SkinSensors>, StopReason> {
         let pages = self.report()?;
         Ok(pages.iter().find_map(|heard| match heard.sensors() {
@@ -226,7 +226,7 @@ impl Session<'_> {
         self.set_test_mode(Node::Cell(self.cell), on)
     }
 
-    /// The same for one cell or for everyone.
+    /// Switches test mode on or off, for this cell or for everyone.
     pub(crate) fn set_test_mode(&mut self, to: Node, on: bool) -> Result<(), StopReason> {
         let (number, words) = (Parameter::Mode.number(), padded_words([on.into()]));
         let reply = self.request(to, Request::Write { number, words })?;
@@ -235,7 +235,8 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Makes the cell compute with parameters, in test mode, not in contact and not halted. Returns true if it does.
+    /// Commits parameters, and puts the cell in test mode, not in contact and not halted. Returns true if the commit
+    /// succeeded.
     pub(crate) fn ready(&mut self, parameters: &protocol::parameters::Parameters) -> Result<bool, StopReason> {
         self.begin_exchange();
         self.send_messages(&[Message::Resume])?;

@@ -1,24 +1,24 @@
-//! The bench's knowledge of the cell, and the state that a heartbeat must therefore report.
+//! The state of the cell as far as the bench knows it, and the check that heartbeats report that state.
 
 use protocol::message::{Message, NetworkPage, SkinSensors, State};
 use protocol::parameters::{Abilities, Parameters};
 
 use super::{Exchange, Session};
 
-/// The abilities of the cell.
+/// The identity and the abilities of the cell.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct CellAbilities {
     pub(crate) serial: Option<u32>,
     pub(crate) abilities: Abilities,
-    /// True if it sends the pages of a cell with ports.
+    /// True if the cell sends the network pages of a cell with ports.
     pub(crate) ports: bool,
-    /// True if it can be in test mode.
+    /// True if the cell has test mode.
     pub(crate) test_mode: bool,
-    /// True if it sends sensor values without a request.
+    /// True if the cell can send sensor values without a request.
     pub(crate) sensing: bool,
-    /// True if it can subtract a zero from its force sensor's readings.
+    /// True if the cell can subtract a zero from its force sensor's readings.
     pub(crate) baseline: bool,
-    /// True if its flash accepts parameters.
+    /// True if the cell accepted a commit.
     pub(crate) committed: bool,
 }
 
@@ -42,11 +42,11 @@ pub(crate) struct TrackedState {
     pub(crate) last_epoch: u8,
     /// The staged parameters.
     pub(crate) staged: Option<Parameters>,
-    /// The latched values.
+    /// The latched sensor values.
     pub(crate) skin: Option<SkinSensors>,
     /// True if the cell subtracts a zero, and so does not compute with the latched values.
     pub(crate) adapts: bool,
-    /// The values that the next joints latch.
+    /// The sensor values that the next joints latch.
     pub(crate) pending: Option<SkinSensors>,
 }
 
@@ -95,24 +95,24 @@ impl Session<'_> {
             if let Some(expected) = expected {
                 let is_set = state.has(bit);
                 self.check(id, is_set == expected, || {
-                    format!("{name} is {}set in state {:04X}", if is_set { "" } else { "not " }, state.0)
+                    format!("{name} is {}set in state {:04X}, but the opposite was expected", if is_set { "" } else { "not " }, state.0)
                 });
             }
         }
         if let Some(parameters) = known.parameters {
             let expected = u16::from(parameters.joint);
             self.check("STATE-3", state.joint() == expected, || {
-                format!("joint {} in state {:04X}, not {expected}", state.joint(), state.0)
+                format!("joint {} is in state {:04X}, but joint {expected} was expected", state.joint(), state.0)
             });
         }
         if let Some(hash) = known.hash {
             self.check("STATE-3", beat.configuration == hash, || {
-                format!("configuration {:04X}, not {hash:04X}", beat.configuration)
+                format!("a heartbeat has configuration {:04X}, but must have {hash:04X}", beat.configuration)
             });
         }
         if let Some(expected) = known.epoch {
             self.check("JOINTS-3", epoch.0 == expected, || {
-                format!("epoch {epoch} in a heartbeat; the last joints taken were {expected}")
+                format!("a heartbeat must have the epoch of the last accepted joints, {expected}, but has {epoch}")
             });
         }
     }

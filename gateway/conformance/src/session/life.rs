@@ -1,7 +1,7 @@
-//! The state of the test that belongs to one life of the cell, from one start to the next.
+//! The part of the test's state that belongs to one life of the cell, that is, from one start to the next.
 //!
-//! A restart replaces it as a whole. Between the command of a restart and the first heartbeat with CLAIMING, a frame
-//! does not show to which life it belongs. Frames are therefore held until that heartbeat is complete. All frames
+//! A restart replaces this state as a whole. Between the command of a restart and the first heartbeat with CLAIMING, a
+//! frame does not show to which life it belongs. Frames are therefore held until that heartbeat is complete. All frames
 //! before it belong to the former life, which may have been cut off in the middle of a packet.
 
 use protocol::can::{Format, Frame};
@@ -14,18 +14,19 @@ use super::Session;
 use super::accounts::Accounts;
 use crate::bus::{ObservedFrame, StopReason};
 
-/// The state of the test for one life of the cell.
+/// The state of the test from one start of the cell to the next.
 #[derive(Debug, Default)]
 pub(super) struct CellLife {
-    /// The time of its first heartbeat with CLAIMING, after a restart.
+    /// The time of the cell's first heartbeat with CLAIMING, after a restart.
     pub(super) claimed: Option<Micros>,
-    /// Segments that wait for others, by kind, with the last one received.
+    /// Segments that wait for the others of their packet, by kind of packet, with the last frame received.
     pub(super) segments: [(Reassembler, Option<ObservedFrame>); 8],
-    /// The kinds of which a whole packet has come; the test may have begun in the middle of the first one.
+    /// True for each kind of packet of which a complete packet has come. The test may have begun in the middle of the
+    /// first one.
     pub(super) joined: [bool; 8],
-    /// The accounts of the bus.
+    /// The bench's counts of packets.
     pub(super) accounts: Accounts,
-    /// *sent* of the last heartbeat, and the number of packets since.
+    /// The field *sent* of the last heartbeat, and the number of packets since that heartbeat.
     pub(super) sent: Option<(u16, u16)>,
     /// True if CLAIMING is set in the last heartbeat.
     pub(super) claiming: bool,
@@ -36,14 +37,14 @@ pub(super) struct CellLife {
 }
 
 impl CellLife {
-    /// Returns the life that begins with a heartbeat of that time. The segments of the test's own packets are kept:
-    /// they were on the bus.
+    /// Returns the state for a life that begins with a heartbeat at this time. Waiting segments of the bench's own
+    /// packets are kept, because they were on the bus.
     fn after(former: Self, claimed: Micros) -> Self {
         let accounts = former.accounts.restarted();
         Self { claimed: Some(claimed), joined: [true; 8], accounts, ..Self::default() }
     }
 
-    /// Notes that packets of a kind are received from their beginnings on; returns true if that was so before.
+    /// Notes that a complete packet of a kind has come. Returns true if one had come before.
     pub(super) fn join_kind(&mut self, place: usize) -> bool {
         self.joined.get_mut(place).is_none_or(|joined| core::mem::replace(joined, true))
     }
@@ -68,7 +69,7 @@ impl Session<'_> {
         self.bus.is_restarting()
     }
 
-    /// Ends the wait for a new life: frames belong to the present one from here on.
+    /// Ends the wait for the first heartbeat after a restart, and processes the held frames.
     pub(crate) fn end_restart(&mut self) {
         for (seen, id) in self.held.take().unwrap_or_default() {
             self.handle_cell_frame(seen, id);
@@ -80,7 +81,7 @@ impl Session<'_> {
         self.life.claimed
     }
 
-    /// Receives a frame of the cell.
+    /// Processes a frame of the cell, or holds it while a restart is in progress.
     pub(super) fn receive(&mut self, seen: ObservedFrame, id: Id) {
         let Some(held) = &mut self.held else { return self.handle_cell_frame(seen, id) };
         held.push((seen, id));

@@ -1,4 +1,4 @@
-//! Reassembly of the cell's frames into packets, and the checks that apply to each packet by itself.
+//! Reassembly of the cell's frames into packets, and the checks that apply to every packet.
 
 use protocol::can::{BIT_RATE_SWITCH, Format};
 use protocol::id::Id;
@@ -10,7 +10,7 @@ use super::{CellPacket, ANSWER_TIMEOUT, SILENCE_TIMEOUT, Session};
 use crate::bus::{ObservedFrame, StopReason};
 
 impl Session<'_> {
-    /// Processes the next frame, if one arrives by then.
+    /// Processes the next frame, and returns it, or `None` if no frame arrives until then.
     pub(super) fn process_next_frame(&mut self, until: Micros) -> Result<Option<ObservedFrame>, StopReason> {
         let Some(seen) = self.bus.receive(until)? else {
             self.check_waiting_segments(self.bus.now());
@@ -46,7 +46,7 @@ impl Session<'_> {
         if is_silent { Err(StopReason::Silent) } else { Ok(()) }
     }
 
-    /// Checks that no segment has waited longer for the others of its packet than any answer takes.
+    /// Checks that no segment has waited longer than [`PATIENT`] for the others of its packet.
     fn check_waiting_segments(&mut self, now: Micros) {
         if self.held.is_some() {
             // It may be a part of the life that was cut off.
@@ -61,7 +61,7 @@ impl Session<'_> {
                     continue;
                 }
                 self.check("SEND-1", false, || {
-                    format!("{frame} is not a packet: no other segment within {} ms", ANSWER_TIMEOUT.0 / 1_000)
+                    format!("{frame} is not a packet: no other segment came within {} ms", ANSWER_TIMEOUT.0 / 1_000)
                 });
             }
         }
@@ -71,13 +71,13 @@ impl Session<'_> {
     pub(super) fn handle_cell_frame(&mut self, seen: ObservedFrame, id: Id) {
         let frame = &seen.frame;
         if frame.format() != self.format {
-            self.check("SEND-1", false, || format!("a {} frame on this bus", frame.format().name()));
+            self.check("SEND-1", false, || format!("the cell must not send {} frames on this bus, but sent one", frame.format().name()));
             return;
         }
         let packet = match self.format {
             Format::Fd => {
                 let switches = frame.flags() & BIT_RATE_SWITCH != 0;
-                self.check("SEND-1", switches, || format!("{frame} is without bit-rate switch"));
+                self.check("SEND-1", switches, || format!("an FD frame must have the bit-rate switch, but {frame} does not"));
                 Packet::from_fd(frame)
             }
             Format::Classic => {
@@ -117,7 +117,7 @@ impl Session<'_> {
         }
     }
 
-    /// Checks the rules for every packet; heartbeats count the packets sent.
+    /// Checks the rules for every packet, and that a heartbeat has the number of packets sent before it.
     fn check_packet(&mut self, heard: &CellPacket) {
         self.life.accounts.count_cell_packet(&heard.message);
         if let Some((&Heartbeat { serial, sent, state, .. }, _)) = heard.beat() {
@@ -129,14 +129,14 @@ impl Session<'_> {
             }
             if let Some((last, packets)) = self.life.sent {
                 let expected = last.wrapping_add(packets);
-                self.check("BEAT-4", sent == expected, || format!("sent is {sent}, not {expected}"));
+                self.check("BEAT-4", sent == expected, || format!("sent must be {expected} in a heartbeat, by the packets that came, but is {sent}"));
             }
             self.life.sent = Some((sent, 0));
             let version = state.version();
-            self.check("STATE-3", version == 1, || format!("version {version}, not 1"));
+            self.check("STATE-3", version == 1, || format!("a heartbeat must have version 1, but has {version}"));
             if let Some(expected) = self.about.serial {
                 self.check("ID-1", serial == expected, || {
-                    format!("serial number {serial} in a heartbeat, and {expected} before")
+                    format!("the serial number must stay {expected}, but is {serial} in a heartbeat")
                 });
             }
         }

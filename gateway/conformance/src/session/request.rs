@@ -1,4 +1,4 @@
-//! Requests for parameters over the bus, with all answers checked by the documents.
+//! Requests for parameters and reports, and the checks of all answers to them.
 
 use model::decode::Decoded;
 use protocol::id::Node;
@@ -10,9 +10,9 @@ use protocol::time::{Micros, Span};
 use super::{CellPacket, ANSWER_TIMEOUT, Session};
 use crate::bus::StopReason;
 
-/// The time by which all pages of a report have come.
+/// The time within which all pages of a report come.
 const REPORT_TIMEOUT: Span = Span::from_millis(150);
-/// The time in which the right answer may follow one with another tag.
+/// The time within which the right answer may follow an answer with another tag.
 const LATE_ANSWER_TIMEOUT: Span = Span::from_millis(30);
 /// The time limit of a commit, which writes flash.
 const COMMIT_TIMEOUT: Span = Span::from_millis(900);
@@ -31,7 +31,7 @@ impl Reply {
     }
 }
 
-/// The counters of a cell.
+/// The counters that a cell reports in network pages 1 and 2.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(crate) struct Counters {
     pub(crate) heard: HeardPage,
@@ -49,7 +49,7 @@ impl core::fmt::Display for Counters {
     }
 }
 
-/// The names of the pages that answer a report.
+/// The names of the pages that answer a report, in their order.
 const REPORT_PAGES: [&str; 6] = ["network 1", "network 2", "sensors 0", "sensors 1", "network 3", "network 4"];
 
 fn page_name(message: &Message) -> &'static str {
@@ -101,12 +101,12 @@ impl Session<'_> {
         Node::Cell(self.cell)
     }
 
-    /// Reads a parameter.
+    /// Reads a parameter, and returns the cell's reply.
     pub(crate) fn read(&mut self, number: u8) -> Result<Reply, StopReason> {
         self.request(self.cell_node(), Request::Read { number })
     }
 
-    /// Writes a parameter.
+    /// Writes a parameter, and returns the cell's reply.
     pub(crate) fn write(&mut self, number: u8, words: [i16; WORDS]) -> Result<Reply, StopReason> {
         self.request(self.cell_node(), Request::Write { number, words })
     }
@@ -146,23 +146,23 @@ impl Session<'_> {
         let found = place.and_then(|place| configured(self.answers().get(place)?));
         let Some((answered, came, answer)) = found else {
             self.check(id, false, || {
-                format!("no answer to parameter {number} within {} ms", longest.0 / 1_000)
+                format!("a request for parameter {number} must be answered within {} ms, but was not", longest.0 / 1_000)
             });
             return Ok(Reply::Nothing);
         };
         self.note_time(if is_commit { "commit" } else { "configured" }, at, answered);
-        self.check("CONF-12", came == tag, || format!("tag {came:02X} in the answer, not {tag:02X}"));
+        self.check("CONF-12", came == tag, || format!("the answer must have the request's tag {tag:02X}, but has {came:02X}"));
         let reply = match answer {
             Answer::Value { number: got, written, words } => {
-                self.check(id, got == number, || format!("the answer is of parameter {got}, not {number}"));
+                self.check(id, got == number, || format!("the answer must name parameter {number}, but names {got}"));
                 self.check(id, written == is_write, || {
-                    format!("0x80 is {}set in the answer", if written { "" } else { "not " })
+                    format!("bit 0x80 must be set only in the answer to a write, but is {}set", if written { "" } else { "not " })
                 });
                 Reply::Value(words)
             }
             Answer::Refused { number: got, reason } => {
                 self.check("CONF-6", got == number, || {
-                    format!("the refusal names parameter {got}, not {number}")
+                    format!("the refusal must name parameter {number}, but names {got}")
                 });
                 Reply::Refused(reason)
             }
@@ -173,7 +173,7 @@ impl Session<'_> {
         Ok(reply)
     }
 
-    /// Writes all stored parameters that differ from the staged ones.
+    /// Stages parameters: writes all stored ones that differ from the staged ones.
     pub(crate) fn stage(&mut self, parameters: &Parameters) -> Result<(), StopReason> {
         let before = self.known.staged.take();
         for parameter in Parameter::stored(parameters.table().len()) {
@@ -181,7 +181,7 @@ impl Session<'_> {
             if before.is_none_or(|before| before.words(parameter) != words) {
                 let reply = self.write(parameter.number(), words)?;
                 self.check("CONF-4", reply == Reply::Value(words), || {
-                    format!("parameter {} was written, and the answer is {reply}", parameter.number())
+                    format!("a write of parameter {} must be answered with its words, but the answer was {reply}", parameter.number())
                 });
             }
         }
@@ -205,7 +205,7 @@ impl Session<'_> {
         let hash = parameters.hash();
         let reply = self.write_first_words(Parameter::Commit.number(), [hash.cast_signed()])?;
         let done = reply == Reply::Value(padded_words([hash.cast_signed()]));
-        self.check("CONF-7", done, || format!("commit with hash {hash:04X} was answered with {reply}"));
+        self.check("CONF-7", done, || format!("a commit with the right hash {hash:04X} must be accepted, but the answer was {reply}"));
         if done {
             self.known.parameters = Some(*parameters);
             (self.known.hash, self.known.joints) = (Some(hash), parameters.joints);
@@ -248,7 +248,7 @@ impl Session<'_> {
             let names: Vec<_> = pages.iter().map(|it| page_name(&it.message)).collect();
             let order = REPORT_PAGES.get(..expected).unwrap_or_default();
             self.check("CMD-4", names == order, || {
-                format!("a report was answered with {}, not {}", names.join(", "), order.join(", "))
+                format!("a report was answered with {}, but must be answered with {}", names.join(", "), order.join(", "))
             });
         }
         Ok(pages)
@@ -268,7 +268,7 @@ impl Session<'_> {
             }
         }
         let whole = heard.zip(refused);
-        self.check("CMD-4", whole.is_some(), || "network pages 1 and 2 did not come to a report".to_owned());
+        self.check("CMD-4", whole.is_some(), || "a report must be answered with network pages 1 and 2, but they did not both come".to_owned());
         if let Some((heard, refused)) = whole {
             for (id, what) in self.life.accounts.compare(heard, refused) {
                 self.check(id, false, || what);
@@ -280,14 +280,14 @@ impl Session<'_> {
             let sum =
                 [length, crc, foreign, meaning, incomplete, stimuli].into_iter().fold(0, u16::wrapping_add);
             self.check("BEAT-4", beat.rejected == sum, || {
-                format!("refused is {} in a heartbeat, and page 2 adds up to {sum}", beat.rejected)
+                format!("refused is {} in a heartbeat, but must be {sum}, the sum of page 2", beat.rejected)
             });
         }
         let (heard, refused) = whole.unwrap_or_default();
         Ok(Counters { heard, refused })
     }
 
-    /// Notes that the cell may have lost packets of a burst, which its counters show.
+    /// Skips the next comparison of counters, because the cell may have lost packets of a burst.
     pub(crate) const fn forget_counters(&mut self) {
         self.life.accounts.forget_counters();
     }

@@ -1,40 +1,42 @@
-//! The part of a bus's torque that counts in a tick.
+//! The fraction of a bus's torque that counts in a tick, by the broadcasts that the bus has carried.
 //!
-//! The torque of a silent cell decays with the broadcasts that its bus carries. On a bus that carries none it would
-//! never decay, so the loop applies the same rule: hold for some epochs, then decay to zero.
+//! The torque of a silent cell decays with the broadcasts that its bus carries. On a bus that carries no broadcasts it
+//! would never decay. The loop therefore applies the same rule to the whole bus: its torque is held for some epochs and
+//! then decays to zero.
 
 use protocol::packet::Epoch;
 use protocol::skin::Safety;
 
 use model::table::BusTotals;
 
-/// State of one bus as input of a tick.
+/// The state of one bus, as input of a tick.
 #[derive(Clone, Copy, Debug)]
 pub struct BusInput<'a> {
-    /// Totals of its table.
+    /// The totals over the cells of the bus.
     pub sums: &'a BusTotals,
-    /// True if the bus works, by its receiver.
+    /// True if the receiver of the bus reports that it works.
     pub works: bool,
 }
 
-/// The bit of a bus in a mask of buses.
+/// Returns the bit of a bus in a mask of buses.
 #[must_use]
 pub fn bit(bus: usize) -> u32 {
     1 << bus.min(31)
 }
 
-/// Number of broadcasts that a bus has carried.
+/// The broadcasts of joints that a bus has carried.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Carried {
-    /// Epoch of the last broadcast that was read back.
+    /// Epoch of the last broadcast that was read back from the bus.
     last: Option<Epoch>,
-    /// Number of that broadcast, from 1.
+    /// Number of that broadcast, counted from 1.
     number: u64,
 }
 
 impl Carried {
-    /// Number of broadcasts that should have been read back and were not. `last` is the epoch of the last one read
-    /// back; `epoch` is that of the latest of `broadcasts`, which may still be under way.
+    /// Returns the number of broadcasts that should have been read back from the bus and were not. `last` is the epoch
+    /// of the last one read back. `epoch` is the epoch of the latest of `broadcasts` broadcasts, which may not have
+    /// been read back yet.
     pub(super) fn unanswered(&mut self, last: Option<Epoch>, epoch: Epoch, broadcasts: u64) -> u64 {
         // Epochs wrap around, so compare each once, when it is new.
         if let Some(read) = last.filter(|_| last != self.last) {
@@ -45,7 +47,7 @@ impl Carried {
     }
 }
 
-/// Fraction of the last torque that still counts.
+/// Returns the fraction of the last torque, 0 to 1, that counts after this many broadcasts were not read back.
 pub(super) fn part(unanswered: u64, safety: &Safety) -> f64 {
     let hold = u64::from(safety.hold_epochs);
     if unanswered <= hold {
@@ -56,7 +58,7 @@ pub(super) fn part(unanswered: u64, safety: &Safety) -> f64 {
     if left == 0 { 0.0 } else { f64::from(left) / f64::from(safety.decay_epochs) }
 }
 
-/// Returns true if a bus that has missed this many broadcasts no longer contributes.
+/// Returns true if a bus that has missed this many broadcasts contributes no torque any more.
 pub(super) fn is_lost(unanswered: u64, safety: &Safety) -> bool {
     unanswered > u64::from(safety.hold_epochs) + u64::from(safety.decay_epochs)
 }

@@ -1,16 +1,16 @@
-//! Chain of a bus among the joints of the robot.
+//! The chain of a bus, as a selection of the robot's joints.
 
 use protocol::fixed::Q1_14;
 use protocol::message::Joints;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{JointKind, MAX_ROBOT_JOINTS, Skin};
 
-/// Joints of a chain, with their last broadcast words.
+/// The joints of a chain, and the words of their last broadcast.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Chain {
-    /// Index among the robot's joints, and kind, of each joint.
+    /// For each joint of the chain, its index among the robot's joints, and its kind.
     joints: Vec<(usize, JointKind)>,
-    /// Last broadcast words.
+    /// The words of the last broadcast.
     said: Joints,
 }
 
@@ -21,13 +21,13 @@ impl Chain {
         Self { joints, said: Joints { positions: [Q1_14::ZERO; MAX_JOINTS], in_use } }
     }
 
-    /// The last broadcast words.
+    /// Returns the words of the last broadcast.
     pub(super) const fn broadcast_joints(&self) -> Joints {
         self.said
     }
 
-    /// Converts the robot's positions to words. A position that is not a number keeps its last word; a robot refuses
-    /// velocities that lead there anyway.
+    /// Converts the robot's positions to the words of the next broadcast. A joint whose position is not a number keeps
+    /// its last word; a robot also refuses velocities that lead to such a position.
     pub(super) fn set_positions(&mut self, q: &[f64; MAX_ROBOT_JOINTS]) {
         for (word, &(joint, kind)) in self.said.positions.iter_mut().zip(&self.joints) {
             if let Some(said) = q.get(joint).and_then(|&q| kind.word(q)) {
@@ -36,7 +36,7 @@ impl Chain {
         }
     }
 
-    /// Positions of the chain's joints in rad or m.
+    /// Returns the positions of the chain's joints in rad or m, given those of all joints of the robot.
     pub(super) fn positions(&self, q: &[f64; MAX_ROBOT_JOINTS]) -> [f64; MAX_JOINTS] {
         let mut positions = [0.0; MAX_JOINTS];
         for (position, (joint, _)) in positions.iter_mut().zip(&self.joints) {
@@ -45,7 +45,8 @@ impl Chain {
         positions
     }
 
-    /// Adds a fraction of the chain's torques to the robot's: a joint that chains share gets both.
+    /// Adds the fraction `part` of a chain's torques to the torques of the robot's joints. A joint that two chains
+    /// share gets the torques of both.
     pub(super) fn add(&self, part: f64, torque: &[f64; MAX_JOINTS], sum: &mut [f64; MAX_ROBOT_JOINTS]) {
         for ((joint, _), torque) in self.joints.iter().zip(torque) {
             if let Some(sum) = sum.get_mut(*joint) {

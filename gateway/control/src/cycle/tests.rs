@@ -57,7 +57,7 @@ fn bad_cycles_in_a_row_halt_once_and_a_resume_releases() {
     assert_eq!((halted.record.halted, halted.command), (Some(Halt::Frame), Some(Command::Halt)));
 }
 
-/// Misses the given number of answers, again and again after as many good ones.
+/// A controller that misses the given number of answers, then gives as many, and so on.
 struct Absent {
     misses: Vec<u64>,
     ticks: u64,
@@ -115,7 +115,7 @@ fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
     assert_eq!(bad(&mut cycle, &bus, limit * 8 + 9), None, "it works again");
 }
 
-/// Two buses in a loop with eight ticks per epoch; each has a torque of 1 Nm.
+/// A loop over two buses with eight ticks per epoch. Each bus has a torque of 1 Nm.
 struct Two {
     cycle: Cycle,
     buses: [BusTotals; 2],
@@ -134,7 +134,7 @@ impl Two {
         Self { cycle, buses: [reference_torque; 2], works: [true; 2], number: 0 }
     }
 
-    /// Runs the ticks of an epoch and returns the last one; the buses that carry the epoch read it back.
+    /// Runs the ticks of one epoch and returns the last record. The broadcast is read back on the buses that carry it.
     fn epoch(&mut self, carries: [bool; 2]) -> TickRecord {
         let mut last = None;
         for _ in 0..8 {
@@ -228,7 +228,7 @@ fn a_halted_robot_stands_whatever_is_commanded() {
     assert_eq!(cycle.positions().map(f64::to_bits), moved.map(f64::to_bits));
 }
 
-/// A program that answers within a range of ticks.
+/// An external controller that answers only within a range of ticks.
 struct Present(std::ops::Range<u64>);
 
 impl Controller for Present {
@@ -243,7 +243,8 @@ impl Controller for Present {
     }
 }
 
-/// Runs a loop whose controller may take a second to start. Returns the reason of its absence at the end.
+/// Runs a loop whose controller has one second to start. Returns the reason for its absence at the end, and that of the
+/// halt.
 fn absence_after(ticks: u64, present: std::ops::Range<u64>) -> (Option<Absence>, Option<Halt>) {
     let (mut cycle, bus) = cycle(Box::new(Present(present)));
     cycle.starts = Some(Micros(1_000_000));

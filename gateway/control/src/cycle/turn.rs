@@ -1,5 +1,5 @@
-//! The part of a tick outside the pure cycle: reads the receivers' snapshots, encodes, sends, and queues a record. It
-//! does not allocate, lock, log or wait.
+//! The input and output of a tick: it reads the snapshots of the receivers, computes the tick, encodes and sends
+//! messages, and queues a record. It does not allocate, lock, log or wait.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -19,52 +19,52 @@ use model::table::Snapshot;
 /// Interval in epochs between repeated halts while the robot is halted.
 const HALT_AGAIN: u8 = 8;
 
-/// State shared by all threads of a run.
+/// The state that all threads of a run share.
 #[derive(Debug, Default)]
 pub struct Shared {
-    /// Set once, to end the loop.
+    /// True once the control loop is to end.
     pub stop_loop: AtomicBool,
-    /// Set once after the end of the loop, to end the receivers.
+    /// True once the receivers are to end, after the loop.
     pub stop: AtomicBool,
-    /// Set once when all cells are present: the gateway starts sending to roots.
+    /// True once all cells are present, so that the gateway sends wire messages to roots.
     pub explore: AtomicBool,
-    /// True while torques are compared with central ones.
+    /// True while the torques of the cells are compared with centrally computed ones.
     pub comparing: AtomicBool,
     /// Number of broadcasts sent so far.
     pub broadcasts: AtomicU64,
-    /// Number of records that did not fit into their queue.
+    /// Number of records that were lost because their queue was full.
     pub records_lost: AtomicU64,
-    /// Number of records that did not fit into the queue to the recorder.
+    /// Number of records that were not recorded because the queue to the recorder was full.
     pub records_unrecorded: AtomicU64,
-    /// Number of broadcasts that were skipped with their ticks.
+    /// Number of broadcasts that were skipped because their ticks were skipped.
     pub broadcasts_skipped: AtomicU64,
-    /// Number of frames that a bus refused.
+    /// Number of frames that a bus did not accept.
     pub unsent: AtomicU64,
 }
 
-/// Record of a tick, with its timing.
+/// The record of a tick, with its timing.
 #[derive(Clone, Copy, Debug)]
 pub struct TimedRecord {
-    /// Record of the tick.
+    /// The record of the tick.
     pub record: TickRecord,
-    /// Nominal start in ns of the monotonic clock.
+    /// Nominal start of the tick in ns of the monotonic clock.
     pub due_ns: u64,
-    /// Lateness of the start in ns.
+    /// Time in ns by which the tick started late.
     pub late_ns: u64,
-    /// Duration in ns.
+    /// Duration of the tick in ns.
     pub took_ns: u64,
-    /// Duration of the central computation in ns, and its result, if the tick compared.
+    /// Duration of the central computation in ns, and its result; `None` if the tick did not compare torques.
     pub central: Option<(u64, CentralTorque)>,
 }
 
-/// State of a bus, shared by all threads.
+/// The state of a bus that all threads share.
 #[derive(Debug)]
 pub struct BusState {
-    /// True if the bus works, by its receiver.
+    /// True if the receiver of the bus reports that it works.
     pub works: AtomicBool,
-    /// Number of accepted commands, including joints.
+    /// Number of commands that the bus accepted for sending, including joints.
     pub commands: AtomicU64,
-    /// Set when cells have returned to the bus after a loss; the loop then resends the halt or resume.
+    /// True if cells have returned to the bus after a loss. The loop then sends the last halt or resume again.
     pub returned: AtomicBool,
 }
 
@@ -75,27 +75,28 @@ impl Default for BusState {
 }
 
 impl BusState {
-    /// Returns true if the bus works now.
+    /// Returns true if the bus works at present.
     #[must_use]
     pub fn is_there(&self) -> bool {
         self.works.load(Ordering::Relaxed)
     }
 }
 
-/// A tick's access to one bus.
+/// The access of a tick to one bus.
 #[derive(Debug)]
 pub struct BusPort {
-    /// Format of the packets: one FD frame, or two classic ones.
+    /// Frame format of the packets: one FD frame, or several classic frames.
     pub format: Format,
-    /// Snapshot from the receiver.
+    /// Latest snapshot of the bus, written by the receiver.
     pub snapshot: triple_buffer::Output<Snapshot>,
-    /// Positions in rad of each broadcast, with which the receiver compares.
+    /// Queue of the joint positions of each broadcast, in rad or m. The receiver computes the torques for comparison
+    /// from them.
     pub positions: rtrb::Producer<(Epoch, [f64; MAX_JOINTS])>,
-    /// State of the bus.
+    /// State of the bus that all threads share.
     pub state: Arc<BusState>,
 }
 
-/// Driver of the ticks: the control loop between two readings of the clock.
+/// The driver of the ticks. Its caller reads the clock and sends the frames.
 #[derive(Debug)]
 pub struct TickDriver {
     cycle: Cycle,
@@ -103,16 +104,16 @@ pub struct TickDriver {
     scenario: Arc<Scenario>,
     shared: Arc<Shared>,
     records: rtrb::Producer<TimedRecord>,
-    /// Queue of records to the recorder, if any.
+    /// Queue of records to the recorder; `None` if the run is not recorded.
     recorded: Option<rtrb::Producer<TimedRecord>>,
-    /// Halt or resume that each bus has not accepted yet: its cells must follow the robot's state.
+    /// For each bus, a halt or resume that the bus has not accepted yet and that its cells need.
     pending_commands: Vec<Option<Message>>,
-    /// True for each bus that worked in the tick before.
+    /// For each bus, true if it worked in the previous tick.
     worked: Vec<bool>,
 }
 
 impl TickDriver {
-    /// Creates a loop over some buses that has not started.
+    /// Creates a driver for a loop over these buses, before its first tick.
     #[must_use]
     pub fn new(
         cycle: Cycle,
@@ -125,27 +126,27 @@ impl TickDriver {
         Self { cycle, lines, scenario, shared, records, recorded: None, pending_commands: owed, worked }
     }
 
-    /// Also queues all ticks to a recorder.
+    /// Sets the queue to a recorder, which then gets all records as well.
     #[must_use]
     pub fn recorded(mut self, queue: Option<rtrb::Producer<TimedRecord>>) -> Self {
         self.recorded = queue;
         self
     }
 
-    /// Counters of the controller by name.
+    /// Returns the controller's counters, each with its name.
     #[must_use]
     pub fn counts(&self) -> Vec<(String, u64)> {
         self.cycle.counts()
     }
 
-    /// Reason why the controller counts as absent, if it does.
+    /// Returns the reason for which the controller counts as absent; `None` if it does not.
     #[must_use]
     pub fn absence(&self) -> Option<Absence> {
         self.cycle.absence()
     }
 
-    /// Runs one tick. `now` reads a monotonic clock in ns; `due` is the nominal start of the tick by it. `send` sends
-    /// frames on the bus with an index, and returns true if the bus accepted them.
+    /// Runs one tick. `now` returns the time of a monotonic clock in ns, and `due` is the nominal start of the tick on
+    /// that clock. `send` sends frames on the bus with the given index and returns true if the bus accepted them.
     pub fn turn(
         &mut self,
         tick: Tick,
@@ -219,8 +220,8 @@ impl TickDriver {
         }
     }
 
-    /// Requeues the halt or resume for buses that work again, and for buses whose cells send again: cells missed
-    /// commands that the bus accepted just before its loss, or before they returned.
+    /// Queues the last halt or resume for buses that work again and for buses whose cells have returned. The cells may
+    /// have missed commands that the bus accepted just before its loss or before the cells returned.
     fn requeue_for_returned_buses(&mut self, halted: bool) {
         for ((line, owed), worked) in self.lines.iter().zip(&mut self.pending_commands).zip(&mut self.worked) {
             let works = line.state.is_there();
@@ -234,7 +235,8 @@ impl TickDriver {
         }
     }
 
-    /// Sends a halt or resume on all buses. A bus that refuses it gets it again before each of its next joints.
+    /// Sends a halt or resume on all buses. If a bus does not accept it, it is sent again before each of the next
+    /// joints on that bus.
     fn command(&mut self, message: Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
         self.pending_commands.fill(Some(message));
         self.send_pending(send);
@@ -248,7 +250,7 @@ impl TickDriver {
 }
 
 impl BusPort {
-    /// Sends a command on this bus and counts it. Returns true if the bus accepted it.
+    /// Sends a command on the bus. If the bus accepts it, counts it and returns true.
     fn send_command(
         &self,
         bus: usize,
@@ -259,7 +261,7 @@ impl BusPort {
         self.give(bus, &Encoded::new(&message.encode(), self.format), shared, send)
     }
 
-    /// Sends the frames of a command and counts it. Returns true if the bus accepted them.
+    /// Sends the frames of a command on the bus. If the bus accepts them, counts the command and returns true.
     fn give(
         &self,
         bus: usize,
@@ -278,7 +280,7 @@ impl BusPort {
     }
 }
 
-/// Frames of a packet in an array, with the number in use.
+/// The frames of an encoded packet in an array, with their number.
 #[derive(Clone, Copy, Debug)]
 struct Encoded {
     all: [Frame; Length::MAX_SEGMENTS],

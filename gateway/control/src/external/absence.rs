@@ -1,11 +1,11 @@
-//! Reasons for which a run ends without the external controller that its skin requires.
+//! The reasons for which an external controller, which the skin requires, counts as absent at the end of a run.
 
 use std::fmt::{self, Display, Formatter};
 use std::path::PathBuf;
 
 use thiserror::Error;
 
-/// Reason why an external controller counts as absent. Each message says what to do.
+/// The reason for which an external controller counts as absent. The message also says what to do.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum Absence {
@@ -18,10 +18,10 @@ pub enum Absence {
     NoHello {
         /// Path of the gateway's socket.
         socket: PathBuf,
-        /// Datagrams that came instead.
+        /// Datagrams that arrived from other programs instead.
         others: OtherDatagrams,
     },
-    /// It sent a hello, but no answer in time.
+    /// A program sent a hello, but no answer in time.
     #[error(
         "the external controller on {} sent a hello and answered no tick in time ({missing} without an answer, {late} \
          answered late, {nonsense} datagrams of nonsense): it must answer each state before the next tick, as in \
@@ -32,12 +32,12 @@ pub enum Absence {
         socket: PathBuf,
         /// Number of ticks without an answer.
         missing: u64,
-        /// Number of answers to ticks that had ended.
+        /// Number of answers that arrived after their tick had ended.
         late: u64,
         /// Number of invalid datagrams.
         nonsense: u64,
     },
-    /// It answered, and then ended or fell silent.
+    /// The program answered at first, and then ended or fell silent.
     #[error(
         "the external controller on {} answered {answers} ticks and none of the last {ticks}, when the run ended: it \
          must answer until then; see its own messages", .socket.display()
@@ -47,17 +47,17 @@ pub enum Absence {
         socket: PathBuf,
         /// Number of answered ticks.
         answers: u64,
-        /// Number of unanswered ticks at the end of the run.
+        /// Number of consecutive unanswered ticks at the end of the run.
         ticks: u32,
     },
 }
 
-/// Datagrams of programs that sent no hello.
+/// Datagrams of programs that have not sent a hello.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct OtherDatagrams {
-    /// Number from senders with an address.
+    /// Number of datagrams from senders whose sockets have an address.
     pub named: u64,
-    /// Number from senders without an address, which cannot be answered.
+    /// Number of datagrams from senders whose sockets have no address, so that they cannot be answered.
     pub unnamed: u64,
 }
 

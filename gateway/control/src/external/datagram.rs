@@ -1,4 +1,4 @@
-//! The three datagrams of an external controller, little endian.
+//! The three datagrams that the gateway and an external controller exchange, little endian.
 //!
 //! ```text
 //!   all      0 magic "SKBC" | 4 version u16 | 6 kind u16: 1 state, 2 answer, 3 hello
@@ -26,45 +26,46 @@ const HEAD_BYTES: usize = 8;
 /// Size of the longest answer in bytes.
 pub(super) const MAX_ANSWER_BYTES: usize = answer_bytes(MAX_ROBOT_JOINTS);
 
-/// Number of values of each kind in a datagram.
+/// Number of values of each kind in a datagram for a robot with `joints` joints.
 const fn values(joints: usize) -> usize {
     if joints < 6 { 6 } else { joints }
 }
 
-/// Size of a state in bytes.
+/// Size in bytes of a state for a robot with `joints` joints.
 const fn state_bytes(joints: usize) -> usize {
     40 + 24 * values(joints)
 }
 
-/// Size of an answer in bytes.
+/// Size in bytes of an answer for a robot with `joints` joints.
 const fn answer_bytes(joints: usize) -> usize {
     24 + 8 * values(joints)
 }
 
-/// State that the gateway sends in each tick.
+/// The state that the gateway sends in each tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StateDatagram {
-    /// Input that all controllers get.
+    /// The input of a controller in this tick.
     pub input: Input,
     /// Number of the robot's joints.
     pub joints: u32,
 }
 
-/// Answer of the other program.
+/// The answer of the external controller to a state.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AnswerDatagram {
-    /// Tick that it answers.
+    /// Number of the tick that the answer is for.
     pub tick: u64,
-    /// Command for the robot.
+    /// The command for the robot.
     pub command: JointCommand,
 }
 
-/// Command for the robot until the next tick.
+/// The command of an external controller for the next tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum JointCommand {
-    /// 1: joint velocities in rad/s.
+    /// 1: joint velocities in rad/s, or in m/s for prismatic joints.
     Velocity([f64; MAX_ROBOT_JOINTS]),
-    /// 2: joint positions in rad, reached by the next tick as far as the speed limits allow.
+    /// 2: joint positions in rad, or in m for prismatic joints. The robot reaches them by the next tick, as far as the
+    /// speed limits allow.
     Position([f64; MAX_ROBOT_JOINTS]),
 }
 
@@ -76,11 +77,11 @@ pub(super) enum ReceivedDatagram {
     Answer(AnswerDatagram),
 }
 
-/// Reason why a datagram is neither an answer nor a hello.
+/// The reason for which a datagram is neither an answer nor a hello.
 #[derive(Clone, Copy, Debug, Eq, Error, Hash, PartialEq)]
 #[non_exhaustive]
 pub enum InvalidDatagram {
-    /// No datagram of this kind has this length.
+    /// The length is not that of any datagram of this kind.
     #[error("wrong length")]
     Length,
     /// The datagram does not begin with `SKBC`.
@@ -89,7 +90,7 @@ pub enum InvalidDatagram {
     /// This program does not support the version.
     #[error("wrong version")]
     Version,
-    /// The gateway does not accept this kind.
+    /// The kind is not one that the gateway accepts.
     #[error("unknown kind")]
     Kind,
     /// The command is neither velocities nor positions.
@@ -98,7 +99,7 @@ pub enum InvalidDatagram {
     /// A value is infinite or not a number.
     #[error("not finite")]
     NotFinite,
-    /// The datagram answers a tick that the gateway has not sent yet.
+    /// The datagram answers a tick for which the gateway has not sent a state yet.
     #[error("tick ahead")]
     Ahead,
 }
@@ -109,7 +110,7 @@ impl InvalidDatagram {
         [Self::Length, Self::Magic, Self::Version, Self::Kind, Self::Command, Self::NotFinite, Self::Ahead];
 }
 
-/// Writes values in sequence.
+/// A writer of values into a byte buffer, one after the other.
 struct Writer<'a>(&'a mut [u8]);
 
 impl Writer<'_> {
@@ -133,7 +134,7 @@ impl Writer<'_> {
     }
 }
 
-/// Reads values in sequence; missing values are zero, so callers check lengths first.
+/// A reader of values from bytes, one after the other. Values beyond the end are zero, so callers check lengths first.
 struct Reader<'a>(&'a [u8]);
 
 impl Reader<'_> {
@@ -143,7 +144,7 @@ impl Reader<'_> {
         *head
     }
 
-    /// Missing values are 0.
+    /// Reads the values of all joints. Joints that the robot does not have get 0.
     fn joints(&mut self, joints: usize) -> [f64; MAX_ROBOT_JOINTS] {
         let mut all = [0.0; MAX_ROBOT_JOINTS];
         for value in all.iter_mut().take(values(joints)) {
@@ -152,7 +153,7 @@ impl Reader<'_> {
         all
     }
 
-    /// Reads the kind if the header is valid.
+    /// Reads the header and returns the kind of the datagram.
     fn head(&mut self) -> Result<u16, InvalidDatagram> {
         if self.0.len() < HEAD_BYTES {
             return Err(InvalidDatagram::Length);
@@ -170,10 +171,11 @@ impl Reader<'_> {
 impl StateDatagram {
     const VALID: u32 = 1;
     const HALTED: u32 = 1 << 1;
-    /// Bit 16 is the first bus; bit 31 is the 16th and all after it.
+    /// The lowest bit of the mask of lost buses in the flags, for the first bus. Bit 31 stands for the 16th bus and all
+    /// after it.
     const MISSING: u32 = 16;
 
-    /// Encodes the state.
+    /// Encodes the state as a datagram.
     #[must_use]
     pub fn encode(&self) -> heapless::Vec<u8, { state_bytes(MAX_ROBOT_JOINTS) }> {
         let joints = usize::try_from(self.joints).unwrap_or(usize::MAX).min(MAX_ROBOT_JOINTS);
@@ -236,7 +238,7 @@ impl ReceivedDatagram {
     }
 }
 
-/// The other program's side of the datagrams, for tests.
+/// The external controller's side of the datagrams, for tests.
 #[cfg(test)]
 mod peer {
     use super::*;
@@ -272,7 +274,7 @@ mod peer {
     }
 
     impl AnswerDatagram {
-        /// Encodes the answer.
+        /// Encodes the answer as a datagram.
         pub(crate) fn encode(&self, joints: usize) -> Vec<u8> {
             let mut bytes = vec![0; answer_bytes(joints)];
             let mut out = Writer(&mut bytes);

@@ -1,4 +1,5 @@
-//! Pending answer, and handling of the datagrams received in a tick: without socket and clock.
+//! The exchange with an external controller without socket and clock: handling of received datagrams, and the pending
+//! answer.
 
 use std::path::PathBuf;
 
@@ -6,33 +7,33 @@ use super::absence::{Absence, OtherDatagrams};
 use super::datagram::{JointCommand, ReceivedDatagram, InvalidDatagram};
 use crate::controller::{BadCycle, Input, SpeedLimits, ControllerOutput};
 
-/// Counts of events since the start.
+/// Numbers of events since the start of the exchange.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub(super) struct ExchangeCounts {
-    /// Hellos.
+    /// Number of hellos.
     pub(super) hellos: u64,
-    /// Answers in time.
+    /// Number of answers that arrived in time.
     pub(super) answers: u64,
-    /// Ticks without an answer from the peer.
+    /// Number of ticks that the peer did not answer.
     pub(super) missing: u64,
-    /// Answers to a tick that had ended.
+    /// Number of answers that arrived after their tick had ended.
     pub(super) late: u64,
-    /// Second answers to the same tick.
+    /// Number of second answers to the same tick.
     pub(super) repeated: u64,
-    /// Datagrams from senders other than the peer.
+    /// Number of datagrams from senders other than the peer.
     pub(super) other_senders: u64,
-    /// States that did not fit into the peer's queue.
+    /// Number of states that were not sent because the peer's queue was full.
     pub(super) unsent: u64,
-    /// Peers that ended.
+    /// Number of peers that ended.
     pub(super) gone: u64,
-    /// Datagrams that could not be received, and hellos from unnamed senders.
+    /// Number of datagrams that could not be received, and of hellos from senders without an address.
     pub(super) failed: u64,
-    /// Invalid datagrams from the peer, in the order of [`Nonsense::ALL`].
+    /// Numbers of invalid datagrams from the peer, by reason, in the order of [`Nonsense::ALL`].
     pub(super) nonsense: [u64; InvalidDatagram::ALL.len()],
 }
 
 impl ExchangeCounts {
-    /// All counts with their names.
+    /// Returns all counters with their names.
     pub(super) fn each(&self) -> impl Iterator<Item = (String, u64)> {
         let own = [
             ("hellos", self.hellos),
@@ -51,8 +52,9 @@ impl ExchangeCounts {
             .chain(nonsense.map(|(why, count)| (format!("nonsense: {why}"), count)))
     }
 
-    /// Reason why the controller counts as absent, if it does: it never answered, or not in the last `silent` ticks,
-    /// which are enough to halt a robot whose controller had started.
+    /// Returns the reason for which the controller counts as absent; `None` if it does not. It is absent if it never
+    /// answered, or not in the last `silent` ticks, which are enough to halt the robot of a controller that had
+    /// started.
     pub(super) fn absence(&self, socket: PathBuf, silent: Option<u32>) -> Option<Absence> {
         let &Self { hellos, answers, missing, late, other_senders, failed, .. } = self;
         match (hellos, answers, silent) {
@@ -77,14 +79,14 @@ impl ExchangeCounts {
     }
 }
 
-/// Sender of a datagram.
+/// The sender of a datagram.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Sender {
     Peer,
     Other,
 }
 
-/// Result of sending a state.
+/// The result of sending a state to the peer.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum SendResult {
     Taken,
@@ -92,11 +94,11 @@ pub(super) enum SendResult {
     NobodyThere,
 }
 
-/// Exchange of datagrams with the peer.
+/// The exchange of datagrams with the peer.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Exchange {
     connected: bool,
-    /// Tick whose answer is due.
+    /// Number of the tick whose answer is awaited.
     due: Option<u64>,
     answer: Option<JointCommand>,
     nonsense: bool,
@@ -111,7 +113,7 @@ impl Exchange {
         Self { joints, ..Self::default() }
     }
 
-    /// Handles a datagram. Returns true if its sender is the peer from now on.
+    /// Handles a received datagram. Returns true if the datagram is a hello that makes its sender the peer.
     pub(super) fn handle(&mut self, bytes: &[u8], sender: Sender) -> bool {
         let answer = match (ReceivedDatagram::decode(bytes, self.joints), sender) {
             (Ok(ReceivedDatagram::Hello), _) => {
@@ -151,7 +153,7 @@ impl Exchange {
         false
     }
 
-    /// Returns the command of the tick; call it after all datagrams have been handled.
+    /// Returns the command of the peer for this tick. To be called after all received datagrams have been handled.
     pub(super) fn step(&mut self, input: &Input, pace: &SpeedLimits) -> ControllerOutput {
         let (due, answer) = (self.due.take(), self.answer.take());
         let nonsense = core::mem::take(&mut self.nonsense);
@@ -169,7 +171,7 @@ impl Exchange {
         }
     }
 
-    /// Notes the result of sending this tick's state.
+    /// Records the result of sending the state of a tick.
     pub(super) fn sent(&mut self, tick: u64, sent: SendResult) {
         match sent {
             SendResult::Taken => self.due = Some(tick),

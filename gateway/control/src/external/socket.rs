@@ -1,4 +1,4 @@
-//! Socket of an external controller: receives and sends, without any logic.
+//! The socket of an external controller. It receives and sends datagrams; the module `exchange` handles them.
 
 use std::io::{self, ErrorKind};
 use std::os::linux::net::SocketAddrExt;
@@ -17,7 +17,8 @@ use super::datagram::{MAX_ANSWER_BYTES, StateDatagram};
 use super::exchange::{Exchange, Sender, SendResult};
 use crate::controller::{Controller, Input, SpeedLimits, ControllerOutput};
 
-/// Maximum number of datagrams received per tick: the rest waits, so that no sender can delay the tick.
+/// Maximum number of datagrams that are received per tick. Others remain in the socket's queue, so that no sender can
+/// delay the tick.
 const PER_TICK: usize = 16;
 
 /// A controller in another program.
@@ -25,7 +26,7 @@ const PER_TICK: usize = 16;
 pub struct External {
     socket: UnixDatagram,
     path: PathBuf,
-    /// Device and inode of the socket's file, so that only this socket's file is removed.
+    /// Device and inode of the socket's file. At the end the file is removed only if it is still this one.
     file: Option<(u64, u64)>,
     peer: Option<SocketAddr>,
     exchange: Exchange,
@@ -33,23 +34,23 @@ pub struct External {
     joints: u32,
 }
 
-/// An error that keeps the gateway from listening on its socket.
+/// The error for a socket on which the gateway cannot listen.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum SocketError {
-    /// Another program listens on the socket.
+    /// Another program listens on this socket.
     #[error("{}: another program listens on this socket; end it, or name another path", path.display())]
     Live {
         /// Path of the socket.
         path: PathBuf,
     },
-    /// The file is not a socket.
+    /// There is a file at the path, but it is not a socket.
     #[error("{}: exists and is no socket; it is left alone", path.display())]
     NotASocket {
         /// Path of the socket.
         path: PathBuf,
     },
-    /// The file system gives the socket other permissions.
+    /// The file system gives the socket other permissions than read and write for its user only.
     #[error("{}: the socket has mode {mode:04o} and not 0600, so that others may connect; name a path on another file system", path.display())]
     Mode {
         /// Path of the socket.
@@ -57,18 +58,18 @@ pub enum SocketError {
         /// Permission bits of the socket.
         mode: u32,
     },
-    /// The system refused.
+    /// The system refuses the operation.
     #[error("{}: cannot listen on this socket", path.display())]
     System {
         /// Path of the socket.
         path: PathBuf,
-        /// Cause.
+        /// The system's error.
         source: io::Error,
     },
 }
 
 impl External {
-    /// Listens at a path. Replaces the file of a socket without a listener.
+    /// Listens on a socket at a path. A socket file that no program listens on is replaced.
     ///
     /// # Errors
     /// Returns [`SocketError`] if another program listens there, the file is not a socket, or the system refuses.
@@ -177,8 +178,8 @@ fn bind(path: &Path) -> Result<UnixDatagram, SocketError> {
     Ok(socket)
 }
 
-/// Binds a socket to which only its user may send, whatever the umask is. Linux gives the file the mode of the socket
-/// that is bound, so others have no access at any moment.
+/// Binds a socket to which only its user may send, whatever the umask is. Linux gives the new file the mode of the
+/// socket that is bound, so other users never have access.
 fn bind_private(path: &Path) -> io::Result<UnixDatagram> {
     let socket = UnixDatagram::unbound()?;
     fchmod(&socket, Mode::RUSR | Mode::WUSR)?;
@@ -186,18 +187,18 @@ fn bind_private(path: &Path) -> io::Result<UnixDatagram> {
     Ok(socket)
 }
 
-/// Returns true if an error of a non-blocking socket may be gone at the next tick.
+/// Returns true if an error of the socket may have passed by the next tick, so that it is no reason to end.
 fn passes(error: &io::Error) -> bool {
     let errno = Errno::from_io_error(error);
     matches!(errno, Some(Errno::AGAIN | Errno::INTR | Errno::NOMEM | Errno::NOBUFS))
 }
 
-/// Device and inode of a file.
+/// Returns the device and inode of a file; `None` if there is no file.
 fn file(path: &Path) -> Option<(u64, u64)> {
     std::fs::symlink_metadata(path).ok().map(|file| (file.dev(), file.ino()))
 }
 
-/// Returns true if two named addresses are equal.
+/// Returns true if two sockets have the same address. Both must have one.
 fn same(one: &SocketAddr, other: &SocketAddr) -> bool {
     one.as_pathname() == other.as_pathname() && one.as_abstract_name() == other.as_abstract_name()
 }

@@ -18,7 +18,7 @@ fn listen(path: &Path) -> Result<External, SocketError> {
     External::listen(path, &skin())
 }
 
-/// Creates a directory, the gateway's socket in it, and the gateway.
+/// Creates a directory, and a gateway that listens on a socket in it. Returns both, and the path of the socket.
 fn gateway() -> (TempDir, PathBuf, External) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("controller.sock");
@@ -26,7 +26,7 @@ fn gateway() -> (TempDir, PathBuf, External) {
     (folder, path, gateway)
 }
 
-/// Creates another program, with the gateway's socket as its peer.
+/// Creates the socket of an external controller, connected to the gateway's socket.
 fn program(folder: &TempDir, name: &str) -> UnixDatagram {
     let socket = UnixDatagram::bind(folder.path().join(name)).unwrap();
     socket.connect(folder.path().join("controller.sock")).unwrap();
@@ -325,8 +325,8 @@ proptest! {
     }
 }
 
-/// Checks the reason why a gateway counts its controller as absent, given the number of bad cycles at the end; the text
-/// names the socket.
+/// Checks the reason for which a gateway counts its controller as absent, with `silent` bad cycles at the end. Also
+/// checks that the message names the path of the socket.
 fn absent(gateway: &External, path: &Path, silent: Option<u32>, words: &str) {
     let absence = gateway.absence(silent).unwrap_or_else(|| panic!("not absent: {words}")).to_string();
     assert!(absence.contains(words) && absence.contains(&path.display().to_string()), "{absence}");

@@ -1,4 +1,4 @@
-//! The Python example closes the loop over the real socket.
+//! Test in which the Python example of an external controller closes the loop over the real socket.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::io::{BufRead, BufReader};
@@ -12,7 +12,7 @@ use protocol::packet::padded;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-/// A process that ends with the test.
+/// A process that is killed at the end of the test.
 struct Running(Child);
 
 impl Drop for Running {

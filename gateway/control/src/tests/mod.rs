@@ -1,4 +1,4 @@
-//! Tests of the whole crate.
+//! Tests of the whole crate with ready-made scenarios and with an external program.
 
 mod external_python;
 mod scenarios;

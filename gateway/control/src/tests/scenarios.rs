@@ -1,4 +1,5 @@
-//! Checks the purposes of the ready-made scenarios: plays them without a bus, with the central computation as the skin.
+//! Checks that each ready-made scenario serves its purpose. The scenarios are played without a bus; the torques of the
+//! skin are computed centrally.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use crate::controller::{Input, ControllerOutput};
@@ -13,18 +14,18 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-/// Maxima over a run.
+/// Maximum values over a run.
 #[derive(Debug, Default)]
 struct Most {
-    /// Torque of one cell in one joint, in Nm.
+    /// Maximum torque that one cell causes in a joint, in Nm.
     torque: f64,
-    /// Torque of all cells in one joint, in Nm.
+    /// Maximum torque that all cells together cause in a joint, in Nm.
     sum: f64,
     /// Number of active cells in each epoch.
     active: Vec<u32>,
-    /// Joints that reached a limit.
+    /// Mask of the joints that reached a limit.
     at_limit: u32,
-    /// Distance in rad from the start, of the joint that went farthest.
+    /// Maximum distance of a joint from its start position, in rad.
     way: f64,
 }
 

@@ -1,14 +1,14 @@
-//! Recognises files whose format is not that of their extension.
+//! Recognises files whose contents have another format than their extension says.
 
 use protocol::xml::kind_of_root;
 use roxmltree::Document;
 
 use super::MeshError;
 
-/// The hint for an unsupported format.
+/// The advice for a file of an unsupported format.
 const CONVERT: &str = "convert it to stl, dae or obj, and name that in the URDF";
 
-/// Formats by their first bytes.
+/// The first bytes, the name of the format, and the advice for each known format.
 const MAGIC: &[(&[u8], &str, &str)] = &[
     (b"glTF", "a binary glTF file", CONVERT),
     (b"ply\n", "a PLY mesh", CONVERT),
@@ -18,7 +18,8 @@ const MAGIC: &[(&[u8], &str, &str)] = &[
     (b"Kaydara FBX", "an FBX file", CONVERT),
 ];
 
-/// Returns a better error for a file whose contents are of another format; `extension` is in lower case.
+/// Returns an error that names the actual format of a file; `None` if no other format is recognised. `extension` is in
+/// lower case.
 pub(super) fn error(file: &str, extension: &str, bytes: &[u8]) -> Option<MeshError> {
     let (what, hint) = kind(extension, bytes)?;
     Some(MeshError::Foreign { file: file.to_owned(), line: None, what, hint })
@@ -41,7 +42,8 @@ fn kind(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
     (extension != "obj" && is_obj).then(|| ("an OBJ mesh".to_owned(), "rename it to .obj, in the URDF too"))
 }
 
-/// Names XML that is not COLLADA, or COLLADA with another extension.
+/// Recognises XML that is not COLLADA, and COLLADA whose extension is another. Returns the name of the format and
+/// advice.
 fn xml(extension: &str, bytes: &[u8]) -> Option<(String, &'static str)> {
     let text = protocol::xml::decode(bytes).ok()?;
     let prepared = protocol::xml::prepare(&text).ok()?;
@@ -86,7 +88,7 @@ mod tests {
             (b"ISO-10303-21;\n", "a STEP file"),
         ] {
             for extension in ["stl", "dae", "obj"] {
-                // Enough bytes for the header of an STL follow.
+                // The bytes that follow are enough for the header of an STL file.
                 let error = refused(&format!("a.{extension}"), &[bytes, &[0; 100]].concat());
                 assert!(
                     error.ends_with(&format!(

@@ -1,4 +1,4 @@
-//! Triangle meshes: STL, COLLADA (DAE) and OBJ files, and primitives.
+//! Reads triangle meshes from STL, COLLADA (DAE) and OBJ files, and creates those of boxes, cylinders and spheres.
 
 mod collada;
 mod misnamed;
@@ -27,27 +27,28 @@ pub const MAX_TRIANGLES: usize = 1_000_000;
 /// The maximum size of a mesh file in bytes: that of an ASCII STL with [`MAX_TRIANGLES`].
 const MAX_BYTES: u64 = 300_000_000;
 
-/// Three corners in m. In a well-made file they are counterclockwise as seen from outside, but this crate does not rely
-/// on that.
+/// The three corners of a triangle, in m. They should be counterclockwise as seen from outside, but this crate does not
+/// rely on that.
 pub type Triangle = [Point3<f64>; 3];
 
-/// The treatment of the up axis of a COLLADA file. STL and OBJ files have none, and are read unchanged.
+/// The treatment of the up axis of a COLLADA file. STL and OBJ files have no such axis and are always read unchanged.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub enum UpAxis {
-    /// Ignores the file's `up_axis`, as RViz and Pinocchio do, with which most URDF files were made.
+    /// Ignores the `up_axis` of the file, as RViz and Pinocchio do. Most URDF files are made for this.
     #[default]
     Ignore,
-    /// Rotates the file's `up_axis`, by default `Y_UP`, to z, as the COLLADA specification requires.
+    /// Rotates the mesh so that the `up_axis` of the file becomes z, as the COLLADA specification requires. It is
+    /// `Y_UP` if the file has none.
     Follow,
 }
 
-/// An unordered, non-empty set of triangles with finite coordinates, in m.
+/// A set of one or more triangles in m, in no particular order. All coordinates are finite.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mesh {
     triangles: Vec<Triangle>,
 }
 
-/// The error of a mesh that cannot be read or built.
+/// The reason why a mesh cannot be read or created.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum MeshError {
@@ -70,7 +71,7 @@ pub enum MeshError {
         /// The text after the last dot.
         extension: String,
     },
-    /// The file is not valid for its extension.
+    /// The contents of the file do not follow the format of its extension.
     #[error("mesh {file}: {reason}; export it again")]
     Syntax {
         /// The file.
@@ -83,19 +84,19 @@ pub enum MeshError {
     Xml {
         /// The file.
         file: String,
-        /// The fault, with its hint.
+        /// The error in the XML, with advice to the user.
         fault: XmlFault,
     },
-    /// The file has another format, or is a placeholder for another file.
+    /// The file has another format than its extension says, or is a placeholder such as a Git LFS pointer.
     #[error("mesh {file}{}: {what}: {hint}", line.map_or_else(String::new, |line| format!(":{line}")))]
     Foreign {
         /// The file.
         file: String,
-        /// The line, from 1, if it is known.
+        /// The line number from 1, if it is known.
         line: Option<usize>,
-        /// The kind of file, as it follows "it is".
+        /// A description of the file that completes the sentence "it is ...".
         what: String,
-        /// The action to take.
+        /// Advice to the user.
         hint: &'static str,
     },
     /// A part of the file is missing.
@@ -103,7 +104,7 @@ pub enum MeshError {
     Damaged {
         /// The file.
         file: String,
-        /// The inconsistency, in one line.
+        /// A description of what is missing, in one line.
         reason: String,
     },
     /// The file has no triangles.
@@ -124,32 +125,32 @@ pub enum MeshError {
         /// The coordinate.
         value: f64,
     },
-    /// The file exceeds a limit.
+    /// The file has more bytes, triangles or other items than allowed.
     #[error("mesh {file}: {count} {what}, at most {most}; decimate the mesh")]
     TooLarge {
         /// The file.
         file: String,
-        /// The number; for triangles possibly only those counted so far.
+        /// The number of items. Triangles may be counted only up to where reading stopped.
         count: u64,
-        /// The counted unit.
+        /// The kind of items.
         what: &'static str,
-        /// The limit.
+        /// The maximum number of items.
         most: u64,
     },
-    /// A size of a primitive is not above zero, or not finite.
+    /// A dimension of a box, cylinder or sphere is not above zero, or is not finite.
     #[error("{shape} with {what} {value} m: a size is above 0 and finite; correct it")]
     Size {
-        /// The primitive.
+        /// The kind of shape.
         shape: &'static str,
-        /// The name of the size.
+        /// The name of the dimension.
         what: &'static str,
-        /// The size, in m.
+        /// The value of the dimension, in m.
         value: f64,
     },
 }
 
 impl Mesh {
-    /// Creates a mesh of these triangles, in m; `name` is used in errors.
+    /// Creates a mesh from triangles in m. `name` is used in errors.
     ///
     /// # Errors
     /// Returns [`MeshError`] if there are no triangles or more than [`MAX_TRIANGLES`], or if a coordinate is not
@@ -171,8 +172,8 @@ impl Mesh {
         Ok(Self { triangles })
     }
 
-    /// Reads a file. The extension determines the format: `.stl` (binary and ASCII), `.dae` or `.obj`, in lower or
-    /// upper case. STL and OBJ have no unit: their numbers are read as m.
+    /// Reads a mesh from a file. The extension determines the format: `.stl` (binary or ASCII), `.dae` or `.obj`, in
+    /// lower or upper case. STL and OBJ files do not state a unit; their numbers are taken as m.
     ///
     /// # Errors
     /// Returns [`MeshError`] if the file cannot be read, has another format, or is not a mesh.
@@ -194,7 +195,7 @@ impl Mesh {
         Self::parse(&name, &fs::read(path).map_err(read)?, up)
     }
 
-    /// Parses the bytes of a file with this name, as [`Mesh::load`] does.
+    /// Parses the contents of a file like [`Mesh::load`]. `name` is the name of the file.
     ///
     /// # Errors
     /// Returns [`MeshError`] as [`Mesh::load`] does.
@@ -244,7 +245,7 @@ fn syntax(file: &str, reason: &str) -> MeshError {
     MeshError::Syntax { file: file.to_owned(), reason: reason.lines().collect::<Vec<_>>().join(" ") }
 }
 
-/// A linear map followed by a translation.
+/// An affine map: a linear map followed by a translation.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Affine {
     pub(crate) linear: Matrix3<f64>,
@@ -256,12 +257,13 @@ impl Affine {
         Self { linear: Matrix3::identity(), shift: Vector3::zeros() }
     }
 
-    /// Returns the composition of this map after `inner`.
+    /// Returns the map that applies `inner` first and then this map.
     pub(crate) fn after(&self, inner: &Self) -> Self {
         Self { linear: self.linear * inner.linear, shift: self.linear * inner.shift + self.shift }
     }
 
-    /// Maps a triangle. A mirroring map exchanges two corners, so that the winding is preserved.
+    /// Applies the map to a triangle. If the map mirrors, two corners are exchanged, so that the winding stays the
+    /// same.
     pub(crate) fn map(&self, triangle: &Triangle) -> Triangle {
         let [a, b, c] = triangle.map(|corner| Point3::from(self.linear * corner.coords + self.shift));
         if self.linear.determinant() < 0.0 { [a, c, b] } else { [a, b, c] }

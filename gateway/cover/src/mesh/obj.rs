@@ -1,15 +1,15 @@
-//! Reads Wavefront OBJ files: vertices and faces. Normals, textures, materials, groups and lines are ignored.
+//! Reads the vertices and faces of Wavefront OBJ files. Normals, textures, materials, groups and lines are ignored.
 
 use nalgebra::Point3;
 
 use super::polygon::Triangulation;
 use super::{MAX_TRIANGLES, MeshError, Triangle, syntax, too_many};
 
-/// Returns the triangles of a file.
+/// Returns the triangles of a file with these contents.
 pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
     let mut vertices: Vec<Point3<f64>> = Vec::new();
     let mut filled = Triangulation::default();
-    // Names may have any encoding; numbers are ASCII.
+    // Names may have any encoding, but numbers are always ASCII.
     let text = String::from_utf8_lossy(bytes);
     for (line, words) in lines(&text) {
         let wrong = |why: String| syntax(name, &format!("line {line}: {why}"));
@@ -30,8 +30,8 @@ pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshE
     filled.finish().map_err(|why| syntax(name, &why))
 }
 
-/// Returns lines without their comments, each with its number from 1. A line that ends with `\` continues in the next
-/// one.
+/// Splits a text into lines of words, each with its line number from 1. Comments are removed, and a line that ends with
+/// `\` is joined with the next one.
 fn lines(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
     let text = text.trim_start_matches('\u{feff}');
     let mut lines = text.lines().enumerate();
@@ -63,7 +63,8 @@ fn vertex<'a>(words: impl Iterator<Item = &'a str>) -> Result<Point3<f64>, Strin
     }
 }
 
-/// Returns the vertex of a face's corner, `5`, `5/1`, `5//1` or `5/1/1`. Negative numbers count from the last vertex.
+/// Returns the vertex of a face's corner: `5`, `5/1`, `5//1` or `5/1/1`. Only the first number is used; a negative one
+/// counts back from the last vertex.
 fn corner(word: &str, vertices: &[Point3<f64>]) -> Result<Point3<f64>, String> {
     let number = word.split('/').next().unwrap_or_default();
     let index = number.parse::<i64>().map_err(|_| format!("{word:?} is not a corner of a face"))?;

@@ -1,4 +1,4 @@
-//! Divides polygons with any number of corners into triangles with the same total area.
+//! Divides polygons into triangles whose total area is that of the polygon.
 
 use earcut::Earcut;
 use nalgebra::{Point3, Unit, Vector3};
@@ -6,33 +6,33 @@ use nalgebra::{Point3, Unit, Vector3};
 use super::Triangle;
 use crate::surface::{self, tangents};
 
-/// The tolerated difference between a polygon's area and that of its triangles, as a share.
+/// The allowed difference between the area of a polygon and that of its triangles, relative to the former.
 const AREA_TOLERANCE: f64 = 1e-6;
 
-/// The maximum area of a nonplanar polygon's triangles relative to the polygon's area: that of triangles tilted by 60
-/// degrees.
+/// The maximum total area of the triangles of a polygon that is not planar, relative to the polygon's area in
+/// projection. At 2.0 the triangles are tilted by 60 degrees.
 const MAX_BENT_AREA: f64 = 2.0;
 
-/// The tolerated share of a mesh's area in polygons that intersect themselves or are bent. Meshes of real robots have
-/// some, of a square millimetre each.
+/// The maximum share of a mesh's area in polygons that intersect themselves or are bent. Meshes of real robots have a
+/// few such polygons, each of about a square millimetre.
 const MAX_FAULTY_SHARE: f64 = 1e-3;
 
-/// The width of a polygon without an area, relative to its length.
+/// The width of a polygon, relative to its length, below which it counts as having no area.
 const MAX_THIN_WIDTH: f64 = 1e-6;
 
-/// The triangles of polygons.
+/// The triangles of all polygons of a mesh, and the errors of dividing them.
 #[derive(Debug, Default)]
 pub(super) struct Triangulation {
     pub(super) triangles: Vec<Triangle>,
-    /// The total difference in area of polygons that intersect themselves or are bent.
+    /// The total error in area of polygons that intersect themselves or are bent.
     off: f64,
-    /// The largest of these differences, with a description of its polygon.
+    /// The largest of these errors, and a description of the polygon that has it.
     worst: Option<(f64, String)>,
 }
 
 impl Triangulation {
-    /// Adds the triangles of a polygon with holes. The polygon is projected along the mean of its normals (Newell's
-    /// method), so it need not be planar. A polygon without an area adds no triangles.
+    /// Adds the triangles of a polygon with holes. The polygon need not be planar: it is projected along its mean
+    /// normal (Newell's method). A polygon without an area adds no triangles.
     pub(super) fn add(&mut self, outline: &[Point3<f64>], holes: &[Vec<Point3<f64>>]) {
         if let (&[a, b, c], []) = (outline, holes) {
             self.triangles.push([a, b, c]);
@@ -76,7 +76,8 @@ impl Triangulation {
         }
     }
 
-    /// Adds a polygon's ears. Returns the polygon's area in its plane and that of its ears.
+    /// Adds the triangles of a polygon, which are found by cutting off its ears. Returns the area of the polygon in its
+    /// plane, and that of the triangles.
     fn ears(
         &mut self,
         plane: &Plane,
@@ -116,8 +117,8 @@ impl Triangulation {
         }
     }
 
-    /// Returns the triangles, or a description of the worst polygon if too much of the surface is in polygons that
-    /// intersect themselves or are bent.
+    /// Returns all triangles. Returns a description of the worst polygon instead, if too much of the area is in
+    /// polygons that intersect themselves or are bent.
     pub(super) fn finish(self) -> Result<Vec<Triangle>, String> {
         let whole: f64 = self.triangles.iter().map(surface::area).sum();
         match self.worst {
@@ -129,7 +130,7 @@ impl Triangulation {
     }
 }
 
-/// Adds the triangles between the first corner and each edge.
+/// Adds a triangle for each edge of a convex polygon: the edge and the first corner.
 pub(super) fn fan(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
     if let [first, rest @ ..] = corners {
         triangles.extend(rest.windows(2).filter_map(|edge| match *edge {
@@ -139,18 +140,19 @@ pub(super) fn fan(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
     }
 }
 
-/// A polygon projected along the mean of its normals.
+/// The result of projecting a polygon along its mean normal.
 enum Outline {
     Flat(Plane),
     /// The polygon has no area.
     Thin,
-    /// The parts of the polygon have opposite areas, together at most about this.
+    /// Parts of the polygon have opposite winding, so that their areas cancel. The value is about the largest possible
+    /// area.
     Opposite {
         area: f64,
     },
 }
 
-/// The plane in which a polygon is largest. Lengths in it are relative to the polygon's extent.
+/// The plane in which the projection of a polygon is largest. Lengths in it are relative to the size of the polygon.
 struct Plane {
     origin: Point3<f64>,
     axes: (Vector3<f64>, Vector3<f64>),
@@ -177,7 +179,7 @@ impl Plane {
         }
     }
 
-    /// Converts points to coordinates in the plane, in which the polygon is counterclockwise.
+    /// Returns the coordinates of points in the plane. The polygon is counterclockwise in these.
     fn points(&self, corners: &[Point3<f64>]) -> Vec<[f64; 2]> {
         let Self { origin, axes: (x, y), extent } = self;
         let flat = |corner: &Point3<f64>| {
@@ -188,19 +190,19 @@ impl Plane {
     }
 }
 
-/// Returns half the cross product of the vectors from one point to two others.
+/// Returns the signed area of the triangle from one point to two others.
 fn between([x, y]: [f64; 2], [ax, ay]: [f64; 2], [bx, by]: [f64; 2]) -> f64 {
     ((ax - x) * (by - y) - (bx - x) * (ay - y)) / 2.0
 }
 
-/// Returns a polygon's area, which is positive if the polygon is counterclockwise.
+/// Returns the area of a polygon: positive if it is counterclockwise, negative if it is clockwise.
 fn area(polygon: &[[f64; 2]]) -> f64 {
     let [first, rest @ ..] = polygon else { return 0.0 };
     rest.windows(2).map(|edge| if let &[a, b] = edge { between(*first, a, b) } else { 0.0 }).sum()
 }
 
-/// Returns true if the fan from the first corner covers exactly the polygon: each triangle has the polygon's direction,
-/// and together they span less than half a turn.
+/// Returns true if the triangles from the first corner cover exactly the polygon: all of them have the winding of the
+/// polygon, and their angles at that corner add up to less than half a turn.
 fn is_fan(polygon: &[[f64; 2]]) -> bool {
     let ([first, second, .., last], [_, rest @ ..]) = (polygon, polygon) else { return false };
     let runs_on = rest.windows(2).all(|edge| match *edge {
@@ -212,7 +214,8 @@ fn is_fan(polygon: &[[f64; 2]]) -> bool {
     runs_on && between(*first, *second, *last) >= 0.0 && turns < core::f64::consts::PI
 }
 
-/// Returns the angle between the directions from a point to two others, in rad; 0 if a direction has no length.
+/// Returns the angle between the directions from one point to two others, in rad. Returns 0 if one of them is the point
+/// itself.
 fn angle([x, y]: [f64; 2], [ax, ay]: [f64; 2], [bx, by]: [f64; 2]) -> f64 {
     let ([ax, ay], [bx, by]) = ([ax - x, ay - y], [bx - x, by - y]);
     (ax * by - ay * bx).atan2(ax * bx + ay * by).abs()
@@ -228,7 +231,7 @@ mod tests {
     use super::*;
 
     fn filled(outline: &[[f64; 2]], holes: &[Vec<[f64; 2]>]) -> Result<Vec<Triangle>, String> {
-        // The polygon is in a general position, and far from the origin compared with its size.
+        // The polygon is not parallel to an axis, and is far from the origin compared with its size.
         let pose = Translation3::new(3.0, -2.0, 1.0) * Rotation3::from_euler_angles(0.4, 1.1, -2.0);
         let points = |ring: &[[f64; 2]]| -> Vec<Point3<f64>> {
             ring.iter().map(|&[x, y]| pose * Point3::new(x, y, 0.0)).collect()
@@ -266,7 +269,7 @@ mod tests {
                 let triangles = filled(&outline, &[]).unwrap();
                 assert_eq!(triangles.len(), 3);
                 assert!((total(&triangles) - 0.045).abs() < 1e-12, "{start}: {triangles:?}");
-                // The triangles have the winding of the polygon.
+                // The triangles must have the winding of the polygon.
                 let up: Vector3<f64> = triangles.iter().map(|[a, b, c]| (b - a).cross(&(c - a))).sum();
                 assert_eq!(up.z < 0.0, mirrored);
             }
@@ -328,7 +331,7 @@ mod tests {
     }
 
     proptest! {
-        /// Star-shaped polygons: seen from their center, each corner is in another direction.
+        /// A star-shaped polygon has its corners in different directions from its center.
         #[test]
         fn triangles_of_any_star_have_its_area_and_are_inside(
             arms in proptest::collection::vec(0.05..1.0_f64, 3..40), start in any::<prop::sample::Index>(),

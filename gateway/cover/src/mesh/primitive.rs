@@ -1,4 +1,5 @@
-//! Boxes, cylinders and spheres as triangles, in the position of URDF: centered on the origin, a cylinder along z.
+//! Creates meshes of boxes, cylinders and spheres in the position that URDF defines: centered on the origin, with the
+//! axis of a cylinder along z.
 
 use core::f64::consts::{PI, TAU};
 
@@ -6,15 +7,15 @@ use nalgebra::Point3;
 
 use super::{Mesh, MeshError, Triangle};
 
-/// The number of corners around a cylinder or a sphere: 5 degrees each, so that a face's normal is within 2.5 degrees
-/// of the surface's.
+/// The number of corners around a cylinder or a sphere. They are 5 degrees apart, so the normal of each face is within
+/// 2.5 degrees of the true one.
 const AROUND: u32 = 72;
 
 fn checked(shape: &'static str, what: &'static str, value: f64) -> Result<f64, MeshError> {
     if value.is_finite() && value > 0.0 { Ok(value) } else { Err(MeshError::Size { shape, what, value }) }
 }
 
-/// Returns the two triangles of four corners in order; those without an area are left out.
+/// Returns the two triangles between four corners, which are given in order. Triangles without an area are left out.
 fn quad([a, b, c, d]: [Point3<f64>; 4]) -> impl Iterator<Item = Triangle> {
     [[a, b, c], [a, c, d]].into_iter().filter(|[a, b, c]| a != b && b != c && c != a)
 }
@@ -48,7 +49,7 @@ impl Mesh {
     pub fn cylinder(radius: f64, length: f64) -> Result<Self, MeshError> {
         let radius = checked("cylinder", "radius", radius)?;
         let top = checked("cylinder", "length", length)? / 2.0;
-        // The profile runs from the center of one end along the wall to the center of the other.
+        // The profile goes from the center of one end, along the wall, to the center of the other end.
         let profile = [(0.0, -top), (radius, -top), (radius, top), (0.0, top)];
         Self::new("cylinder", turned(&profile))
     }
@@ -71,7 +72,7 @@ impl Mesh {
     }
 }
 
-/// Rotates a profile of radii and heights about z.
+/// Returns the surface that results from rotating a profile about z. A profile is a list of radii and heights.
 fn turned(profile: &[(f64, f64)]) -> Vec<Triangle> {
     let point = |(radius, z): (f64, f64), step: u32| {
         let angle = TAU * f64::from(step % AROUND) / f64::from(AROUND);

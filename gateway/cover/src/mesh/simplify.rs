@@ -1,4 +1,4 @@
-//! Reduces the number of triangles of a shape: nearby corners are merged.
+//! Reduces the number of triangles of a shape by merging corners that are near each other.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -6,15 +6,15 @@ use nalgebra::{Point3, Vector3};
 
 use super::Triangle;
 
-/// The factor by which the cubes grow in the next attempt.
+/// The factor by which the cubes of the grid grow if there are still too many triangles.
 const GROWTH: f64 = 1.12;
 
-/// A cube of the grid.
+/// The coordinates of a cube in the grid.
 type Cube = [i64; 3];
 
-/// Returns at most `most` triangles in total with the shape of these parts, or the parts unchanged if they have no
-/// more. Parts stay separate. Corners in the same cube of a grid are replaced by their mean; the cubes are as small as
-/// `most` allows. Triangles with a coordinate that is not finite are left out.
+/// Reduces the parts of a shape to at most `most` triangles in total. Returns them unchanged if they have no more.
+/// Corners of a part that are in the same cube of a grid are replaced by their mean; the cubes are as small as `most`
+/// allows. Triangles with coordinates that are not finite are left out.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "a number of triangles")]
 pub fn simplify(mut parts: Vec<Vec<Triangle>>, most: usize) -> Vec<Vec<Triangle>> {
@@ -25,7 +25,7 @@ pub fn simplify(mut parts: Vec<Vec<Triangle>>, most: usize) -> Vec<Vec<Triangle>
         return parts;
     }
     let area: f64 = parts.iter().flatten().map(area).sum();
-    // On a flat surface two triangles per cube remain, so this first size yields about half too many.
+    // A flat surface keeps two triangles per cube, so this first size leaves about twice the allowed number.
     let mut size = (area / most.max(1) as f64).sqrt().max(1e-6);
     loop {
         let fewer: Vec<_> = parts.iter().map(|part| clustered(part, size)).collect();
@@ -40,10 +40,11 @@ fn area([a, b, c]: &Triangle) -> f64 {
     (b - a).cross(&(c - a)).norm() / 2.0
 }
 
-/// Returns the triangles whose corners are in three different cubes of this size, each once.
+/// Merges the corners within each cube of this size. Returns the triangles whose corners are in three different cubes,
+/// without duplicates.
 #[expect(clippy::cast_possible_truncation, reason = "a coordinate over a size that is no smaller than 1 um")]
 fn clustered(part: &[Triangle], size: f64) -> Vec<Triangle> {
-    // The grid begins at the part's own corner, so that a cube as large as the part contains it.
+    // The grid begins at the smallest coordinates of the part, so that a cube of the part's size contains all of it.
     let infinite = Point3::new(f64::INFINITY, f64::INFINITY, f64::INFINITY);
     let low = part.iter().flatten().fold(infinite, |low, corner| low.inf(corner));
     let cube = |corner: &Point3<f64>| -> Cube { ((corner - low) / size).map(|it| it.floor() as i64).into() };
@@ -73,7 +74,7 @@ mod tests {
     #[test]
     fn a_sphere_of_fewer_triangles_is_a_sphere_still() {
         let sphere = Mesh::sphere(0.1).unwrap();
-        // Each triangle is divided into 64, so that there are triangles to merge.
+        // Each triangle is divided into 64, so that there are enough triangles to be merged.
         let mut fine = sphere.triangles().to_vec();
         for _ in 0..3 {
             let middle = |a: &Point3<f64>, b: &Point3<f64>| {

@@ -1,4 +1,4 @@
-//! Reads STL files, binary and ASCII. Normals are ignored.
+//! Reads binary and ASCII STL files. The normals in them are ignored.
 //!
 //! ```text
 //!              0        80      84     96                        132    134
@@ -16,13 +16,13 @@ const START: usize = TITLE + 4;
 const TRIANGLE: usize = 50;
 const NORMAL: usize = 12;
 
-/// Returns the triangles of a file. A file is binary if its length is that of its count of triangles, whatever its
-/// title.
+/// Returns the triangles of a file with these contents. A file is binary if its length fits the number of triangles
+/// that it states, even if its title begins like an ASCII file.
 pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
     let binary = binary(bytes);
     if let Some(Binary { announced, body }) = binary {
         let (all, rest) = body.as_chunks();
-        // Some exporters end the file with a line break.
+        // Some exporters write a line break after the last triangle.
         if usize::try_from(announced) == Ok(all.len()) && matches!(rest, b"" | b"\n" | b"\r\n") {
             return Ok(all.iter().map(triangle).collect());
         }
@@ -46,7 +46,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshE
     }
 }
 
-/// The count of triangles in a binary file, and the bytes after it.
+/// The number of triangles that a binary file states, and the bytes after this number.
 #[derive(Clone, Copy)]
 struct Binary<'a> {
     announced: u32,
@@ -65,21 +65,21 @@ fn triangle(bytes: &[u8; TRIANGLE]) -> Triangle {
     core::array::from_fn(|_| Point3::new(next(), next(), next()))
 }
 
-/// Returns the bytes without a byte order mark.
+/// Returns the bytes without a byte order mark at their beginning.
 fn unmarked(bytes: &[u8]) -> &[u8] {
     bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)
 }
 
-/// Returns true for text that begins with `solid`. Binary files may also begin so, but have zeros in their titles or
-/// first triangles.
+/// Returns true if the contents are text that begins with `solid`. A binary file may begin in the same way, but has
+/// zeros in its title or its first triangles.
 fn is_ascii(bytes: &[u8]) -> bool {
     let text = unmarked(bytes).trim_ascii_start();
     let head = bytes.get(..bytes.len().min(START + TRIANGLE)).unwrap_or_default();
     text.get(..5).is_some_and(|word| word.eq_ignore_ascii_case(b"solid")) && !head.contains(&0)
 }
 
-/// Returns the triangles of a text, whose numbers have the precision of binary files. Names of solids may have any
-/// encoding.
+/// Returns the triangles of an ASCII file. Numbers are rounded to single precision, as in binary files. The names of
+/// solids may have any encoding.
 fn ascii(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
     let text = String::from_utf8_lossy(unmarked(bytes));
     let mut triangles = Vec::new();
@@ -125,7 +125,7 @@ fn ascii(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
 mod tests {
     use super::*;
 
-    /// Returns a file with twelve triangles.
+    /// Returns a binary file with twelve triangles that states the number `announced`.
     fn binary(announced: u32) -> Vec<u8> {
         let mut bytes = vec![b' '; TITLE];
         bytes.extend(announced.to_le_bytes());

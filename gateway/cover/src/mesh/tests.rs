@@ -5,7 +5,7 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// Returns the smallest and largest corner of a mesh.
+/// Returns the smallest and the largest coordinates of a mesh.
 fn extent(mesh: &Mesh) -> ([f64; 3], [f64; 3]) {
     let mut corners = mesh.triangles().iter().flatten();
     let first = *corners.next().unwrap();
@@ -17,7 +17,8 @@ fn close(a: [f64; 3], b: [f64; 3]) -> bool {
     a.iter().zip(&b).all(|(a, b)| (a - b).abs() < 1e-6)
 }
 
-/// Returns the volume that the triangles enclose, which is positive if all are wound outward.
+/// Returns the volume that the triangles enclose. It is positive if all of them are counterclockwise as seen from
+/// outside.
 fn volume(mesh: &Mesh) -> f64 {
     mesh.triangles().iter().map(|[a, b, c]| a.coords.cross(&b.coords).dot(&c.coords) / 6.0).sum()
 }
@@ -28,7 +29,7 @@ fn message(result: Result<Mesh, MeshError>) -> String {
     message
 }
 
-/// A tetrahedron with edges of 1, 2 and 3 along the axes.
+/// The corners of a tetrahedron whose edges along the axes have the lengths 1, 2 and 3.
 const CORNERS: [[f32; 3]; 4] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]];
 const FACES: [[usize; 3]; 4] = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]];
 
@@ -68,7 +69,7 @@ fn obj() -> String {
     text
 }
 
-/// Returns a file with the tetrahedron, this asset and these nodes.
+/// Returns a COLLADA file with the tetrahedron, an `asset` element, and the nodes of its scene.
 fn dae(asset: &str, nodes: &str) -> String {
     format!(
         r##"<?xml version="1.0"?>
@@ -147,14 +148,13 @@ fn a_file_is_read_from_its_path() {
 
 #[test]
 fn unit_axis_and_nested_nodes_of_collada_are_applied() {
-    // The tetrahedron with edges 1, 2, 3 is moved by 10 along x, and the inner node is rotated by a quarter turn about
-    // z.
+    // The tetrahedron is moved by 10 along x. The inner node is rotated about z by a quarter turn.
     let nodes = r##"<node>
         <matrix>1 0 0 10  0 1 0 0  0 0 1 0  0 0 0 1</matrix>
         <node><rotate>0 0 1 90</rotate><translate>100 0 0</translate><instance_geometry url="#shape"/></node>
     </node>"##;
     let asset = r#"<unit name="millimeter" meter="0.001"/><up_axis>Y_UP</up_axis>"#;
-    // In the file x is 10 - 2 to 10, y is 100 to 101, z is 0 to 3.
+    // In the axes of the file, x is from 8 to 10, y from 100 to 101, and z from 0 to 3.
     let as_written = parsed(&dae(asset, nodes), UpAxis::Ignore);
     assert!(close(extent(&as_written).0, [0.008, 0.1, 0.0]), "{:?}", extent(&as_written));
     assert!(close(extent(&as_written).1, [0.01, 0.101, 0.003]));
@@ -292,7 +292,7 @@ fn primitives_are_closed_and_as_large_as_said() {
 }
 
 proptest! {
-    /// Any file is either a mesh or an error.
+    /// Any bytes are read as a mesh or cause an error; none of them cause a panic.
     #[test]
     fn no_bytes_stop_the_program(
         name in prop::sample::select(vec!["a.stl", "a.obj", "a.dae"]),
@@ -314,7 +314,7 @@ proptest! {
         }
     }
 
-    /// The faces have indices of missing vertices, with either sign.
+    /// Faces may refer to vertices that do not exist, by positive and negative numbers.
     #[test]
     fn no_obj_face_stops_the_program(numbers in proptest::collection::vec(-6..7_i64, 0..9)) {
         let face: Vec<_> = numbers.iter().map(|number| format!("{number}/{number}/{number}")).collect();

@@ -1,5 +1,5 @@
-//! Links of a real robot, measured independently: with random points of the mesh, and rays that are tested against
-//! every triangle.
+//! Tests on the links of a real robot. What the crate computes is compared with a slow and independent computation:
+//! random points of the mesh, and rays that are tested against every triangle.
 
 #![allow(
     clippy::unwrap_used,

@@ -19,35 +19,36 @@ pub const G: f64 = 9.806_65;
 /// Gravity in the base frame of an upright robot, in m/s2.
 pub const UPRIGHT: [f64; 3] = [0.0, 0.0, -G];
 
-/// Positions, speeds and accelerations of the joints of a chain, in rad or m and seconds.
+/// Positions, speeds and accelerations of the joints of one chain: rad, rad/s and rad/s2, or m, m/s and m/s2 for
+/// prismatic joints.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct JointState {
-    /// The positions.
+    /// The positions, in rad or m.
     pub position: [f64; MAX_JOINTS],
-    /// The speeds.
+    /// The speeds, in rad/s or m/s.
     pub speed: [f64; MAX_JOINTS],
-    /// The accelerations.
+    /// The accelerations, in rad/s2 or m/s2.
     pub acceleration: [f64; MAX_JOINTS],
 }
 
-/// The specific force field on one row of the chain, in the frame of the row.
+/// The specific force (acceleration minus gravity) at every point of one row of the chain, in the frame of the row.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RowMotion {
     /// The specific force at the row's origin, in g.
     pub force: Vector3<f64>,
-    /// Its gradient with respect to the position, in g/m.
+    /// The change of the specific force with the position on the row, in g/m.
     pub gradient: Matrix3<f64>,
 }
 
 impl RowMotion {
-    /// Returns the specific force at a position, in g.
+    /// Returns the specific force at a position on the row (in m, in the frame of the row), in g.
     #[must_use]
     pub fn at(&self, position: &Vector3<f64>) -> Vector3<f64> {
         self.force + self.gradient * position
     }
 }
 
-/// The kinematics of a bus's chain.
+/// The geometry of a bus's chain and the direction of gravity, from which the specific forces on its rows follow.
 #[derive(Clone, Debug)]
 pub struct Arm {
     central: Central,
@@ -64,7 +65,8 @@ impl Arm {
         Self { central: Central::unquantised(&skin.with_cells_of_bus(bus)), kinds, gravity: gravity.into() }
     }
 
-    /// Returns the specific force field on each row; the first is the base of the chain, which no joint moves.
+    /// Returns the specific force field of each row of the chain, base to tip. The first entry is the base, which no
+    /// joint moves.
     #[must_use]
     pub fn rows(&self, state: &JointState) -> [RowMotion; MAX_ROWS + 1] {
         let frames = self.central.frames_at(&state.position);
@@ -110,7 +112,8 @@ impl Arm {
         Isometry3::from_parts(change.translation, UnitQuaternion::from_rotation_matrix(&change.rotation))
     }
 
-    /// Returns a position given in the frame of a row in the robot's base frame, in m.
+    /// Converts a position in the frame of a row to a position in the robot's base frame, in m, for these joint
+    /// positions in rad or m.
     #[must_use]
     pub fn place(&self, row: usize, position: &Vector3<f64>, joints: &[f64]) -> Vector3<f64> {
         let frames = self.central.frames_at(joints);

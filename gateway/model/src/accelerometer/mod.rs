@@ -20,14 +20,14 @@ use sensor::{Accelerometer, DataSheet, rotation};
 pub struct RobotState {
     /// The positions, in rad or m.
     pub position: [f64; MAX_ROBOT_JOINTS],
-    /// The speeds.
+    /// The speeds, in rad/s or m/s.
     pub speed: [f64; MAX_ROBOT_JOINTS],
-    /// The accelerations.
+    /// The accelerations, in rad/s2 or m/s2.
     pub acceleration: [f64; MAX_ROBOT_JOINTS],
 }
 
 impl RobotState {
-    /// Returns the state of a chain, given the indices of its joints in the robot.
+    /// Returns the state of the joints of one chain; `joints` are the indices of these joints in the robot.
     #[must_use]
     pub fn of_chain(&self, joints: &[usize]) -> JointState {
         let pick = |from: &[f64; MAX_ROBOT_JOINTS]| {
@@ -45,7 +45,7 @@ impl RobotState {
     }
 }
 
-/// The accelerometers of a skin.
+/// The simulated accelerometers of all cells of a skin.
 #[derive(Clone, Debug)]
 pub struct Accelerometers {
     arms: Vec<Option<Arm>>,
@@ -72,7 +72,7 @@ impl Accelerometers {
     }
 
     /// Returns the reading of each cell of the skin at the time `now` in s, in g. `state` returns the robot's state at
-    /// a time; `tilt` rotates the force at a cell.
+    /// a time in s; `tilt` rotates the specific force at a cell, by the cell's index.
     pub fn readings<'a>(
         &'a self,
         skin: &'a Skin,

@@ -25,7 +25,7 @@ pub struct DataSheet {
     pub noise_g: f64,
     /// Samples per second; 0 to sample at each read.
     pub rate_hz: f64,
-    /// The largest relative error of that rate.
+    /// The largest relative error of the sample rate.
     pub rate_error: f64,
     /// The longest delay from the motion to the sample, including filters, in s.
     pub delay_s: f64,
@@ -35,7 +35,7 @@ pub struct DataSheet {
     pub step_g: f64,
 }
 
-/// The data sheet in a file: a kind, and the values that differ from it.
+/// A data sheet as given in a scenario's file: a named sensor type, and the values that replace those of that type.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DataSheetInput {
@@ -136,12 +136,13 @@ impl DataSheet {
     }
 }
 
-/// One simulated accelerometer.
+/// One simulated accelerometer, with errors drawn from a data sheet.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Accelerometer {
     sheet: DataSheet,
     seed: u64,
-    /// `I + gain + cross`.
+    /// The matrix `I + gain + cross` from true to measured specific force: gain errors on the diagonal, cross-axis
+    /// sensitivity beside it.
     matrix: Matrix3<f64>,
     bias: Vector3<f64>,
     delay: f64,
@@ -183,13 +184,14 @@ impl Accelerometer {
         self.bias
     }
 
-    /// Returns the instant that the newest readable sample at `now` shows: its sampling time minus the delay, in s.
+    /// Returns the time of the motion that the newest readable sample at `now` shows: the sampling time minus the
+    /// delay, in s.
     #[must_use]
     pub fn sampled(&self, now: f64) -> f64 {
         self.sample(now).1
     }
 
-    /// Returns the number of the newest sample and the instant that it shows.
+    /// Returns the number of the newest sample at `now` in s, and the time of the motion that it shows, in s.
     fn sample(&self, now: f64) -> (f64, f64) {
         if self.period > 0.0 {
             let number = ((now - self.phase) / self.period).floor();
@@ -228,8 +230,9 @@ const fn mixed(bits: u64) -> u64 {
     bits ^ (bits >> 31)
 }
 
-/// Returns the rotation of an orientation quaternion x, y, z, w from a skin's file. For a cell with a normal only, its
-/// x axis is as near as possible to that of its row, or to the y axis if the normal is close to x.
+/// Returns the rotation for an orientation quaternion x, y, z, w from a skin's file. If the file gives only the cell's
+/// normal, the x axis of the cell is as near as possible to that of its row, or to the y axis if the normal is close to
+/// x.
 #[must_use]
 pub fn rotation(orientation: Option<[f64; 4]>, normal: [f64; 3]) -> nalgebra::UnitQuaternion<f64> {
     use nalgebra::{Quaternion, Rotation3, UnitQuaternion};

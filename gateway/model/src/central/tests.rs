@@ -12,7 +12,8 @@ fn pressed(contact: f64, proximity: f64) -> SkinSensors {
     }
 }
 
-/// The table was computed by another program, which agrees with a rigid-body library on the URDF.
+/// The expected torques were computed by an independent program, which agrees with a rigid-body library on the same
+/// URDF.
 #[test]
 fn torques_agree_with_the_table_of_another_program() {
     let table = include_str!("../../../tests/vectors/ur5_torque.csv");
@@ -104,7 +105,7 @@ fn the_torque_of_the_skin_is_the_sum_of_its_active_cells() {
 
 proptest! {
     /// The principle of virtual work, with a finite difference as the oracle: the torque of a joint is the force times
-    /// the displacement of the cell per joint angle. A pressed joint therefore yields.
+    /// the displacement of the cell per joint angle, with the sign by which a pressed joint yields.
     #[test]
     fn the_torque_is_the_work_of_the_force_per_angle(q in any::<[i16; 6]>(), k in 1_u8..=6) {
         let mut skin = skin();

@@ -6,15 +6,16 @@ use protocol::time::Micros;
 
 use crate::tracker::{AddressClaim, PerCell, HeartbeatKind};
 
-/// The claims to all node ids of a bus.
+/// The owner of each node id of a bus, from the heartbeats received.
 #[derive(Debug, Default)]
 pub(super) struct AddressTable(PerCell<AddressClaim>);
 
 impl AddressTable {
-    /// Records a heartbeat. Returns two serial numbers that use one node id in turn.
+    /// Records a heartbeat that was sent under the node id `number`. Returns two serial numbers if two cells use that
+    /// node id in turn.
     ///
-    /// A single change means that one cell replaced another; only a change back proves that both are present. A claim
-    /// for a taken node id will be given up and does not change the owner.
+    /// A single change of the serial number means that one cell replaced another; only a change back proves that both
+    /// are present. A claim for a node id with an owner does not change the owner, because the claiming cell yields.
     pub(super) fn receive_heartbeat(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat) -> Option<[u32; 2]> {
         let claim = self.0.get_mut(number)?;
         let before = *claim;

@@ -10,9 +10,9 @@
 //! configuration changes atomically, at its commit: the commit contains the hash of the parameters that must be staged.
 //! So a commissioning may stop at any moment, and the next one continues: cells with the right hash are skipped.
 //!
-//! It listens first and then sends requests. Parameters that all cells share are broadcast, one request at a time; the
-//! rest goes to each cell, several cells at a time. Unanswered requests are repeated. When all cells have committed,
-//! all parameters are read back and compared, and so is the hash in the heartbeats.
+//! The gateway first listens, then sends requests. Parameters that all cells share are broadcast, one request at a
+//! time; the rest goes to each cell, several cells at a time. Unanswered requests are repeated. When all cells
+//! have committed, all parameters are read back and compared, and so is the hash in the heartbeats.
 
 mod address_table;
 pub mod node_ids;
@@ -37,14 +37,14 @@ pub use outcome::{Outcome, Reason, Step, AbortReason};
 pub use report::{CellReport, Progress, Report, UnknownNode};
 pub use task::CommissionOptions;
 
-/// Duration of listening before the first request. Two gateways detect each other in this time.
+/// Duration of listening before the first request: long enough for two gateways to receive each other's heartbeats.
 pub const LISTEN_TIME: Span = Span::from_millis(500);
-/// Time to wait for further cells after the last one appeared.
+/// Time after which no further cells are expected, counted from the appearance of the last one.
 const DISCOVERY_TIMEOUT: Span = Span::from_millis(3_000);
-/// Maximum number of cells with a pending request of their own.
+/// Maximum number of cells that have a pending request addressed to them alone.
 const MAX_PENDING_CELLS: usize = 16;
-/// Limits of a broadcast request while most cells do not answer. After this time without any answer, the remaining
-/// cells get requests of their own.
+/// Retry limits of a broadcast request while most cells do not answer. If no cell answers within this time, each
+/// remaining cell gets a request of its own.
 const BROADCAST_LIMITS: Limits = Limits { first: BROADCAST_TIMEOUT, longest: BROADCAST_TIMEOUT, tries: 3 };
 const BROADCAST_TIMEOUT: Span = Span::from_millis(150);
 /// Interval of syncs while waiting for heartbeats.
@@ -57,28 +57,28 @@ const BROADCAST_TAG: u8 = 0x80;
 /// The phases of a commissioning, in order.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Phase {
-    /// Listening only, until this time.
+    /// Listening without sending, until this time.
     Listen(Micros),
-    /// Waiting for cells; with the time when the last one appeared.
+    /// Waiting for cells to appear; holds the time when the last one appeared.
     Find(Micros),
-    /// Writing parameters and committing.
+    /// Writing parameters to cells, and committing them.
     Write,
-    /// Reading back all parameters.
+    /// Reading back all parameters from cells.
     Read,
-    /// Waiting for heartbeats; with the time of the last sync.
+    /// Waiting for heartbeats with the expected hash; holds the time of the last sync.
     Beat(Micros),
-    /// Finished.
+    /// Finished: nothing is sent any more.
     Over,
 }
 
-/// A broadcast request.
+/// A broadcast request and the state of its retries.
 #[derive(Clone, Copy, Debug)]
 struct Call {
     step: Step,
     tag: u8,
-    /// Number of cells that needed it at first.
+    /// Number of cells that needed the request when it was first sent.
     needed: usize,
-    /// Its retries. An answer from any cell restarts the timeout.
+    /// Retry state of the request. An answer from any cell restarts the timeout.
     attempt: Attempt,
 }
 
@@ -86,17 +86,17 @@ struct Call {
 #[derive(Debug)]
 pub struct Commission {
     wish: CommissionOptions,
-    /// Number of answers that a broadcast request may bring at once.
+    /// Maximum number of answers to one broadcast request that the receive buffer can hold.
     room: usize,
     tasks: Vec<Task>,
     by_serial: HashMap<u32, usize>,
-    /// Serial numbers of cells on other buses, and their buses.
+    /// Serial numbers of the cells that the description has on other buses, with the names of these buses.
     elsewhere: BTreeMap<u32, String>,
     address_table: AddressTable,
     phase: Phase,
     calls: VecDeque<Step>,
     call: Option<Call>,
-    /// All broadcast requests so far, with their tags: late answers count too.
+    /// All broadcast requests so far, each with its tag; late answers to earlier ones still count.
     called: Vec<(Step, u8)>,
     outbox: VecDeque<Message>,
     announced: Option<Micros>,
@@ -106,8 +106,8 @@ pub struct Commission {
 }
 
 impl Commission {
-    /// Starts the commissioning of a skin's bus, with listening; `room` is the number of packets that may arrive at
-    /// once without loss.
+    /// Starts the commissioning of one bus of a skin; it listens first. `room` is the number of packets that the
+    /// receive buffer can hold without loss.
     #[must_use]
     pub fn new(skin: &Skin, bus: usize, wish: CommissionOptions, room: usize, now: Micros) -> Self {
         let tasks: Vec<_> =
@@ -141,13 +141,13 @@ impl Commission {
         self.phase == Phase::Over
     }
 
-    /// Returns true if it may send on the bus: not while it listens, and not in a dry run.
+    /// Returns true if the commissioning may send on the bus: not while it listens, and not in a dry run.
     #[must_use]
     pub const fn may_send(&self) -> bool {
         !matches!(self.phase, Phase::Listen(_) | Phase::Over) && !self.wish.dry_run
     }
 
-    /// Handles a message from another sender on the bus. [`Commission::handle_time`] acts on it.
+    /// Records a message from another sender on the bus. Replies are sent by [`Commission::handle_time`], not here.
     pub fn handle_message(&mut self, now: Micros, message: &Message) {
         if let Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } = message {
             self.end(AbortReason::OtherGateway);
@@ -173,7 +173,7 @@ impl Commission {
         }
     }
 
-    /// Returns the described cell that holds a node id now.
+    /// Returns the task of the described cell that holds a node id now.
     fn holder(&mut self, number: CellId) -> Option<&mut Task> {
         let serial = self.address_table.holder(number)?;
         let task = self.tasks.get_mut(*self.by_serial.get(&serial)?)?;
@@ -222,13 +222,13 @@ impl Commission {
         }
     }
 
-    /// Stops now; the outbox is emptied.
+    /// Stops the commissioning now, and discards the messages that have not been sent.
     pub fn stop(&mut self) {
         self.outbox.clear();
         self.give_up(Reason::Stopped, Reason::Stopped);
     }
 
-    /// Fails all cells that are not done.
+    /// Fails all cells that are not done: with the reason `unheard` if a cell sent no heartbeat, else with `heard`.
     fn give_up(&mut self, unheard: Reason, heard: Reason) {
         for task in self.tasks.iter_mut().filter(|task| !task.is_done()) {
             task.fail(if task.number.is_none() { unheard } else { heard });
@@ -236,7 +236,7 @@ impl Commission {
         self.phase = Phase::Over;
     }
 
-    /// Handles timeouts, and decides what to send. Has no effect when called early.
+    /// Handles expired timeouts, and queues the messages to send. A call before any timeout has no effect.
     pub fn handle_time(&mut self, now: Micros) {
         for place in 0..self.tasks.len() {
             let again = self.tasks.get_mut(place).and_then(|task| Some((task.number, task.time(now)?)));
@@ -314,8 +314,8 @@ impl Commission {
         self.tasks.iter().any(|task| !task.is_done() && is(task.stage))
     }
 
-    /// Sends the requests that are possible now to cells in these stages. Returns true if any cell remains, or is still
-    /// settling.
+    /// Queues the requests that are possible now for the cells whose stage satisfies `is`. Returns true if any such
+    /// cell remains, or if a cell is still claiming its node id.
     fn works(&mut self, now: Micros, is: impl Fn(Stage) -> bool) -> bool {
         if self.call_everyone(now) {
             return true;
@@ -334,7 +334,7 @@ impl Commission {
         self.any(is) || self.tasks.iter().any(|task| !task.is_done() && task.unsettled.is_some())
     }
 
-    /// Continues with broadcast requests. Returns true if one is pending.
+    /// Sends or repeats broadcast requests. Returns true if one is pending.
     fn call_everyone(&mut self, now: Micros) -> bool {
         loop {
             if let Some(call) = &mut self.call {
@@ -377,7 +377,7 @@ impl Commission {
         fits && (matches!(step, Step::Read(_)) || self.address_table.all().all(|(_, serial)| ours(serial)))
     }
 
-    /// Returns the writes with the same value for all cells that need any.
+    /// Returns the writes that are the same for all cells that need them.
     fn common_writes(&self) -> VecDeque<Step> {
         let common = |parameter: &Parameter| {
             let mut words = self
@@ -391,7 +391,7 @@ impl Commission {
         self.all_stored().filter(common).map(Step::Write).collect()
     }
 
-    /// Returns the parameters of the longest table.
+    /// Returns the parameters of the cell with the largest number of parameters.
     fn all_stored(&self) -> impl Iterator<Item = Parameter> + use<> {
         let longest = self.tasks.iter().map(|task| task.stored().count()).max().unwrap_or_default();
         Parameter::stored(MAX_ROWS).take(longest)
@@ -435,7 +435,7 @@ const fn is_failed(stage: Stage) -> bool {
     matches!(stage, Stage::Done(Outcome::Failed(_)))
 }
 
-/// Returns true if a write of this parameter changes stored or staged parameters.
+/// Returns true if a write of the parameter with this number changes stored or staged parameters.
 fn is_stored(number: u8) -> bool {
     let parameter = Parameter::from_number(number);
     parameter.is_some_and(|it| it == Parameter::Commit || it.is_stored())

@@ -1,4 +1,4 @@
-//! A copy of a description with the node ids that cells have on their buses.
+//! Rewrites the text of a skin description, so that it has the node ids that its cells have on their buses.
 
 use std::collections::BTreeMap;
 
@@ -14,14 +14,14 @@ pub enum NodeIdsError {
     /// Cells of a bus did not send a heartbeat.
     #[error("{missing} of the {cells} cells on {bus} sent no heartbeat, so their node ids are not known")]
     Missing {
-        /// The bus.
+        /// Name of the bus.
         bus: String,
         /// Number of cells without a heartbeat.
         missing: usize,
         /// Number of cells of the bus.
         cells: usize,
     },
-    /// The text is not that of the skin that was read.
+    /// The text does not describe the skin that was read.
     #[error("the description's text is not that of the skin that was read: {0}")]
     Text(String),
 }
@@ -29,11 +29,11 @@ pub enum NodeIdsError {
 /// Node ids by serial number; `None` for cells without a heartbeat.
 pub type NodeIds = BTreeMap<u32, Option<CellId>>;
 
-/// Returns the text of a description with other node ids, and everything else unchanged: comments, order, omitted keys.
-/// Cells that are not in `node_ids` keep their node ids. Neighbors are renumbered with the cells.
+/// Returns the text of a description with the node ids in `node_ids`, and everything else unchanged: comments, order,
+/// omitted keys. Cells that are not in `node_ids` keep their node ids. Neighbor lists are renumbered with the cells.
 ///
 /// # Errors
-/// Returns [`NodeIdsError`] if a node id is not known, or if the text is not the skin's.
+/// Returns [`NodeIdsError`] if the node id of a cell is `None`, or if the text does not describe the skin.
 pub fn renumbered(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String, NodeIdsError> {
     for (bus, described) in skin.buses.iter().enumerate() {
         let here = || skin.cells_on_bus(bus).filter_map(|cell| node_ids.get(&cell.serial));

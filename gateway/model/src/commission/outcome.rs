@@ -12,7 +12,7 @@ use thiserror::Error;
 
 use crate::decode::parameter::{ParameterName, ParameterWords};
 
-/// A request to a cell.
+/// A step of the commissioning of a cell: a request that is sent to it.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Step {
     /// Stage a parameter.
@@ -44,89 +44,89 @@ impl fmt::Display for Step {
     }
 }
 
-/// The result of a cell; as JSON, the texts `outcome` and `why`.
+/// The result of commissioning a cell; serialised as the texts `outcome` and `why`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(tag = "outcome", content = "why", rename_all = "lowercase")]
 pub enum Outcome {
-    /// It was written, read back and compared.
+    /// The parameters were written, read back and compared.
     Written,
-    /// Its hash matched the skin's configuration already.
+    /// The cell was skipped, because its hash already matched the skin's configuration.
     #[serde(rename = "already so")]
     AlreadySo,
-    /// Its hash matched already, and all its parameters were read back and compared.
+    /// The hash of the cell already matched; all its parameters were read back and compared.
     Verified,
-    /// A dry run: it would be written.
+    /// The cell would be written, but this was a dry run.
     #[serde(rename = "would be written")]
     WouldWrite,
-    /// It failed. The cell has either its old configuration or all of the new one.
+    /// The commissioning of the cell failed. The cell has either its old configuration or all of the new one.
     Failed(Reason),
 }
 
 /// The reason why a cell was not commissioned.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 pub enum Reason {
-    /// It sent no heartbeat.
+    /// The cell sent no heartbeat.
     #[error("is not on the bus: switch it on, or check its wiring")]
     Missing,
-    /// Its heartbeats stopped.
+    /// The heartbeats of the cell stopped.
     #[error("has gone from the bus")]
     Gone,
-    /// Two cells have its serial number.
+    /// Two cells, with these node ids, have the same serial number.
     #[error("is on the bus twice, with node ids {0} and {1}: give one of them another serial number")]
     Twins(CellId, CellId),
-    /// Another cell uses its node id too.
+    /// Another cell uses the same node id.
     #[error("shares node id {number} with the cell of serial number {other}: switch one of them off")]
     Shared {
-        /// The node id.
+        /// The shared node id.
         number: CellId,
         /// The serial number of the other cell.
         other: u32,
     },
-    /// It uses another version of the protocol.
-    #[error("speaks version {got} of the protocol, and this program {VERSION}: bring both to one version")]
+    /// The cell uses another version of the protocol.
+    #[error("speaks protocol version {got}, but this program speaks {VERSION}: bring both to one version")]
     Version {
-        /// Its version.
+        /// The version that the cell reports.
         got: u16,
     },
-    /// It did not answer a request.
-    #[error("does not answer {step}, sent {tries} times")]
+    /// The cell did not answer a request.
+    #[error("did not answer {step}, although it was sent {tries} times")]
     Silent {
-        /// The request.
+        /// The unanswered request.
         step: Step,
         /// Number of transmissions.
         tries: u8,
     },
-    /// It refused a request.
+    /// The cell refused a request.
     #[error("refuses {step}: {}", reason(i64::from(*.code)))]
     Refused {
-        /// The request.
+        /// The refused request.
         step: Step,
-        /// The reason code in its answer.
+        /// The reason code in the answer of the cell.
         code: i16,
     },
-    /// It lacks an ability that the skin needs.
+    /// The cell lacks an ability that the skin needs.
     #[error("does not support {0}: install newer firmware, or leave it out of the skin")]
     Cannot(MissingAbility),
-    /// Its answer differs from the written value.
+    /// The answer of the cell differs from the written value.
     #[error(
         "answers {step} with {}, not {}",
         ParameterWords(.step.parameter().number(), *.got),
         ParameterWords(.step.parameter().number(), *.target)
     )]
     Differs {
-        /// The request.
+        /// The request that was answered.
         step: Step,
         /// The expected words.
         target: [i16; WORDS],
-        /// The words in its answer.
+        /// The words in the answer.
         got: [i16; WORDS],
     },
-    /// The hash in its heartbeats does not match the parameters that it reads back.
+    /// The hash in the heartbeats of the cell does not match the parameters that it reads back.
     #[error("sends the configuration hash {got:04X} in its heartbeats, not {target:04X}")]
     Hash {
-        /// The skin's hash.
+        /// The hash of the skin's configuration for the cell.
         target: u16,
-        /// The hash in its heartbeats.
+        /// The hash in the heartbeats of the cell.
         got: u16,
     },
     /// The commissioning ended before this cell was done.
@@ -145,12 +145,12 @@ impl Serialize for Reason {
 pub enum AbortReason {
     /// Another gateway sends on the bus.
     OtherGateway,
-    /// Another program writes parameters.
+    /// Another program writes parameters of cells on the bus.
     Meddler,
 }
 
 impl AbortReason {
-    /// Returns the text for users, with the name of the bus.
+    /// Returns the reason as a sentence for users, with the name of the bus.
     #[must_use]
     pub fn on(self, bus: &str) -> String {
         match self {

@@ -1,4 +1,4 @@
-//! Progress and result of a commissioning.
+//! Progress and result of the commissioning of a bus.
 
 use protocol::id::CellId;
 use serde::Serialize;
@@ -11,56 +11,56 @@ use super::{Commission, Outcome, Phase, Reason, AbortReason, is_failed};
 pub struct Progress {
     /// The current activity: listening, looking for cells, writing, reading back, waiting for heartbeats.
     pub activity: &'static str,
-    /// Cells of the description on this bus.
+    /// Number of described cells on this bus.
     pub cells: usize,
-    /// Described cells that were found on the bus.
+    /// Number of described cells that were found on the bus.
     pub found: usize,
-    /// Described cells that are done.
+    /// Number of described cells that are done.
     pub done: usize,
-    /// Described cells that failed.
+    /// Number of described cells that failed.
     pub failed: usize,
 }
 
 /// The result of one cell.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct CellReport {
-    /// Its node id in the description.
+    /// Node id of the cell in the description.
     pub described: CellId,
-    /// Its node id on the bus, if it was found.
+    /// Node id of the cell on the bus, if it was found.
     #[serde(rename = "node")]
     pub number: Option<CellId>,
-    /// Its serial number.
+    /// Serial number of the cell.
     pub serial: u32,
-    /// The result.
+    /// The result of commissioning the cell.
     #[serde(flatten)]
     pub outcome: Outcome,
 }
 
-/// A cell that the description does not have on this bus.
+/// A cell on this bus that the description does not have on this bus.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct UnknownNode {
-    /// Its node id on the bus.
+    /// Node id of the cell on the bus.
     #[serde(rename = "node")]
     pub number: CellId,
-    /// Its serial number.
+    /// Serial number of the cell.
     pub serial: u32,
-    /// The bus to which the description assigns it.
+    /// Name of the bus on which the description has this cell, if it has it at all.
     #[serde(rename = "belongs_to", skip_serializing_if = "Option::is_none")]
     pub belongs: Option<String>,
 }
 
-/// The result of one bus.
+/// The result of commissioning one bus.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Report {
     /// The described cells, in the file's order.
     pub cells: Vec<CellReport>,
-    /// Cells outside the description, by node id; they were not written to.
+    /// Cells on the bus that are not in the description, by node id; they were not written to.
     pub unknown_nodes: Vec<UnknownNode>,
-    /// Requests to single cells and broadcast requests.
+    /// Number of requests, to single cells or broadcast.
     pub requests: u64,
-    /// Repeated requests among them.
+    /// Number of repeated requests, included in `requests`.
     pub repeated: u64,
-    /// The reason why it stopped early.
+    /// The reason why the commissioning stopped early; `None` if it did not.
     pub trouble: Option<AbortReason>,
 }
 

@@ -1,4 +1,4 @@
-//! The state of one cell: its missing parameters and its pending request.
+//! The commissioning of one cell: its stage, the parameters that it still needs, and its pending request.
 
 use protocol::id::CellId;
 use protocol::message::{Answer, Heartbeat, State, VERSION};
@@ -11,33 +11,33 @@ use crate::repeat::{Attempt, Limits, RetryAction};
 
 /// Retry limit and timeout of a request to one cell.
 const REQUEST_LIMITS: Limits = Limits { first: Span::from_millis(100), longest: Span::from_millis(800), tries: 6 };
-/// Retry limit and timeouts of a commit, which writes flash and takes longer.
+/// Retry limit and timeouts of a commit request; longer than [`ANSWER`], because the cell writes its flash.
 const COMMIT_LIMITS: Limits = Limits { first: Span::from_millis(400), ..REQUEST_LIMITS };
-/// Number of times that a cell is written again from the beginning after it restarted in the middle.
+/// Maximum number of times that the writing of a cell starts over after the cell restarted meanwhile.
 const MAX_ROUNDS: u8 = 6;
-/// Longest time to settle for a cell that has started or lost its node id.
+/// Maximum time for a cell to hold a node id after it started or lost its node id.
 pub(super) const SETTLE_TIMEOUT: Span = Span::from_millis(3_000);
-/// Timeout for a heartbeat with the right hash, after everything was read back.
+/// Time to wait for a heartbeat with the expected hash, after all parameters were read back.
 const HEARTBEAT_TIMEOUT: Span = Span::from_millis(2_000);
 
-/// The stage of a cell.
+/// The stage of a cell's commissioning.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Stage {
-    /// It has sent no heartbeat yet.
+    /// The cell has not sent a heartbeat yet.
     Missing,
-    /// Its abilities are being read.
+    /// The abilities of the cell are being read.
     Ask,
-    /// It needs some parameters, then a commit.
+    /// The cell needs parameters, and then a commit.
     Write,
-    /// It has committed, or had the right hash; its parameters are being compared.
+    /// The cell has committed, or had the expected hash; its parameters are being read back and compared.
     Read,
-    /// Waiting for a heartbeat with the right hash; with the start of the wait.
+    /// Waiting for a heartbeat with the expected hash; holds the start of the wait.
     Beat(Micros),
-    /// Finished.
+    /// The commissioning of the cell has finished, with this result.
     Done(Outcome),
 }
 
-/// A request that has not been answered yet.
+/// A request to the cell that has not been answered yet.
 #[derive(Clone, Copy, Debug)]
 struct Pending {
     step: Step,
@@ -45,40 +45,41 @@ struct Pending {
     attempt: Attempt,
 }
 
-/// A cell of the description.
+/// The commissioning of one described cell.
 #[derive(Debug)]
 pub(super) struct Task {
-    /// Its serial number, which identifies it.
+    /// Serial number, which identifies the cell.
     pub(super) serial: u32,
-    /// Its node id in the description.
+    /// Node id of the cell in the description.
     pub(super) described: CellId,
-    /// Its node id on the bus.
+    /// Node id of the cell on the bus; `None` until it is known.
     pub(super) number: Option<CellId>,
-    /// Its stage.
+    /// The present stage of the cell.
     pub(super) stage: Stage,
     target: Parameters,
     hash: u16,
-    /// True if this commissioning has changed, or would change, its configuration.
+    /// True if this commissioning has changed the configuration of the cell; in a dry run, if it would change it.
     touched: bool,
-    /// Bit i is set if the stored parameter i is staged, or reads back right.
+    /// Bit i is set if stored parameter i is staged in the cell, or was read back with the expected value.
     written: u64,
     read: u64,
     pending: Option<Pending>,
     tag: u8,
     rounds: u8,
-    /// Its previous node id.
+    /// The node id that the cell had before its present one.
     before: Option<CellId>,
-    /// The time since when it cannot receive requests: it claims an address, or has lost its node id.
+    /// The time since when the cell cannot receive requests, because it claims a node id or has lost it; `None` if it
+    /// can.
     pub(super) unsettled: Option<Micros>,
     reported_hash: u16,
 }
 
-/// Restrictions on a commissioning, and its checks.
+/// Options of a commissioning: what it may write, and what it checks.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct CommissionOptions {
-    /// True to write nothing.
+    /// True to send no writes.
     pub dry_run: bool,
-    /// True to read back cells that have the right hash, too.
+    /// True to read back also the cells that already have the expected hash.
     pub verify: bool,
 }
 
@@ -107,7 +108,7 @@ impl Task {
         }
     }
 
-    /// Returns the words that the cell should have for a parameter.
+    /// Returns the words that a parameter of the cell should have.
     pub(super) fn words(&self, parameter: Parameter) -> [i16; WORDS] {
         if parameter == Parameter::Commit {
             return protocol::packet::padded_words([self.hash.cast_signed()]);
@@ -115,12 +116,12 @@ impl Task {
         self.target.words(parameter)
     }
 
-    /// Returns the parameters that the target has.
+    /// Returns the parameters that the skin's configuration of the cell has.
     pub(super) fn stored(&self) -> impl Iterator<Item = Parameter> + use<> {
         Parameter::stored(self.target.table().len())
     }
 
-    /// Returns the bit of a parameter; zero for a parameter that the target lacks.
+    /// Returns the bit of a parameter in `written`; zero if the cell's configuration lacks the parameter.
     fn bit(&self, parameter: Parameter) -> u64 {
         self.stored().position(|stored| stored == parameter).map_or(0, bit)
     }
@@ -200,7 +201,7 @@ impl Task {
         };
     }
 
-    /// Handles that another cell now holds its node id.
+    /// Records that another cell now holds the node id of this cell.
     pub(super) fn lose_node_id(&mut self, now: Micros) {
         self.number = None;
         self.unsettled.get_or_insert(now);
@@ -218,7 +219,7 @@ impl Task {
         self.stage = Stage::Done(if self.touched { Outcome::Written } else { Outcome::Verified });
     }
 
-    /// Starts the next request, unless one is pending; returns it with its tag.
+    /// Starts the next request of the cell and returns it with its tag; returns `None` if a request is pending.
     pub(super) fn step(&mut self, now: Micros) -> Option<(Step, u8)> {
         if self.pending.is_some() || self.unsettled.is_some() || self.number.is_none() {
             return None;
@@ -260,14 +261,14 @@ impl Task {
         }
     }
 
-    /// Returns the time of the next call of [`Task::time`].
+    /// Returns the time of the next call of [`Task::time`]; `None` if no timeout is running.
     pub(super) fn due(&self) -> Option<Micros> {
         let settled = self.unsettled.filter(|_| !self.is_done()).map(|since| since + SETTLE_TIMEOUT);
         let beat = if let Stage::Beat(since) = self.stage { Some(since + HEARTBEAT_TIMEOUT) } else { None };
         [self.pending.map(|pending| pending.attempt.due()), settled, beat].into_iter().flatten().min()
     }
 
-    /// Handles an answer to its own request or to `call`, the broadcast request with this tag.
+    /// Handles an answer of the cell to the pending request, or to the broadcast request `call` with this tag.
     pub(super) fn answer(&mut self, now: Micros, tag: u8, answer: Answer, call: Option<Step>, wish: CommissionOptions) {
         let own = self.pending.filter(|pending| pending.tag == tag).map(|pending| pending.step);
         let called = call.filter(|&step| self.needs(step));
@@ -331,7 +332,7 @@ impl Task {
         }
     }
 
-    /// Starts over, up to a limit.
+    /// Starts the writing of the cell over; fails with `why` after the maximum number of rounds.
     fn again(&mut self, why: Reason) {
         self.rounds += 1;
         if self.rounds > MAX_ROUNDS {

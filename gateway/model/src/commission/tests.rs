@@ -14,7 +14,7 @@ fn skin(cells: usize) -> Skin {
     Skin::parse("skin.toml", &(head.to_owned() + &cells.collect::<String>())).unwrap()
 }
 
-/// Returns a commissioning after listening, in which all cells have sent a heartbeat and need everything.
+/// Returns a commissioning that has finished listening. All cells have sent a heartbeat, and need all parameters.
 fn begun(skin: &Skin) -> (Commission, Micros) {
     let mut commission = Commission::new(skin, 0, WISH, 1_000, Micros(0));
     for cell in &skin.cells {
@@ -38,7 +38,7 @@ fn requests(commission: &mut Commission) -> Vec<(Node, u8, Request)> {
         .collect()
 }
 
-/// Advances time until requests are sent again.
+/// Advances the time until requests are sent again; returns the time and the requests.
 fn next_requests(commission: &mut Commission) -> (Micros, Vec<(Node, u8, Request)>) {
     loop {
         let now = commission.poll_timeout().expect("it goes on");
@@ -50,7 +50,7 @@ fn next_requests(commission: &mut Commission) -> (Micros, Vec<(Node, u8, Request
     }
 }
 
-/// Confirms a write of a cell.
+/// Lets a cell confirm a write.
 fn confirm(commission: &mut Commission, now: Micros, from: CellId, tag: u8, request: Request) {
     let Request::Write { number, words } = request else { panic!("{request:?}") };
     let answer = Answer::Value { number, written: true, words };

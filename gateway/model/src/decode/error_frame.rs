@@ -4,7 +4,7 @@ use core::fmt::{Display, Formatter, Result};
 
 use protocol::can::Frame;
 
-/// Names of the identifier's bits.
+/// Names of the error class bits in the identifier, from bit 0.
 const CLASSES: [&str; 10] = [
     "tx-timeout",
     "lost-arbitration",
@@ -23,7 +23,7 @@ const PROTOCOL: u32 = 1 << 3;
 const TRANSCEIVER: u32 = 1 << 4;
 const COUNTERS: u32 = 1 << 9;
 
-/// Names of the bits of data byte 1.
+/// Names of the controller problem bits in data byte 1, from bit 0.
 const CONTROLLER_PROBLEMS: [&str; 7] = [
     "rx-overflow",
     "tx-overflow",
@@ -34,7 +34,7 @@ const CONTROLLER_PROBLEMS: [&str; 7] = [
     "back-to-error-active",
 ];
 
-/// Names of the bits of data byte 2.
+/// Names of the protocol violation bits in data byte 2, from bit 0.
 const VIOLATIONS: [&str; 8] = [
     "single-bit-error",
     "frame-format-error",
@@ -66,7 +66,7 @@ pub fn error_classes(id: u32) -> impl Iterator<Item = &'static str> {
     names(id, &CLASSES)
 }
 
-/// Returns the names of the bits that are set.
+/// Returns the names of the bits that are set in `bits`.
 fn names<'a>(bits: u32, names: &'a [&str]) -> impl Iterator<Item = &'a str> {
     names.iter().enumerate().filter(move |(bit, _)| bits >> bit & 1 != 0).map(|(_, name)| *name)
 }

@@ -24,7 +24,7 @@ impl Display for ParameterWords {
 pub struct ParameterName(pub u8);
 
 impl ParameterName {
-    /// Converts the number from a field's raw value.
+    /// Converts the raw value of a field to the parameter number.
     pub(super) fn from_raw(raw: i64) -> Self {
         Self(raw.to_le_bytes()[0])
     }
@@ -39,7 +39,7 @@ impl Display for ParameterName {
     }
 }
 
-/// Writes the fields of a layout from these bytes.
+/// Writes the fields of a layout as text, read from these bytes.
 pub(super) fn write_layout(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
     fields(f, layout, Bytes { bytes, units: Units::default() })
 }
@@ -64,10 +64,11 @@ pub(super) fn field<'a>(fields: &'a [Field], name: &str) -> Option<&'a Field> {
     fields.iter().find(|field| field.name == name)
 }
 
-/// Looks up the field of a name, or writes the value itself if it is not a field.
+/// A function that returns the field with a name. If the name is not a field, it writes the value itself and returns
+/// `None`.
 pub(super) type Find<'a> = dyn Fn(&mut Formatter<'_>, &str) -> Result<Option<&'a Field>, fmt::Error> + 'a;
 
-/// Writes the parts of a text that apply to a number.
+/// Writes the parts of a text that apply to a value, with their fields filled in.
 pub(super) fn fill<'a>(
     f: &mut Formatter<'_>,
     text: &[TextPart],
@@ -104,8 +105,8 @@ fn pieces<'a>(f: &mut Formatter<'_>, pieces: &[TextPiece], words: Bytes<'_>, fin
     Ok(())
 }
 
-/// Writes a field in the format of its text part. An element with another unit than the field's is followed by its
-/// unit.
+/// Writes a field in the format that the text part requests. If an element has another unit than the field, its unit
+/// follows.
 fn show(
     f: &mut Formatter<'_>,
     field: &Field,

@@ -47,7 +47,7 @@ struct FrameObject<'a> {
     crc_expected: Option<String>,
 }
 
-/// The values of the words, by packet kind and page.
+/// The values of a packet's words, with keys that depend on the packet kind and page.
 struct Values {
     link_id: Option<LinkId>,
     end: &'static [Field],
@@ -71,7 +71,7 @@ impl Serialize for Values {
     }
 }
 
-/// The fields of a group inside one word.
+/// The fields that share one word, as one JSON object.
 struct Group<'a>(&'a [Field], &'a [u8]);
 
 impl Serialize for Group<'_> {
@@ -82,7 +82,7 @@ impl Serialize for Group<'_> {
     }
 }
 
-/// Serialises each field that is present. The epoch and the tag are keys beside the values.
+/// Serialises each field that the packet contains. Epoch and tag are omitted, because they are keys of the frame.
 fn entries<M: SerializeMap>(
     map: &mut M,
     fields: &[Field],
@@ -114,7 +114,7 @@ fn entries<M: SerializeMap>(
     Ok(())
 }
 
-/// The value of a field, or the values of its elements.
+/// The value of a field for JSON, or an array of values if the field has several elements.
 struct Shown<'a>(&'a Field, &'a [u8], Units);
 
 impl Serialize for Shown<'_> {
@@ -225,7 +225,7 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units
     out.write_all(b"\n")
 }
 
-/// Returns the CRC of a packet: the last two bytes of its last frame.
+/// Returns the CRC of a packet, from the last two bytes of the frame that ends it.
 fn last_word(record: &Record<'_>) -> u16 {
     record.frame.data().last_chunk().map_or(0, |last| u16::from_le_bytes(*last))
 }
@@ -235,13 +235,13 @@ fn word(word: u16) -> String {
 }
 
 impl FrameObject<'_> {
-    /// Sets the kind and the node.
+    /// Sets the keys for the packet kind and the node, from the identifier.
     fn about(&mut self, id: Id) {
         self.kind = Some(id.name());
         self.node = Some(if id.kind == Kind::Command { 0 } else { id.node });
     }
 
-    /// Sets the received and the expected CRC, if the CRC is wrong.
+    /// Sets the keys for the received and the expected CRC, if the packet's fault is a wrong CRC.
     fn fails(&mut self, fault: PacketError) {
         if let PacketError::Crc { expected, got } = fault {
             (self.crc, self.crc_expected) = (Some(word(got)), Some(word(expected)));

@@ -34,35 +34,36 @@ use thiserror::Error;
 
 use crate::packets::{Content, PacketReader, Received};
 
-/// Maximum number of buses followed at the same time. Beyond it, the oldest is forgotten or buses share state.
+/// Maximum number of buses whose state is kept. Beyond it, the state of the oldest bus is dropped.
 pub const MAX_BUSES: usize = 64;
 /// The number of identifiers of 11 bits.
 const IDENTIFIER_COUNT: usize = 0x800;
 
-/// The class of a frame.
+/// A frame by its meaning: foreign, damaged, a segment, or a decoded message.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Decoded {
     /// A frame of another protocol.
     Foreign(Foreign),
     /// A message of a cell, or of the gateway, over a simulated wire. Real buses do not carry such frames.
     Wire(port::LinkId, PortMessage),
-    /// A segment of a packet in classic frames, except the last one; from [`Decoder::decode`], a frame that may be one.
+    /// A segment of a packet in classic frames, except the last one; when [`Decoder::decode`] returns it, the frame may
+    /// still turn out to be something else.
     Segment {
-        /// Its identifier.
+        /// Identifier of the frame.
         id: Id,
     },
     /// A frame that is not a packet, under an identifier that carries packets.
     Damaged {
-        /// Its identifier.
+        /// Identifier of the frame.
         id: Id,
-        /// The reason.
+        /// The reason why the frame is not a packet.
         fault: PacketError,
     },
     /// A packet that this version cannot decode.
     Meaningless {
         /// The packet.
         packet: Packet,
-        /// The reason.
+        /// The reason why the packet cannot be decoded.
         error: MessageError,
     },
     /// A decoded packet.
@@ -72,16 +73,16 @@ pub enum Decoded {
 /// The reason why a frame does not belong to this protocol.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 pub enum Foreign {
-    /// It has a 29-bit identifier.
+    /// The frame has a 29-bit identifier.
     #[error("29-bit identifier")]
     Extended,
-    /// It is a remote frame.
+    /// The frame is a remote frame.
     #[error("remote frame")]
     Remote,
-    /// It is the driver's error report.
+    /// The frame is the driver's error report.
     #[error("error frame: {0}")]
     Error(ErrorFrame),
-    /// It is a data frame with an 11-bit identifier that carries no packets.
+    /// The frame is a data frame with an 11-bit identifier that carries no packets.
     #[error("no packet: {0}")]
     Data(PacketError),
 }
@@ -99,7 +100,7 @@ impl Foreign {
 }
 
 impl Decoded {
-    /// Returns the verdict with which its line begins.
+    /// Returns the one-word verdict with which the line of this frame begins.
     #[must_use]
     pub const fn verdict(&self) -> &'static str {
         match self {
@@ -111,7 +112,7 @@ impl Decoded {
         }
     }
 
-    /// Returns the message, if it is one.
+    /// Returns the decoded message; `None` for a frame without one.
     #[must_use]
     pub const fn message(&self) -> Option<&Message> {
         if let Self::Message(message) = self { Some(message) } else { None }
@@ -123,7 +124,7 @@ impl Decoded {
         self.message().and_then(Message::is_saturated).unwrap_or(false)
     }
 
-    /// Returns true if this shows a touch.
+    /// Returns true if the message shows a touch: a nonzero torque or sum, touched sensors, or an active cell.
     #[must_use]
     pub fn is_contact(&self) -> bool {
         self.message().is_some_and(Message::is_contact)
@@ -152,9 +153,10 @@ pub struct Traffic {
 }
 
 impl Traffic {
-    /// Minimum number of packets as evidence: a random frame is a packet with probability 1/65 536.
+    /// Minimum number of packets that prove that an identifier carries packets: a random frame is a packet with
+    /// probability 1/65 536.
     const PACKETS: u64 = 2;
-    /// Maximum number of other frames per packet.
+    /// Maximum number of other frames for each packet, for an identifier that carries packets.
     const OTHERS: u64 = 32;
 
     /// Counts a packet.
@@ -167,7 +169,7 @@ impl Traffic {
         self.others += 1;
     }
 
-    /// Returns true if the identifier carries packets. Other frames with it are then damaged, else foreign.
+    /// Returns true if the identifier carries packets. If so, other frames with it count as damaged, else as foreign.
     #[must_use]
     pub const fn carries_packets(self) -> bool {
         self.packets >= Self::PACKETS && self.others <= Self::OTHERS * self.packets
@@ -179,7 +181,7 @@ impl Traffic {
 pub struct Decoder {
     format: Option<Format>,
     buses: Vec<BusDecoder>,
-    /// Number of buses seen, including forgotten ones.
+    /// Number of buses so far, including those whose state was dropped.
     seen: u64,
 }
 
@@ -187,7 +189,7 @@ pub struct Decoder {
 #[derive(Clone, Debug)]
 struct BusDecoder {
     name: String,
-    /// A number that no earlier bus has had.
+    /// Unique number of the bus, never reused.
     number: u64,
     packets: PacketReader,
     classifier: Classifier,
@@ -203,13 +205,14 @@ struct Classifier {
 /// The state of one identifier of a bus.
 #[derive(Clone, Debug, Default)]
 struct Slot {
-    /// Numbers of the pending frames.
+    /// Numbers of the frames that may be segments of a packet and wait for its other segments.
     waiting: VecDeque<u64>,
     traffic: Traffic,
 }
 
 impl Slot {
-    /// Refuses pending frames except the newest `kept`.
+    /// Settles the pending frames as refused, except the newest `kept`; their numbers and classes are appended to
+    /// `settled`.
     fn drop_beyond(&mut self, kept: usize, id: Id, settled: &mut Vec<(u64, Decoded)>) {
         for _ in kept..self.waiting.len() {
             if let Some(number) = self.waiting.pop_front() {
@@ -258,7 +261,8 @@ impl Classifier {
         }
     }
 
-    /// Counts a packet, and settles the pending frames that belong to it.
+    /// Counts a packet, and settles its pending segments. Returns the numbers and classes of the frames that are
+    /// settled.
     fn packet(&mut self, id: Id, packet: &Packet) -> Vec<(u64, Decoded)> {
         let (slot, mut settled) = (self.slot(id), Vec::new());
         slot.drop_beyond(packet.words.length().segments() - 1, id, &mut settled);
@@ -279,7 +283,7 @@ impl Classifier {
 }
 
 impl Decoder {
-    /// Creates a decoder for buses of one format; with `None`, each frame is read in its own format.
+    /// Creates a decoder for buses of one frame format; with `None`, the format of each frame is used.
     #[must_use]
     pub const fn new(format: Option<Format>) -> Self {
         Self { format, buses: Vec::new(), seen: 0 }
@@ -291,7 +295,7 @@ impl Decoder {
         self.take(0, at, bus, frame).1.0
     }
 
-    /// Classifies the frame with this number; returns the number of its bus, too.
+    /// Classifies the frame with this number. Also returns the number of its bus.
     fn take(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> (u64, Classified) {
         if data_id(frame).is_err() {
             return (0, (not_data(frame), Vec::new()));

@@ -9,20 +9,20 @@ use thiserror::Error;
 
 pub use super::fields::{ParameterName, ParameterWords};
 
-/// The largest parameter number; the next higher bit marks a write.
+/// The largest parameter number. The next higher bit of the byte marks a write.
 const MAX: u8 = 127;
 
 /// The error for text that is not a parameter or not a valid value of one.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ParameterTextError {
-    /// The name is unknown.
+    /// The name is not that of a parameter.
     #[error(
         "{got:?} is not a parameter: allowed are identity, mount, pose, contact, timing, mode, reply, sensing, events, \
          links_down, baseline, tare, row1 to row6, commit, and every number from 0 to {MAX}"
     )]
     Unknown {
-        /// The given text.
+        /// The given name.
         got: String,
     },
     /// The parameter cannot be written.
@@ -31,14 +31,14 @@ pub enum ParameterTextError {
          tare, row1 to row6 or commit"
     )]
     ReadOnly,
-    /// The number of values does not match.
+    /// The number of values differs from the number of fields of the parameter.
     #[error("{name} is written with {} ({fields}), not with {got}", values(*.target))]
     Count {
         /// The parameter.
         name: &'static str,
-        /// Number of values of the parameter.
+        /// Required number of values.
         target: usize,
-        /// Names of its values.
+        /// Names of the values, for the message.
         fields: String,
         /// Number of given values.
         got: usize,
@@ -114,8 +114,8 @@ pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), P
     Ok((number, words))
 }
 
-/// Returns the fields to write and their names, in the order of the words. The first value may decide which fields
-/// follow.
+/// Returns the fields that a write sets, with their names, in the order of the words. The first value may decide which
+/// fields follow.
 fn written(layout: &'static Layout, values: &[String]) -> impl Iterator<Item = (&'static Field, String)> {
     let first = layout.fields.first().zip(values.first()).and_then(|(field, text)| read(field, text).ok());
     let follows = move |field: &&Field| field.is_present_for(first.map(i64::from));

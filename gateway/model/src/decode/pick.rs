@@ -10,29 +10,29 @@ use thiserror::Error;
 
 use super::Decoded;
 
-/// A kind of frame to show.
+/// A class of frames to show.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Selector {
     /// A kind of packet.
     Kind(Kind),
-    /// One command.
+    /// A command of one kind.
     Command(Command),
     /// Messages over simulated wires.
     Wire,
     /// Frames that are foreign or damaged.
     Foreign,
-    /// Damaged frames: not packets, but with an identifier that carries packets.
+    /// Damaged frames, whose identifier carries packets although they are not packets themselves.
     Damaged,
 }
 
-/// The error for a word that does not name a kind.
+/// The given word is not a kind of frame.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[error(
     "{got:?} is not a kind of frame: allowed are command, sum, torque, sensors, network, configure, \
      configured, stimulus; halt, joints, sync, resume, report; wire, foreign and damaged"
 )]
 pub struct UnknownSelector {
-    /// The word.
+    /// The given word.
     pub got: String,
 }
 
@@ -71,7 +71,7 @@ pub fn node(word: &str) -> Result<Node, String> {
 pub struct Party {
     /// The bus; `None` matches any.
     pub bus: Option<String>,
-    /// The node on it.
+    /// The node on that bus.
     pub node: Node,
 }
 
@@ -147,12 +147,13 @@ pub struct FrameFilter {
     pub ids: Vec<IdMask>,
     /// Start, in ns after the origin of times.
     pub from: Option<u64>,
-    /// End (exclusive), in ns after the origin of times.
+    /// End, in ns after the origin of times; frames at this time are not shown.
     pub to: Option<u64>,
 }
 
 impl FrameFilter {
-    /// Returns true if a frame is shown that arrived on `bus` at `nanos` and has this class; times count from `origin`.
+    /// Returns true if all filters match a frame. The frame arrived on `bus` at `nanos`, has the class `decoded`, and
+    /// its time counts from `origin`.
     #[must_use]
     pub fn takes(&self, origin: u64, nanos: u64, bus: &str, frame: &Frame, decoded: &Decoded) -> bool {
         let is_foreign = matches!(decoded, Decoded::Foreign(_));
@@ -170,10 +171,10 @@ impl FrameFilter {
         self.buses.iter().map(String::as_str).chain(of_parties)
     }
 
-    /// Checks that each party is on one of the selected buses.
+    /// Checks that each given node is on one of the given buses.
     ///
     /// # Errors
-    /// Returns the contradiction.
+    /// Returns a sentence that names the node and the buses, if the filters exclude each other.
     pub fn check(&self) -> Result<(), String> {
         let is_out = |party: &&Party| party.bus.as_ref().is_some_and(|bus| !self.buses.contains(bus));
         match self.parties.iter().find(is_out).filter(|_| !self.buses.is_empty()) {

@@ -5,7 +5,7 @@ use core::fmt::{self, Display, Formatter};
 use protocol::port::UPLINK;
 use protocol::schema::Field;
 
-/// A port by its number; the last one is the uplink to the gateway.
+/// A port of a cell by its number; the number after the last port stands for the uplink to the gateway.
 pub(super) struct Port(pub(super) i64);
 
 impl Display for Port {
@@ -17,7 +17,7 @@ impl Display for Port {
     }
 }
 
-/// Writes the neighbour at each port.
+/// Writes the neighbour at each of `ports` ports.
 pub(super) fn write_neighbors(f: &mut Formatter<'_>, parts: &[Field], bytes: &[u8], ports: usize) -> fmt::Result {
     for index in 0..ports {
         let word = bytes.get(2 * index..).unwrap_or_default();
@@ -42,11 +42,11 @@ pub(super) fn write_neighbors(f: &mut Formatter<'_>, parts: &[Field], bytes: &[u
     Ok(())
 }
 
-/// The ports whose bits are set: `0+2`, or `none`.
+/// A set of ports, one bit each, formatted as `0+2` or `none`.
 pub(super) struct PortSet(pub(super) i64);
 
 impl PortSet {
-    /// Returns their numbers.
+    /// Returns the numbers of the ports in the set.
     pub(super) fn ports(&self) -> impl Iterator<Item = u8> + use<> {
         let bits = self.0;
         (0..8).filter(move |port| bits >> port & 1 == 1)

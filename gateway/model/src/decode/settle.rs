@@ -17,19 +17,19 @@ use protocol::time::{Micros, Span};
 
 use super::{Decoded, Decoder};
 
-/// Maximum number of pending frames. Beyond it, the oldest is given up without the rest of its packet.
+/// Maximum number of pending frames. Beyond it, the oldest frame is classified without the rest of its packet.
 const MAX_PENDING_FRAMES: usize = 1 << 16;
-/// Added to the timeout of segments: frames of several buses may be out of order by this time.
+/// Time that is added to the timeout of segments, because the frames of several buses may be out of order by this much.
 const REORDER_TOLERANCE: Span = Span::from_millis(100);
 
-/// Classifies frames in order of arrival; `T` is returned with each.
+/// Classifies frames in order of arrival. A `T` is passed in with each frame and returned with its class.
 #[derive(Debug)]
 pub struct Settler<T> {
     decoder: Decoder,
     waiting: VecDeque<Entry<T>>,
     /// Number of the oldest pending frame.
     oldest: u64,
-    /// Arrival time of the last frame, or the current time if later.
+    /// The current time: the arrival time of the last frame, or later.
     now: Micros,
     is_at_end: bool,
 }
@@ -44,12 +44,12 @@ struct Entry<T> {
 #[derive(Debug)]
 enum State {
     Settled(Decoded),
-    /// Pending, with the number of its bus and its identifier.
+    /// The frame is pending; holds the number of its bus and its identifier.
     Waits(u64, Id),
 }
 
 impl<T> Settler<T> {
-    /// Creates a settler for buses of one format; with `None`, each frame is read in its own format.
+    /// Creates a settler for buses of one frame format; with `None`, the format of each frame is used.
     #[must_use]
     pub const fn new(format: Option<Format>) -> Self {
         Self {
@@ -80,23 +80,23 @@ impl<T> Settler<T> {
         self.waiting.push_back(Entry { item, at, state });
     }
 
-    /// Advances the time when no frame arrives.
+    /// Advances the current time while no frame arrives, so that pending segments can time out.
     pub const fn handle_time(&mut self, now: Micros) {
         self.now = now;
     }
 
-    /// Marks the end of input: pending segments are settled at once.
+    /// Marks the end of input: pending segments are classified at once.
     pub const fn finish(&mut self) {
         self.is_at_end = true;
     }
 
-    /// Returns true if frames are pending.
+    /// Returns true if the class of a frame is still open.
     #[must_use]
     pub fn is_waiting(&self) -> bool {
         !self.waiting.is_empty()
     }
 
-    /// Returns the oldest frame, if its class is known.
+    /// Removes and returns the oldest frame with its class; `None` if that class is still open.
     pub fn pop(&mut self) -> Option<(T, Decoded)> {
         if let Entry { at, state: State::Waits(bus, id), .. } = *self.waiting.front()? {
             let is_in_time = self.now.elapsed_since(at) <= Span(Reassembler::max_gap(id).0 + REORDER_TOLERANCE.0);

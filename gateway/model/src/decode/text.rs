@@ -11,18 +11,18 @@ use super::fields::{Bytes, field, fields, fill};
 use super::wires::WireText;
 
 impl Display for Decoded {
-    /// Formats with default units: no torque format of the bus, revolute joints.
+    /// Formats the frame with default units, for an unknown bus: no torque format, revolute joints.
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         self.in_units(Units::default()).fmt(f)
     }
 }
 
-/// A decoded frame, formatted in the units of its bus.
+/// A decoded frame that is formatted in the units of its bus.
 #[derive(Clone, Copy, Debug)]
 pub struct InUnits<'a>(&'a Decoded, Units);
 
 impl Decoded {
-    /// Formats the frame with the units of its bus' joints and torques.
+    /// Returns a formatter for the frame in these units of joints and torques.
     #[must_use]
     pub const fn in_units(&self, units: Units) -> InUnits<'_> {
         InUnits(self, units)
@@ -30,7 +30,7 @@ impl Decoded {
 }
 
 impl Display for InUnits<'_> {
-    /// Writes the verdict, a space, and the content.
+    /// Writes the verdict, a space, and the content of the frame.
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let Self(decoded, units) = *self;
         write!(f, "{:<7} ", decoded.verdict())?;

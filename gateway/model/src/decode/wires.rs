@@ -10,7 +10,7 @@ use protocol::schema::{self, Layout};
 use super::fields::write_layout;
 use super::ports::Port;
 
-/// Returns the bytes of a message over a wire, and their layout.
+/// Encodes a message over a wire. Returns the bytes and the layout of their fields.
 pub(super) fn encoded(message: PortMessage) -> (Bytes, &'static Layout) {
     let body = message.encode();
     let bytes = body.into_iter().chain([0; BYTES]).take(BYTES).collect();
@@ -66,7 +66,7 @@ fn write_hello(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
     write!(f, ", {}", RankText(rank))
 }
 
-/// The rank of a cell, formatted.
+/// The rank of a cell as text; `None` for a cell without a route.
 struct RankText(Option<Rank>);
 
 impl Display for RankText {

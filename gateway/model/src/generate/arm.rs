@@ -30,16 +30,17 @@ pub(super) struct Arm {
     pub(super) name: &'static str,
     /// Standard Denavit-Hartenberg rows, base to tip.
     pub(super) joints: [DenavitHartenberg; 6],
-    /// From base to tip.
+    /// The upper arm and the forearm, from base to tip.
     pub(super) limbs: [Limb; 2],
 }
 
-/// A round limb along the x axis of its joint's frame, whose origin is the limb's far end.
+/// A round limb of an arm. It lies along the x axis of its joint's frame; the origin of that frame is at the limb's far
+/// end.
 #[derive(Debug)]
 pub(super) struct Limb {
-    /// Its name.
+    /// Name of the limb.
     pub(super) name: &'static str,
-    /// The joint that moves it.
+    /// The joint that moves the limb, from 1.
     pub(super) joint: u8,
     /// The middle of the limb, in m: along x, and offset along z.
     middle: [f64; 2],
@@ -72,7 +73,7 @@ const fn row(a: f64, alpha: f64, d: f64) -> DenavitHartenberg {
     DenavitHartenberg { a, alpha, d, theta_offset: 0.0 }
 }
 
-/// An arm with its skin.
+/// An arm with the cells that lie on it.
 #[derive(Debug)]
 pub(super) struct Covered {
     pub(super) name: &'static str,
@@ -83,19 +84,19 @@ pub(super) struct Covered {
     pub(super) buses: Vec<Vec<PlacedCell>>,
 }
 
-/// A cell; its node id is its index in its bus, plus 1.
+/// A cell on the arm; its node id is its index on its bus, plus 1.
 #[derive(Clone, Debug)]
 pub(super) struct PlacedCell {
     pub(super) joint: u8,
     pub(super) position: [f64; 3],
-    /// Its angle around the limb, from the z axis to the y axis, in rad.
+    /// Angle of the cell around the limb in rad, from the z axis to the y axis.
     pub(super) turn: f64,
-    /// By port, the index in the bus of the neighbour.
+    /// For each port, the neighbour at it, as an index on the bus.
     pub(super) wires: [Option<usize>; PORTS],
     pub(super) root: bool,
 }
 
-/// Places the cells around the limbs at the real distance if they fit, else closer.
+/// Places the cells in rings around the limbs, at the distance of the published skin, or closer if they do not fit.
 pub(super) fn cover(arm: &Arm, cells: usize, buses: usize) -> Result<Covered, GenerateError> {
     let (pitch_mm, shares) = (MIN_PITCH_MM..=PITCH_MM)
         .rev()
@@ -120,7 +121,7 @@ pub(super) fn cover(arm: &Arm, cells: usize, buses: usize) -> Result<Covered, Ge
     Ok(Covered { name: arm.name, joints: arm.joints, pitch_mm, limbs, buses: on_buses })
 }
 
-/// The share of a limb.
+/// The number of cells and of buses on one limb.
 #[derive(Debug)]
 struct Share {
     cells: usize,
@@ -146,7 +147,7 @@ fn share(limbs: &[Limb; 2], pitch: f64, cells: usize, buses: usize) -> Option<[S
     (shares[0].cells <= upper && shares[1].cells <= lower).then_some(shares)
 }
 
-/// The rings of cells around a limb.
+/// The rings of cells that fit around a limb.
 #[derive(Clone, Copy, Debug)]
 struct Rings {
     /// Number of cells in a ring, at least 3.
@@ -173,18 +174,18 @@ impl Rings {
         self.around * self.count
     }
 
-    /// Returns the ring of a cell and its index in the ring; odd rings are counted backwards.
+    /// Returns the ring of a cell and its index in that ring; odd rings are counted backwards.
     const fn spot(&self, number: usize) -> (usize, usize) {
         let (ring, place) = (number / self.around, number % self.around);
         (ring, if ring % 2 == 0 { place } else { self.around - 1 - place })
     }
 
-    /// Returns the number of the cell at a spot.
+    /// Returns the number of the cell at a place, given as ring and index in the ring.
     const fn number(&self, (ring, place): (usize, usize)) -> usize {
         ring * self.around + if ring % 2 == 0 { place } else { self.around - 1 - place }
     }
 
-    /// Returns the cells with these numbers, of the `all` on the limb, wired among themselves.
+    /// Returns the cells with these `numbers`, wired to each other; `all` is the number of cells on the limb.
     fn wired(&self, limb: &Limb, all: usize, numbers: core::ops::Range<usize>) -> Vec<PlacedCell> {
         let rings = all.div_ceil(self.around);
         let place = |number| {
@@ -229,8 +230,8 @@ fn join(upper: &mut Vec<PlacedCell>, lower: &mut Vec<PlacedCell>) {
     upper.append(lower);
 }
 
-/// Wires the gateway to the centre of a bus' cells: the first cell with the smallest distance to its farthest cell, so
-/// that sums have the shortest path.
+/// Wires the gateway to a central cell of a bus: the first one with the fewest wires to its farthest cell, so that sums
+/// have the shortest path.
 fn root(places: &mut [PlacedCell]) {
     let nearest = (0..places.len()).min_by_key(|&from| depth(places, from));
     if let Some(root) = nearest.and_then(|at| places.get_mut(at)) {
@@ -238,7 +239,7 @@ fn root(places: &mut [PlacedCell]) {
     }
 }
 
-/// Returns the number of wires from a cell to the farthest reachable cell.
+/// Returns the number of wires from a cell to the farthest cell that it can reach.
 pub(super) fn depth(places: &[PlacedCell], from: usize) -> usize {
     let mut distance = vec![None; places.len()];
     let mut next = VecDeque::from([(from, 0)]);

@@ -12,7 +12,7 @@ use protocol::id::CellId;
 use protocol::skin::Skin;
 use thiserror::Error;
 
-/// The requested skin.
+/// The robot, the size and the timing of a skin to generate.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Target {
     /// The robot that wears the skin.
@@ -23,9 +23,9 @@ pub struct Target {
     pub buses: usize,
     /// Joint broadcasts per second; must divide the control loop's 500 Hz.
     pub broadcast_hz: f64,
-    /// Replies of the cells.
+    /// Kind of reply that the cells send to joints.
     pub reply: Reply,
-    /// Frame format of their packets.
+    /// Frame format of the cells' packets.
     pub format: Format,
 }
 
@@ -49,7 +49,7 @@ pub enum Robot {
     Ur5,
 }
 
-/// The kind of reply that the cells send.
+/// The kind of reply that the cells send to joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Reply {
     /// Each cell its own torque
@@ -62,7 +62,7 @@ pub enum Reply {
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum GenerateError {
-    /// More cells than the buses have node ids.
+    /// There are more cells than the buses have node ids.
     #[error(
         "{cells} cells do not fit on {}: a bus has {most} node ids; use --buses {needed}",
         if *.buses == 1 { "one bus".to_owned() } else { format!("{buses} buses") },
@@ -76,7 +76,7 @@ pub enum GenerateError {
         /// Number of buses needed.
         needed: usize,
     },
-    /// Fewer cells than buses, or no cells or buses.
+    /// There are fewer cells than buses, or no cells or buses.
     #[error("{cells} cells on {buses} buses: every bus needs at least one")]
     TooFew {
         /// Requested cells.
@@ -84,7 +84,7 @@ pub enum GenerateError {
         /// Requested buses.
         buses: usize,
     },
-    /// More cells than fit on the arm.
+    /// There are more cells than fit on the arm.
     #[error("{cells} cells do not fit on the arm, not even {min_mm} mm apart: ask for fewer")]
     NoRoom {
         /// Requested cells.
@@ -97,7 +97,7 @@ pub enum GenerateError {
     Skin(#[from] DocumentError),
 }
 
-/// Returns the text of a `skin.toml`; the same target gives the same text.
+/// Returns the text of a `skin.toml`; equal targets give equal texts.
 ///
 /// # Errors
 /// Returns [`GenerateError`] if the cells do not fit on the buses or on the arm, or if a requested number is out of

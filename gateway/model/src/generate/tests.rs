@@ -14,7 +14,7 @@ fn apart(one: &Cell, other: &Cell) -> f64 {
     one.position.iter().zip(other.position).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
 }
 
-/// Returns the cells on the same bus that are wired to this one.
+/// Returns the cells that are wired to `cell` on its bus.
 fn wired<'a>(skin: &'a Skin, cell: &'a Cell) -> impl Iterator<Item = &'a Cell> {
     let on_bus = move |node| skin.cells.iter().find(move |it| it.bus == cell.bus && it.node == node);
     cell.neighbors.iter().flatten().map(move |&node| on_bus(node).unwrap())

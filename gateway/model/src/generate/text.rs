@@ -6,7 +6,7 @@ use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
 use super::arm::{self, Covered, PlacedCell};
 use super::{Format, Reply, Target};
 
-/// Maximum share of the broadcast period for the slots of sums.
+/// Maximum share of the broadcast period that the slots of sums may take.
 const SLOTS_SHARE: f64 = 0.75;
 
 pub(super) fn toml(target: &Target, arm: &Covered) -> String {
@@ -65,7 +65,7 @@ fn bus_name(bus: usize) -> String {
     format!("vcan{bus}")
 }
 
-/// Adds a cell of a bus with its node id.
+/// Adds a cell to the draft, on a bus and with a node id.
 fn cell(draft: &mut Draft, bus: usize, place: &PlacedCell, node: usize) {
     // A rotation about x, the limb's direction: the cell's z axis points away from the limb.
     let (sin, cos) = (-place.turn / 2.0).sin_cos();
@@ -84,7 +84,8 @@ fn cell(draft: &mut Draft, bus: usize, place: &PlacedCell, node: usize) {
     });
 }
 
-/// Returns the slot duration in µs: one slot per depth of the tree within a share of the period, in multiples of 10 µs.
+/// Returns the slot duration in µs, a multiple of 10. The slots of all levels of the tree together take at most
+/// [`SLOTS_SHARE`] of the broadcast period.
 #[expect(
     clippy::cast_precision_loss,
     clippy::cast_possible_truncation,

@@ -1,15 +1,15 @@
-//! The packets of a bus that a reader needs to start in the middle of a recording.
+//! The packets with which a recording must begin, if it begins in the middle of a run.
 //!
 //! ```text
 //!   frames of a bus ──> take ──> [ Latched ] ──> frames with a lasting effect, in the bus' order
 //! ```
 //!
-//! For every cell they are its last heartbeat with the hash of its configuration, its last start, its place in the
-//! tree, its switches and parameters written at run time, and its stimuli, latched or pending. For the bus they are the
-//! last joints, and the last halt or resume. Epochs count modulo 256, so a stimulus alone does not show whether it is
-//! still pending. Therefore each stimulus is kept with the joints before it and those at which it is latched. A
-//! receiver that applies these packets in order by the protocol's rules reaches the same state as one that received all
-//! packets.
+//! For every cell these packets are its last heartbeat with the hash of its configuration, its last start, its place in
+//! the tree, its switches and the parameters written at run time, and its stimuli, latched or pending. For the bus they
+//! are the last joints, and the last halt or resume. Epochs count modulo 256, so a stimulus alone does not show whether
+//! it is still pending. Therefore each stimulus is kept with the joints before it and the joints that latch it. A
+//! receiver that applies these packets in order, by the rules of the protocol, reaches the same state as one that
+//! received all packets.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -24,18 +24,18 @@ use protocol::time::Micros;
 use crate::packets::{Content, PacketReader};
 use crate::tracker::{AddressClaim, Contact, PerCell, HeartbeatKind};
 
-/// A received frame.
+/// A frame that was received from the bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ReceivedFrame {
     /// Arrival time in ns since 1970.
     pub at_nanos: u64,
-    /// True if the gateway sent it.
+    /// True if the gateway sent the frame.
     pub from_gateway: bool,
     /// The frame.
     pub frame: Frame,
 }
 
-/// The frames of one packet, and its position in the bus' order.
+/// The frames of one packet, and the packet's position in the order of the bus.
 #[derive(Debug)]
 struct PlacedPacket {
     place: u64,
@@ -44,7 +44,7 @@ struct PlacedPacket {
 
 type SharedPacket = Option<Arc<PlacedPacket>>;
 
-/// A latched page: its packet, the last joints before it, and the joints at which it was latched.
+/// A sensors page that a cell has latched. It is kept with the joints before it and the joints at which it was latched.
 #[derive(Clone, Debug)]
 struct ContactPage {
     placed_packet: Arc<PlacedPacket>,
@@ -52,22 +52,22 @@ struct ContactPage {
     since: SharedPacket,
 }
 
-/// The latched state of one cell.
+/// The packets of one cell that still have an effect.
 #[derive(Clone, Debug, Default)]
 struct LatchedCell {
     claim: AddressClaim,
-    /// Its last heartbeat.
+    /// The last heartbeat.
     heartbeat: SharedPacket,
-    /// The first and the last heartbeat of its last start.
+    /// The first and the last heartbeat since the cell's last start.
     starts: [SharedPacket; 2],
-    /// Its last report of its parent in the tree.
+    /// The last report of the cell's parent in the tree.
     tree: SharedPacket,
-    /// By parameter: the last writes of volatile parameters.
+    /// The last write of each volatile parameter.
     switches: BTreeMap<u8, Arc<PlacedPacket>>,
-    /// By parameter: the last writes that a commit activated, and that commit.
+    /// The last write of each parameter that a commit activated, and that commit.
     committed: BTreeMap<u8, Arc<PlacedPacket>>,
     commit: SharedPacket,
-    /// By parameter: the last writes since then, and a commit that has not been answered.
+    /// The last write of each parameter since the last commit, and a commit that has not been answered yet.
     staged: BTreeMap<u8, Arc<PlacedPacket>>,
     requested: SharedPacket,
     contact: Contact<ContactPage>,
@@ -76,19 +76,20 @@ struct LatchedCell {
     shown: SharedPacket,
 }
 
-/// The packets of one bus that are latched.
+/// The packets of one bus that still have an effect, as they were on the bus.
 #[derive(Clone, Debug)]
 pub struct LatchedPackets {
-    /// Number of packets so far.
+    /// Number of packets so far; gives each packet its position in the order of the bus.
     places: u64,
     cells: PerCell<LatchedCell>,
     joints: Option<(Epoch, Arc<PlacedPacket>)>,
     /// The last halt or resume.
     halt: SharedPacket,
     packets: PacketReader,
-    /// By identifier: segments of incomplete packets.
+    /// Segments of incomplete packets, by identifier.
     waiting: BTreeMap<u16, Vec<ReceivedFrame>>,
-    /// Identifiers of the gateway's packets with pending segments, and the time of the newest, in ns since 1970.
+    /// Identifiers of the gateway's packets with pending segments, each with the time of its newest segment in ns since
+    /// 1970.
     open: BTreeMap<u16, u64>,
 }
 
@@ -107,14 +108,16 @@ impl Default for LatchedPackets {
 }
 
 impl LatchedCell {
-    /// Resets the contact state, after a start or a write of the mode.
+    /// Resets the contact state to no contact, after a start or a write of the mode. `obeys` is true for a cell in test
+    /// mode.
     fn clear(&mut self, obeys: bool) {
         self.contact.write_mode();
         self.contact.set_obeys(obeys);
         self.shown = None;
     }
 
-    /// Applies a page that may prove that all stimuli are on the bus, and keeps the packet if it does.
+    /// Passes to the contact state a page that may prove that all stimuli were received here. Keeps the packet if the
+    /// page proves it.
     fn show(&mut self, contact_page: ContactPage, show: impl FnOnce(&mut Contact<ContactPage>, ContactPage)) {
         let placed_packet = Arc::clone(&contact_page.placed_packet);
         let before = self.contact.known().is_some();
@@ -160,7 +163,7 @@ impl LatchedCell {
         }
     }
 
-    /// Activates the parameters that were written before the last requested commit.
+    /// Marks as active the parameters that were written before the last requested commit.
     fn commit(&mut self) {
         let Some(requested) = self.requested.take() else { return };
         let staged = std::mem::take(&mut self.staged).into_iter();
@@ -170,7 +173,7 @@ impl LatchedCell {
         (self.staged, self.commit) = (later, Some(requested));
     }
 
-    /// Sets the contact state from the cell's own report, if it is not known otherwise.
+    /// Applies the cell's own report of its sensors, which counts only if the contact state is not known otherwise.
     fn learn(&mut self, page: SensorPage, contact_page: ContactPage) {
         let joints = contact_page.before.as_ref().map_or(0, |joints| joints.place);
         if !self
@@ -198,7 +201,7 @@ impl LatchedCell {
 }
 
 impl LatchedPackets {
-    /// Handles a frame from the bus. Bounded work; frames that are not packets are ignored.
+    /// Applies a frame from the bus; ignores frames that are not packets. Bounded work.
     pub fn receive(&mut self, seen: ReceivedFrame) {
         let Ok(id) = packet::data_id(&seen.frame) else { return };
         match id.kind {
@@ -232,7 +235,8 @@ impl LatchedPackets {
         self.apply_message(message, &Arc::new(PlacedPacket { place: self.places, frames }));
     }
 
-    /// Returns true if segments of a gateway packet are pending: a file must not begin between them.
+    /// Returns true if segments of a gateway packet are pending. A new part of the recording must not begin between
+    /// these segments.
     #[must_use]
     pub fn is_within_a_packet(&self, now_nanos: u64) -> bool {
         let within = |bits: u16| Reassembler::max_gap(Id::from_bits(bits)).0 * 1_000;
@@ -295,7 +299,7 @@ impl LatchedPackets {
         }
     }
 
-    /// Returns all frames, in the bus' order.
+    /// Returns all frames that still have an effect, in the order of the bus.
     #[must_use]
     pub fn frames(&self) -> Vec<ReceivedFrame> {
         let joints = self.joints.iter().map(|(_, joints)| joints);

@@ -19,19 +19,19 @@ use protocol::time::Micros;
 use super::touched::KnownContacts;
 use crate::tracker::{AddressClaim, Contact, PerCell, HeartbeatKind};
 
-/// Maximum number of messages since the last joints that are kept as they were sent.
+/// Maximum number of messages since the last joints that are kept for a replay.
 const MAX_PENDING_MESSAGES: usize = 16_384;
 
-/// The contact state of one cell.
+/// The contact state of one cell, without data for each stimulus.
 type ContactState = Contact<()>;
 
-/// Resets the contact state to no contact, in either mode.
+/// Resets the contact state to no contact; `obeys` is true for a cell in test mode.
 fn clear(contact_state: &mut ContactState, obeys: bool) {
     contact_state.reset();
     contact_state.set_obeys(obeys);
 }
 
-/// Returns true if the cell is in contact from the joints of an epoch on; `None` if unknown.
+/// Returns true if the cell is in contact at the joints of `epoch` and later; `None` if unknown.
 fn is_touched_from(contact_state: &ContactState, epoch: Epoch) -> Option<bool> {
     let touches =
         |(skin, ()): &(SkinSensors, ())| skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
@@ -43,7 +43,7 @@ fn is_touched_from(contact_state: &ContactState, epoch: Epoch) -> Option<bool> {
     then.skin().map(touches)
 }
 
-/// Returns the latched pages that differ from the state of a cell at its start.
+/// Returns the latched sensors pages that differ from those of a cell that has just started.
 fn pages(contact_state: &ContactState) -> impl Iterator<Item = SensorPage> {
     let nothing = [SensorPage::Skin(SkinSensors::default()), SensorPage::Acceleration([Q3_12::ZERO; 3])];
     contact_state.latched().map(|(page, ())| page).filter(move |page| !nothing.contains(page))
@@ -52,7 +52,7 @@ fn pages(contact_state: &ContactState) -> impl Iterator<Item = SensorPage> {
 /// The state of a bus before its last joints.
 #[derive(Clone, Debug, Default)]
 struct StateBeforeJoints {
-    /// Parameter writes in order, without overwritten ones.
+    /// Parameter writes in order, without those that later writes replaced.
     writes: Vec<(Node, u8, Message)>,
     halted: bool,
     cells: PerCell<ContactState>,
@@ -64,14 +64,14 @@ pub struct State {
     before: StateBeforeJoints,
     /// The owners of node ids.
     claims: PerCell<AddressClaim>,
-    /// The last joints. The state before them decides whether a cell was in contact at them.
+    /// The last joints with their epoch. The contact state before them decides whether a cell was in contact at them.
     joints: Option<(Epoch, Joints)>,
-    /// Messages since the last joints, as they were sent.
+    /// Messages since the last joints, in the order in which they were sent.
     since: Vec<Message>,
 }
 
 impl StateBeforeJoints {
-    /// Applies a message that came after the joints `last`.
+    /// Applies a message that was sent after the joints with the epoch `last`.
     fn take(&mut self, message: &Message, last: Option<Epoch>) {
         if let Message::Halt | Message::Resume = message {
             self.halted = *message == Message::Halt;
@@ -85,14 +85,14 @@ impl StateBeforeJoints {
         }
     }
 
-    /// Resets the contact state and the volatile writes of a restarted cell.
+    /// Resets the contact state of a restarted cell, and drops its writes of volatile parameters.
     fn start_again(&mut self, cell: Node) {
         self.cells.named(cell).iter_mut().for_each(|cell| clear(cell, true));
         self.writes.retain(|(to, number, _)| *to != cell || !is_volatile(*number));
     }
 
-    /// Keeps a write. It replaces a write of the same parameter to the same cells, unless a commit in between has
-    /// activated that one. So memory grows only with the number of commits.
+    /// Keeps a parameter write. It replaces an earlier write of the same parameter to the same cells, unless a commit
+    /// has activated the earlier one. So memory grows only with the number of commits.
     fn write(&mut self, to: Node, number: u8, message: Message) {
         let commit = Parameter::Commit.number();
         let since_commit =
@@ -113,7 +113,7 @@ fn is_volatile(number: u8) -> bool {
 }
 
 impl State {
-    /// Applies the bus' next message.
+    /// Applies the next message of the bus.
     pub fn apply(&mut self, message: &Message) {
         if let Message::Joints { epoch, joints } = *message {
             // Cells drop joints of the last epoch.
@@ -156,7 +156,7 @@ impl State {
         self.since.retain(|message| !is_forgotten(message));
     }
 
-    /// Moves the messages so far into the state before the joints.
+    /// Moves the messages since the last joints into the state before them, as new joints follow.
     fn fold(&mut self) {
         let last = self.joints.map(|(epoch, _)| epoch);
         if let Some(epoch) = last {
@@ -179,7 +179,7 @@ impl State {
         self.joints.map(|(epoch, _)| epoch)
     }
 
-    /// Returns the cells in contact since the last joints, by the messages before them.
+    /// Returns the cells that are in contact since the last joints, by the messages before these joints.
     #[must_use]
     pub fn touched(&self) -> KnownContacts {
         let mut touched = KnownContacts::default();
@@ -192,7 +192,7 @@ impl State {
         touched
     }
 
-    /// Returns true if a cell that has just started is already in this state.
+    /// Returns true if a cell in its state after a start needs no messages to reach this state.
     #[must_use]
     pub fn is_fresh(&self) -> bool {
         let StateBeforeJoints { writes, halted, cells } = &self.before;
@@ -201,7 +201,7 @@ impl State {
         !contact && writes.is_empty() && !halted && self.joints.is_none() && self.since.is_empty()
     }
 
-    /// Returns true if new parameters were activated.
+    /// Returns true if a message commits parameters, so that cells use new ones.
     #[must_use]
     pub fn configures(&self) -> bool {
         let commit = Parameter::Commit.number();
@@ -209,8 +209,8 @@ impl State {
         self.before.writes.iter().any(|(_, _, message)| commits(message)) || self.since.iter().any(commits)
     }
 
-    /// Returns the messages that bring `cells` into this state. `next` are the joints that will follow, for a bus
-    /// without joints so far: they make the cells drop the epoch of an earlier gateway.
+    /// Returns the messages that bring `cells` into this state. On a bus without joints so far, `next` are the joints
+    /// that will follow: they let the cells forget the epoch of an earlier gateway.
     #[must_use]
     pub fn restoring(&self, cells: impl Fn(CellId) -> bool, next: Option<(Epoch, Joints)>) -> Vec<Message> {
         let StateBeforeJoints { writes, halted, cells: contact_states } = &self.before;

@@ -1,8 +1,8 @@
-//! The cells of a bus that are in contact, as far as known.
+//! A set of the cells of a bus that are in contact.
 
 use protocol::id::CellId;
 
-/// The contact of each cell; `None` if unknown.
+/// The contact of each cell of a bus: true, false, or `None` if unknown.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct KnownContacts([Option<bool>; CellId::COUNT]);
 

@@ -1,4 +1,4 @@
-//! Compares the reports of a network of cells with its description.
+//! Compares the wiring and the identities that cells report with the skin's description.
 //!
 //! Every difference is reported once, by its cause: the wires of a missing cell are not listed.
 
@@ -13,31 +13,31 @@ use thiserror::Error;
 
 use super::tree::{TreePlaces, places};
 
-/// The known state of one cell.
+/// The reports of one cell, and the description of the cell.
 #[derive(Clone, Copy, Debug)]
 pub struct ObservedCell {
-    /// Its node id.
+    /// Node id of the cell.
     pub node: CellId,
-    /// The described serial number for this node id; `None` if the node id is not described.
+    /// Serial number described for this node id; `None` if the node id is not described.
     pub serial: Option<u32>,
-    /// The expected hash of its configuration.
+    /// Expected hash of the cell's configuration.
     pub configuration: u16,
-    /// Its last heartbeat.
+    /// Last heartbeat of the cell.
     pub heartbeat: Option<Heartbeat>,
-    /// True if it sends now.
+    /// True if the cell sends now.
     pub alive: bool,
-    /// Its reported place in the tree.
+    /// Reported place of the cell in the tree.
     pub tree: Option<Tree>,
-    /// Its reported neighbours at the ports.
+    /// Reported neighbours at the ports of the cell.
     pub ports: Option<Ports>,
 }
 
-/// A port of a cell.
+/// One end of a wire: a port of a cell.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub struct WireEnd {
     /// The cell.
     pub cell: CellId,
-    /// Its port, from 0.
+    /// The port of the cell, from 0.
     pub port: usize,
 }
 
@@ -47,14 +47,14 @@ impl fmt::Display for WireEnd {
     }
 }
 
-/// The directions in which a damaged wire works.
+/// The directions in which a damaged wire still works.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub enum WorkingDirection {
-    /// Neither direction, or unknown.
+    /// Neither direction works, or the directions are unknown.
     Nothing,
-    /// From the first end to the second.
+    /// Messages arrive from the first end at the second only.
     There,
-    /// From the second end to the first.
+    /// Messages arrive from the second end at the first only.
     Back,
 }
 
@@ -75,24 +75,24 @@ pub enum Difference {
     /// A described cell does not send.
     #[error("cell {0} is missing: start it, or take it out of the description")]
     MissingCell(CellId),
-    /// A cell sends that is not described.
+    /// A cell that is not described sends on the bus.
     #[error("cell {cell} with serial number {serial} is not described: describe it, or take it off the bus")]
     ExtraCell {
-        /// Its node id.
+        /// Node id of the cell.
         cell: CellId,
-        /// Its serial number.
+        /// Serial number of the cell.
         serial: u32,
     },
-    /// A cell with another serial number than described holds a node id.
+    /// The cell that holds a node id has another serial number than described.
     #[error("{}", other_cell(*cell, *serial, *described, *belongs))]
     OtherCell {
         /// The node id.
         cell: CellId,
-        /// The serial number of its owner.
+        /// Serial number of the cell that holds the node id.
         serial: u32,
-        /// The described serial number.
+        /// Described serial number.
         described: u32,
-        /// The node id with which the owner is described, if any.
+        /// Node id with which the description has that cell, if any.
         belongs: Option<CellId>,
     },
     /// Two cells have the same node id.
@@ -103,10 +103,10 @@ pub enum Difference {
     Version {
         /// The cell.
         cell: CellId,
-        /// Its version; `None` if only its neighbours report the difference.
+        /// Reported version; `None` if only neighbours report the difference.
         version: Option<u16>,
     },
-    /// A cell computes with other parameters than the skin's.
+    /// A cell computes with parameters that differ from the skin's.
     #[error("cell {0} is configured for another skin: configure it with `skinbus commission`")]
     OtherSkin(CellId),
     /// A described wire does not work.
@@ -119,25 +119,25 @@ pub enum Difference {
         /// The directions that still work.
         carries: WorkingDirection,
     },
-    /// A wire is not described.
+    /// A wire exists that is not described.
     #[error("a wire leads from {0} to {1} and is not described: describe it, or unplug it")]
     ExtraWire(WireEnd, WireEnd),
-    /// A port leads to another end than described.
+    /// A port is connected to another end than described.
     #[error(
         "{end} leads to {leads} and should lead to {described}: plug it there, or change the description"
     )]
     SwappedWire {
         /// The port.
         end: WireEnd,
-        /// The end to which it leads.
+        /// The end to which the port leads.
         leads: WireEnd,
-        /// The end to which it should lead.
+        /// The end to which the port should lead.
         described: WireEnd,
     },
-    /// A cell without a node id is at a port.
+    /// A cell without a node id is connected to this port.
     #[error("a cell without a node id is at {0}: it gets one from the network, unless all are used")]
     Unnumbered(WireEnd),
-    /// Cells that are each other's parents, in order.
+    /// Cells whose parents form a circle, in order.
     #[error("{} are each other's parents, a circle that would count cells twice: restart them", names(.0))]
     Circle(Vec<CellId>),
     /// Cells without a route to a root.
@@ -183,7 +183,7 @@ pub fn names(cells: &[CellId]) -> String {
 }
 
 impl Difference {
-    /// Returns true if the torque of some cell is missing from all sums.
+    /// Returns true if the difference makes the torque of some cell missing from all sums.
     #[must_use]
     pub const fn breaks_the_tree(&self) -> bool {
         match self {
@@ -200,7 +200,7 @@ impl Difference {
     }
 }
 
-/// Returns all differences, each once.
+/// Returns all differences between the wires and cells of a network and the description, each once.
 #[must_use]
 pub fn differences(wires: &Wires, cells: &[ObservedCell]) -> Vec<Difference> {
     let mut found: Vec<_> = cells.iter().flat_map(|cell| of_cell(cell, cells)).collect();
@@ -221,7 +221,7 @@ pub fn differences(wires: &Wires, cells: &[ObservedCell]) -> Vec<Difference> {
     found
 }
 
-/// Returns the differences of a cell by itself.
+/// Returns the differences that concern a cell alone, without its wires.
 fn of_cell(cell: &ObservedCell, all: &[ObservedCell]) -> Vec<Difference> {
     let node = cell.node;
     let heartbeat = cell.heartbeat.filter(|_| cell.alive);
@@ -244,7 +244,7 @@ fn of_cell(cell: &ObservedCell, all: &[ObservedCell]) -> Vec<Difference> {
     found
 }
 
-/// Returns the cells with another version, by their own or by their neighbours' reports.
+/// Returns the cells with another version of the protocol, by their own reports or by those of their neighbours.
 fn other_versions(wires: &Wires, cells: &[ObservedCell]) -> BTreeMap<CellId, Option<u16>> {
     let alive = || cells.iter().filter(|cell| cell.alive && cell.serial.is_some());
     let mut versions = BTreeMap::new();
@@ -268,10 +268,10 @@ fn other_versions(wires: &Wires, cells: &[ObservedCell]) -> BTreeMap<CellId, Opt
     versions
 }
 
-/// The neighbours of all ports.
+/// The reported neighbours at all ports of a bus, beside the described ones.
 struct Network<'a> {
     wires: &'a Wires,
-    /// The cells with comparable ports: present, with a unique node id, and of this version.
+    /// The cells whose ports can be compared: present, with a unique node id, and of this program's version.
     sound: BTreeMap<CellId, &'a Ports>,
 }
 
@@ -294,7 +294,7 @@ impl<'a> Network<'a> {
         self.sound.get(&end.cell)?.ports.get(end.port).copied()
     }
 
-    /// Returns the end to which a port leads, if its cell receives anything there.
+    /// Returns the end to which a port leads; `None` if the cell receives nothing there.
     fn leads(&self, end: WireEnd) -> Option<WireEnd> {
         let state = self.state(end).filter(|state| state.receives)?;
         let cell = CellId::new(state.number.into()).ok()?;

@@ -6,12 +6,12 @@ use protocol::id::CellId;
 use protocol::message::Tree;
 use protocol::port::UPLINK;
 
-/// The places of cells in their tree.
+/// The tree of a bus by the reports of its cells.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct TreePlaces {
     /// Number of wires from each reachable cell to its root; a root has 0.
     pub depths: BTreeMap<CellId, u8>,
-    /// True if all these cells report the same depth.
+    /// True if every reachable cell reports the depth that follows from the parents.
     pub agree: bool,
     /// Cells that send but have no route to a root, including those in cycles.
     pub unreachable: Vec<CellId>,
@@ -27,7 +27,8 @@ impl TreePlaces {
     }
 }
 
-/// Returns the places of cells, given for each cell its node id, whether it sends, and its report.
+/// Computes the tree from each cell's node id, a flag that is true if the cell sends now, and the cell's report of its
+/// place.
 pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> TreePlaces {
     let alive: BTreeMap<_, _> =
         cells.filter(|(_, alive, _)| *alive).map(|(node, _, tree)| (node, tree)).collect();
@@ -63,7 +64,7 @@ pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Tree
     places
 }
 
-/// Returns true if the cell is wired to the gateway and uses that wire.
+/// Returns true if the cell is wired to the gateway and uses that wire to send its sums.
 fn is_root(tree: &Tree) -> bool {
     tree.parent == Some(0) && usize::from(tree.parent_port) == UPLINK
 }

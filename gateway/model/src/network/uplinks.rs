@@ -13,16 +13,16 @@ use protocol::message::VERSION;
 use protocol::port::{Hello, PortMessage, Rank, Walk};
 use protocol::time::{Micros, Span};
 
-/// Interval of hellos.
+/// Interval of the hellos that the gateway sends to each root.
 const HELLO_INTERVAL: Span = Span::from_millis(250);
-/// Timeout of a root's hellos.
+/// Time without a hello from a root after which its wire counts as down.
 const HELLO_TIMEOUT: Span = Span::from_millis(600);
-/// Timeout of a walk.
+/// Time after which an unanswered walk counts as lost.
 const WALK_TIMEOUT: Span = Span::from_millis(400);
-/// The port of the gateway's side, in its hellos.
+/// Port number of the gateway's side, as sent in hellos.
 const PORT: u8 = 0;
 
-/// One root's wire.
+/// The wire from the gateway to one root.
 #[derive(Clone, Copy, Debug)]
 struct Wire {
     /// The index of the wire in the description.
@@ -31,7 +31,7 @@ struct Wire {
     is_child: bool,
 }
 
-/// A walk that assigns node ids below one root.
+/// A walk on its way below one root, which assigns node ids to cells.
 #[derive(Clone, Copy, Debug)]
 struct Walking {
     root: usize,
@@ -39,7 +39,7 @@ struct Walking {
     since: Micros,
 }
 
-/// The gateway's ends of all roots' wires of one bus.
+/// The gateway's ends of the wires to all roots of one bus.
 #[derive(Debug)]
 pub struct Uplinks {
     wires: Vec<Wire>,
@@ -47,15 +47,15 @@ pub struct Uplinks {
     used: BTreeSet<u8>,
     walks: u8,
     walking: Option<Walking>,
-    /// Earliest time of the next walk: cells with a node id from a lost walk must claim it first.
+    /// Earliest time of the next walk. Until then, cells with node ids from a lost walk can claim them.
     wait: Micros,
     next_hello: Micros,
     outbox: VecDeque<(usize, PortMessage)>,
 }
 
 impl Uplinks {
-    /// Creates the wires to this number of roots. The first walk has the number `walk`, which must differ from that of
-    /// an earlier gateway.
+    /// Creates the wires to this number of roots. The first walk gets the number `walk`, which must differ from the
+    /// walk numbers of an earlier gateway.
     #[must_use]
     pub fn new(roots: usize, walk: u8, now: Micros) -> Self {
         let wire = |root| Wire { root, last_hello: None, is_child: false };
@@ -76,7 +76,7 @@ impl Uplinks {
         self.used.insert(cell.get());
     }
 
-    /// Returns the next message, with the index of its root.
+    /// Returns the next message to send, with the index of the root to which it goes.
     pub fn poll_transmit(&mut self) -> Option<(usize, PortMessage)> {
         self.outbox.pop_front()
     }
@@ -129,7 +129,7 @@ impl Uplinks {
         self.walk(now);
     }
 
-    /// Starts a round later than this one, unless one has started already.
+    /// Starts a round later than `round`, unless a later one has started already.
     fn renew(&mut self, now: Micros, round: u8) {
         if self.round.wrapping_sub(round).cast_signed() <= 0 {
             self.round = round.wrapping_add(1);
@@ -157,7 +157,7 @@ impl Uplinks {
         }
     }
 
-    /// Handles timeouts.
+    /// Handles expired timeouts: sends hellos, marks silent roots and gives up lost walks.
     pub fn handle_time(&mut self, now: Micros) {
         if now >= self.next_hello {
             let skipped = now.elapsed_since(self.next_hello).0 / HELLO_INTERVAL.0;
@@ -174,13 +174,13 @@ impl Uplinks {
         self.walk(now);
     }
 
-    /// Returns a root above a cell without a node id.
+    /// Returns the index of a root that has a cell without a node id below it.
     fn needs_node_ids(&self) -> Option<usize> {
         let needs = |wire: &&Wire| wire.is_child && wire.last_hello.is_some_and(|(hello, _)| hello.unnumbered);
         self.wires.iter().find(needs).map(|wire| wire.root)
     }
 
-    /// Sends a walk to a root that needs one, with the first range of free node ids.
+    /// Sends a walk, with the first range of free node ids, to a root that has cells without node ids below it.
     fn walk(&mut self, now: Micros) {
         if self.walking.is_some() || now < self.wait {
             return;
@@ -192,7 +192,7 @@ impl Uplinks {
         self.outbox.push_back((root, PortMessage::NodeId(walk)));
     }
 
-    /// Returns the first range of free node ids.
+    /// Returns the first and last node id of the first range of free node ids.
     fn free(&self) -> Option<(u8, u8)> {
         let first = (1..=CellId::MAX.get()).find(|number| !self.used.contains(number))?;
         let last = (first..=CellId::MAX.get()).take_while(|number| !self.used.contains(number)).last()?;

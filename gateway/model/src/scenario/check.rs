@@ -77,7 +77,7 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
     Ok(Motion { start, kind })
 }
 
-/// Returns the value under its key or under the former key, with that key.
+/// Returns the value under a key or under the key's former name, with the name that the file uses.
 fn either<'a, T>(
     at: &KeyPath,
     (key, value): (&'static str, &'a Option<T>),
@@ -92,7 +92,7 @@ fn either<'a, T>(
     }
 }
 
-/// Checks that no joint exceeds its speed limit; the swing is fastest at the start.
+/// Checks that no joint exceeds its speed limit. A swinging joint is fastest at the start of the motion.
 fn speeds(at: &KeyPath, skin: &Skin, amplitude: &[f64; MAX_ROBOT_JOINTS], period_s: f64) -> Checked<()> {
     let limits = skin.controller.max_speed.iter().zip(&skin.robot.joints);
     for (index, (amplitude, (&max, joint))) in amplitude.iter().zip(limits).enumerate() {

@@ -23,7 +23,7 @@ pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &NameTable<'_>) -> Ch
     Ok(faults)
 }
 
-/// One entry of `[[fault]]`.
+/// One entry of `[[fault]]` in a scenario's file.
 struct Entry<'a> {
     at: KeyPath,
     raw: &'a raw::Fault,
@@ -83,7 +83,7 @@ impl Entry<'_> {
         Ok(FaultKind::Wire { link_down, from, to, both_ways: !self.raw.one_way.unwrap_or(false) })
     }
 
-    /// Returns the repair of a wire that is down for a limited time.
+    /// Returns the repair that follows a wire fault of limited duration.
     fn end_of(&self, fault: &Fault) -> Checked<Option<Fault>> {
         let FaultKind::Wire { link_down: true, from, to, both_ways } = fault.kind else { return Ok(None) };
         if self.raw.for_s.is_none() {
@@ -134,7 +134,7 @@ impl Entry<'_> {
         delay.map(Span).ok_or_else(|| wrong(got.to_string()))
     }
 
-    /// Returns a number that this kind of fault requires.
+    /// Returns a number that this kind of fault requires; it must be from `min` to `max`.
     fn given(&self, key: &'static str, value: Option<f64>, min: f64, max: f64) -> Checked<f64> {
         let why = || match (min, max) {
             (f64::NEG_INFINITY, _) => format!("a finite number is needed with kind = {:?}", self.raw.kind),
@@ -145,7 +145,7 @@ impl Entry<'_> {
             .ok_or_else(|| self.at.key(key).fault(value.map_or_else(String::new, |it| it.to_string()), why()))
     }
 
-    /// Refuses keys without a meaning for this kind of fault.
+    /// Refuses keys that have no meaning for this kind of fault.
     fn only(&self, keys: &[&str]) -> Checked<()> {
         let raw = self.raw;
         let given = [

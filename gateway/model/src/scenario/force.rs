@@ -11,8 +11,8 @@ use super::{Profile, Touch};
 /// The maximum total force of three contact words, in N.
 pub const MAX_FORCE_N: f64 = 3.0 * 32_767.0 / 1_024.0;
 
-/// Splits a force in N into three contact words, as equal as possible; their sum is exactly the force rounded to a
-/// word's step. Forces out of range saturate.
+/// Splits a force in N into three contact words that are as equal as possible. Their sum is exactly the force rounded
+/// to the step of a word. Forces out of range saturate.
 #[must_use]
 #[expect(clippy::cast_possible_truncation, reason = "rounded; the cast saturates, and NaN becomes 0")]
 pub fn contact_words(force_n: f64) -> [Q5_10; 3] {

@@ -19,10 +19,10 @@ use crate::accelerometer::sensor::normal;
 /// Time constants of creep in s; their sum approximates a logarithm of time.
 const CREEP_S: [f64; 4] = [1.0, 10.0, 100.0, 1_000.0];
 
-/// The true input of a cell's sensors.
+/// The true input of a cell's sensors, before sensor errors.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct TrueInput {
-    /// The force of touches in N.
+    /// Total force of all touches on the cell, in N.
     pub(super) force_n: f64,
     /// Proximity, and the temperature set by a touch.
     pub(super) sensors: SkinSensors,
@@ -39,16 +39,17 @@ pub(super) struct ImperfectSensors {
     seed: u64,
     period_s: f64,
     cells: Vec<CellSensors>,
-    /// The readings of the epoch before `next`.
+    /// The readings of all cells in the epoch before `next`.
     words: Vec<SkinSensors>,
     next: u64,
 }
 
-/// The errors of one cell, and the state of its force sensor.
+/// The sensor errors of one cell, and the state of its force sensor.
 #[derive(Clone, Debug)]
 struct CellSensors {
     neighbours: Vec<usize>,
-    /// As fractions of the largest error, -1 to 1.
+    /// Zero error of the force sensor as a fraction of the largest one, -1 to 1; the other errors follow in the same
+    /// form.
     offset: f64,
     gain: f64,
     temperature_n: f64,
@@ -79,17 +80,17 @@ impl ImperfectSensors {
         Self { sensors: sensors.clone(), seed, period_s, cells: cells.collect(), words, next: 0 }
     }
 
-    /// Returns the reading of each cell in the epoch before [`Self::next`]; the default before the first.
+    /// Returns the reading of each cell in the epoch before [`Self::next`]; the default reading before the first epoch.
     pub(super) fn words(&self) -> &[SkinSensors] {
         &self.words
     }
 
-    /// Returns the next epoch.
+    /// Returns the number of the next epoch to compute.
     pub(super) const fn next(&self) -> u64 {
         self.next
     }
 
-    /// Resets to the state before the first epoch.
+    /// Resets the sensors to their state before the first epoch.
     pub(super) fn restart(&mut self) {
         for (cell, index) in self.cells.iter_mut().zip(0..) {
             *cell = CellSensors::new(core::mem::take(&mut cell.neighbours), self.seed, index);
@@ -138,7 +139,8 @@ impl CellSensors {
         }
     }
 
-    /// Returns the reading in N, `period_s` after the previous one, at this number of °C above the reference.
+    /// Returns the reading in N for a true force in N. It is `period_s` s after the previous reading, at `degrees` °C
+    /// above the reference temperature.
     fn read(&mut self, force_n: f64, degrees: f64, errors: &ForceErrors, period_s: f64) -> f64 {
         // Hysteresis as a play between the curves of a rising and of a falling force.
         let falling = force_n * (1.0 + errors.hysteresis);

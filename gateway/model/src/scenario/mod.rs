@@ -62,7 +62,7 @@ pub struct Scenario {
 pub struct Motion {
     /// The start position, in rad or m.
     pub start: [f64; MAX_ROBOT_JOINTS],
-    /// The motion from there.
+    /// The kind of motion from the start position.
     pub kind: MotionKind,
 }
 
@@ -108,7 +108,7 @@ impl Motion {
 }
 
 impl MotionKind {
-    /// Returns the word in the file.
+    /// Returns the name of the motion in a scenario's file.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -139,7 +139,7 @@ pub enum Mode {
 }
 
 impl Mode {
-    /// Returns the word in the file.
+    /// Returns the name of the mode in a scenario's file.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -149,7 +149,7 @@ impl Mode {
     }
 }
 
-/// A touch of some cells.
+/// A touch: a force on some cells for some time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Touch {
     /// The start time.
@@ -183,7 +183,7 @@ pub enum Profile {
 }
 
 impl Profile {
-    /// Returns the word in the file; `points` for a list of points.
+    /// Returns the name of the profile in a scenario's file; `points` for a list of points.
     #[must_use]
     pub const fn name(&self) -> &'static str {
         match self {
@@ -195,26 +195,26 @@ impl Profile {
     }
 }
 
-/// A fault, or its repair.
+/// A fault, or the repair of one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fault {
-    /// The time.
+    /// The time of the fault.
     pub at: Micros,
-    /// The action.
+    /// The kind of fault, with its details.
     pub kind: FaultKind,
 }
 
 /// The kind of a fault or repair.
 #[derive(Clone, Debug, PartialEq)]
 pub enum FaultKind {
-    /// An action on the processes of cells.
+    /// An action on the processes of cells, such as killing them.
     Process {
         /// The action.
         action: ProcessAction,
         /// The cells.
         cells: Vec<usize>,
     },
-    /// Wrong readings of cells, applied by [`Touches`].
+    /// An error of the sensor readings of cells, applied by [`Touches`].
     Sensor {
         /// The kind of error.
         fault: SensorFault,
@@ -223,15 +223,15 @@ pub enum FaultKind {
         /// The cells.
         cells: Vec<usize>,
     },
-    /// A change of the wires between two cells.
+    /// A wire between two cells goes down or comes up.
     Wire {
-        /// True to take the link down, false to bring it up.
+        /// True if the wire goes down, false if it comes up.
         link_down: bool,
-        /// The sender.
+        /// The cell that sends over the wire.
         from: usize,
-        /// The receiver.
+        /// The cell that receives over the wire.
         to: usize,
-        /// True if it applies to the other direction, too.
+        /// True if the other direction of the wire changes, too.
         both_ways: bool,
     },
     /// A disturbance of the frames of a bus.
@@ -248,7 +248,7 @@ pub enum FaultKind {
 }
 
 impl FaultKind {
-    /// Returns the word in the file.
+    /// Returns the name of the fault in a scenario's file.
     #[must_use]
     pub const fn name(&self) -> &'static str {
         match self {
@@ -270,22 +270,22 @@ impl FaultKind {
     }
 }
 
-/// An action on a process.
+/// An action on the process of a cell.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ProcessAction {
-    /// `kill`: ends it at once.
+    /// `kill`: ends the process at once.
     Kill,
-    /// `stop`: suspends it, as if its firmware hung.
+    /// `stop`: suspends the process, as if its firmware hung.
     Stop,
-    /// `continue`: resumes it after a stop.
+    /// `continue`: resumes the process after a stop.
     Continue,
-    /// `restart`: restarts it, or starts it if it has ended.
+    /// `restart`: restarts the process, or starts it if it has ended.
     Restart,
 }
 
 impl ProcessAction {
-    /// Returns its name in a scenario's file.
+    /// Returns the name of the action in a scenario's file.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -297,14 +297,14 @@ impl ProcessAction {
     }
 }
 
-/// The error of a cell's sensor.
+/// An error of a cell's force sensor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum SensorFault {
     /// `stuck`: the reading keeps its value from the start of the fault.
     Stuck,
     /// `drift`: the contact force drifts away from the true one.
     Drift {
-        /// The drift in N/s; may be negative.
+        /// The drift in N/s, of either sign.
         n_per_s: f64,
     },
 }
@@ -314,53 +314,53 @@ pub enum SensorFault {
 pub enum BusFault {
     /// `drop`: the frame is lost.
     Drop {
-        /// 0 to 1.
+        /// Probability for each frame, 0 to 1.
         probability: f64,
     },
     /// `delay`: the frame arrives later.
     Delay {
-        /// 0 to 1.
+        /// Probability for each frame, 0 to 1.
         probability: f64,
         /// The delay.
         delay: Span,
     },
     /// `duplicate`: the frame arrives twice.
     Duplicate {
-        /// 0 to 1.
+        /// Probability for each frame, 0 to 1.
         probability: f64,
     },
     /// `corrupt`: bits of the frame are flipped.
     Corrupt {
-        /// 0 to 1.
+        /// Probability for each frame, 0 to 1.
         probability: f64,
     },
     /// `reorder`: the frame arrives after the next one.
     Reorder {
-        /// 0 to 1.
+        /// Probability for each frame, 0 to 1.
         probability: f64,
     },
     /// `babble`: an unknown sender sends frames continuously.
     Babble {
         /// Frames per second.
         frames_per_s: f64,
-        /// The identifier of these frames.
+        /// The identifier of the frames that the unknown sender sends.
         id: u16,
     },
 }
 
 impl Scenario {
-    /// Reads and checks a file.
+    /// Reads and checks a scenario's file.
     ///
     /// # Errors
-    /// Returns [`DocumentError`] if the file cannot be read, with the first fault otherwise.
+    /// Returns [`DocumentError`] if the file cannot be read, or with its first fault.
     pub fn read(path: &Path, skin: &Skin) -> Result<Self, DocumentError> {
         Self::parse(&path.display().to_string(), &document::read_text(path)?, skin)
     }
 
-    /// Checks a text; errors show `path` as its name.
+    /// Checks the text of a scenario; errors name `path` as its file.
     ///
     /// # Errors
-    /// Returns [`DocumentError`] with the first fault.
+    /// Returns [`DocumentError`] with the first fault in the text.
     pub fn parse(path: &str, text: &str, skin: &Skin) -> Result<Self, DocumentError> {
         let what = "this is a skin, not a scenario: `skinbus run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, |raw| check::scenario(raw, skin))

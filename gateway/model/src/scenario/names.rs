@@ -18,16 +18,16 @@ pub(super) struct NameTable<'a> {
     index: HashMap<(usize, i64), usize>,
 }
 
-/// The keys of a table that select cells.
+/// The keys with which a table of a scenario's file selects cells.
 #[derive(Clone, Copy)]
 pub(super) struct CellSelection<'a> {
-    /// The table.
+    /// The position of the table in the file, for errors.
     pub(super) at: &'a KeyPath,
-    /// The bus of cells that are given by node id alone.
+    /// The key `bus`: the bus of cells that are given by node id alone.
     pub(super) bus: Option<&'a str>,
-    /// Node ids, or cells with their buses.
+    /// The key `cells`: node ids, or cells with their buses.
     pub(super) cells: Option<&'a [raw::CellReference]>,
-    /// True for every cell (of the bus, if that is given).
+    /// The key `all`: true selects every cell, of the bus if `bus` is given.
     pub(super) all: bool,
 }
 
@@ -47,7 +47,7 @@ impl<'a> NameTable<'a> {
         self.skin.buses.get(bus).map_or("", |bus| &bus.name)
     }
 
-    /// Returns the bus with this name; `at` and `value` are the key and the value for errors.
+    /// Returns the index of the bus with this name. Errors show `at` and `value` as the key and its value.
     fn named(&self, at: &KeyPath, value: &dyn core::fmt::Display, name: &str) -> Checked<usize> {
         let wrong = || at.fault(value, format_args!("no such bus; there is {}", self.buses()));
         self.skin.bus_named(name).ok_or_else(wrong)
@@ -58,7 +58,7 @@ impl<'a> NameTable<'a> {
         names.collect::<Vec<_>>().join(", ")
     }
 
-    /// Returns the bus that the key `bus` names. The key is optional if the skin has one bus only.
+    /// Returns the index of the bus that the key `bus` names. The key may be omitted if the skin has only one bus.
     fn key(&self, given: CellSelection<'_>) -> Checked<usize> {
         let at = given.at.key("bus");
         match given.bus {
@@ -73,7 +73,7 @@ impl<'a> NameTable<'a> {
         }
     }
 
-    /// Returns the bus of a table: that of its key, else that of its first cell.
+    /// Returns the index of the bus of a table: the bus of its key `bus`, or else of its first cell.
     pub(super) fn bus(&self, given: CellSelection<'_>) -> Checked<usize> {
         match given.cells {
             Some([first, ..]) if given.bus.is_none() => {
@@ -84,7 +84,7 @@ impl<'a> NameTable<'a> {
         }
     }
 
-    /// Returns the cell that is named at `at`.
+    /// Returns the index of the cell that the file names at `at`.
     fn cell(&self, at: &KeyPath, named: &raw::CellReference, given: CellSelection<'_>) -> Checked<usize> {
         let (bus, node) = match named {
             raw::CellReference::Node(node) => (self.key(given)?, *node),
@@ -103,7 +103,7 @@ impl<'a> NameTable<'a> {
         })
     }
 
-    /// Formats the node ids of a bus for an error.
+    /// Formats the node ids of a bus as a list for an error.
     fn nodes(&self, bus: usize) -> String {
         let mut nodes: Vec<_> = self.skin.cells_on_bus(bus).map(|cell| cell.node.get()).collect();
         nodes.sort_unstable();
@@ -115,7 +115,7 @@ impl<'a> NameTable<'a> {
         }
     }
 
-    /// Returns the cells that a table lists, in the file's order. A cell must not occur twice.
+    /// Returns the indices of the cells that a table lists, in the file's order. A cell must not occur twice.
     fn each(&self, given: CellSelection<'_>, named: &[raw::CellReference]) -> Checked<Vec<usize>> {
         if given.bus.is_some() {
             self.key(given)?;
@@ -126,18 +126,18 @@ impl<'a> NameTable<'a> {
             let at = path.element(index);
             let cell = self.cell(&at, named, given)?;
             if let Some(first) = cells.iter().position(|&before| before == cell) {
-                return Err(at.fault(named, format_args!("cells[{first}] names it already")));
+                return Err(at.fault(named, format_args!("cells[{first}] is the same cell")));
             }
             cells.push(cell);
         }
         Ok(cells)
     }
 
-    /// Returns the cells that a table lists, or all of them; sorted.
+    /// Returns the indices of the cells that a table lists, or of all cells; sorted.
     pub(super) fn cells(&self, given: CellSelection<'_>) -> Checked<Vec<usize>> {
         let path = given.at.key("cells");
         match given.cells {
-            Some(_) if given.all => Err(path.fault("", "either some cells, or all = true")),
+            Some(_) if given.all => Err(path.fault("", "give either cells or all = true, not both")),
             None if !given.all => Err(path.fault("", "which cells? give their node ids, or all = true")),
             None => {
                 let bus = given.bus.map(|_| self.key(given)).transpose()?;
@@ -154,7 +154,7 @@ impl<'a> NameTable<'a> {
         }
     }
 
-    /// Returns the cells that a table lists, all of which must be on one bus; sorted.
+    /// Returns the indices of the cells that a table lists, sorted. All of them must be on the given bus.
     pub(super) fn cells_on(&self, given: CellSelection<'_>, bus: usize) -> Checked<Vec<usize>> {
         let cells = self.cells(given)?;
         let is_here = |cell: usize| self.skin.cells.get(cell).is_some_and(|cell| cell.bus == bus);
@@ -172,7 +172,8 @@ impl<'a> NameTable<'a> {
         Ok(cells)
     }
 
-    /// Returns the two cells of one bus that a table lists, in the file's order. A wire must connect them.
+    /// Returns the indices of the two cells that a table lists, in the file's order. Both must be on one bus, and a
+    /// wire must connect them.
     pub(super) fn wired(&self, given: CellSelection<'_>) -> Checked<(usize, usize)> {
         let path = given.at.key("cells");
         self.cells(given)?;
@@ -193,7 +194,7 @@ impl<'a> NameTable<'a> {
             (0..PORTS).any(|port| wires.other_end(from, port).is_some_and(|(other, _)| other == to))
         };
         let pair = (self.cell(&path.element(0), one, given)?, self.cell(&path.element(1), other, given)?);
-        let wrong = || path.fault(format_args!("[{one}, {other}]"), "no wire connects them");
+        let wrong = || path.fault(format_args!("[{one}, {other}]"), "no wire connects these two cells");
         Some(pair).filter(leads).ok_or_else(wrong)
     }
 }
@@ -276,7 +277,7 @@ mod tests {
             ("bus = \"can9\"\ncells = [\"vcan0:1\"]", "touch[0].bus = \"can9\": no such bus"),
             (
                 "bus = \"vcan0\"\ncells = [1, \"vcan0:1\"]",
-                "touch[0].cells[1] = \"vcan0:1\": cells[0] names it already",
+                "touch[0].cells[1] = \"vcan0:1\": cells[0] is the same cell",
             ),
         ] {
             let got = touched(keys).unwrap_err();

@@ -45,7 +45,7 @@ fn touch(at: &KeyPath, raw: &raw::Touch, end: EndS, names: &NameTable<'_>) -> Ch
     })
 }
 
-/// Returns a profile that is given by a word, the touch's duration, and its peak force in N.
+/// Returns the profile that a touch names with a word, the duration of the touch, and its peak force in N.
 fn named(at: &KeyPath, raw: &raw::Touch, word: &str) -> Checked<(Profile, Span, f64)> {
     let profiles = [Profile::HalfSine, Profile::Step, Profile::Ramp].map(|profile| (profile.name(), profile));
     let Some((_, profile)) = profiles.iter().find(|(name, _)| *name == word).cloned() else {
@@ -68,7 +68,7 @@ fn named(at: &KeyPath, raw: &raw::Touch, word: &str) -> Checked<(Profile, Span, 
     Ok((profile, length, force_n))
 }
 
-/// Returns a profile that is given by points, with their duration and peak force.
+/// Returns the profile that a touch gives as points, the duration of the touch, and its peak force in N.
 fn drawn(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile, Span, f64)> {
     let path = at.key("profile");
     let mut points: Vec<(Span, f64)> = Vec::with_capacity(given.len() + 1);
@@ -80,12 +80,12 @@ fn drawn(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile
             return Err(point.fault("", why));
         };
         if !(0.0..=LONGEST_S).contains(&seconds) {
-            let why = format!("0 to {LONGEST_S:e} s after the start of the touch are possible");
+            let why = format!("must be 0 to {LONGEST_S:e} s after the start of the touch");
             return Err(point.element(0).fault(seconds, why));
         }
         let moment = span_from_seconds(seconds);
         if points.last().is_some_and(|(last, _)| *last >= moment) {
-            let why = "times of points increase, by at least 1e-6 s";
+            let why = "the times of points must increase, by at least 1e-6 s";
             return Err(point.element(0).fault(seconds, why));
         }
         newtons(&point.element(1), force_n)?;
@@ -118,13 +118,13 @@ fn newtons(at: &KeyPath, force_n: f64) -> Checked<()> {
     if (0.0..=MAX_FORCE_N).contains(&force_n) {
         return Ok(());
     }
-    let why = format!("0 to {MAX_FORCE_N:.3} N are possible, the range of three contact words");
+    let why = format!("must be 0 to {MAX_FORCE_N:.3} N, the range of three contact words");
     Err(at.fault(force_n, why))
 }
 
-/// Checks that the last of these touches, together with those before it in the file, stays within the contact words of
-/// every cell. The check adds peak forces at the start of each touch, where the number of simultaneous touches is
-/// largest.
+/// Checks that the forces of simultaneous touches together fit the contact words of every cell. `touches` ends with the
+/// touch to check; those before it in the file have passed. The check adds peak forces at the start of each touch,
+/// where the number of simultaneous touches is largest.
 fn together(at: &KeyPath, touches: &[Touch], names: &NameTable<'_>) -> Checked<()> {
     let Some((last, before)) = touches.split_last() else { return Ok(()) };
     for start in touches.iter().map(|touch| touch.at).filter(|&at| last.holds_at(at)) {
@@ -206,13 +206,13 @@ mod tests {
             ("profile = [[0.0, 3.0]]", "4:11: touch[0].profile: a point [t_s, force_n] with t_s above 0"),
             (
                 "profile = [[1.0, 3.0], [0.5, 2.0]]",
-                "4:25: touch[0].profile[1][0] = 0.5: times of points increase",
+                "4:25: touch[0].profile[1][0] = 0.5: the times of points must increase",
             ),
             (
                 "profile = [[1.0, 3.0], [1.0, 2.0]]",
-                "4:25: touch[0].profile[1][0] = 1: times of points increase",
+                "4:25: touch[0].profile[1][0] = 1: the times of points must increase",
             ),
-            ("profile = [[-1.0, 3.0]]", "4:13: touch[0].profile[0][0] = -1: 0 to 3.2e7 s after the start of"),
+            ("profile = [[-1.0, 3.0]]", "4:13: touch[0].profile[0][0] = -1: must be 0 to 3.2e7 s after"),
             ("profile = [[nan, 3.0]]", "4:13: touch[0].profile[0][0] = NaN: 0 to 3.2e7 s"),
             ("profile = [[1.0, 96.0]]", "4:18: touch[0].profile[0][1] = 96: 0 to 95.997 N are possible"),
             ("profile = [[1.0, -0.5]]", "4:18: touch[0].profile[0][1] = -0.5: 0 to 95.997 N are possible"),

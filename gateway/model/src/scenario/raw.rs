@@ -74,7 +74,7 @@ impl<'de> Deserialize<'de> for Profile {
     }
 }
 
-/// A cell as named in the file.
+/// A cell as a scenario's file names it.
 #[derive(Debug)]
 pub(super) enum CellReference {
     Node(i64),
@@ -115,8 +115,8 @@ impl<'de> Deserialize<'de> for CellReference {
 }
 
 impl Scenario {
-    /// Returns the given duration. The default is [`IDLE`], or one second after the last start or end of an event if
-    /// that is later.
+    /// Returns the duration in s from the file. The default is [`IDLE`], or one second after the last start or end of
+    /// an event if that is later.
     pub(super) fn duration_s(&self) -> f64 {
         let end = |at_s: f64, for_s: Option<f64>| at_s + for_s.unwrap_or(0.0);
         let touches = self.touch.iter().map(|touch| end(touch.at_s, touch.for_s()));
@@ -177,7 +177,7 @@ pub(super) struct Touch {
 }
 
 impl Touch {
-    /// Returns the duration, if the file has one; for points, the time of the last one.
+    /// Returns the duration of the touch in s, if the file gives one; for points, the time of the last point.
     fn for_s(&self) -> Option<f64> {
         match &self.profile {
             Profile::Points(points) => points.last()?.first().copied(),

@@ -8,7 +8,7 @@ use super::{MotionKind, Profile, Scenario, Touch, contact_words};
 use crate::central::force;
 
 impl Scenario {
-    /// Returns one line for each part of the scenario that will have no effect.
+    /// Returns one warning for each part of the scenario that will have no effect on this skin.
     #[must_use]
     pub fn remarks(&self, skin: &Skin) -> Vec<String> {
         let controller = unused_controller(self.motion.kind, skin);
@@ -29,7 +29,7 @@ fn unused_controller(motion: MotionKind, skin: &Skin) -> Option<String> {
     })
 }
 
-/// Returns a warning if a touch is below the thresholds of all its cells.
+/// Returns a warning if the force and the proximity of a touch are below the thresholds of all its cells.
 fn weak(touch: &Touch, skin: &Skin) -> Option<String> {
     let sensors = SkinSensors {
         contact: contact_words(touch.force_n),

@@ -16,8 +16,8 @@ pub const REFERENCE_C: f64 = 25.0;
 /// seed.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Sensors {
-    /// The temperature of all cells in °C at some times, in order of time: linear between them, constant before the
-    /// first and after the last one. If empty, temperature is not simulated.
+    /// The temperature of all cells in °C by time, in order of time: linear between the entries, constant before the
+    /// first and after the last. If empty, temperature is not simulated.
     pub temperature: Vec<(Micros, f64)>,
     /// The errors of force sensors.
     pub force: ForceErrors,
@@ -42,7 +42,7 @@ pub struct ForceErrors {
     pub temperature_n_per_c: f64,
     /// The largest relative change of the gain per °C, of either sign.
     pub temperature_gain_per_c: f64,
-    /// The share of the force on a wired neighbour that it reads.
+    /// The share of the force on a wired neighbour that the sensor reads in addition to its own.
     pub crosstalk: f64,
     /// The standard deviation of the noise in N.
     pub noise_n: f64,
@@ -67,7 +67,7 @@ impl Sensors {
 }
 
 impl ForceErrors {
-    /// No errors.
+    /// Force sensors without errors.
     pub const PERFECT: Self = Self {
         offset_n: 0.0,
         gain: 0.0,

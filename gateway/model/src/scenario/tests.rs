@@ -248,7 +248,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
         says("[1, 3]", "[1, 4]"),
         "s.toml:22: touch[0].cells[1] = 4: no cell of \"vcan0\" has node 4: it has 1-3"
     );
-    assert_eq!(says("[1, 3]", "[1, 1]"), "s.toml:22: touch[0].cells[1] = 1: cells[0] names it already");
+    assert_eq!(says("[1, 3]", "[1, 1]"), "s.toml:22: touch[0].cells[1] = 1: cells[0] is the same cell");
     assert_eq!(says("[1, 3]", "[]"), "s.toml:22: touch[0].cells = []: at least one cell is needed");
     assert_eq!(
         says("cells = [1, 3]\n", ""),
@@ -256,7 +256,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("force_n = 3.0", "force_n = 96.0"),
-        "s.toml:23: touch[0].force_n = 96: 0 to 95.997 N are possible, the range of three contact words"
+        "s.toml:23: touch[0].force_n = 96: must be 0 to 95.997 N, the range of three contact words"
     );
     assert_eq!(
         says("\"step\"", "\"poke\""),
@@ -396,7 +396,7 @@ proptest! {
         let _ = contact_words(force_n);
     }
 
-    /// All changes together give the words of every cell, even with skipped epochs.
+    /// The changes from epoch to epoch add up to the words of every cell, even if epochs are skipped.
     #[test]
     fn changes_add_up_to_the_words_of_every_cell(steps in proptest::collection::vec(1_u64..40, 1..60)) {
         let faults = "[[fault]]\nat_s = 2.5\nkind = \"stuck\"\nfor_s = 0.3\ncells = [1]\n\
@@ -466,7 +466,7 @@ fn a_link_between_two_wired_cells_goes_down_and_comes_up_in_time() {
     let wrong = |skin, text| fault(skin, text).unwrap_err();
     assert_eq!(
         wrong(&sums, "kind = \"link_down\"\ncells = [3, 1]"),
-        "s.toml:6: fault[0].cells = [3, 1]: no wire connects them"
+        "s.toml:6: fault[0].cells = [3, 1]: no wire connects these two cells"
     );
     assert_eq!(
         wrong(&sums, "kind = \"link_down\"\ncells = [1]"),

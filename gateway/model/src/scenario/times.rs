@@ -3,12 +3,12 @@
 use protocol::document::{Checked, KeyPath, span_from_seconds};
 use protocol::time::{Micros, Span};
 
-/// The scenario's duration in s.
+/// The duration of a scenario in s, which limits the times in its file.
 #[derive(Clone, Copy)]
 pub(super) struct EndS(pub(super) f64);
 
 impl EndS {
-    /// Checks a time within the scenario.
+    /// Checks that a time in s is from 0 to before the end of the scenario.
     pub(super) fn moment(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
         if (0.0..self.0).contains(&seconds) {
             return Ok(Micros(span_from_seconds(seconds).0));
@@ -16,7 +16,7 @@ impl EndS {
         self.outside(at, seconds)
     }
 
-    /// Checks a time within the scenario, or its end.
+    /// Checks that a time in s is from 0 to the end of the scenario, the end included.
     pub(super) fn moment_or_end(self, at: &KeyPath, seconds: f64) -> Checked<Micros> {
         if (0.0..=self.0).contains(&seconds) {
             return Ok(Micros(span_from_seconds(seconds).0));
@@ -33,7 +33,7 @@ impl EndS {
 /// The longest duration in s: one year.
 pub(super) const LONGEST_S: f64 = 3.2e7;
 
-/// Checks a duration.
+/// Checks a duration in s: above 0 and at most [`LONGEST_S`].
 pub(super) fn length(at: &KeyPath, seconds: f64) -> Checked<Span> {
     if (1e-6..=LONGEST_S).contains(&seconds) {
         return Ok(span_from_seconds(seconds));

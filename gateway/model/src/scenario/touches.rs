@@ -1,7 +1,7 @@
 //! The sensor words of every cell in every epoch, from touches and sensor faults.
 //!
-//! They are a pure function of the scenario and the epoch: epoch 0 is the start of the scenario, epoch k follows k
-//! broadcast periods later. The cell answers the joints of an epoch with these words. Imperfect sensors are computed
+//! The words are a pure function of the scenario and the epoch: epoch 0 is the start of the scenario, epoch k follows k
+//! broadcast periods later. A cell answers the joints of an epoch with these words. Imperfect sensors are computed
 //! epoch by epoch ([`Measured`]).
 
 use protocol::id::CellId;
@@ -14,16 +14,16 @@ use super::force::contact_words;
 use super::measured::{ImperfectSensors, TrueInput};
 use super::{FaultKind, Scenario, SensorFault, Touch};
 
-/// The sensor words of a cell from an epoch on.
+/// The sensor words of a cell, valid from an epoch on.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Stimulus {
     /// The cell, as an index into [`Skin::cells`].
     pub cell: usize,
-    /// Its bus, as an index into [`Skin::buses`].
+    /// The bus of the cell, as an index into [`Skin::buses`].
     pub bus: usize,
-    /// Its node id on that bus.
+    /// Node id of the cell on that bus.
     pub node: CellId,
-    /// Its sensor words.
+    /// Sensor words of the cell.
     pub sensors: SkinSensors,
 }
 
@@ -34,26 +34,27 @@ pub struct Touches {
     /// Broadcast period, in µs.
     period_us: f64,
     touches: Vec<Touch>,
-    /// The period after which they repeat.
+    /// The period with which all touches repeat, if they do.
     repeat: Option<Span>,
-    /// The touches' forces in N before and now: scratch memory of [`Touches::changes`].
+    /// Scratch memory of [`Touches::changes`]: for each touch, its forces in N in the previous and in the present
+    /// epoch.
     levels: Vec<[Option<f64>; 2]>,
     cells: Vec<AffectedCell>,
-    /// The imperfect sensors, if any; `cells` then has every cell.
+    /// The imperfect sensors, if there are any; `cells` then contains every cell of the skin.
     measured: Option<ImperfectSensors>,
-    /// Scratch memory of [`Touches::changes`], as are the next two.
+    /// Scratch memory of [`Touches::changes`]; the next two fields are, too.
     changed: Vec<Stimulus>,
     there: Vec<TrueInput>,
     before: Vec<SkinSensors>,
 }
 
-/// A cell with touches or faults.
+/// A cell with touches or sensor faults.
 #[derive(Clone, Debug)]
 struct AffectedCell {
     cell: usize,
     bus: usize,
     node: CellId,
-    /// Indices into the touches.
+    /// Indices into the touches of the scenario.
     touches: Vec<usize>,
     faults: Vec<TimedSensorFault>,
 }
@@ -110,13 +111,14 @@ impl Touches {
         }
     }
 
-    /// Returns the cells whose words differ from those of the previous epoch.
+    /// Returns the cells whose words in `epoch` differ from those in the previous epoch.
     pub fn stimuli_for(&mut self, epoch: u64) -> impl Iterator<Item = Stimulus> {
         self.changes(epoch.checked_sub(1), epoch)
     }
 
-    /// Returns the cells whose words in `epoch` differ from those in `before`, for a loop that may skip epochs; `None`
-    /// is the time before the first epoch. Each cell occurs at most once, in the skin's order.
+    /// Returns the cells whose words in `epoch` differ from their words in the earlier epoch `before`. A loop that
+    /// skipped epochs passes the last one that it handled. `None` is the time before the first epoch. Each cell occurs
+    /// at most once, in the skin's order.
     ///
     /// Work grows with the number of cells that are ever touched. No allocation.
     pub fn changes(&mut self, before: Option<u64>, epoch: u64) -> impl Iterator<Item = Stimulus> {
@@ -148,7 +150,8 @@ impl Touches {
         self.measured = Some(measured);
     }
 
-    /// Computes the readings up to an epoch, from the start if that epoch has passed.
+    /// Computes the readings of imperfect sensors up to an epoch. If that epoch is earlier than the last computed one,
+    /// the computation starts again from the first.
     fn measure(&mut self, measured: &mut ImperfectSensors, epoch: u64) {
         if measured.next() > epoch + 1 {
             measured.restart();
@@ -202,12 +205,12 @@ impl Touches {
         })
     }
 
-    /// Returns the cells that are ever touched, by index in the skin.
+    /// Returns the cells that the scenario touches at any time, by index in the skin.
     pub fn cells(&self) -> impl Iterator<Item = usize> + '_ {
         self.cells.iter().map(|touched| touched.cell)
     }
 
-    /// Returns the words of a cell in an epoch, for a cell that has restarted.
+    /// Returns the sensor words of a cell in an epoch, to be sent again after a restart of the cell.
     #[must_use]
     pub fn sensors(&self, cell: usize, epoch: u64) -> SkinSensors {
         if let Some(measured) = &self.measured {
@@ -239,7 +242,7 @@ impl Touches {
         Micros((epoch as f64 * self.period_us).round() as u64)
     }
 
-    /// Returns the time since the last start of the touches.
+    /// Returns the time since the touches last began, if they repeat; else the time itself.
     fn phase(&self, time: Micros) -> Micros {
         match self.repeat {
             Some(Span(repeat @ 1..)) => Micros(time.0 % repeat),
@@ -247,12 +250,13 @@ impl Touches {
         }
     }
 
-    /// Returns the force of a touch at a time.
+    /// Returns the force of a touch in N at a time; `None` if the touch is not active.
     fn level(&self, touch: &Touch, time: Micros) -> Option<f64> {
         touch.level(self.phase(time))
     }
 
-    /// Returns the words before and now, from the scratch memory; `None` if no touch of this cell changed.
+    /// Returns the words of a cell in the previous and in the present epoch, from the scratch memory; `None` if no
+    /// touch on it changed.
     fn words_of_levels(&self, touched: &AffectedCell) -> Option<[SkinSensors; 2]> {
         let levels = || touched.touches.iter().filter_map(|&index| Some((index, self.levels.get(index)?)));
         if levels().all(|(_, [before, now])| before == now) {
@@ -263,7 +267,7 @@ impl Touches {
         Some([before, now])
     }
 
-    /// Returns the words of a cell at a time, with its faults.
+    /// Returns the words of a cell at a time, including its sensor faults.
     fn words_at(&self, touched: &AffectedCell, time: Micros) -> SkinSensors {
         let faults = || touched.faults.iter().filter(|wrong| wrong.holds_at(time));
         // A stuck sensor keeps its value from the start of the fault.

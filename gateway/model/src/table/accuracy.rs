@@ -7,12 +7,12 @@ use protocol::parameters::MAX_JOINTS;
 use super::errors::Errors;
 use super::replies::Expected;
 
-/// The effect of rounding exact torques to a torque format.
+/// The errors of a torque format: exact torques rounded to its words.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RoundingErrors {
-    /// Errors of the torques within its range.
+    /// Rounding errors of the torques within the range of the format.
     pub errors: Errors,
-    /// Number of torques beyond its range, whose words are saturated.
+    /// Number of torques beyond the range of the format, whose words saturate.
     pub beyond: u64,
 }
 
@@ -31,36 +31,36 @@ impl RoundingErrors {
     }
 }
 
-/// Errors of distributed torques, over the joints that a contact loads (l <= k).
+/// Errors of distributed torques. A cell's torque is compared only on the joints that a contact on it loads.
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Accuracy {
-    /// Single cells, compared with the central computation on the same words.
+    /// Errors of single cells against the central computation with the same quantised words.
     pub single: Errors,
-    /// Single cells, compared with the central computation on unrounded angles, lengths and poses.
+    /// Errors of single cells against the central computation with unrounded angles, lengths and poses.
     pub unquantised: Errors,
-    /// The torque of the whole skin, in epochs that all cells answered in time; all joints.
+    /// Errors of the summed torque of the whole skin, on all joints, in epochs that all cells answered in time.
     pub whole: Errors,
-    /// The torque of the whole bus as the sum along a tree, in epochs with complete sums in time, over the joints that
-    /// some cell in them loads.
+    /// Errors of a bus's torque as summed along the tree, in epochs with complete sums in time, on the joints that some
+    /// cell in the sums loads.
     pub sums: Errors,
-    /// As `sums`, with each error averaged over 32 such consecutive epochs in which no contact changed.
+    /// Errors as in `sums`, but averaged over 32 consecutive epochs in which no contact changed.
     pub sums_averaged: Errors,
-    /// Number of words that were skipped because they were saturated.
+    /// Number of saturated words, which are not compared.
     pub saturated: u64,
-    /// The central torques of `single`, including saturated ones, in each of [`TorqueFormat::ALL`].
+    /// Rounding errors of the central torques of `single`, saturated ones included, in each of [`TorqueFormat::ALL`].
     #[serde(skip)]
     pub formats: [RoundingErrors; TorqueFormat::ALL.len()],
-    /// `single` by joint.
+    /// The errors of `single` for each joint.
     #[serde(skip)]
     pub single_by_joint: [Errors; MAX_JOINTS],
-    /// `whole` by joint.
+    /// The errors of `whole` for each joint.
     #[serde(skip)]
     pub whole_by_joint: [Errors; MAX_JOINTS],
 }
 
 impl Accuracy {
-    /// Compares one cell's torque, and adds the errors to the cell's own, too. Returns distributed minus central
-    /// torques, zero where saturated.
+    /// Compares one cell's torque with the central one, and adds the errors to those of the cell, too. Returns the
+    /// distributed minus the central torque of each joint; zero for saturated words.
     pub(super) fn compare(
         &mut self,
         joint: usize,
@@ -99,7 +99,7 @@ impl Accuracy {
         }
     }
 
-    /// Merges the figures of two buses.
+    /// Merges the errors of two buses.
     #[must_use]
     pub fn with(self, other: Self) -> Self {
         let joint_by_joint = |mut sum: [Errors; MAX_JOINTS], other: [Errors; MAX_JOINTS]| {

@@ -1,4 +1,4 @@
-//! The gateway's state of one cell.
+//! The gateway's state of one cell of a bus.
 
 use protocol::id::CellId;
 use protocol::message::{Answer, AppliesFrom, Heartbeat, SensorPage, SkinSensors, State};
@@ -18,61 +18,61 @@ use super::status::Status;
 use super::switched::{SWITCHES, Switch, SwitchStates};
 use crate::tracker::{Contact, Pages, CellTracker, Update, Uplink, HeartbeatKind};
 
-/// The requested packets that a cell has sent.
+/// The packets that a cell has sent since they were requested.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Responded {
-    /// True if it sent a heartbeat since the last sync.
+    /// True if the cell sent a heartbeat since the last sync.
     pub heartbeat: bool,
-    /// True if it sent its counters since the last report command.
+    /// True if the cell sent its counters since the last report command.
     pub counters: bool,
 }
 
 /// The halt state of a cell.
 #[derive(Clone, Copy, Debug, Default)]
 struct Halt {
-    /// True if halted, by its last heartbeat or a later command on the bus.
+    /// True if the cell is halted, by its last heartbeat or a later command on the bus.
     halted: bool,
-    /// True if the bus carried a halt or a resume since its last heartbeat.
+    /// True if the bus carried a halt or a resume since the cell's last heartbeat.
     commanded: bool,
 }
 
-/// The gateway's state of one cell.
+/// The gateway's state of one cell: its identity, contact, replies and held torque.
 #[derive(Clone, Debug)]
 pub struct CellState {
-    /// Its node id.
+    /// Node id of the cell.
     pub node: CellId,
-    /// Its described serial number.
+    /// Described serial number of the cell.
     pub serial: u32,
-    /// True if it is wired to the gateway.
+    /// True if the cell is wired to the gateway.
     pub root: bool,
-    /// The joint that moves it, from 1.
+    /// The joint that moves the cell, from 1 in its chain.
     pub(super) joint: usize,
-    /// The expected hash of its configuration.
+    /// Expected hash of the cell's configuration.
     pub configuration: u16,
-    /// The epoch of its last heartbeat.
+    /// The epoch of the last joints that the cell had received when it sent its last heartbeat.
     pub last_joints: Epoch,
-    /// Its reply parameter, as last confirmed since it started.
+    /// The reply parameter that the cell has confirmed since it started.
     pub reply: Option<[i16; WORDS]>,
-    /// Ports that its parameter takes down, one bit each.
+    /// Ports that the parameter `links_down` takes down, one bit each.
     pub ports_down: u8,
-    /// Replies due and received.
+    /// Counts of the replies that were due from the cell, and of those received.
     pub replies: Replies,
-    /// Its sensors frames.
+    /// Sensors frames of the cell.
     pub sensed: SensorFrames,
     pub(super) tracked: CellTracker,
-    /// The requested packets that it has sent.
+    /// The requested packets that the cell has sent.
     pub(super) said: Responded,
-    /// Its contact state, as far as known from the bus.
+    /// Contact state of the cell, as far as the bus shows it.
     contact: Contact<()>,
-    /// The switches that it should have, and those that it has confirmed.
+    /// The switches that the cell should have, and those that it has confirmed.
     switched: SwitchStates,
     halt: Halt,
     sent: SentJoints,
     pub(super) outstanding: Outstanding,
-    /// The number of the last broadcast that it answered.
+    /// The number of the last broadcast that the cell answered.
     pub(super) answered: Option<u64>,
     held: HeldTorque,
-    /// The sums that it sends as a root, on a bus with sums.
+    /// The sums that the cell sends if it is a root, on a bus with sums.
     pub(super) sums: Option<RootSums>,
 }
 
@@ -107,49 +107,49 @@ impl CellState {
         }
     }
 
-    /// Returns its last heartbeat.
+    /// Returns the last heartbeat of the cell.
     #[must_use]
     pub fn heartbeat(&self) -> Option<Heartbeat> {
         self.tracked.claim().heartbeat()
     }
 
-    /// Returns the last page of each kind since it started.
+    /// Returns the last page of each kind since the cell started.
     #[must_use]
     pub const fn pages(&self) -> &Pages {
         self.tracked.pages()
     }
 
-    /// Returns the errors of its torques compared with the central ones, in the joints that move it.
+    /// Returns the errors of the cell's torques against the central ones, on the joints that move the cell.
     #[must_use]
     pub const fn errors(&self) -> Errors {
         self.outstanding.errors
     }
 
     /// Returns the kinds of words (`torque`, `skin`, `acceleration`) that stayed constant while the expected words
-    /// changed, each with the longest run.
+    /// changed, each with the longest run in words.
     pub fn stuck(&self) -> impl Iterator<Item = (&'static str, u64)> {
         self.outstanding.stuck.longest()
     }
 
-    /// Returns true if it sends such words now.
+    /// Returns true if the cell now sends constant words although the expected words change.
     #[must_use]
     pub fn is_stuck(&self) -> bool {
         self.outstanding.stuck.is_now()
     }
 
-    /// Returns true if it measures, so that stimuli have no effect; `None` before its first heartbeat.
+    /// Returns true if the cell measures, so that stimuli have no effect on it; `None` before its first heartbeat.
     #[must_use]
     pub fn measures(&self) -> Option<bool> {
         self.heartbeat().map(|heartbeat| !heartbeat.state.has(State::TEST_MODE))
     }
 
-    /// Returns the packets that it sent and those that arrived.
+    /// Returns the counts of packets that the cell sent and that arrived.
     #[must_use]
     pub const fn uplink(&self) -> Uplink {
         self.tracked.account.uplink()
     }
 
-    /// Starts new accounts: earlier packets do not count.
+    /// Starts counting again: earlier packets do not count.
     pub(super) fn begin_accounts(&mut self) {
         self.tracked.account = Default::default();
         (self.replies, self.sensed) = Default::default();
@@ -157,15 +157,15 @@ impl CellState {
         self.sent.begin();
     }
 
-    /// Records its receive counters; `passed` joints crossed the page on the bus. Later pages are compared with the
-    /// first one since a start.
+    /// Records the cell's receive counters. `passed` is the number of joints that were sent while the page was on its
+    /// way. Later pages are compared with the first one since a start.
     pub(super) fn report(&mut self, passed: u64) {
         let heard = self.pages().heard;
         self.sent.report(heard, passed);
         heard.iter().for_each(|heard| self.contact.count(heard.stimuli, ()));
     }
 
-    /// Applies its heartbeat.
+    /// Applies a heartbeat of the cell. Returns the change of the running sum.
     pub(super) fn take_heartbeat(&mut self, update: &Update, heartbeat: &Heartbeat, epoch: Epoch) -> Change {
         // Ignores heartbeats of a cell that does not own the node id.
         let of_owner = |word: &HeartbeatKind| !matches!(word, HeartbeatKind::Claimant | HeartbeatKind::Outsider);
@@ -206,25 +206,26 @@ impl CellState {
         self.release()
     }
 
-    /// Returns which requested packets it has sent.
+    /// Returns the requested packets that the cell has sent.
     #[must_use]
     pub const fn responded(&self) -> Responded {
         self.said
     }
 
-    /// Returns true if it can be expected to answer: configured, awake, and not halted.
+    /// Returns true if the cell can be expected to answer joints: it is configured, awake, and not halted.
     #[must_use]
     pub fn is_ready(&self) -> bool {
         let claim = self.tracked.claim();
         !self.tracked.is_dead() && !self.halt.halted && claim.is_settled() && claim.has_state(State::CONFIGURED)
     }
 
-    /// Records a stimulus on the bus; `last` is the epoch of the last joints.
+    /// Records a stimulus for the cell on the bus; `last` is the epoch of the last joints.
     pub(super) fn stimulate(&mut self, from: AppliesFrom, page: SensorPage, last: Option<Epoch>) {
         self.contact.push(from, page, (), last);
     }
 
-    /// Records a sensors frame of the cell; `is_newest` if the cell had the newest joints.
+    /// Records a sensors frame of the cell. `is_newest` is true if the cell had the newest joints when it sent the
+    /// frame.
     pub(super) fn take_sensors(&mut self, at: Micros, page: &SensorPage, is_newest: bool, events: &Events) {
         self.sensed.record(at, page, events);
         self.switched.subtracts |= matches!(page, SensorPage::Baseline(_));
@@ -236,7 +237,7 @@ impl CellState {
         }
     }
 
-    /// Records its answer to a request.
+    /// Records the cell's answer to a request.
     pub(super) fn receive_answer(&mut self, answer: &Answer) {
         self.switched.record_answer(answer);
         let Answer::Value { number, written: true, words } = *answer else { return };
@@ -249,47 +250,47 @@ impl CellState {
         }
     }
 
-    /// Returns the switches that it should have but has not confirmed.
+    /// Returns the switches that the cell should have but has not confirmed.
     #[must_use]
     pub fn unconfirmed_switches(&self) -> [Option<Switch>; SWITCHES] {
         self.switched.unconfirmed()
     }
 
-    /// Returns the sensor words that it computes with; `None` if unknown: it measures, subtracts its own zero, may be
-    /// off the bus, or may have received stimuli that did not arrive here.
+    /// Returns the sensor words with which the cell computes. Returns `None` if they are unknown: the cell measures,
+    /// subtracts its own zero, may be off the bus, or may have received stimuli that did not arrive here.
     pub(super) fn sensors(&self) -> Option<SkinSensors> {
         self.contact.known().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
     }
 
-    /// Returns its sensor words for display, from the stimuli and pages that arrived; older stimuli may have changed
-    /// them.
+    /// Returns the sensor words of the cell for display, from the stimuli and pages that arrived. Older stimuli that
+    /// did not arrive may have changed them.
     #[must_use]
     pub fn presumed_sensors(&self) -> Option<SkinSensors> {
         self.contact.skin().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
     }
 
-    /// Returns true if its torques follow from stimuli alone.
+    /// Returns true if the cell's torques follow from stimuli alone: it neither measures nor subtracts a zero.
     fn computes_with_stimuli(&self) -> bool {
         self.tracked.claim().has_state(State::TEST_MODE)
             && !self.switched.subtracts
             && !self.tracked.account.is_interrupted()
     }
 
-    /// Returns true if its torques follow from stimuli alone, some of which may not have arrived here. A write of its
-    /// mode clears them.
+    /// Returns true if the cell's torques follow from stimuli alone, but some stimuli may not have arrived here. A
+    /// write of the cell's mode clears such stimuli.
     #[must_use]
     pub fn has_unseen_stimuli(&self) -> bool {
         self.is_ready() && self.computes_with_stimuli() && self.contact.known().is_none()
     }
 
-    /// Returns its sensor words from the joints of this epoch on; `None` if unknown.
+    /// Returns the sensor words of the cell from the joints of this epoch on; `None` if unknown.
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
         self.contact.latch(epoch, |()| {});
         self.sensors()
     }
 
-    /// Starts a broadcast: a reply that did not arrive in three epochs is missing, and the held torque decays. Returns
-    /// the change of the sum, and the number of epochs without a new torque.
+    /// Starts a broadcast for the cell: a reply that did not arrive within three epochs counts as missing, and the held
+    /// torque decays. Returns the change of the running sum, and the number of epochs without a new torque.
     pub(super) fn open_epoch(&mut self, number: u64, in_contact: bool, safety: &Safety) -> (Change, u32) {
         self.sent.count();
         let due = in_contact && self.is_ready();
@@ -316,18 +317,18 @@ impl CellState {
         self.sent.count();
     }
 
-    /// Returns true if the running sum contains its torque.
+    /// Returns true if the running sum contains a torque of the cell.
     pub(super) const fn contributes(&self) -> bool {
         self.held.contributes()
     }
 
-    /// Returns true if it is in contact, by its own report if its sensors are unknown.
+    /// Returns true if the cell is in contact. If its sensors are unknown, its own report decides.
     fn is_in_contact(&self) -> bool {
         self.outstanding.is_due() || self.sensors().is_none() && self.tracked.claim().has_state(State::ACTIVE)
     }
 
-    /// Records a torque that answers the broadcast `number`, `lag` before the newest; `is_zero` if it only ends a
-    /// contact. Returns whether it was due.
+    /// Records a torque that answers the broadcast `number`, which is `lag` broadcasts before the newest. `is_zero` is
+    /// true for a zero torque, which only ends a contact. Returns whether the torque was due.
     pub(super) fn answer(&mut self, number: u64, lag: usize, is_zero: bool) -> ReplyExpectation {
         self.answered = Some(number);
         let asked = self.outstanding.answer(lag);
@@ -342,8 +343,8 @@ impl CellState {
         asked
     }
 
-    /// Holds a root's sum for the broadcast `number`, in steps of Q3.12, until the next one. A sum for an older
-    /// broadcast than the held one changes nothing.
+    /// Holds a root's sum for the broadcast `number`, in steps of Q3.12, until the next sum. A sum for an older
+    /// broadcast than that of the held sum changes nothing. Returns the change of the running sum.
     pub(super) fn hold_sum(&mut self, number: u64, count: u8, words: [i32; MAX_JOINTS]) -> Change {
         if self.answered.is_some_and(|last| number < last) {
             return Change::default();
@@ -352,7 +353,7 @@ impl CellState {
         self.held.hold_sum(words, count)
     }
 
-    /// Returns true if its held torque is older than the broadcast before `number`.
+    /// Returns true if the held torque is older than the broadcast before `number`.
     pub(super) fn is_behind(&self, number: u64) -> bool {
         self.held.is_some() && self.answered.is_some_and(|last| last + 1 < number)
     }
@@ -362,17 +363,17 @@ impl CellState {
         self.held.cells()
     }
 
-    /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact.
+    /// Holds a torque in steps of Q3.12 until the next one; zeros end a contact. Returns the change of the running sum.
     pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> Change {
         self.held.hold(words)
     }
 
-    /// Releases a held torque.
+    /// Releases the held torque. Returns the change of the running sum.
     pub(super) fn release(&mut self) -> Change {
         self.held.release()
     }
 
-    /// Records a halt on the bus: the cell stops answering.
+    /// Records a halt on the bus: the cell stops answering. Returns the change of the running sum.
     pub(super) fn halt(&mut self) -> Change {
         self.halt = Halt { halted: true, commanded: true };
         self.release()
@@ -383,26 +384,26 @@ impl CellState {
         self.halt = Halt { halted: false, commanded: true };
     }
 
-    /// Returns the joints that the cell reports as skipped because they were old, and the joints sent to it that it
-    /// does not report as received; `None` before its first report.
+    /// Returns two counts of unanswered joints: those that the cell reports as skipped because they were old, and those
+    /// sent to the cell that it does not report as received. Returns `None` before the cell's first report.
     #[must_use]
     pub fn unanswered(&self) -> Option<(u64, u64)> {
         self.sent.unanswered(self.pages().heard)
     }
 
-    /// Records a lost bus: due replies may have been sent and lost.
+    /// Records that the bus was lost: replies that were due may have been sent and lost.
     pub(super) fn interrupt(&mut self) {
         self.forget_contact();
         self.tracked.account.interrupt();
     }
 
-    /// Forgets the contact state: due replies are in doubt.
+    /// Forgets the contact state of the cell: the replies now due are in doubt.
     fn forget_contact(&mut self) {
         self.doubt_outstanding();
         self.contact.reset();
     }
 
-    /// Records a write of a parameter that decides about its answers from now on.
+    /// Records a write of a parameter that changes how the cell answers from now on.
     pub(super) fn write(&mut self, number: u8) {
         self.doubt_outstanding();
         if number == Parameter::Mode.number() {
@@ -418,7 +419,7 @@ impl CellState {
         self.replies.miss(if self.sums.is_some() { 0 } else { due }, true);
     }
 
-    /// Ends the accounts: outstanding replies are missing.
+    /// Ends the counting: replies still outstanding count as missing.
     pub(super) fn settle(&mut self) {
         self.tracked.account.finish();
         if self.sums.is_none() {
@@ -427,8 +428,9 @@ impl CellState {
         }
     }
 
-    /// Records a restart: outstanding replies will never arrive, and the counters can no longer explain missing ones.
-    /// If an apparent restart is taken back, the counters continue and explain all but the outstanding replies.
+    /// Records a restart: outstanding replies will never arrive, and the counters of the cell can no longer explain
+    /// missing ones. If `taken_back`, the cell had not started: its counters continue, and explain all but the
+    /// outstanding replies.
     fn restart(&mut self, word: HeartbeatKind, taken_back: bool, sent: u16) {
         let due = self.outstanding.clear();
         let outstanding = if self.sums.is_some() { 0 } else { due };

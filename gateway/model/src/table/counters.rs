@@ -1,9 +1,9 @@
-//! Counts of frames by kind, and of unusable frames by cause.
+//! Counters of a bus: frames by kind, and unusable frames by cause.
 
 use protocol::id::Kind;
 use protocol::packet::PacketError;
 
-/// The unusual properties of a frame; each has a counter and a name.
+/// An unusual property of a received frame. Each has a counter and a name.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 #[repr(usize)]
 pub enum Event {
@@ -25,7 +25,7 @@ pub enum Event {
     StaleTorque,
     /// A second torque of one cell for one epoch.
     RepeatedTorque,
-    /// A torque with a saturated word; it is used.
+    /// A torque with a saturated word; it is used all the same.
     Saturated,
     /// A cell reports another cell with its node id.
     Duplicate,
@@ -64,7 +64,7 @@ impl Event {
         Self::Switched,
     ];
 
-    /// Returns the name in tables and summaries.
+    /// Returns the name of the event in tables and summaries.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -91,11 +91,11 @@ pub struct Counters {
     received: [u64; Kind::ALL.len()],
     sent: [u64; Kind::ALL.len()],
     events: [u64; Event::ALL.len()],
-    /// Number of closed epochs.
+    /// Number of epochs that have ended.
     pub epochs: u64,
-    /// Epochs among them in which some reply was due.
+    /// Number of ended epochs in which some reply was due.
     pub epochs_due: u64,
-    /// Epochs among these in which all due replies arrived in time.
+    /// Number of ended epochs in which replies were due and all of them arrived in time.
     pub epochs_complete: u64,
 }
 
@@ -119,7 +119,7 @@ impl Counters {
         self.epochs_complete += (due && complete) as u64;
     }
 
-    /// Returns the number of packets of a kind that others sent.
+    /// Returns the number of packets of a kind that other senders sent.
     #[must_use]
     pub fn received(&self, kind: Kind) -> u64 {
         self.received.get(kind as usize).copied().unwrap_or(0)

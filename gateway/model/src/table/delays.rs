@@ -5,7 +5,7 @@ use protocol::time::Span;
 
 use crate::quantiles::histogram;
 
-/// Delays of a bus' cells in µs.
+/// Delays of the cells of a bus in µs, from the time stamps of frames.
 #[derive(Clone, Debug)]
 pub struct Delays {
     last_reply: Histogram<u64>,
@@ -39,20 +39,20 @@ impl Delays {
         }
     }
 
-    /// Returns the delays from a broadcast to its last reply in time, one per epoch with a reply.
+    /// Returns the delays in µs from a broadcast to its last reply in time, one for each epoch with a reply.
     #[must_use]
     pub const fn of_last_replies(&self) -> &Histogram<u64> {
         &self.last_reply
     }
 
-    /// Returns the delays from a broadcast to each reply, including late ones; empty on a bus with sums.
+    /// Returns the delays in µs from a broadcast to each reply, late replies included; empty on a bus with sums.
     #[must_use]
     pub const fn of_replies(&self) -> &Histogram<u64> {
         &self.reply
     }
 
-    /// Returns, for each heartbeat, the age of the oldest joints on the bus that its cell had not received; 0 if it had
-    /// received all.
+    /// Returns for each heartbeat the age in µs of the oldest joints on the bus that the cell had not received when it
+    /// sent the heartbeat; 0 if it had received all.
     #[must_use]
     pub const fn of_joints_not_taken(&self) -> &Histogram<u64> {
         &self.not_taken

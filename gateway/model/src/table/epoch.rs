@@ -1,4 +1,4 @@
-//! The epoch that cells are answering: its due replies, and its end when the next one begins.
+//! The newest broadcast of joints: the replies due to it, and its end when the next one is sent.
 
 use protocol::id::CellId;
 use protocol::message::Joints;
@@ -15,26 +15,26 @@ use crate::tracker::MAX_LATE_EPOCHS;
 /// Looks up the positions in rad or m from which a broadcast's words were rounded.
 pub type Positions<'a> = dyn FnMut(Epoch) -> Option<[f64; MAX_JOINTS]> + 'a;
 
-/// The broadcast that cells are answering.
+/// The newest broadcast, which the cells are answering.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Broadcast {
     pub(super) epoch: Epoch,
-    /// The epochs that may still be answered, with the times of their broadcasts, newest first.
+    /// The epochs of the broadcasts that cells may still answer, each with the time of the broadcast, newest first.
     recent: [Option<(Epoch, Micros)>; MAX_LATE_EPOCHS + 1],
     /// Number of broadcasts before this one.
     pub(super) number: u64,
     at: Micros,
     due: u32,
     pub(super) in_time: u32,
-    /// True if only due torques, and ends of contacts, arrived.
+    /// True if the epoch has received only torques that were due, and ends of contacts.
     pub(super) is_whole: bool,
     pub(super) last_reply: Option<Micros>,
     pub(super) error: [f64; MAX_JOINTS],
 }
 
 impl Broadcast {
-    /// Returns the number of broadcasts after `heard`, the last one that a cell had received when it sent a page; only
-    /// the most recent ones are searched.
+    /// Returns the number of broadcasts after the one with the epoch `heard`, the last that a cell had received when it
+    /// sent a page. Only the most recent broadcasts are searched.
     pub(super) fn broadcasts_since(&self, heard: Epoch) -> u64 {
         // If these are all broadcasts, the cell has received none.
         let recent = || self.recent.iter().flatten().count();
@@ -42,19 +42,19 @@ impl Broadcast {
         self.lag(heard).or_else(all).map_or(0, |passed| passed as u64)
     }
 
-    /// Returns the position of an epoch's broadcast before the newest one, if it may still be answered. The difference
-    /// of epochs would be wrong: broadcasts may be lost on the way back, or change order.
+    /// Returns how many broadcasts before the newest one an epoch was sent, if cells may still answer it. A difference
+    /// of epoch numbers would be wrong: broadcasts may be lost or reordered on their way back to the gateway.
     pub(super) fn lag(&self, epoch: Epoch) -> Option<usize> {
         self.recent.iter().flatten().position(|&(recent, _)| recent == epoch)
     }
 
-    /// Returns the time of the broadcast `lag` before the newest.
+    /// Returns the time of the broadcast `lag` broadcasts before the newest.
     pub(super) fn broadcast_time(&self, lag: usize) -> Micros {
         self.recent.get(lag).copied().flatten().map_or(self.at, |(_, at)| at)
     }
 
-    /// Returns the age, at `now`, of the oldest joints that a cell had not received whose last joints were `taken`.
-    /// Only the most recent broadcasts are searched.
+    /// Returns the age at `now` of the oldest joints that a cell has not received; `taken` is the epoch of the last
+    /// joints that it has received. Only the most recent broadcasts are searched.
     pub(super) fn pending_joints_age(&self, taken: Epoch, now: Micros) -> Span {
         let recent = self.recent.iter().flatten().count();
         self.lag(taken)
@@ -63,12 +63,12 @@ impl Broadcast {
             .map_or(Span(0), |first| now.elapsed_since(self.broadcast_time(first)))
     }
 
-    /// Returns its number, its epoch, and its time on the bus.
+    /// Returns the number, the epoch and the time of the broadcast.
     pub(super) const fn joints(&self) -> (u64, Epoch, Micros) {
         (self.number, self.epoch, self.at)
     }
 
-    /// Resets the counts of due and received replies.
+    /// Sets the counts of due and received replies to zero.
     pub(super) const fn begin_accounts(&mut self) {
         (self.due, self.in_time, self.is_whole, self.last_reply) = (0, 0, true, None);
     }
@@ -162,26 +162,29 @@ impl Table {
         }
     }
 
-    /// Returns the distributed torque of the whole bus minus the central one, for the last closed epoch, in Nm or N by
-    /// joint of the chain, without saturated words. Returns `None` if it was not compared, or if not all due replies
-    /// arrived in time.
+    /// Returns the distributed minus the central torque of the whole bus in the last ended epoch, in Nm or N for each
+    /// joint of the chain; saturated words do not count. Returns `None` if the torques were not compared, or if not all
+    /// due replies arrived in time.
     #[must_use]
     pub fn difference(&self) -> Option<[f64; MAX_JOINTS]> {
         self.root_totals.as_ref().map_or(self.difference, |root_totals| root_totals.error.last)
     }
 
-    /// Records a lost bus: packets in transit are in doubt. The torques stay as they are, and decay in the loop.
+    /// Records that the bus was lost: packets in transit are in doubt. The held torques stay, and decay in the control
+    /// loop.
     pub fn interrupt(&mut self) {
         self.interrupted = true;
         self.interrupt_cells(|_| true);
     }
 
-    /// Records cells that were or are unreachable while the bus works: packets from and to them may be lost.
+    /// Records that cells were unreachable while the bus worked, or are now: packets from and to these cells may be
+    /// lost.
     pub fn interrupt_cells(&mut self, is_in_doubt: impl Fn(CellId) -> bool) {
         self.cells.iter_mut().filter(|cell| is_in_doubt(cell.node)).for_each(CellState::interrupt);
     }
 
-    /// Releases torques that have decayed in the loop while the bus carried no joints, so that they do not come back.
+    /// Releases the torques that decayed in the control loop while the bus carried no joints, so that they do not
+    /// return to the sum.
     fn release_decayed(&mut self, epoch: Epoch) {
         // Broadcasts may change order on the way back: the last one to arrive is not always the newest.
         let recent = self.broadcast.iter().flat_map(|broadcast| broadcast.recent.into_iter().flatten());

@@ -1,4 +1,4 @@
-//! The effects of frames on the table.
+//! Applies received messages to the table of a bus.
 
 use protocol::id::{Id, Node};
 use protocol::message::{AppliesFrom, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
@@ -13,7 +13,7 @@ use super::root_totals::{RootTotals, Sum, SumUse};
 use super::{Event, Notice, Positions, Table};
 use crate::tracker::{Update, HeartbeatKind};
 
-/// Parameters that decide about a cell's answers and take effect at once.
+/// Parameters whose write changes at once how a cell answers.
 const SWITCHED: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];
 
 impl Table {
@@ -243,7 +243,7 @@ impl Table {
         self.release_moved(number);
     }
 
-    /// Releases the held sum of a silent root once its cells are in another root's sum.
+    /// Releases the held sum of a silent root once the sum of another root contains its cells.
     fn release_moved(&mut self, number: u64) {
         let Some(due) = self.root_totals.as_ref().and_then(RootTotals::due) else { return };
         if self.snapshot.sums.contributing > due {

@@ -1,48 +1,50 @@
-//! The last torque of a cell or root. It is held until the next one, decays without one, and is part of the running
-//! sum.
+//! The last torque of a cell, or the last sum of a root. It is held until the next one arrives, decays if none does,
+//! and is part of the running sum.
 
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Safety;
 
-/// A change of the running sum.
+/// A change of the running sum: steps by joint, and cells.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) struct Change {
     pub(super) torque: [i32; MAX_JOINTS],
     pub(super) contributing: i32,
 }
 
-/// The held torque of a cell.
+/// The held torque of a cell, or the held sum of a root.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct HeldTorque {
-    /// The last torque in steps of Q3.12, and its number of cells (for a root, those in its sum).
+    /// The last torque in steps of Q3.12, and the number of cells in it: 1, or for a root those in its sum.
     torque: Option<([i32; MAX_JOINTS], u8)>,
-    /// Its share of the running sum.
+    /// The part of the running sum that comes from this torque, in steps of Q3.12.
     contribution: [i32; MAX_JOINTS],
-    /// Number of its cells that the running sum counts.
+    /// Number of cells of this torque that the running sum counts.
     contributing: u8,
 }
 
 impl HeldTorque {
-    /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact.
+    /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact. Returns the change of the running
+    /// sum.
     pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> Change {
         self.torque = (words != [0; MAX_JOINTS]).then_some((words, 1));
         self.contribute(words, u8::from(self.torque.is_some()))
     }
 
-    /// Holds a sum of this number of cells; a sum of zero cells ends all contacts.
+    /// Holds a sum of `count` cells; a sum of zero cells ends all contacts. Returns the change of the running sum.
     pub(super) fn hold_sum(&mut self, words: [i32; MAX_JOINTS], count: u8) -> Change {
         // Even with cells in contact, all words may round to 0.
         self.torque = (count > 0).then_some((words, count));
         self.contribute(words, count)
     }
 
-    /// Releases the torque.
+    /// Releases the torque. Returns the change of the running sum.
     pub(super) fn release(&mut self) -> Change {
         self.torque = None;
         self.contribute([0; MAX_JOINTS], 0)
     }
 
-    /// Holds or decays the torque after this number of unanswered epochs.
+    /// Keeps the torque or lets it decay, after this number of unanswered epochs. Returns the change of the running
+    /// sum.
     pub(super) fn decay(&mut self, unanswered: u32, safety: &Safety, is_sum: bool) -> Change {
         let Some((held, cells)) = self.torque else { return Change::default() };
         let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(unanswered);
@@ -78,7 +80,7 @@ impl HeldTorque {
         self.torque.is_some()
     }
 
-    /// Returns true if the running sum contains a share of it.
+    /// Returns true if the torque is part of the running sum.
     pub(super) const fn contributes(&self) -> bool {
         self.contributing > 0
     }

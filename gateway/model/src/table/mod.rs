@@ -60,18 +60,18 @@ pub use sensed::SensorFrames;
 pub use status::Status;
 pub use switched::{SWITCHES, Switch};
 
-/// The totals of a bus that a tick needs; their size does not depend on the number of cells.
+/// The totals of a bus that a tick of the control loop needs. Their size does not depend on the number of cells.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct BusTotals {
     /// The sum of all held torques in Nm.
     pub torque: [f64; MAX_JOINTS],
-    /// Number of cells in it.
+    /// Number of cells in the sum.
     pub contributing: u32,
-    /// Number of unanswered epochs of the oldest of them.
+    /// Number of epochs for which the oldest torque in the sum has had no successor.
     pub age: u32,
     /// Number of cells in contact that did not answer the last epoch.
     pub stale: u32,
-    /// Number of silent cells.
+    /// Number of cells that count as dead because they are silent.
     pub dead: u32,
     /// The last broadcast of this gateway that was read back from the bus.
     pub read_back: Option<Epoch>,
@@ -83,12 +83,12 @@ pub struct BusTotals {
     pub other_gateways: u32,
 }
 
-/// The data from a receiver for the loop: the totals, and the input of a central computation.
+/// The data that a tick takes from the receiver of a bus: the totals, and the input of a central computation.
 #[derive(Clone, Debug)]
 pub struct Snapshot {
     /// The totals for a tick.
     pub sums: BusTotals,
-    /// The sensor words of each cell, in the order of the bus' cells; only updated while comparing.
+    /// The sensor words of each cell, in the order of the bus's cells; updated only while torques are compared.
     pub sensors: Vec<SkinSensors>,
 }
 
@@ -109,7 +109,7 @@ pub enum Notice {
     Dead(CellId),
     /// A dead cell sends again.
     Back(CellId),
-    /// A cell restarted: it is not in contact until its stimuli are sent again.
+    /// A cell restarted. It is not in contact until its stimuli are sent again.
     Restarted(CellId),
     /// A cell reports another cell with its node id.
     Duplicate(CellId),
@@ -129,7 +129,7 @@ pub struct Table {
     unquantised: Central,
     comparing: bool,
     cells: Vec<CellState>,
-    /// The index of each node in `cells`.
+    /// For each node id, the index of the cell in `cells`.
     places: [Option<usize>; CellId::COUNT],
     packets: PacketReader,
     broadcast: Option<Broadcast>,
@@ -149,7 +149,7 @@ pub struct Table {
     notices: VecDeque<Notice>,
 }
 
-/// The torque format and the chain length of the bus.
+/// The torque format and the chain length of a bus.
 #[derive(Clone, Debug)]
 struct BusFormat {
     torque_format: TorqueFormat,
@@ -158,7 +158,7 @@ struct BusFormat {
 }
 
 impl Table {
-    /// Creates the table of a skin's bus, before any frame.
+    /// Creates the table of a bus of the skin, before any frame has arrived.
     #[must_use]
     pub fn new(skin: &Skin, bus: usize) -> Self {
         let part = skin.with_cells_of_bus(bus);
@@ -201,13 +201,14 @@ impl Table {
         }
     }
 
-    /// Declares that only the sums of roots are received: sums of other cells then cannot be counted.
+    /// Declares that the gateway receives only the sums of roots. The sums that other cells send then cannot be
+    /// counted.
     pub fn hear_sums_of_roots_only(&mut self) {
         self.cells.iter_mut().filter(|cell| !cell.root).for_each(|cell| cell.tracked.account.without_sums());
     }
 
-    /// Sets whether a root sends its sums to the gateway. If not, another root's sum contains them, and the held sum is
-    /// released so that it does not count twice.
+    /// Sets whether a root sends its sums to the gateway. If it does not, the sum of another root contains them, and
+    /// the held sum is released so that it does not count twice.
     pub fn set_feeds(&mut self, root: CellId, feeds: bool) {
         let Some(cell) = self.cell_mut(root) else { return };
         let Some(sums) = &mut cell.sums else { return };
@@ -218,24 +219,24 @@ impl Table {
         }
     }
 
-    /// Sets whether distributed torques are compared with central ones from the next epoch on.
+    /// Starts or stops the comparison of distributed torques with central ones, from the next epoch on.
     pub const fn set_comparing(&mut self, comparing: bool) {
         self.comparing = comparing;
     }
 
-    /// Returns the data for a tick.
+    /// Returns the newest data for a tick.
     #[must_use]
     pub const fn snapshot(&self) -> &Snapshot {
         &self.snapshot
     }
 
-    /// Returns the packets that all cells sent and those that arrived.
+    /// Returns the counts of packets that all cells sent and that arrived.
     #[must_use]
     pub fn uplink(&self) -> Uplink {
         self.cells.iter().map(CellState::uplink).sum()
     }
 
-    /// Returns the bus' cells, in the skin's order.
+    /// Returns the cells of the bus, in the skin's order.
     #[must_use]
     pub fn cells(&self) -> &[CellState] {
         &self.cells
@@ -266,13 +267,13 @@ impl Table {
         }
     }
 
-    /// Returns the counts of sums and of the cells due in them; `None` if cells answer with torques.
+    /// Returns the counts of sums, and of the cells due in sums; `None` on a bus whose cells answer with torques.
     #[must_use]
     pub fn sums(&self) -> Option<(SumCounts, Contributions)> {
         self.root_totals.as_ref().map(|root_totals| (root_totals.counts, root_totals.contributions))
     }
 
-    /// Returns the account of due and received replies of all cells, or of the cells in sums.
+    /// Returns the counts of due and received replies of all cells; on a bus with sums, of the cells in sums.
     #[must_use]
     pub fn replies(&self) -> Replies {
         let Some(root_totals) = &self.root_totals else {
@@ -282,7 +283,7 @@ impl Table {
         Replies { due, in_time, late, missing, ..Replies::default() }
     }
 
-    /// Returns the number of parent changes in the tree, by the cells' own counters.
+    /// Returns the number of times that cells changed their parent in the tree, by the cells' own counters.
     #[must_use]
     pub fn parent_changes(&self) -> u64 {
         self.cells.iter().filter_map(|cell| cell.pages().ports).map(|ports| u64::from(ports.changes)).sum()
@@ -309,8 +310,8 @@ impl Table {
         self.packets.read(at, frame)
     }
 
-    /// Handles a frame that was on the bus at `at`; `own` if this gateway sent it. `positions` looks up the positions
-    /// in rad or m from which the words of an own broadcast were rounded, if known.
+    /// Handles a frame that was on the bus at `at`; `own` is true if this gateway sent it. For a broadcast of this
+    /// gateway, `positions` returns the positions in rad or m from which its words were rounded, if they are known.
     pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, positions: &mut Positions<'_>) {
         let received = self.read(at, frame);
         self.receive(at, own, &received, positions);
@@ -355,7 +356,7 @@ impl Table {
         }
     }
 
-    /// Counts an unusable frame, also for the cell with its identifier.
+    /// Counts an unusable frame, for the bus and for the cell with its identifier.
     fn reject(&mut self, id: Id, own: bool, event: Event) {
         self.counters.count(event);
         if let (false, Some(cell)) = (own, self.sender(id)) {
@@ -373,7 +374,7 @@ impl Table {
         self.cells.get_mut(place)
     }
 
-    /// Starts new accounts: earlier frames set the state but do not count.
+    /// Starts counting: earlier frames have set the state, but do not count.
     pub fn begin_accounts(&mut self) {
         self.cells.iter_mut().for_each(CellState::begin_accounts);
         if let Some(broadcast) = &mut self.broadcast {
@@ -387,7 +388,7 @@ impl Table {
         self.notices.clear();
     }
 
-    /// Handles timeouts: cells that were silent for too long become dead.
+    /// Handles timeouts: cells that have been silent for too long count as dead.
     pub fn handle_time(&mut self, now: Micros) {
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
@@ -400,7 +401,7 @@ impl Table {
         }
     }
 
-    /// Ends the run: closes the last epoch and the accounts.
+    /// Ends the run: closes the last epoch, and ends all counting.
     pub fn finish(&mut self) {
         self.close_epoch();
         self.broadcast = None;
@@ -432,7 +433,8 @@ impl Table {
             self.snapshot.sums.contributing.saturating_add_signed(change.contributing);
     }
 
-    /// Returns the network's cells, in the skin's order, then those that it does not describe.
+    /// Returns the cells of the network for a comparison with the description: the skin's cells in its order, then the
+    /// cells that the skin does not have.
     pub fn network(&self, now: Micros) -> impl Iterator<Item = ObservedCell> {
         let described = self.statuses(now).map(|(cell, status)| ObservedCell {
             node: cell.node,
@@ -455,21 +457,21 @@ impl Table {
         described.chain(unknown_nodes)
     }
 
-    /// Returns the number, the epoch and the time of the joints that cells are answering.
+    /// Returns the number, the epoch and the time of the newest joints, which the cells are answering.
     #[must_use]
     pub fn newest(&self) -> Option<(u64, Epoch, Micros)> {
         self.broadcast.as_ref().map(Broadcast::joints)
     }
 
-    /// Returns the sensor words of each cell since those joints, from the stimuli and pages that arrived, and its
-    /// status now.
+    /// Returns for each cell its sensor words since the newest joints, from the stimuli and pages that arrived, and its
+    /// status at `now`.
     ///
-    /// They are for display. Comparisons need the certain values ([`Snapshot::sensors`]).
+    /// These words are for display. For comparisons, use [`Snapshot::sensors`], which has only words that are certain.
     pub fn sensors(&self, now: Micros) -> impl Iterator<Item = (Option<SkinSensors>, Status)> {
         self.statuses(now).map(|(cell, status)| (cell.presumed_sensors(), status))
     }
 
-    /// Returns the cells with their statuses now.
+    /// Returns each cell with its status at `now`.
     pub fn statuses(&self, now: Micros) -> impl Iterator<Item = (&CellState, Status)> {
         let newest = self.broadcast.map(|broadcast| broadcast.number);
         self.cells.iter().map(move |cell| (cell, cell.status(now, newest)))

@@ -1,4 +1,4 @@
-//! Senders outside this bench.
+//! Detects other gateways, and cells that are not in the skin, from their frames.
 
 use std::collections::BTreeMap;
 
@@ -6,12 +6,12 @@ use protocol::id::CellId;
 use protocol::message::Heartbeat;
 use protocol::time::{Micros, Span};
 
-/// Number of joints from another sender within [`WITHIN`] that prove a gateway.
+/// Number of joints from another sender within [`WITHIN`] that prove another gateway.
 const GATEWAY_JOINTS: usize = 4;
 /// The time window for these joints; the slowest gateway sends fifteen in it.
 const GATEWAY_WINDOW: Span = Span::from_millis(1_000);
 
-/// The frames of other senders.
+/// Senders on the bus that are neither this gateway nor a cell of the skin.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Outsiders {
     /// Nodes that are not in the skin, each with its last heartbeat.
@@ -21,7 +21,7 @@ pub(super) struct Outsiders {
 }
 
 impl Outsiders {
-    /// Records joints of another sender; returns true if a gateway sends them.
+    /// Records joints from another sender. Returns true if these joints prove another gateway.
     pub(super) fn joints_at(&mut self, at: Micros) -> bool {
         self.joints.rotate_right(1);
         if let Some(newest) = self.joints.first_mut() {

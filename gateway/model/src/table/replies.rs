@@ -1,4 +1,4 @@
-//! Due replies compared with received ones.
+//! Counts of replies: due, in time, late and missing.
 
 use derive_more::{Add, Sum};
 use protocol::parameters::MAX_JOINTS;
@@ -12,29 +12,29 @@ use crate::tracker::MAX_LATE_EPOCHS;
 /// A reply is due when the cell is configured, awake, and in contact by Algorithm 1.
 #[derive(Add, Clone, Copy, Debug, Default, Eq, PartialEq, Sum)]
 pub struct Replies {
-    /// Number of epochs with a due reply.
+    /// Number of epochs in which a reply was due.
     pub due: u64,
-    /// Replies before the next broadcast.
+    /// Due replies that arrived before the next broadcast.
     pub in_time: u64,
-    /// Replies after it.
+    /// Due replies that arrived after the next broadcast.
     pub late: u64,
-    /// Epochs without a reply.
+    /// Epochs in which a due reply never arrived.
     pub missing: u64,
-    /// Missing replies of a cell that was dead or restarted, or whose bus was lost.
+    /// Missing replies that the cell may not be to blame for: it had died or restarted, or its bus was lost.
     pub in_doubt: u64,
-    /// Torques that were not due: ends of contacts, and the next two counts.
+    /// Torques that were not due: ends of contacts, and those in `contact_unknown` and `unexpected`.
     pub unasked: u64,
-    /// Torques among these from cells with an unknown contact state.
+    /// Torques from cells whose contact state was unknown.
     pub contact_unknown: u64,
-    /// Non-zero torques among these from cells with a known contact state: they were not touched, or could not be
-    /// expected to answer.
+    /// Non-zero torques from cells that were known not to be in contact, or could not be expected to answer.
     pub unexpected: u64,
-    /// Torques that arrived after their epoch, or after a torque of the same cell for a later epoch, and were dropped.
+    /// Torques that were dropped because they arrived after their epoch had closed, or after a torque of the same cell
+    /// for a later epoch.
     pub too_late: u64,
 }
 
 impl Replies {
-    /// Sums the accounts of several cells.
+    /// Adds up the counts of several cells.
     #[must_use]
     pub fn total(all: impl Iterator<Item = Self>) -> Self {
         all.sum()
@@ -46,18 +46,18 @@ impl Replies {
     }
 }
 
-/// The expectation of a received torque.
+/// The classification of a received torque as due or not.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum ReplyExpectation {
-    /// It was due.
+    /// The torque was due.
     Due,
-    /// It was not due, by the known contact state of the cell.
+    /// The torque was not due, by the known contact state of the cell.
     NotDue,
     /// The contact state of its cell was unknown.
     Unknown,
 }
 
-/// The central torques of one epoch, in Nm.
+/// The central torques of one epoch that a cell's answer is compared with, in Nm.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Expected {
     pub(super) number: u64,
@@ -65,23 +65,23 @@ pub(super) struct Expected {
     pub(super) unquantised: [f64; MAX_JOINTS],
 }
 
-/// The outstanding replies of a cell for the newest epochs.
+/// The replies of one cell that are still outstanding for the newest epochs.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Outstanding {
-    /// Bit n: the n-th broadcast before the newest one is due and not answered yet.
+    /// Bit n is set if the n-th broadcast before the newest one is due and not answered yet.
     due: u8,
-    /// Bit n: the cell's contact was known at the n-th broadcast before the newest one.
+    /// Bit n is set if the cell's contact was known at the n-th broadcast before the newest one.
     known: u8,
     expected: [Option<Expected>; MAX_LATE_EPOCHS + 1],
-    /// Errors of its answers.
+    /// Errors of the cell's torques.
     pub(super) errors: Errors,
-    /// Its words compared with the expected ones.
+    /// The cell's words beside the expected ones, to detect words that stay constant.
     pub(super) stuck: StuckDetector,
 }
 
 impl Outstanding {
-    /// Starts a broadcast, to be answered if `due`; `is_known` if the cell's contact is known. Returns true if the
-    /// oldest broadcast is unanswered and can no longer be answered.
+    /// Starts a broadcast, which the cell must answer if `due`; `is_known` is true if its contact is known. Returns
+    /// true if the oldest broadcast was due and can no longer be answered.
     pub(super) fn open(&mut self, due: bool, is_known: bool) -> bool {
         let oldest = 1 << MAX_LATE_EPOCHS;
         let unanswered = self.due & oldest != 0;
@@ -90,22 +90,22 @@ impl Outstanding {
         unanswered
     }
 
-    /// Resets the due replies.
+    /// Drops the outstanding replies, so that earlier epochs do not count.
     pub(super) fn begin_accounts(&mut self) {
         *self = Self { known: self.known, ..Self::default() };
     }
 
-    /// Starts a broadcast and drops all earlier ones.
+    /// Starts a broadcast, and drops all earlier outstanding replies.
     pub(super) fn open_only(&mut self, due: bool, is_known: bool) {
         (self.due, self.known) = (u8::from(due), u8::from(is_known));
     }
 
-    /// Returns true if the newest broadcast must be answered.
+    /// Returns true if the cell must answer the newest broadcast.
     pub(super) const fn is_due(&self) -> bool {
         self.due & 1 != 0
     }
 
-    /// Records the answer to the broadcast `lag` before the newest; returns whether it was due.
+    /// Records the answer to the broadcast `lag` broadcasts before the newest one. Returns whether the answer was due.
     pub(super) const fn answer(&mut self, lag: usize) -> ReplyExpectation {
         let bit = 1 << lag;
         let was_due = self.due & bit != 0;
@@ -119,15 +119,15 @@ impl Outstanding {
         }
     }
 
-    /// Clears the outstanding replies, and the knowledge of the contact at their broadcasts. Returns the number of
-    /// outstanding replies.
+    /// Clears the outstanding replies, and marks the contact at their broadcasts as unknown. Returns the number of
+    /// replies that were outstanding.
     pub(super) const fn clear(&mut self) -> u32 {
         let due = self.due.count_ones();
         (self.due, self.known) = (0, 0);
         due
     }
 
-    /// Records the expected newest answer.
+    /// Sets the torques that are expected in answer to the newest broadcast.
     pub(super) fn expect(&mut self, expected: Expected) {
         self.expected.rotate_right(1);
         if let Some(newest) = self.expected.first_mut() {
@@ -135,7 +135,7 @@ impl Outstanding {
         }
     }
 
-    /// Returns the expected answer to a broadcast.
+    /// Returns the torques that are expected in answer to the broadcast with this number, if known.
     pub(super) fn expected(&self, number: u64) -> Option<Expected> {
         self.expected.iter().flatten().find(|expected| expected.number == number).copied()
     }

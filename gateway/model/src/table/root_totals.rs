@@ -10,22 +10,22 @@ use crate::tracker::MAX_LATE_EPOCHS;
 /// Number of epochs over which errors of sums are averaged.
 const AVERAGED_EPOCHS: u32 = 32;
 
-/// Counts of sums.
+/// Counts of the sums that arrived on a bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct SumCounts {
-    /// Received sums, from all cells.
+    /// All sums that arrived, from roots and from other cells.
     pub received: u64,
-    /// The first sum of a root for an epoch.
+    /// Sums that were the first of their root for an epoch.
     pub first: u64,
-    /// Further sums of a root for an epoch; the one with the most cells is used.
+    /// Sums that were not the first of their root for an epoch; the one with the most cells is used.
     pub resent: u64,
-    /// Sums of cells that are not roots: their parents' sums contain them.
+    /// Sums of cells that are not roots; the sums of their parents contain them.
     pub overheard: u64,
-    /// Sums for an epoch that has passed.
+    /// Sums that arrived after their epoch had closed.
     pub stale: u64,
 }
 
-/// Cells in the sums of epochs: due = in time + late + missing.
+/// Counts of cells whose torque was due in the sums of epochs: due = in time + late + missing.
 ///
 /// A cell is due if it is in contact by Algorithm 1 and can be expected to answer. Cells that only forward the sums of
 /// others are not due.
@@ -33,24 +33,24 @@ pub struct SumCounts {
 pub struct Contributions {
     /// Cells due in sums, over all epochs.
     pub due: u64,
-    /// Due cells in a sum before the next joints.
+    /// Due cells in a sum that arrived before the next joints.
     pub in_time: u64,
-    /// Due cells in a sum after them.
+    /// Due cells in a sum that arrived after the next joints.
     pub late: u64,
-    /// Due cells in no sum.
+    /// Due cells that no sum contained.
     pub missing: u64,
-    /// Cells in a sum that were not due.
+    /// Cells in a sum that were not due in it.
     pub unasked: u64,
-    /// Cells among these in epochs in which the contact of some cell was unknown.
+    /// Cells that were not due, in epochs in which the contact of some cell was unknown.
     pub contact_unknown: u64,
 }
 
 /// A root's sum for one epoch.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) struct Sum {
-    /// Number of cells in it.
+    /// Number of cells in the sum.
     pub(super) count: u8,
-    /// Words in steps of Q7.8.
+    /// The torque of each joint, in steps of Q7.8.
     pub(super) words: [i32; MAX_JOINTS],
 }
 
@@ -68,9 +68,9 @@ impl Sum {
 /// The sums of a root.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RootSums {
-    /// True if its sums are for the gateway; otherwise another cell receives them.
+    /// True if the root sends its sums to the gateway; otherwise another cell receives them.
     pub(super) is_for_gateway: bool,
-    /// The best sum of each of the newest epochs.
+    /// For each of the newest epochs, the sum with the most cells.
     pub(super) epochs: [Option<Sum>; MAX_LATE_EPOCHS + 1],
 }
 
@@ -79,7 +79,7 @@ impl RootSums {
         Self { is_for_gateway: feeds, epochs: [None; MAX_LATE_EPOCHS + 1] }
     }
 
-    /// Starts an epoch.
+    /// Starts a new epoch, for which no sum has arrived yet.
     pub(super) fn open(&mut self) {
         self.epochs.rotate_right(1);
         if let Some(newest) = self.epochs.first_mut() {
@@ -88,34 +88,34 @@ impl RootSums {
     }
 }
 
-/// An epoch that may still be answered.
+/// An epoch whose sums may still arrive.
 #[derive(Clone, Copy, Debug)]
 struct OpenEpoch {
     due: u32,
-    /// True if no other cell can be in it.
+    /// True if the contact of every cell is known, so that no other cell than the due ones can be in the sum.
     known: bool,
     received_cells: u32,
-    /// Number of cells before the next joints.
+    /// Number of cells in the sum when the next joints were sent; `None` before that.
     in_time: Option<u32>,
-    /// Words in steps of Q7.8.
+    /// The sum of all roots for each joint, in steps of Q7.8.
     sum: [i32; MAX_JOINTS],
     saturated: bool,
     expected: Option<Expected>,
 }
 
-/// The expected sum by the central computation, in Nm.
+/// The sum that is expected by the central computation, in Nm.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Expected {
-    /// The torque of the whole bus.
+    /// The torque of the whole bus, for each joint.
     pub(super) torque: [f64; MAX_JOINTS],
-    /// Number of joints that some cell in it loads, from the first.
+    /// Number of joints, counted from the base, that some cell in the sum loads.
     pub(super) joints: usize,
     /// True if every cell has the same sensor words as in the previous epoch.
     pub(super) constant: bool,
 }
 
 impl Expected {
-    /// Adds the torque of a cell on this joint.
+    /// Adds the torque of a cell that sits on the joint `joint`.
     pub(super) fn add(&mut self, torque: [f64; MAX_JOINTS], joint: usize) {
         for (sum, torque) in self.torque.iter_mut().zip(torque) {
             *sum += torque;
@@ -131,15 +131,15 @@ pub(super) struct SumError {
     pub(super) averaged: Errors,
     /// Number of words that were skipped because they were saturated.
     pub(super) saturated: u64,
-    /// Number of consecutive epochs, and the sum of their errors.
+    /// Number of consecutive epochs that are averaged, and the sum of their errors.
     epochs: u32,
     sum: [f64; MAX_JOINTS],
-    /// The errors of the last compared epoch.
+    /// The errors in the last epoch that was compared.
     pub(super) last: Option<[f64; MAX_JOINTS]>,
 }
 
 impl SumError {
-    /// Compares the sum of a complete epoch, in steps of Q7.8.
+    /// Compares the sum of a complete epoch, in steps of Q7.8, with the expected one.
     pub(super) fn take(&mut self, words: &[i32; MAX_JOINTS], saturated: bool, expected: &Expected) {
         if !expected.constant {
             self.interrupt();
@@ -172,27 +172,28 @@ impl SumError {
     }
 }
 
-/// The sums of a bus.
+/// The sums of all roots of a bus, by epoch.
 #[derive(Clone, Debug, Default)]
 pub(super) struct RootTotals {
-    /// Newest first.
+    /// Epochs whose sums may still arrive, newest first.
     epochs: [Option<OpenEpoch>; MAX_LATE_EPOCHS + 1],
     pub(super) counts: SumCounts,
     pub(super) contributions: Contributions,
     pub(super) error: SumError,
 }
 
-/// The use of a received sum.
+/// The classification of a root's sum.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum SumUse {
-    /// It is the root's best for its epoch.
+    /// The sum has the most cells so far for its epoch, and is used.
     Best,
-    /// A sum with at least as many cells arrived earlier.
+    /// An earlier sum for the same epoch has at least as many cells; this one is not used.
     Resent,
 }
 
 impl RootTotals {
-    /// Records a root's sum for the epoch `lag` before the newest; `best` is its best sum for that epoch so far.
+    /// Records a root's sum for the epoch `lag` before the newest; `best` is the root's sum with the most cells for
+    /// that epoch so far.
     pub(super) fn take(&mut self, lag: usize, best: &mut Option<Sum>, sum: Sum) -> SumUse {
         let before = *best;
         match before {
@@ -214,12 +215,13 @@ impl RootTotals {
         SumUse::Best
     }
 
-    /// Returns the number of cells due in the newest epoch's sum; `None` if the sensors of some are unknown.
+    /// Returns the number of cells due in the sum of the newest epoch; `None` if the contact of some cell is unknown.
     pub(super) fn due(&self) -> Option<u32> {
         self.epochs.first().copied().flatten().filter(|open| open.known).map(|open| open.due)
     }
 
-    /// Starts an epoch: `due` cells should be in its sum, and no others if `known`. Settles the oldest epoch.
+    /// Starts an epoch in whose sum `due` cells should be. If `known`, no other cells can be in it. Ends the counting
+    /// of the oldest epoch.
     pub(super) fn open(&mut self, due: u32, known: bool, expected: Option<Expected>) {
         self.epochs.rotate_right(1);
         if let Some(oldest) = self.epochs.first_mut() {
@@ -236,7 +238,8 @@ impl RootTotals {
         }
     }
 
-    /// Closes the newest epoch. Returns whether cells were due in it, and whether all of them arrived in time.
+    /// Ends the time for in-time sums of the newest epoch. Returns whether cells were due in its sum, and whether all
+    /// of them arrived in time.
     pub(super) fn close(&mut self) -> (bool, bool) {
         self.error.last = None;
         let Some(Some(open)) = self.epochs.first_mut() else { return (false, false) };
@@ -254,7 +257,7 @@ impl RootTotals {
         (open.due > 0, complete)
     }
 
-    /// Ends the run: settles all epochs.
+    /// Ends the run: ends the counting of all epochs.
     pub(super) fn finish(&mut self) {
         for open in &mut self.epochs {
             self.contributions.settle(open.take());

@@ -1,25 +1,25 @@
-//! Sensors frames of a cell: their rate, and the touches and releases in them.
+//! Counts the sensors frames of a cell, and the touches and releases in them.
 //!
-//! They do not affect the torques that the table expects, which follow from stimuli.
+//! Sensors frames do not change the torques that the table expects; these follow from stimuli.
 
 use protocol::message::SensorPage;
 use protocol::parameters::Events;
 use protocol::time::{Micros, Span};
 use protocol::touch::{Touch, contact_force};
 
-/// The sensors frames of one cell.
+/// Counts of the sensors frames of one cell.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct SensorFrames {
     /// Number of frames.
     pub frames: u64,
-    /// Number of touches: contact rose to its threshold.
+    /// Number of touches: the contact rose to the threshold.
     pub touches: u64,
-    /// Number of releases: contact fell below the threshold minus the hysteresis.
+    /// Number of releases: the contact fell below the threshold minus the hysteresis.
     pub releases: u64,
     contact: Touch,
-    /// Number of frames that do not answer a report command.
+    /// Number of frames that the cell sent without a report command.
     unrequested: u64,
-    /// Arrival times of the first and the last of them.
+    /// Arrival times of the first and the last frame that was sent without a report command.
     span: Option<(Micros, Micros)>,
     /// The kinds of pages that are still expected in answer to a report command.
     requested: [bool; KINDS],
@@ -42,12 +42,12 @@ const fn kind(page: &SensorPage) -> usize {
 }
 
 impl SensorFrames {
-    /// Expects the answer to a report command: one page of each kind follows at once.
+    /// Records a report command: the cell answers with one page of each kind at once.
     pub(super) const fn answer_report(&mut self) {
         self.requested = [true; KINDS];
     }
 
-    /// Ends the answer to a report command: it is complete, or its pages were lost.
+    /// Ends the answer to a report command, because it is complete or its remaining pages were lost.
     pub(super) const fn end_report(&mut self) {
         self.requested = [false; KINDS];
     }
@@ -68,13 +68,13 @@ impl SensorFrames {
         self.releases += u64::from(before == Touch::Touched && self.contact != Touch::Touched);
     }
 
-    /// Records a restart: the cell is not in contact, and no release is counted.
+    /// Records a restart: the cell is not in contact, and this does not count as a release.
     pub(super) const fn restart(&mut self) {
         self.contact = Touch::Free;
     }
 
-    /// Returns the rate in Hz of frames that do not answer a report command, from the first to the last; `None` for
-    /// fewer than three frames or less than a second.
+    /// Returns the rate in Hz of the frames sent without a report command, from the first to the last; `None` for fewer
+    /// than three such frames or for less than a second.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
     pub fn rate_hz(&self) -> Option<f64> {

@@ -4,19 +4,20 @@ use protocol::message::ReceivedCounts;
 
 use crate::tracker::HeartbeatKind;
 
-/// The counts of one cell.
+/// The number of joints sent to one cell, and the cell's own count to compare it with.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct SentJoints {
     since: CountsSince,
-    /// The counts before its last start, with the replies then in doubt, while that start may still be taken back.
+    /// The counts before the cell's last start, and its replies then in doubt; kept while that start may still be taken
+    /// back.
     before: Option<(CountsSince, u64)>,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
 struct CountsSince {
-    /// Its first page of receive counters since it started or the gateway did.
+    /// The first page of receive counters since the cell or the gateway started.
     first: Option<ReceivedCounts>,
-    /// Number of broadcasts since that page.
+    /// Number of broadcasts since that first page.
     joints: u64,
 }
 
@@ -26,12 +27,13 @@ impl SentJoints {
         self.since.joints += 1;
     }
 
-    /// Resets the count.
+    /// Sets the count to zero.
     pub(super) const fn begin(&mut self) {
         self.since.joints = 0;
     }
 
-    /// Records a page of counters that crossed `passed` joints on the bus. Later pages are compared with the first one.
+    /// Records a page of receive counters. `passed` is the number of joints that were sent while the page was on its
+    /// way. Later pages are compared with the first one.
     pub(super) fn report(&mut self, heard: Option<ReceivedCounts>, passed: u64) {
         if self.since.first.is_none() {
             self.since = CountsSince { first: heard, joints: passed };
@@ -43,9 +45,9 @@ impl SentJoints {
         self.before = None;
     }
 
-    /// Records a start of the cell, with a counter of `sent` packets, and with this number of replies outstanding and
-    /// in doubt. If an apparent start is taken back, the earlier counts continue, and the returned number of replies is
-    /// in doubt.
+    /// Records a start of the cell; `sent` is its counter of sent packets, and `of` has the numbers of replies
+    /// outstanding and in doubt. If `taken_back`, the apparent start was none: the earlier counts continue, and the
+    /// returned number of replies is in doubt.
     pub(super) fn restart(&mut self, word: HeartbeatKind, taken_back: bool, sent: u16, of: (u32, u64)) -> Option<u64> {
         let (outstanding, in_doubt) = of;
         if let Some((before, _)) = &mut self.before {
@@ -63,8 +65,8 @@ impl SentJoints {
         before.map(|(_, in_doubt)| in_doubt)
     }
 
-    /// Returns the joints that it reports as skipped because they were old, and the joints that it does not report as
-    /// received.
+    /// Returns two counts of joints: those that the cell reports as skipped because they were old, and those that it
+    /// does not report as received.
     pub(super) fn unanswered(&self, last: Option<ReceivedCounts>) -> Option<(u64, u64)> {
         let first = self.since.first?;
         let last = last.unwrap_or(first);

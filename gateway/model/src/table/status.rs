@@ -3,20 +3,20 @@
 /// The status of a cell.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Status {
-    /// No packet has arrived from it yet.
+    /// No packet has arrived from the cell yet.
     Unknown,
-    /// Alive and not in contact.
+    /// The cell is alive and not in contact.
     Quiet,
-    /// In contact, and answered the last epoch that left time for it.
+    /// The cell is in contact, and answered the last epoch for which the time to answer has passed.
     Active,
-    /// In contact, and did not answer an epoch.
+    /// The cell is in contact, and did not answer an epoch in time.
     Stale,
-    /// Silent for too long.
+    /// The cell has been silent for too long.
     Dead,
 }
 
 impl Status {
-    /// Returns the name in tables and summaries.
+    /// Returns the name of the status in tables and summaries.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -28,7 +28,7 @@ impl Status {
         }
     }
 
-    /// Returns the number in recordings and snapshots.
+    /// Returns the number of the status in recordings and snapshots.
     #[must_use]
     pub const fn number(self) -> u8 {
         self as u8

@@ -16,32 +16,32 @@ use protocol::message::SensorPage;
 use protocol::packet::padded;
 use protocol::parameters::MAX_JOINTS;
 
-/// Length of a run of equal words from which a cell counts as stuck.
+/// Number of equal words in a row from which a cell counts as stuck.
 const STUCK_RUN: u64 = 32;
-/// Minimum number of changes of the expected words in the run.
+/// Minimum number of changes of the expected words during such a run.
 const MIN_EXPECTED_CHANGES: u32 = 4;
-/// Smallest change of a word that counts, in steps.
+/// Smallest change of an expected word that counts, in steps of the word.
 const MIN_CHANGE_STEPS: u16 = 16;
 
-/// Kinds of words that may be stuck, with the names of [`Stuck::longest`].
+/// Kinds of words that may be stuck, in the order of [`Stuck::longest`].
 const NAMES: [&str; 3] = ["torque", "skin", "acceleration"];
 
-/// The sent words of a cell's torques and sensors.
+/// The words that a cell sends in torques and sensors pages, compared with the expected ones.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct StuckDetector {
     kinds: [WordRun; NAMES.len()],
 }
 
-/// The sent words of one kind.
+/// The words of one kind that a cell sends, compared with the expected ones.
 #[derive(Clone, Copy, Debug, Default)]
 struct WordRun {
     sent: Option<[i16; MAX_JOINTS]>,
-    /// Number of consecutive words equal to `sent`.
+    /// Number of words in a row that are equal to `sent`.
     equal: u64,
-    /// The expected words at their last change.
+    /// The expected words after their last counted change.
     right: [i16; MAX_JOINTS],
     changes: u32,
-    /// The longest run that counted as stuck.
+    /// The longest run of equal words for which the cell counted as stuck.
     longest: u64,
 }
 
@@ -68,13 +68,14 @@ impl WordRun {
 }
 
 impl StuckDetector {
-    /// Compares a due torque with the central one.
+    /// Compares a torque that was due with the central torque `right`.
     pub(super) fn take_torque(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
         let [torque, ..] = &mut self.kinds;
         torque.take(sent, right);
     }
 
-    /// Compares a sensors page of the cell with the one that stimuli set; pages of different kinds are skipped.
+    /// Compares a sensors page of the cell with the page `right` that stimuli set. Pages of different kinds are not
+    /// compared.
     pub(super) fn take_page(&mut self, sent: &SensorPage, right: &SensorPage) {
         let [_, skin, acceleration] = &mut self.kinds;
         let words = match (sent, right) {
@@ -90,13 +91,13 @@ impl StuckDetector {
         self.kinds.iter().any(WordRun::is_stuck)
     }
 
-    /// Returns the kinds of words that were stuck, each with its longest run.
+    /// Returns the kinds of words that were stuck, each with its longest run in words.
     pub(super) fn longest(&self) -> impl Iterator<Item = (&'static str, u64)> {
         NAMES.into_iter().zip(self.kinds.map(|words| words.longest)).filter(|(_, longest)| *longest > 0)
     }
 }
 
-/// Returns the words of a page.
+/// Returns the words of a sensors page.
 fn bits(page: &SensorPage) -> [i16; MAX_JOINTS] {
     match page {
         SensorPage::Skin(skin) => {
@@ -118,7 +119,7 @@ mod tests {
     const FEW: i16 = 15;
     const MANY: i16 = 16;
 
-    /// Returns the longest stuck run for pairs of sent and expected words.
+    /// Returns the longest run of stuck words, for pairs of sent and expected words.
     fn longest(words: impl Iterator<Item = (i16, i16)>) -> u64 {
         let mut all = WordRun::default();
         words.for_each(|(sent, right)| all.take(padded(&[0, sent]), padded(&[0, right])));

@@ -1,7 +1,7 @@
-//! Switches of a cell, which a restart resets: events, sensing and baseline (parameters 8, 7 and 11).
+//! Switches of a cell: the parameters events, sensing and baseline (8, 7 and 11), which a restart resets.
 //!
-//! The skin gives their targets, until the cell confirms another value that a command-line tool has written. They are
-//! written to the cell until it confirms them.
+//! The skin gives the target of each switch. If the cell confirms another value, which a command-line tool has written,
+//! that value becomes the target. The gateway writes the targets to the cell until it confirms them.
 
 use protocol::message::Answer;
 use protocol::packet::WORDS;
@@ -13,12 +13,12 @@ pub type Switch = (u8, [i16; WORDS]);
 /// Number of switches.
 pub const SWITCHES: usize = 3;
 
-/// The switches of one cell, in the order of writing: thresholds before the mode that needs them.
+/// The switches of one cell, in the order in which they are written: thresholds before the mode that needs them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct SwitchStates {
     target: [Switch; SWITCHES],
     confirmed: [bool; SWITCHES],
-    /// True if the cell has a baseline, and so subtracts a zero from its input.
+    /// True if the cell has a baseline, so that it subtracts a zero from its force sensor.
     pub(super) subtracts: bool,
 }
 
@@ -35,7 +35,7 @@ impl SwitchStates {
         switched
     }
 
-    /// Resets the switches to their state at a start.
+    /// Resets the switches to their values after a start of the cell.
     pub(super) fn restart(&mut self) {
         let start = [Events::default().words(), Sensing::default().words(), Baseline::default().words()];
         for ((confirmed, (_, target)), start) in self.confirmed.iter_mut().zip(self.target).zip(start) {
@@ -62,7 +62,7 @@ impl SwitchStates {
         }
     }
 
-    /// Returns the switches that must still be written.
+    /// Returns the switches that must still be written to the cell.
     pub(super) fn unconfirmed(&self) -> [Option<Switch>; SWITCHES] {
         let mut lacks = self.target.map(Some);
         for (lacks, confirmed) in lacks.iter_mut().zip(self.confirmed) {

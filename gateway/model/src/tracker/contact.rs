@@ -17,40 +17,41 @@ use protocol::packet::Epoch;
 /// Maximum number of pending stimuli in a cell.
 pub const MAX_PENDING_STIMULI: usize = 8;
 
-/// The contact state of one cell. The reader attaches a `T` to each stimulus, such as its time or its frames.
+/// The contact state of one cell, from its stimuli and its own pages. The caller attaches a `T` to each stimulus, such
+/// as its time or its frames.
 #[derive(Clone, Debug)]
 pub struct Contact<T> {
     waiting: Vec<(AppliesFrom, SensorPage, T)>,
     skin: Option<(SkinSensors, T)>,
     acceleration: Option<([Q3_12; 3], T)>,
     obeys: Option<bool>,
-    /// True if `skin` includes all stimuli that the cell has received.
+    /// True if `skin` reflects all stimuli that the cell has received.
     is_known: bool,
     unseen: UnseenStimuli,
-    /// Number of stimuli since the reader began; `None` once their effect is uncertain.
+    /// Number of stimuli that arrived here; `None` once their effect on the cell is uncertain.
     received_stimuli: Option<u16>,
-    /// True if the cell has counted stimuli that did not arrive here.
+    /// True if the cell has counted more stimuli than arrived here.
     is_short: bool,
-    /// True if the mode was written, and the cell has not confirmed it.
+    /// True if the mode was written and the cell has not confirmed the write.
     clears: bool,
 }
 
-/// Stimuli that were not received here and may be pending in the cell.
+/// Stimuli from before the reader started that may be pending in the cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum UnseenStimuli {
-    /// Any, before the first joints.
+    /// Stimuli for any epoch may be pending; no joints have arrived yet.
     Any,
-    /// Stimuli for one of the next `ahead` epochs after the last joints.
+    /// Stimuli for one of the `ahead` epochs after the epoch `last` may be pending.
     Ahead { last: Epoch, ahead: u8 },
-    /// No stimulus can be pending.
+    /// No such stimulus can be pending.
     None,
 }
 
-/// A stimulus is pending for at most half of all epochs.
+/// Half of the 256 epochs: a stimulus is pending for at most this many.
 const HALF: u8 = 1 << 7;
 
 impl UnseenStimuli {
-    /// Latches all stimuli for an epoch and for the half of all epochs before it.
+    /// Removes the stimuli that the joints of an epoch latch: for this epoch, and for the half of all epochs before it.
     fn latch(&mut self, epoch: Epoch) {
         *self = match *self {
             Self::None => Self::None,
@@ -82,7 +83,8 @@ impl<T> Default for Contact<T> {
 }
 
 impl<T> Contact<T> {
-    /// Adds a stimulus, unless the cell measures or has too many pending; `last` is the epoch of the last joints.
+    /// Adds a stimulus to the pending ones, unless the cell measures or has too many pending; `last` is the epoch of
+    /// the last joints.
     pub fn push(&mut self, from: AppliesFrom, page: SensorPage, tag: T, last: Option<Epoch>) {
         self.received_stimuli = self.received_stimuli.map(|came| came.wrapping_add(1));
         if self.obeys != Some(false) && self.waiting.len() < MAX_PENDING_STIMULI {
@@ -90,7 +92,8 @@ impl<T> Contact<T> {
         }
     }
 
-    /// Latches the stimuli for the joints of this epoch, calling `latched` for each; the newest of each page counts.
+    /// Latches the stimuli whose time has come at the joints of this epoch, calling `latched` for each. If several set
+    /// the same page, the newest counts.
     pub fn latch(&mut self, epoch: Epoch, mut latched: impl FnMut(&mut T)) {
         self.unseen.latch(epoch);
         self.is_short &= self.unseen != UnseenStimuli::None;
@@ -139,19 +142,20 @@ impl<T> Contact<T> {
         }
     }
 
-    /// Records a start of the cell: no contact, and no pending stimulus.
+    /// Records a start of the cell: it is not in contact, and has no pending stimulus.
     pub fn start(&mut self, tag: T) {
         self.reset();
         self.settle(tag);
     }
 
-    /// Records a write of the mode, which clears the contact state once the cell has received it.
+    /// Records a write of the mode. Once the cell has received it, the cell has no contact state and no pending
+    /// stimuli.
     pub fn write_mode(&mut self) {
         self.reset();
         self.clears = true;
     }
 
-    /// Records the confirmed write of the mode: all stimuli since then were received here.
+    /// Records that the cell confirmed the write of its mode: all stimuli since then were received here.
     pub fn confirm_mode(&mut self, tag: T) {
         if self.clears {
             self.settle(tag);
@@ -164,25 +168,26 @@ impl<T> Contact<T> {
         (self.is_known, self.unseen, self.is_short, self.clears) = (true, UnseenStimuli::None, false, false);
     }
 
-    /// Returns the skin sensors if they are known.
+    /// Returns the skin sensors of the cell if they are certain.
     #[must_use]
     pub fn known(&self) -> Option<&(SkinSensors, T)> {
         self.skin.as_ref().filter(|_| self.is_known)
     }
 
-    /// Returns the skin sensors by the stimuli and pages received here; older stimuli may have changed them.
+    /// Returns the skin sensors of the cell by the stimuli and pages received here; older stimuli may have changed
+    /// them.
     #[must_use]
     pub const fn skin(&self) -> Option<&(SkinSensors, T)> {
         self.skin.as_ref()
     }
 
-    /// Returns all latched or reported pages.
+    /// Returns all sensors pages of the cell, latched from stimuli or reported by the cell.
     pub fn latched(&self) -> impl Iterator<Item = (SensorPage, &T)> {
         let skin = self.skin.iter().map(|(skin, tag)| (SensorPage::Skin(*skin), tag));
         skin.chain(self.acceleration.iter().map(|(xyz, tag)| (SensorPage::Acceleration(*xyz), tag)))
     }
 
-    /// Returns the pending stimuli in order, each with the joints from which it applies.
+    /// Returns the pending stimuli in order, each with the joints at which the cell latches it.
     #[must_use]
     pub fn waiting(&self) -> &[(AppliesFrom, SensorPage, T)] {
         &self.waiting
@@ -196,12 +201,13 @@ impl<T> Contact<T> {
         (self.is_short, self.clears) = (false, false);
     }
 
-    /// Forgets the contact state until the next stimulus; stimuli stay pending in the cell.
+    /// Marks the contact state as unknown until the next stimulus; stimuli stay pending in the cell.
     pub fn forget(&mut self) {
         (self.skin, self.acceleration, self.is_known, self.received_stimuli) = (None, None, false, None);
     }
 
-    /// Returns true if the cell obeys stimuli; `None` if unknown, in which case callers assume that it does.
+    /// Returns true if the cell is in test mode and obeys stimuli; `None` if unknown, in which case callers assume that
+    /// it does.
     #[must_use]
     pub const fn obeys(&self) -> Option<bool> {
         self.obeys
@@ -213,8 +219,8 @@ impl<T> Contact<T> {
     }
 }
 
-/// Returns true if the joints from which a stimulus should apply have passed, so that it applies from the next ones.
-/// `last` is the epoch of the last joints.
+/// Returns true if a stimulus comes after the joints at which it should apply, so that the next joints latch it. `last`
+/// is the epoch of the last joints.
 #[must_use]
 pub fn is_late(from: AppliesFrom, last: Option<Epoch>) -> bool {
     matches!((from, last), (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0)
@@ -304,8 +310,8 @@ mod tests {
         assert_eq!(known(&contact), None);
     }
 
-    /// For a cell with one earlier stimulus for any epoch: it is no longer pending when the reader trusts the cell's
-    /// page.
+    /// A cell may have received one stimulus, for any epoch, before the reader started. When the reader begins to trust
+    /// the cell's page, that stimulus is no longer pending.
     #[test]
     fn no_stimulus_from_before_waits_when_a_page_is_believed_whatever_epochs_come() {
         for steps in [&[1_u8][..], &[127], &[3, 1, 255, 1], &[200, 100], &[1, 1, 100], &[254, 7]] {

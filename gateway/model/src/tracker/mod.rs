@@ -25,23 +25,23 @@ pub use contact::{Contact, MAX_PENDING_STIMULI, is_late};
 pub use per_cell::PerCell;
 pub use uplink::{Account, Uplink};
 
-/// The time of silence after which a cell counts as dead: two heartbeats plus the jitter of a busy machine, so that one
-/// lost frame is tolerated.
+/// The time of silence after which a cell counts as dead: two periods of its heartbeat plus the jitter of a busy
+/// machine, so that one lost frame is tolerated.
 pub const DEAD_AFTER: Span = Span::from_millis(600);
 
 /// Maximum age of an answer, in broadcasts before the newest one; older answers are dropped.
 pub const MAX_LATE_EPOCHS: usize = 3;
 
-/// The last page of each kind since a cell started.
+/// The last page of each kind that a cell has sent since it started.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Pages {
-    /// Counters of what it received.
+    /// Counters of the packets that the cell received.
     pub heard: Option<ReceivedCounts>,
-    /// Counters of what the cell refused.
+    /// Counters of the packets that the cell refused.
     pub refused: Option<RejectedCounts>,
-    /// Its place in the tree.
+    /// The place of the cell in the tree.
     pub tree: Option<Tree>,
-    /// The neighbours at its ports.
+    /// The neighbours at the ports of the cell.
     pub ports: Option<Ports>,
 }
 
@@ -58,23 +58,23 @@ impl Pages {
     }
 }
 
-/// The effect of a packet on a cell's state.
+/// The effect of a received packet on the state of its cell.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Update {
-    /// Its meaning as a heartbeat, if it is one.
+    /// The meaning of the packet as a heartbeat, if it is one.
     pub word: Option<HeartbeatKind>,
-    /// True if the cell was dead before.
+    /// True if the cell counted as dead before the packet.
     pub revived: bool,
     /// True for the cell's first heartbeat after the bus was lost, if it has not restarted since.
     pub returned: bool,
-    /// True if an apparent start was taken back, so that the earlier account continues.
+    /// True if the packet proves that the cell's last start was not one, so that the earlier account continues.
     pub taken_back: bool,
 }
 
-/// One cell, followed by the packets of its node id.
+/// The state of one cell, from the packets with its node id.
 #[derive(Clone, Debug, Default)]
 pub struct CellTracker {
-    /// Packets sent and arrived.
+    /// Counts of packets that the cell sent and that arrived.
     pub account: Account,
     claim: AddressClaim,
     pages: Pages,
@@ -83,7 +83,7 @@ pub struct CellTracker {
 }
 
 impl CellTracker {
-    /// Records a packet that arrived at `at`; `joints` is the number of the newest joints.
+    /// Records a packet that arrived at `at`, and returns its effect; `joints` is the number of the newest joints.
     pub fn receive(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> Update {
         let is_first = self.last_packet.replace(at).is_none();
         let revived = core::mem::take(&mut self.dead);
@@ -125,25 +125,25 @@ impl CellTracker {
         Update { word: Some(word), revived, returned, taken_back }
     }
 
-    /// Returns the claim: the owner of the node id, and its last heartbeat.
+    /// Returns the owner of the node id, and its last heartbeat.
     #[must_use]
     pub const fn claim(&self) -> &AddressClaim {
         &self.claim
     }
 
-    /// Returns its last pages since it started.
+    /// Returns the last page of each kind since the cell started.
     #[must_use]
     pub const fn pages(&self) -> &Pages {
         &self.pages
     }
 
-    /// Returns the arrival time of its last packet.
+    /// Returns the arrival time of the cell's last packet.
     #[must_use]
     pub const fn last_packet(&self) -> Option<Micros> {
         self.last_packet
     }
 
-    /// Handles the timeout of a silent cell; returns true if it has just expired.
+    /// Handles the timeout of a silent cell. Returns true if the cell counts as dead from this call on.
     pub fn falls_silent(&mut self, now: Micros) -> bool {
         let silent = self.is_silent(now);
         let falls = silent && !self.dead;
@@ -151,13 +151,13 @@ impl CellTracker {
         falls
     }
 
-    /// Returns true if it is dead: it was found silent, and has sent nothing since.
+    /// Returns true if the cell counts as dead: its timeout has expired, and it has sent nothing since.
     #[must_use]
     pub const fn is_dead(&self) -> bool {
         self.dead
     }
 
-    /// Returns true if it has sent packets, and then was silent for too long.
+    /// Returns true if the cell has sent packets and has then been silent for longer than [`DEAD_AFTER`].
     #[must_use]
     pub fn is_silent(&self, now: Micros) -> bool {
         self.last_packet.is_some_and(|last| now.elapsed_since(last) > DEAD_AFTER)

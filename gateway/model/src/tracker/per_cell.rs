@@ -24,7 +24,7 @@ impl<T> PerCell<T> {
         self.0.get_mut(cell.index())
     }
 
-    /// Returns the values of the cells that an addressee names, by node id.
+    /// Returns the values of the cells that an addressee stands for: one cell, or all.
     pub fn named(&mut self, to: Node) -> &mut [T] {
         let places = match to {
             Node::Gateway => 0..0,

@@ -1,32 +1,33 @@
-//! Packets sent by a cell's own counter, compared with received packets.
+//! Counts the packets that a cell sent, by its own counter, and those that arrived.
 
 use derive_more::{Add, Sum};
 
-/// Packets of one cell, as of its last heartbeat: sent = delivered + rejected + unheard + lost - surplus.
+/// Counts of one cell's packets as of its last heartbeat: sent = delivered + rejected + unheard + lost - surplus.
 #[derive(Add, Clone, Copy, Debug, Default, Eq, PartialEq, Sum)]
 pub struct Uplink {
     /// Packets sent, by the cell's own count.
     pub sent: u64,
-    /// Packets that arrived and were understood.
+    /// Packets that arrived and were decoded.
     pub delivered: u64,
-    /// Packets that arrived and were refused.
+    /// Packets that arrived and were refused as damaged or unknown.
     pub rejected: u64,
     /// Packets that were sent and never arrived.
     pub lost: u64,
-    /// Lost packets while the bus was lost.
+    /// Lost packets from the time in which the bus was lost; `lost` includes them.
     pub outage: u64,
-    /// Packets that arrived more often than sent: repeated on the way, or sent by another cell with this node id.
+    /// Packets that arrived in excess of those sent: repeated on the way, or sent by another cell with this node id.
     pub surplus: u64,
-    /// Heartbeats of other senders among the surplus: of a cell that claims this node id, or repeated old ones.
+    /// Heartbeats from other senders, included in `surplus`: from a cell that claims this node id, or repeated old
+    /// ones.
     pub outsiders: u64,
-    /// Packets that cannot be compared with a count: before a cell's first heartbeat, and between its last one and a
-    /// restart. The cell may have sent more then.
+    /// Packets that no count of the cell covers: before its first heartbeat, and between its last heartbeat and a
+    /// restart. The cell may have sent more packets then.
     pub in_doubt: u64,
     /// Restarts of the cell.
     pub restarts: u32,
-    /// Packets that never arrived because they were sums for another cell, which the gateway does not receive.
+    /// Sums for another cell, which the cell sent and the gateway does not receive.
     pub unheard: u64,
-    /// Packets since the last heartbeat; for a dead cell, its last known packets.
+    /// Packets that arrived since the last heartbeat; for a dead cell, the last that arrived from it.
     pub unsettled: u64,
 }
 
@@ -37,17 +38,17 @@ pub struct Uplink {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Account {
     now: Counts,
-    /// The counts without the last start; for [`Account::take_back`].
+    /// The counts before the cell's last start; [`Account::take_back`] restores them.
     before: Option<Counts>,
 }
 
-/// An account, and the state that its next heartbeat is compared with.
+/// The counts of a cell since its last start, and what its next heartbeat is compared with.
 #[derive(Clone, Copy, Debug, Default)]
 struct Counts {
     total: Uplink,
-    /// Number of packets sent up to the last heartbeat, modulo 2^16.
+    /// The cell's counter of sent packets in its last heartbeat, modulo 2^16.
     reported: Option<u16>,
-    /// Number of packets since then, and of those refused among them.
+    /// Number of packets that arrived since the last heartbeat, and of those refused among them.
     arrived: u64,
     rejected: u64,
     sums: Option<UnreceivedSums>,
@@ -55,40 +56,40 @@ struct Counts {
     interrupted: bool,
 }
 
-/// Sums that a cell sends to another cell, by its own count; the gateway does not receive them.
+/// The sums that a cell sends to another cell, by its own count. The gateway does not receive them.
 #[derive(Clone, Copy, Debug, Default)]
 struct UnreceivedSums {
-    /// The count in its last page, modulo 2^16.
+    /// The count in the cell's last page, modulo 2^16.
     reported: Option<u16>,
     /// Number of sums since the account began.
     count: u64,
-    /// Number of sums among them that account for missing packets.
+    /// Number of these sums that explain packets missing at the gateway.
     found: u64,
-    /// The numbers of the newest joints at its last page and at its last heartbeat. Sums in between are not counted
-    /// yet.
+    /// The number of the newest joints at the cell's last page, and in the next field at its last heartbeat. Sums sent
+    /// between the two are not counted yet.
     page_at: Option<u64>,
     heartbeat_at: Option<u64>,
 }
 
 impl Account {
-    /// Returns the figures so far.
+    /// Returns the counts so far.
     #[must_use]
     pub const fn uplink(&self) -> Uplink {
         Uplink { unsettled: self.now.arrived, ..self.now.total }
     }
 
-    /// Records a lost bus: packets of the cell do not arrive until its next heartbeat.
+    /// Records that the bus was lost: packets of the cell do not arrive until its next heartbeat.
     pub fn interrupt(&mut self) {
         self.each(|counts| counts.interrupted = true);
     }
 
-    /// Returns true if the bus was lost since the cell's last heartbeat, so that the cell may still be off it.
+    /// Returns true if the bus was lost since the cell's last heartbeat, so that the cell may still be disconnected.
     #[must_use]
     pub const fn is_interrupted(&self) -> bool {
         self.now.interrupted
     }
 
-    /// Counts a packet.
+    /// Counts a packet that arrived.
     pub(super) fn arrive(&mut self) {
         self.each(|counts| counts.arrived += 1);
     }
@@ -119,13 +120,13 @@ impl Account {
         }
     }
 
-    /// Ends the account: attributes missing packets to sums that the gateway does not receive.
+    /// Ends the counting: missing packets are attributed to sums that the gateway does not receive.
     pub fn finish(&mut self) {
         self.now.finish();
     }
 
-    /// Records the first heartbeat since a start; the cell had sent `sent` packets before it, modulo 2^16. `again` if
-    /// the cell was present before.
+    /// Records the first heartbeat since a start. The cell had sent `sent` packets before it, modulo 2^16; `again` is
+    /// true if the cell was present before the start.
     pub(super) fn begin(&mut self, sent: u16, again: bool) {
         if again {
             self.before.get_or_insert(self.now);
@@ -140,7 +141,7 @@ impl Account {
         self.now.settle(sent);
     }
 
-    /// Records an old heartbeat of the cell since its last start.
+    /// Records a heartbeat that is older than the last one, since the cell's last start.
     pub(super) fn pass_over(&mut self) {
         self.before.iter_mut().for_each(Counts::count_outsider);
     }
@@ -150,8 +151,8 @@ impl Account {
         self.before = None;
     }
 
-    /// Records a heartbeat that continues the account before the last start, and so disproves that start. Returns true
-    /// if the earlier account is known.
+    /// Records a heartbeat that continues the counts from before the last start, and so disproves that start. Returns
+    /// true if the earlier counts are known.
     pub(super) fn take_back(&mut self, sent: u16) -> bool {
         let before = self.before.take();
         match before {

@@ -1,11 +1,12 @@
-//! Writes the section on benches over their cells.
+//! Writes the section on benches of up to ten thousand cells.
 
 use super::{ACTIVE_SHARE, BenchFigures, MIN_IN_TIME_SHARE, Scale, SizeFigures, cells_of};
 use crate::distributed::{self, TickTimes};
 use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table, number};
 
-/// The limits: of the start in s, of the gateway's memory in MB, and of the distributed tick relative to that of the
-/// fewest cells, on their own buses and on as many as the most have.
+/// The limits for the verdicts: the time to start in s, the gateway's memory in MB, and the time of a tick with the
+/// most cells. The latter is relative to a tick with the fewest cells, on their own buses and on as many as the most
+/// cells need.
 const START_S: f64 = 10.0;
 const MEMORY_MB: f64 = 200.0;
 const TICK: f64 = 4.0;
@@ -37,10 +38,10 @@ pub fn section(measured: &Scale) -> Section {
         .tables([table(sizes)])
 }
 
-/// The caption of a curve, and its value.
+/// The caption of a curve, and the function that returns its value for a bench.
 type Curve<'a> = (&'a str, fn(&SizeFigures) -> f64);
 
-/// Returns a figure of benches over their cells, with a series for each pair of a caption and a value.
+/// Returns a figure over the number of cells, with one curve for each element of the array.
 fn drawn<const N: usize>(
     (name, title): (&str, &str),
     y: Axis,
@@ -125,7 +126,7 @@ fn over_cells(over: &TickTimes) -> Figure {
         .draw("distributed: the whole tick", Shape::Points, micros(|point| point[1]))
 }
 
-/// Returns the findings on the bench with the most cells.
+/// Returns the findings on the bench with the largest number of cells.
 fn of_most(size: &SizeFigures) -> Vec<Finding> {
     let SizeFigures { cells, hz, holds, quiet, active, .. } = size;
     let of = |what: &str| format!("{what}, {cells} cells");
@@ -146,7 +147,7 @@ fn of_most(size: &SizeFigures) -> Vec<Finding> {
     ]
 }
 
-/// Compares the tick of the most cells with that of the fewest.
+/// Compares the time of a tick with the most cells with that of a tick with the fewest.
 fn of_ticks(sizes: &[SizeFigures], [few, few_on_as_many, most]: &[f64; 3]) -> Vec<Finding> {
     let (Some(fewest), Some(largest)) = (sizes.first(), sizes.last()) else { return Vec::new() };
     let (cells, buses, fewest_cells) = (largest.cells, largest.buses, fewest.cells);

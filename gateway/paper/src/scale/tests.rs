@@ -1,4 +1,4 @@
-//! Tests of the choice of benches and of the evaluation of their summaries.
+//! Tests which benches the experiment runs, and how it evaluates their summaries.
 
 use std::cell::Cell;
 
@@ -10,7 +10,8 @@ use model::scenario::Scenario;
 use protocol::skin::Skin;
 use serde_json::json;
 
-/// A lab whose benches reply in time up to a number of replies per second. It records the benches.
+/// A lab that makes up the results of benches: up to a number of replies per second, all are in time. It stores which
+/// benches were requested.
 struct Made {
     most: f64,
     ran: Vec<ScaleBench>,
@@ -39,7 +40,7 @@ impl Lab for Made {
     }
 }
 
-/// Returns a summary; half of the replies of a bench that is too large are late.
+/// Returns the summary of a bench. If `in_time` is false, half of the replies are late.
 pub(crate) fn summary(bench: &ScaleBench, in_time: bool) -> Value {
     let due = if bench.active { count(share(bench.cells)) * bench.hz } else { 0.0 };
     let bus = json!({

@@ -33,7 +33,7 @@ const EXCHANGE: &str = include_str!("../../../../protocol/tests/golden/exchange.
 const WIRE: &str = include_str!("../../../../protocol/tests/golden/wire.log");
 const ARITHMETIC: &str = include_str!("../../../../protocol/tests/golden/arithmetic.json");
 
-/// Converts each frame of a log and its description.
+/// Converts each frame of a log, with its JSON description, by `tell`.
 fn said<T>(log: &str, tell: impl Fn(&Record<'_>, Map<String, Value>) -> T) -> Vec<T> {
     let mut all = Vec::new();
     for line in log.lines() {
@@ -67,7 +67,7 @@ fn session(record: &Record<'_>, says: Map<String, Value>) -> Value {
     json!({ "from": from, "fd": record.frame.to_string(), "kind": says["kind"] })
 }
 
-/// Returns the frames of a log with the comment above each, and the title above that.
+/// Returns the frames of a log, each with the last title and the last comment above it.
 fn commented(log: &str) -> impl Iterator<Item = (&str, &str, Record<'_>)> {
     let (mut title, mut comment) = ("", "");
     log.lines().filter_map(move |line| {
@@ -81,7 +81,7 @@ fn commented(log: &str) -> impl Iterator<Item = (&str, &str, Record<'_>)> {
     })
 }
 
-/// Returns segments in the order and at the times of their arrival, and the outcome of each.
+/// Returns segments in the order of their arrival, each with its time and with the outcome of reassembly.
 fn reassembly() -> Vec<Value> {
     let rows = commented(REASSEMBLY).map(|(title, comment, record)| {
         let outcome = match comment.split_once(' ') {
@@ -118,7 +118,7 @@ fn exchanges() -> Vec<Value> {
     rows
 }
 
-/// Returns messages over wires with their contents; refused ones have an error.
+/// Returns messages over wires, each with its contents, or with an error if it is refused.
 fn wires() -> Vec<Value> {
     let row = |(_, meaning, record): (&str, &str, Record<'_>)| json!({ "frame": record.frame.to_string(), "meaning": meaning });
     commented(WIRE).map(row).collect()
@@ -148,7 +148,7 @@ fn torques() -> Vec<Value> {
     arm::cases().map(row).collect()
 }
 
-/// Returns the text of the file, with each element of an array on its own line.
+/// Returns the text of `vectors.json`, with each element of an array on its own line.
 fn file() -> String {
     let about = "Frames as candump and cansend write them; docs/reference/protocol.md says what they mean, and cell.md what a cell \
                  does. packets: frames and what they say. refused: frames that are none. reassembly: segments in their order, and \

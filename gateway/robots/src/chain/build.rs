@@ -1,4 +1,4 @@
-//! Builds a chain from a URDF.
+//! Construction of a chain from a URDF.
 
 use core::f64::consts::PI;
 use std::collections::BTreeMap;
@@ -14,7 +14,8 @@ use crate::residual::{self, Residual};
 use crate::rows::{self, Axis, MAX_LENGTH_M, MAX_RESIDUAL, DhRow, frames};
 use crate::urdf::{UrdfJointKind, Urdf, UrdfJoint};
 
-/// Builds a chain, or returns the reason why it cannot be built.
+/// Builds the chain from a root link (by default that of the robot) to a tip link. Returns the reason if it cannot be
+/// built.
 pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<UrdfChain, RobotError> {
     let root = urdf.index(root.unwrap_or_else(|| urdf.root()))?;
     let path = path(urdf, root, urdf.index(tip)?)?;
@@ -27,7 +28,7 @@ pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<UrdfCh
     })
 }
 
-/// Builds a chain in which each fixed row must save at least `row_cost`, in m.
+/// Builds the chain. A fixed row is added only if it shortens the rows by at least `row_cost`, in m.
 fn with_rows(
     urdf: &Urdf,
     root: usize,
@@ -73,7 +74,7 @@ fn with_rows(
     Ok(chain)
 }
 
-/// Returns the moving joints of the path.
+/// Returns the joints of the path that move, with their limits.
 fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec<ChainJoint>, RobotError> {
     let mut joints = Vec::new();
     for joint in path {
@@ -105,7 +106,7 @@ fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec
     }
 }
 
-/// Returns frame 0 and the rows.
+/// Returns frame 0 and the Denavit-Hartenberg rows of a path.
 fn table(
     urdf: &Urdf,
     path: &[&UrdfJoint],
@@ -152,7 +153,8 @@ fn table(
     Ok((base, rows))
 }
 
-/// Returns the links that move with the chain, those of the path first, and the reasons why the others do not.
+/// Returns the links that move with the chain, those of the path first. Also returns all other links, each with the
+/// reason why it does not.
 fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<CarriedLink>, Vec<(String, NotCarried)>) {
     // The values are the number of moving joints before the link, and its fixed transform after them.
     let (mut count, mut fixed) = (0, Isometry3::identity());
@@ -193,7 +195,7 @@ fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<CarriedLink>, 
     (hanging, apart)
 }
 
-/// Returns the position of a link on the chain.
+/// Returns the row that carries a link, and the transform from the frame of that row to the link.
 fn carrier(
     rows: &[DhRow],
     at_zero: &[Isometry3<f64>],

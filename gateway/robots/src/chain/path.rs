@@ -1,4 +1,4 @@
-//! The path of a chain in its URDF, and the links fixed to it.
+//! The path of a chain through its URDF, and the links that are fixed to the path.
 
 use nalgebra::Isometry3;
 use protocol::skin::JointKind;
@@ -10,9 +10,9 @@ use crate::urdf::{UrdfJointKind, Urdf, UrdfJoint};
 pub(crate) struct CarriedLink {
     /// The name of the link.
     pub(crate) link: String,
-    /// The number of moving joints of the chain before it.
+    /// Number of moving joints of the chain between the root and this link.
     pub(crate) joint: usize,
-    /// The constant transform from the link after that joint (or the root) to this one.
+    /// The constant transform to this link from the link directly after the last of these joints, or from the root.
     pub(crate) fixed: Isometry3<f64>,
 }
 
@@ -35,7 +35,7 @@ pub(super) fn path(urdf: &Urdf, root: usize, tip: usize) -> Result<Vec<&UrdfJoin
     Err(urdf.error(RobotProblem::NotBelow { tip, root, path: names.join(" > ") }))
 }
 
-/// Returns the motion of a joint on a path; `None` if it is fixed.
+/// Returns the kind of a joint on a path; `None` if the joint is fixed.
 pub(super) fn moves(joint: &UrdfJoint) -> Option<JointKind> {
     match joint.kind {
         UrdfJointKind::Revolute | UrdfJointKind::Continuous => Some(JointKind::Revolute),
@@ -44,8 +44,8 @@ pub(super) fn moves(joint: &UrdfJoint) -> Option<JointKind> {
     }
 }
 
-/// Returns the frames of the links directly after the moving joints of the path, in the root's coordinates. Joints
-/// without a position are at zero.
+/// Returns the frame of the link directly after each moving joint of the path, in the coordinates of the root. Joints
+/// without a value in `positions` are at zero.
 pub(crate) fn behind(path: &[&UrdfJoint], positions: &[f64]) -> Vec<Isometry3<f64>> {
     let mut positions = positions.iter();
     let mut pose = Isometry3::identity();

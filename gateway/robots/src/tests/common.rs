@@ -1,4 +1,4 @@
-//! Helpers of the tests. Torques and differences are computed without the crate's own code where that matters.
+//! Helpers of the tests. Where tests check the crate's results, torques and differences are computed without its code.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -6,14 +6,15 @@ use std::path::PathBuf;
 use crate::{UrdfChain, RowKind};
 use nalgebra::{Isometry3, Point3, Vector3};
 
-/// Returns the folder of example-robot-data, from the environment.
+/// Returns the folder of the package example-robot-data, from the environment variable `SKINBUS_ROBOTS`.
 pub(crate) fn folder() -> PathBuf {
     let folder = std::env::var_os("SKINBUS_ROBOTS");
     PathBuf::from(folder.expect("SKINBUS_ROBOTS is the folder `robots` of example-robot-data"))
 }
 
-/// Returns the torque of each joint in Nm, or its force in N, for a contact with `force` newtons against `normal` at
-/// `point`, both in a link's frame: the transposed Jacobian, from rows.
+/// Returns the torque of each joint in Nm, or the force in N, that a contact with `force` newtons causes. The contact
+/// acts against `normal` at `point`, both in the frame of a link. The torques follow from the transposed Jacobian of
+/// the rows.
 pub(crate) fn torques(
     chain: &UrdfChain,
     link: &str,
@@ -42,13 +43,14 @@ pub(crate) fn torques(
     all
 }
 
-/// Returns the greater of the distance in m and the difference of the rotation matrices.
+/// Returns the difference between two frames: the greater of the distance in m and the difference of the rotation
+/// matrices.
 pub(crate) fn difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
     let turn = one.rotation.to_rotation_matrix().matrix() - other.rotation.to_rotation_matrix().matrix();
     (one.translation.vector - other.translation.vector).norm().max(turn.norm())
 }
 
-/// Returns a function from the name of a joint to its position.
+/// Returns a function that returns the position of a joint, given the name of the joint.
 pub(crate) fn named<'a>(chain: &'a UrdfChain, positions: &[f64]) -> impl Fn(&str) -> f64 + use<'a> {
     let names = chain.joints.iter().map(|joint| joint.name.as_str());
     let all: BTreeMap<_, _> = names.zip(positions.to_vec()).collect();

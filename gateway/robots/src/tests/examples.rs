@@ -1,4 +1,4 @@
-//! The robots in `gateway/examples`.
+//! Tests of the robots in `gateway/examples`.
 
 use std::fs;
 
@@ -31,13 +31,13 @@ fn chain(xml: &str, tip: &str) -> UrdfChain {
     chain
 }
 
-/// Returns the maximum distance of the tip from an axis.
+/// Returns the reach of the tip in m: its maximum distance from the joints that move it.
 fn far(chain: &UrdfChain) -> f64 {
     let place = chain.link(&chain.tip).unwrap();
     reach(&chain.chain_rows()[..place.row], place.frame.translation.vector.into())
 }
 
-/// Returns the position of the tip.
+/// Returns the position of the tip with the joints at these positions, in m.
 fn at(chain: &UrdfChain, positions: &[f64]) -> Point3<f64> {
     let place = chain.link(&chain.tip).unwrap();
     chain.frames(positions)[place.row] * place.frame * Point3::origin()

@@ -1,5 +1,5 @@
-//! Robots of other authors. Needs `pip install example-robot-data==6.0.0`; `SKINBUS_ROBOTS` is its folder
-//! `cmeel.prefix/share/example-robot-data/robots`.
+//! Tests with the robots of other authors. They need `pip install example-robot-data==6.0.0`; the environment variable
+//! `SKINBUS_ROBOTS` is the folder `cmeel.prefix/share/example-robot-data/robots` of this package.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -11,7 +11,7 @@ use protocol::skin::reach;
 
 use super::common::{folder, torques};
 
-/// Returns the URDF files in a folder and below, in order.
+/// Returns the URDF files in a folder and its subfolders, sorted.
 fn files(folder: &Path) -> Vec<PathBuf> {
     let mut found = Vec::new();
     for entry in fs::read_dir(folder).unwrap() {
@@ -30,7 +30,7 @@ fn read(path: &Path) -> Result<Urdf, RobotError> {
     Urdf::parse(&path.display().to_string(), &fs::read_to_string(path).unwrap())
 }
 
-/// Returns one word for a refusal.
+/// Returns one word that stands for a problem.
 fn word(problem: &RobotProblem) -> &'static str {
     let words = [
         (matches!(problem, RobotProblem::Mimic { .. }), "mimic"),

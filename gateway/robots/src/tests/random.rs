@@ -1,4 +1,4 @@
-//! Compares the rows of random chains with kinematics that is computed here with matrices.
+//! Compares the rows of random chains with kinematics that the tests compute with matrices.
 
 use core::f64::consts::{FRAC_PI_2, PI};
 
@@ -10,7 +10,7 @@ use protocol::skin::reach;
 use super::common::torques;
 use super::written::{FIVE_DIGITS, TWELVE_DIGITS, Written, robot};
 
-/// The maximum difference of rows, in m or rad, or in Nm for a force of 1 N.
+/// Maximum difference between rows and matrices, in m or rad, or in Nm for a force of 1 N.
 const ERROR: f64 = 5e-11;
 
 fn angle() -> impl Strategy<Value = f64> {
@@ -57,7 +57,7 @@ fn chains() -> impl Strategy<Value = Vec<(Written, [f64; 2])>> {
     proptest::collection::vec(written(), 1..=14)
 }
 
-/// Returns the transform from a joint's parent to its child.
+/// Returns the transform from the parent of a joint to its child, with the joint at this position.
 fn step(joint: &Written, position: f64) -> Matrix4<f64> {
     let [roll, pitch, yaw] = joint.rpy;
     let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), yaw)

@@ -1,4 +1,4 @@
-//! Files with unusual but valid contents, which must be read correctly.
+//! Tests with files whose contents are unusual but valid, and must be read correctly.
 
 use core::f64::consts::PI;
 

@@ -1,4 +1,4 @@
-//! Refused files and chains, and their error messages.
+//! Tests of files and chains that are rejected, and of their error messages.
 
 use crate::{CellOnLink, UrdfChain, SkinImport, Urdf};
 
@@ -8,7 +8,7 @@ fn parse(xml: &str) -> String {
     Urdf::parse("t.urdf", xml).unwrap_err().to_string()
 }
 
-/// Returns the error of the chain from the root to this tip.
+/// Returns the error for the chain from the root to this tip.
 fn chain(xml: &str, tip: &str) -> String {
     Urdf::parse("t.urdf", xml).unwrap().chain(None, tip).unwrap_err().to_string()
 }
@@ -17,7 +17,7 @@ fn good(xml: &str, tip: &str) -> UrdfChain {
     Urdf::parse("t.urdf", xml).unwrap().chain(None, tip).unwrap()
 }
 
-/// Returns links `a` and `b`, and a joint between them.
+/// Returns a URDF with links `a` and `b` and a joint of this type between them.
 fn joined(kind: &str, inner: &str) -> String {
     wrap(&format!(
         "<link name=\"a\"/>\n<link name=\"b\"/>\n<joint name=\"j\" type=\"{kind}\"><parent link=\"a\"/><child link=\"b\"/>{inner}</joint>\n"

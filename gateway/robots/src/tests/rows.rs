@@ -1,4 +1,4 @@
-//! Rows of hand-written chains.
+//! Tests of the rows of hand-written chains.
 
 use core::f64::consts::{FRAC_PI_2, PI};
 

@@ -1,15 +1,15 @@
-//! URDF files written by the tests.
+//! URDF files that the tests write.
 
 use core::f64::consts::FRAC_PI_2;
 use core::fmt::Write;
 
-/// Pi / 2 as in many files, 1.57079632679.
+/// Pi / 2 as written in many files: 1.57079632679.
 pub(crate) const TWELVE_DIGITS: f64 = FRAC_PI_2 - 4.9e-12;
 
-/// Pi / 2 as in other files, 1.5708.
+/// Pi / 2 as written in other files: 1.5708.
 pub(crate) const FIVE_DIGITS: f64 = FRAC_PI_2 + 3.673_205e-6;
 
-/// A joint of a chain.
+/// A joint of a chain in a written URDF.
 #[derive(Clone, Debug)]
 pub(crate) struct Written {
     pub(crate) kind: &'static str,
@@ -20,7 +20,7 @@ pub(crate) struct Written {
 }
 
 impl Written {
-    /// Returns a revolute joint about z, with limits of 1 rad.
+    /// Returns a revolute joint about z with limits of -1 and 1 rad.
     pub(crate) fn hinge(xyz: [f64; 3], rpy: [f64; 3]) -> Self {
         Self { kind: "revolute", xyz, rpy, axis: [0.0, 0.0, 1.0], limits: [-1.0, 1.0] }
     }

@@ -1,4 +1,4 @@
-//! The URDF that is written for a skin's rows has the kinematics of the rows.
+//! Tests that the URDF written for a skin has the same kinematics as the rows of the skin.
 
 use crate::{SkinImport, Isometry3, DhRow, Urdf, frames, pose_of, written};
 use protocol::skin::Skin;
@@ -13,12 +13,13 @@ fn imported(file: &str, tips: &[&str]) -> Skin {
     Skin::parse("skin.toml", &import.toml().unwrap()).unwrap()
 }
 
-/// Returns the difference of two poses, in m plus rad.
+/// Returns the difference between two poses: the distance in m plus the angle in rad.
 fn apart(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
     (one.translation.vector - other.translation.vector).norm() + one.rotation.angle_to(&other.rotation)
 }
 
-/// Compares the poses of all chains, with the joints at several positions within their limits.
+/// Writes the URDF of a skin and compares the poses of all its chains at several joint positions within the limits.
+/// Returns the URDF.
 fn check(skin: &Skin) -> Urdf {
     let text = written(skin);
     let urdf = Urdf::parse("robot.urdf", &text.xml).unwrap_or_else(|error| panic!("{error}\n{}", text.xml));

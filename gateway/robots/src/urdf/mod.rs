@@ -1,4 +1,4 @@
-//! A URDF file: links, joints, shapes, and its own kinematics.
+//! A URDF file: links, joints and shapes, and the kinematics of the file itself.
 
 mod read;
 mod shape;
@@ -13,55 +13,55 @@ use crate::nearest::nearest;
 pub use shape::{Geometry, Shape};
 pub use xml::text;
 
-/// A checked URDF: its links form one tree, and each joint moves one of them.
+/// A checked URDF. Its links form one tree, and each joint moves one link.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Urdf {
     /// The name of the file, as it was given.
     pub file: String,
     /// The name of the robot; empty if it has none.
     pub name: String,
-    /// The links in the file's order.
+    /// The links, in the order of the file.
     links: Vec<UrdfLink>,
-    /// The joints in the file's order.
+    /// The joints, in the order of the file.
     joints: Vec<UrdfJoint>,
     /// The index of the link without a parent.
     root: usize,
 }
 
-/// The shapes of a link. The error of a faulty shape is kept until the shapes are used.
+/// The shapes of a link. If one of them is invalid, this is the error, which is returned only when the shapes are used.
 type Shapes = Result<Vec<Shape>, RobotError>;
 
-/// A link.
+/// A link of the robot.
 #[derive(Clone, Debug, PartialEq)]
 struct UrdfLink {
     name: String,
     visuals: Shapes,
     collisions: Shapes,
-    /// The index of the joint that moves it.
+    /// Index of the joint that moves the link; `None` for the root.
     parent: Option<usize>,
 }
 
-/// A joint.
+/// A joint of the robot, of any type.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct UrdfJoint {
     pub(crate) name: String,
     pub(crate) kind: UrdfJointKind,
-    /// The index of its parent link.
+    /// Index of the parent link.
     pub(crate) parent: usize,
-    /// The index of the link that it moves.
+    /// Index of the child link, which the joint moves.
     pub(crate) child: usize,
-    /// The transform from the parent to the child at position zero.
+    /// The transform from the parent to the child, with the joint at position zero.
     pub(crate) origin: Isometry3<f64>,
-    /// The axis in the child's coordinates; z for a joint without one.
+    /// The axis in the coordinates of the child; z if the file gives none.
     pub(crate) axis: Unit<Vector3<f64>>,
-    /// The lower and upper limit in rad or m, as written; zero if the file gives none.
+    /// The lower and upper limit in rad or m, as in the file; a missing limit is zero.
     pub(crate) limits: [f64; 2],
-    /// True if the file has a `limit` element with at least one of them.
+    /// True if the file has a `limit` element with a lower or an upper limit.
     pub(crate) has_limit: bool,
-    /// The maximum speed in rad/s or m/s, as written.
+    /// The maximum speed in rad/s or m/s, as in the file.
     pub(crate) velocity: Option<f64>,
     pub(crate) mimic: Option<Mimic>,
-    /// The line in the file.
+    /// Line of the joint in the file.
     pub(crate) line: u32,
 }
 
@@ -76,7 +76,7 @@ pub(crate) enum UrdfJointKind {
     Planar,
 }
 
-/// The joint that another one follows.
+/// The joint that another joint mimics, with factor and offset.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Mimic {
     pub(crate) joint: String,
@@ -85,8 +85,8 @@ pub(crate) struct Mimic {
 }
 
 impl UrdfJoint {
-    /// Returns the transform from the parent to the child with the joint at this position in rad or m. Floating and
-    /// planar joints stay at their origin.
+    /// Returns the transform from the parent to the child, with the joint at this position in rad or m. The position
+    /// has no effect on floating and planar joints.
     pub(crate) fn transform(&self, position: f64) -> Isometry3<f64> {
         match self.kind {
             UrdfJointKind::Revolute | UrdfJointKind::Continuous => {
@@ -97,14 +97,14 @@ impl UrdfJoint {
         }
     }
 
-    /// Returns the name of the joint; `None` if it is fixed.
+    /// Returns the name of the joint if it moves; `None` if it is fixed.
     pub(crate) fn moving_name(&self) -> Option<String> {
         (self.kind != UrdfJointKind::Fixed).then(|| self.name.clone())
     }
 }
 
 impl Urdf {
-    /// Parses the text of a file; `file` is its name in errors. [`text`] decodes bytes.
+    /// Parses the text of a file. `file` names the file in errors. [`text`] decodes bytes to text.
     ///
     /// # Errors
     /// Returns [`RobotError`] if the text is not XML or not a URDF, if a value is not allowed, or if the links do not
@@ -119,12 +119,12 @@ impl Urdf {
         self.link_name(self.root)
     }
 
-    /// Returns the names of the links, in the file's order.
+    /// Returns the names of the links, in the order of the file.
     pub fn links(&self) -> impl Iterator<Item = &str> {
         self.links.iter().map(|link| link.name.as_str())
     }
 
-    /// Returns the links without joints on them, which are the ends of the tree, in the file's order.
+    /// Returns the links that no joint has as its parent: the ends of the tree, in the order of the file.
     pub fn leaves(&self) -> impl Iterator<Item = &str> {
         let is_leaf = |index: &usize| self.joints.iter().all(|joint| joint.parent != *index);
         let indices = (0..self.links.len()).filter(is_leaf);
@@ -134,7 +134,7 @@ impl Urdf {
     /// Returns the visual shapes of a link.
     ///
     /// # Errors
-    /// Returns [`RobotError`] if the link does not exist, or if one of its shapes is faulty.
+    /// Returns [`RobotError`] if the link does not exist, or if one of its shapes is invalid.
     pub fn visuals(&self, link: &str) -> Result<&[Shape], RobotError> {
         self.link(link)?.1.visuals.as_deref().map_err(Clone::clone)
     }
@@ -142,12 +142,12 @@ impl Urdf {
     /// Returns the collision shapes of a link.
     ///
     /// # Errors
-    /// Returns [`RobotError`] if the link does not exist, or if one of its shapes is faulty.
+    /// Returns [`RobotError`] if the link does not exist, or if one of its shapes is invalid.
     pub fn collisions(&self, link: &str) -> Result<&[Shape], RobotError> {
         self.link(link)?.1.collisions.as_deref().map_err(Clone::clone)
     }
 
-    /// Returns the parent of a link; `None` for the root and for a link that does not exist.
+    /// Returns the name of a link's parent; `None` for the root and for a link that does not exist.
     #[must_use]
     pub fn parent(&self, link: &str) -> Option<&str> {
         let (index, _) = self.link(link).ok()?;
@@ -165,9 +165,9 @@ impl Urdf {
         if limited && !(lower <= 0.0 && 0.0 <= upper) && middle.is_finite() { middle } else { 0.0 }
     }
 
-    /// Returns a link's frame in the root's coordinates, by the file's own kinematics. `position` returns each joint's
-    /// position in rad or m by its name; it is not called for joints that mimic others. Floating and planar joints stay
-    /// at their origin.
+    /// Returns the frame of a link in the coordinates of the root, by the kinematics of the file. `position` returns
+    /// the position of the joint with the given name in rad or m. It is not called for joints that mimic others, nor
+    /// does it affect floating and planar joints.
     ///
     /// # Errors
     /// Returns [`RobotError`] if the link does not exist.
@@ -182,7 +182,7 @@ impl Urdf {
         Ok(self.above(index).map(transform).fold(Isometry3::identity(), |pose, joint| joint * pose))
     }
 
-    /// Returns a link and its index.
+    /// Returns a link and its index, by its name.
     fn link(&self, name: &str) -> Result<(usize, &UrdfLink), RobotError> {
         let found = self.links.iter().enumerate().find(|(_, link)| link.name == name);
         found.ok_or_else(|| {
@@ -190,33 +190,33 @@ impl Urdf {
         })
     }
 
-    /// Returns the joints, in the file's order.
+    /// Returns the joints, in the order of the file.
     pub(crate) fn joints(&self) -> &[UrdfJoint] {
         &self.joints
     }
 
-    /// Returns the index of a link.
+    /// Returns the index of the link with this name.
     pub(crate) fn index(&self, link: &str) -> Result<usize, RobotError> {
         Ok(self.link(link)?.0)
     }
 
-    /// Returns the name of a link.
+    /// Returns the name of the link with this index.
     pub(crate) fn link_name(&self, index: usize) -> &str {
         self.links.get(index).map_or("", |link| &link.name)
     }
 
-    /// Returns the joints from a link up to the root.
+    /// Returns the joints between a link and the root, beginning with the joint that moves the link.
     pub(crate) fn above(&self, link: usize) -> impl Iterator<Item = &UrdfJoint> {
         let up = move |link: usize| self.joints.get(self.links.get(link)?.parent?);
         core::iter::successors(up(link), move |joint| up(joint.parent))
     }
 
-    /// Creates an error without a line.
+    /// Creates an error in this file without a line.
     pub(crate) fn error(&self, problem: RobotProblem) -> RobotError {
         RobotError::new(&self.file, None, problem)
     }
 
-    /// Creates an error at a joint.
+    /// Creates an error in this file at the line of a joint.
     pub(crate) fn error_at(&self, joint: &UrdfJoint, problem: RobotProblem) -> RobotError {
         RobotError::new(&self.file, Some(joint.line), problem)
     }

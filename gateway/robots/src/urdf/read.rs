@@ -1,4 +1,4 @@
-//! Parses the text of a URDF.
+//! The parser for the text of a URDF.
 
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 use roxmltree::{Document, Node};
@@ -8,10 +8,10 @@ use super::tree::{self, UnlinkedJoint, LinkWithLine};
 use super::{UrdfJointKind, UrdfLink, Mimic, Shapes, Urdf, UrdfJoint, xml};
 use crate::error::{RobotProblem, RobotError};
 
-/// The minimum length of an axis that has a direction.
+/// Minimum length of an axis vector. A shorter one has no direction.
 const SHORTEST_AXIS: f64 = 1e-6;
 
-/// Parses a file.
+/// Parses the text of a URDF file.
 pub(super) fn read(file: &str, xml: &str) -> Result<Urdf, RobotError> {
     let prepared = xml::prepared(file, xml)?;
     let document = xml::parsed(file, &prepared)?;
@@ -19,13 +19,13 @@ pub(super) fn read(file: &str, xml: &str) -> Result<Urdf, RobotError> {
     UrdfParser { file, document: &document, lines_before: prepared.lines_before, breaks }.robot()
 }
 
-/// The state of parsing a file.
+/// The state of the parser.
 struct UrdfParser<'a> {
     file: &'a str,
     document: &'a Document<'a>,
-    /// The number of lines before the document.
+    /// Number of lines of the file before the XML document.
     lines_before: usize,
-    /// The offsets of the document's line ends.
+    /// Byte offsets of the line ends in the document.
     breaks: Vec<usize>,
 }
 
@@ -52,7 +52,8 @@ impl<'a> UrdfParser<'a> {
         tree::grow(self.file, name, links, joints)
     }
 
-    /// Refuses elements and expressions that xacro would have replaced. Unused definitions are accepted.
+    /// Returns an error if the file contains elements or expressions that xacro should have replaced. Unused
+    /// definitions are accepted.
     fn refuse_xacro(&self, robot: Node<'a, 'a>) -> Result<(), RobotError> {
         // Only the prefix is decisive: files bind it to arbitrary namespaces, and many bind it without using it.
         let is_xacro = |node: &Node<'a, 'a>| self.source(node).starts_with("<xacro:");
@@ -95,7 +96,7 @@ impl<'a> UrdfParser<'a> {
         Ok((UrdfLink { name, visuals, collisions, parent: None }, self.line(node)))
     }
 
-    /// Parses a shape; returns `None` if it has no geometry.
+    /// Parses a visual or collision shape; returns `None` if it has no geometry.
     fn shape(&self, node: Node<'a, 'a>, thing: &str) -> Result<Option<Shape>, RobotError> {
         let origin = self.origin(node, thing)?;
         let geometry = self.child(node, "geometry").and_then(|node| node.first_element_child());
@@ -203,7 +204,7 @@ impl<'a> UrdfParser<'a> {
         Ok(Isometry3::from_parts(Translation3::new(x, y, z), turn))
     }
 
-    /// Returns direct children in the robot's namespace.
+    /// Returns the direct children of an element that have this name and the robot's namespace.
     fn children(&self, node: Node<'a, 'a>, name: &'static str) -> impl Iterator<Item = Node<'a, 'a>> {
         let namespace = self.document.root_element().tag_name().namespace();
         node.children().filter(move |child| {
@@ -211,19 +212,19 @@ impl<'a> UrdfParser<'a> {
         })
     }
 
-    /// Returns the first child of this name.
+    /// Returns the first direct child of an element that has this name.
     fn child(&self, node: Node<'a, 'a>, name: &'static str) -> Option<Node<'a, 'a>> {
         self.children(node, name).next()
     }
 
-    /// Returns a required attribute.
+    /// Returns the value of a required attribute.
     fn text(&self, node: Node<'a, 'a>, thing: &str, attribute: &'static str) -> Result<String, RobotError> {
         let text = node.attribute(attribute).map(str::trim).filter(|text| !text.is_empty());
         let missing = || RobotProblem::Missing { thing: thing.to_owned(), missing: attribute };
         text.map(str::to_owned).ok_or_else(|| self.error(node, missing()))
     }
 
-    /// Parses an optional attribute of `N` finite numbers.
+    /// Parses an optional attribute that consists of `N` finite numbers.
     fn numbers<const N: usize>(
         &self,
         node: Node<'a, 'a>,
@@ -237,7 +238,7 @@ impl<'a> UrdfParser<'a> {
         numbers.map(Some).ok_or_else(|| self.value(node, thing, attribute, text, allowed))
     }
 
-    /// Parses an optional attribute of one number, which may be infinite.
+    /// Parses an optional attribute that is one number, possibly infinite.
     fn any_number(
         &self,
         node: Node<'a, 'a>,
@@ -250,8 +251,8 @@ impl<'a> UrdfParser<'a> {
         number.map(Some).ok_or_else(|| self.value(node, thing, attribute, text, allowed))
     }
 
-    /// Creates the error for a value that is not allowed. If the value contains a xacro expression, the error names
-    /// that.
+    /// Creates the error for a value that is not allowed. If the value contains a xacro expression, the error is about
+    /// the expression.
     fn value(
         &self,
         node: Node<'a, 'a>,
@@ -287,7 +288,7 @@ impl<'a> UrdfParser<'a> {
     }
 }
 
-/// Returns the first xacro expression in a value, as it is written.
+/// Returns the first xacro expression in a value, as it is written; `None` if it contains none.
 fn expression(value: &str) -> Option<&str> {
     let begin = [value.find("${"), value.find("$(")].into_iter().flatten().min()?;
     let rest = value.get(begin..)?;

@@ -1,4 +1,4 @@
-//! Connects links and joints to a tree.
+//! Connection of links and joints to a tree.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -6,20 +6,20 @@ use super::{UrdfLink, Urdf, UrdfJoint};
 use crate::error::{RobotProblem, RobotError};
 use crate::nearest::nearest;
 
-/// A joint whose links are still names.
+/// A joint that is not connected yet: its links are given by name.
 pub(super) struct UnlinkedJoint {
-    /// The joint; its parent and child are not yet set.
+    /// The joint. The indices of its parent and child are not set yet.
     pub(super) joint: UrdfJoint,
     /// The name of the parent link.
     pub(super) parent: String,
-    /// The name of the link that it moves.
+    /// The name of the child link.
     pub(super) child: String,
 }
 
-/// A link and its line.
+/// A link, and its line in the file.
 pub(super) type LinkWithLine = (UrdfLink, u32);
 
-/// Connects links with joints.
+/// Connects links by joints to a tree. Returns the checked URDF.
 pub(super) fn grow(
     file: &str,
     name: String,
@@ -71,7 +71,7 @@ pub(super) fn grow(
     }
 }
 
-/// Returns a link that is its own ancestor.
+/// Returns a link that is its own ancestor; `None` if there is no cycle.
 fn cycle(urdf: &Urdf) -> Option<&UrdfLink> {
     // For each link met on a path to the root: the link from which that path began.
     let mut walked = vec![None; urdf.links.len()];

@@ -1,4 +1,4 @@
-//! Reads a file's bytes as XML, and describes errors.
+//! Decoding of a file's bytes to XML text, and descriptions of XML errors.
 
 use std::borrow::Cow;
 
@@ -8,8 +8,8 @@ use roxmltree::{Document, Error};
 
 use crate::error::{RobotProblem, RobotError};
 
-/// Decodes the bytes of a file: UTF-8, or Latin-1 or Windows-1252 if the file declares it. UTF-16 is refused, as by the
-/// parser of ROS (urdfdom), so that a robot that is imported here also loads there.
+/// Decodes the bytes of a file: UTF-8, or Latin-1 or Windows-1252 if the file declares it. UTF-16 is rejected, because
+/// the parser of ROS (urdfdom) rejects it too: a robot that is imported here also loads there.
 ///
 /// # Errors
 /// Returns [`RobotError`] if the file has another encoding, or is a placeholder for another file (a Git LFS pointer, a
@@ -59,7 +59,7 @@ fn error(file: &str, XmlFault { line, what }: XmlFault) -> RobotError {
     RobotError::new(file, line, RobotProblem::Xml(what))
 }
 
-/// Describes an error of the parser, and the action to take.
+/// Describes an error of the XML parser, and the action that the user can take.
 #[expect(clippy::wildcard_enum_match_arm, reason = "the parser's own words do for all others")]
 fn description(reason: &Error) -> String {
     let plain = |what: &str| what.to_owned();

@@ -1,4 +1,4 @@
-//! Result of the model as JSON lines and as a table.
+//! Results of the model of buses as JSON lines and as tables.
 
 use std::io::{self, Write};
 
@@ -13,7 +13,7 @@ use trace::capture::seconds_since;
 
 use crate::print::{KeyValueTable, count, harmless, comma_separated, or_else_text};
 
-/// Writes the frames that have left the model, one object per line.
+/// Writes the frames whose sending the model has computed, one object per line.
 pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {
     let mut line = Vec::with_capacity(192);
     while let Some(frame) = shadow.poll() {
@@ -43,18 +43,19 @@ fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &FrameTiming) -> io
     Ok(())
 }
 
-/// Writes seconds with nine digits, which a double cannot hold for times since 1970; much faster than `fmt`.
+/// Writes seconds with nine digits after the point. A double cannot hold that many for times since 1970, and `fmt` is
+/// much slower.
 fn seconds(line: &mut Vec<u8>, nanos: Option<u64>) {
     const NANOS: u64 = 1_000_000_000;
     let Some(nanos) = nanos else { return line.extend_from_slice(b"null") };
     let mut digits = itoa::Buffer::new();
     line.extend_from_slice(digits.format(nanos / NANOS).as_bytes());
     line.push(b'.');
-    // A leading one keeps all nine digits.
+    // Add a leading 1, which is then skipped, so that zeros at the beginning are kept.
     line.extend(digits.format(NANOS + nanos % NANOS).bytes().skip(1));
 }
 
-/// Formats the whole result as a table.
+/// Formats the result for all buses as a table.
 pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> String {
     let head = format!("{what}, {} frames", report.frames);
     let beside = if missing > 0 { format!("{missing} frames are missing in it") } else { String::new() };
@@ -95,7 +96,7 @@ fn one(rows: &mut KeyValueTable, bus: &BusShadow, report: &Report) {
     rows.any("never sent", bus.counts.no_room, "4 million frames waited already");
 }
 
-/// Rows on whether the traffic fits, in the worst case and in this run.
+/// Adds rows on whether the traffic fits on the bus, in the worst case and in this run.
 fn fit(rows: &mut KeyValueTable, bus: &BusShadow, has_times: bool) {
     match (&bus.worst_case, &bus.answering) {
         (Some(worst), _) => rows.row(worst.case(), worst.value(), worst.cells),
@@ -143,7 +144,7 @@ fn operation(rows: &mut KeyValueTable, bus: &BusShadow) {
     }
 }
 
-/// Rows on the start-up, which has no limits and no rating.
+/// Adds rows on the start-up, for which no limits apply.
 fn begin(rows: &mut KeyValueTable, bus: &BusShadow, start_up: &StartUp) {
     let beside = format!("{} frames in {:.3} s without joints", start_up.frames, start_up.duration_s);
     load(rows, bus, &start_up.load, ("start-up: average load", &beside));

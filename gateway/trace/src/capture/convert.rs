@@ -1,4 +1,4 @@
-//! Conversion of a capture from one format into the other, entry by entry.
+//! Converts a capture from a log into a recording or back, entry by entry.
 
 use std::io::{self, Write};
 
@@ -8,7 +8,7 @@ pub use super::mcap::Origin;
 use super::{CaptureError, Entry, CaptureFormat, Note, NoteKind, Reader};
 use thiserror::Error;
 
-/// A capture that is being written, in either format.
+/// The file that [`convert`] writes: a candump log or an MCAP recording.
 #[derive(Debug)]
 pub struct CaptureWriter<W: Write>(FormatWriter<W>);
 
@@ -19,7 +19,7 @@ enum FormatWriter<W: Write> {
 }
 
 impl<W: Write> CaptureWriter<W> {
-    /// Begins a capture that is converted from a log; `style` applies to candump text only.
+    /// Begins a file of the given format. `style` applies to a candump log only.
     ///
     /// # Errors
     /// Returns an error if the head of the file cannot be written.
@@ -30,7 +30,7 @@ impl<W: Write> CaptureWriter<W> {
         })
     }
 
-    /// Begins an MCAP recording.
+    /// Begins an MCAP recording that notes `origin`, the source that it is converted from.
     ///
     /// # Errors
     /// Returns an error if the head of the file cannot be written.
@@ -38,7 +38,7 @@ impl<W: Write> CaptureWriter<W> {
         Ok(Self(FormatWriter::Mcap(Box::new(McapWriter::new(out, origin)?))))
     }
 
-    /// Writes an entry.
+    /// Writes an entry. Returns which of the entry's information the format could not hold.
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
@@ -49,7 +49,7 @@ impl<W: Write> CaptureWriter<W> {
         }
     }
 
-    /// Flushes buffered lines of a log. A recording is left alone: it is written in chunks.
+    /// Flushes the lines that a log has buffered. Does nothing for a recording, which is written in chunks.
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
@@ -60,7 +60,7 @@ impl<W: Write> CaptureWriter<W> {
         }
     }
 
-    /// Flushes everything written so far, so that it can be read from the output whatever happens afterwards.
+    /// Flushes everything written so far. It can then be read even if the program is killed.
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
@@ -71,7 +71,7 @@ impl<W: Write> CaptureWriter<W> {
         }
     }
 
-    /// Writes what is buffered, and the end of the file.
+    /// Writes the buffered entries and the end of the file.
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
@@ -83,15 +83,15 @@ impl<W: Write> CaptureWriter<W> {
     }
 }
 
-/// The destination of [`convert`].
+/// The side of [`convert`] that entries are written to.
 pub trait EntrySink {
-    /// Writes an entry.
+    /// Writes an entry. Returns which of the entry's information the output could not hold.
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
     fn write(&mut self, entry: &Entry<'_>) -> io::Result<WriteOutcome>;
 
-    /// Flushes buffered lines.
+    /// Flushes the buffered lines.
     ///
     /// # Errors
     /// Returns an error if the output cannot be written.
@@ -108,10 +108,11 @@ impl<W: Write> EntrySink for CaptureWriter<W> {
     }
 }
 
-/// Counts of frames that lost information in candump text, by the kind of information.
+/// Counts of frames that lost information when they were written as candump text. A frame that lost two kinds of
+/// information counts twice.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct LossCounts {
-    /// Frames whose time lost digits.
+    /// Frames whose time has fewer digits in the log.
     pub digits: u64,
     /// Frames that lost their direction.
     pub direction: u64,
@@ -121,28 +122,28 @@ pub struct LossCounts {
     pub name: u64,
 }
 
-/// The counts of a conversion.
+/// Counts of the entries that a conversion read and wrote.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ConversionCounts {
     /// Frames written.
     pub frames: u64,
-    /// Other lines and texts written.
+    /// Notes written: comments and other lines between frames.
     pub notes: u64,
     /// Lines that begin like a frame but cannot be parsed.
     pub unreadable: u64,
-    /// Messages that do not match their type.
+    /// Messages of a recording whose bytes do not match their message type.
     pub unreadable_messages: u64,
-    /// CAN XL frames, kept as text.
+    /// CAN XL frames, which are copied as text and not decoded.
     pub can_xl: u64,
-    /// Frames that the recorder of the capture lost.
+    /// Frames that were lost when the capture was recorded, by its own notes.
     pub dropped: u64,
-    /// Frames whose line holds less than the capture.
+    /// Frames that lost information because a line of candump text cannot hold it.
     pub shortened: LossCounts,
-    /// Notes that the output cannot hold.
+    /// Notes left out because the output format cannot hold them.
     pub omitted: u64,
 }
 
-/// The error of a conversion that ended early.
+/// An error that ends a conversion early.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ConvertError {
@@ -152,13 +153,13 @@ pub enum ConvertError {
     /// The output cannot be written.
     #[error(transparent)]
     Write(io::Error),
-    /// An entry is unreadable, and the caller allows none.
+    /// An entry is unreadable, and the caller's `unreadable` refused to skip it.
     #[error("{0}")]
     Strict(String),
 }
 
-/// Copies all entries in their order. `unreadable` is called for each line or message that is not a frame; an error
-/// from it stops the conversion.
+/// Copies all entries from a reader to a target, in their order. Calls `unreadable` for each line or message that
+/// should be a frame but cannot be parsed; an error returned by `unreadable` stops the conversion.
 ///
 /// # Errors
 /// Returns [`ConvertError`] if either side fails, or if `unreadable` returns an error.

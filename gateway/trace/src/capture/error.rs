@@ -20,20 +20,20 @@ pub enum CaptureError {
         /// The cause.
         source: io::Error,
     },
-    /// Several files are not the parts of one recording.
+    /// Several files were named that are not the parts of one recording.
     #[error(transparent)]
     Parts(#[from] PartsError),
-    /// The first bytes belong to another format.
+    /// The file begins with the magic bytes of another format.
     #[error("{name} is {what}, and no candump log or MCAP recording: {hint}")]
     Other {
         /// The name of the capture.
         name: String,
         /// The format, such as `a gzip file`.
         what: &'static str,
-        /// The action to take.
+        /// Advice to the user, such as how to convert the file.
         hint: &'static str,
     },
-    /// The rest of the file is damaged.
+    /// The file is damaged after some entries that could be read.
     #[error(
         "{name} is damaged: {what}; {entries} frames and notes before that were read; `skinbus recover` copies the \
          intact part to a new file"
@@ -41,15 +41,15 @@ pub enum CaptureError {
     Damaged {
         /// The name of the capture.
         name: String,
-        /// The damage.
+        /// The kind of damage.
         what: FormatError,
-        /// The number of entries before the damage.
+        /// The number of entries that were read before the damage.
         entries: u64,
     },
 }
 
 impl ReadFault {
-    /// Converts the fault into an error of the file `name`, of which `entries` have been read.
+    /// Adds to the fault the `name` of the file and the number of `entries` read from it before the fault.
     pub(super) fn into_capture_error(self, name: &str, entries: u64) -> CaptureError {
         let name = name.to_owned();
         match self {

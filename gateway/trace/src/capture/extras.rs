@@ -1,4 +1,4 @@
-//! The contents of a recording other than frames and notes.
+//! Attachments, metadata and other topics of a recording: everything except its frames and notes.
 
 use std::collections::BTreeMap;
 
@@ -7,22 +7,23 @@ use protocol::document::DocumentError;
 use protocol::skin::Skin;
 use serde::Serialize;
 
-/// The contents of an MCAP recording other than frames and notes, as far as it has been read.
+/// Attachments, metadata and other topics of an MCAP recording. A recording that is still being read may hold more of
+/// them.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RecordingExtras {
     /// Topics that hold neither frames nor notes, in the order of their first messages.
     pub topics: Vec<Topic>,
-    /// Earlier frames that are latched when the recording begins.
+    /// Frames that were sent before the recording began and were still latched by the cells then.
     pub latched: Vec<LatchedFrame>,
     /// Attachments by name. The largest are listed without their bytes.
     pub attachments: Vec<(String, Vec<u8>)>,
     /// Metadata records by name.
     pub metadata: Vec<(String, Vec<(String, String)>)>,
-    /// A description of the missing end, if the recording was never finished.
+    /// A description of what is missing at the end of the file; `None` if the recording was finished.
     pub unfinished: Option<String>,
 }
 
-/// The name of the metadata record that holds the start of a run's loop.
+/// The name of the metadata record that holds the time of a run's first tick.
 pub const RUN_METADATA: &str = "run";
 /// The key of the first tick's time in [`RUN`], in ns since 1970.
 const BEGAN: &str = "began_ns";
@@ -33,7 +34,8 @@ pub fn facts_of_run(nanos: u64) -> BTreeMap<String, String> {
     [(BEGAN.to_owned(), nanos.to_string())].into()
 }
 
-/// Returns the seconds from `zero` to `nanos`, both in ns since 1970; negative if `nanos` is earlier.
+/// Returns the time from `zero` to `nanos` in s, both given in ns since 1970. The result is negative if `nanos` is
+/// earlier.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "to a nanosecond within three months")]
 pub const fn seconds_since(zero: u64, nanos: u64) -> f64 {
@@ -44,7 +46,7 @@ pub const fn seconds_since(zero: u64, nanos: u64) -> f64 {
 pub const SKIN_ATTACHMENT: &str = "skin.toml";
 
 impl RecordingExtras {
-    /// The empty contents.
+    /// An empty set of extras, for captures that have none.
     pub(super) const NONE: &Self = &Self {
         topics: Vec::new(),
         latched: Vec::new(),
@@ -60,9 +62,9 @@ impl RecordingExtras {
         facts.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
     }
 
-    /// Returns the time of the run's first tick, in ns since 1970. Seconds of the run count from it, or from the
-    /// capture's first frame if it is unknown. An input that is read only once has it after the first frame at the
-    /// earliest.
+    /// Returns the time of the run's first tick, in ns since 1970. Times that are given in seconds of the run count
+    /// from it. If the recording does not store it, this is the time of the capture's first frame. For an input that
+    /// can be read only once, such as a pipe, it is known only after the first frame has been read.
     #[must_use]
     pub fn run_began(&self) -> Option<u64> {
         self.fact(RUN_METADATA, BEGAN)?.parse().ok()
@@ -79,12 +81,12 @@ impl RecordingExtras {
     }
 }
 
-/// A frame that was sent before a recording began and is still latched.
+/// A frame that was sent before the recording began and that the cells still obey, such as a configuration.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LatchedFrame {
     /// The bus of the frame.
     pub bus: String,
-    /// True if the recorder had sent it.
+    /// True if the recorder's own program had sent the frame.
     pub own: bool,
     /// The frame.
     pub frame: Frame,

@@ -9,12 +9,12 @@ use ::mcap::records::op;
 use super::text_kinds::ASC;
 use crate::container::{self, read_some};
 
-/// The length in bytes of a file's beginning that must contain the header record of a recording.
+/// The number of bytes at a file's beginning within which the header record of a recording must end.
 const BEGINNING: usize = 4 << 10;
 const UNPACK: &str = "unpack it first";
 const EXPORT: &str = "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can)";
 
-/// First bytes of known formats. Everything else is text.
+/// The first bytes of known formats. Everything else is treated as text.
 const MAGIC: &[(&[u8], InputFormat)] = &[
     (b"\x89MCAP", InputFormat::Mcap),
     (b"PK\x03\x04", InputFormat::Other("a zip archive", UNPACK)),
@@ -78,17 +78,17 @@ const PCAP: InputFormat = InputFormat::Other(
 const UTF_16: InputFormat =
     InputFormat::Other("text in UTF-16", "save it as UTF-8, as with `iconv -f utf-16 -t utf-8 FILE > NEW.log`");
 
-/// The format of an input.
+/// The format of an input, by its first bytes.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum InputFormat {
     Text,
     Mcap,
-    /// The name of the other format, and the action to take.
+    /// A format that is not read, by its name, with advice to the user.
     Other(&'static str, &'static str),
 }
 
-/// Recognises the format of an input and returns the bytes that were read. Reads as few bytes as necessary, so that a
-/// pipe whose first line is slow does not block longer than needed.
+/// Recognises the format of an input, and returns it with the bytes that were read for it. Reads as few bytes as
+/// necessary, so that a pipe whose first line arrives slowly does not block longer than needed.
 pub(super) fn detect_format(input: &mut impl Read) -> io::Result<(InputFormat, Vec<u8>)> {
     let mut head = Vec::new();
     let longest = MAGIC.iter().map(|(magic, _)| magic.len()).max().unwrap_or(0);
@@ -110,7 +110,7 @@ pub(super) fn detect_format(input: &mut impl Read) -> io::Result<(InputFormat, V
     }
 }
 
-/// Returns true if the first or the last bytes are those of an MCAP recording, and rewinds the file.
+/// Returns true if the file begins or ends with the magic bytes of MCAP. Rewinds the file.
 pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
     let (kind, _) = detect_format(file)?;
     if kind == InputFormat::Mcap {
@@ -125,7 +125,8 @@ pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
         file.read_exact_at(&mut last, size - container::MAGIC.len() as u64)?;
     }
     file.rewind()?;
-    // Some bytes of one magic, or all bytes of the other, may be damaged.
+    // A damaged recording is recognised by intact magic bytes at its end, by most of those at its beginning, or by a
+    // header record after them.
     let alike = first.iter().zip(container::MAGIC).filter(|(one, other)| one == other).count();
     Ok(last == *container::MAGIC
         || alike > container::MAGIC.len() / 2
@@ -167,7 +168,7 @@ mod tests {
             InputFormat::Other(_, hint) => hint,
             kind @ (InputFormat::Text | InputFormat::Mcap) => panic!("{kind:?}"),
         };
-        // can_logconvert writes an empty log for an ASC header of other programs.
+        // can_logconvert reads an ASC file with the header of other programs as empty, so asc2log is advised.
         assert!(hint(b"date Mon Dec 6 11:21:13 am 2021\n").contains("asc2log"));
         assert!(hint(b"MDF     4.11").contains("python-can[mf4]"));
         assert!(hint(b"LOGG").contains("can_logconvert FILE NEW.log"));
@@ -176,7 +177,7 @@ mod tests {
 
     #[test]
     fn of_a_pipe_no_more_is_taken_than_tells_what_it_is() {
-        /// Returns its bytes one by one, and panics if the reader asks for more.
+        /// A reader that returns its bytes one by one, and panics if more are requested.
         struct Slow(&'static [u8]);
         impl Read for Slow {
             fn read(&mut self, room: &mut [u8]) -> io::Result<usize> {

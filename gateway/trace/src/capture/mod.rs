@@ -39,7 +39,7 @@ use std::io::Read;
 
 use protocol::candump::Record;
 
-/// A wrapper around each opened file, such as a progress meter.
+/// A function that wraps each opened file, for example to show the progress of reading.
 pub type FileWrapper = Box<dyn Fn(File) -> Box<dyn Read + Send> + Send>;
 
 /// The format of a capture.
@@ -54,9 +54,9 @@ pub enum CaptureFormat {
 /// One entry of a capture.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Entry<'a> {
-    /// A frame.
+    /// A CAN frame.
     Frame(Record<'a>),
-    /// Anything else that has a position between frames.
+    /// A comment, a report of lost frames, or another line between frames.
     Note(Note<'a>),
 }
 
@@ -72,11 +72,11 @@ pub enum Item<'a> {
 /// A message that is neither a frame nor a note.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct OtherMessage<'a> {
-    /// The topic.
+    /// The topic of the message.
     pub topic: &'a str,
     /// The type of the message.
     pub schema: &'a str,
-    /// The time, in ns since 1970.
+    /// The time of the message, in ns since 1970.
     pub nanos: u64,
     /// The encoded message.
     pub message: &'a [u8],

@@ -5,8 +5,9 @@
 //! ```
 //!
 //! Each part stores its number and the identity of its recording. The order of `run*.mcap`, as a shell expands it, is
-//! corrected by these, whatever the names of the files. Logs, and recordings that other programs split, are ordered by
-//! their first frames.
+//! Each part stores its number and the start of its recording, so the parts are sorted whatever their names are; a
+//! shell expands `run*.mcap` in another order. Logs, and recordings that other programs split, are sorted by the times
+//! of their first frames.
 
 use std::collections::HashSet;
 use std::fs;
@@ -16,7 +17,7 @@ use thiserror::Error;
 
 use super::{RecordingExtras, CaptureFormat};
 
-/// The error for files that are not the parts of one recording.
+/// An error in a list of files that is to be read as one recording or capture.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum PartsError {
@@ -31,12 +32,12 @@ pub enum PartsError {
         /// The other file.
         other: PathBuf,
     },
-    /// The files are of both formats.
+    /// The list contains both a log and a recording.
     #[error("{} is a candump log, and {} an MCAP recording: convert it to a log first with `skinbus convert`", .log.display(), .mcap.display())]
     Formats {
-        /// A log.
+        /// The log.
         log: PathBuf,
-        /// A recording.
+        /// The recording.
         mcap: PathBuf,
     },
     /// One file is text without frames.
@@ -45,7 +46,7 @@ pub enum PartsError {
     /// One file is listed twice.
     #[error("{} is named twice: name it once", .0.display())]
     Same(PathBuf),
-    /// Standard input cannot be one of several files.
+    /// Standard input (`-`) is listed together with other files.
     #[error("- is standard input, which cannot be one of several files: name only files")]
     StandardInput,
     /// Two parts belong to different recordings.
@@ -59,7 +60,7 @@ pub enum PartsError {
         /// The other part.
         other: RecordingPart,
     },
-    /// Two files are the same part.
+    /// Two files have the same part number of the same recording.
     #[error(
         "{} and {} are both part {} of the recording: name one of them",
         .one.path.display(), .other.path.display(), .one.number
@@ -83,45 +84,45 @@ pub enum PartsError {
     },
 }
 
-/// The number of a part, and the recording that it belongs to.
+/// The identity of a part: its file, its number and its recording.
 #[derive(Clone, Debug)]
 pub struct RecordingPart {
     path: PathBuf,
-    /// The start of the recording, in ns since 1970. It identifies the recording.
+    /// The start of the recording, in ns since 1970 as text. All parts of a recording have the same start.
     began: String,
     number: u32,
 }
 
 impl RecordingPart {
-    /// Reads the identity from the metadata of the file; `None` if the file is not a part.
+    /// Reads the identity of a part from the metadata of its file. Returns `None` if the file is not a part.
     fn of(path: &Path, extras: &RecordingExtras) -> Option<Self> {
         let (began, number) = extras.fact("program", "began_ns").zip(extras.fact("part", "number"))?;
         Some(Self { path: path.to_owned(), began: began.to_owned(), number: number.parse().ok()? })
     }
 }
 
-/// One of several files, with the facts that decide its position.
+/// A file of a list, with the information by which the list is sorted.
 #[derive(Debug)]
 pub(super) struct CaptureFile {
     pub(super) path: PathBuf,
     pub(super) format: CaptureFormat,
     part: Option<RecordingPart>,
-    /// The time of its first frame, in ns since 1970.
+    /// The time of the file's first frame, in ns since 1970.
     first: Option<u64>,
-    /// True if it has lines and no frame.
+    /// True if the file has lines but no frame.
     is_text: bool,
 }
 
 impl CaptureFile {
-    /// Describes a file. `lines` counts its lines up to the first frame; it is 0 for a recording.
+    /// Creates the entry for a file. `lines` is the number of lines up to the first frame; 0 for a recording.
     pub(super) fn new(path: &Path, extras: &RecordingExtras, format: CaptureFormat, first: Option<u64>, lines: u64) -> Self {
         let (part, is_text) = (RecordingPart::of(path, extras), first.is_none() && lines > 0);
         Self { path: path.to_owned(), format, part, first, is_text }
     }
 }
 
-/// Returns the files in the order in which they are read: parts of one recording by their numbers, others by the times
-/// of their first frames.
+/// Returns the files in the order in which they are read. Parts of one recording are sorted by part number, other files
+/// by the times of their first frames.
 ///
 /// # Errors
 /// Returns [`PartsError`] if the files are not one capture.
@@ -173,7 +174,7 @@ fn ordered(mut parts: Vec<RecordingPart>) -> Result<Vec<PathBuf>, PartsError> {
     Ok(parts.into_iter().map(|part| part.path).collect())
 }
 
-/// Returns a common name for several files.
+/// Returns a title for several files, which names the first and the last.
 pub(super) fn title(paths: &[PathBuf]) -> String {
     match paths {
         [] => String::new(),

@@ -1,22 +1,22 @@
-//! Positions in a capture at which a reader can continue.
+//! Positions in a capture from which a reader can continue.
 
 use std::path::{Path, PathBuf};
 
 use super::log::Clock;
 use super::mcap::{ReadFault, McapState};
 
-/// The position of an entry in a capture.
+/// A position in a capture, directly before an entry.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct SeekPoint {
-    /// The index of the part.
+    /// The index of the file among the parts of the capture.
     pub(super) part: usize,
     /// The byte offset of the record or line in its part.
     pub(super) offset: u64,
-    /// The number of lines before it, if they were counted.
+    /// The number of lines before this position in a log; 0 if they were not counted.
     pub(super) line: u64,
-    /// The number of entries before it in the same record.
+    /// The number of messages of the record at `offset` that come before this position.
     pub(super) skip: u32,
-    /// The clock of a log at this position.
+    /// The state of the log's clock at this position.
     pub(super) clock: Clock,
 }
 
@@ -24,8 +24,8 @@ pub struct SeekPoint {
 #[derive(Debug)]
 pub struct SeekIndex {
     pub(super) parts: Vec<IndexedFile>,
-    /// The positions in their order, each with the latest time of all entries before the next position, in ns since
-    /// 1970.
+    /// The positions in ascending order. The time with each is the latest one of all entries before the next position,
+    /// in ns since 1970.
     pub(super) marks: Vec<(u64, SeekPoint)>,
     /// The minimum distance between two positions of a file, in bytes.
     pub(super) piece: u64,
@@ -34,7 +34,7 @@ pub struct SeekIndex {
 #[derive(Debug)]
 pub(super) struct IndexedFile {
     pub(super) path: PathBuf,
-    /// Records of the summary that describe the messages: operation codes and contents.
+    /// Schema and channel records of the summary: operation code and contents of each.
     pub(super) descriptions: Vec<(u8, Vec<u8>)>,
 }
 
@@ -45,7 +45,7 @@ impl SeekIndex {
         self.marks.last().map_or(0, |(latest, _)| *latest)
     }
 
-    /// Returns the last position that has only entries earlier than `nanos` before it.
+    /// Returns the last indexed position before which all entries are earlier than `nanos`, in ns since 1970.
     #[must_use]
     pub fn before(&self, nanos: u64) -> SeekPoint {
         let at = self.marks.partition_point(|(latest, _)| *latest < nanos);
@@ -56,12 +56,12 @@ impl SeekIndex {
         self.parts.get(part).map(|part| part.path.as_path())
     }
 
-    /// Returns the files of the parts after `part`.
+    /// Returns the files after the one with the index `part`.
     pub(super) fn behind(&self, part: usize) -> impl Iterator<Item = &PathBuf> {
         self.parts.iter().skip(part + 1).map(|part| &part.path)
     }
 
-    /// Passes the message descriptions of a part to the state of a reader.
+    /// Passes the schemas and channels of a part to the state of a reader.
     pub(super) fn describe(&self, part: usize, state: &mut McapState) -> Result<(), ReadFault> {
         for (opcode, body) in self.parts.get(part).into_iter().flat_map(|part| &part.descriptions) {
             state.process(*opcode, body, false)?;

@@ -1,5 +1,4 @@
-//! Builds the index of positions at which a reader can continue, so that a time is found without reading everything
-//! before it.
+//! Builds an index of positions in a capture. With it a reader can go to a time without reading everything before it.
 //!
 //! ```text
 //! MCAP:  heads of chunks ─────────────────┐
@@ -21,16 +20,15 @@ use super::{CaptureError, Entry, Reader};
 use crate::container::{MAX_DESCRIPTION_BYTES, MAGIC, find};
 use crate::order::WINDOW_NS;
 
-/// The minimum distance between two positions of a file, in bytes.
+/// The minimum distance between two indexed positions of a file, in bytes.
 const MIN_DISTANCE_BYTES: u64 = 64 << 10;
-/// The maximum size of the descriptions that are kept for a part, in bytes.
+/// The maximum size of the schema and channel records that are stored for a part, in bytes.
 const DESCRIPTIONS: usize = 16 << 20;
-/// The length of a log's end in which its last frame is searched, in bytes.
+/// The number of bytes at the end of a log that are searched for its last frame.
 const END: u64 = 4 * LONGEST_LINE as u64;
 
 impl SeekIndex {
-    /// Indexes one file, or the parts of one recording in any order. Reads only the times in each file.
-    ///
+    /// Indexes one file, or the parts of one recording given in any order. Reads only the times of the entries.
     /// # Errors
     /// Returns [`CaptureError`] if a file cannot be read or is not seekable, or if the files are not parts of one
     /// recording.
@@ -38,7 +36,7 @@ impl SeekIndex {
         Self::apart(paths, MIN_DISTANCE_BYTES)
     }
 
-    /// Indexes the files with a position every `piece` bytes.
+    /// Indexes the files with one position at least every `piece` bytes.
     fn apart(paths: &[PathBuf], piece: u64) -> Result<Self, CaptureError> {
         let mut places = Self { parts: Vec::new(), marks: Vec::new(), piece };
         for path in Reader::ordered(paths)? {
@@ -58,8 +56,8 @@ impl SeekIndex {
         if is_mcap(&mut file)? { self.add_mcap(file) } else { self.add_log(file) }
     }
 
-    /// Adds a position in the last part if it is far enough from the one before. All entries before the next position
-    /// have times up to `latest`.
+    /// Adds a position in the last part, unless it is too close to the one before. `latest` is the latest time of all
+    /// entries before the next position.
     fn mark(&mut self, place: SeekPoint, latest: u64) {
         let place = SeekPoint { part: self.parts.len() - 1, ..place };
         let latest = latest.max(self.latest());
@@ -73,7 +71,7 @@ impl SeekIndex {
 
     fn add_mcap(&mut self, file: File) -> io::Result<()> {
         const TARGET: &[u8] = &[op::CHUNK, op::MESSAGE, op::SCHEMA, op::CHANNEL, op::FOOTER];
-        // Most of the skipped data is longer than this.
+        // A small buffer suffices, because most of the skipped records are longer than it.
         let mut from = BufReader::with_capacity(4 << 10, file);
         from.seek(SeekFrom::Start(MAGIC.len() as u64))?;
         let mut described = 0;
@@ -109,8 +107,8 @@ impl SeekIndex {
         Ok(())
     }
 
-    /// Indexes one line of every piece of a log. Neighbouring lines of other buses may differ in time by the window of
-    /// the merge.
+    /// Indexes a log by one line in every piece of it. Lines of different buses may be out of order by at most the
+    /// merge window, which is added to each time.
     fn add_log(&mut self, mut file: File) -> io::Result<()> {
         let length = file.metadata()?.len();
         let mut last = SeekPoint::default();
@@ -134,7 +132,7 @@ impl SeekIndex {
         Ok(())
     }
 
-    /// Indexes a log whose times depend on all lines before them, by reading it whole.
+    /// Indexes a log by reading all of it, because its times depend on all lines before them.
     fn add_by_reading(&mut self, mut file: File) -> io::Result<()> {
         file.rewind()?;
         let part = self.parts.len() - 1;
@@ -158,7 +156,8 @@ const fn is_line_end(byte: u8) -> bool {
     matches!(byte, b'\n' | b'\r')
 }
 
-/// Returns the first frame of a log at or after `at`: the offset of its line, and its time if the line holds one.
+/// Finds the first frame of a log at or after the offset `at`. Returns the offset of the line, and the time if the line
+/// holds an absolute one.
 fn line_at(file: &mut File, at: u64) -> io::Result<Option<(u64, Option<u64>)>> {
     file.seek(SeekFrom::Start(at))?;
     let mut piece = Vec::new();

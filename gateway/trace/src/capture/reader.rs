@@ -1,4 +1,4 @@
-//! The reader of captures in either format.
+//! Reads captures, which may be candump logs or MCAP recordings.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -19,27 +19,27 @@ use super::{CaptureError, Entry, RecordingExtras, CaptureFormat, Item, FileWrapp
 
 /// Reads a capture from its beginning to its end in bounded memory. The parts of a split recording are one capture.
 pub struct Reader {
-    /// The name of the whole capture.
+    /// The name of the capture; for several files, the names of the first and the last.
     name: String,
     /// The name of the file that is being read.
     file: String,
     source: Source,
-    /// True if messages of all topics are requested.
+    /// True if messages of other topics are returned too, not only frames and notes.
     others: bool,
     entries: u64,
-    /// The index of the current part.
+    /// The index of the file that is being read.
     part: usize,
-    /// The parts that follow.
+    /// The files that follow.
     rest: VecDeque<PathBuf>,
     through: FileWrapper,
-    /// True if a part before this one has no end.
+    /// True if an earlier file has no end, because it was never finished.
     is_unfinished: bool,
-    /// The buses of other programs' frames, if they are known before the frames are read.
+    /// The bus names for frames of other programs, if they were found before reading.
     buses: ForeignBuses,
     times: TimeChecks,
-    /// The name of the file before this one, until the first frame of this one is read.
+    /// The name of the preceding file. `None` once the first frame of the current file has been read.
     before: Option<String>,
-    /// Remarks on the logs before this one.
+    /// Remarks on the logs that were read before the current file.
     remarks: Vec<Remark>,
 }
 
@@ -49,7 +49,7 @@ enum Source {
 }
 
 impl Source {
-    /// Opens a file. The attachments and metadata of a recording are known from the beginning if it is a regular file.
+    /// Opens one file. The attachments and metadata of a recording are read at once if it is a regular file.
     fn open(path: &Path, through: &FileWrapper, mut state: McapState) -> Result<(String, Self), CaptureError> {
         let name = path.display().to_string();
         let failed = |source| CaptureError::Io { name: name.clone(), source };
@@ -72,7 +72,7 @@ impl Source {
     ) -> Result<Self, CaptureError> {
         let (name, mut input) = (name.to_owned(), Box::new(input));
         match magic::detect_format(&mut input) {
-            // The first bytes of the recording are damaged; the reader reports them.
+            // The first bytes of the recording are damaged. The MCAP reader reports the damage when it reads them.
             Ok((InputFormat::Text, head)) if file.is_some() => Ok(Self::mcap(&head, input, state, file)),
             Ok((InputFormat::Text, head)) => Ok(Self::Log(LogReader::new(&head, input))),
             Ok((InputFormat::Mcap, head)) => Ok(Self::mcap(&head, input, state, file)),
@@ -85,7 +85,7 @@ impl Source {
         Self::Mcap(Box::new(McapReader::new(head, input, state, file)))
     }
 
-    /// Returns true after the last entry.
+    /// Returns true if there are no more entries in the file.
     fn is_at_its_end(&mut self, name: &str, entries: u64) -> Result<bool, CaptureError> {
         let at_its_end = match self {
             Self::Log(log) => log.is_at_its_end().map_err(ReadFault::from),
@@ -105,15 +105,15 @@ impl fmt::Debug for Reader {
 }
 
 impl Reader {
-    /// Opens a file, or standard input for the name `-`.
+    /// Opens a file as a capture. The name `-` means standard input.
     ///
     /// # Errors
-    /// Returns [`CaptureError`] if it cannot be opened or is not a capture.
+    /// Returns [`CaptureError`] if the file cannot be opened or is not a capture.
     pub fn open(path: &Path) -> Result<Self, CaptureError> {
         Self::open_all(&[path.to_owned()])
     }
 
-    /// Reads from any input; `name` is used in errors. Blocks until the first bytes show the format.
+    /// Reads a capture from any input. `name` is used in errors. Blocks until the first bytes show the format.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the input cannot be read or is not a capture.
@@ -126,8 +126,8 @@ impl Reader {
         Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), plain(), false))
     }
 
-    /// Opens one file, or several as one capture: the parts of one recording in any order, or other files, which are
-    /// read in the order of their first frames.
+    /// Opens one or more files as one capture. The parts of a recording may be given in any order; other files are read
+    /// in the order of their first frames.
     ///
     /// # Errors
     /// Returns [`CaptureError`] as [`Reader::open`] does, and if several files are not one capture.
@@ -135,7 +135,7 @@ impl Reader {
         Self::open_parts(paths, plain(), false)
     }
 
-    /// Opens a capture whose files are read through the wrapper `through`.
+    /// Opens a capture like [`Reader::open_all`], with each file wrapped by `through`.
     ///
     /// # Errors
     /// Returns [`CaptureError`] as [`Reader::open_all`] does.
@@ -143,7 +143,7 @@ impl Reader {
         Self::open_parts(paths, through, false)
     }
 
-    /// Opens a capture with the messages of all topics, which [`Reader::next_item`] returns.
+    /// Opens a capture of which messages of all topics are read. [`Reader::next_item`] returns them.
     ///
     /// # Errors
     /// Returns [`CaptureError`] as [`Reader::open_all`] does.
@@ -169,8 +169,8 @@ impl Reader {
         Ok(Self { buses, ..Self::begin(name, opened, rest, through, others) })
     }
 
-    /// Returns the buses of other programs' frames in all files; empty if they need not be known in advance. Unreadable
-    /// files are skipped here, because reading reports them.
+    /// Finds the bus names for frames of other programs in all files. They are empty if the names do not depend on
+    /// later frames. Files that cannot be read are skipped, because they are reported when they are read.
     fn survey<'a>(paths: impl Iterator<Item = &'a PathBuf> + Clone) -> ForeignBuses {
         let recording = |path: &&PathBuf| {
             let mut file = input::can_be_read_again(path).then(|| File::open(path).ok()).flatten()?;
@@ -187,7 +187,7 @@ impl Reader {
         files.fold(ForeignBuses::default(), |known, file| survey.buses_of(Box::new(file), known)).settled()
     }
 
-    /// Returns the parts of a recording in their order.
+    /// Returns the files of one capture in the order in which they are read.
     pub(super) fn ordered(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CaptureError> {
         if let [] | [_] = paths {
             return Ok(paths.to_vec());
@@ -196,7 +196,7 @@ impl Reader {
             true => Err(CaptureError::from(PartsError::StandardInput)),
             false => {
                 let mut reader = Self::open(path)?;
-                // A part holds its number before its frames.
+                // The part number is stored before the first frame, so it is known after this call.
                 let first = reader.first_time();
                 Ok(CaptureFile::new(path, reader.extras(), reader.format(), first, reader.lines()))
             }
@@ -204,7 +204,8 @@ impl Reader {
         Ok(parts::together(paths.iter().map(named).collect::<Result<_, CaptureError>>()?)?)
     }
 
-    /// Returns the time of the first frame; `None` if the capture has no readable frame.
+    /// Reads up to the first frame and returns its time, in ns since 1970. Returns `None` if the capture has no
+    /// readable frame.
     fn first_time(&mut self) -> Option<u64> {
         loop {
             match self.next() {
@@ -253,13 +254,13 @@ impl Reader {
         }
     }
 
-    /// Returns the name of the capture: that of its file, or those of its first and last part.
+    /// Returns the name of the capture: that of its file, or those of its first and last file.
     #[must_use]
     pub fn name(&self) -> &str {
         &self.name
     }
 
-    /// Opens the next part. Returns false after the last one.
+    /// Opens the next file of the capture. Returns false after the last one.
     fn go_on(&mut self) -> Result<bool, CaptureError> {
         let Some(path) = self.rest.pop_front() else { return Ok(false) };
         self.part += 1;
@@ -281,7 +282,7 @@ impl Reader {
         Ok(true)
     }
 
-    /// Returns the position of the next entry. It is useful only for seekable inputs.
+    /// Returns the position of the next entry. A reader can go back to it only if the input is seekable.
     #[must_use]
     pub const fn place(&self) -> SeekPoint {
         let (offset, skip) = match &self.source {
@@ -294,7 +295,7 @@ impl Reader {
         SeekPoint { part: self.part, offset, line: 0, skip, clock: Clock::NEW }
     }
 
-    /// Seeks to a position of the same capture; the entry there is read next.
+    /// Continues at a position of the same capture. The entry at that position is read next.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the capture cannot be read or is damaged; reading ends then.
@@ -331,7 +332,7 @@ impl Reader {
         Ok(())
     }
 
-    /// Returns the format of the current file.
+    /// Returns the format of the file that is being read.
     #[must_use]
     pub const fn format(&self) -> CaptureFormat {
         match self.source {
@@ -340,7 +341,7 @@ impl Reader {
         }
     }
 
-    /// Returns the next entry in the order of the file; `None` after the last one. Never panics.
+    /// Returns the next entry in the order of the file, or `None` after the last entry. Never panics.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the capture cannot be read or is damaged; reading ends then.
@@ -356,8 +357,8 @@ impl Reader {
         })
     }
 
-    /// Returns the next entry, or the next message of another topic if these were requested, in the order of the file;
-    /// `None` after the last one. Never panics.
+    /// Returns the next entry, in the order of the file, or `None` after the last one. Also returns messages of other
+    /// topics if the reader was opened by [`Reader::open_with_others`]. Never panics.
     ///
     /// # Errors
     /// Returns [`CaptureError`] if the capture cannot be read or is damaged; reading ends then.
@@ -381,16 +382,16 @@ impl Reader {
         Ok(next)
     }
 
-    /// Returns true if the entries are lines of a log, or were before a conversion. Other recordings also hold
-    /// information that a log leaves out, such as the direction of each frame.
+    /// Returns true if the capture is a log, or a recording that was converted from one. Other recordings hold more,
+    /// such as the direction of each frame.
     #[must_use]
     pub fn is_of_a_log(&self) -> bool {
         let (key, value) = SOURCE;
         self.format() == CaptureFormat::Candump || self.extras().fact(ORIGIN_METADATA, key) == Some(value)
     }
 
-    /// Returns the number of log lines read so far, which is the line number of the last entry; 0 for an MCAP
-    /// recording.
+    /// Returns the number of lines read so far from a log, which is the line number of the last entry. Returns 0 for an
+    /// MCAP recording.
     #[must_use]
     pub const fn lines(&self) -> u64 {
         match &self.source {
@@ -399,13 +400,13 @@ impl Reader {
         }
     }
 
-    /// Returns remarks on the times, flags and buses of the frames so far, one per line.
+    /// Returns remarks on the times, flags and buses of the frames read so far, one line each.
     #[must_use]
     pub fn remarks(&self) -> Vec<String> {
         self.times.backwards().into_iter().chain(self.remarks_beside_order()).collect()
     }
 
-    /// Returns the remarks without the one on the order of times.
+    /// Returns the remarks except the one on times that run backwards.
     #[must_use]
     pub fn remarks_beside_order(&self) -> Vec<String> {
         let shared = match &self.source {
@@ -427,13 +428,13 @@ impl Reader {
         remarks
     }
 
-    /// Returns false if lines without a time were read.
+    /// Returns false if any line so far had no time.
     #[must_use]
     pub fn has_times(&self) -> bool {
         !self.log_remarks().contains(&Remark::NoTimes)
     }
 
-    /// Recognises the kind of a text without frames by its first lines. Returns its name and the action to take.
+    /// Returns the kind of a text that has no frames, judged by its first lines, and advice to the user.
     #[must_use]
     pub fn text_kind(&self) -> Option<(&'static str, &'static str)> {
         match &self.source {
@@ -442,7 +443,7 @@ impl Reader {
         }
     }
 
-    /// Returns true if a channel so far has frames of another program's message type.
+    /// Returns true if any channel so far holds frames of another program.
     #[must_use]
     pub fn has_foreign_frames(&self) -> bool {
         match &self.source {
@@ -451,8 +452,8 @@ impl Reader {
         }
     }
 
-    /// Returns true if all data taken from the input is used up, so that the next entry may take a while. Output that
-    /// follows a live pipe is flushed then.
+    /// Returns true if the next entry requires a read from the input, which may block. The caller flushes its output
+    /// then, so that a live pipe is followed without delay.
     #[must_use]
     pub fn is_drained(&self) -> bool {
         match &self.source {
@@ -461,8 +462,8 @@ impl Reader {
         }
     }
 
-    /// Returns the contents other than frames and notes, as far as they have been read. Those before the first frame
-    /// are there from the beginning. A log has none.
+    /// Returns the attachments, metadata and other topics read so far. Those before the first frame are available from
+    /// the beginning. A log has none.
     #[must_use]
     pub fn extras(&self) -> &RecordingExtras {
         match &self.source {
@@ -472,7 +473,7 @@ impl Reader {
     }
 }
 
-/// Returns the wrapper that leaves files unchanged.
+/// Returns a wrapper that leaves files as they are.
 fn plain() -> FileWrapper {
     Box::new(|file| Box::new(file))
 }

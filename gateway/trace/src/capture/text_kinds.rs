@@ -1,17 +1,17 @@
-//! Recognition of texts without frames, by their first lines.
+//! Recognises the kind of a text that has no frames, by its first lines.
 
 const EXPORT: &str =
     "no converter of it is known here: export it as a candump log from the program that wrote it";
 pub(super) const ASC: (&str, &str) =
     ("a Vector ASC log", "write a candump log with can-utils' `asc2log -I FILE -O NEW.log`");
 
-/// The kind of a skin or scenario file.
+/// The name of the kind for skin and scenario files.
 pub const SKIN_OR_SCENARIO: &str = "a skin or a scenario";
-/// Headings of tables that occur in skins and scenarios and hardly in other files.
+/// Table headings that occur in skins and scenarios but rarely in other files.
 const TABLES: [&str; 7] =
     ["[robot]", "[[chain]]", "[[bus]]", "[[cell]]", "[motion]", "[[touch]]", "[[fault]]"];
 
-/// Returns the kind of a text and the action to take; `None` for an unknown kind.
+/// Returns the kind of a text and advice to the user, or `None` if the kind is unknown.
 pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
     let text = String::from_utf8_lossy(text);
     let lines: Vec<_> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();

@@ -1,24 +1,25 @@
-//! Checks of the times of frames: times that run backwards, and one time for all frames.
+//! Detects suspicious times of frames: times that run backwards, and captures in which all frames have the same time.
 
 use std::fmt;
 
 /// The maximum number of buses whose times are checked.
 const BUSES: usize = 64;
-/// The number of frames with one time that is not a coincidence.
+/// The number of frames with the same time from which on this is no coincidence.
 const MIN_CONSTANT_FRAMES: u64 = 3;
 
-/// Checks the times of frames, each bus by itself, because only frames of one bus have an order.
+/// Checks the times of frames. Each bus is checked separately, because frames of different buses may be recorded out of
+/// order.
 #[derive(Debug, Default)]
 pub(super) struct TimeChecks {
     buses: Vec<BusTimes>,
-    /// The index of the last frame's bus.
+    /// The index of the bus of the last frame.
     current: usize,
     frames: u64,
     latest: u64,
-    /// The number of frames that are older than the one before them on their bus, and the first of these frames,
-    /// counted from 1.
+    /// The number of frames that are older than the frame before them on their bus, and the position of the first of
+    /// these in the capture, counted from 1.
     backwards: Option<(u64, u64)>,
-    /// The names of a file that begins before the file before it ends, and of the file before it.
+    /// The names of two successive files: the later one begins before the earlier one ends.
     overlap: Option<(String, String)>,
 }
 
@@ -28,12 +29,12 @@ struct BusTimes {
     first: u64,
     last: u64,
     frames: u64,
-    /// True once two of its frames have different times.
+    /// True once two frames of the bus have different times.
     has_several: bool,
 }
 
 impl TimeChecks {
-    /// Checks the time of a bus' next frame.
+    /// Checks the time of the next frame of a bus.
     #[inline]
     pub(super) fn check(&mut self, bus: &str, nanos: u64) {
         self.frames += 1;
@@ -67,7 +68,7 @@ impl TimeChecks {
         self.latest
     }
 
-    /// Records that a file begins before the file before it ends.
+    /// Records that `file` begins at an earlier time than that at which the file `before` it ends.
     pub(super) fn overlaps(&mut self, file: &str, before: &str) {
         self.overlap.get_or_insert_with(|| (file.to_owned(), before.to_owned()));
     }
@@ -96,7 +97,7 @@ impl TimeChecks {
     }
 }
 
-/// A time that is formatted in seconds, as in a log.
+/// A time in ns that is displayed in seconds, as in a log.
 struct Seconds(u64);
 
 impl fmt::Display for Seconds {

@@ -1,4 +1,4 @@
-//! Chunks of records: decompressed, checked, and read record by record.
+//! Decompresses and checks the chunks of a file, and splits them into records.
 
 use std::fmt;
 use std::io::{self, Read};
@@ -9,27 +9,28 @@ use zstd::zstd_safe::{self, DCtx, ErrorCode, get_error_name};
 use super::field::Fields;
 use super::{FormatError, MAX_RECORD_BYTES};
 
-/// The number of bytes that a file's chunks may always decompress to in total, whatever the length of the file.
+/// The total size in bytes that the chunks of any file may decompress to, even if the file is short.
 const FREE_BYTES: u64 = 256 << 20;
-/// The number of decompressed bytes allowed in addition per byte of the file.
+/// The number of decompressed bytes that are allowed for each byte of the file, in addition to [`FREE_BYTES`].
 const BYTES_A_BYTE: u64 = 1_000;
-/// The number of records that a file's chunks may always hold in total, whatever the length of the file.
+/// The total number of records that the chunks of any file may hold, even if the file is short.
 const FREE_RECORDS: u64 = 1 << 17;
-/// The number of records allowed in addition per byte of the file. Each record should cost an index entry of 16 bytes.
+/// The number of records that are allowed for each byte of the file, in addition to [`FREE_RECORDS`]. A real recording
+/// has an index entry of 16 bytes for each record.
 const RECORDS_A_BYTE: u64 = 1;
 /// The length of a record's header in bytes: operation code and length.
 const RECORD_HEADER_BYTES: usize = 9;
 
-/// The chunk that was decompressed last. It is checked as a whole before any record is returned: its length, its
-/// checksum, and that its last record ends where it does.
+/// The chunk that was decompressed last. The whole chunk is checked before any record is returned: its length, its
+/// checksum, and that its last record ends where the chunk ends.
 #[derive(Default)]
 pub struct Chunk {
     bytes: Vec<u8>,
-    /// The offset of the next record.
+    /// The offset of the next record in the decompressed bytes.
     at: usize,
-    /// The length of the record before it.
+    /// The length of the contents of the record that was returned last.
     body: usize,
-    /// Totals of all chunks so far.
+    /// The total size of all chunks so far after decompression, in bytes.
     total_bytes: u64,
     total_records: u64,
     is_checked: bool,
@@ -46,10 +47,11 @@ impl fmt::Debug for Chunk {
 }
 
 impl Chunk {
-    /// Decompresses a chunk record; `read` is the number of bytes of the file that were read so far.
+    /// Decompresses a chunk record. `read` is the number of bytes read from the file so far, which limits the
+    /// decompressed size.
     ///
     /// # Errors
-    /// Returns [`Damage`] if anything is wrong with the chunk; it then has no records.
+    /// Returns [`Damage`] if the chunk is invalid. It then has no records.
     pub fn unpack(&mut self, record: &[u8], read: u64) -> Result<(), FormatError> {
         self.rewind();
         let unpacked = self.open(record, read);
@@ -76,7 +78,7 @@ impl Chunk {
         self.bytes.get(self.at - self.body..self.at).unwrap_or_default()
     }
 
-    /// Returns true if the current chunk has a checksum. It was correct then.
+    /// Returns true if the current chunk has a checksum. [`Chunk::unpack`] has then found it correct.
     #[must_use]
     pub const fn is_checked(&self) -> bool {
         self.is_checked
@@ -135,7 +137,8 @@ impl Chunk {
         Ok(())
     }
 
-    /// Decompresses frame by frame into one buffer, so that a frame cannot choose a window size.
+    /// Decompresses each zstd frame into the same buffer, which has the size that the chunk claims. The window size
+    /// that a frame requests is therefore not allocated.
     fn unpack_zstd(&mut self, mut packed: &[u8], claimed: u64) -> Result<(), FormatError> {
         let wrong = |code: ErrorCode| FormatError::Unpack(get_error_name(code).to_owned());
         let context = self.zstd.get_or_insert_with(DCtx::create);
@@ -144,7 +147,8 @@ impl Chunk {
             let (frame, rest) = packed.split_at_checked(frame).unwrap_or((packed, &[]));
             packed = rest;
             let room = usize::try_from(claimed).unwrap_or(0) - self.bytes.len();
-            // Reserved, untouched memory is not resident: a small chunk that claims a large size costs nothing.
+            // Memory that is reserved and not written takes no space, so a small chunk that claims a large size costs
+            // nothing.
             if self.bytes.is_empty() {
                 self.bytes.reserve_exact(room);
                 context.decompress(&mut self.bytes, frame).map_err(wrong)?;
@@ -176,7 +180,7 @@ impl Chunk {
 /// A record's operation code, its contents, and the number of bytes after it.
 type First<'a> = (u8, &'a [u8], usize);
 
-/// Splits off the first record.
+/// Splits the first record off a sequence of records.
 fn split(records: &[u8]) -> Option<Result<First<'_>, FormatError>> {
     if records.is_empty() {
         return None;
@@ -225,7 +229,7 @@ mod tests {
         let length = two.len() as u64;
         let checksum = crc32fast::hash(&two);
         let zstd = zstd::bulk::compress(&two, 1).unwrap();
-        // The data is split into two frames, with trailing bytes in one case.
+        // The data is split into two zstd frames. In one case, bytes follow the second frame.
         let (first, second) = two.split_at(7);
         let frames = [first, second].map(|part| zstd::bulk::compress(part, 1).unwrap()).concat();
         let lz4 = [first, second].map(lz4).concat();
@@ -252,7 +256,7 @@ mod tests {
         assert!(matches!(unpacked(&chunk(12, 0, "zstd", &one)), Err(FormatError::Unpack(_))));
         assert!(matches!(unpacked(&chunk(12, 0, "lz4", &one)), Err(FormatError::Unpack(_))));
         assert_eq!(unpacked(&chunk(12, 0, "br", &one)), Err(FormatError::Compression("br".to_owned())));
-        // An LZ4 frame ends with four bytes after its last block, which no chunk needs.
+        // A reader needs no more than the last block of an LZ4 frame; the four bytes after it are spare.
         for (compression, packed, spare) in
             [("zstd", zstd::bulk::compress(&one, 1).unwrap(), 0), ("lz4", lz4(&one), 4)]
         {
@@ -261,7 +265,7 @@ mod tests {
             for end in 0..whole.len() - spare {
                 let mut cut = whole[..end].to_vec();
                 assert!(unpacked(&cut).is_err(), "{compression} {end}");
-                // The truncated chunk fails too if its length field fits.
+                // The truncated chunk must also fail if its length field is adapted to the truncation.
                 if let Some((bytes, left)) = cut.split_at_mut_checked(length + 8) {
                     bytes[length..].copy_from_slice(&(left.len() as u64).to_le_bytes());
                 }

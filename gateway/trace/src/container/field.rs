@@ -1,4 +1,4 @@
-//! Decodes the fields of records.
+//! Decodes the fields of MCAP records.
 
 use std::collections::BTreeMap;
 
@@ -6,51 +6,51 @@ use mcap::records::op;
 
 use super::{FormatError, MAX_DESCRIPTION_BYTES};
 
-/// A record with the fields that readers of recordings need.
+/// A decoded record. It has only the fields that are needed to read a recording.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Record<'a> {
     /// The beginning of a file.
     Header {
-        /// The conventions that the file follows.
+        /// The profile: the conventions that the file follows, such as `ros2`.
         profile: &'a str,
-        /// The program that wrote it.
+        /// The name of the program that wrote the file.
         library: &'a str,
     },
-    /// A type of messages.
+    /// The definition of a message type.
     Schema {
         /// The number of the schema.
         id: u16,
         /// The name of the type.
         name: &'a str,
-        /// The language of its definition.
+        /// The language of the definition, such as `ros2msg`.
         encoding: &'a str,
-        /// The definition.
+        /// The definition of the type.
         data: &'a [u8],
     },
     /// A channel: a topic with a type of messages.
     Channel {
         /// The number of the channel.
         id: u16,
-        /// The number of its schema; 0 if it has none.
+        /// The number of the channel's schema; 0 if the channel has none.
         schema: u16,
         /// The name of the topic.
         topic: &'a str,
         /// The encoding of its messages.
         encoding: &'a str,
-        /// Further properties.
+        /// The metadata of the channel.
         facts: MetadataMap<'a>,
     },
     /// A message.
     Message {
-        /// The number of its channel.
+        /// The number of the message's channel.
         channel: u16,
-        /// Its sequence number in the channel.
+        /// The sequence number of the message within its channel.
         sequence: u32,
         /// The time at which it was recorded, in ns.
         log_time: u64,
         /// The time at which it was sent, in ns.
         publish_time: u64,
-        /// The encoded contents.
+        /// The encoded contents of the message.
         data: &'a [u8],
     },
     /// An attached file.
@@ -59,14 +59,14 @@ pub enum Record<'a> {
         log_time: u64,
         /// The time at which it was created, in ns.
         create_time: u64,
-        /// Its name.
+        /// The name of the attachment.
         name: &'a str,
-        /// Its media type.
+        /// The media type of the attachment.
         media_type: &'a str,
-        /// Its contents.
+        /// The contents of the attachment.
         data: &'a [u8],
     },
-    /// A named set of keys and values.
+    /// A metadata record: a name with keys and values.
     Metadata {
         /// The name.
         name: &'a str,
@@ -78,16 +78,16 @@ pub enum Record<'a> {
         /// The checksum of the summary and of the footer before this field; 0 if there is none.
         crc: u32,
     },
-    /// The end of the data section.
+    /// The end of the section that holds the messages.
     DataEnd {
-        /// The checksum of everything before it; 0 if there is none.
+        /// The checksum of all bytes before this record; 0 if there is none.
         crc: u32,
     },
     /// Any other record: an index, statistics, a chunk, or an unknown one.
     Other,
 }
 
-/// Keys and values as they stand in the file. They are complete and valid UTF-8.
+/// A map of keys to values, undecoded. It was checked to be complete and valid UTF-8.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MetadataMap<'a>(&'a [u8]);
 
@@ -111,17 +111,18 @@ impl From<MetadataMap<'_>> for BTreeMap<String, String> {
     }
 }
 
-/// A limit on the memory for names in a file, whose number and length an untrusted writer chose.
+/// The number of bytes still available for names. The limit is needed because an untrusted file may have any number of
+/// names of any length.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct NameBudget(usize);
 
 impl NameBudget {
-    /// The memory overhead of a name, in bytes.
+    /// The memory that a name takes in addition to its text, in bytes.
     pub const ENTRY_OVERHEAD: usize = 128;
     /// The maximum size of all names together, in bytes.
     const LIMIT: usize = 32 << 20;
 
-    /// Reserves room for another name of `bytes` bytes.
+    /// Counts a name of `bytes` bytes towards the limit.
     ///
     /// # Errors
     /// Returns [`Damage::Names`] if the limit is exceeded.
@@ -195,10 +196,11 @@ impl<'a> Fields<'a> {
     }
 }
 
-/// Decodes a record. Returns [`Record::Other`] for chunks, indexes and the like.
+/// Decodes a record. Chunks, indexes and statistics are returned as [`Record::Other`].
 ///
 /// # Errors
-/// Returns [`Damage`] if the record is shorter than its fields, if a description is too long, if a name is not UTF-8,
+/// Returns [`Damage`] if the record is shorter than its fields, if a schema or another description is too long, if a
+/// name is not UTF-8,
 /// or if an attachment's checksum is wrong.
 pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, FormatError> {
     let description = |record| match body.len() as u64 {

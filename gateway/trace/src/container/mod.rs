@@ -26,10 +26,10 @@ use crate::ros2::MessageError;
 
 /// The first and the last bytes of a file.
 pub const MAGIC: &[u8] = mcap::MAGIC;
-/// The longest record that is read into memory, and the maximum decompressed size of a chunk, in bytes. Chunks of
-/// skinbus have 256 KiB, those of other writers a few MiB.
+/// The maximum length of a record that is read into memory, and the maximum size of a decompressed chunk, in bytes.
+/// Chunks of skinbus have 256 KiB, and those of other programs have a few MiB.
 pub const MAX_RECORD_BYTES: u64 = 128 << 20;
-/// The longest descriptive record in bytes: a schema, a channel, metadata.
+/// The maximum length in bytes of a schema, channel or metadata record.
 pub const MAX_DESCRIPTION_BYTES: usize = 4 << 20;
 
 /// Reads the available bytes and retries if a signal interrupts the call.
@@ -46,7 +46,7 @@ pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<us
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum FormatError {
-    /// A length field leads beyond the end of its record.
+    /// A length field points beyond the end of its record.
     #[error("a {record} record of {bytes} bytes ends within its {field}")]
     Short {
         /// The kind of record.
@@ -77,11 +77,11 @@ pub enum FormatError {
     /// A checksum is wrong.
     #[error("the checksum of {what} is {saved:08x} in the file, and {found:08x} by its bytes")]
     Checksum {
-        /// The checked section.
+        /// The part of the file that the checksum covers.
         what: &'static str,
         /// The checksum in the file.
         saved: u32,
-        /// The checksum of the bytes.
+        /// The checksum that was computed from the bytes of the file.
         found: u32,
     },
     /// The compression of a chunk is not supported.
@@ -112,10 +112,10 @@ pub enum FormatError {
         /// The limit in bytes.
         limit: usize,
     },
-    /// The file does not begin or end with the magic bytes.
+    /// The file does not begin or end with the magic bytes of MCAP.
     #[error("it does not begin and end with the magic bytes of an MCAP file")]
     Magic,
-    /// A message is on an undefined channel.
+    /// A message is on a channel that was not defined before it.
     #[error("a message is on channel {0}, which the file does not define")]
     Channel(u16),
     /// A message does not match the type of its channel.
@@ -129,10 +129,10 @@ pub enum FormatError {
     /// The operation code is not defined by the format.
     #[error("no record has the operation code {0:02x}")]
     Unknown(u8),
-    /// The operation code does not fit the position or the contents of the record.
-    #[error("a record has the operation code {0:02x}, but is not of that kind")]
+    /// The operation code does not fit the place of the record in the file, or its contents.
+    #[error("a record has the operation code {0:02x}, but its position or contents are those of another kind of record")]
     Code(u8),
-    /// The length of a record is not that of its contents.
+    /// The length field of a record contradicts the length of its contents.
     #[error(
         "a record of operation code {code:02x} has {own} bytes by its content, and {bytes} by its length"
     )]
@@ -144,7 +144,7 @@ pub enum FormatError {
         /// The length of the contents.
         own: u64,
     },
-    /// The length of a message spans the records after it.
+    /// The length field of a message spans other records that follow the message.
     #[error("a message of {0} bytes contains the records behind it")]
     Swallowed(u64),
     /// A record reaches beyond the end of the file, but other records follow its beginning.
@@ -155,13 +155,13 @@ pub enum FormatError {
         /// The length in the record's header.
         bytes: u64,
     },
-    /// The magic bytes at the end have no footer before them.
-    #[error("it ends with the magic bytes of an MCAP file, and without the footer before them")]
+    /// The file ends with magic bytes, but without a footer record before them.
+    #[error("it ends with the magic bytes of an MCAP file, but the footer before them is missing")]
     Footer,
-    /// The file continues after its end.
+    /// Bytes follow the end of the recording.
     #[error("the file continues after its end")]
     Behind,
-    /// The number of messages is not that of the statistics.
+    /// The file holds another number of messages than its statistics record states.
     #[error("it has {found} messages, but its statistics say {stated}")]
     Messages {
         /// The number of messages read.
@@ -169,14 +169,14 @@ pub enum FormatError {
         /// The number in the statistics.
         stated: u64,
     },
-    /// The chunks decompress to far more than the file holds.
+    /// The chunks decompress to far more bytes or records than a file of this length should.
     #[error("{read} bytes unpack to more than {limit} {what}")]
     Bomb {
         /// The number of bytes read.
         read: u64,
-        /// The limit.
+        /// The maximum number of bytes or records.
         limit: u64,
-        /// The unit of the limit: bytes or records.
+        /// The kind of items that the limit counts: bytes or records.
         what: &'static str,
     },
 }

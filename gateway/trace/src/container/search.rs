@@ -1,7 +1,8 @@
 //! Finds the next intact record after damage.
 //!
-//! A wrong length leads to an arbitrary offset. Certain again is a chunk or an attachment, whose length fields agree
-//! with each other, or a row of records each of which ends where the next one begins.
+//! After a wrong length, reading would continue at an arbitrary offset. The search therefore accepts only what cannot
+//! be there by chance: a chunk or an attachment, whose length fields agree with each other, or several records in a
+//! row, each of which begins where the one before it ends.
 
 use std::io::{self, Read, Seek, SeekFrom};
 
@@ -12,22 +13,22 @@ use super::{MAX_RECORD_BYTES, MAGIC, read_some};
 
 /// The length of a record's header in bytes: operation code and length.
 pub const RECORD_HEADER_BYTES: usize = 9;
-/// The number of bytes that are searched at once.
+/// The number of bytes that are read and searched at once.
 const WINDOW: usize = 1 << 20;
-/// The maximum number of bytes that identify a record.
+/// The maximum number of bytes at the beginning of a record by which it is identified.
 const BEGINNING: usize = 512;
-/// The number of records in a row that is not a coincidence.
+/// The number of consecutive records that are not considered a coincidence.
 const ROW: usize = 4;
-/// The length of a message record before its contents, in bytes.
+/// The length in bytes of the fields of a message record before the message itself.
 const MESSAGE_HEAD: u64 = 22;
 
-/// Returns true if the format defines the operation code. Codes from 0x80 on belong to applications.
+/// Returns true if the operation code is defined by MCAP, or is free for applications (0x80 and above).
 #[must_use]
 pub(super) const fn is_known(opcode: u8) -> bool {
     matches!(opcode, 0x01..=0x0F | 0x80..)
 }
 
-/// Returns the minimum length of such a record, in bytes.
+/// Returns the minimum length of a record with this operation code, in bytes.
 const fn min_length(opcode: u8) -> Option<u64> {
     Some(match opcode {
         op::HEADER | op::METADATA => 8,
@@ -56,7 +57,8 @@ pub fn is_record(input: &mut (impl Read + Seek), at: u64, size: u64) -> io::Resu
     Ok(at == size || next(input, at, size)?.is_some())
 }
 
-/// Returns the offset of the first record from `from` on and before `until`. Only chunks and attachments are found
+/// Returns the offset of the first record that begins at or after `from` and before `until`. Finds only chunks and
+/// attachments unless `any` is true.
 /// unless `any` is true.
 ///
 /// # Errors
@@ -88,8 +90,8 @@ pub fn first_record(
     Ok(None)
 }
 
-/// Returns the operation code and the length of the record that begins with these bytes, if they are possible and the
-/// record fits in `leftover` bytes.
+/// Returns the operation code and the length of the record that begins with these bytes. Returns `None` if they are not
+/// possible, or if the record is longer than `leftover` bytes.
 fn head(bytes: &[u8], leftover: u64) -> Option<(u8, u64)> {
     let &[opcode, ref length @ ..] = bytes.first_chunk::<RECORD_HEADER_BYTES>()?;
     let length = u64::from_le_bytes(*length);
@@ -105,8 +107,8 @@ fn is_certain(bytes: &[u8], leftover: u64) -> bool {
     is_of_two && own_length(opcode, body) == Some(length)
 }
 
-/// Returns the length of a record according to its fields; `None` if its kind has no such fields, or if the bytes end
-/// too early.
+/// Returns the length of a record as computed from its own fields. Returns `None` for a kind of record whose length
+/// cannot be computed, or if the bytes end too early.
 #[must_use]
 pub fn own_length(opcode: u8, body: &[u8]) -> Option<u64> {
     match opcode {
@@ -130,7 +132,7 @@ pub fn own_length(opcode: u8, body: &[u8]) -> Option<u64> {
 /// The length of an entry in a message index, in bytes.
 const INDEX_ENTRY: u64 = 16;
 
-/// Returns the length of `fixed` bytes followed by strings, each with its length in 32 bits before it.
+/// Returns the length of `fixed` bytes and the strings after them. Each string is preceded by its length in 32 bits.
 fn lengths(body: &[u8], fixed: u64, strings: &str) -> Option<u64> {
     strings.bytes().try_fold(fixed, |at, _| {
         let from = usize::try_from(at).ok()?;
@@ -139,7 +141,7 @@ fn lengths(body: &[u8], fixed: u64, strings: &str) -> Option<u64> {
     })
 }
 
-/// Returns the length of a chunk record according to its fields.
+/// Returns the length of a chunk record as computed from its fields.
 fn chunk(body: &[u8]) -> Option<u64> {
     let mut from = Fields::new("chunk", body);
     let (start, end, unpacked) = (from.u64("").ok()?, from.u64("").ok()?, from.u64("").ok()?);
@@ -157,7 +159,7 @@ pub(super) fn is_plain(chunk: &[u8]) -> bool {
     chunk.get(28..32).is_some_and(|length| length == [0; 4])
 }
 
-/// Returns the length of an attachment record according to its fields.
+/// Returns the length of an attachment record as computed from its fields.
 fn attachment(body: &[u8]) -> Option<u64> {
     let mut from = Fields::new("attachment", body);
     from.u64("").and_then(|_| from.u64("")).ok()?;
@@ -166,15 +168,15 @@ fn attachment(body: &[u8]) -> Option<u64> {
     data.checked_add(36 + name.len() as u64 + media_type.len() as u64)
 }
 
-/// Returns true if a record of an application's kind has the contents of a chunk, an attachment or metadata: a bit of
-/// its operation code is wrong.
+/// Returns true if a record with an application's operation code has the contents of a chunk, an attachment or
+/// metadata. A bit of the operation code was then changed.
 #[must_use]
 pub(super) fn is_disguised(body: &[u8], length: u64) -> bool {
     let kinds = [op::CHUNK, op::ATTACHMENT, op::METADATA];
     length > 8 && kinds.iter().any(|&code| own_length(code, body) == Some(length))
 }
 
-/// Returns true if the contents of a message end with a row of records: its length is wrong and spans them.
+/// Returns true if a message ends with several consecutive records. Its length field is then wrong and spans them.
 #[must_use]
 pub(super) fn has_records(message: &[u8]) -> bool {
     let first = usize::try_from(MESSAGE_HEAD).unwrap_or(usize::MAX);
@@ -190,7 +192,8 @@ pub(super) fn has_records(message: &[u8]) -> bool {
     })
 }
 
-/// Returns true if records follow each other from `at` on, or up to the end of the file.
+/// Returns true if several consecutive records begin at `at`, or if records follow each other up to the end of the
+/// file.
 fn is_row(input: &mut (impl Read + Seek), mut at: u64, size: u64) -> io::Result<bool> {
     for before in 0..ROW {
         if before > 0 && at == size {

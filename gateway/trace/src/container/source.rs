@@ -1,4 +1,4 @@
-//! Reads the records of a file, one after the other.
+//! Reads the records of a file in order, without decoding them.
 
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
@@ -8,15 +8,15 @@ use super::field::{Record, attachment_name, parse};
 use super::search::{RECORD_HEADER_BYTES, has_records, is_disguised, is_known, is_plain, own_length};
 use super::{FormatError, MAX_RECORD_BYTES, MAGIC, read_some};
 
-/// The number of bytes kept of a record that is too long for memory, or that no reader needs.
+/// The maximum number of bytes stored of a record that is too long for memory or that no reader needs.
 const BEGINNING: u64 = 64 << 10;
-/// The number of bytes kept of a message index, which no reader needs.
+/// The maximum number of bytes stored of a message index record, which no reader needs.
 const INDEX: u64 = 64;
 
-/// The number of bytes of a footer before its checksum, which covers them.
+/// The number of bytes at the beginning of a footer that its checksum covers.
 const FOOTER_CHECKED: usize = 16;
 
-/// The next item of a file.
+/// A record of the file, or the reason why there is no further record.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Framed {
     /// A record with this operation code, whose contents are in [`Source::body`].
@@ -28,34 +28,35 @@ pub enum Framed {
     Long(u8, u64),
     /// A record with an operation code that the format does not define, and its length.
     Unknown(u8, u64),
-    /// A record with this operation code and length that ends beyond the input. The kept part of its beginning is in
-    /// [`Source::body`].
+    /// A record with this operation code and length that the input does not hold completely. The available beginning,
+    /// up to a limit, is in [`Source::body`].
     Cut(u8, u64),
-    /// The end of the input after this number of bytes, too few for an operation code and a length. 0 if the file ends
-    /// between two records.
+    /// The end of the input. The number counts the remaining bytes, which are too few for a record header; it is 0 if
+    /// the file ends between two records.
     End(u64),
 }
 
-/// Frames the records of an input. Records that no reader needs are skipped: only the beginning of indexes, statistics
-/// and unknown records is kept.
+/// Splits an input into records. Of indexes, statistics and unknown records, which no reader needs, only the beginning
+/// is stored.
 #[derive(Debug)]
 pub struct RecordReader<R> {
     input: R,
     body: Vec<u8>,
     /// The number of bytes read.
     read: u64,
-    /// The offset and the operation code of the last record.
+    /// The offset and the operation code of the record that was read last.
     began: u64,
     code: u8,
-    /// The offset of the record before it, if that is a message: no checksum confirms its length.
+    /// The offset of the record before the last one if that record is a message, whose length is not confirmed by a
+    /// checksum.
     message_before: Option<u64>,
     /// The longest attachment that is read into memory, in bytes.
     attachments: u64,
-    /// The checksum of everything before the end of the data section.
+    /// The checksum of all bytes in the data section so far; `None` once it cannot be computed.
     checksum: Option<crc32fast::Hasher>,
     /// True once a chunk was read.
     has_chunks: bool,
-    /// True after the end of the data section.
+    /// True in the summary section, which follows the data section.
     in_summary: bool,
     /// The last bytes read.
     last: [u8; MAGIC.len()],
@@ -86,7 +87,7 @@ impl<R: Read> RecordReader<R> {
         Self { read, checksum: None, ..Self::new(input, attachments) }
     }
 
-    /// Reads the magic bytes of the beginning or the end into [`Source::body`]. Returns true if they are correct.
+    /// Reads the magic bytes at the beginning or end of a file into [`Source::body`]. Returns true if they are correct.
     ///
     /// # Errors
     /// Returns an error if the input fails.
@@ -127,17 +128,18 @@ impl<R: Read> RecordReader<R> {
         self.last == *MAGIC
     }
 
-    /// Returns the length of the last record by its fields if it is an uncompressed chunk, as far as it is available:
-    /// records in it are its own.
+    /// Returns the length of the last record, computed from its fields, if it is an uncompressed chunk. Anything in
+    /// that range that looks like a record belongs to the chunk.
     #[must_use]
     pub fn plain_chunk(&self) -> Option<u64> {
         own_length(op::CHUNK, &self.body).filter(|_| self.code == op::CHUNK && is_plain(&self.body))
     }
 
-    /// Compares the last item with its own fields, and with its position in the file.
+    /// Checks the record that was read last: its length against its own fields, and its operation code against its
+    /// position in the file.
     ///
     /// # Errors
-    /// Returns [`Damage`] if its operation code or its length is wrong.
+    /// Returns [`Damage`] if the operation code or the length is wrong.
     pub fn check(&self, framed: Framed) -> Result<(), FormatError> {
         let (code, bytes) = match framed {
             Framed::Unknown(code, _) => return Err(FormatError::Unknown(code)),
@@ -153,7 +155,7 @@ impl<R: Read> RecordReader<R> {
         );
         let is_elsewhere =
             (is_index && !self.in_summary) || (code == op::HEADER && self.began > MAGIC.len() as u64);
-        // Messages stand in chunks or between descriptions. Message indexes follow chunks.
+        // Messages stand in chunks or between schemas and channels. Message indexes follow chunks.
         let is_of = |kind| own_length(kind, &self.body) == Some(bytes);
         let is_other = code == op::MESSAGE
             && (is_of(op::SCHEMA) || is_of(op::CHANNEL) || (self.has_chunks && is_of(op::MESSAGE_INDEX)));
@@ -167,14 +169,14 @@ impl<R: Read> RecordReader<R> {
         }
     }
 
-    /// Returns the name of an attachment that is too long.
+    /// Returns the name of the attachment that was read last, if the attachment is too long for memory.
     #[must_use]
     pub fn attachment_name(&self) -> &str {
         attachment_name(&self.body)
     }
 
-    /// Compares a section with the checksum in the last record: the data section at its end, or the summary at the
-    /// footer. Accepts a file without checksums, and one of which a part was skipped.
+    /// Compares the checksum in the last record with the bytes that were read: those of the data section at its end, or
+    /// those of the summary at the footer. Accepts a file without checksums, and one of which a part was skipped.
     ///
     /// # Errors
     /// Returns [`Damage`] if the record or the checksum is wrong.
@@ -191,13 +193,13 @@ impl<R: Read> RecordReader<R> {
         }
     }
 
-    /// Begins the summary section: its checksum covers everything from here to the checksum in the footer.
+    /// Begins the summary section. The checksum in the footer covers it from here on.
     pub fn begin_summary(&mut self) {
         self.checksum = Some(crc32fast::Hasher::new());
         self.in_summary = true;
     }
 
-    /// Returns to the data section, because the summary was not one.
+    /// Continues the data section, because what looked like a summary was not one.
     pub const fn end_summary(&mut self) {
         self.in_summary = false;
     }
@@ -258,7 +260,8 @@ impl<R: Read> RecordReader<R> {
         })
     }
 
-    /// Appends up to `bytes` bytes to the body. The body grows with the bytes read, not with those requested.
+    /// Appends up to `bytes` bytes of the input to the body. Memory is allocated only for bytes that were read,
+    /// whatever number is requested.
     fn read_into_body(&mut self, bytes: u64) -> io::Result<u64> {
         let came = (&mut self.input).take(bytes).read_to_end(&mut self.body)?;
         self.read += came as u64;
@@ -277,7 +280,7 @@ impl<R: Read> RecordReader<R> {
         }
     }
 
-    /// Skips `bytes` bytes. Returns true if the input had them all.
+    /// Skips `bytes` bytes. Returns false if the input ended before.
     fn pass_over(&mut self, bytes: u64) -> io::Result<bool> {
         let mut leftover = bytes;
         let mut piece = [0; 8 << 10];
@@ -313,7 +316,8 @@ impl<R: Read + Seek> RecordReader<R> {
         Ok(size)
     }
 
-    /// Seeks to `place`. The checksum is dropped, unless the position stays the same.
+    /// Continues reading at the offset `place`. The checksum of the section can then no longer be computed, unless
+    /// `place` is the present offset.
     ///
     /// # Errors
     /// Returns an error if the input fails.
@@ -325,8 +329,8 @@ impl<R: Read + Seek> RecordReader<R> {
         Ok(())
     }
 
-    /// Reads the contents of the record at `began` into [`Source::body`], with `length` in place of its own length.
-    /// Returns true if all bytes are available.
+    /// Reads the contents of the record at offset `began` into [`Source::body`]. Uses `length` instead of the record's
+    /// own length field, which is wrong. Returns true if the input has all these bytes.
     ///
     /// # Errors
     /// Returns an error if the input fails.
@@ -338,7 +342,7 @@ impl<R: Read + Seek> RecordReader<R> {
     }
 }
 
-/// Keeps the last bytes of the input.
+/// Stores the last bytes of the input for [`Source::ends_with_magic`].
 fn remember(last: &mut [u8; MAGIC.len()], came: &[u8]) {
     let came = came.get(came.len().saturating_sub(last.len())..).unwrap_or_default();
     last.rotate_left(came.len());
@@ -348,8 +352,8 @@ fn remember(last: &mut [u8; MAGIC.len()], came: &[u8]) {
     }
 }
 
-/// Seeks to the next record of one of the kinds in `target`, without reading those before it. Returns its operation
-/// code and length.
+/// Finds the next record with one of the operation codes in `target`; other records are skipped unread. Returns the
+/// operation code and the length of the record.
 ///
 /// # Errors
 /// Returns an error if the input fails.
@@ -365,7 +369,7 @@ pub fn find<R: Read + Seek>(input: &mut BufReader<R>, target: &[u8]) -> io::Resu
         if target.contains(&opcode) {
             return Ok(Some((opcode, length)));
         }
-        // The length leads beyond any file.
+        // The length exceeds that of any file.
         let Ok(length) = i64::try_from(length) else { return Ok(None) };
         if input.seek_relative(length).is_err() {
             return Ok(None);

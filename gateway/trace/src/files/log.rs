@@ -1,4 +1,4 @@
-//! Log files, which have their names while they grow and can be followed.
+//! Log files. Unlike result files, they have their name while they grow, so that other programs can follow them.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufRead, BufReader, Write};
@@ -14,8 +14,8 @@ use super::target::{
     sync_folder, with_hint, write_all_patiently,
 };
 
-/// A log file. It has its name from the start, is locked against other writers, and holds only complete lines. It
-/// replaces an existing file with its first line.
+/// A log file. It has its name from the start and is locked against other writers. It always ends with a complete line.
+/// An existing file is replaced when the first line is written.
 #[derive(Debug)]
 pub struct LogFile {
     path: PathBuf,
@@ -27,34 +27,34 @@ pub struct LogFile {
 
 #[derive(Debug)]
 enum LogTarget {
-    /// A regular file of this log.
+    /// A regular file that this log has created.
     Ours(File),
-    /// An existing file, which the first line replaces. It is locked until then.
+    /// An existing file of the same name. It stays until the first line is written, and is locked until then.
     Old(File),
     /// A stream such as a terminal, which has no length and no lock.
     Stream(InterruptibleWriter<File>),
 }
 
 impl LogFile {
-    /// Begins a log. Waits for a reader of a FIFO until `stopped` is set.
+    /// Begins a log. If `path` is a FIFO, waits until it has a reader or `stopped` is set.
     ///
     /// # Errors
-    /// Returns an error that includes what to do if the file cannot be written.
+    /// Returns an error, with advice to the user, if the file cannot be written.
     pub fn create(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
         let state = match OutputTarget::inspect(path, force) {
             Ok(OutputTarget::Stream) => LogTarget::Stream(InterruptibleWriter::new(open_stream(path, stopped)?)),
             Ok(OutputTarget::New) => LogTarget::Ours(begin(path)?),
             Ok(OutputTarget::Old) => {
-                // A link that replaced the file meanwhile is not followed.
+                // If the file was replaced by a symlink meanwhile, the link is not followed.
                 let old = open_unfollowed(path).map_err(with_hint)?;
                 hold_log(&old)?;
-                // A folder that allows no replacement is reported before the first line.
+                // Missing write access to the folder is reported now, not when the first line is written.
                 let writes = access(folder_of(path), Access::WRITE_OK | Access::EXEC_OK);
                 writes.map_err(|errno| with_hint(errno.into()))?;
                 LogTarget::Old(old)
             }
             Err(error) => {
-                // The error that another run writes the file is more useful than that it exists.
+                // If another run writes the file, that is reported rather than that the file exists.
                 let about = fs::symlink_metadata(path);
                 if about.is_ok_and(|about| about.is_file()) {
                     File::open(path).map_or(Ok(()), |old| hold_log(&old))?;
@@ -68,7 +68,7 @@ impl LogFile {
     /// Begins a log under the first free name of `run.log`, `run-1.log`, `run-2.log`, ...
     ///
     /// # Errors
-    /// Returns an error that includes what to do if none can be written.
+    /// Returns an error, with advice to the user, if no such file can be written.
     pub fn create_numbered(path: &Path, stopped: &AtomicBool) -> io::Result<Self> {
         let mut number = 0;
         let mut name = path.to_owned();
@@ -95,15 +95,15 @@ impl LogFile {
         self.bytes
     }
 
-    /// Appends complete lines, all of them or none.
+    /// Appends complete lines. Writes all of them or none.
     ///
     /// # Errors
-    /// Returns an error if the file cannot be written; it then ends with the lines before.
+    /// Returns an error if the file cannot be written. The file then ends with the line before.
     pub fn append(&mut self, lines: &str) -> io::Result<()> {
         self.append_bytes(lines.as_bytes())
     }
 
-    /// Appends complete lines that need not be UTF-8.
+    /// Appends complete lines, which may have any encoding.
     ///
     /// # Errors
     /// Returns an error as [`LogFile::append`] does.
@@ -120,9 +120,9 @@ impl LogFile {
         };
         match &self.state {
             _ if written.is_ok() => self.bytes += lines.len() as u64,
-            // The file must not end within a line. If truncating fails too, nothing more can be done.
+            // The file must not end with an incomplete line. An error of truncating it cannot be handled.
             LogTarget::Ours(file) => {
-                // Only make the file shorter: another program may have truncated it.
+                // Truncation must not extend the file, which another program may have truncated further.
                 if file.metadata().is_ok_and(|about| about.len() > self.bytes) {
                     let _ = file.set_len(self.bytes);
                 }
@@ -132,13 +132,13 @@ impl LogFile {
         written
     }
 
-    /// Checks that the file still has its name and its contents.
+    /// Checks that the file still has its name, and that only this program has changed it.
     ///
     /// # Errors
     /// Returns an error if another program has renamed, removed, truncated or written it.
     pub fn check(&self) -> io::Result<()> {
         let LogTarget::Ours(file) = &self.state else { return Ok(()) };
-        // A failure to query the file is not evidence of a change.
+        // If the file cannot be queried, it is not known to have changed.
         let Ok(about) = file.metadata() else { return Ok(()) };
         let (bytes, written) = (about.len(), self.bytes);
         let why = if is_still(&self.path, identity(&about)) == Some(false) {
@@ -155,7 +155,7 @@ impl LogFile {
         Err(io::Error::other(why))
     }
 
-    /// Counts the lines of the file that begin with `begin`; `None` if the name belongs to another file now.
+    /// Counts the lines of the file that begin with `begin`. Returns `None` if the name now belongs to another file.
     ///
     /// # Errors
     /// Returns an error if the file cannot be read.
@@ -170,7 +170,8 @@ impl LogFile {
         Ok(Some(lines))
     }
 
-    /// Replaces the old file with a new one. Other hard links and readers keep the old one.
+    /// Replaces the old file by a new, empty one. The old file remains available under other hard links and to programs
+    /// that have it open.
     fn take_place(&self) -> io::Result<File> {
         let part = part_of(&self.path);
         let file = begin(&part)?;
@@ -180,7 +181,7 @@ impl LogFile {
         Ok(file)
     }
 
-    /// Ends the log: its contents survive a loss of power from now on.
+    /// Ends the log and writes it to the disk, so that it survives a loss of power.
     ///
     /// # Errors
     /// Returns an error if the disk cannot store them.
@@ -198,13 +199,13 @@ impl LogFile {
 }
 
 impl Drop for LogFile {
-    /// Removes a log that was never ended and is empty.
+    /// Removes the file if nothing was written and [`LogFile::finish`] was not called.
     fn drop(&mut self) {
         let LogTarget::Ours(file) = &self.state else { return };
         let is_there =
             file.metadata().is_ok_and(|about| is_still(&self.path, identity(&about)) == Some(true));
         if !self.ended && self.bytes == 0 && is_there {
-            // Nothing more can be done.
+            // An error of removing the file cannot be handled here.
             let _ = fs::remove_file(&self.path);
         }
     }
@@ -223,7 +224,7 @@ fn begin(path: &Path) -> io::Result<File> {
     Ok(file)
 }
 
-/// Locks a log against other writers. File systems without locks are accepted.
+/// Locks a log against other writers. Succeeds on file systems that do not support locks.
 fn hold_log(file: &File) -> io::Result<()> {
     if hold(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock) {
         let why = "another run is writing it: name another file, or wait for that run's end";

@@ -1,4 +1,4 @@
-//! Output files of commands. A file is overwritten only on request, and a symlink to a file is never followed.
+//! Output files of commands. An existing file is overwritten only on request. A symlink to a file is never followed.
 //!
 //! - [`WholeFile`]: a result file, which appears under its name only when it is complete.
 //! - [`LogFile`]: a log file, which exists from its first line on and grows.
@@ -27,26 +27,26 @@ pub(crate) use target::{hold, identity, is_still, link, nameless, open_unfollowe
 pub struct WholeFile {
     path: PathBuf,
     force: bool,
-    /// The file until it has its name; `None` if the target is written directly.
+    /// The open file; `None` if the target is written directly.
     file: Option<File>,
-    /// True if it has a temporary name until then.
+    /// True if the file has a temporary name until it is complete.
     is_part: bool,
 }
 
 impl WholeFile {
-    /// Opens a file early, so that errors are reported before there is anything to write. An existing file is
-    /// overwritten if `force` is true, and refused otherwise.
+    /// Opens a file before there is anything to write, so that errors are reported early. An existing file is
+    /// overwritten if `force` is true, and is an error otherwise.
     ///
     /// # Errors
-    /// Returns an error that includes what to do if the file cannot be written.
+    /// Returns an error, with advice to the user, if the file cannot be written.
     pub fn create(path: &Path, force: bool) -> io::Result<(Self, File)> {
         Self::create_unless(path, force, &AtomicBool::new(false))
     }
 
-    /// Opens a file. Waits for a reader of a FIFO only until `stopped` is set.
+    /// Opens a file like [`WholeFile::create`]. If it is a FIFO, waits until it has a reader or `stopped` is set.
     ///
     /// # Errors
-    /// Returns an error that includes what to do if the file cannot be written.
+    /// Returns an error, with advice to the user, if the file cannot be written.
     pub fn create_unless(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<(Self, File)> {
         let begun = |file, is_part| Self { path: path.to_owned(), force, file, is_part };
         if OutputTarget::inspect(path, force)? == OutputTarget::Stream {
@@ -81,7 +81,8 @@ impl WholeFile {
         let Some(file) = &self.file else { return Ok(()) };
         file.sync_all()?;
         if !self.is_part {
-            // A hard link never replaces another file, so the file gets a temporary name first.
+            // Linking fails if the name exists. To replace a file, the new one therefore gets a temporary name and is
+            // renamed.
             let name = if self.force { part_of(&self.path) } else { self.path.clone() };
             link(file, &name).map_err(or_exists)?;
             self.is_part = self.force;
@@ -98,16 +99,16 @@ impl WholeFile {
 impl Drop for WholeFile {
     fn drop(&mut self) {
         if self.is_part {
-            // Nothing more can be done.
+            // An error of removing the file cannot be handled here.
             let _ = fs::remove_file(part_of(&self.path));
         }
     }
 }
 
-/// Writes a text to a file, as [`WholeFile`] does.
+/// Writes a text to a file that appears under its name only when it is complete, as [`WholeFile`] does.
 ///
 /// # Errors
-/// Returns an error that includes what to do if the file cannot be written.
+/// Returns an error, with advice to the user, if the file cannot be written.
 pub fn write_whole(path: &Path, text: &str, force: bool) -> io::Result<()> {
     let (whole, mut file) = WholeFile::create(path, force)?;
     file.write_all(text.as_bytes())?;

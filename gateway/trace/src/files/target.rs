@@ -1,4 +1,4 @@
-//! Checks of output files: the kind of the existing target, and permission to write it.
+//! Checks output files before they are written: the kind of an existing file, and the permissions.
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, FileType, OpenOptions};
@@ -19,13 +19,13 @@ use rustix::io::Errno;
 /// The interval between two attempts to open a FIFO that has no reader.
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// The name of standard output. A file of this name is written as `./-`.
+/// The name that stands for standard output. A file that is called `-` is named `./-`.
 pub const STANDARD_OUTPUT: &str = "-";
 
-/// The kind of target under a name.
+/// The kind of file that exists under the name of an output file.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum OutputTarget {
-    /// The name is free.
+    /// No file has this name.
     New,
     /// A regular file, which is to be overwritten.
     Old,
@@ -34,8 +34,8 @@ pub(super) enum OutputTarget {
 }
 
 impl OutputTarget {
-    /// Determines the target under a name. A regular file is accepted only with `force`; a symlink to one, or to
-    /// nothing, is never followed.
+    /// Determines which kind of file exists under a name. Returns an error for a regular file unless `force` is true,
+    /// and for a symlink to a regular file or to nothing.
     pub(super) fn inspect(path: &Path, force: bool) -> io::Result<Self> {
         if path == Path::new(STANDARD_OUTPUT) {
             return Ok(Self::Stream);
@@ -69,18 +69,18 @@ impl OutputTarget {
     }
 }
 
-/// Checks early that a file may be written.
+/// Checks that a file may be written, before there is anything to write.
 ///
 /// # Errors
-/// Returns an error that includes what to do if it may not.
+/// Returns an error, with advice to the user, if it may not.
 pub fn check(path: &Path, force: bool) -> io::Result<()> {
     OutputTarget::inspect(path, force).map(|_| ())
 }
 
-/// Checks early that a regular file may be written.
+/// Checks that a file may be written and is not a FIFO or a device, before there is anything to write.
 ///
 /// # Errors
-/// Returns an error that includes what to do if it may not.
+/// Returns an error, with advice to the user, if it may not.
 pub fn check_regular(path: &Path, force: bool) -> io::Result<()> {
     match OutputTarget::inspect(path, force)? {
         OutputTarget::New | OutputTarget::Old => Ok(()),
@@ -92,13 +92,14 @@ fn no_regular_file() -> io::Error {
     io::Error::new(io::ErrorKind::AlreadyExists, "it is not a regular file: name another one")
 }
 
-/// Returns the error for a name that is taken.
+/// Returns the error for an output file that exists already.
 pub(super) fn exists() -> io::Error {
     let why = "it exists: name another file, or overwrite it with --overwrite";
     io::Error::new(io::ErrorKind::AlreadyExists, why)
 }
 
-/// Replaces an error of the kind `AlreadyExists` by [`exists`], which includes what to do.
+/// Replaces an error of the kind `AlreadyExists` by [`exists`], which has advice for the user. Returns other errors
+/// unchanged.
 pub(super) fn or_exists(error: io::Error) -> io::Error {
     if error.kind() == io::ErrorKind::AlreadyExists { exists() } else { error }
 }
@@ -107,7 +108,7 @@ fn is_stream(kind: FileType) -> bool {
     kind.is_fifo() || kind.is_char_device()
 }
 
-/// Opens a target that is written directly. Waits for a reader of a FIFO until `stopped` is set.
+/// Opens a FIFO, terminal or other stream. A FIFO is awaited until it has a reader or `stopped` is set.
 pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File> {
     let descriptor = if path == Path::new(STANDARD_OUTPUT) { Some(1) } else { own_descriptor(path) };
     let own: Option<OwnedFd> = match descriptor {
@@ -140,7 +141,7 @@ pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File>
     Ok(file)
 }
 
-/// Returns a file's name with a suffix between its stem and its extension.
+/// Returns the path of a file with `suffix` after its stem and with the extension `end`, as in `run-1.mcap`.
 #[must_use]
 pub fn suffixed(path: &Path, suffix: impl AsRef<OsStr>, end: &OsStr) -> PathBuf {
     let mut name = path.file_stem().unwrap_or_default().to_owned();
@@ -152,7 +153,7 @@ pub fn suffixed(path: &Path, suffix: impl AsRef<OsStr>, end: &OsStr) -> PathBuf 
     path.with_file_name(name)
 }
 
-/// Creates an unnamed file in a folder, for writing and reading.
+/// Creates a file without a name in a folder, for writing and reading.
 ///
 /// # Errors
 /// Returns an error if the folder cannot be written, or if the file system does not support unnamed files.
@@ -161,7 +162,7 @@ pub(crate) fn nameless(folder: &Path, mode: u32) -> io::Result<File> {
     Ok(open(folder, flags, Mode::from_raw_mode(mode))?.into())
 }
 
-/// Gives an unnamed file a name. Never replaces another file.
+/// Gives a name to a file that has none. Fails if the name exists.
 ///
 /// # Errors
 /// Returns an error if the name cannot be given.
@@ -188,12 +189,13 @@ pub(crate) fn hold(file: &File) -> io::Result<()> {
     Ok(flock(file, FlockOperation::NonBlockingLockExclusive)?)
 }
 
-/// Returns the device and inode, which identify a file whatever its name.
+/// Returns the device and the inode of a file, which identify it under any name.
 pub(crate) fn identity(about: &fs::Metadata) -> (u64, u64) {
     (about.dev(), about.ino())
 }
 
-/// Returns true if the name is that of the file `is`, and not of a link to it; `None` if the name cannot be queried.
+/// Returns true if `path` is a name of the file with the identity `is`, and not a symlink to it. Returns `None` if the
+/// name cannot be queried.
 pub(crate) fn is_still(path: &Path, is: (u64, u64)) -> Option<bool> {
     match fs::symlink_metadata(path) {
         Ok(about) => Some(identity(&about) == is),
@@ -204,13 +206,13 @@ pub(crate) fn is_still(path: &Path, is: (u64, u64)) -> Option<bool> {
     }
 }
 
-/// The time for which a blocked write is retried.
+/// The time after which a write that stays blocked is an error.
 const RETRY_TIMEOUT: Duration = Duration::from_secs(1);
-/// The interval between two attempts.
+/// The interval between two attempts to write while writing is blocked.
 const RETRY_INTERVAL: Duration = Duration::from_millis(2);
 
-/// Writes as many bytes as the file accepts. An interrupted call is retried, a blocked one for up to a second, and one
-/// with any other error once.
+/// Writes as many bytes as the file accepts. Interrupted calls are repeated, blocked ones for up to a second. A call
+/// that fails with any other error is repeated once.
 ///
 /// # Errors
 /// Returns the error if it persists.
@@ -233,7 +235,7 @@ pub(crate) fn write_patiently(file: &mut impl Write, bytes: &[u8]) -> io::Result
     }
 }
 
-/// Writes all bytes, with the retries of [`write_patiently`].
+/// Writes all bytes, and retries like [`write_patiently`].
 ///
 /// # Errors
 /// Returns the error if it persists, and an error if the file accepts no bytes.
@@ -247,7 +249,7 @@ pub(crate) fn write_all_patiently(file: &mut impl Write, mut bytes: &[u8]) -> io
     Ok(())
 }
 
-/// Returns a temporary name beside a file that no other program uses.
+/// Returns a temporary name in the folder of a file. The name contains the process id, so no other program uses it.
 pub(super) fn part_of(path: &Path) -> PathBuf {
     let mut name = OsString::from(".");
     name.push(path.file_name().unwrap_or_default());
@@ -264,19 +266,20 @@ pub fn rename(from: &Path, to: &Path, force: bool) -> io::Result<()> {
         return fs::rename(from, to);
     }
     match renameat_with(CWD, from, CWD, to, RenameFlags::NOREPLACE) {
-        // The file system does not support this atomically.
+        // The file system cannot rename without replacing, so the name is checked first.
         Err(Errno::INVAL | Errno::NOSYS) if fs::symlink_metadata(to).is_err() => fs::rename(from, to),
         Err(Errno::EXIST | Errno::INVAL | Errno::NOSYS) => Err(exists()),
         renamed => Ok(renamed?),
     }
 }
 
-/// Makes the names in a file's folder durable, as far as the file system supports it.
+/// Writes the folder of a file to the disk, so that the file's name survives a loss of power. Ignores errors of file
+/// systems that do not support this.
 pub fn sync_folder(path: &Path) {
     let _ = File::open(folder_of(path)).and_then(|folder| folder.sync_all());
 }
 
-/// Adds what to do to an error of creating a file, if the cause is its location.
+/// Adds advice to an error of creating a file, if the folder or the disk causes it.
 #[must_use]
 pub fn with_hint(error: io::Error) -> io::Error {
     if matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) {

@@ -16,7 +16,7 @@ fn log(path: &Path, force: bool) -> io::Result<LogFile> {
     LogFile::create(path, force, &AtomicBool::new(false))
 }
 
-/// Begins a file of either kind under a name, and returns both error messages.
+/// Creates a log and a result file under the same name, and returns the error message of each.
 fn refusals(path: &Path, force: bool) -> [String; 2] {
     let [whole, log] = [WholeFile::create(path, force).map(drop), log(path, force).map(drop)];
     [whole, log].map(|refused| refused.unwrap_err().to_string())
@@ -54,7 +54,7 @@ fn what_is_there_is_not_overwritten_and_no_symlink_is_followed_to_a_file() {
     assert_eq!(refusals(&file, false), [exists; 2]);
     for force in [false, true] {
         for path in [&link, &dangling] {
-            // The target of the link exists, and would be refused too.
+            // The link's target exists, so it would be refused as well.
             let itself = if path == &link && !force { " and add --overwrite" } else { "" };
             let why = format!(
                 "it is a symlink, which is not followed: name the file itself{itself}, or another one"
@@ -71,7 +71,7 @@ fn what_is_there_is_not_overwritten_and_no_symlink_is_followed_to_a_file() {
 
 #[test]
 fn of_a_full_disk_the_hint_is_another_one() {
-    // Another folder may be on the same full disk.
+    // The folder of another file may be on the same full disk, so no other folder is advised.
     let full = with_hint(io::ErrorKind::StorageFull.into());
     assert!(full.to_string().ends_with("; make room, or name a file on another disk"), "{full}");
     assert_eq!(full.kind(), io::ErrorKind::StorageFull);
@@ -100,7 +100,7 @@ fn a_name_that_another_program_took_meanwhile_is_left_to_it() {
         file.write_all(b"mine").unwrap();
         whole
     };
-    // The same holds on file systems without unnamed files.
+    // A file with a temporary name must behave like one without a name.
     let nameless = begun();
     let mut part = begun();
     let file = OpenOptions::new().write(true).create_new(true).open(part_of(&path)).unwrap();
@@ -133,7 +133,7 @@ fn a_descriptor_of_this_program_is_written_to_whatever_it_is() {
     file.write_all(b"before\n").unwrap();
     for name in ["/dev/fd", "/proc/self/fd", "/proc/thread-self/fd"] {
         let path = Path::new(name).join(file.as_raw_fd().to_string());
-        // The descriptors of a thread are those of the process under another name.
+        // The descriptors below `thread-self` are those of the process by another path.
         if name.contains("thread") {
             assert!(log(&path, false).is_err());
             continue;
@@ -179,7 +179,7 @@ fn a_log_is_there_while_it_grows_and_gone_when_nothing_came() {
         assert!(fs::read_to_string(&path).unwrap().ends_with(lines));
     }
     assert_eq!(growing.bytes(), 14);
-    // A run that fails drops its log.
+    // A run that fails drops its log without finishing it.
     drop(growing);
     assert_eq!(fs::read_to_string(&path).unwrap(), "one\ntwo\nthree\n");
     log(&folder.path().join("empty.log"), false).unwrap().finish().unwrap();
@@ -231,7 +231,7 @@ fn a_numbered_log_takes_the_first_name_that_is_free() {
     let logs = [create(), create(), create()];
     let taken = logs.each_ref().map(|log| log.path().file_name().unwrap().to_owned());
     assert_eq!(taken, ["demo.log", "demo-1.log", "demo-2.log"]);
-    // Dots in a name belong to its stem.
+    // Only the last dot of a name separates the extension.
     let dotted = folder.path().join("a.b.log");
     let logs = [(); 3].map(|()| LogFile::create_numbered(&dotted, &AtomicBool::new(false)).unwrap());
     let taken = logs.each_ref().map(|log| log.path().file_name().unwrap().to_owned());
@@ -240,7 +240,7 @@ fn a_numbered_log_takes_the_first_name_that_is_free() {
     assert!(LogFile::create_numbered(&nowhere, &AtomicBool::new(false)).is_err());
 }
 
-/// A file that returns errors, and accepts one byte at a time.
+/// A file that returns the given errors first, and accepts one byte per call.
 struct Moody(Vec<io::ErrorKind>, Vec<u8>);
 
 impl Write for Moody {

@@ -1,26 +1,26 @@
-//! Counts of what a recording wrote and lost.
+//! Counts the messages that a recording has written and lost.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use serde::Serialize;
 
-/// One file of a recording.
+/// A finished file of a recording, with its size and message counts.
 #[derive(Clone, Debug, Serialize)]
 pub struct WrittenFile {
     /// The name of the file.
     pub path: String,
     /// The format: `candump` or `mcap`.
     pub format: &'static str,
-    /// The number of frames in it.
+    /// The number of frames in the file.
     pub frames: u64,
-    /// The number of messages in it, including frames.
+    /// The number of messages in the file, including frames.
     pub messages: u64,
-    /// Its size in bytes.
+    /// The size of the file in bytes.
     pub bytes: u64,
 }
 
-/// Counts of messages.
+/// A number of frames and a number of other messages.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct MessageCount {
     /// Frames.
@@ -30,10 +30,10 @@ pub struct MessageCount {
 }
 
 impl MessageCount {
-    /// One frame of a bus.
+    /// The count of a single frame.
     pub const FRAME: Self = Self { frames: 1, others: 0 };
 
-    /// Counts `others` other messages.
+    /// Returns the count of `others` messages that are not frames.
     #[must_use]
     pub const fn others(others: u64) -> Self {
         Self { frames: 0, others }
@@ -44,32 +44,33 @@ impl MessageCount {
         self.others += other.others;
     }
 
-    /// Returns the account of a file that holds these messages.
+    /// Returns the entry for a file of `bytes` bytes that holds these messages.
     pub(super) fn in_file(self, path: &Path, bytes: u64) -> WrittenFile {
         let Self { frames, others } = self;
         WrittenFile { path: path.display().to_string(), format: "mcap", frames, messages: frames + others, bytes }
     }
 }
 
-/// The account of a run's recording.
+/// A summary of a run's recording: its files, and the messages that were written and lost.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct RecordingAccount {
     /// The files, in the order in which they were finished.
     pub files: Vec<WrittenFile>,
     /// Frames that are in every requested format.
     pub frames: u64,
-    /// Lost frames: the sum of the two below.
+    /// Frames that were lost: the sum of `lost_queue` and `lost_write`.
     pub lost: u64,
-    /// Frames that did not fit into the recorder's queue.
+    /// Frames lost because the recorder's queue was full.
     pub lost_queue: u64,
-    /// Frames that could not be written.
+    /// Frames lost because the file could not be written.
     pub lost_write: u64,
-    /// Other messages that are missing, by kind of topic: ticks and epochs, and those that could not be written.
+    /// Lost messages other than frames, by kind: ticks, epochs, and messages that could not be written.
     pub messages_lost: BTreeMap<&'static str, u64>,
-    /// Messages that arrived too late for their position in the order of times, and stand after it.
+    /// Messages that reached the recorder after messages of later times had been written. The file holds them out of
+    /// order.
     pub messages_late: u64,
-    /// The processor time of the recorder's thread, in s.
+    /// The processor time used by the recorder's thread, in s.
     pub processor_s: f64,
-    /// Error messages, each once.
+    /// Error messages of the recorder, without repetitions.
     pub errors: Vec<String>,
 }

@@ -1,10 +1,9 @@
-//! Writes one MCAP file: its settings, channels and messages.
+//! Writes one MCAP file of a recording: its header, channels and messages.
 //!
 //! This is the only module that uses the writer of the crate `mcap`.
-//!
-//! Schemas and channels are written by the crate in the chunk of their first message. This module repeats them outside
-//! of chunks, after that chunk and then every [`DESCRIBED_EVERY`] chunks; the crate also writes them in the summary. No
-//! single damaged place in a file therefore destroys what all messages need.
+//! The crate writes the schema and the channel of a message into the chunk of the first message, and again into the
+//! summary. This module repeats all schemas and channels outside of chunks, after that chunk and then every
+//! [`DESCRIBED_EVERY`] chunks. No single damaged place can therefore make all messages unreadable.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};
@@ -22,19 +21,19 @@ use super::output::SharedOutput;
 use crate::container::{Framed, Record, RecordReader, parse};
 use crate::ros2::Message;
 
-/// The number of bytes that are compressed together. Larger chunks block the writer for so long that its queues fill
-/// up.
+/// The size of a chunk in bytes before compression. Compressing a larger chunk would block the writer for so long that
+/// its queues fill up.
 pub const CHUNK_BYTES: u64 = 256 << 10;
 
-/// The number of chunks between two descriptions of all schemas and channels.
+/// The number of chunks after which all schemas and channels are written again.
 pub const CHUNKS_PER_DESCRIPTION: u32 = 64;
 
-/// The overhead of a message record in bytes.
+/// The length in bytes of a message record without the message itself.
 const MESSAGE_OVERHEAD: u64 = 31;
 
-/// Returns the settings of every written file. The crate does not seek, so that flushed data stays readable whatever
-/// happens afterwards, and uses no threads, which cost more than they save. The [`FileWriter`] ends chunks, and the
-/// [`Output`] computes the checksum of the data section.
+/// Returns the options for the writer of the crate `mcap`. Seeking is off, so that flushed data stays readable even if
+/// the program is killed. Threads are off, because they cost more than they save. Chunk ends and the checksum of the
+/// data section are left to [`FileWriter`] and [`Output`].
 fn options() -> WriteOptions {
     WriteOptions::new()
         .profile(PROFILE)
@@ -46,36 +45,38 @@ fn options() -> WriteOptions {
         .disable_seeking(true)
 }
 
-/// The name of the metadata record that identifies the file in which a recording was begun.
+/// The name of the metadata record that stores the identity of the file. A copy of a recording has another identity
+/// than it stores.
 const MARK: &str = "recorder";
-/// The key of the inode in [`MARK`].
+/// The key of the file's inode in [`MARK`].
 const INODE: &str = "inode";
 const BORN: &str = "born_ns";
-/// The conventions that a recording follows.
+/// The MCAP profile of a recording: the conventions that it follows.
 const PROFILE: &str = "ros2";
-/// The name of the writing program.
+/// The beginning of the name of the writing program; the version follows.
 const PROGRAM: &str = "skinbus ";
 
-/// Returns the identity that distinguishes a file from a copy: its inode, and its creation time if the file system
-/// stores it, because inodes are reused.
+/// Returns the values that distinguish a file from its copies: the inode, and the creation time if the file system
+/// stores it, because an inode can be reused.
 fn identity(about: &fs::Metadata) -> BTreeMap<String, String> {
     let born = about.created().ok().and_then(|at| at.duration_since(UNIX_EPOCH).ok());
     let born = born.map(|born| (BORN.to_owned(), born.as_nanos().to_string()));
     [(INODE.to_owned(), about.ino().to_string())].into_iter().chain(born).collect()
 }
 
-/// Returns the beginning of a recording: magic bytes, header, and the identity of the file `about`.
+/// Returns the first bytes of a recording: magic bytes, header, and a metadata record with the identity of the file
+/// whose metadata are `about`.
 ///
 /// # Errors
-/// Never returns one, because it writes to memory.
+/// Returns no error in practice, because it writes to memory.
 pub fn mark(about: &fs::Metadata) -> io::Result<Vec<u8>> {
     let mut writer = FileWriter::in_file(Vec::new(), about)?;
     writer.flush()?;
     Ok(writer.into_inner())
 }
 
-/// Returns true if a file begins with its own identity, written by any version of this program. Moves the position in
-/// the file.
+/// Returns true if a file begins with its own identity, in the form of any version of this program. Changes the
+/// position in the file.
 ///
 /// # Errors
 /// Returns an error if the file cannot be read.
@@ -101,7 +102,7 @@ pub fn io_error(error: McapError) -> io::Error {
     if let McapError::Io(error) = error { error } else { io::Error::other(error.to_string()) }
 }
 
-/// A channel of a file.
+/// A channel of a file, with the sequence number of its next message.
 #[derive(Clone, Copy, Debug)]
 pub struct Channel {
     id: u16,
@@ -115,8 +116,8 @@ impl Channel {
         self.id
     }
 
-    /// Returns the number of the channel, the sequence number of its next message, and true if it holds frames of a
-    /// bus.
+    /// Counts a message of the channel. Returns the number of the channel, the sequence number of the message, and true
+    /// if the channel holds frames.
     pub(super) const fn next(&mut self) -> (u16, u32, bool) {
         let sequence = self.sequence;
         self.sequence = sequence.wrapping_add(1);
@@ -124,13 +125,13 @@ impl Channel {
     }
 }
 
-/// Returns true if a channel holds frames of a bus.
+/// Returns true if a channel with this topic and type holds frames of a bus.
 #[must_use]
 pub(super) fn is_frames(topic: &str, schema: &str) -> bool {
     schema == Frame::TYPE && topic.starts_with(BUS_TOPIC_PREFIX)
 }
 
-/// A file that is being written. It is unusable after an error.
+/// An MCAP file that is being written. After an error it must not be used any more.
 pub struct FileWriter<W: Write> {
     writer: Writer<SharedOutput<W>>,
     output: SharedOutput<W>,
@@ -139,11 +140,12 @@ pub struct FileWriter<W: Write> {
     chunks: u64,
     /// The number of uncompressed bytes in the open chunk.
     open: u64,
-    /// The records of all schemas and channels.
+    /// The records of all schemas and channels so far, as they are repeated in the file.
     descriptions: Vec<u8>,
-    /// The numbers of the schemas and channels in `descriptions`.
+    /// The numbers of the schemas and of the channels in `descriptions`.
     described: (BTreeSet<u16>, BTreeSet<u16>),
-    /// The number of chunks since the descriptions were written; `None` if some have not been written yet.
+    /// The number of chunks since all schemas and channels were last written; `None` if a new one has not been written
+    /// yet.
     chunks_since_description: Option<u32>,
 }
 
@@ -154,7 +156,7 @@ impl<W: Write> core::fmt::Debug for FileWriter<W> {
 }
 
 impl<W: Write> FileWriter<W> {
-    /// Begins a file.
+    /// Begins a file with the profile of a recording.
     ///
     /// # Errors
     /// Returns an error if the file cannot be written, as all methods below do.
@@ -162,7 +164,7 @@ impl<W: Write> FileWriter<W> {
         Self::with_profile(out, PROFILE)
     }
 
-    /// Begins a file that follows other conventions.
+    /// Begins a file with another profile than that of a recording.
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
@@ -181,7 +183,7 @@ impl<W: Write> FileWriter<W> {
         })
     }
 
-    /// Begins the file of a run's recording, with its identity.
+    /// Begins the file of a run's recording. The identity of the file is written after the header.
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
@@ -209,7 +211,7 @@ impl<W: Write> FileWriter<W> {
         self.attach_at(name, media_type, (nanos, nanos), bytes)
     }
 
-    /// Attaches a file with separate times of recording and creation.
+    /// Attaches a file whose recording time and creation time differ.
     pub(super) fn attach_at(
         &mut self,
         name: &str,
@@ -239,7 +241,7 @@ impl<W: Write> FileWriter<W> {
         Ok(Channel { id, sequence: 0, is_frames: is_frames(topic, M::TYPE) })
     }
 
-    /// Adds a schema with a given number.
+    /// Adds a schema under a given number, as in a file that is copied.
     pub(super) fn schema_as(
         &mut self,
         id: u16,
@@ -251,7 +253,7 @@ impl<W: Write> FileWriter<W> {
         Ok(())
     }
 
-    /// Adds a channel with given numbers of its own and of its schema.
+    /// Adds a channel under a given number, for the schema with a given number.
     pub(super) fn channel_as(
         &mut self,
         (id, schema): (u16, u16),
@@ -288,7 +290,7 @@ impl<W: Write> FileWriter<W> {
     }
 
     fn describe(&mut self, opcode: u8, body: &[u8]) {
-        // The crate also writes the description into the chunk.
+        // The crate writes the schema and the channel into the chunk too, so the chunk grows by them.
         self.open += (HEAD_OF_RECORD + body.len()) as u64;
         self.descriptions.push(opcode);
         self.descriptions.extend((body.len() as u64).to_le_bytes());
@@ -296,7 +298,7 @@ impl<W: Write> FileWriter<W> {
         self.chunks_since_description = None;
     }
 
-    /// Writes a message. Allocates only when the chunk grows.
+    /// Writes a message. Memory is allocated only if the chunk is larger than all before it.
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
@@ -309,7 +311,7 @@ impl<W: Write> FileWriter<W> {
         put
     }
 
-    /// Writes an encoded message with its channel and sequence numbers, and its times of logging and publishing.
+    /// Writes a message that is already encoded, with its channel number, sequence number, log time and publish time.
     pub(super) fn put(
         &mut self,
         (channel_id, sequence): (u16, u32),
@@ -325,7 +327,8 @@ impl<W: Write> FileWriter<W> {
         Ok(())
     }
 
-    /// Ends the chunk, and writes the descriptions after it if they are due.
+    /// Ends the chunk. Writes all schemas and channels after it if one is new or [`DESCRIBED_EVERY`] chunks have
+    /// passed.
     fn end_chunk(&mut self) -> io::Result<()> {
         if self.open == 0 {
             return Ok(());
@@ -343,13 +346,13 @@ impl<W: Write> FileWriter<W> {
         Ok(())
     }
 
-    /// Returns an upper bound of the number of chunks so far.
+    /// Returns the number of chunks so far, including the open one.
     #[must_use]
     pub const fn chunks(&self) -> u64 {
         self.chunks + 1
     }
 
-    /// Ends the chunk and flushes the output: the file can be read up to here from now on.
+    /// Ends the chunk and flushes the output. Everything up to here can then be read even if the program is killed.
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
@@ -358,7 +361,7 @@ impl<W: Write> FileWriter<W> {
         self.output.hand_on()
     }
 
-    /// Writes the end of the file: indexes and statistics for seeking.
+    /// Ends the file with indexes and statistics, which readers need for seeking.
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
@@ -372,7 +375,7 @@ impl<W: Write> FileWriter<W> {
     /// Returns the output. The file has no end unless [`FileWriter::finish`] wrote it.
     ///
     /// # Panics
-    /// Never: the other handle of the output is dropped here.
+    /// Never in practice: this method drops the only other handle of the output.
     #[must_use]
     pub fn into_inner(self) -> W {
         drop(self.writer.into_inner());
@@ -383,7 +386,7 @@ impl<W: Write> FileWriter<W> {
 /// The length of a record's header in bytes: operation code and length.
 const HEAD_OF_RECORD: usize = 9;
 
-/// Encodes bytes after their length, as the format stores strings.
+/// Encodes a string as MCAP does: its length in 32 bits, then its bytes.
 fn text(bytes: &[u8]) -> Vec<u8> {
     [&u32::try_from(bytes.len()).unwrap_or(u32::MAX).to_le_bytes()[..], bytes].concat()
 }

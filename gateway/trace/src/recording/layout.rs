@@ -1,4 +1,4 @@
-//! The topics of a recording and their contents, derived from the skin.
+//! Derives the topics of a recording, and what each of them holds, from the skin.
 
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
@@ -9,48 +9,48 @@ use robots::{UniqueNames, chain_words, word};
 use super::robot::RecordedRobot;
 use super::{BUS_TOPIC_PREFIX, STATE_TOPIC_PREFIX};
 
-/// The reference frame of positions if no robot description names one.
+/// The name of the frame in which positions are given if no robot description names one.
 const BASE: &str = "base";
-/// The maximum rate at which the points of a patch are recorded.
+/// The maximum rate of point clouds of a patch, in Hz.
 const POINTS_HZ: f64 = 30.0;
 
-/// The cells of one bus on one link.
+/// The cells of one bus on one link. The state of a patch has one topic.
 #[derive(Clone, Debug)]
 pub struct Patch {
     /// The topic of the patch.
     pub topic: String,
-    /// The link, which is a frame of the robot.
+    /// The link that the cells are on, which is a frame of the robot.
     pub link: String,
     /// The index of the bus in the skin.
     pub bus: usize,
-    /// The index of the chain, and the joint of that chain that moves the patch, from 1.
+    /// The index of the chain, and the number of the joint (from 1) that moves the patch.
     pub joint: (usize, usize),
-    /// The cells: index among the cells of the bus, and node id.
+    /// The cells of the patch: index among the cells of the bus, and node id.
     pub cells: Vec<(usize, u16)>,
 }
 
-/// The layout of a skin's recording.
+/// The topics of a skin's recording and the data needed to fill them.
 #[derive(Debug)]
 pub struct Layout {
     /// The names of the buses.
     pub buses: Vec<String>,
-    /// The name of the robot, as topics contain it.
+    /// The name of the robot, in the form that topics contain.
     pub arm: String,
     /// The names of the joints.
     pub joints: Vec<String>,
-    /// The patches.
+    /// The patches of all buses.
     pub patches: Vec<Patch>,
-    /// By bus: the index in the robot of each joint of its chain.
+    /// By bus: for each joint of the bus's chain, its index among the joints of the robot.
     chains: Vec<Vec<usize>>,
-    /// By bus: the computation of forces from sensor values, and the positions of its cells.
+    /// By bus: the computation of forces from sensor values, and the positions of the bus's cells.
     pub central: Vec<Central>,
-    /// The interval between two point clouds of a patch, in epochs.
+    /// The number of epochs between two point clouds of a patch.
     pub epochs_per_cloud: u64,
     /// The duration of a tick, in ns.
     pub tick_ns: u64,
-    /// The interval between two recordings of link poses, in ticks.
+    /// The number of ticks between two messages with the poses of links.
     pub ticks_per_poses: u64,
-    /// The robot's links, if they are known.
+    /// The robot's links and their poses, if they are known.
     pub robot: Option<RecordedRobot>,
 }
 
@@ -103,7 +103,7 @@ impl Layout {
         }
     }
 
-    /// Adds the robot's links, whose names the patches get.
+    /// Adds the robot's links. The patches are then named after them.
     #[must_use]
     pub fn with_robot(mut self, robot: RecordedRobot) -> Self {
         for patch in &mut self.patches {
@@ -114,8 +114,9 @@ impl Layout {
         Self { robot: Some(robot), ..self }
     }
 
-    /// Returns the topics of the buses' frames, and of the frames that were latched before a file. They avoid the
-    /// topics of the patches and `others`: readers identify a bus by its messages, not by its topic.
+    /// Returns two topics for each bus: one for its frames, and one for frames that were latched before the file began.
+    /// The topics differ from those of the patches and from `others`. Readers do not need the topic, because each
+    /// message names its bus.
     #[must_use]
     pub fn bus_topics(&self, others: impl Iterator<Item = String>) -> [Vec<String>; 2] {
         let mut taken = UniqueNames::default();
@@ -131,13 +132,13 @@ impl Layout {
         self.robot.is_some() && tick.is_multiple_of(self.ticks_per_poses)
     }
 
-    /// Returns the frame of the cells' positions: the robot's base.
+    /// Returns the name of the frame in which the positions of cells are given: the robot's base.
     #[must_use]
     pub fn base(&self) -> &str {
         self.robot.as_ref().map_or(BASE, RecordedRobot::base)
     }
 
-    /// Selects the positions of a bus' chain from those of the robot.
+    /// Returns the positions of the joints in a bus's chain, taken from those of all joints of the robot.
     #[must_use]
     pub fn chain_positions(&self, bus: usize, q: &[f64; MAX_ROBOT_JOINTS]) -> [f64; MAX_JOINTS] {
         let mut positions = [0.0; MAX_JOINTS];
@@ -165,7 +166,7 @@ mod tests {
         let cells: usize = layout.patches.iter().map(|patch| patch.cells.len()).sum();
         assert_eq!(cells, skin.cells.len(), "each in one patch");
         assert_eq!(layout.epochs_per_cloud, 3, "62.5 Hz are 20.8 clouds a second");
-        // A second bus has the same cells: its name distinguishes the patches on one link.
+        // A second bus has the same cells. The patches on one link must then be named after their buses.
         let mut other = skin.buses[0].clone();
         other.name = "vcan-1".to_owned();
         skin.buses.push(other);
@@ -176,7 +177,7 @@ mod tests {
         let first = layout.patches[0].link.clone();
         assert_eq!(topics[0], format!("/skin/{first}_{}", word(&skin.buses[0].name)));
         assert_eq!(topics[1], format!("/skin/{first}_vcan_1"));
-        // Names that map to the same topic word stay distinct, and topics of buses avoid all others.
+        // Names of buses that become the same word in a topic must stay distinct, and differ from all other topics.
         skin.buses[0].name = "notes".to_owned();
         skin.buses[1].name = "vcan_1".to_owned();
         skin.buses.push(protocol::skin::SkinBus { name: "vcan-1".to_owned(), ..skin.buses[0].clone() });

@@ -1,4 +1,4 @@
-//! Recordings: MCAP files that are written in parts, named, found and repaired.
+//! Recordings of runs: MCAP files, their names, how they are split, and the repair of those that were not finished.
 
 pub mod account;
 pub mod file;
@@ -13,9 +13,9 @@ pub mod series;
 pub mod sink;
 pub mod window;
 
-/// The prefix of topics of frames; the name of the bus follows.
+/// The beginning of a topic of frames; the name of the bus follows.
 pub const BUS_TOPIC_PREFIX: &str = "/can/";
-/// The prefix of topics of frames that were latched before the file began.
+/// The beginning of a topic of frames that were latched before the file began; the name of the bus follows.
 pub const STATE_TOPIC_PREFIX: &str = "/state/";
 /// The topic of notes between frames.
 pub const NOTES_TOPIC: &str = "/can/notes";

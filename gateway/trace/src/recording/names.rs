@@ -3,9 +3,9 @@
 //! ```text
 //!   run.mcap.part  ── finish ──>  run.mcap         then run-1.mcap.part, run-2.mcap.part, ...
 //!        └─ writer killed ──────>  run-recovered.mcap     and run.mcap.damaged, if more is lost than its end
-//! ```
-//!
-//! The writer of a file holds a lock on it, which ends with the process. It stores the identity of the file in it
+//! The writer of a file holds a lock on it, which ends with its process. Before the file gets a name, the writer stores
+//! the identity of the file in it. A `.part` file that is not locked and holds its own identity is therefore orphaned:
+//! the process that wrote it has ended. Other `.part` files belong to other programs.
 //! before the file gets a name. A `.part` file that is not locked and holds its own identity is therefore orphaned. All
 //! others belong to other programs.
 
@@ -22,19 +22,19 @@ use crate::files::{
     folder_of, hold, identity, is_still, link, nameless, open_unfollowed, rename, suffixed, with_hint,
 };
 
-/// The extension of a file until it is complete.
+/// The extension of a file that is not complete yet.
 const PART: &str = "part";
 /// The extension of a recording.
 const MCAP: &str = "mcap";
 
-/// A file that is being written and locked.
+/// A `.part` file that this process writes and has locked.
 #[derive(Debug)]
 pub struct PartFile {
-    /// The temporary name.
+    /// The present, temporary name.
     pub path: PathBuf,
-    /// The final name.
+    /// The name that the file gets when it is complete.
     pub goal: PathBuf,
-    /// The device and inode, which identify the file whatever its name.
+    /// The device and inode of the file, which identify it under any name.
     is: (u64, u64),
 }
 
@@ -44,13 +44,13 @@ pub fn goal_of(part: &Path) -> PathBuf {
     if part.extension() == Some(OsStr::new(PART)) { part.with_extension("") } else { part.to_owned() }
 }
 
-/// Returns the name of a recording's file with this number: the requested name for 0, then the name with the number.
+/// Returns the name of a file of a recording: `run.mcap` for number 0, `run-1.mcap` for number 1, and so on.
 #[must_use]
 pub fn numbered(path: &Path, number: u32) -> PathBuf {
     if number == 0 { path.to_owned() } else { suffixed(path, format!("-{number}"), MCAP.as_ref()) }
 }
 
-/// Returns an unused name for a recovered file.
+/// Returns a name for a recovered file that no other file has.
 #[must_use]
 pub fn recovered(goal: &Path) -> PathBuf {
     let first = suffixed(goal, "-recovered", MCAP.as_ref());
@@ -61,7 +61,7 @@ fn exists(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
 }
 
-/// The extension of a damaged file that is kept beside the recovered one.
+/// The extension of a damaged file that is kept beside the file recovered from it.
 const DAMAGED: &str = "damaged";
 
 /// Renames a part file to `run.mcap.damaged`, so that later runs do not try to repair it. Returns the new name.
@@ -88,14 +88,14 @@ pub fn keep_damaged(part: &Path, from: &File) -> io::Result<PathBuf> {
     Err(io::Error::other("it has no name left"))
 }
 
-/// Returns the existing files of an earlier recording of this name: the first one and those with numbers.
+/// Returns the existing files of an earlier recording under this name: the first file and the numbered ones.
 #[must_use]
 pub fn series(path: &Path) -> Vec<PathBuf> {
     let from = |first: u32| -> Vec<_> {
         (first..).map(|number| numbered(path, number)).take_while(|path| exists(path)).collect()
     };
     let all = from(0);
-    // The first file may have been removed.
+    // The first file may have been removed while the numbered ones remain.
     if all.is_empty() { from(1) } else { all }
 }
 
@@ -103,7 +103,7 @@ impl PartFile {
     /// Creates and locks a part file.
     ///
     /// # Errors
-    /// Returns an error if another program is writing it, or if it cannot be written.
+    /// Returns an error if another program writes the file, or if it cannot be written.
     pub fn create(goal: PathBuf) -> io::Result<(Self, File)> {
         let mut name = goal.file_name().unwrap_or_default().to_owned();
         name.push(".");
@@ -131,7 +131,7 @@ impl PartFile {
         rename(&self.path, &self.goal, force)
     }
 
-    /// Returns true if the file still has its temporary name, or if the name cannot be queried.
+    /// Returns true if the file still has its temporary name, or if that cannot be queried.
     #[must_use]
     pub fn is_there(&self) -> bool {
         is_still(&self.path, self.is) != Some(false)
@@ -158,15 +158,15 @@ impl PartFile {
     }
 }
 
-/// Returns the message that another program took the name while a recording was written.
+/// Returns the error message for a recording whose name another program took while it was written.
 pub(super) fn taken_meanwhile(goal: &Path) -> String {
     format!("{}: another program made a file of this name meanwhile", goal.display())
 }
 
-/// Returns the reason why a recording cannot begin under a name.
+/// Returns the error message for a recording whose name is already in use.
 fn why_taken(path: &Path) -> String {
     let name = path.display();
-    // A pipe is not opened: a program that waits at its other end would take that for a reader.
+    // A pipe is not opened, because a program at its other end would take this program for a reader.
     if fs::symlink_metadata(path).is_ok_and(|about| !about.is_file()) {
         return format!("{name} exists and is not a regular file: move it away, or record to another name");
     }
@@ -178,8 +178,8 @@ fn why_taken(path: &Path) -> String {
     }
 }
 
-/// Creates a file that gets its name only when it is locked and holds its identity; `None` if the file system does not
-/// support that.
+/// Creates a file that gets its name only after it is locked and holds its identity. Returns `None` if the file system
+/// does not support files without a name.
 fn unnamed(path: &Path) -> Option<io::Result<File>> {
     let mut file = nameless(folder_of(path), 0o666).ok()?;
     claim(&mut file).ok()?;
@@ -192,13 +192,13 @@ fn unnamed(path: &Path) -> Option<io::Result<File>> {
 fn named(path: &Path) -> io::Result<File> {
     let mut file = OpenOptions::new().write(true).create_new(true).open(path)?;
     claim(&mut file).inspect_err(|_| {
-        // The file was just created here, and is useless without its identity.
+        // A file without an identity could never be recognised as an orphan.
         let _ = fs::remove_file(path);
     })?;
     Ok(file)
 }
 
-/// Locks a file, and writes its identity, by which later runs recognise it.
+/// Locks a file and writes its identity into it.
 fn claim(file: &mut File) -> io::Result<()> {
     hold(file)?;
     let about = file.metadata()?;
@@ -211,7 +211,7 @@ pub fn is_held(file: &File) -> bool {
     hold(file).is_err_and(|error| error.kind() == io::ErrorKind::WouldBlock)
 }
 
-/// The reason why a `.part` file is not repaired or removed.
+/// The reason why a `.part` file is neither repaired nor removed.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum PartFileError {
@@ -241,23 +241,23 @@ pub enum PartFileError {
     /// Another process holds the lock.
     #[error("another program is writing it")]
     Held,
-    /// It holds no identity, or that of another file.
+    /// The file does not hold its own identity, so it may be a copy or a file of another program.
     #[error("no run of this program created it here")]
     Unmarked,
 }
 
 impl PartFileError {
-    /// Returns true if it may be a recording.
+    /// Returns true if the file may be a recording, so that the user should be told of it.
     #[must_use]
     pub const fn may_be_recording(&self) -> bool {
         matches!(self, Self::Owner { .. } | Self::Linked(_) | Self::Unmarked)
     }
 }
 
-/// A file that a killed run left, which is locked from now on; or the reason why it is not touched.
+/// A file left by a run that was killed, now locked by this process; or the reason why it is left alone.
 pub type Orphan = Result<File, PartFileError>;
 
-/// Returns the part files in a recording's folder.
+/// Returns the `.part` files in the folder of a recording, each with the file or the reason why it is left alone.
 ///
 /// # Errors
 /// Returns an error if the folder cannot be read.
@@ -276,7 +276,7 @@ pub fn parts(path: &Path) -> io::Result<Vec<(PathBuf, Orphan)>> {
     Ok(found)
 }
 
-/// Locks a part file if it is an orphan.
+/// Opens and locks a `.part` file, if the process that wrote it has ended.
 fn claim_orphan(path: &Path) -> Orphan {
     // Opening anything but a regular file may have side effects.
     let kind = fs::symlink_metadata(path)?.file_type();
@@ -304,7 +304,7 @@ fn claim_orphan(path: &Path) -> Orphan {
     if file::is_marked(&mut file).map_err(PartFileError::Unreadable)? { Ok(file) } else { Err(PartFileError::Unmarked) }
 }
 
-/// Removes an orphan, if its name still belongs to it.
+/// Removes an orphaned file, if the name is still that of the file.
 ///
 /// # Errors
 /// Returns an error if the name belongs to another file now, or if the file cannot be removed.
@@ -313,7 +313,7 @@ pub fn remove(path: &Path, file: &File) -> io::Result<()> {
     fs::remove_file(path)
 }
 
-/// Checks that a name still belongs to a file.
+/// Checks that a name is still that of the given file.
 fn is_its_own(path: &Path, file: &File) -> io::Result<()> {
     if is_still(path, identity(&file.metadata()?)) == Some(true) {
         return Ok(());

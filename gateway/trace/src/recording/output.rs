@@ -1,5 +1,5 @@
-//! The output below the writer of the crate `mcap`. It allows records to be inserted that the crate cannot write:
-//! descriptions outside of chunks.
+//! The output that the writer of the crate `mcap` writes to. Records that the crate cannot write, namely schemas and
+//! channels outside of chunks, can be inserted between those of the crate.
 //!
 //! ```text
 //!   crate's writer ── bytes ──┐
@@ -12,16 +12,17 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use mcap::records::op;
 
-/// The length of the record that ends the data section, in bytes: its header, and a checksum of the section.
+/// The length in bytes of the record that ends the data section: a record header and the checksum of the section.
 const DATA_END: usize = 13;
 
-/// The state that all handles share.
+/// The state that all handles of an output share.
 struct Inner<W> {
     out: W,
     place: u64,
     /// The checksum of all bytes of the data section.
     checksum: crc32fast::Hasher,
-    /// The bytes so far of the record that ends the data section, while the crate writes it.
+    /// The bytes received so far of the record that ends the data section; `None` unless the crate is writing that
+    /// record.
     end: Option<Vec<u8>>,
 }
 
@@ -33,8 +34,8 @@ impl<W: Write> Inner<W> {
         Ok(())
     }
 
-    /// Takes the bytes of the record that ends the data section, and writes that record with the checksum of all bytes.
-    /// Returns the number of bytes that belonged to it.
+    /// Receives the crate's bytes of the record that ends the data section. Once they are complete, writes the record
+    /// with the checksum of all bytes instead. Returns the number of bytes that belonged to the record.
     fn put_end(&mut self, bytes: &[u8]) -> io::Result<usize> {
         let Some(end) = &mut self.end else { return Ok(0) };
         let taken = bytes.get(..bytes.len().min(DATA_END - end.len())).unwrap_or_default();
@@ -49,7 +50,7 @@ impl<W: Write> Inner<W> {
     }
 }
 
-/// A handle of the output. Flushes by the crate are ignored, because it flushes after each chunk.
+/// A handle of the output. It ignores requests to flush, because the crate flushes after each chunk.
 pub(super) struct SharedOutput<W>(Arc<Mutex<Inner<W>>>);
 
 impl<W> Clone for SharedOutput<W> {
@@ -68,12 +69,12 @@ impl<W: Write> SharedOutput<W> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Writes complete records while the crate's writer is between two records.
+    /// Inserts complete records. The crate must be between two records.
     pub(super) fn records(&self, records: &[u8]) -> io::Result<()> {
         self.inner().put(records)
     }
 
-    /// Expects the record that ends the data section next.
+    /// Announces that the next bytes of the crate are the record that ends the data section.
     pub(super) fn begin_end(&self) {
         self.inner().end = Some(Vec::new());
     }
@@ -83,7 +84,7 @@ impl<W: Write> SharedOutput<W> {
         self.inner().out.flush()
     }
 
-    /// Returns the inner writer if this is the last handle.
+    /// Returns the underlying writer if this is the last handle.
     pub(super) fn into_inner(self) -> Option<W> {
         let inner = Arc::into_inner(self.0)?;
         Some(inner.into_inner().unwrap_or_else(PoisonError::into_inner).out)

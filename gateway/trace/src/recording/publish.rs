@@ -1,5 +1,5 @@
-//! Gives files their final names once they are on the disk. Syncing may block for longer than a recorder can wait, so a
-//! thread does it, one file after the other.
+//! Writes finished files to the disk and then renames them. This may take longer than a recorder can wait, so a thread
+//! does it for one file after the other.
 
 use std::fs::File;
 use std::io;
@@ -10,7 +10,7 @@ use std::thread::{self, JoinHandle};
 use super::names::{self, PartFile};
 use crate::files::sync_folder;
 
-/// A complete file, and the information that is returned with its final name.
+/// A finished file with its temporary name, and data for the caller that is returned with its final name.
 #[derive(Debug)]
 pub(super) struct Ended<T> {
     /// The file, which stays locked until it is renamed.
@@ -22,14 +22,14 @@ pub(super) struct Ended<T> {
 /// A file with its final name.
 #[derive(Debug)]
 pub(super) struct Published<T> {
-    /// The name; `None` if another program renamed or removed the file.
+    /// The final name; `None` if another program renamed or removed the file.
     pub(super) path: Option<PathBuf>,
     pub(super) about: T,
-    /// The reason why the name is not the requested one.
+    /// An error message if the file does not have the requested name.
     pub(super) error: Option<String>,
 }
 
-/// The thread, and the files that it has finished.
+/// The thread that renames finished files, and the files that it has renamed.
 #[derive(Debug)]
 pub(super) struct Publisher<T> {
     force: bool,
@@ -45,7 +45,7 @@ impl<T: Send + 'static> Publisher<T> {
         Self { force, running: None, sender, published }
     }
 
-    /// Queues a file for syncing and renaming.
+    /// Passes a finished file to the thread.
     pub(super) fn publish(&mut self, ended: Ended<T>) {
         if self.running.is_none() {
             self.running = self.start().ok();
@@ -55,7 +55,7 @@ impl<T: Send + 'static> Publisher<T> {
             None => Some(ended),
         };
         if let Some(ended) = unsent {
-            // If the thread cannot be started, the recorder waits; messages meanwhile wait in its queue.
+            // Without a thread the recorder renames the file itself; new messages meanwhile wait in its queue.
             let _ = self.sender.send(publish(ended, self.force));
         }
     }
@@ -71,12 +71,12 @@ impl<T: Send + 'static> Publisher<T> {
         Ok((sender, thread::Builder::new().name("sync".into()).spawn(work)?))
     }
 
-    /// Returns the files that have been published since the last call.
+    /// Returns the files that were renamed since the last call.
     pub(super) fn done(&self) -> impl Iterator<Item = Published<T>> {
         self.published.try_iter()
     }
 
-    /// Waits until all files are published.
+    /// Waits until all files are renamed.
     pub(super) fn finish(&mut self) {
         if let Some((sender, thread)) = self.running.take() {
             drop(sender);
@@ -86,7 +86,8 @@ impl<T: Send + 'static> Publisher<T> {
     }
 }
 
-/// Syncs a file before it renames it: a file under its final name is complete even after a loss of power.
+/// Writes a file to the disk before it is renamed, so that a file with its final name is complete even after a loss of
+/// power.
 fn publish<T>(Ended { file, part, about }: Ended<T>, force: bool) -> Published<T> {
     let named = file.sync_all().and_then(|()| part.finish(force));
     match named {

@@ -7,7 +7,7 @@
 //! ```
 //!
 //! A chunk is kept if it is complete and its checksum is correct. Damaged chunks, and bytes that are not a record, are
-//! left out and reported. Intact records after them are kept; where a length is wrong they are searched for.
+//! left out and reported. Intact records after them are kept; if a length is wrong, the next records are searched for.
 
 mod described;
 mod survey;
@@ -26,31 +26,31 @@ use crate::container::{Chunk, FormatError, Framed, Record, RecordReader, parse};
 /// The longest attachment that is copied, in bytes.
 const LONGEST_ATTACHMENT: u64 = 1 << 30;
 
-/// The result of a recovery.
+/// The result of a recovery: what was kept and what was lost.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct RecoveryResult {
     /// Messages kept.
     pub messages: u64,
-    /// Frames of buses among them.
+    /// Frames among the kept messages.
     pub frames: u64,
     /// The latest time of a message, in ns since 1970; 0 without messages.
     pub last_nanos: u64,
-    /// Bytes at the end that are not a complete record.
+    /// Bytes at the end of the file that are not a complete record.
     pub unfinished: u64,
     /// The number of damaged places, and the bytes lost there.
     pub damaged: (u64, u64),
-    /// Messages whose channel was described only in a lost part.
+    /// Messages that were lost because their channel was described only in a damaged part of the file.
     pub orphaned_messages: u64,
     /// The number of messages according to the statistics of the file, if it has any.
     pub stated: Option<u64>,
-    /// True if the file had its end.
+    /// True if the file had a complete summary and footer.
     pub whole: bool,
     /// True if the checksum of all data or of the summary is wrong.
     pub checksum: bool,
 }
 
 impl RecoveryResult {
-    /// Returns true if only the data that a killed writer had not finished is lost.
+    /// Returns true if only the end is missing that a killed writer had not written yet.
     #[must_use]
     pub const fn is_undamaged(&self) -> bool {
         self.damaged.0 == 0 && self.orphaned_messages == 0
@@ -63,7 +63,7 @@ impl RecoveryResult {
         self.whole && self.unfinished == 0 && self.is_undamaged() && !self.checksum && is_all
     }
 
-    /// Returns true if more messages were lost than kept, as far as their number is known.
+    /// Returns true if more messages were lost than kept. This can be determined only if the file states their number.
     #[must_use]
     pub fn is_little(&self) -> bool {
         let missing = self.stated.map_or(0, |stated| stated.saturating_sub(self.messages));
@@ -100,13 +100,13 @@ impl fmt::Display for RecoveryResult {
     }
 }
 
-/// The error of a recovery that finds nothing.
+/// An error that ends a recovery without a new file.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RecoverError {
-    /// The input is not an MCAP file.
+    /// The input does not begin like an MCAP file.
     #[error(
-        "it is no MCAP file: it begins with {}, an MCAP file with 89 4d 43 41 50: name a recording",
+        "it is not an MCAP file: it begins with {}, but MCAP begins with 89 4d 43 41 50; name a recording",
         hex(got)
     )]
     NoMcap {
@@ -114,7 +114,7 @@ pub enum RecoverError {
         got: Vec<u8>,
     },
     /// The MCAP file ends before its first message.
-    #[error("it ends within its first {0} bytes: there is nothing in it")]
+    #[error("it ends after {0} bytes, before its first message, so nothing can be recovered")]
     Empty(u64),
     /// The input cannot be read.
     #[error("reading: {0}")]
@@ -129,11 +129,12 @@ fn hex(bytes: &[u8]) -> String {
     if digits.is_empty() { "nothing".to_owned() } else { digits.join(" ") }
 }
 
-/// Copies all intact records into a new file, and finishes it. After damage it continues with the next record that is
-/// certain. Schemas and channels are collected from the whole file in advance.
+/// Copies all intact records into a new file and writes its end. After damage, copying continues at the next record
+/// that is certainly one. Schemas and channels are collected from the whole file first.
 ///
 /// # Errors
-/// Returns [`RecoverError`] if there is nothing to keep, if a file fails, or if the input is not seekable.
+/// Returns [`RecoverError`] if no message can be recovered, if reading or writing fails, or if the input is not
+/// seekable.
 pub fn recover(mut from: impl Read + Seek, out: impl Write) -> Result<RecoveryResult, RecoverError> {
     let FileSurvey { profile, pieces, described, recovered } = FileSurvey::new(&mut from)?;
     let begin = || -> io::Result<_> {
@@ -170,13 +171,13 @@ pub fn recover(mut from: impl Read + Seek, out: impl Write) -> Result<RecoveryRe
 
 struct Copy<W: Write> {
     writer: FileWriter<W>,
-    /// Channel numbers, each with true if its messages are frames.
+    /// The channel numbers of the new file, each with true if its messages are frames.
     topics: BTreeMap<u16, bool>,
     recovered: RecoveryResult,
 }
 
 impl<W: Write> Copy<W> {
-    /// Copies a record that the survey found intact; `read` is the number of bytes of the file read so far.
+    /// Copies a record that the survey found intact. `read` is the number of bytes of the input read so far.
     fn copy_record(&mut self, chunk: &mut Chunk, code: u8, body: &[u8], read: u64) -> Result<(), RecoverError> {
         if code != op::CHUNK {
             return self.record(code, body).map_err(RecoverError::Write);
@@ -209,7 +210,8 @@ impl<W: Write> Copy<W> {
                 self.writer.attach_at(name, media_type, (log_time, create_time), data)
             }
             Record::Metadata { name, facts } => self.writer.metadata(name, &facts.into()),
-            // These records are already written, are generated anew, or are not written by skinbus.
+            // These records are already written, are generated for the new file, or do not occur in a recording of
+            // skinbus.
             Record::Schema { .. }
             | Record::Channel { .. }
             | Record::Header { .. }
@@ -220,7 +222,7 @@ impl<W: Write> Copy<W> {
     }
 }
 
-/// The input changed between the survey and the copy.
+/// Returns the error for an input that was changed between the survey and the copy.
 fn changed(damage: FormatError) -> RecoverError {
     RecoverError::Read(io::Error::other(format!("it was changed meanwhile: {damage}")))
 }

@@ -1,4 +1,4 @@
-//! Finds, repairs and reports files whose writers were killed.
+//! Finds and repairs the files of runs that were killed.
 
 use std::fs::{File, Permissions};
 use std::io::{self, BufReader, BufWriter, Seek};
@@ -12,25 +12,26 @@ use super::recover::{RecoverError, RecoveryResult, recover};
 use super::sink::is_full;
 use crate::files::{WholeFile, folder_of, nameless};
 
-/// The maximum number of names that are tried for a new file while other programs take them.
+/// The maximum number of names to try for a new file if other programs create files of the same names.
 const NAMES: u32 = 100;
 
-/// A repaired recording.
+/// The result of repairing a recording.
 #[derive(Clone, Debug)]
 pub struct Repaired {
     /// The result of the recovery.
     pub recovered: RecoveryResult,
-    /// The new file and its length in bytes; `None` if nothing was recorded.
+    /// The new file and its length in bytes; `None` if the old one held no messages.
     pub new: Option<(PathBuf, u64)>,
-    /// The new name of the original, if it is damaged before its end; otherwise the original is removed.
+    /// The name under which the original is kept, if it is damaged before its end; `None` if it was removed.
     pub original: Option<PathBuf>,
 }
 
-/// Makes a complete file from one that broke off. Removes the latter, or keeps it under another name if it is damaged
-/// before its end. `goal` returns a name for the new file at each attempt; another file is replaced only with `force`.
+/// Makes a complete file from one that was not finished. The original is removed, or kept under another name if it is
+/// damaged before its end. `goal` returns a name for the new file at each attempt. An existing file is replaced only if
+/// `force` is true.
 ///
 /// # Errors
-/// Returns [`RecoverError`] if nothing can be recovered or written; the file stays as it is.
+/// Returns [`RecoverError`] if nothing can be recovered or written. The original then stays as it is.
 pub fn repair(
     part: &Path,
     from: &File,
@@ -62,7 +63,7 @@ pub fn repair(
     Ok(Repaired { original, ..repaired })
 }
 
-/// Returns the message for a file that broke off and could not be repaired.
+/// Returns the error message for a file that was not finished and cannot be repaired.
 pub(super) fn unrepaired(PartFile { path, goal, .. }: &PartFile, error: &RecoverError) -> String {
     let path = path.display();
     let is = |kind: fn(&io::Error) -> bool| matches!(error, RecoverError::Write(error) if kind(error));
@@ -75,8 +76,8 @@ pub(super) fn unrepaired(PartFile { path, goal, .. }: &PartFile, error: &Recover
     format!("{why}; what was recorded is in {path}: repair it with `skinbus recover {path}{more}")
 }
 
-/// Recovers a file, unless it is sound or holds no messages. Returns the result, and the length of the new file in
-/// bytes if one was made. Replaces another file only with `force`.
+/// Recovers a file into a new one, unless the file is sound or holds no messages. Returns the result, and the length of
+/// the new file in bytes if one was made. Replaces an existing file only if `force` is true.
 ///
 /// # Errors
 /// Returns [`RecoverError`] if nothing can be recovered or written.
@@ -98,7 +99,7 @@ fn copy(
     as_private(from, &file).map_err(RecoverError::Write)?;
     let mut out = BufWriter::new(file);
     let mut from = from;
-    // A recording is read twice, but a pipe can be read only once.
+    // The file is read twice. A pipe can be read only once, so it is copied first.
     let kept = if from.rewind().is_err() {
         Some(kept(from, folder_of(to)).map_err(RecoverError::Read)?)
     } else {
@@ -116,7 +117,7 @@ fn copy(
     Ok((recovered, Some(finish().map_err(RecoverError::Write)?)))
 }
 
-/// Copies a pipe to its end into an unnamed file.
+/// Copies the rest of a pipe into an unnamed file.
 fn kept(mut from: &File, folder: &Path) -> io::Result<File> {
     let mut file = nameless(folder, 0o600)?;
     io::copy(&mut from, &mut file)?;
@@ -132,16 +133,16 @@ fn as_private(from: &File, copy: &File) -> io::Result<()> {
     }
     let mut mode = original.mode() & about.mode() & 0o777;
     if original.gid() != about.gid() && fchown(copy, None, Some(Gid::from_raw(original.gid()))).is_err() {
-        // The copy belongs to another group.
+        // The group of the copy is another one, so it gets no permissions.
         mode &= 0o707;
     }
     copy.set_permissions(Permissions::from_mode(mode))
 }
 
-/// Repairs the files of killed runs in a recording's folder, and reports each in a line. Also reports files of other
-/// programs.
+/// Repairs the files of killed runs in the folder of a recording. Reports each of them to `say` in a line, and also
+/// `.part` files of other programs.
 pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
-    // An unreadable folder is reported when the recording is begun.
+    // An unreadable folder is reported when the recording begins.
     for (part, found) in names::parts(path).unwrap_or_default() {
         let name = part.display();
         let held = match found {

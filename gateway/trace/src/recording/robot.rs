@@ -6,25 +6,25 @@ use robots::{LinkPose, RobotProblem, RobotError, DhRow, Urdf, frames, pose_of, w
 
 use crate::ros2::robot::Transform;
 
-/// The maximum difference between the rows of a skin and the links of a description, in m.
+/// The maximum distance between a row of the skin and the link of the description that should match it, in m.
 const TOLERANCE_M: f64 = 1e-6;
-/// The distance by which joints are moved for the comparison, in rad or m.
+/// The distance by which each joint is moved to compare the skin with the description, in rad or m.
 const STEP: f64 = 0.3;
 
-/// The robot in a recording.
+/// The robot as it is described in a recording.
 #[derive(Clone, Debug)]
 pub struct RecordedRobot {
-    /// The URDF text.
+    /// The robot description: a URDF.
     pub description: String,
     base: String,
     poses: Vec<LinkPose>,
-    /// By chain: the link that each of its joints moves.
+    /// By chain: the name of the link that each joint of the chain moves.
     links: Vec<Vec<String>>,
-    /// The cells: link, own frame, and pose on the link.
+    /// The cells: the link, the cell's own frame, and the pose of that frame on the link.
     cells: Vec<(String, String, Isometry3<f64>)>,
 }
 
-/// A URDF with its link poses and link names.
+/// A URDF, the poses of its links, and the names of its links.
 struct Described {
     urdf: Urdf,
     poses: Vec<LinkPose>,
@@ -36,7 +36,8 @@ impl RecordedRobot {
     ///
     /// # Errors
     /// Returns [`RobotError`] if the rows cannot be described, for example if chains share a joint that has different
-    /// poses.
+    /// Returns [`RobotError`] if the rows cannot be described as a URDF, for example if two chains share a joint that
+    /// has different
     pub fn of_rows(skin: &Skin) -> Result<Self, RobotError> {
         let written = written(skin);
         let urdf = Urdf::parse("the skin's robot", &written.xml)?;
@@ -72,26 +73,26 @@ impl RecordedRobot {
         Ok(Self { description, base, poses, links, cells })
     }
 
-    /// Returns the root link.
+    /// Returns the name of the robot's root link.
     #[must_use]
     pub fn base(&self) -> &str {
         &self.base
     }
 
-    /// Returns the link that a joint of a chain, from 1, moves.
+    /// Returns the name of the link that a joint moves. `chain` counts from 0 and `joint` from 1.
     #[must_use]
     pub fn link(&self, (chain, joint): (usize, usize)) -> Option<&str> {
         self.links.get(chain)?.get(joint.checked_sub(1)?).map(String::as_str)
     }
 
-    /// Returns the poses of links that move, for joints at `q` in rad or m.
+    /// Returns the poses of all links that joints move, for the joint positions `q` in rad or m.
     #[must_use]
     pub fn moving(&self, q: &[f64]) -> Vec<Transform<'_>> {
         let moving = self.poses.iter().filter(|pose| pose.moves());
         moving.map(|pose| transform(&pose.parent, &pose.child, &pose.pose(q))).collect()
     }
 
-    /// Returns the poses of fixed links and of cells.
+    /// Returns the poses that never change: those of fixed links, and those of cells on their links.
     #[must_use]
     pub fn still(&self) -> Vec<Transform<'_>> {
         let links = self.poses.iter().filter(|pose| !pose.moves());
@@ -101,7 +102,7 @@ impl RecordedRobot {
 }
 
 impl Described {
-    /// Returns the link that a cell's joint moves, the cell's own frame, and its pose on the link.
+    /// Returns the link that a cell is on, the name of the cell's own frame, and the pose of that frame on the link.
     fn cell(&self, skin: &Skin, cell: &Cell) -> Result<(String, String, Isometry3<f64>), RobotError> {
         let bus = skin.buses.get(cell.bus);
         let index = bus.map_or(0, |bus| bus.chain);
@@ -131,7 +132,7 @@ impl Described {
         Ok((link.to_owned(), name, one * place))
     }
 
-    /// Returns the pose of a row's frame relative to a link.
+    /// Returns the pose of a row's frame relative to a link, for the joint positions `q`.
     fn row_on(&self, link: &str, chain: &Chain, row: usize, q: &[f64]) -> Isometry3<f64> {
         let of_chain: Vec<_> =
             chain.joints.iter().map(|joint| q.get(*joint).copied().unwrap_or_default()).collect();

@@ -1,8 +1,8 @@
-//! Writes a recording as a series of MCAP files. Each file begins with all that makes it readable by itself, is flushed
-//! regularly, ends when it is large or old enough, and gets its final name when it is complete.
+//! Writes a recording as a series of MCAP files. Each file can be read without the others. It is flushed regularly,
+//! ends when it is large or old enough, and gets its final name when it is complete.
 //!
-//! After an error the file is closed, and repaired at the end. Another file is begun at once, then every few seconds;
-//! messages that arrive meanwhile are counted as lost.
+//! After an error the file is closed, and it is repaired at the end of the recording. Another file is begun at once; if
+//! that fails, it is tried again every few seconds. Messages that arrive meanwhile are counted as lost.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -23,24 +23,25 @@ use super::sink::{FileGauge, ReservedFile};
 use super::window::ReorderWindow;
 use crate::files::folder_of;
 
-/// The size of the write buffer in bytes. A chunk is larger and bypasses it.
+/// The size of the write buffer in bytes. Chunks are larger and are written without it.
 const BUFFER: usize = 64 << 10;
-/// The interval between two attempts after an error.
+/// The interval between two attempts to begin a file after an error.
 const RETRY_INTERVAL: Duration = Duration::from_secs(5);
-/// The maximum time for which an open segment delays the end of a file, because any traffic may look like a segment.
+/// The maximum time for which an incomplete packet delays the end of a file. The time is limited because any traffic
+/// may look like a segment.
 const MAX_HOLD: Duration = Duration::from_millis(500);
 /// The interval between two checks that a file still has its name.
 const NAME_CHECK_INTERVAL: Duration = Duration::from_secs(1);
-/// The free space that a full disk must have before recording is tried again, in bytes.
+/// The free space in bytes that a disk must have before recording continues after the disk was full.
 const MIN_FREE_BYTES: u64 = 64 << 20;
 
-/// The writer of a file.
+/// The writer of one file of a recording.
 pub type Writer = FileWriter<BufWriter<ReservedFile>>;
 
-/// The limits at which another file is begun.
+/// The limits of a file. When one is reached, the next file is begun.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct SplitLimits {
-    /// The size of a file in bytes, without what each file begins with.
+    /// The size of a file in bytes, without the attachments and metadata at its beginning.
     pub bytes: u64,
     /// The age of a file.
     pub age: Duration,
@@ -53,7 +54,7 @@ impl Default for SplitLimits {
     }
 }
 
-/// An attachment.
+/// A file that is attached to the recording.
 #[derive(Clone, Debug)]
 pub struct AttachedFile {
     /// The name of the attachment.
@@ -64,7 +65,7 @@ pub struct AttachedFile {
     pub bytes: Vec<u8>,
 }
 
-/// The contents at the beginning of each file.
+/// The metadata and attachments that each file of the recording begins with.
 #[derive(Clone, Debug, Default)]
 pub struct FileHead {
     /// The start of the recording, in ns since 1970.
@@ -89,17 +90,17 @@ impl FileHead {
     }
 }
 
-/// An event to be reported.
+/// An event of a recording that is to be reported.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum RecordingEvent {
-    /// A file failed; the run goes on.
+    /// A file could not be written further. The run continues.
     BrokeOff(String),
-    /// Any other event.
+    /// Any other event, such as a finished file.
     Else(String),
 }
 
 impl RecordingEvent {
-    /// Returns the description of the event, for the end of the run.
+    /// Returns the text of the event without its consequences, for the summary of the run.
     #[must_use]
     pub fn what(&self) -> &str {
         match self {
@@ -120,28 +121,28 @@ impl core::fmt::Display for RecordingEvent {
     }
 }
 
-/// A file that is being written.
+/// The file that is being written.
 #[derive(Debug)]
 struct OpenFile<T> {
     writer: Writer,
     topics: T,
     part: PartFile,
     gauge: Arc<FileGauge>,
-    /// The number of bytes before the first message.
+    /// The number of bytes in the file before its first message.
     head: u64,
     began: Instant,
-    /// The time of the last check that the file still has its name.
+    /// The time at which the name of the file was last checked.
     looked: Instant,
-    /// The time since when it is large or old enough.
+    /// The time at which the file became large or old enough to end; `None` before.
     enough: Option<Instant>,
-    /// Messages that are flushed to the file.
+    /// The number of messages that were flushed to the file.
     kept: MessageCount,
-    /// Messages written since the last flush.
+    /// The number of messages written since the last flush.
     written: MessageCount,
 }
 
 impl<T> OpenFile<T> {
-    /// Writes messages that have waited long enough, or all that wait.
+    /// Writes the waiting messages that have waited long enough, or all of them if `all` is true.
     fn release(&mut self, window: &mut ReorderWindow, all: bool) -> io::Result<()> {
         let Self { writer, written, .. } = self;
         written.add(if all { window.release_all(writer) } else { window.release(writer) }?);
@@ -149,7 +150,7 @@ impl<T> OpenFile<T> {
     }
 }
 
-/// A file that broke off and is locked until it is repaired.
+/// A file that could not be written further. It stays locked until it is repaired.
 #[derive(Debug)]
 struct BrokenFile {
     part: PartFile,
@@ -164,23 +165,23 @@ pub struct SplitRecording<T> {
     force: bool,
     split: SplitLimits,
     head: FileHead,
-    /// The recorder's time.
+    /// The time of the recorder, in ns since 1970.
     now: u64,
-    /// The number of the open file, or of the last one.
+    /// The number of the open file, or of the last one if none is open.
     number: u32,
-    /// The first file, claimed but not begun.
+    /// The first file, which is created and locked but has no contents yet.
     claimed: Option<(PartFile, File)>,
-    /// Files of an earlier recording that this one replaces.
+    /// Files of an earlier recording of the same name, which are removed at the end.
     stale: Vec<PathBuf>,
     open: Option<OpenFile<T>>,
     /// Messages that wait for the open file. All files share the window, so that its buffers stay allocated.
     window: ReorderWindow,
     /// The time of the last error.
     failed: Option<Instant>,
-    /// The time at which a file was last begun at once after an error, and true if this is to be done next.
+    /// The time at which a file was last begun directly after an error, and true if another file is to be begun now.
     prompt: (Option<Instant>, bool),
     broken: Vec<BrokenFile>,
-    /// Publishes complete files, each with its message counts and its length.
+    /// Renames complete files. Each has its message counts and its length in bytes.
     publisher: Publisher<(MessageCount, u64)>,
     written: Vec<WrittenFile>,
     lost: MessageCount,
@@ -189,10 +190,10 @@ pub struct SplitRecording<T> {
 }
 
 impl<T> SplitRecording<T> {
-    /// Claims the first file early, so that errors are reported before there is anything to write.
+    /// Creates and locks the first file, so that errors are reported before the recording begins.
     ///
     /// # Errors
-    /// Returns an error if another program is writing it, or if it cannot be written.
+    /// Returns an error if another program writes the file, or if it cannot be written.
     pub fn claim(path: &Path, force: bool, split: SplitLimits) -> io::Result<Self> {
         let stale = names::series(path);
         if let Some(there) = stale.first().filter(|_| !force) {
@@ -221,7 +222,7 @@ impl<T> SplitRecording<T> {
         })
     }
 
-    /// Begins the first file.
+    /// Begins the first file with `head`. `topics` creates the channels of a file.
     pub fn begin(&mut self, head: FileHead, topics: impl FnOnce(&mut Writer) -> io::Result<T>) {
         (self.now, self.head) = (head.nanos, head);
         let Some((part, file)) = self.claimed.take() else { return };
@@ -231,7 +232,7 @@ impl<T> SplitRecording<T> {
         }
     }
 
-    /// Adds a metadata record to the open file and to all that follow.
+    /// Adds a metadata record to the open file and to all later ones.
     pub fn add(&mut self, name: &'static str, facts: BTreeMap<String, String>) {
         let written = self.open.as_mut().map_or(Ok(()), |open| open.writer.metadata(name, &facts));
         self.head.metadata.push((name, facts));
@@ -266,7 +267,7 @@ impl<T> SplitRecording<T> {
         Ok(OpenFile { writer, topics, part, gauge, head, began, looked: began, enough: None, kept, written })
     }
 
-    /// Sets the recorder's time, in ns since 1970, by which messages are ordered.
+    /// Sets the time of the recorder, in ns since 1970.
     pub fn set_time(&mut self, now: u64) {
         self.now = now;
         let Some(OpenFile { writer, written, .. }) = &mut self.open else { return };
@@ -276,7 +277,7 @@ impl<T> SplitRecording<T> {
         }
     }
 
-    /// Adds messages to the open file. They count as lost if no file is open.
+    /// Adds `count` messages to the open file by calling `write`. If no file is open, they are counted as lost.
     pub fn put(&mut self, count: MessageCount, write: impl FnOnce(&mut ReorderWindow, &mut T)) {
         let Some(open) = &mut self.open else { return self.lost.add(count) };
         write(&mut self.window, &mut open.topics);
@@ -285,7 +286,7 @@ impl<T> SplitRecording<T> {
         }
     }
 
-    /// Writes all waiting messages to the open file. Messages added later stand after them.
+    /// Writes all waiting messages to the open file. Messages that are added later stand after them.
     pub fn settle(&mut self) {
         self.release(true);
     }
@@ -296,8 +297,9 @@ impl<T> SplitRecording<T> {
         }
     }
 
-    /// Flushes messages that have waited long enough. Ends a file that is large or old enough once `holds` is false,
-    /// and one whose disk is full. Returns true if another file should be begun with [`Series::next`].
+    /// Writes the messages that have waited long enough. Ends a file whose disk is full, or one that is large or old
+    /// enough, the latter only if `holds` is false. Returns true if the caller should begin another file with
+    /// [`Series::next`].
     pub fn flush(&mut self, holds: bool) -> bool {
         self.take_published();
         let Some(open) = &mut self.open else {
@@ -333,7 +335,7 @@ impl<T> SplitRecording<T> {
         enough
     }
 
-    /// Begins another file. Returns true on success.
+    /// Begins another file. `topics` creates its channels. Returns true on success.
     pub fn next(&mut self, topics: impl FnOnce(&mut Writer) -> io::Result<T>) -> bool {
         let number = self.number + 1;
         let goal = names::numbered(&self.path, number);
@@ -362,13 +364,13 @@ impl<T> SplitRecording<T> {
         self.open.is_some()
     }
 
-    /// Returns the messages that were not written.
+    /// Returns the number of messages that could not be written.
     #[must_use]
     pub const fn lost(&self) -> MessageCount {
         self.lost
     }
 
-    /// Returns the number of messages that arrived after later ones were written.
+    /// Returns the number of messages that arrived after messages of later times had been written.
     #[must_use]
     pub const fn late(&self) -> u64 {
         self.window.late()
@@ -380,12 +382,12 @@ impl<T> SplitRecording<T> {
         self.open.as_ref().map_or(0, |open| open.gauge.bytes())
     }
 
-    /// Returns the events since the last call.
+    /// Returns the events since the last call, and removes them.
     pub fn drain_events(&mut self) -> std::vec::Drain<'_, RecordingEvent> {
         self.said.drain(..)
     }
 
-    /// Ends the file and publishes it.
+    /// Ends the open file, and passes it on to be renamed.
     fn end(&mut self) {
         let Some(mut open) = self.open.take() else { return };
         if let Err(error) = open.release(&mut self.window, true).and_then(|()| open.writer.finish()) {
@@ -398,7 +400,7 @@ impl<T> SplitRecording<T> {
         self.publisher.publish(Ended { file: sink.into_file(), part: open.part, about });
     }
 
-    /// Collects the files that have their final names by now.
+    /// Adds the files that were renamed since the last call to those of the recording.
     fn take_published(&mut self) {
         for Published { path, about: (kept, bytes), error } in self.publisher.done() {
             self.said.extend(error.map(RecordingEvent::Else));
@@ -415,13 +417,13 @@ impl<T> SplitRecording<T> {
         let Some(open) = self.open.take() else { return };
         self.lost.add(open.written);
         self.lost.add(self.window.count());
-        // The buffer holds an incomplete record and is dropped. The file stays locked until it is repaired.
+        // The buffer holds an incomplete record, which is dropped. The file stays locked until it is repaired.
         let (sink, _) = open.writer.into_inner().into_parts();
         self.broken.push(BrokenFile { part: open.part, file: sink.into_file(), kept: open.kept });
         self.fail(error);
     }
 
-    /// Requests another file at once, unless that was tried a moment ago: then the error is not a single one.
+    /// Handles an error. Requests another file at once, unless that was done a moment ago: the error then persists.
     fn fail(&mut self, error: &io::Error) {
         let (last, prompt) = &mut self.prompt;
         if last.is_none_or(|at| at.elapsed() >= RETRY_INTERVAL) {
@@ -433,7 +435,7 @@ impl<T> SplitRecording<T> {
         }
     }
 
-    /// Removes the open file.
+    /// Removes the open file, which is not wanted.
     pub fn discard(&mut self) {
         if let Some(open) = self.open.take() {
             // If this fails, the next run repairs the file.
@@ -441,7 +443,7 @@ impl<T> SplitRecording<T> {
         }
     }
 
-    /// Ends the recording. Returns its files and the lost messages.
+    /// Ends the recording. Returns its files, and the number of lost messages.
     pub fn finish(&mut self) -> (Vec<WrittenFile>, MessageCount) {
         self.end();
         self.publisher.finish();
@@ -451,7 +453,7 @@ impl<T> SplitRecording<T> {
             let goal = || part.goal.clone();
             match from.and_then(|from| repair::repair(&part.path, &from, goal, self.force)) {
                 Ok(Repaired { recovered, new: Some((goal, bytes)), .. }) => {
-                    // More or fewer messages may have reached the disk than were counted.
+                    // The number of messages on the disk may differ from the counted one, so the recovered ones decide.
                     self.lost.frames = (self.lost.frames + kept.frames).saturating_sub(recovered.frames);
                     let others = recovered.messages - recovered.frames;
                     self.lost.others = (self.lost.others + kept.others).saturating_sub(others);
@@ -468,7 +470,7 @@ impl<T> SplitRecording<T> {
         // An earlier recording with more files would seem to continue this one.
         for stale in std::mem::take(&mut self.stale) {
             if !self.written.iter().any(|written| Path::new(&written.path) == stale) {
-                // The file was to be overwritten; it does no harm if it stays.
+                // The file was to be overwritten. An error of removing it does no harm.
                 let _ = std::fs::remove_file(stale);
             }
         }

@@ -1,5 +1,5 @@
-//! The file below a recording. It counts bytes and holds space in reserve, so that a file can be finished although its
-//! disk becomes full.
+//! The file that a recording is written to. It reserves disk space, so that it can be finished even if the disk becomes
+//! full.
 
 use std::fs::File;
 use std::io::{self, Write};
@@ -11,12 +11,12 @@ use rustix::fs::{FallocateFlags, fallocate};
 
 use crate::files::{nameless, write_patiently};
 
-/// The space in bytes that a file without chunks may need for its end, including one pending chunk.
+/// The space in bytes that is reserved for the end of a file without chunks; half of it is for one pending chunk.
 const RESERVE: u64 = 512 << 10;
-/// The space in bytes that the end grows by with each chunk, for its index entry.
+/// The space in bytes that is reserved for the index entry of each chunk, which the end of the file holds.
 const RESERVE_FOR_CHUNK: u64 = 400;
 
-/// The state of a file that is visible outside of its writer.
+/// The size and the reserve of a file, as seen by other objects than its writer.
 #[derive(Debug, Default)]
 pub struct FileGauge {
     bytes: AtomicU64,
@@ -24,7 +24,7 @@ pub struct FileGauge {
     reserve: Mutex<Option<Reserve>>,
 }
 
-/// Disk space held by an unnamed file.
+/// Disk space that an unnamed file occupies until it is needed.
 #[derive(Debug)]
 struct Reserve {
     file: File,
@@ -38,13 +38,13 @@ impl FileGauge {
         self.bytes.load(Ordering::Relaxed)
     }
 
-    /// Returns true if the disk is full: the file uses the reserve and must be finished now.
+    /// Returns true if the disk is full. The file then uses the reserved space and must be finished at once.
     #[must_use]
     pub fn is_full(&self) -> bool {
         self.full.load(Ordering::Relaxed)
     }
 
-    /// Extends the reserve for the end of a file with `chunks` chunks.
+    /// Extends the reserve to the end of a file with `chunks` chunks.
     pub fn reserve_for(&self, chunks: u64) {
         let mut held = self.reserve.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(reserve) = held.as_mut() else { return };
@@ -71,14 +71,15 @@ impl FileGauge {
 #[derive(Debug)]
 pub struct ReservedFile {
     file: File,
-    /// The number of bytes that the file already holds; the writer writes them again, and they are skipped.
+    /// The number of bytes at the beginning that the file already holds. The writer writes them again, and they are
+    /// skipped.
     there: u64,
     gauge: Arc<FileGauge>,
 }
 
 impl ReservedFile {
-    /// Wraps a file, and reserves space in its folder. The writer must begin with the bytes that are already in the
-    /// file. If the file system reserves no space, a full disk is an ordinary error.
+    /// Wraps a file, and reserves disk space in `folder`. The writer must first write the bytes that are already in the
+    /// file. If the file system cannot reserve space, a full disk is an error like any other.
     ///
     /// # Errors
     /// Returns an error if the file cannot be queried.
@@ -95,7 +96,7 @@ impl ReservedFile {
     }
 }
 
-/// Reserves space; `None` if the file system does not support unnamed files or preallocation.
+/// Reserves disk space. Returns `None` if the file system does not support unnamed files or preallocation.
 fn reserve(folder: &Path) -> Option<Reserve> {
     let file = nameless(folder, 0o600).ok()?;
     fallocate(&file, FallocateFlags::empty(), 0, RESERVE).ok()?;

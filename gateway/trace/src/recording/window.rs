@@ -1,12 +1,13 @@
-//! Orders messages by time: each waits briefly before it is written.
+//! Sorts messages by time: each message waits a short time for older ones before it is written.
 //!
 //! ```text
 //! topics ──> write ──> [ waiting ] ──> release ──> file, in order of log_time
 //! ```
 //!
-//! Receivers and the loop deliver messages in turn, so only the messages of one topic arrive in order. The `log_time`
-//! of a message is its own time, or later if the file has already passed that, so that a file is always ordered by
-//! `log_time`. The message's own time is its `publish_time`. The order of one topic is never changed.
+//! The receivers of the buses and the loop deliver messages in turn, so only the messages of one topic arrive in order.
+//! The `publish_time` of a message is its own time. Its `log_time` is the same, unless messages of later times were
+//! already written: then it is the time of the last one. A file is therefore always ordered by `log_time`, and the
+//! order within a topic never changes.
 
 use std::io::{self, Write};
 
@@ -16,21 +17,21 @@ use crate::ros2::Message;
 
 /// The time for which a message waits for older ones, in ns.
 pub const WINDOW_NS: u64 = 40_000_000;
-/// The maximum number of waiting messages: more than a second of three full buses.
+/// The maximum number of waiting messages: those of three full buses in more than a second.
 const MESSAGES: usize = 65_536;
 /// The maximum size of waiting messages, in bytes.
 const BYTES: usize = 16 << 20;
-/// The initial size of each buffer, in bytes. Growth while a file was blocked is given back.
+/// The initial size of each buffer, in bytes. A buffer that grew while the file was blocked is shrunk to it again.
 const INITIAL_BYTES: usize = 1 << 20;
 
 /// A waiting message.
 #[derive(Clone, Copy, Debug)]
 struct WaitingMessage {
-    /// The position in the order of the file, in ns since 1970.
+    /// The time by which the message is sorted in the file, in ns since 1970.
     log_nanos: u64,
     /// The message's own time.
     nanos: u64,
-    /// The range of its bytes in the buffer.
+    /// The range of the encoded message in the buffer.
     begin: usize,
     end: usize,
     channel: u16,
@@ -38,25 +39,25 @@ struct WaitingMessage {
     is_frame: bool,
 }
 
-/// Messages that wait to be written, for one file after the other.
+/// The messages that wait to be written to a file. When a file ends, the next one uses the same window.
 #[derive(Debug)]
 pub struct ReorderWindow {
     waiting: Vec<WaitingMessage>,
     bytes: Vec<u8>,
-    /// The latest position of each channel.
+    /// The latest position in time of each channel's messages, in ns since 1970.
     latest: Vec<u64>,
-    /// The recorder's time.
+    /// The time of the recorder, in ns since 1970.
     now: u64,
-    /// The position of the last written message.
+    /// The position in time of the message that was written last, in ns since 1970.
     released: u64,
-    /// The number of messages that arrived after later ones were written.
+    /// The number of messages that arrived after messages of later times had been written.
     late: u64,
     buffers: (Vec<u8>, Vec<u8>),
 }
 
 impl Default for ReorderWindow {
-    /// Returns an empty window. Its memory is written to once, so that a recorder occupies it from its start on, and
-    /// not when it is late for the first time.
+    /// Returns an empty window. All of its memory is written to at once, so that the memory is allocated when the
+    /// recorder starts and not when many messages wait for the first time.
     fn default() -> Self {
         let bytes = || {
             let mut bytes = vec![1; INITIAL_BYTES];
@@ -79,7 +80,7 @@ impl Default for ReorderWindow {
 }
 
 impl ReorderWindow {
-    /// Begins the order of another file at `now`, in ns since 1970. Waiting messages are dropped; the buffers stay
+    /// Begins another file at the time `now`, in ns since 1970. Waiting messages are dropped. The buffers stay
     /// allocated.
     pub fn begin(&mut self, now: u64) {
         self.waiting.clear();
@@ -88,18 +89,19 @@ impl ReorderWindow {
         (self.now, self.released) = (now, 0);
     }
 
-    /// Adds a message with its own time, in ns since 1970.
+    /// Adds a message of a channel with its own time, in ns since 1970.
     pub fn write<M: Message>(&mut self, channel: &mut Channel, nanos: u64, message: &M) {
         self.write_at(channel, nanos, nanos, message);
     }
 
-    /// Adds a message whose position in the file, `at`, differs from its own time.
+    /// Adds a message that is sorted in the file by the time `at` instead of its own time `nanos`, both in ns since
+    /// 1970.
     pub fn write_at<M: Message>(&mut self, channel: &mut Channel, at: u64, nanos: u64, message: &M) {
         let id = usize::from(channel.id());
         if self.latest.len() <= id {
             self.latest.resize(id + 1, 0);
         }
-        // Without this limit, a time in the future would delay all other messages.
+        // Without this limit, a message with a time in the future would delay all later messages of its channel.
         let mut at = at.min(self.now.saturating_add(WINDOW_NS));
         if let Some(latest) = self.latest.get_mut(id) {
             at = at.max(*latest);
@@ -113,7 +115,7 @@ impl ReorderWindow {
         self.waiting.push(WaitingMessage { log_nanos: at, nanos, begin, end, channel, sequence, is_frame });
     }
 
-    /// Returns the latest position of a channel's messages; 0 without messages.
+    /// Returns the latest position in time of a channel's messages, in ns since 1970; 0 without messages.
     #[must_use]
     pub fn latest(&self, channel: &Channel) -> u64 {
         self.latest.get(usize::from(channel.id())).copied().unwrap_or_default()
@@ -125,13 +127,14 @@ impl ReorderWindow {
         count(&self.waiting)
     }
 
-    /// Returns the number of messages that arrived after later ones were written.
+    /// Returns the number of messages that arrived after messages of later times had been written.
     #[must_use]
     pub const fn late(&self) -> u64 {
         self.late
     }
 
-    /// Sets the time. If the clock was set back, all waiting messages are written first, and a new order begins.
+    /// Sets the time of the recorder. If the clock was set back, all waiting messages are written first, and sorting
+    /// begins anew.
     ///
     /// # Errors
     /// Returns an error if the file cannot be written, as all methods below do.
@@ -148,7 +151,8 @@ impl ReorderWindow {
         Ok(written)
     }
 
-    /// Writes the messages that have waited long enough, and the older half if too many wait. Returns their number.
+    /// Writes the messages that have waited long enough, and the older half of the others if too many wait. Returns the
+    /// number of written messages.
     ///
     /// # Errors
     /// Returns an error if the file cannot be written.
@@ -160,7 +164,7 @@ impl ReorderWindow {
         self.write_out(due, file)
     }
 
-    /// Returns true if a limit is reached.
+    /// Returns true if the number or the size of the waiting messages has reached its limit.
     #[must_use]
     pub const fn is_full(&self) -> bool {
         self.waiting.len() >= MESSAGES || self.bytes.len() >= BYTES
@@ -175,12 +179,12 @@ impl ReorderWindow {
         self.write_out(self.waiting.len(), file)
     }
 
-    /// Sorts the messages. Those of the same position keep their order of arrival.
+    /// Sorts the waiting messages by their time. Messages with the same time keep the order in which they arrived.
     fn sort(&mut self) {
         self.waiting.sort_by_key(|it| it.log_nanos);
     }
 
-    /// Writes the first `due` messages.
+    /// Writes the first `due` of the sorted messages.
     fn write_out<W: Write>(&mut self, due: usize, file: &mut FileWriter<W>) -> io::Result<MessageCount> {
         let Self { waiting, bytes, released, late, buffers: (_, kept), .. } = self;
         let written = waiting.get(..due).unwrap_or_default();

@@ -9,20 +9,20 @@
 use protocol::can::IdentifierError;
 use thiserror::Error;
 
-/// "Plain CDR, little endian", and two option bytes.
+/// The encapsulation header: "plain CDR, little endian", and two option bytes.
 const HEAD: [u8; 4] = [0, 1, 0, 0];
 /// The maximum number of elements in a decoded sequence.
 const MAX_ELEMENTS: u32 = 64;
 
-/// A part of a message that can be encoded.
+/// A value that can be encoded as a field of a message.
 pub trait Encode {
-    /// Appends it to the message.
+    /// Appends the value to the message.
     fn encode(&self, out: &mut CdrWriter<'_>);
 }
 
-/// A part of a message that can be decoded. Texts are borrowed from the message.
+/// A value that can be decoded from a field of a message. Texts are borrowed from the message.
 pub trait Decode<'a>: Sized {
-    /// Decodes it at the reader's position. Never panics.
+    /// Decodes the value at the reader's position. Never panics.
     ///
     /// # Errors
     /// Returns [`CdrError`] if the message ends too early or holds an invalid value.
@@ -80,7 +80,7 @@ impl<'a> Decode<'a> for &'a str {
         let wrong = CdrError::Text { at: from.at - bytes.len() };
         let text = match bytes {
             _ if from.form == Form::Ros1 => bytes,
-            // Some writers omit the NUL of an empty text.
+            // Some programs write an empty text without its NUL.
             [] => bytes,
             [text @ .., 0] => text,
             _ => return Err(wrong),
@@ -89,7 +89,7 @@ impl<'a> Decode<'a> for &'a str {
     }
 }
 
-/// Decodes at most `LONGEST` elements.
+/// Decodes a sequence of at most `LONGEST` elements.
 impl<'a, T: Decode<'a>> Decode<'a> for Vec<T> {
     fn decode(from: &mut CdrReader<'a>) -> Result<Self, CdrError> {
         let count = from.get::<u32>()?;
@@ -100,7 +100,7 @@ impl<'a, T: Decode<'a>> Decode<'a> for Vec<T> {
     }
 }
 
-/// Decodes the elements without a count.
+/// Decodes an array of N elements, which is stored without a count.
 impl<'a, T: Decode<'a> + Copy + Default, const N: usize> Decode<'a> for [T; N] {
     fn decode(from: &mut CdrReader<'a>) -> Result<Self, CdrError> {
         let mut all = [T::default(); N];
@@ -131,22 +131,22 @@ pub struct CdrWriter<'a> {
 }
 
 impl<'a> CdrWriter<'a> {
-    /// Begins a message and clears the buffer.
+    /// Begins a message in the buffer, whose former contents are removed.
     pub fn new(out: &'a mut Vec<u8>) -> Self {
         out.clear();
         out.extend_from_slice(&HEAD);
         Self { out }
     }
 
-    /// Appends a number, a text, or another part of a message.
+    /// Appends a number, a text, or another field.
     pub fn put(&mut self, value: impl Encode) {
         value.encode(self);
     }
 
-    /// Appends the number of elements that follow.
+    /// Appends the count of a sequence, whose elements the caller appends afterwards.
     ///
     /// # Panics
-    /// If there are more than 2^32 - 1 elements, which no message of skinbus has.
+    /// Panics if there are more than 2^32 - 1 elements, which no message of skinbus has.
     pub fn count(&mut self, count: usize) {
         self.put(u32::try_from(count).expect("a message has fewer than 2^32 elements"));
     }
@@ -163,7 +163,7 @@ impl<'a> CdrWriter<'a> {
         elements.for_each(|element| self.put(element));
     }
 
-    /// Appends an aligned number.
+    /// Appends a number after the padding that aligns it.
     fn number<const N: usize>(&mut self, bytes: [u8; N]) {
         let over = (self.out.len() - HEAD.len()) % N;
         if over != 0 {
@@ -173,34 +173,34 @@ impl<'a> CdrWriter<'a> {
     }
 }
 
-/// An error in an encoded message.
+/// An error in the bytes of a message.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum CdrError {
     /// The encoding is not supported.
     #[error("a message begins with {got:02x?}, not with 00 01: only little-endian CDR is read")]
     Encoding {
-        /// The first two bytes, or 0.
+        /// The first two bytes of the message, which name the encoding; 0 if they are missing.
         got: [u8; 2],
     },
     /// The message ends too early.
     #[error("a message ends at byte {at} in the middle of {what}")]
     Short {
-        /// The offset of its end.
+        /// The length of the message in bytes.
         at: usize,
-        /// The incomplete part.
+        /// The kind of field that is incomplete.
         what: &'static str,
     },
-    /// A text is invalid.
+    /// A text is not UTF-8, or does not end with a NUL.
     #[error("the text at byte {at} of a message is not UTF-8 with a NUL at its end")]
     Text {
-        /// The offset of the text.
+        /// The offset of the text in the message.
         at: usize,
     },
-    /// A value is not allowed.
+    /// The value of a field is not allowed.
     #[error("{what} of a message is {got}: allowed is {allowed}")]
     Value {
-        /// The name of the value.
+        /// The name of the field.
         what: &'static str,
         /// The value.
         got: u64,
@@ -222,7 +222,7 @@ pub enum CdrError {
     },
 }
 
-/// The encoding of a message.
+/// The encoding in which a message is stored.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Form {
     /// The encoding of ROS 2.
@@ -231,7 +231,7 @@ enum Form {
     Ros1,
 }
 
-/// Decodes a message. Texts and bytes are borrowed from it. Never panics.
+/// Decodes the fields of a message in order. Texts and bytes are borrowed from the message. Never panics.
 #[derive(Clone, Debug)]
 pub struct CdrReader<'a> {
     bytes: &'a [u8],
@@ -303,7 +303,7 @@ mod tests {
     use proptest::prelude::*;
     use serde::{Deserialize, Serialize};
 
-    /// One field of every kind, encoded in this order.
+    /// A message with one field of every kind, encoded in this order.
     #[derive(Clone, Debug, Deserialize, PartialEq, Serialize)]
     struct Everything {
         byte: u8,

@@ -10,7 +10,7 @@ use super::cdr::{CdrError, Encode, CdrReader, CdrWriter};
 use super::{Header, Message, definition};
 use crate::note::{Note, NoteKind};
 
-/// A frame of a bus.
+/// Encodes a frame of a bus as a message.
 impl Message for Record<'_> {
     const TYPE: &'static str = "skinbus_msgs/msg/CanFrame";
     const DEFINITION: &'static str =
@@ -40,16 +40,15 @@ impl Encode for Record<'_> {
 /// Returns the time of a frame on its bus according to its header, in ns since 1970. For a frame that was latched
 /// before the recording, this is earlier than the time of the record.
 ///
-/// # Errors
-/// Returns [`CdrError`] if the bytes are not such a message.
+/// Returns [`CdrError`] if the bytes are not a message of this type.
 pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
     Ok(CdrReader::new(message)?.get::<Header<'_>>()?.nanos)
 }
 
-/// Decodes a frame, with the time of its record. Never panics.
+/// Decodes a frame. Its time is `time`, that of the MCAP record.
 ///
 /// # Errors
-/// Returns [`CdrError`] if the bytes are not such a message.
+/// Returns [`CdrError`] if the bytes are not a message of this type.
 pub fn frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrError> {
     let mut from = CdrReader::new(message)?;
     let (Header { frame_id: interface, .. }, number) = (from.get()?, from.get::<u32>()?);
@@ -97,7 +96,7 @@ fn value(what: &'static str, got: u8, allowed: &'static str) -> CdrError {
     CdrError::Value { what, got: got.into(), allowed }
 }
 
-/// A note between frames: a comment, lost frames, or a line that is not a frame.
+/// Encodes a note (a comment, lost frames, or a line that is not a frame) as a message.
 impl Message for Note<'_> {
     const TYPE: &'static str = "skinbus_msgs/msg/CaptureNote";
     const DEFINITION: &'static str =
@@ -106,7 +105,7 @@ impl Message for Note<'_> {
 
 impl Encode for Note<'_> {
     fn encode(&self, out: &mut CdrWriter<'_>) {
-        // Some readers end a CDR text at its first NUL.
+        // Some readers end a CDR text at its first NUL, so a text with a NUL is stored as bytes.
         let same = || str::from_utf8(self.text).ok().filter(|text| !text.contains('\0'));
         let (kind, frames, same) = match self.kind {
             NoteKind::Text => (0_u8, 0, same()),
@@ -126,10 +125,10 @@ impl Encode for Note<'_> {
     }
 }
 
-/// Decodes a note, with the time of its record. Never panics.
+/// Decodes a note. Its time is `nanos`, that of the MCAP record. Never panics.
 ///
 /// # Errors
-/// Returns [`CdrError`] if the bytes are not such a message.
+/// Returns [`CdrError`] if the bytes are not a message of this type.
 pub fn note(message: &[u8], nanos: u64) -> Result<Note<'_>, CdrError> {
     let mut from = CdrReader::new(message)?;
     let (Header { frame_id: interface, .. }, kind) = (from.get()?, from.get::<u8>()?);
@@ -191,7 +190,7 @@ mod tests {
             bytes[at] = value;
             frame(&bytes, time).map(|_| ()).unwrap_err().to_string()
         };
-        // The empty name takes 5 bytes, followed by 3 bytes of padding.
+        // An empty name takes 5 bytes, and 3 bytes of padding follow it.
         let id = "id of a message: FF000000 does not fit an identifier of 11 bits: at most 7FF";
         assert_eq!(with(23, 0xFF), id);
         assert!(with(21, 8).ends_with("800 does not fit an identifier of 11 bits: at most 7FF"));

@@ -1,7 +1,7 @@
 //! Messages of ROS 2: the encoding (CDR) and the types in recordings, with their definitions.
 //!
-//! Viewers and bag tools decode the messages by the definitions in the same file. Neither ROS nor a generated type is
-//! needed on either side. The definitions are the files in `gateway/trace/msg`.
+//! A viewer decodes the messages by the definitions in the same file. Neither ROS nor generated code is therefore
+//! needed to write or to read them. The definitions are the files in `gateway/trace/msg`.
 
 pub mod cdr;
 pub mod messages;
@@ -13,27 +13,27 @@ pub mod standard;
 use cdr::{CdrError, Decode, Encode, CdrReader, CdrWriter};
 use thiserror::Error;
 
-/// A message type with its definition and its encoding.
+/// A type that is recorded as a ROS 2 message.
 pub trait Message: Encode {
     /// The full name of the type, `package/msg/Type`.
     const TYPE: &'static str;
-    /// The fields of the type and of every type in it (encoding `ros2msg`).
+    /// The definition of the message type and of all types that it contains, in the encoding `ros2msg`.
     const DEFINITION: &'static str;
 
-    /// Encodes the message into a buffer and replaces its contents. Allocates only if the buffer grows.
+    /// Encodes the message into a buffer, whose former contents are removed. Allocates only if the buffer grows.
     fn encode_into(&self, buffer: &mut Vec<u8>) {
         self.encode(&mut CdrWriter::new(buffer));
     }
 }
 
-/// An error in a message of a recording.
+/// An error of decoding a message of a recording.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum MessageError {
     /// The message is too long for its type.
     #[error("it has {bytes} bytes, but at most {limit} are allowed")]
     Long {
-        /// Its length in bytes.
+        /// The length of the message in bytes.
         bytes: usize,
         /// The limit in bytes.
         limit: usize,
@@ -43,7 +43,7 @@ pub enum MessageError {
     Cdr(#[from] CdrError),
 }
 
-/// Joins the definition of a type and those of the types in it, from their files.
+/// Joins the definition of a message type with those of the types that it contains, each from its file.
 macro_rules! definition {
     ($own:literal $(, $used:literal)*) => {
         concat!(
@@ -64,9 +64,10 @@ const NANOS: u64 = 1_000_000_000;
 /// The header of a message: `std_msgs/Header`.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Header<'a> {
-    /// The time, in ns since 1970. Encoded seconds end in 2038; the times of records do not.
+    /// The time, in ns since 1970. The encoded seconds have 32 bits and end in 2038; the times of MCAP records have 64
+    /// bits.
     pub nanos: u64,
-    /// The subject of the message: a bus, a link, or empty.
+    /// The bus or the link that the message is about; empty for other messages.
     pub frame_id: &'a str,
 }
 
@@ -85,7 +86,7 @@ impl<'a> Decode<'a> for Header<'a> {
     }
 }
 
-/// Returns the time of a message in ns since 1970.
+/// Converts the time in a message to ns since 1970.
 ///
 /// # Errors
 /// Returns [`CdrError::Time`] if the time is before 1970, or if `nanosec` is a second or more.

@@ -1,4 +1,4 @@
-//! Decodes messages of the control loop from a recording.
+//! Decodes the messages that the control loop has recorded.
 
 use super::Header;
 use super::cdr::{CdrError, CdrReader};
@@ -13,21 +13,21 @@ pub struct Joints {
     pub velocity: Vec<f64>,
 }
 
-/// The torques of the cells and of the central computation at a tick.
+/// The joint torques at a tick, by the cells and by the central computation.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Torques {
-    /// The joint torques of the cells, in Nm.
+    /// The sum of the cells' torques for each joint, in Nm.
     pub distributed: Vec<f64>,
-    /// The joint torques of the central computation, in Nm; empty in ticks without one.
+    /// The torques of the central computation for each joint, in Nm; empty in ticks without one.
     pub central: Vec<f64>,
-    /// The number of cells in contact.
+    /// The number of cells with a force above zero, by the central computation.
     pub active: u32,
 }
 
 /// Decodes `sensor_msgs/JointState`.
 ///
 /// # Errors
-/// Returns [`CdrError`] if the bytes are not such a message.
+/// Returns [`CdrError`] if the bytes are not a message of this type.
 pub fn joints(message: &[u8]) -> Result<Joints, CdrError> {
     let mut from = CdrReader::new(message)?;
     from.get::<Header<'_>>()?;
@@ -38,7 +38,7 @@ pub fn joints(message: &[u8]) -> Result<Joints, CdrError> {
 /// Decodes `skinbus_msgs/Torques`.
 ///
 /// # Errors
-/// Returns [`CdrError`] if the bytes are not such a message.
+/// Returns [`CdrError`] if the bytes are not a message of this type.
 pub fn torques(message: &[u8]) -> Result<Torques, CdrError> {
     let mut from = CdrReader::new(message)?;
     from.get::<Header<'_>>()?;
@@ -49,7 +49,7 @@ pub fn torques(message: &[u8]) -> Result<Torques, CdrError> {
 /// Decodes `skinbus_msgs/LoopTiming`.
 ///
 /// # Errors
-/// Returns [`CdrError`] if the bytes are not such a message.
+/// Returns [`CdrError`] if the bytes are not a message of this type.
 pub fn timing(message: &[u8]) -> Result<LoopTiming, CdrError> {
     CdrReader::new(message)?.get()
 }

@@ -3,12 +3,12 @@
 use super::cdr::{Encode, CdrWriter};
 use super::{Header, Message, definition};
 
-/// The pose of a frame relative to its parent.
+/// The pose of a coordinate frame relative to its parent frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Transform<'a> {
-    /// The parent frame.
+    /// The name of the parent frame.
     pub parent: &'a str,
-    /// The frame.
+    /// The name of the frame.
     pub child: &'a str,
     /// The translation in m.
     pub translation: [f64; 3],
@@ -16,7 +16,7 @@ pub struct Transform<'a> {
     pub rotation: [f64; 4],
 }
 
-/// `tf2_msgs/TFMessage`: the poses of frames.
+/// `tf2_msgs/TFMessage`: the poses of coordinate frames.
 #[derive(Clone, Copy, Debug)]
 pub struct Transforms<'a> {
     /// The time, in ns since 1970.

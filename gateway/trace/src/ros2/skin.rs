@@ -1,38 +1,38 @@
-//! Message types of skinbus for a run: the timing of the loop, torques, and the state of cells.
+//! Message types of skinbus that record a run: the timing of the loop, torques, and the state of cells.
 
 use super::cdr::{CdrError, Decode, Encode, CdrReader, CdrWriter};
 use super::{Header, Message, definition};
 
-/// The timing and state of a tick, in numbers that any viewer can plot.
+/// The timing and the state of a tick, as numbers that any viewer can plot.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct LoopTiming {
-    /// The scheduled start, in ns since 1970.
+    /// The scheduled start of the tick, in ns since 1970.
     pub nanos: u64,
-    /// The number of the tick, counting skipped ones.
+    /// The number of the tick; skipped ticks are counted too.
     pub tick: u64,
-    /// The number of ticks skipped just before it.
+    /// The number of ticks that were skipped directly before this one.
     pub skipped: u64,
-    /// The delay of the start, in µs.
+    /// The delay of the tick's actual start after the scheduled one, in µs.
     pub late_us: f64,
     /// The duration of the tick, in µs.
     pub took_us: f64,
     /// The part of the duration used by the central computation, in µs; 0 in ticks without one.
     pub central_us: f64,
-    /// The number of cells in the torque.
+    /// The number of cells whose torques are in the sum.
     pub contributing: u32,
-    /// The number of epochs that the oldest of them has missed.
+    /// The age in epochs of the oldest torque in the sum.
     pub age: u32,
-    /// The number of cells in contact that missed the last epoch.
+    /// The number of cells in contact whose torque for the last epoch is missing.
     pub stale: u32,
-    /// The number of cells that have timed out.
+    /// The number of cells from which nothing was received for longer than the timeout.
     pub dead: u32,
-    /// The reason for a bad cycle, one of the definition's constants.
+    /// The reason why the cycle was bad, as a constant of the message definition.
     pub bad: u8,
-    /// The reason for a halt of the robot, one of the definition's constants.
+    /// The reason why the robot is halted, as a constant of the message definition.
     pub halted: u8,
-    /// A bit for each of joints 1 to 8 that is at a limit and was commanded beyond it; joint 1 is the lowest bit.
+    /// Bit n is set if joint n + 1 is at a limit and was commanded beyond it, for the first 8 joints.
     pub at_limit: u8,
-    /// True if a velocity was not finite and was replaced by zero.
+    /// True if a commanded velocity was not finite and was replaced by zero.
     pub refused: bool,
 }
 
@@ -42,7 +42,7 @@ impl Message for LoopTiming {
         definition!("skinbus_msgs/LoopTiming", "std_msgs/Header", "builtin_interfaces/Time");
 }
 
-/// Encodes and decodes a header without a frame id, followed by these fields in this order.
+/// Encodes and decodes a message that consists of a header without a frame id and these fields in this order.
 macro_rules! fields {
     ($message:ty: $($field:ident),+) => {
         impl Encode for $message {
@@ -72,7 +72,8 @@ pub struct Torques<'a> {
     pub nanos: u64,
     /// The sum of the cells' joint torques, in Nm.
     pub distributed: &'a [f64],
-    /// The gateway's joint torques for the same joints and touches, in Nm; empty in ticks without the computation.
+    /// The joint torques that the gateway computed for the same joints and touches, in Nm; empty in ticks without this
+    /// computation.
     pub central: &'a [f64],
     /// The number of cells with a force above zero, by the central computation.
     pub active: u32,
@@ -95,27 +96,27 @@ impl Encode for Torques<'_> {
     }
 }
 
-/// The state and sensor values of a cell.
+/// The state of a cell and the values of its sensors.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ContactState {
     /// The node id of the cell.
     pub node: u16,
-    /// The force in N that Algorithm 1 computes from its sensors; NaN while it is unknown.
+    /// The force in N by Algorithm 1; NaN while it is unknown.
     pub force: f32,
     /// The proximity, 0 to 1; NaN while it is unknown.
     pub proximity: f32,
-    /// The status, one of the definition's constants.
+    /// The status of the cell, as a constant of the message definition.
     pub status: u8,
 }
 
-/// The cells of a patch at the time when the joints were on the bus.
+/// The state of all cells of a patch when the joints of an epoch were on the bus.
 #[derive(Clone, Copy, Debug)]
 pub struct PatchState<'a> {
     /// The time of the joints on the bus, in ns since 1970.
     pub nanos: u64,
-    /// The link that the patch is on.
+    /// The link that the patch is on; its name is a frame of the robot.
     pub frame_id: &'a str,
-    /// The epoch of the joints.
+    /// The epoch of these joints.
     pub epoch: u8,
     /// The cells.
     pub cells: &'a [ContactState],

@@ -3,7 +3,7 @@
 use super::cdr::{Encode, CdrWriter};
 use super::{Header, Message, definition};
 
-/// `sensor_msgs/JointState`: the joints of a robot. Unknown values are empty.
+/// `sensor_msgs/JointState`: the joints of a robot. An array of unknown values is empty.
 #[derive(Clone, Copy, Debug)]
 pub struct JointState<'a> {
     /// The time, in ns since 1970.
@@ -34,7 +34,7 @@ impl Encode for JointState<'_> {
     }
 }
 
-/// A point of a cloud, with the force on it.
+/// A point of a cloud: a cell with the force on it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Point {
     /// The position in the cloud's frame, in m.
@@ -48,14 +48,14 @@ pub struct Point {
 pub struct PointCloud<'a> {
     /// The time, in ns since 1970.
     pub nanos: u64,
-    /// The reference frame of the positions.
+    /// The name of the frame in which positions are given.
     pub frame_id: &'a str,
     /// The points.
     pub points: &'a [Point],
 }
 
 impl PointCloud<'_> {
-    /// The size of a point in bytes.
+    /// The size of an encoded point, in bytes.
     const STEP: u32 = 16;
     /// The `PointField` constant for single precision.
     const FLOAT32: u8 = 7;

@@ -1,4 +1,5 @@
-//! Captures survive the conversion into the other format and back, and damaged ones are read as far as they are intact.
+//! Tests that captures survive the conversion to the other format and back, and that damaged ones are read up to the
+//! damage.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::collections::BTreeMap;
@@ -31,7 +32,7 @@ fn converted(bytes: &[u8], format: CaptureFormat) -> (Vec<u8>, ConversionCounts)
     (out, done)
 }
 
-/// Converts to the other format and back.
+/// Converts a log to a recording and back.
 fn there_and_back(log: &[u8]) -> Vec<u8> {
     converted(&converted(log, CaptureFormat::Mcap).0, CaptureFormat::Candump).0
 }
@@ -149,7 +150,7 @@ fn of_the_odd_lines_nothing_is_lost() {
     assert_eq!(before, after);
     let same = CORPUS.split(|&byte| byte == b'\n').zip(back.split(|&byte| byte == b'\n'));
     let other: Vec<_> = same.filter(|(before, after)| before != after).collect();
-    // The other lines differ in padding, dots, case or indentation only.
+    // All other lines of the output differ only in padding, dots, case or indentation.
     assert_eq!(
         other.len(),
         17,
@@ -190,7 +191,7 @@ fn notes_before_the_first_frame_have_its_time_in_a_recording() {
     assert_eq!(entries(&mcap).0, entries(log).0);
 }
 
-/// Returns the remarks on a log.
+/// Returns the remarks on the times of a log.
 fn backwards(log: &str) -> Vec<String> {
     let mut reader = reader(log.as_bytes());
     while reader.next().unwrap().is_some() {}
@@ -225,7 +226,7 @@ fn recording() -> (Vec<u8>, Vec<(u64, Vec<u8>)>) {
     (converted(log.as_bytes(), CaptureFormat::Mcap).0, frames(log.as_bytes()).0)
 }
 
-/// The end of a capture, according to its reader.
+/// The end of a capture as its reader reports it: an error, or a description of a missing end.
 type End = Result<Option<String>, CaptureError>;
 
 /// Returns the times and data of all frames, and the end of the capture.
@@ -270,7 +271,7 @@ fn a_damaged_recording_is_read_up_to_the_damage() {
         partly += usize::from((1..all.len()).contains(&found.len()));
         match end {
             Ok(None) => {
-                // The damaged byte is stored twice, or is never read.
+                // The file stores the damaged byte twice, or it is never read.
                 assert_eq!(found, all, "byte {at}");
                 silent += 1;
             }

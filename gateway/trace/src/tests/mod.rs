@@ -1,3 +1,3 @@
-//! Tests of the whole crate.
+//! Tests that involve several modules of the crate.
 
 mod captures;

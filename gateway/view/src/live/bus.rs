@@ -1,4 +1,4 @@
-//! The state of one bus: the table of its cells, and the torques of the last epoch.
+//! The state of one bus: the state of its cells, and the torques of the last epoch.
 
 use analysis::fit::rates::RequestedRates;
 use bench::view::CellView;
@@ -18,22 +18,22 @@ use protocol::wire_time::{BitRates, Bits};
 
 use super::flag;
 
-/// The window over which the bus load is measured, in µs.
+/// The time over which the load of the bus is averaged, in µs.
 const LOAD_WINDOW_US: u64 = 1_000_000;
 
-/// The joints of an epoch, as seen on the bus.
+/// An epoch, and the joint positions that were broadcast in it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct BroadcastJoints {
     pub(super) epoch: Epoch,
     pub(super) positions: [Q1_14; MAX_JOINTS],
 }
 
-/// The load of the real bus.
+/// The share of time for which frames occupy the real bus.
 #[derive(Clone, Copy, Debug, Default)]
 struct Load {
     since: Option<Micros>,
     busy_s: f64,
-    /// The load in the last complete window.
+    /// The load in the last complete window; 1 is the bus's capacity.
     share: Option<f64>,
 }
 
@@ -44,15 +44,15 @@ pub(super) struct LiveBus {
     pub(super) central: Central,
     pub(super) torque_format: TorqueFormat,
     pub(super) sums: bool,
-    /// The joints of the current epoch, and those of the previous one.
+    /// The joint positions of the current epoch; `before` has those of the previous one.
     pub(super) current: Option<BroadcastJoints>,
     previous: Option<BroadcastJoints>,
-    /// Distributed and central torque in the last completed epoch, by joint of the chain.
+    /// The distributed and the central torque of each joint of the chain in the last completed epoch.
     torques: [(f64, f64); MAX_JOINTS],
     joints: usize,
-    /// The last torque of each cell, by its index.
+    /// The last torque of each cell, by the cell's index on the bus.
     pub(super) last: Vec<Option<(Epoch, Words)>>,
-    /// The time since which each cell is dead.
+    /// For each cell, the time since which it is dead; `None` for a live cell.
     pub(super) dead_since: Vec<Option<Micros>>,
     rates: Option<BitRates>,
     load: Load,
@@ -93,7 +93,7 @@ impl LiveBus {
         let message = received.message().copied();
         let is_wire = received.content == Content::NotData && wired(frame).is_some();
         if !is_wire && !matches!(message, Some(Message::Stimulus { .. })) {
-            // Wire states and stimuli come from the bench, and do not load the real bus.
+            // On a bench, wire states and stimuli are frames of the same bus, but a real bus would not carry them.
             let busy = self.rates.zip(Bits::from_frame(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
             self.load.busy_s += busy;
         }
@@ -115,7 +115,7 @@ impl LiveBus {
             Some(Message::Resume) => self.halted = false,
             Some(_) | None => {}
         }
-        // Joints open an epoch, whoever sent them.
+        // Joints begin an epoch, whichever node sent them.
         self.table.receive(at, joints, &received, &mut |_| None);
         joints
     }
@@ -125,13 +125,14 @@ impl LiveBus {
         self.table.begin_accounts();
     }
 
-    /// Returns the total of all losses so far, for any reason.
+    /// Returns the number of all losses so far, of any kind.
     pub(super) fn losses(&self) -> u64 {
         let (replies, uplink) = (self.table.replies(), self.table.uplink());
         replies.late + replies.missing + uplink.lost + uplink.rejected + self.dropped
     }
 
-    /// Closes the epoch before the next joints: stores the sum of the received torques and the centrally computed one.
+    /// Completes the epoch before new joints: stores the sum of the torques received, and the torque computed
+    /// centrally.
     fn close_epoch(&mut self) {
         let Some(heard) = self.current else { return };
         let frames = self.central.frames(&heard.positions);
@@ -178,23 +179,23 @@ impl LiveBus {
         self.table.sensors(now).nth(self.table.place(node)?)?.0
     }
 
-    /// Returns distributed and central torque, by joint of the chain.
+    /// Returns the distributed and the central torque of each joint of the chain.
     pub(super) fn torques(&self) -> impl Iterator<Item = (f64, f64)> {
         self.torques.into_iter().take(self.joints)
     }
 
-    /// Returns the position of a joint of the chain in rad or m, once joints have been received.
+    /// Returns the position of a joint of the chain in rad or m; `None` before the first joints.
     pub(super) fn position(&self, joint: usize) -> Option<f64> {
         self.central.positions(&self.current?.positions).get(joint).copied()
     }
 
-    /// Returns the positions that were broadcast in an epoch, for the last two epochs.
+    /// Returns the joint positions that were broadcast in one of the last two epochs; `None` for another epoch.
     pub(super) fn positions_of(&self, epoch: Epoch) -> Option<[Q1_14; MAX_JOINTS]> {
         let both = [self.current, self.previous];
         both.into_iter().flatten().find(|heard| heard.epoch == epoch).map(|heard| heard.positions)
     }
 
-    /// Encodes each cell for a snapshot.
+    /// Encodes the state of each cell as a snapshot contains it.
     pub(super) fn encode_cells(&self, now: Micros) -> Vec<[u8; 8]> {
         let cells = self.table.cells().iter().zip(self.table.sensors(now)).enumerate();
         let bytes = cells.map(|(place, (cell, (sensors, status)))| {
@@ -221,7 +222,7 @@ impl LiveBus {
     }
 }
 
-/// Rounds to the nearest integer and clamps to the bounds.
+/// Rounds to the nearest integer between `min` and `max`.
 #[expect(clippy::cast_possible_truncation, reason = "within 17 bits")]
 fn clamped_integer(value: f64, min: f64, max: f64) -> i32 {
     value.round().clamp(min, max) as i32

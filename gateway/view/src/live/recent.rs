@@ -1,4 +1,4 @@
-//! The decoded frames of the last seconds, and the explanation of a torque among them.
+//! Stores the decoded frames of the last seconds, and explains how a cell computed the torque in one of them.
 
 use std::collections::VecDeque;
 
@@ -15,22 +15,22 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
 
-/// The time that frames are kept, in µs.
+/// The time for which frames are stored, in µs.
 const RETENTION_US: u64 = 3_000_000;
-/// The maximum number of frames that are kept.
+/// The maximum number of stored frames.
 const MAX_FRAMES: usize = 65_536;
-/// The number of frames that are listed for a cell.
+/// The maximum number of frames listed for a cell.
 const MAX_LISTED_FRAMES: usize = 8;
-/// The joints that a torque replies to are searched this long before the torque, in ns.
+/// The maximum time from the joints of an epoch to a torque that replies to them, in ns.
 const JOINTS_LOOKBACK_NS: u64 = 500_000_000;
 
-/// The frames of the last seconds on all buses.
+/// The frames of all buses in the last seconds.
 #[derive(Clone, Debug)]
 pub struct RecentFrames {
     frames: VecDeque<RecentFrame>,
-    /// The number of frames so far.
+    /// The number of frames so far, which is also the number that the next frame gets.
     count: u64,
-    /// The state that was latched on each bus before the oldest kept frame.
+    /// For each bus, the state that was latched before the oldest stored frame.
     latched: Vec<LatchedPackets>,
 }
 
@@ -41,31 +41,31 @@ struct RecentFrame {
     frame: Frame,
 }
 
-/// A decoded frame.
+/// A decoded frame, as the page lists it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DecodedFrame {
-    /// The frame's number, by which the page requests more.
+    /// The number of the frame, by which the page requests an explanation.
     pub number: u64,
-    /// Seconds of the run, or since the first frame.
+    /// The time in s of the run, or in s since the first frame.
     pub at_s: f64,
     /// The frame in candump's notation.
     pub frame: String,
-    /// Verdict and meaning, as `skinbus dump` prints them.
+    /// The verdict and the meaning of the frame, as `skinbus dump` prints them.
     pub said: String,
-    /// True for a torque, which can be explained.
+    /// True if the frame is a torque, which can be explained.
     pub is_torque: bool,
 }
 
-/// The explanation of a torque.
+/// The steps by which a cell computed the torque in a frame.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TorqueExplanation {
-    /// The frame's number.
+    /// The number of the frame.
     pub number: u64,
-    /// The epoch of the joints.
+    /// The epoch to which the torque belongs.
     pub epoch: u8,
-    /// The steps of the cell's computation.
+    /// The steps of the cell's computation; `None` if inputs are unknown.
     pub cell: Option<CellExplained>,
-    /// The inputs that are unknown, one line each.
+    /// The inputs of the computation that are unknown, one line each.
     pub missing: Vec<String>,
 }
 
@@ -85,7 +85,7 @@ impl RecentFrames {
         }
     }
 
-    /// Drops all frames, and keeps the latched state.
+    /// Drops all stored frames. The latched state stays.
     pub(super) fn clear(&mut self) {
         while !self.frames.is_empty() {
             self.drop_first();
@@ -100,8 +100,8 @@ impl RecentFrames {
         }
     }
 
-    /// Returns the newest frames from and to a cell, newest first; `seconds` converts a time to seconds of the run, or
-    /// since the first frame.
+    /// Returns the newest frames that a cell sent or received, newest first. `seconds` converts a time to s of the run,
+    /// or to s since the first frame.
     pub(super) fn cell_frames(
         &self,
         skin: &Skin,
@@ -112,7 +112,7 @@ impl RecentFrames {
         let mut settler = Settler::new(format);
         for (number, kept) in (self.first_number()..).zip(&self.frames).filter(|(_, kept)| kept.bus == bus) {
             let Ok(id) = data_id(&kept.frame) else { continue };
-            // The lengths of torques depend on the commands before them.
+            // The frame of a command is needed too, because the length of a torque depends on earlier commands.
             let is_command = id.kind == Kind::Command;
             if is_command || Node::from_byte(id.node) == Node::Cell(node) {
                 settler.push(kept.at, "", &kept.frame, (number, *kept, is_command));
@@ -139,7 +139,7 @@ impl RecentFrames {
         all.into()
     }
 
-    /// Explains the torque in a frame while the frame is kept.
+    /// Explains the torque in the frame with this number. Returns `None` if the frame is no longer stored.
     pub(super) fn explain_torque(&self, skin: &Skin, number: u64) -> Option<TorqueExplanation> {
         let place = usize::try_from(number.checked_sub(self.first_number())?).ok()?;
         let asked = self.frames.get(place)?;

@@ -1,4 +1,4 @@
-//! The status message: values that change slowly, as JSON for the page.
+//! The status message to the page: values that change slowly, as JSON.
 
 use bench::remote::BenchState;
 use model::table::{Event, Status};
@@ -13,131 +13,132 @@ use super::{DecodedFrame, Live, TorqueExplanation};
 use crate::command::SelectedCell;
 use crate::player::Playback;
 
-/// The maximum number of dead cells that are listed.
+/// The maximum number of dead cells that are listed by name.
 const MAX_LISTED_DEAD_CELLS: usize = 20;
 
-/// The status that the page shows as text.
+/// The status of a bench or a recording, which the page shows as text.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StatusMessage {
-    /// The type of this message: `said`.
+    /// The type of the message, always `said`.
     pub is: &'static str,
     /// The number of cells in contact.
     pub contacts: usize,
     /// The number of dead cells.
     pub dead: usize,
-    /// The first dead cells.
+    /// Some of the dead cells, at most 20.
     pub dead_cells: Vec<DeadCell>,
     /// True while any bus is halted.
     pub halted: bool,
     /// The state of each bus.
     pub buses: Vec<BusStatus>,
-    /// The details of the cell that the page has chosen.
+    /// The details of the cell that the page has selected.
     pub detail: Option<CellDetail>,
-    /// The position in a recording.
+    /// The state of the playback; null for a live view.
     pub playback: Option<Playback>,
-    /// The state that the run reports; it lists only the process of the chosen cell.
+    /// The state that the bench reports. Of its processes, only that of the selected cell is listed.
     pub bench: Option<BenchState>,
 }
 
-/// A dead cell.
+/// A dead cell, from which frames have stopped coming.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct DeadCell {
-    /// The name of its bus.
+    /// The name of the cell's bus.
     pub bus: String,
-    /// Its node id.
+    /// The node id of the cell.
     pub node: u8,
-    /// The time since it was found dead, in s.
+    /// The time since the cell was found dead, in s.
     pub for_s: f64,
 }
 
 /// The status of a bus.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BusStatus {
-    /// The bus's name.
+    /// The name of the bus.
     pub name: String,
-    /// True if the bus works.
+    /// True if the bus is open and works.
     pub up: bool,
-    /// The share of time that the real bus would be busy: 1 is the bus's capacity.
+    /// The share of time for which the frames would occupy a real bus, where 1 is its capacity; null if its bit rates
+    /// are unknown.
     pub load: Option<f64>,
-    /// Epochs in which at least one reply was due.
+    /// The number of epochs in which at least one reply was due.
     pub epochs_due: u64,
-    /// Epochs in which all replies due came in time.
+    /// The number of epochs in which all replies that were due came in time.
     pub epochs_complete: u64,
-    /// Replies due.
+    /// The number of replies that were due.
     pub due: u64,
-    /// Replies in time.
+    /// The number of replies that came in time.
     pub in_time: u64,
-    /// Late replies.
+    /// The number of replies that came late.
     pub late: u64,
-    /// Missing replies.
+    /// The number of replies that did not come.
     pub missing: u64,
-    /// Packets lost on the way from the cells, by the cells' own counts.
+    /// The number of packets that cells sent and that were not received, by the cells' own counts.
     pub lost: u64,
-    /// Packets that arrived damaged or could not be decoded.
+    /// The number of packets that were damaged or could not be decoded.
     pub rejected: u64,
-    /// Torques with a saturated word.
+    /// The number of torques with a saturated word.
     pub saturated: u64,
-    /// Frames that this program did not receive.
+    /// The number of frames that this program did not receive.
     pub dropped: u64,
-    /// The mean absolute error of single torques against the central computation, in Nm.
+    /// The mean absolute difference between the torques of single cells and those of the central computation, in Nm.
     pub error_nm: Option<f64>,
-    /// On a bus with sums, the place of each cell in the tree, in the skin's order; null for a cell that is silent or
-    /// has not reported it.
+    /// For a bus whose cells send sums: the wires of each cell in the tree, in the skin's order. It is null for a cell
+    /// that has not reported them or is dead.
     pub tree: Option<Vec<Option<TreePlace>>>,
 }
 
-/// A cell's place in the tree, as the cell reports it.
+/// A cell's parent and wires in the tree, as the cell reports them.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 pub struct TreePlace(
-    /// The parent: the node id of a cell, or 0 for the gateway's side; null if the cell is unreachable.
+    /// The node id of the parent, or 0 if that is the gateway's side. It is null if the cell is unreachable.
     pub Option<u8>,
-    /// Bit p is set if port p works in both directions.
+    /// A bit for each port: bit p is set if the wire at port p works in both directions.
     pub u8,
 );
 
-/// The details of a cell.
+/// The details of the cell that a page has selected.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CellDetail {
-    /// The cell's bus, as an index into the skin's buses.
+    /// The index of the cell's bus in the skin.
     pub bus: usize,
-    /// The cell's node id.
+    /// The node id of the cell.
     pub node: u8,
-    /// The cell's serial number.
+    /// The serial number of the cell.
     pub serial: u32,
-    /// The name of its status.
+    /// The name of the cell's status.
     pub status: &'static str,
-    /// The hash of its configuration, and the hash that the skin requires.
+    /// The hash of the cell's configuration, and the hash that the skin requires.
     pub configuration: [Option<String>; 2],
-    /// Its gains and thresholds, from the skin.
+    /// The gains and thresholds of the cell, from the skin.
     pub gains: Gains,
-    /// Its three contact forces in N.
+    /// The contact forces that the cell's three sensors measure, in N.
     pub contact_n: [f64; 3],
-    /// Its proximity, 0 to 1.
+    /// The proximity that the cell measures, 0 to 1.
     pub proximity: f64,
-    /// Its temperatures in °C.
+    /// The temperatures that the cell measures, in °C.
     pub temperature_c: [f64; 2],
-    /// Its force by Algorithm 1, in N.
+    /// The force on the cell by Algorithm 1, in N.
     pub force_n: f64,
-    /// Its last torque.
+    /// The last torque that the cell sent.
     pub torque: Option<TorqueReply>,
-    /// Replies due, and replies in time.
+    /// The number of replies that were due, and the number that came in time.
     pub replies: [u64; 2],
-    /// Packets lost, by the cell's own count.
+    /// The number of packets that the cell sent and that were not received, by the cell's own count.
     pub lost: u64,
-    /// The number of restarts.
+    /// The number of times that the cell has restarted.
     pub restarts: u32,
-    /// The newest frames from and to the cell, newest first.
+    /// The newest frames that the cell sent or received, newest first.
     pub frames: Vec<DecodedFrame>,
-    /// The explanation of the torque in the chosen frame, while that frame is kept.
+    /// The explanation of the torque in the selected frame; null if that frame is no longer stored.
     pub why: Option<TorqueExplanation>,
 }
 
 /// The gains and thresholds of Algorithm 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Gains {
-    /// alpha_c (a number) and alpha_p in N.
+    /// The gains α_c (a number) and α_p (in N).
     pub alpha: [f64; 2],
-    /// F_c,th in N, F_p,th (0 to 1), F_z,th in N.
+    /// The thresholds F_c,th in N, F_p,th (0 to 1) and F_z,th in N.
     pub thresholds: [f64; 3],
 }
 
@@ -151,25 +152,26 @@ impl Gains {
     }
 }
 
-/// A torque reply of a cell.
+/// The last torque of a cell, beside the central computation for the same epoch.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct TorqueReply {
-    /// The epoch.
+    /// The epoch to which the torque belongs.
     pub epoch: u8,
-    /// The words of the reply.
+    /// The torque of each joint as a 16-bit number, as in the packet.
     pub words: Vec<i16>,
-    /// The same values in Nm or N.
+    /// The torque of each joint in Nm or N.
     pub distributed: Vec<f64>,
-    /// The central computation at the positions of that epoch, while they are known.
+    /// The torque by the central computation at the joint positions of that epoch; null if these are no longer stored.
     pub central: Option<Vec<f64>>,
-    /// J at these positions, while they are known: in m for revolute joints, a number for prismatic ones.
+    /// The Jacobian of the cell for each joint at these positions: in m for a revolute joint, a number for a prismatic
+    /// one. It is null if the positions are no longer stored.
     pub jacobian: Option<Vec<f64>>,
-    /// True if a word is saturated.
+    /// True if a torque was too large for its word and was saturated.
     pub saturated: bool,
 }
 
 impl Live {
-    /// Returns the status for all pages, without the details of a cell.
+    /// Returns the status that all pages get, without the details of a cell.
     #[must_use]
     pub fn status_message(&self, now: Micros) -> StatusMessage {
         let (mut contacts, mut dead, mut dead_cells) = (0, 0, Vec::new());
@@ -196,7 +198,7 @@ impl Live {
         }
     }
 
-    /// Returns the details of a cell, or `None` if the skin does not have the cell.
+    /// Returns the details of the cell that a page has selected; `None` if the skin does not have this cell.
     #[must_use]
     pub fn detail(&self, chosen: SelectedCell, now: Micros) -> Option<CellDetail> {
         let SelectedCell { bus: index, node, frame } = chosen;

@@ -1,4 +1,4 @@
-//! Synthetic frames, and the state after them.
+//! Tests of the state that results from generated frames.
 
 use super::*;
 use crate::command::SelectedCell;
@@ -12,11 +12,11 @@ fn skin() -> Skin {
     Skin::parse("ur5", include_str!("../../../examples/ur5-253.toml")).unwrap()
 }
 
-/// The example skin at 62.5 Hz.
+/// The state of the example skin, whose frames are generated at 62.5 Hz.
 struct Bench {
     live: Live,
     now: Micros,
-    /// The bus that messages go to.
+    /// The index of the bus on which messages are sent.
     bus: usize,
 }
 
@@ -98,7 +98,7 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     assert_eq!(cell(7)[0], 0, "never heard");
 
     let said = bench.live.status_message(bench.now);
-    // The table has not seen the cell's start, so that no reply is due.
+    // The start of the cell was not observed, so no reply of it was due.
     assert_eq!((said.contacts, said.dead, said.halted, said.buses[0].due), (1, 0, false, 0));
     let detail = bench.live.detail(SelectedCell { bus: 0, node: 5, frame: None }, bench.now).unwrap();
     let answer = detail.torque.unwrap();

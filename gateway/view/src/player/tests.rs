@@ -1,5 +1,5 @@
-//! A synthetic recording: at every moment, on whatever way the player got there, its state equals that of a straight
-//! read.
+//! Tests that the player shows the same state at a position, whichever way it got there, as after reading the recording
+//! up to there from its beginning.
 
 use std::io::Write;
 
@@ -18,7 +18,7 @@ use protocol::packet::Epoch;
 /// The time of the first frame, in ns since 1970.
 const BEGAN: u64 = 1_700_000_000_000_000_000;
 const MS: u64 = 1_000_000;
-/// The length of the log in ms, and the period of an epoch.
+/// The length of the log in ms. It has an epoch every `EPOCH_MS`.
 const LENGTH_MS: u64 = 40_000;
 const EPOCH_MS: u64 = 16;
 const CELLS: u8 = 24;
@@ -27,8 +27,8 @@ fn skin() -> Skin {
     Skin::parse("ur5", include_str!("../../../examples/ur5-253.toml")).unwrap()
 }
 
-/// A log of 24 cells: cell 5 is touched from 6 s to 9 s and from 30 s on, cell 7 falls silent at 20 s, replies are
-/// missing at 12 s, and the robot is halted from 25 s to 26 s.
+/// Writes a log of 24 cells. Cell 5 is touched from 6 s to 9 s and from 30 s on, cell 7 is silent from 20 s on, replies
+/// are missing at 12 s, and the robot is halted from 25 s to 26 s.
 fn log(skin: &Skin) -> Vec<u8> {
     let mut out = Vec::new();
     let mut say = |ms: u64, micros: u64, message: &Message| {
@@ -81,14 +81,14 @@ fn log(skin: &Skin) -> Vec<u8> {
     out
 }
 
-/// Returns what a page would show, without the snapshot's number.
+/// Returns the snapshot without its number, and the status.
 fn shown(tape: &mut Live, now: Micros) -> (Vec<u8>, String) {
     let detail = tape.detail(SelectedCell { bus: 0, node: 5, frame: None }, now);
     let said = StatusMessage { detail, ..tape.status_message(now) };
     (tape.snapshot(now, &TouchRegistry::default()).split_off(4), serde_json::to_string(&said).unwrap())
 }
 
-/// Returns the same after reading everything from the beginning.
+/// Returns the same as [`shown`] after reading the recording from its beginning up to `until`.
 fn straight(bytes: &[u8], skin: &Skin, until: u64) -> (Vec<u8>, String) {
     let mut reader = Reader::from_read("log", std::io::Cursor::new(bytes.to_vec())).unwrap();
     let mut tape = Tape::new(skin.clone(), BEGAN + 10_000);
@@ -220,7 +220,7 @@ fn a_recording_without_frames_is_refused() {
     assert!(error.ends_with("empty.log: there is no frame in it"), "{error}");
 }
 
-/// Times of frames: arbitrary ones, ones near the limits of 64 bits of ns, and ones near each other.
+/// Generates times of frames: any times, times near the limits of 64 bits of ns, and times near each other.
 fn times() -> impl Strategy<Value = Vec<u64>> {
     let near = |at: u64| (0..3_000_000_000_u64).prop_map(move |off| at.saturating_sub(off));
     let any = prop_oneof![any::<u64>(), near(u64::MAX), near(3_000_000_000), near(BEGAN), Just(u64::MAX)];

@@ -6,43 +6,43 @@ use super::Shared;
 use super::request::Request;
 use crate::web;
 
-/// The content security policy: no resources from elsewhere, and no embedding in other pages.
+/// The content security policy: a page loads nothing from other servers, and no other page can embed it.
 const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; \
                       base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-/// A complete answer.
+/// A complete HTTP answer.
 #[derive(Debug)]
 pub(super) struct Answer {
     pub(super) bytes: Vec<u8>,
-    /// True if the client has shown the token, or does not need one.
+    /// True if the client has sent the token, or if none is needed.
     pub(super) is_known: bool,
 }
 
-/// The reasons for a refusal.
+/// The reason why a request is refused.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Refusal {
-    /// The head is not a GET of HTTP/1.1.
+    /// The request is not a GET request of HTTP/1.1.
     Malformed,
-    /// The request asks for another host, or comes from a page of another site.
+    /// The request is addressed to another host, or comes from a page of another site.
     Elsewhere,
-    /// The token is missing or wrong.
+    /// The request does not carry the right token.
     Unknown,
     /// The file does not exist.
     NoFile,
-    /// The request asks for the WebSocket as for a file.
+    /// The path of the WebSocket was requested like a file.
     NoPage,
-    /// The head took too long.
+    /// The head of the request did not arrive in time.
     Late,
-    /// The head is too long.
+    /// The head of the request is too long.
     Long,
-    /// Too many other clients are connected without having sent a request.
+    /// Too many other clients are connected that have not sent their requests yet.
     Crowded,
-    /// The maximum number of pages is reached.
+    /// The maximum number of pages is connected.
     Full,
 }
 
 impl Refusal {
-    /// Returns the status line, and a text that says what to do.
+    /// Returns the HTTP status line, and a text that tells the user what to do.
     const fn status_and_advice(self) -> (&'static str, &'static str) {
         match self {
             Self::Malformed => ("400 Bad Request", "only GET requests of HTTP/1.1 are answered"),
@@ -72,7 +72,7 @@ impl Refusal {
 }
 
 impl Answer {
-    /// Creates the answer for a refused client.
+    /// Returns the answer for a request that is refused.
     pub(super) fn refusal(why: Refusal) -> Self {
         let (status, words) = why.status_and_advice();
         let number = status.split(' ').next().unwrap_or_default();
@@ -93,10 +93,10 @@ impl Answer {
     }
 }
 
-/// Answers a request with this head; returns `None` if the client becomes a page.
+/// Answers a request with this head. Returns `None` if the client becomes a page, with a WebSocket.
 ///
-/// Scripts and styles are the same for every client and reveal nothing about the bench, so they need no token: the
-/// page's links to them carry none.
+/// Scripts and styles need no token, because the page requests them by links without one. They are the same for every
+/// client and reveal nothing about the bench.
 pub(super) fn answer(head: &[u8], shared: &Shared) -> Option<Answer> {
     let turned = |why| {
         shared.refused.fetch_add(1, Ordering::Relaxed);

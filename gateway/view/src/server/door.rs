@@ -1,9 +1,9 @@
-//! The door: one thread that reads the requests of all clients, answers them, and passes on the clients that become
-//! pages.
+//! The door of the server: one thread that reads and answers the requests of all clients. It passes clients that become
+//! pages on to their own threads.
 //!
-//! A client has [`HEAD_TIME`] for its whole head. If too many clients wait, the one that has waited longest is refused.
-//! A client with the token sends its head at once and is answered by then, so that any number of clients without a
-//! token cannot keep it out. Pages have a limit of their own.
+//! A client must send the whole head of its request within [`HEAD_TIME`]. If too many clients wait, the one that has
+//! waited longest is refused. A client with the token sends its head at once and is answered before that, so clients
+//! without a token cannot keep it out, however many they are. The number of pages is limited separately.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -21,48 +21,48 @@ use super::page::{self, PrefixedStream};
 use super::request::MAX_HEAD_BYTES;
 use super::{MAX_PAGES, Shared};
 
-/// The time limit for a whole head, and for sending an answer.
+/// The time within which a client must send the head of its request, and must receive the answer.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(5);
-/// The time limit per piece of an answer to a client with the token.
+/// The time within which a client with the token must receive each piece of an answer.
 const PIECE_TIMEOUT: Duration = Duration::from_secs(5);
-/// The maximum number of clients that are neither answered nor pages.
+/// The maximum number of clients that are neither answered yet nor pages.
 const MAX_VISITORS: usize = 256;
 /// The number of file descriptors that are kept free for buses and pages.
 const RESERVED_FILES: u64 = 64;
-/// The maximum number of connections that are accepted before the other clients are served.
+/// The maximum number of connections that are accepted before the clients that wait are served.
 const MAX_ACCEPTED_AT_ONCE: usize = 32;
 /// The interval at which the server checks whether it has to stop.
 const POLL_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
-/// The pause after accepting has failed.
+/// The time for which no connection is accepted after accepting has failed.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(50);
-/// The niceness of the door's thread, so that a storm of connections does not take the bench's processor time.
+/// The niceness of the thread, so that many connections do not take processor time from the bench.
 const NICE: i32 = 10;
-/// The read size in bytes.
+/// The maximum number of bytes that are read at once.
 const READ_SIZE: usize = 4 * 1024;
 
-/// A client that has not got its answer yet.
+/// A client that has not received its answer yet.
 #[derive(Debug)]
 struct Visitor {
     stream: TcpStream,
     head: Vec<u8>,
-    /// The answer, once it is known, and the number of its bytes that were sent.
+    /// The answer and the number of its bytes that were already sent; `None` until the request is complete.
     answer: Option<(Answer, usize)>,
     until: Instant,
 }
 
-/// The next step with a visitor.
+/// What becomes of a visitor after its data was read and written.
 enum NextStep {
-    /// The visitor waits.
+    /// The visitor stays, because its request or answer is not complete.
     Stays(Visitor),
-    /// The visitor becomes a page.
+    /// The visitor becomes a page with a WebSocket.
     Page(PrefixedStream),
-    /// The visitor has its answer, or has gone.
+    /// The visitor has received its answer, or has disconnected.
     Done,
 }
 
-/// Serves until the server stops, and passes on the clients that become pages.
+/// Serves clients until the server stops. Passes clients that become pages to `pages`.
 pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<PrefixedStream>) {
-    // On Linux the priority is the thread's own. The door also works without it.
+    // On Linux, niceness applies to the thread alone. If it cannot be set, the door works without it.
     let _ = setpriority_process(None, NICE);
     let room = visitor_limit();
     let mut visitors = Vec::<Visitor>::new();
@@ -72,11 +72,12 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Pref
         let ready = wait(listener, resting.is_none(), &visitors);
         let [listener_is_ready, rest @ ..] = ready.as_slice() else { continue };
         let now = Instant::now();
-        // Clients whose data has arrived are served before new ones can displace them.
+        // Clients whose data has arrived are served before new clients can push them out.
         for (visitor, is_ready) in std::mem::take(&mut visitors).into_iter().zip(rest) {
             if now >= visitor.until {
                 shared.refused.fetch_add(1, Ordering::Relaxed);
-                // Browsers connect ahead of a request, and would show this text as its answer.
+                // Browsers open connections before they need them, and would take this text for the answer to a later
+                // request.
                 if !visitor.head.is_empty() {
                     visitor.turn_away(Refusal::Late);
                 }
@@ -105,7 +106,7 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Pref
                 Err(error)
                     if matches!(error.kind(), ErrorKind::Interrupted | ErrorKind::ConnectionAborted) => {}
                 Err(_) => {
-                    // Out of file descriptors: this lasts until some are closed, so close one connection.
+                    // No file descriptor is free. This lasts until one is closed, so one client is disconnected.
                     turn_oldest_away(&mut visitors, shared);
                     resting = Some(Instant::now() + ACCEPT_PAUSE);
                     break;
@@ -115,15 +116,16 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Pref
     }
 }
 
-/// Returns the number of visitors that may wait: it leaves file descriptors for buses and pages.
+/// Returns the maximum number of visitors for which file descriptors are left beside those of buses and pages.
 fn visitor_limit() -> usize {
     let files = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
     usize::try_from(files.saturating_sub(RESERVED_FILES) / 2).unwrap_or(MAX_VISITORS).clamp(4, MAX_VISITORS)
 }
 
-/// Waits for the listener and the visitors, and returns a flag for each: true if it is ready.
+/// Waits until a client connects or the socket of a visitor is ready. Returns a flag for the listener and each
+/// visitor: true if it is ready.
 fn wait(listener: &TcpListener, accepts: bool, visitors: &[Visitor]) -> Vec<bool> {
-    // A listener whose accept fails stays ready: it is left out during the pause.
+    // While accepting fails, the listener is always ready, so it is not polled during the pause.
     let listened = if accepts { PollFlags::IN } else { PollFlags::empty() };
     let mut files = vec![PollFd::new(listener, listened)];
     files.extend(visitors.iter().map(|visitor| {
@@ -137,17 +139,17 @@ fn wait(listener: &TcpListener, accepts: bool, visitors: &[Visitor]) -> Vec<bool
     files.iter().map(|file| !file.revents().is_empty()).collect()
 }
 
-/// Handles the next step of a visitor.
+/// Keeps a visitor, passes it on as a page, or drops it.
 fn enter(next: NextStep, visitors: &mut Vec<Visitor>, pages: &Sender<PrefixedStream>) {
     match next {
         NextStep::Stays(visitor) => visitors.push(visitor),
         NextStep::Done => {}
-        // The receiving end stops together with this one.
+        // If the receiver no longer exists, the server stops, so the error is ignored.
         NextStep::Page(begun) => _ = pages.send(begun),
     }
 }
 
-/// Starts a thread for each page, up to the limit. These threads have the normal priority of this one.
+/// Starts a thread for each new page, up to the maximum number. These threads have normal priority.
 pub(super) fn open(pages: Receiver<PrefixedStream>, shared: &Arc<Shared>) {
     for (page, begun) in (1..).zip(pages) {
         if shared.pages.fetch_add(1, Ordering::Relaxed) >= MAX_PAGES {
@@ -168,7 +170,7 @@ pub(super) fn open(pages: Receiver<PrefixedStream>, shared: &Arc<Shared>) {
     }
 }
 
-/// Refuses the visitor that has waited longest, if possible one that has not shown the token.
+/// Refuses the visitor that has waited longest. Visitors that have sent the token are spared as long as possible.
 fn turn_oldest_away(visitors: &mut Vec<Visitor>, shared: &Shared) {
     let is_known = |visitor: &Visitor| visitor.answer.as_ref().is_some_and(|(answer, _)| answer.is_known);
     let at = visitors.iter().position(|visitor| !is_known(visitor)).unwrap_or(0);
@@ -187,11 +189,11 @@ impl Visitor {
         Self { stream, head: Vec::new(), answer: None, until: Instant::now() + HEAD_TIMEOUT }
     }
 
-    /// Reads the data that has arrived, and writes as much as the socket accepts.
+    /// Reads the data that has arrived from a visitor, and sends as much of the answer as the socket accepts.
     fn advance(mut self, shared: &Shared) -> NextStep {
         while self.answer.is_none() {
             let mut piece = [0; READ_SIZE];
-            // The end of the head may begin in the last three bytes of the data before.
+            // The empty line that ends the head may begin in the last three bytes that were read before.
             let seen = self.head.len().saturating_sub(3);
             match self.stream.read(&mut piece) {
                 Ok(0) => return NextStep::Done,
@@ -238,7 +240,7 @@ impl Visitor {
         NextStep::Stays(self)
     }
 
-    /// Sends the reason of the refusal, as far as that is possible without waiting.
+    /// Refuses the visitor. Sends the reason only as far as the socket accepts it at once.
     fn turn_away(mut self, why: Refusal) {
         if self.answer.is_none() {
             let _ = self.stream.write(&Answer::refusal(why).bytes);
@@ -246,7 +248,8 @@ impl Visitor {
         self.close();
     }
 
-    /// Closes the connection. Unread bytes would reset it, and the client might not read its answer.
+    /// Closes the connection after reading what has arrived. Closing with unread data would reset it, and the answer
+    /// might be lost.
     fn close(mut self) {
         let _ = self.stream.shutdown(Shutdown::Write);
         let mut piece = [0; READ_SIZE];

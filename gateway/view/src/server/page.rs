@@ -1,4 +1,4 @@
-//! A connected page: it receives the newest messages, and sends commands.
+//! A connected page. Its thread sends the newest messages to it, and receives its commands.
 
 use std::io::{self, Cursor, ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpStream};
@@ -12,14 +12,14 @@ use super::Shared;
 use crate::command::{self, Command};
 use crate::locked;
 
-/// The time limit for a page to receive a piece of a message.
+/// The time within which a page must receive each piece of a message.
 const TIMEOUT: Duration = Duration::from_secs(5);
-/// The time that the thread waits for a page's message before it checks for a new snapshot.
+/// The time for which the thread waits for a message from the page before it checks for a new snapshot.
 const POLL_INTERVAL: Duration = Duration::from_millis(15);
-/// The maximum number of messages that are read in a row.
+/// The maximum number of messages that are read from the page before the next snapshot.
 const MAX_MESSAGES_AT_ONCE: usize = 64;
 
-/// A stream whose first bytes were already read.
+/// A stream whose first bytes, the head of a request, were already read.
 #[derive(Debug)]
 pub(super) struct PrefixedStream {
     head: Cursor<Vec<u8>>,
@@ -55,7 +55,7 @@ impl Write for PrefixedStream {
     }
 }
 
-/// Serves a page until it disconnects, or takes too long.
+/// Serves a page until it disconnects, or receives messages too slowly.
 pub(super) fn serve(begun: PrefixedStream, page: u64, shared: &Shared) {
     let _ = live(begun, page, shared);
 }
@@ -113,7 +113,7 @@ fn exchange_messages(socket: &mut WebSocket<PrefixedStream>, page: u64, shared: 
                 Ok(Message::Close(_)) => return Ok(()),
                 Ok(Message::Binary(_)) => _ = shared.ignored.fetch_add(1, Ordering::Relaxed),
                 Ok(Message::Ping(_) | Message::Pong(_) | Message::Frame(_)) => {}
-                // SIGCONT interrupts the read; retry.
+                // A signal such as SIGCONT has interrupted the read, which is repeated.
                 Err(Error::Io(error))
                     if matches!(
                         error.kind(),
@@ -129,7 +129,7 @@ fn exchange_messages(socket: &mut WebSocket<PrefixedStream>, page: u64, shared: 
     Ok(())
 }
 
-/// Handles a message of a page.
+/// Handles a message that a page has sent.
 fn handle_message(text: &str, page: u64, shared: &Shared) {
     let ignore = || _ = shared.ignored.fetch_add(1, Ordering::Relaxed);
     match Command::parse(text) {

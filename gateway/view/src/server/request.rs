@@ -1,4 +1,4 @@
-//! The head of an HTTP request, and the conditions under which it is served.
+//! Parses the head of an HTTP request, and checks whether it may be served.
 
 use std::net::{IpAddr, SocketAddr};
 
@@ -6,10 +6,10 @@ use crate::token::Token;
 
 /// The maximum length of a head, in bytes.
 pub(super) const MAX_HEAD_BYTES: usize = 8 * 1024;
-/// The port of an address without a port.
+/// The port that is meant if an address has none.
 const DEFAULT_PORT: u16 = 80;
 
-/// The relevant parts of a request.
+/// The parts of a request that decide how it is answered.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub(super) struct Request {
     pub(super) path: String,
@@ -20,7 +20,8 @@ pub(super) struct Request {
 }
 
 impl Request {
-    /// Parses a head, which ends with an empty line; returns `None` unless it is a GET request.
+    /// Parses the head of a request, up to and including the empty line. Returns `None` unless it is a valid GET
+    /// request.
     pub(super) fn parse(head: &str) -> Option<Self> {
         let mut lines = head.split("\r\n");
         let mut first = lines.next()?.split(' ');
@@ -33,7 +34,7 @@ impl Request {
             let Some((name, value)) = line.split_once(':') else { continue };
             let value = value.trim();
             match name.to_ascii_lowercase().as_str() {
-                // A second Host header may be an attempt to be parsed in two ways.
+                // A request with two Host headers could be understood in two ways, so it is refused.
                 "host" if request.host.is_some() => return None,
                 "host" => request.host = Some(value.to_ascii_lowercase()),
                 "origin" => request.origin = Some(value.to_ascii_lowercase()),
@@ -44,8 +45,8 @@ impl Request {
         Some(request)
     }
 
-    /// Checks that the request asks for this server by one of its own addresses, and does not come from a page of
-    /// another site.
+    /// Returns true if the request is addressed to this server by one of its own addresses and does not come from a
+    /// page of another site.
     pub(super) fn is_for(&self, address: SocketAddr) -> bool {
         let Some(host) = self.host.as_deref().and_then(Authority::parse) else { return false };
         // Browsers send an origin with every WebSocket; other programs may omit it.
@@ -55,7 +56,7 @@ impl Request {
         host.matches_address(address) && is_origin
     }
 
-    /// Checks that the request carries the token, if there is one.
+    /// Returns true if the request carries the token, or if none is needed.
     pub(super) fn has_token(&self, token: Option<&Token>) -> bool {
         let Some(token) = token else { return true };
         let given = self.query.split('&').find_map(|part| part.strip_prefix("token="));
@@ -63,7 +64,7 @@ impl Request {
     }
 }
 
-/// The host and the port of an address.
+/// The host and the port of a URL or a Host header.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 struct Authority<'a> {
     host: &'a str,
@@ -86,9 +87,8 @@ impl<'a> Authority<'a> {
         Some(Self { host, port })
     }
 
-    /// Compares the authority with the address that the server listens on. Other sites can make their names resolve to
-    /// this machine. Names other than localhost are therefore refused, so that a page of such a site cannot read this
-    /// one.
+    /// Returns true if the host and the port mean the address `listen`. Other names than localhost are refused: any
+    /// site can make its own name resolve to this machine, and its pages could then read this one.
     fn matches_address(self, listen: SocketAddr) -> bool {
         let is_anywhere = listen.ip().is_unspecified();
         let inner = self.host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));

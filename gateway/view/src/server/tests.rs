@@ -8,7 +8,7 @@ use tungstenite::{WebSocket, client};
 use super::*;
 
 const TOKEN: &str = "abcdef0123456789";
-/// The time limit for operations that should finish at once.
+/// The time within which operations must finish that should finish at once.
 const TIMEOUT: Duration = Duration::from_secs(40);
 
 fn served(token: Option<&str>) -> Server {
@@ -68,7 +68,7 @@ fn without_the_token_only_the_code_of_the_page_is_served() {
         assert_eq!(page(&server, query).err(), Some(403), "{query}");
     }
     assert_eq!(server.counts().clients, 0);
-    // The page's links to its code carry no token.
+    // The links in the page to its scripts and styles carry no token.
     for path in ["/app.js", "/style.css"] {
         assert_eq!(status(&get(&server, path)), "200", "{path}");
     }
@@ -88,7 +88,7 @@ fn bytes_behind_a_head_do_not_change_its_answer() {
     let server = served(Some(TOKEN));
     let mut stream = connect(&server);
     let head = format!("GET /live HTTP/1.1\r\nHost: {}\r\nUpgrade: websocket\r\n\r\n", server.address());
-    // A page's message, masked with zeros, is not UTF-8.
+    // A message of a page follows the head. Its own header is not UTF-8, so it is written as bytes.
     stream
         .write_all(&[head.as_bytes(), &[0x81, 0x80 | 13, 0, 0, 0, 0], br#"{"do":"halt"}"#].concat())
         .unwrap();
@@ -126,7 +126,7 @@ fn clients_that_send_no_request_keep_nobody_out_who_has_the_token() {
     let server = served(Some(TOKEN));
     let beginning = |_| {
         let mut stream = connect(&server);
-        // The client may have been refused already.
+        // Writing may fail, because the server may already have refused the client.
         let _ = write!(stream, "GET /?token=wrong HTTP/1.1\r\nX: ");
         stream
     };

@@ -1,4 +1,4 @@
-//! The events of a recording, which a page can jump to.
+//! Detects the events of a recording to which a page can jump.
 
 use std::collections::BTreeMap;
 
@@ -8,9 +8,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::live::Live;
 
-/// Losses on a bus within this time of each other count as one event, in ns.
+/// The maximum time in ns between two losses on a bus that count as one event.
 const LOSS_MERGE_NS: u64 = 200_000_000;
-/// The maximum number of events that are kept.
+/// The maximum number of events that are stored.
 const MAX_EVENTS: usize = 1 << 18;
 
 /// The kind of an event.
@@ -21,13 +21,13 @@ pub enum EventKind {
     Touch,
     /// Replies or packets were lost, late or damaged, or frames were not recorded.
     Loss,
-    /// A cell falls silent.
+    /// A cell becomes silent.
     Silence,
     /// The robot is halted.
     Halt,
 }
 
-/// An event.
+/// An event of a recording.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Event {
     /// The time at which it was detected, in ns since 1970, in steps of 20 ms.
@@ -36,22 +36,22 @@ pub struct Event {
     pub kind: EventKind,
     /// The bus on which it happened.
     pub bus: usize,
-    /// The cell that it concerns.
+    /// The node id of the cell to which the event happened; `None` if it happened to the whole bus.
     pub node: Option<u8>,
 }
 
-/// Compares the state with the previous one, and reports the changes as events.
+/// Detects events by comparing the state of a recording with its previous state.
 #[derive(Clone, Debug, Default)]
 pub struct EventDetector {
-    /// For each bus: its losses, true if it is halted, and the time of the last loss.
+    /// For each bus: the number of losses, true if the bus is halted, and the time of the last loss.
     buses: Vec<(u64, bool, Option<u64>)>,
-    /// For each cell: true if it is touched, and true if it is dead.
+    /// For each cell: true if the cell is touched, and true if it is dead.
     cells: BTreeMap<(usize, CellId), [bool; 2]>,
     events: usize,
 }
 
 impl EventDetector {
-    /// Returns the events since the last call.
+    /// Returns the events that have happened since the last call.
     pub fn detect(&mut self, at: u64, live: &Live) -> Vec<Event> {
         let mut events = Vec::new();
         for (bus, (losses, halted)) in live.losses().enumerate() {
@@ -80,7 +80,7 @@ impl EventDetector {
                 }
             }
         }
-        // Only the first events are kept.
+        // Events beyond the maximum number are dropped.
         events.truncate(MAX_EVENTS - self.events.min(MAX_EVENTS));
         self.events += events.len();
         events

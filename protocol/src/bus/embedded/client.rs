@@ -18,9 +18,9 @@ use crate::bus::{Bus, BusError, Filter, BusOptions};
 
 /// Maximum time to wait for a server, which answers at once unless it is stopped.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
-/// Time within which a server that is ending resets connections.
+/// Maximum time until a server that is ending resets a new connection.
 const RESET_TIMEOUT: Duration = Duration::from_millis(50);
-/// Size of the send buffer: some 700 FD frames, the answers of a whole skin at once.
+/// Size of the send buffer in bytes: room for some 700 FD frames, the answers of a whole skin to one message.
 const SEND_BUFFER: usize = 1 << 18;
 
 /// The embedded bus: served by another process of this user.
@@ -92,14 +92,14 @@ impl Carrier for Embedded {
     }
 }
 
-/// Returns the error for a lost connection: its server has ended, or still serves others and hung up on this
-/// client.
+/// Returns the error for a lost connection: [`BusError::Closed`] if the server has ended, [`BusError::HungUp`] if it
+/// still serves other clients.
 pub(in crate::bus) fn closed_error(name: &str, directory: Option<&Path>) -> BusError {
     let is_served = connect(name, directory).is_ok_and(|socket| is_kept(&socket));
     if is_served { BusError::HungUp(name.to_owned()) } else { BusError::Closed(name.to_owned()) }
 }
 
-/// Returns true if a server keeps a new connection open. A server that is ending resets it.
+/// Returns true if a server keeps a new connection open. A server that is ending resets new connections.
 fn is_kept(socket: &OwnedFd) -> bool {
     let wait = Timespec::try_from(RESET_TIMEOUT).unwrap_or_default();
     let mut polled = [PollFd::new(socket, PollFlags::IN)];
@@ -107,8 +107,7 @@ fn is_kept(socket: &OwnedFd) -> bool {
     is_quiet || rustix::net::recv(socket, &mut [0; 64], RecvFlags::DONTWAIT).is_ok()
 }
 
-/// Connects to a server. The socket may still be in the server's queue; sending on it is limited by a
-/// timeout.
+/// Connects to a server. The connection may still wait to be accepted by the server, so a timeout limits sending on it.
 fn connect(name: &str, directory: Option<&Path>) -> Result<OwnedFd, BusError> {
     let directory = directory.map_or_else(default_directory, Path::to_owned);
     let failed = |errno: Errno| BusError::open_error(name, "connect to", errno);

@@ -11,7 +11,7 @@ use rustix::io::Errno;
 use rustix::net::SocketAddrUnix;
 use thiserror::Error;
 
-/// The file that marks a directory as created by a program, which may therefore remove it with its last bus.
+/// Name of the file that marks a directory as created by a program. Such a directory is removed with its last bus.
 pub const MARK: &str = ".skinbus";
 
 /// Returns the default directory of embedded buses: `$SKINBUS_DIR`, else `$XDG_RUNTIME_DIR/skinbus`, else
@@ -43,7 +43,7 @@ pub fn address(directory: &Path, bus: &str) -> Result<SocketAddrUnix, DirectoryE
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum DirectoryError {
-    /// The directory belongs to another user.
+    /// The directory belongs to another user, who could replace its sockets.
     #[error("{} belongs to user {owner}, and this is user {us}: set SKINBUS_DIR to a directory of your own", path.display())]
     Owner {
         /// The directory.
@@ -58,10 +58,10 @@ pub enum DirectoryError {
     Mode {
         /// The directory.
         path: PathBuf,
-        /// Its permission bits.
+        /// Permission bits of the directory.
         mode: u32,
     },
-    /// The path of the socket is too long.
+    /// The path of the bus's socket is longer than a socket address allows.
     #[error("{} is too long for a socket, whose path has at most 107 bytes: set SKINBUS_DIR to a shorter one", .0.display())]
     TooLong(PathBuf),
     /// The directory cannot be opened or created. Symbolic links are not followed.
@@ -103,8 +103,7 @@ pub fn open_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
     Ok(directory)
 }
 
-/// Creates the directory with mode 0700 if it does not exist, then opens it. A directory created here
-/// contains a [`MARK`].
+/// Creates the directory with mode 0700 and a [`MARK`] if it does not exist, then opens it.
 ///
 /// # Errors
 /// Returns the errors of [`open_directory`], or an error if the directory cannot be created.
@@ -121,10 +120,10 @@ pub fn make_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
     }
 }
 
-/// Writes the [`MARK`] into a directory that was created here.
+/// Writes the [`MARK`] into a new directory.
 ///
 /// # Errors
-/// Returns an error if it cannot be written.
+/// Returns an error if the file cannot be written.
 pub fn mark(directory: impl AsFd) -> Result<(), Errno> {
     let flags = OFlags::CREATE | OFlags::EXCL | OFlags::WRONLY | OFlags::CLOEXEC;
     match rustix::fs::openat(directory, MARK, flags, Mode::RUSR | Mode::WUSR) {
@@ -133,11 +132,11 @@ pub fn mark(directory: impl AsFd) -> Result<(), Errno> {
     }
 }
 
-/// Removes a directory that contains only the [`MARK`]. A directory that the user created has no mark and
-/// stays. The caller holds the lock on it.
+/// Removes a directory that contains only the [`MARK`]. A directory that the user created has no mark and is not
+/// removed. The caller holds the lock on the directory.
 ///
 /// # Errors
-/// Returns an error if it contains other files, has no mark, or cannot be removed.
+/// Returns an error if the directory contains other files, has no mark, or cannot be removed.
 pub fn remove_directory(directory: impl AsFd, path: &Path) -> Result<(), Errno> {
     for entry in rustix::fs::Dir::read_from(&directory)? {
         if ![".", "..", MARK].map(str::as_bytes).contains(&entry?.file_name().to_bytes()) {

@@ -1,4 +1,4 @@
-//! Error messages for mistakes that the TOML parser finds: the key, its value and what is allowed.
+//! Error messages for mistakes that the TOML parser finds. They name the key, its value and the allowed values.
 
 use core::ops::Range;
 
@@ -10,7 +10,7 @@ use crate::skin::CellName;
 /// Maximum number of characters quoted from a value.
 const MAX_QUOTED_CHARS: usize = 40;
 
-/// Rewrites the parser's message about the value at these bytes.
+/// Rewrites the parser's error message about the value at the bytes `at` in terms of the key and its value.
 pub(super) fn explain(text: &str, at: Range<usize>, message: &str) -> String {
     let found = DeTable::parse(text).ok().and_then(|root| find_in_table(root.get_ref(), at.start));
     if let Some(field) = message.strip_prefix("missing field ") {
@@ -28,7 +28,7 @@ pub(super) fn explain(text: &str, at: Range<usize>, message: &str) -> String {
     }
 }
 
-/// Describes the values that the parser expected.
+/// Describes the values that the parser expected at a path; `None` if its message does not contain them.
 fn describe_allowed(path: &str, message: &str) -> Option<String> {
     if let Some((got, target)) = message
         .strip_prefix("invalid length ")
@@ -59,12 +59,12 @@ fn describe_allowed(path: &str, message: &str) -> Option<String> {
     })
 }
 
-/// Parses a cell that is written as `string "BUS:NODE"`, as on the command line.
+/// Parses the name of a cell that the user has copied from the command line: `string "BUS:NODE"`.
 fn cell_of_bus(got: &str) -> Option<CellName> {
     got.strip_prefix("string \"")?.strip_suffix('"')?.parse().ok()
 }
 
-/// Rewrites the message about text that is not TOML. The parser's advice only fits strings.
+/// Rewrites the parser's message about text that is not TOML, without the parser's advice, which only fits strings.
 fn explain_syntax_error(message: &str) -> String {
     let more = if message.starts_with("string values must be quoted") {
         "; write numbers without units or formulas, such as 5000000 or 1.5708"

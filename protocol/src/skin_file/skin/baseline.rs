@@ -1,11 +1,11 @@
-//! The baseline of the force sensors in a skin file.
+//! Checks of the baseline settings for force sensors in a skin file.
 
 use super::raw;
 use crate::document::{DocumentFault, KeyPath};
 use crate::fixed::{Q1_14, Q5_10};
 use crate::parameters::{Baseline, BaselineSettings};
 
-/// Values for omitted keys.
+/// Baseline settings for omitted keys.
 const DEFAULT: BaselineSettings = BaselineSettings {
     threshold: Q5_10::from_bits(103),
     hysteresis: Q1_14::from_bits(8_192),
@@ -14,7 +14,7 @@ const DEFAULT: BaselineSettings = BaselineSettings {
     n_per_c: Q1_14::ZERO,
 };
 
-/// Checks the table `[baseline]`.
+/// Checks the table `[baseline]` of a skin and returns its settings.
 pub(super) fn skin_baseline(raw: Option<raw::Baseline>) -> Result<Baseline, DocumentFault> {
     let Some(raw) = raw else { return Ok(Baseline::Off) };
     let at = KeyPath::top_level_key("baseline");
@@ -42,7 +42,7 @@ pub(super) fn skin_baseline(raw: Option<raw::Baseline>) -> Result<Baseline, Docu
     })
 }
 
-/// Applies the overrides of a cell.
+/// Returns the settings of a cell: `base`, with the keys that the cell overrides.
 pub(super) fn cell_baseline(at: &KeyPath, raw: &raw::RawCell, base: Baseline) -> Result<Baseline, DocumentFault> {
     let Baseline::On(mut to) = base else {
         let given = [("baseline_limit_n", raw.baseline_limit_n), ("baseline_n_per_c", raw.baseline_n_per_c)];
@@ -56,7 +56,7 @@ pub(super) fn cell_baseline(at: &KeyPath, raw: &raw::RawCell, base: Baseline) ->
     Ok(Baseline::On(to))
 }
 
-/// Sets the temperature slope, which may be negative.
+/// Sets the drift of the zero with temperature, which may be negative, in N/°C.
 fn set_slope(at: &KeyPath, given: Option<f64>, to: &mut BaselineSettings) -> Result<(), DocumentFault> {
     if let Some(given) = given {
         to.n_per_c = at.to_fixed(given, Q1_14::try_nearest)?;

@@ -8,7 +8,7 @@ use crate::document::{Checked, KeyPath};
 use crate::fixed::TorqueFormat;
 use crate::wire_time::BitRates;
 
-/// Maximum number of buses of a skin.
+/// Maximum number of buses in a skin.
 const MAX_BUSES: usize = 64;
 
 pub(super) fn buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<SkinBus>> {
@@ -42,7 +42,7 @@ pub(super) fn buses(raw: &[raw::RawBus], robot: &Robot) -> Checked<Vec<SkinBus>>
     raw.iter().enumerate().map(bus).collect()
 }
 
-/// Returns the chain of a bus. The name may be omitted if there is only one chain.
+/// Returns the index of the chain that carries a bus. The file may omit the name if there is only one chain.
 fn chain(at: &KeyPath, bus: &raw::RawBus, robot: &Robot) -> Checked<usize> {
     let names =
         || robot.chains.iter().map(|chain| format!("{:?}", chain.name)).collect::<Vec<_>>().join(", ");
@@ -56,8 +56,8 @@ fn chain(at: &KeyPath, bus: &raw::RawBus, robot: &Robot) -> Checked<usize> {
     }
 }
 
-/// Returns the torque format of a bus. The default is the finest, or Q5.10 for a chain with prismatic joints,
-/// where a range of 8 N would be too small.
+/// Returns the torque format of a bus. The default is Q3.12, the finest, but Q5.10 for a chain with prismatic joints,
+/// because forces exceed the range of 8 N.
 fn torque_format(at: &KeyPath, bus: &raw::RawBus, robot: &Robot, chain: usize) -> Checked<TorqueFormat> {
     if let Some(name) = &bus.torque_format {
         let formats = TorqueFormat::ALL.map(|format| (format.name(), format));
@@ -68,7 +68,7 @@ fn torque_format(at: &KeyPath, bus: &raw::RawBus, robot: &Robot, chain: usize) -
     Ok(if joints.iter().any(slides) { TorqueFormat::Q5_10 } else { TorqueFormat::Q3_12 })
 }
 
-/// Checks the reply of a bus.
+/// Checks the reply of the cells of a bus to joints.
 fn reply(at: &KeyPath, bus: &raw::RawBus) -> Checked<SkinReply> {
     let sums = at.key("reply").choose(&bus.reply, &[("torque", false), ("sum", true)])?;
     let only_sum = "only with reply = \"sum\"";
@@ -84,7 +84,7 @@ fn reply(at: &KeyPath, bus: &raw::RawBus) -> Checked<SkinReply> {
     }
 }
 
-/// Checks the optional bit rates of real hardware.
+/// Checks the nominal and data bit rates of a bus, which are optional and only needed for real hardware.
 fn bit_rates(at: &KeyPath, bus: &raw::RawBus, format: Format) -> Checked<(Option<u32>, Option<u32>)> {
     let within = |key, got, min, max| at.key(key).check_range(got, min..=max, " bit/s");
     let (min, max) = (BitRates::MIN_NOMINAL, BitRates::MAX_NOMINAL);

@@ -1,14 +1,14 @@
-//! Names of cells on the command line and in files.
+//! Names of cells, as users write them on the command line and in files.
 
 use core::fmt;
 use core::str::FromStr;
 
 use crate::id::CellId;
 
-/// The name of a cell: `NODE`, or `BUS:NODE` if several buses may have that node id.
+/// The name of a cell: `NODE`, or `BUS:NODE` where several buses can have a cell with that node id.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct CellName {
-    /// The bus, if given.
+    /// Name of the bus, if given.
     pub bus: Option<String>,
     /// The node id on that bus.
     pub node: CellId,
@@ -20,8 +20,8 @@ impl FromStr for CellName {
     /// Parses a name.
     ///
     /// # Errors
-    /// Returns an error if the text does not end with a node id from 1 to 254, or has nothing before the
-    /// colon.
+    /// Returns an error if the text does not end with a node id from 1 to 254, or if the bus name before the colon is
+    /// empty.
     fn from_str(text: &str) -> Result<Self, String> {
         let (bus, number) = split_bus(text)?;
         let node = number.parse().map_err(|_| format!("{number:?} is not a node id: use 1 to 254"))?;
@@ -32,7 +32,7 @@ impl FromStr for CellName {
 /// Splits `BUS:NODE` or `NODE` into bus and node. The bus name may contain colons.
 ///
 /// # Errors
-/// Returns an error if nothing precedes the colon.
+/// Returns an error if the bus name before the colon is empty.
 pub fn split_bus(text: &str) -> Result<(Option<&str>, &str), String> {
     match text.rsplit_once(':') {
         Some(("", _)) => Err("no bus precedes the colon: write NODE or BUS:NODE".to_owned()),

@@ -10,7 +10,7 @@ use crate::fixed::Q;
 use crate::id::CellId;
 use crate::parameters::{Baseline, Contact};
 
-/// The values that cells inherit from the skin.
+/// The settings of the skin that apply to a cell unless the cell overrides them.
 #[derive(Clone, Copy)]
 pub(super) struct CellDefaults {
     pub(super) contact: Contact,
@@ -45,7 +45,8 @@ pub(super) fn cells(raw: &[raw::RawCell], robot: &Robot, buses: &[SkinBus], base
     Ok(cells)
 }
 
-/// Iterates over the neighbours that cells name: cell index, port, cell and neighbour.
+/// Iterates over the neighbours that cells name. Each item is the index of a cell, one of its ports, the cell, and the
+/// node id of the neighbour at that port.
 fn neighbor_mentions(cells: &[Cell]) -> impl Iterator<Item = (usize, usize, &Cell, CellId)> {
     cells.iter().enumerate().flat_map(|(index, cell)| {
         let ports = cell.neighbors.iter().enumerate();
@@ -53,7 +54,7 @@ fn neighbor_mentions(cells: &[Cell]) -> impl Iterator<Item = (usize, usize, &Cel
     })
 }
 
-/// Checks that every wire has two ends: two cells must name each other equally often.
+/// Checks that every wire has two ends: if a cell names a neighbour, the neighbour must name the cell equally often.
 fn check_wire_ends(cells: &[Cell]) -> Checked<()> {
     let mut all = HashMap::new();
     for (.., cell, neighbor) in neighbor_mentions(cells) {
@@ -119,7 +120,7 @@ fn cell(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, buses: &[SkinBus], base
     })
 }
 
-/// Applies the given gains and thresholds to `base`.
+/// Returns `base` with the gains and thresholds that are given.
 pub(super) fn contact(at: &KeyPath, raw: raw::Contact, base: Contact) -> Checked<Contact> {
     let raw::Contact { alpha_c, alpha_p, contact_threshold_n, proximity_threshold, force_threshold_n } = raw;
     let mut to = base;
@@ -131,12 +132,12 @@ pub(super) fn contact(at: &KeyPath, raw: raw::Contact, base: Contact) -> Checked
     Ok(to)
 }
 
-/// Returns the default serial number, which is unique among default numbers.
+/// Returns the serial number of a cell whose file gives none. Default serial numbers are unique within a skin.
 fn default_serial(bus: usize, node: CellId) -> i64 {
     i64::try_from(bus).unwrap_or(0) * 1_000 + i64::from(node.get())
 }
 
-/// Returns the joint that moves a cell and the row that carries it. Either may be omitted, but not both.
+/// Returns the joint that moves a cell and the row that carries it. The file may omit either, but not both.
 fn joint_and_row(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, chain: usize) -> Checked<(u8, u8)> {
     let Some(chain) = robot.chains.get(chain) else { return Ok((0, 0)) };
     let (joints, rows) = (chain.joints.len(), chain.rows.len());
@@ -162,7 +163,7 @@ fn joint_and_row(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, chain: usize) 
     }
 }
 
-/// Returns the bus of a cell. The name may be omitted if there is only one bus.
+/// Returns the index of a cell's bus. The file may omit the name if there is only one bus.
 fn bus(at: &KeyPath, raw: &raw::RawCell, buses: &[SkinBus]) -> Checked<usize> {
     let names = || buses.iter().map(|bus| format!("{:?}", bus.name)).collect::<Vec<_>>().join(", ");
     let at = at.key("bus");
@@ -175,7 +176,7 @@ fn bus(at: &KeyPath, raw: &raw::RawCell, buses: &[SkinBus]) -> Checked<usize> {
     }
 }
 
-/// Returns the outward normal: the given one, or the z axis of the orientation.
+/// Returns the outward normal of a cell: the given one, or the z axis of the given orientation.
 fn normal(at: &KeyPath, raw: &raw::RawCell) -> Checked<[f64; 3]> {
     match (raw.orientation, raw.normal) {
         (Some(orientation), None) => {

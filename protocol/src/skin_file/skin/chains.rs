@@ -8,14 +8,14 @@ use crate::document::{Checked, KeyPath};
 use crate::fixed::Q1_14;
 use crate::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
 
-/// Maximum position of a prismatic joint in m: the 2 m of a word, less a margin for rounding.
+/// Maximum position of a prismatic joint in m: the range of a Q1.14 word, 2 m, less a margin for rounding.
 const MAX_PRISMATIC_POSITION: f64 = 2.0 - 1e-3;
-/// Maximum coordinate of a chain's base relative to the robot's base, in m.
+/// Maximum absolute coordinate of a chain's base relative to the robot's base, in m.
 const MAX_BASE_COORDINATE: f64 = 100.0;
-/// Maximum deviation of a vector's or quaternion's length from one.
+/// Maximum deviation of the length of a unit vector or unit quaternion from one.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
-/// Checks the robot.
+/// Checks the joints and chains of the robot.
 pub(super) fn robot(raw: raw::Robot) -> Checked<Robot> {
     let at = KeyPath::top_level_key("robot");
     if raw.urdf.as_ref().is_some_and(String::is_empty) {
@@ -78,7 +78,7 @@ fn serial_robot(
     Ok(Robot { name, urdf: None, joints: all.iter().enumerate().map(joint).collect(), chains: vec![chain] })
 }
 
-/// Checks that the lengths of a row fit their words and its angles are finite.
+/// Checks that the lengths of a row, in m, fit Q1.14 words, and that the angles are finite.
 fn check_row(at: &KeyPath, row: &DenavitHartenberg) -> Checked<()> {
     at.key("a").to_fixed(row.a, Q1_14::try_nearest)?;
     at.key("d").to_fixed(row.d, Q1_14::try_nearest)?;
@@ -217,7 +217,7 @@ pub(super) fn check_length(at: &KeyPath, got: usize, joints: usize) -> Checked<(
     Err(at.fault(format_args!("{got} values"), why))
 }
 
-/// Normalises a vector or quaternion, whose length must be one within the tolerance.
+/// Normalises a vector or quaternion. Its length must be one, to within 1e-3.
 pub(super) fn normalized<const N: usize>(at: &KeyPath, what: &str, parts: [f64; N]) -> Checked<[f64; N]> {
     let length = parts.iter().map(|part| part * part).sum::<f64>().sqrt();
     if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {

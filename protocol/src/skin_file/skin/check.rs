@@ -1,4 +1,4 @@
-//! Checks of a skin file: conversion from raw values to checked types.
+//! Conversion of a skin file from raw values to checked types.
 
 use super::chains::{self, check_length};
 use super::{SkinBus, Cell, Controller, ControllerKind, LostBus, SkinReply, Safety, Skin, Timing};
@@ -13,7 +13,7 @@ pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
     check_skin(raw, |_| true)
 }
 
-/// Checks a whole skin from a recording. Unprintable characters in names are escaped instead of refused.
+/// Checks a whole skin from a recording. Unprintable characters in names are escaped instead of rejected.
 pub(super) fn recorded_skin(mut raw: raw::Skin) -> Checked<Skin> {
     names::escape(&mut raw);
     check_skin(raw, |_| true)
@@ -29,7 +29,7 @@ pub(super) fn skin_on(raw: raw::Skin, bus: &str) -> Checked<Skin> {
     }
 }
 
-/// Checks everything. `has_cells` returns true for the buses whose cells are present.
+/// Checks all values of a skin. `has_cells` returns true for each bus whose cells are part of `raw`.
 fn check_skin(raw: raw::Skin, has_cells: impl Fn(&SkinBus) -> bool) -> Checked<Skin> {
     if raw.version != 1 {
         return Err(KeyPath::top_level_key("version").fault(raw.version, "this program reads version 1"));
@@ -61,8 +61,8 @@ fn check_skin(raw: raw::Skin, has_cells: impl Fn(&SkinBus) -> bool) -> Checked<S
     Ok(skin)
 }
 
-/// Checks the tree of a bus with sums: every cell needs a path to the gateway's side, and every depth a slot
-/// within one period.
+/// Checks the tree of a bus whose cells reply with sums. Every cell must have a path to the gateway's side, and the
+/// slots of all depths must fit into one broadcast period.
 fn check_tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> {
     let at = KeyPath::top_level_key("bus").element(index);
     if !skin.cells_on_bus(index).any(|cell| cell.root) {

@@ -1,7 +1,7 @@
 //! The description of a skin: the robot, its buses, and the place of every cell.
 //!
-//! A [`Skin`] exists only if everything in its file has been checked. Every error names the line, the key,
-//! the value and what is allowed, in one line.
+//! A [`Skin`] is created only after its whole file has been checked. An error is one line with the line number, the
+//! key, the value and the allowed values.
 
 mod baseline;
 mod buses;
@@ -33,9 +33,9 @@ pub use reach::{REACH, reach};
 pub use robot::{ChainBase, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
 pub use wires::Wires;
 
-/// Keys that distinguish a skin from a scenario.
+/// Keys at the top level that only skin files have. They distinguish a skin from a scenario.
 pub const SKIN_KEYS: &[&str] = &["robot", "cell"];
-/// Keys that distinguish a scenario from a skin; see [`KEYS`].
+/// Keys at the top level that only scenarios have; see [`KEYS`].
 const SCENARIO_KEYS: &[&str] = &["duration_s", "motion", "mode", "touch", "fault", "sensors"];
 
 /// A checked skin description.
@@ -47,13 +47,13 @@ pub struct Skin {
     pub robot: Robot,
     /// The rates of the control loop and the joint broadcast.
     pub timing: Timing,
-    /// The thresholds of event mode.
+    /// The thresholds at which cells in event mode send measurements.
     pub events: Events,
     /// The buses, in the order of the file.
     pub buses: Vec<SkinBus>,
     /// The controller that turns torques into motion.
     pub controller: Controller,
-    /// Limits for holding torques and halting the robot.
+    /// Limits for holding the torques of missing cells and for halting the robot.
     pub safety: Safety,
     /// The cells, in the order of the file.
     pub cells: Vec<Cell>,
@@ -64,7 +64,7 @@ pub struct Skin {
 pub struct Timing {
     /// Frequency of the control loop in Hz.
     pub control_hz: f64,
-    /// Ticks per joint broadcast.
+    /// Number of control ticks per joint broadcast.
     pub ticks_per_broadcast: u32,
 }
 
@@ -83,16 +83,16 @@ impl Timing {
     }
 }
 
-/// The reply of the cells of a bus to joints.
+/// The message with which the cells of a bus reply to joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum SkinReply {
-    /// Each cell sends its own torque, in the bus' [`Bus::torque_format`].
+    /// Each cell sends its own torque, in the format [`Bus::torque_format`].
     Torque,
-    /// Cells send sums along the tree, Q7.8.
+    /// Each cell sends the sum of its own torque and those of its children in the tree, in Q7.8.
     Sum {
         /// Width of a slot in µs.
         slot_us: u32,
-        /// True if the rounding error is carried into a cell's next value.
+        /// True if a cell adds the rounding error of a sum to its next sum.
         carry: bool,
     },
 }
@@ -102,19 +102,19 @@ pub enum SkinReply {
 pub struct SkinBus {
     /// The name of the interface.
     pub name: String,
-    /// The reply of its cells.
+    /// The reply of the bus's cells to joints.
     pub reply: SkinReply,
     /// The frame format: one FD frame per packet, or several classic ones.
     pub format: Format,
-    /// The chain that carries its cells: an index into [`Robot::chains`].
+    /// The chain that carries the bus's cells: an index into [`Robot::chains`].
     pub chain: usize,
-    /// The format of its cells' own torques.
+    /// The format of the torques that the cells send on their own, not as sums.
     pub torque_format: TorqueFormat,
-    /// Nominal bit rate of hardware in bit/s, if given.
+    /// Nominal bit rate of the hardware in bit/s, if given.
     pub bitrate: Option<u32>,
-    /// Data bit rate of hardware in bit/s, if given.
+    /// Data bit rate of the hardware in bit/s, if given.
     pub data_bitrate: Option<u32>,
-    /// The times at which its cells send measurements.
+    /// The times at which the cells send measurements.
     pub sensing: Sensing,
 }
 
@@ -130,48 +130,47 @@ pub struct Controller {
 /// The kind of controller.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ControllerKind {
-    /// `M q'' + D q' = tau`, independently for each joint: pushing the skin moves the arm.
+    /// Independently for each joint, `M q'' + D q' = tau`, so that pushing the skin moves the arm.
     Kinesthetic {
-        /// M in kg m2, or kg for prismatic joints.
+        /// Inertia M of each joint in kg m2, or mass in kg for prismatic joints.
         inertia: Vec<f64>,
-        /// D in Nm s/rad, or N s/m for prismatic joints.
+        /// Damping D of each joint in Nm s/rad, or in N s/m for prismatic joints.
         damping: Vec<f64>,
     },
-    /// Another program, connected by a Unix datagram socket.
+    /// Another program, which exchanges datagrams with the gateway over a Unix socket.
     External {
         /// Path of the socket that the gateway listens on.
         socket: String,
-        /// Maximum time until the program sends its first command. The robot stands still meanwhile.
+        /// Maximum time until the program sends its first command. The robot stands still until then.
         start: Span,
     },
 }
 
-/// Limits for holding torques and halting the robot.
+/// Limits for holding the torques of missing cells and for halting the robot.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Safety {
-    /// Epochs for which the last torque of a cell is held after it stops sending in contact.
+    /// Number of epochs for which the last torque of a cell is held if the cell stops sending while in contact.
     pub hold_epochs: u32,
-    /// Epochs over which the torque then decays linearly to zero.
+    /// Number of epochs over which the held torque then decays linearly to zero.
     pub decay_epochs: u32,
     /// Number of consecutive bad cycles that halt the robot.
     pub bad_cycles: u32,
-    /// The reaction to the loss of some of several buses.
+    /// The reaction to the loss of one of several buses.
     pub lost_bus: LostBus,
 }
 
-/// The reaction to the loss of some of several buses. If all are lost, the torque is invalid in any case.
+/// The reaction to the loss of one of several buses. If all buses are lost, the torque is always invalid.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum LostBus {
-    /// The torques of a lost bus decay to zero like those of missing cells; the robot continues with the
-    /// others.
+    /// The torques of a lost bus decay to zero like those of missing cells. The robot continues with the other buses.
     #[default]
     Continue,
-    /// The torque is invalid; the bad cycles halt the robot.
+    /// The torque becomes invalid, so the robot halts after [`Safety::bad_cycles`] cycles.
     Halt,
 }
 
 impl LostBus {
-    /// Returns the word in the file.
+    /// Returns the value of the key in a skin file.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -184,35 +183,37 @@ impl LostBus {
 /// A cell of a skin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cell {
-    /// Its bus: an index into [`Skin::buses`].
+    /// The cell's bus: an index into [`Skin::buses`].
     pub bus: usize,
-    /// Its node id on that bus.
+    /// Node id of the cell on its bus.
     pub node: CellId,
-    /// Its serial number.
+    /// Serial number of the cell.
     pub serial: u32,
-    /// The joint k that moves its link, counted from 1 in its chain.
+    /// Number of the joint k that moves the cell's link, from 1 in its chain.
     pub joint: u8,
-    /// The row whose frame carries it, counted from 1 in its chain: that of joint k, or a fixed one after it.
+    /// Number of the row whose frame carries the cell, from 1 in its chain: the row of joint k, or a fixed row after
+    /// it.
     pub row: u8,
     /// Position in the frame of that row, in m.
     pub position: [f64; 3],
-    /// Outward normal in the same frame: the cell's z axis.
+    /// Outward normal of the cell in the same frame: its z axis.
     pub normal: [f64; 3],
-    /// Its orientation in the same frame, a quaternion x, y, z, w; `None` if the file only gives the normal.
+    /// Orientation of the cell in the same frame, a unit quaternion x, y, z, w; `None` if the file gives only the
+    /// normal.
     pub orientation: Option<[f64; 4]>,
-    /// The cell wired to each port.
+    /// Node id of the cell wired to each port; `None` for a free port.
     pub neighbors: [Option<CellId>; 4],
-    /// True if it is wired to the gateway's side.
+    /// True if the cell is wired to the gateway's side.
     pub root: bool,
-    /// Its gains and thresholds as words.
+    /// Gains and thresholds of the cell, as fixed-point words.
     pub contact: Contact,
-    /// The baseline of its force sensor.
+    /// Baseline settings of the cell's force sensor.
     pub baseline: Baseline,
 }
 
 impl Skin {
-    /// Returns the part of the skin on some buses, given as indices into [`Skin::buses`]. Invalid indices are
-    /// ignored.
+    /// Returns a copy with these buses and their cells only. The buses are given as indices into [`Skin::buses`];
+    /// invalid indices are ignored.
     #[must_use]
     pub fn restricted_to_buses(&self, kept: &[usize]) -> Self {
         let place = |bus: usize| kept.iter().position(|&it| it == bus);
@@ -222,7 +223,7 @@ impl Skin {
         Self { buses: buses.collect(), ..self.with_cells(cells.collect()) }
     }
 
-    /// Returns a copy with other cells, without copying its own.
+    /// Returns a copy of the skin with `cells` in place of its cells, which are not copied.
     #[must_use]
     pub fn with_cells(&self, cells: Vec<Cell>) -> Self {
         let Self { name, robot, timing, events, buses, controller, safety, cells: _ } = self;
@@ -241,12 +242,12 @@ impl Skin {
     /// Reads and checks a file.
     ///
     /// # Errors
-    /// Returns an error if it cannot be read, or the first error in it.
+    /// Returns an error if the file cannot be read, or the first error in it.
     pub fn read(path: &Path) -> Result<Self, DocumentError> {
         Self::parse(&path.display().to_string(), &document::read_text(path)?)
     }
 
-    /// Parses and checks a text. `path` is its name in errors.
+    /// Parses and checks a text. `path` names the text in errors.
     ///
     /// # Errors
     /// Returns the first error in the text.
@@ -256,9 +257,9 @@ impl Skin {
             .map_err(|error: DocumentError| error.or_wrong_kind(text, SCENARIO_KEYS, SKIN_KEYS, what))
     }
 
-    /// Parses and checks the text of a skin in a recording. `path` is its name in errors.
+    /// Parses and checks the text of a skin in a recording. `path` names the text in errors.
     ///
-    /// Unprintable characters in names are escaped like `\u{1b}`; [`Skin::parse`] refuses them.
+    /// Unprintable characters in names are escaped like `\u{1b}`, where [`Skin::parse`] returns an error.
     ///
     /// # Errors
     /// Returns the first error in the text.
@@ -266,7 +267,7 @@ impl Skin {
         document::parse(path, text, check::recorded_skin)
     }
 
-    /// Returns the parameters of a cell.
+    /// Returns the parameters that are written into a cell.
     #[must_use]
     #[expect(clippy::missing_panics_doc, reason = "only a checked skin exists, and checking made sure of it")]
     pub fn parameters(&self, cell: &Cell) -> Parameters {
@@ -319,13 +320,13 @@ impl Skin {
         self.robot.joints.get(joint).expect("a checked skin has the joints of its chains")
     }
 
-    /// Returns the packet length of joints, torques and sums on a bus.
+    /// Returns the packet length of joints, torques and sums on a bus, which depends on the joints of its chain.
     #[must_use]
     pub fn packet_length(&self, bus: usize) -> Length {
         Length::for_joints(self.chain(bus).joints.len())
     }
 
-    /// Returns the period of the joint broadcast in µs; `None` if it does not fit a word.
+    /// Returns the period of the joint broadcast in µs; `None` if it exceeds the 16 bits of a word.
     #[must_use]
     #[expect(
         clippy::cast_possible_truncation,
@@ -341,7 +342,7 @@ impl Skin {
         self.cells.iter().filter(move |cell| cell.bus == bus)
     }
 
-    /// Returns a copy with the cells of one bus only. All buses are kept.
+    /// Returns a copy with the cells of one bus only. All buses remain, so that their indices stay valid.
     #[must_use]
     pub fn with_cells_of_bus(&self, bus: usize) -> Self {
         self.with_cells(self.cells_on_bus(bus).cloned().collect())

@@ -1,5 +1,5 @@
-//! Checks of names in a skin file. Names appear on terminals and in URDF, SVG and topics, and must not be
-//! misleading there.
+//! Checks of names in a skin file. Names appear on terminals and in URDF, SVG and topics, so they must not contain
+//! characters that mislead a reader or break these formats.
 
 use super::raw;
 use crate::document::{Checked, KeyPath};
@@ -8,8 +8,8 @@ use crate::usage::{is_unprintable, printable};
 /// Maximum length of a name in characters.
 const MAX_CHARACTERS: usize = 200;
 
-/// Refuses names that are empty, too long, or contain characters that control a terminal, change the
-/// direction of text, or are not allowed in XML.
+/// Checks all names of a skin. Returns an error for a name that is empty, too long, or contains characters that control
+/// a terminal, change the direction of text, or are not allowed in XML.
 pub(super) fn check(skin: &raw::Skin) -> Checked<()> {
     let robot = KeyPath::top_level_key("robot");
     for (at, given) in [(KeyPath::top_level_key("name"), &skin.name), (robot.key("name"), &skin.robot.name)] {
@@ -40,8 +40,8 @@ fn check_name(at: &KeyPath, name: &str) -> Checked<()> {
     Ok(())
 }
 
-/// Escapes unprintable characters in names like `\u{1b}`, so that every recording can be read. Different
-/// names stay different.
+/// Escapes unprintable characters in names like `\u{1b}`, so that every recording can be read. Names that differ also
+/// differ after escaping.
 pub(super) fn escape(skin: &mut raw::Skin) {
     let robot = &mut skin.robot;
     let named = [&mut skin.name, &mut robot.name].into_iter();

@@ -1,5 +1,5 @@
-//! Parsing of a skin without the cells of other buses. A process with the cells of one of many buses need not
-//! parse the others, which are most of the file.
+//! Parsing of a skin with the cells of one bus only. A cell process serves one bus and need not parse the cells of the
+//! others, which are most of a large file.
 
 use std::path::Path;
 
@@ -7,17 +7,17 @@ use super::{DocumentError, Skin, check};
 use crate::document;
 
 impl Skin {
-    /// Reads the part of a file on one bus, like [`Skin::parse_on`].
+    /// Reads a file with the cells of one bus only, like [`Skin::parse_on`].
     ///
     /// # Errors
-    /// Returns an error if it cannot be read, or the first error in it.
+    /// Returns an error if the file cannot be read, or the first error in it.
     pub fn read_on(path: &Path, bus: &str) -> Result<Self, DocumentError> {
         Self::parse_on(&path.display().to_string(), &document::read_text(path)?, bus)
     }
 
-    /// Like [`Skin::parse`], but with the cells of one bus only, as from [`Skin::part_on`]; with all cells if
-    /// there is no such bus. The cells of other buses are not checked, unless the rest has an error: then the
-    /// whole text is parsed, to report its first error.
+    /// Like [`Skin::parse`], but with the cells of one bus only, as [`Skin::part_on`] returns them. If the skin has no
+    /// bus of this name, it keeps all cells. The cells of other buses are not checked, unless the rest of the text has
+    /// an error: then the whole text is parsed, to report its first error.
     ///
     /// # Errors
     /// Returns the first error in the text.
@@ -33,8 +33,8 @@ impl Skin {
     }
 }
 
-/// Returns the text without each `[[cell]]` that names another bus; `None` if a line may be inside a
-/// multi-line string.
+/// Returns the text without the `[[cell]]` tables that name another bus. Returns `None` if a line may be inside a
+/// multi-line string, where tables cannot be recognised.
 fn without_other_cells(text: &str, bus: &str) -> Option<String> {
     if text.contains("\"\"\"") || text.contains("'''") {
         return None;
@@ -58,7 +58,7 @@ fn without_other_cells(text: &str, bus: &str) -> Option<String> {
     Some(part)
 }
 
-/// Returns the bus that a line of a cell names in the usual notation.
+/// Returns the name of the bus in a line `bus = "NAME"`; `None` for any other line.
 fn bus_of_line(line: &str) -> Option<&str> {
     let value = line.strip_prefix("bus")?.trim_start().strip_prefix('=')?.trim_start().strip_prefix('"')?;
     let (name, _) = value.split_once('"')?;
@@ -70,7 +70,7 @@ mod tests {
     use super::super::tests::GOOD;
     use super::*;
 
-    /// Returns [`GOOD`] with two buses, each with its cells.
+    /// Returns the text [`GOOD`] with two buses and cells on each.
     fn two_buses(reply: &str) -> String {
         let bus = "[[bus]]\nname = \"vcan0\"\nreply = \"torque\"\nformat = \"fd\"\n\n";
         let other = bus.replace("vcan0", "vcan1").replace("\"torque\"", reply);

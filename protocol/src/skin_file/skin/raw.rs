@@ -1,4 +1,4 @@
-//! The structure of a skin file before it is checked.
+//! The structure of a skin file before it is checked, as `serde` deserialises it.
 
 use serde::Deserialize;
 
@@ -76,7 +76,7 @@ pub(super) struct Chain {
     pub(super) rows: Vec<Row>,
 }
 
-/// The base of a chain.
+/// The pose of a chain's base relative to the robot's base.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Base {
@@ -85,7 +85,7 @@ pub(super) struct Base {
     pub(super) orientation: Option<[f64; 4]>,
 }
 
-/// A row of a chain; fixed if it has no joint.
+/// A row of a chain's table; a fixed row if it names no joint.
 #[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Row {
@@ -108,13 +108,13 @@ pub(super) struct Timing {
 }
 
 impl Default for Timing {
-    /// The rates of the paper.
+    /// Returns the rates that the paper uses.
     fn default() -> Self {
         Self { control_hz: 500.0, joint_broadcast_hz: 62.5 }
     }
 }
 
-/// Gains and thresholds; in a cell, overrides of those of the skin.
+/// Gains and thresholds. In the table of a cell they override those of the skin.
 #[derive(Clone, Copy, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Contact {
@@ -159,7 +159,7 @@ impl Default for RawBus {
     }
 }
 
-/// The thresholds of event mode.
+/// The thresholds at which cells in event mode send measurements.
 #[derive(Clone, Copy, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Events {
@@ -170,7 +170,7 @@ pub(super) struct Events {
     pub(super) hysteresis: Option<f64>,
 }
 
-/// The baseline of the force sensors.
+/// The baseline settings of the force sensors.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Baseline {
@@ -219,7 +219,8 @@ pub(super) struct Safety {
 }
 
 impl Default for Safety {
-    /// Two missing replies are held, four more decay to zero, and 25 bad cycles (1/20 s) halt the robot.
+    /// Returns limits with which the torque is held for two missing replies and decays over four more, and 25 bad
+    /// cycles (1/20 s) halt the robot.
     fn default() -> Self {
         Self { hold_epochs: 2, decay_epochs: 4, bad_cycles: 25, lost_bus: LostBus::Continue.name().to_owned() }
     }
@@ -250,7 +251,7 @@ pub(super) struct RawCell {
 }
 
 impl RawCell {
-    /// Returns the overrides of this cell.
+    /// Returns the gains and thresholds that the cell overrides.
     pub(super) const fn contact(&self) -> Contact {
         Contact {
             alpha_c: self.alpha_c,

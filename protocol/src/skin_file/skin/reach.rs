@@ -1,19 +1,19 @@
-//! The reach of a cell: its maximum distance from the joints that move it.
+//! The reach of a cell: its maximum distance from the origins of the frames below it in its chain.
 //!
-//! The reach bounds every moment of a unit force that a kernel computes on its way: the distance of the cell
-//! from the origin of each frame below it. The algorithm follows the possible positions of the cell from its
-//! row down to the base, as the hull of circles. A revolute joint spreads them around its axis and a
-//! prismatic joint along it; fixed rows only move them, so that long rows that fold back cost nothing.
+//! A kernel computes the moment of a unit force on the cell about the origin of each of these frames. No such moment
+//! exceeds the reach. To find the reach, the algorithm follows the possible positions of the cell from its row down to
+//! the base, as the convex hull of circles. A revolute joint spreads the positions around its axis, and a prismatic
+//! joint along its axis. Fixed rows only move them, so long rows that fold back do not increase the reach.
 
 use super::robot::{ChainRow, DenavitHartenberg};
 use crate::parameters::RowKind;
 
-/// Maximum reach in m: the range of Q1.14, less a margin for accumulated rounding.
+/// Maximum reach in m: the range of Q1.14, 2 m, less a margin for accumulated rounding.
 pub const REACH: f64 = 2.0 - 1e-3;
 
 type Vector = [f64; 3];
 
-/// The points at a distance from a centre, in the plane perpendicular to a unit axis.
+/// A circle: the points at one distance from a centre, in the plane perpendicular to a unit axis.
 #[derive(Clone, Copy, Debug)]
 struct Circle {
     center: Vector,
@@ -25,8 +25,8 @@ fn dot([a, b, c]: Vector, [x, y, z]: Vector) -> f64 {
     a * x + b * y + c * z
 }
 
-/// Applies `Rz(theta) Tz(d) Tx(a) Rx(alpha)`: from a row's frame to the frame below. Translations apply to
-/// points only.
+/// Transforms a vector by `Rz(theta) Tz(d) Tx(a) Rx(alpha)`, from the frame of a row to the frame below. If `is_point`
+/// is false, the vector is a direction, which translations do not change.
 fn carry(row: &DenavitHartenberg, d: f64, theta: f64, [x, y, z]: Vector, is_point: bool) -> Vector {
     let (sine, cosine) = row.alpha.sin_cos();
     let (a, d) = if is_point { (row.a, d) } else { (0.0, 0.0) };
@@ -41,14 +41,15 @@ impl Circle {
         Self { center, axis: carry(row, d, theta, self.axis, false), radius: self.radius }
     }
 
-    /// Returns the distance of its farthest point from the origin.
+    /// Returns the maximum distance of a point of the circle from the origin.
     fn farthest_distance(&self) -> f64 {
         let along = dot(self.center, self.axis);
         let across = (dot(self.center, self.center) - along * along).max(0.0).sqrt();
         (across + self.radius).hypot(along)
     }
 
-    /// Returns the distance of its farthest point from the z axis, and its range along the axis.
+    /// Returns the maximum distance of a point of the circle from the z axis, and the range of the points along that
+    /// axis.
     fn around_z(&self) -> (f64, [f64; 2]) {
         let [x, y, z] = self.center;
         let [ax, ay, _] = self.axis;
@@ -57,10 +58,10 @@ impl Circle {
     }
 }
 
-/// Returns an upper bound in m of the distance of a point from the origin of each frame below it, for joints
-/// within their limits; revolute joints turn freely. At the first revolute joint only the distance from its
-/// axis counts. `rows` are the rows from the base to that of the point. No moment of a unit force at the
-/// point exceeds the bound.
+/// Returns an upper bound in m of the distance between a point and the origin of each frame below it. `rows` are the
+/// rows from the base to the row that carries the point, and `position` is in the frame of that row. Prismatic joints
+/// move within their limits; revolute joints turn freely. At the first revolute joint only the distance from its axis
+/// counts. No moment of a unit force at the point exceeds the bound.
 #[must_use]
 pub fn reach(rows: &[ChainRow], position: [f64; 3]) -> f64 {
     let mut circles = vec![Circle { center: position, axis: [0.0, 0.0, 1.0], radius: 0.0 }];

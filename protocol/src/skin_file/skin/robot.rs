@@ -5,30 +5,30 @@ use serde::Deserialize;
 use crate::fixed::Q1_14;
 use crate::parameters::RowKind;
 
-/// Maximum number of joints of a robot, over all of its chains.
+/// Maximum number of joints of a robot, over all chains.
 pub const MAX_ROBOT_JOINTS: usize = 32;
 
 /// A tree of joints, given as chains from the base that may share their first joints.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Robot {
-    /// Its name.
+    /// Name of the robot.
     pub name: String,
-    /// The path of its URDF file, relative to the skin file.
+    /// Path of the robot's URDF file, relative to the skin file.
     pub urdf: Option<String>,
-    /// Its joints, in the order of controllers and recordings.
+    /// Joints of the robot. Controllers and recordings use the same order.
     pub joints: Vec<Joint>,
-    /// Its chains, each with at least one joint.
+    /// Chains of the robot, each with at least one joint.
     pub chains: Vec<Chain>,
 }
 
 /// A joint of the robot.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Joint {
-    /// Its name.
+    /// Name of the joint.
     pub name: String,
-    /// Its kind.
+    /// Kind of the joint.
     pub kind: JointKind,
-    /// Minimum and maximum position, in the unit of its kind.
+    /// Minimum and maximum position of the joint, in rad or m.
     pub limits: [f64; 2],
 }
 
@@ -49,7 +49,7 @@ impl JointKind {
         self.row().name()
     }
 
-    /// Returns the kind of its row.
+    /// Returns the kind of a table row with such a joint.
     #[must_use]
     pub const fn row(self) -> RowKind {
         match self {
@@ -58,7 +58,7 @@ impl JointKind {
         }
     }
 
-    /// Returns the unit of its position.
+    /// Returns the unit of the joint's position: `rad` or `m`.
     #[must_use]
     pub const fn unit(self) -> &'static str {
         match self {
@@ -67,7 +67,7 @@ impl JointKind {
         }
     }
 
-    /// Returns the unit of its torque or force.
+    /// Returns the unit of the joint's torque or force.
     #[must_use]
     pub const fn torque_unit(self) -> &'static str {
         match self {
@@ -76,7 +76,8 @@ impl JointKind {
         }
     }
 
-    /// Converts a position in rad or m to a word: quarter turns or m. Returns `None` if it is not finite.
+    /// Converts a position in rad or m to a Q1.14 word in quarter turns or m. Returns `None` if the position is not
+    /// finite.
     #[must_use]
     pub fn word(self, position: f64) -> Option<Q1_14> {
         match self {
@@ -85,7 +86,7 @@ impl JointKind {
         }
     }
 
-    /// Converts a word to a position in rad or m.
+    /// Converts a Q1.14 word in quarter turns or m to a position in rad or m.
     #[must_use]
     pub fn position(self, word: Q1_14) -> f64 {
         match self {
@@ -95,20 +96,20 @@ impl JointKind {
     }
 }
 
-/// A chain of joints, from base to tip.
+/// A chain of joints from base to tip, which carries buses of cells.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Chain {
-    /// Its name.
+    /// Name of the chain.
     pub name: String,
-    /// The pose of frame 0 of its table, relative to the robot's base.
+    /// Pose of frame 0 of the chain's table, relative to the robot's base.
     pub base: ChainBase,
-    /// Its joints as indices into [`Robot::joints`]; 1 to 14.
+    /// Joints of the chain as indices into [`Robot::joints`]; 1 to 14.
     pub joints: Vec<usize>,
-    /// Its table from base to tip: a row for each joint, and fixed rows; at most 32.
+    /// Denavit-Hartenberg table of the chain from base to tip: a row for each joint, and fixed rows; at most 32.
     pub rows: Vec<ChainRow>,
 }
 
-/// The pose of a chain's base. No cell uses it.
+/// The pose of a chain's base relative to the robot's base. Cells compute in frame 0 and do not need it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ChainBase {
     /// Position in m.
@@ -124,7 +125,8 @@ impl Default for ChainBase {
 }
 
 impl ChainBase {
-    /// Returns the transform from frame 0 to the robot's base, as a 4 by 4 matrix in columns, lengths in m.
+    /// Returns the homogeneous transform from frame 0 to the robot's base, a 4 by 4 matrix in columns with lengths in
+    /// m.
     #[must_use]
     pub fn matrix(&self) -> [[f64; 4]; 4] {
         let norm = self.orientation.iter().map(|it| it * it).sum::<f64>().sqrt();
@@ -142,15 +144,15 @@ impl ChainBase {
 /// A row of a chain's table.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ChainRow {
-    /// The kind of its joint.
+    /// Kind of the row: the kind of its joint, or fixed.
     pub kind: RowKind,
-    /// Its constants.
+    /// Denavit-Hartenberg constants of the row.
     pub table: DenavitHartenberg,
-    /// The range of its joint's position; zeros for a fixed row.
+    /// Minimum and maximum position of the row's joint, in rad or m; zeros for a fixed row.
     pub limits: [f64; 2],
 }
 
-/// A row of a table, `Rz(theta + theta_offset) Tz(d) Tx(a) Rx(alpha)`; omitted values are 0.
+/// The constants of a table row, `Rz(theta + theta_offset) Tz(d) Tx(a) Rx(alpha)`. Omitted values are 0.
 #[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq)]
 #[serde(deny_unknown_fields, default)]
 pub struct DenavitHartenberg {
@@ -158,22 +160,22 @@ pub struct DenavitHartenberg {
     pub a: f64,
     /// Twist in rad.
     pub alpha: f64,
-    /// Offset along the joint's axis in m; the position of a prismatic joint is added to it.
+    /// Offset along the joint's axis in m. For a prismatic joint, the joint position is added to it.
     pub d: f64,
-    /// Angle added to the position of a revolute joint, in rad; the whole angle of other rows.
+    /// Angle in rad. For a revolute joint, the joint position is added to it; for other rows it is the whole angle.
     pub theta_offset: f64,
 }
 
 impl Chain {
-    /// Returns the row of a joint; both are counted from 1.
+    /// Returns the number of the row that a joint moves. Joints and rows are counted from 1.
     #[must_use]
     pub fn row_of(&self, joint: u8) -> Option<u8> {
         let moving = (1..).zip(&self.rows).filter(|(_, row)| row.kind != RowKind::Fixed);
         moving.map(|(number, _)| number).nth(usize::from(joint).checked_sub(1)?)
     }
 
-    /// Returns the joint that moves the link of a row, both counted from 1; 0 for rows before the first
-    /// joint.
+    /// Returns the number of the joint that moves the link of a row: the last joint up to this row. Joints and rows are
+    /// counted from 1; 0 is returned for rows before the first joint.
     #[must_use]
     pub fn joint_of_row(&self, row: u8) -> u8 {
         let moving = self.rows.iter().take(row.into()).filter(|row| row.kind != RowKind::Fixed);

@@ -1,14 +1,14 @@
-//! The sensing modes of buses in a skin file.
+//! Checks of the sensing modes of buses in a skin file.
 
 use super::raw;
 use crate::document::{DocumentFault, KeyPath};
 use crate::fixed::{OutOfRange, Q};
 use crate::parameters::{Events, Sensing};
 
-/// Returns continuous sensing with a frequency in Hz.
+/// Returns the setting for measurements at a frequency in Hz.
 ///
 /// # Errors
-/// Returns a text with the possible values: the period must be a whole number of ms, 1 to 65 535.
+/// Returns a text with the allowed frequencies: the period must be a whole number of ms, 1 to 65 535.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within 1 to 65535")]
 pub fn continuous_sensing(hz: f64) -> Result<Sensing, String> {
     let period = 1_000.0 / hz;
@@ -27,7 +27,7 @@ pub fn continuous_sensing(hz: f64) -> Result<Sensing, String> {
 
 /// Checks the sensing mode of a bus.
 pub(super) fn bus_sensing(at: &KeyPath, bus: &raw::RawBus) -> Result<Sensing, DocumentFault> {
-    /// The words for a mode.
+    /// The values of the key `mode`.
     #[derive(Clone, Copy)]
     enum Mode {
         Off,
@@ -49,9 +49,9 @@ pub(super) fn bus_sensing(at: &KeyPath, bus: &raw::RawBus) -> Result<Sensing, Do
     }
 }
 
-/// Checks the thresholds of event mode; omitted values are a cell's defaults.
+/// Checks the thresholds of event mode. An omitted value is the default of a cell.
 pub(super) fn events(raw: raw::Events) -> Result<Events, DocumentFault> {
-    /// Rounds a threshold; the range in its errors begins with 0.
+    /// Rounds a threshold to a word. An error gives 0 as the lower limit, because a threshold is not negative.
     fn magnitude<const F: u32>(value: f64) -> Result<Q<F>, OutOfRange> {
         Q::try_nearest(value).map_err(|error| OutOfRange { min: 0.0, ..error })
     }

@@ -47,7 +47,8 @@ alpha_c = 0.5
 neighbors = [0, 0, 0, 1]
 "#;
 
-/// Returns a skin with one bus whose cells, numbered from 1, have these neighbours and are roots or not.
+/// Returns a skin with one bus. Each element gives the neighbours of a cell and whether it is a root; cells are
+/// numbered from 1.
 pub(super) fn wired(cells: &[([i64; 4], bool)]) -> Skin {
     Skin::parse("skin.toml", &wired_text("reply = \"torque\"", cells)).unwrap()
 }

@@ -1,9 +1,9 @@
-//! The wires of a bus: the end of each port, and the link id that each end sends with.
+//! The wires of a bus: the two ports that each wire connects, and the link id that each end sends with.
 //!
-//! Wires are numbered in the order of their first mention: cells in the order of the file, ports 0 to 3.
-//! After them comes one wire for each root, to the gateway's side, in the order of the file. Two wires
-//! between the same two cells pair in the order of their ports. The end mentioned first sends with
-//! [`LinkId::back`] = false, the other end with true. The cell is the first end of a root's wire.
+//! Wires are numbered in the order in which their cells name them: cells in the order of the file, ports 0 to 3. After
+//! them comes one wire for each root, to the gateway's side, in the order of the file. If two wires connect the same
+//! two cells, their ports are paired in ascending order. The end that is named first sends with [`LinkId::back`] =
+//! false, the other end with true. The cell is the first end of a root's wire.
 //!
 //! ```text
 //!   cell 1   neighbors = [2, 2, 0, 0], root = true      wire 0   1 port 0 <-> 2 port 1
@@ -18,7 +18,7 @@ use super::{Cell, Skin};
 use crate::id::CellId;
 use crate::port::{LinkId, MAX_WIRES, PORTS, UPLINK};
 
-/// A port of a cell; [`UPLINK`] for a root's wire to the gateway's side.
+/// One end of a wire: a cell and its port; the port is [`UPLINK`] for a root's wire to the gateway's side.
 type PortEnd = (CellId, usize);
 
 // A bus never has more wires than link ids.
@@ -27,9 +27,9 @@ const _: () = assert!(CellId::COUNT * (PORTS + 1) <= MAX_WIRES);
 /// The wires of one bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Wires {
-    /// The link id that each port sends with, by cell ([`CellId::index`]) and port.
+    /// Link id that each port sends with, by cell ([`CellId::index`]) and port; `None` for a free port.
     link_ids: Vec<[Option<LinkId>; PORTS + 1]>,
-    /// The ends of each wire: the one mentioned first, and the other, which is `None` at the gateway's side.
+    /// The two ends of each wire: the end named first, and the other, which is `None` at the gateway's side.
     ends: Vec<(PortEnd, Option<PortEnd>)>,
 }
 
@@ -43,8 +43,8 @@ impl Skin {
 }
 
 impl Wires {
-    /// Returns the wires of these cells, all of one bus. A mention without another end, which a checked skin
-    /// does not have, is ignored.
+    /// Returns the wires between these cells, all of one bus. A port is free if its neighbour does not name the cell in
+    /// turn, which does not happen in a checked skin.
     pub(super) fn new(cells: &[&Cell]) -> Self {
         let mut wires = Self { link_ids: vec![[None; PORTS + 1]; CellId::COUNT], ends: Vec::new() };
         for cell in cells {
@@ -89,7 +89,7 @@ impl Wires {
         *self.link_ids.get(cell.index())?.get(port)?
     }
 
-    /// Returns the link id that each port of a cell sends with; [`UPLINK`] is a root's wire to the gateway's
+    /// Returns the link id that each port of a cell sends with; the port [`UPLINK`] is a root's wire to the gateway's
     /// side. The cell receives with the reversed link ids.
     #[must_use]
     pub fn link_ids_of(&self, cell: CellId) -> [Option<LinkId>; PORTS + 1] {
@@ -183,7 +183,7 @@ mod tests {
         assert_eq!(depths[..6], [Some(0), Some(1), Some(2), Some(1), Some(3), None]);
     }
 
-    /// Generates cells whose ports are connected at random, with random roots.
+    /// Generates cells with random wires between their ports, and with random roots.
     fn wiring() -> impl Strategy<Value = Vec<([i64; PORTS], bool)>> {
         let joints = proptest::collection::vec((0..24_usize, 0..PORTS, 0..24_usize, 0..PORTS), 0..60);
         (joints, proptest::collection::vec(any::<bool>(), 24)).prop_map(|(joints, roots)| {

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use super::{XmlFault, line_of};
 
-/// The characters of 0x80 to 0x9F in Windows-1252.
+/// The characters that the bytes 0x80 to 0x9F stand for in Windows-1252.
 const WINDOWS_1252: [char; 32] = [
     '\u{20ac}', '\u{81}', '\u{201a}', '\u{192}', '\u{201e}', '\u{2026}', '\u{2020}', '\u{2021}', '\u{2c6}',
     '\u{2030}', '\u{160}', '\u{2039}', '\u{152}', '\u{8d}', '\u{17d}', '\u{8f}', '\u{90}', '\u{2018}',
@@ -12,9 +12,9 @@ const WINDOWS_1252: [char; 32] = [
     '\u{203a}', '\u{153}', '\u{9d}', '\u{17e}', '\u{178}',
 ];
 
-/// Decodes a file: UTF-8, UTF-16 with a byte order mark or a declaration, or declared Latin-1 or
-/// Windows-1252. Valid UTF-8 is read as such, whatever the declaration. The declaration of a decoded file is
-/// changed to UTF-8.
+/// Decodes a file to text. The file may be in UTF-8, in UTF-16 with a byte order mark or a declaration, or in Latin-1
+/// or Windows-1252 with a declaration. Valid UTF-8 is read as UTF-8, whatever its declaration. In a text that was
+/// converted, the declaration is changed to UTF-8.
 ///
 /// # Errors
 /// Returns an error for any other encoding.
@@ -61,7 +61,7 @@ pub fn decode(bytes: &[u8]) -> Result<Cow<'_, str>, XmlFault> {
     }
 }
 
-/// Returns `iconv`'s name for the encoding of a file in UTF-16; `None` for other encodings.
+/// Returns the name that `iconv` uses for the encoding of a file in UTF-16; `None` for other encodings.
 #[must_use]
 pub fn utf16_name(bytes: &[u8]) -> Option<&'static str> {
     match bytes {
@@ -81,7 +81,7 @@ fn declared(bytes: &[u8]) -> Option<String> {
     name.bytes().all(|byte| byte.is_ascii_graphic()).then(|| name.to_ascii_lowercase())
 }
 
-/// Returns the byte range of the encoding's name in the declaration.
+/// Returns the byte range of the encoding's name in the XML declaration.
 fn encoding_range(text: &str) -> Option<(usize, usize)> {
     let begin = text.find("<?xml")?;
     let declaration = text.get(begin..begin + text.get(begin..)?.find("?>")?)?;

@@ -1,19 +1,19 @@
-//! Detection of files that are not what their name says.
+//! Detection of files whose content is of another kind than their name says.
 
-/// The detected kind of a file, and a hint.
+/// The detected kind of a file, and a hint for the user.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct ForeignFile {
-    /// The line, from 1, if it matters.
+    /// Line of the file that shows the kind, from 1, if there is one.
     pub line: Option<usize>,
-    /// The kind of the file, as the continuation of "it is".
+    /// The kind of the file, worded to follow "it is".
     pub what: &'static str,
-    /// The hint, as an imperative.
+    /// The hint for the user, in the imperative.
     pub hint: &'static str,
 }
 
 const CONFLICT: &[u8] = b"<<<<<<< ";
 
-/// Detects a file that stands for another one: a Git LFS pointer, a saved web page, an archive, or a file
+/// Detects a file that is in the place of the expected one: a Git LFS pointer, a saved web page, an archive, or a file
 /// with an unresolved merge conflict.
 #[must_use]
 pub fn detect_foreign(bytes: &[u8]) -> Option<ForeignFile> {

@@ -1,9 +1,9 @@
-//! Tolerant reading of XML that a strict parser refuses, and detection of other files.
+//! Reading of XML that a strict parser rejects, and detection of files that are not XML.
 //!
-//! [`text`] decodes a file by its byte order mark or its declaration. [`prepare`] makes repairs that change
-//! no value: it binds unbound prefixes, blanks comments that contain `--` and document types without
-//! definitions, and strips trailing NUL bytes. Line numbers do not change. [`foreign`] detects files that are
-//! not XML or not the expected ones. [`escaped`] escapes a text for XML or HTML.
+//! [`text`] decodes a file by its byte order mark or its declaration. [`prepare`] repairs common errors without
+//! changing any value: it binds undeclared prefixes, blanks comments that contain `--` and document types without
+//! definitions, and strips trailing NUL bytes. Line numbers do not change. [`foreign`] detects files that are not XML
+//! or not of the expected kind. [`escaped`] escapes a text for XML or HTML.
 
 mod encoding;
 mod escape;
@@ -20,15 +20,16 @@ pub use escape::escaped;
 pub use foreign::{ForeignFile, detect_foreign, kind_of_root};
 use tags::{XmlPart, Tag, parts};
 
-/// Maximum number of attributes of an element; a parser compares each with all others.
+/// Maximum number of attributes of an element. The limit exists because a parser compares each attribute with all
+/// others.
 pub const MAX_ATTRIBUTES: usize = 256;
 
-/// Maximum number of prefixes in a file, and of bindings; for each binding, a parser compares all those in
-/// scope.
+/// Maximum number of prefixes in a file, and of their bindings. The limit exists because a parser compares each binding
+/// with all others in scope.
 const MAX_PREFIXES: usize = 64;
 const MAX_BINDINGS: usize = 10_000;
 
-/// An error in a file, with advice.
+/// An error in an XML file, with advice for the user.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct XmlFault {
     /// The line, from 1, if it is known.
@@ -61,9 +62,9 @@ fn line_of(text: &[u8], offset: usize) -> usize {
 /// A text that is ready for a parser.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Prepared<'a> {
-    /// The text, from the first `<` of the file; its line breaks are those of the file.
+    /// The text from the first `<` of the file on, with the line breaks of the file.
     pub text: Cow<'a, str>,
-    /// Number of lines of the file before the text.
+    /// Number of lines of the file before the first `<`.
     pub lines_before: usize,
 }
 
@@ -85,19 +86,19 @@ pub fn prepare(file: &str) -> Result<Prepared<'_>, XmlFault> {
     Ok(Prepared { text: survey.repaired(text), lines_before: line_of(whole.as_bytes(), before) - 1 })
 }
 
-/// The results of one pass over the parts of a text.
+/// Prefixes and ranges found in one pass over a text, for the limits and the repairs.
 #[derive(Debug, Default)]
 struct Survey<'a> {
-    /// Comments and document types to be blanked.
+    /// Byte ranges of the comments and document types to be blanked.
     blanked: Vec<Range<usize>>,
-    /// Prefixes of elements and attributes.
+    /// Prefixes that elements and attributes use.
     used: BTreeSet<&'a str>,
-    /// Prefixes bound at the root element.
+    /// Prefixes that the root element binds.
     bound: BTreeSet<&'a str>,
-    /// All prefixes, and the number of bindings.
+    /// All prefixes that the text binds, and the number of bindings.
     prefixes: BTreeSet<&'a str>,
     bindings: usize,
-    /// The end of the root element's name.
+    /// Byte offset of the end of the root element's name.
     root: Option<usize>,
     depth: usize,
     /// True after the root element has ended.
@@ -105,7 +106,7 @@ struct Survey<'a> {
 }
 
 impl<'a> Survey<'a> {
-    /// Processes the next part. An error has the offset of its cause.
+    /// Processes the next part of the text. An error consists of a byte offset and the reason.
     fn visit(&mut self, text: &str, part: XmlPart<'a>) -> Result<(), (usize, String)> {
         let of = |range: &Range<usize>| text.get(range.clone()).unwrap_or_default();
         let content = match &part {
@@ -176,7 +177,7 @@ impl<'a> Survey<'a> {
         Ok(())
     }
 
-    /// Checks the limits on which a parser's running time depends.
+    /// Checks the numbers of prefixes and bindings, on which a parser's running time depends.
     fn check(&self) -> Result<(), XmlFault> {
         for (count, what, most) in [
             (self.prefixes.len(), "prefixes of names", MAX_PREFIXES),
@@ -192,7 +193,8 @@ impl<'a> Survey<'a> {
         Ok(())
     }
 
-    /// Binds unbound prefixes at the root element, and blanks what a parser refuses.
+    /// Returns the text with undeclared prefixes bound at the root element, and with spaces in place of the blanked
+    /// ranges.
     fn repaired(self, text: &str) -> Cow<'_, str> {
         let unbound = self.used.difference(&self.bound).filter(|prefix| is_bindable_prefix(prefix));
         let names = unbound.map(|prefix| format!(" xmlns:{prefix}=\"unbound:{prefix}\"")).collect::<String>();
@@ -218,7 +220,7 @@ impl<'a> Survey<'a> {
     }
 }
 
-/// Returns true for a prefix that a file may bind; `xml` and `xmlns` are predefined.
+/// Returns true for a prefix that a file may bind: a valid name other than the predefined `xml` and `xmlns`.
 fn is_bindable_prefix(prefix: &str) -> bool {
     let mut letters = prefix.chars();
     !matches!(prefix, "xml" | "xmlns")

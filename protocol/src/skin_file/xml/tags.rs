@@ -1,12 +1,12 @@
-//! The parts of an XML text, found in one pass. Malformed text is split as well.
+//! Division of an XML text into tags and other parts, in one pass. Malformed text is divided as well.
 
 use std::ops::Range;
 
-/// A part of a text.
+/// A part of an XML text.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub(super) enum XmlPart<'a> {
     Comment(Range<usize>),
-    /// `<!DOCTYPE ...>`.
+    /// A document type: `<!DOCTYPE ...>`.
     DocType(Range<usize>),
     /// A start tag.
     Open(Tag<'a>),
@@ -21,9 +21,9 @@ pub(super) enum XmlPart<'a> {
 pub(super) struct Tag<'a> {
     pub(super) range: Range<usize>,
     pub(super) name: &'a str,
-    /// The names of the attributes.
+    /// Names of the attributes.
     pub(super) attributes: Vec<&'a str>,
-    /// True for `<name/>`.
+    /// True for an element without content, `<name/>`.
     pub(super) is_empty: bool,
 }
 
@@ -38,7 +38,7 @@ pub(super) fn parts(text: &str) -> impl Iterator<Item = XmlPart<'_>> {
     })
 }
 
-/// Returns the first part of `rest`, and its length.
+/// Returns the first part of `rest`, and its length in bytes.
 fn part(rest: &str, at: usize) -> (XmlPart<'_>, usize) {
     let until = |end: &str, from: usize| {
         let found = rest.get(from..).and_then(|rest| rest.find(end));
@@ -69,7 +69,8 @@ fn part(rest: &str, at: usize) -> (XmlPart<'_>, usize) {
     tag(rest, at)
 }
 
-/// Returns the length of a document type. Brackets enclose its definitions; quotes hide brackets and the end.
+/// Returns the length in bytes of a document type. Its definitions are in brackets; brackets and `>` in quotes do not
+/// count.
 fn doctype_length(rest: &str) -> usize {
     let (mut quote, mut depth) = (None, 0_usize);
     for (index, byte) in rest.bytes().enumerate() {

@@ -1,4 +1,4 @@
-//! The language of the comments in the golden logs.
+//! Parser of the comments in the golden logs, which describe a message in words and fields.
 
 use std::collections::BTreeMap;
 use std::str::FromStr;
@@ -16,7 +16,7 @@ use crate::parameters::{
 };
 use crate::port::{Hello, LinkId, PortMessage, Rank, Walk};
 
-/// A comment: a word, and `key=value` fields that must all be used.
+/// A comment: a word that names the message, and `key=value` fields, all of which a test must use.
 pub(crate) struct Meaning<'a> {
     text: &'a str,
     what: &'a str,
@@ -47,7 +47,7 @@ impl<'a> Meaning<'a> {
         u16::from_str_radix(self.take(key), 16).expect(self.text)
     }
 
-    /// Parses a real number, which must be an exact step of the format.
+    /// Parses a real number, which must be a whole number of steps of the format.
     #[expect(clippy::float_cmp, reason = "the comments hold exact decimals")]
     fn q<const F: u32>(&self, text: &str) -> Q<F> {
         let value: f64 = text.parse().expect(self.text);
@@ -67,7 +67,7 @@ impl<'a> Meaning<'a> {
         all.try_into().unwrap_or_else(|_| panic!("{}: {key} needs {N} numbers", self.text))
     }
 
-    /// Returns the words of joints, a torque or a sum.
+    /// Returns the words of a joints, torque or sum message.
     fn words_of<const F: u32>(&mut self, key: &str) -> Words {
         let text = self.take(key);
         let mut words = [0; MAX_WORDS];
@@ -125,7 +125,7 @@ impl<'a> Meaning<'a> {
         State(bits)
     }
 
-    /// Parses bit numbers separated by `+`, or `none`.
+    /// Parses bit numbers separated by `+`, or `none`, to a mask.
     fn bits(&mut self, key: &str) -> u8 {
         let text = self.take(key);
         text.split('+')
@@ -242,7 +242,7 @@ impl<'a> Meaning<'a> {
         Baseline::On(zeroing)
     }
 
-    /// Returns the words of a parameter, encoded with its own type.
+    /// Returns the words of a parameter, encoded with the type of that parameter.
     fn words(&mut self, number: u8) -> [i16; WORDS] {
         if self.has("words") {
             let mut words = [0; WORDS];
@@ -454,7 +454,7 @@ impl<'a> Meaning<'a> {
     }
 }
 
-/// The error of a frame without a message.
+/// The error for a frame that does not decode to a message.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Error {
     Packet(PacketError),

@@ -1,16 +1,16 @@
 //! The longest and shortest classic frames, determined from all possible frames.
 //!
-//! A frame's stuff bits depend on its history only through the state of the run (8 states) and, for the
-//! future CRC, the CRC register (2^15 values). All identifiers and data that lead to the same pair continue
-//! alike, so they are processed together: backwards from the CRC over the data, and forwards over the
+//! The number of stuff bits still to come depends on the preceding bits only through the state of the run (8 states)
+//! and, because of the CRC, the CRC register (2^15 values). All identifiers and data that lead to the same pair of
+//! these continue alike, so they are processed together: backwards from the CRC over the data, and forwards over the
 //! identifier.
 
 use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Frame};
 use crate::wire_time::{Bits, Coding, Shape};
 
-/// Number of pairs: states of a run times values of the register.
+/// Number of pairs of a run state and a value of the CRC register.
 const PAIRS: usize = 8 << 15;
-/// The counts of an unreachable pair.
+/// The counts for a pair that no frame reaches.
 const NEVER: [u8; 2] = [u8::MAX, 0];
 
 /// The minimum and maximum number of stuff bits for each pair.
@@ -26,7 +26,7 @@ fn run_on(run: usize, bit: usize) -> (usize, u8) {
     }
 }
 
-/// The next pair for each pair and bit, and 1 if a stuff bit was inserted.
+/// For each pair and each value of the next bit: the next pair, and 1 if a stuff bit was inserted.
 struct Steps(Vec<[(u32, u8); 2]>);
 
 impl Steps {
@@ -45,7 +45,7 @@ impl Steps {
         (next as usize, stuffed)
     }
 
-    /// Prepends one free bit to the counts.
+    /// Returns the counts with one more bit of any value before them.
     fn with_a_free_bit(&self, after: &Counts) -> Counts {
         let mut counts = Vec::with_capacity(PAIRS);
         for &[(zero, if_zero), (one, if_one)] in &self.0 {
@@ -56,7 +56,7 @@ impl Steps {
         counts
     }
 
-    /// Proceeds over some bits: fixed ones, or free ones (`None`).
+    /// Advances the counts over some bits: fixed ones, or bits of any value (`None`).
     fn forward(&self, mut reached: Counts, bits: impl IntoIterator<Item = Option<usize>>) -> Counts {
         for bit in bits {
             let mut then = vec![NEVER; PAIRS];
@@ -74,7 +74,7 @@ impl Steps {
         reached
     }
 
-    /// Returns the counts up to the DLC, of remote frames and of data frames.
+    /// Returns the counts from SOF to the DLC, of remote frames and of data frames.
     fn heads(&self, extended: bool) -> [Counts; 2] {
         let mut idle = vec![NEVER; PAIRS];
         // One recessive bit, which the first bit of the frame ends.
@@ -89,7 +89,7 @@ impl Steps {
         }
     }
 
-    /// Returns the range over all identifiers and all bits after the DLC.
+    /// Returns the minimum and maximum number of stuff bits over all identifiers and all bits after the DLC.
     fn over_all(&self, heads: &Counts, dlc: usize, rest: &Counts) -> [u32; 2] {
         let mut over_all = NEVER;
         for (pair, &[min, max]) in heads.iter().enumerate().filter(|&(_, &counts)| counts != NEVER) {
@@ -112,7 +112,7 @@ fn plus([min, max]: [u8; 2], stuffed: u8) -> [u8; 2] {
     [min + stuffed, max + stuffed]
 }
 
-/// Returns the stuff bits within the 15 bits of the CRC.
+/// Returns the counts of stuff bits within the 15 bits of the CRC.
 fn of_the_crc() -> Counts {
     let count = |pair: usize| {
         let step = |(run, sum), place: usize| {
@@ -156,7 +156,7 @@ fn no_classic_frame_is_longer_or_shorter_and_one_is_as_long_and_one_as_short() {
     }
 }
 
-/// Returns the minimum and maximum of nominal and data bits of some frames.
+/// Returns the minimum and the maximum of nominal and data bits over some frames.
 fn ends(frames: impl Iterator<Item = Frame>) -> (Bits, Bits) {
     let start = (Bits { nominal: u32::MAX, data: u32::MAX }, Bits::default());
     frames.map(|frame| Bits::from_frame(&frame).unwrap()).fold(start, |(best, worst), bits| {

@@ -1,4 +1,4 @@
-//! A straightforward second implementation that writes a frame bit by bit.
+//! A second implementation of the bit count that writes a frame bit by bit.
 
 use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Format, Frame};
 use crate::wire_time::Bits;
@@ -17,7 +17,7 @@ pub(crate) fn crc15(bits: &[bool]) -> u32 {
     })
 }
 
-/// Returns the positions of stuff bits: the number of plain bits before each.
+/// Returns the positions of the stuff bits. A position is the number of plain bits before the stuff bit.
 fn stuff_bits(bits: &[bool]) -> Vec<usize> {
     let (mut places, mut last, mut run) = (Vec::new(), None, 0);
     for (at, &bit) in bits.iter().enumerate() {
@@ -31,7 +31,7 @@ fn stuff_bits(bits: &[bool]) -> Vec<usize> {
     places
 }
 
-/// Counts the bits of a frame.
+/// Counts the bits of a frame, including stuff bits and the intermission.
 pub(crate) fn bits(frame: &Frame) -> Bits {
     let mut plain = Vec::new();
     let (fd, id) = (frame.format() == Format::Fd, frame.id());

@@ -1,6 +1,6 @@
-//! The fast path of the parser, for lines in the subset that every tool reads: nearly all lines.
+//! The fast path of the parser, for lines in the subset that all tools can read. Nearly all lines are in it.
 //!
-//! It accepts only this layout and leaves all other lines to the general parser, which gives the same result:
+//! It accepts only this layout. The general parser handles all other lines, and would give the same result for these:
 //!
 //! ```text
 //!   (1700000000.123456) vcan0 22C##5AABBCC
@@ -11,10 +11,10 @@ use super::read::{eight_digits, four_bytes, is_blank, hex_value};
 use super::{Record, Timestamp};
 use crate::can::{EXTENDED, EXTENDED_MASK, Format, Frame, STANDARD_MASK};
 
-/// Length of a time with 10 + 6 digits, its parentheses and the space after it.
+/// Length in bytes of a time with 10 + 6 digits, its parentheses and the space after it.
 const TIME_LEN: usize = 20;
 
-/// Parses a line without its line ending. Returns `None` if the line needs the general parser.
+/// Parses a line without its line ending. Returns `None` if the line has another layout, for the general parser.
 #[inline(always)]
 pub(super) fn parse_record(line: &[u8]) -> Option<Record<'_>> {
     let (time, rest) = line.split_first_chunk::<TIME_LEN>()?;

@@ -1,10 +1,10 @@
-//! A cursor over the bytes of a line, and the parsers of each field.
+//! A cursor over the bytes of a line, and the parser of each field.
 
 use super::write::MAX_PAD;
 use super::{Direction, LineError, Timestamp};
 use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, check_identifier};
 
-/// The value of each byte as a hexadecimal digit; [`NONE`] for other bytes.
+/// The value of each byte as a hexadecimal digit; [`NONE`] for bytes that are not digits.
 #[expect(clippy::indexing_slicing, reason = "when this is compiled")]
 const NIBBLES: [u8; 256] = {
     let mut nibbles = [NOT_A_DIGIT; 256];
@@ -54,7 +54,7 @@ pub(super) const fn four_bytes(digits: [u8; 8]) -> Option<[u8; 4]> {
     Some([a, b, c, d])
 }
 
-/// Returns the decimal number at the start of eight bytes, and its number of digits.
+/// Returns the value of the decimal digits at the start of eight bytes, and their number.
 #[inline]
 pub(super) fn eight_digits(text: [u8; 8]) -> (u64, usize) {
     const ZEROS: u64 = 0x3030_3030_3030_3030;
@@ -72,8 +72,8 @@ pub(super) fn eight_digits(text: [u8; 8]) -> (u64, usize) {
     (digits.wrapping_mul(10_000).wrapping_add(digits >> 32) & 0xFFFF_FFFF, (bits >> 3) as usize)
 }
 
-/// Returns true if the rest of a frame is CAN XL after an identifier of `digits` digits: `#81:00:12345678#`
-/// as can-utils write it, or `###` as early drafts did.
+/// Returns true if the text after an identifier of `digits` digits belongs to a CAN XL frame: `#81:00:12345678#` as
+/// can-utils write it, or `###` as early drafts did.
 fn is_can_xl(digits: usize, rest: &[u8]) -> bool {
     let is_header = |text: &[u8]| {
         text.iter().zip(b"#00:00:00000000#").all(|(byte, like)| match like {
@@ -121,7 +121,7 @@ impl<'a> Cursor<'a> {
         if self.accept(byte) { Ok(()) } else { Err(self.error(expected)) }
     }
 
-    /// Skips spaces and tabs; at least one is required.
+    /// Skips spaces and tabs. Returns an error if there are none.
     pub(super) fn skip_blanks(&mut self) -> Result<(), LineError> {
         let blanks = self.rest().iter().take_while(|byte| is_blank(**byte)).count();
         self.at += blanks;
@@ -139,7 +139,7 @@ impl<'a> Cursor<'a> {
         Ok(word)
     }
 
-    /// Reads decimal digits. Returns their value and count.
+    /// Reads decimal digits. Returns their value and their number.
     fn digits(&mut self, expected: &'static str) -> Result<(u64, usize), LineError> {
         let start = self.at;
         let mut value = 0_u64;
@@ -161,7 +161,7 @@ impl<'a> Cursor<'a> {
         Ok(Timestamp { nanos, nine_digits: digits > 6, min_digits })
     }
 
-    /// Reads the fraction of a second. Returns nanoseconds and the number of digits.
+    /// Reads the fraction of a second. Returns the nanoseconds and the number of digits.
     fn fraction(&mut self) -> Result<(u64, usize), LineError> {
         let count = self.rest().iter().take_while(|byte| byte.is_ascii_digit()).count();
         let digits = self.rest().get(..count).unwrap_or_default();
@@ -170,7 +170,7 @@ impl<'a> Cursor<'a> {
         Ok((nanos, digits))
     }
 
-    /// Reads a frame. Returns `None` for CAN XL, whose text is skipped.
+    /// Reads a frame. Returns `None` for a CAN XL frame, whose text is skipped.
     pub(super) fn frame(&mut self) -> Result<Option<Frame>, LineError> {
         let expected = "an identifier of 3 or 8 hexadecimal digits";
         let start = self.at;
@@ -256,7 +256,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Reads the direction after a frame. Other words are ignored; a further data byte is an error.
+    /// Reads the direction after a frame, if any. Other words are ignored, but a further data byte is an error.
     pub(super) fn direction(&mut self) -> Result<Option<Direction>, LineError> {
         if self.is_at_end() {
             return Ok(None);
@@ -280,8 +280,8 @@ pub(super) const fn is_blank(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t')
 }
 
-/// Converts the digits of a fraction of a second to nanoseconds. Also returns the number of digits. Digits
-/// below a nanosecond are dropped. Returns `None` if `digits` is empty or contains other bytes.
+/// Converts the digits after the decimal point of a second to nanoseconds. Returns the nanoseconds and the number of
+/// digits. Digits below a nanosecond are dropped. Returns `None` if `digits` is empty or contains other bytes.
 #[must_use]
 pub fn fraction(digits: &[u8]) -> Option<(u64, usize)> {
     if digits.is_empty() || !digits.iter().all(u8::is_ascii_digit) {
@@ -291,9 +291,9 @@ pub fn fraction(digits: &[u8]) -> Option<(u64, usize)> {
     Some((nine.fold(0, |nanos, digit| nanos * 10 + u64::from(digit - b'0')), digits.len()))
 }
 
-/// Converts an identifier of 8 hexadecimal digits to one with flags. The kernel's flags are in the upper
-/// three bits. Without flags the identifier is extended, as in can-utils and python-can, except for an error
-/// frame.
+/// Converts an identifier of 8 hexadecimal digits to a raw identifier. The upper three bits are the kernel's flags. If
+/// they are all 0, the identifier is extended, as in can-utils and python-can; an error frame is not marked as
+/// extended.
 #[must_use]
 pub const fn eight_digit_identifier(word: u32) -> u32 {
     let number = word & EXTENDED_MASK;

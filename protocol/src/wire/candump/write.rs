@@ -1,5 +1,5 @@
-//! The writer of frames and records. It formats into a buffer on the stack and passes the text on in few
-//! pieces.
+//! The writer of frames and records. It formats a line in a buffer on the stack, so that the output is called only a
+//! few times per line.
 
 use core::fmt::{self, Write};
 
@@ -19,17 +19,17 @@ const HEX: [[u8; 2]; 256] = {
     pairs
 };
 
-/// Maximum length of a frame: 8 digits of an identifier, `##`, flags, 64 bytes, a raw DLC.
+/// Maximum length in bytes of a frame: 8 digits of an identifier, `##`, flags, 64 data bytes and a raw DLC.
 const MAX_FRAME_LEN: usize = 8 + 2 + 1 + 128 + 2;
-/// Maximum number of digits that seconds are padded to.
+/// Maximum number of digits to which seconds are padded.
 pub(super) const MAX_PAD: u8 = 20;
-/// Maximum length of a time: two parentheses, digits of seconds, a point, 9 digits, a space.
+/// Maximum length in bytes of a time: two parentheses, digits of seconds, a point, 9 digits and a space.
 const MAX_TIME_LEN: usize = 2 + MAX_PAD as usize + 1 + 9 + 1;
 
-/// Writes one line without a line ending: single spaces, upper case, no direction.
+/// Writes one record without a line ending, with single spaces, in upper case and without the direction.
 ///
 /// # Errors
-/// Returns an error if `out` fails.
+/// Returns an error if writing to `out` fails.
 pub fn write_record(out: &mut impl Write, record: &Record<'_>) -> fmt::Result {
     let mut time = TextBuffer::<MAX_TIME_LEN>::new();
     let (seconds, nanos) = (record.time.nanos / 1_000_000_000, record.time.nanos % 1_000_000_000);
@@ -52,7 +52,7 @@ pub fn write_record(out: &mut impl Write, record: &Record<'_>) -> fmt::Result {
 /// Writes a frame without time and interface, in the notation of cansend.
 ///
 /// # Errors
-/// Returns an error if `out` fails.
+/// Returns an error if writing to `out` fails.
 pub fn write_frame(out: &mut impl Write, frame: &Frame) -> fmt::Result {
     let mut text = TextBuffer::<MAX_FRAME_LEN>::new();
     if frame.is_error() || frame.is_extended() {
@@ -113,13 +113,13 @@ impl<const N: usize> TextBuffer<N> {
         }
     }
 
-    /// Appends the lower hexadecimal digit of a value.
+    /// Appends the lower four bits of a value as a hexadecimal digit.
     fn push_digit(&mut self, value: u8) {
         let [_, digit] = hex_digits(value);
         self.push(digit);
     }
 
-    /// Appends both hexadecimal digits of a value.
+    /// Appends a byte as two hexadecimal digits.
     fn push_byte(&mut self, value: u8) {
         if let Some(place) = self.bytes.get_mut(self.len..).and_then(<[u8]>::first_chunk_mut) {
             *place = hex_digits(value);

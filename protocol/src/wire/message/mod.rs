@@ -33,11 +33,11 @@ use crate::parameters::MAX_JOINTS;
 /// The version of this protocol, sent in every heartbeat.
 pub const VERSION: u8 = 1;
 
-/// Set in the count of a stimulus: it applies from the next joints on, whatever their epoch.
+/// Bit in the count byte of a stimulus: the stimulus applies from the next joints on, whatever their epoch.
 pub(crate) const FROM_NEXT_FLAG: u8 = 0x80;
-/// Set in the count of `configure` and `configured`: the request is a write.
+/// Bit in the count byte of `configure` and `configured`: the request is a write, not a read.
 pub(crate) const WRITE_FLAG: u8 = 0x80;
-/// The parameter number of a refusal.
+/// Value of the parameter number in a `configured` packet that refuses a request.
 pub(crate) const REFUSAL_NUMBER: u8 = 126;
 
 /// The joint positions of one epoch.
@@ -61,16 +61,16 @@ pub enum AppliesFrom {
 /// The request in a `configure` packet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Request {
-    /// Reads a parameter.
+    /// A request for the value of a parameter.
     Read {
-        /// The parameter's number, known or not.
+        /// The number of the parameter, which need not exist.
         number: u8,
     },
-    /// Writes a parameter.
+    /// A request to change the value of a parameter.
     Write {
-        /// The parameter's number, known or not.
+        /// The number of the parameter, which need not exist.
         number: u8,
-        /// Its words.
+        /// The new words of the parameter.
         words: [i16; WORDS],
     },
 }
@@ -78,13 +78,13 @@ pub enum Request {
 /// The reply in a `configured` packet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Answer {
-    /// The value that was read or written.
+    /// The value of the parameter after a read or write.
     Value {
         /// The parameter's number.
         number: u8,
         /// True after a write, false after a read.
         written: bool,
-        /// Its words.
+        /// The words of the parameter.
         words: [i16; WORDS],
     },
     /// The request was refused.
@@ -98,61 +98,61 @@ pub enum Answer {
 }
 
 impl Answer {
-    /// Refusal: the hash of a commit differs from that of the written parameters.
+    /// Reason of a refusal: the hash of a commit differs from that of the written parameters.
     pub const WRONG_HASH: i16 = 16;
-    /// Refusal: writing to flash failed.
+    /// Reason of a refusal: writing to flash failed.
     pub const FLASH_FAILED: i16 = 17;
-    /// Refusal: the parameter does not exist.
+    /// Reason of a refusal: the parameter does not exist.
     pub const UNKNOWN: i16 = 18;
-    /// Refusal: the words are invalid for this parameter, or `links_down` was written outside test mode.
+    /// Reason of a refusal: the words are invalid for this parameter, or `links_down` was written outside test mode.
     pub const INVALID: i16 = 19;
-    /// Refusal: a tare while the cell is touched, or before it has received joints.
+    /// Reason of a refusal: a tare was requested while the cell is touched, or before it has received joints.
     pub const TOUCHED: i16 = 20;
-    /// Refusal: the sensor value exceeds the limit of the baseline.
+    /// Reason of a refusal: the sensor value exceeds the limit of the baseline.
     pub const BEYOND_LIMIT: i16 = 21;
 }
 
 /// A decoded packet.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Message {
-    /// Cells stop answering until a resume.
+    /// A command to stop sending torques and sums until a resume.
     Halt,
-    /// New joint positions.
+    /// A broadcast of joint positions, which begins an epoch.
     Joints {
-        /// The epoch of this broadcast.
+        /// The epoch that the broadcast begins.
         epoch: Epoch,
-        /// The positions.
+        /// The joint positions.
         joints: Joints,
     },
-    /// Cells answer with a heartbeat.
+    /// A command to send a heartbeat.
     Sync,
-    /// Cells leave the halted state.
+    /// A command to leave the halted state.
     Resume,
-    /// Cells answer with the pages of counters.
+    /// A command to send the pages of counters.
     Report,
-    /// The torque sum of a subtree.
+    /// The sum of the torques of a cell and of all cells below it in the tree.
     Sum {
         /// The sender.
         from: CellId,
-        /// The epoch of the joints it answers.
+        /// The epoch of the joints that the sum answers.
         epoch: Epoch,
-        /// Sum in Nm or N, Q7.8, one word per joint.
+        /// Sum in Nm or N in Q7.8, one word per joint.
         torque: Words,
-        /// Number of contributing cells; 0 ends earlier sums.
+        /// Number of cells whose torque is in the sum. With 0 the sender ends its earlier sums.
         count: u8,
     },
-    /// The own torque of a cell.
+    /// The torque of one cell alone.
     Torque {
         /// The sender.
         from: CellId,
-        /// The epoch of the joints it answers.
+        /// The epoch of the joints that the torque answers.
         epoch: Epoch,
-        /// Torque in Nm or N, in the format of the bus, one word per joint.
+        /// Torque in Nm or N in the torque format of the bus, one word per joint.
         torque: Words,
     },
     /// Measurements of a cell.
     Sensors {
-        /// The sender.
+        /// The epoch of the last joints that the cell accepted.
         from: CellId,
         /// The epoch of the last accepted joints.
         epoch: Epoch,
@@ -163,34 +163,34 @@ pub enum Message {
     Network {
         /// The sender.
         from: Node,
-        /// The epoch of the last accepted joints.
+        /// The epoch of the last joints that the sender accepted.
         epoch: Epoch,
         /// The status page.
         page: NetworkPage,
     },
     /// A request to read or write a parameter.
     Configure {
-        /// Destination.
+        /// The node whose parameter is requested.
         to: Node,
-        /// An arbitrary tag that the reply repeats.
+        /// A tag that the requester chooses and the reply repeats.
         tag: u8,
         /// The request.
         request: Request,
     },
     /// The reply to a request.
     Configured {
-        /// The sender.
+        /// The replying cell.
         from: CellId,
-        /// The request's tag.
+        /// The tag of the request.
         tag: u8,
-        /// The value or refusal.
+        /// The value of the parameter, or a refusal.
         answer: Answer,
     },
     /// Simulated sensor values for a cell.
     Stimulus {
-        /// The addressee.
+        /// The node that is to use the values.
         to: Node,
-        /// The time from which it applies.
+        /// The time from which the stimulus applies.
         from: AppliesFrom,
         /// The sensor values.
         page: SensorPage,
@@ -201,39 +201,39 @@ pub enum Message {
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum MessageError {
-    /// The command does not exist.
+    /// The number of the command is undefined.
     #[error("command {0} does not exist: use 0 halt, 1 joints, 2 sync, 3 resume or 4 report")]
     Command(u8),
-    /// The node field is not a valid sender of this kind.
+    /// The node field does not name a node that may send this kind.
     #[error("{kind} from node {node}, which is not a cell", kind = .kind.name())]
     Sender {
-        /// The kind.
+        /// The kind of the packet.
         kind: Kind,
         /// The node field.
         node: u8,
     },
-    /// The node field is not a valid addressee of this kind.
+    /// The node field does not name a node that this kind may be sent to.
     #[error("{kind} to node {node}, which is not a cell", kind = .kind.name())]
     Addressee {
-        /// The kind.
+        /// The kind of the packet.
         kind: Kind,
         /// The node field.
         node: u8,
     },
-    /// The page does not exist.
+    /// The page number is undefined for this kind.
     #[error("{kind} page {page} does not exist", kind = .kind.name())]
     Page {
-        /// The kind.
+        /// The kind of the packet.
         kind: Kind,
-        /// The page.
+        /// The page number.
         page: u8,
     },
-    /// The count is out of range.
+    /// The count byte is out of range for this kind.
     #[error("{kind} with count {got}; {allowed} is allowed", kind = .kind.name())]
     Count {
-        /// The kind.
+        /// The kind of the packet.
         kind: Kind,
-        /// The count.
+        /// The count byte.
         got: u8,
         /// The allowed range.
         allowed: &'static str,
@@ -386,7 +386,7 @@ impl Message {
         self.id().sender()
     }
 
-    /// Returns the epoch, if the message has one.
+    /// Returns the epoch of a message; `None` for a kind without one.
     #[must_use]
     pub const fn epoch(&self) -> Option<Epoch> {
         match *self {
@@ -406,19 +406,19 @@ impl Message {
         }
     }
 
-    /// Returns the tag of a request or reply.
+    /// Returns the tag of a request or reply; `None` for other messages.
     #[must_use]
     pub const fn tag(&self) -> Option<u8> {
         if let Self::Configure { tag, .. } | Self::Configured { tag, .. } = *self { Some(tag) } else { None }
     }
 
-    /// Returns the sensor page of a measurement or a stimulus.
+    /// Returns the sensor page of a measurement or a stimulus; `None` for other messages.
     #[must_use]
     pub const fn sensor_page(&self) -> Option<SensorPage> {
         if let Self::Sensors { page, .. } | Self::Stimulus { page, .. } = *self { Some(page) } else { None }
     }
 
-    /// Returns true if a word of a torque or sum means *saturated*; `None` for other messages.
+    /// Returns true if a torque or sum has a word that means *saturated*; `None` for other messages.
     #[must_use]
     pub fn is_saturated(&self) -> Option<bool> {
         self.torque_words().map(|words| words.is_saturated())
@@ -437,20 +437,20 @@ impl Message {
         self.torque_words().is_some_and(|words| !words.is_zero())
     }
 
-    /// Returns the words of a torque or a sum.
+    /// Returns the words of a torque or a sum; `None` for other messages.
     const fn torque_words(&self) -> Option<Words> {
         if let Self::Torque { torque, .. } | Self::Sum { torque, .. } = *self { Some(torque) } else { None }
     }
 }
 
 impl Joints {
-    /// Returns the positions as words, in the shortest packet that fits the joints in use.
+    /// Returns the positions as words, in the shortest packet length that holds the joints in use.
     fn words(&self) -> Words {
         Words::new(Length::for_joints(self.in_use.into()), self.positions.map(Q1_14::to_bits))
     }
 }
 
-/// Returns the numbers of joints that use words of this length, and the text for errors.
+/// Returns the possible numbers of joints in a packet of this length, and their range as text for errors.
 const fn allowed_joints(length: Length) -> (RangeInclusive<u8>, &'static str) {
     match length {
         Length::Six => (1..=6, "1 to 6"),

@@ -1,12 +1,12 @@
-//! Network pages: the state of a cell and its part of the network.
+//! Network pages: the state of a cell, its counters, and its place in the tree.
 
 use super::{MessageError, State};
 use crate::id::Kind;
 use crate::packet::{self, WORDS};
 
-/// The parent field of a tree page without a parent.
+/// Value of the parent field in a tree page if the cell has no parent.
 const NO_PARENT: u8 = 255;
-/// A page of a cell's state and its part of the network.
+/// A page with the state of a cell, its counters, or its place in the tree.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum NetworkPage {
     /// Page 0: the heartbeat.
@@ -15,7 +15,7 @@ pub enum NetworkPage {
     Received(ReceivedCounts),
     /// Page 2: counters of rejected frames, by reason.
     Rejected(RejectedCounts),
-    /// Page 3: the place in the tree, and counters of sums.
+    /// Page 3: the place of the cell in the tree, and counters of sums.
     Tree(Tree),
     /// Page 4: the state of each port.
     Ports(Ports),
@@ -25,13 +25,13 @@ pub enum NetworkPage {
 /// accepted joints.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Heartbeat {
-    /// The cell's serial number.
+    /// Serial number of the cell.
     pub serial: u32,
-    /// Hash of its configuration: [`crate::parameters::Parameters::hash`].
+    /// Hash of the cell's configuration: [`crate::parameters::Parameters::hash`].
     pub configuration: u16,
-    /// Number of packets sent before this one, modulo 2^16.
+    /// Number of packets that the cell sent before this one, modulo 2^16.
     pub sent: u16,
-    /// Number of rejected frames, modulo 2^16; page 2 has the reasons.
+    /// Number of rejected frames, modulo 2^16; page 2 counts them by reason.
     pub rejected: u16,
     /// State bits, the joint that moves the cell, and the protocol version.
     pub state: State,
@@ -41,17 +41,17 @@ pub struct Heartbeat {
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 #[cfg_attr(feature = "host", derive(serde::Serialize))]
 pub struct ReceivedCounts {
-    /// Joints accepted (and answered if the cell is in contact).
+    /// Number of joints messages accepted. The cell answered them if it was in contact.
     pub joints: u16,
-    /// Joints skipped because they were older than one period.
+    /// Number of joints messages skipped because they were older than one broadcast period.
     pub joints_late: u16,
-    /// Joints with the same epoch as the last ones.
+    /// Number of joints messages with the same epoch as the previous one.
     pub joints_repeated: u16,
-    /// Stimuli accepted.
+    /// Number of stimuli accepted.
     pub stimuli: u16,
-    /// Stimuli that arrived after their epoch; they apply from the next epoch on.
+    /// Number of stimuli that arrived after their epoch. They apply from the next epoch on.
     pub stimuli_late: u16,
-    /// Torques sent.
+    /// Number of torques sent.
     pub torques: u16,
 }
 
@@ -59,41 +59,42 @@ pub struct ReceivedCounts {
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 #[cfg_attr(feature = "host", derive(serde::Serialize))]
 pub struct RejectedCounts {
-    /// Frames with a length or format that the bus does not use: 16 bytes FD, or classic segments of 8 bytes.
+    /// Number of frames with a length or format that the bus does not use: 16 bytes FD, or classic segments of 8 bytes.
     pub length: u16,
-    /// Packets with a wrong CRC.
+    /// Number of packets with a wrong CRC.
     pub crc: u16,
-    /// Remote frames, error frames and frames with a 29-bit identifier.
+    /// Number of remote frames, error frames and frames with a 29-bit identifier.
     pub foreign: u16,
-    /// Packets with an undefined kind, page or command, or with invalid words.
+    /// Number of packets with an undefined kind, page or command, or with invalid words.
     pub meaning: u16,
-    /// Packets whose later segments did not arrive.
+    /// Number of packets whose later segments did not arrive.
     pub incomplete: u16,
-    /// Stimuli that did not fit into the queue, or were sent to a cell outside test mode.
+    /// Number of stimuli that did not fit into the queue, or were sent to a cell outside test mode.
     pub stimuli: u16,
 }
 
 /// Page 3: a cell's place in the tree. The epoch byte is that of the last accepted joints.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Tree {
-    /// The parent, which receives its sums: the node id of a cell, or 0 for the gateway's side. `None` while
+    /// The parent, to which the cell sends its sums: the node id of a cell, or 0 for the gateway's side. `None` while
     /// the cell is unreachable.
     pub parent: Option<u8>,
     /// The port that leads to the parent, 0 to 4; undefined without a parent.
     pub parent_port: u8,
-    /// Number of wires to the root of its tree; 0 for a root. Undefined without a parent.
+    /// Number of wires between the cell and the root of its tree; 0 for a root. Undefined without a parent.
     pub depth: u8,
-    /// The round of the exploration that determined the depth.
+    /// The round of the exploration in which the depth was determined.
     pub round: u8,
     /// Bit p is set if the cell at port p is a child.
     pub children: u8,
     /// Bit p is set if port p works in both directions.
     pub working_ports: u8,
-    /// Sums sent, including repetitions, modulo 2^16.
+    /// Number of sums sent, including repetitions, modulo 2^16.
     pub sent: u16,
-    /// Sums accepted from children, modulo 2^16.
+    /// Number of sums accepted from children, modulo 2^16.
     pub accepted: u16,
-    /// Sums of children that were dropped, because they were late or lacked a state message; modulo 2^16.
+    /// Number of sums of children that were dropped, because they were late or no state message came before them;
+    /// modulo 2^16.
     pub dropped: u16,
 }
 
@@ -102,22 +103,22 @@ pub struct Tree {
 pub struct Ports {
     /// The state of each port.
     pub ports: [PortState; 4],
-    /// Number of changes of the parent, modulo 2^16.
+    /// Number of times that the cell changed its parent, modulo 2^16.
     pub changes: u16,
 }
 
 /// The cell at the other end of a port, and the state of the link.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct PortState {
-    /// The node id of the cell at the other end; 0 if it has none, or the port receives nothing.
+    /// Node id of the cell at the other end; 0 if that cell has none, or if the port receives nothing.
     pub number: u8,
-    /// The port at the other end.
+    /// Number of the port at the other end.
     pub port: u8,
-    /// True if hellos arrive from the other end.
+    /// True if the port receives hellos from the other end.
     pub receives: bool,
-    /// True if the other end also receives this cell.
+    /// True if the link works in both directions: the other end also receives hellos from this port.
     pub works: bool,
-    /// True if the other end uses another version of the protocol.
+    /// True if the cell at the other end uses another version of the protocol.
     pub other_version: bool,
 }
 

@@ -12,11 +12,11 @@ pub enum SensorPage {
     Skin(SkinSensors),
     /// Page 1: accelerometer x, y, z in g.
     Acceleration([Q3_12; 3]),
-    /// Page 3: the baseline of the force sensor; only measured.
+    /// Page 3: the baseline of the force sensor. A cell measures it; a stimulus cannot contain it.
     Baseline(BaselinePage),
 }
 
-/// Page 3 of the sensors: the baseline of the force sensor.
+/// Sensor page 3: the baseline of the force sensor.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct BaselinePage {
     /// The zero in N, which is subtracted from the sum of the contact words.
@@ -25,20 +25,20 @@ pub struct BaselinePage {
     pub n_per_c: Q1_14,
     /// The temperature at which the zero was measured, in degrees Celsius.
     pub temperature: Q9_6,
-    /// True if the cell has a zero.
+    /// True if the cell has a zero, from a tare.
     pub tared: bool,
-    /// True while the cell is touched, during which the zero does not follow the sensor.
+    /// True while the cell is touched. The zero does not follow the sensor during a touch.
     pub touched: bool,
-    /// True if the zero has reached its limit.
+    /// True if the zero is at its limit.
     pub limited: bool,
     /// Number of refused tares, modulo 2^16.
     pub refused: u16,
 }
 
-/// Page 0 of the sensors: the skin.
+/// Sensor page 0: contact forces, proximity and temperatures.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct SkinSensors {
-    /// Three capacitive contact forces in N; the touch is their sum.
+    /// Three capacitive contact forces in N. The force of a touch is their sum.
     pub contact: [Q5_10; 3],
     /// Proximity, from 0 (nothing near) to 1.
     pub proximity: Q1_14,

@@ -2,8 +2,8 @@
 
 use super::VERSION;
 
-/// The state of a cell: flags in bits 0 to 7, the joint in bits 8 to 11, the protocol version in bits 12 to
-/// 15.
+/// The state word of a cell: flags in bits 0 to 7, the joint that moves the cell in bits 8 to 11, and the protocol
+/// version in bits 12 to 15.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct State(pub u16);
 
@@ -14,18 +14,18 @@ impl State {
     pub const ACTIVE: Self = Self(1 << 1);
     /// The cell was halted and waits for a resume.
     pub const HALTED: Self = Self(1 << 2);
-    /// The contents of its flash are damaged and not used.
+    /// The contents of the cell's flash are damaged and not used.
     pub const FLASH_DAMAGED: Self = Self(1 << 3);
-    /// The cell has received frames from another cell with its node id.
+    /// The cell has received frames from another cell with the same node id.
     pub const DUPLICATE: Self = Self(1 << 4);
     /// The cell uses stimuli instead of its sensors.
     pub const TEST_MODE: Self = Self(1 << 5);
     /// A torque has saturated since the last heartbeat.
     pub const SATURATED: Self = Self(1 << 6);
-    /// The cell has just started and checks whether another cell has its node id.
+    /// The cell has just started and checks whether another cell uses its node id.
     pub const CLAIMING: Self = Self(1 << 7);
 
-    /// Each flag with the name that all output uses.
+    /// Each flag and its name in all output.
     pub const NAMES: [(Self, &'static str); 8] = [
         (Self::CONFIGURED, "configured"),
         (Self::ACTIVE, "active"),
@@ -54,7 +54,7 @@ impl State {
         if set { Self(self.0 | bits.0) } else { Self(self.0 & !bits.0) }
     }
 
-    /// Returns a copy with this joint and the version of this protocol.
+    /// Returns a copy with this joint, and with the protocol version of this crate.
     #[must_use]
     pub const fn with_joint(self, joint: u8) -> Self {
         Self((self.0 & 0xFF) | (((joint & 0xF) as u16) << 8) | ((VERSION as u16) << 12))

@@ -12,11 +12,11 @@ pub enum Length {
     /// 6 words in 16 bytes: chains of up to 6 joints, and all packets without a word per joint.
     #[default]
     Six,
-    /// 8 words in 20 bytes.
+    /// 8 words in 20 bytes, for chains of 7 or 8 joints.
     Eight,
-    /// 10 words in 24 bytes.
+    /// 10 words in 24 bytes, for chains of 9 or 10 joints.
     Ten,
-    /// 14 words in 32 bytes.
+    /// 14 words in 32 bytes, for chains of 11 to 14 joints.
     Fourteen,
 }
 
@@ -35,7 +35,7 @@ impl Length {
         }
     }
 
-    /// Returns the size in bytes: words, epoch, count and CRC.
+    /// Returns the size of the packet in bytes: words, epoch, count and CRC.
     #[must_use]
     pub const fn bytes(self) -> usize {
         2 * self.words() + 4
@@ -44,20 +44,20 @@ impl Length {
     /// Number of classic frames of the longest packet.
     pub const MAX_SEGMENTS: usize = Self::Fourteen.segments();
 
-    /// Returns the number of classic frames.
+    /// Returns the number of classic frames that carry a packet of this length.
     #[must_use]
     pub const fn segments(self) -> usize {
         self.bytes().div_ceil(SEGMENT_BYTES)
     }
 
-    /// Returns the size of the last classic frame in bytes; the others have 8.
+    /// Returns the size in bytes of the last classic frame of a packet; the frames before it have 8 bytes.
     #[must_use]
     pub const fn last_segment(self) -> usize {
         self.bytes() - (self.segments() - 1) * SEGMENT_BYTES
     }
 
-    /// Returns the length of joints, torques and sums for a chain of `joints` joints. More joints than a
-    /// chain can have give the longest.
+    /// Returns the length of joints, torques and sums for a chain of `joints` joints. If there are more than 14 joints,
+    /// returns the greatest length.
     #[must_use]
     pub const fn for_joints(joints: usize) -> Self {
         match joints {
@@ -75,7 +75,7 @@ impl Length {
     }
 }
 
-/// A set of packet lengths.
+/// A set of possible packet lengths.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Lengths(u8);
 
@@ -89,22 +89,22 @@ impl Lengths {
         Self(1 << length as u8)
     }
 
-    /// Returns the set for a chain: one length if it is known, else all.
+    /// Returns the set for a chain: its one length, or all lengths if the chain is unknown.
     #[must_use]
     pub fn for_chain(length: Option<Length>) -> Self {
         length.map_or(Self::ALL, Self::only)
     }
 
-    /// Returns the lengths that packets with this identifier can have on any chain. Only joints, torques and
-    /// sums vary.
+    /// Returns the lengths that packets with this identifier can have on any chain. Only the lengths of joints, torques
+    /// and sums depend on the chain.
     #[must_use]
     pub fn for_id(id: Id) -> Self {
         let grows = matches!(id.kind, Kind::Torque | Kind::Sum) || id == Id::command(Command::Joints);
         if grows { Self::ALL } else { Self::only(Length::Six) }
     }
 
-    /// Restricts this set to the lengths that packets with this identifier can have. Kinds with a fixed
-    /// length always get six words.
+    /// Returns the lengths of this set that packets with this identifier can have. A kind with a fixed length always
+    /// has six words.
     #[must_use]
     pub fn restricted_to(self, id: Id) -> Self {
         let own = Self::for_id(id);
@@ -139,7 +139,7 @@ impl Lengths {
 #[repr(align(4))]
 pub struct Words {
     length: Length,
-    /// Words beyond the length are zero.
+    /// The words, followed by zeros up to the maximum.
     words: [i16; MAX_WORDS],
 }
 
@@ -150,7 +150,7 @@ impl Words {
         Self { length, words: [0; MAX_WORDS] }
     }
 
-    /// Creates words of this length; further elements of `words` are dropped.
+    /// Creates words of this length from the first elements of `words`; the others are dropped.
     #[must_use]
     pub fn new(length: Length, words: [i16; MAX_WORDS]) -> Self {
         let mut it = Self { length, words };
@@ -186,7 +186,7 @@ impl Words {
         self
     }
 
-    /// Returns the first six words: all of them in a packet that does not vary with the chain.
+    /// Returns the first six words, which are all words of a packet whose length does not depend on the chain.
     #[must_use]
     pub const fn six(&self) -> [i16; WORDS] {
         let [a, b, c, d, e, f, ..] = self.words;
@@ -199,7 +199,7 @@ impl Words {
         self.words == [0; MAX_WORDS]
     }
 
-    /// Returns true if a word has the largest or smallest value, which means *saturated* in torques and sums.
+    /// Returns true if a word has the largest or smallest value, which means *saturated* in a torque or sum.
     #[must_use]
     pub fn is_saturated(&self) -> bool {
         self.words.iter().any(|&word| is_saturated(word))

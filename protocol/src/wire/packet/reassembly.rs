@@ -6,31 +6,31 @@ use super::{Length, Lengths, MAX_BYTES, Packet, PacketError, SEGMENT_BYTES};
 use crate::id::{Command, Id, Kind};
 use crate::time::{Micros, Span};
 
-/// The result of a classic frame.
+/// The result of adding a classic frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Reassembly {
     /// The packet still lacks segments.
     Waiting,
     /// The packet is complete and its CRC is correct.
     Complete(Packet),
-    /// A packet is lost: its segments do not fit together, or arrived too far apart. The oldest segment is
-    /// dropped, and the next one is now the first. Returned once for a packet of which several segments
-    /// arrived.
+    /// A packet was lost: its segments do not fit together, or arrived too far apart. The oldest segment is dropped,
+    /// and the one after it counts as the first. Returned once for each lost packet of which several segments arrived.
     Incomplete,
     /// The segment completes packets of several lengths with correct CRCs; all of them are dropped.
     Ambiguous,
 }
 
-/// The reassembly buffer of one identifier: the segments of a packet received so far.
+/// The reassembly buffer for one identifier: the segments received so far of one packet.
 ///
-/// Segments arrive in order and within [`Segment::within`] of each other. The length of a packet follows from
-/// its kind and the chain of its bus; where the chain is unknown, every length is tried. When the CRC fails,
-/// only the oldest segment is dropped, so that a lost frame costs one packet and not all later ones.
+/// Segments arrive in order. The last segment of a packet arrives within [`Segment::within`] after the first. The
+/// length of a packet follows from its kind and the chain of its bus; if the chain is unknown, all lengths are tried.
+/// If the CRC is wrong, only the oldest segment is dropped, so that a lost frame costs one packet and not all later
+/// ones.
 #[derive(Clone, Debug, Default)]
 pub struct Reassembler {
     waiting: Deque<PendingSegment, { Length::MAX_SEGMENTS }>,
-    /// The number of oldest segments that may belong to a packet already reported as incomplete; they are not
-    /// reported again.
+    /// Number of segments at the front of the buffer that may belong to a packet already reported as incomplete. That
+    /// packet is not reported again.
     reported: usize,
     /// True if a packet was lost before the last complete one and has not been reported yet.
     unreported_loss: bool,
@@ -44,16 +44,18 @@ struct PendingSegment {
 }
 
 impl Reassembler {
-    /// The maximum time between the segments of joints, torques and sums. It is below the usual 16 ms between
-    /// two broadcasts, because one in 65 536 groups of segments of different packets has a correct CRC.
+    /// The maximum time between the segments of joints, torques and sums. It is less than the usual 16 ms between two
+    /// broadcasts, so that segments of different packets are rarely combined: one in 65 536 such combinations has a
+    /// correct CRC.
     const MAX_PERIODIC_GAP: Span = Span::from_millis(15);
-    /// The maximum time between the segments of all other packets, most of which are sent once.
+    /// The maximum time between the segments of all other packets. Most of them are sent only once, so no later packet
+    /// can be mixed in.
     const MAX_GAP: Span = Span::from_millis(100);
 
     /// An empty buffer.
     pub const NONE: Self = Self { waiting: Deque::new(), reported: 0, unreported_loss: false };
 
-    /// Returns the maximum time between the arrivals of the first and the last segment of a packet.
+    /// Returns the maximum time from the arrival of the first segment of a packet to that of the last.
     #[must_use]
     pub fn max_gap(id: Id) -> Span {
         let is_periodic = matches!(id.kind, Kind::Sum | Kind::Torque) || id == Id::command(Command::Joints);
@@ -72,11 +74,12 @@ impl Reassembler {
         self.waiting.len()
     }
 
-    /// Adds the next classic frame of this identifier, whose packets can have one of `lengths`. The set is
-    /// restricted to the lengths of the identifier ([`Lengths::of`]).
+    /// Adds the next classic frame with this identifier. Its packets can have one of `lengths`, restricted to the
+    /// lengths that the identifier allows ([`Lengths::of`]).
     ///
     /// # Errors
-    /// Returns an error if no segment of these lengths has that size. The buffer does not change.
+    /// Returns an error if no segment of packets with these lengths has the size of the frame. The buffer does not
+    /// change then.
     pub fn push(
         &mut self,
         at: Micros,
@@ -117,8 +120,8 @@ impl Reassembler {
         Ok(self.drop_oldest(at, within, lengths.longest().segments(), belong_together))
     }
 
-    /// Returns the packet of this length that ends with the newest segment, if its CRC is correct, and the
-    /// arrival time of its first segment.
+    /// Returns the packet of this length that ends with the newest segment, and the arrival time of its first segment.
+    /// Returns `None` if the CRC is wrong or segments are missing.
     fn packet_ending_with(&self, id: Id, length: Length) -> Option<(Packet, Micros)> {
         let skipped = self.waiting.len().checked_sub(length.segments())?;
         let mut bytes = [0; MAX_BYTES];
@@ -137,8 +140,8 @@ impl Reassembler {
         Some((packet, since?))
     }
 
-    /// Handles a segment that completes no packet: drops the segments that are too old, or else the oldest
-    /// one if the buffer holds as many as a packet has.
+    /// Handles a segment that completes no packet. Drops the segments that are too old. If there are none, drops the
+    /// oldest segment once the buffer holds as many as the longest packet has.
     fn drop_oldest(
         &mut self,
         now: Micros,

@@ -1,11 +1,12 @@
-//! The abilities that a cell reports in its identity.
+//! The abilities of a cell, which it reports in its identity (parameter 0).
 
 use core::fmt;
 
 use super::{MAX_JOINTS, MAX_ROWS, Parameters, RowKind};
 use crate::fixed::TorqueFormat;
 
-/// The abilities of a cell: word 5 of parameter 0.
+/// The abilities of a cell: the longest chain and table, and the kinds of rows and torque formats that it supports.
+/// They are word 5 of parameter 0.
 ///
 /// | bits | meaning |
 /// |---|---|
@@ -18,26 +19,26 @@ use crate::fixed::TorqueFormat;
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Abilities(u16);
 
-/// An ability that parameters require and a cell lacks.
+/// An ability that given parameters require and a cell lacks.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum MissingAbility {
-    /// A chain of this length.
+    /// A chain with more joints than the cell supports.
     Joints {
-        /// Required number of joints.
+        /// Number of joints that the parameters require.
         needed: usize,
-        /// Maximum of the cell.
+        /// Maximum number of joints that the cell supports.
         most: usize,
     },
-    /// A table of this length.
+    /// A table with more rows than the cell supports.
     Rows {
-        /// Required number of rows.
+        /// Number of rows that the parameters require.
         needed: usize,
-        /// Maximum of the cell.
+        /// Maximum number of rows that the cell supports.
         most: usize,
     },
-    /// Rows of this kind.
+    /// A row of a kind that the cell does not support.
     Kind(RowKind),
-    /// Torques in this format.
+    /// A torque format that the cell does not support.
     Format(TorqueFormat),
 }
 
@@ -70,13 +71,13 @@ impl Abilities {
             | Self::Q7_8,
     );
 
-    /// Decodes the word.
+    /// Decodes the abilities from their word.
     #[must_use]
     pub const fn from_word(word: i16) -> Self {
         Self(word.cast_unsigned())
     }
 
-    /// Returns the word.
+    /// Returns the abilities as a word.
     #[must_use]
     pub const fn word(self) -> i16 {
         self.0.cast_signed()
@@ -102,7 +103,7 @@ impl Abilities {
         self.0 & bit != 0
     }
 
-    /// Returns the first ability that `parameters` require and the cell lacks.
+    /// Returns the first ability that `parameters` require and the cell lacks; `None` if it lacks none.
     #[must_use]
     pub fn first_missing(self, parameters: &Parameters) -> Option<MissingAbility> {
         let (joints, table) = (usize::from(parameters.joints), parameters.table());

@@ -1,19 +1,20 @@
-//! The baseline of a cell's force sensor, parameter 11: the reading without a touch.
+//! The baseline settings of a cell's force sensor, parameters 11 and 12. The baseline is the sensor's reading without a
+//! touch.
 
 use crate::fixed::{Q1_14, Q5_10};
 use crate::packet::{self, WORDS};
 
-/// The baseline mode, parameter 11. Volatile: a cell starts with [`Baseline::Off`].
+/// The baseline mode, parameter 11. It is volatile: a cell starts with [`Baseline::Off`].
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Baseline {
-    /// The raw sensor value is used.
+    /// The cell uses the raw sensor value.
     #[default]
     Off,
-    /// The zero found by a tare is subtracted.
+    /// The cell subtracts the zero that a tare has found from the sensor value.
     On(BaselineSettings),
 }
 
-/// The way a cell finds its zero and follows its drift.
+/// The settings with which a cell finds the zero of its force sensor and follows the drift of the sensor.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct BaselineSettings {
     /// Force above the zero from which the cell counts as touched, in N; greater than 0.
@@ -32,7 +33,7 @@ impl Baseline {
     const HOLD: i16 = 1;
     const FOLLOW: i16 = 2;
 
-    /// Encodes the words of the parameter.
+    /// Encodes the mode as the words of parameter 11.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
         let Self::On(zeroing) = self else { return [0; WORDS] };
@@ -47,8 +48,8 @@ impl Baseline {
         ])
     }
 
-    /// Decodes the words. Returns `None` if they are invalid: an undefined mode, a threshold of 0 or below, a
-    /// hysteresis outside 0 to 1, a negative limit, or a zero that follows at a rate of 0.
+    /// Decodes the words of parameter 11. Returns `None` for an undefined mode, a threshold of 0 or below, a hysteresis
+    /// outside 0 to 1, a negative limit, or the mode *follow* with a rate of 0.
     #[must_use]
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
         let [mode, threshold, hysteresis, rate, limit, n_per_c] = words;
@@ -72,16 +73,16 @@ impl Baseline {
 /// A tare command: a write of parameter 12.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Tare {
-    /// 0: forgets the zero; it is found again as after a start.
+    /// 0: discards the zero. The cell finds a new one as after a start.
     Forget,
-    /// 1: uses the present reading as zero, unless the cell is touched.
+    /// 1: takes the present reading as the zero, unless the cell is touched.
     Untouched,
-    /// 2: uses the present reading as zero, even if the cell is touched.
+    /// 2: takes the present reading as the zero, even if the cell is touched.
     Forced,
 }
 
 impl Tare {
-    /// Decodes the words. Returns `None` for an undefined command.
+    /// Decodes the words of parameter 12. Returns `None` for an undefined command.
     #[must_use]
     pub const fn from_words(words: [i16; WORDS]) -> Option<Self> {
         match words {

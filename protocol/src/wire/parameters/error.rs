@@ -8,7 +8,7 @@ use super::{MAX_JOINTS, MAX_ROWS};
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ParameterError {
-    /// The parameter does not exist, or cannot be written this way.
+    /// The parameter does not exist, or is not one that is written and stored.
     #[error("parameter {0} cannot be written")]
     NotWritable(u8),
     /// The number of joints is out of range.
@@ -28,7 +28,7 @@ pub enum ParameterError {
     /// The normal does not have unit length.
     #[error("the outward normal has length^2 {got} / 2^28; within 1/64 of 2^28 is allowed")]
     Normal {
-        /// The square of its length, in steps of 2^-28.
+        /// Square of the length, in steps of 2^-28.
         got: i64,
     },
     /// A gain or threshold is negative.
@@ -39,7 +39,7 @@ pub enum ParameterError {
         /// The value of the word.
         got: i16,
     },
-    /// The broadcast period is zero.
+    /// The period of the joint broadcast is zero.
     #[error("a joint broadcast every 0 us is not possible")]
     Period,
     /// The number of rows is out of range, or does not match the joints.
@@ -50,7 +50,7 @@ pub enum ParameterError {
         /// The number of joints of the chain.
         joints: i16,
     },
-    /// The row that carries the cell does not follow its joint.
+    /// The row that carries the cell is not the row of its joint or a fixed row after it.
     #[error("row {got} of {rows} does not follow the joint that moves the cell")]
     Row {
         /// The requested row.

@@ -1,7 +1,7 @@
 //! The parameters of a cell: the robot's table, the cell's pose, its gains and thresholds, as words on the
 //! bus and in flash.
 //!
-//! Each parameter is the six words of one packet. Unused words are ignored, and are stored and answered as 0:
+//! Each parameter is the six words of one packet. Unused words are ignored when written, and are stored and read as 0:
 //!
 //! | number | parameter | words |
 //! |---|---|---|
@@ -42,7 +42,7 @@ use crate::packet::{MAX_WORDS, WORDS, crc16_of_parts, padded_words};
 pub const MAX_JOINTS: usize = MAX_WORDS;
 /// Maximum number of rows of a chain's table.
 pub const MAX_ROWS: usize = 32;
-/// Number of rows in every image; rows of a longer chain follow them.
+/// Minimum number of rows in a flash image. The rows of a chain with more than six follow.
 const IMAGE_ROWS: usize = 6;
 /// The parameter number of row 1.
 const FIRST_ROW: u8 = 16;
@@ -77,16 +77,16 @@ pub enum Parameter {
     Baseline,
     /// 12: a tare command.
     Tare,
-    /// 16 to 47: one row of the chain's table, counted from 0.
+    /// 16 to 47: one row of the chain's table. The index is counted from 0.
     Row(u8),
     /// 127: stores and activates the written parameters.
     Commit,
 }
 
-/// The stored parameters before the rows, in the order in which they are hashed.
+/// The stored parameters other than rows. They are hashed in this order, before the rows.
 const STORED: [Parameter; 4] = [Parameter::Mount, Parameter::Pose, Parameter::Contact, Parameter::Timing];
 
-/// Every parameter except the rows, with its number.
+/// The number of every parameter other than the rows.
 const NUMBERS: [(Parameter, u8); 13] = [
     (Parameter::Identity, 0),
     (Parameter::Mount, 1),
@@ -111,13 +111,13 @@ impl Parameter {
         STORED.into_iter().chain((0..).take(rows).map(Self::Row))
     }
 
-    /// Returns true if the parameter is kept in flash.
+    /// Returns true if the cell keeps the parameter in flash.
     #[must_use]
     pub fn is_stored(self) -> bool {
         matches!(self, Self::Row(_)) || STORED.contains(&self)
     }
 
-    /// Returns the parameter with this number, if it exists.
+    /// Returns the parameter with this number; `None` for other numbers.
     #[must_use]
     pub fn from_number(number: u8) -> Option<Self> {
         if (FIRST_ROW..END_ROW).contains(&number) {
@@ -126,7 +126,7 @@ impl Parameter {
         NUMBERS.iter().find(|(_, known)| *known == number).map(|(parameter, _)| *parameter)
     }
 
-    /// Returns the parameter number. A row that does not exist has the number of the commit.
+    /// Returns the number of the parameter. For a row above the 32nd, returns the number of the commit.
     #[must_use]
     pub fn number(self) -> u8 {
         if let Self::Row(row) = self
@@ -137,7 +137,7 @@ impl Parameter {
         NUMBERS.iter().find(|(known, _)| *known == self).map_or(127, |(_, number)| *number)
     }
 
-    /// Returns true if a write takes effect at once and is lost at a restart.
+    /// Returns true if a write of the parameter takes effect at once and is lost when the cell restarts.
     #[must_use]
     pub const fn is_volatile(self) -> bool {
         matches!(
@@ -152,8 +152,8 @@ impl Parameter {
         )
     }
 
-    /// Returns true if a cell accepts these words. Stored parameters are accepted here and checked at the
-    /// commit.
+    /// Returns true if a cell accepts these words for the parameter. Words of stored parameters are always accepted
+    /// here, because they are checked at the commit.
     #[must_use]
     pub fn accepts(self, words: [i16; WORDS]) -> bool {
         match self {
@@ -180,11 +180,11 @@ impl Parameter {
 pub struct Pose {
     /// Position in m.
     pub position: [Q1_14; 3],
-    /// Outward unit normal; contact forces push against it.
+    /// Outward unit normal. Contact forces act against it.
     pub normal: [Q1_14; 3],
 }
 
-/// Gains and thresholds of the paper's Algorithm 1.
+/// Gains and thresholds of the paper's Algorithm 1, which fuses contact force and proximity.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Contact {
     /// Gain of the contact force.
@@ -206,10 +206,10 @@ pub struct Parameters {
     pub joint: u8,
     /// Number of joints of the chain, 1 to 14.
     pub joints: u8,
-    /// The row that carries the cell, 1 to `table_rows`. It is 0 if `table_rows` is 0: then row k carries the
-    /// cell.
+    /// Number of the row that carries the cell, 1 to `table_rows`. If `table_rows` is 0, it is also 0, and row k
+    /// carries the cell.
     pub row: u8,
-    /// Number of rows of the chain, `joints` to 32. 0 stands for one revolute row per joint.
+    /// Number of rows of the chain, `joints` to 32. The value 0 means that each joint has one revolute row.
     pub table_rows: u8,
     /// The format of the cell's own torque.
     pub torque_format: TorqueFormat,
@@ -217,9 +217,9 @@ pub struct Parameters {
     pub pose: Pose,
     /// Gains and thresholds.
     pub contact: Contact,
-    /// The period of the joint broadcast in µs. Joints older than this are skipped.
+    /// The period of the joint broadcast in µs. A joints message that arrives later than this is skipped.
     pub period_us: u16,
-    /// The table of the chain; unused rows are zero.
+    /// Table of the chain. Unused rows are zero.
     pub rows: [Row; MAX_ROWS],
 }
 
@@ -247,9 +247,9 @@ impl Default for Parameters {
     }
 }
 
-/// Size of the image of a chain with up to 6 rows, in bytes.
+/// Size in bytes of the image for a chain with up to 6 rows.
 pub const IMAGE_BYTES: usize = (STORED.len() + IMAGE_ROWS) * WORDS * 2;
-/// Size of the image of a chain with 32 rows, in bytes.
+/// Size in bytes of the image for a chain with 32 rows.
 pub const MAX_IMAGE_BYTES: usize = (STORED.len() + MAX_ROWS) * WORDS * 2;
 
 /// The stored parameters as bytes: [`IMAGE_BYTES`], and 12 more for each row after the sixth.
@@ -289,7 +289,7 @@ impl Parameters {
         }
     }
 
-    /// Sets one parameter from its words. [`Parameters::check`] validates the result as a whole.
+    /// Sets one parameter from its words. [`Parameters::check`] validates all parameters together.
     ///
     /// # Errors
     /// Returns an error if the parameter is not stored, a count does not fit a byte, or the kind of a row or
@@ -342,10 +342,10 @@ impl Parameters {
         Ok(())
     }
 
-    /// Checks that a cell can compute with these parameters.
+    /// Checks that the parameters are valid and consistent, so that a cell can compute torques with them.
     ///
     /// # Errors
-    /// Returns the first error: in the joints, the normal, the gains and thresholds, the period or the rows.
+    /// Returns the first error found in the joints, the normal, the gains and thresholds, the period or the rows.
     pub fn check(&self) -> Result<(), ParameterError> {
         let (joint, joints) = (i16::from(self.joint), i16::from(self.joints));
         if self.joints == 0 || usize::from(self.joints) > MAX_JOINTS {
@@ -369,7 +369,8 @@ impl Parameters {
         self.check_rows(joints)
     }
 
-    /// Checks that the rows have as many joints as the chain, and that the row of the cell follows joint k.
+    /// Checks that the table has as many rows with a joint as the chain has joints, and that the cell's row is the row
+    /// of joint k or a fixed row after it.
     fn check_rows(&self, joints: i16) -> Result<(), ParameterError> {
         let (row, rows) = (i16::from(self.row), i16::from(self.table_rows));
         let moving = |rows: &[Row]| rows.iter().filter(|row| row.moves()).count();
@@ -389,26 +390,26 @@ impl Parameters {
         Ok(())
     }
 
-    /// Returns true if all rows in use are revolute.
+    /// Returns true if all rows of the chain are revolute.
     fn is_plain(&self) -> bool {
         self.table().iter().all(|row| row.kind == RowKind::Revolute)
     }
 
-    /// Returns the rows of the whole chain.
+    /// Returns the rows of the whole chain, from base to tip.
     #[must_use]
     pub fn table(&self) -> &[Row] {
         let rows = if self.table_rows == 0 { self.joints } else { self.table_rows };
         self.rows.get(..usize::from(rows)).unwrap_or_default()
     }
 
-    /// Returns the rows from the base to the cell.
+    /// Returns the rows from the base to the row that carries the cell.
     #[must_use]
     pub fn chain(&self) -> &[Row] {
         let row = if self.row == 0 { self.joint } else { self.row };
         self.rows.get(..usize::from(row)).unwrap_or_default()
     }
 
-    /// Returns equivalent parameters in the shortest form: row numbers are 0 where they follow from the
+    /// Returns equivalent parameters in the shortest form, in which the row numbers are 0 if they follow from the
     /// joints.
     #[must_use]
     pub fn shortest_form(self) -> Self {
@@ -426,7 +427,7 @@ impl Parameters {
         self.image_parts().flatten().collect()
     }
 
-    /// Returns the parts of [`Parameters::image`], one parameter each, for callers with a small stack.
+    /// Returns [`Parameters::image`] in pieces of one parameter each, for callers with a small stack.
     pub fn image_parts(&self) -> impl Iterator<Item = [u8; WORDS * 2]> {
         Parameter::stored(self.table().len()).map(|parameter| self.image_part(parameter))
     }
@@ -444,8 +445,8 @@ impl Parameters {
     /// Decodes an image and checks it.
     ///
     /// # Errors
-    /// Returns an error if [`Parameters::set`] or [`Parameters::check`] refuses it, or its length does not
-    /// match its rows.
+    /// Returns an error if [`Parameters::set`] or [`Parameters::check`] rejects the parameters, or the length of the
+    /// image does not match its number of rows.
     pub fn from_image(image: &[u8]) -> Result<Self, ParameterError> {
         let mut parameters = Self::default();
         let mut words = image.as_chunks::<2>().0.as_chunks::<WORDS>().0.iter();
@@ -462,7 +463,7 @@ impl Parameters {
         Ok(parameters)
     }
 
-    /// Returns the configuration hash of heartbeats: the CRC-16 of packets over [`Parameters::image`].
+    /// Returns the configuration hash, as sent in heartbeats: the CRC-16 of packets over [`Parameters::image`].
     #[must_use]
     pub fn hash(&self) -> u16 {
         crc16_of_parts(self.image_parts())

@@ -4,20 +4,20 @@ use super::ParameterError;
 use crate::fixed::Q1_14;
 use crate::packet::{WORDS, padded_words};
 
-/// The joint of a row.
+/// The kind of a row, by its joint.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum RowKind {
-    /// A revolute joint about z: its position is added to theta.
+    /// A revolute joint about the z axis. The joint position is added to theta.
     #[default]
     Revolute,
-    /// A prismatic joint along z: its position, in m, is added to d.
+    /// A prismatic joint along the z axis. The joint position, in m, is added to d.
     Prismatic,
     /// A fixed row, without a joint.
     Fixed,
 }
 
 impl RowKind {
-    /// All kinds. The index of a kind is its number in a parameter.
+    /// All kinds. The index of a kind is its number in the parameter of a row.
     pub const ALL: [Self; 3] = [Self::Revolute, Self::Prismatic, Self::Fixed];
 
     /// Returns the name of the kind.
@@ -42,7 +42,8 @@ pub struct Row {
     pub d: Q1_14,
     /// Twist in quarter turns.
     pub alpha: Q1_14,
-    /// Angle added to the joint position, in quarter turns; the whole angle of a row that does not turn.
+    /// Angle in quarter turns. In a revolute row, the joint position is added to it; in other rows it is the whole
+    /// angle.
     pub theta_offset: Q1_14,
 }
 
@@ -62,14 +63,14 @@ impl Row {
         self.kind != RowKind::Fixed
     }
 
-    /// Encodes the words of the parameter.
+    /// Encodes the row as the words of its parameter.
     #[must_use]
     pub(super) fn words(self) -> [i16; WORDS] {
         let [a, d, alpha, theta_offset] = [self.a, self.d, self.alpha, self.theta_offset].map(Q1_14::to_bits);
         padded_words([a, d, alpha, theta_offset, self.kind as i16])
     }
 
-    /// Decodes the words. `row` is counted from 0.
+    /// Decodes the words of a row's parameter. `row` is the index of the row, from 0, for errors.
     pub(super) fn from_words(row: u8, words: [i16; WORDS]) -> Result<Self, ParameterError> {
         let [a, d, alpha, theta_offset, kind, _] = words;
         let known = usize::try_from(kind).ok().and_then(|kind| RowKind::ALL.get(kind));

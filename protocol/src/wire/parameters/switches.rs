@@ -1,32 +1,32 @@
-//! Volatile parameters that are set at run time: 6 to 9. The baseline is volatile too, but has its own
-//! module.
+//! Volatile parameters that the gateway sets at run time: 6 to 9. The baseline is volatile too, but has its own module.
 
 use crate::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use crate::packet::{self, WORDS};
 
-/// The reply to joints, parameter 6. Volatile: a cell starts with [`Reply::Torque`].
+/// The message with which a cell replies to joints, parameter 6. It is volatile: a cell starts with [`Reply::Torque`].
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Reply {
-    /// The cell's own torque, Q3.12.
+    /// The cell's own torque, in the torque format of its parameters.
     #[default]
     Torque,
-    /// The sum of its own and its children's torques, Q7.8, in slots by depth.
+    /// The sum of the cell's own torque and those of its children in the tree, in Q7.8. Cells send at times that depend
+    /// on their depth.
     Sum(Slots),
 }
 
-/// The schedule of sums.
+/// The schedule by which the cells of a tree send their sums, the deepest first.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Slots {
     /// Width of a slot in µs.
     pub slot_us: u16,
     /// Depth of the deepest cell; a root has depth 0. A cell at depth d sends in slot `deepest - d`.
     pub deepest: u8,
-    /// True if the rounding error is carried into the cell's next value.
+    /// True if a cell adds the rounding error of a sum to its next sum.
     pub carry: bool,
 }
 
 impl Reply {
-    /// Encodes the words of the parameter.
+    /// Encodes the reply as the words of parameter 6.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
         match self {
@@ -37,8 +37,8 @@ impl Reply {
         }
     }
 
-    /// Decodes the words. Returns `None` if they are invalid: an undefined reply, a slot of 0, a depth above
-    /// 253, or a carry other than 0 and 1.
+    /// Decodes the words of parameter 6. Returns `None` for an undefined reply, a slot of 0, a depth above 253, or a
+    /// carry other than 0 and 1.
     #[must_use]
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
         match words {
@@ -53,24 +53,23 @@ impl Reply {
     }
 }
 
-/// The times at which a cell sends measurements without a request, parameter 7. Volatile: a cell starts with
-/// [`Sensing::Off`].
+/// The times at which a cell sends measurements, parameter 7. It is volatile: a cell starts with [`Sensing::Off`].
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Sensing {
-    /// Only in response to a report command.
+    /// Measurements are sent only in response to a report command.
     #[default]
     Off,
-    /// Periodically.
+    /// Measurements are sent periodically.
     Continuous {
         /// The period in ms.
         period_ms: u16,
     },
-    /// When a value exceeds a threshold or is released, and with each heartbeat.
+    /// Measurements are sent when a value exceeds its threshold or is released, and with each heartbeat.
     Event,
 }
 
 impl Sensing {
-    /// Encodes the words of the parameter.
+    /// Encodes the mode as the words of parameter 7.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
         match self {
@@ -80,7 +79,7 @@ impl Sensing {
         }
     }
 
-    /// Decodes the words. Returns `None` for an undefined mode or a period of 0.
+    /// Decodes the words of parameter 7. Returns `None` for an undefined mode or a period of 0.
     #[must_use]
     pub const fn from_words(words: [i16; WORDS]) -> Option<Self> {
         match words {
@@ -94,8 +93,7 @@ impl Sensing {
     }
 }
 
-/// The changes of measurements that are events, parameter 8. Volatile: a cell starts with
-/// [`Events::default`].
+/// The thresholds of event mode, parameter 8. They are volatile: a cell starts with [`Events::default`].
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Events {
     /// Threshold of each contact word, in N.
@@ -111,7 +109,7 @@ pub struct Events {
 }
 
 impl Default for Events {
-    /// Thresholds of 0.1 N, 0.05, 0.5 °C and 0.1 g, and a hysteresis of one half.
+    /// Returns thresholds of 0.1 N, 0.05, 0.5 °C and 0.1 g, and a hysteresis of one half.
     fn default() -> Self {
         Self {
             contact: Q5_10::from_bits(102),
@@ -124,7 +122,7 @@ impl Default for Events {
 }
 
 impl Events {
-    /// Encodes the words of the parameter.
+    /// Encodes the thresholds as the words of parameter 8.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
         packet::padded_words([
@@ -136,7 +134,7 @@ impl Events {
         ])
     }
 
-    /// Decodes the words. Returns `None` if a word is negative or the hysteresis is above 1.
+    /// Decodes the words of parameter 8. Returns `None` if a word is negative or the hysteresis is above 1.
     #[must_use]
     pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
         let [thresholds @ .., _] = words;
@@ -153,13 +151,13 @@ impl Events {
 }
 
 impl LinksDown {
-    /// Encodes the words of the parameter.
+    /// Encodes the mask as the words of parameter 9.
     #[must_use]
     pub fn words(self) -> [i16; WORDS] {
         packet::padded_words([i16::from(self.ports)])
     }
 
-    /// Decodes the words; bits without a port are ignored.
+    /// Decodes the words of parameter 9. Bits without a port are ignored.
     #[must_use]
     pub const fn from_words(words: [i16; WORDS]) -> Self {
         let [deaf, ..] = words;
@@ -167,8 +165,8 @@ impl LinksDown {
     }
 }
 
-/// The ports of a cell that receive nothing, neither messages nor sums, parameter 9. A bench takes a link
-/// down with it, one direction at each end. Effective only in test mode.
+/// The ports of a cell that receive neither messages nor sums, parameter 9. A bench uses it to interrupt a link: each
+/// end stops one direction. It is effective only in test mode.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct LinksDown {
     /// Bit p is set if port p receives nothing; bit 4 is the wire to the gateway's side.

@@ -1,4 +1,4 @@
-//! Fields of a packet: the position of their bits, their format and their values.
+//! Fields of a packet: the position of a field's bits, their format and their values.
 
 use serde::Deserialize;
 
@@ -7,7 +7,7 @@ use crate::packet::{MAX_WORDS, WORDS};
 
 /// Size of six words in bytes.
 const WORD_BYTES: usize = 2 * WORDS;
-/// The index of the count byte; in joints, it is the number of joints in use.
+/// Index of the count byte. In a joints packet, this byte is the number of joints in use.
 const COUNT: usize = WORD_BYTES + 1;
 
 /// The format of a field's bits.
@@ -21,9 +21,9 @@ pub enum FieldFormat {
     Unsigned(u8),
     /// A signed word.
     Signed,
-    /// A signed word that selects a name in [`Field::names`].
+    /// A signed word that stands for a name in [`Field::names`].
     Choice,
-    /// A flag in the lowest of this many bits.
+    /// A flag in the lowest bit of a field of this many bits.
     Flag(u8),
     /// A word in hexadecimal.
     Hex,
@@ -35,15 +35,15 @@ pub enum FieldFormat {
     Saturating(u32),
     /// Like `Saturating`, with the fraction bits of the bus' torque format.
     Torque,
-    /// The sum of three neighbouring words with this many fraction bits, which are fields of their own.
+    /// The sum of three neighbouring words with this many fraction bits. Each word is also a field.
     Total(u32),
     /// An angle in quarter turns, shown in rad.
     Angle,
-    /// Like `Angle`, for the joints in use, whose number is in byte 13.
+    /// Like `Angle`, with one element per joint in use. Byte 13 contains the number of joints in use.
     Position,
-    /// A port in 8 bits; the last number is the uplink to the gateway's side.
+    /// A port number of 8 bits. The highest number is the uplink to the gateway's side.
     Port,
-    /// This many bits, in which bit p stands for port p. The second number is the number of ports.
+    /// A field of this many bits, of which bit p stands for port p. The second number is the number of ports.
     Ports(u8, u8),
     /// A state word: [`crate::message::State`].
     State,
@@ -51,9 +51,9 @@ pub enum FieldFormat {
     Parameter(u8),
     /// A page number of this many bits, which selects the layout of the words.
     Page(u8),
-    /// The reason of a refusal: [`super::reasons`].
+    /// The reason of a refusal, a number in [`super::reasons`].
     Reason,
-    /// Fields within a word.
+    /// Several fields within one word.
     Group(Vec<Field>),
 }
 
@@ -66,13 +66,13 @@ pub enum FieldRange {
     All,
     /// Zero and above.
     NotNegative,
-    /// Zero and above; checked only by the cell, at the commit.
+    /// Zero and above. Only the cell checks this, at the commit.
     NotNegativeAtCommit,
     /// Values between these bounds, inclusive.
     Within(u16, u16),
 }
 
-/// The representation of a field whose condition `when` is false.
+/// The representation in JSON of a field whose condition `when` is false.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq)]
 #[serde(rename_all = "snake_case")]
 pub enum Absent {
@@ -83,15 +83,16 @@ pub enum Absent {
     Null,
 }
 
-/// A field of a packet, or several neighbouring words with one meaning.
+/// A field of a packet: one value, or several neighbouring words with one meaning.
 #[derive(Clone, Debug, Default, Deserialize, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Field {
-    /// The name in JSON and on the command line, ending with the unit. Empty for a field that only a DBC has.
+    /// Name of the field in JSON and on the command line, ending with the unit. Empty for a field that appears only in
+    /// DBC files.
     pub name: String,
-    /// The signal name in a DBC, if it differs; `{}` stands for the label.
+    /// Name of the signal in a DBC file, if it differs from `name`; `{}` stands for the label of an element.
     pub signal: String,
-    /// The position of the first bit: see [`Field::at`].
+    /// Index of the word with the field's first bit; see [`Field::at`].
     word: u8,
     byte: u8,
     bit: u8,
@@ -101,20 +102,20 @@ pub struct Field {
     pub unit: String,
     /// The valid values.
     pub range: FieldRange,
-    /// The names of the elements, if the field has several words.
+    /// Names of the elements, if the field has more than one.
     pub labels: Vec<String>,
-    /// Values with a name.
+    /// Values that have a name, with this name.
     pub names: Vec<(i16, String)>,
-    /// The condition of the field: the first field of its layout lies within these bounds, inclusive. Without
-    /// bounds the field is always present.
+    /// Condition for the presence of the field: the first field of the layout must lie within these bounds, inclusive.
+    /// Without bounds the field is always present.
     when: Option<[u16; 2]>,
-    /// The representation while the condition is false.
+    /// Representation of the field while the condition is false.
     pub absent: Absent,
-    /// True if it may be omitted on the command line; its value is then 0.
+    /// True if the field may be omitted on the command line. The value is then 0.
     pub optional: bool,
-    /// A description of further restrictions on its values.
+    /// Description of further restrictions on the values.
     pub allowed: String,
-    /// The meaning, in one line.
+    /// Meaning of the field, in one line.
     pub meaning: String,
 }
 
@@ -125,7 +126,7 @@ impl Field {
         usize::from(self.word) * 16 + usize::from(self.byte) * 8 + usize::from(self.bit)
     }
 
-    /// Returns the bits of one element, its fraction bits, and true if it is two's complement.
+    /// Returns the number of bits of one element, the number of its fraction bits, and true if it is two's complement.
     fn shape(&self) -> (u8, u32, bool) {
         match self.format {
             FieldFormat::Unsigned(bits)
@@ -169,14 +170,14 @@ impl Field {
         if self.labels.is_empty() { 1 } else { self.labels.len() }
     }
 
-    /// Returns true if the number of elements varies with the length of the packet.
+    /// Returns true if the number of elements depends on the length of the packet.
     #[must_use]
     pub fn varies_with_chain(&self) -> bool {
         self.labels.len() == MAX_WORDS
     }
 
-    /// Returns the raw value of an element in [`crate::packet::Packet::fields`], with its sign; 0 beyond the
-    /// end.
+    /// Returns the raw value of an element, sign-extended if the field is signed. `bytes` are those of
+    /// [`crate::packet::Packet::fields`]; an element beyond their end is 0.
     #[must_use]
     pub fn raw(&self, bytes: &[u8], element: usize) -> i64 {
         // Epoch and count follow the sixth word.
@@ -188,14 +189,14 @@ impl Field {
         if self.is_signed() && bits >> (width - 1) == 1 { bits - (1 << width) } else { bits }
     }
 
-    /// Returns the sum of the field's word and the two after it.
+    /// Returns the sum of the field's word and the two words after it.
     #[must_use]
     pub fn total(&self, bytes: &[u8]) -> f64 {
         (0..3).map(|element| self.real(self.raw(bytes, element))).sum()
     }
 
-    /// Returns the number of elements in use: the joints in use for positions, the words of the packet for
-    /// other fields that vary with it, otherwise all.
+    /// Returns the number of elements in use: for positions the joints in use, for other fields whose length varies the
+    /// words of the packet, else all elements.
     #[must_use]
     pub fn elements_in(&self, bytes: &[u8]) -> usize {
         let there = bytes.len().saturating_sub(WORD_BYTES + 2) / 2 + WORDS;
@@ -206,13 +207,13 @@ impl Field {
         }
     }
 
-    /// Returns the name of a value.
+    /// Returns the name of a value; `None` if it has no name.
     #[must_use]
     pub fn name_of(&self, raw: i64) -> Option<&str> {
         self.names.iter().find(|(value, _)| i64::from(*value) == raw).map(|(_, name)| name.as_str())
     }
 
-    /// Returns the value of a name.
+    /// Returns the value that a name stands for; `None` for an unknown name.
     #[must_use]
     pub fn value_of(&self, name: &str) -> Option<i16> {
         self.names.iter().find(|(_, known)| known == name).map(|(value, _)| *value)
@@ -224,7 +225,7 @@ impl Field {
         matches!(self.format, FieldFormat::Saturating(_) | FieldFormat::Torque)
     }
 
-    /// Returns true if the field is present in these bytes of a packet; `first` is the first field of its
+    /// Returns true if the field is present in the packet with these bytes. `first` is the first field of the same
     /// layout.
     #[must_use]
     pub fn is_present(&self, bytes: &[u8], first: &Self) -> bool {
@@ -255,7 +256,7 @@ impl Field {
         }
     }
 
-    /// Returns the name without the unit.
+    /// Returns the name of the field without its unit.
     #[must_use]
     pub fn bare_name(&self) -> &str {
         match self.name.rsplit_once('_') {

@@ -1,4 +1,4 @@
-//! The schema file, `schema.toml`.
+//! The types of the schema file, `schema.toml`, and its content.
 
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
@@ -15,26 +15,26 @@ static SCHEMA: LazyLock<Schema> = LazyLock::new(|| {
     Schema::from(file)
 });
 
-/// Returns every kind of packet and every command, in the order of their identifiers.
+/// Returns the schema of every kind of packet and every command, in the order of their identifiers.
 #[must_use]
 pub fn packets() -> &'static [PacketSchema] {
     &SCHEMA.packets
 }
 
-/// Returns the parameters, in the order of their numbers.
+/// Returns the layout of every parameter, in the order of their numbers.
 #[must_use]
 pub fn parameters() -> &'static [Layout] {
     &SCHEMA.parameters
 }
 
-/// Returns the messages over wires, by their first byte. Hello and return have no text, because their fields
-/// depend on several other fields.
+/// Returns the layouts of the messages over wires, by their first byte. Hello and return have no human-readable text
+/// here, because their text depends on several fields together.
 #[must_use]
 pub fn wires() -> &'static [Layout] {
     &SCHEMA.wires
 }
 
-/// Returns the reasons of refusals, each with its number.
+/// Returns the reasons of refusals. Each is a number and its meaning.
 #[must_use]
 pub fn reasons() -> &'static [(i16, String)] {
     &SCHEMA.reasons
@@ -45,7 +45,7 @@ pub(super) fn empty() -> &'static Layout {
     &SCHEMA.empty
 }
 
-/// The layout of words with an unknown meaning.
+/// Returns the layout of six words with unknown meaning.
 pub(super) fn unknown() -> &'static Layout {
     &SCHEMA.unknown
 }
@@ -59,40 +59,40 @@ struct Schema {
     unknown: Layout,
 }
 
-/// One part of a human-readable text.
+/// One alternative of a human-readable text, used for some values of a number.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TextPart {
-    /// The part is used while a number lies within these bounds, inclusive.
+    /// Bounds of the number, inclusive, within which this alternative is used.
     pub when: [u16; 2],
-    /// The field with that number; by default the one that selects a part.
+    /// Name of the field with the number; `None` for the number that the layout or packet defines.
     pub of: Option<String>,
-    /// The pieces of the text.
+    /// Pieces of the text.
     pub pieces: Vec<TextPiece>,
 }
 
-/// A piece of a text.
+/// A piece of a human-readable text.
 #[derive(Clone, Debug, PartialEq)]
 pub enum TextPiece {
     /// Literal text.
     Literal(String),
-    /// `{name}`: a field; `{name:3}`: with this many decimals; `{}`: the text of the page.
+    /// The value of a field: `{name}`, or `{name:3}` with this many decimals. `{}` stands for the text of the page.
     Field {
-        /// The name of the field.
+        /// Name of the field.
         name: String,
-        /// Digits after the decimal point.
+        /// Number of digits after the decimal point.
         decimals: usize,
     },
-    /// `{name?no|yes}`: one of two texts, selected by a field.
+    /// One of two texts, selected by a field: `{name?no|yes}`.
     Either {
-        /// The name of the field.
+        /// Name of the field.
         name: String,
-        /// The text for values other than 1, and the text for 1.
+        /// Text for values other than 1, and text for the value 1.
         words: [String; 2],
     },
 }
 
 impl TextPiece {
-    /// Parses the text between braces.
+    /// Parses the text of a piece between its braces.
     fn parse_braces(text: &str) -> Self {
         if let Some((name, (no, yes))) =
             text.split_once('?').and_then(|(name, words)| Some((name, words.split_once('|')?)))
@@ -138,22 +138,22 @@ impl<'de> Deserialize<'de> for TextPart {
 #[derive(Clone, Debug, Default, Deserialize, PartialEq)]
 #[serde(default, deny_unknown_fields)]
 pub struct Layout {
-    /// The number of the page or parameter; 0 for a kind with a single layout.
+    /// Number of the page or parameter; 0 for a kind with a single layout.
     pub number: u8,
-    /// The number of consecutive numbers with this layout; `{}` in its name stands for 1, 2 and so on.
+    /// Number of consecutive pages or parameters with this layout. In `name`, `{}` then stands for 1, 2 and so on.
     times: Option<u8>,
-    /// The name; empty where the name of the packet suffices.
+    /// Name of the page or parameter; empty if the name of the packet suffices.
     pub name: String,
-    /// The prefix of the signals in a DBC.
+    /// Prefix of the signal names in a DBC file.
     pub prefix: String,
-    /// The human-readable text; the number that selects a part is the first field.
+    /// Human-readable text. The first field selects an alternative, unless the alternative names another field.
     pub text: Vec<TextPart>,
-    /// The fields, in order.
+    /// Fields of the words, in order.
     pub fields: Vec<Field>,
 }
 
 impl Layout {
-    /// Returns one layout for each of its numbers.
+    /// Returns a copy of the layout for each page or parameter that it describes.
     fn expand(&self) -> impl Iterator<Item = Self> {
         (0..self.times.unwrap_or(1)).map(|index| {
             let named = |text: &str| text.replace("{}", &(index + 1).to_string());
@@ -170,13 +170,13 @@ pub struct PacketSchema {
     pub kind: Kind,
     /// The command, if the kind is [`Kind::Command`].
     pub command: Option<Command>,
-    /// The meaning, in a sentence or a few.
+    /// Meaning of the packet, in one or a few sentences.
     pub meaning: String,
-    /// The human-readable text; the number that selects a part is byte 13.
+    /// Human-readable text. Byte 13 selects an alternative, unless the alternative names a field.
     pub text: Vec<TextPart>,
-    /// The fields of bytes 12 and 13, in the order of JSON output.
+    /// Fields of bytes 12 and 13 (epoch and count), in the order of JSON output.
     pub end: Vec<Field>,
-    /// The layouts of the words, by page or parameter.
+    /// Layouts of the words, by page or parameter.
     pub layouts: Vec<Layout>,
 }
 

@@ -5,8 +5,8 @@
 //!   schema.toml ──> packets, parameters, messages over wires ──> Layout ──> Fields ──> raw bits, real values
 //! ```
 //!
-//! [`crate::message`] encodes and decodes packets as types. All code that displays, lists or parses fields by
-//! name uses these tables: `dump` (text and JSON), DBC files, `skinbus frame`, the tables of
+//! [`crate::message`] encodes and decodes packets as Rust types. All code that displays, lists or parses fields by name
+//! uses the tables of this module: `dump` (text and JSON), DBC files, `skinbus frame`, and the tables of
 //! `docs/reference/protocol.md`.
 
 mod field;
@@ -22,11 +22,11 @@ use crate::message::{FROM_NEXT_FLAG, Message, REFUSAL_NUMBER, Request, WRITE_FLA
 use crate::packet::{Packet, WORDS};
 use crate::parameters::Parameter;
 
-/// Bounds that contain every number.
+/// Bounds that contain every 16-bit number.
 const ALWAYS: [u16; 2] = [0, u16::MAX];
 
 impl PacketSchema {
-    /// Returns the schema of an identifier; `None` for an undefined command.
+    /// Returns the schema of packets with an identifier; `None` for an undefined command.
     #[must_use]
     pub fn for_id(id: Id) -> Option<&'static Self> {
         let is_it = |schema: &&Self| {
@@ -35,14 +35,14 @@ impl PacketSchema {
         packets().iter().find(is_it)
     }
 
-    /// Returns the fields of bytes 12 and 13 that apply with this layout.
+    /// Returns the fields of bytes 12 and 13 (epoch and count) that are defined for this layout.
     #[must_use]
     pub fn end(&self, layout: &Layout) -> &[Field] {
         if self.kind == Kind::Configured && layout.number == REFUSAL_NUMBER { &[] } else { &self.end }
     }
 }
 
-/// Returns the layout of a packet that [`Message::encode`] returned.
+/// Returns the layout of the words in a packet. `packet` is the encoding of `message`.
 #[must_use]
 pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
     let number = match packet.id.kind {
@@ -62,15 +62,15 @@ pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
     layouts.iter().find(|layout| layout.number == number).unwrap_or_else(file::empty)
 }
 
-/// Returns the layout of a parameter's words. Invalid words and unknown parameters get a layout of plain
-/// words.
+/// Returns the layout of the words of a parameter. Invalid words and unknown parameters get a layout of plain words
+/// without meaning.
 #[must_use]
 pub fn parameter_layout(number: u8, words: [i16; WORDS]) -> &'static Layout {
     let can_be = Parameter::from_number(number).is_some_and(|parameter| parameter.accepts(words));
     parameters().iter().find(|layout| can_be && layout.number == number).unwrap_or_else(file::unknown)
 }
 
-/// Returns the name of a parameter.
+/// Returns the name of the parameter with this number; `None` if it does not exist.
 #[must_use]
 pub fn parameter_name(number: u8) -> Option<&'static str> {
     parameters().iter().find(|layout| layout.number == number).map(|layout| layout.name.as_str())
@@ -82,7 +82,7 @@ pub fn find_parameter(name: &str) -> Option<&'static Layout> {
     parameters().iter().find(|layout| layout.name == name)
 }
 
-/// Returns the meaning of a refusal's reason.
+/// Returns the meaning of a refusal's reason, in words.
 #[must_use]
 pub fn reason(number: i64) -> &'static str {
     let found = reasons().iter().find(|(known, _)| i64::from(*known) == number);

@@ -3,7 +3,7 @@
 use super::*;
 use crate::packet::{Epoch, MAX_WORDS};
 
-/// Returns every layout with the fields of bytes 12 and 13 that go with it.
+/// Returns every layout, together with the fields of bytes 12 and 13 that are defined for it.
 fn all() -> impl Iterator<Item = (&'static [Field], &'static Layout)> {
     let packets = packets()
         .iter()

@@ -1,4 +1,4 @@
-//! Units and resolution of the words of joints, torques and sums on a bus.
+//! Units and resolution of the words in joints, torques and sums, which depend on the bus.
 
 use core::f64::consts::FRAC_PI_2;
 
@@ -6,8 +6,8 @@ use super::{Field, FieldFormat};
 use crate::fixed::TorqueFormat;
 use crate::skin::{JointKind, Skin};
 
-/// The properties of a bus that determine units: its torque format, and the prismatic joints of its chain.
-/// The default is Q3.12 and revolute joints.
+/// The properties of a bus on which units depend: the torque format, and which joints of the chain are prismatic. The
+/// default is Q3.12 and revolute joints only.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Units {
     torque: TorqueFormat,
@@ -31,7 +31,7 @@ impl Units {
         self.torque
     }
 
-    /// Returns the unit of a joint's torque. `joint` is the index in the chain, from 0.
+    /// Returns the unit of a joint's torque: Nm, or N for a prismatic joint. `joint` is the index in the chain, from 0.
     #[must_use]
     pub const fn torque_unit(self, joint: usize) -> &'static str {
         if self.slides(joint) {
@@ -45,14 +45,14 @@ impl Units {
         joint < 16 && self.prismatic >> joint & 1 == 1
     }
 
-    /// Returns true if the element of a field is a position or torque of a prismatic joint.
+    /// Returns true if the element of the field is the position or torque of a prismatic joint.
     fn is_prismatic(self, field: &Field, element: usize) -> bool {
         field.varies_with_chain() && self.slides(element)
     }
 }
 
 impl Field {
-    /// Returns the value of one step of an element, in [`Self::unit_in`].
+    /// Returns the value of one step of an element, in the unit [`Self::unit_in`].
     #[must_use]
     pub fn step_in(&self, element: usize, units: Units) -> f64 {
         let step = 1.0 / f64::from(1_u32 << self.fraction());
@@ -67,19 +67,19 @@ impl Field {
         }
     }
 
-    /// Converts the raw value of an element to [`Self::unit_in`].
+    /// Converts the raw value of an element to the unit [`Self::unit_in`].
     #[must_use]
     pub fn real_in(&self, raw: i64, element: usize, units: Units) -> f64 {
         f64::from(i16::try_from(raw).unwrap_or_default()) * self.step_in(element, units)
     }
 
-    /// Converts a raw value whose unit is the same on every bus.
+    /// Converts a raw value to the unit of the field, for fields whose unit is the same on every bus.
     #[must_use]
     pub fn real(&self, raw: i64) -> f64 {
         self.real_in(raw, 0, Units::default())
     }
 
-    /// Returns the unit of an element: that of the field, or m and N for prismatic joints.
+    /// Returns the unit of an element: that of the field, but m or N if the element belongs to a prismatic joint.
     #[must_use]
     pub fn unit_in(&self, element: usize, units: Units) -> &str {
         let (turns, slides) = (JointKind::Revolute, JointKind::Prismatic);

@@ -10,33 +10,33 @@ use crate::can::{
 /// A decoded line.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum SlcanLine {
-    /// A frame: received from the bus if an adapter wrote the line, to be sent if a host did. Its time stamp
-    /// is ignored.
+    /// A frame. If an adapter wrote the line, the frame was received from the bus; if a host did, it is to be sent. A
+    /// time stamp is ignored.
     Frame(Frame),
     /// A command of a host.
     Command(SlcanCommand),
-    /// An empty line: the acknowledgement of an adapter. Hosts send it too, without a meaning.
+    /// An empty line. From an adapter it is an acknowledgement; from a host it has no meaning.
     Done,
     /// `z` or `Z`: the adapter has accepted a frame for sending.
     Sent,
     /// BEL: the adapter refused a line.
     Failed,
-    /// A fault or the bus state, reported by an adapter. Only hosts decode it, because a board has no
-    /// adapter.
+    /// A fault or the bus state, reported by an adapter. Only hosts decode such lines; the firmware of a cell ignores
+    /// them.
     #[cfg(feature = "host")]
     Reported(AdapterReport),
-    /// Any other line of printable characters, such as the version of an adapter. To be ignored.
+    /// Any other line of printable characters, such as the version of an adapter. The caller ignores it.
     Other,
-    /// An invalid line, counted in [`Decoder::refused`].
+    /// An invalid line, which [`Decoder::refused`] counts.
     Refused(Refusal),
 }
 
-/// The reason of a refused line.
+/// The reason for which the decoder refused a line.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Refusal {
     /// The line contains an unprintable byte, or a frame contains a byte that is not a hexadecimal digit.
     Garbage,
-    /// The line is longer than [`MAX_LINE`], or than its DLC and a time stamp allow.
+    /// The line is longer than [`MAX_LINE`], or longer than a frame with its DLC and a time stamp.
     Long,
     /// The frame has fewer digits than its DLC requires, or has no DLC.
     Short,
@@ -46,18 +46,18 @@ pub enum Refusal {
     Identifier,
 }
 
-/// Numbers of refused lines, by reason. The counters saturate.
+/// Numbers of refused lines, by reason. Each counter saturates.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct RejectedLines {
-    /// [`Refusal::Garbage`].
+    /// Number of lines refused as [`Refusal::Garbage`].
     pub garbage: u32,
-    /// [`Refusal::Long`].
+    /// Number of lines refused as [`Refusal::Long`].
     pub long: u32,
-    /// [`Refusal::Short`].
+    /// Number of lines refused as [`Refusal::Short`].
     pub short: u32,
-    /// [`Refusal::Dlc`].
+    /// Number of lines refused as [`Refusal::Dlc`].
     pub dlc: u32,
-    /// [`Refusal::Identifier`].
+    /// Number of lines refused as [`Refusal::Identifier`].
     pub identifier: u32,
 }
 
@@ -81,8 +81,8 @@ impl RejectedLines {
     }
 }
 
-/// Decodes a serial line byte by byte. It never allocates and never panics, and decodes the next valid line
-/// after any input.
+/// A decoder for a serial line, byte by byte. It never allocates and never panics. After any invalid input, it decodes
+/// the next valid line.
 ///
 /// ```
 /// use protocol::can::Frame;
@@ -96,33 +96,32 @@ impl RejectedLines {
 pub struct Decoder {
     /// The bytes of the current line so far.
     line: heapless::Vec<u8, MAX_LINE>,
-    /// The reason for which the current line will be refused.
+    /// The reason for which the current line will be refused, if an error was found in it.
     fault: Option<Refusal>,
     refused: RejectedLines,
     endings: Endings,
 }
 
-/// Learns from earlier frames whether an adapter ends each frame with a digit for the state of the sender.
-/// Adapters do this for all frames or for none, so a line that lost a byte is not mistaken for one with
-/// another ending.
+/// Detects from earlier frames whether the adapter appends a digit for the sender's error state to each frame. Adapters
+/// do so for all frames or for none. A line that lost a byte is thus not mistaken for a line of the other form.
 #[derive(Clone, Debug, Default)]
 struct Endings {
     has_state: bool,
-    /// Number of consecutive frames with this ending.
+    /// Number of consecutive frames of the same form.
     run_length: u8,
-    /// True if the last frame had the other ending.
+    /// True if the last frame had the other form.
     deviated: bool,
 }
 
 impl Endings {
-    /// Number of frames after which a single frame with the other ending is refused; two in a row switch.
+    /// Number of frames of one form after which a single frame of the other form is refused. Two in a row are accepted.
     const CONFIRMED_AFTER: u8 = 16;
 
     const fn new() -> Self {
         Self { has_state: false, run_length: 0, deviated: false }
     }
 
-    /// Records the ending of a frame. Returns true if it is plausible.
+    /// Records the form of a frame. Returns true if the form is plausible after the earlier frames.
     const fn record(&mut self, has_state: bool) -> bool {
         if self.has_state == has_state {
             self.run_length = self.run_length.saturating_add(1);
@@ -140,7 +139,7 @@ impl Endings {
 }
 
 impl Decoder {
-    /// Creates a decoder before the first byte.
+    /// Creates a decoder that has received nothing yet.
     #[must_use]
     pub const fn new() -> Self {
         Self {
@@ -151,10 +150,10 @@ impl Decoder {
         }
     }
 
-    /// Processes one byte and returns the line that it ends, if any. The work per byte is bounded.
+    /// Processes one byte. Returns the line that ends with it, if any. The work per byte is bounded.
     ///
-    /// CR and LF both end a line, but an empty line that ends with LF is ignored. BEL is a line of its own;
-    /// an unfinished line before it is counted as garbage.
+    /// CR and LF both end a line; an empty line that ends with LF is ignored, so that CR LF ends only one. BEL is a
+    /// line of its own, and an unfinished line before it counts as garbage.
     pub fn push(&mut self, byte: u8) -> Option<SlcanLine> {
         match byte {
             CR => Some(self.end()),
@@ -185,8 +184,8 @@ impl Decoder {
         self.refused
     }
 
-    /// Discards an unfinished line whose sender is gone, and counts it as short. Returns true if there was
-    /// one.
+    /// Discards an unfinished line, for example when the connection was lost, and counts it as short. Returns true if
+    /// there was one.
     pub fn restart(&mut self) -> bool {
         let begun = !self.is_empty();
         if begun {
@@ -216,7 +215,7 @@ impl Decoder {
     }
 }
 
-/// Decodes a line of printable characters without its line ending.
+/// Decodes a line of printable characters, given without its line ending.
 fn decode_line(line: &[u8], endings: &mut Endings) -> SlcanLine {
     let [kind, rest @ ..] = line else { return SlcanLine::Done };
     let flags = match kind.to_ascii_lowercase() {
@@ -239,7 +238,7 @@ fn decode_line(line: &[u8], endings: &mut Endings) -> SlcanLine {
     }
 }
 
-/// Decodes a frame after its letter. `flags` are the FD flags, or `None` for a classic frame.
+/// Decodes the part of a frame after its first letter. `flags` are the FD flags, or `None` for a classic frame.
 fn frame(
     text: &[u8],
     is_extended: bool,

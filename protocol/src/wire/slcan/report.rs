@@ -1,4 +1,5 @@
-//! Faults that adapters report about themselves and their bus, and the kernel's error frame for each report.
+//! Faults that adapters report about themselves and their bus, and the conversion of each report to the error frame of
+//! Linux.
 //!
 //! ```text
 //!   e 2 ab CR          bus errors: how many, then a letter each              firmware that Linux' slcan driver reads
@@ -64,7 +65,7 @@ impl BusState {
         }
     }
 
-    /// Returns the controller bits of an error frame for this state of the transmitter, the receiver or both.
+    /// Returns the controller bits of an error frame that reports this state for the transmitter, the receiver or both.
     const fn bits(self, transmits: bool, receives: bool) -> u8 {
         let (transmit, receive) = match self {
             Self::Active => (ERROR_ACTIVE, ERROR_ACTIVE),
@@ -76,7 +77,7 @@ impl BusState {
     }
 }
 
-/// A fault other than a state.
+/// A fault of the bus or of the adapter.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 #[repr(u16)]
 pub enum AdapterFault {
@@ -86,11 +87,11 @@ pub enum AdapterFault {
     Bit0 = 0x002,
     /// A recessive bit was sent and a dominant one received.
     Bit1 = 0x004,
-    /// A wrong checksum.
+    /// A received frame had a wrong checksum.
     Crc = 0x008,
-    /// A bit of fixed value was wrong.
+    /// A bit with a fixed value had the other value.
     Form = 0x010,
-    /// Six equal bits in succession.
+    /// Six equal bits were received in succession.
     Stuff = 0x020,
     /// A bus error of an unknown kind.
     Bus = 0x040,
@@ -146,7 +147,7 @@ impl AdapterFault {
         }
     }
 
-    /// Returns class, controller, protocol and location of the error frame.
+    /// Returns the class, and the controller, protocol and location bytes, of the error frame for this fault.
     const fn error(self) -> (u32, u8, u8, u8) {
         const BUS: u32 = CLASS_PROTOCOL | CLASS_BUS_ERROR;
         match self {
@@ -175,18 +176,18 @@ pub struct ErrorCounters {
     pub receive: u16,
 }
 
-/// A fault report of an adapter.
+/// A report of an adapter: faults, controller state and error counters.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub struct AdapterReport {
     faults: u16,
     state: Option<BusState>,
     counters: Option<ErrorCounters>,
-    /// True for a line of bus errors, whose error frame always has the class of bus errors.
+    /// True for a line of bus errors. The class of its error frame always includes bus errors.
     is_bus_error: bool,
 }
 
 impl AdapterReport {
-    /// Returns the faults.
+    /// Returns the reported faults.
     pub fn faults(self) -> impl Iterator<Item = AdapterFault> {
         AdapterFault::ALL.into_iter().filter(move |&fault| self.has(fault))
     }
@@ -203,8 +204,8 @@ impl AdapterReport {
         self.counters
     }
 
-    /// Returns the error frame that Linux' slcan driver creates for this report, given the controller state
-    /// `before` it. Returns `None` if the report contains no fault and no change.
+    /// Returns the error frame that Linux' slcan driver creates for this report. `before` is the controller state
+    /// before the report. Returns `None` if there is no fault and the state has not changed.
     #[must_use]
     pub fn frame(self, before: BusState) -> Option<Frame> {
         let bus_error = if self.is_bus_error { CLASS_PROTOCOL | CLASS_BUS_ERROR } else { 0 };
@@ -256,7 +257,7 @@ impl AdapterReport {
         set.fold(self, |report, &(_, fault)| report.with(fault))
     }
 
-    /// Decodes a line without its line ending.
+    /// Decodes a report from a line without its line ending; `None` for any other line.
     pub(super) fn read(line: &[u8]) -> Option<Self> {
         match line {
             [b'e', count @ b'1'..=b'8', letters @ ..] => {
@@ -297,7 +298,7 @@ impl AdapterReport {
         }
     }
 
-    /// An unknown letter makes the whole line unknown.
+    /// Decodes a line of bus errors, one letter each. Returns `None` if a letter is unknown.
     fn bus_errors(letters: &[u8]) -> Option<Self> {
         letters.iter().try_fold(Self { is_bus_error: true, ..Self::default() }, |report, letter| {
             Some(report.with(match letter {
@@ -332,7 +333,7 @@ impl AdapterReport {
         Some(Self { state: Some(state), counters: Some(counters), ..Self::default() })
     }
 
-    /// Adds the last error of the controller, by its number.
+    /// Adds the fault that stands for the controller's last error code.
     const fn with_last_error(self, last: u8) -> Self {
         match last {
             1 => self.with(AdapterFault::Stuff),

@@ -17,7 +17,7 @@ fn fd(id: u32, flags: u8, data: &[u8]) -> Frame {
     Frame::fd(id, flags, data).unwrap()
 }
 
-/// Lines written by hand, and their frames, in both directions.
+/// Compares frames with lines written by hand, in both directions.
 #[test]
 fn frames_are_these_lines() {
     let count: Vec<u8> = (0..12).collect();
@@ -363,7 +363,7 @@ fn the_longest_line_fits_and_one_byte_more_does_not() {
     assert_eq!(one(&"x".repeat(1_000_000)), SlcanLine::Refused(Refusal::Long));
 }
 
-/// Frames that slcan carries without loss.
+/// Generates frames that slcan can represent without loss.
 fn frames() -> impl Strategy<Value = Frame> {
     let id = prop_oneof![0_u32..0x800, (0_u32..0x2000_0000).prop_map(|id| id | EXTENDED)];
     (id, 0_u8..4, 0_u8..16, any::<[u8; 64]>()).prop_map(|(id, kind, dlc, data)| {

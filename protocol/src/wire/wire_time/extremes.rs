@@ -1,15 +1,15 @@
-//! The minimum and maximum number of bits of a frame with a given kind and length.
+//! The minimum and maximum number of bits of a frame, given its kind and its length.
 //!
-//! For FD they are computed: the algorithm walks over the bits of a frame, follows both values of each free
-//! bit, and keeps only the minimum and maximum number of stuff bits for each of the eight states of stuffing.
-//! The bits after the data follow a separate rule. In classic CAN the CRC is stuffed too and depends on the
-//! data, so a table is used, which the test `every_frame` computes from all possible frames. Its maxima are
-//! one to four bits below the usual formula, which treats the CRC as free.
+//! For FD frames the algorithm walks over the bits of a frame and follows both values of each free bit. For each of the
+//! eight states of stuffing, it keeps only the minimum and maximum number of stuff bits. The bits after the data follow
+//! a separate rule. In classic CAN the CRC is also stuffed and depends on the data, so a table is used; the test
+//! `every_frame` computes the table from all possible frames. The maxima in the table are one to four bits below the
+//! usual formula, which treats the CRC as free.
 
 use super::{Bits, CLASSIC_TAIL, fd_bits, stuffing};
 use crate::can::{BIT_RATE_SWITCH, Format, Frame, fd_dlc, fd_len};
 
-/// The kind of a frame as far as it determines the number of bits.
+/// The kind of a frame, as far as the number of bits depends on it.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Coding {
     /// A classic data frame.
@@ -22,15 +22,15 @@ pub enum Coding {
     FdSwitched,
 }
 
-/// The kind and length of a frame: its bits without the values of identifier and data.
+/// The kind and length of a frame, without the values of identifier and data.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub struct Shape {
     /// The kind of frame.
     pub coding: Coding,
     /// True for a 29-bit identifier.
     pub extended: bool,
-    /// Data bytes, at most 8 (FD: 64). Greater values are clamped, and FD lengths are rounded up to the next
-    /// valid one.
+    /// Number of data bytes, at most 8 (FD: 64). Greater values are clamped, and FD lengths are rounded up to the next
+    /// length that CAN FD allows.
     pub len: u8,
 }
 
@@ -108,26 +108,26 @@ impl Shape {
 /// The minimum and maximum number of stuff bits.
 type Range = (u32, u32);
 
-/// Ranges of classic data frames with 11-bit identifiers, by length.
+/// Ranges for classic data frames with 11-bit identifiers, by number of data bytes.
 const CLASSIC: [Range; 9] = [(1, 6), (1, 7), (1, 9), (1, 12), (0, 14), (0, 15), (0, 18), (0, 21), (0, 22)];
-/// Ranges of classic data frames with 29-bit identifiers, by length.
+/// Ranges for classic data frames with 29-bit identifiers, by number of data bytes.
 const CLASSIC_EXTENDED: [Range; 9] =
     [(1, 11), (1, 13), (1, 15), (1, 17), (0, 19), (0, 21), (0, 23), (0, 25), (0, 27)];
-/// Ranges of remote frames with 11-bit identifiers, by requested length.
+/// Ranges for remote frames with 11-bit identifiers, by requested number of bytes.
 const REMOTE: [Range; 9] = [(1, 5), (1, 6), (0, 5), (0, 6), (0, 4), (0, 4), (0, 4), (0, 5), (0, 5)];
-/// Ranges of remote frames with 29-bit identifiers, by requested length.
+/// Ranges for remote frames with 29-bit identifiers, by requested number of bytes.
 const REMOTE_EXTENDED: [Range; 9] =
     [(1, 10), (1, 11), (0, 10), (0, 11), (0, 10), (0, 10), (0, 9), (0, 10), (0, 10)];
 
-/// The minimum and maximum number of stuff bits on all paths to each state of stuffing.
+/// For each state of stuffing, the minimum and maximum number of stuff bits in any sequence of bits that ends in it.
 #[derive(Clone, Copy)]
 struct Ways([Option<Range>; stuffing::STATES]);
 
 impl Ways {
-    /// The bus before SOF: state 4, as in [`stuffing::Run::IDLE`].
+    /// The idle bus before SOF: only state 4 is possible, as in [`stuffing::Run::IDLE`].
     const IDLE: Self = Self([None, None, None, None, Some((0, 0)), None, None, None]);
 
-    /// Appends the lowest `count` bits of a word.
+    /// Appends the lowest `count` bits of a word with their values.
     fn fixed(self, word: u64, count: u32) -> Self {
         (0..count).rev().fold(self, |ways, place| {
             let bit = (word >> place) & 1 == 1;
@@ -135,17 +135,17 @@ impl Ways {
         })
     }
 
-    /// Appends `count` bits of any value.
+    /// Appends `count` bits that can have any value.
     fn free(self, count: u32) -> Self {
         (0..count).fold(self, |ways, _| ways.step(true, true))
     }
 
-    /// Keeps the reachable states and resets the number of stuff bits.
+    /// Keeps the reachable states but sets the numbers of stuff bits to 0.
     fn restarted(self) -> Self {
         Self(self.0.map(|range| range.map(|_| (0, 0))))
     }
 
-    /// Returns the range over all states.
+    /// Returns the minimum and maximum number of stuff bits over all states.
     fn stuffed(self) -> Range {
         self.0.into_iter().flatten().reduce(wider).unwrap_or((0, 0))
     }

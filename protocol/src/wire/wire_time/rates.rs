@@ -1,4 +1,4 @@
-//! Bit rates of a bus, and their text form.
+//! Bit rates of a bus, and their notation in text.
 
 use core::fmt;
 use core::str::FromStr;
@@ -7,7 +7,7 @@ use thiserror::Error;
 
 /// The nominal and data bit rate of a bus, within the limits of CAN.
 ///
-/// The text form is `1M/5M`, or `1M` if both are equal (classic CAN).
+/// The notation is `1M/5M`, or `1M` if both rates are equal (classic CAN).
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub struct BitRates {
     nominal: u32,
@@ -70,18 +70,18 @@ impl BitRates {
     /// Creates the rates of a classic bus: one rate in bit/s for all bits.
     ///
     /// # Errors
-    /// Returns an error if it is not in [10 000, 1 000 000].
+    /// Returns an error if the rate is not in [10 000, 1 000 000].
     pub const fn classic(nominal: u32) -> Result<Self, BitRatesError> {
         Self::new(nominal, nominal)
     }
 
-    /// Returns the nominal rate in bit/s: of arbitration, and of whole frames without bit rate switch.
+    /// Returns the nominal rate in bit/s. Arbitration and frames without bit rate switch use it.
     #[must_use]
     pub const fn nominal(self) -> u32 {
         self.nominal
     }
 
-    /// Returns the data rate in bit/s: of the data phase of frames with bit rate switch.
+    /// Returns the data rate in bit/s. The data phase of frames with bit rate switch uses it.
     #[must_use]
     pub const fn data(self) -> u32 {
         self.data
@@ -91,7 +91,7 @@ impl BitRates {
 /// Parses one bit rate: `1000000`, `500k`, `1M`, `2.5M`. [`BitRates::new`] checks the limits of CAN.
 ///
 /// # Errors
-/// Returns an error if it is not a whole number of bit/s in [0, 2^32).
+/// Returns an error if the rate is not a whole number of bit/s in [0, 2^32).
 pub fn parse_bit_rate(text: &str) -> Result<u32, BitRatesError> {
     let (number, unit) = match text.as_bytes().last() {
         Some(b'k' | b'K') => (text.get(..text.len() - 1).unwrap_or(""), 1_000),

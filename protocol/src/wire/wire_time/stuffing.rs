@@ -1,26 +1,27 @@
 //! Bit stuffing: after five equal bits a sender inserts one of the opposite value, which starts the next run.
 //!
-//! A run is one of eight states: the value of the bit, and its number of repetitions, one to four. The fifth
-//! makes a stuff bit, and thus the state in which the other bit has come once. A table holds the effect of up
-//! to eight bits on a state.
+//! A run of equal bits has one of eight states: the value of the bit, and its number of repetitions, one to four. The
+//! fifth repetition causes a stuff bit, after which the opposite value has occurred once. A table holds the effect of
+//! up to eight bits on a state.
 
-/// Number of states. A state has three bits: the value of the bit, and its repetitions minus one.
+/// Number of states. A state consists of three bits: the value of the repeated bit, and the number of repetitions minus
+/// one.
 pub(super) const STATES: usize = 8;
-/// Number of sequences of up to eight bits, each encoded behind a leading one.
+/// Number of sequences of up to eight bits. A sequence is encoded with a leading one.
 const SEQUENCES: usize = 512;
-/// The result for each state and sequence: the number of stuff bits above the three bits of the next state.
+/// For each state and sequence, the next state in the lowest three bits and the number of stuff bits above them.
 static STEPS: [u8; STATES * SEQUENCES] = steps();
 
 /// The current run of equal bits, and the number of stuff bits so far.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Run {
     state: u8,
-    /// Number of stuff bits.
+    /// Number of stuff bits so far.
     pub(super) stuffed: u32,
 }
 
 impl Run {
-    /// The idle bus before the first bit of a frame, which has the opposite value.
+    /// The state of the idle bus: recessive bits, before the dominant first bit of a frame.
     pub(super) const IDLE: Self = Self { state: 0b100, stuffed: 0 };
 
     /// Appends eight bits, most significant first.

@@ -1,4 +1,4 @@
-//! Accepts clients, and turns away those that find no room.
+//! Accepts clients, and disconnects those for which there is no free file descriptor.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -14,21 +14,21 @@ use super::{LISTENER, Server};
 use crate::embedded::client::Client;
 use crate::embedded::routing::ClientId;
 
-/// The maximum send buffer of a client's socket in bytes, whatever it requests.
+/// The maximum size of the send buffer for a client, in bytes. A client may request less.
 const BUFFER_MAX: usize = 64 << 20;
 
-/// The maximum number of clients accepted before other work is done.
+/// The maximum number of clients accepted before frames are forwarded again.
 const ADMISSIONS: usize = 64;
 
 impl Server {
-    /// Accepts waiting clients, up to the limit per event.
+    /// Accepts waiting clients, at most [`ADMISSIONS`].
     pub(super) fn accept(&mut self) {
         for _ in 0..ADMISSIONS {
             match self.accepted() {
                 Ok(socket) => self.admit(socket),
                 Err(Errno::INTR | Errno::CONNABORTED) => {}
                 Err(Errno::AGAIN) => return,
-                // The system checks for a free file descriptor before it checks for a waiting client.
+                // The system reports the lack of a file descriptor even if no client waits.
                 Err(Errno::MFILE | Errno::NFILE) => match self.turn_away() {
                     Ok(()) => {}
                     Err(Errno::AGAIN) => return,
@@ -43,8 +43,8 @@ impl Server {
         rustix::net::accept_with(&self.place.listener, SocketFlags::CLOEXEC | SocketFlags::NONBLOCK)
     }
 
-    /// Hangs up on a client that finds no free file descriptor, by means of the reserved one. A client that has not
-    /// sent its hello yet keeps that descriptor until [`Server::part`].
+    /// Accepts a client with the reserved file descriptor and disconnects it, because no other descriptor is free. If
+    /// the client's hello has not arrived yet, the descriptor is in use until [`Server::part`] is called.
     fn turn_away(&mut self) -> Result<(), Errno> {
         drop(self.spare.take());
         let accepted = self.accepted();
@@ -63,7 +63,7 @@ impl Server {
         Ok(())
     }
 
-    /// Closes the connection of a client that was turned away, and reserves its descriptor for the next one.
+    /// Disconnects the client that uses the reserved file descriptor, and reserves the descriptor again.
     pub(super) fn part(&mut self) {
         if let Some(socket) = self.parting.take() {
             hang_up(&socket);
@@ -92,7 +92,7 @@ impl Server {
         }
     }
 
-    /// Reads a client's first datagram, and sets its filters.
+    /// Reads the first datagram of a client, its hello, and sets the filters in it.
     pub(super) fn greet(&mut self, id: ClientId) {
         let Some(client) = self.client(id) else { return };
         let mut bytes = [0; MAX_HELLO_BYTES + 1];
@@ -103,14 +103,14 @@ impl Server {
             Ok((len, _)) => ClientHello::decode(bytes.get(..len).unwrap_or_default()),
         };
         let Some(hello) = hello else {
-            // The client may not wait for an answer.
+            // The client may have closed its socket already, so an error is ignored.
             let _ = send_one(&client.socket, &HelloReply::Refused { version: VERSION }.encode());
             self.post.totals.refused += 1;
             return self.forget(id);
         };
         let target = usize::try_from(hello.buffer).unwrap_or(BUFFER_MAX).min(BUFFER_MAX);
         if sockopt::set_socket_send_buffer_size_force(&client.socket, target).is_err() {
-            // The granted size is reported, whatever it is.
+            // If the size cannot be set, the client is told the size that the socket has.
             let _ = sockopt::set_socket_send_buffer_size(&client.socket, target);
         }
         let granted = sockopt::socket_send_buffer_size(&client.socket).unwrap_or(0) as u64;
@@ -124,14 +124,15 @@ impl Server {
     }
 }
 
-/// Ends a connection without an answer. Returns true if the other end had sent something. Reading that data makes the
-/// other end see an end of file rather than a reset, which would mean that the server ended.
+/// Closes a connection without an answer. Returns true if the client had sent something. That data is read first,
+/// because closing with unread data would cause a reset, which the client takes for the end of the server.
 fn hang_up(socket: &OwnedFd) -> bool {
     let _ = shutdown(socket, Shutdown::Write);
     rustix::net::recv(socket, &mut [0; MAX_HELLO_BYTES + 1], RecvFlags::DONTWAIT).err() != Some(Errno::AGAIN)
 }
 
-/// Sends the answer, the first datagram in the socket. Only a lack of memory can prevent that.
+/// Sends the answer to a client's hello. As the first datagram in the socket it always finds room, so only a lack of
+/// memory can prevent it.
 fn welcome(socket: &OwnedFd, granted: u64) -> io::Result<usize> {
     let answer = HelloReply::Welcome { granted }.encode();
     let mut tries = 0..10;

@@ -7,12 +7,12 @@ use tempfile::TempDir;
 
 use super::*;
 
-/// Receives from a socket after given errors.
+/// A source of datagrams that returns given errors before it receives from the socket.
 struct Faulty {
     batch: Batch,
-    /// The results before each reception, each an error or none.
+    /// The result of each reception to come: an error, or `None` to receive.
     errors: VecDeque<Option<Errno>>,
-    /// The error of all receptions after those.
+    /// The error of all receptions after those in `errors`.
     last: Option<Errno>,
 }
 
@@ -29,7 +29,7 @@ impl Receive for Faulty {
     }
 }
 
-/// A bus that a thread of this test serves.
+/// A bus that a thread of the test serves.
 struct Bench {
     directory: TempDir,
     stop: UnixStream,
@@ -90,7 +90,7 @@ fn errors_of_a_reception_that_pass_cost_a_client_no_frame() {
     let bench = Bench::new(&errors, None);
     let [sender, receiver] = [bench.open(), bench.open()];
     let frames: Vec<_> = (0..500).map(|id| Frame::classic(id, &[1]).unwrap()).collect();
-    // Frames are sent in pieces, so that every error affects some.
+    // The frames are sent in several batches, so that each error occurs at some of them.
     for piece in frames.chunks(5) {
         sender.send(piece).unwrap();
         let ids: Vec<_> = piece.iter().map(Frame::id).collect();
@@ -105,9 +105,9 @@ fn errors_of_a_reception_that_pass_cost_a_client_no_frame() {
 fn time_stamps_of_a_process_with_two_sockets_are_in_the_order_of_the_bus() {
     let bench = Bench::new(&[], None);
     let open = |id| bench.open_with(vec![Filter { id, mask: STANDARD_MASK }]);
-    // The first two clients of a process are a pair, and so are the next two.
+    // The server pairs the first two clients of a process, and the next two.
     let [sender, _idle, first, second] = [bench.open(), open(3), open(1), open(2)];
-    // Within one round of the server every socket is written to once, at its end, or more often.
+    // Within one round, the server writes to each socket at the end of the round, and possibly before.
     let expected = [1, 2, 1, 2, 2, 1];
     sender.send(&expected.map(|id| Frame::classic(id, &[]).unwrap())).unwrap();
     let mut came: Vec<_> = [first, second].iter().flat_map(|bus| arrivals(bus, 3)).collect();
@@ -118,7 +118,7 @@ fn time_stamps_of_a_process_with_two_sockets_are_in_the_order_of_the_bus() {
 
 #[test]
 fn a_client_whose_socket_fails_for_good_is_hung_up_on_and_the_others_go_on() {
-    // Only the first client sends before all receptions fail.
+    // All receptions after the first one fail, so only the first client can send.
     let bench = Bench::new(&[None], Some(Errno::BADF));
     let [sender, receiver] = [bench.open(), bench.open()];
     sender.send(&[Frame::classic(1, &[1]).unwrap()]).unwrap();

@@ -1,4 +1,4 @@
-//! Properties that every plan must have, in a simulated world that steps change.
+//! Checks properties that every plan must have, by executing plans in a simulation of the kernel's interfaces.
 
 use proptest::prelude::*;
 
@@ -90,7 +90,7 @@ impl World {
     }
 }
 
-/// Returns an end of a pair with this index, in this namespace.
+/// Returns the other end of a pair as an interface of this namespace with this index.
 fn number(index: u32) -> Peer {
     Peer { index, name: None, namespace: None, namespace_id: None }
 }
@@ -139,7 +139,7 @@ fn any_target() -> impl Strategy<Value = Vec<InterfaceTarget>> {
         let data = (rate > 0 && data > 0 && fd).then_some(data * 1_000_000);
         in_skin(name, format, bitrate, data)
     });
-    // Each name occurs once, because two skins may give one bus different values.
+    // Each interface is named once, because two skins may contradict each other.
     proptest::collection::vec(target, 0..5).prop_map(|mut all| {
         let mut seen = std::collections::HashSet::new();
         all.retain(|target| seen.insert(target.name.clone()));

@@ -31,12 +31,12 @@ const RX: u32 = 25;
 /// Frequency of the watchdog's clock in Hz, and the word that feeds the watchdog.
 const WATCHDOG_HZ: u32 = 32_768;
 const FEED: u32 = 0x6E52_4635;
-/// Minimum lead of a timer compare in µs; a nearer one may have passed when it is set.
+/// Minimum time in µs from now to a timer compare. A nearer one may already have passed when it is set.
 const NEAR: u64 = 10;
 
 static WAITING: Mutex<RefCell<Waiting>> = Mutex::new(RefCell::new(Waiting::new()));
 
-/// The board of this build.
+/// The micro:bit, the board that this build is for.
 #[derive(Debug)]
 pub struct Chosen {
     clock: Clock,
@@ -155,7 +155,7 @@ impl Board for Chosen {
     }
 }
 
-/// The two pages before the factory record's page.
+/// The two flash pages for parameters, before the page of the factory record.
 #[derive(Debug)]
 pub struct Pages;
 
@@ -167,9 +167,9 @@ impl Pages {
         }
     }
 
-    /// Enables a flash operation (1 write, 2 erase) and waits until it is done. The processor stalls
-    /// meanwhile: 46 µs for a word, 21 ms for a page, during which the UART buffers six bytes and loses the
-    /// rest.
+    /// Enables a flash operation (1 write, 2 erase), performs it and waits until it is done. The processor stalls
+    /// during the operation: 46 µs for a word, 21 ms for a page. The UART buffers six bytes in that time and loses
+    /// further ones.
     fn controlled(enabled: u32, work: impl FnOnce(&pac::nvmc::RegisterBlock)) {
         // SAFETY: only this type uses the flash controller.
         let nvmc = unsafe { &*NVMC::ptr() };
@@ -223,7 +223,7 @@ fn timer() -> &'static pac::timer0::RegisterBlock {
     unsafe { &*TIMER0::ptr() }
 }
 
-/// Returns the counter in µs. Must be called only while no handler can interrupt.
+/// Returns the counter in µs. It must be called only while no interrupt handler can run.
 fn counter() -> u32 {
     set(&timer().tasks_capture[0], 1);
     timer().cc[0].read().bits()
@@ -239,7 +239,7 @@ fn UART0() {
     }
 }
 
-/// Wakes the processor.
+/// Handles the timer interrupt, which only wakes the processor.
 #[interrupt]
 fn TIMER0() {
     set(&timer().events_compare[1], 0);

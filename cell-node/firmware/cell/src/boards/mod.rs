@@ -1,4 +1,4 @@
-//! The boards, one file each: `board::Board` implemented with the registers of a microcontroller.
+//! The boards, one file each. A board implements `board::Board` with the registers of a microcontroller.
 
 #[cfg(feature = "microbit")]
 mod microbit;
@@ -14,7 +14,7 @@ use core::ptr::read_volatile;
 
 use protocol::factory::{BYTES, ERASED, Factory};
 
-/// The factory record in its own page of flash, erased until the manufacturer writes it.
+/// The factory record, in a flash page of its own. The page is erased until the manufacturer writes it.
 #[used]
 #[unsafe(link_section = ".factory")]
 static FACTORY: [u8; BYTES] = ERASED;

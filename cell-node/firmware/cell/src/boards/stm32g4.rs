@@ -1,9 +1,8 @@
 //! STM32G431 with a CAN transceiver, as on a Nucleo-G431RB: Cortex-M4 at 80 MHz, FDCAN1 on PA11 and PA12, 1
 //! Mbit/s and 5 Mbit/s. Every test run builds it, but no emulator exists to run it.
 //!
-//! It uses the registers of the reference manual (RM0440), whose names the constants have. The crate `fdcan`
-//! 0.2 is unsuitable: it lacks delay compensation, replaces frames that wait to be sent, and sends empty
-//! frames as remote ones.
+//! Constants have the names of the registers in the reference manual (RM0440). The crate `fdcan` 0.2 is unsuitable: it
+//! lacks delay compensation, replaces frames that wait to be sent, and sends empty frames as remote frames.
 
 use core::mem::size_of;
 use core::ptr::{read_volatile, write_volatile};
@@ -56,7 +55,7 @@ const TIM2_IRQ: u32 = 1 << 28;
 const BUSY: u32 = 1 << 16;
 const ERRORS: u32 = 0xC3FA;
 
-/// Minimum lead of a timer compare in µs; a nearer one may have passed when it is set.
+/// Minimum time in µs from now to a timer compare. A nearer one may already have passed when it is set.
 const NEAR: u64 = 10;
 
 fn read(address: usize) -> u32 {
@@ -77,7 +76,7 @@ fn wait(address: usize, bits: u32, value: u32) {
     while read(address) & bits != value {}
 }
 
-/// The board of this build.
+/// The STM32G431, the board that this build is for.
 #[derive(Debug)]
 pub struct Chosen {
     clock: Clock,
@@ -180,7 +179,7 @@ impl Board for Chosen {
     }
 }
 
-/// The two pages before the factory record's page.
+/// The two flash pages for parameters, before the page of the factory record.
 #[derive(Debug)]
 pub struct Pages;
 
@@ -192,9 +191,9 @@ impl Pages {
         }
     }
 
-    /// Runs a flash operation and waits until it is done. The processor stalls meanwhile, because it runs
-    /// from the same bank: 82 µs for 8 bytes, 22 ms for a page. The CAN controller's FIFO buffers three
-    /// frames.
+    /// Runs a flash operation and waits until it is done. The processor stalls during the operation, because the
+    /// program is in the same flash bank: 82 µs for 8 bytes, 22 ms for a page. The FIFO of the CAN controller buffers
+    /// three frames in that time.
     fn controlled(bits: u32, work: impl FnOnce()) -> Result<(), NotWritten> {
         wait(FLASH_SR, BUSY, 0);
         write(FLASH_SR, ERRORS);
@@ -234,7 +233,7 @@ impl Flash for Pages {
     }
 }
 
-/// Decodes an element of the message RAM from its first two words and its data.
+/// Decodes a frame from the first two words and the data of an element in the message RAM.
 fn frame_of(head: [u32; 2], data: &[u8; 64]) -> Option<Frame> {
     let [first, second] = head;
     let id = if first & 1 << 30 == 0 {

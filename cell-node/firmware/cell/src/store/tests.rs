@@ -2,7 +2,7 @@ use super::*;
 
 const PAGE: usize = 1 << 10;
 
-/// Two pages that lose power after `left` writes.
+/// Two simulated flash pages that lose power after `left` writes.
 struct Simulated {
     pages: [[u8; PAGE]; 2],
     left: usize,

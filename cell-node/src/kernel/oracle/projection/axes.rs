@@ -1,16 +1,16 @@
-//! The axes of a frame in the base frame: their components that are known for all joint positions, and their
-//! rotation.
+//! The axes of a frame in base coordinates: which components are known for all joint positions, and how the axes are
+//! rotated.
 //!
-//! The first two components of an axis are of the same kind: both depend on the joints, except in upright
-//! axes and in those of the base. An axis is therefore characterised by its third component, [`Axis`], and a
-//! pair of axes that is rotated by the combination of both, [`Mix`].
+//! The first two components of an axis are alike: both depend on the joints, except in vertical axes and in those of
+//! the base. An axis is therefore characterised by its third component, [`Axis`]. Two axes that are rotated together
+//! are characterised by the combination of both, [`Mix`].
 
 use crate::kernel::{Number, Twist};
 
-/// The components of an axis or another vector in the base frame.
+/// The components of an axis or another vector, in base coordinates.
 pub(super) type Vector<N> = [N; 3];
 
-/// The known components of an axis.
+/// The components of an axis that are known for all joint positions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Axis {
     /// The axis is (0, 0, 1).
@@ -23,50 +23,49 @@ pub(super) enum Axis {
     Any,
 }
 
-/// The products that a turn of two axes a and b needs: `c a + s b` and `c b - s a`.
+/// The products needed to rotate two axes a and b to `c a + s b` and `c b - s a`, with cosine c and sine s.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Mix {
     /// No products: a and b are the first two axes of the base.
     Base,
-    /// b is up.
+    /// Axis b is (0, 0, 1).
     Up,
-    /// b is down.
+    /// Axis b is (0, 0, -1).
     Down,
-    /// Both third components are 0.
+    /// The third components of a and b are 0.
     Level,
     /// The third component of a is 0.
     Second,
     /// The third component of b is 0.
     First,
-    /// All products.
+    /// All components of a and b need products.
     Both,
 }
 
-/// The known components of a frame's axes x, y and z.
+/// The known components of the axes x, y and z of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Frame {
     known: [Axis; 3],
-    /// True if x and y are those of the base.
+    /// True if x and y are the axes of the base.
     base: bool,
 }
 
 impl Frame {
     pub(super) const BASE: Self = Self { known: [Axis::Level, Axis::Level, Axis::Up], base: true };
 
-    /// Returns the known components of z.
+    /// Returns the known components of the z axis.
     pub(super) fn z(self) -> Axis {
         let [.., z] = self.known;
         z
     }
 
-    /// Returns the mix of x and y for a turn about z.
+    /// Returns the products needed to rotate x and y by a turn about z.
     pub(super) fn turn(self) -> Mix {
         let [x, y, _] = self.known;
         if self.base { Mix::Base } else { Mix::new(x, y) }
     }
 
-    /// Returns the frame after a turn about z and a twist about the new x, and the mix of the other two axes
-    /// in the twist.
+    /// Returns the frame after a turn about z and a twist about the new x axis, and the products needed for the twist.
     pub(super) fn after<N>(self, twist: Twist<N>) -> (Self, Mix) {
         let (x, v) = self.turn().axes();
         let z = self.z();
@@ -110,7 +109,7 @@ impl Mix {
         }
     }
 
-    /// Returns the known components of both results.
+    /// Returns the known components of both rotated axes.
     fn axes(self) -> (Axis, Axis) {
         match self {
             Self::Base | Self::Level => (Axis::Level, Axis::Level),
@@ -119,14 +118,14 @@ impl Mix {
     }
 }
 
-/// The products that transform a vector from a frame to the base.
+/// The products needed to transform a vector from a frame to the base.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct ToBase {
     pub(super) level: Level,
     pub(super) height: Height,
 }
 
-/// The axes that contribute to the first two components.
+/// The axes that contribute to the first two components of the transformed vector.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Level {
     Xy,
@@ -134,12 +133,12 @@ pub(super) enum Level {
     All,
 }
 
-/// The axes that contribute to the third component.
+/// The axes that contribute to the third component of the transformed vector.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Height {
     /// The component is not needed.
     Nothing,
-    /// One axis is upright; no product is needed.
+    /// Only the y axis, which is vertical, so no product is needed.
     Y,
     MinusY,
     Z,
@@ -151,7 +150,8 @@ pub(super) enum Height {
 }
 
 impl ToBase {
-    /// Creates the transform for the known axes of a frame. `upright` is true if no height is needed.
+    /// Creates the transform from a frame with these known components. `upright` is true if the third component is not
+    /// needed.
     pub(super) fn new(Frame { known, .. }: Frame, upright: bool) -> Self {
         let [_, y, z] = known;
         let level = if y.is_upright() {
@@ -176,15 +176,15 @@ impl ToBase {
     }
 }
 
-/// A turn, given by its sine and cosine.
+/// A rotation, given by its sine and cosine.
 ///
-/// Axes have length 1 except for rounding and the error of the sine, so no component can leave the range of a
+/// Axes have length 1 except for rounding and the error of the sine. No component can therefore leave the range of a
 /// word, and no saturation is needed: see [`super::range`].
 #[derive(Clone, Copy)]
 pub(super) struct Rotation<N>(pub(super) [N; 2]);
 
 impl<N: Number> Rotation<N> {
-    /// Returns `c a + s b`.
+    /// Returns `c a + s b`, with cosine c and sine s.
     #[inline(always)]
     pub(super) fn ahead(self, mix: Mix, &[a0, a1, a2]: &Vector<N>, &[b0, b1, b2]: &Vector<N>) -> Vector<N> {
         let Self([sine, cosine]) = self;
@@ -199,7 +199,7 @@ impl<N: Number> Rotation<N> {
         }
     }
 
-    /// Replaces a by `c a + s b`, and b by `c b - s a`.
+    /// Replaces a by `c a + s b`, and b by `c b - s a`, with cosine c and sine s.
     #[inline(always)]
     pub(super) fn both(self, mix: Mix, [a0, a1, a2]: &mut Vector<N>, [b0, b1, b2]: &mut Vector<N>) {
         let Self([sine, cosine]) = self;

@@ -1,4 +1,4 @@
-//! Bounds of the projection kernel: the range of axes, force, position and moments.
+//! Bounds for the projection kernel: the ranges of axes, force, position and moments.
 
 use super::{Link, Vector};
 use crate::kernel::Number;
@@ -33,7 +33,7 @@ pub(super) fn is_bounded<N: Number>(force: Vector<N>, position: Vector<N>, links
     [force, reach, moment, most].iter().all(within)
 }
 
-/// Returns the error of the axes after one more turn.
+/// Returns the bound of the axes' error after one more rotation, given the bound before it.
 fn further_off(off: u32) -> u32 {
     off + (off >> 10) + 20
 }
@@ -47,8 +47,8 @@ mod tests {
     use crate::kernel::oracle::{Counted, Projection};
     use crate::kernel::{Kernel, Operations};
 
-    /// Returns an arm with `rows` rows, in which quarter turns and zeros are more frequent than by chance,
-    /// and some rows are fixed.
+    /// Returns an arm with `rows` rows. Quarter turns and zeros are more frequent than by chance, and some rows are
+    /// fixed.
     fn arm(rows: usize, words: &[i16]) -> Parameters {
         let mut words = words.iter().copied().cycle();
         let mut next = || words.next().unwrap_or_default();

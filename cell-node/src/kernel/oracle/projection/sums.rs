@@ -3,13 +3,13 @@
 use crate::kernel::Number;
 use crate::kernel::rounding::{Bounded, Saturating, Rounding};
 
-/// Sums of products of three-component vectors, in addition to those of the cell's kernel.
+/// Roundings of sums that only the projection kernel needs, with saturation or without.
 pub(super) trait Sums: Rounding {
-    /// Adds two products to a number and rounds.
+    /// Adds two products to a number, and rounds the result.
     fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N;
     /// Adds two products without rounding.
     fn plus<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N::Wide;
-    /// Rounds a sum.
+    /// Rounds a sum to a number.
     fn round<N: Number>(sum: N::Wide) -> N;
 }
 

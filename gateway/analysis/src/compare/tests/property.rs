@@ -1,4 +1,4 @@
-//! Property test: for any loss, change or cut of a run, the counts are those of its numbers.
+//! Property test: for any loss, change or cut of a run, the comparison counts exactly the damaged epochs.
 
 use std::collections::BTreeSet;
 
@@ -6,10 +6,10 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// The damage to the second capture.
+/// The damage that is done to the second capture.
 #[derive(Clone, Debug)]
 struct Harm {
-    /// The number of its first joints, and the number after its last ones.
+    /// Number of the first joints that the damaged capture has, and the number after its last ones.
     first: u64,
     end: u64,
     /// Consecutive lost joints: first number and count.

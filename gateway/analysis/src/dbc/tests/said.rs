@@ -1,4 +1,5 @@
-//! Computes a packet's values from the protocol's own types, with the names of a DBC.
+//! Computes the values of a packet by the protocol's own types, with the signal names of the DBC, as the oracle of the
+//! tests.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +8,7 @@ use protocol::message::{Answer, AppliesFrom, Message, NetworkPage, Request, Sens
 use protocol::packet::{Packet, WORDS};
 use protocol::parameters::Parameter;
 
-/// A message's values by name and in units, from the protocol's own types.
+/// The values of a message's signals by name, in units, from the protocol's own types.
 #[derive(Default)]
 struct Said(BTreeMap<String, f64>);
 
@@ -143,7 +144,8 @@ impl Said {
     }
 }
 
-/// Returns the name of a message and its values; `None` for values that cannot be encoded.
+/// Returns the DBC name of a message, and its values by the protocol's own types; `None` for a message that cannot be
+/// encoded.
 pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeMap<String, f64>) {
     let mut said = Said::default();
     let crc = u16::from_le_bytes(*packet.encode().last_chunk().unwrap());

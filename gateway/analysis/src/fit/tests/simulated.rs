@@ -12,45 +12,45 @@ use rand_pcg::Pcg64Mcg;
 use super::{Answers, COMPUTATION_NS, Case};
 use bus_model::{BusModel, Priority, Request};
 
-/// The computation times of the cells in an epoch.
+/// The times that the cells need to compute their answers in an epoch.
 #[derive(Clone, Copy, Debug)]
 enum Computation {
     /// The longest time for all cells.
     Longest,
-    /// A random time up to the longest.
+    /// A random time for each cell, up to the longest.
     Any,
-    /// Zero for all cells but one.
+    /// Zero for all cells but one, which needs the longest time.
     Straggler,
 }
 
-/// The due times of the cells' heartbeats.
+/// The times at which the cells should send their heartbeats.
 #[derive(Clone, Copy, Debug)]
 enum Heartbeats {
-    /// Spread over their period by node id, with cells started together.
+    /// Spread over the period by node id, as if all cells started together.
     Spread,
     /// Random, as if each cell started on its own.
     Any,
-    /// All while cells compute after the same joints.
+    /// All while cells compute, after the same joints.
     Together,
 }
 
-/// The content of words.
+/// The content of the words in packets.
 #[derive(Clone, Copy, Debug)]
 enum Data {
     /// Random.
     Any,
-    /// Random, with zeros as in torques of joints beyond the cell.
+    /// Random, with zeros as in torques on joints beyond the cell.
     Zeros,
-    /// The content of the longest frames.
+    /// The content that makes a frame longest.
     Longest,
 }
 
-/// The longest times in one simulation.
+/// The longest times that occurred in one simulation.
 #[derive(Clone, Copy, Debug, Default)]
 struct Longest {
-    /// From the due time of the broadcast to the end of the last answer in ns.
+    /// From the time at which joints should be sent to the end of the last answer, in ns.
     last_ns: u64,
-    /// From the due time of a heartbeat to its end in ns; zero if it ended before.
+    /// From the time at which a heartbeat should be sent to its end, in ns; zero if it ended before that time.
     heartbeat_ns: u64,
 }
 
@@ -74,7 +74,7 @@ impl Sent {
     }
 }
 
-/// A bus with its cells.
+/// A simulated bus with its cells.
 struct Bench<'a> {
     case: &'a Case,
     data: Data,
@@ -82,10 +82,10 @@ struct Bench<'a> {
     longest: Bits,
     dice: Pcg64Mcg,
     bus: BusModel,
-    /// The frames to send, by time, each with its due time.
+    /// The frames that are to be sent, by time, each with the time from which its delay counts.
     agenda: BTreeMap<(u64, u32), (Sent, u64)>,
     entered: u32,
-    /// By tag: the frame, its due time, and whether it is the packet's last frame.
+    /// The frames on the bus by tag: the frame, the time from which its delay counts, and true if it ends a packet.
     on_the_way: Vec<(Sent, u64, bool)>,
 }
 
@@ -125,7 +125,7 @@ impl Bench<'_> {
     }
 }
 
-/// Runs a number of epochs of a bus whose cells are all in contact.
+/// Simulates a number of epochs of a bus whose cells are all in contact, and returns the longest times.
 fn simulate(case: &Case, epochs: u64, seed: u64, how: (Computation, Heartbeats, Data)) -> Longest {
     let (computation, heartbeats, data) = how;
     let (cells, period) = (case.answers.cells(), case.period_ns);
@@ -229,8 +229,8 @@ fn case(rates: &str, cells: u32) -> Case {
     }
 }
 
-/// Returns the share of the smaller bound that the slowest of many seeds reached, with varied scenarios, and asserts
-/// that none exceeds a bound.
+/// Simulates a bus with many seeds and varied scenarios, and asserts that no time exceeds a bound. Returns the share of
+/// the smaller bound that the slowest simulation reached.
 fn reached(case: &Case, data: &[Data], seeds: u64) -> f64 {
     let times = case.times();
     let mut slowest_ns = 0;
@@ -253,7 +253,7 @@ fn reached(case: &Case, data: &[Data], seeds: u64) -> f64 {
     slowest_ns as f64 / times.last_ns().unwrap() as f64
 }
 
-/// Torques and heartbeats as cells send them.
+/// The content of torques and heartbeats as cells send them.
 const REAL: &[Data] = &[Data::Any, Data::Zeros];
 
 #[test]

@@ -1,4 +1,4 @@
-//! Figures from the frames of one bus: the same accounts as the gateway kept, epoch by epoch.
+//! Counts and series of one bus, from its frames: replies, losses and errors as the gateway counted them in the run.
 
 use protocol::can::Frame;
 use protocol::candump::{Direction, Record};
@@ -18,7 +18,7 @@ use model::central::Central;
 use model::table::{Replies, BusTotals, Table};
 use trace::capture::LatchedFrame;
 
-/// Interval of timeout handling for the cells in µs, as in a receiver.
+/// Interval in µs at which timeouts of cells are checked, as in the gateway's receiver.
 const TIMEOUT_INTERVAL_US: u64 = 20_000;
 /// The reply times of a cell, in µs.
 #[derive(Clone, Copy, Debug, Default)]
@@ -28,49 +28,50 @@ pub(super) struct Latency {
     pub(super) count: u64,
 }
 
-/// The open epoch.
+/// The epoch that cells are answering.
 #[derive(Clone, Copy, Debug, Default)]
 struct OpenEpoch {
     number: u64,
     at: f64,
-    /// Number of due replies.
+    /// Number of replies due in the epoch.
     due: u64,
-    /// The account when it was opened.
+    /// The counts of replies when the epoch began.
     before: Replies,
-    /// Number and sum of errors before it.
+    /// Number and sum of errors when the epoch began.
     errors: (u64, f64),
-    /// Number of lost packets of cells before it.
+    /// Number of lost packets of cells when the epoch began.
     lost: u64,
-    /// Its slowest reply, in µs.
+    /// The slowest reply in the epoch, in µs.
     slowest: Option<u64>,
 }
 
-/// Lines over time with one point per epoch.
+/// Series over time with one point for each epoch.
 #[derive(Debug, Default)]
 pub(super) struct Lines {
     pub(super) due: ThinnedLine,
     pub(super) in_time: ThinnedLine,
     pub(super) late: ThinnedLine,
     pub(super) missing: ThinnedLine,
-    /// The slowest reply, in ms.
+    /// The slowest reply of each epoch, in ms.
     pub(super) slowest: ThinnedLine,
-    /// Mean absolute error of the whole bus' torque in an epoch that all cells answered, in Nm.
+    /// Mean absolute error of the bus's torque in each epoch that all cells answered, in Nm.
     pub(super) error: ThinnedLine,
-    /// By joint of the chain: distributed minus central torque of an epoch that all cells answered, in Nm or N.
+    /// For each joint of the chain, the distributed minus the central torque in each epoch that all cells answered, in
+    /// Nm or N.
     pub(super) difference: Vec<ThinnedLine>,
 }
 
-/// The effect of a frame on the lines of a capture without a loop.
+/// The effect of a frame on the series of a capture that has frames only, without the loop's topics.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Effect {
-    /// New joints, by joint of the chain, in rad or m.
+    /// New joint positions of the chain, in rad or m.
     Joints([f64; MAX_JOINTS]),
-    /// A halt (true) or a resume of cells.
+    /// True for a halt of the cells, false for a resume.
     Halted(bool),
 }
 
-/// Returns true for frames that cells receive and that change a table like the gateway's own. The capture does not
-/// contain the sender of a frame, but its identifier shows its receiver.
+/// Returns true for a frame that cells receive and that the gateway's table records. The capture does not contain the
+/// sender of a frame, but the identifier shows the receiver.
 fn is_for_cells(frame: &Frame) -> bool {
     let Ok(id) = data_id(frame) else { return false };
     // A table counts a resume only in frames of others: the gateway knows its own.
@@ -78,13 +79,14 @@ fn is_for_cells(frame: &Frame) -> bool {
     id.sender().is_none() && !is_resume
 }
 
-/// The state of a bus after the frames so far.
+/// The table of a bus as far as its frames have been read.
 #[derive(Debug)]
 pub(super) struct Received {
     last_timeout_check: Micros,
-    /// True if frames have no direction that identifies the gateway's own.
+    /// True for a capture without the direction of frames, in which the gateway's own frames are recognised by their
+    /// identifiers.
     is_of_frames_only: bool,
-    /// The totals before the newest joints.
+    /// The totals of the table when the newest joints arrived.
     pub(super) before: BusTotals,
     /// Number of cells in contact since the newest joints; `None` if unknown for some cell.
     pub(super) in_contact: Option<u32>,
@@ -95,33 +97,33 @@ pub(super) struct Received {
 pub(super) struct BusFigures {
     pub(super) name: String,
     pub(super) table: Table,
-    /// The central computation of its cells' forces.
+    /// The central computation for the cells of the bus.
     central: Central,
-    /// By index of the cell on the bus: the last reported force in N, for cells that measure.
+    /// The last reported force in N of each cell that measures, by its index on the bus.
     measured: Vec<Option<f64>>,
     pub(super) touched: TouchHistory,
     pub(super) moments: Moments,
-    /// Time and size of the largest error of the whole bus' torque.
+    /// Time in s and size in Nm of the largest error of the bus's torque.
     pub(super) farthest: Option<(f64, f64)>,
     /// True if cells answer with sums.
     pub(super) sums: bool,
     pub(super) received: Received,
     open: Option<OpenEpoch>,
     pub(super) lines: Lines,
-    /// By index of the cell on the bus.
+    /// Reply times of each cell, by its index on the bus.
     pub(super) latency: Vec<Latency>,
     pub(super) frames: u64,
     /// Times of the first and the last joints on the bus, in s, and the number of joints.
     pub(super) joints: Option<(f64, f64, u64)>,
-    /// The bit rates of the corresponding real bus.
+    /// Bit rates of the real bus for which the load is computed.
     pub(super) rates: ChosenRates,
-    /// The source of the rates; `None` for defaults.
+    /// Where the rates come from; `None` for defaults.
     pub(super) rates_from: Option<&'static str>,
-    /// Seconds of transmission on the real bus.
+    /// Time in s that the frames take on the real bus, by time of the run.
     pub(super) load: BinnedSums,
-    /// Seconds of transmission, including frames that only a bench sends.
+    /// Time in s as in `load`, with the frames that only a bench sends included.
     pub(super) load_of_all: BinnedSums,
-    /// Frames that the recorder lost, by its own notes.
+    /// Number of frames that the recorder lost, by its own notes.
     pub(super) dropped: u64,
 }
 
@@ -166,12 +168,12 @@ impl BusFigures {
         }
     }
 
-    /// Handles a frame that was latched before the start of the recording.
+    /// Handles a packet from before the start of the recording, which still has an effect.
     pub(super) fn latched(&mut self, before: &LatchedFrame) {
         self.table.handle_frame(Micros(before.nanos / 1_000), before.own, &before.frame, &mut |_| None);
     }
 
-    /// Starts the recording.
+    /// Starts counting, after the packets from before the start.
     pub(super) fn begin(&mut self) {
         self.table.begin_accounts();
         self.open = self.table.newest().map(|(number, _, _)| OpenEpoch { number, ..OpenEpoch::default() });
@@ -218,12 +220,12 @@ impl BusFigures {
         }
     }
 
-    /// Adds the load of a frame on a real bus; zero for a frame that only a bench sends.
+    /// Adds the time that a frame takes on a real bus; zero for a frame that only a bench sends.
     pub(super) fn carried(&mut self, at: f64, bits: Option<Bits>) {
         self.load.add(at, bits.map_or(0.0, |bits| bits.seconds(self.rates.rates)));
     }
 
-    /// Records the reply time of a cell, if this is its answer to the newest joints.
+    /// Records the reply time of a cell, if the message is its answer to the newest joints.
     fn answer(&mut self, now: Micros, message: &Message) {
         let (Message::Torque { from, epoch, .. } | Message::Sum { from, epoch, .. }) = message else {
             return;
@@ -243,7 +245,7 @@ impl BusFigures {
         }
     }
 
-    /// Records the force that a cell measures, if this is its sensors page.
+    /// Records the force that a cell measures, if the message is its sensors page.
     fn measure(&mut self, message: &Message) {
         let Message::Sensors { from, page: SensorPage::Skin(skin), .. } = message else { return };
         let Some(place) = self.table.cells().iter().position(|cell| cell.node == *from) else { return };
@@ -252,7 +254,7 @@ impl BusFigures {
         }
     }
 
-    /// Updates the force on each cell since the newest joints, from its stimuli or from its measurement.
+    /// Updates the force on each cell for the newest joints, from the cell's stimuli or its own measurement.
     fn forces(&mut self, at: f64) {
         let (table, central, measured) = (&self.table, &self.central, &self.measured);
         let sensors = table.sensors(self.received.last_timeout_check).zip(table.cells()).zip(measured).enumerate();
@@ -269,19 +271,19 @@ impl BusFigures {
         self.received.in_contact = in_contact;
     }
 
-    /// Returns the account of due and received replies over all epochs.
+    /// Returns the counts of due and received replies over all epochs.
     pub(super) fn account(&self) -> Replies {
         self.table.replies()
     }
 
-    /// Returns the number and the sum of errors so far.
+    /// Returns the number and the sum in Nm of the torque errors so far.
     fn errors(&self) -> (u64, f64) {
         let accuracy = self.table.accuracy();
         let errors = if self.sums { accuracy.sums } else { accuracy.whole };
         (errors.count(), errors.mean().unwrap_or(0.0) * errors.count() as f64)
     }
 
-    /// Handles new joints on the bus.
+    /// Handles new joints on the bus: ends the epoch, and begins the next one.
     fn next(&mut self, number: u64, at: f64) {
         let (first, _, count) = self.joints.unwrap_or((at, at, 0));
         self.joints = Some((first, at, count + 1));
@@ -291,7 +293,8 @@ impl BusFigures {
         self.forces(at);
     }
 
-    /// Closes the open epoch. Returns the number of newly due replies, the account and the errors now.
+    /// Ends the epoch. Returns the number of replies that were due in it, and the counts of replies and errors after
+    /// it.
     fn close(&mut self) -> (u64, Replies, (u64, f64)) {
         let (account, errors) = (self.account(), self.errors());
         let Some(OpenEpoch { at, due, before, errors: errors_before, lost, slowest, .. }) = self.open.take()
@@ -322,7 +325,7 @@ impl BusFigures {
         (account.due.saturating_sub(before.due), account, errors)
     }
 
-    /// Ends the figures.
+    /// Ends the series after the last frame.
     pub(super) fn finish(&mut self) {
         self.table.finish();
         self.close();

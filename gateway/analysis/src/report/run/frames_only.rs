@@ -1,21 +1,21 @@
-//! Captures with frames only, such as a candump log: series from joints and torques on the buses instead of the loop's
-//! topics, and the missing parts of the report.
+//! Reports on captures with frames only, such as a candump log. The series come from the joints and torques on the
+//! buses, because the topics of the control loop are missing.
 
 use protocol::skin::Skin;
 
 use super::bus_figures::{Effect, BusFigures};
 use super::motion::Motion;
 
-/// The kind of a capture without a loop, and the state of reading it.
+/// A capture with frames only, as far as it has been read.
 #[derive(Debug)]
 pub(super) struct FramesOnly {
-    /// Its description in a sentence, without article: `candump log`.
+    /// Kind of the capture for use in a sentence, without article: `candump log`.
     pub(super) format: &'static str,
-    /// Its description as the subject of missing parts: `a log`.
+    /// Kind of the capture with its article, as the subject of a sentence: `a log`.
     pub(super) noun: &'static str,
-    /// The file of its skin.
+    /// Name of the file of the skin.
     pub(super) skin_file: String,
-    /// The bus whose joints give the times of the series.
+    /// The bus whose joints determine the times of the series, as an index into the skin's buses.
     clock: Option<usize>,
     is_halted: bool,
     /// Time of the last frame, in s after the first.
@@ -32,7 +32,7 @@ impl FramesOnly {
         Self { format, noun, skin_file, clock: None, is_halted: false, end: 0.0, began: None }
     }
 
-    /// Handles a frame of one of the skin's buses with its effect there.
+    /// Handles a frame on one of the skin's buses; `effect` is its effect on the series.
     pub(super) fn receive(
         &mut self,
         (at, bus, effect): (f64, usize, Option<Effect>),
@@ -66,13 +66,13 @@ impl FramesOnly {
         }
     }
 
-    /// Ends the capture: sets the covered time, from the first joints to the last frame.
+    /// Ends the capture: sets the time that the series cover, from the first joints to the last frame.
     pub(super) fn finish(&self, motion: &mut Motion) {
         motion.first.get_or_insert(0.0);
         motion.last = self.end;
     }
 
-    /// Returns the missing parts of the report, as list items.
+    /// Returns the parts of the report that this capture cannot have, as list items.
     pub(super) fn missing(&self, bus_figures: &[BusFigures], motion: &Motion) -> Vec<&'static str> {
         let has_joints = bus_figures.iter().any(|it| it.joints.is_some());
         let compared = bus_figures.iter().any(|it| {
@@ -92,7 +92,7 @@ impl FramesOnly {
     }
 }
 
-/// Adds the sums of all buses before the joints.
+/// Adds to the series the sums of all buses from before the joints at `at`.
 fn sums(at: f64, skin: &Skin, bus_figures: &[BusFigures], motion: &mut Motion) {
     let mut torque = vec![0.0; motion.distributed.len()];
     let (mut contributing, mut active) = (0, Some(0));

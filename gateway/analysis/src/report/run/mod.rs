@@ -36,39 +36,39 @@ use trace::capture::{
 use trace::recording::layout::Layout;
 use trace::ros2::read;
 
-/// The error of a report.
+/// The error of making a report on a recording.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ReportError {
-    /// The recording cannot be opened, or is something else.
+    /// The recording cannot be opened, or the file is not a recording.
     #[error(transparent)]
     Open(CaptureError),
     /// The recording cannot be read.
     #[error(transparent)]
     Capture(#[from] CaptureError),
-    /// The capture has frames only, and no skin was given.
+    /// The capture has frames only, and the options do not name its skin.
     #[error(
         "{name} is a log, and frames alone are not enough: name their skin with --skin; a recording, `skinbus run SKIN \
          --record run.mcap`, has it"
     )]
     Log {
-        /// Its name.
+        /// Name of the capture.
         name: String,
     },
-    /// The capture has only frames that cannot be reported.
+    /// The capture has only frames that a report cannot use.
     #[error("{name} {what}")]
     Frames {
-        /// Its name.
+        /// Name of the capture.
         name: String,
-        /// The fault, as the rest of a sentence, with the remedy.
+        /// The reason and the remedy, as the rest of a sentence.
         what: String,
     },
-    /// The skin in the options differs from the recording's.
+    /// The skin in the options differs from the one in the recording.
     #[error("{name} was recorded with another skin")]
     OtherSkin {
-        /// Its name.
+        /// Name of the recording.
         name: String,
-        /// The skin that is attached to it.
+        /// The skin that is attached to the recording.
         recorded: Box<Skin>,
     },
     /// The recording is from another program, or is empty.
@@ -77,43 +77,43 @@ pub enum ReportError {
         if *.has_skin { "" } else { ", and frames alone need their --skin" }
     )]
     Foreign {
-        /// Its name.
+        /// Name of the recording.
         name: String,
-        /// The missing part.
+        /// The part that is missing.
         what: String,
-        /// True if a skin was named.
+        /// True if the options name a skin.
         has_skin: bool,
     },
-    /// The recording ends before there is anything to report.
+    /// The recording ends before the first data of a run.
     #[error("{name} holds no run that can be shown: {what}")]
     Unfinished {
-        /// Its name.
+        /// Name of the recording.
         name: String,
-        /// The missing part.
+        /// The part that is missing.
         what: String,
     },
-    /// The bit rates are not valid for CAN.
+    /// CAN does not allow the bit rates.
     #[error("{bus}: {source}; correct --nominal or --data")]
     Rates {
-        /// The bus.
+        /// Name of the bus.
         bus: String,
-        /// The reason.
+        /// The limit that the rates violate.
         source: BitRatesError,
     },
 }
 
-/// A report, and the missing parts of its recording.
+/// A report, with warnings about its recording.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Report {
-    /// Its contents.
+    /// Contents of the report.
     pub page: Page,
-    /// A sentence, if the recording is cut off or damaged.
+    /// A sentence about the missing end, if the recording is cut off or damaged.
     pub missing: Option<String>,
     /// True if the recording is damaged, so that the report covers only the part before the damage.
     pub is_damaged: bool,
     /// Name of the recording.
     pub name: String,
-    /// Missing parts of a capture with frames only, and remarks on it: lines for standard error.
+    /// Warnings for standard error about a capture with frames only: missing parts, and other remarks.
     pub remarks: Vec<String>,
 }
 
@@ -131,7 +131,8 @@ pub struct Options {
 }
 
 impl Options {
-    /// Returns the source of a bus' rates: the options' names, or the skin's key; `None` for defaults.
+    /// Returns where the bit rates of a bus come from: the names of the options, or the key in the skin; `None` for
+    /// defaults.
     fn origin(&self, bus: &SkinBus) -> Option<&'static str> {
         match (self.nominal, self.data, bus.bitrate) {
             (Some(_), Some(_), _) => Some("--nominal, --data"),
@@ -142,18 +143,18 @@ impl Options {
         }
     }
 
-    /// Returns the bit rates for a bus' load.
+    /// Returns the bit rates for which the load of a bus is computed.
     fn rates(&self, bus: &SkinBus) -> Result<ChosenRates, ReportError> {
         let rates = RequestedRates { nominal: self.nominal, data: self.data }.of_bus(bus);
         rates.map_err(|source| ReportError::Rates { bus: bus.name.clone(), source })
     }
 }
 
-/// Reads a recording, or the parts of one, and creates its report.
+/// Reads a recording, whose parts are given in order, and creates its report.
 ///
 /// # Errors
-/// Returns [`ReportError`] if it is not a recording of a run, if it is empty, or if the bit rates are not valid for
-/// CAN.
+/// Returns [`ReportError`] if the files are not a recording of a run, if they contain no run, or if CAN does not allow
+/// the bit rates.
 pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportError> {
     let (run, broken, is_damaged) = read(paths, options)?;
     let missing = broken.map(|why| run.missing(&why));
@@ -163,15 +164,15 @@ pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportErro
     Ok(Report { page, missing, is_damaged, name: run.name, remarks })
 }
 
-/// Checks that these files are recordings, without reading them.
+/// Checks that the files are recordings, without reading them to the end.
 ///
 /// # Errors
-/// Returns [`ReportError`] if they are not, or cannot be opened.
+/// Returns [`ReportError`] if a file is not a recording, or cannot be opened.
 pub fn check(paths: &[PathBuf], options: &Options) -> Result<(), ReportError> {
     open(paths, options).map(drop)
 }
 
-/// Opens a recording; also returns the size of its files, if known.
+/// Opens a recording. Also returns the size of its files in bytes, if known.
 fn open(paths: &[PathBuf], options: &Options) -> Result<(Reader, Option<u64>), ReportError> {
     let mut items = Reader::open_with_others(paths).map_err(ReportError::Open)?;
     let name = items.name().to_owned();
@@ -197,7 +198,7 @@ fn open(paths: &[PathBuf], options: &Options) -> Result<(Reader, Option<u64>), R
     Ok((items, bytes))
 }
 
-/// Reads the whole recording; also returns why it has no proper end, if so, and whether that is damage.
+/// Reads the whole recording. Also returns the reason why it ends early, if it does, and true if that is damage.
 fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bool), ReportError> {
     let (mut items, bytes) = open(paths, options)?;
     let name = items.name().to_owned();
@@ -235,7 +236,7 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bo
     Ok((run, damaged.map(|error| error.to_string()).or(unfinished), is_damaged))
 }
 
-/// Creates the computation of real buses for these buses.
+/// Creates the timing model of the real buses for which the load is computed.
 fn shadow(skin: &Skin, bus_figures: &[BusFigures]) -> Shadow {
     let rates = RequestedRates::default().rates().expect("the default rates are valid");
     let of_bus =
@@ -249,34 +250,35 @@ fn shadow(skin: &Skin, bus_figures: &[BusFigures]) -> Shadow {
 #[derive(Debug)]
 struct Run {
     skin: Skin,
-    /// Its path, and its size in bytes.
+    /// Path of the recording; the next field is the size of its files in bytes.
     name: String,
     bytes: u64,
     /// Metadata records by name.
     metadata: Vec<(String, Vec<(String, String)>)>,
     /// The topics of joints and of torques.
     topics: [String; 2],
-    /// Its files, in the given order.
+    /// Names of the recording's files, in the given order.
     files: Vec<String>,
     /// Time of the first message, in ns since 1970.
     began: Option<u64>,
-    /// The origin of seconds in commands, in s after the first message: the run's first tick, or the first frame.
+    /// Time that counts as 0 s in commands, in s after the first message: the first tick of the run, or else the first
+    /// frame.
     zero: Option<f64>,
     /// Start of the loop, in ns since 1970, if the recording has it.
     run_began: Option<u64>,
     motion: Motion,
     bus_figures: Vec<BusFigures>,
     shadow: Shadow,
-    /// Packets of any network that the kernel dropped before they reached their sockets.
+    /// Number of packets, of any network, that the kernel dropped before they reached their sockets.
     backlog: u64,
     /// Number of frames on buses that are not in the skin, and the name of the first such bus.
     others: u64,
     other_bus: Option<String>,
     /// Number of messages that do not match the type of their topic.
     unreadable: u64,
-    /// The state of a capture without a loop.
+    /// The additional state for a capture with frames only.
     frames_only: Option<FramesOnly>,
-    /// Remarks on a capture without a loop.
+    /// Warnings about a capture with frames only.
     remarks: Vec<String>,
 }
 
@@ -402,12 +404,12 @@ impl Run {
         self.unreadable += u64::from(taken.is_err());
     }
 
-    /// Returns the seconds since the first message.
+    /// Converts a time in ns since 1970 to s after the first message.
     fn seconds(&mut self, nanos: u64) -> f64 {
         seconds_since(*self.began.get_or_insert(nanos), nanos)
     }
 
-    /// Adds the frames for which the load on a real bus is known now.
+    /// Adds the frames whose load on the real bus the timing model has computed.
     fn carried(&mut self) {
         while let Some(frame) = self.shadow.poll() {
             let at = self.seconds(frame.nanos);
@@ -431,13 +433,14 @@ impl Run {
         self.frames_only.is_some() && self.bus_figures.iter().any(|bus_figures| bus_figures.joints.is_some())
     }
 
-    /// Returns the missing parts of a capture with frames only, as a list.
+    /// Returns the parts that a report on this capture with frames only lacks, as a list in words.
     fn missing_parts(&self) -> String {
         let missing = self.frames_only.as_ref().map(|it| it.missing(&self.bus_figures, &self.motion));
         missing.unwrap_or_default().join("; ")
     }
 
-    /// Returns why a capture with frames only cannot be reported, as the rest of a sentence.
+    /// Returns the reason why a capture with frames only cannot be reported, as the rest of a sentence; `None` if it
+    /// can.
     fn unusable(&self, items: &Reader) -> Option<String> {
         if !items.has_times() {
             return Some(
@@ -464,13 +467,13 @@ impl Run {
         self.motion.counts.ticks == 0 && self.bus_figures.iter().all(|bus_figures| bus_figures.frames == 0)
     }
 
-    /// Returns a value of the recording's metadata.
+    /// Returns a value from the recording's metadata, by record and key.
     fn fact(&self, record: &str, key: &str) -> Option<&str> {
         let (_, facts) = self.metadata.iter().find(|(name, _)| name == record)?;
         facts.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
     }
 
-    /// Returns a sentence about the missing part of a recording without its end.
+    /// Returns a sentence about a recording that ends early; `why` is the reason.
     fn missing(&self, why: &str) -> String {
         let here = self.motion.seconds();
         let planned = self.fact("configuration", "duration_s").and_then(|text| text.parse::<f64>().ok());

@@ -5,19 +5,19 @@ use std::collections::VecDeque;
 use model::table::{Notice, Replies};
 use model::tracker::MAX_LATE_EPOCHS;
 
-/// Maximum distance of losses that are joined into one, in s.
+/// Maximum time in s between losses that are listed as one.
 const MAX_LOSS_GAP_S: f64 = 0.5;
-/// Maximum number of entries of each kind that are kept.
+/// Maximum number of losses, and of notices, that are kept.
 const MAX_KEPT: usize = 500;
 
-/// Losses shortly after each other.
+/// Late, missing or lost items within a short time, listed as one loss.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Loss {
-    /// The first and the last epoch with a loss, in s after the recording's first message.
+    /// Times of the first and the last epoch with a loss, in s after the recording's first message.
     pub(super) seconds: (f64, f64),
     pub(super) late: u64,
     pub(super) missing: u64,
-    /// Lost packets of cells, by their own counts; found at the next heartbeat.
+    /// Number of packets lost by the cells' own counts, which are known at the next heartbeat.
     pub(super) packets: u64,
 }
 
@@ -30,17 +30,17 @@ impl Loss {
 /// The losses and notices of one bus.
 #[derive(Debug, Default)]
 pub(super) struct Moments {
-    /// Start times of the newest epochs, newest first.
+    /// Start times of the most recent epochs, newest first.
     opened: VecDeque<f64>,
     pub(super) losses: Vec<Loss>,
     pub(super) notices: Vec<(f64, Notice)>,
-    /// Number of entries that were not kept.
+    /// Number of losses and notices that were not kept.
     pub(super) further: u64,
 }
 
 impl Moments {
-    /// Records the end of an epoch that was opened at `at`: newly late and missing replies in it, and packets found
-    /// lost.
+    /// Records the end of an epoch that began at `at`. The counts of replies before and after it show how many became
+    /// late or missing, and `packets` is the number of packets found lost.
     pub(super) fn epoch(&mut self, at: f64, before: &Replies, now: &Replies, packets: u64) {
         self.opened.push_front(at);
         self.opened.truncate(MAX_LATE_EPOCHS + 1);
@@ -65,7 +65,7 @@ impl Moments {
         }
     }
 
-    /// Records a notice of a table.
+    /// Records a notice of the bus's table, such as a silent cell.
     pub(super) fn notice(&mut self, at: f64, notice: Notice) {
         if self.notices.len() < MAX_KEPT {
             self.notices.push((at, notice));
@@ -74,7 +74,7 @@ impl Moments {
         }
     }
 
-    /// Returns the loss with the highest count.
+    /// Returns the loss for which `of` returns the highest count.
     pub(super) fn worst(&self, of: impl Fn(&Loss) -> u64) -> Option<&Loss> {
         self.losses.iter().filter(|loss| of(loss) > 0).max_by_key(|loss| of(loss))
     }

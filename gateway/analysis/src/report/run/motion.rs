@@ -5,7 +5,7 @@ use model::quantiles::Times;
 use trace::ros2::read::{Joints, Torques};
 use trace::ros2::skin::LoopTiming;
 
-/// Maximum number of changes of the loop that are listed.
+/// Maximum number of changes of the control loop's state that are listed.
 const MAX_CHANGES: usize = 12;
 
 /// The series and counts of all ticks.
@@ -28,9 +28,9 @@ pub(super) struct Motion {
     /// The first and the last tick in s; for frames only, the first joints and the last frame.
     pub(super) first: Option<f64>,
     pub(super) last: f64,
-    /// Time and size of the largest number of skipped ticks.
+    /// Time in s and size of the largest number of skipped ticks.
     pub(super) skip: Option<(f64, u64)>,
-    /// Changes of the loop, with their times.
+    /// Changes of the control loop's state, with their times in s.
     pub(super) turns: Vec<(f64, &'static str)>,
     number: Option<u64>,
     comparing: Option<bool>,
@@ -42,14 +42,14 @@ pub(super) struct Motion {
 pub(super) struct Counts {
     pub(super) ticks: u64,
     pub(super) skipped: u64,
-    /// Ticks that happened, by their numbers, but are not in the recording.
+    /// Ticks that were run, by their numbers, but are missing from the recording.
     pub(super) unrecorded: u64,
     pub(super) bad: u64,
     pub(super) halted: u64,
     pub(super) refused: u64,
 }
 
-/// A duration in each tick: a line in µs, and a histogram.
+/// The duration of a part of each tick: as a series in µs, and as a histogram.
 #[derive(Debug, Default)]
 pub(super) struct Timed {
     pub(super) line: ThinnedLine,
@@ -124,7 +124,7 @@ impl Motion {
 }
 
 impl Counts {
-    /// Counts the next tick, after the tick with number `before`.
+    /// Counts a tick, and the skipped or unrecorded ones since the tick with the number `before`.
     fn take(&mut self, timing: &LoopTiming, before: Option<u64>) {
         self.ticks += 1;
         self.skipped = self.skipped.saturating_add(timing.skipped);

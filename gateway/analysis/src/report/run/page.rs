@@ -209,7 +209,7 @@ impl Draft<'_> {
         let more = if cells.len() > MAX_LISTED_CELLS { ", and others" } else { "" };
         let named: Vec<_> = cells.iter().take(MAX_LISTED_CELLS).map(String::as_str).collect();
         let what = format!(
-            "stuck cells, which sent constant words while others were due ({}{more})",
+            "stuck cells, which sent constant words while the expected words changed ({}{more})",
             named.join("; ")
         );
         (!cells.is_empty()).then(|| none(what, cells.len() as u64))

@@ -1,5 +1,5 @@
-//! The touches of the cells of a bus, with time and force, in bounded memory: the largest force in equal bins of time,
-//! which double in width when there are too many.
+//! Records the touches of the cells of a bus, with time and force, in bounded memory. It keeps the largest force in
+//! equal bins of time, which double in width when there are too many.
 
 use std::collections::BTreeMap;
 
@@ -8,15 +8,15 @@ use protocol::skin::Skin;
 /// Maximum number of bins, and their initial width in s.
 const MAX_BINS: usize = 600;
 const BIN_S: f64 = 0.016;
-/// Maximum number of touches with details.
+/// Maximum number of touches that are kept with their details.
 const MAX_TOUCHES: usize = 2_000;
 
-/// A time span with contact on some cell of a link.
+/// A time span during which cells on one link are in contact.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Touch {
-    /// The row that carries the cells, from 1.
+    /// The row of the chain that carries these cells, from 1.
     pub(super) row: u8,
-    /// Start and end, in s after the recording's first message.
+    /// Start and end of the span, in s after the recording's first message.
     pub(super) seconds: (f64, f64),
     /// The cells in contact, by index on the bus.
     pub(super) cells: Vec<usize>,
@@ -27,20 +27,20 @@ pub(super) struct Touch {
 /// The touches of the cells of one bus.
 #[derive(Debug)]
 pub(super) struct TouchHistory {
-    /// By index of the cell on the bus: the row that carries it.
+    /// For each cell, by its index on the bus, the row of the chain that carries it.
     rows: Vec<u8>,
     width: f64,
-    /// Largest forces in N by bin, for touched cells.
+    /// The largest force of each touched cell in each bin, in N.
     bins: BTreeMap<usize, Vec<f64>>,
     /// The largest force of each cell, in N; `None` while unknown.
     pub(super) max: Vec<Option<f64>>,
     /// Forces since the last joints, and the time of those joints.
     now: Vec<f64>,
     at: Option<f64>,
-    /// Open touches by row.
+    /// Touches that have not ended, by row.
     open: BTreeMap<u8, Touch>,
     pub(super) touches: Vec<Touch>,
-    /// Number of touches beyond those with details.
+    /// Number of touches whose details were not kept.
     pub(super) further: u64,
 }
 
@@ -60,7 +60,7 @@ impl TouchHistory {
         }
     }
 
-    /// Records new joints on the bus with the forces on its cells since then, in N, where known.
+    /// Records new joints on the bus at `at` in s, with the force on each cell since these joints in N, where known.
     pub(super) fn joints(&mut self, at: f64, forces: impl Iterator<Item = Option<f64>>) {
         self.until(at);
         self.at = Some(at);
@@ -111,7 +111,7 @@ impl TouchHistory {
         }
     }
 
-    /// Extends the last forces to the time `at`.
+    /// Adds the last forces to the bins up to the time `at` in s.
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
@@ -144,7 +144,7 @@ impl TouchHistory {
         rows.into_iter().for_each(|row| self.end(row, at));
     }
 
-    /// Returns the touched cells by index: start and end of each bin in s, and the largest force in it in N.
+    /// Returns for each touched cell its index, and the bins: start and end in s, and the largest force in N.
     pub(super) fn cells(&self) -> impl Iterator<Item = (usize, Vec<(f64, f64, f64)>)> + '_ {
         self.bins.iter().map(|(place, bins)| {
             let place_of = |at: usize| at as f64 * self.width;
@@ -165,7 +165,7 @@ mod tests {
         TouchHistory::new(&skin, 0)
     }
 
-    /// Records joints with forces by index of the cell; all others are 0.
+    /// Records joints with these forces, each with the index of its cell; the force on other cells is 0.
     fn joints(touched: &mut TouchHistory, at: f64, forces: &[(usize, f64)]) {
         let cells = touched.rows.len();
         let force = |place| forces.iter().find(|(of, _)| *of == place).map_or(0.0, |(_, force)| *force);

@@ -9,19 +9,19 @@ use super::super::scale::Span;
 use super::colour::{LEVELS, TRACK, colours, level};
 use super::{FAINT, INK, LETTERS, dark, natural};
 
-/// Mean width of a letter.
+/// Mean width of a letter, in pixels.
 const LETTER: f64 = 0.56 * LETTERS;
-/// Margin of a drawing.
+/// Margin of a drawing, in pixels.
 const MARGIN: f64 = 12.0;
-/// Height of the legend, with the space below it.
+/// Height of the legend with the space below it, in pixels.
 const LEGEND: f64 = 52.0;
-/// Height of the heading of a panel or group.
+/// Height of the heading of a panel or group, in pixels.
 const HEADING: f64 = 24.0;
-/// Maximum distance between the centres of adjacent cells.
+/// Maximum distance between the centres of adjacent cells, in pixels.
 const PITCH: f64 = 18.0;
-/// Overlap of adjacent areas, which hides seams.
+/// Overlap of adjacent areas in pixels, so that no seams are visible.
 const SEAM: f64 = 0.3;
-/// Distance of cells for a link with one cell, in m.
+/// Distance between cells in m that is assumed for a link with a single cell.
 const SINGLE_CELL_PITCH_M: f64 = 0.028;
 
 /// Draws a standalone SVG file.
@@ -34,7 +34,8 @@ pub fn draw(drawing: &Drawing) -> String {
     document(drawing, (width.into(), height), &attributes, &format!("{style}{body}"))
 }
 
-/// Draws a part of a page that contains the rules of [`dark()`]; `width` is the natural width in pixels.
+/// Draws cells as an element of a page that contains the CSS rules of [`dark()`]; `width` is the width in pixels before
+/// scaling.
 #[must_use]
 pub fn inline(drawing: &Drawing, width: u32, class: &str) -> String {
     let (height, body) = body(drawing, width.into());
@@ -49,7 +50,7 @@ fn document(drawing: &Drawing, (width, height): (f64, f64), attributes: &str, bo
     )
 }
 
-/// Returns the drawing's height and its elements.
+/// Returns the height of a drawing in pixels and the text of its SVG elements.
 fn body(drawing: &Drawing, width: f64) -> (f64, String) {
     let mut out = String::new();
     let height = match drawing {
@@ -95,7 +96,7 @@ fn track(out: &mut String, path: &str) {
     let _ = writeln!(out, "<path class=\"track\" fill=\"{paper}\" d=\"{path}\"/>");
 }
 
-/// Areas by their level; each level becomes one element.
+/// Areas to fill, by level of colour; the areas of a level become one SVG element.
 #[derive(Default)]
 struct Levels([String; LEVELS]);
 
@@ -175,13 +176,13 @@ fn strip_of(out: &mut String, strip: &Strip, width: f64) -> f64 {
     y + 46.0
 }
 
-/// A panel's cells and its size, in m.
+/// The cells of one panel, and the area that they cover in m.
 struct Sheet<'a> {
     panel: &'a Panel,
-    /// The smallest coordinates, and the extent.
+    /// The smallest coordinates of the area in m; in the next field, its width and height.
     from: [f64; 2],
     size: [f64; 2],
-    /// Median distance from a cell to its nearest neighbour.
+    /// Median distance from a cell to its nearest neighbour, in m.
     pitch: f64,
     /// Mean direction of the nearest neighbours, modulo 60 degrees.
     turn: f64,
@@ -236,7 +237,7 @@ fn map_of(out: &mut String, map: &Map, width: f64) -> f64 {
     y + height
 }
 
-/// Draws one link; returns its height including heading and axis.
+/// Draws one link, and returns its height in pixels, including heading and axis.
 fn panel_of(out: &mut String, sheet: &Sheet<'_>, legend: &Legend, (x, y): (f64, f64), scale: f64) -> f64 {
     words(out, (x, y + 14.0), Anchor::Start, false, &sheet.panel.title);
     let (left, top) = (x + 44.0, y + HEADING);

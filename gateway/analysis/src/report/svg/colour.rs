@@ -4,10 +4,10 @@
 
 use std::fmt::Write as _;
 
-/// Number of colours.
+/// Number of colours for values above 0.
 pub(super) const LEVELS: usize = 16;
 
-/// Cividis at equal distances.
+/// The colours of cividis at equal distances, as red, green and blue.
 const CIVIDIS: [[f64; 3]; 10] = [
     [0.0, 34.0, 78.0],
     [18.0, 53.0, 112.0],
@@ -24,7 +24,7 @@ const CIVIDIS: [[f64; 3]; 10] = [
 /// The background of cells and rows, on paper and on a dark screen.
 pub(super) const TRACK: [&str; 2] = ["#EBEDEF", "#26292E"];
 
-/// Returns a colour for a position from 0 to 1.
+/// Returns the cividis colour at a position from 0 to 1, as a CSS colour.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 9, and 0 to 255")]
 fn cividis(place: f64) -> String {
     let at = place.clamp(0.0, 1.0) * (CIVIDIS.len() - 1) as f64;
@@ -38,20 +38,20 @@ fn cividis(place: f64) -> String {
     text
 }
 
-/// Returns the colours of a level, from 0, on paper and on a dark screen.
+/// Returns the colours of a level on paper and on a dark screen; levels count from 0.
 pub(super) fn colours(level: usize) -> [String; 2] {
     let part = level as f64 / (LEVELS - 1) as f64;
     [cividis(1.0 - part), cividis(0.2 + 0.8 * part)]
 }
 
-/// Returns the level of a value above 0 that is at most `max`.
+/// Returns the level of colour, from 0, for a value above 0 and up to `max`.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 15")]
 pub(super) fn level(value: f64, max: f64) -> usize {
     let part = (value / max).clamp(0.0, 1.0) * LEVELS as f64;
     (part.ceil() as usize).clamp(1, LEVELS) - 1
 }
 
-/// Adds the CSS rules for a dark screen.
+/// Adds the CSS rules with which a dark screen replaces the colours.
 pub(super) fn dark(rules: &mut String) {
     let [_, track] = TRACK;
     let _ = write!(rules, ".track{{fill:{track}}}");

@@ -18,7 +18,7 @@ fn line(points: &[(f64, f64)]) -> Series {
     Series::new("a \"line\" & more", Shape::Line, points.to_vec())
 }
 
-/// Returns the lines of a class, as positions in units.
+/// Returns the lines with this CSS class, each as a list of positions in drawing units.
 fn lines<'a>(document: &'a Document<'_>, class: &'a str) -> Vec<Vec<(f64, f64)>> {
     let of_class =
         |node: &Node<'_, '_>| node.has_tag_name((SVG, "polyline")) && node.attribute("class") == Some(class);

@@ -28,15 +28,16 @@ use model::latched::KnownContacts;
 
 /// Maximum number of remembered unanswered requests per cell.
 const ANNOUNCED: usize = 256;
-/// Number of final joints within which a request may be answered after the end.
+/// Number of the last joint broadcasts of the recording within which a request may lack its answer because the
+/// recording ended.
 const AT_THE_END: u64 = 8;
 
 /// A cell on the bus now.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct PresentCell {
-    /// Claim of its node id, with its last heartbeat.
+    /// The cell's claim of its node id, with its last heartbeat.
     pub claim: AddressClaim,
-    /// First and last counters received from it.
+    /// First and last counters that the cell reported.
     pub counters: Option<(ReceivedCounts, ReceivedCounts)>,
     /// Progress with the joints announced last.
     pub(super) progress: Progress,
@@ -53,22 +54,22 @@ impl PresentCell {
     }
 }
 
-/// A recorded value and its present counterpart.
+/// A value from the recording, and its counterpart from this replay.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Both<T> {
     pub(super) recorded: T,
     pub(super) now: T,
 }
 
-/// Announced joints.
+/// Joints that are about to be sent, or were sent.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Announced {
     pub(super) announcement: u64,
-    /// Number among the replayed joints, or `None` for joints that only restore a state.
+    /// Number of their round, or `None` for joints that only restore a state.
     pub(super) round: Option<u64>,
 }
 
-/// Recorded joints and their replies.
+/// A round: recorded joints, with the recorded replies and the replies in this replay.
 #[derive(Debug, Default)]
 pub(super) struct Round {
     pub(super) epoch: Epoch,
@@ -76,18 +77,18 @@ pub(super) struct Round {
     pub(super) nanos: u64,
     /// State of resending the joints.
     pub(super) sending: Sending,
-    /// Words of each reply, recorded and now.
+    /// Words of each reply, in the recording and in this replay.
     pub(super) replies: BTreeMap<(CellId, ReplyKind), Both<Option<Words>>>,
-    /// Sums, recorded and now.
+    /// Sums, in the recording and in this replay.
     pub(super) sums: Both<SumsByCell>,
-    /// Cells that the recorded stimuli touch at the joints before, and at these.
+    /// Cells that the recorded stimuli touch at the previous joints, and at these joints.
     pub(super) touched: [KnownContacts; 2],
-    /// True if a pass begins with these joints.
+    /// True if a pass over the capture begins with these joints.
     pub(super) is_first: bool,
 }
 
 impl Round {
-    /// Returns true if sums of this epoch belong to the latest sending of these joints, not to an earlier one.
+    /// Returns true if sums of this epoch answer the last sending of these joints, not an earlier one.
     pub(super) fn has_sums_of(&self, epoch: Epoch) -> bool {
         self.sending.under().unwrap_or(self.epoch) == epoch
     }
@@ -107,9 +108,9 @@ impl Round {
 #[derive(Debug)]
 pub(super) struct KnownCell {
     pub(super) cell: Surveyed,
-    /// State of its recorded contact.
+    /// State of the cell's contact in the recording.
     pub(super) contact: Contact,
-    /// End of its contact in the replay.
+    /// End of the cell's contact in this replay, compared with the recording.
     pub(super) end: End,
 }
 
@@ -119,12 +120,12 @@ impl KnownCell {
     }
 }
 
-/// Answers to `configure` that have not been compared: the recorded ones and the present ones.
+/// Answers to `configure` that have not been compared: those of the recording and those of this replay.
 #[derive(Debug, Default)]
 pub(super) struct Answers {
-    /// Number of rounds before the answer, its tag, and the answer.
+    /// Number of rounds before each answer, the tag of the answer, and the answer.
     pub(super) recorded: VecDeque<(u64, u8, Answer)>,
-    /// Recorded requests without an answer so far.
+    /// Recorded requests for which no answer has been read yet.
     announced: VecDeque<Question>,
     pub(super) now: VecDeque<(u8, Answer)>,
 }
@@ -133,19 +134,19 @@ pub(super) struct Answers {
 #[derive(Clone, Copy, Debug)]
 struct Question {
     tag: u8,
-    /// Number of rounds before it, and the time of the last of them.
+    /// Number of rounds before the request, and the time of the last of them.
     round: u64,
     nanos: u64,
 }
 
-/// A pass over the capture, as far as it has been read.
+/// State of a pass over the capture, up to the message that was read last.
 #[derive(Debug, Default)]
 struct Reading {
     pass: Pass,
     /// State at the last recorded joints, and the cells touched at them.
     state: State,
     touched: KnownContacts,
-    /// Number of its first round.
+    /// Number of the first round of the pass.
     first_round: u64,
 }
 
@@ -162,7 +163,7 @@ impl Reading {
 #[derive(Debug, Default)]
 pub(super) struct BusComparator {
     pub(super) name: String,
-    /// Units of its torques, as far as a skin gives them.
+    /// Units of the bus's torques, as far as a skin gives them.
     pub(super) units: Units,
     pub(super) present: BTreeMap<CellId, PresentCell>,
     pub(super) known: BTreeMap<CellId, KnownCell>,
@@ -177,11 +178,11 @@ pub(super) struct BusComparator {
     /// Trees of the cells, recorded and now.
     pub(super) trees: Both<Trees>,
     pub(super) answers: BTreeMap<CellId, Answers>,
-    /// Cells whose last recorded sum did not end a contact: they must send another sum or the end.
+    /// Cells whose last recorded sum did not end a contact. Each must send another sum, or the end of the contact.
     pub(super) speaking: BTreeSet<CellId>,
     /// True if cells were configured to send sensor frames without request, which arrive at times of their own.
     pub(super) senses: bool,
-    /// First joints of each cell since its start.
+    /// State of each cell's first joints since its start, in the recording and in this replay.
     pub(super) first_joints: Both<PerCell<FirstJoints>>,
     reading: Reading,
     /// Number of announced rounds.
@@ -192,7 +193,7 @@ pub(super) struct BusComparator {
 }
 
 impl BusComparator {
-    /// Its name and the units of its torques.
+    /// Returns the name of the bus and the units of its torques.
     pub(super) fn called(&self) -> (&str, Units) {
         (&self.name, self.units)
     }
@@ -227,24 +228,24 @@ impl BusComparator {
         self.rounds.get_mut(usize::try_from(at).ok()?)
     }
 
-    /// Round of the latest recorded joints of an epoch.
+    /// Returns the round of the latest recorded joints of an epoch.
     pub(super) fn recorded_round(&mut self, epoch: Epoch) -> Option<&mut Round> {
         let number = self.recorded.get(usize::from(epoch.0)).copied().flatten()?;
         self.round(number)
     }
 
-    /// Latest announced joints of an epoch.
+    /// Returns the latest announced joints of an epoch.
     fn announced(&self, epoch: Epoch) -> Option<Announced> {
         self.announced.get(usize::from(epoch.0)).copied().flatten()
     }
 
-    /// Number and state of the round sent last under an epoch.
+    /// Returns the number and the state of the round whose joints were sent last under an epoch.
     pub(super) fn announced_round(&mut self, epoch: Epoch) -> Option<(u64, &mut Round)> {
         let number = self.announced(epoch)?.round?;
         Some((number, self.round(number)?))
     }
 
-    /// Counts a torque or sum of the part whose joints are not in it, with the reason.
+    /// Counts a torque or sum in the replayed part whose joints are not in that part, by the reason.
     pub(super) fn count_without_joints(&self, epoch: Epoch, lacking: &mut Uncompared) {
         if self.is_earlier(epoch) {
             lacking.joints_earlier += 1;
@@ -253,14 +254,14 @@ impl BusComparator {
         }
     }
 
-    /// Requires another message of each cell as confirmation of all that was announced so far.
+    /// Requires from each cell another heartbeat, which confirms all messages announced so far.
     pub(super) fn announce(&mut self) {
         self.announcements += 1;
         let announced = |progress: Progress| progress.next(progress::Input::Announced);
         self.present.values_mut().for_each(|present| present.progress = announced(present.progress));
     }
 
-    /// Gives up and returns the cells that have not answered in time.
+    /// Stops waiting. Returns the cells that have not answered in time.
     pub(super) fn give_up(&mut self) -> Vec<CellId> {
         let mut late = Vec::new();
         for (cell, present) in self.present.iter_mut().filter(|(_, present)| present.is_awaited()) {
@@ -275,13 +276,13 @@ impl BusComparator {
         let Some(round) = self.round(number) else { return };
         round.sending = round.sending.next(input);
         if matches!(input, sending::Input::Sent { .. }) {
-            // Repeated joints make all cells resend their sums.
+            // After repeated joints, all cells send their sums again.
             round.sums.now.clear();
         }
     }
 
-    /// Drops recorded replies to messages that were not sent. It is unknown whether messages after the last joints were
-    /// sent, so replies to them are not expected.
+    /// Drops recorded replies to messages that were not sent. Replies to messages after the last joints are not
+    /// expected either, because it is unknown whether those messages were sent.
     pub(super) fn forget_the_unsent(&mut self) {
         let sent = self.sent;
         for answers in self.answers.values_mut() {
@@ -292,7 +293,7 @@ impl BusComparator {
         }
     }
 
-    /// Handles a restart of the capture.
+    /// Starts another pass over the capture.
     pub(super) fn begin(&mut self) {
         self.recorded.fill(None);
         let mut reading = Reading { first_round: self.rounds_so_far(), ..Reading::default() };
@@ -304,7 +305,7 @@ impl BusComparator {
         self.base + self.rounds.len() as u64
     }
 
-    /// Records joints of the capture. Returns the number of their round if they will be sent.
+    /// Adds joints of the capture. Returns the number of their round if they will be sent.
     pub(super) fn record_joints(&mut self, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
         let number = self.rounds_so_far();
         let last = self.reading.state.last_epoch();
@@ -325,7 +326,7 @@ impl BusComparator {
         std::mem::replace(&mut self.reading.touched, self.reading.state.touched())
     }
 
-    /// Records any other message of the capture. `is_in_part` is true in the part that is replayed.
+    /// Adds any other message of the capture. `is_in_part` is true if the message is in the replayed part.
     pub(super) fn record_state(&mut self, message: &Message, is_in_part: bool) {
         if !is_in_part {
             self.reading.next(pass::Input::NotSent);
@@ -348,13 +349,13 @@ impl BusComparator {
         }
     }
 
-    /// Returns true if the recorded cell with this node id only claims it.
+    /// Returns true if the recorded cell with this node id claims the id and does not own it yet.
     pub(super) fn is_claiming(&self, cell: CellId) -> bool {
         self.reading.state.claim(cell).is_some_and(|claim| !claim.is_settled())
     }
 
-    /// Returns true if a reply of this epoch, which no joints of the part have had yet, answers joints from before the
-    /// part.
+    /// Returns true if a reply of this epoch answers joints from before the replayed part. Call it only if no joints in
+    /// the part have had this epoch yet.
     fn is_earlier(&self, epoch: Epoch) -> bool {
         let Reading { pass, state, first_round, .. } = &self.reading;
         let last = pass.earlier(state.last_epoch());
@@ -362,7 +363,7 @@ impl BusComparator {
             && last.is_some_and(|last| (0..100).contains(&last.epochs_since(epoch)))
     }
 
-    /// Records an answer to `configure`. Returns true if its request is in the part.
+    /// Adds a recorded answer to `configure`. Returns true if its request is in the replayed part.
     pub(super) fn record_answer(&mut self, from: CellId, tag: u8, answer: Answer) -> bool {
         let rounds = self.rounds_so_far();
         let answers = self.answers.entry(from).or_default();
@@ -375,15 +376,15 @@ impl BusComparator {
         true
     }
 
-    /// Records the parent that a cell reported in the capture. Its page has the epoch of the last joints that it
-    /// received: sums go to that parent from the next joints on.
+    /// Adds the parent that a cell reported in the capture. `epoch` is that of the last joints that the cell received;
+    /// its sums go to that parent from the next joints on.
     pub(super) fn record_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let next = self.base + self.rounds.len() as u64;
         let last = self.recorded.get(usize::from(epoch.0)).copied().flatten();
         self.trees.recorded.set_parent(cell, parent, last.map_or(next, |last| last + 1));
     }
 
-    /// Notes the parent that a cell reports now.
+    /// Adds the parent that a cell reports in this replay.
     fn hear_parent(&mut self, cell: CellId, epoch: Epoch, parent: Option<u8>) {
         let last = self.announced(epoch).and_then(|announced| announced.round);
         self.trees.now.set_parent(cell, parent, last.map_or(self.sent, |last| last + 1));
@@ -417,15 +418,15 @@ impl BusComparator {
         }
     }
 
-    /// Cells that the next joints wait for.
+    /// Returns the cells for which the next joints wait.
     pub(super) fn undone(&self) -> impl Iterator<Item = CellId> {
         self.present.iter().filter(|(_, present)| present.is_awaited()).map(|(cell, _)| *cell)
     }
 }
 
 impl Answers {
-    /// Returns true and counts the reason if the recording explains why it has the request of this tag but no answer.
-    /// `rounds` is the total number of rounds.
+    /// Returns true if the recording explains why it lacks the answer of this tag, and counts the reason. `rounds` is
+    /// the total number of rounds.
     pub(super) fn explain_extra(
         &mut self,
         lacking: &mut Uncompared,
@@ -434,7 +435,7 @@ impl Answers {
         rounds: u64,
     ) -> bool {
         let Some(KnownCell { cell, .. }) = known_cell else {
-            // The recording does not have this cell.
+            // The recording lacks this cell altogether.
             lacking.silent += 1;
             return true;
         };
@@ -456,7 +457,7 @@ impl Answers {
     }
 }
 
-/// Updates the first-joints state of the message's cell.
+/// Updates the state of the message's sender: whether it has received joints since its start.
 pub(super) fn take_first_joints(cells: &mut PerCell<FirstJoints>, message: &Message) {
     let Some((cell, input)) = first_joints::Input::from_message(message) else { return };
     if let Some(place) = cells.get_mut(cell) {

@@ -1,4 +1,4 @@
-//! Comparison of complete rounds with the recording.
+//! Compares complete rounds with the recording.
 
 use std::collections::BTreeSet;
 
@@ -93,7 +93,7 @@ impl BusComparator {
                 tally.lacking.said_later += 1;
                 None
             }
-            // Reports may have been requested by this replay.
+            // This replay may have requested the report itself.
             (None, Some(now)) => {
                 let counts = is_torque
                     && !explain_extra(&mut tally.lacking, known_cell, (cell, round), is_last, now.is_zero());
@@ -177,7 +177,7 @@ impl BusComparator {
         }
     }
 
-    /// Compares the answers to `configure`, in order.
+    /// Compares the answers to `configure` with the recorded ones, in order.
     pub(super) fn close_answers(&mut self, tally: &mut Tally, first: &mut First) {
         for (cell, mut answers) in std::mem::take(&mut self.answers) {
             loop {
@@ -209,7 +209,7 @@ impl BusComparator {
     }
 }
 
-/// Returns true and counts the reason if the recording explains why it lacks this reply.
+/// Returns true if the recording explains why it lacks this reply, and counts the reason.
 fn explain_extra(
     lacking: &mut Uncompared,
     known_cell: Option<&mut KnownCell>,
@@ -217,10 +217,10 @@ fn explain_extra(
     is_last: bool,
     is_end: bool,
 ) -> bool {
-    // After an apparent restart its contact is unknown, and may last.
+    // After an apparent restart, the cell's contact state is unknown: the contact may continue.
     let is_free = round.touched.iter().all(|touched| touched.is(cell) == Some(false));
     let Some(known_cell) = known_cell else {
-        // The recording does not have this cell.
+        // The recording lacks this cell altogether.
         lacking.silent += 1;
         return true;
     };
@@ -246,7 +246,7 @@ fn explain_extra(
     } else {
         return false;
     }
-    // Counters tell how many messages are missing, not which: the end may have been sent later.
+    // Counters show how many messages are missing, but not which: the end may have been sent later.
     known_cell.end = known_cell.end.next(contact::Round::Extra { is_end });
     true
 }

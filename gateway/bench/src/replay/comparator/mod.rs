@@ -37,7 +37,8 @@ pub use tally::{Uncompared, Steps, Tally};
 use super::difference::{Difference, DifferenceKind, SentValue, ReplyKind, Position};
 use super::survey::SurveyedCell as Surveyed;
 
-/// Maximum number of joints between those that a reply answers and the reply; far below the 256 epochs.
+/// Maximum number of joint broadcasts between the joints that a reply answers and the arrival of the reply. It is far
+/// below the number of epochs, 256.
 const WINDOW: u64 = 100;
 
 /// The first difference found.
@@ -49,7 +50,7 @@ struct First {
 }
 
 impl First {
-    /// Keeps the first difference, with the number, the epoch and the time of its joints.
+    /// Keeps the first difference, with the number, the epoch and the time of the joints that the reply answers.
     fn note(
         &mut self,
         how: DifferenceKind,
@@ -84,8 +85,8 @@ pub struct Comparator {
 }
 
 impl Comparator {
-    /// Compares buses, given by their present names and their cells in the capture. Compares replies within
-    /// `tolerance`, in steps of torques, once unmuted; `None` skips the comparison.
+    /// Creates the comparison of buses, given by their names in this replay and their cells in the capture. Compares
+    /// replies within `tolerance`, in steps of torques, once unmuted; with `None`, compares no replies.
     #[must_use]
     pub fn new(
         buses: impl IntoIterator<Item = (String, BTreeMap<CellId, Surveyed>)>,
@@ -113,7 +114,7 @@ impl Comparator {
         }
     }
 
-    /// Records the next joints of the capture. Returns the number of their round on their bus if they will be sent.
+    /// Adds the next joints of the capture. If they will be sent, returns the number of their round on their bus.
     pub fn expect_joints(
         &mut self,
         bus_index: usize,
@@ -124,7 +125,7 @@ impl Comparator {
         self.buses.get_mut(bus_index)?.record_joints(nanos, epoch, is_sent)
     }
 
-    /// Records any other message of the capture. `is_in_part` is true in the part that is replayed.
+    /// Adds any other message of the capture. `is_in_part` is true if the message is in the replayed part.
     pub fn expect(&mut self, bus_index: usize, message: &Message, is_in_part: bool) {
         let expects = self.tolerance.is_some();
         let (Some(bus_comparator), tally) =
@@ -158,14 +159,14 @@ impl Comparator {
         let Some((cell, epoch, what, words)) = reply(message) else { return };
         let untaken = FirstJoints::Awaited { epoch };
         if what != ReplyKind::Torque && bus_comparator.first_joints.recorded.get(cell) == Some(&untaken) {
-            // The reply belongs to no joints, even if joints of that epoch were on the bus by then.
+            // The reply answers joints outside the replayed part, even if joints of its epoch were on the bus by then.
             return;
         }
         let measured = bus_comparator.known.get(&cell).is_some_and(|known_cell| known_cell.cell.measured);
         match bus_comparator.recorded_round(epoch) {
             Some(_) if measured => tally.lacking.measured += 1,
             Some(round) => round.replies.entry((cell, what)).or_default().recorded = Some(words),
-            // Before the first joints, sensor replies belong to no joints.
+            // Before the first joints, sensor frames belong to no joints.
             None if is_in_part && what == ReplyKind::Torque => {
                 bus_comparator.count_without_joints(epoch, &mut tally.lacking)
             }
@@ -173,7 +174,8 @@ impl Comparator {
         }
     }
 
-    /// Starts a new pass of the capture: replies before its first joints answer joints of no earlier pass.
+    /// Starts another pass over the capture. Replies before the first joints of this pass do not answer joints of the
+    /// pass before.
     pub fn expect_restart(&mut self) {
         self.buses.iter_mut().for_each(BusComparator::begin);
     }
@@ -186,7 +188,8 @@ impl Comparator {
         }
     }
 
-    /// Notes that joints are about to be sent: those of a round, or others.
+    /// Notes that joints are about to be sent. `round` is the number of their round, or `None` if they only restore a
+    /// state.
     pub fn sent_joints(&mut self, bus_index: usize, round: Option<u64>, epoch: Epoch) {
         let Some(it) = self.buses.get_mut(bus_index) else { return };
         it.announce();
@@ -206,7 +209,7 @@ impl Comparator {
         }
     }
 
-    /// Notes a sync without joints: all cells must confirm everything sent so far.
+    /// Notes a sync without joints, after which all cells must confirm all messages sent so far.
     pub fn announce_sync(&mut self, bus_index: usize) {
         let Some(it) = self.buses.get_mut(bus_index) else { return };
         it.announce();
@@ -225,7 +228,7 @@ impl Comparator {
         }
     }
 
-    /// Handles a message of another sender on a bus.
+    /// Handles a message that another sender has sent on a bus.
     pub fn observe(&mut self, index: usize, message: &Message) {
         let Some(bus_comparator) = self.buses.get_mut(index) else { return };
         bus_comparator.line(line::Input::Message);
@@ -276,7 +279,7 @@ impl Comparator {
         }
     }
 
-    /// Returns true if all awaited cells of a bus have processed the joints announced last.
+    /// Returns true if all awaited cells of a bus have processed the joints that were announced last.
     #[must_use]
     pub fn is_done(&self, bus_index: usize) -> bool {
         self.buses
@@ -284,7 +287,7 @@ impl Comparator {
             .is_none_or(|bus_comparator| bus_comparator.is_down() || bus_comparator.undone().next().is_none())
     }
 
-    /// Number of cells that have processed the joints announced last, to show progress.
+    /// Returns the number of cells that have processed the joints announced last, to show progress.
     #[must_use]
     pub fn done(&self, bus_index: usize) -> usize {
         self.buses.get(bus_index).map_or(0, |bus_comparator| {
@@ -292,12 +295,13 @@ impl Comparator {
         })
     }
 
-    /// Gives up and returns the cells that are not done.
+    /// Stops waiting for the cells of a bus, and returns those that have not answered.
     pub fn give_up(&mut self, bus_index: usize) -> Vec<CellId> {
         self.buses.get_mut(bus_index).map_or_else(Vec::new, BusComparator::give_up)
     }
 
-    /// Number of recorded torques and sums of a round whose present counterparts have not arrived, of present cells.
+    /// Returns the number of recorded torques and sums of a round that the cells on the bus have not sent in this
+    /// replay yet.
     #[must_use]
     pub fn unanswered(&self, bus_index: usize, number: u64) -> usize {
         let Some(bus_comparator) = self.buses.get(bus_index) else { return 0 };
@@ -321,14 +325,15 @@ impl Comparator {
         torques + round.sums.recorded.cells().filter(misses).count()
     }
 
-    /// Marks a bus as down, so that its cells are not awaited. The next message ends this.
+    /// Marks a bus as down, so that its cells are not awaited until the next message arrives.
     pub fn mark_down(&mut self, bus_index: usize) {
         if let Some(bus_comparator) = self.buses.get_mut(bus_index) {
             bus_comparator.line(line::Input::Lost);
         }
     }
 
-    /// Ignores replies while muted. After unmuting, compares replies to joints that are yet to be sent.
+    /// Mutes or unmutes the comparison. While muted, it ignores replies. After unmuting, it compares replies to joints
+    /// that are sent from then on.
     pub fn mute(&mut self, is_muted: bool) {
         self.is_muted = is_muted;
         for announced in self
@@ -354,12 +359,12 @@ impl Comparator {
             .flat_map(|bus_comparator| bus_comparator.present.iter().map(|(cell, it)| (*cell, it)))
     }
 
-    /// Cells on a bus that own their node id.
+    /// Returns the cells on a bus that own their node id.
     pub fn settled_cells(&self, bus_index: usize) -> impl Iterator<Item = (CellId, &PresentCell)> {
         self.present_cells(bus_index).filter(|(_, present)| present.claim.is_settled())
     }
 
-    /// Cells that have not reported a parent for their sums, or are unreachable.
+    /// Returns the cells that have no parent for their sums: they have reported none, or are unreachable.
     #[must_use]
     pub fn unreachable(&self, bus_index: usize) -> Vec<CellId> {
         let settled = self.settled_cells(bus_index);
@@ -367,7 +372,7 @@ impl Comparator {
         settled.map(|(cell, _)| cell).filter(|cell| !bus_comparator.trees.now.is_reachable(*cell)).collect()
     }
 
-    /// Compares all that has been sent; call it once. `is_whole` is true if all of the capture was sent.
+    /// Compares all remaining rounds; call it once, at the end. `is_whole` is true if the whole capture was sent.
     pub fn finish(&mut self, is_whole: bool) {
         self.is_muted = true;
         for bus_comparator in self.buses.iter_mut().filter(|_| !is_whole) {
@@ -387,20 +392,20 @@ impl Comparator {
         }
     }
 
-    /// Counts so far.
+    /// Returns the counts so far.
     #[must_use]
     pub const fn tally(&self) -> &Tally {
         &self.tally
     }
 
-    /// First difference: a different, missing or extra reply.
+    /// Returns the first difference: a different, missing or extra reply.
     #[must_use]
     pub const fn first(&self) -> Option<&Difference> {
         self.first.difference.as_ref()
     }
 }
 
-/// Returns false for the answer to `identify`, which depends on the time of the request through the cell's state.
+/// Returns false for the answer to `identify`, whose content depends on the cell's state at the time of the request.
 fn is_compared(answer: Answer) -> bool {
     !matches!(answer, Answer::Value { number, .. } if number == Parameter::Identity.number())
 }

@@ -1,4 +1,4 @@
-//! Each cell's own contribution to a sum: the sum minus the sums of its children, independent of the tree.
+//! A cell's own contribution to a sum: the sum minus the sums of the cell's children, which is independent of the tree.
 //!
 //! ```text
 //!   tree pages, joints by joints ──> [Trees] ─┐
@@ -17,7 +17,7 @@ use protocol::id::CellId;
 use protocol::packet::Words;
 use protocol::parameters::MAX_JOINTS;
 
-/// Parents of the cells from round to round.
+/// The parent of each cell, as it changes from round to round.
 #[derive(Debug, Default)]
 pub(super) struct Trees(BTreeMap<CellId, VecDeque<Step>>);
 
@@ -25,12 +25,12 @@ pub(super) struct Trees(BTreeMap<CellId, VecDeque<Step>>);
 #[derive(Clone, Copy, Debug)]
 struct Step {
     since: u64,
-    /// Node id of the parent, 0 for the gateway's side, or `None` if the cell is unreachable.
+    /// Node id of the parent; 0 for the gateway's side, or `None` if the cell is unreachable.
     parent: Option<u8>,
 }
 
 impl Trees {
-    /// Sets the parent that a cell reports from round `since` on.
+    /// Sets the parent that a cell reports, from round `since` on.
     pub(super) fn set_parent(&mut self, cell: CellId, parent: Option<u8>, since: u64) {
         let steps = self.0.entry(cell).or_default();
         if steps.back().is_none_or(|last| last.parent != parent) {
@@ -43,15 +43,15 @@ impl Trees {
         self.0.get(&cell).and_then(VecDeque::back).is_some_and(|step| step.parent.is_some())
     }
 
-    /// Parent of a cell in a round, or `None` if unknown.
+    /// Returns the parent of a cell in a round, or `None` if it is unknown.
     fn parent(&self, cell: CellId, round: u64) -> Option<Option<u8>> {
         let steps = self.0.get(&cell)?;
         steps.iter().rev().find(|step| step.since <= round).map(|step| step.parent)
     }
 
-    /// Cells whose parent differs between the rounds around this one, with those parents. Their pages carry the epoch
-    /// of the last joints, which may be the joints before the change or those at it. A cell between two parents sends
-    /// no page; a cell that has lost its parent for good is not between two.
+    /// Returns the cells that may have changed their parent in this round, and their parents before and after the
+    /// change. A page with the new parent carries the epoch of the last joints, so the change is at those joints or the
+    /// next. A cell between two parents sends no page; a cell that has lost its parent for good is not included.
     fn affected(&self, round: u64) -> BTreeSet<CellId> {
         let mut all = BTreeSet::new();
         for (cell, steps) in &self.0 {
@@ -70,7 +70,7 @@ impl Trees {
         all
     }
 
-    /// Drops changes from before a round.
+    /// Drops changes of parents from before a round.
     pub(super) fn forget_before(&mut self, round: u64) {
         for steps in self.0.values_mut() {
             // The entry before a change holds the former parent.
@@ -81,15 +81,15 @@ impl Trees {
     }
 }
 
-/// Sum sent by one cell.
+/// The sum that one cell sent.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) struct CellSum {
     pub(super) torque: Words,
-    /// Number of cells in it.
+    /// Number of cells that contribute to the sum.
     pub(super) count: u8,
 }
 
-/// Last sum of each cell for one epoch: the sum with the most cells.
+/// Last sum of each cell for one epoch, which is the sum of the most cells.
 #[derive(Clone, Debug, Default)]
 pub(super) struct SumsByCell(BTreeMap<CellId, CellSum>);
 
@@ -113,7 +113,7 @@ impl SumsByCell {
         self.0.contains_key(&cell)
     }
 
-    /// Each cell and the number of cells in its sum.
+    /// Returns each cell with the number of cells that contribute to its sum.
     pub(super) fn counts(&self) -> impl Iterator<Item = (CellId, u8)> {
         self.0.iter().map(|(cell, sum)| (*cell, sum.count))
     }
@@ -123,18 +123,18 @@ impl SumsByCell {
     }
 }
 
-/// Maximum difference in steps between sum words of two cells in the same contact state: rounding carries its
-/// remainder.
+/// Maximum difference in steps between the words of two sums from the same contact state, because rounding carries its
+/// remainder into the next sum.
 pub(super) const ROUNDING: u32 = 1;
 
 /// A cell's own contribution to its sum.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct OwnTerm {
-    /// The sum as sent.
+    /// The sum as it was sent.
     pub sum: Words,
-    /// Number of cells in it.
+    /// Number of cells that contribute to the sum.
     pub count: u8,
-    /// Children whose sums it contains.
+    /// Children whose sums are contained in this sum.
     pub children: Vec<CellId>,
     /// The sum minus the children's sums, in steps of Q7.8; `None` for saturated words.
     pub steps: [Option<i32>; MAX_JOINTS],
@@ -149,19 +149,20 @@ impl OwnTerm {
         self.steps.iter().flatten().all(|step| *step == 0)
     }
 
-    /// Differences in steps between the words of two terms, where neither word is saturated.
+    /// Returns the differences in steps between the words of two contributions, for words that are saturated in
+    /// neither.
     pub(super) fn differences(&self, other: &Self) -> impl Iterator<Item = u32> {
         let both = self.steps.iter().zip(&other.steps);
         both.filter_map(|(own, it)| Some(own.as_ref()?.abs_diff(*it.as_ref()?)))
     }
 }
 
-/// Sums of one epoch and their tree, recorded or now.
+/// Sums of one epoch and their tree: one side of the comparison, from the recording or from this replay.
 pub(super) struct EpochSums<'a> {
     sums: &'a SumsByCell,
     children: BTreeMap<u8, Vec<CellId>>,
     affected: BTreeSet<CellId>,
-    /// All remembered parents of each cell that changed its parent.
+    /// All remembered parents of each cell that has changed its parent.
     parents: BTreeMap<CellId, BTreeSet<u8>>,
     /// True if the parents of all cells are known.
     is_known: bool,
@@ -170,18 +171,18 @@ pub(super) struct EpochSums<'a> {
 /// Reason why a sum is not compared.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum OmitReason {
-    /// The cell, or a former or present child, was changing its parent.
+    /// The cell, or one of its former or present children, was changing its parent.
     Changing,
-    /// A cell has not reported its parent.
+    /// The parent of some cell is unknown, because it has not reported it.
     Unknown,
-    /// The sum does not contain the sums of all children, or contains others than were received.
+    /// The sum lacks the sum of a child, or contains sums other than those received.
     NotTaken,
 }
 
 /// Result of the comparison of a cell's sums.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum SumComparison {
-    /// The cell contributed nothing itself, neither then nor now.
+    /// The cell contributed no torque of its own, neither in the recording nor in this replay.
     Nothing,
     Equal,
     Different,
@@ -208,7 +209,7 @@ impl<'a> EpochSums<'a> {
         self.children.get(&cell.get()).map_or(&[], Vec::as_slice)
     }
 
-    /// A cell's own contribution to its sum, or `None` if it sent no sum.
+    /// Returns a cell's own contribution to its sum, or `None` if the cell sent no sum.
     pub(super) fn own_term(&self, cell: CellId) -> Option<OwnTerm> {
         let CellSum { torque: sum, count } = *self.sums.0.get(&cell)?;
         let below = self.children(cell).iter().filter_map(|child| Some((*child, self.sums.0.get(child)?)));
@@ -224,8 +225,9 @@ impl<'a> EpochSums<'a> {
         Some(OwnTerm { sum, count, children, steps, cells })
     }
 
-    /// Returns true if the remainder of a cell's sum cannot be its own contribution, given whether it was touched: it
-    /// had other children than their pages report. If joints were resent, sums of two sendings may be mixed too.
+    /// Returns true if a cell's sum minus its children's sums cannot be its own contribution, given whether stimuli
+    /// touch the cell. Its children were then others than their pages report or, if joints were resent (`is_mixed`),
+    /// sums of two sendings are mixed.
     pub(super) fn is_doubtful(&self, cell: CellId, is_touched: Option<bool>, is_mixed: bool) -> bool {
         self.own_term(cell).is_some_and(|own| {
             let adds = own.cells == 0 && !own.is_nothing();
@@ -238,24 +240,24 @@ impl<'a> EpochSums<'a> {
         self.own_term(cell).is_some_and(|own| own.cells > 0)
     }
 
-    /// Returns true if a cell's sum contains the received sums of all its children, so that the remainder is its own
-    /// contribution.
+    /// Returns true if a cell's sum contains the received sums of all its children. The sum minus those sums is then
+    /// the cell's own contribution.
     fn is_whole(&self, cell: CellId, other: &Self) -> bool {
         let Some(own) = self.own_term(cell) else { return true };
         let adds_up = match own.cells {
-            // It contains the cell's own contribution but lacks the sum of a child of one cell.
+            // The sum contains the cell's own contribution but lacks the sum of a child, which counts one cell.
             0 => own.is_nothing() || !other.feels(cell),
             1 => true,
             _ => false,
         };
-        // A child received on one side only may or may not be in this sum.
+        // If a child's sum was received on one side only, it is unknown whether this sum contains it.
         let silent = |child: &CellId| !self.sums.has(*child) && other.feels(*child);
         adds_up && !self.children(cell).iter().any(silent)
     }
 
-    /// Returns true if a cell's sum exceeds the other side's by the sum of a former or later child, which by its page
-    /// is not a child in this epoch: pages follow the change that they report. That sum must not be in another parent's
-    /// sum.
+    /// Returns true if a cell's sum exceeds that of the other side by the sum of a former or later child. By its page,
+    /// that cell is not a child in this epoch, because a page follows the change that it reports. Its sum must not be
+    /// contained in another parent's sum.
     fn holds_a_mover(&self, cell: CellId, other: &Self, allowed: u32) -> bool {
         let own_of = |cell| Some((self.own_term(cell)?, other.own_term(cell)?));
         let Some((own, its)) = own_of(cell) else { return false };
@@ -278,7 +280,7 @@ impl<'a> EpochSums<'a> {
         })
     }
 
-    /// Cells in a cell's sum, by the tree.
+    /// Returns the cells below a cell in the tree.
     fn below(&self, cell: CellId) -> BTreeSet<CellId> {
         let (mut all, mut next) = (BTreeSet::new(), vec![cell]);
         while let Some(cell) = next.pop() {
@@ -294,9 +296,9 @@ fn exact(word: i16) -> Option<i32> {
     (!Q7_8::from_bits(word).is_saturated()).then(|| i32::from(word))
 }
 
-/// Compares a cell's own contributions. A torque may differ by `tolerance` of its own steps, which may move the rounded
-/// sum across one more bound. The children's differences cancel, so the tolerance does not depend on the number of
-/// cells in the sum.
+/// Compares a cell's own contribution in the recording with that in this replay. A torque may differ by `tolerance` of
+/// its own steps, which may move the rounded sum across one more bound. The children's differences cancel, so the
+/// tolerance does not depend on the number of cells in the sum.
 pub(super) fn compare(
     recorded: &EpochSums<'_>,
     now: &EpochSums<'_>,
@@ -316,7 +318,8 @@ pub(super) fn compare(
     let (then, today) = (recorded.own_term(cell), now.own_term(cell));
     match (then, today) {
         (Some(then), Some(today)) => {
-            // The whole subtree saturates a word: in another tree, other cells do.
+            // A word can be saturated by the sum over a whole subtree, so in another tree other cells have saturated
+            // words.
             let alike = |then: i16, today: i16| {
                 exact(then).is_none() == exact(today).is_none() || recorded.below(cell) != now.below(cell)
             };
@@ -345,7 +348,7 @@ pub(super) fn compare(
         }
         (Some(then), None) if then.cells > 0 => SumComparison::Missing,
         (None, Some(today)) if today.cells > 0 => SumComparison::Extra,
-        // The tree decides whether a cell forwards others' sums, but it adds nothing to them.
+        // The tree decides whether a cell forwards sums of others, but forwarding adds no torque.
         (Some(own), None) | (None, Some(own)) if !own.is_nothing() => SumComparison::Different,
         (Some(_), None) | (None, Some(_) | None) => SumComparison::Nothing,
     }

@@ -14,33 +14,35 @@ pub struct Tally {
     pub different: u64,
     /// Recorded replies that did not come.
     pub missing: u64,
-    /// Replies that were not recorded, without an explanation in the recording.
+    /// Replies that were not recorded, without a reason in the recording for their absence.
     pub extra: u64,
     /// Recorded replies to joints that a bus refused in this replay.
     pub not_requested: u64,
-    /// Sums, less their children, among the equal replies.
+    /// Number of sums among the equal replies. Sums are compared after the children's sums are subtracted.
     pub sums: u64,
     /// Torques and sums among the equal replies that are equal only within the tolerance.
     pub tolerated: u64,
-    /// Words of torques, in steps of Q3.12.
+    /// Differences between words of torques, in steps of Q3.12 (2
+    /// -12 Nm).
     pub torque_words: Steps,
-    /// Words of sums less their children, in steps of Q7.8.
+    /// Differences between words of sums without the children's sums, in steps of Q7.8 (2
+    /// -8 Nm).
     pub sum_words: Steps,
-    /// Replies that the recording lacks, or whose joints it lacks.
+    /// Replies that have no recorded counterpart, or whose joints were not recorded.
     pub lacking: Uncompared,
 }
 
-/// Histogram of the differences between words and recorded ones, in steps.
+/// Histogram of the differences between words in this replay and in the recording, in steps.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Steps {
     /// Number of words that differ by 0, 1, ... steps; the last entry counts all larger differences too.
     pub by_steps: [u64; 9],
-    /// Largest difference.
+    /// Largest difference in steps.
     pub max: u32,
 }
 
 impl Steps {
-    /// Counts the words of one reply. Returns the largest difference among them.
+    /// Counts the differences between the words of one reply and the recorded ones. Returns the largest of them.
     pub(super) fn count(&mut self, differences: impl IntoIterator<Item = u32>) -> u32 {
         let mut max = 0;
         for steps in differences {
@@ -56,21 +58,22 @@ impl Steps {
     }
 }
 
-/// Replies that were not recorded, or not with their joints, by the reason that the recording shows.
+/// Replies that lack a recorded counterpart or recorded joints, by the reason that the recording shows.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Uncompared {
-    /// The cell was silent in the recording: absent, killed, hung, or claiming its node id.
+    /// Replies of cells that were silent in the recording: absent, killed, hung, or claiming their node id.
     pub silent: u64,
-    /// The cell missed this many joints, by its own counters.
+    /// Replies to joints that the cell missed in the recording, by its own counters.
     pub untaken: u64,
-    /// The cell sent more packets than were recorded, by its own counters.
+    /// Replies that the cell sent in the recording, by its own counters, but that were not recorded.
     pub unrecorded: u64,
-    /// The recording ended before its last joints, or its last `configure`, were answered.
+    /// Replies to the last joints or the last `configure`, after which the recording ended.
     pub ended: u64,
-    /// The end of a contact, sent later because the cell missed the joints at which it ended.
+    /// Ends of contacts that the cell sent later in the recording, because it had missed the joints at which the
+    /// contact ended.
     pub said_later: u64,
-    /// Replies of touched cells at joints for which no counters tell how many the cell received: in a part of a
-    /// recording, before the first report and after the last one.
+    /// Replies of touched cells at joints for which counters do not show how many the cell received. In a part of a
+    /// recording, these are the joints before the first report and after the last one.
     pub uncounted: u64,
     /// Recorded replies whose joints were not recorded.
     pub joints_unrecorded: u64,
@@ -78,22 +81,25 @@ pub struct Uncompared {
     pub joints_earlier: u64,
     /// Recorded answers to `configure` messages from before the part.
     pub requested_earlier: u64,
-    /// Recorded replies of cells that measured: the recording has no measured forces.
+    /// Recorded replies of cells that measured. They are not compared, because the recording does not contain the
+    /// measured forces.
     pub measured: u64,
-    /// Unrequested sensor frames, sent at another time than now.
+    /// Sensor frames that cells sent without request, at other times than in the recording.
     pub sensed_otherwise: u64,
-    /// Sums of cells that had started a contact but missed their slot.
+    /// Sums of cells whose contact had begun in the recording but that missed their slot.
     pub slot_skipped: u64,
-    /// Sums of cells that were changing their parent in that epoch, or whose children were, then or now.
+    /// Sums in an epoch in which the cell or one of its children changed its parent, in the recording or in this
+    /// replay.
     pub parent_changing: u64,
-    /// Sums of epochs in which a cell had not reported its parent, then or now.
+    /// Sums in an epoch in which some cell had not reported its parent, in the recording or in this replay.
     pub tree_unknown: u64,
-    /// Sums that do not contain those of all children, then or now.
+    /// Sums that do not contain the sums of all children, in the recording or in this replay.
     pub sums_not_taken: u64,
 }
 
 impl Tally {
-    /// Counts a reply that differs from the recorded one. Joints that a bus refused get no reply.
+    /// Counts a reply that differs from the recorded one. A missing reply to joints that the bus refused (`is_unsent`)
+    /// counts as not requested.
     pub(super) const fn count(&mut self, how: DifferenceKind, is_unsent: bool) {
         let count = match how {
             DifferenceKind::Missing if is_unsent => &mut self.not_requested,
@@ -117,13 +123,13 @@ impl Tally {
         is_equal
     }
 
-    /// Returns true if no sum could be compared because their trees are unknown.
+    /// Returns true if sums had to be left out because their trees are unknown, and none could be compared.
     #[must_use]
     pub const fn lacks_the_tree(&self) -> bool {
         self.sums == 0 && self.lacking.tree_unknown > 0
     }
 
-    /// Returns true if all replies are equal and no other replies came.
+    /// Returns true if all recorded replies came and are equal, and no others came.
     #[must_use]
     pub const fn is_good(&self) -> bool {
         self.different == 0

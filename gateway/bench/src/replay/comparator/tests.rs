@@ -390,7 +390,7 @@ fn a_cell_that_stopped_without_the_end_did_not_come_to_its_slot() {
     late.retain(|message| !silent(3)(message));
     let comparator = rated(&late, &row());
     assert_eq!((counts(&comparator), comparator.tally.lacking.slot_skipped), ([17, 0, 0, 0], 1));
-    // A cell that had sent the end would have had to send the beginning.
+    // Before a contact can begin, a cell that had sent the end would have had to send the beginning.
     let mut ended = row();
     ended.retain(|message| !silent(2)(message) && !silent(3)(message));
     let at = ended.iter().position(|message| *message == joints(3)).unwrap();

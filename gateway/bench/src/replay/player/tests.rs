@@ -8,9 +8,9 @@ use protocol::message::Joints;
 #[derive(Debug, Default)]
 struct Fake {
     clock: u64,
-    /// Duration of a send in ns.
+    /// Duration of each send in ns.
     takes: u64,
-    /// Results of the next sends; later ones succeed.
+    /// Results of the next sends; after these, all sends succeed.
     outcomes: Vec<Result<(), SendError>>,
     /// Sent frames with their time and bus.
     sent: Vec<(u64, usize, Vec<Frame>)>,

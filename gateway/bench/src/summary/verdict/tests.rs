@@ -109,7 +109,7 @@ fn nothing_is_well_that_is_not_known() {
 /// The beginning of the expected finding, and the change of a good run that causes it.
 type Case = (&'static str, fn(&mut Summary));
 
-/// All findings, the most important first.
+/// All findings with their causes, the most important first.
 const CASES: &[Case] = &[
     ("the run failed: no memory", |it| it.failure = Some("no memory".to_owned())),
     ("the robot was halted at 1.500 s and not resumed: a halt frame", |it| {

@@ -20,7 +20,7 @@ const TICKS: u64 = 8;
 /// The durations of recordings, in s.
 const DURATIONS: [f64; 5] = [20.0, 30.0, 45.0, 80.0, 150.0];
 
-/// The clock of the motion that sensors measure.
+/// The clock that drives the motion which the sensors measure, against the broadcasts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Clock {
     /// The plan, at the time of each broadcast.
@@ -125,7 +125,7 @@ struct Tally {
     recordings: usize,
     refused: usize,
     cells: usize,
-    /// The number within the stated uncertainty: position and orientation.
+    /// The number of cells whose error is within the stated uncertainty: by position, and by orientation.
     within: [usize; 2],
     named: usize,
     unsure: usize,
@@ -136,8 +136,8 @@ fn recordings() -> u64 {
     std::env::var("SKINBUS_RECORDINGS").ok().and_then(|it| it.parse().ok()).unwrap_or(5)
 }
 
-/// Returns true if a part of this many cells is plausible, where 90 to 99 % of all cells are within the stated
-/// uncertainty; it is wrong 1 time in 1000.
+/// Returns true if the fraction `part` of this many cells is plausible, given that 90 to 99 % of all cells are within
+/// the stated uncertainty. The answer is wrong 1 time in 1000.
 fn is_likely(part: f64, cells: usize) -> bool {
     let scatter = |of: f64| 3.1 * (of * (1.0 - of) / cells as f64).sqrt();
     part >= 0.9 - scatter(0.9) && part <= 0.99 + scatter(0.99)

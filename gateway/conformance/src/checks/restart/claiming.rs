@@ -1,4 +1,4 @@
-//! A cell that claims its node id: the packets that it accepts, gives way to, and answers.
+//! Checks of a cell that claims its node id: the packets that it accepts, gives way to, and answers.
 
 use protocol::id::Node;
 use protocol::message::{Message, Request, SensorPage, State};
@@ -12,7 +12,7 @@ use crate::arm;
 use crate::bus::StopReason;
 use crate::session::{CellPacket, Session};
 
-/// The number of restarts for a check that a late bench has spoilt.
+/// The maximum number of restarts for one check, which is repeated if the bench was late.
 const ATTEMPTS: usize = 4;
 /// The maximum time that a cell which waits for a processor takes to process a frame; beyond it, the whole group is
 /// repeated.
@@ -52,7 +52,7 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
         session.answers().last().and_then(CellPacket::beat).map(|(beat, _)| beat.state).unwrap_or_default();
     let presses = state.has(State::TEST_MODE);
     session.check("CONF-9", presses == after_test_mode || !session.about.test_mode, || {
-        "test mode after a restart is as it was before".to_owned()
+        "test mode must have the same initial value after each restart, but kept an earlier one".to_owned()
     });
     session.begin_expected_exchange();
     session.press(arm::press(4_096))?;
@@ -90,7 +90,7 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
     let came = session.answers().iter().filter(|it| it.at < end);
     let came: Vec<_> = came.map(|it| it.message.id().kind.name()).collect();
     session
-        .check("CLAIM-2", came.is_empty(), || format!("a claiming cell answered with {}", came.join(", ")));
+        .check("CLAIM-2", came.is_empty(), || format!("a claiming cell must not answer requests, but sent {}", came.join(", ")));
     let at = settled(session, claimed)?;
     if at.is_none() {
         return Ok(true);
@@ -99,13 +99,13 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
     session.known.halted = Some(true);
     session.known.hash = session.known.parameters.map(|it| it.hash());
     let is_on = session.exchange_all(&[])?.state().has(State::TEST_MODE);
-    session.check("CLAIM-2", is_on == presses, || "a claiming cell obeyed a write of parameter 5".to_owned());
+    session.check("CLAIM-2", is_on == presses, || "a claiming cell must ignore a write of parameter 5, but obeyed it".to_owned());
     let counters = session.counters()?;
     let is_so = counters.heard.joints == 2 && counters.heard.torques == 0;
-    session.check("CLAIM-2", is_so, || format!("a claiming cell takes joints; of 2: {counters}"));
+    session.check("CLAIM-2", is_so, || format!("a claiming cell must count 2 joints and no torques, but the counters are {counters}"));
     let refused = protocol::message::RejectedCounts { stimuli: u16::from(!presses), ..Default::default() };
     session.check("CLAIM-2", counters.refused == refused, || {
-        format!("a claiming cell counted packets that it must ignore: {counters}")
+        format!("a claiming cell must not count packets that it ignores, but the counters are {counters}")
     });
     if presses {
         let report = session.report()?;
@@ -114,14 +114,14 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
             _ => None,
         });
         session.check("STIM-8", skin == Some(arm::press(4_096)), || {
-            format!("a claiming cell did not latch a stimulus: {}", arm::format_skin(skin))
+            format!("a claiming cell must latch a stimulus, but {} is latched", arm::format_skin(format_skin))
         });
     }
     session.ready(&arm::example_parameters(2))?;
     Ok(true)
 }
 
-/// Checks a claim with a higher serial number, before and after the first heartbeat.
+/// Checks that the cell does not give way to claims with a higher serial number, before and after its first heartbeat.
 pub(super) fn stays(session: &mut Session<'_>) -> Result<(), StopReason> {
     let own = session.about.serial.unwrap_or_default();
     let Some(higher) = own.checked_add(1) else {
@@ -146,28 +146,28 @@ pub(super) fn stays(session: &mut Session<'_>) -> Result<(), StopReason> {
         let answer = session.answers().iter().find_map(|it| Some((it.at, it.beat()?.0.state)));
         session.consume();
         session.check("CLAIM-3", came, || {
-            format!("a claiming cell did not answer a claim with the higher serial number {serial}")
+            format!("a claiming cell must answer a claim with the higher serial number {serial}, but did not")
         });
         if let Some((answered, state)) = answer {
             session.note_time("heartbeat to a claimant", at, answered);
             let is_so = state.has(State::CLAIMING) || answered >= end;
-            session.check("CLAIM-3", is_so, || "its answer has no CLAIMING".to_owned());
+            session.check("CLAIM-3", is_so, || "a claiming cell must set CLAIMING in its answer to a claim, but it is clear".to_owned());
             session
-                .check("CLAIM-7", state.has(State::DUPLICATE), || "its answer has no DUPLICATE".to_owned());
+                .check("CLAIM-7", state.has(State::DUPLICATE), || "a claiming cell must set DUPLICATE in its answer to a claim, but it is clear".to_owned());
         }
         session.idle(Span::from_millis(30))?;
     }
     session.begin_expected_exchange();
     let at = settled(session, claimed)?;
-    session.check("CLAIM-3", at.is_some(), || "it gave way to a higher serial number".to_owned());
+    session.check("CLAIM-3", at.is_some(), || "the cell must not give way to a higher serial number, but did".to_owned());
     session.known.hash = None;
     session.ready(&arm::example_parameters(2))?;
     Ok(())
 }
 
 /// Sends claims with a higher serial number continuously while the cell starts, and returns the time of its first
-/// heartbeat. DUPLICATE is set in it if one of the claims came before it, (serial mod 64) ms after the start; a late
-/// computer may delay the claims.
+/// heartbeat. That heartbeat is sent (serial mod 64) ms after the start, and must have DUPLICATE if a claim came before
+/// it. A late computer may delay the claims, so the check is then repeated.
 fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Option<Micros>, StopReason> {
     const ATTEMPTS: usize = 3;
     let rest = twin_heartbeat(session, higher, true);
@@ -179,7 +179,7 @@ fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Op
         let Some(claimed) = claimed else {
             session.check("CLAIM-3", false, || {
                 format!(
-                    "no heartbeat came while claims with the higher serial number {higher} did: it gave way to them"
+                    "the cell must not give way to claims with the higher serial number {higher}, but sent no heartbeat"
                 )
             });
             return Ok(None);
@@ -191,10 +191,10 @@ fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Op
         let is_answered = new.count() > 1;
         if is_set && is_answered || !is_long || attempt == ATTEMPTS {
             session.check("CLAIM-7", is_set || !is_long, || {
-                "DUPLICATE is not set in the first heartbeat after claims that came before it".to_owned()
+                "DUPLICATE must be set in the first heartbeat if claims came before it, but is clear".to_owned()
             });
             session.check("CLAIM-3", is_answered || !is_long, || {
-                "claims that came before its first heartbeat were not answered".to_owned()
+                "claims that came before the first heartbeat must be answered, but were not".to_owned()
             });
             return Ok(Some(claimed));
         }
@@ -203,7 +203,7 @@ fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Op
     Ok(None)
 }
 
-/// Checks that an invalid `4nn` changes nothing.
+/// Checks that a claiming cell ignores a `4nn` of a page that does not exist.
 pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), StopReason> {
     let claimed = restart(session)?;
     session.begin_expected_exchange();
@@ -216,11 +216,11 @@ pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.send(&frames)?;
     let at = settled(session, claimed)?;
     session
-        .check("CLAIM-3", at.is_some(), || "it gave way to a 4nn of a page that does not exist".to_owned());
+        .check("CLAIM-3", at.is_some(), || "the cell must ignore a 4nn of a page that does not exist, but gave way to it".to_owned());
     let is_set =
         session.answers().iter().filter_map(CellPacket::beat).any(|(beat, _)| beat.state.has(State::DUPLICATE));
     session
-        .check("COUNT-1", !is_set, || "DUPLICATE is set by a 4nn of a page that does not exist".to_owned());
+        .check("COUNT-1", !is_set, || "DUPLICATE must not be set by a 4nn of a page that does not exist, but is set".to_owned());
     session.known.hash = None;
     Ok(())
 }
@@ -255,9 +255,9 @@ fn is_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Result<(
     session.consume();
     let serial = session.about.serial.unwrap_or_default();
     session.check("CLAIM-3", came == 0, || {
-        format!("it (serial number {serial}) did not give way to {what}: {came} packets came after it")
+        format!("the cell (serial number {serial}) must give way to {what}, but sent {came} packets after it")
     });
-    session.check("CLAIM-4", came == 0, || format!("{came} packets came after it had to give way to {what}"));
+    session.check("CLAIM-4", came == 0, || format!("the cell must be silent after it gave way to {what}, but sent {came} packets"));
     Ok(())
 }
 

@@ -1,4 +1,4 @@
-//! Restarts that cut off the previous life of the cell at any point, and faulty cells.
+//! Tests of restarts that cut off the cell's packets at any point, and of faulty cells.
 
 use std::collections::VecDeque;
 
@@ -12,16 +12,16 @@ use crate::bus::{TestBus, ObservedFrame};
 
 const OLD: Span = Span(120);
 const NEW: Span = Span::from_millis(60);
-/// The restart command ends before the cell sends, or after it.
+/// Durations of the restart command: it ends before the restarted cell sends, or after that.
 const COMMANDS: [Span; 2] = [Span::from_millis(40), Span::from_millis(100)];
 
 /// A bus that plays back a script of the cell's frames.
 struct Script {
     now: Micros,
     wire: VecDeque<ObservedFrame>,
-    /// The frames after the command of each restart.
+    /// The frames that come after the command of each restart, with their delays.
     next: VecDeque<Vec<(Span, Frame)>>,
-    /// The duration of the command, and the time at which it is done.
+    /// The duration of the restart command.
     takes: Span,
     restarted: Micros,
 }
@@ -90,7 +90,7 @@ fn frames(messages: &[Message], format: Format) -> Vec<Frame> {
     messages.iter().flat_map(|message| message.encode().frames(format).collect::<Vec<_>>()).collect()
 }
 
-/// Returns frames of a life that has lasted for a while.
+/// Returns `length` frames, from index `start` on, of a cell that started a while ago.
 fn former_life(format: Format, start: usize, length: usize) -> Vec<Frame> {
     let all = (0..10)
         .map(|place| if place % 3 == 0 { beat(40 + place, false) } else { answer(place.to_le_bytes()[0]) });
@@ -98,13 +98,13 @@ fn former_life(format: Format, start: usize, length: usize) -> Vec<Frame> {
     frames(&all, format).into_iter().skip(start).take(length).collect()
 }
 
-/// Returns the first frames of a correct cell.
+/// Returns the frames that a correct cell sends right after its start.
 fn new_life(format: Format) -> Vec<Frame> {
     frames(&[beat(0, true), beat(1, false), answer(1), beat(3, false)], format)
 }
 
-/// Returns the requirements that fail at a restart, if the first `before` frames of the former life come before its
-/// command and the others after it.
+/// Returns the requirements that fail at a restart. The first `before` of the frames `former` come before the restart
+/// command, the others and then `new` after it.
 fn failed(format: Format, takes: Span, former: &[Frame], before: usize, new: &[Frame]) -> Vec<&'static str> {
     let (before, after) = former.split_at(before);
     let now = Micros(1_000_000);
@@ -166,7 +166,7 @@ fn a_cell_that_is_wrong_about_its_packets_is_still_found() {
     let without = |frames: &[Frame], place: usize| -> Vec<_> {
         frames.iter().enumerate().filter(|(at, _)| *at != place).map(|(_, frame)| *frame).collect()
     };
-    // A segment is missing, in either life, except in the first and the last packet of its identifier in the former life.
+    // A segment is missing before or after the restart, but not in the first and last packet of its identifier before it.
     for place in 4..8 {
         let failed = failed(format, takes, &without(&former, place), 0, &new);
         assert!(failed.contains(&"SEND-1"), "former, without {place}: {failed:?}");

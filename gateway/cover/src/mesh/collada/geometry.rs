@@ -1,4 +1,4 @@
-//! The `mesh` of a geometry: its vertices, and the triangles of its primitives.
+//! Reads the `mesh` element of a geometry: its vertices, and the triangles of its primitives.
 
 use nalgebra::Point3;
 use roxmltree::Node;
@@ -7,25 +7,25 @@ use super::{Named as _, ElementIds, child, children, floats, numbers};
 use crate::mesh::polygon::{Triangulation, fan};
 use crate::mesh::{MAX_TRIANGLES, MeshError, Triangle, syntax, too_many};
 
-/// The maximum number of indices per corner.
+/// The maximum number of indices that a file may give for a corner.
 const MAX_OFFSET: usize = 64;
 
-/// A `mesh` element.
+/// A `mesh` element, with the elements that it refers to.
 #[derive(Debug)]
 pub(super) struct MeshElement<'a, 'i, 'n> {
-    /// The name of the file, for errors.
+    /// The name of the file, which is used in errors.
     name: &'a str,
     mesh: Node<'a, 'i>,
-    /// The ids of the mesh's own elements.
+    /// The elements within the mesh that have ids.
     own: ElementIds<'a, 'i>,
-    /// The ids of the whole file.
+    /// The elements of the whole file that have ids.
     all: &'n ElementIds<'a, 'i>,
 }
 
-/// The corners of a primitive, as indices into a list of points.
+/// The form in which a primitive lists its corners: as indices into a list of points.
 struct Corners {
     kind: &'static str,
-    /// The position of the vertex index in each group of indices.
+    /// The position of the vertex index among the indices of a corner.
     offset: usize,
     /// The number of indices per corner.
     stride: usize,
@@ -41,7 +41,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         syntax(self.name, reason)
     }
 
-    /// Returns the triangles in the file's own coordinates.
+    /// Returns the triangles of the mesh, in the unit and axes of the file.
     pub(super) fn triangles(&self) -> Result<Vec<Triangle>, MeshError> {
         let mut filled = Triangulation::default();
         for element in self.mesh.children().filter(Node::is_element) {
@@ -70,7 +70,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         filled.finish().map_err(|why| self.error(&why))
     }
 
-    /// Reads triangles with three corners each.
+    /// Reads a primitive of triangles, each with three corners.
     fn plain(
         &self,
         element: Node<'a, 'i>,
@@ -89,7 +89,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         self.counted(element, "triangles", triangles.len() - before)
     }
 
-    /// Reads polygons whose corners are all in one list.
+    /// Reads a primitive of polygons whose corners are in one list.
     fn polylist(
         &self,
         element: Node<'a, 'i>,
@@ -115,7 +115,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         Ok(())
     }
 
-    /// Reads polygons with a list of corners each, some with holes.
+    /// Reads a primitive of polygons with a list of corners each. Polygons may have holes.
     fn polygons(
         &self,
         element: Node<'a, 'i>,
@@ -139,7 +139,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         self.counted(element, "polygons", count)
     }
 
-    /// Checks the element's count of its primitives, if it has one.
+    /// Checks that an element has as many primitives as it states, if it states a number.
     fn counted(&self, element: Node<'_, '_>, what: &str, got: usize) -> Result<(), MeshError> {
         match element.attribute("count").map(|count| count.trim().parse::<usize>()) {
             Some(Ok(count)) if count != got => {
@@ -149,7 +149,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         }
     }
 
-    /// Returns the points of a list of indices.
+    /// Returns the points of the corners in a list of indices.
     fn points(&self, indices: Node<'_, '_>, corners: &Corners) -> Result<Vec<Point3<f64>>, MeshError> {
         let Corners { kind, offset, stride, points } = corners;
         let indices = numbers(self.name, indices, str::parse::<usize>)?;
@@ -171,8 +171,8 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         groups.map(point).collect()
     }
 
-    /// Returns the element of this kind that a reference of this mesh names: one of its own, or else the only one of
-    /// the file.
+    /// Returns the element of this kind to which an input of the mesh refers. It is an element within the mesh, or else
+    /// the only one with this id in the file.
     fn referred(&self, kind: &'static str, input: Node<'_, '_>) -> Result<Node<'a, 'i>, MeshError> {
         let source = input.attribute("source").unwrap_or_default();
         let own = self.own.find(kind, source)?;
@@ -180,7 +180,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         found.ok_or_else(|| self.error(&format!("{kind} {source:?} is not there")))
     }
 
-    /// Reads the inputs that relate a primitive's indices to points.
+    /// Reads the inputs of a primitive, which state what the indices of its corners refer to.
     fn corners(&self, element: Node<'a, 'i>, kind: &'static str) -> Result<Corners, MeshError> {
         let mut stride = 0;
         let mut vertex = None;
@@ -203,7 +203,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
         Ok(Corners { kind, offset, stride, points })
     }
 
-    /// Returns the points of a source.
+    /// Returns the points that a source lists.
     fn positions(&self, source: Node<'a, 'i>) -> Result<Vec<Point3<f64>>, MeshError> {
         let accessor = child(source, "technique_common").and_then(|common| child(common, "accessor"));
         let number = |name: &str| accessor?.attribute(name)?.trim().parse::<usize>().ok();
@@ -228,7 +228,7 @@ impl<'a, 'i, 'n> MeshElement<'a, 'i, 'n> {
     }
 }
 
-/// Returns the triangles of a strip, every other one of which has the opposite winding.
+/// Adds the triangles of a strip. Every other triangle is reversed, so that all have the same winding.
 fn strip(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
     triangles.extend(corners.windows(3).enumerate().filter_map(|(at, corners)| {
         let &[a, b, c] = corners else { return None };

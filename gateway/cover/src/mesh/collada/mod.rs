@@ -1,9 +1,10 @@
-//! Reads COLLADA files: unit, axis, the scene's nodes with their transforms, and the geometries that they place.
+//! Reads COLLADA files: the unit, the up axis, the nodes of the scene with their transforms, and the geometries at the
+//! nodes.
 //!
 //! Triangles, polygons with and without holes, strips and fans are read; lines, materials and animations are ignored. A
-//! reference names one element of one kind: identifiers that several elements of that kind share are refused where they
-//! are referred to. A geometry's sources and vertices are its own: many exporters give those of all geometries the same
-//! identifiers.
+//! reference must name exactly one element of its kind: if several elements of the kind have the id, the reference is
+//! an error. Sources and vertices are first searched within the same geometry, because many exporters give them the
+//! same ids in all geometries.
 
 mod geometry;
 #[cfg(test)]
@@ -19,13 +20,13 @@ use roxmltree::{Document, Node};
 use super::{Affine, MAX_TRIANGLES, MeshError, Triangle, UpAxis, syntax, too_many};
 use geometry::MeshElement;
 
-/// The maximum nesting depth of nodes. A cycle of `instance_node` ends here.
+/// The maximum nesting depth of nodes, at which a cycle of `instance_node` elements is detected.
 const MAX_DEPTH: usize = 64;
 
-/// The maximum number of visited nodes, which limits nodes that are placed repeatedly.
+/// The maximum number of nodes to be visited. The limit is needed because a node may be placed repeatedly.
 const MAX_NODES: usize = 100_000;
 
-/// Returns the triangles of a file's scene, in m.
+/// Returns the triangles of the scene in a file, in m.
 pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Triangle>, MeshError> {
     let wrong = |fault: XmlFault| MeshError::Xml { file: name.to_owned(), fault };
     let text = protocol::xml::decode(bytes).map_err(wrong)?;
@@ -52,7 +53,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Tria
             }
         }
         None => {
-            // The file contains only geometries.
+            // The file has no scene, only geometries. All of them are read.
             for geometry in root.descendants().filter(|node| node.has_tag_name_of("geometry")) {
                 reader.place(geometry, &outer)?;
             }
@@ -61,7 +62,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Tria
     Ok(reader.triangles)
 }
 
-/// Compares element names without their namespace, which only some files have.
+/// Comparison of element names without the namespace, which only some files have.
 trait Named {
     fn has_tag_name_of(&self, name: &str) -> bool;
 }
@@ -80,7 +81,7 @@ fn child<'a, 'i>(node: Node<'a, 'i>, name: &'static str) -> Option<Node<'a, 'i>>
     children(node, name).next()
 }
 
-/// Returns the transform for the file's unit and axis.
+/// Returns the transform from the unit and axes of the file to m and z up.
 fn outer(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine, MeshError> {
     let asset = child(root, "asset");
     let meter = asset.and_then(|asset| child(asset, "unit")?.attribute("meter"));
@@ -94,7 +95,7 @@ fn outer(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine, MeshError
     let axis = asset.and_then(|asset| child(asset, "up_axis")?.text()).map_or("Y_UP", str::trim);
     let turn = match (up, axis) {
         (UpAxis::Ignore, _) | (UpAxis::Follow, "Z_UP") => Matrix3::identity(),
-        // x stays, and y becomes z.
+        // x stays, y becomes z, and z becomes -y.
         (UpAxis::Follow, "Y_UP") => Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0),
         // x becomes z, y becomes -x, and z becomes -y: X_UP has y to the left, and z towards the viewer.
         (UpAxis::Follow, "X_UP") => Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0),
@@ -105,10 +106,10 @@ fn outer(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine, MeshError
     Ok(Affine { linear: turn * scale, shift: Vector3::zeros() })
 }
 
-/// Elements by kind and id.
+/// The elements that have ids, by kind and id.
 #[derive(Debug)]
 struct ElementIds<'a, 'i> {
-    /// The name of the file, for errors.
+    /// The name of the file, which is used in errors.
     file: &'a str,
     elements: HashMap<(&'a str, &'a str), Vec<Node<'a, 'i>>>,
 }
@@ -124,7 +125,7 @@ impl<'a, 'i> ElementIds<'a, 'i> {
         Self { file, elements }
     }
 
-    /// Returns the element of this kind that `reference` names, if it exists.
+    /// Returns the element of this kind with the id in `reference`; `None` if there is none.
     fn find(&self, kind: &str, reference: &str) -> Result<Option<Node<'a, 'i>>, MeshError> {
         let wrong = |reason: String| Err(syntax(self.file, &reason));
         let Some(id) = reference.strip_prefix('#') else {
@@ -140,12 +141,12 @@ impl<'a, 'i> ElementIds<'a, 'i> {
 
 #[derive(Debug)]
 struct SceneReader<'a, 'i> {
-    /// The name of the file, for errors.
+    /// The name of the file, which is used in errors.
     name: &'a str,
     names: ElementIds<'a, 'i>,
-    /// The triangles of geometries that were already read.
+    /// The triangles of each geometry that was already read.
     geometry: HashMap<roxmltree::NodeId, Vec<Triangle>>,
-    /// The number of visited nodes.
+    /// The number of nodes visited so far.
     visited: usize,
     triangles: Vec<Triangle>,
 }
@@ -155,7 +156,7 @@ impl<'a, 'i> SceneReader<'a, 'i> {
         syntax(self.name, reason)
     }
 
-    /// Returns the element of this kind that an element's `url` names, in this file.
+    /// Returns the element of this kind to which the `url` of an element refers. It must be in the same file.
     fn referred(&self, node: Node<'_, '_>, kind: &str) -> Result<Node<'a, 'i>, MeshError> {
         let url = node.attribute("url").unwrap_or_default();
         let missing = || self.error(&format!("{kind} {url:?} is not there"));
@@ -186,7 +187,7 @@ impl<'a, 'i> SceneReader<'a, 'i> {
                     let geometry = self.referred(element, "geometry")?;
                     self.place(geometry, &here)?;
                 }
-                // Joints would determine the positions of its vertices.
+                // The vertices of a controller are moved by joints, which are not read.
                 "instance_controller" => {
                     let url = element.attribute("url").unwrap_or_default();
                     return Err(self.error(&format!("controller {url:?} deforms a mesh; apply it first")));
@@ -197,7 +198,7 @@ impl<'a, 'i> SceneReader<'a, 'i> {
         Ok(())
     }
 
-    /// Returns the transform of a node's element; `None` for other elements.
+    /// Returns the transform of an element such as `translate` or `matrix`; `None` if the element is no transform.
     fn transform(&self, element: Node<'_, '_>) -> Result<Option<Affine>, MeshError> {
         let kind = element.tag_name().name();
         if !matches!(kind, "matrix" | "translate" | "rotate" | "scale") {
@@ -248,7 +249,7 @@ impl<'a, 'i> SceneReader<'a, 'i> {
     }
 }
 
-/// Returns the numbers in an element's text.
+/// Returns the numbers in the text of an element.
 fn floats(file: &str, element: Node<'_, '_>) -> Result<Vec<f64>, MeshError> {
     numbers(file, element, str::parse::<f64>)
 }

@@ -2,8 +2,8 @@ use std::fmt::Write as _;
 
 use crate::mesh::{Mesh, UpAxis};
 
-/// Returns a geometry with a tetrahedron at x and with these primitives. Its sources have the same ids as those of all
-/// others.
+/// Returns a geometry with a tetrahedron that begins at `x` and has these primitives. The ids of its sources are the
+/// same for all geometries.
 fn geometry(id: &str, x: f64, primitives: &str) -> String {
     format!(
         r##"<geometry id="{id}"><mesh>
@@ -37,7 +37,7 @@ fn parse(text: &str) -> Result<Mesh, String> {
     Mesh::parse("a.dae", text.as_bytes(), UpAxis::Ignore).map_err(|error| error.to_string())
 }
 
-/// Returns the smallest x of each tetrahedron.
+/// Returns the smallest x coordinate of each tetrahedron.
 fn places(mesh: &Mesh) -> Vec<f64> {
     let x = mesh.triangles().chunks(4).map(|four| four.iter().flatten().map(|corner| corner.x));
     x.map(|x| x.fold(f64::INFINITY, f64::min)).collect()
@@ -49,7 +49,7 @@ fn geometries_may_share_the_names_of_their_sources() {
     let geometries = geometry("a", 0.0, TRIANGLES) + &geometry("b", 5.0, TRIANGLES);
     let mesh = parse(&file(&geometries, &placed(&["a", "b", "a"]), "")).unwrap();
     assert_eq!(places(&mesh), [0.0, 5.0, 0.0]);
-    // The second geometry is shorter.
+    // The second geometry has fewer points.
     let short =
         geometry("b", 5.0, "").replace("count=\"12\"", "count=\"3\"").replace("  6 0 0  5 2 0  5 0 3", "");
     let mesh = parse(&file(&(geometry("a", 0.0, TRIANGLES) + &short), &placed(&["a", "b"]), "")).unwrap();
@@ -67,7 +67,7 @@ fn a_name_of_several_elements_is_refused_where_it_is_used() {
     assert!(
         parse(&file(&sources, &placed(&["a"]), "")).unwrap_err().contains("belongs to 2 source elements")
     );
-    // A source outside the geometry is searched in the whole file, where several have the id.
+    // A source that is not in the geometry is searched for in the whole file, where several elements have its id.
     let elsewhere =
         geometry("c", 0.0, TRIANGLES).replace("source=\"#pos\"/></vertices>", "source=\"#far\"/></vertices>");
     let missing = parse(&file(&elsewhere, &placed(&["c"]), "")).unwrap_err();
@@ -96,7 +96,7 @@ fn nodes_and_scenes_are_found_by_kind_and_missed_in_words() {
 
 #[test]
 fn polygons_of_each_kind_have_their_own_area() {
-    // The points are a square with a notch and a square with a hole, in the plane of x and y.
+    // The points form a square with a notch, and a square with a hole, both in the plane of x and y.
     let points = "0 0 0 3 0 0 3 3 0 1.5 1 0 0 3 0  1 0.2 0 2 0.2 0 2 0.6 0 1 0.6 0";
     let with = |primitives: &str| {
         let text = geometry("a", 0.0, primitives).replace("count=\"12\"", "count=\"27\"");

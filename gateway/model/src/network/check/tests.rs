@@ -34,11 +34,11 @@ fn skin(neighbors: &[[usize; PORTS]]) -> Skin {
     Skin::parse("skin.toml", &text).unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// A bench with the actual wires and cells.
+/// The actual cells and wires of a network, damaged at random.
 struct Truth {
     wires: Wires,
     cells: usize,
-    /// From each end, the end at which its messages arrive.
+    /// For each end, the end at which its messages arrive.
     leads: BTreeMap<WireEnd, WireEnd>,
     dead: BTreeSet<CellId>,
     beats: BTreeMap<CellId, Heartbeat>,

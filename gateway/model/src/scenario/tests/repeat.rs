@@ -81,7 +81,7 @@ proptest! {
         prop_assert_eq!(again.sensors(cell, epoch), again.sensors(cell, epoch + period));
     }
 
-    /// All changes together give the words of every cell in every period, even with skipped epochs.
+    /// The changes from epoch to epoch add up to the words of every cell in every period, even if epochs are skipped.
     #[test]
     fn changes_add_up_over_periods(steps in proptest::collection::vec(1_u64..300, 1..40)) {
         let endless = "[[touch]]\nat_s = 2.9\ncells = [2]\nforce_n = 1.0\n";

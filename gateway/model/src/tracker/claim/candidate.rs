@@ -13,15 +13,16 @@ use protocol::time::Span;
 
 use super::life::Incarnation;
 
-/// Number of heartbeats with a continuous counter that prove a start without its claim, on an id that two senders have
-/// used.
+/// Number of heartbeats in a row with a continuous counter that prove a start even if its claim was lost. This applies
+/// to a node id that two senders have used.
 const PROVING_HEARTBEATS: u8 = 3;
 
-/// Minimum interval of a cell's heartbeats, which are 250 ms apart. Old heartbeats that happen to be repeated in order
-/// arrive much faster.
+/// Minimum interval of heartbeats with a continuous counter. Cells send them every 250 ms; old heartbeats that happen
+/// to be repeated in order arrive much faster.
 const MIN_HEARTBEAT_INTERVAL: Span = Span::from_millis(100);
 
-/// An outsider: its last heartbeat, and the number of heartbeats with a continuous counter.
+/// A sender that is not the owner of a node id: its last heartbeat, and the number of heartbeats with a continuous
+/// counter.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) struct Candidate {
     last: Incarnation,
@@ -29,14 +30,14 @@ pub(super) struct Candidate {
 }
 
 impl Candidate {
-    /// Returns the candidate after a heartbeat of an outsider.
+    /// Returns the candidate after a heartbeat that is not the owner's; `before` is the candidate before it.
     pub(super) fn next(before: Option<Self>, new: Incarnation) -> Self {
         let goes_on = |it: &Self| it.last.sent(&new).is_some() && new.at.elapsed_since(it.last.at) >= MIN_HEARTBEAT_INTERVAL;
         let shown = before.filter(goes_on).map_or(1, |it| it.shown.saturating_add(1));
         Self { last: new, shown }
     }
 
-    /// Returns true if it owns the id from its last heartbeat on.
+    /// Returns true if the candidate owns the node id from its last heartbeat on; `owner` is the owner so far.
     pub(super) fn succeeds(&self, owner: Option<&Incarnation>) -> bool {
         let is_silent = owner.is_none_or(|owner| !owner.is_alive(self.last.at));
         is_silent && (self.last.has_just_started() || self.shown >= PROVING_HEARTBEATS)

@@ -23,48 +23,50 @@ use candidate::Candidate;
 use life::Incarnation;
 use ownership::{Evidence, Ownership};
 
-/// The meaning of a heartbeat for its node id.
+/// The meaning of a heartbeat for the owner of its node id.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum HeartbeatKind {
     /// The first heartbeat of the owner, whose start was not observed.
     First,
     /// A further heartbeat of the owner.
     Known,
-    /// An old heartbeat of the owner, or its last one again, without new information.
+    /// An old heartbeat of the owner, or a copy of its last one; it contains nothing new.
     Overtaken,
     /// The first heartbeat since the cell started.
     Started {
-        /// True if the cell, or an earlier owner of the id, sent packets before.
+        /// True if this cell, or an earlier owner of the node id, has sent packets before.
         again: bool,
     },
-    /// A heartbeat of the previous owner, which continues: two senders use the id in turn, and the apparent start was
-    /// none.
+    /// A heartbeat that continues the counter of the previous owner. So two senders use the node id in turn, and the
+    /// apparent start of the owner was not one.
     Shared,
-    /// A heartbeat of another sender while the owner is alive: after two senders used the id in turn, or with a counter
-    /// that no cell can have reached since the owner's last heartbeat.
+    /// A heartbeat of another sender while the owner is alive: either two senders have used the node id in turn, or no
+    /// cell can have reached its counter since the owner's last heartbeat.
     Outsider,
-    /// A claim by another cell, which will give it up.
+    /// A claim by another cell, which will yield to the owner.
     Claimant,
 }
 
-/// The address claim of one node id.
+/// The owner of one node id, and the other senders that use or claim it.
 ///
-/// A cell is identified by its serial number. A claiming cell yields to a cell that owns the id already, so a claim of
-/// a settled cell's id does not change that cell's state.
+/// A cell is identified by its serial number. A claiming cell yields to a cell that owns the node id already, so a
+/// claim for a settled cell's node id does not change that cell's state.
 ///
-/// Heartbeats are not authenticated, and old ones may be repeated. So a start is accepted at once, and taken back if
-/// the counter before it continues; after that, a start is accepted only if the owner is silent.
+/// Heartbeats are not authenticated, and old ones may be repeated. So a start is accepted at once, and taken back if a
+/// later heartbeat continues the counter from before the start; after that, a start is accepted only if the owner is
+/// silent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct AddressClaim {
     ownership: Ownership,
-    /// The outsider that sent the last heartbeat, unless the owner has sent one since.
+    /// The sender of the last heartbeat that was not the owner's; `None` if the owner has sent one since.
     candidate: Option<Candidate>,
-    /// Serial number of the last owner that was another cell than the current one.
+    /// Serial number of the last cell that owned the node id before the present owner.
     previous: Option<u32>,
 }
 
 impl AddressClaim {
-    /// Records a heartbeat of this node id that arrived at `at`. Only this function detects restarts.
+    /// Records a heartbeat with this node id that arrived at `at`, and returns its meaning. Restarts are detected only
+    /// here.
     pub fn receive(&mut self, at: Micros, heartbeat: &Heartbeat) -> HeartbeatKind {
         let new = Incarnation::new(at, heartbeat);
         let (mut next, mut word) = self.ownership.next(self.ownership.evidence(&new), new);
@@ -87,18 +89,18 @@ impl AddressClaim {
         word
     }
 
-    /// Returns true if an accepted start may still be taken back.
+    /// Returns true if an accepted start of the owner may still be taken back.
     pub(super) fn is_in_question(&self, at: Micros) -> bool {
         self.ownership.former().is_some_and(|former| former.may_go_on(at))
     }
 
-    /// Returns the last heartbeat of the cell that owns the id, or of the first one to claim it.
+    /// Returns the last heartbeat of the owner of the node id, or of the first cell to claim it.
     #[must_use]
     pub fn heartbeat(&self) -> Option<Heartbeat> {
         self.ownership.owner().map(|owner| owner.heartbeat)
     }
 
-    /// Returns the serial number of that cell.
+    /// Returns the serial number of the owner of the node id, or of the first cell to claim it.
     #[must_use]
     pub fn serial(&self) -> Option<u32> {
         self.ownership.owner().map(|owner| owner.heartbeat.serial)
@@ -110,13 +112,13 @@ impl AddressClaim {
         self.previous
     }
 
-    /// Returns true if that cell reports this state.
+    /// Returns true if the last heartbeat of the owner has this state flag.
     #[must_use]
     pub fn has_state(&self, state: State) -> bool {
         self.ownership.owner().is_some_and(|owner| owner.heartbeat.state.has(state))
     }
 
-    /// Returns true if a cell owns the id, and so answers.
+    /// Returns true if a cell owns the node id, and so answers joints.
     #[must_use]
     pub fn is_settled(&self) -> bool {
         self.ownership.owner().is_some_and(Incarnation::is_settled)

@@ -41,7 +41,7 @@
 use super::HeartbeatKind;
 use super::life::{MAX_PACKETS_PER_HEARTBEAT, Incarnation};
 
-/// The owner of a node id, and its certainty.
+/// The owner of a node id, and how certain its ownership is.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) enum Ownership {
     /// No heartbeat has arrived.
@@ -49,46 +49,51 @@ pub(super) enum Ownership {
     Free,
     /// One cell owns the id, or is the first one to claim it.
     Sole { owner: Incarnation },
-    /// The owner seems to have started; if the life before it goes on, that was not a start.
+    /// The owner seems to have started. If a heartbeat continues the `former` life, the cell did not start.
     Doubted { owner: Incarnation, former: Incarnation },
     /// Two senders have used the id in turn: only a successor of a silent owner is accepted.
     Shared { owner: Incarnation },
-    /// The owner succeeded a silent one of a shared id; the life before it may go on.
+    /// A candidate succeeded the silent owner of a shared node id. The `former` life may still continue.
     Inherited { owner: Incarnation, former: Incarnation },
 }
 
-/// A fact that a heartbeat proves. [`Ownership::evidence`] returns the first that holds.
+/// A fact about the sender that a heartbeat proves. If several hold, [`Ownership::evidence`] returns the first in this
+/// order.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Evidence {
-    /// It has CLAIMING, and another serial number than the owner, if there is one.
+    /// The heartbeat has CLAIMING, and a serial number other than the owner's, if there is an owner.
     Claims,
-    /// It does not have CLAIMING, and has another serial number than an owner that only claims the id, if there is one.
+    /// The heartbeat does not have CLAIMING, and the node id has no owner, or an owner with another serial number that
+    /// still claims it.
     Settles,
-    /// The former's counter continues with it, and either its serial number differs from a settled owner's, or its
-    /// counter does not fit the owner. If both counters continue with it: the owner's claim was received and cannot be
-    /// over; or it was not received, and the former's counter is nearer.
+    /// The heartbeat continues the counter of the former life, and either its serial number differs from a settled
+    /// owner's, or it does not continue the owner's counter. If it continues both counters, it counts as the former's
+    /// in two cases: the owner's claim was received and cannot be over yet; or the claim was not received, and the
+    /// former's counter is nearer.
     FormerContinues,
-    /// It is from another settled cell, while the owner is settled.
+    /// The heartbeat is from another settled cell, while the owner is settled.
     Intrudes,
-    /// It is the owner's first packet after a start.
+    /// The heartbeat is the owner's first packet after a start.
     Starts,
-    /// It is the owner's last one again, or an older one. If the owner's claim was not received, it may also be the
-    /// former's.
+    /// The heartbeat is a copy of the owner's last one, or an older one. If the owner's claim was not received, it may
+    /// also be an old one of the former life.
     Repeats,
-    /// The owner's counter continues with it.
+    /// The heartbeat continues the owner's counter.
     Continues,
-    /// The owner was away for more than 10 s, and its counter is ahead of its last one.
+    /// The owner was silent for more than 10 s, and the counter in the heartbeat is ahead of its last one.
     Returns,
-    /// Its counter is larger than that of any cell that started since the owner's last heartbeat.
+    /// The counter in the heartbeat is larger than that of any cell that started since the owner's last heartbeat.
     Exceeds,
-    /// Its counter fits neither the owner nor the former: a cell whose claim was lost, or an old heartbeat.
+    /// The counter in the heartbeat continues neither the owner's nor the former's: the sender is a cell whose claim
+    /// was lost, or repeats an old heartbeat.
     Jumps,
-    /// An outsider now owns the id, by the rules of [`super::candidate`]. A single heartbeat cannot prove this.
+    /// The sender of the heartbeat succeeds the silent owner, by the rules of [`super::candidate`]. A single heartbeat
+    /// cannot prove this.
     Succeeds,
 }
 
 impl Ownership {
-    /// Returns the cell that owns the id, or claims it.
+    /// Returns the life of the cell that owns the node id, or claims it.
     pub(super) const fn owner(&self) -> Option<&Incarnation> {
         match self {
             Self::Free => None,
@@ -99,7 +104,7 @@ impl Ownership {
         }
     }
 
-    /// Returns the life before the owner's start, which may disprove that start.
+    /// Returns the life before the owner's start, if it may still disprove that start.
     pub(super) const fn former(&self) -> Option<&Incarnation> {
         match self {
             Self::Doubted { former, .. } | Self::Inherited { former, .. } => Some(former),
@@ -160,15 +165,15 @@ impl Ownership {
         }
     }
 
-    /// Returns true if a counter that is `own` ahead of the owner's and `its` ahead of the former's more likely belongs
-    /// to the former.
+    /// Returns true if a heartbeat that continues both counters more likely belongs to the former life. Its counter is
+    /// `own` ahead of the owner's and `its` ahead of the former's.
     fn is_formers(&self, new: &Incarnation, own: u16, its: u16) -> bool {
         let is_alive = self.former().is_some_and(|former| former.is_alive(new.at));
         its < own && (is_alive || own > MAX_PACKETS_PER_HEARTBEAT && its < own / 8)
     }
 
-    /// Returns the state after a heartbeat with this evidence, and the heartbeat's meaning; `new` is the life that
-    /// would begin with it. The arms name the rows of the table.
+    /// Returns the state after a heartbeat with this evidence, and the meaning of the heartbeat; `new` is the life that
+    /// would begin with it. Each arm names its rows of the table.
     pub(super) fn next(self, evidence: Evidence, new: Incarnation) -> (Self, HeartbeatKind) {
         use Evidence as E;
         const AGAIN: HeartbeatKind = HeartbeatKind::Started { again: true };

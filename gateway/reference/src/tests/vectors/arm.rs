@@ -65,12 +65,12 @@ pub(crate) fn cases() -> impl Iterator<Item = Case> {
 }
 
 impl Case {
-    /// Returns the words of the robot's rows in use.
+    /// Returns the parameter words of the rows in use.
     pub(crate) fn rows(&self) -> Vec<[i16; WORDS]> {
         (0..self.parameters.joints).map(|row| self.parameters.words(Parameter::Row(row))).collect()
     }
 
-    /// Selects from a value for each joint those that a packet of this chain has.
+    /// Returns the values, of one for each joint, that fit into a packet of this chain.
     pub(crate) fn of_chain(&self, all: [i16; MAX_JOINTS]) -> Vec<i16> {
         all[..Length::for_joints(self.parameters.joints.into()).words()].to_vec()
     }
@@ -80,7 +80,7 @@ impl Case {
         packet::padded_words(self.contact.map(Q::to_bits))
     }
 
-    /// Returns the Jacobian and the torques, as the cell computes them.
+    /// Returns the words of the Jacobian and of the torques that the cell computes.
     pub(crate) fn answer(&self) -> ([Q1_14; MAX_JOINTS], [i16; MAX_JOINTS]) {
         let sensors = SkinSensors { contact: self.contact, ..SkinSensors::default() };
         let cell = ReferenceCell::new(&self.parameters);
@@ -98,7 +98,7 @@ impl Case {
         self.under(self.contact.iter().map(|word| word.to_f64()).sum())
     }
 
-    /// Returns the torques of a force in N.
+    /// Returns the torques in Nm of a force in N against the normal.
     fn under(&self, force_n: f64) -> Vec<f64> {
         let Pose { position, normal } = self.parameters.pose;
         let turn =

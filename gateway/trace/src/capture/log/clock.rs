@@ -1,7 +1,8 @@
-//! Times of frames whose lines do not hold an absolute time.
+//! Assigns times to frames whose lines hold no absolute time.
 //!
-//! `candump -t d` prints the time since the line before, `-t z` that since the first one. The log does not say which
-//! one was used, but only differences run backwards on one bus. Without `-t` there are no times.
+//! `candump -t d` prints the time since the line before, and `-t z` the time since the first line. The log does not say
+//! which option was used. Times since the first line never run backwards on one bus, so times that do are differences.
+//! Without `-t` a line has no time.
 
 use std::fmt;
 
@@ -10,26 +11,26 @@ use protocol::candump::Timestamp;
 use super::console::Stamp;
 use crate::capture::last_times::LastTimes;
 
-/// The step from one frame to the next if there are no times.
+/// The time between successive frames, in ns, that is assumed if the lines hold no times.
 const STEP_NS: u64 = 1_000;
-/// The maximum number of buses whose times are compared.
+/// The maximum number of buses whose times are compared to find the reference.
 const BUSES: usize = 16;
-/// The number of comparisons that decide.
+/// The number of comparisons after which the reference of relative times is decided.
 const MIN_COMPARISONS: u32 = 20;
 
-/// A remark on the times and flags of a capture.
+/// A remark for the user on the times and flags of a log.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 #[non_exhaustive]
 pub enum Remark {
     /// The lines have no times.
     NoTimes,
-    /// The times are dates of an unknown time zone.
+    /// The lines have dates and times of day without a time zone; they are read as UTC.
     LocalTimes,
     /// The times count from the first frame.
     SinceFirst,
-    /// The times are differences between lines.
+    /// The times are counted from the line before.
     Differences,
-    /// FD frames have no flags.
+    /// The lines of FD frames do not show the flags (BRS, ESI).
     NoFlags,
 }
 
@@ -51,14 +52,14 @@ impl fmt::Display for Remark {
     }
 }
 
-/// The reference of relative times.
+/// The reference of relative times: the first frame or the line before.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Relative {
     First,
     Before,
 }
 
-/// Assigns times to frames, one after the other.
+/// Assigns a time to each frame of a log, one after the other.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(crate) struct Clock {
     /// The reference of relative times, once it is known.
@@ -90,7 +91,7 @@ impl Clock {
         self.last = Some(nanos);
     }
 
-    /// Returns the time of the next frame, and a remark on it.
+    /// Returns the time of the next frame, and a remark if the time is not absolute.
     pub(super) fn time(&mut self, stamp: Stamp) -> (Timestamp, Option<Remark>) {
         let (time, remark) = match stamp {
             Stamp::None => {
@@ -110,7 +111,7 @@ impl Clock {
     }
 }
 
-/// Compares the times of several lines to find out their reference.
+/// Compares the times of several lines to find out what they are relative to.
 #[derive(Debug, Default)]
 pub(super) struct Evidence {
     last: LastTimes<BUSES>,
@@ -131,7 +132,8 @@ impl Evidence {
         self.compared >= MIN_COMPARISONS
     }
 
-    /// Returns the reference. Times since the first frame grow on each bus, except for a few where the clock was set.
+    /// Returns the reference of the times. Times since the first frame grow on each bus, with few exceptions where the
+    /// clock was set.
     pub(super) const fn verdict(&self) -> Relative {
         if self.smaller * 8 > self.compared || self.same * 2 > self.compared {
             Relative::Before

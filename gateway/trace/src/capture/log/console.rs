@@ -19,14 +19,14 @@
 use protocol::can::{BIT_RATE_SWITCH, ERROR_STATE, Frame, REMOTE, check_identifier};
 use protocol::candump::{self, Direction, LineError, Timestamp, eight_digit_identifier};
 
-/// A line that holds a frame.
+/// A frame parsed from a line, with the information whether the line showed its flags.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct ConsoleFrame<'a> {
     pub(super) stamp: Stamp,
     pub(super) interface: &'a str,
     pub(super) frame: Frame,
     pub(super) direction: Option<Direction>,
-    /// True if the line holds the flags of an FD frame, or needs none.
+    /// True if the line shows the flags of an FD frame, or if the frame is a classic one, which has no flags.
     pub(super) has_flags: bool,
 }
 
@@ -43,15 +43,15 @@ pub(super) enum Stamp {
     Relative(Timestamp),
 }
 
-/// A line of console output.
+/// A line of candump's console output that was recognised.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum ConsoleLine<'a> {
     Frame(ConsoleFrame<'a>),
     CanXl,
 }
 
-/// Parses one line without its end. Returns `None` if it is not console output, that is, a name, an identifier and a
-/// length. Never panics.
+/// Parses one line, given without its line end. Returns `None` if the line does not consist of a bus name, an
+/// identifier and a length, as console output does. Never panics.
 ///
 /// # Errors
 /// Returns [`LineError`] if the line begins like console output, but the text after the length is not a frame.
@@ -67,7 +67,7 @@ pub(super) fn parse(line: &[u8]) -> Option<Result<ConsoleLine<'_>, LineError>> {
     if first.is_some() || cursor.rest().starts_with(b"(") {
         return first;
     }
-    // Text before the frame may be a prompt. A line that only resembles a frame there is ignored, as it may be
+    // Text before the frame may be a prompt. A malformed frame after such text is not an error, because the line may be
     // anything.
     while !cursor.word().is_empty() {
         cursor.blanks();
@@ -78,7 +78,7 @@ pub(super) fn parse(line: &[u8]) -> Option<Result<ConsoleLine<'_>, LineError>> {
     None
 }
 
-/// The length in brackets.
+/// The length that a line prints in brackets.
 #[derive(Clone, Copy)]
 enum Length {
     Classic(u8),
@@ -104,7 +104,7 @@ struct Cursor<'a> {
 }
 
 impl<'a> Cursor<'a> {
-    /// Parses the line from here on, after blanks.
+    /// Parses a line from the position of the cursor on. Blanks are skipped first.
     fn line(mut self) -> Option<Result<ConsoleLine<'a>, LineError>> {
         let stamp = if self.accept(b'(') { self.stamp()? } else { Stamp::None };
         self.blanks();
@@ -140,7 +140,7 @@ impl<'a> Cursor<'a> {
         Some(frame.map(|frame| ConsoleLine::Frame(ConsoleFrame { stamp, interface, frame, direction, has_flags })))
     }
 
-    /// Parses the direction after a frame of a log.
+    /// Parses the direction (`T` or `R`) after a frame in a log.
     fn direction(&mut self) -> Option<Direction> {
         self.blanks();
         match self.word() {
@@ -150,8 +150,8 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Returns true if a dash and a quoted text follow the data: isotpsniffer prints messages this way that it joins
-    /// from frames.
+    /// Returns true if a dash and a quoted text follow the data. isotpsniffer prints messages this way, which it has
+    /// joined from several frames.
     fn is_of_isotpsniffer(&self, has_frame: bool) -> bool {
         if has_frame {
             self.rest().starts_with(b"- '")
@@ -199,7 +199,7 @@ impl<'a> Cursor<'a> {
         self.run(|byte| !matches!(byte, b' ' | b'\t' | 0x1B))
     }
 
-    /// Returns the bytes from here on that match `is`.
+    /// Returns the longest run of bytes from the cursor on that match `is`.
     fn run(&mut self, is: impl Fn(u8) -> bool) -> &'a [u8] {
         let rest = self.rest();
         let len = rest.iter().take_while(|&&byte| is(byte)).count();
@@ -207,13 +207,13 @@ impl<'a> Cursor<'a> {
         rest.get(..len).unwrap_or_default()
     }
 
-    /// Returns a number and the count of its decimal digits.
+    /// Returns a decimal number and the count of its digits.
     fn number(&mut self) -> Option<(u64, usize)> {
         let digits = self.run(|byte| byte.is_ascii_digit());
         Some((core::str::from_utf8(digits).ok()?.parse().ok()?, digits.len()))
     }
 
-    /// Parses the time in the parentheses before the name, with the closing one.
+    /// Parses the time in parentheses before the bus name, up to and including the closing parenthesis.
     fn stamp(&mut self) -> Option<Stamp> {
         let is_padded = self.rest().first() == Some(&b'0');
         let (number, digits) = self.number()?;
@@ -244,7 +244,7 @@ impl<'a> Cursor<'a> {
             .then(|| ((days(year, month, day) * 24 + hour) * 60 + minute) * 60 + second)
     }
 
-    /// Parses the output of `-x`: a direction, and the flags, which may be missing.
+    /// Parses the output of `-x`: the direction, and the flags of an FD frame, which may be missing.
     fn marks(&mut self) -> Option<(Direction, Option<u8>)> {
         let mut cursor = *self;
         let direction = match cursor.word() {
@@ -310,7 +310,7 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// Parses exactly `len` bytes, in hexadecimal or binary digits. Returns `too_long` if `len` exceeds 64.
+    /// Parses exactly `len` bytes in hexadecimal or binary digits. Returns the error `too_long` if `len` exceeds 64.
     fn data(&mut self, len: usize, too_long: LineError) -> Result<[u8; 64], LineError> {
         let mut data = [0; 64];
         let mut is_swapped = false;
@@ -351,9 +351,9 @@ fn byte(digits: &[u8]) -> Option<u8> {
 
 /// Returns the days from 1970-01-01 to a day of the Gregorian calendar, for years from 1970 on.
 const fn days(year: u64, month: u64, day: u64) -> u64 {
-    // Years begin in March here, so that a leap day is the last one.
+    // Years begin in March here, so that a leap day is the last day of its year.
     let (year, month) = if month > 2 { (year, month - 3) } else { (year - 1, month + 9) };
     let of_years = year * 365 + year / 4 - year / 100 + year / 400;
-    // The constant is the number of days up to 1970-03-01 less January and February, in the same count.
+    // The constant is the day count of 1970-01-01 in this calendar.
     of_years + (153 * month + 2) / 5 + day - 1 - 719_468
 }

@@ -1,4 +1,4 @@
-//! Reads captures as candump text, line by line, in bounded memory whatever the file contains.
+//! Reads the entries of a candump log line by line. Memory is bounded whatever the file contains.
 
 use std::io::{self, Read};
 use std::ops::Range;
@@ -10,28 +10,29 @@ use super::console::{self, ConsoleLine, ConsoleFrame, Stamp};
 use crate::capture::{Entry, Note, NoteKind};
 use crate::container::read_some;
 
-/// The longest line that is read with its end, in bytes: twice the longest CAN XL frame.
+/// The maximum length of a line in bytes, with its line end: twice the longest CAN XL frame. Longer lines are cut.
 pub const MAX_LINE_BYTES: usize = 8_192;
-/// The number of bytes that are read at once; a multiple of the longest line.
+/// The number of bytes requested from the input at once. It must be a multiple of [`LONGEST`].
 const CHUNK: usize = 1 << 18;
-/// The length of the sample of lines before the first frame, from which the kind of a text is recognised.
+/// The maximum size in bytes of the sample of lines before the first frame. The kind of a text without frames is
+/// recognised from this sample.
 const SAMPLE: usize = 4_096;
-/// The bytes that some editors write before the first line.
+/// The UTF-8 byte order mark, which some editors write at the beginning of a file.
 const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
 
 /// Reads the entries of a log.
 pub(crate) struct LogReader {
     input: Box<dyn Read + Send>,
     buffer: Vec<u8>,
-    /// The range of unused bytes in the buffer.
+    /// The range of the buffer that has been read and not yet parsed.
     rest: Range<usize>,
     at_end: bool,
-    /// Bytes taken from the input, including those before the position where it began.
+    /// The offset in the file of the next byte to be read into the buffer.
     taken: u64,
-    /// Lines read so far.
+    /// The number of lines read so far.
     lines: u64,
     clock: Clock,
-    /// Each remark once.
+    /// The remarks on the log, each listed once.
     remarks: Vec<Remark>,
     /// The sample of lines before the first frame. It does not grow afterwards.
     sample: Vec<u8>,
@@ -39,7 +40,7 @@ pub(crate) struct LogReader {
 }
 
 impl LogReader {
-    /// Continues after `head`, which has already been read.
+    /// Creates a reader for an input whose first bytes, `head`, have already been read.
     pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>) -> Self {
         let mut buffer = vec![0; CHUNK];
         let taken = head.len() as u64;
@@ -52,17 +53,17 @@ impl LogReader {
         Self { input, buffer, rest, at_end: false, taken, lines: 0, clock, remarks, sample, any_frame }
     }
 
-    /// Continues counting lines after those of other logs.
+    /// Continues the line numbers of earlier logs that have `lines` lines in total.
     pub(crate) fn behind(self, lines: u64) -> Self {
         Self { lines, ..self }
     }
 
-    /// Continues after bytes and lines that were skipped.
+    /// Creates a reader for an input of which bytes and lines were skipped, with the clock at that position.
     pub(crate) fn resume((bytes, lines, clock): (u64, u64, Clock), input: Box<dyn Read + Send>) -> Self {
         Self { taken: bytes, lines, clock, ..Self::new(&[], input) }
     }
 
-    /// Returns the number of input bytes that are used up.
+    /// Returns the offset in the file of the next line.
     pub(crate) const fn offset(&self) -> u64 {
         self.taken - (self.rest.end - self.rest.start) as u64
     }
@@ -85,12 +86,12 @@ impl LogReader {
         &self.sample
     }
 
-    /// Returns true if the buffer has no complete line.
+    /// Returns true if the buffer has no complete line, so that the next entry requires a read from the input.
     pub(crate) fn is_drained(&self) -> bool {
         self.buffer.get(self.rest.clone()).is_none_or(|rest| line_end(rest).is_none())
     }
 
-    /// Returns true after the last line. Reads more if necessary.
+    /// Returns true after the last line. May read from the input.
     pub(crate) fn is_at_its_end(&mut self) -> io::Result<bool> {
         while self.rest.is_empty() && !self.at_end {
             self.fill()?;
@@ -98,7 +99,7 @@ impl LogReader {
         Ok(self.rest.is_empty())
     }
 
-    /// Returns the next entry, one per line. Never panics.
+    /// Returns the next entry; each line is one entry. Never panics.
     #[inline]
     pub(crate) fn next(&mut self) -> io::Result<Option<Entry<'_>>> {
         let Some((line, long)) = self.next_line()? else { return Ok(None) };
@@ -141,8 +142,8 @@ impl LogReader {
         Ok(Some(Entry::Note(note)))
     }
 
-    /// Finds out the reference of relative times from the lines that follow, as many as are needed and fit into the
-    /// buffer.
+    /// Determines what relative times count from, by the lines that follow in the buffer. Reads as many lines as are
+    /// needed and fit.
     #[cold]
     fn look_ahead(&mut self) -> io::Result<()> {
         let mut evidence = Evidence::default();
@@ -168,8 +169,8 @@ impl LogReader {
         Ok(())
     }
 
-    /// Returns the next line's range in the buffer, without its end, and true if the line was too long. A line ends
-    /// with a line feed, a carriage return, or both.
+    /// Returns the range of the next line in the buffer, without its line end, and true if the line was cut because it
+    /// is too long. A line ends with a line feed, a carriage return, or both.
     #[inline]
     fn next_line(&mut self) -> io::Result<Option<(Range<usize>, bool)>> {
         let Range { start, end } = self.rest;
@@ -184,7 +185,7 @@ impl LogReader {
         }
     }
 
-    /// Consumes the next line with its end, and returns its range.
+    /// Consumes the next line and its line end. Returns the range of the line.
     #[inline]
     const fn end_line(&mut self, end: usize, length: usize) -> Range<usize> {
         let start = self.rest.start;
@@ -192,16 +193,16 @@ impl LogReader {
         start..end
     }
 
-    /// Returns the next line if it is not complete in the buffer, or too long.
+    /// Returns the next line if the buffer does not hold all of it, or if it is too long.
     fn line_beyond(&mut self) -> io::Result<Option<(Range<usize>, bool)>> {
         let mut seen = 0;
         loop {
             let Range { start, end } = self.rest;
             let fresh = self.buffer.get(start + seen..end).unwrap_or_default();
-            // A line end beyond the limit does not count.
+            // The search for a line end stops at the maximum length of a line.
             let within = fresh.get(..MAX_LINE_BYTES - seen).unwrap_or(fresh);
             match line_end(within).map(|at| (at, fresh.get(at..).unwrap_or_default())) {
-                // The line feed of this line end may follow.
+                // The buffer ends with the carriage return; a line feed that belongs to it may follow.
                 Some((at, [b'\r'])) if !self.at_end => {
                     seen += at;
                     self.fill()?;
@@ -225,7 +226,8 @@ impl LogReader {
         }
     }
 
-    /// Skips to the end of a line of which `line` is kept. Returns the range of the kept bytes in the buffer.
+    /// Skips the rest of a line that is too long; its beginning, `line`, is kept. Returns the range of the kept bytes
+    /// in the buffer.
     fn skip_line(&mut self, line: Range<usize>) -> io::Result<Range<usize>> {
         self.buffer.copy_within(line.clone(), 0);
         let kept = line.len();
@@ -262,13 +264,13 @@ impl LogReader {
     }
 }
 
-/// Returns the offset of the line end.
+/// Returns the offset of the first line end in a text.
 #[inline]
 fn line_end(text: &[u8]) -> Option<usize> {
     memchr::memchr2(b'\n', b'\r', text)
 }
 
-/// Returns the bus and the time of a frame whose time is relative.
+/// Returns the bus and the time of the frame in a line if the time is relative; `None` for other lines.
 #[inline]
 fn relative(line: &[u8]) -> Option<(&str, u64)> {
     // Lines of a log have ten digits before the point.
@@ -283,8 +285,8 @@ fn relative(line: &[u8]) -> Option<(&str, u64)> {
     }
 }
 
-/// Returns the time of a line that holds a frame, in ns since 1970; `Some(None)` if the time depends on the lines
-/// before it.
+/// Returns the time of the frame in a line, in ns since 1970. Returns `None` if the line holds no frame, and
+/// `Some(None)` if the time depends on the lines before it.
 pub(crate) fn known_time(line: &[u8]) -> Option<Option<u64>> {
     let line = line.trim_ascii_end();
     if let Ok(CandumpLine::Frame(record)) = candump::parse_bytes(line) {
@@ -299,8 +301,8 @@ pub(crate) fn known_time(line: &[u8]) -> Option<Option<u64>> {
     }
 }
 
-/// Makes the note of a line that is not a frame. A line that does not begin with a parenthesis is text and never counts
-/// as unreadable.
+/// Makes a note of a line that is not a frame. Only a line that begins with a parenthesis, as lines with frames do,
+/// counts as unreadable; others are text.
 #[cold]
 fn note(text: &[u8], long: bool, nanos: u64, line: u64) -> Note<'_> {
     let why = format!("a line of more than {MAX_LINE_BYTES} bytes, whose rest is left out");
@@ -337,7 +339,7 @@ mod tests {
         }
     }
 
-    /// Returns each note's line number, text and kind.
+    /// Returns the line number, the text and the kind of each note.
     fn all(bytes: &[u8], piece: usize) -> Vec<(u64, Vec<u8>, NoteKind)> {
         let mut log = LogReader::new(&[], Box::new(Pieces(bytes.to_vec(), piece)));
         let mut all = Vec::new();

@@ -1,4 +1,4 @@
-//! Output of candump, compared with the same frames in a log.
+//! Tests that console output of candump is read as the same frames in a log are.
 
 use std::fmt::Write as _;
 
@@ -12,7 +12,7 @@ use crate::capture::{Entry, NoteKind};
 /// note's kind, or an error.
 const CONSOLE: &str = include_str!("console.txt");
 
-/// Returns the entries as text: frames as lines of a log, notes by their kind.
+/// Returns the entries of a log as text (frames as lines of a log, notes by their kind) and the remarks.
 fn entries(text: &[u8]) -> (Vec<String>, Vec<Remark>) {
     let mut log = LogReader::new(&[], Box::new(std::io::Cursor::new(text.to_vec())));
     let mut all = Vec::new();
@@ -109,10 +109,10 @@ fn no_more_of_a_pipe_is_waited_for_than_is_needed() {
     }
 }
 
-/// The format of a printed line, as selected by candump's options.
+/// The options of candump that select the format of a printed line.
 #[derive(Clone, Copy, Debug)]
 struct Print {
-    /// `-t a`, `z`, `d`, `A`, or no option.
+    /// The option that prints times: `-t a`, `z`, `d` or `A`, or a blank for none.
     time: char,
     nine_digits: bool,
     marks: bool,
@@ -120,7 +120,7 @@ struct Print {
     swapped: bool,
     binary: bool,
     dlc: bool,
-    /// `-c`, up to three times.
+    /// The number of times that `-c` is given, 0 to 3.
     colour: u8,
     indented: bool,
 }
@@ -151,7 +151,8 @@ fn frame() -> impl Strategy<Value = Frame> {
     })
 }
 
-/// Prints a frame as candump does. Follows the source of candump, not the parser under test.
+/// Prints a frame as candump does. The function follows candump's source, so that the parser is not tested against
+/// itself.
 fn printed(print: Print, nanos: u64, step: u64, bus: &str, sent: bool, frame: &Frame) -> String {
     let mut line = " ".to_owned();
     let on = "\u{1b}[1m\u{1b}[34m";

@@ -1,4 +1,4 @@
-//! Writes captures as candump text.
+//! Writes the entries of a capture as a candump log.
 
 use std::collections::{HashMap, HashSet};
 use std::fmt;
@@ -9,33 +9,33 @@ use protocol::usage::is_unprintable;
 
 use crate::capture::{Entry, Note, NoteKind};
 
-/// The number of bytes that are written together.
+/// The size in bytes at which buffered lines are written.
 const WRITE_BYTES: usize = 1 << 16;
-/// The maximum size of lines that wait for the first frame, in bytes. A text without frames is not a log, so nothing is
-/// written before.
+/// The maximum size in bytes of lines that wait for the first frame. Nothing is written before the first frame, because
+/// a text without frames is not a log.
 const WAITING: usize = 1 << 20;
 
-/// The number of digits after the point of a time in seconds.
+/// The number of decimals of a time in seconds.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Digits {
-    /// As many as the capture has.
+    /// As many decimals as in the capture.
     #[default]
     Own,
-    /// 6, candump's default.
+    /// 6 decimals, candump's default.
     Six,
-    /// 9, as with `candump -N`.
+    /// 9 decimals, as with `candump -N`.
     Nine,
 }
 
-/// The style of a log.
+/// The style in which a log is written.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Style {
-    /// The digits of times.
+    /// The number of decimals of the times.
     pub digits: Digits,
-    /// True to write only what every tool reads: frames, without raw DLC.
+    /// True to write only frames, and no raw DLC, so that every tool can read the log.
     pub plain: bool,
     /// True to write `T` or `R` after frames whose direction is known, as `candump -x` does. Wireshark does not read
-    /// that.
+    /// such lines.
     pub directions: bool,
 }
 
@@ -44,26 +44,26 @@ pub struct Style {
 pub enum WriteOutcome {
     /// The log holds the whole entry.
     All,
-    /// The line holds less than the entry.
+    /// The log holds the entry without some of its information.
     Less(OmittedProperties),
-    /// The log omits the entry: a note that was not requested, or that a log cannot hold.
+    /// The log omits the entry, because it is a note that was not requested or that a log cannot hold.
     Nothing,
 }
 
-/// Properties of a frame that its line omits.
+/// The kinds of information that a line omits of its frame.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct OmittedProperties {
-    /// Digits of its time.
+    /// True if digits of the time are omitted.
     pub digits: bool,
-    /// Its direction.
+    /// True if the direction is omitted.
     pub direction: bool,
-    /// Its raw DLC.
+    /// True if the raw DLC is omitted.
     pub raw_dlc: bool,
-    /// The name of its bus, which is replaced in the log.
+    /// True if the bus has another name in the log, because a line cannot hold its own.
     pub name: bool,
 }
 
-/// Writes entries as lines.
+/// Writes the entries of a capture as lines of a log.
 #[derive(Debug)]
 pub struct LogWriter<W> {
     out: W,
@@ -71,12 +71,12 @@ pub struct LogWriter<W> {
     /// Lines that wait to be written.
     lines: Lines,
     any_frame: bool,
-    /// The number of frames lost so far, by bus.
+    /// The number of frames that the recorder lost so far, by bus.
     lost: HashMap<String, u64>,
     names: BusNames,
 }
 
-/// A text buffer that can hold any bytes.
+/// A text buffer that can hold any bytes, not only UTF-8.
 #[derive(Debug, Default)]
 struct Lines(Vec<u8>);
 
@@ -87,7 +87,7 @@ impl fmt::Write for Lines {
     }
 }
 
-/// The names of buses in a log.
+/// The names that the buses have in the log.
 #[derive(Debug, Default)]
 struct BusNames {
     /// The bus of the last frame, and its name in the log if that differs.
@@ -98,10 +98,10 @@ struct BusNames {
 }
 
 impl BusNames {
-    /// The maximum number of buses with an entry.
+    /// The maximum number of buses whose names are stored.
     const MAX_NAMES: usize = 4_096;
 
-    /// Makes `bus` the last one, and returns its name in the log if that differs.
+    /// Returns the name of `bus` in the log if it differs from its own name. Stores `bus` as the last one.
     #[inline]
     fn replacement(&mut self, bus: &str) -> Option<&str> {
         if self.last.0 != bus || self.taken.is_empty() {
@@ -111,8 +111,8 @@ impl BusNames {
         self.last.1.as_deref()
     }
 
-    /// Returns a name that a line can hold and that no other bus has there. Blanks and terminal control characters are
-    /// replaced.
+    /// Returns a name for the bus that a line can hold and that no other bus of the log has. Blanks and control
+    /// characters are replaced.
     fn assign(&mut self, bus: &str) -> String {
         if let Some(name) = self.written.get(bus) {
             return name.clone();
@@ -188,11 +188,12 @@ impl<W: Write> LogWriter<W> {
         Ok(if less == OmittedProperties::default() { WriteOutcome::All } else { WriteOutcome::Less(less) })
     }
 
-    /// Writes a line of a log unchanged. A recording's own note becomes candump's message on lost frames, or a comment.
+    /// Writes a note: a line of a log unchanged, and a note of a recording as candump's message on lost frames or as a
+    /// comment.
     fn note(&mut self, note: &Note<'_>) -> io::Result<WriteOutcome> {
         let lines = &mut self.lines.0;
         match note.kind {
-            // A line feed in the text would begin a line that is not in the source.
+            // A line feed within the text would begin a further line, which the source does not have.
             _ if note.line > 0 => {
                 let ends = |byte: &u8| if matches!(byte, b'\n' | b'\r') { b' ' } else { *byte };
                 lines.extend(note.text.iter().map(ends));
@@ -230,7 +231,7 @@ impl<W: Write> LogWriter<W> {
         Ok(())
     }
 
-    /// Flushes the buffer if there was a frame.
+    /// Writes the buffered lines to the output if there was a frame before.
     ///
     /// # Errors
     /// Returns an error if `out` fails.

@@ -1,4 +1,5 @@
-//! Names the buses of other programs' frames: topic and `frame_id` together identify the bus of a frame.
+//! Names the buses of frames that other programs recorded. The topic and the `frame_id` of a message together identify
+//! its bus.
 //!
 //! ```text
 //! /can0/from_can_bus  can ──┬─ one frame_id ──> /can0/from_can_bus
@@ -7,21 +8,22 @@
 //! ```
 //!
 //! ROS nodes write the same `frame_id` whatever their interface is. All pairs of a file are known from the beginning.
-//! In a pipe the first topic with a `frame_id` keeps it as the name of its bus, and later ones get their own.
+//! In a pipe, whose pairs are not known in advance, the first topic with a `frame_id` uses it as the name of its bus;
+//! later topics get their own names.
 
 use std::collections::{HashMap, HashSet};
 
-/// The maximum number of pairs. Frames of further ones use their `frame_id` as the bus.
+/// The maximum number of pairs of topic and `frame_id`. Frames of further pairs are named by their `frame_id`.
 const PAIRS: usize = 4_096;
 /// The maximum length of a bus name made from a topic, in bytes.
 const MAX_NAME_BYTES: usize = 255;
 
-/// The names of buses.
+/// The names of the buses in a recording of another program.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct ForeignBuses {
-    /// Names by topic and `frame_id`.
+    /// The name of the bus, by topic and `frame_id`.
     names: HashMap<String, HashMap<String, String>>,
-    /// The topics with each `frame_id`.
+    /// The topics that use each `frame_id`.
     topics: HashMap<String, HashSet<String>>,
     /// Pairs of topic and `frame_id`, in the order of their first frames.
     pairs: Vec<(String, String)>,
@@ -30,7 +32,7 @@ pub(crate) struct ForeignBuses {
 }
 
 impl ForeignBuses {
-    /// Returns the bus of a message.
+    /// Returns the name of the bus for a message with this topic and `frame_id`.
     pub(super) fn name<'a>(&'a mut self, topic: &str, frame_id: &'a str) -> &'a str {
         let is_known = self.names.get(topic).is_some_and(|names| names.contains_key(frame_id));
         if !is_known && self.pairs.len() < PAIRS {
@@ -41,7 +43,8 @@ impl ForeignBuses {
         self.names.get(topic).and_then(|names| names.get(frame_id)).map_or(frame_id, String::as_str)
     }
 
-    /// Returns the names that result when all pairs are known in advance.
+    /// Returns the names with all pairs taken into account: buses whose topics share a `frame_id` are named by their
+    /// topics.
     pub(crate) fn settled(self) -> Self {
         let mut all = Self { topics: self.topics, ..Self::default() };
         for (topic, frame_id) in &self.pairs {
@@ -55,7 +58,7 @@ impl ForeignBuses {
         self.is_shared
     }
 
-    /// Gives a pair a unique name.
+    /// Assigns a unique bus name to a pair of topic and `frame_id`.
     fn assign(&mut self, topic: &str, frame_id: &str) {
         let is_shared = self.topics.get(frame_id).is_some_and(|topics| topics.len() > 1);
         let own = Some(frame_id).filter(|name| !name.is_empty() && !is_shared).map(str::to_owned);
@@ -72,7 +75,7 @@ impl ForeignBuses {
     }
 }
 
-/// Returns the beginning of a topic's name, at most [`LONGEST`] bytes.
+/// Returns the beginning of a topic's name, at most [`LONGEST`] bytes long.
 pub(super) fn beginning(topic: &str) -> &str {
     let ends = (0..=MAX_NAME_BYTES.min(topic.len())).rev();
     ends.filter_map(|end| topic.get(..end)).next().unwrap_or_default()

@@ -1,4 +1,4 @@
-//! Decodes frames in recordings of other programs, which bridge CAN and ROS.
+//! Decodes frames from recordings of other programs, such as bridges between CAN and ROS.
 //!
 //! ```text
 //!   can_msgs/msg/Frame, can_msgs/Frame of ROS 1    ros2_socketcan_msgs/msg/FdFrame
@@ -15,7 +15,7 @@ use protocol::candump::{Record, Timestamp};
 use crate::ros2::cdr::{CdrError, CdrReader};
 use crate::ros2::{Header, nanos};
 
-/// A message type of other programs' frames.
+/// A message type in which other programs record frames.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum ForeignType {
     Classic,
@@ -52,8 +52,9 @@ impl ForeignType {
         Ok((header, from))
     }
 
-    /// Decodes a message. Its time is that of its header, or `log_time` if the header has none; its bus is the header's
-    /// `frame_id`. The message holds no FD flags, so the frame has FDF alone.
+    /// Decodes a message as a frame. The time is that of the header, or `log_time` if the header has none; the bus is
+    /// named by the header's `frame_id`. An `FdFrame` message holds no FD flags; the frame gets FDF and neither BRS nor
+    /// ESI.
     pub(super) fn decode(self, message: &[u8], log_time: u64) -> Result<Record<'_>, CdrError> {
         let (Header { nanos: stamp, frame_id: interface }, mut from) = self.header(message)?;
         let number = from.get::<u32>()?;
@@ -103,7 +104,7 @@ mod tests {
         }
         let record = ForeignType::from_schema("cdr", "can_msgs/msg/Frame").unwrap().decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#AABB");
-        // The bytes become a remote frame, and then one that is too long.
+        // The length field is changed, first into that of a remote frame and then into one that is too long.
         let at = bytes.len() - 12;
         bytes[at] = 1;
         let record = ForeignType::Classic.decode(&bytes, 9).unwrap();

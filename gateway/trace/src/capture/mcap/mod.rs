@@ -1,4 +1,4 @@
-//! Captures as MCAP recordings: channels of frames and notes are read and written, messages of other topics are
+//! Reads and writes captures as MCAP recordings. Frames and notes become entries; messages of other topics are only
 //! counted.
 
 mod buses;
@@ -21,12 +21,12 @@ use thiserror::Error;
 
 use crate::container::FormatError;
 
-/// Returns true if messages of an encoding and a type are frames of another program.
+/// Returns true if messages with this encoding and type are frames that another program recorded.
 pub(crate) fn is_foreign_frame(encoding: &str, schema: &str) -> bool {
     foreign::ForeignType::from_schema(encoding, schema).is_some()
 }
 
-/// An error of reading a recording, before it is given the name of the file.
+/// An error of reading a recording, without the name of the file, which the caller adds.
 #[derive(Debug, Error)]
 pub(super) enum ReadFault {
     #[error(transparent)]

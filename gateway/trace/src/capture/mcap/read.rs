@@ -23,19 +23,20 @@ pub(crate) struct McapReader {
     chunk: Chunk,
     place: Phase,
     state: McapState,
-    /// The first requested message, or the error before it, read when the recording was opened.
+    /// The first requested message, or the error before it. It is read when the recording is opened.
     first: Option<Result<RequestedMessage, ReadFault>>,
-    /// The offset of the record that holds the next messages, and the number of its messages that were returned.
+    /// The offset of the record that holds the next message (a chunk or the message itself), and the number of its
+    /// messages that were already returned.
     anchor: (u64, u32),
     /// The file, if it can be read at other offsets.
     file: Option<File>,
-    /// The number of messages from the beginning; `None` if reading began elsewhere.
+    /// The number of messages read; `None` if reading did not begin at the beginning of the file.
     messages: Option<u64>,
-    /// The number of messages in the statistics record.
+    /// The number of messages according to the file's statistics record.
     stated: Option<u64>,
 }
 
-/// The phase of reading.
+/// The section of the file that is read next.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Phase {
     Magic,
@@ -45,7 +46,8 @@ enum Phase {
 }
 
 impl McapReader {
-    /// Continues after `head`, which has already been read. `file` is the input if it is a regular file.
+    /// Creates a reader for an input whose first bytes, `head`, have already been read. `file` is the input if it is a
+    /// regular file.
     pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>, state: McapState, file: Option<File>) -> Self {
         let input = BufReader::with_capacity(READ_BYTES, Cursor::new(head.to_vec()).chain(input));
         let (source, chunk) = (RecordReader::new(input, MAX_KEPT_BYTES as u64), Chunk::default());
@@ -60,12 +62,14 @@ impl McapReader {
             messages: Some(0),
             stated: None,
         };
-        // The contents before the first message are known from the beginning.
+        // Attachments and metadata before the first message are read now, so that the caller has them from the
+        // beginning.
         reader.first = reader.advance().transpose();
         reader
     }
 
-    /// Continues at a record that begins at the offset `bytes`, with the known state of the file.
+    /// Creates a reader that continues at the record with the offset `bytes`. `state` holds the channels that are
+    /// already known.
     pub(crate) fn resume(bytes: u64, input: Box<dyn Read + Send>, state: McapState, file: Option<File>) -> Self {
         let input = BufReader::with_capacity(READ_BYTES, Cursor::new(Vec::new()).chain(input));
         let (source, chunk) = (RecordReader::at(bytes, input, MAX_KEPT_BYTES as u64), Chunk::default());
@@ -86,8 +90,8 @@ impl McapReader {
         self.state
     }
 
-    /// Returns the offset of the record that holds the next message, unless a later record does, and the number of its
-    /// messages before that one.
+    /// Returns a position from which the next message can be found: the offset of a record, and the number of messages
+    /// in that record before it. The message may also be in a later record.
     pub(crate) const fn anchor(&self) -> (u64, u32) {
         self.anchor
     }
@@ -100,12 +104,13 @@ impl McapReader {
         self.state.buses()
     }
 
-    /// Returns true if a channel so far has frames of another program's type.
+    /// Returns true if any channel so far holds frames of another program.
     pub(crate) fn has_foreign(&self) -> bool {
         self.state.has_foreign()
     }
 
-    /// Returns true after the last message. Reads up to the next message, which [`McapReader::next`] then returns.
+    /// Returns true after the last message. May read up to the next message, which [`McapReader::next`] returns
+    /// afterwards.
     pub(crate) fn is_at_its_end(&mut self) -> Result<bool, ReadFault> {
         if self.first.is_none() {
             self.first = self.advance()?.map(Ok);
@@ -113,7 +118,7 @@ impl McapReader {
         Ok(self.first.is_none())
     }
 
-    /// Returns the next entry, or the next message of another topic if these are requested. Never panics.
+    /// Returns the next entry, or the next message of another topic if such messages are requested. Never panics.
     pub(crate) fn next(&mut self) -> Result<Option<Item<'_>>, ReadFault> {
         let target = match self.first.take() {
             Some(first) => Some(first?),
@@ -178,7 +183,7 @@ impl McapReader {
                     }
                     Framed::Record(op::FOOTER) => {
                         *place = Phase::Over;
-                        // Reading goes on without a damaged summary.
+                        // A damaged summary is ignored; the records after it are still read.
                         if source.check_section(op::FOOTER).is_err() {
                             self.stated = None;
                         }
@@ -209,7 +214,7 @@ impl McapReader {
         Ok(None)
     }
 
-    /// Checks the magic bytes, which must be here.
+    /// Reads the magic bytes. Returns an error if other bytes are found.
     fn take_magic(&mut self) -> Result<(), ReadFault> {
         if !self.source.magic()? {
             if !MAGIC.starts_with(self.source.body()) {
@@ -220,7 +225,7 @@ impl McapReader {
         Ok(())
     }
 
-    /// Checks that the number of messages is that of the statistics and that the file ends here.
+    /// Checks that as many messages were read as the statistics state, and that the input ends here.
     fn end(&self) -> Result<(), ReadFault> {
         if let (Some(found), Some(stated)) = (self.messages, self.stated)
             && found != stated
@@ -233,8 +238,8 @@ impl McapReader {
         }
     }
 
-    /// Handles an input that ends within a record after `bytes` of it. The recording was cut off, unless its end or
-    /// other records follow: then the record's length is wrong.
+    /// Handles an input that ends within a record, after `bytes` bytes of it. The recording was cut off, unless its end
+    /// or other records follow the beginning of this record; then the length of the record is wrong.
     fn truncated(&mut self, bytes: u64) -> Result<(), ReadFault> {
         self.place = Phase::Over;
         if self.source.ends_with_magic() && self.source.read() > 2 * MAGIC.len() as u64 {
@@ -246,7 +251,8 @@ impl McapReader {
             && file.metadata()?.len() == read
         {
             let any = self.source.plain_chunk().is_none();
-            // A message before it may have a wrong length, which skipped other records and led into the middle of one.
+            // An earlier message may have a wrong length that led into the middle of a record and skipped those
+            // between.
             let before = self.source.message_before().filter(|_| any);
             let began = before.unwrap_or_else(|| self.source.began());
             if first_record(&mut OffsetReader { file, at: 0 }, began + 1, read, any)?.is_some() {
@@ -258,7 +264,7 @@ impl McapReader {
     }
 }
 
-/// A reader with an offset of its own in a shared file.
+/// Reads a shared file at an offset that is independent of the file's own position.
 struct OffsetReader<'a> {
     file: &'a File,
     at: u64,

@@ -1,4 +1,4 @@
-//! Schemas, channels and extras of an MCAP recording, and the decoding of its messages.
+//! Holds the schemas, channels and extras of an MCAP recording while it is read, and decodes its messages.
 
 use std::collections::HashMap;
 use std::fmt::Display;
@@ -27,28 +27,28 @@ const LONGEST_FRAME: usize = 4 << 10;
 /// The longest message that is decoded as a note, in bytes: a line and its position.
 const LONGEST_NOTE: usize = LONGEST_LINE + (1 << 10);
 
-/// The state of reading a recording.
+/// The part of a recording's contents that is needed to decode its messages: schemas, channels and bus names.
 pub(crate) struct McapState {
     schemas: HashMap<u16, String>,
     channels: HashMap<u16, Channel>,
-    /// The indices of topics that are only counted, by name and type.
+    /// The index in the list of topics, by the name and type of the topic. Messages of these topics are only counted.
     counted: HashMap<(String, String), usize>,
     names: NameBudget,
     extras: RecordingExtras,
-    /// The size of the attachments and metadata so far, in bytes.
+    /// The size of the attachments and metadata kept so far, in bytes.
     kept: usize,
-    /// True if attachments and metadata are already known.
+    /// True if attachments and metadata were read in advance.
     knows_files: bool,
     any_frame: bool,
-    /// The buses of other programs' frames.
+    /// The bus names for frames of other programs.
     buses: ForeignBuses,
-    /// True if messages that are only counted are requested too.
+    /// True if the caller requests messages of other topics too, which are otherwise only counted.
     others: bool,
-    /// True if no other part of the recording came before.
+    /// True in the first part of a recording.
     is_first: bool,
 }
 
-/// A requested message. Its contents are in the record that was read last.
+/// A message to be decoded. Its contents are in the record that was read last.
 #[derive(Clone, Copy)]
 pub(crate) struct RequestedMessage {
     pub(super) channel: u16,
@@ -59,13 +59,13 @@ pub(crate) struct RequestedMessage {
 /// The times of a message, in ns since 1970.
 #[derive(Clone, Copy)]
 pub(crate) struct MessageTimes {
-    /// The time that orders the file.
+    /// The time by which the messages of the file are ordered (`log_time`).
     pub(super) logged: u64,
-    /// The time at which the message was published.
+    /// The time at which the message was published (`publish_time`).
     pub(super) published: u64,
 }
 
-/// A channel: its topic and its use.
+/// A channel: its topic and how its messages are used.
 struct Channel {
     topic: String,
     what: ChannelUsage,
@@ -73,20 +73,20 @@ struct Channel {
 
 #[derive(Clone, Copy)]
 enum ChannelUsage {
-    /// Frames, whose times are written in this form.
+    /// Frames. The channel's metadata state the form of their times.
     Frames(Timestamp),
-    /// Earlier frames that are latched when the recording begins.
+    /// Frames that were sent before the recording began and were still latched then.
     Latched,
     Notes,
     Foreign(ForeignType),
-    /// Messages that are counted, under this index in the list of topics.
+    /// Messages that are only counted, with the index of the topic.
     Counted(usize),
 }
 
 impl McapState {
-    /// Creates an empty state, or one that continues the extras of the parts `before` this one. In the latter case
-    /// latched frames at the beginning of this part are already known, and its topics are those of the earlier parts.
-    /// `others` requests the messages that are otherwise only counted.
+    /// Creates an empty state, or one that continues the extras of the parts `before` this one. In that case latched
+    /// frames at the beginning of this part are ignored, because they are already known. With `others`, messages of
+    /// other topics are requested and not only counted.
     pub(crate) fn new(others: bool, before: Option<RecordingExtras>) -> Self {
         let is_first = before.is_none();
         let extras = before.unwrap_or_default();
@@ -106,7 +106,7 @@ impl McapState {
         }
     }
 
-    /// Uses buses that are already known.
+    /// Uses bus names that were found in advance.
     pub(crate) fn with_buses(self, buses: ForeignBuses) -> Self {
         Self { buses, ..self }
     }
@@ -119,7 +119,7 @@ impl McapState {
         self.buses
     }
 
-    /// Returns true if a channel so far has frames of another program's type.
+    /// Returns true if any channel so far holds frames of another program.
     pub(super) fn has_foreign(&self) -> bool {
         self.channels.values().any(|channel| matches!(channel.what, ChannelUsage::Foreign(_)))
     }
@@ -128,14 +128,14 @@ impl McapState {
         &self.extras
     }
 
-    /// Records that the file ends after `read` bytes without a footer.
+    /// Records that the file ends without a footer, after `read` bytes.
     pub(super) fn truncated(&mut self, read: u64) {
         let why = || format!("it has no end: after {read} bytes it was cut off, or never finished");
         self.extras.unfinished.get_or_insert_with(why);
     }
 
-    /// Reads the attachments and metadata of a seekable file in advance without reading all of it, and detects a
-    /// missing end.
+    /// Reads the attachments and metadata of a seekable file in advance; other records are skipped. Also detects that
+    /// the end of the file is missing.
     pub(crate) fn find_files(&mut self, file: &mut (impl Read + Seek)) -> io::Result<()> {
         let size = file.seek(SeekFrom::End(0))?;
         file.seek(SeekFrom::Start(size.saturating_sub(MAGIC.len() as u64)))?;
@@ -149,7 +149,7 @@ impl McapState {
         if self.knows_files {
             return Ok(());
         }
-        // Most of the skipped data is longer than this.
+        // A small buffer suffices, because most of the skipped records are longer than it.
         let mut from = BufReader::with_capacity(4 << 10, file);
         if from.read_exact(&mut [0; MAGIC.len()]).is_err() {
             return Ok(());
@@ -172,11 +172,11 @@ impl McapState {
             match parse(opcode, &body) {
                 Ok(Raw::Attachment { name, data, .. }) => self.attachment(name, data),
                 Ok(Raw::Metadata { name, facts }) => self.metadata(name, &facts),
-                // Errors are reported when the record is read.
+                // Errors are reported when this record is read again in its place.
                 _ => {}
             }
         }
-        // A wrong length may have skipped some attachments. They are then added when their records are read.
+        // A wrong length may have skipped attachments. Such attachments are added when their records are read.
         self.knows_files = !has_end || footer.is_some_and(|end| end + MAGIC.len() as u64 == size);
         if !self.knows_files {
             self.extras.attachments.clear();
@@ -195,7 +195,7 @@ impl McapState {
                     self.schemas.insert(id, name.to_owned());
                 }
             }
-            // A channel is repeated in the summary, or in every chunk.
+            // A channel may be repeated in the summary or in every chunk.
             Raw::Channel { id, .. } if self.channels.contains_key(&id) => {}
             Raw::Channel { id, schema, topic, encoding, facts } => {
                 self.channel(id, schema, topic, encoding, &facts)?;
@@ -217,7 +217,8 @@ impl McapState {
         Ok(None)
     }
 
-    /// Counts or keeps a message. Returns true if it is requested.
+    /// Returns true if the message is to be decoded and returned. Otherwise counts it, or keeps it if it is a latched
+    /// frame.
     fn is_requested(&mut self, channel: u16, data: &[u8]) -> Result<bool, ReadFault> {
         let Channel { topic, what } = self.channels.get(&channel).ok_or(FormatError::Channel(channel))?;
         match *what {
@@ -242,7 +243,7 @@ impl McapState {
         }
     }
 
-    /// Keeps something of `size` bytes while there is room.
+    /// Calls `keep` if `size` more bytes fit into the limit [`KEPT`].
     fn keep(&mut self, size: usize, keep: impl FnOnce(&mut RecordingExtras)) {
         self.kept = self.kept.saturating_add(size);
         if self.is_first && self.kept <= MAX_KEPT_BYTES {
@@ -275,7 +276,7 @@ impl McapState {
         facts: &MetadataMap<'_>,
     ) -> Result<(), ReadFault> {
         let schema = self.schemas.get(&schema).cloned().unwrap_or_default();
-        // Topic and schema may be stored twice each.
+        // The topic and the type of a message may be stored twice each.
         self.names.add(2 * (topic.len() + schema.len()))?;
         let what = if let Some(foreign) = ForeignType::from_schema(encoding, &schema) {
             Some(ChannelUsage::Foreign(foreign))
@@ -304,7 +305,7 @@ impl McapState {
     }
 
     pub(super) fn item<'a>(&'a mut self, channel: u16, times: MessageTimes, message: &'a [u8]) -> Item<'a> {
-        // Other programs may have published their messages by another clock.
+        // Programs may publish messages by another clock than that of the recorder.
         let MessageTimes { logged: log_time, published } = times;
         let Some(Channel { topic, what }) = self.channels.get(&channel) else {
             return Item::Entry(unreadable("", log_time, message, &"no channel"));
@@ -344,7 +345,7 @@ impl McapState {
     }
 }
 
-/// Returns the form of times that the metadata of a channel specify.
+/// Returns the form of times that is stated in the metadata of a channel.
 fn form(facts: &MetadataMap<'_>) -> Timestamp {
     let nine_digits = facts.get(TIME_DIGITS).is_none_or(|digits| digits != "6");
     let min_digits = facts.get(SECONDS_DIGITS).and_then(|digits| digits.parse().ok()).unwrap_or(1);
@@ -361,14 +362,14 @@ fn decode<'a, T>(
     if bytes > limit { Err(MessageError::Long { bytes, limit }) } else { Ok(decode(message)?) }
 }
 
-/// Decodes a latched frame, with its own time.
+/// Decodes a latched frame with the time at which it was on the bus.
 fn latched(message: &[u8]) -> Result<Record<'_>, MessageError> {
     decode(message, LONGEST_FRAME, |message| {
         messages::frame(message, Timestamp::nine_digits(messages::stamp(message)?))
     })
 }
 
-/// Makes the note of a message that does not match the type of its channel.
+/// Makes the note for a message that cannot be decoded by the type of its channel.
 fn unreadable<'a>(topic: &str, nanos: u64, message: &'a [u8], why: &dyn Display) -> Entry<'a> {
     let topic = beginning(topic);
     let kind = NoteKind::Unreadable(format!("a message of {topic}: {why}"));

@@ -1,4 +1,4 @@
-//! Surveys the topics of recordings for frames of other programs, before they are read.
+//! Finds out which topics of a recording hold frames of other programs, before the recording is read.
 
 use std::collections::HashSet;
 use std::fs::File;
@@ -12,19 +12,19 @@ use super::read::McapReader;
 use super::state::McapState;
 use crate::container::{MAX_DESCRIPTION_BYTES, MAGIC, Record, find, parse};
 
-/// The maximum number of topics.
+/// The maximum number of topics that are stored.
 const TOPICS: usize = 4_096;
 
-/// Finds the buses of recordings whose frames other programs wrote.
+/// The topics of one or more recordings that hold frames of other programs.
 #[derive(Debug, Default)]
 pub(crate) struct TopicSurvey {
     topics: HashSet<String>,
-    /// True once a file had no channels outside its chunks.
+    /// True once a file had no channel records outside of its chunks, so that its topics are unknown.
     is_silent: bool,
 }
 
 impl TopicSurvey {
-    /// Adds the topics of a file, which its summary repeats. Moves the position in the file.
+    /// Adds the topics of a file from its summary. Changes the position in the file.
     ///
     /// # Errors
     /// Returns an error if the file cannot be read.
@@ -60,15 +60,15 @@ impl TopicSurvey {
         Ok(())
     }
 
-    /// Returns true if all messages must be read to find the buses.
+    /// Returns true if all messages must be read to find the bus names.
     pub(crate) fn is_needed(&self) -> bool {
         self.is_silent || self.topics.len() > 1
     }
 
-    /// Reads the frames of a recording to find their buses. Adds them to the `known` ones.
+    /// Reads the frames of a recording and returns the `known` bus names with those of these frames.
     pub(crate) fn buses_of(&self, input: Box<dyn Read + Send>, known: ForeignBuses) -> ForeignBuses {
         let mut reader = McapReader::new(&[], input, McapState::new(false, None).with_buses(known), None);
-        // If the topics are unknown, the type of the first messages decides.
+        // If the topics are unknown, the types of the first messages show whether there are frames of other programs.
         if self.topics.len() > 1 || reader.has_foreign() {
             // Errors are reported when the recording is read.
             while let Ok(Some(_)) = reader.next() {}

@@ -11,24 +11,26 @@ use crate::capture::{Entry, Note, NoteKind};
 use crate::recording::file::{Channel, FileWriter};
 use crate::recording::{NOTES_TOPIC, BUS_TOPIC_PREFIX};
 
-/// The maximum number of frame channels. Each costs a reader memory, and a log may contain any number of buses.
+/// The maximum number of channels for frames. Each channel costs a reader memory, and a log may contain any number of
+/// buses.
 const CHANNELS: usize = 64;
-/// The topic of the frames of further buses. Each message holds the name of its bus.
+/// The topic for frames of all buses beyond [`CHANNELS`]. Each message holds the name of its bus.
 const FURTHER: &str = "/further";
-/// The name of the metadata record that holds the source of a converted recording.
+/// The name of the metadata record that states what a recording was converted from.
 pub const ORIGIN_METADATA: &str = "capture";
-/// The key and value of [`ORIGIN`] in a recording that was converted from a log.
+/// The entry of [`ORIGIN`] in a recording that was converted from a log.
 pub(crate) const SOURCE: (&str, &str) = ("from", "candump log");
-/// The key and value of [`ORIGIN`] in a recording that was converted from another recording.
+/// The entry of [`ORIGIN`] in a recording that was converted from another recording.
 const OTHER_SOURCE: (&str, &str) = ("from", "MCAP recording");
-/// The key in a channel's metadata for the digits of a fraction of a second, 6 or 9.
+/// The metadata key of a channel for the number of decimals of its times: 6 or 9.
 pub(super) const TIME_DIGITS: &str = "time_digits";
-/// The key in a channel's metadata for the number of digits that seconds are padded to; missing if they are not padded.
+/// The metadata key of a channel for the number of digits to which seconds are padded. It is missing if they are not
+/// padded.
 pub(super) const SECONDS_DIGITS: &str = "seconds_digits";
 /// The maximum size of notes that wait for the first frame, in bytes.
 const WAITING: usize = 1 << 20;
 
-/// Writes entries as messages. Notes before the first frame wait for its time.
+/// Writes the entries of a capture as messages. Notes before the first frame are held back, because they get its time.
 #[derive(Debug)]
 pub(crate) struct McapWriter<W: Write> {
     file: FileWriter<W>,
@@ -36,16 +38,16 @@ pub(crate) struct McapWriter<W: Write> {
     /// The topic of each bus, for at most [`CHANNELS`] buses.
     topics: HashMap<String, String>,
     taken: UniqueNames,
-    /// The index of the last frame's channel.
+    /// The index of the channel that the last frame was written to.
     last: usize,
     notes: Option<Channel>,
-    /// Notes before the first frame.
+    /// Notes before the first frame; `None` after it.
     waiting: Option<Vec<WaitingNote>>,
-    /// The size of these notes, in bytes.
+    /// The size of the waiting notes, in bytes.
     bytes: usize,
 }
 
-/// The channel for frames of one bus with times in one form.
+/// The channel for the frames of one bus whose times have one form.
 #[derive(Debug)]
 struct BusChannel {
     interface: String,
@@ -53,7 +55,7 @@ struct BusChannel {
     channel: Channel,
 }
 
-/// A waiting note.
+/// A note that waits for the first frame.
 #[derive(Debug)]
 struct WaitingNote {
     kind: NoteKind,
@@ -62,12 +64,13 @@ struct WaitingNote {
     text: Vec<u8>,
 }
 
-/// The source and the file of a recording.
+/// The source that a recording is converted from, and the file that it is written to.
 #[derive(Clone, Copy, Debug)]
 pub struct Origin<'a> {
     /// True if the source is a log, false if it is a recording.
     pub of_log: bool,
-    /// The file that is being written, whose identity is stored in the recording.
+    /// The metadata of the file that is written. Its inode is stored in the recording, so that an unfinished file can
+    /// be recognised.
     pub file: Option<&'a Metadata>,
 }
 
@@ -120,8 +123,8 @@ impl<W: Write> McapWriter<W> {
         }
     }
 
-    /// Writes the waiting notes. They get the time of the first frame, so that a viewer's time line does not begin in
-    /// 1970.
+    /// Writes the waiting notes with the time of the first frame. With their own time, 0, the time line of a viewer
+    /// would begin in 1970.
     fn write_waiting(&mut self, nanos: u64) -> io::Result<()> {
         for WaitingNote { kind, interface, line, text } in self.waiting.take().unwrap_or_default() {
             self.note(&Note { kind, nanos, interface: &interface, line, text: &text })?;
@@ -137,7 +140,7 @@ impl<W: Write> McapWriter<W> {
         self.file.write(channel, note.nanos, note)
     }
 
-    /// Returns the index of a frame's channel, which is created for its first frame.
+    /// Returns the index of the channel for a frame. Creates the channel at its first frame.
     fn channel(&mut self, record: &Record<'_>) -> io::Result<usize> {
         let form = Timestamp { nanos: 0, ..record.time };
         let is = |name: &str, bus: &BusChannel| bus.form == form && bus.interface == name;
@@ -167,7 +170,7 @@ impl<W: Write> McapWriter<W> {
         Ok(self.last)
     }
 
-    /// Ends the chunk, and flushes everything except notes that wait for the first frame.
+    /// Ends the chunk and flushes it. Notes that wait for the first frame are kept.
     pub(crate) fn flush(&mut self) -> io::Result<()> {
         self.file.flush()
     }

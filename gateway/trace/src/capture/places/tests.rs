@@ -8,7 +8,7 @@ use std::os::fd::AsRawFd;
 const COUNT: u32 = 20_000;
 const MS: u64 = 1_000_000;
 
-/// A capture of two buses whose frames are read in turn, up to 0.3 s late.
+/// Writes a capture of two buses whose frames are read in turn, up to 0.3 s late.
 fn capture(path: &Path, format: CaptureFormat) {
     let style = Style { digits: Digits::Nine, ..Style::default() };
     let mut out = CaptureWriter::new(File::create(path).unwrap(), format, style).unwrap();
@@ -25,7 +25,7 @@ fn capture(path: &Path, format: CaptureFormat) {
     out.finish().unwrap();
 }
 
-/// Number and time of the next frames.
+/// Returns the number and the time of each of the next `count` frames.
 fn next(reader: &mut Reader, count: usize) -> Vec<(u32, u64)> {
     let mut all = Vec::new();
     while let Some(entry) = reader.next().unwrap() {

@@ -1,9 +1,9 @@
 //! Collects the schemas and channels of a damaged file from all places that describe them.
 //!
-//! A writer may describe them in the chunk of the first message, again between chunks, and in the summary. A
-//! description that a checksum covers counts more than any number of those that none covers; among the latter the most
-//! frequent one counts. If two contradict each other equally, neither counts: a message under a wrong topic is worse
-//! than a lost one.
+//! A writer may describe a schema or channel in the chunk of its first message, again between chunks, and in the
+//! summary. Descriptions of the same number may differ if the file is damaged. One that a checksum covers has
+//! precedence over all others; among those without a checksum the most frequent one is used. If two are equally
+//! frequent, neither is used, because a message under a wrong topic is worse than a lost one.
 
 use std::collections::BTreeMap;
 use std::io::{self, Write};
@@ -13,7 +13,7 @@ use crate::container::{FormatError, NameBudget, Record, parse};
 use crate::recording::file::{FileWriter, is_frames};
 use mcap::records::op;
 
-/// The reliability of a description.
+/// The reliability of a description, by the checksum that covers it.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Trust {
     /// A correct checksum covers it.
@@ -24,19 +24,19 @@ pub(super) enum Trust {
     Doubtful,
 }
 
-/// A description, as stored in its record.
+/// A description of a schema or channel, as its record stores it, and how often it occurs.
 #[derive(Debug)]
 struct Statement {
     body: Vec<u8>,
-    /// The number of occurrences under a checksum, and that of all except those under a wrong one.
+    /// The number of occurrences that a correct checksum covers, and the number that no wrong checksum covers.
     certain: u32,
     times: u32,
 }
 
-/// Descriptions by the number of the schema or channel.
+/// All descriptions of each schema or channel, by its number.
 type Statements = BTreeMap<u16, Vec<Statement>>;
 
-/// The described schemas and channels.
+/// The descriptions of all schemas and channels in a file.
 #[derive(Debug, Default)]
 pub(super) struct Described {
     schemas: Statements,
@@ -45,7 +45,7 @@ pub(super) struct Described {
 }
 
 impl Described {
-    /// Adds a description. Ignores other records.
+    /// Adds a description, if the record is a schema or a channel.
     pub(super) fn add(&mut self, code: u8, body: &[u8], trust: Trust) -> Result<(), FormatError> {
         let (id, statements) = match parse(code, body)? {
             Record::Schema { id, .. } => (id, &mut self.schemas),
@@ -75,8 +75,8 @@ impl Described {
         Ok(())
     }
 
-    /// Writes all known descriptions into a new file. Returns the channel numbers, each with true if its messages are
-    /// frames.
+    /// Writes the selected descriptions into a new file. Returns the numbers of the channels, each with true if its
+    /// messages are frames.
     pub(super) fn write<W: Write>(&self, writer: &mut FileWriter<W>) -> io::Result<BTreeMap<u16, bool>> {
         let mut types = BTreeMap::new();
         for body in self.schemas.values().filter_map(|all| chosen(all)) {
@@ -103,7 +103,7 @@ impl Described {
     }
 }
 
-/// Returns the description that counts; `None` if another one counts as much.
+/// Returns the description to be used; `None` if two are equally reliable.
 fn chosen(all: &[Statement]) -> Option<&[u8]> {
     let weight = |it: &Statement| (it.certain, it.times);
     let best = all.iter().max_by_key(|it| weight(it))?;

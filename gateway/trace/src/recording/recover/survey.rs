@@ -17,22 +17,22 @@ use crate::container::{
     Chunk, FormatError, Framed, RECORD_HEADER_BYTES, MAX_RECORD_BYTES, MAGIC, Record, RecordReader, first_record, is_record, parse,
 };
 
-/// The number of records before a wrong one that are searched for other records.
+/// The number of records before a wrong one that are examined again, because their lengths may have been wrong.
 const UNSURE: usize = 4;
 
 /// The length of a footer record in bytes.
 const FOOTER: usize = 29;
 
-/// A range of intact records.
+/// A part of the file that can be copied.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum IntactRange {
     /// All records from one offset to another.
     Records { from: u64, to: u64 },
-    /// One record whose length field is wrong, with the length of its contents.
+    /// A record whose length field is wrong, with the length computed from its contents.
     Record { at: u64, code: u8, length: u64 },
 }
 
-/// The contents of a file.
+/// The intact parts of a damaged file, and its schemas and channels.
 #[derive(Debug, Default)]
 pub(super) struct FileSurvey {
     pub(super) profile: String,
@@ -41,13 +41,13 @@ pub(super) struct FileSurvey {
     pub(super) recovered: RecoveryResult,
 }
 
-/// The summary of a file, found from its end.
+/// The summary section of a file, which is found from the end of the file.
 struct Summary {
-    /// The offset of the end of the data section, after its last record.
+    /// The offset at which the data section ends.
     data_end: u64,
     /// The number of messages according to the statistics.
     stated: Option<u64>,
-    /// False if its checksum is wrong.
+    /// False if the checksum of the summary is wrong.
     is_right: bool,
 }
 
@@ -55,30 +55,31 @@ struct Summary {
 enum Examined {
     /// The record is intact.
     Right,
-    /// The record is intact except for one of its lengths: its operation code, the length of its contents, and the
-    /// offset of its end.
+    /// The record is intact except for its operation code or one of its lengths. The fields are the correct operation
+    /// code, the length of the contents, and the offset of the record's end.
     As(u8, u64, u64),
-    /// The data section or the file ends here.
+    /// The data section or the file ends with this record.
     End,
-    /// The record looks like the end, but records follow. The source is positioned at them.
+    /// The record looks like the end of the data section, but other records follow it. The source is positioned at
+    /// them.
     NoEnd,
-    /// The record is wrong: the offset of its end by its length, if that may be correct, and the offset from which on
-    /// rows of records are accepted. Records inside a damaged, uncompressed chunk are not accepted.
+    /// The record is wrong. `end` is where it ends by its length field, if that may be correct. From `rows` on, several
+    /// records in a row are accepted as intact; before it they may be inside of a damaged, uncompressed chunk.
     Wrong { end: Option<u64>, rows: u64 },
 }
 
-/// The state of a survey.
+/// The state of a survey while the file is read.
 struct Surveyor<R> {
     source: RecordReader<R>,
     size: u64,
-    /// The offset at which the data section ends at the latest.
+    /// The latest offset at which the data section can end.
     limit: u64,
     /// True if the file ends with the magic bytes.
     has_magic: bool,
     chunk: Chunk,
     survey: FileSurvey,
-    /// The last records whose lengths no checksum confirms: the offset of each, and the offset from which on rows of
-    /// records inside it are accepted.
+    /// The last records whose lengths are not confirmed by a checksum. Each has its offset, and the offset from which
+    /// several records in a row are accepted inside of it.
     unsure: VecDeque<(u64, u64)>,
 }
 
@@ -105,14 +106,14 @@ impl FileSurvey {
 }
 
 impl<R: Read + Seek> Surveyor<R> {
-    /// Surveys the whole file. Returns true if it is a recording.
+    /// Surveys the whole file. Returns true if the file is an MCAP recording.
     fn go(&mut self, is_begun: bool) -> io::Result<bool> {
         let summary = self.summary()?;
         let mut at = MAGIC.len() as u64;
         if !is_begun {
             let known = summary.is_some() || self.is_header(at)?;
             if !known {
-                // A chunk proves that the file is a recording; other records may stand before it.
+                // A chunk proves that the file is a recording. Other records may stand before the chunk.
                 let Some(certain) = self.first(0, self.size, false)? else { return Ok(false) };
                 at = self.first(0, certain, true)?.unwrap_or(certain);
             }
@@ -147,12 +148,12 @@ impl<R: Read + Seek> Surveyor<R> {
             }
         }
         self.survey.recovered.whole |= summary.is_some();
-        // The record that ends the data section holds its checksum.
+        // The checksum of the data section is missing with the record that should end the section.
         self.survey.recovered.checksum |= summary.is_some() && !is_ended;
         Ok(true)
     }
 
-    /// Returns true if the header record begins at `at`.
+    /// Returns true if a header record begins at `at`.
     fn is_header(&mut self, at: u64) -> io::Result<bool> {
         self.source.move_to(at)?;
         let framed = self.source.next()?;
@@ -165,7 +166,8 @@ impl<R: Read + Seek> Surveyor<R> {
         first_record(self.source.input(), from, until, any)
     }
 
-    /// Returns the first certain record from `from` on, or from `rows` on the first row of records.
+    /// Returns the offset of the first record: a chunk or attachment at or after `from`, or several records in a row at
+    /// or after `rows`.
     fn first_of_two(&mut self, from: u64, rows: u64, until: u64) -> io::Result<Option<u64>> {
         match self.first(from, rows.min(until), false)? {
             None => self.first(rows, until, true),
@@ -173,13 +175,13 @@ impl<R: Read + Seek> Surveyor<R> {
         }
     }
 
-    /// Counts `bytes` lost bytes at a damaged place.
+    /// Counts a damaged place at which `bytes` bytes were lost.
     fn lost(&mut self, bytes: u64) {
         self.survey.recovered.damaged.0 += 1;
         self.survey.recovered.damaged.1 += bytes;
     }
 
-    /// Adds an intact record that ends at the source's position.
+    /// Adds a record that begins at `began` and ends at the source's position to the intact parts.
     fn right(&mut self, began: u64) {
         let to = self.source.read();
         match self.survey.pieces.last_mut() {
@@ -194,8 +196,8 @@ impl<R: Read + Seek> Surveyor<R> {
         let (began, end) = (self.source.began(), self.source.read());
         let checked = self.source.check(framed);
         let content = began + RECORD_HEADER_BYTES as u64;
-        // Compressed data does not look like records. Where bytes are missing, later records have moved up to before
-        // the end of the chunk.
+        // Compressed data does not look like records. If bytes are missing in a chunk, the records after it have moved
+        // forward into the range that the chunk's length spans.
         let own = self.source.plain_chunk();
         let rows = own.map_or(0, |own| content.saturating_add(own));
         let wrong = Examined::Wrong { end: Some(end), rows };
@@ -237,7 +239,7 @@ impl<R: Read + Seek> Surveyor<R> {
         Ok(Examined::Right)
     }
 
-    /// Remembers a record whose length no checksum confirms.
+    /// Stores a record whose length is not confirmed by a checksum, to be examined again if the next record is wrong.
     fn doubt(&mut self, began: u64, rows: u64) {
         if self.unsure.len() == UNSURE {
             self.unsure.pop_front();
@@ -245,7 +247,7 @@ impl<R: Read + Seek> Surveyor<R> {
         self.unsure.push_back((began, rows));
     }
 
-    /// Returns the last record with the length of its contents, if these are intact and only the length field is wrong.
+    /// Returns the last record with the length of its contents if only its length field is wrong.
     fn by_content(&mut self, code: u8, checked: &Result<(), FormatError>) -> io::Result<Option<Examined>> {
         let &Err(FormatError::Length { own, bytes, .. }) = checked else { return Ok(None) };
         let content = self.source.began() + RECORD_HEADER_BYTES as u64;
@@ -254,10 +256,11 @@ impl<R: Read + Seek> Surveyor<R> {
         if own > limit || end > self.limit || matches!(code, op::DATA_END | op::FOOTER) {
             return Ok(None);
         }
-        // Either length may be the wrong one: records follow after the correct one, and not before it.
+        // Either the length field or the lengths in the contents may be wrong. Other records follow after the correct
+        // length, but not after the wrong one.
         let by_length = content.saturating_add(bytes);
         let is_shorter = by_length < end && is_record(self.source.input(), by_length, self.limit)?;
-        // The contents of these records prove that they are complete.
+        // Chunks and attachments have two lengths in their contents, which prove that they are complete.
         let is_sure = matches!(code, op::CHUNK | op::ATTACHMENT);
         if !is_sure && !is_record(self.source.input(), end, self.limit)? {
             return Ok(None);
@@ -267,7 +270,7 @@ impl<R: Read + Seek> Surveyor<R> {
         Ok(is_right.then_some(Examined::As(code, own, end)))
     }
 
-    /// Checks the current record, and collects its schemas and channels.
+    /// Checks the record that was read last. Collects the schemas and channels in it.
     fn check_contents(&mut self, code: u8) -> Result<(), FormatError> {
         let Self { source, chunk, survey, .. } = self;
         let FileSurvey { described, profile, .. } = survey;
@@ -292,7 +295,7 @@ impl<R: Read + Seek> Surveyor<R> {
         Ok(())
     }
 
-    /// Handles the end of the data section, unless it is damage that looks like it: then records follow.
+    /// Handles a record that ends the data section. If other records follow it, it is damage that looks like the end.
     fn data_end(&mut self, began: u64) -> io::Result<Examined> {
         let checked = self.source.check_section(op::DATA_END).is_ok();
         let end = self.source.read();
@@ -331,7 +334,7 @@ impl<R: Read + Seek> Surveyor<R> {
             }
         }
         for (code, body) in all {
-            // Wrong descriptions are ignored.
+            // Descriptions that cannot be decoded are ignored.
             let _ = self.survey.described.add(code, &body, of_all);
         }
         self.source.end_summary();
@@ -342,13 +345,14 @@ impl<R: Read + Seek> Surveyor<R> {
         Ok(Examined::NoEnd)
     }
 
-    /// Seeks to the next records after a wrong one. Returns false if none follow.
+    /// Continues at the next intact records after a wrong one. Returns false if there are no more.
     fn resume(&mut self, began: u64, end: Option<u64>, rows: u64) -> io::Result<bool> {
         let end = match end.filter(|end| *end <= self.limit) {
             Some(end) => is_record(self.source.input(), end, self.limit)?.then_some(end),
             None => None,
         };
-        // The wrong length of an earlier record may have skipped others and led to something that looked like a record.
+        // An earlier record with a wrong length may have led into the middle of another one, to bytes that look like a
+        // record.
         let mut until = began;
         while let Some((at, within)) = self.unsure.pop_back() {
             if let Some(found) = self.first_of_two(at + 1, within.max(at + 1), until)? {
@@ -379,7 +383,7 @@ impl<R: Read + Seek> Surveyor<R> {
         Ok(true)
     }
 
-    /// Removes the last record from the intact ones, because it contains others.
+    /// Removes the last record from the intact parts, because its length was wrong and spans other records.
     fn cut(&mut self, at: u64) {
         if let Some(IntactRange::Records { from, to }) = self.survey.pieces.last_mut() {
             *to = at;
@@ -389,7 +393,7 @@ impl<R: Read + Seek> Surveyor<R> {
         }
     }
 
-    /// Reads the summary if the file has its end, and collects its descriptions.
+    /// Reads the summary, if the file ends with one, and collects the schemas and channels in it.
     fn summary(&mut self) -> io::Result<Option<Summary>> {
         let Some(footer) = self.size.checked_sub((FOOTER + MAGIC.len()) as u64) else { return Ok(None) };
         let mut at_end = [0; FOOTER + MAGIC.len()];
@@ -440,14 +444,14 @@ impl<R: Read + Seek> Surveyor<R> {
         let is_right = checksum.is_ok();
         let trust = trust(is_right, at_end.ends_with(&[&[0; 4][..], MAGIC].concat()));
         for (code, body) in all {
-            // Wrong descriptions are ignored.
+            // Descriptions that cannot be decoded are ignored.
             let _ = self.survey.described.add(code, &body, trust);
         }
         Ok(Some(Summary { data_end: start, stated: stated.filter(|_| is_right), is_right }))
     }
 }
 
-/// Returns the reliability of a summary's descriptions.
+/// Returns how reliable the descriptions in a summary are, by its checksum.
 const fn trust(is_right: bool, has_none: bool) -> Trust {
     match (is_right, has_none) {
         (false, _) => Trust::Doubtful,

@@ -8,7 +8,7 @@ use crate::ros2::standard::JointState;
 const MS: u64 = 1_000_000;
 const START: u64 = 1_000_000_000 * MS;
 
-/// A message in the file: topic, time of logging, time of publishing, and sequence number on its topic.
+/// A message in the file: topic, log time, publish time, and sequence number within its topic.
 type Seen = (String, u64, u64, u32);
 
 struct Bench {
@@ -45,7 +45,7 @@ impl Bench {
         written
     }
 
-    /// Returns all messages, and the number of those that came too late.
+    /// Returns all messages of the file, and the number of those that arrived after later ones had been written.
     fn end(mut self) -> (Vec<Seen>, u64) {
         self.window.release_all(&mut self.file).unwrap();
         assert_eq!(self.window.count(), MessageCount::default());

@@ -6,54 +6,54 @@ use super::Value;
 use crate::can::Format;
 use crate::usage::printable;
 
-/// The text of a new skin, written from top to bottom.
+/// The text of a new skin file, written from top to bottom.
 #[derive(Clone, Debug, Default)]
 pub struct Draft(String);
 
-/// A bus of a new skin.
+/// A bus to write into a new skin file.
 #[derive(Clone, Copy, Debug)]
 pub struct DraftBus<'a> {
-    /// Its name.
+    /// Name of the interface.
     pub name: &'a str,
-    /// Its chain; `None` to omit the key.
+    /// Name of the chain that carries the bus; `None` to omit the key.
     pub chain: Option<&'a str>,
-    /// The slot of a sum in µs; `None` for cells that answer with their torques.
+    /// Width of a slot for sums, in µs; `None` if the cells reply with their own torques.
     pub slot_us: Option<u64>,
-    /// The format of its frames.
+    /// Frame format of the bus.
     pub format: Format,
 }
 
 /// The direction in which a cell faces.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Facing {
-    /// The outward normal in the frame of the cell's row.
+    /// Outward normal, in the frame of the cell's row.
     Normal([f64; 3]),
-    /// The cell's orientation in that frame, as a quaternion x, y, z, w.
+    /// Orientation of the cell in the frame of its row, a unit quaternion x, y, z, w.
     Orientation([f64; 4]),
 }
 
-/// A cell of a new skin.
+/// A cell to write into a new skin file.
 #[derive(Clone, Copy, Debug)]
 pub struct DraftCell<'a> {
     /// A comment beside the table header.
     pub remark: Option<&'a str>,
-    /// Its bus.
+    /// Name of the cell's bus.
     pub bus: &'a str,
-    /// Its node id.
+    /// Node id of the cell.
     pub node: usize,
-    /// Its serial number; `None` to omit the key.
+    /// Serial number of the cell; `None` to omit the key.
     pub serial: Option<usize>,
-    /// The joint that moves it, counted from 1.
+    /// Number of the joint that moves the cell, from 1.
     pub joint: usize,
-    /// Its row; `None` for the row of the joint.
+    /// Number of the row that carries the cell; `None` for the row of the joint.
     pub row: Option<usize>,
-    /// Its centre in the frame of its row, in m.
+    /// Position of the cell's centre in the frame of its row, in m.
     pub position: [f64; 3],
-    /// Its normal or orientation.
+    /// Normal or orientation of the cell.
     pub facing: Facing,
-    /// The node ids at its ports, 0 for a free port; `None` to omit the key.
+    /// Node ids of the neighbours at the cell's ports, 0 for a free port; `None` to omit the key.
     pub neighbors: Option<[u8; 4]>,
-    /// True if it is wired to the gateway.
+    /// True if the cell is wired to the gateway.
     pub root: bool,
 }
 
@@ -83,7 +83,7 @@ impl Draft {
         self.line(format_args!("{key} = {value}"));
     }
 
-    /// Adds a key with a value and a comment, separated by this many spaces.
+    /// Adds a key with a value and a comment, separated by `blanks` spaces.
     pub fn set_with_comment(&mut self, key: &str, value: Value<'_>, blanks: usize, remark: &str) {
         self.line(format_args!("{key} = {value}{:blanks$}# {}", "", printable(remark)));
     }
@@ -108,7 +108,7 @@ impl Draft {
         self.0.push_str("]\n");
     }
 
-    /// Adds the timing and the gains of the paper.
+    /// Adds the timing tables with this broadcast frequency in Hz, and the gains and thresholds of the paper.
     pub fn paper(&mut self, broadcast_hz: f64) {
         self.table("[timing]", None);
         self.set("control_hz", Value::Number(500.0));
@@ -125,7 +125,7 @@ impl Draft {
         }
     }
 
-    /// Adds a bus.
+    /// Adds the table of a bus.
     pub fn bus(&mut self, bus: &DraftBus<'_>) {
         self.table("[[bus]]", None);
         self.set("name", Value::Text(bus.name));
@@ -139,7 +139,7 @@ impl Draft {
         self.set("format", Value::Text(bus.format.name()));
     }
 
-    /// Adds a cell.
+    /// Adds the table of a cell.
     pub fn cell(&mut self, cell: &DraftCell<'_>) {
         let whole = |value: usize| Value::Integer(i64::try_from(value).unwrap_or(i64::MAX));
         self.table("[[cell]]", cell.remark);
@@ -165,7 +165,7 @@ impl Draft {
         }
     }
 
-    /// Returns the text.
+    /// Returns the complete text of the file.
     #[must_use]
     pub fn text(self) -> String {
         self.0

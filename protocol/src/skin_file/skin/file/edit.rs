@@ -1,4 +1,4 @@
-//! The editor of existing skin files.
+//! The editor of existing skin files, which changes single values in the text.
 
 use core::ops::Range;
 
@@ -8,7 +8,7 @@ use toml_edit::{Document, Item, Key, Table, TableLike};
 use super::Value;
 use crate::skin::Skin;
 
-/// The error for a text that does not match the skin.
+/// The error for a text that is not that of the given skin.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum EditError {
@@ -18,7 +18,7 @@ pub enum EditError {
     /// The text has no cells.
     #[error("its cells are not [[cell]] tables")]
     NoCells,
-    /// The text has another number of cells than the skin.
+    /// The numbers of cells in the text and in the skin differ.
     #[error("{found} cells, not {expected}")]
     Count {
         /// Number of cells in the text.
@@ -68,13 +68,13 @@ impl<'a> Edit<'a> {
         cells.as_array()?.get(index)?.as_inline_table().map(|table| table as &dyn TableLike)
     }
 
-    /// Returns the byte ranges of a cell's key and its value.
+    /// Returns the byte ranges of a key of a cell and of its value.
     fn key_and_value_ranges(&self, cell: usize, key: &str) -> Option<(Range<usize>, Range<usize>)> {
         let (key, item) = self.cell(cell)?.get_key_value(key)?;
         Some((Key::span(key)?, item.span()?))
     }
 
-    /// Returns true if a cell has a key.
+    /// Returns true if a cell has the key.
     #[must_use]
     pub fn has(&self, cell: usize, key: &str) -> bool {
         self.key_and_value_ranges(cell, key).is_some()
@@ -87,7 +87,7 @@ impl<'a> Edit<'a> {
         }
     }
 
-    /// Replaces an element of a cell's array, if it exists.
+    /// Replaces one element of an array of a cell, if the element exists.
     pub fn set_element(&mut self, cell: usize, key: &str, index: usize, value: Value<'_>) {
         let array = self.cell(cell).and_then(|cell| cell.get(key)?.as_array());
         if let Some(place) = array.and_then(|array| array.get(index)?.span()) {
@@ -95,7 +95,7 @@ impl<'a> Edit<'a> {
         }
     }
 
-    /// Replaces a key and its value by another key and value, if the cell has it.
+    /// Replaces a key of a cell and its value by the key `other` and another value, if the cell has the key.
     pub fn replace(&mut self, cell: usize, key: &str, other: &str, value: Value<'_>) {
         if let Some((name, place)) = self.key_and_value_ranges(cell, key) {
             self.changes.push((name, other.to_owned()));
@@ -103,7 +103,7 @@ impl<'a> Edit<'a> {
         }
     }
 
-    /// Adds a key after the key `after`: on a new line, or in an inline table after the value.
+    /// Adds a key to a cell after the key `after`: on a new line in a table, or behind the value in an inline table.
     pub fn insert(&mut self, cell: usize, key: &str, value: Value<'_>, after: &str) {
         let Some((name, place)) = self.key_and_value_ranges(cell, after) else { return };
         let rest = self.text.get(place.end..).unwrap_or_default();
@@ -125,7 +125,7 @@ impl<'a> Edit<'a> {
         self.changes.push((at..at, text));
     }
 
-    /// Returns the text with all changes.
+    /// Returns the text with all changes applied.
     #[must_use]
     pub fn text(mut self) -> String {
         // The sort is stable: insertions at one position keep the order of the calls.

@@ -1,5 +1,5 @@
-//! Writing of skin files: an [`Edit`] changes values in an existing text and keeps all other bytes, a
-//! [`Draft`] creates a new text.
+//! Writers of skin files: an [`Edit`] changes values in an existing text and keeps all other bytes; a [`Draft`] creates
+//! a new text.
 
 mod draft;
 mod edit;

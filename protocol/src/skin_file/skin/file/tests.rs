@@ -1,4 +1,4 @@
-//! Existing texts keep their bytes; new texts parse.
+//! Tests that edits keep all other bytes of a text, and that new texts can be parsed.
 
 use super::*;
 use crate::can::Format;
@@ -43,7 +43,7 @@ fn parsed(text: &str) -> Skin {
     Skin::parse("skin.toml", text).unwrap()
 }
 
-/// Returns the text in four forms: as it is, with CRLF, with mixed line endings, and with a byte order mark.
+/// Returns the text in four variants: unchanged, with CRLF, with mixed line endings, and with a byte order mark.
 fn forms(text: &str) -> [String; 4] {
     let dos = text.replace('\n', "\r\n");
     let mixed = text.replacen('\n', "\r\n", 3);

@@ -1,21 +1,21 @@
-//! Values in a skin file.
+//! Values to write into a skin file.
 
 use core::fmt::{self, Write};
 
 use crate::usage::is_unprintable;
 
-/// A value to write. Numbers must be finite.
+/// A value to write into a skin file. Numbers must be finite.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Value<'a> {
     /// An integer.
     Integer(i64),
-    /// A number, with the fewest digits that identify it.
+    /// A number, written with the fewest digits that identify it.
     Number(f64),
-    /// An array of numbers.
+    /// An array of numbers, each written with the fewest digits that identify it.
     Numbers(&'a [f64]),
-    /// An array of node ids; 0 for a free port.
+    /// An array of node ids, where 0 is a free port.
     Nodes(&'a [u8]),
-    /// A string, which is quoted.
+    /// A string, written in quotes.
     Text(&'a str),
     /// A boolean.
     Flag(bool),

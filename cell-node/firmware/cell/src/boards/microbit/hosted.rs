@@ -1,17 +1,17 @@
-//! Flash of an emulated cell in a file of the host, accessed with Arm semihosting. The program's command line
-//! is the path. A new image is written to a second file, which then replaces the first, so that killing the
-//! emulator leaves either the old or the new image.
+//! Flash of an emulated cell in a file of the host, accessed with Arm semihosting. The command line of the emulated
+//! program is the path of the file. A new image is written to a second file, which then replaces the first, so that
+//! killing the emulator leaves either the old or the new image.
 
 use cortex_m_semihosting::syscall;
 
-/// Size of the path buffer, including the suffix.
+/// Size of the path buffer in bytes, including the suffix.
 const MAX_PATH: usize = 256;
-/// Suffix of the file that is being written.
+/// Suffix of the file to which a new image is written.
 const PART: &[u8] = b".part";
 /// Modes of OPEN: `rb` and `wb`.
 const READ: usize = 1;
 const WRITE: usize = 5;
-/// The result of a failed call.
+/// The result of a semihosting call that failed.
 const FAILED: usize = usize::MAX;
 
 /// A path with a terminating 0.
@@ -21,7 +21,7 @@ struct Path {
 }
 
 impl Path {
-    /// Returns the path on the command line; `None` if the emulator got none.
+    /// Returns the path on the command line; `None` if the emulator was started without one.
     fn given() -> Option<Self> {
         let mut bytes = [0; MAX_PATH];
         // SAFETY: the buffer is on this stack frame, and its size is passed.
@@ -30,7 +30,7 @@ impl Path {
         (answer == 0 && len > 0).then_some(Self { bytes, len })
     }
 
-    /// Returns the path of the file that is being written.
+    /// Returns the path of the file to which a new image is written.
     fn part(&self) -> Self {
         let mut bytes = self.bytes;
         bytes.iter_mut().skip(self.len).zip(PART).for_each(|(byte, part)| *byte = *part);
@@ -44,7 +44,7 @@ impl Path {
     }
 }
 
-/// An open file.
+/// The handle of an open file.
 struct File(usize);
 
 impl Drop for File {
@@ -54,7 +54,7 @@ impl Drop for File {
     }
 }
 
-/// Reads the file into `into`, as far as there is room. Returns the number of bytes; `None` without a file.
+/// Reads the file into `into`, as far as there is room. Returns the number of bytes read; `None` if there is no file.
 #[inline(never)]
 pub(super) fn load(into: &mut [u8]) -> Option<usize> {
     let file = Path::given()?.open(READ)?;
@@ -63,7 +63,7 @@ pub(super) fn load(into: &mut [u8]) -> Option<usize> {
     into.len().checked_sub(left)
 }
 
-/// Replaces the file by the image. Returns true on success.
+/// Replaces the content of the file by an image. Returns true on success.
 // Not inlined, to keep the paths off the caller's stack.
 #[inline(never)]
 pub(super) fn store(image: &[u8]) -> bool {

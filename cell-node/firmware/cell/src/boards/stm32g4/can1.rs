@@ -29,22 +29,22 @@ const RAM: usize = 0x4000_A400;
 const EXTENDED_FILTERS: usize = RAM + 0x70;
 const FIFO_0: usize = RAM + 0xB0;
 const TO_SEND: usize = RAM + 0x278;
-/// Size of an element in bytes: two words and the data.
+/// Size in bytes of an element of the message RAM: two words and the data.
 const ELEMENT: usize = 72;
 /// Number of standard filters, and of extended ones.
 const STANDARD: usize = 28;
 const EXTENDED: usize = 8;
 
-/// Bits of `CCCR`.
+/// Bits of the register `CCCR`.
 const INIT: u32 = 1;
 const CONFIGURE: u32 = 1 << 1;
 const FD: u32 = 1 << 8 | 1 << 9; // FD frames, bit rate switch
-/// Bit of `IR`: a frame is in FIFO 0.
+/// Bit of the register `IR`: a frame is in FIFO 0.
 const RECEIVED: u32 = 1;
-/// Bit of `PSR`.
+/// Bit of the register `PSR`: the controller is bus off.
 const BUS_OFF: u32 = 1 << 7;
 
-/// Joins the bus. No frames pass before filters are set.
+/// Joins the bus. No frames are received until filters are set.
 pub(super) fn open(format: Format) {
     change(CCCR, 0, INIT);
     wait(CCCR, INIT, INIT);
@@ -65,9 +65,9 @@ pub(super) fn open(format: Format) {
     change(CCCR, INIT, 0);
 }
 
-/// Passes these identifiers to FIFO 0: `standard` of 11 bits, `extended` of 29 bits. There is room for all
-/// that a cell receives. An element of zeros is a disabled filter, so this can be called while the controller
-/// is on the bus.
+/// Sets filters that pass these identifiers to FIFO 0: `standard` of 11 bits, `extended` of 29 bits. There are enough
+/// filters for all identifiers that a cell receives. An element of zeros is a disabled filter, so this function can be
+/// called while the controller is on the bus.
 pub(super) fn filter(standard: impl Iterator<Item = u32>, extended: impl Iterator<Item = u32>) {
     // A dual filter with two equal identifiers, to FIFO 0.
     let mut standard = standard.map(|id| 1 << 30 | 1 << 27 | id << 16 | id);
@@ -82,7 +82,7 @@ pub(super) fn filter(standard: impl Iterator<Item = u32>, extended: impl Iterato
     }
 }
 
-/// Clears the flag for received frames.
+/// Clears the interrupt flag for received frames.
 pub(super) fn acknowledge() {
     write(IR, RECEIVED);
 }
@@ -92,7 +92,7 @@ pub(super) fn is_empty() -> bool {
     read(RXF0S) & 15 == 0
 }
 
-/// Returns the next frame.
+/// Returns the next frame in FIFO 0; `None` if there is none.
 pub(super) fn receive() -> Option<Frame> {
     // After too many errors the controller leaves the bus; this makes it rejoin after 129 idle phases.
     if read(PSR) & BUS_OFF != 0 {
@@ -118,7 +118,7 @@ pub(super) fn receive() -> Option<Frame> {
     None
 }
 
-/// Passes a frame to the controller. Returns false if it has no room.
+/// Passes a frame to the controller. Returns false if all transmit buffers are in use.
 pub(super) fn send(frame: &Frame) -> bool {
     let state = read(TXFQS);
     if state & 1 << 21 != 0 {

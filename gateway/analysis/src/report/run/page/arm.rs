@@ -1,4 +1,4 @@
-//! The sections on the arm: figures from the ticks and from the cells' torques.
+//! The sections on the arm: torques, motion and cycle times, from the ticks and from the cells' torques.
 
 use hdrhistogram::Histogram;
 
@@ -22,7 +22,7 @@ fn without_rounding(error: f64) -> f64 {
 }
 
 impl Draft<'_> {
-    /// Creates the section that corresponds to the paper's Fig. 6.
+    /// Creates the section on torques, which corresponds to the paper's Fig. 6.
     pub(super) fn torque(&self) -> Section {
         let joints = 0..self.run.skin.robot.joints.len();
         let (loaded, free): (Vec<_>, Vec<_>) = joints.partition(|joint| self.is_loaded(*joint));
@@ -42,7 +42,7 @@ impl Draft<'_> {
         });
         let mut section = Section::new("torque", "Torque, and its difference from the central one");
         if !loaded.is_empty() {
-            let when = if self.run.frames_only.is_some() { "before each joints" } else { "at each tick" };
+            let when = if self.run.frames_only.is_some() { "before each broadcast" } else { "at each tick" };
             section = section.text(format!("The upper curve is the sum of the torques received {when}. The lower curve is the \
              difference, once per epoch, of all cells' answers to the same joints and the central computation for them; an epoch without an \
              answer in time is a gap. Dotted: one step of the torque words."));
@@ -73,7 +73,7 @@ impl Draft<'_> {
         })
     }
 
-    /// Returns one step of the torque words of a bus, in Nm or N.
+    /// Returns the size of one step of the torque words of a bus, in Nm or N.
     fn step(&self, bus: usize) -> f64 {
         let bus = self.run.skin.buses.get(bus);
         let format = bus.map_or_else(TorqueFormat::default, |bus| match bus.reply {
@@ -97,7 +97,7 @@ impl Draft<'_> {
         ticks.into_iter().chain(epochs).any(|line| largest(line) >= step * 0.5)
     }
 
-    /// Creates the figure of the torque on one joint, with the difference below.
+    /// Creates the figure of the torque on one joint, with the distributed minus the central torque below.
     fn torque_of(&self, joint: usize) -> Figure {
         let name = self.joint(joint);
         let name =
@@ -134,13 +134,13 @@ impl Draft<'_> {
         }
     }
 
-    /// Returns the unit of torques over all joints.
+    /// Returns the unit of the torques of all joints together: Nm, N, or both.
     pub(super) fn torque_unit(&self) -> &'static str {
         let slides = self.run.skin.robot.joints.iter().any(|joint| joint.kind == JointKind::Prismatic);
         if slides { "Nm or N" } else { JointKind::Revolute.torque_unit() }
     }
 
-    /// Creates the table of errors by joint.
+    /// Creates the table of torque errors by joint.
     fn errors(&self) -> Option<Table> {
         let skin = &self.run.skin;
         let mut by_joint = vec![[Errors::default(); 2]; skin.robot.joints.len()];
@@ -180,7 +180,7 @@ impl Draft<'_> {
         ))
     }
 
-    /// Creates the section that corresponds to the paper's Fig. 7, with the positions.
+    /// Creates the section on joint positions and torques over time, which corresponds to the paper's Fig. 7.
     pub(super) fn motion(&self) -> Section {
         let motion = &self.run.motion;
         let figures = self.groups().into_iter().enumerate().flat_map(|(group, (kind, joints))| {
@@ -195,7 +195,7 @@ impl Draft<'_> {
                 figure("velocities", "Joint velocities", Axis::new("velocity", speed), &motion.velocity),
             ]
         });
-        let no_velocity = self.missing_sentence("joint velocities, as joints frames have positions");
+        let no_velocity = self.missing_sentence("joint velocities, because joints frames contain only positions");
         let is_there = |figure: &Figure| no_velocity.is_none() || !figure.name.starts_with("velocities");
         let (still, figures): (Vec<_>, Vec<_>) = figures.filter(is_there).partition(is_zero);
         let mut section = Section::new("motion", "The arm").figures(figures.into_iter().filter_map(shown));
@@ -207,7 +207,8 @@ impl Draft<'_> {
         }
     }
 
-    /// Groups the joints that share a figure: joints of one kind that a chain adds to the previous chains.
+    /// Groups the joints that share a figure. A group has joints of one kind (revolute or prismatic) that a chain has
+    /// and the chains before it do not, at most one for each colour.
     fn groups(&self) -> Vec<(JointKind, Vec<usize>)> {
         let robot = &self.run.skin.robot;
         let mut rest: Vec<_> = (0..robot.joints.len()).collect();
@@ -247,7 +248,7 @@ impl Draft<'_> {
         }
     }
 
-    /// Creates the section that corresponds to the paper's Fig. 8.
+    /// Creates the section on cycle times, which corresponds to the paper's Fig. 8.
     pub(super) fn cycle(&self) -> Section {
         let motion = &self.run.motion;
         let lacks = "the durations of ticks and of the central computation, and the lateness of ticks";

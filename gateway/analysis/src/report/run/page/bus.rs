@@ -11,7 +11,7 @@ use crate::shadow::BusShadow;
 use model::quantiles::Quantiles;
 use model::table::{CellState, Event};
 
-/// Maximum number of cells in the table of the worst cells.
+/// Maximum number of cells in the table of the cells with most problems.
 const MAX_WORST_CELLS: usize = 12;
 
 impl Draft<'_> {
@@ -58,7 +58,7 @@ impl Draft<'_> {
             [("late", &bus_figures.lines.late), ("missing", &bus_figures.lines.missing)],
         ];
         let mut figures = vec![steps("replies", "due and in time, epoch by epoch", y.clone(), due)];
-        figures.extend((lost > 0).then(|| steps("late", "late and missing, when settled", y, late)));
+        figures.extend((lost > 0).then(|| steps("late", "late and missing, once known", y, late)));
         let slowest = self.figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"));
         let slowest = slowest.series([self.line("", &bus_figures.lines.slowest)]);
         figures.push(if lost > 0 { slowest } else { slowest.half() });
@@ -99,7 +99,7 @@ impl Draft<'_> {
         Table::new("Replies by bus", head, rows)
     }
 
-    /// Creates the table of cells, by their problems and then by their slowness.
+    /// Creates the table of the cells with most problems; among cells with equally many, the slowest come first.
     fn worst(&self) -> Option<Table> {
         let cells = self.run.bus_figures.iter().enumerate().flat_map(|(bus, bus_figures)| {
             let described = self.run.skin.cells_on_bus(bus);
@@ -157,20 +157,21 @@ impl Draft<'_> {
         Some(Table::new(title, head, rows))
     }
 
-    /// Returns a load in % from the first tick or joints on; before that, all cells start at once.
+    /// Returns the load in % from the first tick or joints on. Before that the load is not typical, because all cells
+    /// start at once.
     pub(super) fn percent(&self, binned: &BinnedSums) -> Vec<(f64, f64)> {
         let rates = binned.rates().into_iter().map(|(x, part)| (x - self.zero, part * 100.0));
         rates.filter(|(x, _)| *x >= 0.0).collect()
     }
 
-    /// Returns the timing of the real bus for each bus with frames.
+    /// Returns the timing on the real bus, for each bus with frames.
     fn shadows(&self) -> impl Iterator<Item = BusShadow> {
         let buses = self.run.shadow.report().buses;
         buses.into_iter().filter(|bus| self.run.skin.bus_named(&bus.bus).is_some())
     }
 
-    /// Creates the findings on the fit of real buses, in this run and in the worst case. Only chosen bit rates are
-    /// rated, not defaults.
+    /// Creates the findings on whether real buses can carry the traffic, in this run and in the worst case. They are
+    /// rated only if the bit rates were chosen, not for defaults.
     pub(super) fn fits(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         let limits = format!("at most 100 %, replies before the next joints, {MAX_NODES} nodes");
@@ -239,8 +240,8 @@ impl Draft<'_> {
             row(format!("{name}: frames recorded"), bus_figures.frames, true);
             row(format!("{name}: frames lost by the recorder, by its own notes"), bus_figures.dropped, true);
             row(format!("{name}: packets that cells sent, by their own count"), uplink.sent, true);
-            row(format!("{name}: of these lost"), uplink.lost, true);
-            row(format!("{name}: of these refused"), uplink.rejected, false);
+            row(format!("{name}: packets lost, of those that cells sent"), uplink.lost, true);
+            row(format!("{name}: packets refused, of those that cells sent"), uplink.rejected, false);
             row(format!("{name}: restarts of cells during the run"), u64::from(uplink.restarts), false);
             for event in Event::ALL {
                 row(format!("{name}: {}", event.name()), bus_figures.table.counters().events(event), false);
@@ -256,7 +257,7 @@ impl Draft<'_> {
     }
 }
 
-/// Creates the table of a bus's load in operation and in start-up.
+/// Creates the table of a bus's load, with a column for operation and one for start-up.
 fn carried(bus: &BusShadow) -> Table {
     let share = |share: Option<f64>| share.map_or_else(|| "?".to_owned(), percent);
     let mut rows = Vec::new();

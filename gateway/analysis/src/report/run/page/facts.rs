@@ -1,4 +1,4 @@
-//! The origin of a capture, and its machine.
+//! The facts at the head of a report: the capture, its origin, and the machine.
 
 use super::super::Run;
 use crate::report::figure::quantity;
@@ -8,7 +8,7 @@ pub(super) fn micros(text: &str) -> String {
     text.parse().map_or_else(|_| text.to_owned(), |micros| quantity(micros, "µs"))
 }
 
-/// Returns the facts about the capture, by name.
+/// Returns the facts about the capture, each with its name.
 pub(super) fn facts(run: &Run, command: &str) -> Vec<(String, String)> {
     if let Some(frames_only) = &run.frames_only {
         let began = frames_only.began.map(utc).map(|began| ("first frame", began));

@@ -1,4 +1,4 @@
-//! The comparison of torque formats for the torques of a bus.
+//! Compares the torque formats for the torques that occurred on a bus.
 
 use model::table::RoundingErrors;
 use protocol::fixed::TorqueFormat;
@@ -7,7 +7,7 @@ use super::super::bus_figures::BusFigures;
 use super::Draft;
 use crate::report::figure::{Finding, Table, quantity};
 
-/// The rounding of the torques on a bus in all formats.
+/// The rounding errors in each torque format, for the torques of one bus.
 struct Choice<'a> {
     bus: &'a str,
     used: TorqueFormat,
@@ -19,13 +19,13 @@ impl Choice<'_> {
         self.all.iter().find(|(it, _)| *it == format).map_or_else(RoundingErrors::default, |(_, rounded)| *rounded)
     }
 
-    /// Returns the finest format that holds every torque; the widest one if none does.
+    /// Returns the finest format whose range contains every torque; the format with the widest range if there is none.
     fn best(&self) -> TorqueFormat {
         let holds = |(_, rounded): &&(TorqueFormat, RoundingErrors)| rounded.beyond == 0;
         self.all.iter().find(holds).or_else(|| self.all.last()).map_or(self.used, |(format, _)| *format)
     }
 
-    /// Returns the benefit and the cost of a better format.
+    /// Returns a sentence on what a better format gains and costs; `None` if the format of the bus is the best.
     fn advice(&self) -> Option<String> {
         let (used, best) = (self.used, self.best());
         let beyond = self.of(used).beyond;
@@ -49,7 +49,7 @@ impl Choice<'_> {
 }
 
 impl Draft<'_> {
-    /// Returns the comparison for each bus with compared torques.
+    /// Returns the comparison of formats for each bus whose torques were compared.
     fn choices(&self) -> impl Iterator<Item = Choice<'_>> {
         let buses = self.run.bus_figures.iter().zip(&self.run.skin.buses);
         buses.filter_map(|(BusFigures { name, table, .. }, bus)| {
@@ -61,7 +61,7 @@ impl Draft<'_> {
         })
     }
 
-    /// Creates the findings of torques beyond the range of the bus' format.
+    /// Creates the findings on torques beyond the range of a bus's format.
     pub(super) fn beyond_range(&self) -> impl Iterator<Item = Finding> {
         self.choices().map(|choice| {
             let (bus, used) = (choice.bus, choice.used);

@@ -1,4 +1,4 @@
-//! Tables of moments of the recording, each with the command that shows it.
+//! Tables of times in the recording at which something happened, each with the command that shows it.
 
 use model::table::Notice;
 
@@ -9,10 +9,10 @@ use crate::report::figure::{Table, quantity};
 /// Maximum number of rows of a table of moments.
 const MAX_ROWS: usize = 25;
 
-/// The heading of such a table.
+/// The headings of a table of times.
 const HEAD: [&str; 3] = ["at", "what", "command"];
 
-/// A moment, its weight, and its description.
+/// An event in the recording: its time, its weight by which it is selected, and its description.
 struct Moment {
     at: f64,
     weight: f64,
@@ -20,7 +20,7 @@ struct Moment {
 }
 
 impl Draft<'_> {
-    /// Returns the command that shows the recording at a time, in s after its first message.
+    /// Returns the command that shows the recording around a time, given in s after its first message.
     pub(super) fn view_command(&self, at: f64) -> String {
         let seconds = (at - self.run.zero.unwrap_or(0.0)).max(0.0);
         let files: Vec<_> = self.run.files.iter().map(|file| quoted(file)).collect();
@@ -28,7 +28,7 @@ impl Draft<'_> {
         format!("skinbus view {}{} --at {seconds:.3}", files.join(" "), skin.unwrap_or_default())
     }
 
-    /// Creates the table of touches, by link.
+    /// Creates the table of touches, each on a link.
     pub(super) fn touches(&self) -> Option<Table> {
         let skin = &self.run.skin;
         let mut all = Vec::new();
@@ -87,7 +87,8 @@ impl Draft<'_> {
         self.table("Moments of losses", all, further)
     }
 
-    /// Creates a table of the moments with the highest weights, by time.
+    /// Creates a table of the events with the highest weights, in order of time. `further` is the number of events that
+    /// were not kept.
     fn table(&self, title: &str, mut all: Vec<Moment>, further: u64) -> Option<Table> {
         if all.is_empty() {
             return None;

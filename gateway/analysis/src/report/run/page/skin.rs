@@ -10,10 +10,10 @@ use crate::report::figure::{
     Drawing, Legend, Map, Panel, Section, Spot, Strip, StripGroup, StripRow, quantity,
 };
 
-/// Maximum number of rows of the strip.
+/// Maximum number of rows of the strip of touched cells.
 const MAX_STRIP_ROWS: usize = 40;
 
-/// A link: a row of a chain, from 1.
+/// A link of the robot: the index of a chain, and a row of it from 1.
 type ChainRow = (usize, u8);
 
 impl Draft<'_> {
@@ -55,7 +55,7 @@ impl Draft<'_> {
         }
     }
 
-    /// Returns true for a capture without a loop in which cells sent torques but the forces are unknown.
+    /// Returns true for a capture with frames only in which cells sent torques, but the forces on them are unknown.
     pub(super) fn lacks_forces(&self) -> bool {
         let lines = self.run.motion.distributed.iter();
         let is_loaded = lines.flat_map(|line| line.points()).any(|(_, torque)| torque != 0.0);
@@ -112,7 +112,8 @@ impl Draft<'_> {
         Some(Strip { name: "touches".to_owned(), title, seconds, legend, groups })
     }
 
-    /// Returns a value for each cell in the skin's order, given its bus and its index there.
+    /// Returns one value for each cell in the skin's order. `value` computes it from the index of the bus and the index
+    /// of the cell on the bus.
     fn by_cell(&self, value: impl Fn(usize, usize) -> Option<f64>) -> Vec<Option<f64>> {
         let mut places = vec![0; self.run.skin.buses.len()];
         let of = |cell: &protocol::skin::Cell| {

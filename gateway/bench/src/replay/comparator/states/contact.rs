@@ -20,7 +20,7 @@
 //! | `extra_torque` | both | `Extra`, no end | `AsRecorded` | the contact lasts now |
 //! | `late_end` | both | `LateEnd` | `AsRecorded` | the recorded end came; no other end can be late |
 
-/// Contact of a cell by its last recorded torque.
+/// State of a cell's contact according to its last recorded torque.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Contact {
     /// The cell has sent no torque in this pass.
@@ -32,7 +32,7 @@ pub(in super::super) enum Contact {
     Over,
 }
 
-/// A recorded torque, or the start of a pass.
+/// An input from the recording: a torque, or the start of a pass.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Recorded {
     Torque,
@@ -42,23 +42,23 @@ pub(in super::super) enum Recorded {
     PassBegins,
 }
 
-/// Present end of a contact compared with the recorded one.
+/// End of a contact in this replay, compared with the recorded end.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum End {
     #[default]
     AsRecorded,
-    /// Earlier than recorded: the cell received joints that it had missed in the capture.
+    /// The end came earlier than recorded, because the cell received joints that it had missed in the capture.
     Earlier,
 }
 
-/// Torques of a cell in one round.
+/// Torques of a cell in one round, in the recording and in this replay.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Round {
-    /// The cell sent one in the capture and one now.
+    /// The cell sent a torque in the capture and in this replay.
     Both,
-    /// The cell sent one only now, which the recording explains.
+    /// The cell sent a torque only in this replay, and the recording explains why.
     Extra { is_end: bool },
-    /// The cell sent the end only in the capture, later than now.
+    /// The cell sent the end of its contact in the capture, but had sent it earlier in this replay.
     LateEnd,
 }
 
@@ -72,8 +72,8 @@ impl Contact {
         }
     }
 
-    /// Returns true if the contact was over before a recorded end that came late: by the recorded stimuli the cell
-    /// cannot have been in contact at these joints or the ones before, or it was in contact before the replayed part.
+    /// Returns true if the contact was over before a recorded end that came late. This is so if the recorded stimuli
+    /// rule out a contact at these joints and at those before, or if the contact began before the replayed part.
     pub(in super::super) const fn was_over(self, begins_later: bool, may_answer: bool) -> bool {
         match self {
             Self::Unknown => begins_later,

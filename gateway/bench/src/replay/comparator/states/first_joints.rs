@@ -22,28 +22,28 @@ pub(in super::super) enum FirstJoints {
     /// The cell has received joints, or its state is unknown.
     #[default]
     Taken,
-    /// The cell had received no joints when it reported its counters, with this epoch.
+    /// The cell reported its counters, which showed no joints, under this epoch.
     Awaited { epoch: Epoch },
 }
 
-/// A packet of the cell, by the evidence that it gives.
+/// Evidence that a packet gives about a cell's first joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
     /// Counters that show no joints since the start.
     CountsNone {
         epoch: Epoch,
     },
-    /// Counters that show some joints.
+    /// Counters that show at least one joint broadcast.
     CountsSome,
     Torque,
-    /// Another page of its state, with this epoch.
+    /// Another page of the cell's state, with this epoch.
     Sends {
         epoch: Epoch,
     },
 }
 
 impl Input {
-    /// Returns a message's cell and the evidence about that cell's first joints.
+    /// Returns the sender of a message, and the evidence about that cell's first joints.
     pub(in super::super) const fn from_message(message: &Message) -> Option<(CellId, Self)> {
         if let Message::Torque { from, .. } = *message {
             return Some((from, Self::Torque));

@@ -5,7 +5,7 @@
 //! | `lost` | both | `Lost` | `Down` | its cells cannot send, so they are not awaited |
 //! | `back` | both | `Message` | `Up` | a message arrived |
 
-/// State of a bus by its last event.
+/// State of a bus according to its last event.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum BusCondition {
     #[default]

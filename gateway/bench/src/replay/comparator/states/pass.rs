@@ -18,23 +18,24 @@ use protocol::packet::Epoch;
 /// A pass over the capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Pass {
-    /// No message has been read.
+    /// No message of the capture has been read in this pass.
     #[default]
     Fresh,
-    /// Messages came that are not resent, but no joints that are.
+    /// Only messages that are not resent have been read.
     Before,
-    /// Joints came that are resent, and nothing before them.
+    /// Joints that are resent have been read, and no message before them.
     Whole,
-    /// Joints came that are resent, after others: the last of those had this epoch.
+    /// Joints that are resent have been read, after messages that are not. `earlier` is the epoch of the last joints
+    /// among those messages.
     Part { earlier: Option<Epoch> },
 }
 
-/// The next message of the capture, by its handling.
+/// An event of reading the capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
     /// The capture starts again.
     Begins,
-    /// A message that is not resent: before the part, or excluded from it.
+    /// A message that is not resent, because it is before the replayed part or excluded from it.
     NotSent,
     /// Joints that are resent; `last` is the epoch of the joints before them.
     Joints { last: Option<Epoch> },
@@ -55,13 +56,13 @@ impl Pass {
         }
     }
 
-    /// Returns true if messages came before the first joints that are resent.
+    /// Returns true if other messages came before the first joints that are resent.
     pub(in super::super) const fn begins_later(self) -> bool {
         matches!(self, Self::Before | Self::Part { .. })
     }
 
-    /// Returns the epoch of the last joints before the resent ones, if replies to it can come. `last` is the epoch of
-    /// the latest recorded joints.
+    /// Returns the epoch of the last joints before the resent ones, as long as replies to it can come. `last` is the
+    /// epoch of the latest recorded joints.
     pub(in super::super) const fn earlier(self, last: Option<Epoch>) -> Option<Epoch> {
         match self {
             Self::Fresh | Self::Whole => None,

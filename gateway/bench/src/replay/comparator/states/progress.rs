@@ -21,12 +21,12 @@
 /// Progress of a cell with the joints announced last.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Progress {
-    /// The cell has processed the joints, or there were none.
+    /// The cell has processed the joints, or no joints have been announced.
     #[default]
     Done,
     /// The cell has not reported the joints. `heard` is true after one heartbeat since the announcement.
     Awaited { heard: bool },
-    /// As `Awaited`, but not awaited until its next heartbeat, because it did not answer in time.
+    /// The cell did not answer in time, and is not awaited until its next heartbeat. `heard` is as in `Awaited`.
     GivenUp { heard: bool },
 }
 

@@ -10,10 +10,10 @@
 
 use protocol::packet::Epoch;
 
-/// Joints of a round, and the epoch under which they were sent last.
+/// State of sending the joints of a round, with the epoch under which they were sent last.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Sending {
-    /// Not sent: nothing is compared.
+    /// The joints have not been sent, and nothing is compared.
     #[default]
     Recorded,
     Sent {
@@ -33,7 +33,7 @@ pub(in super::super) enum Sending {
     },
 }
 
-/// An event of joints.
+/// An event of sending joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
     /// The joints are sent under this epoch.
@@ -72,7 +72,7 @@ impl Sending {
         matches!(self, Self::Repeated { .. } | Self::RepeatedUnsent { .. })
     }
 
-    /// Returns the epoch under which they were sent last.
+    /// Returns the epoch under which the joints were sent last.
     pub(in super::super) const fn under(self) -> Option<Epoch> {
         match self {
             Self::Recorded => None,

@@ -8,7 +8,7 @@ use Sample::{Doubted, DoubtedLong, Free, Inherited, InheritedLong, Shared, Sole}
 
 const AGAIN: HeartbeatKind = HeartbeatKind::Started { again: true };
 
-/// A sample of each state; the two with a former life occur twice: it may go on, or not any more.
+/// A sample of each state. The two states with a former life occur twice: that life may continue, or may not any more.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Sample {
     Free,
@@ -37,7 +37,8 @@ const EVIDENCE: [E; 11] = [
     E::Succeeds,
 ];
 
-/// Returns the indices in the lists above. A new variant without an arm does not compile.
+/// Returns the samples of a state, and the index of a kind of evidence in the list above. A new variant without an arm
+/// does not compile.
 const fn places(ownership: &Ownership, evidence: E) -> (&[Sample], usize) {
     let samples: &[Sample] = match ownership {
         Ownership::Free => &[Free],
@@ -62,17 +63,17 @@ const fn places(ownership: &Ownership, evidence: E) -> (&[Sample], usize) {
     (samples, place)
 }
 
-/// The origin of the next owner's or former's life.
+/// The life that the owner or the former has in the next state.
 #[derive(Clone, Copy, Debug)]
 enum Whose {
     Nobody,
-    /// Keeps the life from before.
+    /// The life that it had before.
     Same,
-    /// The previous owner's, with the new heartbeat.
+    /// The previous owner's life, extended by the new heartbeat.
     Longer,
-    /// The life of the new heartbeat.
+    /// The life that begins with the new heartbeat.
     New,
-    /// The previous owner's.
+    /// The previous owner's life.
     Owner,
 }
 use Whose::{Longer, New, Nobody, Owner, Same};
