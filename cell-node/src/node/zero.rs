@@ -1,9 +1,8 @@
 //! Reports of the force sensor's zero (sensors page 3): when its state changes, and once a second.
 
-use protocol::message::{Message, SensorPage};
+use protocol::message::{Message, Readings, SensorPage};
 
 use super::Node;
-use super::stimuli::SensedValues;
 use crate::baseline::BaselineStatus;
 
 /// Number of heartbeats per page.
@@ -18,9 +17,9 @@ pub(super) struct ReportedBaseline {
 
 impl Node {
     /// Returns the sensor values with the zero subtracted.
-    pub(super) fn net(&self) -> SensedValues {
-        let SensedValues { skin, acceleration } = self.stimuli.sensed;
-        SensedValues { skin: self.baseline.subtract_zero(&skin), acceleration }
+    pub(super) fn net(&self) -> Readings {
+        let sensed = self.stimuli.sensed;
+        Readings { skin: self.baseline.subtract_zero(&sensed.skin), ..sensed }
     }
 
     /// Reports the zero if its state has changed and the cell owns its node id.

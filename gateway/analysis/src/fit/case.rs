@@ -1,6 +1,7 @@
 //! One bus, the frames of its cells, and their worst-case times.
 
 use protocol::can::Format;
+use protocol::message::SensorPage;
 use protocol::packet::Length;
 use protocol::parameters::Sensing;
 use protocol::skin::{SkinReply, Skin};
@@ -10,8 +11,11 @@ use super::response::{Response, Stream, response};
 
 /// Period of heartbeats, in ns.
 const HEARTBEAT_NS: u64 = 250_000_000;
-/// With sensors on, an acceleration frame follows every fourth heartbeat.
-const ACCELERATION_NS: u64 = 4 * HEARTBEAT_NS;
+/// With sensors on, the pages other than the skin's follow every fourth heartbeat.
+const OTHERS_NS: u64 = 4 * HEARTBEAT_NS;
+/// Number of these pages.
+#[expect(clippy::cast_possible_truncation, reason = "a few pages")]
+const OTHERS: u32 = SensorPage::SIMULATED.len() as u32 - 1;
 /// Share of the period that `skinbus skin generate` gives to slots, in percent.
 const SLOTS_SHARE: u64 = 75;
 
@@ -187,7 +191,7 @@ impl Case {
         1_000_000_000_u64.div_ceil(u64::from(self.rates.nominal()))
     }
 
-    /// Returns the streams on the bus, highest priority first: joints, answers, sensors (page 0, page 1), heartbeats.
+    /// Returns the streams on the bus, highest priority first: joints, answers, sensors (page 0, others), heartbeats.
     ///
     /// Heartbeats, and pages that follow them, may be sent up to a period of the joints early.
     fn streams(&self, answers_jitter_ns: u64) -> [Stream; 5] {
@@ -197,22 +201,22 @@ impl Case {
             Stream { count, period_ns, jitter_ns, frame_ns: self.frame_of_ns(length) }
         };
         let stream = |senders, period_ns, jitter_ns| of(Length::Six, senders, period_ns, jitter_ns);
-        let none = stream(0, ACCELERATION_NS, early_ns);
-        let acceleration = stream(cells, ACCELERATION_NS, early_ns);
-        let [page_0, page_1] = match self.sensing {
+        let none = stream(0, OTHERS_NS, early_ns);
+        let others = stream(cells.saturating_mul(OTHERS), OTHERS_NS, early_ns);
+        let [page_0, others] = match self.sensing {
             Sensing::Off => [none; 2],
             Sensing::Continuous { period_ms } => {
                 let period_ns = u64::from(period_ms) * 1_000_000;
                 let early_ns = if period_ns > self.period_ns { early_ns } else { 0 };
-                [stream(cells, period_ns, early_ns), acceleration]
+                [stream(cells, period_ns, early_ns), others]
             }
-            Sensing::Event => [stream(cells, HEARTBEAT_NS, early_ns), acceleration],
+            Sensing::Event => [stream(cells, HEARTBEAT_NS, early_ns), others],
         };
         [
             of(self.length, 1, self.period_ns, 0),
             of(self.length, cells, self.period_ns, answers_jitter_ns),
             page_0,
-            page_1,
+            others,
             stream(cells, HEARTBEAT_NS, early_ns),
         ]
     }
@@ -220,8 +224,8 @@ impl Case {
     /// Returns the load of the bus. Event-driven sensors count with their rate without changes.
     #[must_use]
     pub fn load(&self) -> Load {
-        let [joints, answers, page_0, page_1, heartbeats] = self.streams(0).map(|it| it.load());
-        Load { joints, answers, sensors: page_0 + page_1, heartbeats }
+        let [joints, answers, page_0, others, heartbeats] = self.streams(0).map(|it| it.load());
+        Load { joints, answers, sensors: page_0 + others, heartbeats }
     }
 
     /// Returns the worst-case times.

@@ -1,7 +1,7 @@
 //! The gateway's state of one cell.
 
 use protocol::id::CellId;
-use protocol::message::{Answer, AppliesFrom, Heartbeat, SensorPage, SkinSensors, State};
+use protocol::message::{Answer, AppliesFrom, Heartbeat, NetworkPages, Readings, SensorPage, SkinSensors, State};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::{Events, LinksDown, Parameter, Parameters};
@@ -16,7 +16,7 @@ use super::sensed::SensorFrames;
 use super::sent::SentJoints;
 use super::status::Status;
 use super::switched::{SWITCHES, Switch, SwitchStates};
-use crate::tracker::{Contact, Pages, CellTracker, Update, Uplink, HeartbeatKind};
+use crate::tracker::{Contact, CellTracker, Update, Uplink, HeartbeatKind};
 
 /// The requested packets that a cell has sent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -115,7 +115,7 @@ impl CellState {
 
     /// Returns the last page of each kind since it started.
     #[must_use]
-    pub const fn pages(&self) -> &Pages {
+    pub const fn pages(&self) -> &NetworkPages {
         self.tracked.pages()
     }
 
@@ -160,7 +160,7 @@ impl CellState {
     /// Records its receive counters; `passed` joints crossed the page on the bus. Later pages are compared with the
     /// first one since a start.
     pub(super) fn report(&mut self, passed: u64) {
-        let heard = self.pages().heard;
+        let heard = self.pages().received;
         self.sent.report(heard, passed);
         heard.iter().for_each(|heard| self.contact.count(heard.stimuli, ()));
     }
@@ -217,6 +217,12 @@ impl CellState {
     pub fn is_ready(&self) -> bool {
         let claim = self.tracked.claim();
         !self.tracked.is_dead() && !self.halt.halted && claim.is_settled() && claim.has_state(State::CONFIGURED)
+    }
+
+    /// Returns the newest sensor values by the stimuli and pages received; the default for unknown ones.
+    #[must_use]
+    pub fn readings(&self) -> Readings {
+        self.contact.readings()
     }
 
     /// Records a stimulus on the bus; `last` is the epoch of the last joints.
@@ -387,7 +393,7 @@ impl CellState {
     /// does not report as received; `None` before its first report.
     #[must_use]
     pub fn unanswered(&self) -> Option<(u64, u64)> {
-        self.sent.unanswered(self.pages().heard)
+        self.sent.unanswered(self.pages().received)
     }
 
     /// Records a lost bus: due replies may have been sent and lost.
