@@ -8,7 +8,7 @@ use cell_node::flash::{FlashState, FlashContent};
 use cell_node::identity::Identity;
 use cell_node::io::{Cells, FlashFile, BusPort, LinkIds, Sockets, StopReason};
 use clap::Parser;
-use protocol::bus::KindChoice;
+use protocol::bus::{BusKind, KindChoice};
 use protocol::id::CellId;
 use protocol::last_words::{CellRange, ExitReason};
 use protocol::skin::{SkinReply, Skin, Wires};
@@ -48,8 +48,7 @@ struct Arguments {
     /// Open the bus again when it is gone, and wait for it at the start, instead of ending
     #[arg(long)]
     reconnect: bool,
-    /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
-    #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto)]
+    #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     bus_kind: KindChoice,
     /// End when this process, the parent, ends
     #[arg(long, value_name = "PID")]

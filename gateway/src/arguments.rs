@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
-use protocol::bus::{KindChoice, KindChoices, KindOption};
+use protocol::bus::{BusKind, KindChoice, KindChoices, KindOption};
 use protocol::can::Format;
 use protocol::skin::{CellName, Skin};
 use protocol::usage::Failure;
@@ -57,10 +57,16 @@ pub(crate) fn nanos(text: &str) -> Result<u64, String> {
 /// The option for the kinds of one or several buses.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct BusKinds {
-    /// Bus kind: socketcan or embedded. Default: socketcan if an interface has this name, else embedded. For one of
-    /// several buses, BUS=KIND; repeat the option for further buses
-    #[arg(long, value_name = "[BUS=]KIND")]
+    #[arg(long, value_name = "[BUS=]KIND", help = kinds_help())]
     bus_kind: Vec<KindOption>,
+}
+
+fn kinds_help() -> String {
+    format!(
+        "Bus kind: {}. Default: socketcan if an interface has this name, else embedded. For one of several buses, \
+         BUS=KIND; repeat the option for further buses",
+        BusKind::names()
+    )
 }
 
 impl BusKinds {

@@ -1,6 +1,7 @@
 //! Single packets: `skinbus frame`.
 
 mod addressee;
+mod others;
 mod packets;
 mod sensing;
 

@@ -135,6 +135,11 @@ impl Recording {
     }
 }
 
+fn demo_kinds() -> String {
+    let names = BusKind::names();
+    format!("{names}; auto is SocketCAN if an interface vcan0 exists [default: embedded]")
+}
+
 /// Run a demonstration: 253 cells on an arm, touched here and there
 ///
 /// Needs no setup: the cells are processes on an embedded bus of the demonstration's own, unless SKINBUS_DIR names a
@@ -143,7 +148,7 @@ impl Recording {
 #[derive(Args, Debug)]
 #[command(
     after_help = "Example:\n  skinbus demo --duration 5",
-    mut_arg("bus_kind", |arg| arg.help("socketcan or embedded; auto is SocketCAN if an interface vcan0 exists [default: embedded]"))
+    mut_arg("bus_kind", |arg| arg.help(demo_kinds()))
 )]
 pub(crate) struct Demo {
     #[command(flatten)]
@@ -224,12 +229,12 @@ impl Demo {
             .map_err(Failure::usage)?;
         let kind = options.kinds.kind_of("vcan0").resolve("vcan0");
         let given = std::env::var_os("SKINBUS_DIR").filter(|given| !given.is_empty()).map(PathBuf::from);
-        let own = given.is_none() && kind == BusKind::Embedded;
+        let own = given.is_none() && !kind.is_interface();
         let buses = own.then(|| buses::directory("demo")).transpose()?;
         options.directory = buses.as_ref().map(|buses| buses.path().to_owned()).or(given);
         let place = options.directory.as_ref();
         let place = place.map(|path| format!("SKINBUS_DIR={} ", shell_quoted_os(path.as_os_str())));
-        let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
+        let place = place.filter(|_| !kind.is_interface()).unwrap_or_default();
         options.announced.push(format!("its frames in words: {place}skinbus dump vcan0 --bus-kind {kind}"));
         let Common { recording, summary, verbose, view, listen, .. } = self.common;
         let numbered = self.candump.is_none();

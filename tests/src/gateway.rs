@@ -164,10 +164,10 @@ impl Gateway {
         while self.script_epoch < until {
             let from = AppliesFrom::Epoch(epoch_of(self.script_epoch));
             for stimulus in self.touches.stimuli_for(self.script_epoch) {
-                let page = SensorPage::Skin(stimulus.sensors);
-                messages.push(Message::Stimulus { to: Node::Cell(stimulus.node), from, page });
+                let to = Node::Cell(stimulus.node);
+                messages.extend(stimulus.pages().map(|page| Message::Stimulus { to, from, page }));
                 if let Some(pressed) = self.pressed.get_mut(stimulus.cell) {
-                    *pressed = stimulus.sensors;
+                    *pressed = stimulus.readings.skin;
                 }
             }
             self.script_epoch += 1;

@@ -96,22 +96,19 @@ pub fn would_run(findings: &[Finding]) -> bool {
 #[must_use]
 pub fn assess(facts: &Facts) -> Vec<Finding> {
     let mut findings = vec![facts.kind()];
-    match facts.bus_kind() {
-        BusKind::SocketCan if facts.kernel.has_can => {
-            findings.extend(facts.making());
-            findings.extend(facts.buses.iter().flat_map(|bus| facts.interface(bus)));
-            findings.extend(facts.any_interface());
-            findings.extend(facts.receive_buffer());
-            findings.extend(facts.backlog());
-        }
-        // Without CAN in the kernel, there can be no interfaces to check.
-        BusKind::SocketCan => {}
-        BusKind::Embedded => {
-            findings.push(facts.embedded());
-            findings.extend(facts.buses.iter().filter_map(|bus| facts.absent(bus)));
-            findings.extend(facts.buses.iter().flat_map(|bus| facts.traffic(bus, "the embedded bus")));
-        }
+    let kind = facts.bus_kind();
+    if !kind.is_interface() {
+        findings.push(facts.embedded());
+        findings.extend(facts.buses.iter().filter_map(|bus| facts.absent(bus)));
+        findings.extend(facts.buses.iter().flat_map(|bus| facts.traffic(bus, kind.display_name())));
+    } else if facts.kernel.has_can {
+        findings.extend(facts.making());
+        findings.extend(facts.buses.iter().flat_map(|bus| facts.interface(bus)));
+        findings.extend(facts.any_interface());
+        findings.extend(facts.receive_buffer());
+        findings.extend(facts.backlog());
     }
+    // Without CAN in the kernel there are no interfaces to check.
     findings.extend(facts.cell_node());
     findings
 }
@@ -151,10 +148,10 @@ impl Facts {
         let Kernel { release, has_can, can_raw, .. } = &self.kernel;
         let hints = || self.kernel.hints(*can_raw);
         match (self.choice, has_can) {
-            (KindChoice::Only(BusKind::Embedded), _) => {
-                Finding::ok("the embedded bus was chosen, which needs nothing of the kernel")
+            (KindChoice::Only(kind), _) if !kind.is_interface() => {
+                Finding::ok(format!("{} was chosen, which needs nothing of the kernel", kind.display_name()))
             }
-            (KindChoice::Auto | KindChoice::Only(BusKind::SocketCan), true) => {
+            (KindChoice::Auto | KindChoice::Only(_), true) => {
                 Finding::ok(format!("the kernel ({release}) has CAN"))
             }
             (KindChoice::Auto, false) => Finding::note(format!(
@@ -162,7 +159,7 @@ impl Facts {
                  for a kernel with CAN:"
             ))
             .hints(hints()),
-            (KindChoice::Only(BusKind::SocketCan), false) => {
+            (KindChoice::Only(_), false) => {
                 Finding::fault(format!("the kernel ({release}) has no CAN, and --bus-kind socketcan needs it"))
                     .hints(hints())
                     .hint("# leave out --bus-kind socketcan: the bench then runs on the embedded bus")

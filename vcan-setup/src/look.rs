@@ -67,7 +67,7 @@ fn listen_to_all(buses: &[BusFacts], choice: KindChoice) -> Vec<Option<Result<Op
         (KindChoice::Auto, None) => BusKind::Embedded,
     };
     let is_open = |bus: &&BusFacts| {
-        kind_of(bus) == BusKind::Embedded || bus.interface.as_ref().is_some_and(|it| usable(&bus.target, it))
+        !kind_of(bus).is_interface() || bus.interface.as_ref().is_some_and(|it| usable(&bus.target, it))
     };
     thread::scope(|scope| {
         let begin = |bus: &'_ BusFacts| {

@@ -1,6 +1,6 @@
 //! The parameters with which a process opens its bus.
 
-use protocol::bus::{Bus, BusKind, KindChoice, BusOptions};
+use protocol::bus::{Bus, KindChoice, BusOptions};
 
 use super::StopReason;
 
@@ -24,7 +24,7 @@ impl BusPort {
     /// Returns an error if the bus does not exist, is not accessible, or does not support `options`.
     pub fn open(&self, options: &BusOptions) -> Result<Bus, StopReason> {
         let bus = Bus::open(&self.name, self.choice, options)?;
-        if self.wires && bus.kind() == BusKind::SocketCan && !bus.is_virtual()? {
+        if self.wires && bus.kind().is_interface() && !bus.is_virtual()? {
             return Err(StopReason::Real { bus: self.name.clone() });
         }
         Ok(bus)

@@ -286,7 +286,7 @@ impl Node {
             Message::Report => {
                 self.push_network(NetworkPage::Received(self.received));
                 self.push_network(NetworkPage::Rejected(self.receiver.refused));
-                self.push_sensors(Pages::BOTH);
+                self.push_sensors(Pages::ALL);
                 self.push_zero();
                 if self.summing.network.exists() {
                     self.push_tree(now);

@@ -12,28 +12,38 @@
 
 use protocol::fixed::Q;
 use protocol::id::CellId;
-use protocol::message::{Message, SensorPage, SkinSensors};
+use protocol::message::{Message, Readings, SkinSensors};
 use protocol::parameters::{Events, Sensing as Mode};
 use protocol::time::{Micros, Span};
 use protocol::touch::{Touch, contact_force};
 
-use super::stimuli::SensedValues;
 use super::{Node, Switches};
 use crate::phase;
 
-/// Number of heartbeats per page with the acceleration, which does not show touches and is rarely needed.
-const BEATS_PER_ACCELERATION: u8 = 4;
+/// Number of heartbeats per page other than the skin's; such a page shows no touch and is rarely needed.
+const BEATS_PER_OTHER: u8 = 4;
 
 /// The sensor pages that are to be sent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) struct Pages {
     skin: bool,
     acceleration: bool,
+    /// All further pages.
+    others: bool,
 }
 
 impl Pages {
-    const NONE: Self = Self { skin: false, acceleration: false };
-    pub(super) const BOTH: Self = Self { skin: true, acceleration: true };
+    const NONE: Self = Self { skin: false, acceleration: false, others: false };
+    pub(super) const ALL: Self = Self { skin: true, acceleration: true, others: true };
+
+    /// Returns true if they contain the page with this index in [`Readings::pages`].
+    const fn contain(self, index: usize) -> bool {
+        match index {
+            0 => self.skin,
+            1 => self.acceleration,
+            _ => self.others,
+        }
+    }
 }
 
 /// The values that were sent last, and the time of the next page.
@@ -42,9 +52,9 @@ pub(super) struct Sensing {
     mode: Mode,
     /// The time of the next page in continuous mode.
     due: Option<Micros>,
-    /// The values that were sent last, by request or without.
-    sent: SensedValues,
-    /// The time at which page 0 was last sent without a request.
+    /// The last sent values, requested or not.
+    sent: Readings,
+    /// The time of the last page 0 sent without a request.
     last_sent_at: Option<Micros>,
     contact: Touch,
     proximity: Touch,
@@ -53,8 +63,8 @@ pub(super) struct Sensing {
 }
 
 impl Sensing {
-    /// Returns the pages to send, after sensor values or the mode may have changed.
-    fn update(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &SensedValues) -> Pages {
+    /// Returns the pages to send after sensor values or the mode may have changed.
+    fn update(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &Readings) -> Pages {
         let Switches { sensing, events, .. } = switches;
         if *sensing != self.mode {
             return self.switch(now, switches, cell, sensed);
@@ -62,17 +72,18 @@ impl Sensing {
         if *sensing != Mode::Event {
             return Pages::NONE;
         }
-        let SensedValues { skin, acceleration } = sensed;
+        let Readings { skin, acceleration, .. } = sensed;
         let turned = self.follow(skin, events);
         let pages = Pages {
             skin: *skin != self.sent.skin && (turned || has_moved(skin, &self.sent.skin, events)),
             acceleration: is_far(acceleration, &self.sent.acceleration, events.acceleration),
+            others: false,
         };
         self.mark_sent(now, pages)
     }
 
-    /// Switches to another mode. Returns the pages with the present values, which are sent at once.
-    fn switch(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &SensedValues) -> Pages {
+    /// Switches to another mode, which starts with the present contact state.
+    fn switch(&mut self, now: Micros, switches: &Switches, cell: CellId, sensed: &Readings) -> Pages {
         let mode = switches.sensing;
         *self = Self { mode, sent: self.sent, ..Self::default() };
         match mode {
@@ -85,7 +96,7 @@ impl Sensing {
                 self.follow(&sensed.skin, &switches.events);
             }
         }
-        self.mark_sent(now, Pages::BOTH)
+        self.mark_sent(now, Pages::ALL)
     }
 
     /// Updates the touch states of contact and proximity. Returns true if one of them was touched or released.
@@ -103,9 +114,10 @@ impl Sensing {
         if self.mode == Mode::Off {
             return Pages::NONE;
         }
-        self.beats = (self.beats + 1) % BEATS_PER_ACCELERATION;
+        self.beats = (self.beats + 1) % BEATS_PER_OTHER;
         let skin = self.mode == Mode::Event && self.last_sent_at != Some(now);
-        self.mark_sent(now, Pages { skin, acceleration: self.beats == 0 })
+        let is_due = self.beats == 0;
+        self.mark_sent(now, Pages { skin, acceleration: is_due, others: is_due })
     }
 
     /// Returns the page that is due before `until` in continuous mode. Periods that have passed are skipped; the phase
@@ -117,7 +129,7 @@ impl Sensing {
         }
         let period = Span::from_millis(period_ms.into());
         self.due = Some(phase::next(due, period, now));
-        self.mark_sent(now, Pages { skin: true, acceleration: false })
+        self.mark_sent(now, Pages { skin: true, ..Pages::NONE })
     }
 
     const fn mark_sent(&mut self, now: Micros, pages: Pages) -> Pages {
@@ -178,13 +190,11 @@ impl Node {
         }
     }
 
-    /// Sends the selected pages with the present sensor values.
-    pub(super) fn push_sensors(&mut self, Pages { skin, acceleration }: Pages) {
+    /// Sends pages with the present contact state.
+    pub(super) fn push_sensors(&mut self, pages: Pages) {
         let Some(from) = self.identity.cell else { return };
-        let net = self.net();
-        let skin = skin.then_some(SensorPage::Skin(net.skin));
-        let acceleration = acceleration.then_some(SensorPage::Acceleration(net.acceleration));
-        for page in skin.into_iter().chain(acceleration) {
+        for (_, page) in self.net().pages().into_iter().enumerate().filter(|(index, _)| pages.contain(*index))
+        {
             self.sensing.sent.set(&page);
             self.push(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });
         }

@@ -4,8 +4,7 @@
 //! that it answers, and not on the order of other frames on the bus.
 
 use heapless::Vec;
-use protocol::fixed::Q3_12;
-use protocol::message::{AppliesFrom, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, Readings, SensorPage};
 use protocol::packet::Epoch;
 
 /// Maximum number of stimuli that wait for their epoch.
@@ -22,31 +21,12 @@ pub(super) enum Arrival {
     Refused,
 }
 
-/// All sensor values of a cell.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(super) struct SensedValues {
-    pub(super) skin: SkinSensors,
-    /// Acceleration in g.
-    pub(super) acceleration: [Q3_12; 3],
-}
-
-impl SensedValues {
-    /// Sets the values of one page.
-    pub(super) const fn set(&mut self, page: &SensorPage) {
-        match *page {
-            SensorPage::Skin(skin) => self.skin = skin,
-            SensorPage::Acceleration(acceleration) => self.acceleration = acceleration,
-            SensorPage::Baseline(_) => {}
-        }
-    }
-}
-
 /// The simulated sensors of a cell in test mode.
 #[derive(Debug, Default)]
 pub(super) struct Stimuli {
     pending: Vec<(AppliesFrom, SensorPage), MAX_PENDING>,
-    /// The present sensor values.
-    pub(super) sensed: SensedValues,
+    /// The present contact state.
+    pub(super) sensed: Readings,
 }
 
 impl Stimuli {
@@ -86,6 +66,7 @@ impl Stimuli {
 mod tests {
     use super::*;
     use protocol::fixed::Q5_10;
+    use protocol::message::SkinSensors;
 
     fn press(newtons: f64) -> SensorPage {
         SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() })

@@ -1,9 +1,8 @@
 //! Reports of the zero of the force sensor (sensor page 3), which are sent when its state changes and once a second.
 
-use protocol::message::{Message, SensorPage};
+use protocol::message::{Message, Readings, SensorPage};
 
 use super::Node;
-use super::stimuli::SensedValues;
 use crate::baseline::BaselineStatus;
 
 /// Number of heartbeats per report.
@@ -17,10 +16,10 @@ pub(super) struct ReportedBaseline {
 }
 
 impl Node {
-    /// Returns the sensor values with the zero subtracted from the contact force.
-    pub(super) fn net(&self) -> SensedValues {
-        let SensedValues { skin, acceleration } = self.stimuli.sensed;
-        SensedValues { skin: self.baseline.subtract_zero(&skin), acceleration }
+    /// Returns the sensor values with the zero subtracted.
+    pub(super) fn net(&self) -> Readings {
+        let sensed = self.stimuli.sensed;
+        Readings { skin: self.baseline.subtract_zero(&sensed.skin), ..sensed }
     }
 
     /// Reports the zero if its state has changed since the last report, and the cell owns its node id.

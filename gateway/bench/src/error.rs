@@ -217,11 +217,9 @@ pub(crate) fn why(said: Option<&str>) -> String {
 fn other_gateway(link: Option<&(String, BusKind)>) -> String {
     match link {
         None => "another gateway is on the bus".to_owned(),
-        Some((name, BusKind::SocketCan)) => {
-            format!("another gateway is on {name}: stop one of the two, or give this one another bus")
-        }
-        Some((name, BusKind::Embedded)) => {
-            format!("another gateway is on {name}: stop one of the two, or {ELSEWHERE}")
+        Some((name, kind)) => {
+            let elsewhere = if kind.is_interface() { "give this one another bus" } else { ELSEWHERE };
+            format!("another gateway is on {name}: stop one of the two, or {elsewhere}")
         }
     }
 }

@@ -349,7 +349,7 @@ pub struct SensorsSummary {
 pub struct BusSummary {
     /// Name of the bus.
     pub name: String,
-    /// Kind of the bus: `socketcan` or `embedded`.
+    /// Kind of the bus: the name of a [`protocol::bus::BusKind`].
     pub kind: String,
     /// Size of the socket's receive buffer in bytes.
     pub receive_buffer: usize,

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use protocol::can::Format;
-use protocol::message::{ReceivedCounts, Heartbeat, Message, NetworkPage, Ports, RejectedCounts, Tree};
+use protocol::message::{Heartbeat, Message, NetworkPage, NetworkPages};
 use protocol::time::{Micros, Span};
 
 use crate::tracker::{AddressClaim, HeartbeatKind};
@@ -24,14 +24,8 @@ pub fn ranges(nodes: &[u8]) -> Vec<String> {
 pub struct ListedCell {
     /// The last heartbeat, with the identity and the state of the cell.
     pub heartbeat: Option<Heartbeat>,
-    /// Counters of the packets that the cell received.
-    pub heard: Option<ReceivedCounts>,
-    /// Counters of the packets that the cell refused.
-    pub refused: Option<RejectedCounts>,
-    /// The place of the cell in the tree.
-    pub tree: Option<Tree>,
-    /// The neighbours at the ports of the cell.
-    pub ports: Option<Ports>,
+    /// Its last other pages.
+    pub pages: NetworkPages,
     /// The serial number of another cell that claims this node id, or held it before.
     pub other: Option<u32>,
     claim: AddressClaim,
@@ -47,21 +41,16 @@ impl ListedCell {
     }
 
     fn record_page(&mut self, now: Micros, page: &NetworkPage) {
-        match *page {
-            NetworkPage::Heartbeat(heartbeat) => {
-                let before = self.claim.serial();
-                if matches!(self.claim.receive(now, &heartbeat), HeartbeatKind::Claimant | HeartbeatKind::Outsider) {
-                    self.other = Some(heartbeat.serial);
-                } else if before.is_some_and(|before| before != heartbeat.serial) {
-                    // The reports so far belong to the previous cell: start again.
-                    *self = Self { other: before, claim: self.claim, last: self.last, ..Self::default() };
-                }
-                self.heartbeat = self.claim.heartbeat();
+        self.pages.record(page);
+        if let NetworkPage::Heartbeat(heartbeat) = page {
+            let before = self.claim.serial();
+            if matches!(self.claim.receive(now, heartbeat), HeartbeatKind::Claimant | HeartbeatKind::Outsider) {
+                self.other = Some(heartbeat.serial);
+            } else if before.is_some_and(|before| before != heartbeat.serial) {
+                // The reports so far belong to the previous cell: start again.
+                *self = Self { other: before, claim: self.claim, last: self.last, ..Self::default() };
             }
-            NetworkPage::Received(heard) => self.heard = Some(heard),
-            NetworkPage::Rejected(refused) => self.refused = Some(refused),
-            NetworkPage::Tree(tree) => self.tree = Some(tree),
-            NetworkPage::Ports(ports) => self.ports = Some(ports),
+            self.heartbeat = self.claim.heartbeat();
         }
     }
 }
@@ -124,7 +113,7 @@ impl Listing {
 mod tests {
     use super::*;
     use protocol::id::{CellId, Node};
-    use protocol::message::State;
+    use protocol::message::{ReceivedCounts, RejectedCounts, State};
     use protocol::packet::Epoch;
 
     fn says(number: i64, page: NetworkPage) -> Message {
@@ -145,8 +134,8 @@ mod tests {
         listing.receive(Micros(20), Format::Classic, &says(4, NetworkPage::Rejected(RejectedCounts::default())));
         let cells: Vec<_> = listing.cells().collect();
         let [(3, third), (4, fourth)] = cells.as_slice() else { panic!("{cells:?}") };
-        assert_eq!((third.heartbeat, third.refused, third.tree), (Some(heartbeat), None, None));
-        assert_eq!((fourth.heartbeat, fourth.refused), (None, Some(RejectedCounts::default())));
+        assert_eq!((third.heartbeat, third.pages.rejected, third.pages.tree), (Some(heartbeat), None, None));
+        assert_eq!((fourth.heartbeat, fourth.pages.rejected), (None, Some(RejectedCounts::default())));
         assert_eq!(
             (third.age(Micros(110)), listing.number_of(7), listing.number_of(8)),
             (Span(100), Some(3), None)
@@ -162,7 +151,7 @@ mod tests {
             listing.receive(Micros(0), Format::Fd, &says(3, page));
         }
         let (_, cell) = listing.cells().next().unwrap();
-        assert_eq!((cell.other, cell.heard), (Some(7), None));
+        assert_eq!((cell.other, cell.pages.received), (Some(7), None));
     }
 
     #[test]

@@ -225,11 +225,11 @@ impl CellShown {
             skin: known.and_then(|known| known.compared(node, beat?)),
             sent: beat.map(|it| it.sent),
             refused: beat.map(|it| it.rejected),
-            heard: cell.heard,
-            refused_by: cell.refused,
-            tree: cell.tree.as_ref().map(TreeShown::of),
-            ports: cell.ports.map(|it| it.ports.iter().map(PortShown::of).collect()),
-            parent_changes: cell.ports.map(|it| it.changes),
+            heard: cell.pages.received,
+            refused_by: cell.pages.rejected,
+            tree: cell.pages.tree.as_ref().map(TreeShown::of),
+            ports: cell.pages.ports.map(|it| it.ports.iter().map(PortShown::of).collect()),
+            parent_changes: cell.pages.ports.map(|it| it.changes),
             other_serial: cell.other,
         }
     }

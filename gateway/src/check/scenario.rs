@@ -105,13 +105,7 @@ impl Plan {
                 named @ (Profile::HalfSine | Profile::Step | Profile::Ramp) => json!(named.name()),
             };
             let mut how = map([("force_n", json!(touch.force_n)), ("profile", profile)]);
-            let proximity = touch.proximity.to_f64();
-            if proximity > 0.0 {
-                how.extend(map([("proximity", json!((proximity * 1e4).round() / 1e4))]));
-            }
-            let temperature =
-                touch.temperature.map(|both| both.map(|one| (one.to_f64() * 1e2).round() / 1e2));
-            how.extend(temperature.map(|both| ("temperature_c".to_owned(), json!(both))));
+            how.extend(touch.felt.listed().map(|(key, value)| (key.to_owned(), value)));
             events.extend(on_cells(skin, touch.at, length(touch.length), "touch", &touch.cells, &how));
         }
         for fault in &scenario.faults {

@@ -5,13 +5,12 @@ use model::decode::parameter;
 use model::decode::pick::Party;
 use model::scenario::contact_words;
 use protocol::fixed::{Q, Q1_14, Q5_10};
-use protocol::id::Kind;
 use protocol::message::{AppliesFrom, Joints, Message, Request, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
-use protocol::schema::packets;
 
 use super::addressee::addressee;
+use super::others::{OtherDatagrams, layouts};
 use super::sensing;
 
 #[derive(Debug, Subcommand)]
@@ -80,15 +79,8 @@ pub(super) struct Stimulus {
     /// The two temperatures in degrees Celsius
     #[arg(long, num_args = 2, value_names = ["T1", "T2"], allow_negative_numbers = true)]
     temperature: Option<Vec<String>>,
-    /// Acceleration in g, instead of a touch
-    #[arg(
-        long,
-        num_args = 3,
-        value_names = ["X", "Y", "Z"],
-        allow_negative_numbers = true,
-        conflicts_with_all = ["force", "proximity", "temperature"]
-    )]
-    acceleration: Option<Vec<String>>,
+    #[command(flatten)]
+    others: OtherDatagrams,
     /// Take effect with the joints of this epoch [default: with the next joints]
     #[arg(long, value_name = "E")]
     epoch: Option<u8>,
@@ -190,23 +182,24 @@ impl Positions {
 
 impl Stimulus {
     fn message(&self) -> Result<Message, String> {
-        let page = match &self.acceleration {
-            Some(texts) => SensorPage::Acceleration(several("--acceleration", "acceleration_g", texts)?),
-            None => SensorPage::Skin(SkinSensors {
-                contact: self.force.as_deref().map_or(Ok([Q5_10::ZERO; 3]), contact)?,
-                proximity: self
-                    .proximity
-                    .as_deref()
-                    .map_or(Ok(Q1_14::ZERO), |text| contact_state("--proximity", "proximity", text))?,
-                temperature: several(
-                    "--temperature",
-                    "temperature_c",
-                    self.temperature.as_deref().unwrap_or_default(),
-                )?,
-            }),
-        };
-        let from = self.epoch.map_or(AppliesFrom::Next, |epoch| AppliesFrom::Epoch(Epoch(epoch)));
-        Ok(Message::Stimulus { to: self.cell.node, from, page })
+        let (to, from) = (self.cell.node, self.epoch.map_or(AppliesFrom::Next, |epoch| AppliesFrom::Epoch(Epoch(epoch))));
+        if let Some((number, words)) = self.others.page()? {
+            let page = SensorPage::of_stimulus(number, words).map_err(|error| error.to_string())?;
+            return Ok(Message::Stimulus { to, from, page });
+        }
+        let page = SensorPage::Skin(SkinSensors {
+            contact: self.force.as_deref().map_or(Ok([Q5_10::ZERO; 3]), contact)?,
+            proximity: self
+                .proximity
+                .as_deref()
+                .map_or(Ok(Q1_14::ZERO), |text| contact_state("--proximity", "proximity", text))?,
+            temperature: several(
+                "--temperature",
+                "temperature_c",
+                self.temperature.as_deref().unwrap_or_default(),
+            )?,
+        });
+        Ok(Message::Stimulus { to, from, page })
     }
 }
 
@@ -232,9 +225,7 @@ fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) 
 
 /// Parses a value of a sensor field.
 fn contact_state<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
-    let layouts =
-        packets().iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| &schema.layouts);
-    let field = layouts.flat_map(|layout| &layout.fields).find(|field| field.name == name);
+    let field = layouts().flat_map(|layout| &layout.fields).find(|field| field.name == name);
     let field = field.ok_or_else(|| format!("{option}: cells measure no {name}"))?;
     let word = value(option, text, |text| parameter::real(text).and_then(|_| parameter::read(field, text)))?;
     Ok(Q::from_bits(word))

@@ -12,7 +12,7 @@ use protocol::time::Micros;
 
 use self::bus::LiveBus;
 pub use self::recent::{DecodedFrame, RecentFrames, TorqueExplanation};
-pub use self::said::{TorqueReply, BusStatus, DeadCell, CellDetail, Gains, StatusMessage, TreePlace};
+pub use self::said::{TorqueReply, BusStatus, DeadCell, CellDetail, Gains, Reading, StatusMessage, TreePlace};
 use crate::pressed::{CellKey, TouchRegistry};
 use protocol::message::SkinSensors;
 

@@ -85,6 +85,12 @@ function where(scene, { bus, node }) {
   ];
 }
 
+// A field of a sensors page, by the schema.
+function reading({ name, unit, decimals, values }) {
+  const title = name[0].toUpperCase() + name.slice(1);
+  return [unit ? `${title}, ${unit}` : title, values.map((v) => v.toFixed(decimals).replace("-", "−")).join(", ")];
+}
+
 function detail(scene, it, ask) {
   const joints = scene.chains[scene.buses[it.bus].chain].rows.filter((row) => row.joint !== null).map((row) => scene.joints[row.joint]);
   const wrong = it.configuration[0] !== null && it.configuration[0] !== it.configuration[1];
@@ -96,9 +102,7 @@ function detail(scene, it, ask) {
     ["Gains α", it.gains.alpha.map(String).join(", ") + " N"],
     ["Thresholds", it.gains.thresholds.map((value, at) => `${Number(value.toPrecision(3))}${[" N", "", " N"][at]}`).join(", ")],
     ["Force", `${it.force_n.toFixed(3)} N`],
-    ["Contact, N", it.contact_n.map((v) => v.toFixed(3)).join(" + ")],
-    ["Proximity", it.proximity.toFixed(3)],
-    ["Temperature", `${it.temperature_c.map((v) => v.toFixed(1)).join(", ")} °C`],
+    ...it.readings.map(reading),
     ["Replies in time", `${it.replies[1]} of ${it.replies[0]}`],
     ["Packets lost, restarts", `${it.lost}, ${it.restarts}`, it.lost ? "bad" : ""],
   ];

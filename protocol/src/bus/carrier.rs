@@ -14,6 +14,11 @@ pub(super) trait Carrier {
     /// buffer as the kernel counts it.
     fn open(&self, name: &str, options: &BusOptions) -> Result<(CanFdSocket, usize), BusError>;
 
+    /// Returns the name under which a process serves the bus.
+    fn served_as(&self, name: &str) -> String {
+        name.to_owned()
+    }
+
     /// Replaces the filters.
     fn set_filters(&self, bus: &Bus, filters: &[Filter]) -> Result<(), BusError>;
 

@@ -34,7 +34,34 @@ impl BusKind {
         }
     }
 
-    /// Returns the name of the kind as used in sentences.
+    /// Returns the names of all kinds as text: `socketcan or embedded`.
+    #[must_use]
+    pub fn names() -> String {
+        let [first @ .., last] = Self::ALL.map(Self::name);
+        format!("{} or {last}", first.join(", "))
+    }
+
+    /// Returns the help of an option for the kind of one bus.
+    #[must_use]
+    pub fn help() -> String {
+        let names = Self::names();
+        format!("{names}; else SocketCAN if there is an interface of this name, else the embedded bus")
+    }
+
+    /// Returns true for network interfaces of the kernel; buses of all other kinds are sockets that a process
+    /// serves.
+    #[must_use]
+    pub const fn is_interface(self) -> bool {
+        matches!(self, Self::SocketCan)
+    }
+
+    /// Returns the name under which a process serves a bus of this kind.
+    #[must_use]
+    pub fn served_as(self, name: &str) -> String {
+        self.carrier().served_as(name)
+    }
+
+    /// Returns the name of the kind in sentences.
     #[must_use]
     pub const fn display_name(self) -> &'static str {
         match self {
@@ -70,8 +97,17 @@ pub enum KindChoice {
 }
 
 impl KindChoice {
-    /// Returns the kind for the bus of this name. For [`Choice::Auto`], the kind depends on the network interfaces that
-    /// exist at the time of the call.
+    /// Returns the kind of a bus that a process serves for this choice.
+    #[must_use]
+    pub const fn served(self) -> BusKind {
+        match self {
+            Self::Only(kind) if !kind.is_interface() => kind,
+            Self::Only(_) | Self::Auto => BusKind::Embedded,
+        }
+    }
+
+    /// Returns the kind of the bus of this name, which for [`Choice::Auto`] depends on the interfaces that
+    /// exist now.
     #[must_use]
     pub fn resolve(self, name: &str) -> BusKind {
         match self {
@@ -93,7 +129,7 @@ impl fmt::Display for KindChoice {
 
 /// The error for a word that does not name a kind of bus.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
-#[error("{got:?} is not a kind of bus: use auto, socketcan or embedded")]
+#[error("{got:?} is not a kind of bus: use auto, {}", BusKind::names())]
 pub struct UnknownKind {
     /// The rejected word.
     pub got: String,

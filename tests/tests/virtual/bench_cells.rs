@@ -277,7 +277,7 @@ fn a_cell_that_hung_takes_the_stimuli_of_meanwhile_and_refuses_none() {
     bench.run_epochs(5);
     assert_eq!(status(&bench, CELL), Status::Quiet);
     finish(&mut bench);
-    assert_eq!(bench.gateway.table.cells()[CELL].pages().refused.unwrap().stimuli, 0);
+    assert_eq!(bench.gateway.table.cells()[CELL].pages().rejected.unwrap().stimuli, 0);
 }
 
 #[test]

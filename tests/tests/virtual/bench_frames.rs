@@ -69,7 +69,7 @@ fn joints_that_come_twice_are_answered_once() {
     assert_eq!((replies(&bench).missing, replies(&bench).unasked), (0, 0));
     assert_eq!(events(&bench, Event::RepeatedTorque) + events(&bench, Event::StaleTorque), 0);
     for cell in bench.gateway.table.cells() {
-        assert_eq!(cell.pages().heard.unwrap().joints_repeated, 50);
+        assert_eq!(cell.pages().received.unwrap().joints_repeated, 50);
         assert_eq!(cell.unanswered(), Some((0, 0)));
     }
 }
@@ -172,7 +172,7 @@ fn a_late_stimulus_holds_from_the_next_joints_on_and_is_counted() {
         bench.run_epochs(2);
     }
     finish(&mut bench);
-    assert_eq!(bench.gateway.table.cells()[0].pages().heard.unwrap().stimuli_late, 20);
+    assert_eq!(bench.gateway.table.cells()[0].pages().received.unwrap().stimuli_late, 20);
     assert_eq!(replies(&bench).missing, 0);
     assert!(bench.gateway.table.accuracy().single.max() < 1e-3, "both sides take it at the same joints");
 }
@@ -278,7 +278,7 @@ fn cells_reassemble_segments_as_the_gateway_does() {
         finish(&mut bench);
         let cell = &bench.gateway.table.cells()[0];
         let (skipped, unheard) = cell.unanswered().unwrap();
-        assert!(cell.pages().refused.unwrap().incomplete > 0);
+        assert!(cell.pages().rejected.unwrap().incomplete > 0);
         assert_eq!((skipped, unheard), (0, cell.replies.missing));
         assert!(bench.gateway.table.accuracy().single.max() < 1e-3);
     }

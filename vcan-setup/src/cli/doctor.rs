@@ -26,8 +26,7 @@ pub(crate) struct Doctor {
     /// Names of buses, or skin files, which end in .toml or contain a '/'
     #[arg(value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
-    /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
-    #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto)]
+    #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     bus_kind: KindChoice,
     /// Expect cells that run already, or real ones, as `skinbus run --no-spawn` does
     #[arg(long)]
@@ -42,8 +41,8 @@ impl Doctor {
         let mut buses = named(&self.what, BusFacts::of_skin, BusFacts::named)?;
         let present = match (query(), self.bus_kind) {
             (Ok((_, present)), _) => present,
-            // The embedded bus needs no interface.
-            (Err(_), KindChoice::Only(BusKind::Embedded)) => Vec::new(),
+            // Only SocketCAN needs an interface.
+            (Err(_), KindChoice::Only(kind)) if !kind.is_interface() => Vec::new(),
             (Err(_), KindChoice::Auto) if !has_socketcan() => Vec::new(),
             (Err(failure), _) => return Err(failure),
         };

@@ -4,7 +4,7 @@ use std::os::unix::net::UnixStream;
 use std::time::Duration;
 
 use clap::Args;
-use protocol::bus::KindChoice;
+use protocol::bus::{BusKind, KindChoice};
 use protocol::id::CellId;
 use protocol::usage::{Failure, print_text};
 use protocol::wire_time::BitRates;
@@ -54,8 +54,7 @@ pub(crate) struct Slcan {
     /// Begin without unavailable lines, and open them later
     #[arg(long)]
     wait: bool,
-    /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
-    #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto)]
+    #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     bus_kind: KindChoice,
     /// Print the counts of all frames as JSON
     #[arg(long)]

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use protocol::bus::{BusError, KindChoice, check_name};
+use protocol::bus::{BusError, BusKind, KindChoice, check_name};
 
 /// Join a bus here with those of the same name on other hosts, until SIGINT or SIGTERM
 ///
@@ -35,8 +35,8 @@ pub struct LinkOptions {
     /// This host's name among the others; by default the machine's name
     #[arg(long, value_name = "NAME")]
     pub host: Option<String>,
-    /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
-    #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto)]
+    /// The requested kind of the bus.
+    #[arg(long, value_name = "KIND", default_value_t = KindChoice::Auto, help = BusKind::help())]
     pub bus_kind: KindChoice,
     /// Print the counts of all frames as JSON
     #[arg(long)]

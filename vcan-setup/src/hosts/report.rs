@@ -54,9 +54,10 @@ pub struct HostReport {
 /// Returns the address at which the link of a bus listens. `directory` is that of embedded buses, `None` for the
 /// default.
 fn address(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<SocketAddr> {
-    let place = match kind {
-        BusKind::Embedded => directory.map_or_else(default_directory, Path::to_owned),
-        _ => PathBuf::new(),
+    let place = if kind.is_interface() {
+        PathBuf::new()
+    } else {
+        directory.map_or_else(default_directory, Path::to_owned)
     };
     let mut name = format!("skinbus-link {bus} {}", place.display()).into_bytes();
     if name.len() > NAME {

@@ -2,6 +2,7 @@
 //! them.
 
 use protocol::can::Format;
+use protocol::message::SensorPage;
 use protocol::packet::Length;
 use protocol::parameters::Sensing;
 use protocol::skin::{SkinReply, Skin};
@@ -11,9 +12,12 @@ use super::response::{Response, Stream, response};
 
 /// Period of heartbeats, in ns.
 const HEARTBEAT_NS: u64 = 250_000_000;
-/// With sensors on, an acceleration frame follows every fourth heartbeat.
-const ACCELERATION_NS: u64 = 4 * HEARTBEAT_NS;
-/// Share of the broadcast period that `skinbus skin generate` gives to the slots of sums, in percent.
+/// With sensors on, the pages other than the skin's follow every fourth heartbeat.
+const OTHERS_NS: u64 = 4 * HEARTBEAT_NS;
+/// Number of these pages.
+#[expect(clippy::cast_possible_truncation, reason = "a few pages")]
+const OTHERS: u32 = SensorPage::SIMULATED.len() as u32 - 1;
+/// Share of the period that `skinbus skin generate` gives to slots, in percent.
 const SLOTS_SHARE: u64 = 75;
 
 /// The answers of a bus's cells to joints, if all cells are in contact.
@@ -202,22 +206,22 @@ impl Case {
             Stream { count, period_ns, jitter_ns, frame_ns: self.frame_of_ns(length) }
         };
         let stream = |senders, period_ns, jitter_ns| of(Length::Six, senders, period_ns, jitter_ns);
-        let none = stream(0, ACCELERATION_NS, early_ns);
-        let acceleration = stream(cells, ACCELERATION_NS, early_ns);
-        let [page_0, page_1] = match self.sensing {
+        let none = stream(0, OTHERS_NS, early_ns);
+        let others = stream(cells.saturating_mul(OTHERS), OTHERS_NS, early_ns);
+        let [page_0, others] = match self.sensing {
             Sensing::Off => [none; 2],
             Sensing::Continuous { period_ms } => {
                 let period_ns = u64::from(period_ms) * 1_000_000;
                 let early_ns = if period_ns > self.period_ns { early_ns } else { 0 };
-                [stream(cells, period_ns, early_ns), acceleration]
+                [stream(cells, period_ns, early_ns), others]
             }
-            Sensing::Event => [stream(cells, HEARTBEAT_NS, early_ns), acceleration],
+            Sensing::Event => [stream(cells, HEARTBEAT_NS, early_ns), others],
         };
         [
             of(self.length, 1, self.period_ns, 0),
             of(self.length, cells, self.period_ns, answers_jitter_ns),
             page_0,
-            page_1,
+            others,
             stream(cells, HEARTBEAT_NS, early_ns),
         ]
     }
@@ -226,8 +230,8 @@ impl Case {
     /// changes.
     #[must_use]
     pub fn load(&self) -> Load {
-        let [joints, answers, page_0, page_1, heartbeats] = self.streams(0).map(|it| it.load());
-        Load { joints, answers, sensors: page_0 + page_1, heartbeats }
+        let [joints, answers, page_0, others, heartbeats] = self.streams(0).map(|it| it.load());
+        Load { joints, answers, sensors: page_0 + others, heartbeats }
     }
 
     /// Returns the worst-case times.

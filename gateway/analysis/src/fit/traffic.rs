@@ -5,7 +5,7 @@
 
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Node};
-use protocol::message::{Message, NetworkPage, SensorPage, State};
+use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::Epoch;
 use protocol::time::Micros;
 use serde::Serialize;
@@ -103,10 +103,14 @@ pub struct Traffic {
     owed: Vec<PendingReplies>,
 }
 
-/// Answers that a cell still owes to sync and report: a heartbeat, sensors page 0, sensors page 1, the tree page.
-type PendingReplies = [bool; 4];
-/// The index of the tree page in [`Owed`].
-const TREE: usize = 3;
+/// Outstanding replies of a cell to sync and report that it also sends at other times.
+#[derive(Clone, Copy, Debug, Default)]
+struct PendingReplies {
+    heartbeat: bool,
+    tree: bool,
+    /// Bit n is set for page n of the sensors.
+    sensors: u8,
+}
 
 impl Traffic {
     /// Returns true if most of the frames that may be packets are packets of this protocol; a random frame is one with
@@ -152,43 +156,48 @@ impl Traffic {
             Message::Configure { .. } | Message::Configured { .. } => says(RunEvent::Preparation),
             Message::Stimulus { .. } => bench(BenchFrame::Stimulus),
             Message::Sync => {
-                self.cells().iter_mut().for_each(|[heartbeat, ..]| *heartbeat = true);
+                self.cells().iter_mut().for_each(|owed| owed.heartbeat = true);
                 bench(BenchFrame::Sync)
             }
             Message::Report => ClassifiedFrame { says: RunEvent::Preparation, ..bench(BenchFrame::Report) },
-            Message::Sensors { from, page: SensorPage::Skin(_), .. } => self.page(*from, 1),
-            Message::Sensors { from, page: SensorPage::Acceleration(_), .. } => self.page(*from, 2),
-            Message::Sensors { page: SensorPage::Baseline(_), .. } => ClassifiedFrame::OTHER,
+            Message::Sensors { from, page, .. } if page.simulated().is_some() => self.page(*from, |owed| {
+                let bit = 1 << page.number();
+                let is_owed = owed.sensors & bit != 0;
+                owed.sensors &= !bit;
+                is_owed
+            }),
+            Message::Sensors { .. } => ClassifiedFrame::OTHER,
             Message::Network { from, page, .. } => {
-                let Node::Cell(from) = from else { return ClassifiedFrame::OTHER };
-                match page {
-                    NetworkPage::Heartbeat(heartbeat) if heartbeat.state.has(State::CLAIMING) => {
-                        // A starting cell leaves sync and report unanswered.
-                        self.take(*from);
+                let Node::Cell(from) = *from else { return ClassifiedFrame::OTHER };
+                if let NetworkPage::Heartbeat(heartbeat) = page {
+                    let owed = self.take(from);
+                    // A starting cell leaves sync and report unanswered.
+                    if heartbeat.state.has(State::CLAIMING) {
                         says(RunEvent::Preparation)
+                    } else if owed.heartbeat {
+                        bench(BenchFrame::Sync)
+                    } else {
+                        ClassifiedFrame::OTHER
                     }
-                    NetworkPage::Heartbeat(_) => {
-                        let [heartbeat, ..] = self.take(*from);
-                        if heartbeat { bench(BenchFrame::Sync) } else { ClassifiedFrame::OTHER }
+                } else if page.is_only_reported() {
+                    // The pages that are also sent at other times follow the counters.
+                    if let (NetworkPage::Received(_) | NetworkPage::Rejected(_), Some(owed)) =
+                        (page, self.cells().get_mut(from.index()))
+                    {
+                        (owed.sensors, owed.tree) = (u8::MAX, true);
                     }
-                    // A cell sends these pages only on a report command; the other pages follow.
-                    NetworkPage::Received(_) | NetworkPage::Rejected(_) => {
-                        let owed = self.cells().get_mut(from.index());
-                        owed.into_iter().for_each(|[_, pages @ ..]| *pages = [true; 3]);
-                        bench(BenchFrame::Report)
-                    }
-                    NetworkPage::Ports(_) => bench(BenchFrame::Report),
-                    NetworkPage::Tree(_) => self.page(*from, TREE),
+                    bench(BenchFrame::Report)
+                } else {
+                    self.page(from, |owed| std::mem::take(&mut owed.tree))
                 }
             }
         }
     }
 
-    /// Sorts a page that a cell sends in answer to a report command and also at other times.
-    fn page(&mut self, from: CellId, page: usize) -> ClassifiedFrame {
-        let owed = self.cells().get_mut(from.index()).and_then(|owed| owed.get_mut(page));
-        let owed = owed.map(std::mem::take).unwrap_or(false);
-        ClassifiedFrame { bench: owed.then_some(BenchFrame::Report), ..ClassifiedFrame::OTHER }
+    /// Classifies a page that a cell sends on a report command and also at other times.
+    fn page(&mut self, from: CellId, take: impl FnOnce(&mut PendingReplies) -> bool) -> ClassifiedFrame {
+        let is_owed = self.cells().get_mut(from.index()).is_some_and(take);
+        ClassifiedFrame { bench: is_owed.then_some(BenchFrame::Report), ..ClassifiedFrame::OTHER }
     }
 
     /// Returns the answers that a cell still owes, and clears them.
@@ -206,7 +215,7 @@ impl Traffic {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-    use protocol::message::{ReceivedCounts, Heartbeat, RejectedCounts, SkinSensors, Tree};
+    use protocol::message::{ReceivedCounts, Heartbeat, RejectedCounts, SensorPage, SkinSensors, Tree};
 
     fn said(traffic: &mut Traffic, format: Format, message: &Message) -> Vec<Option<BenchFrame>> {
         message.encode().frames(format).map(|frame| traffic.sort(0, &frame).bench).collect()

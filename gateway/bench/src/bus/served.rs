@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 
-use protocol::bus::{Bus, BusError, BusKind, KindChoice, BusOptions};
+use protocol::bus::{Bus, BusError, KindChoice, BusOptions};
 use thiserror::Error;
 
 use crate::processes::{LaunchError, apart, wait_or_kill, program, spawn};
@@ -54,7 +54,7 @@ impl ServedBus {
         self.child.id()
     }
 
-    /// Name of the bus.
+    /// Name under which the bus is served: [`protocol::bus::BusKind::served_as`].
     #[must_use]
     pub fn bus(&self) -> &str {
         &self.bus
@@ -128,21 +128,22 @@ pub fn open_or_serve_all(
         begun.push(match opened {
             Err(_) if is_served => {
                 let program = program("vcan-setup")?;
-                Err(ServedBus::begin(&program, name, target.directory.as_deref())
+                let name = kind.served().served_as(name);
+                Err(ServedBus::begin(&program, &name, target.directory.as_deref())
                     .map(|served| (program, served))?)
             }
             opened => Ok(opened?),
         });
     }
     let (mut opened, mut all_served) = (Vec::with_capacity(buses.len()), Vec::new());
-    for ((name, _, target), begun) in buses.iter().zip(begun) {
+    for ((name, kind, target), begun) in buses.iter().zip(begun) {
         opened.push(match begun {
             Ok(bus) => bus,
             Err((program, mut served)) => {
                 served.wait(&program)?;
                 all_served.push(served);
-                // Name the kind, because an interface of this name may have appeared since.
-                Bus::open(name, KindChoice::Only(BusKind::Embedded), target)?
+                // Not by the user's choice: an interface of this name may have appeared meanwhile.
+                Bus::open(name, KindChoice::Only(kind.served()), target)?
             }
         });
     }

@@ -19,10 +19,8 @@ use model::decode::Decoded;
 pub enum ReplyKind {
     /// A torque packet.
     Torque,
-    /// A sensor packet, page 0.
-    Skin,
-    /// A sensor packet, page 1.
-    Acceleration,
+    /// A sensor packet with this page.
+    Sensors(u8),
 }
 
 /// Kind of a difference.
@@ -119,8 +117,7 @@ impl SentValue {
             &Self::Words(what, words) => {
                 let (kind, count) = match what {
                     ReplyKind::Torque => (Kind::Torque, 1),
-                    ReplyKind::Skin => (Kind::Sensors, 0),
-                    ReplyKind::Acceleration => (Kind::Sensors, 1),
+                    ReplyKind::Sensors(page) => (Kind::Sensors, page),
                 };
                 let packet = Packet { id: Id::new(kind, Node::Cell(cell)), words, epoch, count };
                 Message::decode(&packet)
@@ -138,7 +135,7 @@ impl SentValue {
                 Some((words.padded().map(|word| Some(word.into())), units.torque_format()))
             }
             Self::Sum(own) => Some((own.steps, TorqueFormat::Q7_8)),
-            Self::Words(ReplyKind::Skin | ReplyKind::Acceleration, ..) | Self::Answer(..) => None,
+            Self::Words(ReplyKind::Sensors(_), ..) | Self::Answer(..) => None,
         }
     }
 }

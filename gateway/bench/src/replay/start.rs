@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError, BusKind, KindChoice, Filter, KindChoices, BusOptions as BusOptions};
+use protocol::bus::{Bus, BusError, KindChoice, Filter, KindChoices, BusOptions as BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Message, Request};
@@ -196,8 +196,8 @@ pub(super) fn open(
                 opened => (opened?, None),
             },
         };
-        // Wires are simulated by frames on virtual buses only.
-        let has_wires = options.hears() && (bus.kind() == BusKind::Embedded || bus.is_virtual()?);
+        // Real buses have real wires.
+        let has_wires = options.hears() && (!bus.kind().is_interface() || bus.is_virtual()?);
         let root = spawned_skin.filter(|_| has_wires).and_then(|(skin, bus)| RootWires::for_bus(skin, bus));
         let (own, wired) = (of_ours.is_some(), root.is_some());
         roots.push(root);

@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{BusKind, KindChoices};
+use protocol::bus::KindChoices;
 use protocol::id::{CellId, Node};
 use protocol::message::Message;
 use protocol::packet::Epoch;
@@ -130,7 +130,7 @@ impl Bench<'_> {
         if cells.is_empty() {
             return Ok(());
         }
-        let embedded = self.bus_links.iter().any(|bus_link| bus_link.link.kind == BusKind::Embedded);
+        let embedded = self.bus_links.iter().any(|bus_link| !bus_link.link.kind.is_interface());
         Err(RunError::CellsThere { cells, embedded })
     }
 

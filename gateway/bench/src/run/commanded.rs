@@ -3,7 +3,6 @@
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use protocol::bus::BusKind;
 use protocol::skin::{Cell, Skin};
 use vcan_setup::link::InterfaceKind;
 use vcan_setup::netlink::Netlink;
@@ -132,19 +131,18 @@ impl Bench<'_> {
 
     fn switch_bus(&mut self, down: bool, bus: usize) -> Result<(), CommandError> {
         let link = &self.bus_links.get(bus).ok_or(CommandError::NoBus)?.link;
-        match link.kind {
-            BusKind::Embedded => {
-                let served = self.served.iter_mut().find(|served| served.bus() == link.name);
-                let served = served.ok_or(CommandError::NotServed)?;
-                if down {
-                    served.stop();
-                } else {
-                    *served = serve(self.options, &link.name)?;
-                }
-                Ok(())
-            }
-            BusKind::SocketCan => switch_interface(&link.name, down),
+        if link.kind.is_interface() {
+            return switch_interface(&link.name, down);
         }
+        let name = link.kind.served_as(&link.name);
+        let served = self.served.iter_mut().find(|served| served.bus() == name);
+        let served = served.ok_or(CommandError::NotServed)?;
+        if down {
+            served.stop();
+        } else {
+            *served = serve(self.options, &name)?;
+        }
+        Ok(())
     }
 
     fn state(&self, remote: &RemoteControl, measured: &LoopTotals) -> BenchState {

@@ -208,7 +208,7 @@ fn linked(
     bus: Bus,
 ) -> Result<(ReceiveEnd, Slot), RunError> {
     let name = &described.name;
-    if described.reply != SkinReply::Torque && bus.kind() == BusKind::SocketCan && !bus.is_virtual()? {
+    if described.reply != SkinReply::Torque && bus.kind().is_interface() && !bus.is_virtual()? {
         return Err(RunError::RealWires(name.clone()));
     }
     if !options.quiet {

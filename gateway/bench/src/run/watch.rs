@@ -30,7 +30,7 @@ use crate::summary::{PrivateMemory, Summary};
 use crate::threads::{ThreadError, spawn};
 use control::cycle::turn::{TimedRecord, TickDriver};
 use control::external::Absence;
-use model::scenario::{FaultKind, Stimulus, Touches};
+use model::scenario::{FaultKind, Touches};
 use model::table::Notice;
 
 /// Number of epochs by which stimuli are sent ahead of the epoch that latches them; a cell queues at most 8.
@@ -224,7 +224,7 @@ impl Bench<'_> {
             let epoch = script.epoch.max(broadcasts);
             let numbered = self.first_epoch.advanced_by(epoch.to_le_bytes()[0]);
             for stimulus in script.touches.changes(script.epoch.checked_sub(1), epoch) {
-                self.stimulate(&stimulus, AppliesFrom::Epoch(numbered))?;
+                self.stimulate((stimulus.bus, stimulus.node), stimulus.pages(), AppliesFrom::Epoch(numbered))?;
             }
             if let Some(accelerations) = &script.accelerations {
                 let now = seconds(&script.touches, epoch);
@@ -252,17 +252,22 @@ impl Bench<'_> {
         let touched =
             script.touches.cells().filter_map(|place| Some((place, self.options.skin.cells.get(place)?)));
         for (cell, &Cell { bus, node, .. }) in touched.filter(|(_, cell)| selects(cell)) {
-            let sensors = script.touches.sensors(cell, script.epoch.saturating_sub(1));
-            self.stimulate(&Stimulus { cell, bus, node, sensors }, AppliesFrom::Next)?;
+            let pages = script.touches.pages(cell, script.epoch.saturating_sub(1));
+            self.stimulate((bus, node), pages, AppliesFrom::Next)?;
         }
         Ok(())
     }
 
-    fn stimulate(&self, stimulus: &Stimulus, from: AppliesFrom) -> Result<(), RunError> {
-        let page = SensorPage::Skin(stimulus.sensors);
-        let message = Message::Stimulus { to: Node::Cell(stimulus.node), from, page };
-        // The receiver tracks the cells' contact states from the frames that the bus carried, including these.
-        self.send_all(&[(stimulus.bus, message)])
+    fn stimulate(
+        &self,
+        (bus, node): (usize, CellId),
+        pages: impl Iterator<Item = SensorPage>,
+        from: AppliesFrom,
+    ) -> Result<(), RunError> {
+        let to = Node::Cell(node);
+        let messages: Vec<_> = pages.map(|page| (bus, Message::Stimulus { to, from, page })).collect();
+        // The cells' contact state follows the frames that the bus carried.
+        self.send_all(&messages)
     }
 
     /// Injects the scenario's process faults at their times.

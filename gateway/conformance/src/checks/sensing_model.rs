@@ -1,7 +1,7 @@
 //! A model of event mode (SENSE-7, SENSE-8 and SENSE-9), which predicts the sensors pages that a cell must send.
 
 use protocol::fixed::{Q, Q3_12};
-use protocol::message::{SensorPage, SkinSensors};
+use protocol::message::{Readings, SensorPage, SkinSensors};
 use protocol::parameters::Events;
 
 /// The state of contact or of proximity in event mode.
@@ -39,8 +39,8 @@ impl Touch {
 #[derive(Clone, Debug)]
 pub(super) struct Model {
     events: Events,
-    latched: (SkinSensors, [Q3_12; 3]),
-    sent: (SkinSensors, [Q3_12; 3]),
+    latched: Readings,
+    sent: Readings,
     contact: Touch,
     proximity: Touch,
 }
@@ -48,7 +48,7 @@ pub(super) struct Model {
 impl Model {
     /// Creates the state at a switch to event mode, if all latched values are 0.
     pub(super) fn new(events: Events) -> Self {
-        let nothing = (SkinSensors::default(), [Q3_12::ZERO; 3]);
+        let nothing = Readings::default();
         let mut model =
             Self { events, latched: nothing, sent: nothing, contact: Touch::Free, proximity: Touch::Free };
         model.follow();
@@ -56,11 +56,11 @@ impl Model {
     }
 
     pub(super) const fn sent_skin(&self) -> SkinSensors {
-        self.sent.0
+        self.sent.skin
     }
 
     pub(super) const fn sent_acceleration(&self) -> [Q3_12; 3] {
-        self.sent.1
+        self.sent.acceleration
     }
 
     /// Returns a description of the states of contact and proximity, for a message.
@@ -75,28 +75,20 @@ impl Model {
 
     /// Takes the values of a page that the cell sent as its last sent ones.
     pub(super) const fn sends(&mut self, page: &SensorPage) {
-        match *page {
-            SensorPage::Skin(skin) => self.sent.0 = skin,
-            SensorPage::Acceleration(acceleration) => self.sent.1 = acceleration,
-            SensorPage::Baseline(_) => {}
-        }
+        self.sent.set(page);
     }
 
     /// Returns true if a page equals the latched values.
     pub(super) fn has(&self, page: &SensorPage) -> bool {
-        match *page {
-            SensorPage::Skin(skin) => self.latched.0 == skin,
-            SensorPage::Acceleration(acceleration) => self.latched.1 == acceleration,
-            // The model has no baseline.
-            SensorPage::Baseline(_) => false,
-        }
+        // The model has no baseline.
+        self.latched.pages().contains(page)
     }
 
     /// Updates the states of contact and proximity from the latched values, and returns true if one has changed.
     fn follow(&mut self) -> bool {
         let before = (self.contact, self.proximity);
         let hysteresis = i64::from(self.events.hysteresis.to_bits());
-        let skin = self.latched.0;
+        let skin = self.latched.skin;
         let sum: i64 = skin.contact.iter().map(|word| i64::from(word.to_bits())).sum();
         self.contact = self.contact.next(sum, self.events.contact.to_bits().into(), hysteresis);
         let proximity = skin.proximity.to_bits().into();
@@ -111,9 +103,10 @@ impl Model {
         acceleration: Option<[Q3_12; 3]>,
     ) -> (Vec<u8>, &'static str) {
         let before = self.latched;
-        self.latched = (skin, acceleration.unwrap_or(self.latched.1));
+        self.latched.skin = skin;
+        self.latched.acceleration = acceleration.unwrap_or(self.latched.acceleration);
         let turned = self.follow();
-        let (now, sent, events) = (self.latched.0, self.sent.0, self.events);
+        let (now, sent, events) = (self.latched.skin, self.sent.skin, self.events);
         let has_moved = |from: &SkinSensors| {
             is_far(&now.contact, &from.contact, events.contact)
                 || is_far(&now.temperature, &from.temperature, events.temperature)
@@ -124,12 +117,13 @@ impl Model {
         if now != sent && (turned || moved) {
             pages.push(0);
         }
-        if is_far(&self.latched.1, &self.sent.1, events.acceleration) {
+        if is_far(&self.latched.acceleration, &self.sent.acceleration, events.acceleration) {
             pages.push(1);
         }
-        let far = |from: &[Q3_12; 3]| is_far(&self.latched.1, from, events.acceleration);
+        let far = |from: &[Q3_12; 3]| is_far(&self.latched.acceleration, from, events.acceleration);
         // The difference to the last latched values is not the difference to the last sent ones.
-        let by_sent = moved != has_moved(&before.0) || far(&before.1) != far(&self.sent.1);
+        let by_sent =
+            moved != has_moved(&before.skin) || far(&before.acceleration) != far(&self.sent.acceleration);
         let id = match (by_sent, turned && !moved) {
             (true, _) => "SENSE-8",
             (false, true) => "SENSE-9",

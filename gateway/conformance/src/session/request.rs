@@ -2,7 +2,7 @@
 
 use model::decode::Decoded;
 use protocol::id::Node;
-use protocol::message::{Answer, ReceivedCounts as HeardPage, Message, NetworkPage, RejectedCounts, Request, SensorPage};
+use protocol::message::{Answer, ReceivedCounts as HeardPage, Message, NetworkPage, Readings, RejectedCounts, Request};
 use protocol::packet::{Epoch, WORDS, padded_words};
 use protocol::parameters::{Parameter, Parameters};
 use protocol::time::{Micros, Span};
@@ -49,26 +49,30 @@ impl core::fmt::Display for Counters {
     }
 }
 
-/// The names of the pages that answer a report, in their order.
-const REPORT_PAGES: [&str; 6] = ["network 1", "network 2", "sensors 0", "sensors 1", "network 3", "network 4"];
+/// The network pages that answer a report; the simulated sensors pages follow them.
+const REPORT_PAGES: [u8; 2] = [1, 2];
+/// The further network pages of a cell with ports.
+const REPORT_OF_PORTS: [u8; 2] = [3, 4];
 
-fn page_name(message: &Message) -> &'static str {
+/// Returns the names of the pages that answer a report, in order.
+fn report_of(has_ports: bool) -> Vec<String> {
+    let network = |pages: &[u8]| pages.iter().map(|page| format!("network {page}")).collect::<Vec<_>>();
+    let sensors = Readings::default().pages().map(|page| format!("sensors {}", page.number()));
+    let of_ports = if has_ports { network(&REPORT_OF_PORTS) } else { Vec::new() };
+    network(&REPORT_PAGES).into_iter().chain(sensors).chain(of_ports).collect()
+}
+
+fn page_name(message: &Message) -> String {
+    let kind = message.id().kind.name();
     if let Message::Network { page, .. } = message {
-        match page {
-            NetworkPage::Heartbeat(_) => "heartbeat",
-            NetworkPage::Received(_) => "network 1",
-            NetworkPage::Rejected(_) => "network 2",
-            NetworkPage::Tree(_) => "network 3",
-            NetworkPage::Ports(_) => "network 4",
+        match page.number() {
+            0 => "heartbeat".to_owned(),
+            number => format!("{kind} {number}"),
         }
     } else if let Message::Sensors { page, .. } = message {
-        match page {
-            SensorPage::Skin(_) => "sensors 0",
-            SensorPage::Acceleration(_) => "sensors 1",
-            SensorPage::Baseline(_) => "sensors 3",
-        }
+        format!("{kind} {}", page.number())
     } else {
-        message.id().kind.name()
+        kind.to_owned()
     }
 }
 
@@ -226,7 +230,7 @@ impl Session<'_> {
     pub(crate) fn has_ports(&mut self) -> Result<bool, StopReason> {
         self.begin_exchange();
         let asked = self.send_messages(&[Message::Report])?;
-        let pages = self.collect(asked, REPORT_PAGES.len())?;
+        let pages = self.collect(asked, report_of(true).len())?;
         let is_of_ports = |page: &NetworkPage| matches!(page, NetworkPage::Tree(_) | NetworkPage::Ports(_));
         Ok(pages.iter().any(|it| matches!(&it.message, Message::Network { page, .. } if is_of_ports(page))))
     }
@@ -242,11 +246,10 @@ impl Session<'_> {
 
     /// Returns the pages of a report that was requested at a time.
     pub(crate) fn pages(&mut self, asked: Micros) -> Result<Vec<CellPacket>, StopReason> {
-        let expected = if self.about.ports { 6 } else { 4 };
-        let pages = self.collect(asked, expected + usize::from(self.known.adapts))?;
+        let order = report_of(self.about.ports);
+        let pages = self.collect(asked, order.len() + usize::from(self.known.adapts))?;
         if !self.known.senses {
             let names: Vec<_> = pages.iter().map(|it| page_name(&it.message)).collect();
-            let order = REPORT_PAGES.get(..expected).unwrap_or_default();
             self.check("CMD-4", names == order, || {
                 format!("a report was answered with {}, but must be answered with {}", names.join(", "), order.join(", "))
             });
@@ -260,10 +263,10 @@ impl Session<'_> {
         let (mut heard, mut refused) = (None, None);
         for answer in &report {
             if let Message::Network { page, .. } = answer.message {
-                match page {
-                    NetworkPage::Received(page) => heard = Some(page),
-                    NetworkPage::Rejected(page) => refused = Some(page),
-                    NetworkPage::Heartbeat(_) | NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
+                if let NetworkPage::Received(page) = page {
+                    heard = Some(page);
+                } else if let NetworkPage::Rejected(page) = page {
+                    refused = Some(page);
                 }
             }
         }

@@ -44,7 +44,7 @@ fn play(scenario: &str) -> Most {
     for tick in 0..scenario.duration.0 / 2_000 {
         if tick % per_broadcast == 0 {
             for stimulus in touches.stimuli_for(tick / per_broadcast) {
-                *sensors.get_mut(stimulus.cell).unwrap() = stimulus.sensors;
+                *sensors.get_mut(stimulus.cell).unwrap() = stimulus.readings.skin;
             }
             let joints: Vec<_> = arm.positions().map(|angle| Q1_14::from_radians(angle).unwrap()).to_vec();
             let frames = central.frames(&joints);

@@ -9,9 +9,9 @@
 //! resends, in this order: the configuration as it was written; resume; the stimuli latched before the last joints; the
 //! stimuli pending then; halt, if the cells were halted; the last joints; and all later inputs, as they were sent.
 
-use protocol::fixed::{Q1_14, Q3_12, Q5_10};
+use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node};
-use protocol::message::{AppliesFrom, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, Joints, Message, NetworkPage, Readings, Request, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
@@ -45,7 +45,7 @@ fn is_touched_from(contact_state: &ContactState, epoch: Epoch) -> Option<bool> {
 
 /// Returns the latched sensors pages that differ from those of a cell that has just started.
 fn pages(contact_state: &ContactState) -> impl Iterator<Item = SensorPage> {
-    let nothing = [SensorPage::Skin(SkinSensors::default()), SensorPage::Acceleration([Q3_12::ZERO; 3])];
+    let nothing = Readings::default().pages();
     contact_state.latched().map(|(page, ())| page).filter(move |page| !nothing.contains(page))
 }
 

@@ -6,7 +6,7 @@
 //! ```
 
 use protocol::fixed::Q9_6;
-use protocol::message::SkinSensors;
+use protocol::message::{Readings, SkinSensors};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use rand::{RngExt, SeedableRng};
@@ -24,8 +24,8 @@ const CREEP_S: [f64; 4] = [1.0, 10.0, 100.0, 1_000.0];
 pub(super) struct TrueInput {
     /// Total force of all touches on the cell, in N.
     pub(super) force_n: f64,
-    /// Proximity, and the temperature set by a touch.
-    pub(super) sensors: SkinSensors,
+    /// The values set by touches besides the force.
+    pub(super) readings: Readings,
     pub(super) is_warmed: bool,
     /// Offset in N that a fault adds to the reading.
     pub(super) added_n: f64,
@@ -39,8 +39,8 @@ pub(super) struct ImperfectSensors {
     seed: u64,
     period_s: f64,
     cells: Vec<CellSensors>,
-    /// The readings of all cells in the epoch before `next`.
-    words: Vec<SkinSensors>,
+    /// The readings of the epoch before `next`.
+    words: Vec<Readings>,
     next: u64,
 }
 
@@ -76,12 +76,12 @@ impl ImperfectSensors {
         let neighbours = skin.cells.iter().map(neighbours);
         let cells = neighbours.zip(0..).map(|(neighbours, index)| CellSensors::new(neighbours, seed, index));
         let period_s = 1.0 / skin.timing.broadcast_hz();
-        let words = vec![SkinSensors::default(); skin.cells.len()];
+        let words = vec![Readings::default(); skin.cells.len()];
         Self { sensors: sensors.clone(), seed, period_s, cells: cells.collect(), words, next: 0 }
     }
 
-    /// Returns the reading of each cell in the epoch before [`Self::next`]; the default reading before the first epoch.
-    pub(super) fn words(&self) -> &[SkinSensors] {
+    /// Returns the reading of each cell in the epoch before [`Self::next`]; the default before the first.
+    pub(super) fn words(&self) -> &[Readings] {
         &self.words
     }
 
@@ -95,7 +95,7 @@ impl ImperfectSensors {
         for (cell, index) in self.cells.iter_mut().zip(0..) {
             *cell = CellSensors::new(core::mem::take(&mut cell.neighbours), self.seed, index);
         }
-        self.words.fill(SkinSensors::default());
+        self.words.fill(Readings::default());
         self.next = 0;
     }
 
@@ -105,16 +105,17 @@ impl ImperfectSensors {
         for ((cell, there_is), words) in self.cells.iter_mut().zip(there).zip(&mut self.words) {
             let beside: f64 =
                 cell.neighbours.iter().filter_map(|&index| Some(there.get(index)?.force_n)).sum();
-            let mut sensors = there_is.sensors;
+            let mut readings = there_is.readings;
             if !there_is.is_warmed {
-                sensors.temperature = [Q9_6::nearest(ambient); 2];
+                readings.skin.temperature = [Q9_6::nearest(ambient); 2];
             }
-            let [temperature, _] = sensors.temperature;
+            let [temperature, _] = readings.skin.temperature;
             let errors = &self.sensors.force;
             let force_n = there_is.force_n + errors.crosstalk * beside;
             let read_n = cell.read(force_n, temperature.to_f64() - REFERENCE_C, errors, self.period_s);
             if !there_is.is_stuck {
-                *words = SkinSensors { contact: contact_words(read_n + there_is.added_n), ..sensors };
+                let contact = contact_words(read_n + there_is.added_n);
+                *words = Readings { skin: SkinSensors { contact, ..readings.skin }, ..readings };
             }
         }
         self.next += 1;

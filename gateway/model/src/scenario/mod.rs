@@ -7,6 +7,7 @@
 mod check;
 mod curve;
 mod faults;
+mod felt;
 mod force;
 mod measured;
 mod names;
@@ -21,13 +22,13 @@ use core::f64::consts::TAU;
 use std::path::Path;
 
 use protocol::document::{self, DocumentError};
-use protocol::fixed::{Q1_14, Q9_6};
 use protocol::skin::{SKIN_KEYS, MAX_ROBOT_JOINTS, Skin};
 use protocol::time::{Micros, Span};
 use serde::{Deserialize, Serialize};
 
 use crate::accelerometer::RobotState;
 
+pub use felt::Felt;
 pub use force::{MAX_FORCE_N, contact_words};
 pub use sensors::{ForceErrors, REFERENCE_C, Sensors};
 pub use touches::{Stimulus, Touches};
@@ -162,10 +163,8 @@ pub struct Touch {
     pub force_n: f64,
     /// The course of the force.
     pub profile: Profile,
-    /// The proximity during the touch, 0 to 1.
-    pub proximity: Q1_14,
-    /// The temperatures of the touched cells, in °C.
-    pub temperature: Option<[Q9_6; 2]>,
+    /// The values besides the force.
+    pub felt: Felt,
 }
 
 /// The course of a touch's force over time.

@@ -1,13 +1,12 @@
 //! Checks the touches of a scenario's file.
 
 use protocol::document::{Checked, KeyPath, span_from_seconds};
-use protocol::fixed::{Q, Q1_14};
 use protocol::time::Span;
 
 use super::force::MAX_FORCE_N;
 use super::names::{CellSelection, NameTable};
 use super::times::{EndS, LONGEST_S, length};
-use super::{Profile, Touch, raw};
+use super::{Felt, Profile, Touch, raw};
 
 /// Checks the touches; returns them in the file's order.
 pub(super) fn touches(raw: &[raw::Touch], end: EndS, names: &NameTable<'_>) -> Checked<Vec<Touch>> {
@@ -25,14 +24,7 @@ fn touch(at: &KeyPath, raw: &raw::Touch, end: EndS, names: &NameTable<'_>) -> Ch
         raw::Profile::Word(word) => named(at, raw, word)?,
         raw::Profile::Points(points) => drawn(at, raw, points)?,
     };
-    if !(0.0..=1.0).contains(&raw.proximity) {
-        return Err(at.key("proximity").fault(raw.proximity, "0 (nothing near) to 1 are possible"));
-    }
-    let degrees = |got| at.key("temperature_c").to_fixed(got, Q::try_nearest);
-    let temperature = match raw.temperature_c {
-        Some([first, second]) => Some([degrees(first)?, degrees(second)?]),
-        None => None,
-    };
+    let felt = Felt::check(at, raw)?;
     let given = CellSelection { at, bus: raw.bus.as_deref(), cells: raw.cells.as_deref(), all: raw.all };
     Ok(Touch {
         at: end.moment(&at.key("at_s"), raw.at_s)?,
@@ -40,8 +32,7 @@ fn touch(at: &KeyPath, raw: &raw::Touch, end: EndS, names: &NameTable<'_>) -> Ch
         cells: names.cells(given)?,
         force_n,
         profile,
-        proximity: Q1_14::nearest(raw.proximity),
-        temperature,
+        felt,
     })
 }
 

@@ -1,6 +1,6 @@
 //! Warnings about scenarios that are valid but probably not intended.
 
-use protocol::message::SkinSensors;
+use protocol::message::{Readings, SkinSensors};
 use protocol::skin::{ControllerKind, Skin};
 use protocol::time::Span;
 
@@ -31,11 +31,9 @@ fn unused_controller(motion: MotionKind, skin: &Skin) -> Option<String> {
 
 /// Returns a warning if the force and the proximity of a touch are below the thresholds of all its cells.
 fn weak(touch: &Touch, skin: &Skin) -> Option<String> {
-    let sensors = SkinSensors {
-        contact: contact_words(touch.force_n),
-        proximity: touch.proximity,
-        temperature: touch.temperature.unwrap_or_default(),
-    };
+    let mut readings = Readings::default();
+    touch.felt.apply(&mut readings);
+    let sensors = SkinSensors { contact: contact_words(touch.force_n), ..readings.skin };
     let mut cells = touch.cells.iter().filter_map(|&cell| skin.cells.get(cell));
     let in_vain = touch.force_n > 0.0 && cells.all(|cell| force(&cell.contact, &sensors) <= 0.0);
     in_vain.then(|| {

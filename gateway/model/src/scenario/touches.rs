@@ -5,7 +5,7 @@
 //! epoch by epoch ([`Measured`]).
 
 use protocol::id::CellId;
-use protocol::message::SkinSensors;
+use protocol::message::{Readings, SensorPage, SkinSensors};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
@@ -23,11 +23,20 @@ pub struct Stimulus {
     pub bus: usize,
     /// Node id of the cell on that bus.
     pub node: CellId,
-    /// Sensor words of the cell.
-    pub sensors: SkinSensors,
+    /// Its readings.
+    pub readings: Readings,
+    /// The pages to send, by [`SensorPage::simulated`].
+    sent: [bool; SensorPage::SIMULATED.len()],
 }
 
-/// The touches of a scenario, by cell. A cell without a touch has [`SkinSensors::default`], as every cell has before
+impl Stimulus {
+    /// Returns the pages to send: those that changed.
+    pub fn pages(&self) -> impl Iterator<Item = SensorPage> {
+        self.readings.pages().into_iter().zip(self.sent).filter_map(|(page, is_sent)| is_sent.then_some(page))
+    }
+}
+
+/// The touches of a scenario, by cell. A cell without a touch has [`Readings::default`], as every cell has before
 /// the first epoch.
 #[derive(Clone, Debug)]
 pub struct Touches {
@@ -45,7 +54,9 @@ pub struct Touches {
     /// Scratch memory of [`Touches::changes`]; the next two fields are, too.
     changed: Vec<Stimulus>,
     there: Vec<TrueInput>,
-    before: Vec<SkinSensors>,
+    before: Vec<Readings>,
+    /// The pages that touches set: the skin's, and others that differ from their default in some touch.
+    set: [bool; SensorPage::SIMULATED.len()],
 }
 
 /// A cell with touches or sensor faults.
@@ -98,7 +109,13 @@ impl Touches {
         if measured.is_none() {
             cells.retain(|touched| !touched.touches.is_empty() || !touched.faults.is_empty());
         }
+        let mut felt = Readings::default();
+        scenario.touches.iter().for_each(|touch| touch.felt.apply(&mut felt));
+        let mut set = differing(&Readings::default(), &felt);
+        let [of_skin, ..] = &mut set;
+        *of_skin = true;
         Self {
+            set,
             period_us: 1e6 / skin.timing.broadcast_hz(),
             levels: vec![[None; 2]; scenario.touches.len()],
             touches: scenario.touches.clone(),
@@ -140,13 +157,11 @@ impl Touches {
             self.measure(&mut measured, before);
             self.before.extend(measured.words());
         } else {
-            self.before.resize(self.cells.len(), SkinSensors::default());
+            self.before.resize(self.cells.len(), Readings::default());
         }
         self.measure(&mut measured, epoch);
         let words = self.cells.iter().zip(&self.before).zip(measured.words());
-        changed.extend(words.filter(|((_, before), now)| before != now).map(|((touched, _), now)| {
-            Stimulus { cell: touched.cell, bus: touched.bus, node: touched.node, sensors: *now }
-        }));
+        changed.extend(words.filter_map(|((touched, before), now)| touched.stimulus(before, now)));
         self.measured = Some(measured);
     }
 
@@ -172,10 +187,8 @@ impl Touches {
         for touch in touched.touches.iter().filter_map(|&index| self.touches.get(index)) {
             let Some(level) = self.level(touch, time) else { continue };
             there.force_n += level;
-            there.sensors.proximity = there.sensors.proximity.max(touch.proximity);
-            if let Some(temperature) = touch.temperature {
-                (there.sensors.temperature, there.is_warmed) = (temperature, true);
-            }
+            touch.felt.apply(&mut there.readings);
+            there.is_warmed |= touch.felt.temperature.is_some();
         }
         for wrong in touched.faults.iter().filter(|wrong| wrong.holds_at(time)) {
             match wrong.fault {
@@ -197,11 +210,9 @@ impl Touches {
             let [before, now] = if touched.faults.is_empty() {
                 this.words_of_levels(touched)?
             } else {
-                times.map(|time| time.map_or_else(SkinSensors::default, |time| this.words_at(touched, time)))
+                times.map(|time| time.map_or_else(Readings::default, |time| this.words_at(touched, time)))
             };
-            let stimulus =
-                Stimulus { cell: touched.cell, bus: touched.bus, node: touched.node, sensors: now };
-            (before != now).then_some(stimulus)
+            touched.stimulus(&before, &now)
         })
     }
 
@@ -213,6 +224,16 @@ impl Touches {
     /// Returns the sensor words of a cell in an epoch, to be sent again after a restart of the cell.
     #[must_use]
     pub fn sensors(&self, cell: usize, epoch: u64) -> SkinSensors {
+        self.readings(cell, epoch).skin
+    }
+
+    /// Returns all pages of a cell in an epoch that touches set, for a cell that has restarted.
+    pub fn pages(&self, cell: usize, epoch: u64) -> impl Iterator<Item = SensorPage> {
+        let pages = self.readings(cell, epoch).pages().into_iter();
+        pages.zip(self.set).filter_map(|(page, is_set)| is_set.then_some(page))
+    }
+
+    fn readings(&self, cell: usize, epoch: u64) -> Readings {
         if let Some(measured) = &self.measured {
             if measured.next() == epoch + 1 {
                 return measured.words().get(cell).copied().unwrap_or_default();
@@ -225,8 +246,8 @@ impl Touches {
             Ok(at) => self
                 .cells
                 .get(at)
-                .map_or_else(SkinSensors::default, |touched| self.words_at(touched, self.time_of(epoch))),
-            Err(_) => SkinSensors::default(),
+                .map_or_else(Readings::default, |touched| self.words_at(touched, self.time_of(epoch))),
+            Err(_) => Readings::default(),
         }
     }
 
@@ -255,9 +276,8 @@ impl Touches {
         touch.level(self.phase(time))
     }
 
-    /// Returns the words of a cell in the previous and in the present epoch, from the scratch memory; `None` if no
-    /// touch on it changed.
-    fn words_of_levels(&self, touched: &AffectedCell) -> Option<[SkinSensors; 2]> {
+    /// Returns the words before and now, from the scratch memory; `None` if no touch of this cell changed.
+    fn words_of_levels(&self, touched: &AffectedCell) -> Option<[Readings; 2]> {
         let levels = || touched.touches.iter().filter_map(|&index| Some((index, self.levels.get(index)?)));
         if levels().all(|(_, [before, now])| before == now) {
             return None;
@@ -267,8 +287,8 @@ impl Touches {
         Some([before, now])
     }
 
-    /// Returns the words of a cell at a time, including its sensor faults.
-    fn words_at(&self, touched: &AffectedCell, time: Micros) -> SkinSensors {
+    /// Returns the words of a cell at a time, with its faults.
+    fn words_at(&self, touched: &AffectedCell, time: Micros) -> Readings {
         let faults = || touched.faults.iter().filter(|wrong| wrong.holds_at(time));
         // A stuck sensor keeps its value from the start of the fault.
         let stuck = faults().filter(|wrong| wrong.fault == SensorFault::Stuck).map(|wrong| wrong.at).min();
@@ -284,18 +304,34 @@ impl Touches {
         self.words(levels, drift.sum())
     }
 
-    /// Combines touches: forces add up, the nearest touch gives the proximity, and the last touch in the file gives the
-    /// temperature.
-    fn words(&self, levels: impl Iterator<Item = (usize, Option<f64>)>, mut force_n: f64) -> SkinSensors {
-        let mut sensors = SkinSensors::default();
+    /// Combines touches: forces add up, the other values as by [`super::Felt`].
+    fn words(&self, levels: impl Iterator<Item = (usize, Option<f64>)>, mut force_n: f64) -> Readings {
+        let mut readings = Readings::default();
         for (index, level) in levels {
             let (Some(touch), Some(level)) = (self.touches.get(index), level) else { continue };
             force_n += level;
-            sensors.proximity = sensors.proximity.max(touch.proximity);
-            sensors.temperature = touch.temperature.unwrap_or(sensors.temperature);
+            touch.felt.apply(&mut readings);
         }
-        SkinSensors { contact: contact_words(force_n), ..sensors }
+        readings.skin.contact = contact_words(force_n);
+        readings
     }
+}
+
+impl AffectedCell {
+    /// Returns the stimulus for a change of readings, if there is one.
+    fn stimulus(&self, before: &Readings, now: &Readings) -> Option<Stimulus> {
+        let &Self { cell, bus, node, .. } = self;
+        (before != now).then(|| Stimulus { cell, bus, node, readings: *now, sent: differing(before, now) })
+    }
+}
+
+/// Returns the pages that differ, by [`SensorPage::simulated`].
+fn differing(before: &Readings, now: &Readings) -> [bool; SensorPage::SIMULATED.len()] {
+    let mut differ = [false; SensorPage::SIMULATED.len()];
+    for ((differ, before), now) in differ.iter_mut().zip(before.pages()).zip(now.pages()) {
+        *differ = before != now;
+    }
+    differ
 }
 
 impl TimedSensorFault {

@@ -1,7 +1,7 @@
 //! The gateway's state of one cell of a bus.
 
 use protocol::id::CellId;
-use protocol::message::{Answer, AppliesFrom, Heartbeat, SensorPage, SkinSensors, State};
+use protocol::message::{Answer, AppliesFrom, Heartbeat, NetworkPages, Readings, SensorPage, SkinSensors, State};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::{Events, LinksDown, Parameter, Parameters};
@@ -16,7 +16,7 @@ use super::sensed::SensorFrames;
 use super::sent::SentJoints;
 use super::status::Status;
 use super::switched::{SWITCHES, Switch, SwitchStates};
-use crate::tracker::{Contact, Pages, CellTracker, Update, Uplink, HeartbeatKind};
+use crate::tracker::{Contact, CellTracker, Update, Uplink, HeartbeatKind};
 
 /// The packets that a cell has sent since they were requested.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -115,7 +115,7 @@ impl CellState {
 
     /// Returns the last page of each kind since the cell started.
     #[must_use]
-    pub const fn pages(&self) -> &Pages {
+    pub const fn pages(&self) -> &NetworkPages {
         self.tracked.pages()
     }
 
@@ -160,7 +160,7 @@ impl CellState {
     /// Records the cell's receive counters. `passed` is the number of joints that were sent while the page was on its
     /// way. Later pages are compared with the first one since a start.
     pub(super) fn report(&mut self, passed: u64) {
-        let heard = self.pages().heard;
+        let heard = self.pages().received;
         self.sent.report(heard, passed);
         heard.iter().for_each(|heard| self.contact.count(heard.stimuli, ()));
     }
@@ -219,7 +219,13 @@ impl CellState {
         !self.tracked.is_dead() && !self.halt.halted && claim.is_settled() && claim.has_state(State::CONFIGURED)
     }
 
-    /// Records a stimulus for the cell on the bus; `last` is the epoch of the last joints.
+    /// Returns the newest sensor values by the stimuli and pages received; the default for unknown ones.
+    #[must_use]
+    pub fn readings(&self) -> Readings {
+        self.contact.readings()
+    }
+
+    /// Records a stimulus on the bus; `last` is the epoch of the last joints.
     pub(super) fn stimulate(&mut self, from: AppliesFrom, page: SensorPage, last: Option<Epoch>) {
         self.contact.push(from, page, (), last);
     }
@@ -388,7 +394,7 @@ impl CellState {
     /// sent to the cell that it does not report as received. Returns `None` before the cell's first report.
     #[must_use]
     pub fn unanswered(&self) -> Option<(u64, u64)> {
-        self.sent.unanswered(self.pages().heard)
+        self.sent.unanswered(self.pages().received)
     }
 
     /// Records that the bus was lost: replies that were due may have been sent and lost.

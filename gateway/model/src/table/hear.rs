@@ -101,25 +101,22 @@ impl Table {
             self.snapshot.sums.dead -= 1;
             self.notices.push_back(Notice::Back(cell.node));
         }
-        let is_answer = matches!(
-            message,
-            Message::Sensors { .. }
-                | Message::Network { page: NetworkPage::Received(_) | NetworkPage::Rejected(_), .. }
-        );
+        let is_answer = if let Message::Network { page, .. } = message {
+            page.is_only_reported()
+        } else {
+            matches!(message, Message::Sensors { .. })
+        };
         if !is_answer {
             cell.sensed.end_report();
         }
         if let Message::Network { epoch, page, .. } = *message {
-            match page {
-                NetworkPage::Heartbeat(heartbeat) => {
-                    self.take_heartbeat(at, place, &update, &heartbeat, epoch)
-                }
-                NetworkPage::Received(_) => {
-                    cell.sensed.answer_report();
-                    cell.report(self.broadcast.as_ref().map_or(0, |newest| newest.broadcasts_since(epoch)));
-                }
-                NetworkPage::Rejected(_) => cell.said.counters = true,
-                NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
+            if let NetworkPage::Heartbeat(heartbeat) = page {
+                self.take_heartbeat(at, place, &update, &heartbeat, epoch);
+            } else if let NetworkPage::Received(_) = page {
+                cell.sensed.answer_report();
+                cell.report(self.broadcast.as_ref().map_or(0, |newest| newest.broadcasts_since(epoch)));
+            } else if let NetworkPage::Rejected(_) = page {
+                cell.said.counters = true;
             }
         } else if let Message::Sensors { epoch, page, .. } = *message {
             let is_newest = self.broadcast.as_ref().is_none_or(|broadcast| broadcast.epoch == epoch);

@@ -21,42 +21,33 @@ pub struct SensorFrames {
     unrequested: u64,
     /// Arrival times of the first and the last frame that was sent without a report command.
     span: Option<(Micros, Micros)>,
-    /// The kinds of pages that are still expected in answer to a report command.
-    requested: [bool; KINDS],
+    /// The pages that are still expected in answer to a report command: bit n for page n.
+    requested: u8,
 }
 
-/// Number of kinds of sensors pages.
-const KINDS: usize = 3;
 /// Minimum number of frames for a rate.
 const MIN_RATE_FRAMES: u64 = 3;
 /// Minimum time for a rate.
 const MIN_RATE_SPAN: Span = Span::from_millis(1_000);
 
-/// Returns the index of a page's kind in [`Sensed`].
-const fn kind(page: &SensorPage) -> usize {
-    match page {
-        SensorPage::Skin(_) => 0,
-        SensorPage::Acceleration(_) => 1,
-        SensorPage::Baseline(_) => 2,
-    }
-}
-
 impl SensorFrames {
     /// Records a report command: the cell answers with one page of each kind at once.
     pub(super) const fn answer_report(&mut self) {
-        self.requested = [true; KINDS];
+        self.requested = u8::MAX;
     }
 
     /// Ends the answer to a report command, because it is complete or its remaining pages were lost.
     pub(super) const fn end_report(&mut self) {
-        self.requested = [false; KINDS];
+        self.requested = 0;
     }
 
     /// Records a sensors frame.
     pub(super) fn record(&mut self, at: Micros, page: &SensorPage, events: &Events) {
         self.frames += 1;
-        let requested = self.requested.get_mut(kind(page)).is_some_and(core::mem::take);
-        if !requested {
+        let bit = 1 << page.number();
+        let is_requested = self.requested & bit != 0;
+        self.requested &= !bit;
+        if !is_requested {
             self.unrequested += 1;
             let (first, _) = *self.span.get_or_insert((at, at));
             self.span = Some((first, at));

@@ -23,13 +23,14 @@ const MIN_EXPECTED_CHANGES: u32 = 4;
 /// Smallest change of an expected word that counts, in steps of the word.
 const MIN_CHANGE_STEPS: u16 = 16;
 
-/// Kinds of words that may be stuck, in the order of [`Stuck::longest`].
-const NAMES: [&str; 3] = ["torque", "skin", "acceleration"];
+/// Name of the torques in [`Stuck::longest`]; pages have their own.
+const TORQUE: &str = "torque";
 
 /// The words that a cell sends in torques and sensors pages, compared with the expected ones.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct StuckDetector {
-    kinds: [WordRun; NAMES.len()],
+    torque: WordRun,
+    pages: [WordRun; SensorPage::SIMULATED.len()],
 }
 
 /// The words of one kind that a cell sends, compared with the expected ones.
@@ -70,43 +71,28 @@ impl WordRun {
 impl StuckDetector {
     /// Compares a torque that was due with the central torque `right`.
     pub(super) fn take_torque(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
-        let [torque, ..] = &mut self.kinds;
-        torque.take(sent, right);
+        self.torque.take(sent, right);
     }
 
     /// Compares a sensors page of the cell with the page `right` that stimuli set. Pages of different kinds are not
     /// compared.
     pub(super) fn take_page(&mut self, sent: &SensorPage, right: &SensorPage) {
-        let [_, skin, acceleration] = &mut self.kinds;
-        let words = match (sent, right) {
-            (SensorPage::Skin(_), SensorPage::Skin(_)) => skin,
-            (SensorPage::Acceleration(_), SensorPage::Acceleration(_)) => acceleration,
-            (..) => return,
-        };
-        words.take(bits(sent), bits(right));
+        let page = sent.simulated().filter(|page| right.simulated() == Some(*page));
+        if let Some(words) = page.and_then(|page| self.pages.get_mut(page)) {
+            words.take(padded(&sent.words()), padded(&right.words()));
+        }
     }
 
     /// Returns true if the cell counts as stuck now.
     pub(super) fn is_now(&self) -> bool {
-        self.kinds.iter().any(WordRun::is_stuck)
+        self.torque.is_stuck() || self.pages.iter().any(WordRun::is_stuck)
     }
 
     /// Returns the kinds of words that were stuck, each with its longest run in words.
     pub(super) fn longest(&self) -> impl Iterator<Item = (&'static str, u64)> {
-        NAMES.into_iter().zip(self.kinds.map(|words| words.longest)).filter(|(_, longest)| *longest > 0)
-    }
-}
-
-/// Returns the words of a sensors page.
-fn bits(page: &SensorPage) -> [i16; MAX_JOINTS] {
-    match page {
-        SensorPage::Skin(skin) => {
-            let [a, b, c] = skin.contact.map(|word| word.to_bits());
-            let [warmth, inside] = skin.temperature.map(|word| word.to_bits());
-            padded(&[a, b, c, skin.proximity.to_bits(), warmth, inside])
-        }
-        SensorPage::Acceleration(xyz) => padded(&xyz.map(|word| word.to_bits())),
-        SensorPage::Baseline(_) => [0; MAX_JOINTS],
+        let pages = SensorPage::SIMULATED.into_iter().zip(self.pages.map(|words| words.longest));
+        let all = [(TORQUE, self.torque.longest)].into_iter().chain(pages);
+        all.filter(|(_, longest)| *longest > 0)
     }
 }
 

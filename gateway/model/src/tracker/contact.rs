@@ -10,8 +10,7 @@
 //!   129 joints; then a stimulus, or the cell's page ──> earlier stimuli are latched and replaced
 //! ```
 
-use protocol::fixed::Q3_12;
-use protocol::message::{AppliesFrom, SensorPage, SkinSensors};
+use protocol::message::{AppliesFrom, Readings, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 
 /// Maximum number of pending stimuli in a cell.
@@ -23,7 +22,8 @@ pub const MAX_PENDING_STIMULI: usize = 8;
 pub struct Contact<T> {
     waiting: Vec<(AppliesFrom, SensorPage, T)>,
     skin: Option<(SkinSensors, T)>,
-    acceleration: Option<([Q3_12; 3], T)>,
+    /// The other pages, by [`SensorPage::simulated`].
+    others: [Option<(SensorPage, T)>; SensorPage::SIMULATED.len()],
     obeys: Option<bool>,
     /// True if `skin` reflects all stimuli that the cell has received.
     is_known: bool,
@@ -71,7 +71,7 @@ impl<T> Default for Contact<T> {
         Self {
             waiting: Vec::new(),
             skin: None,
-            acceleration: None,
+            others: [const { None }; SensorPage::SIMULATED.len()],
             obeys: None,
             is_known: false,
             unseen: UnseenStimuli::Any,
@@ -103,13 +103,11 @@ impl<T> Contact<T> {
         };
         for (_, page, mut tag) in self.waiting.extract_if(.., is_due) {
             latched(&mut tag);
-            match page {
-                SensorPage::Skin(skin) => {
-                    self.skin = Some((skin, tag));
-                    self.is_known |= self.unseen == UnseenStimuli::None;
-                }
-                SensorPage::Acceleration(acceleration) => self.acceleration = Some((acceleration, tag)),
-                SensorPage::Baseline(_) => {}
+            if let SensorPage::Skin(skin) = page {
+                self.skin = Some((skin, tag));
+                self.is_known |= self.unseen == UnseenStimuli::None;
+            } else if let Some(other) = other(&mut self.others, &page) {
+                *other = Some((page, tag));
             }
         }
     }
@@ -118,17 +116,14 @@ impl<T> Contact<T> {
     /// than the joints at which the cell latched the next stimulus. It does not count while a stimulus that was not
     /// received here may be pending.
     pub fn apply_reported_page(&mut self, page: SensorPage, tag: T) {
-        match page {
-            SensorPage::Skin(skin) if !self.is_known && self.unseen == UnseenStimuli::None => {
+        if let SensorPage::Skin(skin) = page {
+            if !self.is_known && self.unseen == UnseenStimuli::None {
                 (self.skin, self.is_known) = (Some((skin, tag)), true);
+            } else if !self.is_short {
+                self.skin.get_or_insert((skin, tag));
             }
-            SensorPage::Skin(_) if self.is_short => {}
-            SensorPage::Skin(skin) => _ = self.skin.get_or_insert((skin, tag)),
-            SensorPage::Acceleration(acceleration) => {
-                _ = self.acceleration.get_or_insert((acceleration, tag))
-            }
-            // A baseline belongs to the computation and is not a reading.
-            SensorPage::Baseline(_) => {}
+        } else if let Some(other) = other(&mut self.others, &page) {
+            other.get_or_insert((page, tag));
         }
     }
 
@@ -184,7 +179,15 @@ impl<T> Contact<T> {
     /// Returns all sensors pages of the cell, latched from stimuli or reported by the cell.
     pub fn latched(&self) -> impl Iterator<Item = (SensorPage, &T)> {
         let skin = self.skin.iter().map(|(skin, tag)| (SensorPage::Skin(*skin), tag));
-        skin.chain(self.acceleration.iter().map(|(xyz, tag)| (SensorPage::Acceleration(*xyz), tag)))
+        skin.chain(self.others.iter().flatten().map(|(page, tag)| (*page, tag)))
+    }
+
+    /// Returns the values of all latched or reported pages, and the default of others.
+    #[must_use]
+    pub fn readings(&self) -> Readings {
+        let mut readings = Readings::default();
+        self.latched().for_each(|(page, _)| readings.set(&page));
+        readings
     }
 
     /// Returns the pending stimuli in order, each with the joints at which the cell latches it.
@@ -196,14 +199,15 @@ impl<T> Contact<T> {
     /// Forgets the contact state and the pending stimuli: stimuli may have been lost, or sent by others.
     pub fn reset(&mut self) {
         self.waiting.clear();
-        (self.skin, self.acceleration) = (None, None);
+        (self.skin, self.others) = (None, [const { None }; SensorPage::SIMULATED.len()]);
         (self.is_known, self.unseen, self.received_stimuli) = (false, UnseenStimuli::Any, None);
         (self.is_short, self.clears) = (false, false);
     }
 
     /// Marks the contact state as unknown until the next stimulus; stimuli stay pending in the cell.
     pub fn forget(&mut self) {
-        (self.skin, self.acceleration, self.is_known, self.received_stimuli) = (None, None, false, None);
+        (self.skin, self.others) = (None, [const { None }; SensorPage::SIMULATED.len()]);
+        (self.is_known, self.received_stimuli) = (false, None);
     }
 
     /// Returns true if the cell is in test mode and obeys stimuli; `None` if unknown, in which case callers assume that
@@ -219,8 +223,16 @@ impl<T> Contact<T> {
     }
 }
 
-/// Returns true if a stimulus comes after the joints at which it should apply, so that the next joints latch it. `last`
-/// is the epoch of the last joints.
+/// Returns the place of a page; `None` for a baseline, which belongs to the computation and is not a reading.
+fn other<'a, T>(
+    others: &'a mut [Option<(SensorPage, T)>],
+    page: &SensorPage,
+) -> Option<&'a mut Option<(SensorPage, T)>> {
+    others.get_mut(page.simulated()?)
+}
+
+/// Returns true if the joints from which a stimulus should apply have passed, so that it applies from the next ones.
+/// `last` is the epoch of the last joints.
 #[must_use]
 pub fn is_late(from: AppliesFrom, last: Option<Epoch>) -> bool {
     matches!((from, last), (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0)
@@ -229,7 +241,7 @@ pub fn is_late(from: AppliesFrom, last: Option<Epoch>) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::fixed::Q5_10;
+    use protocol::fixed::{Q3_12, Q5_10};
 
     fn press(newtons: f64) -> SensorPage {
         SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(newtons); 3], ..SkinSensors::default() })

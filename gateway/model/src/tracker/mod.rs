@@ -17,7 +17,7 @@ mod contact;
 mod per_cell;
 mod uplink;
 
-use protocol::message::{ReceivedCounts, Message, NetworkPage, Ports, RejectedCounts, Tree};
+use protocol::message::{Message, NetworkPage, NetworkPages};
 use protocol::time::{Micros, Span};
 
 pub use claim::{AddressClaim, HeartbeatKind};
@@ -32,33 +32,7 @@ pub const DEAD_AFTER: Span = Span::from_millis(600);
 /// Maximum age of an answer, in broadcasts before the newest one; older answers are dropped.
 pub const MAX_LATE_EPOCHS: usize = 3;
 
-/// The last page of each kind that a cell has sent since it started.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Pages {
-    /// Counters of the packets that the cell received.
-    pub heard: Option<ReceivedCounts>,
-    /// Counters of the packets that the cell refused.
-    pub refused: Option<RejectedCounts>,
-    /// The place of the cell in the tree.
-    pub tree: Option<Tree>,
-    /// The neighbours at the ports of the cell.
-    pub ports: Option<Ports>,
-}
-
-impl Pages {
-    /// Records a page.
-    const fn take(&mut self, page: &NetworkPage) {
-        match *page {
-            NetworkPage::Heartbeat(_) => {}
-            NetworkPage::Received(heard) => self.heard = Some(heard),
-            NetworkPage::Rejected(refused) => self.refused = Some(refused),
-            NetworkPage::Tree(tree) => self.tree = Some(tree),
-            NetworkPage::Ports(ports) => self.ports = Some(ports),
-        }
-    }
-}
-
-/// The effect of a received packet on the state of its cell.
+/// The effect of a packet on a cell's state.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Update {
     /// The meaning of the packet as a heartbeat, if it is one.
@@ -77,7 +51,7 @@ pub struct CellTracker {
     /// Counts of packets that the cell sent and that arrived.
     pub account: Account,
     claim: AddressClaim,
-    pages: Pages,
+    pages: NetworkPages,
     last_packet: Option<Micros>,
     dead: bool,
 }
@@ -90,7 +64,7 @@ impl CellTracker {
         self.account.arrive();
         let Message::Network { page, .. } = message else { return Update { revived, ..Update::default() } };
         let NetworkPage::Heartbeat(heartbeat) = page else {
-            self.pages.take(page);
+            self.pages.record(page);
             if let NetworkPage::Tree(tree) = page {
                 self.account.sums_sent(tree.sent, joints);
             }
@@ -111,11 +85,11 @@ impl CellTracker {
             HeartbeatKind::Shared => {
                 taken_back = self.account.take_back(heartbeat.sent);
                 // Some pages may be from the other sender.
-                self.pages = Pages::default();
+                self.pages = NetworkPages::default();
             }
             HeartbeatKind::Started { again } => {
                 self.account.begin(heartbeat.sent, again);
-                self.pages = Pages::default();
+                self.pages = NetworkPages::default();
             }
             HeartbeatKind::Overtaken => self.account.pass_over(),
             HeartbeatKind::Claimant | HeartbeatKind::Outsider => self.account.count_outsider(),
@@ -133,7 +107,7 @@ impl CellTracker {
 
     /// Returns the last page of each kind since the cell started.
     #[must_use]
-    pub const fn pages(&self) -> &Pages {
+    pub const fn pages(&self) -> &NetworkPages {
         &self.pages
     }
 

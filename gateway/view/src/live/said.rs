@@ -3,8 +3,10 @@
 use bench::remote::BenchState;
 use model::table::{Event, Status};
 use protocol::fixed::is_saturated;
-use protocol::id::CellId;
+use protocol::id::{CellId, Id, Kind};
+use protocol::message::{Readings, SensorPage};
 use protocol::parameters::Contact;
+use protocol::schema::{FieldFormat, PacketSchema};
 use protocol::time::Micros;
 use serde::Serialize;
 
@@ -111,13 +113,9 @@ pub struct CellDetail {
     pub configuration: [Option<String>; 2],
     /// The gains and thresholds of the cell, from the skin.
     pub gains: Gains,
-    /// The contact forces that the cell's three sensors measure, in N.
-    pub contact_n: [f64; 3],
-    /// The proximity that the cell measures, 0 to 1.
-    pub proximity: f64,
-    /// The temperatures that the cell measures, in °C.
-    pub temperature_c: [f64; 2],
-    /// The force on the cell by Algorithm 1, in N.
+    /// The fields of its sensors pages.
+    pub readings: Vec<Reading>,
+    /// Its force by Algorithm 1, in N.
     pub force_n: f64,
     /// The last torque that the cell sent.
     pub torque: Option<TorqueReply>,
@@ -131,6 +129,39 @@ pub struct CellDetail {
     pub frames: Vec<DecodedFrame>,
     /// The explanation of the torque in the selected frame; null if that frame is no longer stored.
     pub why: Option<TorqueExplanation>,
+}
+
+/// A field of a sensors page, by the schema.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Reading {
+    /// The name, without the unit.
+    pub name: &'static str,
+    /// The unit.
+    pub unit: &'static str,
+    /// Digits after the decimal point.
+    pub decimals: usize,
+    /// The value of each element.
+    pub values: Vec<f64>,
+}
+
+impl Reading {
+    /// Returns the fields of a page. The total of a skin's page is left out: the force is shown by Algorithm 1.
+    fn from_page(page: SensorPage) -> impl Iterator<Item = Self> {
+        let bytes = page.words().map(i16::to_le_bytes);
+        let layout = PacketSchema::for_id(Id { kind: Kind::Sensors, node: 1 })
+            .and_then(|schema| schema.layouts.iter().find(|layout| layout.number == page.number()));
+        layout.into_iter().flat_map(move |layout| {
+            let fields = layout.fields.iter().filter(|field| !matches!(field.format, FieldFormat::Total(_)));
+            fields.map(move |field| Self {
+                name: field.bare_name(),
+                unit: &field.unit,
+                decimals: layout.decimals(field),
+                values: (0..field.elements())
+                    .map(|element| field.real(field.raw(bytes.as_flattened(), element)))
+                    .collect(),
+            })
+        })
+    }
 }
 
 /// The gains and thresholds of Algorithm 1.
@@ -239,9 +270,11 @@ impl Live {
                 Some(hash(cell.configuration)),
             ],
             gains: Gains::from_contact(skin_cell.contact),
-            contact_n: sensors.contact.map(|word| word.to_f64()),
-            proximity: sensors.proximity.to_f64(),
-            temperature_c: sensors.temperature.map(|word| word.to_f64()),
+            readings: Readings { skin: sensors, ..cell.readings() }
+                .pages()
+                .into_iter()
+                .flat_map(Reading::from_page)
+                .collect(),
             force_n,
             torque,
             replies: [cell.replies.due, cell.replies.in_time],

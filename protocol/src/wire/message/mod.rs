@@ -17,8 +17,8 @@ mod network;
 mod sensors;
 mod state;
 
-pub use network::{ReceivedCounts, Heartbeat, NetworkPage, PortState, Ports, RejectedCounts, Tree};
-pub use sensors::{BaselinePage, SensorPage, SkinSensors};
+pub use network::{ReceivedCounts, Heartbeat, NetworkPage, NetworkPages, PortState, Ports, RejectedCounts, Tree};
+pub use sensors::{BaselinePage, Readings, SensorPage, SkinSensors};
 pub use state::State;
 
 use core::ops::RangeInclusive;

@@ -147,7 +147,46 @@ impl PortState {
     }
 }
 
+/// The last page of each kind from one cell, besides its heartbeat.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct NetworkPages {
+    /// Counters of accepted packets.
+    pub received: Option<ReceivedCounts>,
+    /// Counters of rejected frames.
+    pub rejected: Option<RejectedCounts>,
+    /// Its place in the tree.
+    pub tree: Option<Tree>,
+    /// The state of its ports.
+    pub ports: Option<Ports>,
+}
+
+impl NetworkPages {
+    /// Records a page.
+    pub const fn record(&mut self, page: &NetworkPage) {
+        match *page {
+            NetworkPage::Heartbeat(_) => {}
+            NetworkPage::Received(counts) => self.received = Some(counts),
+            NetworkPage::Rejected(counts) => self.rejected = Some(counts),
+            NetworkPage::Tree(tree) => self.tree = Some(tree),
+            NetworkPage::Ports(ports) => self.ports = Some(ports),
+        }
+    }
+}
+
 impl NetworkPage {
+    /// Returns true for a page that a cell sends only in answer to a report command. A heartbeat and the tree
+    /// are also sent at other times.
+    #[must_use]
+    pub const fn is_only_reported(&self) -> bool {
+        !matches!(self, Self::Heartbeat(_) | Self::Tree(_))
+    }
+
+    /// Returns the number of the page.
+    #[must_use]
+    pub fn number(&self) -> u8 {
+        self.encode().0
+    }
+
     pub(super) fn decode(page: u8, words: [i16; WORDS]) -> Result<Self, MessageError> {
         let [a, b, c, d, e, f, ..] = words.map(i16::cast_unsigned);
         match page {

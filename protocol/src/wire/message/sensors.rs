@@ -46,7 +46,66 @@ pub struct SkinSensors {
     pub temperature: [Q9_6; 2],
 }
 
+/// The values of all simulated pages: the contact state of a cell.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Readings {
+    /// Page 0.
+    pub skin: SkinSensors,
+    /// Page 1: acceleration in g.
+    pub acceleration: [Q3_12; 3],
+}
+
+impl Readings {
+    /// Sets the values of a page. Other pages than simulated ones have no effect.
+    pub const fn set(&mut self, page: &SensorPage) {
+        match *page {
+            SensorPage::Skin(skin) => self.skin = skin,
+            SensorPage::Acceleration(acceleration) => self.acceleration = acceleration,
+            SensorPage::Baseline(_) => {}
+        }
+    }
+
+    /// Returns the simulated pages, in the order of [`SensorPage::SIMULATED`].
+    #[must_use]
+    pub const fn pages(&self) -> [SensorPage; SensorPage::SIMULATED.len()] {
+        [SensorPage::Skin(self.skin), SensorPage::Acceleration(self.acceleration)]
+    }
+}
+
 impl SensorPage {
+    /// The names of the simulated pages: those that a cell measures and a stimulus sets.
+    pub const SIMULATED: [&str; 2] = ["skin", "acceleration"];
+
+    /// Returns the index in [`Self::SIMULATED`]; `None` for a page that is only measured.
+    #[must_use]
+    pub const fn simulated(&self) -> Option<usize> {
+        match self {
+            Self::Skin(_) => Some(0),
+            Self::Acceleration(_) => Some(1),
+            Self::Baseline(_) => None,
+        }
+    }
+
+    /// Returns the page of a stimulus with these words.
+    ///
+    /// # Errors
+    /// Returns an error if a stimulus has no page of this number.
+    pub fn of_stimulus(number: u8, words: [i16; WORDS]) -> Result<Self, MessageError> {
+        Self::decode(Kind::Stimulus, number, words)
+    }
+
+    /// Returns the number of the page.
+    #[must_use]
+    pub fn number(&self) -> u8 {
+        self.encode().0
+    }
+
+    /// Returns the words of the page.
+    #[must_use]
+    pub fn words(&self) -> [i16; WORDS] {
+        self.encode().1
+    }
+
     pub(super) fn decode(kind: Kind, page: u8, words: [i16; WORDS]) -> Result<Self, MessageError> {
         let [a, b, c, d, e, f, ..] = words;
         match page {

@@ -153,7 +153,18 @@ pub struct Layout {
 }
 
 impl Layout {
-    /// Returns a copy of the layout for each page or parameter that it describes.
+    /// Returns the digits after the decimal point of a field in the text.
+    #[must_use]
+    pub fn decimals(&self, field: &Field) -> usize {
+        let pieces = self.text.iter().flat_map(|part| &part.pieces);
+        let of = |piece: &TextPiece| match piece {
+            TextPiece::Field { name, decimals } if *name == field.name => Some(*decimals),
+            TextPiece::Literal(_) | TextPiece::Field { .. } | TextPiece::Either { .. } => None,
+        };
+        pieces.filter_map(of).next().unwrap_or_default()
+    }
+
+    /// Returns one layout for each of its numbers.
     fn expand(&self) -> impl Iterator<Item = Self> {
         (0..self.times.unwrap_or(1)).map(|index| {
             let named = |text: &str| text.replace("{}", &(index + 1).to_string());

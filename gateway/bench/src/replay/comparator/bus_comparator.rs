@@ -395,26 +395,23 @@ impl BusComparator {
         let has_announced = self.announcements > 0;
         let found = || PresentCell { progress: Progress::found(has_announced), ..PresentCell::default() };
         let present = self.present.entry(cell).or_insert_with(found);
-        match *page {
-            NetworkPage::Heartbeat(heartbeat) => {
-                if matches!(present.claim.receive(Micros(0), &heartbeat), HeartbeatKind::Claimant | HeartbeatKind::Outsider) {
-                    return;
-                }
-                present.progress = present.progress.next(if reported == Some(self.announcements) {
-                    progress::Input::ReportsLast
-                } else {
-                    progress::Input::ReportsOther
-                });
-                if !present.claim.is_settled() {
-                    self.hear_parent(cell, epoch, None);
-                }
+        if let NetworkPage::Heartbeat(heartbeat) = page {
+            if matches!(present.claim.receive(Micros(0), heartbeat), HeartbeatKind::Claimant | HeartbeatKind::Outsider) {
+                return;
             }
-            NetworkPage::Received(heard) => {
-                let first = present.counters.map_or(heard, |(first, _)| first);
-                present.counters = Some((first, heard));
+            present.progress = present.progress.next(if reported == Some(self.announcements) {
+                progress::Input::ReportsLast
+            } else {
+                progress::Input::ReportsOther
+            });
+            if !present.claim.is_settled() {
+                self.hear_parent(cell, epoch, None);
             }
-            NetworkPage::Tree(tree) => self.hear_parent(cell, epoch, tree.parent),
-            NetworkPage::Rejected(_) | NetworkPage::Ports(_) => {}
+        } else if let NetworkPage::Received(counts) = *page {
+            let first = present.counters.map_or(counts, |(first, _)| first);
+            present.counters = Some((first, counts));
+        } else if let NetworkPage::Tree(tree) = page {
+            self.hear_parent(cell, epoch, tree.parent);
         }
     }
 

@@ -70,7 +70,7 @@ impl BusComparator {
                 }
                 let is_equal = match what {
                     ReplyKind::Torque => tally.compare_torque(&recorded, &now, tolerance),
-                    ReplyKind::Skin | ReplyKind::Acceleration => recorded == now,
+                    ReplyKind::Sensors(_) => recorded == now,
                 };
                 tally.equal += u64::from(is_equal);
                 (!is_equal).then_some(DifferenceKind::Different)

@@ -19,7 +19,7 @@ mod tally;
 use std::collections::BTreeMap;
 
 use protocol::id::{CellId, Node};
-use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage};
+use protocol::message::{Answer, Message, NetworkPage, Request};
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::{Parameter, Sensing};
 use protocol::schema::Units;
@@ -415,7 +415,7 @@ fn reply(message: &Message) -> Option<(CellId, Epoch, ReplyKind, Words)> {
     let (from, epoch, what) = if let Message::Torque { from, epoch, .. } = *message {
         (from, epoch, ReplyKind::Torque)
     } else if let Message::Sensors { from, epoch, page } = *message {
-        (from, epoch, if matches!(page, SensorPage::Skin(_)) { ReplyKind::Skin } else { ReplyKind::Acceleration })
+        (from, epoch, ReplyKind::Sensors(page.number()))
     } else {
         return None;
     };

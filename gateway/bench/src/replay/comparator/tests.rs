@@ -4,7 +4,7 @@ use crate::replay::survey::{TimeRange, Survey};
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
 use protocol::fixed::Q3_12;
-use protocol::message::{ReceivedCounts, Heartbeat, Joints, State as Flags, Tree};
+use protocol::message::{ReceivedCounts, Heartbeat, Joints, SensorPage, State as Flags, Tree};
 use protocol::packet;
 use protocol::parameters::Parameter as P;
 

@@ -117,7 +117,7 @@ fn changes_in_order_at_random_and_over_a_gap_are_the_same() {
     let mut words = [SkinSensors::default(); 3];
     for epoch in 0..150 {
         for change in each.stimuli_for(epoch) {
-            words[change.cell] = change.sensors;
+            words[change.cell] = change.readings.skin;
             assert_eq!(Some(change.node), CellId::new(i64::try_from(change.cell).unwrap() + 1).ok());
         }
         assert_eq!(words, [0, 1, 2].map(|cell| each.sensors(cell, epoch)));
@@ -125,7 +125,7 @@ fn changes_in_order_at_random_and_over_a_gap_are_the_same() {
     let mut gap = touches(text);
     let _ = gap.changes(None, 20).count();
     for change in gap.changes(Some(20), 149) {
-        assert_eq!(change.sensors, words[change.cell]);
+        assert_eq!(change.readings.skin, words[change.cell]);
     }
     assert_eq!(gap.sensors(1, 60), touches(text).sensors(1, 60), "back in time");
     assert_eq!(gap.sensors(1, 55), gap.sensors(1, 62), "stuck");

@@ -90,7 +90,7 @@ proptest! {
         let (mut before, mut epoch) = (None, 0);
         for step in steps {
             for stimulus in touches.changes(before, epoch) {
-                known[stimulus.cell] = stimulus.sensors;
+                known[stimulus.cell] = stimulus.readings.skin;
             }
             for (cell, known) in known.iter().enumerate() {
                 prop_assert_eq!(*known, touches.sensors(cell, epoch), "cell {}, epoch {}", cell, epoch);

@@ -49,15 +49,11 @@ impl Input {
             return Some((from, Self::Torque));
         }
         let Message::Network { from: Node::Cell(cell), epoch, page } = *message else { return None };
-        let input = match page {
-            NetworkPage::Received(ReceivedCounts { joints: 0, joints_late: 0, .. }) => Self::CountsNone { epoch },
-            NetworkPage::Received(_) => Self::CountsSome,
-            NetworkPage::Heartbeat(_)
-            | NetworkPage::Tree(_)
-            | NetworkPage::Rejected(_)
-            | NetworkPage::Ports(_) => Self::Sends { epoch },
+        let NetworkPage::Received(ReceivedCounts { joints, joints_late, .. }) = page else {
+            return Some((cell, Self::Sends { epoch }));
         };
-        Some((cell, input))
+        let none = joints == 0 && joints_late == 0;
+        Some((cell, if none { Self::CountsNone { epoch } } else { Self::CountsSome }))
     }
 }
 

@@ -1,0 +1,88 @@
+//! Options of a stimulus for the sensors pages other than the skin's, from the fields of the schema.
+
+use clap::{Arg, ArgMatches, Args, Command, Error, FromArgMatches};
+use model::decode::parameter;
+use protocol::id::Kind;
+use protocol::packet::WORDS;
+use protocol::schema::{Field, Layout, packets};
+
+/// Options of the page of the skin, which exclude all others.
+const OF_SKIN: [&str; 3] = ["force", "proximity", "temperature"];
+
+/// The values of one page.
+#[derive(Clone, Debug, Default)]
+pub(super) struct OtherDatagrams {
+    /// Each given field, with its texts.
+    given: Vec<(&'static Layout, &'static Field, Vec<String>)>,
+}
+
+/// Returns the layouts of the pages that a stimulus sets.
+pub(super) fn layouts() -> impl Iterator<Item = &'static Layout> {
+    packets().iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| &schema.layouts)
+}
+
+/// Returns the fields of the pages other than the skin's.
+fn fields() -> impl Iterator<Item = (&'static Layout, &'static Field)> {
+    let others = layouts().filter(|layout| layout.number != 0);
+    others.flat_map(|layout| layout.fields.iter().map(move |field| (layout, field)))
+}
+
+impl OtherDatagrams {
+    /// Returns the number and the words of the page, if one is given.
+    pub(super) fn page(&self) -> Result<Option<(u8, [i16; WORDS])>, String> {
+        let Some((layout, ..)) = self.given.first() else { return Ok(None) };
+        let mut words = [0; WORDS];
+        for (_, field, texts) in &self.given {
+            for (word, text) in words.iter_mut().skip(field.first_bit() / 16).zip(texts) {
+                let read = parameter::real(text).and_then(|_| parameter::read(field, text));
+                *word = read.map_err(|allowed| format!("--{} {text}: {allowed}", field.bare_name()))?;
+            }
+        }
+        Ok(Some((layout.number, words)))
+    }
+}
+
+impl FromArgMatches for OtherDatagrams {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, Error> {
+        let texts = |field: &Field| {
+            let texts = matches.get_many::<String>(field.bare_name())?;
+            Some(texts.cloned().collect())
+        };
+        let given = fields().filter_map(|(layout, field)| Some((layout, field, texts(field)?)));
+        Ok(Self { given: given.collect() })
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+impl Args for OtherDatagrams {
+    fn augment_args(command: Command) -> Command {
+        fields().fold(command, |command, (layout, field)| {
+            let name = field.bare_name();
+            let (first, rest) = name.split_at(name.chars().next().map_or(0, char::len_utf8));
+            // The names last as long as the program, as clap requires.
+            let labels: Vec<&'static str> = match field.labels.as_slice() {
+                [] => vec![first.to_uppercase().leak()],
+                labels => labels.iter().map(|label| &*label.to_uppercase().leak()).collect(),
+            };
+            let unit = if field.unit.is_empty() { String::new() } else { format!(" in {}", field.unit) };
+            let pages = fields().filter(|(other, _)| other.number != layout.number);
+            command.arg(
+                Arg::new(name)
+                    .long(name)
+                    .num_args(field.elements())
+                    .value_names(labels)
+                    .allow_negative_numbers(true)
+                    .conflicts_with_all(OF_SKIN.into_iter().chain(pages.map(|(_, field)| field.bare_name())))
+                    .help(format!("{}{rest}{unit}, instead of a touch", first.to_uppercase())),
+            )
+        })
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
