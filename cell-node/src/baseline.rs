@@ -13,7 +13,7 @@
 
 use protocol::fixed::{Q1_14, Q5_10, Q9_6};
 use protocol::message::{BaselinePage, SkinSensors};
-use protocol::parameters::{Baseline as Rule, Tare, BaselineSettings};
+use protocol::parameters::{Baseline as Rule, BaselineSettings, Tare};
 use protocol::touch::{Touch, contact_force};
 
 /// Number of consecutive joints messages with a steady reading before the first tare.
@@ -266,7 +266,8 @@ impl Baseline {
         if degrees.abs() <= MAX_LEARNING_SPAN && anchor.joints <= MAX_LEARNING_JOINTS && !self.is_limited {
             // Per 2 °C, with 14 fraction bits. From the second time on only half is applied, to limit the
             // effect of a single error.
-            let lacks = (self.base - anchor.base) >> (EXTRA_FRACTION_BITS + 10 - 14 + 1 + u32::from(self.is_n_per_c_known));
+            let lacks = (self.base - anchor.base)
+                >> (EXTRA_FRACTION_BITS + 10 - 14 + 1 + u32::from(self.is_n_per_c_known));
             self.is_n_per_c_known = true;
             let lacks = if degrees < 0 { -lacks } else { lacks };
             let n_per_c = i32::from(self.n_per_c.to_bits()) + lacks;

@@ -165,7 +165,10 @@ impl TorqueRounding {
     pub fn new(format: TorqueFormat, bound: u16) -> Self {
         // J F is at most the largest word, so rounding cannot exceed it.
         let largest = i64::from(i16::MAX) << (14 + 16 - format.fraction());
-        Self { format, max_unsaturated_force: i32::try_from(largest / i64::from(bound.max(1))).unwrap_or(i32::MAX) }
+        Self {
+            format,
+            max_unsaturated_force: i32::try_from(largest / i64::from(bound.max(1))).unwrap_or(i32::MAX),
+        }
     }
 }
 

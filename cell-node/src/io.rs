@@ -184,7 +184,11 @@ impl Cells {
     ///
     /// # Errors
     /// Always returns the reason for which the cells stopped.
-    pub fn run(&mut self, mut sockets: Sockets, line: &BusPort) -> Result<core::convert::Infallible, StopReason> {
+    pub fn run(
+        &mut self,
+        mut sockets: Sockets,
+        line: &BusPort,
+    ) -> Result<core::convert::Infallible, StopReason> {
         let mut now = self.clock.now();
         loop {
             match self.run_once(&mut sockets, now) {
@@ -278,7 +282,8 @@ impl Cells {
         let frame = &received.frame;
         if let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) {
             if let Some((place, port)) = self.subscriptions.port_for_link(link_id)
-                && let (Some(hosted_cell), Some(message)) = (self.cells.get_mut(place), link_id.decode_frame(frame))
+                && let (Some(hosted_cell), Some(message)) =
+                    (self.cells.get_mut(place), link_id.decode_frame(frame))
             {
                 hosted_cell.node.handle_port(now, age, port, message);
                 self.subscriptions_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);

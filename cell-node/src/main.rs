@@ -4,14 +4,14 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail, ensure};
-use cell_node::flash::{FlashState, FlashContent};
+use cell_node::flash::{FlashContent, FlashState};
 use cell_node::identity::Identity;
-use cell_node::io::{Cells, FlashFile, BusPort, LinkIds, Sockets, StopReason};
+use cell_node::io::{BusPort, Cells, FlashFile, LinkIds, Sockets, StopReason};
 use clap::Parser;
 use protocol::bus::{BusKind, KindChoice};
 use protocol::id::CellId;
 use protocol::last_words::{CellRange, ExitReason};
-use protocol::skin::{SkinReply, Skin, Wires};
+use protocol::skin::{Skin, SkinReply, Wires};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
 /// A tactile skin cell: receives joint positions, answers with its joint torques.
@@ -74,7 +74,11 @@ impl Arguments {
     fn report_exit(&self, why: impl core::fmt::Display) {
         match self.nodes().filter(|_| self.with_parent.is_some()) {
             Some((first, last)) => {
-                eprint_line(ExitReason { cells: CellRange(first, last), bus: self.bus.clone(), why: why.to_string() });
+                eprint_line(ExitReason {
+                    cells: CellRange(first, last),
+                    bus: self.bus.clone(),
+                    why: why.to_string(),
+                });
             }
             None => eprint_line(why),
         }
@@ -168,9 +172,10 @@ fn start(
     wires: Option<&Wires>,
     cell: CellId,
 ) -> Result<()> {
-    let described = skin.cells_on_bus(bus_index).find(|described| described.node == cell).with_context(|| {
-        format!("cell {cell} is not on {} in {}", arguments.bus, arguments.skin.display())
-    })?;
+    let described =
+        skin.cells_on_bus(bus_index).find(|described| described.node == cell).with_context(|| {
+            format!("cell {cell} is not on {} in {}", arguments.bus, arguments.skin.display())
+        })?;
     // A cell without wires is never assigned a node id.
     let is_nameless = arguments.fresh && wires.is_some();
     let mut identity = Identity { cell: (!is_nameless).then_some(cell), serial: described.serial };

@@ -141,7 +141,8 @@ impl Sum {
         }
         self.own = own.map(|exact| self.round(exact, slots.carry));
         // Send an end, so that the parent does not keep the last sum forever.
-        self.ends = follows && self.last_sent.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
+        self.ends =
+            follows && self.last_sent.is_some_and(|(of, words)| Some(of) == before && !words.is_end());
         self.due = None;
         self.schedule(begin.at);
         (self.is_checked, self.check) = (false, None);
@@ -289,7 +290,8 @@ impl Sum {
         if self.last_sent == Some((epoch, words)) {
             return None;
         }
-        let follows = |(of, before): (Epoch, SumWords)| of == epoch || (of.next() == epoch && !before.is_end());
+        let follows =
+            |(of, before): (Epoch, SumWords)| of == epoch || (of.next() == epoch && !before.is_end());
         let goes_on = self.last_sent.is_some_and(follows) && !core::mem::take(&mut self.restate);
         self.last_sent = Some((epoch, words));
         self.sent = self.sent.wrapping_add(1);

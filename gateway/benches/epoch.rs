@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use criterion::{Criterion, Throughput};
 use model::generate::{Target, generate};
 use model::table::Table;
-use protocol::bus::{Bus, BusKind, KindChoice, Filter, Inbox, BusOptions};
+use protocol::bus::{Bus, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q3_12;
 use protocol::id::CellId;

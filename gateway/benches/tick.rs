@@ -10,19 +10,19 @@ use std::time::{Duration, Instant};
 
 use bench::bus::realtime;
 use control::controller::Kinesthetic;
-use control::cycle::turn::{BusPort, Shared, TimedRecord, TickDriver};
+use control::cycle::turn::{BusPort, Shared, TickDriver, TimedRecord};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
 use criterion::{BenchmarkId, Criterion};
 use model::generate::{Target, generate};
 use model::scenario::{Mode, ModeChange, Scenario};
-use model::table::{Snapshot, BusTotals};
+use model::table::{BusTotals, Snapshot};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::message::SkinSensors;
 use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{SkinBus, Skin};
+use protocol::skin::{Skin, SkinBus};
 use protocol::time::{Micros, Span};
 
 /// Maximum number of cells per bus.

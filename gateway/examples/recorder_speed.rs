@@ -18,11 +18,11 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use bench::record::feed::{self, Feed};
-use bench::record::{Mcap, RecordOptions, Outputs};
+use bench::record::{Mcap, Outputs, RecordOptions};
 use model::central::Central;
 use model::latched::ReceivedFrame;
 use protocol::can::Format;
-use protocol::candump::{self, Direction, CandumpLine, Record, Timestamp};
+use protocol::candump::{self, CandumpLine, Direction, Record, Timestamp};
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::message::{Joints, Message};
 use protocol::packet::padded;
@@ -63,7 +63,11 @@ fn of_run(skin: &Skin, seconds: u32) -> Vec<ReceivedFrame> {
     let (hz, began) = (skin.timing.broadcast_hz(), 1_700_000_000_000_000_000_u64);
     let mut frames = Vec::new();
     let mut say = |at_nanos, own, message: &Message| {
-        frames.extend(message.encode().frames(Format::Fd).map(|frame| ReceivedFrame { at_nanos, from_gateway: own, frame }));
+        frames.extend(message.encode().frames(Format::Fd).map(|frame| ReceivedFrame {
+            at_nanos,
+            from_gateway: own,
+            frame,
+        }));
     };
     let mut number = 0_u32;
     loop {
@@ -99,7 +103,11 @@ fn of_log(text: &str) -> Result<Vec<ReceivedFrame>, Box<dyn Error>> {
     let mut frames = Vec::new();
     for line in text.lines() {
         if let CandumpLine::Frame(Record { time, frame, direction, .. }) = candump::parse(line)? {
-            frames.push(ReceivedFrame { at_nanos: time.nanos, from_gateway: direction == Some(Direction::Sent), frame });
+            frames.push(ReceivedFrame {
+                at_nanos: time.nanos,
+                from_gateway: direction == Some(Direction::Sent),
+                frame,
+            });
         }
     }
     Ok(frames)

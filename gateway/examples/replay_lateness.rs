@@ -11,7 +11,7 @@ use bench::replay::player::Pace;
 use bench::replay::replay_plan::SenderFilter;
 use bench::replay::survey::TimeRange;
 use bench::replay::{ReplayOptions, replay};
-use protocol::bus::{Bus, BusKind, KindChoice, Inbox, KindChoices, BusOptions as BusOptions};
+use protocol::bus::{Bus, BusKind, BusOptions, Inbox, KindChoice, KindChoices};
 use rustix::time::{ClockId, clock_gettime};
 use vcan_setup::embedded::Server;
 

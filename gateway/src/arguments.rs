@@ -82,7 +82,10 @@ impl BusKinds {
     }
 
     /// Returns the kinds of these buses, or an error if the option names another bus.
-    pub(crate) fn kinds_of<'a>(&self, buses: impl IntoIterator<Item = &'a str>) -> Result<KindChoices, Failure> {
+    pub(crate) fn kinds_of<'a>(
+        &self,
+        buses: impl IntoIterator<Item = &'a str>,
+    ) -> Result<KindChoices, Failure> {
         self.of_any()?.restrict_to(buses).map_err(Failure::usage)
     }
 }

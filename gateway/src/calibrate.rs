@@ -235,7 +235,8 @@ impl Calibrate {
         let mut attachments = vec![attached("skin.toml", "application/toml", text.to_owned())];
         attachments.extend(robot.urdf.map(|text| attached("robot.urdf", "application/xml", text)));
         let command_line = protocol::usage::command_line();
-        let mcap = Mcap { path, split: SplitLimits::default(), attachments, robot: robot.robot, command_line };
+        let mcap =
+            Mcap { path, split: SplitLimits::default(), attachments, robot: robot.robot, command_line };
         let length_us = (motion.length_s() * 1e6).round();
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "20 to 3600 s: checked")]
         let mut scenario = Scenario::idle(Span(length_us as u64));
@@ -263,7 +264,11 @@ impl Calibrate {
             cells_per_process: usize::from(CellId::MAX.get()),
             flash: None,
             receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
-            record: record::RecordOptions { candump: None, mcap: Some(mcap), force: self.overwrite.overwrite },
+            record: record::RecordOptions {
+                candump: None,
+                mcap: Some(mcap),
+                force: self.overwrite.overwrite,
+            },
             quiet: self.quiet,
             planned: Some(motion),
             announced: Vec::new(),

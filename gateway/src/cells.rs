@@ -10,9 +10,9 @@ use std::time::{Duration, Instant};
 use bench::cells::CellWatch;
 use clap::Args;
 use protocol::skin::Skin;
-use protocol::usage::{Failure, print_text, write_stdout, printable_lines, ignore_broken_pipe};
+use protocol::usage::{Failure, ignore_broken_pipe, print_text, printable_lines, write_stdout};
 
-use self::show::{DescribedBus, CellList};
+use self::show::{CellList, DescribedBus};
 use super::arguments::{BusKinds, bus_of, seconds};
 use super::input;
 use super::print::{json, json_line};
@@ -83,7 +83,11 @@ impl Cells {
             if self.watch && drawn.elapsed() >= DRAW {
                 drawn = Instant::now();
                 let text = show(&watch)?;
-                let shown = if terminal { write_stdout(&show::screen(&printable_lines(&text))) } else { write_stdout(&text) };
+                let shown = if terminal {
+                    write_stdout(&show::screen(&printable_lines(&text)))
+                } else {
+                    write_stdout(&text)
+                };
                 if shown.is_err() {
                     return ignore_broken_pipe(shown);
                 }

@@ -3,7 +3,7 @@
 use csv::{StringRecord, StringRecordsIntoIter, Trim};
 use protocol::usage::Failure;
 
-use super::print::{count, comma_separated};
+use super::print::{comma_separated, count};
 
 /// Maximum number of characters of a first line that an error quotes.
 const REPEATED: usize = 60;

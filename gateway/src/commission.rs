@@ -10,14 +10,14 @@ use bench::commission::{CommissionedBus, commission, open};
 use bench::progress::Progress as Line;
 use clap::Args;
 use model::commission::node_ids::{NodeIds, renumbered};
-use model::commission::{Outcome, Progress, CommissionOptions};
+use model::commission::{CommissionOptions, Outcome, Progress};
 use protocol::document;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 
 use super::arguments::{BusKinds, bus_names, bus_of};
 use super::output::{Overwrite, apart, print_beside};
-use super::print::{comma_separated, abbreviated};
+use super::print::{abbreviated, comma_separated};
 use super::{input, output};
 
 /// Write a skin's description into its cells, and read it back

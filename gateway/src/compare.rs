@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::time::Instant;
 
-use analysis::compare::{Both, Comparison, Options, Report, CaptureSide};
+use analysis::compare::{Both, CaptureSide, Comparison, Options, Report};
 use analysis::explain::NotFound;
 use clap::Args;
 use model::decode::Decoder;
@@ -17,7 +17,7 @@ use protocol::stop;
 use protocol::time::Micros;
 use protocol::usage::Failure;
 use serde::Serialize;
-use trace::capture::{Entry, CaptureFormat, NoteKind, Reader};
+use trace::capture::{CaptureFormat, Entry, NoteKind, Reader};
 
 use self::files::{parts, starts};
 use super::input;

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::{Args, Command};
 use clap_complete::Shell;
-use protocol::usage::{Failure, print_raw, ignore_broken_pipe};
+use protocol::usage::{Failure, ignore_broken_pipe, print_raw};
 
 use super::output::{Overwrite, is_standard_output, note};
 

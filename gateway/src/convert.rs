@@ -16,9 +16,11 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::input::can_be_read_again;
 use protocol::stop::{self, InterruptibleWriter};
 use protocol::usage::Failure;
-use trace::capture::convert::{ConvertError, ConversionCounts, Origin, CaptureWriter, LossCounts, EntrySink, convert};
+use trace::capture::convert::{
+    CaptureWriter, ConversionCounts, ConvertError, EntrySink, LossCounts, Origin, convert,
+};
 use trace::capture::log::{Digits, Style, WriteOutcome};
-use trace::capture::{Entry, CaptureFormat, NoteKind, Reader};
+use trace::capture::{CaptureFormat, Entry, NoteKind, Reader};
 use trace::files::WholeFile;
 
 use self::live::GrowingCapture;
@@ -197,7 +199,8 @@ impl Convert {
                     }
                 }
                 Ok(None)
-                    if !stop::stop_flag().load(Ordering::Relaxed) && (!self.strict || unreadable.is_empty()) =>
+                    if !stop::stop_flag().load(Ordering::Relaxed)
+                        && (!self.strict || unreadable.is_empty()) =>
                 {
                     unreadable.iter().for_each(note);
                     return Err(no_frame(&reader));

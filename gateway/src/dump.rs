@@ -11,24 +11,24 @@ use std::time::{Duration, Instant};
 use analysis::stats::Report;
 use bench::bus::listen::now;
 use clap::Args;
-use model::decode::pick::{IdMask, Party, FrameFilter, Selector};
+use model::decode::pick::{FrameFilter, IdMask, Party, Selector};
 use protocol::bus::BusOptions;
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
 use protocol::skin::Skin;
 use protocol::stop::{self, InterruptibleWriter};
-use protocol::usage::{Failure, print_text, ignore_broken_pipe};
+use protocol::usage::{Failure, ignore_broken_pipe, print_text};
 use serde::Serialize;
-use trace::capture::{Entry, RecordingExtras, NoteKind, Reader, Topic};
+use trace::capture::{Entry, NoteKind, Reader, RecordingExtras, Topic};
 
-use self::show::{OutputStyle, FrameOutput};
+use self::show::{FrameOutput, OutputStyle};
 use super::arguments::{BusKinds, OptionValue, nanos, one_of};
 use super::input::{
-    self, POLL_TIMEOUT, LossCounts, ReceiveEnd, captures, is_file, is_path, no_frame, place, remark_another,
+    self, LossCounts, POLL_TIMEOUT, ReceiveEnd, captures, is_file, is_path, no_frame, place, remark_another,
     skin_beside, stopped,
 };
 use super::output;
-use super::print::{json, comma_separated};
+use super::print::{comma_separated, json};
 
 /// Show the traffic of a bus or a capture, decoded beside the raw frames
 ///
@@ -215,7 +215,12 @@ impl Dump {
 }
 
 /// Returns the statistics as JSON.
-fn as_json(source: &str, format: &str, report: &Report, extras: Option<&RecordingExtras>) -> Result<String, Failure> {
+fn as_json(
+    source: &str,
+    format: &str,
+    report: &Report,
+    extras: Option<&RecordingExtras>,
+) -> Result<String, Failure> {
     #[derive(Serialize)]
     struct Whole<'a> {
         source: &'a str,

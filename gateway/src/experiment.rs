@@ -90,7 +90,9 @@ impl Experiment {
             return Err(Failure::usage("-o DIR is missing: name the folder for report.html and the figures"));
         };
         let target = |named: &Named| {
-            self.names.iter().any(|word| matches!(word, ExperimentArgument::All) || *word == ExperimentArgument::One(*named))
+            self.names.iter().any(|word| {
+                matches!(word, ExperimentArgument::All) || *word == ExperimentArgument::One(*named)
+            })
         };
         let named: Vec<Named> = Named::ALL.into_iter().filter(target).collect();
         let stop = stopped()?;

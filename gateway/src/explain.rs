@@ -98,7 +98,8 @@ impl Explain {
         self.check(&skin)?;
         let mut reader = Reader::open_all(&self.files).map_err(Failure::usage)?;
         let name = reader.name().to_owned();
-        let requested = RequestedJoints { epoch: Epoch(epoch), from_ns: self.at, occurrence: self.occurrence };
+        let requested =
+            RequestedJoints { epoch: Epoch(epoch), from_ns: self.at, occurrence: self.occurrence };
         let found = find(&mut reader, &skin, requested).map_err(Failure::run)?;
         for (count, what) in [
             (found.dropped, "frames are missing before this point; contact states may be out of date"),

@@ -11,7 +11,7 @@ use protocol::can::Format;
 use protocol::input::can_be_read_again;
 use protocol::usage::Failure;
 use protocol::wire_time::{BitRates, parse_bit_rate};
-use trace::capture::{CaptureFormat as CaptureFormat, Reader};
+use trace::capture::{CaptureFormat, Reader};
 
 use super::arguments::{BusKinds, FORMATS, one_of, seconds};
 use super::input::{is_file, read_skin};

@@ -15,7 +15,7 @@ use bench::sensing as switching;
 use clap::Args;
 use model::decode::Decoded;
 use model::decode::pick::Party;
-use protocol::bus::{Bus, BusError, KindChoice, KindChoices, BusOptions};
+use protocol::bus::{Bus, BusError, BusOptions, KindChoice, KindChoices};
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame as CanFrame};
 use protocol::id::CellId;
 use protocol::message::{Answer, Message};

@@ -52,7 +52,9 @@ pub(crate) fn unknown(program: &Command, name: &str) -> String {
     let best = likely.max_by(|one, other| one.0.total_cmp(&other.0)).filter(|(likeness, _)| *likeness > 0.75);
     match best {
         Some((_, best)) => format!("there is no command {name}; did you mean {best}?"),
-        None => format!("there is no command {name}; the commands are {}", crate::print::comma_separated(names)),
+        None => {
+            format!("there is no command {name}; the commands are {}", crate::print::comma_separated(names))
+        }
     }
 }
 
@@ -117,8 +119,11 @@ mod tests {
         for arg in commands.iter().flat_map(|it| options(it)) {
             let long = arg.get_long().unwrap_or_default().to_owned();
             let names = arg.get_value_names().unwrap_or_default();
-            let takes =
-                if arg.get_action().takes_values() { crate::print::space_separated(names) } else { String::new() };
+            let takes = if arg.get_action().takes_values() {
+                crate::print::space_separated(names)
+            } else {
+                String::new()
+            };
             // FILE and DIR both name a path.
             let takes = if takes == "DIR" { "FILE".to_owned() } else { takes };
             meanings.entry(long.clone()).or_default().insert(takes);

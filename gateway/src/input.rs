@@ -8,10 +8,10 @@ use std::sync::{Arc, OnceLock};
 use std::thread;
 use std::time::Duration;
 
-use bench::bus::follow::{Follower, OpenedOnce, FollowStep};
+use bench::bus::follow::{FollowStep, Follower, OpenedOnce};
 use bench::bus::listen;
 use bench::signals::caught;
-use protocol::bus::{Bus, BusError, KindChoice, KindChoices, BusOptions, Received};
+use protocol::bus::{Bus, BusError, BusOptions, KindChoice, KindChoices, Received};
 use protocol::can::{self, EXTENDED_MASK};
 use protocol::input::{can_be_read_again, is_standard_input};
 use protocol::skin::{Cell, Skin};
@@ -19,10 +19,12 @@ use protocol::stop;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use trace::capture::{CaptureError, SKIN_OR_SCENARIO, CaptureFormat, Note, NoteKind, ORIGIN_METADATA, Reader};
+use trace::capture::{
+    CaptureError, CaptureFormat, Note, NoteKind, ORIGIN_METADATA, Reader, SKIN_OR_SCENARIO,
+};
 
 use super::output;
-use super::print::{count, abbreviated};
+use super::print::{abbreviated, count};
 
 /// Interval between attempts to open an awaited bus.
 const RETRY_INTERVAL: Duration = Duration::from_millis(20);

@@ -6,7 +6,7 @@ use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use protocol::usage::{Failure, print_raw, print_text, eprint_line, eprint_lines, ignore_broken_pipe};
+use protocol::usage::{Failure, eprint_line, eprint_lines, ignore_broken_pipe, print_raw, print_text};
 use trace::files::{STANDARD_OUTPUT, WholeFile, check, folder_of, with_hint};
 
 /// The option that allows existing files to be overwritten.

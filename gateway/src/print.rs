@@ -63,7 +63,10 @@ fn joined(between: &str, items: impl IntoIterator<Item: Display>) -> String {
 /// Joins all names, or the first few of many names with the total number.
 pub(crate) fn abbreviated(names: &[String]) -> String {
     let few = names.get(..NAMES).filter(|_| names.len() > NAMES);
-    few.map_or_else(|| comma_separated(names), |few| format!("{}, ... ({} in all)", comma_separated(few), names.len()))
+    few.map_or_else(
+        || comma_separated(names),
+        |few| format!("{}, ... ({} in all)", comma_separated(few), names.len()),
+    )
 }
 
 /// Formats a count with its noun.

@@ -8,13 +8,15 @@ use bench::replay::player::Pace;
 use bench::replay::replay_plan::SenderFilter;
 use bench::replay::report::{Expect, Summary};
 use bench::replay::survey::TimeRange;
-use bench::replay::{ReplayOptions, ReplayError, SpawnOptions, replay};
+use bench::replay::{ReplayError, ReplayOptions, SpawnOptions, replay};
 use clap::Args;
 use protocol::usage::{Failure, printable, printable_lines};
 
 use super::arguments::{BusKinds, OptionValue, cells_per_process, nanos, of_environment, one_of};
 use super::output::{self, Overwrite, apart, print_table};
-use super::print::{GREEN, PLAIN, KeyValueTable, YELLOW, count, hanging, json, comma_separated, or_else_text, quantiles};
+use super::print::{
+    GREEN, KeyValueTable, PLAIN, YELLOW, comma_separated, count, hanging, json, or_else_text, quantiles,
+};
 
 /// Receive buffer in bytes: all cells may answer a report at once.
 const RECEIVE_BUFFER: u32 = 8 << 20;
@@ -235,7 +237,9 @@ fn table(summary: &Summary, is_coloured: bool) -> String {
         expectation(&mut rows, expect);
     }
     let first = summary.expect.as_ref().and_then(|expect| expect.first.as_ref());
-    first_line + &rows.text() + &or_else_text(first.map(|first| format!("{}\n", printable_lines(&first.text))), "")
+    first_line
+        + &rows.text()
+        + &or_else_text(first.map(|first| format!("{}\n", printable_lines(&first.text))), "")
 }
 
 fn expectation(rows: &mut KeyValueTable, expect: &Expect) {

@@ -8,7 +8,7 @@ use analysis::report::run::{self, ReportError};
 use analysis::report::{figure::Page, page, svg};
 use clap::Args;
 use protocol::skin::Skin;
-use protocol::usage::{Failure, command_line, print_text, printable, ignore_broken_pipe};
+use protocol::usage::{Failure, command_line, ignore_broken_pipe, print_text, printable};
 use protocol::wire_time::parse_bit_rate;
 
 use super::input::{difference, read_skin};

@@ -28,7 +28,9 @@ impl RobotOfSkin {
     /// Returns [`Failure`] if the file cannot be read or is not a URDF.
     pub(crate) fn read(skin: &Skin, file: Option<&Path>) -> Result<Self, Failure> {
         let of_rows = || {
-            RecordedRobot::of_rows(skin).map_err(|error| note(format_args!("the robot is not shown: {error}"))).ok()
+            RecordedRobot::of_rows(skin)
+                .map_err(|error| note(format_args!("the robot is not shown: {error}")))
+                .ok()
         };
         let Some(path) = file else { return Ok(Self { robot: of_rows(), urdf: None }) };
         let hint = "correct the skin's path, or take the key out";

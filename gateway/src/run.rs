@@ -15,7 +15,7 @@ use bench::run::{self, RunOptions};
 use bench::summary::Summary;
 use clap::Args;
 use model::scenario::{DEFAULT_DURATION, Scenario};
-use protocol::bus::{BusKind, KindChoice, GATEWAY_RECEIVE_BUFFER, KindChoices};
+use protocol::bus::{BusKind, GATEWAY_RECEIVE_BUFFER, KindChoice, KindChoices};
 use protocol::document;
 use protocol::input::can_be_read_again;
 use protocol::skin::{CellName, Skin};

@@ -6,7 +6,7 @@ use std::path::Path;
 use cover::LinkMesh;
 use cover::mesh::{Triangle, simplify};
 use protocol::skin::{Chain, ChainRow, Skin};
-use robots::{Isometry3, LinkFrame, DhRow, Urdf};
+use robots::{DhRow, Isometry3, LinkFrame, Urdf};
 use view::RowMesh;
 
 use super::output::note;

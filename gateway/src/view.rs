@@ -150,8 +150,16 @@ impl View {
         let stop = stopped()?;
         let bench = self.of_run.then(run_of_this).transpose().map_err(|error| failed(&error))?;
         let Served { listener, access, url } = served;
-        let options =
-            Options { skin, surface, kinds, directory: None, listener, access, waits_for_buses: self.wait, bench };
+        let options = Options {
+            skin,
+            surface,
+            kinds,
+            directory: None,
+            listener,
+            access,
+            waits_for_buses: self.wait,
+            bench,
+        };
         serve(options, &stop, || print_address(url)).map_err(Failure::usage)?;
         Ok(())
     }

@@ -62,7 +62,8 @@ impl<'a> Visuals<'a> {
     }
 
     fn part(&self, shape: &Shape) -> Result<LinkMesh, String> {
-        let plain = |mesh: Result<Mesh, MeshError>| mesh.map(LinkMesh::new).map_err(|error| error.to_string());
+        let plain =
+            |mesh: Result<Mesh, MeshError>| mesh.map(LinkMesh::new).map_err(|error| error.to_string());
         let part = match &shape.geometry {
             Geometry::Mesh { path, scale } => {
                 let mesh = Mesh::load(&self.find(path)?, UpAxis::Ignore);

@@ -41,10 +41,15 @@ fn main() {
         ("FD, 64 bytes", long()),
         ("classic, 8 bytes", replies(Format::Classic)),
     ] {
-        assert!(frames.iter().all(|frame| Bits::from_frame(frame).is_some_and(|bits| bits.total() > 100)), "{name}");
+        assert!(
+            frames.iter().all(|frame| Bits::from_frame(frame).is_some_and(|bits| bits.total() > 100)),
+            "{name}"
+        );
         group.throughput(Throughput::Elements(frames.len() as u64));
         group.bench_function(name, |bencher| {
-            bencher.iter(|| black_box(&frames).iter().filter_map(Bits::from_frame).map(Bits::total).sum::<u32>());
+            bencher.iter(|| {
+                black_box(&frames).iter().filter_map(Bits::from_frame).map(Bits::total).sum::<u32>()
+            });
         });
     }
     group.finish();

@@ -15,7 +15,7 @@ use std::hint::black_box;
 use gungraun::{library_benchmark, library_benchmark_group};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id, Kind, Node};
-use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembly, Reassembler};
+use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembler, Reassembly};
 use protocol::time::Micros;
 use protocol::wire_time::Bits;
 

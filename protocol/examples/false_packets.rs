@@ -11,7 +11,7 @@
 #![expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
 
 use protocol::id::{Id, Kind};
-use protocol::packet::{Length, Lengths, Reassembly, Reassembler};
+use protocol::packet::{Length, Lengths, Reassembler, Reassembly};
 use protocol::time::Micros;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;

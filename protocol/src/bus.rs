@@ -54,7 +54,7 @@ pub use error::{BusError, SendError};
 pub use filter::Filter;
 pub use inbox::{Inbox, Received};
 pub use kernel::{GATEWAY_RECEIVE_BUFFER, has_socketcan, set_receive_buffer};
-pub use kinds::{BusKind, KindChoice, KindChoices, KindsError, KindOption, UnknownKind};
+pub use kinds::{BusKind, KindChoice, KindChoices, KindOption, KindsError, UnknownKind};
 
 /// Options for opening a bus.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -280,8 +280,13 @@ impl Bus {
                 Ok(_) => break,
                 // The server ended with unread frames of ours. Its own frames can still be received.
                 Err(error) if is_errno(&error, Errno::CONNRESET) => {}
-                Err(error) if is_errno(&error, Errno::AGAIN) || is_errno(&error, Errno::INTR) => return Ok(0),
-                Err(error) if batch::is_memory_shortage(&error) && is_before_deadline(&mut give_up, MAX_SHORTAGE) => {
+                Err(error) if is_errno(&error, Errno::AGAIN) || is_errno(&error, Errno::INTR) => {
+                    return Ok(0);
+                }
+                Err(error)
+                    if batch::is_memory_shortage(&error)
+                        && is_before_deadline(&mut give_up, MAX_SHORTAGE) =>
+                {
                     std::thread::sleep(RETRY_INTERVAL);
                 }
                 Err(error) => return Err(self.io_error("receive from", error)),

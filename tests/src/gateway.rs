@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 
 use control::cycle::carried::BusInput;
-use control::cycle::{Cycle, TickRecord, Tick};
+use control::cycle::{Cycle, Tick, TickRecord};
 use control::motion::controller_of;
 use control::robot::SimulatedArm;
 use model::scenario::{Scenario, Touches};

@@ -192,8 +192,10 @@ impl Wiring {
         let place = &self.cells[cell];
         let Some(node_id) = place.node_id else { return };
         let deaf = place.deaf.iter().enumerate().map(|(port, deaf)| u8::from(*deaf) << port).sum();
-        let request =
-            Request::Write { number: Parameter::LinksDown.number(), words: LinksDown { ports: deaf }.words() };
+        let request = Request::Write {
+            number: Parameter::LinksDown.number(),
+            words: LinksDown { ports: deaf }.words(),
+        };
         let message = Message::Configure { to: protocol::id::Node::Cell(node_id), tag: 0, request };
         let frame = message.encode().frames(Format::Fd).next().expect("one frame");
         self.deliver(cell, Inlet::Frame(frame));

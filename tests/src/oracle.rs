@@ -1,7 +1,7 @@
 //! A second, simpler gateway that knows the truth about every frame: its damage, its sender, and the starts of each
 //! cell. The real gateway's results for the same frames must agree with it, whatever was damaged.
 
-use model::table::{Notice, BusTotals};
+use model::table::{BusTotals, Notice};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
@@ -254,8 +254,9 @@ impl Oracle {
         }
         // An equal first segment counts like the packet's own.
         let first = truth.packet.and_then(|packet| packet.frames(self.format).next());
-        let in_time =
-            |since| truth.packet.is_some_and(|packet| stood.elapsed_since(since) <= Reassembler::max_gap(packet.id));
+        let in_time = |since| {
+            truth.packet.is_some_and(|packet| stood.elapsed_since(since) <= Reassembler::max_gap(packet.id))
+        };
         let whole =
             truth.segment == 1 && last.is_some_and(|(waits, since)| Some(waits) == first && in_time(since));
         *last = if whole { None } else { Some((*frame, stood)) };

@@ -36,7 +36,8 @@ impl<T> RealBus<T> {
     pub(crate) fn request(&mut self, now: Micros, frame: &Frame, item: T) {
         let Some(bits) = Bits::from_frame(frame) else { return };
         let tag = u64::try_from(self.requested.len()).unwrap_or(u64::MAX);
-        let request = Request { at: now.0 * 1_000, priority: Priority::from_frame(frame), bits, queue: None, tag };
+        let request =
+            Request { at: now.0 * 1_000, priority: Priority::from_frame(frame), bits, queue: None, tag };
         self.requested.push((now, *frame));
         self.waiting.insert(tag, item);
         self.model.request(request);

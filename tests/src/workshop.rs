@@ -4,7 +4,7 @@
 use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
-use model::commission::{Commission, Report, CommissionOptions};
+use model::commission::{Commission, CommissionOptions, Report};
 use model::decode::{Decoded, Decoder};
 use protocol::can::{Format, Frame};
 use protocol::id::CellId;

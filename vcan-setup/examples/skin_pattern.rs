@@ -12,7 +12,7 @@ use std::error::Error;
 use std::thread::Builder;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusKind, KindChoice, Filter, Inbox, BusOptions};
+use protocol::bus::{Bus, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{BIT_RATE_SWITCH, Frame};
 use rustix::time::{ClockId, clock_gettime};
 use vcan_setup::embedded::Server;

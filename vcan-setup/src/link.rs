@@ -228,7 +228,9 @@ impl Interface {
         match &self.kind {
             InterfaceKind::Vcan => "a vcan".to_owned(),
             InterfaceKind::Vxcan(_) => "a vxcan".to_owned(),
-            InterfaceKind::Hardware(Hardware { driver: Some(driver), .. }) => format!("CAN hardware ({driver})"),
+            InterfaceKind::Hardware(Hardware { driver: Some(driver), .. }) => {
+                format!("CAN hardware ({driver})")
+            }
             InterfaceKind::Hardware(_) => "CAN hardware".to_owned(),
             InterfaceKind::Other(what) => what.clone(),
         }

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::thread::{self, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
-use protocol::bus::embedded::{address, open_directory, seqpacket, socket_name, default_directory};
-use protocol::bus::{self, BusError, BusKind, KindChoice, GATEWAY_RECEIVE_BUFFER, Inbox, BusOptions};
+use protocol::bus::embedded::{address, default_directory, open_directory, seqpacket, socket_name};
+use protocol::bus::{self, BusError, BusKind, BusOptions, GATEWAY_RECEIVE_BUFFER, Inbox, KindChoice};
 use protocol::can::Format;
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::usage::shell_quoted_os;
@@ -60,7 +60,10 @@ fn usable(target: &InterfaceTarget, interface: &Interface) -> bool {
 }
 
 /// Observes all buses that can be opened, at the same time. Returns the result for each bus, in their order.
-fn listen_to_all(buses: &[BusFacts], choice: KindChoice) -> Vec<Option<Result<Option<ObservedTraffic>, String>>> {
+fn listen_to_all(
+    buses: &[BusFacts],
+    choice: KindChoice,
+) -> Vec<Option<Result<Option<ObservedTraffic>, String>>> {
     let kind_of = |bus: &BusFacts| match (choice, &bus.interface) {
         (KindChoice::Only(kind), _) => kind,
         (KindChoice::Auto, Some(_)) => BusKind::SocketCan,

@@ -59,7 +59,11 @@ impl Namespace {
     pub fn named(word: &OsStr) -> Self {
         let Some(word) = word.to_str().filter(|word| !word.contains('/')) else {
             let is_path = word.as_encoded_bytes().contains(&b'/');
-            return Self::Path(if is_path { word.into() } else { PathBuf::from(NAMESPACE_DIRECTORY).join(word) });
+            return Self::Path(if is_path {
+                word.into()
+            } else {
+                PathBuf::from(NAMESPACE_DIRECTORY).join(word)
+            });
         };
         match word.parse() {
             Ok(pid) if !PathBuf::from(NAMESPACE_DIRECTORY).join(word).exists() => Self::Process(pid),

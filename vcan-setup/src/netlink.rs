@@ -20,9 +20,9 @@ use protocol::bus::netlink::RtnetlinkSocket;
 use rustix::io::Errno;
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
-use crate::link::{FD_MTU, Hardware, Interface, InterfaceKind, ALIAS_MARK, Peer, HardwareRates};
+use crate::link::{ALIAS_MARK, FD_MTU, Hardware, HardwareRates, Interface, InterfaceKind, Peer};
 use crate::namespace::NAMESPACE_DIRECTORY;
-use crate::plan::{StepAction, Step};
+use crate::plan::{Step, StepAction};
 
 mod reading;
 
@@ -206,7 +206,11 @@ impl Netlink {
                 Err(error) if is(&error, Errno::BUSY) && number < MAX_INDEX_ATTEMPTS => number += 2,
                 // Another program has taken the index of this end. The kernel returns the same error if the name is
                 // taken.
-                Err(error) if is(&error, Errno::EXIST) && number < MAX_INDEX_ATTEMPTS && self.free_index()? > index => {
+                Err(error)
+                    if is(&error, Errno::EXIST)
+                        && number < MAX_INDEX_ATTEMPTS
+                        && self.free_index()? > index =>
+                {
                     number += 2;
                 }
                 Err(error) => return Err(error),
@@ -287,7 +291,9 @@ impl Netlink {
             StepAction::MakePair { ref peer, .. } => {
                 self.make_pair(name, peer, there).map(|index| Some(Undo::Remove { index }))
             }
-            StepAction::BringUp { index } => self.set_up(index, true).map(|()| Some(restore(index, None, false))),
+            StepAction::BringUp { index } => {
+                self.set_up(index, true).map(|()| Some(restore(index, None, false)))
+            }
             StepAction::Widen { index, from, was_up } => {
                 let done = self.set_up(index, false).and_then(|()| self.set_mtu(index, FD_MTU));
                 let done = done.and_then(|()| self.set_up(index, true));

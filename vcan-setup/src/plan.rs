@@ -16,7 +16,7 @@ use protocol::can::Format;
 use protocol::skin::Skin;
 use protocol::usage::shell_quoted_os;
 
-use crate::link::{FD_MTU, Hardware, Interface, InterfaceKind, HardwareRates};
+use crate::link::{FD_MTU, Hardware, HardwareRates, Interface, InterfaceKind};
 use crate::namespace::Namespace;
 
 mod refusal;
@@ -24,7 +24,7 @@ mod step;
 
 pub use refusal::Refusal;
 pub(crate) use step::widen;
-pub use step::{StepAction, Step};
+pub use step::{Step, StepAction};
 
 /// An interface that the user wants, by itself or as a bus of a skin.
 #[derive(Clone, Debug, Eq, PartialEq)]
@@ -156,7 +156,9 @@ pub fn up(target: &[InterfaceTarget], present: &[Interface], set_bit_rates: bool
             (InterfaceKind::Hardware(hardware), Some(skin)) => {
                 plan.hardware(target, skin, interface, hardware, set_bit_rates)?;
             }
-            (InterfaceKind::Hardware(_), None) | (InterfaceKind::Other(_), _) => return Err(Refusal::real(interface)),
+            (InterfaceKind::Hardware(_), None) | (InterfaceKind::Other(_), _) => {
+                return Err(Refusal::real(interface));
+            }
         }
     }
     Ok(plan)

@@ -12,7 +12,7 @@ use protocol::input::{self, folder_of};
 use rustix::fs::{CWD, FlockOperation, RenameFlags, flock, renameat_with};
 use rustix::io::Errno;
 
-use crate::flash::{self, FlashError, FlashContent};
+use crate::flash::{self, FlashContent, FlashError};
 use crate::identity::Identity;
 
 /// Maximum number of bytes that are read from a file. A flash image is far smaller.
@@ -174,7 +174,9 @@ mod tests {
         first.store(&FlashContent::default()).unwrap();
         let name = fs::read_to_string("/proc/self/comm").unwrap();
         let who = format!("process {} ({}) uses it", std::process::id(), name.trim_end());
-        for error in [second.load().map(drop).unwrap_err(), second.store(&FlashContent::default()).unwrap_err()] {
+        for error in
+            [second.load().map(drop).unwrap_err(), second.store(&FlashContent::default()).unwrap_err()]
+        {
             assert_eq!(error.kind(), io::ErrorKind::ResourceBusy);
             let said = error.to_string();
             assert!(said.starts_with(&who) || said.starts_with("another process"), "{said}");

@@ -1,6 +1,6 @@
 //! The parameters with which a process opens its bus.
 
-use protocol::bus::{Bus, KindChoice, BusOptions};
+use protocol::bus::{Bus, BusOptions, KindChoice};
 
 use super::StopReason;
 

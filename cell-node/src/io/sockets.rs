@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use protocol::bus::batch::BATCH;
-use protocol::bus::{Bus, BusError, Filter, Inbox, BusOptions, Received, SendError};
+use protocol::bus::{Bus, BusError, BusOptions, Filter, Inbox, Received, SendError};
 use protocol::can::Frame;
 
 use super::BusPort;
@@ -63,7 +63,11 @@ impl Sockets {
     ///
     /// # Errors
     /// Returns an error if the bus does not exist, is not accessible, or does not support `options`.
-    pub(super) fn open(line: &BusPort, options: &BusOptions, deferred: &[Filter]) -> Result<Self, StopReason> {
+    pub(super) fn open(
+        line: &BusPort,
+        options: &BusOptions,
+        deferred: &[Filter],
+    ) -> Result<Self, StopReason> {
         let second = BusOptions { filters: deferred.to_vec(), own_frames: false, ..options.clone() };
         Ok(Self {
             bus: line.open(options)?,
@@ -83,7 +87,11 @@ impl Sockets {
     }
 
     /// Sets the filters `hearing` on both sockets, given the present filters `before`.
-    pub(super) fn set_filters(&mut self, hearing: &ReceiveFilters, before: &ReceiveFilters) -> Result<(), BusError> {
+    pub(super) fn set_filters(
+        &mut self,
+        hearing: &ReceiveFilters,
+        before: &ReceiveFilters,
+    ) -> Result<(), BusError> {
         // A filter that moves between the sockets is set on both for a moment, so that no frame is lost.
         let (update, old) =
             (only_in(&hearing.deferred, &before.deferred), only_in(&before.deferred, &hearing.deferred));

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use protocol::bus::Filter;
 use protocol::can::{EXTENDED, REMOTE};
 use protocol::id::Id;
-use protocol::port::{WIRE_FLAG, LinkId};
+use protocol::port::{LinkId, WIRE_FLAG};
 
 use super::sockets::ReceiveFilters;
 
@@ -67,7 +67,10 @@ impl Subscriptions {
         }
         let kinds: BTreeSet<_> = self.by_id.keys().map(|id| id.kind).collect();
         let wires = (link_ids.len() > 0).then_some(ALL_WIRES);
-        ReceiveFilters { at_once: kinds.into_iter().map(Filter::for_kind).chain(wires).collect(), deferred: Vec::new() }
+        ReceiveFilters {
+            at_once: kinds.into_iter().map(Filter::for_kind).chain(wires).collect(),
+            deferred: Vec::new(),
+        }
     }
 }
 

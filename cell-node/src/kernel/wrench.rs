@@ -26,8 +26,8 @@ use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 use self::fold::fold;
 use self::range::bound;
 use super::joint::Joint;
-use super::rounding::{Bounded, Saturating, Rounding};
-use super::{Kernel, Number, Scalar, Twist, chain, length, cold_path, settled_turn};
+use super::rounding::{Bounded, Rounding, Saturating};
+use super::{Kernel, Number, Scalar, Twist, chain, cold_path, length, settled_turn};
 use crate::contact::{MAX_J, TorqueRounding};
 
 /// The wrench kernel of one cell.
@@ -456,7 +456,10 @@ impl<N: Number> Rotation<N> {
     }
 
     #[inline(always)]
-    fn all<R: Rounding>(&self, PerComponent { force: [fx, fy, _], moment: [mx, my, _] }: &mut PerComponent<N>) {
+    fn all<R: Rounding>(
+        &self,
+        PerComponent { force: [fx, fy, _], moment: [mx, my, _] }: &mut PerComponent<N>,
+    ) {
         (*fx, *fy) = (self.x::<R>(*fx, *fy), self.y::<R>(*fx, *fy));
         (*mx, *my) = (self.x::<R>(*mx, *my), self.y::<R>(*mx, *my));
     }

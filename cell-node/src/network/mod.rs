@@ -189,8 +189,9 @@ impl Network {
     /// Forgets the former parent after an epoch in which this cell sent no sum, because a cell then accepts no more
     /// sums. The gateway's side is forgotten only one hello interval after it was left.
     pub(crate) fn forget_former_parent(&mut self, now: Micros) {
-        self.former_parent
-            .take_if(|former_parent| former_parent.port != UPLINK || now.elapsed_since(former_parent.since) >= HELLO_INTERVAL);
+        self.former_parent.take_if(|former_parent| {
+            former_parent.port != UPLINK || now.elapsed_since(former_parent.since) >= HELLO_INTERVAL
+        });
     }
 
     /// Returns a mask of the children: bit p is set if the cell at port p is a child.
@@ -358,10 +359,13 @@ impl Network {
             return;
         }
         self.hello_by(now, now);
-        if let Some(former_parent) = self.unacknowledged_former_parent().filter(|former_parent| now >= former_parent.resend_at)
+        if let Some(former_parent) =
+            self.unacknowledged_former_parent().filter(|former_parent| now >= former_parent.resend_at)
         {
-            self.former_parent =
-                Some(FormerParent { resend_at: FormerParent::next(former_parent.port, now), ..former_parent });
+            self.former_parent = Some(FormerParent {
+                resend_at: FormerParent::next(former_parent.port, now),
+                ..former_parent
+            });
             self.send(former_parent.port, PortMessage::Leave);
         }
         let silent = |parent: &Parent| self.ports.get(parent.port).is_none_or(|it| it.hello(now).is_none());

@@ -29,7 +29,8 @@ impl Port {
         let restarted = self.hello(now).is_none();
         self.last_hello = Some((hello, now));
         // The child has had time to learn of the grant but names another parent.
-        let forgot = !hello.is_parent && self.child.is_some_and(|since| now.elapsed_since(since) > GRANT_TIMEOUT);
+        let forgot =
+            !hello.is_parent && self.child.is_some_and(|since| now.elapsed_since(since) > GRANT_TIMEOUT);
         if forgot {
             self.child = None;
         }
@@ -38,7 +39,10 @@ impl Port {
 
     /// Returns the last hello, unless it is so old that the port counts as disconnected.
     pub(super) fn hello(&self, now: Micros) -> Option<&Hello> {
-        self.last_hello.as_ref().filter(|(_, at)| now.elapsed_since(*at) <= HELLO_TIMEOUT).map(|(hello, _)| hello)
+        self.last_hello
+            .as_ref()
+            .filter(|(_, at)| now.elapsed_since(*at) <= HELLO_TIMEOUT)
+            .map(|(hello, _)| hello)
     }
 
     /// Returns true if the port works in both directions, and the cell at the other end uses the same protocol version.
@@ -66,7 +70,9 @@ impl Port {
     /// Returns true if a new round must be announced at this port at once, because a child or an unreachable cell is
     /// there.
     pub(super) fn needs_round(&self, now: Micros) -> bool {
-        self.child.is_some() || self.round_requested || self.hello(now).is_some_and(|hello| hello.rank.is_none())
+        self.child.is_some()
+            || self.round_requested
+            || self.hello(now).is_some_and(|hello| hello.rank.is_none())
     }
 
     pub(super) const fn is_child(&self) -> bool {

@@ -163,8 +163,9 @@ impl Network {
         self.parent_unreachable |= is_deserted;
         // A repair that went to the parent only does not count for a deserted cell: the parent may have two
         // wires to this cell, and repair on both.
-        let again =
-            |(of, everywhere, at)| of == round && now.elapsed_since(at) < REPAIR_INTERVALS.0 && (everywhere || !is_deserted);
+        let again = |(of, everywhere, at)| {
+            of == round && now.elapsed_since(at) < REPAIR_INTERVALS.0 && (everywhere || !is_deserted)
+        };
         if self.forwarded_repair.is_some_and(again) {
             return;
         }

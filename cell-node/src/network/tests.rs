@@ -234,7 +234,11 @@ fn a_walk_goes_to_the_children_below_which_a_cell_has_no_node_id() {
     adopt(&mut network, now, 1, 7);
     adopt(&mut network, now, 2, 8);
     let unnumbered = |network: &mut Network, port, unnumbered| {
-        network.handle(now, port, PortMessage::Hello(Hello { is_parent: true, unnumbered, ..neighbour(8, None) }));
+        network.handle(
+            now,
+            port,
+            PortMessage::Hello(Hello { is_parent: true, unnumbered, ..neighbour(8, None) }),
+        );
         let announced = said(network).into_iter().find_map(|said| {
             let (0, PortMessage::Hello(hello)) = said else { return None };
             Some(hello.unnumbered)

@@ -46,7 +46,13 @@ impl AddressClaim {
     pub(super) fn new(identity: Identity, now: Micros) -> Self {
         let wait = phase::by_serial(FIRST_HEARTBEAT_SPREAD, identity.serial);
         let next_heartbeat = identity.cell.map_or(Micros(u64::MAX), |_| now + wait);
-        Self { stage: ClaimStage::Unsent, next_heartbeat, sync_waits: false, defended: None, other_owner: None }
+        Self {
+            stage: ClaimStage::Unsent,
+            next_heartbeat,
+            sync_waits: false,
+            defended: None,
+            other_owner: None,
+        }
     }
 
     /// Returns true if this cell owns the node id.

@@ -24,14 +24,14 @@ use heapless::Deque;
 use protocol::can::{Format, Frame};
 use protocol::fixed::Q7_8;
 use protocol::id::{Command, Id, Kind, Node as Address};
-use protocol::message::{AppliesFrom, ReceivedCounts, Joints, Message, NetworkPage, SensorPage, State};
+use protocol::message::{AppliesFrom, Joints, Message, NetworkPage, ReceivedCounts, SensorPage, State};
 use protocol::packet::{self, Epoch, Length, Lengths, Packet};
 use protocol::port::{PORTS, PortMessage};
 use protocol::time::{Micros, Span};
 
 use crate::baseline::Baseline;
 use crate::contact::{Force, Torque};
-use crate::flash::{FlashState, FlashContent};
+use crate::flash::{FlashContent, FlashState};
 use crate::identity::{Identity, OWN_IDS};
 use crate::kernel::Kernel;
 use crate::sum::SumWords;

@@ -3,7 +3,7 @@
 use protocol::can::{Format, Frame};
 use protocol::id::Id;
 use protocol::message::RejectedCounts;
-use protocol::packet::{Lengths, Packet, PacketError, Reassembly, Reassembler};
+use protocol::packet::{Lengths, Packet, PacketError, Reassembler, Reassembly};
 use protocol::time::Micros;
 
 use super::{MAX_RECEIVED_IDS, increment};

@@ -34,7 +34,9 @@ impl Stimuli {
     /// accepted.
     pub(super) fn push(&mut self, from: AppliesFrom, page: SensorPage, last: Option<Epoch>) -> Arrival {
         let (from, arrival) = match (from, last) {
-            (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0 => (AppliesFrom::Next, Arrival::Late),
+            (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0 => {
+                (AppliesFrom::Next, Arrival::Late)
+            }
             (from @ (AppliesFrom::Epoch(_) | AppliesFrom::Next), _) => (from, Arrival::InTime),
         };
         if self.pending.push((from, page)).is_ok() { arrival } else { Arrival::Refused }

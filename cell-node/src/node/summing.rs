@@ -209,7 +209,14 @@ impl Summing {
     }
 
     /// Handles the sum of a neighbour. Returns true if the neighbour is a child.
-    pub(super) fn handle_sum(&mut self, now: Micros, age: Span, from: CellId, epoch: Epoch, words: SumWords) -> bool {
+    pub(super) fn handle_sum(
+        &mut self,
+        now: Micros,
+        age: Span,
+        from: CellId,
+        epoch: Epoch,
+        words: SumWords,
+    ) -> bool {
         if let EpochParent::Cell { port, number, heard } = &mut self.parent
             && *number == Some(from)
         {
@@ -240,9 +247,15 @@ impl Summing {
             (Some(unanswered), _) => {
                 *unanswered += 1;
                 // A cell that sent nothing in this epoch has no lease any more.
-                lost = (*unanswered > tolerated).then_some(if said { LossReason::Unsure } else { LossReason::Done });
+                lost = (*unanswered > tolerated).then_some(if said {
+                    LossReason::Unsure
+                } else {
+                    LossReason::Done
+                });
             }
-            (None, EpochParent::Cell { heard: true, .. }) => self.tolerance = self.tolerance.saturating_sub(1),
+            (None, EpochParent::Cell { heard: true, .. }) => {
+                self.tolerance = self.tolerance.saturating_sub(1)
+            }
             (None, EpochParent::Cell { heard: false, .. }) => self.unanswered = said.then_some(0),
             (None, EpochParent::Gateway | EpochParent::None) => {}
         }

@@ -373,7 +373,10 @@ fn what_cannot_be_used_is_counted_by_its_reason() {
     hear(Packet { count: 2, ..joints(0).encode() }.frames(Format::Fd).next().unwrap()); // a robot of two joints
     hear(Frame::fd(0x2FF, 1, &[0; 16]).unwrap()); // not for this cell
     let (_, refused) = heard(&mut node);
-    assert_eq!(refused, RejectedCounts { length: 2, crc: 1, foreign: 1, meaning: 2, incomplete: 0, stimuli: 0 });
+    assert_eq!(
+        refused,
+        RejectedCounts { length: 2, crc: 1, foreign: 1, meaning: 2, incomplete: 0, stimuli: 0 }
+    );
     assert_eq!(heartbeat(&tell(&mut node, &Message::Sync)).rejected, 6);
 }
 

@@ -10,7 +10,14 @@ fn sum(carry: bool) -> Sum {
 
 fn begin(epoch: u8, depth: u8) -> EpochStart {
     let at = Micros(u64::from(epoch) * PERIOD.0);
-    EpochStart { epoch: Epoch(epoch), at, period: PERIOD, depth: Some(depth), may_send: true, children: 0b1111 }
+    EpochStart {
+        epoch: Epoch(epoch),
+        at,
+        period: PERIOD,
+        depth: Some(depth),
+        may_send: true,
+        children: 0b1111,
+    }
 }
 
 /// Returns a torque of this many thousandths of a Q7.8 step, the same for every joint.

@@ -37,7 +37,8 @@ impl Cell {
             cell: Some(CellId::new(fields["node"].parse().unwrap()).unwrap()),
             serial: fields["serial"].parse().unwrap(),
         };
-        let flash = if fields["flash"] == "session" { FlashState::Valid(configuration()) } else { FlashState::Empty };
+        let flash =
+            if fields["flash"] == "session" { FlashState::Valid(configuration()) } else { FlashState::Empty };
         let node = Node::new(identity, format, &flash, fields["test"] == "1", Micros(0));
         Self { node, format, sent: VecDeque::new() }
     }

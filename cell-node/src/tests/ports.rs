@@ -7,7 +7,9 @@ use crate::node::Node;
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};
-use protocol::message::{Answer, AppliesFrom, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
+use protocol::message::{
+    Answer, AppliesFrom, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors,
+};
 use protocol::packet::{Epoch, WORDS, padded_words};
 use protocol::parameters::{Contact, Parameter, Parameters, Pose};
 use protocol::port::{Hello, PortMessage, Rank, UPLINK, Walk};
@@ -106,8 +108,15 @@ fn a_root_sends_its_sums_to_the_gateways_side_without_a_state() {
 /// Makes the cell a root, by a grant from the gateway's side.
 fn join_gateway(node: &mut Node, now: Micros) {
     let rank = Rank { round: 1, depth: 0 };
-    let hello =
-        Hello { version: 1, number: 0, port: 0, receives: true, is_parent: false, unnumbered: false, rank: Some(rank) };
+    let hello = Hello {
+        version: 1,
+        number: 0,
+        port: 0,
+        receives: true,
+        is_parent: false,
+        unnumbered: false,
+        rank: Some(rank),
+    };
     node.handle_port(now, Span(0), UPLINK, PortMessage::Hello(hello));
     node.handle_port(now, Span(0), UPLINK, PortMessage::Grant(rank));
 }

@@ -7,7 +7,7 @@
 //! The work per frame is bounded. Memory grows with the number of buses, up to [`BUSES`], not with the number of
 //! frames.
 
-use model::decode::{MAX_BUSES, Decoded};
+use model::decode::{Decoded, MAX_BUSES};
 use model::tracker::{CellTracker, HeartbeatKind};
 use protocol::candump::Record;
 use protocol::id::CellId;
@@ -451,7 +451,9 @@ impl CellStats {
             // A report older than the last torque does not end the contact.
             let is_over = !heartbeat.state.has(State::ACTIVE)
                 && joints.and_then(|joints| joints.of(*epoch)) >= self.touching;
-            if matches!(word, Some(HeartbeatKind::Started { .. })) || is_over && word != Some(HeartbeatKind::Claimant) {
+            if matches!(word, Some(HeartbeatKind::Started { .. }))
+                || is_over && word != Some(HeartbeatKind::Claimant)
+            {
                 self.touching = None;
             }
         }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use model::decode::Decoded;
 use model::listing::Listing;
-use protocol::bus::{Bus, BusError, KindChoice, Filter, GATEWAY_RECEIVE_BUFFER, BusOptions};
+use protocol::bus::{Bus, BusError, BusOptions, Filter, GATEWAY_RECEIVE_BUFFER, KindChoice};
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind};
 use protocol::message::Message;

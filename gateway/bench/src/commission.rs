@@ -6,9 +6,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
-use model::commission::{Commission, Progress, Report, CommissionOptions};
+use model::commission::{Commission, CommissionOptions, Progress, Report};
 use model::decode::Decoded;
-use protocol::bus::{BusError, Filter, GATEWAY_RECEIVE_BUFFER, KindChoices, BusOptions};
+use protocol::bus::{BusError, BusOptions, Filter, GATEWAY_RECEIVE_BUFFER, KindChoices};
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind};
 use protocol::skin::Skin;
@@ -118,7 +118,13 @@ pub fn commission(
 
 impl BusCommissioner {
     /// Commissions the cells of the bus until done or stopped, and reports the progress.
-    fn work(mut self, skin: &Skin, wish: CommissionOptions, stopped: &AtomicBool, tell: impl FnMut(Progress)) -> CommissionedBus {
+    fn work(
+        mut self,
+        skin: &Skin,
+        wish: CommissionOptions,
+        stopped: &AtomicBool,
+        tell: impl FnMut(Progress),
+    ) -> CommissionedBus {
         let frames = match self.format {
             Format::Fd => 1,
             Format::Classic => 2,
@@ -165,7 +171,8 @@ impl BusCommissioner {
                 passing(send(listener.bus(), &message, *format), DOWN_PAUSE)?;
             }
             let Some(next) = commission.poll_timeout() else { return Ok(()) };
-            let quiet = roots.as_ref().filter(|_| commission.may_send()).map_or(POLL_TIMEOUT, RootWires::timeout);
+            let quiet =
+                roots.as_ref().filter(|_| commission.may_send()).map_or(POLL_TIMEOUT, RootWires::timeout);
             let wait = Duration::from_micros(next.elapsed_since(clock()).0).min(quiet).min(POLL_TIMEOUT);
             passing(listener.receive(wait), DOWN_PAUSE)?;
             for (received, decoded) in listener.decoded() {

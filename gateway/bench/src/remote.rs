@@ -259,7 +259,10 @@ mod tests {
         assert_eq!(read(r#"{"on":"process","action":"kill","bus":0,"node":12}"#), Some(kill));
         let link = BenchCommand::Link { down: true, bus: 1, nodes: [3, 4] };
         assert_eq!(read(r#"{"on":"link","down":true,"bus":1,"nodes":[3,4]}"#), Some(link));
-        assert_eq!(read(r#"{"on":"bus","down":false,"bus":0}"#), Some(BenchCommand::Bus { down: false, bus: 0 }));
+        assert_eq!(
+            read(r#"{"on":"bus","down":false,"bus":0}"#),
+            Some(BenchCommand::Bus { down: false, bus: 0 })
+        );
         for wrong in [
             r#"{"on":"process","action":"shoot","bus":0,"node":12}"#,
             r#"{"on":"process","action":"kill","bus":0,"node":256}"#,

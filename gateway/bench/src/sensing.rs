@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
 use model::repeat::Repeats;
-use protocol::bus::{Bus, BusError, KindChoice, Filter, BusOptions};
+use protocol::bus::{Bus, BusError, BusOptions, Filter, KindChoice};
 use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Answer, Message, Request};

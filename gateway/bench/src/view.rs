@@ -5,7 +5,7 @@ use protocol::message::State;
 use protocol::packet::{Epoch, WORDS};
 
 use model::network::check::ObservedCell;
-use model::table::{CellState, SWITCHES, Responded, Status, Switch};
+use model::table::{CellState, Responded, SWITCHES, Status, Switch};
 
 /// State of a bus's cells, updated every 20 ms.
 #[derive(Clone, Debug, Default)]

@@ -10,11 +10,11 @@ use std::time::Duration;
 
 use bench::bus::follow::fill;
 use bench::bus::listen;
-use protocol::bus::{Bus as Socket, BusError, KindChoice, GATEWAY_RECEIVE_BUFFER, Inbox, BusOptions};
+use protocol::bus::{Bus as Socket, BusError, BusOptions, GATEWAY_RECEIVE_BUFFER, Inbox, KindChoice};
 use protocol::can::{Format, Frame};
 use protocol::time::{Micros, Span};
 
-use crate::bus::{TestBus, ObservedFrame, StopReason};
+use crate::bus::{ObservedFrame, StopReason, TestBus};
 use probe::Probe;
 
 /// The interval at which a termination signal is checked.
@@ -130,7 +130,9 @@ impl TestBus for SocketBus {
     }
 
     fn begin_restart(&mut self) -> Result<(), StopReason> {
-        let Some(command) = &self.command else { return Err(StopReason::Restart("a restart needs the option --restart".to_owned())) };
+        let Some(command) = &self.command else {
+            return Err(StopReason::Restart("a restart needs the option --restart".to_owned()));
+        };
         let child = Command::new("sh")
             .args(["-c", command])
             .stdin(Stdio::null())
@@ -150,7 +152,9 @@ impl TestBus for SocketBus {
                 self.child = None;
                 if status.success() { Ok(false) } else { failed(format!("failed: {status}")) }
             }
-            Ok(None) if now.elapsed_since(*began) > RESTART_TIMEOUT => failed("did not end within 15 s".to_owned()),
+            Ok(None) if now.elapsed_since(*began) > RESTART_TIMEOUT => {
+                failed("did not end within 15 s".to_owned())
+            }
             Ok(None) => Ok(true),
             Err(error) => failed(error.to_string()),
         }

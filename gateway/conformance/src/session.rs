@@ -18,7 +18,7 @@ use protocol::packet::{Epoch, Words};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
 
-use crate::bus::{TestBus, ObservedFrame, StopReason};
+use crate::bus::{ObservedFrame, StopReason, TestBus};
 use crate::findings::Findings;
 use crate::timings::Timings;
 
@@ -218,7 +218,8 @@ impl<'a> Session<'a> {
             self.findings.pass(id);
         } else if !self.clock.skipped {
             let (log, name) = (&self.log, &self.name);
-            self.findings.fail(id, what(), || log.present().iter().map(|seen| frame_line(name, seen)).collect());
+            self.findings
+                .fail(id, what(), || log.present().iter().map(|seen| frame_line(name, seen)).collect());
         }
         is_so
     }
@@ -230,7 +231,9 @@ impl<'a> Session<'a> {
         for stray in strays {
             if let Some(id) = self.known.unexpected(&stray.message) {
                 let kind = stray.message.id().kind.name();
-                self.check(id, false, || format!("the cell must not send a {kind} packet unrequested, but one came"));
+                self.check(id, false, || {
+                    format!("the cell must not send a {kind} packet unrequested, but one came")
+                });
             }
         }
         self.begin_expected_exchange();
@@ -293,7 +296,10 @@ impl<'a> Session<'a> {
                 return Ok(own);
             }
             if self.bus.now() >= give_up {
-                return Err(StopReason::Bus(format!("{}: {last} was sent, but did not appear on the bus", self.name)));
+                return Err(StopReason::Bus(format!(
+                    "{}: {last} was sent, but did not appear on the bus",
+                    self.name
+                )));
             }
             self.process_next_frame(give_up)?;
         }

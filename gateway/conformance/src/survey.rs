@@ -9,7 +9,7 @@ use protocol::message::{Message, NetworkPage};
 use protocol::packet::{self, Packet};
 use protocol::time::Span;
 
-use crate::bus::{TestBus, StopReason};
+use crate::bus::{StopReason, TestBus};
 
 /// The listening time: more than two intervals of heartbeats.
 pub const LISTEN_TIME: Span = Span::from_millis(600);

@@ -24,10 +24,10 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{ControllerKind, LostBus, MAX_ROBOT_JOINTS, Safety, Skin};
 use protocol::time::Micros;
 
-use crate::controller::{BadCycle, Controller, Input, ControllerOutput};
+use crate::controller::{BadCycle, Controller, ControllerOutput, Input};
 use crate::external::Absence;
-use crate::robot::{StepResult, Robot};
-use carried::{Carried, BusInput, bit};
+use crate::robot::{Robot, StepResult};
+use carried::{BusInput, Carried, bit};
 use chain::Chain;
 use model::central::Central;
 use model::table::Snapshot;
@@ -276,7 +276,11 @@ impl Cycle {
         let velocity = match step {
             ControllerOutput::Move(velocity) if self.halted.is_none() => velocity,
             // Without an answer, the robot first keeps its velocity for some cycles; then it stands, halted or not.
-            ControllerOutput::Bad(_) if self.halted.is_none() && self.bad_in_a_row < self.safety.bad_cycles => input.qdot,
+            ControllerOutput::Bad(_)
+                if self.halted.is_none() && self.bad_in_a_row < self.safety.bad_cycles =>
+            {
+                input.qdot
+            }
             ControllerOutput::Move(_) | ControllerOutput::Bad(_) => [0.0; MAX_ROBOT_JOINTS],
         };
         let moved = self.robot.step(&velocity, self.tick_seconds);

@@ -31,7 +31,7 @@ pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>
 #[expect(clippy::float_cmp, reason = "what does not move is exactly where it was")]
 mod tests {
     use super::*;
-    use crate::controller::{Input, ControllerOutput};
+    use crate::controller::{ControllerOutput, Input};
     use model::testing::skin;
     use protocol::packet::padded;
 

@@ -6,7 +6,12 @@ use crate::surface::{Sample, Surface, real};
 use crate::{LinkFigures, RobotLink};
 
 /// Computes how well the cells at `spots` cover a link.
-pub(crate) fn figures(link: &RobotLink, surface: &Surface<'_>, spots: &[CellPosition], pitch: f64) -> LinkFigures {
+pub(crate) fn figures(
+    link: &RobotLink,
+    surface: &Surface<'_>,
+    spots: &[CellPosition],
+    pitch: f64,
+) -> LinkFigures {
     let grid = Grid::with_points(pitch, spots.iter().map(|spot| &spot.point));
     let covered = |sample: &&Sample| {
         let mut near = grid.around(grid.cube(&sample.point)).filter_map(|index| spots.get(index));

@@ -33,7 +33,8 @@ pub(crate) struct Site {
 impl Site {
     /// Returns the squared distance to a sample in m²; `None` if the sample faces another way.
     pub(crate) fn distance(&self, sample: &Sample) -> Option<f64> {
-        (self.normal.dot(&sample.smooth) > MIN_NORMAL_COSINE).then(|| (self.point - sample.point).norm_squared())
+        (self.normal.dot(&sample.smooth) > MIN_NORMAL_COSINE)
+            .then(|| (self.point - sample.point).norm_squared())
     }
 }
 
@@ -73,7 +74,8 @@ impl<'a> Field<'a> {
         let free = |site: &Site, apart: f64, sites: &[Site], grid: &Grid| {
             let mut near = grid.around(grid.cube(&site.point)).filter_map(|index| sites.get(index));
             near.all(|other| {
-                other.normal.dot(&site.normal) <= MIN_NORMAL_COSINE || (other.point - site.point).norm() >= apart
+                other.normal.dot(&site.normal) <= MIN_NORMAL_COSINE
+                    || (other.point - site.point).norm() >= apart
             })
         };
         for sample in order.iter().filter_map(|&index| self.samples.get(index)) {

@@ -7,7 +7,7 @@ use nalgebra::{Isometry3, Matrix3, Point3, Unit, Vector3};
 use crate::grid::Grid;
 use crate::mesh::{Affine, MAX_TRIANGLES, Triangle};
 use crate::tree::{Ray, TriangleTree};
-use crate::{CoverError, KeepOut, RobotLink, CoverOptions};
+use crate::{CoverError, CoverOptions, KeepOut, RobotLink};
 
 /// The number of samples on the area of a cell.
 const PER_CELL: f64 = 64.0;

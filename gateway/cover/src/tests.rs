@@ -311,7 +311,8 @@ fn keep_out_boxes_hold_no_cell() {
 
 #[test]
 fn the_same_seed_gives_the_same_cells() {
-    let skin = |seed| covered(single(Mesh::cylinder(0.06, 0.2).unwrap()), &CoverOptions { seed, ..options() });
+    let skin =
+        |seed| covered(single(Mesh::cylinder(0.06, 0.2).unwrap()), &CoverOptions { seed, ..options() });
     assert_eq!(skin(7), skin(7));
     assert_ne!(skin(7).cells, skin(8).cells);
 }
@@ -357,11 +358,16 @@ fn what_cannot_be_covered_is_refused_in_one_line() {
     assert!(refused(overflowing, options()).starts_with("link l: inf m²"));
     let pitch = refused(single(cube(1.0)), CoverOptions { pitch: 0.0, ..options() });
     assert_eq!(pitch, "pitch 0 m: it is 0.001 to 1 m; correct it");
-    assert!(refused(single(cube(1.0)), CoverOptions { pitch: f64::NAN, ..options() }).starts_with("pitch NaN m"));
     assert!(
-        refused(single(cube(1.0)), CoverOptions { clearance: -1.0, ..options() }).starts_with("clearance -1 m")
+        refused(single(cube(1.0)), CoverOptions { pitch: f64::NAN, ..options() }).starts_with("pitch NaN m")
     );
-    assert!(refused(single(cube(1.0)), CoverOptions { nodes_per_bus: 251, ..options() }).starts_with("251 nodes"));
+    assert!(
+        refused(single(cube(1.0)), CoverOptions { clearance: -1.0, ..options() })
+            .starts_with("clearance -1 m")
+    );
+    assert!(
+        refused(single(cube(1.0)), CoverOptions { nodes_per_bus: 251, ..options() }).starts_with("251 nodes")
+    );
 }
 
 #[test]

@@ -103,7 +103,9 @@ impl TriangleTree {
             let node = nodes.len();
             nodes.push((bounds, NodeKind::Leaf(from, to)));
             // The parent stores the index of its second child; the first one follows the parent directly.
-            if let Some((_, NodeKind::Fork(_, second))) = place.and_then(|parent: usize| nodes.get_mut(parent)) {
+            if let Some((_, NodeKind::Fork(_, second))) =
+                place.and_then(|parent: usize| nodes.get_mut(parent))
+            {
                 *second = node;
             }
             if to - from <= LEAF {

@@ -18,7 +18,7 @@ use nalgebra::{IsometryMatrix3, Matrix4, Point3, Rotation3, Translation3, Vector
 use protocol::fixed::{Q, Q1_14};
 use protocol::message::SkinSensors;
 use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
-use protocol::skin::{ChainBase, Cell, Chain, Skin};
+use protocol::skin::{Cell, Chain, ChainBase, Skin};
 
 /// The central computation for the cells of one chain. Cells are named by their index in [`Skin::cells`].
 #[derive(Clone, Debug)]

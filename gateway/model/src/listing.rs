@@ -44,7 +44,8 @@ impl ListedCell {
         self.pages.record(page);
         if let NetworkPage::Heartbeat(heartbeat) = page {
             let before = self.claim.serial();
-            if matches!(self.claim.receive(now, heartbeat), HeartbeatKind::Claimant | HeartbeatKind::Outsider) {
+            if matches!(self.claim.receive(now, heartbeat), HeartbeatKind::Claimant | HeartbeatKind::Outsider)
+            {
                 self.other = Some(heartbeat.serial);
             } else if before.is_some_and(|before| before != heartbeat.serial) {
                 // The reports so far belong to the previous cell: start again.
@@ -131,7 +132,11 @@ mod tests {
         let mut listing = Listing::new();
         let heartbeat = Heartbeat { serial: 7, state: State(0x1101), ..Heartbeat::default() };
         listing.receive(Micros(10), Format::Classic, &says(3, NetworkPage::Heartbeat(heartbeat)));
-        listing.receive(Micros(20), Format::Classic, &says(4, NetworkPage::Rejected(RejectedCounts::default())));
+        listing.receive(
+            Micros(20),
+            Format::Classic,
+            &says(4, NetworkPage::Rejected(RejectedCounts::default())),
+        );
         let cells: Vec<_> = listing.cells().collect();
         let [(3, third), (4, fourth)] = cells.as_slice() else { panic!("{cells:?}") };
         assert_eq!((third.heartbeat, third.pages.rejected, third.pages.tree), (Some(heartbeat), None, None));

@@ -12,7 +12,7 @@
 use protocol::can::{Format, Frame};
 use protocol::id::{Command, Id};
 use protocol::message::{Message, MessageError};
-use protocol::packet::{Length, Lengths, Packet, PacketError, Reassembly, Reassembler, data_id};
+use protocol::packet::{Length, Lengths, Packet, PacketError, Reassembler, Reassembly, data_id};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 

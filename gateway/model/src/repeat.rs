@@ -127,7 +127,10 @@ mod tests {
         }
         assert_eq!((attempt.tries(), attempt.due()), (4, Micros(900)));
         attempt.extend(Micros(800));
-        assert_eq!((attempt.turn(Micros(1_099)), attempt.turn(Micros(1_100))), (RetryAction::Wait, RetryAction::GiveUp));
+        assert_eq!(
+            (attempt.turn(Micros(1_099)), attempt.turn(Micros(1_100))),
+            (RetryAction::Wait, RetryAction::GiveUp)
+        );
     }
 
     #[test]

@@ -75,8 +75,7 @@ pub fn over_cells(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) -> 
     let sensors = vec![SkinSensors::default(); skin.cells.len()];
     let cells: Vec<usize> = (0..=skin.cells.len()).step_by(extent.step.max(1)).collect();
     let measured = samples::interleaved(cells.len(), extent.rounds, 9, |place| {
-        let sensors =
-            cells.get(place).and_then(|&cells| sensors.get(..cells)).unwrap_or_default();
+        let sensors = cells.get(place).and_then(|&cells| sensors.get(..cells)).unwrap_or_default();
         timed(&central, sensors, &now)
     });
     let points = cells.iter().zip(&measured).map(|(&cells, values)| {
@@ -107,7 +106,8 @@ pub fn over_active(skin: &Skin, extent: CentralExtent, now: impl Fn() -> u64) ->
         }
     }
     let points = by_active.iter_mut().enumerate().filter(|(_, values)| !values.is_empty());
-    let points: Vec<_> = points.map(|(active, values)| WeightedPoint::median(count(active), values)).collect();
+    let points: Vec<_> =
+        points.map(|(active, values)| WeightedPoint::median(count(active), values)).collect();
     Some(OverActive { cells, line: LinearFit::through(&points)?, points })
 }
 
@@ -269,7 +269,8 @@ mod tests {
     #[test]
     fn the_papers_own_laws_lead_to_its_limits_and_to_no_verdict_but_the_same() {
         let law = line(paper::CELL_S * 1e9, paper::FIXED_S * 1e9);
-        let points = [0.0, 1500.0, 3000.0].map(|cells| [cells, law.value_at(cells), law.value_at(cells), law.value_at(cells)]);
+        let points = [0.0, 1500.0, 3000.0]
+            .map(|cells| [cells, law.value_at(cells), law.value_at(cells), law.value_at(cells)]);
         let cells = OverCells { points: points.to_vec(), line: law };
         let over = line(paper::ACTIVE_S * 1e9, paper::NONE_ACTIVE_S * 1e9);
         let points = [0.0, 100.0, 253.0].map(|x| WeightedPoint { x, y: over.value_at(x), weight: 3.0 });
@@ -312,6 +313,9 @@ mod tests {
         let active = over_active(&skin, extent, now).unwrap();
         assert!((active.points.iter().map(|point| point.weight).sum::<f64>() - 200.0).abs() < 1e-9);
         assert!(active.points.iter().all(|point| (point.y - 1.0).abs() < 1e-9 && point.x <= 40.0));
-        assert!(over_cells(&skin, CentralExtent { step: 40, ..extent }, now).is_none(), "two numbers make no law");
+        assert!(
+            over_cells(&skin, CentralExtent { step: 40, ..extent }, now).is_none(),
+            "two numbers make no law"
+        );
     }
 }

@@ -180,7 +180,8 @@ mod tests {
         let once = [(0.0, 1.0), (1.0, 2.0), (1.0, 2.0), (1.0, 2.0), (2.0, 5.0)];
         let thrice = [(0.0, 1.0, 1.0), (1.0, 2.0, 3.0), (2.0, 5.0, 1.0)];
         let thrice = thrice.map(|(x, y, weight)| WeightedPoint { x, y, weight });
-        let (once, thrice) = (LinearFit::through_equals(&once).unwrap(), LinearFit::through(&thrice).unwrap());
+        let (once, thrice) =
+            (LinearFit::through_equals(&once).unwrap(), LinearFit::through(&thrice).unwrap());
         assert!((once.slope - thrice.slope).abs() < 1e-12);
         assert!((once.intercept - thrice.intercept).abs() < 1e-12);
         assert!((once.quality - thrice.quality).abs() < 1e-12);

@@ -88,7 +88,7 @@ fn by_joint(numbers: &[f64]) -> [f64; MAX_ROBOT_JOINTS] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use trace::ros2::cdr::{Encode, CdrWriter};
+    use trace::ros2::cdr::{CdrWriter, Encode};
 
     #[test]
     fn the_messages_of_a_tick_make_one_row() {

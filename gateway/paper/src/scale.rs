@@ -212,7 +212,8 @@ const FULL: ScaleExtent = ScaleExtent {
     rounds: 100,
 };
 
-const QUICK: ScaleExtent = ScaleExtent { cells: &[24, 300], rates: &[62.5], seconds: 1.0, steps: 4, rounds: 5 };
+const QUICK: ScaleExtent =
+    ScaleExtent { cells: &[24, 300], rates: &[62.5], seconds: 1.0, steps: 4, rounds: 5 };
 
 /// Runs all benches and measures all ticks.
 ///
@@ -255,7 +256,12 @@ fn size<L: Lab>(lab: &mut L, cells: usize, extent: ScaleExtent) -> Result<SizeFi
 }
 
 /// Measures ticks without threads: for different numbers of cells, and three for comparison.
-fn loops(fewest: usize, most: usize, extent: ScaleExtent, now: impl Fn() -> u64 + Copy) -> (TickTimes, ComparedTicks) {
+fn loops(
+    fewest: usize,
+    most: usize,
+    extent: ScaleExtent,
+    now: impl Fn() -> u64 + Copy,
+) -> (TickTimes, ComparedTicks) {
     let skin = |cells, buses| ticks::skin(cells, buses).expect("so many cells fit on the arm");
     let buses = most.div_ceil(CellId::COUNT);
     let large = skin(most, buses);

@@ -10,8 +10,8 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, Skin};
 use protocol::time::{Micros, Span};
 
-use control::controller::{Controller, Input, Kinesthetic, ControllerOutput};
-use control::cycle::turn::{BusPort, Shared, TimedRecord, TickDriver};
+use control::controller::{Controller, ControllerOutput, Input, Kinesthetic};
+use control::cycle::turn::{BusPort, Shared, TickDriver, TimedRecord};
 use control::cycle::{Cycle, Tick};
 use control::robot::SimulatedArm;
 use model::generate::{GenerateError, Target, generate};
@@ -87,7 +87,9 @@ struct HoldingController(Kinesthetic);
 impl Controller for HoldingController {
     fn step(&mut self, input: &Input) -> ControllerOutput {
         match self.0.step(input) {
-            ControllerOutput::Move(velocity) => ControllerOutput::Move(std::hint::black_box(velocity).map(|_| 0.0)),
+            ControllerOutput::Move(velocity) => {
+                ControllerOutput::Move(std::hint::black_box(velocity).map(|_| 0.0))
+            }
             ControllerOutput::Bad(why) => ControllerOutput::Bad(why),
         }
     }
@@ -186,11 +188,7 @@ impl Ticks {
         self.number += 1;
         let timed = self.records.pop().ok();
         timed.map_or((0, None, true), |TimedRecord { record, central, .. }| {
-            (
-                record.contributing,
-                central.map(|(_, total)| total.active),
-                record.halted.is_some(),
-            )
+            (record.contributing, central.map(|(_, total)| total.active), record.halted.is_some())
         })
     }
 }

@@ -113,11 +113,7 @@ impl SumTree {
             };
             let force = self.central.force(*place, sensors);
             add(&mut came.central, self.central.torque(*place, &frames, force));
-            let force = Force::fuse(
-                sensors.contact,
-                sensors.proximity,
-                &self.skin.parameters(cell).contact,
-            );
+            let force = Force::fuse(sensors.contact, sensors.proximity, &self.skin.parameters(cell).contact);
             let exact = Torque::new(&kernel.jacobian(&words), force).exact();
             add(&mut came.truncated, exact.map(truncated));
             came.loaded = came.loaded.max(cell.joint.into());

@@ -15,7 +15,7 @@ use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
 use protocol::skin::{JointKind, MAX_ROBOT_JOINTS, REACH, Skin, reach};
 use thiserror::Error;
 
-use crate::chain::{UrdfChain, ChainJoint};
+use crate::chain::{ChainJoint, UrdfChain};
 use crate::error::RobotError;
 
 /// Default number of cells per bus. With node ids 1 to 250, a few remain for cells that are added later.
@@ -180,7 +180,9 @@ impl ImportError {
     /// Converts an error of the check of the written skin. The result refers to the lines of the file of cells, because
     /// the user does not see the text of the skin.
     fn of_check(error: DocumentError, cells: &[CellOnLink], buses: &[BusAssignment]) -> Self {
-        let DocumentError::InvalidValue { what, .. } = error else { return Self::Robot { what: error.to_string() } };
+        let DocumentError::InvalidValue { what, .. } = error else {
+            return Self::Robot { what: error.to_string() };
+        };
         let lines_of_buses = || buses.iter().map(|bus| bus.line);
         let found =
             numbered(&what, "cell").map(|(index, rest)| (cells.get(index).map(|cell| cell.line), rest));
@@ -252,7 +254,11 @@ impl SkinImport<'_> {
     }
 
     /// Assigns a cell to the first chain that moves its link, and to a bus with a node id.
-    fn place<'a>(&self, cell: &'a CellOnLink, buses: &mut Vec<BusAssignment>) -> Result<PlacedCell<'a>, ImportError> {
+    fn place<'a>(
+        &self,
+        cell: &'a CellOnLink,
+        buses: &mut Vec<BusAssignment>,
+    ) -> Result<PlacedCell<'a>, ImportError> {
         let line = cell.line;
         let mut found = None;
         let mut refused = None;
@@ -298,12 +304,26 @@ impl SkinImport<'_> {
         };
         there.taken.push((node, line));
         let (chain, joint, row) = (owner, frame.joint, frame.row);
-        Ok(PlacedCell { cell, bus, node, chain, joint, row, position: position.into(), normal: normal.into() })
+        Ok(PlacedCell {
+            cell,
+            bus,
+            node,
+            chain,
+            joint,
+            row,
+            position: position.into(),
+            normal: normal.into(),
+        })
     }
 
     /// Returns the index of a cell's bus: the bus that the cell names, or the last bus of its chain with a free node
     /// id. Adds a bus if necessary.
-    fn bus(&self, cell: &CellOnLink, chain: usize, buses: &mut Vec<BusAssignment>) -> Result<usize, ImportError> {
+    fn bus(
+        &self,
+        cell: &CellOnLink,
+        chain: usize,
+        buses: &mut Vec<BusAssignment>,
+    ) -> Result<usize, ImportError> {
         let name = |chain: usize| self.chains.get(chain).map_or_else(String::new, |chain| chain.tip.clone());
         if let Some(named) = &cell.bus {
             if let Some(index) = buses.iter().position(|bus| bus.name == *named) {
@@ -320,10 +340,17 @@ impl SkinImport<'_> {
             if !is_plain_name(named) || named.starts_with('.') {
                 return Err(ImportError::BusName { line: cell.line, bus: named.clone() });
             }
-            buses.push(BusAssignment { name: named.clone(), chain, line: cell.line, taken: Vec::new(), named: true });
+            buses.push(BusAssignment {
+                name: named.clone(),
+                chain,
+                line: cell.line,
+                taken: Vec::new(),
+                named: true,
+            });
             return Ok(buses.len() - 1);
         }
-        let has_room = |bus: &BusAssignment| bus.chain == chain && !bus.named && bus.taken.len() < DEFAULT_CELLS_PER_BUS;
+        let has_room =
+            |bus: &BusAssignment| bus.chain == chain && !bus.named && bus.taken.len() < DEFAULT_CELLS_PER_BUS;
         if let Some(index) = buses.iter().rposition(has_room) {
             return Ok(index);
         }
@@ -384,7 +411,12 @@ impl SkinImport<'_> {
         draft.table("[controller]", Some("M q'' + D q' = tau, joint by joint"));
         draft.set("kind", Value::Text("kinesthetic"));
         draft.set_with_comment("inertia", Value::Numbers(&each(&by_kind(1.0, 10.0))), 5, "kg m2, or kg");
-        draft.set_with_comment("damping", Value::Numbers(&each(&by_kind(4.0, 80.0))), 5, "Nm s/rad, or N s/m");
+        draft.set_with_comment(
+            "damping",
+            Value::Numbers(&each(&by_kind(4.0, 80.0))),
+            5,
+            "Nm s/rad, or N s/m",
+        );
         let speed = each(&|joint| joint.max_speed.unwrap_or(MAX_SPEED));
         draft.set_with_comment("max_speed", Value::Numbers(&speed), 3, "rad/s, or m/s");
         for cell in cells {

@@ -40,14 +40,14 @@ mod taken;
 mod urdf;
 mod written;
 
-pub use chain::{UrdfChain, ChainJoint, LinkFrame};
-pub use describe::{DEFAULT_CELLS_PER_BUS, CellOnLink, SkinImport, ImportError};
-pub use error::{RobotProblem, RobotError};
+pub use chain::{ChainJoint, LinkFrame, UrdfChain};
+pub use describe::{CellOnLink, DEFAULT_CELLS_PER_BUS, ImportError, SkinImport};
+pub use error::{RobotError, RobotProblem};
 pub use links::LinkPose;
 pub use nalgebra::Isometry3;
 pub use protocol::parameters::RowKind;
 pub use protocol::skin::JointKind;
-pub use rows::{MAX_LENGTH_M, MAX_RESIDUAL, DhRow, frames, pose_of};
+pub use rows::{DhRow, MAX_LENGTH_M, MAX_RESIDUAL, frames, pose_of};
 pub use taken::{UniqueNames, chain_words, word};
 pub use urdf::{Geometry, Shape, Urdf, text};
 pub use written::{WrittenUrdf, written};

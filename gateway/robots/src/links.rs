@@ -2,9 +2,9 @@
 
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
-use crate::error::{RobotProblem, RobotError};
+use crate::error::{RobotError, RobotProblem};
 use crate::nearest::nearest;
-use crate::urdf::{UrdfJointKind, Urdf, UrdfJoint};
+use crate::urdf::{Urdf, UrdfJoint, UrdfJointKind};
 
 /// The pose of a link relative to its parent link.
 #[derive(Clone, Debug, PartialEq)]
@@ -68,9 +68,13 @@ impl Urdf {
                 None => (joint.name.as_str(), 1.0, 0.0),
             };
             let slides = joint.kind == UrdfJointKind::Prismatic;
-            let moves = matches!(joint.kind, UrdfJointKind::Revolute | UrdfJointKind::Continuous | UrdfJointKind::Prismatic);
+            let moves = matches!(
+                joint.kind,
+                UrdfJointKind::Revolute | UrdfJointKind::Continuous | UrdfJointKind::Prismatic
+            );
             let motion = place(of).filter(|_| moves);
-            let motion = motion.map(|of| LinkMotion { joint: of, slides, axis: joint.axis, multiplier, offset });
+            let motion =
+                motion.map(|of| LinkMotion { joint: of, slides, axis: joint.axis, multiplier, offset });
             let origin = match motion {
                 Some(_) => joint.origin,
                 None => joint.transform(multiplier * self.rest(of) + offset),
@@ -91,7 +95,10 @@ impl Urdf {
 
     fn moving(&self, name: &str) -> Result<&UrdfJoint, RobotError> {
         let moves = |joint: &&UrdfJoint| {
-            let kind = matches!(joint.kind, UrdfJointKind::Revolute | UrdfJointKind::Continuous | UrdfJointKind::Prismatic);
+            let kind = matches!(
+                joint.kind,
+                UrdfJointKind::Revolute | UrdfJointKind::Continuous | UrdfJointKind::Prismatic
+            );
             kind && joint.mimic.is_none()
         };
         let found = self.joints().iter().filter(moves).find(|joint| joint.name == name);

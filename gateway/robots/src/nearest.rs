@@ -9,7 +9,8 @@ pub(crate) fn nearest<'a>(target: &str, names: impl IntoIterator<Item = &'a str>
     let mut found: Vec<_> =
         names.into_iter().map(|name| (edits(&target, &name.to_lowercase()), name)).collect();
     found.sort();
-    let found: Vec<_> = found.into_iter().take(MAX_SUGGESTIONS).map(|(_, name)| format!("{name:?}")).collect();
+    let found: Vec<_> =
+        found.into_iter().take(MAX_SUGGESTIONS).map(|(_, name)| format!("{name:?}")).collect();
     match found.as_slice() {
         [] => "none".to_owned(),
         [one] => one.clone(),

@@ -8,13 +8,13 @@ use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use model::listing::ListedCell;
 use protocol::can::Format;
 use protocol::id::CellId;
-use protocol::message::{ReceivedCounts, Heartbeat, PortState, RejectedCounts, State, Tree};
+use protocol::message::{Heartbeat, PortState, ReceivedCounts, RejectedCounts, State, Tree};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use rustix::termios::tcgetwinsize;
 use serde::Serialize;
 
-use crate::print::{drop_empty_columns, abbreviated, space_separated};
+use crate::print::{abbreviated, drop_empty_columns, space_separated};
 
 /// A bus as a skin describes it, for comparison with the cells found.
 pub(super) struct DescribedBus {
@@ -149,7 +149,8 @@ impl DescribedBus {
     /// Selects one bus of the skin that was read from `file`.
     pub(super) fn from_skin(skin: &Skin, bus: usize, file: String) -> Self {
         let format = skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format);
-        let cells = skin.cells_on_bus(bus).map(|cell| (cell.serial, (cell.node, skin.parameters(cell).hash())));
+        let cells =
+            skin.cells_on_bus(bus).map(|cell| (cell.serial, (cell.node, skin.parameters(cell).hash())));
         Self { file, format, cells: cells.collect() }
     }
 

@@ -13,7 +13,7 @@ use protocol::usage::{Failure, printable};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-use crate::print::{count, decimals, json as pretty, comma_separated, or_else_text, table, space_separated};
+use crate::print::{comma_separated, count, decimals, json as pretty, or_else_text, space_separated, table};
 
 /// Maximum number of values listed one by one.
 const LISTED: usize = 8;
@@ -113,8 +113,12 @@ impl Plan {
         }
         events.sort_by(|a, b| a.at_s.total_cmp(&b.at_s));
         let units = skin.robot.joints.iter().map(|joint| joint.kind.unit()).collect();
-        let motion =
-            PlannedMotion { kind: scenario.motion.kind.name(), start: each(&scenario.motion.start), units, how };
+        let motion = PlannedMotion {
+            kind: scenario.motion.kind.name(),
+            start: each(&scenario.motion.start),
+            units,
+            how,
+        };
         let (duration_s, seed) = (scenario.duration.seconds(), scenario.seed);
         let remarks = scenario.remarks(skin);
         let errors = errors(&scenario.sensors.force).into_iter().filter(|(_, error)| *error > 0.0);
@@ -155,7 +159,8 @@ impl Plan {
             or_else_text(touches_repeat_s.map(|period| format!("the touches repeat every {period} s\n")), ""),
             if sensors.is_empty() { String::new() } else { format!("sensors: {}\n", described(sensors)) }
         );
-        let remarks: String = remarks.iter().map(|remark| format!("remark: {}\n", printable(remark))).collect();
+        let remarks: String =
+            remarks.iter().map(|remark| format!("remark: {}\n", printable(remark))).collect();
         if events.is_empty() {
             return head + "no touches and no faults\n" + &remarks;
         }

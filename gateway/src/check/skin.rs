@@ -6,12 +6,12 @@ use std::path::Path;
 
 use protocol::fixed::TorqueFormat;
 use protocol::packet::crc16;
-use protocol::skin::{Cell, CellName, ControllerKind, SkinReply, Skin};
+use protocol::skin::{Cell, CellName, ControllerKind, Skin, SkinReply};
 use protocol::usage::{Failure, printable};
 use serde_json::{Value, json};
 
 use crate::arguments::bus_names;
-use crate::print::{count, comma_separated, or_else_text, space_separated};
+use crate::print::{comma_separated, count, or_else_text, space_separated};
 use crate::robot_file::{RobotOfSkin, urdf_of};
 
 /// Selection of the cells that are listed with or without the summary.
@@ -75,8 +75,9 @@ fn describe(skin: &Skin) -> String {
     for chain in
         robot.chains.iter().filter(|chain| robot.chains.len() > 1 || chain.rows.len() > chain.joints.len())
     {
-        let names =
-            space_separated(chain.joints.iter().filter_map(|joint| robot.joints.get(*joint)).map(|joint| &joint.name));
+        let names = space_separated(
+            chain.joints.iter().filter_map(|joint| robot.joints.get(*joint)).map(|joint| &joint.name),
+        );
         let (joints, rows) = (count(chain.joints.len(), "joint"), count(chain.rows.len(), "row"));
         text += &format!("chain {}: {joints} in {rows}: {}\n", printable(&chain.name), printable(&names));
     }
@@ -92,7 +93,8 @@ fn describe(skin: &Skin) -> String {
             *by_joint.entry(cell.joint).or_default() += 1;
         }
         let cells = count(by_joint.values().sum::<usize>(), "cell");
-        let parts = comma_separated(by_joint.iter().map(|(joint, cells)| format!("{cells} on joint {joint}")));
+        let parts =
+            comma_separated(by_joint.iter().map(|(joint, cells)| format!("{cells} on joint {joint}")));
         let roots: Vec<_> = skin.cells_on_bus(index).filter(|cell| cell.root).map(|cell| cell.node).collect();
         let roots = match roots.as_slice() {
             [] => "no root".to_owned(),
@@ -153,7 +155,8 @@ fn bus_name<'a>(skin: &'a Skin, cell: &Cell) -> &'a str {
 fn line(skin: &Skin, cell: &Cell) -> String {
     let on_bus = bus_name(skin, cell);
     let Cell { node, serial, joint, row, position, normal, neighbors, root, .. } = cell;
-    let (position, ports) = (space_separated(position), space_separated(neighbors.map(|port| or_else_text(port, "-"))));
+    let (position, ports) =
+        (space_separated(position), space_separated(neighbors.map(|port| or_else_text(port, "-"))));
     let normal = space_separated(rounded(normal));
     let root = if *root { " root" } else { "" };
     let row = Some(*row).filter(|row| skin.chain(cell.bus).row_of(*joint) != Some(*row));

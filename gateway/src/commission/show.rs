@@ -8,7 +8,7 @@ use protocol::id::CellId;
 use protocol::usage::Failure;
 use serde::Serialize;
 
-use crate::print::{KeyValueTable, count, abbreviated};
+use crate::print::{KeyValueTable, abbreviated, count};
 
 /// Maximum number of cells with other node ids that get a line each.
 const LINES: usize = 8;
@@ -146,7 +146,8 @@ impl CommissionResult<'_> {
             (false, true) => "dry run, nothing was written",
             (false, false) => "done",
         };
-        let mut rows = KeyValueTable::new(self.skin, format!("{cells} cells, {:.1} s, {ended}", self.seconds), "");
+        let mut rows =
+            KeyValueTable::new(self.skin, format!("{cells} cells, {:.1} s, {ended}", self.seconds), "");
         self.buses.iter().for_each(|bus| bus.rows(&mut rows));
         rows.text()
     }

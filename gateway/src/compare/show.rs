@@ -4,12 +4,12 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use analysis::compare::{ASPECTS, Both, CellRow, FirstDifference, Replies, Report, Source, CaptureSide};
+use analysis::compare::{ASPECTS, Both, CaptureSide, CellRow, FirstDifference, Replies, Report, Source};
 use model::quantiles::Quantiles;
 use protocol::usage::printable;
 
 use crate::junit::{Case, Outcome, Suite};
-use crate::print::{count, decimals, comma_separated, or_else_text, abbreviated, table};
+use crate::print::{abbreviated, comma_separated, count, decimals, or_else_text, table};
 
 /// Width of the tables in columns.
 const WIDTH: u16 = 80;
@@ -207,10 +207,16 @@ impl ComparisonText<'_> {
         if first.cell.is_some() && *what != "contact" {
             let inputs = match (first.inputs.as_slice(), first.unknown_inputs.as_slice()) {
                 ([], []) => "the inputs are the same: joints, halt, stimulus, configuration".to_owned(),
-                ([], unknown) => format!("no input is known to differ; not known: {}", comma_separated(unknown)),
+                ([], unknown) => {
+                    format!("no input is known to differ; not known: {}", comma_separated(unknown))
+                }
                 (inputs, []) => format!("other inputs: {}", comma_separated(inputs)),
                 (inputs, unknown) => {
-                    format!("other inputs: {}; not known: {}", comma_separated(inputs), comma_separated(unknown))
+                    format!(
+                        "other inputs: {}; not known: {}",
+                        comma_separated(inputs),
+                        comma_separated(unknown)
+                    )
                 }
             };
             let _ = writeln!(text, "  {inputs}");

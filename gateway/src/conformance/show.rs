@@ -10,7 +10,7 @@ use protocol::can::Format;
 use serde::Serialize;
 
 use crate::junit::{Case, Outcome, Suite};
-use crate::print::{count, comma_separated, readable, table};
+use crate::print::{comma_separated, count, readable, table};
 
 /// Result of a conformance test, as JSON.
 #[derive(Debug, Serialize)]

@@ -15,9 +15,9 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use trace::capture::convert::{Origin, CaptureWriter, EntrySink};
+use trace::capture::convert::{CaptureWriter, EntrySink, Origin};
 use trace::capture::log::{Style, WriteOutcome};
-use trace::capture::{Entry, CaptureFormat};
+use trace::capture::{CaptureFormat, Entry};
 use trace::files::LogFile;
 use trace::recording::names::{self, PartFile};
 

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use analysis::explain::series::{EpochTorque, SeriesError, each_epoch, is_summed};
 use csv::{Writer, WriterBuilder};
-use protocol::skin::{SkinReply, Skin};
+use protocol::skin::{Skin, SkinReply};
 use trace::capture::{Reader, seconds_since};
 
 use crate::input::LossCounts;

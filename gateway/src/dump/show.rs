@@ -20,7 +20,7 @@ use protocol::time::Micros;
 use protocol::usage::printable;
 
 use crate::output::note;
-use crate::print::{GREEN, PLAIN, RED, YELLOW, harmless, comma_separated};
+use crate::print::{GREEN, PLAIN, RED, YELLOW, comma_separated, harmless};
 
 /// Colours of a terminal.
 const DIM: &str = "\x1b[2m";
@@ -72,7 +72,14 @@ pub(super) struct FrameOutput<W> {
 }
 
 impl<W: Write> FrameOutput<W> {
-    pub(super) fn new(out: W, format: Option<Format>, pick: FrameFilter, contact: bool, how: OutputStyle, max: u64) -> Self {
+    pub(super) fn new(
+        out: W,
+        format: Option<Format>,
+        pick: FrameFilter,
+        contact: bool,
+        how: OutputStyle,
+        max: u64,
+    ) -> Self {
         let absent = pick.bus_names().map(str::to_owned).collect();
         Self {
             out,
@@ -98,8 +105,9 @@ impl<W: Write> FrameOutput<W> {
     /// Sets the units of the skin's buses; other buses keep the default. Call it before the first frame.
     pub(super) fn describe(&mut self, skin: &Skin) {
         let buses = skin.buses.iter().enumerate();
-        let described =
-            buses.map(|(index, bus)| (bus.name.clone(), Units::for_bus(skin, index), skin.joints_on_bus(index).len()));
+        let described = buses.map(|(index, bus)| {
+            (bus.name.clone(), Units::for_bus(skin, index), skin.joints_on_bus(index).len())
+        });
         self.described = described.collect();
     }
 

@@ -8,7 +8,9 @@ use model::decode::error_classes;
 use protocol::usage::printable;
 use trace::capture::{RecordingExtras, Topic};
 
-use crate::print::{self, KeyValueTable, decimals, drop_empty_columns, comma_separated, or_else_text, space_separated};
+use crate::print::{
+    self, KeyValueTable, comma_separated, decimals, drop_empty_columns, or_else_text, space_separated,
+};
 
 /// Formats the whole report: the capture, each bus, and each bus's cells.
 pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&RecordingExtras>) -> String {

@@ -43,7 +43,9 @@ pub(super) fn text(
     let finest = TorqueFormat::default().name();
     let is_finest = explanation.buses.iter().all(|bus| bus.torque_format == finest);
     match (what, cells.as_slice()) {
-        (ExplainDetail::All | ExplainDetail::Cells, []) => text += "\nno cell was in contact, and none answered\n",
+        (ExplainDetail::All | ExplainDetail::Cells, []) => {
+            text += "\nno cell was in contact, and none answered\n"
+        }
         (ExplainDetail::Joint, _) => text += &joint(cells),
         (ExplainDetail::Cells, _) | (ExplainDetail::All, [_]) => {
             for cell in cells {

@@ -2,13 +2,13 @@
 
 use analysis::fit::{self, BusFit, COMPUTATION_NS, rates};
 use protocol::can::Format;
-use protocol::skin::{SkinBus, Skin};
+use protocol::skin::{Skin, SkinBus};
 use protocol::usage::{Failure, print_text};
 use protocol::wire_time::BitRates;
 
 use super::{Fit, skin_text};
 use crate::output::note;
-use crate::print::{json, comma_separated};
+use crate::print::{comma_separated, json};
 
 impl Fit {
     /// Computes and prints the fit of a skin.

@@ -3,12 +3,12 @@
 use analysis::fit::case::{Answers, Case};
 use analysis::fit::limits::{Limit, MAX_NODES, NeededBuses};
 use analysis::fit::verdict::{Answer, percent};
-use analysis::fit::{BusFit, AssessedBus, Row, Spread, SkinFit, name};
+use analysis::fit::{AssessedBus, BusFit, Row, SkinFit, Spread, name};
 use protocol::parameters::Sensing;
 use protocol::skin::Skin;
 use protocol::usage::printable;
 
-use crate::print::{self, KeyValueTable, count, decimals, comma_separated, or_else_text};
+use crate::print::{self, KeyValueTable, comma_separated, count, decimals, or_else_text};
 
 /// Columns of the table over bit rates.
 const HEAD: [&str; 8] = [

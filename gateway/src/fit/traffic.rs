@@ -11,13 +11,14 @@ use analysis::shadow::{self, Shadow};
 use protocol::bus::{BusError, BusOptions};
 use protocol::skin::Skin;
 use protocol::stop::{self, InterruptibleWriter};
-use protocol::usage::{Failure, print_text, ignore_broken_pipe};
+use protocol::usage::{Failure, ignore_broken_pipe, print_text};
 use trace::capture::{Entry, NoteKind, Reader};
 
 use self::show::write_frames;
 use super::Fit;
 use crate::input::{
-    self, POLL_TIMEOUT, LossCounts, ReceiveEnd, captures, is_file, no_frame, place, remark_another, skin_beside, stopped,
+    self, LossCounts, POLL_TIMEOUT, ReceiveEnd, captures, is_file, no_frame, place, remark_another,
+    skin_beside, stopped,
 };
 use crate::output;
 use crate::print::comma_separated;

@@ -182,7 +182,8 @@ impl Positions {
 
 impl Stimulus {
     fn message(&self) -> Result<Message, String> {
-        let (to, from) = (self.cell.node, self.epoch.map_or(AppliesFrom::Next, |epoch| AppliesFrom::Epoch(Epoch(epoch))));
+        let (to, from) =
+            (self.cell.node, self.epoch.map_or(AppliesFrom::Next, |epoch| AppliesFrom::Epoch(Epoch(epoch))));
         if let Some((number, words)) = self.others.page()? {
             let page = SensorPage::of_stimulus(number, words).map_err(|error| error.to_string())?;
             return Ok(Message::Stimulus { to, from, page });
@@ -308,8 +309,11 @@ mod tests {
         for (force, steps) in
             [("3.0", 3_072), ("-96", -98_304), ("95.997", 98_301), ("0.0005", 1), ("1", 1_024)]
         {
-            let Ok(Message::Stimulus { page: SensorPage::Skin(skin), from: AppliesFrom::Next, to: Node::Everyone }) =
-                message(&format!("stimulus --cell everyone --force {force}"))
+            let Ok(Message::Stimulus {
+                page: SensorPage::Skin(skin),
+                from: AppliesFrom::Next,
+                to: Node::Everyone,
+            }) = message(&format!("stimulus --cell everyone --force {force}"))
             else {
                 panic!("{force}");
             };

@@ -61,15 +61,22 @@ impl SensingCommand {
         let mode = self.sensing().map_err(Failure::usage)?;
         let on = format!("{} ({})", bus.name(), bus.kind());
         let confirmed = switch(bus, format, only_cell(&self.cell), mode).map_err(Failure::run)?;
-        print_text(&format!("{confirmed} on {on}: {}\n", ParameterWords(Parameter::Sensing.number(), mode.words())))
+        print_text(&format!(
+            "{confirmed} on {on}: {}\n",
+            ParameterWords(Parameter::Sensing.number(), mode.words())
+        ))
     }
 
     fn sensing(&self) -> Result<Sensing, String> {
         match (self.mode, self.hz) {
             (SensingMode::Off, None) => Ok(Sensing::Off),
             (SensingMode::Event, None) => Ok(Sensing::Event),
-            (SensingMode::Continuous, Some(hz)) => continuous_sensing(hz).map_err(|why| format!("HZ = {hz}: {why}")),
-            (SensingMode::Continuous, None) => Err("continuous needs a rate, such as `continuous 62.5`".to_owned()),
+            (SensingMode::Continuous, Some(hz)) => {
+                continuous_sensing(hz).map_err(|why| format!("HZ = {hz}: {why}"))
+            }
+            (SensingMode::Continuous, None) => {
+                Err("continuous needs a rate, such as `continuous 62.5`".to_owned())
+            }
             (SensingMode::Off | SensingMode::Event, Some(hz)) => {
                 Err(format!("HZ = {hz}: only continuous has a rate; leave it out"))
             }

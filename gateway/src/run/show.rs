@@ -10,7 +10,10 @@ use model::listing::ranges;
 use model::table::Errors;
 use protocol::usage::printable;
 
-use crate::print::{GREEN, PLAIN, RED, KeyValueTable, YELLOW, count, hanging, comma_separated, or_else_text, quantiles, space_separated};
+use crate::print::{
+    GREEN, KeyValueTable, PLAIN, RED, YELLOW, comma_separated, count, hanging, or_else_text, quantiles,
+    space_separated,
+};
 
 /// Maximum number of halts listed one by one.
 const HALTS: usize = 10;
@@ -197,7 +200,11 @@ fn replies(rows: &mut KeyValueTable, bus: &BusSummary, is_verbose: bool) {
                 .map(|(n, way)| format!("{} lost {way}", count(n, "frame"))),
         );
         let cells = count(it.cells, "cell");
-        rows.row(format!("host {}", it.name), comma_separated([cells].into_iter().chain(gone).chain(end)), lost);
+        rows.row(
+            format!("host {}", it.name),
+            comma_separated([cells].into_iter().chain(gone).chain(end)),
+            lost,
+        );
     }
     if !bus.silent_cells.is_empty() {
         rows.row("silent cells", comma_separated(ranges(&bus.silent_cells)), "");
@@ -346,11 +353,19 @@ fn noteworthy(rows: &mut KeyValueTable, bus: &BusSummary, all: &[CellSummary]) {
     let unclear: Vec<_> =
         all().filter(|cell| cell.contact_unknown > 0 && !cell.measures()).map(|cell| cell.node).collect();
     if !unclear.is_empty() {
-        rows.row("cells of unknown contact", space_separated(unclear), "stimuli from before this run, or a baseline");
+        rows.row(
+            "cells of unknown contact",
+            space_separated(unclear),
+            "stimuli from before this run, or a baseline",
+        );
     }
     for cell in all().filter(|cell| !cell.stuck.is_empty()) {
         let kinds = cell.stuck.iter().map(|(kind, count)| format!("{count} times one {kind}"));
-        rows.row(format!("stuck: cell {}", cell.node), comma_separated(kinds), "while it should have sent others");
+        rows.row(
+            format!("stuck: cell {}", cell.node),
+            comma_separated(kinds),
+            "while it should have sent others",
+        );
     }
     let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| mean > CELL_ERROR_NM);
     let rank =

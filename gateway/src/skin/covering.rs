@@ -4,11 +4,11 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 
 use clap::Args;
-use cover::{LinkFigures, KeepOut, RobotLink, MAX_NODES, MAX_PITCH, MIN_PITCH, CoverOptions, cover};
+use cover::{CoverOptions, KeepOut, LinkFigures, MAX_NODES, MAX_PITCH, MIN_PITCH, RobotLink, cover};
 use protocol::usage::Failure;
-use robots::{CellOnLink, UrdfChain, Isometry3, Urdf};
+use robots::{CellOnLink, Isometry3, Urdf, UrdfChain};
 
-use super::super::print::{count, comma_separated};
+use super::super::print::{comma_separated, count};
 use super::super::visuals::{Packages, Visuals};
 
 /// Options for the covered links.

@@ -6,11 +6,11 @@ use clap::Args;
 use protocol::document;
 use protocol::id::CellId;
 use protocol::usage::{Failure, print_text};
-use robots::{CellOnLink, UrdfChain, SkinImport as Described, ImportError, JointKind};
+use robots::{CellOnLink, ImportError, JointKind, SkinImport as Described, UrdfChain};
 
 use super::super::columns::{Columns, Table};
 use super::super::output::{Overwrite, apart, is_standard_output, note};
-use super::super::print::{count, comma_separated};
+use super::super::print::{comma_separated, count};
 use super::super::robot_file::{path_from, read_urdf};
 use super::covering::{self, Covered, Covering};
 

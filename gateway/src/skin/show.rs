@@ -79,7 +79,10 @@ fn details(skin: &Skin, cell: &Cell) -> Vec<(String, String)> {
     if skin.chain(cell.bus).rows.iter().any(|row| row.kind == RowKind::Fixed) {
         detail("Row", cell.row.to_string());
     }
-    detail("In its frame", format!("{} m", space_separated(cell.position.map(|it| (it * 1e5).round() / 1e5 + 0.0))));
+    detail(
+        "In its frame",
+        format!("{} m", space_separated(cell.position.map(|it| (it * 1e5).round() / 1e5 + 0.0))),
+    );
     detail("Serial", cell.serial.to_string());
     detail("Hash", format!("{:04X}", skin.parameters(cell).hash()));
     details

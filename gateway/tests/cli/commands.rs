@@ -12,7 +12,7 @@ use std::process::{Command, Output, Stdio};
 use protocol::can::{Format, Frame};
 use protocol::candump;
 use protocol::message::Message;
-use protocol::packet::{Lengths, Packet, Reassembly, Reassembler, data_id};
+use protocol::packet::{Lengths, Packet, Reassembler, Reassembly, data_id};
 use protocol::time::Micros;
 use tempfile::TempDir;
 

@@ -10,7 +10,9 @@ use protocol::can::Format;
 use protocol::candump::{Direction, Record, Timestamp, write_record};
 use protocol::fixed::Q1_14;
 use protocol::id::{CellId, Node};
-use protocol::message::{AppliesFrom, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::message::{
+    AppliesFrom, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State,
+};
 use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use serde_json::Value;

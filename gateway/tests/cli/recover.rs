@@ -88,7 +88,10 @@ fn a_file_that_breaks_off_anywhere_keeps_what_was_handed_on() {
                     "{end}: whole chunks, in order"
                 );
                 assert!(kept.len() >= most, "{end}: more bytes, fewer messages");
-                assert!(!said.is_sound() && said.damaged == (0, 0) && said.orphaned_messages == 0, "{end}: {said:?}");
+                assert!(
+                    !said.is_sound() && said.damaged == (0, 0) && said.orphaned_messages == 0,
+                    "{end}: {said:?}"
+                );
                 most = kept.len();
                 // A repaired file needs no repair.
                 let (again, _) = recovered(&copy).unwrap();
@@ -201,7 +204,10 @@ fn types_and_topics_are_described_outside_of_chunks_again_and_again() {
         }
         assert!(since <= CHUNKS_PER_DESCRIPTION);
     }
-    assert_eq!((chunks, described), (count, vec![1, CHUNKS_PER_DESCRIPTION, CHUNKS_PER_DESCRIPTION, CHUNKS_PER_DESCRIPTION]));
+    assert_eq!(
+        (chunks, described),
+        (count, vec![1, CHUNKS_PER_DESCRIPTION, CHUNKS_PER_DESCRIPTION, CHUNKS_PER_DESCRIPTION])
+    );
 }
 
 /// Checks that all messages of undamaged chunks are kept in order, and that no message was invented.

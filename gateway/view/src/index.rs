@@ -8,10 +8,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 
 use protocol::skin::Skin;
-use trace::capture::{CaptureError, SeekPoint, Reader};
+use trace::capture::{CaptureError, Reader, SeekPoint};
 
 use crate::locked;
-use crate::tape::{Event, EventKind, TapeStep, Tape, EventDetector};
+use crate::tape::{Event, EventDetector, EventKind, Tape, TapeStep};
 
 /// The approximate maximum memory for all stored states, in bytes.
 const MEMORY_LIMIT: usize = 256 << 20;

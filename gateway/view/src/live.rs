@@ -12,7 +12,9 @@ use protocol::time::Micros;
 
 use self::bus::LiveBus;
 pub use self::recent::{DecodedFrame, RecentFrames, TorqueExplanation};
-pub use self::said::{TorqueReply, BusStatus, DeadCell, CellDetail, Gains, Reading, StatusMessage, TreePlace};
+pub use self::said::{
+    BusStatus, CellDetail, DeadCell, Gains, Reading, StatusMessage, TorqueReply, TreePlace,
+};
 use crate::pressed::{CellKey, TouchRegistry};
 use protocol::message::SkinSensors;
 
@@ -124,7 +126,8 @@ impl Live {
     fn joint_rows(&self) -> Vec<[f64; 3]> {
         let mut rows = vec![[0.0_f64; 3]; self.skin.robot.joints.len()];
         for (index, bus) in self.buses.iter().enumerate() {
-            for ((place, (joint, _)), torque) in self.skin.joints_on_bus(index).enumerate().zip(bus.torques()) {
+            for ((place, (joint, _)), torque) in self.skin.joints_on_bus(index).enumerate().zip(bus.torques())
+            {
                 let Some([position, distributed, central]) = rows.get_mut(joint) else { continue };
                 *position = bus.position(place).unwrap_or(*position);
                 *distributed += torque.0;

@@ -17,7 +17,7 @@ use crate::player::{PlayError, Player};
 use crate::pressed::TouchRegistry;
 use crate::scene::Scene;
 use crate::serve::ServeError;
-use crate::server::{Access, ServerCounts, Server};
+use crate::server::{Access, Server, ServerCounts};
 use crate::surface::{RowMesh, pack};
 use crate::tape::EventKind;
 
@@ -62,7 +62,8 @@ pub fn play(
     let mut player = Player::open(&paths, skin.clone())?;
     let reader = Reader::open_all(&paths).map_err(PlayError::from)?;
     let (shells, corners) = pack(&surface);
-    let scene = serde_json::to_string(&Scene { shells, ..Scene::from_skin(&skin, false) }).unwrap_or_default();
+    let scene =
+        serde_json::to_string(&Scene { shells, ..Scene::from_skin(&skin, false) }).unwrap_or_default();
     let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
     is_served();
     let (index, times) = (player.index(), (player.first(), player.zero()));
@@ -122,7 +123,10 @@ fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
                 let playback = player.playback();
                 if marks.0 != playback.events {
                     let kinds = [EventKind::Touch, EventKind::Loss, EventKind::Silence, EventKind::Halt];
-                    marks = (playback.events, kinds.map(|kind| (kind, player.marks(kind, TIMELINE_PARTS))).into());
+                    marks = (
+                        playback.events,
+                        kinds.map(|kind| (kind, player.marks(kind, TIMELINE_PARTS))).into(),
+                    );
                 }
                 let live = player.live();
                 let playback = Some(playback.with_marks(marks.1.clone()));

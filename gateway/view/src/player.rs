@@ -8,11 +8,11 @@ use std::time::Duration;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
-use trace::capture::{CaptureError, Entry, SeekPoint, SeekIndex, Reader, seconds_since};
+use trace::capture::{CaptureError, Entry, Reader, SeekIndex, SeekPoint, seconds_since};
 
-use crate::index::{Index, Checkpoint};
+use crate::index::{Checkpoint, Index};
 use crate::live::Live;
-use crate::tape::{EventKind, TapeStep, Tape};
+use crate::tape::{EventKind, Tape, TapeStep};
 
 /// The time before a position for which the plots get values, in ns.
 const HISTORY_NS: u64 = 10_000_000_000;

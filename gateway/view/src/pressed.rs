@@ -147,7 +147,9 @@ mod tests {
         let mut pressed = TouchRegistry::default();
         pressed.press(1, cell(3), 1.0);
         pressed.release(1);
-        let sent = (0..100_u64).map(|at| pressed.due_stimuli(Micros(at * RETRY_INTERVAL_US), |_| None).len()).sum::<usize>();
+        let sent = (0..100_u64)
+            .map(|at| pressed.due_stimuli(Micros(at * RETRY_INTERVAL_US), |_| None).len())
+            .sum::<usize>();
         assert_eq!((sent, pressed.targets.len()), (MAX_RELEASE_ATTEMPTS as usize, 0));
     }
 }

@@ -9,9 +9,9 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use bench::bus::follow::{Follower, FollowedItem, Source, FollowStep};
+use bench::bus::follow::{FollowStep, FollowedItem, Follower, Source};
 use bench::bus::listen::{now, open, send};
-use bench::remote::{JsonPipe, BenchState};
+use bench::remote::{BenchState, JsonPipe};
 use protocol::bus::batch::BATCH;
 use protocol::bus::{self, Bus, BusError, KindChoices};
 use protocol::can::Format;
@@ -26,7 +26,7 @@ use crate::locked;
 use crate::player::PlayError;
 use crate::pressed::TouchRegistry;
 use crate::scene::Scene;
-use crate::server::{Access, ServerCounts, Server};
+use crate::server::{Access, Server, ServerCounts};
 use crate::surface::{RowMesh, pack};
 
 /// The interval between snapshots.
@@ -94,8 +94,13 @@ struct SharedBus {
 /// # Errors
 /// Returns [`ServeError`] if a bus cannot be opened at the start and `patient` is false, or if a thread cannot be
 /// started.
-pub fn serve(options: Options, stop: &AtomicBool, is_served: impl FnOnce()) -> Result<ServerCounts, ServeError> {
-    let Options { skin, surface, kinds, directory, listener, access, waits_for_buses: patient, bench } = options;
+pub fn serve(
+    options: Options,
+    stop: &AtomicBool,
+    is_served: impl FnOnce(),
+) -> Result<ServerCounts, ServeError> {
+    let Options { skin, surface, kinds, directory, listener, access, waits_for_buses: patient, bench } =
+        options;
     let may_act = access.may_act;
     let opened = |name: &str, format: Format| {
         let options = bus::BusOptions {
@@ -242,7 +247,10 @@ fn publish(
         };
         for ((bus, node), sensors) in due {
             let page = SensorPage::Skin(sensors);
-            send_message(buses.get(bus), &Message::Stimulus { to: Node::Cell(node), from: AppliesFrom::Next, page });
+            send_message(
+                buses.get(bus),
+                &Message::Stimulus { to: Node::Cell(node), from: AppliesFrom::Next, page },
+            );
         }
         next = (next + SNAPSHOT_INTERVAL).max(Instant::now());
         thread::sleep(next.saturating_duration_since(Instant::now()).max(Duration::from_millis(1)));

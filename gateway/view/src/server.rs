@@ -19,7 +19,7 @@ use std::thread;
 
 use tungstenite::{Bytes, Utf8Bytes};
 
-use crate::command::{SelectedCell, Command};
+use crate::command::{Command, SelectedCell};
 use crate::locked;
 use crate::token::Token;
 

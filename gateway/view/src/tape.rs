@@ -14,10 +14,10 @@ use std::collections::VecDeque;
 use protocol::can::Frame;
 use protocol::skin::Skin;
 use protocol::time::Micros;
-use trace::capture::{CaptureError, Entry, RecordingExtras, NoteKind, Reader};
+use trace::capture::{CaptureError, Entry, NoteKind, Reader, RecordingExtras};
 use trace::order::{BusMerger, ReleasedFrame};
 
-pub use self::events::{Event, EventKind, EventDetector};
+pub use self::events::{Event, EventDetector, EventKind};
 use crate::live::Live;
 
 /// The interval in ns at which the passing of time is applied to the state: cells become silent, and loads are
@@ -160,9 +160,11 @@ impl Tape {
         };
         if self.first.is_none() {
             self.first = Some(next.send_nanos);
-            (self.at, self.next_update) = (next.send_nanos, next.send_nanos.saturating_add(UPDATE_INTERVAL_NS));
+            (self.at, self.next_update) =
+                (next.send_nanos, next.send_nanos.saturating_add(UPDATE_INTERVAL_NS));
             let latched = std::mem::take(&mut self.latched);
-            self.live.apply_latched(Micros(next.send_nanos / 1_000), latched.iter().map(|it| (it.bus, &it.frame)));
+            self.live
+                .apply_latched(Micros(next.send_nanos / 1_000), latched.iter().map(|it| (it.bus, &it.frame)));
         }
         if let Some(looked) = self.update_until(until.min(next.send_nanos.saturating_sub(1))) {
             return looked;

@@ -43,7 +43,8 @@ impl BitErrors {
         if !(0.0..=Self::MAX).contains(&rate) {
             return Err(BitErrorsError { got: rate });
         }
-        let mut errors = Self { dice: Pcg64Mcg::seed_from_u64(seed), log_undamaged: (-rate).ln_1p(), undamaged_bits: 0 };
+        let mut errors =
+            Self { dice: Pcg64Mcg::seed_from_u64(seed), log_undamaged: (-rate).ln_1p(), undamaged_bits: 0 };
         errors.draw();
         Ok(errors)
     }
@@ -57,7 +58,11 @@ impl BitErrors {
     fn draw(&mut self) {
         let uniform: f64 = self.dice.random();
         // `1 - uniform` is in (0, 1]. Without errors the distance is unlimited.
-        self.undamaged_bits = if self.log_undamaged < 0.0 { ((1.0 - uniform).ln() / self.log_undamaged) as u64 } else { u64::MAX };
+        self.undamaged_bits = if self.log_undamaged < 0.0 {
+            ((1.0 - uniform).ln() / self.log_undamaged) as u64
+        } else {
+            u64::MAX
+        };
     }
 
     /// Counts the bits of one attempt to send a frame. Returns the bits sent up to the first damaged one, plus the

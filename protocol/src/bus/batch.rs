@@ -168,7 +168,9 @@ impl<const N: usize> Outgoing<N> {
         match self.count {
             0 => Ok(0),
             1 => send_one(fd, datagrams.next().unwrap_or_default()),
-            2..=SMALL_BATCH => retry_on_interrupt(|| calls::send::<SMALL_BATCH>(fd.as_fd(), datagrams.clone())),
+            2..=SMALL_BATCH => {
+                retry_on_interrupt(|| calls::send::<SMALL_BATCH>(fd.as_fd(), datagrams.clone()))
+            }
             _ => retry_on_interrupt(|| calls::send::<N>(fd.as_fd(), datagrams.clone())),
         }
     }

@@ -6,7 +6,7 @@ use rustix::io::Errno;
 use socketcan::CanFdSocket;
 
 use super::batch::Datagram;
-use super::{Bus, BusError, Filter, BusOptions};
+use super::{Bus, BusError, BusOptions, Filter};
 
 /// The operations in which the kinds of buses differ; the rest of [`Bus`] is common to all.
 pub(super) trait Carrier {

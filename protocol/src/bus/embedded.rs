@@ -11,8 +11,8 @@ use super::{Filter, calls};
 pub use client::seqpacket;
 pub(super) use client::{Embedded, closed_error};
 pub use directory::{
-    DirectoryError, MARK, address, make_directory, mark, open_directory, remove_directory, socket_name,
-    default_directory,
+    DirectoryError, MARK, address, default_directory, make_directory, mark, open_directory, remove_directory,
+    socket_name,
 };
 
 mod client;
@@ -224,8 +224,13 @@ mod tests {
     #[test]
     fn the_bytes_of_a_hello() {
         let filter = Filter { id: 0x001, mask: 0xC000_07FF };
-        let hello =
-            ClientHello { filters: vec![filter], own_frames: true, fd: true, error_mask: 0x1FF, buffer: 0x10_0000 };
+        let hello = ClientHello {
+            filters: vec![filter],
+            own_frames: true,
+            fd: true,
+            error_mask: 0x1FF,
+            buffer: 0x10_0000,
+        };
         let expected = b"skinbus\x02\x01\x01\xff\x01\0\0\0\0\x10\0\0\0\0\0\0\x01\0\0\0\xff\x07\0\xc0";
         assert_eq!(hello.encode(), expected);
     }

@@ -10,7 +10,7 @@ use socketcan::{CanAddr, CanFdSocket, CanFilter, Socket, SocketOptions};
 use super::batch::{Batch, Datagram};
 use super::carrier::Carrier;
 use super::link::NetworkInterface;
-use super::{Bus, BusError, Filter, BusOptions};
+use super::{Bus, BusError, BusOptions, Filter};
 
 /// The MTU of an interface that carries CAN FD.
 const FD_MTU: u32 = 72;
@@ -29,7 +29,8 @@ pub fn has_socketcan() -> bool {
 /// Returns true if there is an interface of this name, CAN or not. Any error except "no such device" counts
 /// as true.
 pub(super) fn has_interface(name: &str) -> bool {
-    !NetworkInterface::query(name).is_err_and(|error| matches!(error.raw_os_error(), Some(libc::ENODEV | libc::ENXIO)))
+    !NetworkInterface::query(name)
+        .is_err_and(|error| matches!(error.raw_os_error(), Some(libc::ENODEV | libc::ENXIO)))
 }
 
 fn probe() -> Result<OwnedFd, Errno> {

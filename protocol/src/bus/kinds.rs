@@ -283,8 +283,9 @@ mod tests {
 
     #[test]
     fn what_cannot_be_is_said_with_what_can() {
-        let wrong =
-            |words: &[&str]| kinds(words).and_then(|kinds| kinds.restrict_to(["vcan0", "vcan1"])).unwrap_err();
+        let wrong = |words: &[&str]| {
+            kinds(words).and_then(|kinds| kinds.restrict_to(["vcan0", "vcan1"])).unwrap_err()
+        };
         assert_eq!(
             wrong(&["vcan1=embedded", "vcan1=auto"]).to_string(),
             "--bus-kind is given twice for vcan1: embedded and auto; leave out one"

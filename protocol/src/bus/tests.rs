@@ -39,7 +39,8 @@ fn a_bus_of_either_kind_that_is_absent_names_both_ways() {
 
 #[test]
 fn a_kernel_without_can_says_so_and_one_with_it_names_the_missing_interface() {
-    let error = Bus::open("nosuchcan0", KindChoice::Only(BusKind::SocketCan), &BusOptions::default()).unwrap_err();
+    let error =
+        Bus::open("nosuchcan0", KindChoice::Only(BusKind::SocketCan), &BusOptions::default()).unwrap_err();
     if has_socketcan() {
         let expected = "there is no interface nosuchcan0: make it with `vcan-setup up nosuchcan0`, or plug \
                         it in if it is hardware";

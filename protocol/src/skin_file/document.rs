@@ -94,7 +94,12 @@ impl KeyPath {
     ///
     /// # Errors
     /// Returns an error if it is outside the range.
-    pub fn check_range(&self, got: i64, range: RangeInclusive<u32>, unit: &str) -> Result<u32, DocumentFault> {
+    pub fn check_range(
+        &self,
+        got: i64,
+        range: RangeInclusive<u32>,
+        unit: &str,
+    ) -> Result<u32, DocumentFault> {
         u32::try_from(got).ok().filter(|value| range.contains(value)).ok_or_else(|| {
             let (min, max) = range.into_inner();
             self.fault(got, format_args!("{min} to {max}{unit} are possible"))
@@ -132,7 +137,12 @@ impl KeyPath {
     ///
     /// # Errors
     /// Returns an error if the number is negative, or outside the range of the word.
-    pub fn set_word<const F: u32>(&self, given: Option<f64>, word: &mut Q<F>, fit: RoundingFn<F>) -> Result<(), DocumentFault> {
+    pub fn set_word<const F: u32>(
+        &self,
+        given: Option<f64>,
+        word: &mut Q<F>,
+        fit: RoundingFn<F>,
+    ) -> Result<(), DocumentFault> {
         match given {
             None => {}
             Some(value) if value < 0.0 => return Err(self.fault(value, "must not be negative")),
@@ -236,8 +246,9 @@ pub fn read_text(path: &Path) -> Result<String, DocumentError> {
 /// # Errors
 /// Returns an error if the file is longer, or cannot be read as UTF-8.
 pub fn read_text_within(path: &Path, longest: u64) -> Result<String, DocumentError> {
-    let read =
-        || String::from_utf8(input::read_bytes(path, longest)?).map_err(|_| io::Error::other("it is not UTF-8"));
+    let read = || {
+        String::from_utf8(input::read_bytes(path, longest)?).map_err(|_| io::Error::other("it is not UTF-8"))
+    };
     read().map_err(|error: io::Error| DocumentError::Unreadable {
         path: path.display().to_string(),
         reason: error.to_string(),

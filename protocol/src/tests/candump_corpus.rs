@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 
 use crate::can::{FD_FORMAT, Format, Frame};
-use crate::candump::{self, Direction, CandumpLine, Record};
+use crate::candump::{self, CandumpLine, Direction, Record};
 use socketcan::dump::{self, CanDumpRecord, Reader};
 use socketcan::{CanAnyFrame, EmbeddedFrame as _, Frame as _};
 
@@ -108,7 +108,9 @@ fn every_line_is_what_the_corpus_says() {
                 assert_eq!(again, CandumpLine::Frame(Record { direction: None, ..record }), "and read again");
             }
             ("xl", Ok(CandumpLine::CanXl)) | ("other", Ok(CandumpLine::Other)) => {}
-            (what, Ok(CandumpLine::Dropped { frames })) => assert_eq!(what, format!("dropped={frames}"), "{line}"),
+            (what, Ok(CandumpLine::Dropped { frames })) => {
+                assert_eq!(what, format!("dropped={frames}"), "{line}")
+            }
             ("error", Err(error)) => {
                 assert_eq!(error.column.to_string(), expected.get("column"), "{line}: {error}");
             }

@@ -13,7 +13,7 @@ use std::path::Path;
 use crate::id::{Command, Kind};
 use crate::message::State;
 use crate::parameters::Parameter;
-use crate::schema::{Field, FieldFormat, Layout, PacketSchema, FieldRange, packets, reasons, wires};
+use crate::schema::{Field, FieldFormat, FieldRange, Layout, PacketSchema, packets, reasons, wires};
 
 /// The documents with the requirements.
 const REQUIREMENTS: [&str; 3] = [
@@ -134,7 +134,11 @@ fn range(field: &Field) -> String {
 
 /// Returns the unit of a field on the wire, where angles are in quarter turns.
 fn unit(field: &Field) -> &str {
-    if matches!(field.format, FieldFormat::Angle | FieldFormat::Position) { "quarter turns" } else { &field.unit }
+    if matches!(field.format, FieldFormat::Angle | FieldFormat::Position) {
+        "quarter turns"
+    } else {
+        &field.unit
+    }
 }
 
 /// Formats the position of a field in words or bytes: `0`, `0 to 2`, `2, bits 8 to 15`.
@@ -159,7 +163,10 @@ fn format_of(field: &Field) -> String {
         FieldFormat::Signed | FieldFormat::Choice | FieldFormat::Reason => "signed".to_owned(),
         FieldFormat::Flag(_) => "0 or 1".to_owned(),
         FieldFormat::Hex => "16 bits".to_owned(),
-        FieldFormat::Fixed(bits) | FieldFormat::Threshold(bits) | FieldFormat::Saturating(bits) | FieldFormat::Total(bits) => {
+        FieldFormat::Fixed(bits)
+        | FieldFormat::Threshold(bits)
+        | FieldFormat::Saturating(bits)
+        | FieldFormat::Total(bits) => {
             format!("Q{}.{bits}", 15 - bits)
         }
         FieldFormat::Angle | FieldFormat::Position => "Q1.14".to_owned(),

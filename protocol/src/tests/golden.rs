@@ -17,7 +17,7 @@ use crate::candump::{self, CandumpLine};
 use crate::fixed::{Acc, TorqueFormat};
 use crate::id::{CellId, Id, Kind};
 use crate::message::{Answer, Message, Request};
-use crate::packet::{Epoch, Length, Lengths, Packet, Reassembly, Reassembler, crc16, data_id};
+use crate::packet::{Epoch, Length, Lengths, Packet, Reassembler, Reassembly, crc16, data_id};
 use crate::parameters::{Baseline, Events, Parameter, ParameterError, Parameters, Reply, Sensing, Tare};
 use crate::port::LinkId;
 use crate::time::Micros;
@@ -51,7 +51,9 @@ fn lines(log: &str) -> Vec<Golden<'_>> {
                 text: line.rsplit_once(' ').unwrap().1,
                 frame: record.frame,
             }),
-            CandumpLine::Dropped { .. } | CandumpLine::CanXl | CandumpLine::Other => comment = line.strip_prefix("# "),
+            CandumpLine::Dropped { .. } | CandumpLine::CanXl | CandumpLine::Other => {
+                comment = line.strip_prefix("# ")
+            }
         }
     }
     assert!(golden.len() > 10, "the log is there");
@@ -286,8 +288,9 @@ fn cannot_be<T: core::fmt::Debug>(read: Option<T>) -> i16 {
 
 #[test]
 fn wires_bytes_and_meaning_agree_both_ways() {
-    let read =
-        |frame: &Frame| LinkId::from_raw_id(frame.raw_id()).map(|link_id| (link_id, link_id.decode_frame(frame)));
+    let read = |frame: &Frame| {
+        LinkId::from_raw_id(frame.raw_id()).map(|link_id| (link_id, link_id.decode_frame(frame)))
+    };
     let mut kinds = BTreeSet::new();
     let mut odd = 0;
     for golden in lines(WIRE) {

@@ -66,7 +66,11 @@ fn an_fd_length_that_does_not_exist_is_filled_up_with_zeros() {
             [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64].into_iter().find(|&wire| wire >= len);
         full.resize(wire.unwrap(), 0);
         for id in [0x123, EXTENDED | 0x123] {
-            assert_eq!(Bits::from_frame(&frame("fd-brs", id, &data)), Bits::from_frame(&frame("fd-brs", id, &full)), "{len}");
+            assert_eq!(
+                Bits::from_frame(&frame("fd-brs", id, &data)),
+                Bits::from_frame(&frame("fd-brs", id, &full)),
+                "{len}"
+            );
         }
     }
 }

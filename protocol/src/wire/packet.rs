@@ -27,7 +27,7 @@ mod length;
 mod reassembly;
 
 pub use length::{Length, Lengths, Words};
-pub use reassembly::{Reassembly, Reassembler};
+pub use reassembly::{Reassembler, Reassembly};
 
 use thiserror::Error;
 
@@ -216,7 +216,8 @@ impl Packet {
     pub fn decode(id: Id, bytes: &[u8]) -> Result<Self, PacketError> {
         let lengths = Lengths::for_id(id);
         let wrong = PacketError::Length { expected: lengths.first().bytes(), got: bytes.len() };
-        let length = Length::from_byte_count(bytes.len()).filter(|&length| lengths.contains(length)).ok_or(wrong)?;
+        let length =
+            Length::from_byte_count(bytes.len()).filter(|&length| lengths.contains(length)).ok_or(wrong)?;
         let (chunks, _) = bytes.as_chunks::<2>();
         let [words @ .., end, crc] = chunks else {
             return Err(wrong);
@@ -295,7 +296,8 @@ mod tests {
         let words = (0_usize..4, any::<[i16; MAX_WORDS]>());
         (0_u16..0x800, words, any::<u8>(), any::<u8>()).prop_map(|(id, (length, words), epoch, count)| {
             let id = Id::from_bits(id);
-            let length = Length::ALL.into_iter().filter(|&it| Lengths::for_id(id).contains(it)).cycle().nth(length);
+            let length =
+                Length::ALL.into_iter().filter(|&it| Lengths::for_id(id).contains(it)).cycle().nth(length);
             Packet { id, words: Words::new(length.unwrap(), words), epoch: Epoch(epoch), count }
         })
     }

@@ -211,7 +211,9 @@ impl LinkId {
     #[must_use]
     pub const fn from_raw_id(raw_id: u32) -> Option<Self> {
         let bits = raw_id & EXTENDED_MASK & !WIRE_FLAG;
-        if raw_id & (EXTENDED | REMOTE | WIRE_FLAG) != EXTENDED | WIRE_FLAG || (bits >> 1) as usize >= MAX_WIRES {
+        if raw_id & (EXTENDED | REMOTE | WIRE_FLAG) != EXTENDED | WIRE_FLAG
+            || (bits >> 1) as usize >= MAX_WIRES
+        {
             return None;
         }
         let [low, high, ..] = (bits >> 1).to_le_bytes();

@@ -30,9 +30,9 @@ mod tests;
 
 use crate::can::{BIT_RATE_SWITCH, Format, Frame, dlc_len, fd_dlc};
 
-pub use decoder::{Decoder, SlcanLine, Refusal, RejectedLines};
+pub use decoder::{Decoder, Refusal, RejectedLines, SlcanLine};
 #[cfg(feature = "host")]
-pub use report::{BusState, ErrorCounters, AdapterFault, AdapterReport};
+pub use report::{AdapterFault, AdapterReport, BusState, ErrorCounters};
 
 /// Maximum length of a line in bytes without its line ending: an FD frame with bit rate switch, 64 data bytes, a 29-bit
 /// identifier, 8 digits of time and the state of the sender.

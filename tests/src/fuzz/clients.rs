@@ -7,7 +7,7 @@ use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
 use std::os::unix::net::UnixDatagram;
 use std::time::Duration;
 
-use control::controller::{Controller as _, Input, ControllerOutput};
+use control::controller::{Controller as _, ControllerOutput, Input};
 use control::external::External;
 use protocol::skin::Skin;
 use tempfile::TempDir;

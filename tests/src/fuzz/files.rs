@@ -128,7 +128,8 @@ pub(super) fn urdf(data: &[u8]) {
     let leaves: Vec<_> = urdf.leaves().take(4).map(str::to_owned).collect();
     for tip in leaves {
         let Ok(chain) = urdf.chain(None, &tip) else { continue };
-        let import = SkinImport { name: "robot", command: "import", urdf: None, chains: &[chain], cells: &[] };
+        let import =
+            SkinImport { name: "robot", command: "import", urdf: None, chains: &[chain], cells: &[] };
         let Ok(skin) = import.toml() else { continue };
         Skin::parse("skin.toml", &skin).unwrap_or_else(|error| panic!("{error}: {skin}"));
     }

@@ -11,7 +11,7 @@ use protocol::can::{Format, fd_len};
 use protocol::candump::{Record, Timestamp};
 use protocol::id::Id;
 use protocol::message::Message;
-use protocol::packet::{Length, Lengths, Packet, Reassembly, Reassembler};
+use protocol::packet::{Length, Lengths, Packet, Reassembler, Reassembly};
 use protocol::schema::Units;
 use protocol::slcan::{self, Decoder, SlcanLine};
 use protocol::time::Micros;

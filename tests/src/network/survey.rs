@@ -69,7 +69,8 @@ impl Wiring {
     pub fn routes(&self) -> String {
         let route = |cell: usize| {
             let place = &self.cells[cell];
-            let tree = place.tree.map(|tree| (tree.parent, tree.parent_port, tree.depth, tree.round, tree.children));
+            let tree =
+                place.tree.map(|tree| (tree.parent, tree.parent_port, tree.depth, tree.round, tree.children));
             format!("{cell}={:?} {tree:?} {:?}", place.node_id.map(CellId::get), self.route(cell))
         };
         (0..self.cells.len()).map(route).collect::<Vec<_>>().join("; ")

@@ -7,7 +7,7 @@ use protocol::candump::{self, CandumpLine};
 use protocol::fixed::Q;
 use protocol::id::{Kind, Node};
 use protocol::message::{AppliesFrom, Heartbeat, Message, NetworkPage, SensorPage, SkinSensors};
-use protocol::packet::{Epoch, Lengths, Packet, Reassembly, Reassembler, data_id};
+use protocol::packet::{Epoch, Lengths, Packet, Reassembler, Reassembly, data_id};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
 
@@ -153,7 +153,8 @@ struct ContactState {
 
 impl ContactState {
     fn push(&mut self, from: AppliesFrom, skin: SkinSensors, last: Option<Epoch>) {
-        let late = matches!((from, last), (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0);
+        let late =
+            matches!((from, last), (AppliesFrom::Epoch(first), Some(last)) if last.epochs_since(first) >= 0);
         self.waiting.push((if late { AppliesFrom::Next } else { from }, skin));
     }
 

@@ -6,7 +6,7 @@ use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
 use model::decode::{Decoded, Decoder};
-use protocol::bus::{Bus, KindChoice, Inbox, BusOptions};
+use protocol::bus::{Bus, BusOptions, Inbox, KindChoice};
 use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};

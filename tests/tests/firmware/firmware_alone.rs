@@ -67,7 +67,8 @@ impl Alone {
             hosted: true,
             link_ids: [None; 5],
         };
-        let elf = if named { Firmware::read(&path).unwrap().for_cell(&factory) } else { fs::read(&path).unwrap() };
+        let elf =
+            if named { Firmware::read(&path).unwrap().for_cell(&factory) } else { fs::read(&path).unwrap() };
         fs::write(folder.join("cell.elf"), elf).unwrap();
         let mut command = Command::new("qemu-system-arm");
         command.args([

@@ -18,7 +18,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use process::{Ended, PRESSED, Place, Running, TIMEOUT, program, skin, until};
-use protocol::bus::{Bus, BusKind, KindChoice, Inbox, BusOptions};
+use protocol::bus::{Bus, BusKind, BusOptions, Inbox, KindChoice};
 use protocol::can::Frame;
 use proxy::Proxy;
 use rustix::process::Signal;

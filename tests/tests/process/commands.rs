@@ -10,7 +10,7 @@ use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use protocol::bus::{Bus, BusKind, KindChoice, BusOptions, has_socketcan};
+use protocol::bus::{Bus, BusKind, BusOptions, KindChoice, has_socketcan};
 use protocol::id::{CellId, Id, Kind, Node};
 use serde_json::Value;
 use served::Served;

@@ -8,13 +8,13 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use skinbus_tests::process::until;
 
-use protocol::bus::embedded::{HelloReply, FilterPart, ClientHello, VERSION, address};
-use protocol::bus::{Bus, BusError, BusKind, KindChoice, Filter, Inbox, BusOptions};
+use protocol::bus::embedded::{ClientHello, FilterPart, HelloReply, VERSION, address};
+use protocol::bus::{Bus, BusError, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{FD_FORMAT, Frame};
 use rustix::net::{AddressFamily, SendFlags, SocketFlags, SocketType};
 use socketcan::{CanAnyFrame, CanFdSocket, EmbeddedFrame, Socket};
 use tempfile::TempDir;
-use vcan_setup::embedded::{ServerThread, BusTotals};
+use vcan_setup::embedded::{BusTotals, ServerThread};
 
 use skinbus_tests::can_raw as cases;
 mod place;
@@ -176,8 +176,11 @@ fn wait_until_routed(bench: &Bench) {
 fn filters_change_in_order_with_the_frames() {
     let bench = Bench::new();
     let other = bench.open(&[]);
-    let client =
-        bench.open_with(BusOptions { own_frames: true, filters: vec![exact(1), exact(2)], ..bench.options() });
+    let client = bench.open_with(BusOptions {
+        own_frames: true,
+        filters: vec![exact(1), exact(2)],
+        ..bench.options()
+    });
     // The order between its own frames and its filters is kept.
     client.send(&[frame(1, 1), frame(3, 1)]).unwrap();
     client.set_filters(&[exact(2), exact(3), exact(LAST)]).unwrap();
@@ -421,7 +424,11 @@ fn a_server_that_lets_nobody_in_is_given_up_on() {
     // Bound but not running, like a stopped process: it accepts no client.
     let server = vcan_setup::embedded::Server::bind_in(&parent.path().join("skinbus"), BUS).unwrap();
     let directory = Some(parent.path().join("skinbus"));
-    let error = Bus::open(BUS, KindChoice::Only(BusKind::Embedded), &BusOptions { directory, ..BusOptions::default() });
+    let error = Bus::open(
+        BUS,
+        KindChoice::Only(BusKind::Embedded),
+        &BusOptions { directory, ..BusOptions::default() },
+    );
     let error = error.unwrap_err().to_string();
     let expected = "the embedded bus vcan0 did not answer within 2000 ms: is its server stopped, or out of files (`ulimit -n`)?";
     assert_eq!(error, expected);

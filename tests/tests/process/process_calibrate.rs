@@ -74,7 +74,10 @@ fn what_cannot_be_calibrated_is_refused_in_one_line() {
         refused("--start 0.5 --dry-run"),
         "skinbus: the pose has 1 positions; the robot has 6 joints: give one for each\n"
     );
-    assert_eq!(refused("--duration 5s --dry-run"), "skinbus: a motion of 5 s is too short or too long: choose 20 to 3600 s\n");
+    assert_eq!(
+        refused("--duration 5s --dry-run"),
+        "skinbus: a motion of 5 s is too short or too long: choose 20 to 3600 s\n"
+    );
     place.write("sheet.toml", "noise_g = 3.0\n");
     assert_eq!(
         refused("--data-sheet sheet.toml --dry-run"),

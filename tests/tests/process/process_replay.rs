@@ -111,8 +111,10 @@ fn two_buses_of_classic_frames_come_back_too() {
 
 /// Returns the times of the first and the last such message, in s after the first frame of a log.
 fn seconds(log: &str, is: impl Fn(&Message) -> bool) -> [f64; 2] {
-    let records =
-        || log.lines().map(|line| if let Ok(CandumpLine::Frame(it)) = parse(line) { it } else { panic!("{line}") });
+    let records = || {
+        log.lines()
+            .map(|line| if let Ok(CandumpLine::Frame(it)) = parse(line) { it } else { panic!("{line}") })
+    };
     let first = records().next().unwrap().time.nanos;
     let they = records().filter(|it| {
         let packet = Packet::from_fd(&it.frame).ok();
@@ -274,7 +276,8 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
         it && counted.replace(counted.get() + 1) == 5
     });
     // The recording must not have counters that show that it is incomplete.
-    let silent = |message: &Message| matches!(message, Message::Network { page: NetworkPage::Received(_), .. });
+    let silent =
+        |message: &Message| matches!(message, Message::Network { page: NetworkPage::Received(_), .. });
     let beats = Counter::new(0);
     let heartbeat = |message: &Message| {
         let it = matches!(message, Message::Network { page: NetworkPage::Heartbeat(beat), .. } if !beat.state.has(State::CLAIMING));

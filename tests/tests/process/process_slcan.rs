@@ -10,7 +10,7 @@ use std::os::unix::net::UnixListener;
 use std::time::Duration;
 
 use process::{Place, Running, until};
-use protocol::bus::{Bus, Inbox, BusOptions};
+use protocol::bus::{Bus, BusOptions, Inbox};
 use protocol::can::{ERROR, ERROR_STATE, EXTENDED, EXTENDED_MASK, Frame};
 use rustix::process::Signal;
 use serde_json::Value;

@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-use protocol::bus::embedded::{HelloReply, ClientHello, address, encode_dropped, seqpacket};
-use protocol::bus::{Bus, BusError, BusKind, KindChoice, Filter, Inbox, BusOptions};
+use protocol::bus::embedded::{ClientHello, HelloReply, address, encode_dropped, seqpacket};
+use protocol::bus::{Bus, BusError, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{EXTENDED, Frame};
 use protocol::candump::{self, CandumpLine};
 use rustix::net::sockopt::{self, Timeout};
@@ -46,7 +46,8 @@ fn frames_pass_once_the_line_is_printed_and_a_signal_ends_it_well() {
         let directory = parent.path().join("skinbus");
         let child = serve(&directory, &[]);
         let options = BusOptions { directory: Some(directory), ..BusOptions::default() };
-        let [a, b] = [(); 2].map(|()| Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap());
+        let [a, b] =
+            [(); 2].map(|()| Bus::open("vcan0", KindChoice::Only(BusKind::Embedded), &options).unwrap());
         let frame = Frame::fd(0x123, 1, &[1; 16]).unwrap();
         a.send(&[frame]).unwrap();
         let mut inbox = Inbox::new();
@@ -269,7 +270,9 @@ fn the_documents_programs_send_receive_and_end_with_the_server() {
             for frame in frames {
                 let mut line = String::new();
                 output.read_line(&mut line).unwrap();
-                let Ok(CandumpLine::Frame(record)) = candump::parse(line.trim_end()) else { panic!("{line}") };
+                let Ok(CandumpLine::Frame(record)) = candump::parse(line.trim_end()) else {
+                    panic!("{line}")
+                };
                 assert_eq!((record.interface, record.frame), ("vcan0", frame));
                 assert!((before..=nanos_now()).contains(&record.time.nanos), "{line}");
             }

@@ -13,7 +13,7 @@ use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use process::{Place, TIMEOUT};
-use protocol::bus::{Bus, Inbox, BusOptions};
+use protocol::bus::{Bus, BusOptions, Inbox};
 use protocol::can::{BIT_RATE_SWITCH, EXTENDED, Format, Frame};
 use rustix::process::Signal;
 use serde_json::Value;

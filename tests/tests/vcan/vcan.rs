@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use protocol::bus::{Bus, BusError, BusKind, KindChoice, Filter, Inbox, BusOptions};
+use protocol::bus::{Bus, BusError, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{FD_FORMAT, Frame};
 
 use skinbus_tests::can_raw as cases;

@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use process::vcan::{Candump, backlog_drops, frames_of, own_network, small_skin, tool};
 use process::{PRESSED, Place, TIMEOUT, is_stopped, until};
-use protocol::bus::{Bus, BusKind, KindChoice, Filter, Inbox, BusOptions};
+use protocol::bus::{Bus, BusKind, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{EXTENDED, Frame};
 use protocol::candump::{CandumpLine, parse};
 use recorded::Recorded;

@@ -12,7 +12,7 @@ use std::os::unix::process::CommandExt;
 use std::process::Command;
 use std::time::Duration;
 
-use protocol::bus::{Bus, BusKind, KindChoice, Inbox, BusOptions};
+use protocol::bus::{Bus, BusKind, BusOptions, Inbox, KindChoice};
 use protocol::can::Frame;
 use protocol::id::{CellId, Id, Kind, Node};
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};

@@ -7,7 +7,7 @@ use skinbus_tests::process::slcan;
 
 use process::vcan::tool;
 use process::{Place, until};
-use protocol::bus::{Bus, Inbox, BusOptions};
+use protocol::bus::{Bus, BusOptions, Inbox};
 use protocol::can::{EXTENDED, Frame};
 use rustix::process::Signal;
 use serde_json::Value;

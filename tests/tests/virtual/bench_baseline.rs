@@ -14,7 +14,7 @@ use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
 use protocol::message::{Answer, BaselinePage, Message, Request, SensorPage};
 use protocol::packet::{Packet, padded_words};
-use protocol::parameters::{Baseline, Parameter, BaselineSettings};
+use protocol::parameters::{Baseline, BaselineSettings, Parameter};
 use protocol::skin::{Skin, Timing};
 use protocol::time::{Micros, Span};
 use skinbus_tests::accounts;

@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
 
-use analysis::shadow::{BusShadow, Options, FrameTiming, Shadow};
+use analysis::shadow::{BusShadow, FrameTiming, Options, Shadow};
 use model::table::Replies;
 use protocol::can::Format;
 use protocol::id::{Command, Id};

@@ -94,7 +94,10 @@ fn a_heartbeat_of_a_quiet_cell_clears_a_held_torque() {
     let released = bench.now();
     while bench.gateway.table.snapshot().sums.contributing > 0 {
         bench.run(Span::from_millis(1));
-        assert!(bench.now().elapsed_since(released) <= Span(HEARTBEAT_INTERVAL.0 + bench.epoch().0), "held for ever");
+        assert!(
+            bench.now().elapsed_since(released) <= Span(HEARTBEAT_INTERVAL.0 + bench.epoch().0),
+            "held for ever"
+        );
     }
     assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; MAX_JOINTS]);
     assert_eq!(status(&bench, CELL), Status::Quiet);

@@ -4,7 +4,7 @@
 
 use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
-use model::commission::{Outcome, Reason, Report, AbortReason, CommissionOptions};
+use model::commission::{AbortReason, CommissionOptions, Outcome, Reason, Report};
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::id::{Kind, Node};
@@ -49,10 +49,17 @@ fn all(report: &Report, expected: Outcome) {
 }
 
 /// Checks that the flash of a cell only ever had its old configuration or its new one.
-fn nothing_is_mixed(workshop: &Workshop, old: impl Fn(usize) -> FlashState, new: impl Fn(usize) -> Parameters) {
+fn nothing_is_mixed(
+    workshop: &Workshop,
+    old: impl Fn(usize) -> FlashState,
+    new: impl Fn(usize) -> Parameters,
+) {
     for (place, piece) in workshop.pieces.iter().enumerate() {
         for flash in &piece.history {
-            assert!(*flash == old(place) || *flash == FlashState::Valid(new(place)), "cell {place}: {flash:?}");
+            assert!(
+                *flash == old(place) || *flash == FlashState::Valid(new(place)),
+                "cell {place}: {flash:?}"
+            );
         }
     }
 }
@@ -257,7 +264,8 @@ fn cells_are_identified_by_serial_number_with_any_node_id() {
     for (place, described) in skin.cells.iter().enumerate() {
         // Numbers in the reverse order.
         let number = cell(CELLS + 1 - described.node.get());
-        workshop.add(Identity { cell: Some(number), serial: described.serial }, FlashState::Valid(old(place)));
+        workshop
+            .add(Identity { cell: Some(number), serial: described.serial }, FlashState::Valid(old(place)));
     }
     let report = workshop.commission(&skin, WISH, None);
     all(&report, Outcome::Written);
@@ -378,7 +386,11 @@ fn a_pose_that_came_wrong_is_refused_at_the_commit_and_the_old_one_stays() {
         assert_eq!(reason.to_string(), "refuses a commit: the hash is not that of the staged copy");
     }
     assert!(
-        workshop.pieces.iter().enumerate().all(|(place, piece)| piece.history == [FlashState::Valid(old(place))])
+        workshop
+            .pieces
+            .iter()
+            .enumerate()
+            .all(|(place, piece)| piece.history == [FlashState::Valid(old(place))])
     );
     workshop.forgers = None;
     all(&workshop.commission(&skin, WISH, None), Outcome::Written);

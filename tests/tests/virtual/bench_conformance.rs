@@ -23,7 +23,12 @@ use protocol::packet::Packet;
 use protocol::time::Span;
 
 /// Returns the findings on a cell and the failed requirements.
-fn test(bus: &mut Virtual, format: Format, number: u8, only: &RequirementFilter) -> (Vec<Finding>, Vec<&'static str>) {
+fn test(
+    bus: &mut Virtual,
+    format: Format,
+    number: u8,
+    only: &RequirementFilter,
+) -> (Vec<Finding>, Vec<&'static str>) {
     let cell = CellId::new(number.into()).unwrap();
     let survey = Survey::listen(bus, "vcan0").unwrap();
     assert_eq!(survey.check(cell, "vcan0", None, false), Ok(format));

@@ -42,7 +42,8 @@ fn pressed(seed: u64, format: Format) -> Bench {
             (rng.random_range(0..8), [0.0, 0.05, 1.5, 4.0, 8.0, 90.0][rng.random_range(0..6)]);
         // From the next joints on; or ahead, or late.
         let ahead = rng.random_range(0..u8::try_from(EPOCHS).unwrap());
-        let from = if rng.random_range(0..3) == 0 { AppliesFrom::Next } else { AppliesFrom::Epoch(Epoch(ahead)) };
+        let from =
+            if rng.random_range(0..3) == 0 { AppliesFrom::Next } else { AppliesFrom::Epoch(Epoch(ahead)) };
         bench.press_from(place, newtons, from);
         bench.run_epochs(1);
     }
@@ -147,7 +148,10 @@ fn unknown_causes_are_named_and_not_guessed() {
     let cell = explanation.cells.iter().find(|cell| cell.node == one).unwrap();
     assert!(cell.force.is_some() && cell.answered_after_ns.is_none());
     let said = explanation.missing.join("\n");
-    assert!(said.contains(&format!("vcan0 {one}: no torque of this epoch arrived in time: it was")), "{said}");
+    assert!(
+        said.contains(&format!("vcan0 {one}: no torque of this epoch arrived in time: it was")),
+        "{said}"
+    );
     assert_eq!(explanation.total[0].open, 1);
 }
 

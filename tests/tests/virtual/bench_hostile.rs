@@ -7,7 +7,8 @@ use model::table::Replies;
 use protocol::can::{ERROR, EXTENDED, Format, Frame};
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::message::{
-    Answer, ReceivedCounts, Heartbeat, Message, NetworkPage, Ports, RejectedCounts, Request, SensorPage, State, Tree,
+    Answer, Heartbeat, Message, NetworkPage, Ports, ReceivedCounts, RejectedCounts, Request, SensorPage,
+    State, Tree,
 };
 use protocol::packet::{Epoch, Packet};
 use protocol::parameters::Parameter;
@@ -144,7 +145,9 @@ impl What {
                 Act::Inject(Message::Sensors { from, epoch, page: SensorPage::Skin(touch(3.0)) })
             }
             Self::Counters if dice.random() => network(NetworkPage::Received(ReceivedCounts::default())),
-            Self::Counters => network(NetworkPage::Rejected(RejectedCounts { crc: 9, ..RejectedCounts::default() })),
+            Self::Counters => {
+                network(NetworkPage::Rejected(RejectedCounts { crc: 9, ..RejectedCounts::default() }))
+            }
             Self::Place if dice.random() => network(NetworkPage::Tree(Tree::default())),
             Self::Place => network(NetworkPage::Ports(Ports::default())),
             Self::Answer => {

@@ -5,8 +5,8 @@
 
 use analysis::explain::{RequestedJoints, Watch};
 use bench::replay::comparator::{Comparator, Tally};
-use bench::replay::replay_plan::{SenderFilter, ReplayPlan, FrameRole, Selection, PlayerStep};
-use bench::replay::survey::{TimeRange, Survey};
+use bench::replay::replay_plan::{FrameRole, PlayerStep, ReplayPlan, Selection, SenderFilter};
+use bench::replay::survey::{Survey, TimeRange};
 use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
@@ -149,7 +149,8 @@ impl Cells {
         let format = skin.buses[0].format;
         let started = |cell: &protocol::skin::Cell| {
             let identity = Identity { cell: Some(cell.node), serial: cell.serial };
-            let mut node = Node::new(identity, format, &FlashState::Valid(skin.parameters(cell)), true, Micros(0));
+            let mut node =
+                Node::new(identity, format, &FlashState::Valid(skin.parameters(cell)), true, Micros(0));
             for _ in 0..2 {
                 node.handle_timeout(node.poll_timeout());
                 while node.poll_transmit().is_some() {}

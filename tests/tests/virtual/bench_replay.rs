@@ -86,7 +86,9 @@ fn script(random: &mut Pcg64, tame: bool) -> Vec<Message> {
                 let contact = [Q5_10::nearest(if newtons < 1.0 { 0.0 } else { newtons }); 3];
                 let from = match random.random_range(0..3) {
                     0 => AppliesFrom::Next,
-                    _ => AppliesFrom::Epoch(epoch.advanced_by(random.random_range(0..6)).advanced_by(u8::MAX)),
+                    _ => {
+                        AppliesFrom::Epoch(epoch.advanced_by(random.random_range(0..6)).advanced_by(u8::MAX))
+                    }
                 };
                 Message::Stimulus {
                     to,

@@ -14,7 +14,7 @@ use model::scenario::Scenario;
 use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Message, Request, SensorPage, SkinSensors};
-use protocol::packet::{Lengths, Packet, Reassembly, Reassembler, data_id};
+use protocol::packet::{Lengths, Packet, Reassembler, Reassembly, data_id};
 use protocol::parameters::{Parameter, Sensing};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
@@ -74,8 +74,12 @@ fn sensors_frames(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPa
         Format::Fd => Packet::from_fd(frame).ok(),
         Format::Classic => {
             let id = data_id(frame).ok()?;
-            match segments.entry(id).or_insert(Reassembler::NONE).push(Micros(0), id, Lengths::ALL, frame.data())
-            {
+            match segments.entry(id).or_insert(Reassembler::NONE).push(
+                Micros(0),
+                id,
+                Lengths::ALL,
+                frame.data(),
+            ) {
                 Ok(Reassembly::Complete(packet)) => Some(packet),
                 Ok(Reassembly::Waiting | Reassembly::Incomplete | Reassembly::Ambiguous) | Err(_) => None,
             }
@@ -246,8 +250,7 @@ fn one_cell_is_switched_alone_and_all_at_once_while_the_bench_runs() {
         bench.run_epochs(2);
         let fifth = bench.skin.cells[4].node;
         let events: Vec<_> = sensors_frames(&bench, from);
-        let pressed =
-            |it: &&(Micros, CellId, SensorPage)| matches!(it.2, SensorPage::Skin(skin) if contact_force(&skin) > 0);
+        let pressed = |it: &&(Micros, CellId, SensorPage)| matches!(it.2, SensorPage::Skin(skin) if contact_force(&skin) > 0);
         assert!(events.iter().filter(pressed).all(|&(_, cell, _)| cell == fifth), "{events:?}");
         assert!(events.iter().any(|it| pressed(&it)), "{events:?}");
 

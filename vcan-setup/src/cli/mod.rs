@@ -102,9 +102,9 @@ fn word(word: &OsStr) -> Result<BusArgument, Failure> {
         let skin = Skin::read(Path::new(word)).map_err(Failure::usage)?;
         return Ok(BusArgument::File(Box::new(skin)));
     }
-    let name = word
-        .to_str()
-        .ok_or_else(|| Failure::usage(format!("{} is no bus name: it is not UTF-8", shell_quoted_os(word))))?;
+    let name = word.to_str().ok_or_else(|| {
+        Failure::usage(format!("{} is no bus name: it is not UTF-8", shell_quoted_os(word)))
+    })?;
     bus_name(name).map(BusArgument::Name).map_err(Failure::usage)
 }
 

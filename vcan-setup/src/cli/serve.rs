@@ -8,7 +8,7 @@ use clap::Args;
 use protocol::usage::Failure;
 use rustix::process::{Resource, Rlimit, Signal, getrlimit, setrlimit};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use vcan_setup::embedded::{Server, BusTotals};
+use vcan_setup::embedded::{BusTotals, Server};
 
 use super::bus_name;
 
@@ -91,7 +91,9 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
         ));
     }
     if let Some(failure) = failure {
-        print_to_stderr(&format!("{name}: gave up {failed} clients whose sockets failed, the last one with: {failure}"));
+        print_to_stderr(&format!(
+            "{name}: gave up {failed} clients whose sockets failed, the last one with: {failure}"
+        ));
     }
     Ok(())
 }

@@ -11,7 +11,7 @@ use protocol::wire_time::BitRates;
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
 use vcan_setup::slcan::options::{ALLOWED_SETTLE, settle_time};
-use vcan_setup::slcan::{LineAccount, Bridge, BridgeError, LineOptions, BridgeSettings};
+use vcan_setup::slcan::{Bridge, BridgeError, BridgeSettings, LineAccount, LineOptions};
 
 use super::{bus_name, json};
 

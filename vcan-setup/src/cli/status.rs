@@ -10,7 +10,9 @@ use protocol::bus::BusKind;
 use protocol::usage::{Failure, print_text};
 use serde::Serialize;
 use vcan_setup::hosts::report as hosts;
-use vcan_setup::link::{CLASSIC_MTU, Counters, FD_MTU, Hardware, Interface, InterfaceKind, Peer, HardwareRates};
+use vcan_setup::link::{
+    CLASSIC_MTU, Counters, FD_MTU, Hardware, HardwareRates, Interface, InterfaceKind, Peer,
+};
 use vcan_setup::look::{EmbeddedBus, embedded_buses};
 
 use super::{json, query, targets};
@@ -137,7 +139,9 @@ fn kind(interface: &Interface) -> String {
         }
         InterfaceKind::Hardware(Hardware { driver: Some(driver), .. }) => driver.clone(),
         InterfaceKind::Other(what) => format!("no CAN: {what}"),
-        kind @ (InterfaceKind::Vcan | InterfaceKind::Vxcan(None) | InterfaceKind::Hardware(_)) => kind.name().to_owned(),
+        kind @ (InterfaceKind::Vcan | InterfaceKind::Vxcan(None) | InterfaceKind::Hardware(_)) => {
+            kind.name().to_owned()
+        }
     }
 }
 
@@ -174,7 +178,9 @@ fn frames(interface: &Interface) -> String {
 fn rates(interface: &Interface) -> String {
     match interface.kind {
         InterfaceKind::Hardware(Hardware { bitrate: None, .. }) => "none set".to_owned(),
-        InterfaceKind::Hardware(Hardware { bitrate, data_bitrate, .. }) => HardwareRates { bitrate, data_bitrate }.to_string(),
+        InterfaceKind::Hardware(Hardware { bitrate, data_bitrate, .. }) => {
+            HardwareRates { bitrate, data_bitrate }.to_string()
+        }
         InterfaceKind::Vcan | InterfaceKind::Vxcan(_) | InterfaceKind::Other(_) => String::new(),
     }
 }

@@ -13,7 +13,7 @@ use vcan_setup::kernel::{Kernel, ModuleState};
 use vcan_setup::look;
 use vcan_setup::namespace::{Namespace, NamespaceError};
 use vcan_setup::netlink::Netlink;
-use vcan_setup::plan::{self, StepAction, Plan, Step, TargetPair, OtherNamespace};
+use vcan_setup::plan::{self, OtherNamespace, Plan, Step, StepAction, TargetPair};
 
 use super::{BusArgument, query, targets, unreadable, word};
 
@@ -219,9 +219,10 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
     let kind = match step.action {
         StepAction::MakeVcan => Some("vcan"),
         StepAction::MakePair { .. } => Some("vxcan"),
-        StepAction::BringUp { .. } | StepAction::Widen { .. } | StepAction::SetRates { .. } | StepAction::Remove { .. } => {
-            None
-        }
+        StepAction::BringUp { .. }
+        | StepAction::Widen { .. }
+        | StepAction::SetRates { .. }
+        | StepAction::Remove { .. } => None,
     };
     let doing = step.doing();
     let unknown = |kind: &str, kernel: &Kernel| {

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 
 use protocol::bus::KindChoice;
 use protocol::id::CellId;
-use protocol::skin::{SkinReply, Skin};
+use protocol::skin::{Skin, SkinReply};
 
 use crate::kernel::Kernel;
 use crate::link::Interface;

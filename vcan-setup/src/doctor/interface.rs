@@ -5,7 +5,7 @@ use protocol::can::Format;
 
 use super::{BusFacts, Facts, Finding, User, would_run};
 use crate::kernel::ModuleState;
-use crate::link::{FD_MTU, Hardware, Interface, InterfaceKind, ControllerState};
+use crate::link::{ControllerState, FD_MTU, Hardware, Interface, InterfaceKind};
 use crate::plan::widen;
 
 impl Facts {
@@ -112,7 +112,8 @@ impl Facts {
             let text = format!("{name} is {what}, up, and carries {}", carries(interface.mtu));
             findings.insert(0, Finding::ok(text));
             if interface.is_virtual() && bus.target.hardware().is_some() {
-                let command = if interface.ours { self.own_command("down") } else { self.sudo("ip link del") };
+                let command =
+                    if interface.ours { self.own_command("down") } else { self.sudo("ip link del") };
                 let text =
                     format!("{name} is {what} and has no bit rate; the skin gives it one, as hardware has");
                 let hint = format!("{command} {name}  # if hardware is to have this name");

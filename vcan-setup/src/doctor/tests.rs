@@ -1,6 +1,8 @@
 use super::*;
 use crate::kernel::ModuleState;
-use crate::link::{CLASSIC_MTU, Counters, FD_MTU, Hardware, Interface, InterfaceKind, HardwareRates, ControllerState};
+use crate::link::{
+    CLASSIC_MTU, ControllerState, Counters, FD_MTU, Hardware, HardwareRates, Interface, InterfaceKind,
+};
 use crate::plan::SkinBus;
 
 fn interface(name: &str, kind: InterfaceKind) -> Interface {
@@ -212,9 +214,12 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
         "note: the kernel's module vcan is not loaded; making an interface loads it | modprobe vcan";
     assert_eq!(missing(admin, ModuleState::Loadable)[0], loadable);
     assert!(
-        missing(admin, ModuleState::Missing)[0].starts_with("fault: the kernel (6.1.0) has CAN and no vcan | ")
+        missing(admin, ModuleState::Missing)[0]
+            .starts_with("fault: the kernel (6.1.0) has CAN and no vcan | ")
     );
-    assert!(missing(admin, ModuleState::Unknown)[0].starts_with("note: cannot see whether the kernel has vcan"));
+    assert!(
+        missing(admin, ModuleState::Unknown)[0].starts_with("note: cannot see whether the kernel has vcan")
+    );
     let contained = missing(User { root: true, admin: false }, ModuleState::There);
     assert!(contained[0].starts_with("fault: root may not make interfaces here: it has no CAP_NET_ADMIN"));
     let named = about(|facts| {
@@ -292,7 +297,9 @@ fn hardware_has_to_have_the_skins_bit_rates_and_to_take_part() {
         bus_off[0].starts_with("fault: can0 is BUS-OFF")
             && bus_off[0].contains("sudo ip link set can0 type can restart")
     );
-    assert!(state(ControllerState::ErrorPassive)[0].starts_with("note: can0 is ERROR-PASSIVE: it sees errors"));
+    assert!(
+        state(ControllerState::ErrorPassive)[0].starts_with("note: can0 is ERROR-PASSIVE: it sees errors")
+    );
     let deaf = about_hardware(same, |_, hardware| hardware.listen_only = true);
     assert!(deaf[0].starts_with("fault: can0 only listens"));
 }

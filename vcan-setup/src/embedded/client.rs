@@ -11,7 +11,7 @@ use rustix::io::Errno;
 
 use super::BusTotals;
 use super::parcel::FrameDatagram;
-use super::queue::{QueueEntry, ClientQueue};
+use super::queue::{ClientQueue, QueueEntry};
 use super::routing::ClientId;
 
 /// The maximum number of frames in a client's queue, beyond those in its socket buffer.

@@ -123,7 +123,8 @@ const MOST_ABSENT: u32 = 1_000;
 
 /// Creates the directory if it does not exist, and locks it.
 fn lock(path: &Path) -> Result<OwnedFd, BusSocketError> {
-    let failed = |errno: Errno| BusSocketError::Io { path: path.to_owned(), doing: "lock", source: errno.into() };
+    let failed =
+        |errno: Errno| BusSocketError::Io { path: path.to_owned(), doing: "lock", source: errno.into() };
     let mut absent = 0;
     loop {
         let directory = match make_directory(path) {

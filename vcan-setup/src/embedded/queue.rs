@@ -95,7 +95,10 @@ mod tests {
         assert_eq!(kept, [true, true, false, false, false]);
         assert_eq!(queue.sent(2), 2);
         assert!(queue.push(parcel(5)));
-        assert_eq!(queue.iter().copied().collect::<Vec<_>>(), [QueueEntry::Dropped(3), QueueEntry::Frame(parcel(5))]);
+        assert_eq!(
+            queue.iter().copied().collect::<Vec<_>>(),
+            [QueueEntry::Dropped(3), QueueEntry::Frame(parcel(5))]
+        );
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::thread::JoinHandle;
 
 use protocol::bus::embedded::default_directory;
 
-use super::{ServeError, Server, BusTotals};
+use super::{BusTotals, ServeError, Server};
 
 /// A bus that is served by a thread of this process. Dropping it stops the thread.
 #[derive(Debug)]

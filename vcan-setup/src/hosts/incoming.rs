@@ -6,7 +6,7 @@ use protocol::can::Frame;
 use protocol::id::{CellId, Id};
 use serde::{Deserialize, Serialize};
 
-use super::message::{MessageHeader, MessageError, Stamped, decode};
+use super::message::{MessageError, MessageHeader, Stamped, decode};
 
 /// The maximum number of frames in the queue to the bus.
 pub const MAX_WAITING_FRAMES: usize = 8_192;

@@ -69,7 +69,9 @@ pub enum MessageError {
     },
     /// The numbers in the header are impossible: a frame number would exceed 2^64, or more frames were dropped than
     /// numbered.
-    #[error("a message has impossible numbers: {first} for its first frame, and {dropped} frames dropped before it")]
+    #[error(
+        "a message has impossible numbers: {first} for its first frame, and {dropped} frames dropped before it"
+    )]
     Numbers {
         /// The number of the first frame.
         first: u64,
@@ -161,7 +163,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const HEAD_OF: MessageHeader = MessageHeader { life: 0x0102_0304_0506_0708, first: 9, dropped: 2, missed: 1 };
+    const HEAD_OF: MessageHeader =
+        MessageHeader { life: 0x0102_0304_0506_0708, first: 9, dropped: 2, missed: 1 };
 
     fn stamped(at_nanos: u64, frame: Frame) -> Stamped {
         Stamped { at_nanos, frame }

@@ -40,7 +40,12 @@ impl Outgoing {
     /// Creates an empty queue. `life` is a random number that identifies this start of the link.
     #[must_use]
     pub fn new(life: u64) -> Self {
-        Self { life, waiting: VecDeque::with_capacity(MAX_WAITING_FRAMES), next: 0, account: BusAccount::default() }
+        Self {
+            life,
+            waiting: VecDeque::with_capacity(MAX_WAITING_FRAMES),
+            next: 0,
+            account: BusAccount::default(),
+        }
     }
 
     /// Numbers a frame from the bus and queues it, or drops it if the queue is full.

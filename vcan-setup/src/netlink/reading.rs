@@ -8,7 +8,7 @@ use netlink_packet_route::link::{
 };
 use protocol::bus::netlink::attributes;
 
-use crate::link::{Counters, Hardware, Interface, InterfaceKind, ALIAS_MARK, Peer, ControllerState};
+use crate::link::{ALIAS_MARK, ControllerState, Counters, Hardware, Interface, InterfaceKind, Peer};
 
 /// Decodes the kernel's message about an interface. Returns `None` if it is incomplete.
 pub(super) fn interface(bytes: &[u8]) -> Option<Interface> {

@@ -4,7 +4,7 @@ use protocol::usage::Failure;
 use thiserror::Error;
 
 use super::widen;
-use crate::link::{FD_MTU, Interface, HardwareRates};
+use crate::link::{FD_MTU, HardwareRates, Interface};
 
 /// The reason why a plan is refused. Its text is one line that contains a command to fix the cause.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]

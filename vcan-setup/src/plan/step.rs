@@ -2,7 +2,7 @@
 
 use core::fmt;
 
-use crate::link::{FD_MTU, ALIAS_MARK, HardwareRates};
+use crate::link::{ALIAS_MARK, FD_MTU, HardwareRates};
 use crate::namespace::Namespace;
 
 /// A step of a plan: an action on one interface.
@@ -98,7 +98,9 @@ impl Step {
         let name = &self.name;
         match &self.action {
             StepAction::MakeVcan => {
-                format!("ip link add {name} mtu {FD_MTU} type vcan && ip link set {name} alias {ALIAS_MARK} up")
+                format!(
+                    "ip link add {name} mtu {FD_MTU} type vcan && ip link set {name} alias {ALIAS_MARK} up"
+                )
             }
             StepAction::MakePair { peer, namespace } => {
                 let (netns, ip) = match namespace {

@@ -221,8 +221,11 @@ fn a_bus_with_a_bit_rate_is_never_made_of_software() {
 #[test]
 fn a_pair_is_made_once_and_told_from_other_pairs() {
     let mut world = World::of(vec![ours("vcan0", 2)]);
-    let named =
-        |there: &World, id| OtherNamespace { name: Namespace::Name("blue".into()), id, present: there.there.clone() };
+    let named = |there: &World, id| OtherNamespace {
+        name: Namespace::Name("blue".into()),
+        id,
+        present: there.there.clone(),
+    };
     let there = named(&world, None);
     let target = TargetPair { name: "vcan1", peer: "vcan1", there: Some(&there) };
     let plan = up_pair(&target, &world.here).unwrap();
@@ -265,7 +268,8 @@ fn a_pair_is_made_once_and_told_from_other_pairs() {
 
 #[test]
 fn only_what_is_ours_is_removed() {
-    let present = [ours("vcan0", 2), interface("vcan1", 3, InterfaceKind::Vcan), can0(kvaser(None, None), true)];
+    let present =
+        [ours("vcan0", 2), interface("vcan1", 3, InterfaceKind::Vcan), can0(kvaser(None, None), true)];
     let names = ["vcan0", "vcan1", "can0", "vcan9"];
     let skin = names.map(|name| in_skin(name, Format::Fd, None, None));
     let plan = down(&skin, &present).unwrap();

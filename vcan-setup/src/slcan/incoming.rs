@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use protocol::can::{Format, Frame};
-use protocol::slcan::{BusState, Decoder, AdapterFault, SlcanLine, AdapterReport};
+use protocol::slcan::{AdapterFault, AdapterReport, BusState, Decoder, SlcanLine};
 
 use super::account::{Faults, ToBusCounts};
 

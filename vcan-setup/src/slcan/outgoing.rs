@@ -9,7 +9,7 @@ use protocol::slcan::{CR, encode};
 use protocol::wire_time::{BitRates, Bits};
 
 use super::account::ToLineCounts;
-use super::options::{LineOptions, OpeningStep, OpeningStage};
+use super::options::{LineOptions, OpeningStage, OpeningStep};
 
 /// The maximum number of queued frames: those that a line at 1 Mbaud carries in a tenth of a second.
 pub const MAX_WAITING_FRAMES: usize = 256;
@@ -33,7 +33,8 @@ impl Pace {
     }
 
     fn cost(self, frame: &Frame, bytes: usize) -> Duration {
-        let bus = self.bit_rates.zip(Bits::from_frame(frame)).map_or(0, |(rates, bits)| bits.nanoseconds(rates));
+        let bus =
+            self.bit_rates.zip(Bits::from_frame(frame)).map_or(0, |(rates, bits)| bits.nanoseconds(rates));
         let wire = self.baud.map_or(0, |baud| bytes as u64 * 10_000_000_000 / u64::from(baud.max(1)));
         Duration::from_nanos(bus.max(wire))
     }
@@ -439,14 +440,17 @@ mod tests {
         let mut outgoing = Outgoing::new(true, pace);
         outgoing.up(&[]);
         // The frame has 34 + 8 + 13 bits, and stuff bits in addition.
-        let cost = Duration::from_nanos(Bits::from_frame(&frame(0xAA)).unwrap().nanoseconds("125k".parse().unwrap()));
+        let cost = Duration::from_nanos(
+            Bits::from_frame(&frame(0xAA)).unwrap().nanoseconds("125k".parse().unwrap()),
+        );
         let (mut now, mut sent) = (NOW, 0);
         while now < NOW + Duration::from_secs(1) {
             outgoing.push_frame(&frame(0xAA));
             sent += drain(&mut outgoing, now).len() / 8;
             now += Duration::from_micros(100);
         }
-        let carried = usize::try_from((Duration::from_secs(1) + MAX_AHEAD).as_nanos() / cost.as_nanos()).unwrap();
+        let carried =
+            usize::try_from((Duration::from_secs(1) + MAX_AHEAD).as_nanos() / cost.as_nanos()).unwrap();
         assert!((carried..=carried + 1).contains(&sent), "{sent} of {carried}");
         let ToLineCounts { received, sent, dropped, .. } = outgoing.account;
         assert_eq!(received, sent + dropped.queue_full + outgoing.entries.len() as u64);

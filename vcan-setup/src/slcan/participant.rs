@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use protocol::bus::{Bus, BusError, Inbox};
 use rustix::event::PollFlags;
 
-use super::account::{LineAccount, Faults, faults_since};
+use super::account::{Faults, LineAccount, faults_since};
 use super::event::LineEvent;
 use super::incoming::Incoming;
 use super::link::{Opener, Port};
@@ -165,7 +165,12 @@ impl Participant {
     }
 
     /// Forwards all data that is available at either end.
-    pub(super) fn work(&mut self, settings: &BridgeSettings, ready: Ready, report: &mut impl FnMut(LineEvent)) {
+    pub(super) fn work(
+        &mut self,
+        settings: &BridgeSettings,
+        ready: Ready,
+        report: &mut impl FnMut(LineEvent),
+    ) {
         let now = Instant::now();
         self.open_line(now, report);
         if self.settled_at.is_some_and(|at| at <= now) {

@@ -50,7 +50,13 @@ impl Refusals {
 
     /// Evaluates the refusals so far. `bells` is their number since the start; `replies` are those since the adapter
     /// was opened.
-    pub fn evaluate(&mut self, now: Duration, stage: OpeningStage, bells: u64, replies: Replies) -> RefusalAction {
+    pub fn evaluate(
+        &mut self,
+        now: Duration,
+        stage: OpeningStage,
+        bells: u64,
+        replies: Replies,
+    ) -> RefusalAction {
         let more = bells - std::mem::replace(&mut self.seen, bells);
         if replies.accepted && replies.refusals == 0 {
             self.pause = FIRST_PAUSE;
@@ -61,7 +67,9 @@ impl Refusals {
             // closing an adapter that was closed already.
             OpeningStage::Away | OpeningStage::Closed => RefusalAction::Count(more),
             OpeningStage::Setting => RefusalAction::ReportSettings,
-            OpeningStage::Open if now < self.next || (replies.accepted && replies.refusals < REFUSAL_THRESHOLD) => {
+            OpeningStage::Open
+                if now < self.next || (replies.accepted && replies.refusals < REFUSAL_THRESHOLD) =>
+            {
                 RefusalAction::Count(more)
             }
             OpeningStage::Open => {
@@ -94,7 +102,9 @@ mod tests {
         let replies = |refusals| Replies { accepted: false, refusals };
         let mut times = Vec::new();
         for number in 1..=100_000 {
-            if let RefusalAction::Reopen(1) = refusals.evaluate(at(number), OpeningStage::Open, number, replies(number)) {
+            if let RefusalAction::Reopen(1) =
+                refusals.evaluate(at(number), OpeningStage::Open, number, replies(number))
+            {
                 times.push(number);
             }
         }
@@ -113,11 +123,15 @@ mod tests {
         let mut refusals = Refusals::new();
         for refused in 1..=REFUSAL_THRESHOLD {
             let replies = Replies { accepted: true, refusals: refused };
-            let expected = if refused < REFUSAL_THRESHOLD { RefusalAction::Count(1) } else { RefusalAction::Reopen(1) };
+            let expected =
+                if refused < REFUSAL_THRESHOLD { RefusalAction::Count(1) } else { RefusalAction::Reopen(1) };
             assert_eq!(refusals.evaluate(at(refused), OpeningStage::Open, refused, replies), expected);
         }
         let accepted = Replies { accepted: true, refusals: 0 };
-        assert_eq!(refusals.evaluate(at(9), OpeningStage::Open, REFUSAL_THRESHOLD, accepted), RefusalAction::Nothing);
+        assert_eq!(
+            refusals.evaluate(at(9), OpeningStage::Open, REFUSAL_THRESHOLD, accepted),
+            RefusalAction::Nothing
+        );
     }
 
     #[test]
@@ -126,7 +140,10 @@ mod tests {
         let replies = Replies { accepted: false, refusals: 1 };
         assert_eq!(refusals.evaluate(at(1), OpeningStage::Away, 1, replies), RefusalAction::Count(1));
         assert_eq!(refusals.evaluate(at(2), OpeningStage::Closed, 2, replies), RefusalAction::Count(1));
-        assert_eq!(refusals.evaluate(at(3), OpeningStage::Setting, 3, replies), RefusalAction::ReportSettings);
+        assert_eq!(
+            refusals.evaluate(at(3), OpeningStage::Setting, 3, replies),
+            RefusalAction::ReportSettings
+        );
         assert_eq!(refusals.evaluate(at(4), OpeningStage::Setting, 3, replies), RefusalAction::Nothing);
         assert_eq!(refusals.reopened(), 0);
     }

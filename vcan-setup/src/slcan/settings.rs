@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use protocol::bus::{Bus, BusError, KindChoice, Filter, BusOptions};
+use protocol::bus::{Bus, BusError, BusOptions, Filter, KindChoice};
 
 use super::options::LineOptions;
 

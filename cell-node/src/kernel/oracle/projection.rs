@@ -23,7 +23,7 @@ mod sums;
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
-use self::axes::{Axis, Frame, Height, Level, Mix, ToBase, Rotation, Vector, negate};
+use self::axes::{Axis, Frame, Height, Level, Mix, Rotation, ToBase, Vector, negate};
 use self::range::is_bounded;
 use self::sums::Sums;
 use crate::kernel::joint::Joint;

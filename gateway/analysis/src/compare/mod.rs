@@ -28,7 +28,8 @@ use crate::explain::NotFound;
 
 pub use self::align::{Trace, starts};
 pub use self::report::{
-    ASPECTS, CellRow, Contacts, Epochs, ExtraCell, FirstDifference, Joints, Losses, UnpairedCounts, Replies, Report, Source,
+    ASPECTS, CellRow, Contacts, Epochs, ExtraCell, FirstDifference, Joints, Losses, Replies, Report, Source,
+    UnpairedCounts,
 };
 
 /// One of the two captures that are compared.
@@ -264,7 +265,12 @@ impl<'a> Comparison<'a> {
         }
     }
 
-    fn describe(&self, bus: usize, moments: &Both<Option<&Moment>>, mut found: FoundDifference) -> Option<FirstDifference> {
+    fn describe(
+        &self,
+        bus: usize,
+        moments: &Both<Option<&Moment>>,
+        mut found: FoundDifference,
+    ) -> Option<FirstDifference> {
         if let Some(cell) = found.cell()
             && self.restarts(bus, cell, CaptureSide::A) != self.restarts(bus, cell, CaptureSide::B)
         {

@@ -6,7 +6,7 @@ use protocol::id::CellId;
 use super::numbering::Key;
 use super::report::{CellRow, ExtraCell, Losses, Replies, Report, Source};
 use super::side::{ComparedCell, Side};
-use super::{ASPECTS, Both, Comparison, CaptureSide};
+use super::{ASPECTS, Both, CaptureSide, Comparison};
 
 impl Comparison<'_> {
     /// Returns the report; call it after both captures have ended.
@@ -132,6 +132,7 @@ fn source(side: &Side<'_>) -> Source {
         source.restarts += cell.restarts;
     }
     let histogram = side.reply().histogram();
-    source.reply_us = (side.has_times && !histogram.is_empty()).then(|| Quantiles::from_histogram(histogram, 1e-3));
+    source.reply_us =
+        (side.has_times && !histogram.is_empty()).then(|| Quantiles::from_histogram(histogram, 1e-3));
     source
 }

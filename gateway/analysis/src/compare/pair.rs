@@ -8,7 +8,7 @@ use protocol::packet::Words;
 use protocol::schema::Units;
 use protocol::skin::{JointKind, Skin};
 
-use super::report::{Contacts, FirstDifference, Joints, UnpairedCounts, Replies};
+use super::report::{Contacts, FirstDifference, Joints, Replies, UnpairedCounts};
 use super::side::Moment;
 use super::{Both, Options};
 use crate::explain::CellMoment;
@@ -130,11 +130,20 @@ pub(super) fn compare(
         tally.joints.tolerated += 1;
     } else {
         tally.joints.different += 1;
-        first.note(FoundDifference { what: "joints", how: "different", word: joints, ..FoundDifference::default() });
+        first.note(FoundDifference {
+            what: "joints",
+            how: "different",
+            word: joints,
+            ..FoundDifference::default()
+        });
     }
     if a.watched.halted != b.watched.halted {
         tally.halts.count(a.watched.halted);
-        first.note(FoundDifference { what: "halt", how: missing(!a.watched.halted), ..FoundDifference::default() });
+        first.note(FoundDifference {
+            what: "halt",
+            how: missing(!a.watched.halted),
+            ..FoundDifference::default()
+        });
     }
     for ((cell, in_a), in_b) in CellId::all().zip(&a.watched.cells).zip(&b.watched.cells) {
         contact(&mut tally.contacts, cell, (in_a, in_b), &mut first);

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use model::quantiles::Times;
-use model::tracker::{MAX_LATE_EPOCHS, PerCell, CellTracker};
+use model::tracker::{CellTracker, MAX_LATE_EPOCHS, PerCell};
 use protocol::id::CellId;
 use protocol::message::{Joints, Message};
 use protocol::packet::{Epoch, Words};

@@ -182,12 +182,20 @@ fn an_input_that_differs_is_named() {
     let skin = skin();
     let a = run(&skin, 0..40);
     // Another force, and so another torque.
-    let b = changed(&a, |it| matches!(it, Message::Stimulus { .. }), Some(press(AppliesFrom::Epoch(Epoch(5)), 2.0)));
+    let b = changed(
+        &a,
+        |it| matches!(it, Message::Stimulus { .. }),
+        Some(press(AppliesFrom::Epoch(Epoch(5)), 2.0)),
+    );
     let b = changed(&b, is_torque_of(5), Some(torque(1, 5, 200)));
     let first = equal(&skin, &a, &b).first.unwrap();
     assert_eq!((first.number, first.inputs.as_slice()), (5, &["stimulus"][..]));
     // The touch arrives an epoch later: a contact that only A has, and its torque.
-    let b = changed(&a, |it| matches!(it, Message::Stimulus { .. }), Some(press(AppliesFrom::Epoch(Epoch(6)), 1.0)));
+    let b = changed(
+        &a,
+        |it| matches!(it, Message::Stimulus { .. }),
+        Some(press(AppliesFrom::Epoch(Epoch(6)), 1.0)),
+    );
     let b = changed(&b, is_torque_of(5), None);
     let report = equal(&skin, &a, &b);
     assert_eq!(report.differs, ["contacts", "torques"]);
@@ -251,7 +259,8 @@ fn what_one_has_before_and_after_the_other_is_no_difference_but_a_missing_epoch_
     let b = run(&skin, 100..500);
     let report = equal(&skin, &a, &b);
     assert!(report.equal, "{report:?}");
-    let (before, after) = (UnpairedCounts { only_a: 100, only_b: 0 }, UnpairedCounts { only_a: 100, only_b: 0 });
+    let (before, after) =
+        (UnpairedCounts { only_a: 100, only_b: 0 }, UnpairedCounts { only_a: 100, only_b: 0 });
     assert_eq!((report.epochs.before, report.epochs.after, report.epochs.compared), (before, after, 400));
     let b = changed(&b, |it| *it == joints(256), None);
     let report = equal(&skin, &a, &b);

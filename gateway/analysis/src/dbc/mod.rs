@@ -23,7 +23,7 @@ use protocol::can::Format;
 use protocol::id::{Command, Id, Kind, Node};
 use protocol::packet::{Length, Lengths};
 use protocol::schema::{PacketSchema, Units, packets};
-use protocol::skin::{SkinBus, Skin};
+use protocol::skin::{Skin, SkinBus};
 
 use signal::Signal;
 

@@ -6,7 +6,7 @@ use protocol::id::Kind;
 use protocol::message::State;
 use protocol::packet::{Length, WORDS};
 use protocol::parameters::Parameter;
-use protocol::schema::{Field, FieldFormat, Layout, PacketSchema, FieldRange, Units, parameters, reasons};
+use protocol::schema::{Field, FieldFormat, FieldRange, Layout, PacketSchema, Units, parameters, reasons};
 
 /// Position after the last word in a packet of six words, in bits.
 const END: usize = WORDS * 16;

@@ -3,10 +3,10 @@
 use core::fmt::{self, Write};
 
 use protocol::message::VERSION;
-use protocol::skin::{SkinBus, Skin};
+use protocol::skin::{Skin, SkinBus};
 
 use super::signal::{Page, Signal};
-use super::{Message, DbcNode, SendSchedule, are_packets};
+use super::{DbcNode, Message, SendSchedule, are_packets};
 
 /// The format's placeholder for an unnamed sender or receiver.
 const UNNAMED: &str = "Vector__XXX";

@@ -24,7 +24,7 @@ pub use watch::{CellMoment, Moment, Origin, RequestedJoints, Watch};
 use protocol::fixed::{Q, is_saturated};
 use protocol::message::{SkinSensors, State};
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{Cell, MAX_ROBOT_JOINTS, SkinReply, Skin};
+use protocol::skin::{Cell, MAX_ROBOT_JOINTS, Skin, SkinReply};
 use serde::Serialize;
 
 use self::row::{jacobian_steps, number, row};

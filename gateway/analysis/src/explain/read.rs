@@ -30,7 +30,11 @@ pub struct FoundJoints {
 ///
 /// # Errors
 /// Returns [`CaptureError`] if the capture cannot be read, or is damaged.
-pub fn find(reader: &mut Reader, skin: &Skin, requested: RequestedJoints) -> Result<FoundJoints, CaptureError> {
+pub fn find(
+    reader: &mut Reader,
+    skin: &Skin,
+    requested: RequestedJoints,
+) -> Result<FoundJoints, CaptureError> {
     let mut watch = Watch::new(skin, requested);
     let mut decoder = Decoder::new(None);
     for before in &reader.extras().latched {

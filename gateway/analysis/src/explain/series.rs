@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 
 use model::decode::{Decoded, Decoder};
 use protocol::packet::Epoch;
-use protocol::skin::{SkinReply, Skin};
+use protocol::skin::{Skin, SkinReply};
 use protocol::time::Micros;
 use thiserror::Error;
 use trace::capture::{CaptureError, Entry, Note, Reader};
@@ -117,7 +117,9 @@ pub fn each_epoch<E>(
 #[must_use]
 pub fn is_summed(skin: &Skin, joint: usize) -> bool {
     let mut buses = skin.buses.iter().enumerate();
-    buses.any(|(at, bus)| bus.reply != SkinReply::Torque && skin.joints_on_bus(at).any(|(of_bus, _)| of_bus == joint))
+    buses.any(|(at, bus)| {
+        bus.reply != SkinReply::Torque && skin.joints_on_bus(at).any(|(of_bus, _)| of_bus == joint)
+    })
 }
 
 /// Joins the joints of several buses into epochs.

@@ -202,7 +202,8 @@ fn what_is_not_there_is_named_with_what_is() {
     assert_eq!(error, "none of its buses (can7) is one of the skin's (vcan0)");
     // Memory is bounded for any input.
     let said: Vec<_> = (0..200).map(|epoch: u8| joints(epoch.wrapping_mul(3))).collect();
-    let error = explained(&skin, &said, RequestedJoints { occurrence: 9, ..first(5) }).unwrap_err().to_string();
+    let error =
+        explained(&skin, &said, RequestedJoints { occurrence: 9, ..first(5) }).unwrap_err().to_string();
     assert!(error.ends_with("; 192 further runs"), "{error}");
 }
 
@@ -239,8 +240,13 @@ fn a_claim_of_an_owned_node_id_changes_nothing() {
         let page = NetworkPage::Heartbeat(heartbeat);
         Message::Network { from: Node::Cell(cell()), epoch: Epoch(0), page }
     };
-    let mut said =
-        vec![heartbeat(0x266D), press(AppliesFrom::Next, 1.0), joints(6), joints(7), torque(7, [-1075, 3195])];
+    let mut said = vec![
+        heartbeat(0x266D),
+        press(AppliesFrom::Next, 1.0),
+        joints(6),
+        joints(7),
+        torque(7, [-1075, 3195]),
+    ];
     let without = explained(&skin, &said, first(7)).unwrap();
     // The claim replaces other joints, so that the times are equal.
     said[2] = claim;

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use model::tracker::{AddressClaim, Contact, MAX_LATE_EPOCHS, PerCell, HeartbeatKind, is_late};
+use model::tracker::{AddressClaim, Contact, HeartbeatKind, MAX_LATE_EPOCHS, PerCell, is_late};
 use protocol::id::{CellId, Node};
 use protocol::message::{
     Answer, AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
@@ -167,7 +167,8 @@ impl<'a> Watch<'a> {
     }
 
     fn of(skin: &'a Skin, requested: Option<RequestedJoints>) -> Self {
-        let bus_watch = |bus| BusWatch { cells_here: skin.cells_on_bus(bus).next().is_some(), ..BusWatch::default() };
+        let bus_watch =
+            |bus| BusWatch { cells_here: skin.cells_on_bus(bus).next().is_some(), ..BusWatch::default() };
         let bus_watches = (0..skin.buses.len()).map(bus_watch).collect();
         Self { skin, requested, zero: None, bus_watches, others: Vec::new() }
     }
@@ -408,7 +409,14 @@ impl BusWatch {
         }
     }
 
-    fn joints(&mut self, nanos: u64, after: u64, epoch: Epoch, joints: Joints, requested: Option<RequestedJoints>) {
+    fn joints(
+        &mut self,
+        nanos: u64,
+        after: u64,
+        epoch: Epoch,
+        joints: Joints,
+        requested: Option<RequestedJoints>,
+    ) {
         self.run(nanos, epoch);
         self.latch(epoch);
         for open in &mut self.open {

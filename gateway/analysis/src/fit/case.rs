@@ -5,7 +5,7 @@ use protocol::can::Format;
 use protocol::message::SensorPage;
 use protocol::packet::Length;
 use protocol::parameters::Sensing;
-use protocol::skin::{SkinReply, Skin};
+use protocol::skin::{Skin, SkinReply};
 use protocol::wire_time::{BitRates, Coding, Shape};
 
 use super::response::{Response, Stream, response};
@@ -138,7 +138,13 @@ impl Case {
     /// Returns the timing inputs of one bus as the skin describes it, with these rates; `None` if a cell that answers
     /// with sums is unreachable.
     #[must_use]
-    pub fn from_skin(skin: &Skin, bus: usize, format: Format, rates: BitRates, computation_ns: u64) -> Option<Self> {
+    pub fn from_skin(
+        skin: &Skin,
+        bus: usize,
+        format: Format,
+        rates: BitRates,
+        computation_ns: u64,
+    ) -> Option<Self> {
         let described = skin.buses.get(bus)?;
         let period_ns = u64::from(skin.timing.ticks_per_broadcast) * skin.timing.tick_nanos();
         let answers = match described.reply {

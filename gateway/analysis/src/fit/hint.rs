@@ -2,12 +2,12 @@
 
 use protocol::can::Format;
 use protocol::parameters::Sensing;
-use protocol::skin::{SkinReply, Skin};
+use protocol::skin::{Skin, SkinReply};
 use serde::Serialize;
 
 use super::case::{self, Answers, Case};
 use super::limits::{Limit, MaxCells, NeededBuses, exceeded};
-use super::{COMMON_RATES, AssessedBus};
+use super::{AssessedBus, COMMON_RATES};
 
 /// The longest period of joints that the wire protocol can express, in ns.
 const MAX_PERIOD_NS: u64 = 65_535_000;
@@ -81,7 +81,8 @@ fn is_in_time(case: &Case) -> bool {
 /// Returns the hint of a slower broadcast: the shortest period in whole ticks that meets the timing limits.
 fn slower_joints(skin: &Skin, case: &Case) -> Option<Hint> {
     let tick_ns = skin.timing.tick_nanos();
-    let periods = (1_u64..).map(|ticks| case.period_ns + ticks * tick_ns).take_while(|&it| it <= MAX_PERIOD_NS);
+    let periods =
+        (1_u64..).map(|ticks| case.period_ns + ticks * tick_ns).take_while(|&it| it <= MAX_PERIOD_NS);
     let slower = periods.map(|period_ns| Case { period_ns, ..case.clone() }).find(is_in_time)?;
     Some(hint(format!("joint_broadcast_hz = {}", hertz(slower.period_ns)), &slower))
 }

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::case::{Answers, Load};
 use super::limits::NeededBuses;
-use super::{BusFit, AssessedBus, Row, SkinFit, name};
+use super::{AssessedBus, BusFit, Row, SkinFit, name};
 
 #[derive(Serialize)]
 struct Document<'a> {

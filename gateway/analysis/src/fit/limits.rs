@@ -201,7 +201,8 @@ mod tests {
     }
     #[test]
     fn the_larger_need_binds_and_equal_ones_both() {
-        let need = |bandwidth, deadline| NeededBuses::for_cells(&MaxCells { bandwidth, deadline, nodes: 109 }, 253);
+        let need =
+            |bandwidth, deadline| NeededBuses::for_cells(&MaxCells { bandwidth, deadline, nodes: 109 }, 253);
         assert_eq!((need(212, 223).buses(), need(212, 223).binding()), (Some(3), vec![Limit::Nodes]));
         assert_eq!(need(212, 223).in_time(), Some(2));
         assert_eq!(

@@ -215,7 +215,7 @@ impl Traffic {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-    use protocol::message::{ReceivedCounts, Heartbeat, RejectedCounts, SensorPage, SkinSensors, Tree};
+    use protocol::message::{Heartbeat, ReceivedCounts, RejectedCounts, SensorPage, SkinSensors, Tree};
 
     fn said(traffic: &mut Traffic, format: Format, message: &Message) -> Vec<Option<BenchFrame>> {
         message.encode().frames(format).map(|frame| traffic.sort(0, &frame).bench).collect()
@@ -248,12 +248,16 @@ mod tests {
             assert_eq!(last(&heartbeat(2, State::CONFIGURED)), None);
             assert_eq!(last(&Message::Report), Some(BenchFrame::Report));
             assert_eq!(last(&skin(1)), None, "before the answers begin");
-            for page_of_one in
-                [NetworkPage::Received(ReceivedCounts::default()), NetworkPage::Rejected(RejectedCounts::default())]
-            {
+            for page_of_one in [
+                NetworkPage::Received(ReceivedCounts::default()),
+                NetworkPage::Rejected(RejectedCounts::default()),
+            ] {
                 assert_eq!(last(&page(1, page_of_one)), Some(BenchFrame::Report));
             }
-            assert_eq!([last(&skin(1)), last(&skin(1)), last(&skin(2))], [Some(BenchFrame::Report), None, None]);
+            assert_eq!(
+                [last(&skin(1)), last(&skin(1)), last(&skin(2))],
+                [Some(BenchFrame::Report), None, None]
+            );
             assert_eq!([last(&tree), last(&tree)], [Some(BenchFrame::Report), None]);
             // A cell without ports sends no tree; its next one is unrequested.
             last(&page(1, NetworkPage::Rejected(RejectedCounts::default())));

@@ -226,7 +226,8 @@ mod tests {
                 figure(&format!("{name}-half"), Size::Half),
             ],
             findings: vec![
-                Finding::less_is_better("error", 0.0054, nm(6.3e-5)).with_command(Some("look <here>".to_owned())),
+                Finding::less_is_better("error", 0.0054, nm(6.3e-5))
+                    .with_command(Some("look <here>".to_owned())),
                 Finding::stated("slope", nm(0.25).plus_minus(0.5)).must("below 1 Nm", false).from("--limit"),
             ],
             tables: vec![

@@ -364,7 +364,8 @@ fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Dr
     if !(0.0..=1.0).contains(&place) {
         return Ok(());
     }
-    let ends = if mark.on == MarkAxis::X { [(place, 0.0), (place, 1.0)] } else { [(0.0, place), (1.0, place)] };
+    let ends =
+        if mark.on == MarkAxis::X { [(place, 0.0), (place, 1.0)] } else { [(0.0, place), (1.0, place)] };
     let line = ends.map(|(across, up)| (x.value(across), y.value(up)));
     chart.draw_series([PathElement::new(line.to_vec(), FAINT.stroke_width(DOTTED))])?;
     // Put the text on the side with room.

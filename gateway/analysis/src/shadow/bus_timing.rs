@@ -12,7 +12,7 @@ use super::report::{BusShadow, Counts, Delays, Loads, Peak, Stretches};
 use super::reported::FrameTimings;
 use super::{SATURATED_NS, WINDOW_FRAMES, WINDOW_NS};
 use crate::fit;
-use crate::fit::traffic::{RunEvent, ClassifiedFrame, Traffic};
+use crate::fit::traffic::{ClassifiedFrame, RunEvent, Traffic};
 use crate::fit::verdict::{Answer, Cells};
 use bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 

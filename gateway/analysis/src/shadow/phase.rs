@@ -67,7 +67,8 @@ impl CaptureStart {
     }
 
     fn phase(&self, is_ours: bool) -> Phase {
-        let soon = self.joints.zip(self.first).is_some_and(|(joints, first)| joints - first < MAX_FIRST_JOINTS_NS);
+        let soon =
+            self.joints.zip(self.first).is_some_and(|(joints, first)| joints - first < MAX_FIRST_JOINTS_NS);
         let in_the_middle = self.in_the_middle || self.is_answered || soon && !self.is_prepared;
         if in_the_middle || !is_ours { Phase::Operation } else { Phase::StartUp }
     }
@@ -160,7 +161,9 @@ impl Figures {
 
     pub(super) fn kinds(&self) -> Vec<KindDelays> {
         let kinds = Kind::ALL.into_iter().zip(&self.kinds).filter(|(_, delay)| !delay.histogram().is_empty());
-        kinds.map(|(kind, delay)| KindDelays { kind: kind.name(), delay_us: Delays::from_times(delay) }).collect()
+        kinds
+            .map(|(kind, delay)| KindDelays { kind: kind.name(), delay_us: Delays::from_times(delay) })
+            .collect()
     }
 
     /// Returns the loads of a phase that lasted `span` ns; transmissions continued for `overrun` ns after its end.

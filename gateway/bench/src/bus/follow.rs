@@ -334,7 +334,11 @@ mod tests {
             match follower.step(&mut source, Duration::from_millis(30)) {
                 FollowStep::Nothing => {}
                 FollowStep::Refused(error) => steps.push(error.to_string()),
-                FollowStep::Frames(_) | FollowStep::Down(_) | FollowStep::Leftover(_) | FollowStep::Drained | FollowStep::Gone(_) => {
+                FollowStep::Frames(_)
+                | FollowStep::Down(_)
+                | FollowStep::Leftover(_)
+                | FollowStep::Drained
+                | FollowStep::Gone(_) => {
                     panic!("a bus that is gone has neither frames nor a loss")
                 }
             }

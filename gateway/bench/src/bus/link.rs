@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError, BusKind, KindChoice, BusOptions, SendError};
+use protocol::bus::{Bus, BusError, BusKind, BusOptions, KindChoice, SendError};
 use protocol::can::Frame;
 use vcan_setup::hosts::report::ReportReader;
 

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use model::decode::{Decoded, Decoder};
-use protocol::bus::{Bus, BusError, KindChoice, Inbox, BusOptions, Received};
+use protocol::bus::{Bus, BusError, BusOptions, Inbox, KindChoice, Received};
 use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::time::Micros;
@@ -16,7 +16,12 @@ use super::realtime::wall;
 ///
 /// # Errors
 /// Returns [`BusError`] if the bus cannot be opened.
-pub fn open(name: &str, kind: KindChoice, format: Option<Format>, options: BusOptions) -> Result<Bus, BusError> {
+pub fn open(
+    name: &str,
+    kind: KindChoice,
+    format: Option<Format>,
+    options: BusOptions,
+) -> Result<Bus, BusError> {
     let options = BusOptions { fd: format != Some(Format::Classic), ..options };
     match Bus::open(name, kind, &options) {
         Err(BusError::ClassicOnly { .. }) if format.is_none() => {

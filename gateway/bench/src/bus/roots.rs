@@ -6,8 +6,8 @@ use protocol::bus::{Bus, Filter};
 use protocol::can::{EXTENDED, Frame, REMOTE};
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::packet;
-use protocol::port::{WIRE_FLAG, LinkId};
-use protocol::skin::{SkinReply, Skin};
+use protocol::port::{LinkId, WIRE_FLAG};
+use protocol::skin::{Skin, SkinReply};
 use protocol::time::Micros;
 
 use model::network::Uplinks;
@@ -222,9 +222,17 @@ mod tests {
         assert!(roots.handle_frame(&leave));
         assert_eq!(roots.uplinks.poll_transmit(), None, "it does not send yet");
         roots.explore();
-        assert!(roots.handle_frame(&LinkId { wire: 0, back: false }.encode_frame(protocol::port::PortMessage::Join)));
+        assert!(
+            roots.handle_frame(
+                &LinkId { wire: 0, back: false }.encode_frame(protocol::port::PortMessage::Join)
+            )
+        );
         assert_eq!(roots.uplinks.poll_transmit(), None);
-        assert!(roots.handle_frame(&LinkId { wire: 1, back: false }.encode_frame(protocol::port::PortMessage::Join)));
+        assert!(
+            roots.handle_frame(
+                &LinkId { wire: 1, back: false }.encode_frame(protocol::port::PortMessage::Join)
+            )
+        );
         let answer = roots.uplinks.poll_transmit();
         assert!(matches!(answer, Some((0, protocol::port::PortMessage::Grant(_)))), "{answer:?}");
         let root = CellId::new(1).unwrap();
@@ -238,9 +246,9 @@ mod tests {
             unnumbered: false,
             rank: Some(Rank { round: 1, depth: 1 }),
         };
-        assert!(
-            roots.handle_frame(&LinkId { wire: 1, back: false }.encode_frame(protocol::port::PortMessage::Hello(hello)))
-        );
+        assert!(roots.handle_frame(
+            &LinkId { wire: 1, back: false }.encode_frame(protocol::port::PortMessage::Hello(hello))
+        ));
         assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, true)]);
         assert_eq!(roots.changes().collect::<Vec<_>>(), []);
         assert!(roots.handle_frame(&leave));

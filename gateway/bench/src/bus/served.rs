@@ -4,10 +4,10 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 
-use protocol::bus::{Bus, BusError, KindChoice, BusOptions};
+use protocol::bus::{Bus, BusError, BusOptions, KindChoice};
 use thiserror::Error;
 
-use crate::processes::{LaunchError, apart, wait_or_kill, program, spawn};
+use crate::processes::{LaunchError, apart, program, spawn, wait_or_kill};
 
 /// An embedded bus in a process of its own, which removes its socket even if the gateway is killed.
 #[derive(Debug)]

@@ -5,8 +5,8 @@ use std::io::{PipeWriter, pipe};
 use std::path::{Path, PathBuf};
 use std::thread::JoinHandle;
 
-use protocol::bus::{KindChoice, Filter};
-use vcan_setup::slcan::{Address, Bridge, LineOptions, BridgeSettings};
+use protocol::bus::{Filter, KindChoice};
+use vcan_setup::slcan::{Address, Bridge, BridgeSettings, LineOptions};
 
 use super::EmulateError;
 
@@ -44,7 +44,8 @@ impl PlannedLines {
     pub(super) fn join(self, directory: Option<&Path>) -> Result<SlcanLines, EmulateError> {
         let mut lines = SlcanLines::default();
         for (bus, (choice, options)) in self.by_bus {
-            let settings = BridgeSettings { bus, choice, directory: directory.map(Path::to_owned), wait: true };
+            let settings =
+                BridgeSettings { bus, choice, directory: directory.map(Path::to_owned), wait: true };
             let (stopped, stop) = pipe().map_err(EmulateError::Lines)?;
             let bridge = Bridge::open(settings, options)?;
             let work = move || {

@@ -14,11 +14,11 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-use model::commission::{Outcome, CommissionOptions};
+use model::commission::{CommissionOptions, Outcome};
 use protocol::bus::{Filter, KindChoices};
 use protocol::factory::Factory;
 use protocol::id::{Id, Kind, Node};
-use protocol::skin::{Cell, SkinReply, Skin};
+use protocol::skin::{Cell, Skin, SkinReply};
 use rustix::fs::{FlockOperation, flock};
 use rustix::io::Errno;
 use tempfile::TempDir;
@@ -30,7 +30,7 @@ use crate::processes::{LaunchError, Processes, STARTING};
 use crate::setup::Timeout;
 
 pub use firmware::{Firmware, FirmwareError};
-use line::{SlcanLines, PlannedLines};
+use line::{PlannedLines, SlcanLines};
 
 /// Name of the emulator's program.
 const QEMU: &str = "qemu-system-arm";

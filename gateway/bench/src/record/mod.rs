@@ -30,7 +30,7 @@ use trace::recording::account::RecordingAccount;
 use trace::recording::layout::Layout;
 use trace::recording::repair;
 use trace::recording::robot::RecordedRobot;
-use trace::recording::series::{AttachedFile, FileHead, SplitRecording, SplitLimits};
+use trace::recording::series::{AttachedFile, FileHead, SplitLimits, SplitRecording};
 
 use crate::bus::realtime::wall;
 use crate::threads::{ThreadError, spawn};

@@ -22,7 +22,7 @@ use trace::capture::{Note, NoteKind, RUN_METADATA, facts_of_run};
 use trace::recording::account::{MessageCount, RecordingAccount};
 use trace::recording::layout::Layout;
 use trace::recording::series::{FileHead, RecordingEvent, SplitRecording};
-use trace::recording::window::{WINDOW_NS, ReorderWindow};
+use trace::recording::window::{ReorderWindow, WINDOW_NS};
 use trace::ros2::skin::ContactState;
 use trace::ros2::standard::{Diagnosis, Level, Point};
 
@@ -195,7 +195,8 @@ impl RecorderThread {
                     seen.latched.receive(frame);
                     seen.missing += u64::from(self.files.is_between());
                     self.files.text(|text| text.frame(name, &frame));
-                    self.files.put(MessageCount::FRAME, |window, topics| topics.frame(window, bus, name, &frame));
+                    self.files
+                        .put(MessageCount::FRAME, |window, topics| topics.frame(window, bus, name, &frame));
                 }
                 Captured::Dropped { at_nanos, frames } => {
                     seen.dropped += frames;
@@ -233,8 +234,9 @@ impl RecorderThread {
                 series.add(RUN_METADATA, facts_of_run(nanos.saturating_sub(since)));
             }
             let messages = 4 + u64::from(layout.poses_at(timed.record.tick.number));
-            self.files
-                .put(MessageCount::others(messages), |window, topics| topics.tick(window, layout, nanos, &timed));
+            self.files.put(MessageCount::others(messages), |window, topics| {
+                topics.tick(window, layout, nanos, &timed)
+            });
         }
     }
 
@@ -350,7 +352,11 @@ impl RecorderThread {
             series.discard();
         }
         let files: Vec<_> = self.files.text.and_then(Text::discard).into_iter().collect();
-        RecordingAccount { frames: files.iter().map(|file| file.frames).sum(), files, ..RecordingAccount::default() }
+        RecordingAccount {
+            frames: files.iter().map(|file| file.frames).sum(),
+            files,
+            ..RecordingAccount::default()
+        }
     }
 
     fn finish(mut self) -> RecordingAccount {
@@ -400,7 +406,11 @@ impl Files {
             && let Err(error) = write(text)
         {
             let what = format!("{}: {error}", text.path().display());
-            self.errors.push(if text.is_over() { RecordingEvent::BrokeOff(what) } else { RecordingEvent::Else(what) });
+            self.errors.push(if text.is_over() {
+                RecordingEvent::BrokeOff(what)
+            } else {
+                RecordingEvent::Else(what)
+            });
         }
     }
 

@@ -111,7 +111,13 @@ impl Topics {
 
     /// Writes a frame that was latched when the file began, under the time `nanos`, at which the file begins. Its own
     /// time may be much earlier, and viewers would start there.
-    pub fn latched(&mut self, window: &mut ReorderWindow, nanos: u64, (bus, name): (usize, &str), seen: &ReceivedFrame) {
+    pub fn latched(
+        &mut self,
+        window: &mut ReorderWindow,
+        nanos: u64,
+        (bus, name): (usize, &str),
+        seen: &ReceivedFrame,
+    ) {
         if let Some(channel) = self.state.get_mut(bus) {
             window.write_at(channel, nanos, seen.at_nanos, &message(name, seen));
         }

@@ -9,7 +9,7 @@ use super::ReplayOptions;
 use super::comparator::Comparator;
 use super::error::Mismatch;
 use super::start::Routes;
-use super::survey::{SurveyedBus, SurveyedCell, KnownValue, Survey};
+use super::survey::{KnownValue, Survey, SurveyedBus, SurveyedCell};
 use crate::setup::names;
 
 /// Checks of the cells before a replay: the options, the survey of the capture and the routes of its buses.
@@ -111,8 +111,9 @@ impl Checks {
     pub(super) fn measuring(&self, comparator: &Comparator) -> Vec<Vec<CellId>> {
         let measures = |(bus_link, (_, bus)): (usize, (&str, &SurveyedBus))| {
             let obeyed = |cell: &CellId| bus.cells.get(cell).is_some_and(|cell| !cell.measured);
-            let now =
-                comparator.settled_cells(bus_link).filter(|(_, present)| !present.claim.has_state(State::TEST_MODE));
+            let now = comparator
+                .settled_cells(bus_link)
+                .filter(|(_, present)| !present.claim.has_state(State::TEST_MODE));
             now.map(|(cell, _)| cell).filter(obeyed).collect()
         };
         self.bus_links().enumerate().map(measures).collect()

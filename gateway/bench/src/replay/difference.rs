@@ -231,8 +231,15 @@ mod tests {
     fn a_reply_that_was_not_sent_is_nothing() {
         let refused = SentValue::Answer(9, Answer::Refused { number: 127, reason: Answer::WRONG_HASH });
         let cell = CellId::new(3).unwrap();
-        let text =
-            Difference::new(DifferenceKind::Missing, ("can1", Units::default()), cell, None, Some(&refused), None).text;
+        let text = Difference::new(
+            DifferenceKind::Missing,
+            ("can1", Units::default()),
+            cell,
+            None,
+            Some(&refused),
+            None,
+        )
+        .text;
         let lines: Vec<_> = text.lines().collect();
         assert_eq!(lines.len(), 3, "{text}");
         assert_eq!(lines[0], "the first missing reply: cell 3 on can1");

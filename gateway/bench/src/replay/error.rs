@@ -64,7 +64,9 @@ pub enum ReplayError {
     #[error(transparent)]
     Kinds(#[from] KindsError),
     /// Standard input cannot be read twice.
-    #[error("a replay reads its capture twice, but standard input only once: write it to a file, and name that")]
+    #[error(
+        "a replay reads its capture twice, but standard input only once: write it to a file, and name that"
+    )]
     StandardInput,
     /// A pipe cannot be read twice.
     #[error("{} is not a regular file, but a replay reads its capture twice: write it to a file, and name that", .0.display())]

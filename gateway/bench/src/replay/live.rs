@@ -16,7 +16,7 @@ use super::replay_plan::OpenJoints;
 use super::report::Lockstep;
 use super::shared_state::SharedState;
 use super::start::{ReplayBus, mode};
-use super::{ReplayOptions, ReplayError};
+use super::{ReplayError, ReplayOptions};
 use crate::bus::realtime;
 use crate::setup::names;
 
@@ -185,7 +185,8 @@ impl LiveStage {
     /// Returns the messages that reset the contact state of those cells on a bus that are in test mode.
     fn forgetting(&self, bus_index: usize) -> Vec<Message> {
         let comparator = self.shared_state.comparator();
-        let obeying = comparator.settled_cells(bus_index).filter(|(_, cell)| cell.claim.has_state(Flags::TEST_MODE));
+        let obeying =
+            comparator.settled_cells(bus_index).filter(|(_, cell)| cell.claim.has_state(Flags::TEST_MODE));
         obeying.map(|(cell, _)| mode(cell, true)).collect()
     }
 

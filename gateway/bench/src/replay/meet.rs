@@ -47,8 +47,8 @@ impl Session {
         self.wait_for_cells(&target)?;
         self.wait_for_tree()?;
         let comparator = shared_state.comparator();
-        let nobody =
-            (0..self.buses.bus_links.len()).all(|bus_link| comparator.settled_cells(bus_link).next().is_none());
+        let nobody = (0..self.buses.bus_links.len())
+            .all(|bus_link| comparator.settled_cells(bus_link).next().is_none());
         if nobody && (options.expect.is_some() || options.lockstep || skin_override.is_some()) {
             let names: Vec<_> = checks.bus_links().map(|(name, _)| name).collect();
             return Err(ReplayError::NoCell(names.join(", ")));
@@ -153,7 +153,8 @@ impl Session {
         let give_up = Instant::now() + DISCOVERY_TIMEOUT;
         self.wait(|_, comparator| {
             let obeys = |(bus_link, cells): (usize, &Vec<CellId>)| {
-                let obeying = comparator.present_cells(bus_link).filter(|(_, it)| it.claim.has_state(State::TEST_MODE));
+                let obeying =
+                    comparator.present_cells(bus_link).filter(|(_, it)| it.claim.has_state(State::TEST_MODE));
                 obeying.filter(|(cell, _)| cells.contains(cell)).count() == cells.len()
             };
             let all_obey = measuring.iter().enumerate().all(obeys);

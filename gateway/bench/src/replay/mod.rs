@@ -48,14 +48,14 @@ use self::report::Summary;
 use self::session::Session;
 use self::shared_state::SharedState;
 use self::start::Routes;
-use self::survey::{TimeRange, Survey};
+use self::survey::{Survey, TimeRange};
 use crate::bus::realtime::idle_lateness;
 use crate::processes::ended::EndedProcesses;
 use crate::progress::Progress;
 use crate::setup::names;
 use crate::signals::caught;
 use model::decode::MAX_BUSES;
-use trace::capture::{CaptureError, Entry, RecordingExtras, NoteKind, Reader, seconds_since};
+use trace::capture::{CaptureError, Entry, NoteKind, Reader, RecordingExtras, seconds_since};
 
 /// Period in ns of the wake-ups whose lateness is measured.
 const GRID_NS: u64 = 2_000_000;
@@ -145,7 +145,10 @@ pub fn replay(options: &ReplayOptions) -> Result<Summary, ReplayError> {
 }
 
 /// Reads the whole capture once. Returns its survey, its contents other than frames, and its display name.
-fn look_through(options: &ReplayOptions, progress: &Progress) -> Result<(Survey, RecordingExtras, String), ReplayError> {
+fn look_through(
+    options: &ReplayOptions,
+    progress: &Progress,
+) -> Result<(Survey, RecordingExtras, String), ReplayError> {
     if options.files.iter().any(|file| is_standard_input(file)) {
         return Err(ReplayError::StandardInput);
     }

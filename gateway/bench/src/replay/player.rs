@@ -15,7 +15,7 @@ use protocol::packet::Epoch;
 use serde::Serialize;
 
 use super::ReplayError;
-use super::replay_plan::{DueFrame, OpenJoints, FrameRole, PlayerStep};
+use super::replay_plan::{DueFrame, FrameRole, OpenJoints, PlayerStep};
 use model::quantiles::histogram;
 
 /// Time in ns from the decision to start to the first frame.
@@ -182,7 +182,12 @@ impl Player {
     }
 
     /// Sends a frame when it is due, in one batch with the following frames of the same bus that are due by then.
-    fn frames_from(&mut self, first: &DueFrame, steps: &mut rtrb::Consumer<PlayerStep>, stage: &mut impl Stage) {
+    fn frames_from(
+        &mut self,
+        first: &DueFrame,
+        steps: &mut rtrb::Consumer<PlayerStep>,
+        stage: &mut impl Stage,
+    ) {
         let bus_link = first.bus_index;
         if self.syncs.is_some() && is_joints(first) {
             self.wait_for_answers(bus_link, stage);

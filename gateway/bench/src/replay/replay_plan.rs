@@ -201,7 +201,9 @@ impl<'a> ReplayPlan<'a> {
             let there: Vec<_> = bus.cells_in(bounds).map(|(cell, _)| cell).collect();
             Some(((*bus_link)?, bus.state.restoring(|cell| there.contains(&cell), bus.first_joints)))
         };
-        PlayerStep::Restore(self.survey.buses.iter().zip(&self.selection.destinations).filter_map(of).collect())
+        PlayerStep::Restore(
+            self.survey.buses.iter().zip(&self.selection.destinations).filter_map(of).collect(),
+        )
     }
 
     /// Ends the plan, and returns the counts of all passes.
@@ -250,7 +252,13 @@ impl<'a> ReplayPlan<'a> {
         let at = self.offset + (next.send_nanos - *first);
         self.counts.0 += 1;
         self.counts.1 += u64::from(matches!(role, FrameRole::Joints(_)) && bus_link == 0);
-        self.steps.push_back(PlayerStep::Frame(DueFrame { at, bus_index: bus_link, frame, role, is_late: next.is_late }));
+        self.steps.push_back(PlayerStep::Frame(DueFrame {
+            at,
+            bus_index: bus_link,
+            frame,
+            role,
+            is_late: next.is_late,
+        }));
         ControlFlow::Continue(())
     }
 

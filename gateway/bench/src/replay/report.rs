@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use serde::Serialize;
 
-use super::comparator::{Uncompared, Tally};
+use super::comparator::{Tally, Uncompared};
 use super::difference::Difference;
 use super::player::BusLinkTally;
 use crate::summary::{CellError, cells_in_error, many};

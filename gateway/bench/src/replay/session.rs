@@ -14,7 +14,7 @@ use protocol::message::Message;
 use super::ReplayError;
 use super::checks::Checks;
 use super::live::LiveStage;
-use super::player::{BusLinkTally, PlayerResult, Player};
+use super::player::{BusLinkTally, Player, PlayerResult};
 use super::replay_plan::PlanSummary;
 use super::report::{BusSummary, Expect, Lockstep, Summary};
 use super::shared_state::SharedState;

@@ -9,7 +9,7 @@ use protocol::time::Micros;
 use super::checks::Checks;
 use super::comparator::Comparator;
 use super::start::ReplayBus;
-use crate::bus::follow::{Follower, OpenedOnce, FollowedItem, FollowStep};
+use crate::bus::follow::{FollowStep, FollowedItem, Follower, OpenedOnce};
 use crate::bus::realtime;
 use crate::bus::roots::RootWires;
 use model::decode::{Decoded, Decoder};
@@ -37,7 +37,8 @@ pub(super) struct SharedState {
 impl SharedState {
     pub(super) fn new(checks: Checks) -> Self {
         let named_cells = checks.bus_links().map(|(name, bus)| (name.to_owned(), bus.cells.clone()));
-        let comparator = Comparator::new(named_cells, checks.survey.first.unwrap_or(0), checks.options.expect);
+        let comparator =
+            Comparator::new(named_cells, checks.survey.first.unwrap_or(0), checks.options.expect);
         Self {
             checks,
             comparator: Mutex::new(comparator),

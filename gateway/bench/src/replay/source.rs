@@ -4,7 +4,7 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use super::checks::Checks;
-use super::replay_plan::{PlanSummary, ReplayPlan, Selection, PlayerStep, reason};
+use super::replay_plan::{PlanSummary, PlayerStep, ReplayPlan, Selection, reason};
 use super::shared_state::SharedState;
 use trace::capture::{CaptureError, Entry, Reader};
 

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError, KindChoice, Filter, KindChoices, BusOptions as BusOptions};
+use protocol::bus::{Bus, BusError, BusOptions, Filter, KindChoice, KindChoices};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Message, Request};
@@ -15,11 +15,11 @@ use protocol::skin::Skin;
 
 use super::replay_plan::SenderFilter;
 use super::survey::Survey;
-use super::{ReplayOptions, ReplayError, SpawnOptions};
+use super::{ReplayError, ReplayOptions, SpawnOptions};
 use crate::bus::listen::{self, Listener};
 use crate::bus::roots::{ReceiveFilter, RootWires};
 use crate::bus::served::{IfAbsent, ServedBus, open_or_serve};
-use crate::processes::{GATEWAY_DETECTION_TIME, CellLaunch, Processes, in_memory, program};
+use crate::processes::{CellLaunch, GATEWAY_DETECTION_TIME, Processes, in_memory, program};
 use crate::setup::names;
 use model::decode::Decoded;
 use trace::capture::{RecordingExtras, SKIN_ATTACHMENT};
@@ -254,8 +254,9 @@ impl Buses {
             let cells = names(&cells.iter().copied().collect::<Vec<_>>(), "");
             return Err(ReplayError::CellsThere { bus: bus_link.bus.name().to_owned(), cells });
         }
-        let kinds =
-            KindChoices::exactly(self.bus_links.iter().map(|bus_link| (bus_link.bus.name(), bus_link.bus.kind())));
+        let kinds = KindChoices::exactly(
+            self.bus_links.iter().map(|bus_link| (bus_link.bus.name(), bus_link.bus.kind())),
+        );
         self.processes = Processes::new()?;
         self.processes.start(&CellLaunch {
             directory: None,

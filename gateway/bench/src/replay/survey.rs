@@ -3,11 +3,13 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use model::tracker::{Account, DEAD_AFTER, MAX_LATE_EPOCHS, CellTracker, HeartbeatKind};
+use model::tracker::{Account, CellTracker, DEAD_AFTER, HeartbeatKind, MAX_LATE_EPOCHS};
 use protocol::can::Format;
 use protocol::candump::Record;
 use protocol::id::{CellId, Command, Id, Node};
-use protocol::message::{Answer, ReceivedCounts, Heartbeat, Joints, Message, NetworkPage, Request, State as Flags};
+use protocol::message::{
+    Answer, Heartbeat, Joints, Message, NetworkPage, ReceivedCounts, Request, State as Flags,
+};
 use protocol::packet::{Epoch, data_id};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
@@ -285,10 +287,13 @@ impl SurveyedBus {
         {
             let is_settled = !heartbeat.state.has(Flags::CLAIMING);
             let before = self.before.entry(from).or_default();
-            if before.tracked.receive(Micros(nanos / 1_000), message, None).word != Some(HeartbeatKind::Claimant) {
+            if before.tracked.receive(Micros(nanos / 1_000), message, None).word
+                != Some(HeartbeatKind::Claimant)
+            {
                 before.heard = nanos;
                 before.measures = is_settled && !heartbeat.state.has(Flags::TEST_MODE);
-                before.hash = if is_settled { KnownValue::Yes(heartbeat.configuration) } else { KnownValue::No };
+                before.hash =
+                    if is_settled { KnownValue::Yes(heartbeat.configuration) } else { KnownValue::No };
             }
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
             for (_, before) in self.before.iter_mut().filter(|(cell, _)| to.addresses(**cell)) {
@@ -385,7 +390,9 @@ impl SurveyedCell {
         let word = self.tracked.receive(Micros(nanos / 1_000), message, None).word;
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             match word {
-                Some(HeartbeatKind::Claimant | HeartbeatKind::Outsider | HeartbeatKind::Overtaken) | None => return,
+                Some(HeartbeatKind::Claimant | HeartbeatKind::Outsider | HeartbeatKind::Overtaken) | None => {
+                    return;
+                }
                 // A restart sets the counters to 0. They then count joints from before this heartbeat.
                 Some(HeartbeatKind::Started { .. }) => {
                     let last = joints.back().map(|last| (last.number, last.nanos)).unwrap_or_default();

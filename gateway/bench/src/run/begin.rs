@@ -16,7 +16,7 @@ use protocol::usage::eprint_line;
 use super::bench::{Bench, POLL_INTERVAL};
 use super::receiver::BusEvent;
 use crate::error::RunError;
-use crate::processes::{GATEWAY_DETECTION_TIME, CellLaunch, STARTING, program};
+use crate::processes::{CellLaunch, GATEWAY_DETECTION_TIME, STARTING, program};
 use crate::setup::{Timeout, names};
 use crate::view::View;
 use model::repeat::Repeats;

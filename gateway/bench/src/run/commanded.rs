@@ -14,7 +14,7 @@ use super::measured::LoopTotals;
 use crate::bus::served::ServedBus;
 use crate::processes::{LaunchError, program};
 use crate::progress::Progress;
-use crate::remote::{BusState, BenchCommand, LinkDown, Phase, ProcessState, BenchState};
+use crate::remote::{BenchCommand, BenchState, BusState, LinkDown, Phase, ProcessState};
 use model::scenario::ProcessAction;
 
 /// Maximum number of commands carried out in one round, so that stimuli are not delayed.
@@ -195,7 +195,9 @@ fn switch_interface(name: &str, down: bool) -> Result<(), CommandError> {
     let interface = interfaces.into_iter().find(|interface| interface.name == name);
     let interface = interface.ok_or(CommandError::NoInterface)?;
     match interface.kind {
-        InterfaceKind::Vcan | InterfaceKind::Vxcan(_) => netlink.set_up(interface.index, !down).map_err(failed),
+        InterfaceKind::Vcan | InterfaceKind::Vxcan(_) => {
+            netlink.set_up(interface.index, !down).map_err(failed)
+        }
         InterfaceKind::Hardware(_) | InterfaceKind::Other(_) => Err(CommandError::NotVirtual),
     }
 }

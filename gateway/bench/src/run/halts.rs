@@ -125,7 +125,7 @@ fn seconds(time: Micros) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use control::controller::{BadCycle, Controller, Input, ControllerOutput};
+    use control::controller::{BadCycle, Controller, ControllerOutput, Input};
     use control::cycle::carried::BusInput;
     use control::cycle::{Cycle, Tick};
     use control::robot::SimulatedArm;
@@ -138,7 +138,11 @@ mod tests {
 
     impl Controller for Until {
         fn step(&mut self, input: &Input) -> ControllerOutput {
-            if input.tick < self.0 { ControllerOutput::Move(padded(&[0.25; 6])) } else { ControllerOutput::Bad(BadCycle::NoAnswer) }
+            if input.tick < self.0 {
+                ControllerOutput::Move(padded(&[0.25; 6]))
+            } else {
+                ControllerOutput::Bad(BadCycle::NoAnswer)
+            }
         }
     }
 
@@ -167,7 +171,13 @@ mod tests {
                     self.sums.read_back = Some(epoch);
                 }
                 let record = outcome.record;
-                self.halts.add_tick(&TimedRecord { record, due_ns: 0, late_ns: 1_500, took_ns: 2_500, central: None });
+                self.halts.add_tick(&TimedRecord {
+                    record,
+                    due_ns: 0,
+                    late_ns: 1_500,
+                    took_ns: 2_500,
+                    central: None,
+                });
                 self.tick += 1;
             }
         }

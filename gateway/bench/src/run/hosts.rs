@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use protocol::id::CellId;
 use vcan_setup::hosts::report::{HostReport, LinkReport, ReportReader};
 
-use crate::bus::link::{SharedBus, Outages};
+use crate::bus::link::{Outages, SharedBus};
 use crate::setup::names;
 use crate::summary::HostSummary;
 
@@ -111,7 +111,8 @@ impl KnownHosts {
             let known = self.hosts.entry(host.clone()).or_default();
             let before = std::mem::replace(&mut known.newest, newest);
             let newest = &known.newest;
-            let missing = |host: &HostReport| [host.heard.missing(), host.ours.map_or(0, |ours| ours.missing())];
+            let missing =
+                |host: &HostReport| [host.heard.missing(), host.ours.map_or(0, |ours| ours.missing())];
             let (was, is) = (missing(&before), missing(newest));
             if is_first {
                 // Losses from before the run do not belong to the run.

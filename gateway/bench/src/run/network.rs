@@ -8,7 +8,7 @@ use protocol::message::{Message, Request};
 use protocol::packet::WORDS;
 use protocol::parameters::{LinksDown, Parameter, Reply as Words, Slots};
 use protocol::port::PORTS;
-use protocol::skin::{SkinReply, Skin, Wires};
+use protocol::skin::{Skin, SkinReply, Wires};
 use protocol::time::{Micros, Span};
 use thiserror::Error;
 
@@ -203,8 +203,10 @@ impl Network {
         let due = self.reported_links_down.due(now, open.map(|cell| cell.node));
         let message = |cell: CellId| {
             let deaf = target(&cell)?;
-            let request =
-                Request::Write { number: Parameter::LinksDown.number(), words: LinksDown { ports: deaf }.words() };
+            let request = Request::Write {
+                number: Parameter::LinksDown.number(),
+                words: LinksDown { ports: deaf }.words(),
+            };
             Some(Message::Configure { to: Node::Cell(cell), tag: deaf, request })
         };
         due.into_iter().filter_map(message).collect()
@@ -243,7 +245,8 @@ impl Network {
             self.without.entry(cell).or_insert(now);
         }
         let bus_event = |(cell, since): (&CellId, &Micros)| {
-            (now.elapsed_since(*since) >= REROUTE_TIMEOUT && !self.reported.contains_key(cell)).then_some((*cell, *since))
+            (now.elapsed_since(*since) >= REROUTE_TIMEOUT && !self.reported.contains_key(cell))
+                .then_some((*cell, *since))
         };
         let bus_event: Vec<_> = self.without.iter().filter_map(bus_event).collect();
         if let Some(oldest) = bus_event.iter().map(|(_, since)| now.elapsed_since(*since)).max() {
@@ -276,7 +279,7 @@ mod tests {
     use super::*;
     use crate::view::CellView;
     use model::network::check::ObservedCell;
-    use model::table::{SWITCHES, Responded};
+    use model::table::{Responded, SWITCHES};
     use protocol::message::Tree;
     use protocol::packet::Epoch;
 

@@ -28,7 +28,8 @@ impl Bench<'_> {
                 let (count, all) = Network::progress(&view);
                 have_ways += count;
                 whole &= all;
-                network.tree_ready = all.then(|| network.tree_ready.unwrap_or_else(|| now.elapsed_since(began)));
+                network.tree_ready =
+                    all.then(|| network.tree_ready.unwrap_or_else(|| now.elapsed_since(began)));
             }
             Ok(whole || timeout.is_over(have_ways))
         })?;
@@ -45,7 +46,9 @@ impl Bench<'_> {
         {
             let (name, deepest) = (network.name(), network.deepest());
             let tree_ready = network.tree_ready.unwrap_or_default().seconds();
-            eprint_line(&format!("the cells of {name} are a tree of depth {deepest} after {tree_ready:.2} s"));
+            eprint_line(&format!(
+                "the cells of {name} are a tree of depth {deepest} after {tree_ready:.2} s"
+            ));
         }
         Ok(())
     }

@@ -13,11 +13,11 @@ use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
 
-use crate::bus::follow::{Follower, FollowedItem, FollowStep};
+use crate::bus::follow::{FollowStep, FollowedItem, Follower};
 use crate::bus::link::{Outages, ReceiveEnd};
 use crate::bus::realtime::wall;
 use crate::bus::roots::RootWires;
-use crate::record::feed::{Outlet, EpochContacts, Unrecorded};
+use crate::record::feed::{EpochContacts, Outlet, Unrecorded};
 use crate::view::{CellView, View};
 use control::cycle::turn::Shared;
 use model::latched::ReceivedFrame;

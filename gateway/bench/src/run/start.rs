@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
-use protocol::bus::{Bus, BusKind, KindChoice, Filter, BusOptions as BusOptions};
+use protocol::bus::{Bus, BusKind, BusOptions, Filter, KindChoice};
 use protocol::can::Format;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
@@ -22,10 +22,10 @@ use super::hosts::Hosts;
 use super::network::Network;
 use super::receiver::{BusEvent, Receiver, look_at};
 use crate::bus::follow::Follower;
-use crate::bus::link::{SharedBus, ReceiveEnd, Slot};
+use crate::bus::link::{ReceiveEnd, SharedBus, Slot};
 use crate::bus::realtime;
 use crate::bus::roots::{ReceiveFilter, RootWires};
-use crate::bus::served::{IfAbsent, ServedBus, BusTarget, open_or_serve, open_or_serve_all};
+use crate::bus::served::{BusTarget, IfAbsent, ServedBus, open_or_serve, open_or_serve_all};
 use crate::emulate::{self, Emulation, Emulator};
 use crate::error::RunError;
 use crate::processes::ended::EndedProcesses;
@@ -170,7 +170,8 @@ fn emulate(
         let (_, own) = open_or_serve(&bus.name, kinds.kind_of(&bus.name), &target, absent(options))?;
         served.extend(own);
     }
-    let bench = emulate::EmulationSetup { skin, kinds, directory: directory.as_deref(), flash: flash.as_deref() };
+    let bench =
+        emulate::EmulationSetup { skin, kinds, directory: directory.as_deref(), flash: flash.as_deref() };
     let emulation = emulator.start(&bench, processes)?;
     let said = emulator.commission(&bench, processes, signalled)?;
     if !options.quiet {

@@ -28,7 +28,7 @@ use crate::progress::Progress;
 use crate::record::Recorder;
 use crate::summary::{PrivateMemory, Summary};
 use crate::threads::{ThreadError, spawn};
-use control::cycle::turn::{TimedRecord, TickDriver};
+use control::cycle::turn::{TickDriver, TimedRecord};
 use control::external::Absence;
 use model::scenario::{FaultKind, Touches};
 use model::table::Notice;
@@ -137,7 +137,11 @@ impl Bench<'_> {
     }
 
     /// Starts the loop's thread.
-    fn start_loop(&self, mut turn: TickDriver, mut slots: Vec<Slot>) -> Result<JoinHandle<LoopEnd>, ThreadError> {
+    fn start_loop(
+        &self,
+        mut turn: TickDriver,
+        mut slots: Vec<Slot>,
+    ) -> Result<JoinHandle<LoopEnd>, ThreadError> {
         let period_ns = self.options.skin.timing.tick_nanos();
         let ticks = self.options.scenario.duration.0 * 1_000 / period_ns;
         let shared = Arc::clone(&self.shared);
@@ -224,7 +228,11 @@ impl Bench<'_> {
             let epoch = script.epoch.max(broadcasts);
             let numbered = self.first_epoch.advanced_by(epoch.to_le_bytes()[0]);
             for stimulus in script.touches.changes(script.epoch.checked_sub(1), epoch) {
-                self.stimulate((stimulus.bus, stimulus.node), stimulus.pages(), AppliesFrom::Epoch(numbered))?;
+                self.stimulate(
+                    (stimulus.bus, stimulus.node),
+                    stimulus.pages(),
+                    AppliesFrom::Epoch(numbered),
+                )?;
             }
             if let Some(accelerations) = &script.accelerations {
                 let now = seconds(&script.touches, epoch);

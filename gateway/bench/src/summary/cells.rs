@@ -111,7 +111,8 @@ impl CellSummary {
     pub fn new(skin: &Skin, described: &skin::Cell, known: Option<&CellState>) -> Self {
         let mut replies = RepliesSummary::default();
         known.into_iter().for_each(|cell| replies.add(cell));
-        let mode = known.and_then(CellState::measures).map(|measures| if measures { "measure" } else { "test" });
+        let mode =
+            known.and_then(CellState::measures).map(|measures| if measures { "measure" } else { "test" });
         Self {
             node: described.node.get(),
             bus: skin.buses.get(described.bus).map_or_else(String::new, |bus| bus.name.clone()),

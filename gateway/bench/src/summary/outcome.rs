@@ -182,7 +182,8 @@ mod tests {
     /// Creates a summary in which the flagged conditions hold: controller absent, errors of cells, a halt, an
     /// interruption.
     fn summary([absent, errors, halted, interrupted]: [bool; 4]) -> Summary {
-        let halt = HaltSummary { at_s: 1.0, tick: 500, epoch: 62, reason: "no answer".to_owned(), until_s: None };
+        let halt =
+            HaltSummary { at_s: 1.0, tick: 500, epoch: 62, reason: "no answer".to_owned(), until_s: None };
         Summary {
             no_controller: absent.then(|| "no hello".to_owned()),
             cell_errors: if errors { vec![error("no memory", &[1, 2, 3])] } else { Vec::new() },

@@ -7,7 +7,7 @@ use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt, symlink};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-use crate::record::{Mcap, RecordOptions, Outputs};
+use crate::record::{Mcap, Outputs, RecordOptions};
 use rustix::fs::{FlockOperation, Mode, flock};
 use tempfile::TempDir;
 use trace::recording::file::FileWriter;

@@ -4,8 +4,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::summary::{
-    BusSummary, CellError, CellSummary, ErrorCells, HaltSummary, HostSummary, LoopSummary, PrivateMemory, NetworkSummary,
-    Outcome, ProcessorUse, RecordingAccount, RepliesSummary, Summary, SumsSummary, TickBefore, Verdict, WrittenFile,
+    BusSummary, CellError, CellSummary, ErrorCells, HaltSummary, HostSummary, LoopSummary, NetworkSummary,
+    Outcome, PrivateMemory, ProcessorUse, RecordingAccount, RepliesSummary, Summary, SumsSummary, TickBefore,
+    Verdict, WrittenFile,
 };
 use model::quantiles::{Quantiles, histogram};
 use model::table::{Accuracy, Event, Status, Table};
@@ -287,7 +288,8 @@ fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
         let answer = Answer::Value { number, written: true, words };
         say(&mut table, false, &Message::Configured { from, tag: 0, answer }, false);
     }
-    let press = Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page: SensorPage::Skin(skin_page) };
+    let press =
+        Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page: SensorPage::Skin(skin_page) };
     say(&mut table, true, &press, false);
     for epoch in 0..8 {
         say(&mut table, true, &Message::Joints { epoch: Epoch(epoch), joints }, false);

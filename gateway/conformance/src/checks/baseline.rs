@@ -8,7 +8,7 @@ use protocol::time::Span;
 
 use crate::arm;
 use crate::bus::StopReason;
-use crate::session::{CellPacket, Reply, Session, JointsResult};
+use crate::session::{CellPacket, JointsResult, Reply, Session};
 
 const BASELINE: u8 = 11;
 const TARE: u8 = 12;
@@ -52,7 +52,12 @@ fn reading(sum: i32, temperature: i16) -> SkinSensors {
 }
 
 /// Sends joints messages with this sum of contact words and this temperature, and returns the result of the last one.
-fn send_reading(session: &mut Session<'_>, sum: i32, temperature: i16, joints: usize) -> Result<JointsResult, StopReason> {
+fn send_reading(
+    session: &mut Session<'_>,
+    sum: i32,
+    temperature: i16,
+    joints: usize,
+) -> Result<JointsResult, StopReason> {
     session.press(reading(sum, temperature))?;
     let mut step = session.step(&[0x0321; MAX_JOINTS])?;
     for _ in 1..joints {
@@ -69,7 +74,9 @@ fn report(session: &mut Session<'_>) -> Result<Option<(i32, BaselinePage, SkinSe
     let skin =
         pages.iter().find_map(|page| if let SensorPage::Skin(skin) = page { Some(*skin) } else { None });
     let zero = pages.iter().find_map(zero_of);
-    session.check("BASE-7", zero.is_some(), || "a report must be answered with sensors page 3, but that page did not come".to_owned());
+    session.check("BASE-7", zero.is_some(), || {
+        "a report must be answered with sensors page 3, but that page did not come".to_owned()
+    });
     let sum = |skin: SkinSensors| skin.contact.iter().map(|word| i32::from(word.to_bits())).sum();
     Ok(skin.zip(zero).map(|(skin, zero)| (sum(skin), zero, skin)))
 }
@@ -82,7 +89,10 @@ const fn zero_of(page: &SensorPage) -> Option<BaselinePage> {
 fn set(session: &mut Session<'_>, rule: [i16; WORDS]) -> Result<(), StopReason> {
     let reply = session.write(BASELINE, rule)?;
     session.check("BASE-1", reply == Reply::Value(rule), || {
-        format!("a write of {} to parameter 11 must be accepted, but the answer was {reply}", Reply::Value(rule))
+        format!(
+            "a write of {} to parameter 11 must be accepted, but the answer was {reply}",
+            Reply::Value(rule)
+        )
     });
     Ok(())
 }
@@ -125,7 +135,9 @@ fn ranges(session: &mut Session<'_>) -> Result<(), StopReason> {
     }
     set(session, [0; WORDS])?;
     let step = send_reading(session, 307, TEMPERATURE_25_C, 1)?;
-    session.check("BASE-1", step.torque.is_some(), || "while the baseline is off, 0.3 N must give a torque, but none came".to_owned());
+    session.check("BASE-1", step.torque.is_some(), || {
+        "while the baseline is off, 0.3 N must give a torque, but none came".to_owned()
+    });
     send_reading(session, 0, TEMPERATURE_25_C, 2)?;
     Ok(())
 }
@@ -145,7 +157,9 @@ fn start(session: &mut Session<'_>) -> Result<(), StopReason> {
     }
     let raw = reading(307 + TOUCH, TEMPERATURE_25_C);
     let step = send_reading(session, 307 + TOUCH, TEMPERATURE_25_C, 1)?;
-    session.check("BASE-8", step.torque.is_some(), || "1 N above the zero must give a torque, but none came".to_owned());
+    session.check("BASE-8", step.torque.is_some(), || {
+        "1 N above the zero must give a torque, but none came".to_owned()
+    });
     if let Some((_, zero, skin)) = report(session)? {
         let zero = i32::from(zero.zero.to_bits());
         let third = (zero * 21_845) >> 16;
@@ -157,7 +171,9 @@ fn start(session: &mut Session<'_>) -> Result<(), StopReason> {
             .collect();
         let got: Vec<_> = skin.contact.iter().map(|word| i32::from(word.to_bits())).collect();
         session.check("BASE-8", got == expected, || {
-            format!("with a zero of {zero} steps page 0 must have the contact words {expected:?}, but has {got:?}")
+            format!(
+                "with a zero of {zero} steps page 0 must have the contact words {expected:?}, but has {got:?}"
+            )
         });
     }
     // A reading beyond the limit is a touch from the start.
@@ -247,7 +263,12 @@ fn tares(session: &mut Session<'_>) -> Result<(), StopReason> {
         if let Some((_, zero, _)) = report(session)? {
             let is_counted = refused.is_none_or(|refused| zero.refused == refused);
             let is_so = near(zero.zero.to_bits().into(), expected, 2) && is_counted;
-            session.check("BASE-6", is_so, || format!("{what} page 3 must have a zero of {expected} steps and count refused tares, but is {}", text(zero)));
+            session.check("BASE-6", is_so, || {
+                format!(
+                    "{what} page 3 must have a zero of {expected} steps and count refused tares, but is {}",
+                    text(zero)
+                )
+            });
         }
         Ok::<_, StopReason>(())
     };
@@ -292,7 +313,9 @@ fn pages(session: &mut Session<'_>) -> Result<(), StopReason> {
     let count = pages.filter(|(_, page)| zero_of(page).is_some()).count();
     session.consume();
     session.check("BASE-7", count >= beats / 4 && count <= beats / 4 + 1, || {
-        format!("page 3 must come with every fourth heartbeat, but came {count} times with {beats} heartbeats")
+        format!(
+            "page 3 must come with every fourth heartbeat, but came {count} times with {beats} heartbeats"
+        )
     });
     Ok(())
 }

@@ -64,14 +64,18 @@ fn held(session: &mut Session<'_>) -> Result<Option<Grid>, StopReason> {
     let grid = regular(session, 2_300)?;
     let beats = session.packets.get(first..).unwrap_or_default().iter().filter_map(CellPacket::beat);
     let is_halted = beats.clone().all(|(beat, _)| beat.state.has(State::HALTED));
-    session.check("CMD-1", is_halted, || "HALTED must stay set until a resume, but a heartbeat came without it".to_owned());
+    session.check("CMD-1", is_halted, || {
+        "HALTED must stay set until a resume, but a heartbeat came without it".to_owned()
+    });
     session.step(&[0; MAX_JOINTS])?;
     session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);
     if presses {
         let step = session.step(&[0; MAX_JOINTS])?;
         let is_there = step.torque.is_some();
-        session.check("STIM-7", is_there, || "a latched stimulus must hold for more than 2 s, but no torque came after that time".to_owned());
+        session.check("STIM-7", is_there, || {
+            "a latched stimulus must hold for more than 2 s, but no torque came after that time".to_owned()
+        });
         session.press_and_step(&[0; MAX_JOINTS], arm::press(0))?;
     }
     Ok(grid)
@@ -88,14 +92,21 @@ fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, StopReaso
         let times = times(session);
         session.consume();
         let apart: Vec<_> = times.windows(2).filter_map(|pair| Some(pair.get(1)? - pair.first()?)).collect();
-        let (from, to) = (HEARTBEAT_INTERVAL_US - MAX_LATENESS_US - CLOCK_TOLERANCE_US, HEARTBEAT_INTERVAL_US + MAX_LATENESS_US + CLOCK_TOLERANCE_US);
+        let (from, to) = (
+            HEARTBEAT_INTERVAL_US - MAX_LATENESS_US - CLOCK_TOLERANCE_US,
+            HEARTBEAT_INTERVAL_US + MAX_LATENESS_US + CLOCK_TOLERANCE_US,
+        );
         let is_so =
             (due..=due + 1).contains(&times.len()) && apart.iter().all(|span| (from..=to).contains(span));
         if is_so || attempt == 2 || late.0 < 1_000 {
             session.check("BEAT-1", is_so, || {
                 format!("a heartbeat is due every 250 ms, at most 20 ms late, but {} came in {ms} ms, {} ms apart", times.len(), format_ms(apart.iter().copied()))
             });
-            let due = times.iter().zip(0..).map(|(at, place)| at.saturating_sub(place * HEARTBEAT_INTERVAL_US)).min();
+            let due = times
+                .iter()
+                .zip(0..)
+                .map(|(at, place)| at.saturating_sub(place * HEARTBEAT_INTERVAL_US))
+                .min();
             let each = apart.iter().sum::<u64>().checked_div(apart.len() as u64);
             let grid = due.zip(each).map(|(due, each)| Grid { due, each });
             return Ok(grid.filter(|_| is_so));
@@ -115,7 +126,8 @@ fn shifted(session: &mut Session<'_>) -> Result<(), StopReason> {
             session.idle(Span::from_millis(offset))?;
             session.begin_exchange();
             let at = session.send_messages(&[message])?;
-            session.idle(Span((grid.0 + 2 * HEARTBEAT_INTERVAL_US + 60_000).saturating_sub(session.now().0)))?;
+            session
+                .idle(Span((grid.0 + 2 * HEARTBEAT_INTERVAL_US + 60_000).saturating_sub(session.now().0)))?;
             let late = session.lateness();
             let times = times(session);
             session.consume();
@@ -123,8 +135,10 @@ fn shifted(session: &mut Session<'_>) -> Result<(), StopReason> {
             let is_so = match times.as_slice() {
                 [answer, first, second] => {
                     answer - at.0 < MAX_LATENESS_US + CLOCK_TOLERANCE_US
-                        && first.abs_diff(grid.0 + HEARTBEAT_INTERVAL_US) <= MAX_LATENESS_US + CLOCK_TOLERANCE_US
-                        && second.abs_diff(grid.0 + 2 * HEARTBEAT_INTERVAL_US) <= MAX_LATENESS_US + CLOCK_TOLERANCE_US
+                        && first.abs_diff(grid.0 + HEARTBEAT_INTERVAL_US)
+                            <= MAX_LATENESS_US + CLOCK_TOLERANCE_US
+                        && second.abs_diff(grid.0 + 2 * HEARTBEAT_INTERVAL_US)
+                            <= MAX_LATENESS_US + CLOCK_TOLERANCE_US
                 }
                 _ => false,
             };

@@ -39,7 +39,9 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
 fn identity(session: &mut Session<'_>) -> Result<(), StopReason> {
     let reply = session.read(Parameter::Identity.number())?;
     let Reply::Value([.., version, hash, state, _]) = reply else {
-        session.check("CONF-1", false, || format!("a read of the identity (parameter 0) must return its words, but the answer was {reply}"));
+        session.check("CONF-1", false, || {
+            format!("a read of the identity (parameter 0) must return its words, but the answer was {reply}")
+        });
         return Ok(());
     };
     session.check("CONF-1", version == i16::from(VERSION), || {
@@ -48,10 +50,16 @@ fn identity(session: &mut Session<'_>) -> Result<(), StopReason> {
     let exchange = session.exchange_all(&[])?;
     let Some((beat, _)) = exchange.beat else { return Ok(()) };
     session.check("CONF-1", hash.cast_unsigned() == beat.configuration, || {
-        format!("identity and heartbeat must have the same configuration, but have {hash:04X} and {:04X}", beat.configuration)
+        format!(
+            "identity and heartbeat must have the same configuration, but have {hash:04X} and {:04X}",
+            beat.configuration
+        )
     });
     session.check("CONF-1", state.cast_unsigned() == beat.state.0, || {
-        format!("identity and heartbeat must have the same state, but have {state:04X} and {:04X}", beat.state.0)
+        format!(
+            "identity and heartbeat must have the same state, but have {state:04X} and {:04X}",
+            beat.state.0
+        )
     });
     session.known.hash = Some(beat.configuration);
     Ok(())

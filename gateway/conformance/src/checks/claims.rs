@@ -1,7 +1,9 @@
 //! Checks of a settled cell whose node id another sender claims or uses, in packets `4nn` with that id.
 
 use protocol::id::Node;
-use protocol::message::{ReceivedCounts as HeardPage, Heartbeat, Message, NetworkPage, Ports, RejectedCounts, State, Tree};
+use protocol::message::{
+    Heartbeat, Message, NetworkPage, Ports, ReceivedCounts as HeardPage, RejectedCounts, State, Tree,
+};
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
 use protocol::time::{Micros, Span};
@@ -77,11 +79,15 @@ fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), StopReason> {
         session.check("CLAIM-7", state.has(State::DUPLICATE), || {
             format!("DUPLICATE must be set in the answer to a claim, but the state is {:04X}", state.0)
         });
-        session.check("CLAIM-6", !state.has(State::CLAIMING), || "CLAIMING must be clear in the answer of a settled cell to a claim, but is set".to_owned());
+        session.check("CLAIM-6", !state.has(State::CLAIMING), || {
+            "CLAIMING must be clear in the answer of a settled cell to a claim, but is set".to_owned()
+        });
     }
     session.idle(Span::from_millis(5))?;
     let count = beats(session).len();
-    session.check("CLAIM-6", count <= 1, || format!("a claim must be answered with one heartbeat, but {count} came"));
+    session.check("CLAIM-6", count <= 1, || {
+        format!("a claim must be answered with one heartbeat, but {count} came")
+    });
     session.consume();
     // The heartbeat that answers the sync is checked as usual.
     session.exchange_all(&[])?;
@@ -98,11 +104,15 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
     for _ in 0..3 {
         session.wait_for_quiet(Span::from_millis(120))?;
         session.begin_exchange();
-        let frames: Vec<_> =
-            (1..=3).flat_map(|it| session.frames(&twin_heartbeat(session, own.wrapping_add(it), true))).collect();
+        let frames: Vec<_> = (1..=3)
+            .flat_map(|it| session.frames(&twin_heartbeat(session, own.wrapping_add(it), true)))
+            .collect();
         let times = session.send_all(&frames)?;
-        let apart =
-            times.last().copied().unwrap_or_default().elapsed_since(times.first().copied().unwrap_or_default());
+        let apart = times
+            .last()
+            .copied()
+            .unwrap_or_default()
+            .elapsed_since(times.first().copied().unwrap_or_default());
         session.idle(Span::from_millis(25))?;
         let count = beats(session).len();
         session.consume();
@@ -110,7 +120,10 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
             continue;
         }
         session.check("CLAIM-6", count == 1, || {
-            format!("three claims within {} us must be answered with one heartbeat, but {count} came", apart.0)
+            format!(
+                "three claims within {} us must be answered with one heartbeat, but {count} came",
+                apart.0
+            )
         });
         // The next heartbeat shows the later claims.
         session.begin_exchange();
@@ -118,7 +131,8 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), StopReason> {
         session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
         let is_set = beats(session).first().is_some_and(|(_, state)| state.has(State::DUPLICATE));
         session.check("CLAIM-7", is_set, || {
-            "DUPLICATE must be set in the heartbeat after a claim that was not answered, but is clear".to_owned()
+            "DUPLICATE must be set in the heartbeat after a claim that was not answered, but is clear"
+                .to_owned()
         });
         session.consume();
         session.exchange_all(&[])?;
@@ -135,21 +149,29 @@ fn not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), StopRe
     session.send_messages(&[*other])?;
     session.idle(Span::from_millis(25))?;
     let count = beats(session).len();
-    session.check("CLAIM-6", count == 0, || "a 4nn that is not a claim must not be answered, but a heartbeat came".to_owned());
+    session.check("CLAIM-6", count == 0, || {
+        "a 4nn that is not a claim must not be answered, but a heartbeat came".to_owned()
+    });
     session.consume();
     // A read of the identity shows DUPLICATE, and does not clear it.
     let reply = session.read(Parameter::Identity.number())?;
     let shown = reply.words().map(|[.., state, _]| State(state.cast_unsigned())).unwrap_or_default();
     let is_set = shown.has(State::DUPLICATE);
     session.check("CONF-1", is_set, || {
-        format!("DUPLICATE must be set in the identity after a 4nn of another cell, but the state is {:04X}", shown.0)
+        format!(
+            "DUPLICATE must be set in the identity after a 4nn of another cell, but the state is {:04X}",
+            shown.0
+        )
     });
     session.begin_exchange();
     let at = session.send_messages(&[Message::Sync])?;
     session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
     let state = beats(session).last().map(|(_, state)| *state).unwrap_or_default();
     session.check("CLAIM-7", state.has(State::DUPLICATE), || {
-        format!("DUPLICATE must be set in the heartbeat after a 4nn of another cell, but the state is {:04X}", state.0)
+        format!(
+            "DUPLICATE must be set in the heartbeat after a 4nn of another cell, but the state is {:04X}",
+            state.0
+        )
     });
     session.consume();
     session.exchange_all(&[])?;

@@ -9,7 +9,7 @@ use protocol::time::Span;
 
 use crate::arm;
 use crate::bus::StopReason;
-use crate::session::{Exchange, ANSWER_TIMEOUT, Session};
+use crate::session::{ANSWER_TIMEOUT, Exchange, Session};
 
 const HERE: [i16; MAX_JOINTS] = [0x0400, -0x2100, 0x1700, -0x0300, 0x2900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
 const THERE: [i16; MAX_JOINTS] = [-0x1400, 0x1100, -0x0700, 0x2300, -0x1900, 0x0800, 0, 0, 0, 0, 0, 0, 0, 0];
@@ -31,10 +31,16 @@ fn command(session: &mut Session<'_>, command: Message, id: &'static str) -> Res
         session.known.active = Some(false);
     }
     let exchange = session.exchange_all(&[command])?;
-    session.check(id, exchange.is_silent(), || "the command must not be answered, but packets came besides the heartbeat to the sync after it".to_owned());
+    session.check(id, exchange.is_silent(), || {
+        "the command must not be answered, but packets came besides the heartbeat to the sync after it"
+            .to_owned()
+    });
     let is_set = exchange.state().has(State::HALTED);
     session.check(id, is_set == is_halt, || {
-        format!("a halt must set HALTED and a resume must clear it, but HALTED is {}set after the command", if is_set { "" } else { "not " })
+        format!(
+            "a halt must set HALTED and a resume must clear it, but HALTED is {}set after the command",
+            if is_set { "" } else { "not " }
+        )
     });
     Ok(exchange)
 }
@@ -80,13 +86,17 @@ fn halt(session: &mut Session<'_>) -> Result<(), StopReason> {
     for round in 0..2 {
         session.press_and_step(&HERE, unit)?;
         let exchange = command(session, Message::Halt, "CMD-1")?;
-        session
-            .check("STATE-1", !exchange.state().has(State::ACTIVE), || "ACTIVE must be clear after a halt, but is set".to_owned());
+        session.check("STATE-1", !exchange.state().has(State::ACTIVE), || {
+            "ACTIVE must be clear after a halt, but is set".to_owned()
+        });
         if round == 1 {
             command(session, Message::Halt, "CMD-1")?;
         } else {
             // Only a resume ends a halt: neither a commit nor an exchange does.
-            session.commit(&protocol::parameters::Parameters { period_us: 46_500, ..arm::example_parameters(6) })?;
+            session.commit(&protocol::parameters::Parameters {
+                period_us: 46_500,
+                ..arm::example_parameters(6)
+            })?;
             session.commit(&arm::example_parameters(6))?;
             session.exchange_all(&[])?;
         }
@@ -98,25 +108,36 @@ fn halt(session: &mut Session<'_>) -> Result<(), StopReason> {
         let after = session.counters()?.heard;
         let taken = |of: &protocol::message::ReceivedCounts| of.joints.wrapping_add(of.joints_late);
         let counted = taken(&after).wrapping_sub(taken(&before));
-        session
-            .check("CMD-1", counted == 5, || format!("a halted cell must count 5 joints, but counted {counted}"));
+        session.check("CMD-1", counted == 5, || {
+            format!("a halted cell must count 5 joints, but counted {counted}")
+        });
         session.check("CMD-1", after.torques == before.torques, || {
             "a halted cell must not count torques, but its count changed".to_owned()
         });
         command(session, Message::Resume, "CMD-2")?;
         let step = session.step(&THERE)?;
         let exact = arm::exact_jacobian(&central, &THERE);
-        let off =
-            step.words().iter().zip(exact).map(|(word, exact)| arm::steps_off(*word, exact)).max().unwrap_or(0);
+        let off = step
+            .words()
+            .iter()
+            .zip(exact)
+            .map(|(word, exact)| arm::steps_off(*word, exact))
+            .max()
+            .unwrap_or(0);
         session.check("CMD-2", off <= 8, || {
-            format!("the first torque after a resume must be that of the new joints, but is {}", arm::format_words(&step.words()))
+            format!(
+                "the first torque after a resume must be that of the new joints, but is {}",
+                arm::format_words(&step.words())
+            )
         });
         // A release while halted clears ACTIVE, so no torque of zeros is due.
         command(session, Message::Halt, "CMD-1")?;
         session.press_and_step(&HERE, arm::press(0))?;
         command(session, Message::Resume, "CMD-2")?;
         let step = session.step(&THERE)?;
-        session.check("CMD-1", step.torque.is_none(), || "after a release while halted no torque must come, but one came".to_owned());
+        session.check("CMD-1", step.torque.is_none(), || {
+            "after a release while halted no torque must come, but one came".to_owned()
+        });
     }
     // A resume does not change a cell that is not halted.
     session.press_and_step(&HERE, unit)?;
@@ -135,7 +156,8 @@ fn syncs(session: &mut Session<'_>) -> Result<(), StopReason> {
     for _ in 0..SYNCS {
         let at = session.send_messages(&[Message::Sync])?;
         let before = beats;
-        let count = |heard: &[crate::session::CellPacket]| heard.iter().filter(|it| it.beat().is_some()).count();
+        let count =
+            |heard: &[crate::session::CellPacket]| heard.iter().filter(|it| it.beat().is_some()).count();
         session.wait(at + ANSWER_TIMEOUT, |heard| count(heard) > before)?;
         session.idle(Span::from_millis(4))?;
         beats = count(session.answers());
@@ -171,7 +193,10 @@ fn report(session: &mut Session<'_>) -> Result<(), StopReason> {
         }
         let epochs_right =
             answers.iter().all(|heard| heard.message.epoch().map(|it| it.0) == session.known.epoch);
-        session.check("JOINTS-3", epochs_right, || "the pages of a report must have the epoch of the last joints, but one has another epoch".to_owned());
+        session.check("JOINTS-3", epochs_right, || {
+            "the pages of a report must have the epoch of the last joints, but one has another epoch"
+                .to_owned()
+        });
         let sent: Vec<_> =
             answers.iter().filter_map(|heard| heard.sensors().map(|(_, page)| *page)).collect();
         let mut latched = Readings::default();
@@ -184,7 +209,11 @@ fn report(session: &mut Session<'_>) -> Result<(), StopReason> {
             let text = |pages: &[SensorPage]| {
                 pages.iter().map(|page| arm::format_page(*page)).collect::<Vec<_>>().join("; ")
             };
-            format!("a report must have the latched values, but has {}, and {} is latched", text(&sent), text(&latched))
+            format!(
+                "a report must have the latched values, but has {}, and {} is latched",
+                text(&sent),
+                text(&latched)
+            )
         });
     }
     session.press_and_step(&HERE, arm::press(0))?;

@@ -45,7 +45,9 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         let mut beats = usize::MAX;
         for _ in 0..ATTEMPTS {
             let exchange = session.exchange(&frames)?;
-            session.check("COUNT-1", exchange.is_silent(), || format!("{what} must be dropped, but was answered"));
+            session.check("COUNT-1", exchange.is_silent(), || {
+                format!("{what} must be dropped, but was answered")
+            });
             let has_effect = exchange.state().has(State::HALTED) || exchange.state().has(State::DUPLICATE);
             session.check("COUNT-1", !has_effect, || {
                 format!("{what} must have no effect, but the state after it is {:04X}", exchange.state().0)
@@ -56,7 +58,10 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
             let after = session.counters()?;
             let is_so = is_counted(before.refused, after.refused, reason) && before.heard == after.heard;
             session.check("COUNT-1", is_so, || {
-                format!("{what} must be counted {}, but the counters are {after}; before: {before}", reason.text())
+                format!(
+                    "{what} must be counted {}, but the counters are {after}; before: {before}",
+                    reason.text()
+                )
             });
             before = after;
             // A regular heartbeat may have come beside the one to the sync, but not in each attempt.
@@ -65,7 +70,9 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
                 break;
             }
         }
-        session.check("COUNT-1", beats <= 1, || format!("{what} must be dropped, but was answered with a heartbeat"));
+        session.check("COUNT-1", beats <= 1, || {
+            format!("{what} must be dropped, but was answered with a heartbeat")
+        });
     }
     Ok(())
 }

@@ -39,7 +39,11 @@ fn epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
         if let (Some(came), Some(before)) = (came, torque) {
             let words = |words: &Words| arm::format_words(words.as_slice());
             session.check("TORQUE-1", came == before, || {
-                format!("the same joints must give the same torque, but gave {}, and {} before", words(&came), words(&before))
+                format!(
+                    "the same joints must give the same torque, but gave {}, and {} before",
+                    words(&came),
+                    words(&before)
+                )
             });
         }
         torque = came.or(torque);
@@ -49,7 +53,9 @@ fn epochs(session: &mut Session<'_>) -> Result<(), StopReason> {
     let skipped = after.joints_late.wrapping_sub(before.joints_late);
     let late = session.skips;
     session.check("JOINTS-5", skipped <= late, || {
-        format!("{skipped} joints were counted as skipped, but only {late} were answered late enough for that")
+        format!(
+            "{skipped} joints were counted as skipped, but only {late} were answered late enough for that"
+        )
     });
     Ok(())
 }
@@ -64,7 +70,9 @@ fn repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
         for positions in [POSITIONS, [0x1234; MAX_JOINTS]] {
             let joints = session.joints(first, &positions);
             let exchange = session.exchange_all(&[joints])?;
-            session.check("JOINTS-1", exchange.is_silent(), || format!("repeated joints {first} must not be answered, but were"));
+            session.check("JOINTS-1", exchange.is_silent(), || {
+                format!("repeated joints {first} must not be answered, but were")
+            });
         }
         // A pending stimulus must not be latched by repeated joints.
         session.press(arm::press(2_000))?;
@@ -72,7 +80,7 @@ fn repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.exchange_all(&[joints])?;
         let skin = session.latched()?;
         session.check("JOINTS-1", skin == Some(arm::press(4_096)), || {
-            format!("repeated joints must not latch a stimulus, but {} is latched", arm::format_skin(format_skin))
+            format!("repeated joints must not latch a stimulus, but {} is latched", arm::format_skin(skin))
         });
         let second = session.next_epoch();
         session.step_at(second, &POSITIONS)?;
@@ -81,7 +89,9 @@ fn repeats(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.step_at(second, &POSITIONS)?;
         let after = session.counters()?.heard;
         let counted = after.joints_repeated.wrapping_sub(before.joints_repeated);
-        session.check("JOINTS-1", counted == 3, || format!("3 repeated joints must be counted as repeated, but {counted} were"));
+        session.check("JOINTS-1", counted == 3, || {
+            format!("3 repeated joints must be counted as repeated, but {counted} were")
+        });
     }
     Ok(())
 }
@@ -101,7 +111,10 @@ fn counts(session: &mut Session<'_>) -> Result<(), StopReason> {
         let exchange = session.exchange(&frames)?;
         let skin = session.latched()?;
         session.check("JOINTS-2", skin == before_press, || {
-            format!("joints with count {count} must not latch a stimulus, but {} is latched", arm::format_skin(format_skin))
+            format!(
+                "joints with count {count} must not latch a stimulus, but {} is latched",
+                arm::format_skin(skin)
+            )
         });
         session.check("JOINTS-2", exchange.is_silent(), || {
             format!("joints with count {count} must not be answered, because the chain has 6, but were")
@@ -277,7 +290,9 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
 fn look_at_old(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<String> {
     const MARGIN: Span = Span(100);
     let late = answers.windows(2).find(|pair| match pair {
-        [(before, _), (_, epoch)] => sent.iter().any(|(of, at)| of == epoch && before.elapsed_since(*at) > MARGIN),
+        [(before, _), (_, epoch)] => {
+            sent.iter().any(|(of, at)| of == epoch && before.elapsed_since(*at) > MARGIN)
+        }
         _ => false,
     });
     let Some([(before, first), (_, epoch)]) = late else { return None };

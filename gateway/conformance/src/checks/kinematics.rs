@@ -4,7 +4,7 @@ use model::central::Central;
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::parameters::{Abilities, MAX_JOINTS, Parameters, Pose, Row, RowKind};
 
-use crate::arm::{self, TestRandom, ChainShape};
+use crate::arm::{self, ChainShape, TestRandom};
 use crate::bus::StopReason;
 use crate::session::Session;
 

@@ -38,12 +38,14 @@ fn touched(session: &mut Session<'_>) -> Result<u8, StopReason> {
 /// Checks that the latched stimulus and the one pending for epoch `later` still exist.
 fn is_touched(session: &mut Session<'_>, later: u8, id: &'static str, what: &str) -> Result<(), StopReason> {
     let is_there = session.step(&POSITIONS)?.torque.is_some();
-    session.check(id, is_there, || format!("{what} must keep the latched stimulus, but no torque came after it"));
+    session.check(id, is_there, || {
+        format!("{what} must keep the latched stimulus, but no torque came after it")
+    });
     session.known.skin = Some(arm::press(LATER));
     session.step_at(later, &POSITIONS)?;
     let skin = session.latched()?;
     session.check(id, skin == Some(arm::press(LATER)), || {
-        format!("{what} must keep a pending stimulus, but at its epoch {} is latched", arm::format_skin(format_skin))
+        format!("{what} must keep a pending stimulus, but at its epoch {} is latched", arm::format_skin(skin))
     });
     Ok(())
 }
@@ -64,8 +66,9 @@ fn commit(session: &mut Session<'_>) -> Result<(), StopReason> {
     // The cell stays in contact until the next joints.
     session.exchange_all(&[])?;
     let after = session.counters()?;
-    session
-        .check("CONF-7", before == after, || format!("a commit must not change the counters, but they are {after}; before: {before}"));
+    session.check("CONF-7", before == after, || {
+        format!("a commit must not change the counters, but they are {after}; before: {before}")
+    });
     if session.about.sensing {
         for (number, expected) in [(thresholds, events), (sensing, padded_words([1, i16::MAX]))] {
             let reply = session.read(number)?;

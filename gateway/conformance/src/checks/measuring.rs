@@ -40,7 +40,10 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
             (Some(_), ..) | (None, false, Some(false) | None) => None,
         };
         session.check("JOINTS-6", wrong.is_none(), || {
-            format!("answers to joints must agree with ACTIVE outside test mode: {}", wrong.unwrap_or_default())
+            format!(
+                "answers to joints must agree with ACTIVE outside test mode: {}",
+                wrong.unwrap_or_default()
+            )
         });
         before = Some(is_active);
     }

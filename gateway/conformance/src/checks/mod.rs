@@ -63,7 +63,11 @@ const fn group(
 }
 
 const GROUPS: &[Group] = &[
-    group(&["CONF-1", "CONF-2", "CONF-3", "CONF-4", "CONF-7", "CONF-12"], Precondition::Nothing, parameters::run),
+    group(
+        &["CONF-1", "CONF-2", "CONF-3", "CONF-4", "CONF-7", "CONF-12"],
+        Precondition::Nothing,
+        parameters::run,
+    ),
     group(&["CONF-11", "CONF-13", "ID-2", "OPT-1"], Precondition::Nothing, parameters::others),
     group(&["CONF-7", "CONF-9", "CMD-2", "STATE-1"], Precondition::Press, leaves::run),
     group(&["CONF-5", "CONF-6", "COUNT-2"], Precondition::Nothing, refusals::run),
@@ -92,7 +96,11 @@ const GROUPS: &[Group] = &[
     group(&["COUNT-1", "SEND-1"], Precondition::Nothing, counters::run),
     group(&["COUNT-3"], Precondition::Classic, segments::run),
     group(&["CLAIM-6", "CLAIM-7", "STATE-2"], Precondition::Nothing, claims::run),
-    group(&["BEAT-1", "BEAT-2", "BEAT-3", "CMD-1", "STIM-7", "TIME-1", "TIME-3"], Precondition::Nothing, beats::run),
+    group(
+        &["BEAT-1", "BEAT-2", "BEAT-3", "CMD-1", "STIM-7", "TIME-1", "TIME-3"],
+        Precondition::Nothing,
+        beats::run,
+    ),
     group(
         &["SENSE-4", "SENSE-5", "SENSE-6", "SENSE-7", "SENSE-8", "SENSE-9", "SENSE-10", "SENSE-11", "TIME-3"],
         Precondition::Sensing,
@@ -205,7 +213,9 @@ fn check_needs(session: &Session<'_>, needs: Precondition) -> Result<(), (bool, 
         }
         Precondition::Press if !about.committed => Err((true, "the cell does not take a configuration")),
         Precondition::Restart if !session.can_restart() => Err((true, "without --restart")),
-        Precondition::Sensing if !about.sensing => Err((false, "it sends no sensor values without a request")),
+        Precondition::Sensing if !about.sensing => {
+            Err((false, "it sends no sensor values without a request"))
+        }
         Precondition::Sensing if !about.test_mode => {
             Err((true, "without test mode (parameter 5) nothing can press the cell"))
         }

@@ -103,7 +103,9 @@ fn reply_mode(session: &mut Session<'_>) -> Result<(), StopReason> {
     }
     expect(session, "CONF-3", REPLY, [0, 5, 6, 7, 8, 9], Reply::Value([0; WORDS]))?;
     let reply = session.read(REPLY)?;
-    session.check("CONF-9", reply == Reply::Value([0; WORDS]), || format!("parameter 6 must be read as 0 after a write of 0, but is read as {reply}"));
+    session.check("CONF-9", reply == Reply::Value([0; WORDS]), || {
+        format!("parameter 6 must be read as 0 after a write of 0, but is read as {reply}")
+    });
     Ok(())
 }
 
@@ -141,7 +143,9 @@ fn sensing(session: &mut Session<'_>) -> Result<(), StopReason> {
         let [a, b, c, d, e, _] = good;
         expect(session, "SENSE-3", EVENTS, [a, b, c, d, e, 77], Reply::Value(good))?;
         let reply = session.read(EVENTS)?;
-        session.check("CONF-9", reply == Reply::Value(good), || format!("parameter 8 must be read as it was written, but is read as {reply}"));
+        session.check("CONF-9", reply == Reply::Value(good), || {
+            format!("parameter 8 must be read as it was written, but is read as {reply}")
+        });
     }
     Ok(())
 }
@@ -187,7 +191,10 @@ fn rows(session: &mut Session<'_>) -> Result<(), StopReason> {
     };
     let reply = session.read(number)?;
     session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
-        format!("row {} of a cell that can have {most} rows must be read as 0, but is read as {reply}", most + 1)
+        format!(
+            "row {} of a cell that can have {most} rows must be read as 0, but is read as {reply}",
+            most + 1
+        )
     });
     expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
     refuse(session, "OPT-1", number, padded_words([1, 2, 3, 4]))
@@ -217,14 +224,17 @@ pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.begin_exchange();
     let asked = session.send(&frames(session, junk(Command::Report)))?;
     let pages = session.pages(asked)?;
-    session
-        .check("OPT-2", !pages.is_empty(), || "unused words of a report must be ignored, but it was not answered".to_owned());
+    session.check("OPT-2", !pages.is_empty(), || {
+        "unused words of a report must be ignored, but it was not answered".to_owned()
+    });
     let frames_of_sync = frames(session, junk(Command::Sync));
     session.begin_exchange();
     let at = session.send(&frames_of_sync)?;
-    let is_there =
-        session.wait(at + crate::session::ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
-    session.check("OPT-2", is_there, || "unused words of a sync must be ignored, but it was not answered".to_owned());
+    let is_there = session
+        .wait(at + crate::session::ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+    session.check("OPT-2", is_there, || {
+        "unused words of a sync must be ignored, but it was not answered".to_owned()
+    });
     read_with_words(session)?;
     if session.format == Format::Fd {
         // A frame without the bit-rate switch.
@@ -233,9 +243,11 @@ pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.begin_exchange();
         let frames: Vec<_> = frame.into_iter().collect();
         let at = session.send(&frames)?;
-        let is_there =
-            session.wait(at + crate::session::ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
-        session.check("OPT-2", is_there, || "a sync in a frame without bit-rate switch must be answered, but was not".to_owned());
+        let is_there = session
+            .wait(at + crate::session::ANSWER_TIMEOUT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+        session.check("OPT-2", is_there, || {
+            "a sync in a frame without bit-rate switch must be answered, but was not".to_owned()
+        });
     }
     if session.about.test_mode && session.about.committed {
         words_beyond(session)?;
@@ -253,7 +265,9 @@ fn read_with_words(session: &mut Session<'_>) -> Result<(), StopReason> {
     let answer = protocol::message::Answer::Value { number: 2, written: false, words: expected };
     let answer = Message::Configured { from: session.cell, tag: 3, answer };
     let is_so = exchange.answers.iter().any(|heard| heard.message == answer);
-    session.check("OPT-2", is_so, || "unused words of a read must be ignored, but the answer was not the value of parameter 2".to_owned());
+    session.check("OPT-2", is_so, || {
+        "unused words of a read must be ignored, but the answer was not the value of parameter 2".to_owned()
+    });
     Ok(())
 }
 

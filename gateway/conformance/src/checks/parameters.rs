@@ -37,7 +37,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
         session.stage(&Parameters { joints: 3, joint: 3, ..other })?;
         let step = session.press_and_step(&[0x0222; MAX_JOINTS], arm::press(4_096))?;
         session.check("JOINTS-2", step.torque.is_some(), || {
-            "joints of the chain in use must be answered while a shorter chain is staged, but were not".to_owned()
+            "joints of the chain in use must be answered while a shorter chain is staged, but were not"
+                .to_owned()
         });
         session.press_and_step(&[0x0222; MAX_JOINTS], arm::press(0))?;
         session.stage(&other)?;
@@ -56,7 +57,9 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     session.exchange_all(&[])?;
     computes(session, &other, &one, "CONF-7")?;
     let reply = session.read(Parameter::Commit.number())?;
-    session.check("CONF-1", reply == Reply::Value([0; WORDS]), || format!("the commit parameter must be read as 0, but is read as {reply}"));
+    session.check("CONF-1", reply == Reply::Value([0; WORDS]), || {
+        format!("the commit parameter must be read as 0, but is read as {reply}")
+    });
     unused(session)?;
     tags(session)
 }
@@ -67,7 +70,11 @@ fn reads(session: &mut Session<'_>, expected: &Parameters, id: &'static str) -> 
         let reply = session.read(parameter.number())?;
         let words = expected.words(parameter);
         session.check(id, reply == Reply::Value(words), || {
-            format!("parameter {} is read as {reply}, but must be read as {}", parameter.number(), Reply::Value(words))
+            format!(
+                "parameter {} is read as {reply}, but must be read as {}",
+                parameter.number(),
+                Reply::Value(words)
+            )
         });
     }
     Ok(())
@@ -91,13 +98,17 @@ fn computes(
         let central = model::central::Central::of_cell(parameters);
         let exact = arm::exact_jacobian(&central, &positions);
         let force = arm::force(&parameters.contact, &press);
-        let word =
-            |x: f64| i32::from(arm::torque_word(Q1_14::nearest(x).to_bits(), force, parameters.torque_format));
+        let word = |x: f64| {
+            i32::from(arm::torque_word(Q1_14::nearest(x).to_bits(), force, parameters.torque_format))
+        };
         step.words().iter().zip(exact).all(|(got, x)| (i32::from(*got) - word(x)).abs() <= 24)
     };
     debug_assert!(!near(expected) || !near(not), "they are apart");
     session.check(id, near(expected), || {
-        format!("the torque must follow from the parameters in use, but is {}", arm::format_words(&step.words()))
+        format!(
+            "the torque must follow from the parameters in use, but is {}",
+            arm::format_words(&step.words())
+        )
     });
     session.press_and_step(&positions, arm::press(0))?;
     Ok(())
@@ -171,7 +182,8 @@ fn tags(session: &mut Session<'_>) -> Result<(), StopReason> {
             format!("the same request must get the same answer, but was answered with {second}, and with {first} before")
         });
     }
-    session.known.staged = staged.map(|staged| Parameters { pose: arm::example_parameters(3).pose, ..staged });
+    session.known.staged =
+        staged.map(|staged| Parameters { pose: arm::example_parameters(3).pose, ..staged });
     session.known.skin = session.about.test_mode.then(Default::default);
     session.known.pending = None;
     Ok(())
@@ -195,7 +207,9 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), StopReason> {
     let mode = Request::Write { number: Parameter::Mode.number(), words: on };
     let reply = session.request(Node::Everyone, mode)?;
     session.check("CONF-11", reply == Reply::Value(on), || {
-        format!("a write of the mode sent to everyone must be answered with its words, but the answer was {reply}")
+        format!(
+            "a write of the mode sent to everyone must be answered with its words, but the answer was {reply}"
+        )
     });
     let staged = Parameters { pose: other().pose, ..arm::example_parameters(2) };
     session.known.staged = Some(staged);
@@ -219,7 +233,11 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), StopReason> {
 fn unknown(session: &mut Session<'_>) -> Result<(), StopReason> {
     for number in (10..=10).chain(13..16).chain(48..127) {
         // Reads and writes alternate.
-        let reply = if number % 2 == 0 { session.read(number)? } else { session.write_first_words(number, [1, 2, 3])? };
+        let reply = if number % 2 == 0 {
+            session.read(number)?
+        } else {
+            session.write_first_words(number, [1, 2, 3])?
+        };
         session.check("CONF-13", reply == Reply::Refused(18), || {
             format!("parameter {number} does not exist and must be refused with reason 18, but the answer was {reply}")
         });
@@ -246,7 +264,9 @@ fn not_its_own(session: &mut Session<'_>) -> Result<(), StopReason> {
         let press = protocol::message::SensorPage::Skin(arm::press(4_096));
         let press = Message::Stimulus { to, from: protocol::message::AppliesFrom::Next, page: press };
         let exchange = session.exchange_all(&[read, press])?;
-        session.check("ID-2", exchange.is_silent(), || format!("a request to cell {cell} must not be answered by this cell, but was"));
+        session.check("ID-2", exchange.is_silent(), || {
+            format!("a request to cell {cell} must not be answered by this cell, but was")
+        });
         session.step(&[0; MAX_JOINTS])?;
     }
     let after = session.counters()?;

@@ -13,7 +13,7 @@ use protocol::time::{Micros, Span};
 use super::claims::{page, twin_heartbeat};
 use crate::arm;
 use crate::bus::StopReason;
-use crate::session::{CellPacket, TrackedState, ANSWER_TIMEOUT, Reply, Session};
+use crate::session::{ANSWER_TIMEOUT, CellPacket, Reply, Session, TrackedState};
 use claiming::{gives_way, invalid, stays, while_claiming};
 
 /// The time limit from switching the cell off to its first packet.
@@ -28,16 +28,26 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     let own = session.about.serial.unwrap_or_default();
     // CLAIMING and a higher serial number have these meanings in a heartbeat only.
     let state = State::CLAIMING.0 | 1 << 12;
-    let other =
-        protocol::message::RejectedCounts { length: 0xFFFF, crc: 0xFFFF, stimuli: state, ..Default::default() };
+    let other = protocol::message::RejectedCounts {
+        length: 0xFFFF,
+        crc: 0xFFFF,
+        stimuli: state,
+        ..Default::default()
+    };
     let lower = own.wrapping_sub(0x1_0000).wrapping_add(1);
     let others = [
         ("a claim with a lower serial number", twin_heartbeat(session, own.wrapping_sub(1), true)),
-        ("a claim with a lower serial number, whose low word is higher", twin_heartbeat(session, lower, true)),
+        (
+            "a claim with a lower serial number, whose low word is higher",
+            twin_heartbeat(session, lower, true),
+        ),
         ("network page 2", page(session, NetworkPage::Rejected(other))),
         ("a claim with its own serial number", twin_heartbeat(session, own, true)),
         ("a heartbeat without CLAIMING", twin_heartbeat(session, own.wrapping_add(1), false)),
-        ("network page 1", page(session, NetworkPage::Received(protocol::message::ReceivedCounts::default()))),
+        (
+            "network page 1",
+            page(session, NetworkPage::Received(protocol::message::ReceivedCounts::default())),
+        ),
     ];
     let has_lower = |what: &str| match what.contains("low word") {
         true => own >= 0x1_0000 && own & 0xFFFF != 0xFFFF,
@@ -71,8 +81,11 @@ fn restart_with(
     longest: Span,
     meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), StopReason>,
 ) -> Result<Option<Micros>, StopReason> {
-    let keep =
-        TrackedState { last_epoch: session.known.last_epoch, joints: session.known.joints, ..TrackedState::default() };
+    let keep = TrackedState {
+        last_epoch: session.known.last_epoch,
+        joints: session.known.joints,
+        ..TrackedState::default()
+    };
     let (parameters, senses) = (session.known.parameters, session.known.senses);
     session.consume();
     session.begin_restart()?;
@@ -126,8 +139,9 @@ fn await_claim(
 
 /// Waits until the node id is settled, and returns the time of the first heartbeat without CLAIMING.
 fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>, StopReason> {
-    let is_settled =
-        |it: &CellPacket| it.at > claimed && it.beat().is_some_and(|(beat, _)| !beat.state.has(State::CLAIMING));
+    let is_settled = |it: &CellPacket| {
+        it.at > claimed && it.beat().is_some_and(|(beat, _)| !beat.state.has(State::CLAIMING))
+    };
     let until = claimed + claim(session) + Span::from_millis(300);
     // It may have come in an earlier exchange, if the bench was late.
     let first = |session: &Session<'_>| {
@@ -141,7 +155,10 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
     session.consume();
     let expected = claim(session);
     session.check("CLAIM-5", at.is_some(), || {
-        format!("a heartbeat without CLAIMING is due {} ms after the first one, but none came", expected.0 / 1_000)
+        format!(
+            "a heartbeat without CLAIMING is due {} ms after the first one, but none came",
+            expected.0 / 1_000
+        )
     });
     session.known.may_be_silent = false;
     session.extend_life();
@@ -177,10 +194,12 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
             first.0.sent, first.0.rejected, first.1
         )
     });
-    session
-        .check("STATE-3", !first.0.state.has(State::HALTED), || "HALTED must be clear after a restart, but is set".to_owned());
-    session
-        .check("STATE-1", !first.0.state.has(State::ACTIVE), || "ACTIVE must be clear after a restart, but is set".to_owned());
+    session.check("STATE-3", !first.0.state.has(State::HALTED), || {
+        "HALTED must be clear after a restart, but is set".to_owned()
+    });
+    session.check("STATE-1", !first.0.state.has(State::ACTIVE), || {
+        "ACTIVE must be clear after a restart, but is set".to_owned()
+    });
     let others = session.answers().iter().filter(|it| it.at >= claimed).count();
     let at = settled(session, claimed)?;
     if let Some(at) = at {
@@ -188,10 +207,15 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
         let late = session.lateness().0;
         let range = expected - expected / 100 - 2_000..=expected + expected / 100 + 22_000 + late;
         session.check("CLAIM-5", range.contains(&took), || {
-            format!("claiming ended after {:.1} ms, but must end after {:.1} ms", took as f64 / 1e3, expected as f64 / 1e3)
+            format!(
+                "claiming ended after {:.1} ms, but must end after {:.1} ms",
+                took as f64 / 1e3,
+                expected as f64 / 1e3
+            )
         });
     }
-    session.check("CLAIM-1", others >= 1, || "a heartbeat must come after a restart, but none came".to_owned());
+    session
+        .check("CLAIM-1", others >= 1, || "a heartbeat must come after a restart, but none came".to_owned());
     let same = first.0.configuration == kept.hash() && first.0.state.has(State::CONFIGURED);
     session.check("CONF-8", same, || {
         format!(
@@ -200,14 +224,19 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
             kept.hash()
         )
     });
-    session.check("ID-3", at.is_some(), || "after a restart the cell must send under its node id, but did not".to_owned());
+    session.check("ID-3", at.is_some(), || {
+        "after a restart the cell must send under its node id, but did not".to_owned()
+    });
     session.known.hash = Some(kept.hash());
     (session.known.halted, session.known.epoch) = (Some(false), Some(0));
     session.exchange_all(&[])?;
     for parameter in Parameter::stored(kept.table().len()) {
         let reply = session.read(parameter.number())?;
         session.check("CONF-8", reply == Reply::Value(kept.words(parameter)), || {
-            format!("after a restart parameter {} must be read as it was committed, but is read as {reply}", parameter.number())
+            format!(
+                "after a restart parameter {} must be read as it was committed, but is read as {reply}",
+                parameter.number()
+            )
         });
     }
     // Values that were only staged are gone.
@@ -223,10 +252,14 @@ fn survives(session: &mut Session<'_>) -> Result<bool, StopReason> {
     session.known.active = None;
     let done = session.commit(&next)?;
     session.test_mode(session.about.test_mode)?;
-    session.check("CONF-2", done, || "after a restart the staged copy must equal the values in use, but a commit on top of it failed".to_owned());
+    session.check("CONF-2", done, || {
+        "after a restart the staged copy must equal the values in use, but a commit on top of it failed"
+            .to_owned()
+    });
     let after = if session.known.test_mode == Some(true) { touched(session)? } else { None };
     session.check("CONF-8", after.is_none() || before.is_none() || before == after, || {
-        let words = |words: Option<Words>| words.map_or_else(String::new, |it| arm::format_words(it.as_slice()));
+        let words =
+            |words: Option<Words>| words.map_or_else(String::new, |it| arm::format_words(it.as_slice()));
         format!(
             "the same press must give the same torque, but gave {} before a restart, and {} after it",
             words(before),
@@ -272,11 +305,14 @@ fn in_the_middle(session: &mut Session<'_>) -> Result<(), StopReason> {
     let claimed = restart(session)?;
     settled(session, claimed)?;
     session.known.hash = None;
-    let (old, new) = (arm::example_parameters(2), Parameters { period_us: 44_000, ..arm::example_parameters(4) });
+    let (old, new) =
+        (arm::example_parameters(2), Parameters { period_us: 44_000, ..arm::example_parameters(4) });
     session.ready(&old)?;
     session.stage(&new)?;
-    let request =
-        Request::Write { number: Parameter::Commit.number(), words: padded_words([new.hash().cast_signed()]) };
+    let request = Request::Write {
+        number: Parameter::Commit.number(),
+        words: padded_words([new.hash().cast_signed()]),
+    };
     session.send_messages(&[Message::Configure { to: Node::Cell(session.cell), tag: 1, request }])?;
     session.consume();
     let claimed = restart(session)?;

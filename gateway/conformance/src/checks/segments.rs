@@ -59,7 +59,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
 /// Checks joints of three segments: each comes in time after the one before, but the first is too old for the last.
 fn three(session: &mut Session<'_>) -> Result<(), StopReason> {
     let mut dice = arm::TestRandom::new(7);
-    let parameters = arm::random_parameters(&mut dice, arm::ChainShape { joints: 8, rows: 8, prismatic: false });
+    let parameters =
+        arm::random_parameters(&mut dice, arm::ChainShape { joints: 8, rows: 8, prismatic: false });
     if session.about.abilities.first_missing(&parameters).is_some() || !session.ready(&parameters)? {
         return Ok(());
     }

@@ -64,7 +64,12 @@ fn list(pages: &[u8]) -> String {
 }
 
 /// Writes parameter 7, and checks the pages that follow at once.
-fn switched(session: &mut Session<'_>, mode: [i16; 2], expected: &[u8], what: &str) -> Result<(), StopReason> {
+fn switched(
+    session: &mut Session<'_>,
+    mode: [i16; 2],
+    expected: &[u8],
+    what: &str,
+) -> Result<(), StopReason> {
     session.wait_for_quiet(Span::from_millis(60))?;
     session.begin_exchange();
     session.write(SENSING, padded_words(mode))?;
@@ -153,8 +158,8 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
         // sent.
         if beats == 1 && skips == session.skips {
             session.check(ids, numbers == expected, || {
-                let moved =
-                    acceleration.map_or_else(String::new, |it| arm::format_page(SensorPage::Acceleration(it)));
+                let moved = acceleration
+                    .map_or_else(String::new, |it| arm::format_page(SensorPage::Acceleration(it)));
                 format!(
                     "{} {moved} is latched at step {} (before: {turned}): pages {} came, but must be {}",
                     arm::format_skin(Some(skin)),
@@ -170,7 +175,10 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
         let is_latched = pages.all(|(_, page)| model.has(page));
         session.check("SENSE-7", is_latched, || {
             let sent: Vec<_> = sent.iter().map(|page| arm::format_page(*page)).collect();
-            format!("sensors pages must have the latched values, but {} was sent and is not latched", sent.join("; "))
+            format!(
+                "sensors pages must have the latched values, but {} was sent and is not latched",
+                sent.join("; ")
+            )
         });
         if step % 40 == 39 {
             // The pages of a report count as sent, too.
@@ -197,7 +205,12 @@ fn crafted(events: &Events) -> [SkinSensors; CRAFTED] {
 }
 
 /// Returns sensor values near the last sent ones, and near the thresholds.
-fn values(dice: &mut TestRandom, events: &Events, model: &Model, step: usize) -> (SkinSensors, Option<[Q3_12; 3]>) {
+fn values(
+    dice: &mut TestRandom,
+    events: &Events,
+    model: &Model,
+    step: usize,
+) -> (SkinSensors, Option<[Q3_12; 3]>) {
     let sent = model.sent_skin();
     let mut skin = sent;
     let near = |dice: &mut TestRandom, threshold: i16| {
@@ -268,7 +281,9 @@ fn after_beats(session: &mut Session<'_>) -> Result<(), StopReason> {
     // Other heartbeats are not followed by pages.
     session.wait_for_quiet(Span::from_millis(60))?;
     let sync = session.exchange_all(&[])?;
-    session.check("SENSE-10", sync.is_silent(), || "no page must follow the heartbeat to a sync, but one came".to_owned());
+    session.check("SENSE-10", sync.is_silent(), || {
+        "no page must follow the heartbeat to a sync, but one came".to_owned()
+    });
     Ok(())
 }
 

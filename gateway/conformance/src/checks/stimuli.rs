@@ -24,7 +24,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     if !session.ready(&parameters)? {
         return Ok(());
     }
-    let j = session.press_and_step(&POSITIONS, arm::press(arm::unit_press(parameters.torque_format)))?.words();
+    let j =
+        session.press_and_step(&POSITIONS, arm::press(arm::unit_press(parameters.torque_format)))?.words();
     let cell = Pressed { parameters, j };
     let before = session.counters()?;
     let mut count = next(session, &cell)?;
@@ -34,11 +35,17 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), StopReason> {
     count += order(session, &cell)?;
     let after = session.counters()?;
     let counted = after.heard.stimuli.wrapping_sub(before.heard.stimuli);
-    session.check("STIM-3", counted == count, || format!("{count} stimuli were sent, but {counted} were counted"));
+    session.check("STIM-3", counted == count, || {
+        format!("{count} stimuli were sent, but {counted} were counted")
+    });
     let counted = after.heard.stimuli_late.wrapping_sub(before.heard.stimuli_late);
-    session.check("STIM-5", counted == late, || format!("{late} stimuli were sent too late, but {counted} were counted as late"));
+    session.check("STIM-5", counted == late, || {
+        format!("{late} stimuli were sent too late, but {counted} were counted as late")
+    });
     let is_same = after.refused == before.refused;
-    session.check("STIM-6", is_same, || format!("stimuli must not be refused while fewer than 8 are pending, but the counters are {after}"));
+    session.check("STIM-6", is_same, || {
+        format!("stimuli must not be refused while fewer than 8 are pending, but the counters are {after}")
+    });
     pending(session, &cell)?;
     forgotten(session, &cell)?;
     measuring(session)?;
@@ -208,7 +215,10 @@ fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), StopReason> 
         after.refused.stimuli.wrapping_sub(before.refused.stimuli),
     );
     session.check("STIM-6", counted == (8, 2), || {
-        format!("of 10 stimuli 8 must be accepted and 2 refused, but {} were accepted and {} refused", counted.0, counted.1)
+        format!(
+            "of 10 stimuli 8 must be accepted and 2 refused, but {} were accepted and {} refused",
+            counted.0, counted.1
+        )
     });
     for ahead in [1, 2, 3, 5, 6, 7, 8, 9, 10, 11] {
         let expected = if ahead < 8 { 1_000 * i32::from(ahead) } else { 7_000 };
@@ -272,7 +282,7 @@ fn halted(session: &mut Session<'_>, cell: &Pressed) -> Result<(), StopReason> {
     session.step_at(epoch.wrapping_add(1), &POSITIONS)?;
     let skin = session.latched()?;
     session.check("STIM-8", skin == Some(arm::press(2_222)), || {
-        format!("a halted cell must latch a stimulus, but {} is latched", arm::format_skin(format_skin))
+        format!("a halted cell must latch a stimulus, but {} is latched", arm::format_skin(skin))
     });
     session.send_messages(&[Message::Resume])?;
     session.known.halted = Some(false);

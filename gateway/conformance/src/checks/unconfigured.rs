@@ -74,10 +74,14 @@ fn joints(session: &mut Session<'_>) -> Result<(), StopReason> {
     }
     let after = session.counters()?;
     let skipped = after.heard.joints_late.wrapping_sub(before.heard.joints_late);
-    session.check("JOINTS-4", skipped == 0, || format!("a cell without a configuration must not skip joints, but skipped {skipped}"));
+    session.check("JOINTS-4", skipped == 0, || {
+        format!("a cell without a configuration must not skip joints, but skipped {skipped}")
+    });
     let counted = after.heard.joints.wrapping_sub(before.heard.joints);
     session.check("JOINTS-2", counted == u16::from(most), || {
-        format!("a cell without a configuration must count joints of {most} chain lengths, but counted {counted}")
+        format!(
+            "a cell without a configuration must count joints of {most} chain lengths, but counted {counted}"
+        )
     });
     let repeated = after.heard.joints_repeated.wrapping_sub(before.heard.joints_repeated);
     session.check("JOINTS-3", repeated == u16::from(most), || {

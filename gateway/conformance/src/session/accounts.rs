@@ -2,8 +2,8 @@
 
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id};
-use protocol::message::{ReceivedCounts as HeardPage, Message, NetworkPage, RejectedCounts, State};
-use protocol::packet::{Epoch, Lengths, Packet, Reassembly, Reassembler, data_id};
+use protocol::message::{Message, NetworkPage, ReceivedCounts as HeardPage, RejectedCounts, State};
+use protocol::packet::{Epoch, Lengths, Packet, Reassembler, Reassembly, data_id};
 use protocol::time::{Micros, Span};
 
 use crate::bus::ObservedFrame;
@@ -59,7 +59,13 @@ pub(super) type Discrepancy = (&'static str, String);
 impl Accounts {
     /// Counts the packet that a frame of the bench completes; `joints` is the number of joints of the chain, if the
     /// cell has a configuration.
-    pub(super) fn count_own_frame(&mut self, seen: &ObservedFrame, cell: CellId, format: Format, joints: Option<u8>) {
+    pub(super) fn count_own_frame(
+        &mut self,
+        seen: &ObservedFrame,
+        cell: CellId,
+        format: Format,
+        joints: Option<u8>,
+    ) {
         let Some(message) = self.message(seen, format) else { return };
         if let Message::Joints { epoch, joints: came } = message {
             if self.last == Some(epoch) {
@@ -166,7 +172,8 @@ impl Accounts {
         ];
         let differs = |(id, name, what, counted, now, before): (_, _, _, u16, u16, u16)| {
             let expected = now.wrapping_sub(before);
-            let text = || format!("{name} must go up by {expected}, the number of {what}, but went up by {counted}");
+            let text =
+                || format!("{name} must go up by {expected}, the number of {what}, but went up by {counted}");
             (counted != expected).then(|| (id, text()))
         };
         all.into_iter().filter_map(differs).collect()

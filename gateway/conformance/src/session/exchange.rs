@@ -5,7 +5,7 @@ use protocol::message::{Heartbeat, Message, State};
 use protocol::packet::Epoch;
 use protocol::time::{Micros, Span};
 
-use super::{CellPacket, SYNC_GRACE, ANSWER_TIMEOUT, Session};
+use super::{ANSWER_TIMEOUT, CellPacket, SYNC_GRACE, Session};
 use crate::bus::StopReason;
 
 /// The packets and heartbeats that a cell sent during an exchange.
@@ -52,7 +52,9 @@ impl Session<'_> {
         let sync = self.send_messages(&[Message::Sync])?;
         let is_answer = |heard: &CellPacket| heard.beat().is_some() && heard.at >= sync;
         let answered = self.wait_for_answer(sync)?;
-        self.check("CMD-3", answered, || "a sync must be answered with a heartbeat, but none came".to_owned());
+        self.check("CMD-3", answered, || {
+            "a sync must be answered with a heartbeat, but none came".to_owned()
+        });
         let beats = |it: &Self| it.answers().iter().filter(|heard| heard.beat().is_some()).count();
         if self.answers().len() == beats(self) || self.known.senses {
             // A regular heartbeat may have come between, and a faulty cell may answer later.
@@ -69,7 +71,9 @@ impl Session<'_> {
                 self.idle(Span::from_millis(20))?;
             }
             let is_after = after(self);
-            self.check("CMD-3", is_after, || "the heartbeat to a sync must follow the torque, but came before it".to_owned());
+            self.check("CMD-3", is_after, || {
+                "the heartbeat to a sync must follow the torque, but came before it".to_owned()
+            });
         }
         let beat =
             self.answers().iter().rev().find_map(|heard| heard.beat().map(|(beat, epoch)| (*beat, epoch)));

@@ -5,7 +5,7 @@ use protocol::message::{AppliesFrom, Message, Request, SensorPage, SkinSensors, 
 use protocol::packet::{Epoch, Length, Words, padded_words};
 use protocol::parameters::{MAX_JOINTS, Parameter};
 
-use super::{Exchange, CellPacket, Session};
+use super::{CellPacket, Exchange, Session};
 use crate::arm;
 use crate::bus::StopReason;
 
@@ -43,14 +43,22 @@ impl Session<'_> {
     pub(crate) fn press(&mut self, skin: SkinSensors) -> Result<(), StopReason> {
         self.known.pending = Some(skin);
         let to = Node::Cell(self.cell);
-        self.send_messages(&[Message::Stimulus { to, from: AppliesFrom::Next, page: SensorPage::Skin(skin) }])?;
+        self.send_messages(&[Message::Stimulus {
+            to,
+            from: AppliesFrom::Next,
+            page: SensorPage::Skin(skin),
+        }])?;
         Ok(())
     }
 
     /// Sends a stimulus for the joints of an epoch.
     pub(crate) fn press_at(&mut self, first: u8, skin: SkinSensors) -> Result<(), StopReason> {
         let to = Node::Cell(self.cell);
-        self.send_messages(&[Message::Stimulus { to, from: AppliesFrom::Epoch(Epoch(first)), page: SensorPage::Skin(skin) }])?;
+        self.send_messages(&[Message::Stimulus {
+            to,
+            from: AppliesFrom::Epoch(Epoch(first)),
+            page: SensorPage::Skin(skin),
+        }])?;
         Ok(())
     }
 
@@ -69,13 +77,21 @@ impl Session<'_> {
     }
 
     /// Sends a stimulus for the next joints, then sends those joints, and returns their result.
-    pub(crate) fn press_and_step(&mut self, positions: &[i16; MAX_JOINTS], skin: SkinSensors) -> Result<JointsResult, StopReason> {
+    pub(crate) fn press_and_step(
+        &mut self,
+        positions: &[i16; MAX_JOINTS],
+        skin: SkinSensors,
+    ) -> Result<JointsResult, StopReason> {
         self.press(skin)?;
         self.step(positions)
     }
 
     /// Sends joints of an epoch other than the last one, and checks the answers.
-    pub(crate) fn step_at(&mut self, epoch: u8, positions: &[i16; MAX_JOINTS]) -> Result<JointsResult, StopReason> {
+    pub(crate) fn step_at(
+        &mut self,
+        epoch: u8,
+        positions: &[i16; MAX_JOINTS],
+    ) -> Result<JointsResult, StopReason> {
         let joints = self.joints(epoch, positions);
         if let Some(skin) = self.known.pending.take() {
             self.known.skin = Some(skin);
@@ -120,15 +136,24 @@ impl Session<'_> {
     }
 
     /// Checks the answers to joints.
-    fn check_torques(&mut self, epoch: u8, due: Option<ExpectedAnswer>, exchange: Exchange) -> Result<JointsResult, StopReason> {
+    fn check_torques(
+        &mut self,
+        epoch: u8,
+        due: Option<ExpectedAnswer>,
+        exchange: Exchange,
+    ) -> Result<JointsResult, StopReason> {
         let torques: Vec<_> =
             exchange.answers.iter().filter(|heard| heard.torque().is_some()).copied().collect();
         let count = torques.len();
-        self.check("JOINTS-6", count <= 1, || format!("joints {epoch} must be answered with at most one torque, but {count} came"));
+        self.check("JOINTS-6", count <= 1, || {
+            format!("joints {epoch} must be answered with at most one torque, but {count} came")
+        });
         for other in exchange.answers.iter().filter(|heard| heard.torque().is_none()) {
             if let Some(id) = self.known.unexpected(&other.message) {
                 let kind = other.message.id().kind.name();
-                self.check(id, false, || format!("joints must not be answered with a {kind} packet, but one came"));
+                self.check(id, false, || {
+                    format!("joints must not be answered with a {kind} packet, but one came")
+                });
             }
         }
         let first = torques.first().and_then(|heard| Some((heard.at, heard.torque()?.0, *heard.torque()?.1)));
@@ -158,9 +183,13 @@ impl Session<'_> {
             if self.known.parameters.is_some_and(|it| it.period_us == arm::fast_parameters(1).period_us) {
                 self.note_time("torque", exchange.at, at);
             }
-            self.check("JOINTS-6", of.0 == epoch, || format!("the torque that answers joints {epoch} must have their epoch, but has {of}"));
+            self.check("JOINTS-6", of.0 == epoch, || {
+                format!("the torque that answers joints {epoch} must have their epoch, but has {of}")
+            });
             if due == Some(ExpectedAnswer::Zeros) {
-                self.check("JOINTS-6", words.is_zero(), || "after a release the torque must be of zeros, but is not".to_owned());
+                self.check("JOINTS-6", words.is_zero(), || {
+                    "after a release the torque must be of zeros, but is not".to_owned()
+                });
             }
             self.check_words(&words);
             self.check_saturation(&words);
@@ -186,7 +215,11 @@ impl Session<'_> {
         });
         let beyond = words.padded().iter().skip(parameters.joint.into()).all(|word| *word == 0);
         self.check("J-1", beyond, || {
-            format!("torque words beyond joint {} must be 0, but the torque is {}", parameters.joint, arm::format_words(words.as_slice()))
+            format!(
+                "torque words beyond joint {} must be 0, but the torque is {}",
+                parameters.joint,
+                arm::format_words(words.as_slice())
+            )
         });
     }
 
@@ -207,7 +240,9 @@ impl Session<'_> {
                 format!("SATURATED must be set only after a torque at a limit of its range, but is {set}set after {words}")
             });
             let again = expected && rest.contains(&true);
-            self.check("STATE-2", !again, || "SATURATED must be set in one heartbeat only, but is set in two".to_owned());
+            self.check("STATE-2", !again, || {
+                "SATURATED must be set in one heartbeat only, but is set in two".to_owned()
+            });
             self.life.saturated = expected;
         }
     }
@@ -237,7 +272,10 @@ impl Session<'_> {
 
     /// Commits parameters, and puts the cell in test mode, not in contact and not halted. Returns true if the commit
     /// succeeded.
-    pub(crate) fn ready(&mut self, parameters: &protocol::parameters::Parameters) -> Result<bool, StopReason> {
+    pub(crate) fn ready(
+        &mut self,
+        parameters: &protocol::parameters::Parameters,
+    ) -> Result<bool, StopReason> {
         self.begin_exchange();
         self.send_messages(&[Message::Resume])?;
         self.known.halted = Some(false);

@@ -54,7 +54,9 @@ impl TrackedState {
     /// Returns the requirement that forbids the cell to send this packet unrequested.
     pub(crate) fn unexpected(&self, message: &Message) -> Option<&'static str> {
         match message {
-            Message::Network { page: NetworkPage::Received(_) | NetworkPage::Rejected(_), .. } => Some("CMD-4"),
+            Message::Network { page: NetworkPage::Received(_) | NetworkPage::Rejected(_), .. } => {
+                Some("CMD-4")
+            }
             Message::Network { .. } => None,
             Message::Sensors { .. } if self.senses => None,
             Message::Torque { .. } => Some("JOINTS-6"),
@@ -95,14 +97,22 @@ impl Session<'_> {
             if let Some(expected) = expected {
                 let is_set = state.has(bit);
                 self.check(id, is_set == expected, || {
-                    format!("{name} is {}set in state {:04X}, but the opposite was expected", if is_set { "" } else { "not " }, state.0)
+                    format!(
+                        "{name} is {}set in state {:04X}, but the opposite was expected",
+                        if is_set { "" } else { "not " },
+                        state.0
+                    )
                 });
             }
         }
         if let Some(parameters) = known.parameters {
             let expected = u16::from(parameters.joint);
             self.check("STATE-3", state.joint() == expected, || {
-                format!("joint {} is in state {:04X}, but joint {expected} was expected", state.joint(), state.0)
+                format!(
+                    "joint {} is in state {:04X}, but joint {expected} was expected",
+                    state.joint(),
+                    state.0
+                )
             });
         }
         if let Some(hash) = known.hash {
@@ -112,7 +122,9 @@ impl Session<'_> {
         }
         if let Some(expected) = known.epoch {
             self.check("JOINTS-3", epoch.0 == expected, || {
-                format!("a heartbeat must have the epoch of the last accepted joints, {expected}, but has {epoch}")
+                format!(
+                    "a heartbeat must have the epoch of the last accepted joints, {expected}, but has {epoch}"
+                )
             });
         }
     }

@@ -7,7 +7,7 @@
 use protocol::can::{Format, Frame};
 use protocol::id::{Id, Kind};
 use protocol::message::{Heartbeat, Message, NetworkPage, State};
-use protocol::packet::{Length, Lengths, Packet, Reassembly, Reassembler};
+use protocol::packet::{Length, Lengths, Packet, Reassembler, Reassembly};
 use protocol::time::Micros;
 
 use super::Session;
@@ -113,7 +113,8 @@ fn claim(held: &[(ObservedFrame, Id)], format: Format) -> Option<(Heartbeat, Vec
     let (packet, places) = match format {
         Format::Fd => (Packet::from_fd(&last.frame).ok()?, vec![held.len() - 1]),
         Format::Classic => {
-            let is_of_it = |(_, (seen, of)): &(usize, &(ObservedFrame, Id))| of == id && seen.frame.format() == format;
+            let is_of_it =
+                |(_, (seen, of)): &(usize, &(ObservedFrame, Id))| of == id && seen.frame.format() == format;
             let of_it: Vec<_> = held.iter().enumerate().filter(is_of_it).collect();
             // Pages have six words.
             let of_it = of_it.get(of_it.len().checked_sub(Length::Six.segments())?..)?;

@@ -3,10 +3,10 @@
 use protocol::can::{BIT_RATE_SWITCH, Format};
 use protocol::id::Id;
 use protocol::message::{Heartbeat, Message, State};
-use protocol::packet::{self, Lengths, Packet, PacketError, Reassembly, Reassembler};
+use protocol::packet::{self, Lengths, Packet, PacketError, Reassembler, Reassembly};
 use protocol::time::{Micros, Span};
 
-use super::{CellPacket, ANSWER_TIMEOUT, SILENCE_TIMEOUT, Session};
+use super::{ANSWER_TIMEOUT, CellPacket, SILENCE_TIMEOUT, Session};
 use crate::bus::{ObservedFrame, StopReason};
 
 impl Session<'_> {
@@ -61,7 +61,10 @@ impl Session<'_> {
                     continue;
                 }
                 self.check("SEND-1", false, || {
-                    format!("{frame} is not a packet: no other segment came within {} ms", ANSWER_TIMEOUT.0 / 1_000)
+                    format!(
+                        "{frame} is not a packet: no other segment came within {} ms",
+                        ANSWER_TIMEOUT.0 / 1_000
+                    )
                 });
             }
         }
@@ -71,13 +74,17 @@ impl Session<'_> {
     pub(super) fn handle_cell_frame(&mut self, seen: ObservedFrame, id: Id) {
         let frame = &seen.frame;
         if frame.format() != self.format {
-            self.check("SEND-1", false, || format!("the cell must not send {} frames on this bus, but sent one", frame.format().name()));
+            self.check("SEND-1", false, || {
+                format!("the cell must not send {} frames on this bus, but sent one", frame.format().name())
+            });
             return;
         }
         let packet = match self.format {
             Format::Fd => {
                 let switches = frame.flags() & BIT_RATE_SWITCH != 0;
-                self.check("SEND-1", switches, || format!("an FD frame must have the bit-rate switch, but {frame} does not"));
+                self.check("SEND-1", switches, || {
+                    format!("an FD frame must have the bit-rate switch, but {frame} does not")
+                });
                 Packet::from_fd(frame)
             }
             Format::Classic => {
@@ -129,11 +136,15 @@ impl Session<'_> {
             }
             if let Some((last, packets)) = self.life.sent {
                 let expected = last.wrapping_add(packets);
-                self.check("BEAT-4", sent == expected, || format!("sent must be {expected} in a heartbeat, by the packets that came, but is {sent}"));
+                self.check("BEAT-4", sent == expected, || {
+                    format!("sent must be {expected} in a heartbeat, by the packets that came, but is {sent}")
+                });
             }
             self.life.sent = Some((sent, 0));
             let version = state.version();
-            self.check("STATE-3", version == 1, || format!("a heartbeat must have version 1, but has {version}"));
+            self.check("STATE-3", version == 1, || {
+                format!("a heartbeat must have version 1, but has {version}")
+            });
             if let Some(expected) = self.about.serial {
                 self.check("ID-1", serial == expected, || {
                     format!("the serial number must stay {expected}, but is {serial} in a heartbeat")

@@ -2,12 +2,14 @@
 
 use model::decode::Decoded;
 use protocol::id::Node;
-use protocol::message::{Answer, ReceivedCounts as HeardPage, Message, NetworkPage, Readings, RejectedCounts, Request};
+use protocol::message::{
+    Answer, Message, NetworkPage, Readings, ReceivedCounts as HeardPage, RejectedCounts, Request,
+};
 use protocol::packet::{Epoch, WORDS, padded_words};
 use protocol::parameters::{Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
-use super::{CellPacket, ANSWER_TIMEOUT, Session};
+use super::{ANSWER_TIMEOUT, CellPacket, Session};
 use crate::bus::StopReason;
 
 /// The time within which all pages of a report come.
@@ -42,7 +44,8 @@ impl core::fmt::Display for Counters {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let (from, epoch) = (Node::Gateway, Epoch(0));
         let text = |page| Decoded::Message(Message::Network { from, epoch, page }).to_string();
-        let [heard, refused] = [NetworkPage::Received(self.heard), NetworkPage::Rejected(self.refused)].map(text);
+        let [heard, refused] =
+            [NetworkPage::Received(self.heard), NetworkPage::Rejected(self.refused)].map(text);
         let fields =
             |text: &str| text.split_once(": ").map_or_else(String::new, |(_, fields)| fields.to_owned());
         write!(f, "{}; refused: {}", fields(&heard), fields(&refused))
@@ -116,7 +119,11 @@ impl Session<'_> {
     }
 
     /// Writes the first words of a parameter, and zeros for the others.
-    pub(crate) fn write_first_words<const N: usize>(&mut self, number: u8, first: [i16; N]) -> Result<Reply, StopReason> {
+    pub(crate) fn write_first_words<const N: usize>(
+        &mut self,
+        number: u8,
+        first: [i16; N],
+    ) -> Result<Reply, StopReason> {
         self.write(number, padded_words(first))
     }
 
@@ -150,17 +157,27 @@ impl Session<'_> {
         let found = place.and_then(|place| configured(self.answers().get(place)?));
         let Some((answered, came, answer)) = found else {
             self.check(id, false, || {
-                format!("a request for parameter {number} must be answered within {} ms, but was not", longest.0 / 1_000)
+                format!(
+                    "a request for parameter {number} must be answered within {} ms, but was not",
+                    longest.0 / 1_000
+                )
             });
             return Ok(Reply::Nothing);
         };
         self.note_time(if is_commit { "commit" } else { "configured" }, at, answered);
-        self.check("CONF-12", came == tag, || format!("the answer must have the request's tag {tag:02X}, but has {came:02X}"));
+        self.check("CONF-12", came == tag, || {
+            format!("the answer must have the request's tag {tag:02X}, but has {came:02X}")
+        });
         let reply = match answer {
             Answer::Value { number: got, written, words } => {
-                self.check(id, got == number, || format!("the answer must name parameter {number}, but names {got}"));
+                self.check(id, got == number, || {
+                    format!("the answer must name parameter {number}, but names {got}")
+                });
                 self.check(id, written == is_write, || {
-                    format!("bit 0x80 must be set only in the answer to a write, but is {}set", if written { "" } else { "not " })
+                    format!(
+                        "bit 0x80 must be set only in the answer to a write, but is {}set",
+                        if written { "" } else { "not " }
+                    )
                 });
                 Reply::Value(words)
             }
@@ -185,7 +202,10 @@ impl Session<'_> {
             if before.is_none_or(|before| before.words(parameter) != words) {
                 let reply = self.write(parameter.number(), words)?;
                 self.check("CONF-4", reply == Reply::Value(words), || {
-                    format!("a write of parameter {} must be answered with its words, but the answer was {reply}", parameter.number())
+                    format!(
+                        "a write of parameter {} must be answered with its words, but the answer was {reply}",
+                        parameter.number()
+                    )
                 });
             }
         }
@@ -209,7 +229,9 @@ impl Session<'_> {
         let hash = parameters.hash();
         let reply = self.write_first_words(Parameter::Commit.number(), [hash.cast_signed()])?;
         let done = reply == Reply::Value(padded_words([hash.cast_signed()]));
-        self.check("CONF-7", done, || format!("a commit with the right hash {hash:04X} must be accepted, but the answer was {reply}"));
+        self.check("CONF-7", done, || {
+            format!("a commit with the right hash {hash:04X} must be accepted, but the answer was {reply}")
+        });
         if done {
             self.known.parameters = Some(*parameters);
             (self.known.hash, self.known.joints) = (Some(hash), parameters.joints);
@@ -251,7 +273,11 @@ impl Session<'_> {
         if !self.known.senses {
             let names: Vec<_> = pages.iter().map(|it| page_name(&it.message)).collect();
             self.check("CMD-4", names == order, || {
-                format!("a report was answered with {}, but must be answered with {}", names.join(", "), order.join(", "))
+                format!(
+                    "a report was answered with {}, but must be answered with {}",
+                    names.join(", "),
+                    order.join(", ")
+                )
             });
         }
         Ok(pages)
@@ -271,7 +297,9 @@ impl Session<'_> {
             }
         }
         let whole = heard.zip(refused);
-        self.check("CMD-4", whole.is_some(), || "a report must be answered with network pages 1 and 2, but they did not both come".to_owned());
+        self.check("CMD-4", whole.is_some(), || {
+            "a report must be answered with network pages 1 and 2, but they did not both come".to_owned()
+        });
         if let Some((heard, refused)) = whole {
             for (id, what) in self.life.accounts.compare(heard, refused) {
                 self.check(id, false, || what);

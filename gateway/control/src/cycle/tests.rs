@@ -67,7 +67,11 @@ impl Controller for Absent {
     fn step(&mut self, _: &Input) -> ControllerOutput {
         self.ticks += 1;
         let moves = [0.5; MAX_ROBOT_JOINTS];
-        if self.misses.contains(&self.ticks) { ControllerOutput::Bad(BadCycle::NoAnswer) } else { ControllerOutput::Move(moves) }
+        if self.misses.contains(&self.ticks) {
+            ControllerOutput::Bad(BadCycle::NoAnswer)
+        } else {
+            ControllerOutput::Move(moves)
+        }
     }
 }
 
@@ -106,7 +110,8 @@ fn a_bus_that_no_longer_carries_the_joints_makes_bad_cycles() {
     let skin = testing::skin();
     let limit = u64::from(skin.safety.hold_epochs + skin.safety.decay_epochs + 1);
     let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&skin).unwrap()));
-    let bad = |cycle: &mut Cycle, bus: &BusTotals, number| cycle.tick(tick(number), 0, [works(bus)]).record.bad;
+    let bad =
+        |cycle: &mut Cycle, bus: &BusTotals, number| cycle.tick(tick(number), 0, [works(bus)]).record.bad;
     for number in 0..=limit * 8 {
         assert_eq!(bad(&mut cycle, &bus, number), None, "tick {number}");
     }
@@ -129,7 +134,8 @@ impl Two {
         skin.safety.lost_bus = lost_bus;
         let robot = SimulatedArm::new(&skin, [0.0; MAX_ROBOT_JOINTS]);
         let controller = Box::new(Kinesthetic::new(&skin).unwrap());
-        let reference_torque = BusTotals { torque: [1.0; MAX_JOINTS], contributing: 1, ..BusTotals::default() };
+        let reference_torque =
+            BusTotals { torque: [1.0; MAX_JOINTS], contributing: 1, ..BusTotals::default() };
         let cycle = Cycle::new(&skin, controller, Box::new(robot));
         Self { cycle, buses: [reference_torque; 2], works: [true; 2], number: 0 }
     }
@@ -234,7 +240,11 @@ struct Present(std::ops::Range<u64>);
 impl Controller for Present {
     fn step(&mut self, input: &Input) -> ControllerOutput {
         let answers = self.0.contains(&input.tick);
-        if answers { ControllerOutput::Move([0.0; MAX_ROBOT_JOINTS]) } else { ControllerOutput::Bad(BadCycle::NoPeer) }
+        if answers {
+            ControllerOutput::Move([0.0; MAX_ROBOT_JOINTS])
+        } else {
+            ControllerOutput::Bad(BadCycle::NoPeer)
+        }
     }
 
     fn absence(&self, silent: Option<u32>) -> Option<Absence> {

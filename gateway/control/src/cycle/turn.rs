@@ -11,7 +11,7 @@ use protocol::packet::{Epoch, Length, Packet};
 use protocol::parameters::MAX_JOINTS;
 
 use crate::cycle::carried::BusInput;
-use crate::cycle::{Cycle, TickRecord, CentralTorque, Tick};
+use crate::cycle::{CentralTorque, Cycle, Tick, TickRecord};
 use crate::external::Absence;
 use model::scenario::{Mode, Scenario};
 use model::table::Snapshot;
@@ -223,7 +223,8 @@ impl TickDriver {
     /// Queues the last halt or resume for buses that work again and for buses whose cells have returned. The cells may
     /// have missed commands that the bus accepted just before its loss or before the cells returned.
     fn requeue_for_returned_buses(&mut self, halted: bool) {
-        for ((line, owed), worked) in self.lines.iter().zip(&mut self.pending_commands).zip(&mut self.worked) {
+        for ((line, owed), worked) in self.lines.iter().zip(&mut self.pending_commands).zip(&mut self.worked)
+        {
             let works = line.state.is_there();
             // Load before swap: a swap in every tick is costly, and the flag is rarely set.
             let returned = &line.state.returned;

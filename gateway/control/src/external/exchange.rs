@@ -4,8 +4,8 @@
 use std::path::PathBuf;
 
 use super::absence::{Absence, OtherDatagrams};
-use super::datagram::{JointCommand, ReceivedDatagram, InvalidDatagram};
-use crate::controller::{BadCycle, Input, SpeedLimits, ControllerOutput};
+use super::datagram::{InvalidDatagram, JointCommand, ReceivedDatagram};
+use crate::controller::{BadCycle, ControllerOutput, Input, SpeedLimits};
 
 /// Numbers of events since the start of the exchange.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
@@ -117,7 +117,8 @@ impl Exchange {
     pub(super) fn handle(&mut self, bytes: &[u8], sender: Sender) -> bool {
         let answer = match (ReceivedDatagram::decode(bytes, self.joints), sender) {
             (Ok(ReceivedDatagram::Hello), _) => {
-                let counts = ExchangeCounts { hellos: self.counts.hellos + 1, ..core::mem::take(&mut self.counts) };
+                let counts =
+                    ExchangeCounts { hellos: self.counts.hellos + 1, ..core::mem::take(&mut self.counts) };
                 // A second hello of the peer keeps its pending answer.
                 if sender == Sender::Other || !self.connected {
                     *self = Self::new(self.joints);
@@ -164,7 +165,9 @@ impl Exchange {
         }
         match (answer, due) {
             _ if nonsense => ControllerOutput::Bad(BadCycle::Nonsense),
-            (Some(JointCommand::Velocity(velocity)), _) => ControllerOutput::Move(pace.limited(velocity, input)),
+            (Some(JointCommand::Velocity(velocity)), _) => {
+                ControllerOutput::Move(pace.limited(velocity, input))
+            }
             (Some(JointCommand::Position(goal)), _) => ControllerOutput::Move(pace.towards(&goal, input)),
             (None, Some(_)) => ControllerOutput::Bad(BadCycle::NoAnswer),
             (None, None) => ControllerOutput::Bad(BadCycle::NoPeer),

@@ -15,7 +15,7 @@ mod exchange;
 mod socket;
 
 pub use absence::{Absence, OtherDatagrams};
-pub use datagram::{AnswerDatagram, JointCommand, InvalidDatagram, StateDatagram};
+pub use datagram::{AnswerDatagram, InvalidDatagram, JointCommand, StateDatagram};
 pub use socket::{External, SocketError};
 
 #[cfg(test)]

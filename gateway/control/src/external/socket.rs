@@ -14,8 +14,8 @@ use thiserror::Error;
 
 use super::absence::Absence;
 use super::datagram::{MAX_ANSWER_BYTES, StateDatagram};
-use super::exchange::{Exchange, Sender, SendResult};
-use crate::controller::{Controller, Input, SpeedLimits, ControllerOutput};
+use super::exchange::{Exchange, SendResult, Sender};
+use crate::controller::{Controller, ControllerOutput, Input, SpeedLimits};
 
 /// Maximum number of datagrams that are received per tick. Others remain in the socket's queue, so that no sender can
 /// delay the tick.

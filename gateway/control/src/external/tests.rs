@@ -8,7 +8,7 @@ use tempfile::TempDir;
 
 use super::datagram::ReceivedDatagram;
 use super::*;
-use crate::controller::{BadCycle, Controller, Input, ControllerOutput};
+use crate::controller::{BadCycle, Controller, ControllerOutput, Input};
 use model::testing::skin;
 use protocol::packet::padded;
 
@@ -107,7 +107,10 @@ fn an_answer_is_the_bytes_of_the_documented_table() {
     assert_eq!(bytes[..24], *b"SKBC\x01\x00\x02\x00\x07\0\0\0\0\0\0\0\x02\0\0\0\0\0\0\0");
     assert_eq!(bytes[24..32], *b"\0\0\0\0\0\0\0\xc0");
     assert_eq!(bytes[64..], *b"\0\0\0\0\0\0\xf0\x3f");
-    assert_eq!(ReceivedDatagram::decode(&bytes, 6), Ok(ReceivedDatagram::Answer(AnswerDatagram { tick: 7, command })));
+    assert_eq!(
+        ReceivedDatagram::decode(&bytes, 6),
+        Ok(ReceivedDatagram::Answer(AnswerDatagram { tick: 7, command }))
+    );
 }
 
 #[test]
@@ -116,7 +119,11 @@ fn an_answer_is_executed_in_the_next_tick() {
     assert_eq!(gateway.step(&input(0)), ControllerOutput::Bad(BadCycle::NoPeer));
     let program = program(&folder, "program");
     program.send(HELLO).unwrap();
-    assert_eq!(gateway.step(&input(1)), ControllerOutput::Bad(BadCycle::NoPeer), "it has not got a state yet");
+    assert_eq!(
+        gateway.step(&input(1)),
+        ControllerOutput::Bad(BadCycle::NoPeer),
+        "it has not got a state yet"
+    );
     assert_eq!(state(&program), StateDatagram { input: input(1), joints: 6 });
     program.send(&velocity(1, 0.5)).unwrap();
     assert_eq!(gateway.step(&input(2)), ControllerOutput::Move(padded(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0])));
@@ -204,11 +211,19 @@ fn the_sender_of_the_last_hello_is_the_peer_and_others_are_ignored() {
     assert_eq!(count(&gateway, "other senders"), 2);
     second.send(HELLO).unwrap();
     first.send(&velocity(2, 0.5)).unwrap();
-    assert_eq!(gateway.step(&input(3)), ControllerOutput::Bad(BadCycle::NoPeer), "the new one has not got a state yet");
+    assert_eq!(
+        gateway.step(&input(3)),
+        ControllerOutput::Bad(BadCycle::NoPeer),
+        "the new one has not got a state yet"
+    );
     second.send(HELLO).unwrap();
     second.send(&velocity(3, 0.25)).unwrap();
     let step = gateway.step(&input(4));
-    assert_eq!(step, ControllerOutput::Move(padded(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])), "a second hello changes nothing");
+    assert_eq!(
+        step,
+        ControllerOutput::Move(padded(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])),
+        "a second hello changes nothing"
+    );
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::controller::{Controller, Input, ControllerOutput};
+use crate::controller::{Controller, ControllerOutput, Input};
 use crate::external::External;
 use protocol::packet::padded;
 use protocol::skin::Skin;

@@ -2,7 +2,7 @@
 //! skin are computed centrally.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
-use crate::controller::{Input, ControllerOutput};
+use crate::controller::{ControllerOutput, Input};
 use crate::motion::controller_of;
 use crate::robot::{Robot, SimulatedArm};
 use model::central::Central;
@@ -60,7 +60,9 @@ fn play(scenario: &str) -> Most {
         let (q, qdot) = (arm.positions(), arm.velocities());
         let time = Micros(tick * 2_000);
         let input = Input { tick, time, q, qdot, torque: padded(&torque), valid: true, ..Input::default() };
-        let ControllerOutput::Move(velocity) = controller.step(&input) else { unreachable!("the input is valid") };
+        let ControllerOutput::Move(velocity) = controller.step(&input) else {
+            unreachable!("the input is valid")
+        };
         most.at_limit |= arm.step(&velocity, 0.002).at_limit;
         for (q, start) in arm.positions().iter().zip(start) {
             most.way = most.way.max((q - start).abs());

@@ -16,7 +16,7 @@ use std::io;
 use std::path::Path;
 
 use nalgebra::{Matrix3, Point3, Vector3};
-use protocol::xml::{XmlFault, ForeignFile, detect_foreign};
+use protocol::xml::{ForeignFile, XmlFault, detect_foreign};
 use thiserror::Error;
 
 pub use simplify::simplify;

@@ -12,7 +12,7 @@ use std::env;
 use std::path::PathBuf;
 
 use crate::mesh::{Mesh, Triangle, UpAxis};
-use crate::{CoverCell, RobotLink, CoverOptions, LinkMesh, Cover, cover};
+use crate::{Cover, CoverCell, CoverOptions, LinkMesh, RobotLink, cover};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;

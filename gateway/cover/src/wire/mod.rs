@@ -36,7 +36,11 @@ pub(crate) fn wire(placed: &[Vec<CellPosition>], options: &CoverOptions) -> (Vec
     let buses = shares(&sizes, options.nodes_per_bus);
     let all = placed.iter().enumerate().flat_map(|(link, spots)| {
         let limb = Limb::from_cells(spots);
-        limb.order(spots, options.pitch).into_iter().map(move |spot| UnwiredCell { link, spot, axis: limb.axis })
+        limb.order(spots, options.pitch).into_iter().map(move |spot| UnwiredCell {
+            link,
+            spot,
+            axis: limb.axis,
+        })
     });
     let mut all = all.collect::<Vec<_>>().into_iter();
     let mut cells = Vec::new();
@@ -65,8 +69,10 @@ fn shares(links: &[usize], budget: usize) -> Vec<usize> {
         let off = |share: &usize| share.abs_diff(even);
         let of_links =
             ends.iter().map(|end| end.saturating_sub(from)).filter(|share| possible.contains(share));
-        let share =
-            of_links.filter(|share| real(off(share)) <= MAX_UNEVENNESS * real(budget)).min_by_key(off).unwrap_or(even);
+        let share = of_links
+            .filter(|share| real(off(share)) <= MAX_UNEVENNESS * real(budget))
+            .min_by_key(off)
+            .unwrap_or(even);
         shares.push(share);
         from += share;
     }

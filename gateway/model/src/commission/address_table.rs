@@ -4,7 +4,7 @@ use protocol::id::CellId;
 use protocol::message::Heartbeat;
 use protocol::time::Micros;
 
-use crate::tracker::{AddressClaim, PerCell, HeartbeatKind};
+use crate::tracker::{AddressClaim, HeartbeatKind, PerCell};
 
 /// The owner of each node id of a bus, from the heartbeats received.
 #[derive(Debug, Default)]
@@ -16,10 +16,18 @@ impl AddressTable {
     ///
     /// A single change of the serial number means that one cell replaced another; only a change back proves that both
     /// are present. A claim for a node id with an owner does not change the owner, because the claiming cell yields.
-    pub(super) fn receive_heartbeat(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat) -> Option<[u32; 2]> {
+    pub(super) fn receive_heartbeat(
+        &mut self,
+        now: Micros,
+        number: CellId,
+        heartbeat: &Heartbeat,
+    ) -> Option<[u32; 2]> {
         let claim = self.0.get_mut(number)?;
         let before = *claim;
-        let took = matches!(claim.receive(now, heartbeat), HeartbeatKind::Started { again: true } | HeartbeatKind::Shared);
+        let took = matches!(
+            claim.receive(now, heartbeat),
+            HeartbeatKind::Started { again: true } | HeartbeatKind::Shared
+        );
         let [holder, earlier] = [before.serial()?, before.previous()?];
         (took && claim.serial() == Some(earlier) && earlier != holder).then_some([earlier, holder])
     }

@@ -33,7 +33,7 @@ use address_table::AddressTable;
 use task::{Stage, Task};
 
 use crate::repeat::{Attempt, Limits, RetryAction};
-pub use outcome::{Outcome, Reason, Step, AbortReason};
+pub use outcome::{AbortReason, Outcome, Reason, Step};
 pub use report::{CellReport, Progress, Report, UnknownNode};
 pub use task::CommissionOptions;
 
@@ -110,8 +110,10 @@ impl Commission {
     /// receive buffer can hold without loss.
     #[must_use]
     pub fn new(skin: &Skin, bus: usize, wish: CommissionOptions, room: usize, now: Micros) -> Self {
-        let tasks: Vec<_> =
-            skin.cells_on_bus(bus).map(|cell| Task::new(cell.serial, cell.node, skin.parameters(cell))).collect();
+        let tasks: Vec<_> = skin
+            .cells_on_bus(bus)
+            .map(|cell| Task::new(cell.serial, cell.node, skin.parameters(cell)))
+            .collect();
         let by_serial = tasks.iter().enumerate().map(|(place, task)| (task.serial, place)).collect();
         let others = skin.cells.iter().filter(|cell| cell.bus != bus);
         let elsewhere =

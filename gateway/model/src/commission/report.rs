@@ -4,7 +4,7 @@ use protocol::id::CellId;
 use serde::Serialize;
 
 use super::task::{Stage, Task};
-use super::{Commission, Outcome, Phase, Reason, AbortReason, is_failed};
+use super::{AbortReason, Commission, Outcome, Phase, Reason, is_failed};
 
 /// The progress of a commissioning, for display.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]

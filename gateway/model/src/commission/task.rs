@@ -10,7 +10,8 @@ use super::outcome::{Outcome, Reason, Step};
 use crate::repeat::{Attempt, Limits, RetryAction};
 
 /// Retry limit and timeout of a request to one cell.
-const REQUEST_LIMITS: Limits = Limits { first: Span::from_millis(100), longest: Span::from_millis(800), tries: 6 };
+const REQUEST_LIMITS: Limits =
+    Limits { first: Span::from_millis(100), longest: Span::from_millis(800), tries: 6 };
 /// Retry limit and timeouts of a commit request; longer than [`ANSWER`], because the cell writes its flash.
 const COMMIT_LIMITS: Limits = Limits { first: Span::from_millis(400), ..REQUEST_LIMITS };
 /// Maximum number of times that the writing of a cell starts over after the cell restarted meanwhile.
@@ -151,7 +152,13 @@ impl Task {
     }
 
     /// Records a heartbeat that arrived under a node id.
-    pub(super) fn handle_heartbeat(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat, wish: CommissionOptions) {
+    pub(super) fn handle_heartbeat(
+        &mut self,
+        now: Micros,
+        number: CellId,
+        heartbeat: &Heartbeat,
+        wish: CommissionOptions,
+    ) {
         if let Some(old) = self.number.filter(|&old| old != number) {
             // One change is a cell with a new node id; a change back means two cells.
             if self.before == Some(number) {
@@ -269,7 +276,14 @@ impl Task {
     }
 
     /// Handles an answer of the cell to the pending request, or to the broadcast request `call` with this tag.
-    pub(super) fn answer(&mut self, now: Micros, tag: u8, answer: Answer, call: Option<Step>, wish: CommissionOptions) {
+    pub(super) fn answer(
+        &mut self,
+        now: Micros,
+        tag: u8,
+        answer: Answer,
+        call: Option<Step>,
+        wish: CommissionOptions,
+    ) {
         let own = self.pending.filter(|pending| pending.tag == tag).map(|pending| pending.step);
         let called = call.filter(|&step| self.needs(step));
         let Some(step) = own.or(called) else { return };

@@ -103,7 +103,8 @@ fn a_write_is_repeated_after_100_ms_and_a_commit_after_400() {
 fn other_gateways_hear_of_one_that_sends() {
     let skin = skin(1);
     let announced = |dry_run| {
-        let mut commission = Commission::new(&skin, 0, CommissionOptions { dry_run, verify: false }, 1_000, Micros(0));
+        let mut commission =
+            Commission::new(&skin, 0, CommissionOptions { dry_run, verify: false }, 1_000, Micros(0));
         let mut times = Vec::new();
         while let Some(now) = commission.poll_timeout().filter(|now| *now <= Micros(1_000_000)) {
             assert!(!commission.may_send() || now > Micros(0) + LISTEN_TIME);

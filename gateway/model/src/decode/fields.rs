@@ -6,7 +6,7 @@ use protocol::message::State;
 use protocol::packet::WORDS;
 use protocol::schema::{self, Field, FieldFormat, Layout, TextPart, TextPiece, Units};
 
-use super::ports::{PortSet, Port, write_neighbors, joined};
+use super::ports::{Port, PortSet, joined, write_neighbors};
 
 /// The words of the parameter with this number, formatted as values with units.
 #[derive(Clone, Copy, Debug)]

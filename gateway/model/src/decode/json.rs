@@ -286,7 +286,9 @@ mod tests {
                     assert_eq!(text.iter().filter(|&&byte| byte == b'\n').count(), 1);
                     all.push((comment.to_owned(), serde_json::from_slice(&text).unwrap()));
                 }
-                CandumpLine::Dropped { .. } | CandumpLine::CanXl | CandumpLine::Other => comment = line.trim_start_matches("# "),
+                CandumpLine::Dropped { .. } | CandumpLine::CanXl | CandumpLine::Other => {
+                    comment = line.trim_start_matches("# ")
+                }
             }
         }
         all

@@ -4,7 +4,7 @@ use protocol::fixed::{OutOfRange, Q, Q1_14};
 use protocol::packet::WORDS;
 use protocol::parameters::Parameter;
 use protocol::port::{PORTS, UPLINK};
-use protocol::schema::{self, Field, FieldFormat, Layout, FieldRange};
+use protocol::schema::{self, Field, FieldFormat, FieldRange, Layout};
 use thiserror::Error;
 
 pub use super::fields::{ParameterName, ParameterWords};

@@ -298,8 +298,10 @@ mod tests {
     fn identifiers_are_compared_by_the_bits_of_the_mask() {
         let ids = [0x000, 0x001, 0x20C, 0x50C, 0x5FF, 0x1234 | EXTENDED, 0x20C | EXTENDED];
         let taken = |words: &[&str]| -> Vec<u32> {
-            let pick =
-                FrameFilter { ids: words.iter().map(|word| word.parse().unwrap()).collect(), ..FrameFilter::default() };
+            let pick = FrameFilter {
+                ids: words.iter().map(|word| word.parse().unwrap()).collect(),
+                ..FrameFilter::default()
+            };
             ids.into_iter().filter(|&id| takes(&pick, &frame(id))).collect()
         };
         assert_eq!(taken(&["0x20C"]), [0x20C]);

@@ -18,7 +18,12 @@ impl Display for Port {
 }
 
 /// Writes the neighbour at each of `ports` ports.
-pub(super) fn write_neighbors(f: &mut Formatter<'_>, parts: &[Field], bytes: &[u8], ports: usize) -> fmt::Result {
+pub(super) fn write_neighbors(
+    f: &mut Formatter<'_>,
+    parts: &[Field],
+    bytes: &[u8],
+    ports: usize,
+) -> fmt::Result {
     for index in 0..ports {
         let word = bytes.get(2 * index..).unwrap_or_default();
         let part =

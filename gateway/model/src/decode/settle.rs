@@ -99,7 +99,8 @@ impl<T> Settler<T> {
     /// Removes and returns the oldest frame with its class; `None` if that class is still open.
     pub fn pop(&mut self) -> Option<(T, Decoded)> {
         if let Entry { at, state: State::Waits(bus, id), .. } = *self.waiting.front()? {
-            let is_in_time = self.now.elapsed_since(at) <= Span(Reassembler::max_gap(id).0 + REORDER_TOLERANCE.0);
+            let is_in_time =
+                self.now.elapsed_since(at) <= Span(Reassembler::max_gap(id).0 + REORDER_TOLERANCE.0);
             if is_in_time && !self.is_at_end && self.waiting.len() < MAX_PENDING_FRAMES {
                 return None;
             }

@@ -27,7 +27,9 @@ fn decoded(log: &str, format: Option<Format>) -> Vec<(String, String)> {
                 let at = Micros(record.time.nanos / 1_000);
                 settler.push(at, record.interface, &record.frame, comment.to_owned());
             }
-            CandumpLine::Dropped { .. } | CandumpLine::CanXl | CandumpLine::Other => comment = line.trim_start_matches("# "),
+            CandumpLine::Dropped { .. } | CandumpLine::CanXl | CandumpLine::Other => {
+                comment = line.trim_start_matches("# ")
+            }
         }
     }
     settler.finish();

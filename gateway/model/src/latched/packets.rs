@@ -22,7 +22,7 @@ use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use crate::packets::{Content, PacketReader};
-use crate::tracker::{AddressClaim, Contact, PerCell, HeartbeatKind};
+use crate::tracker::{AddressClaim, Contact, HeartbeatKind, PerCell};
 
 /// A frame that was received from the bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -421,7 +421,8 @@ mod tests {
         };
         let placed_packet = [write(1, 1), write(127, 9), taken, write(2, 1), write(1, 2), write(7, 1)];
         let placed_packet = [&placed_packet[..], &[stimulus(3, 1.0, 0), joints(0)]].concat();
-        let kept = |force: &LatchedPackets| force.frames().iter().map(|seen| seen.at_nanos).collect::<Vec<_>>();
+        let kept =
+            |force: &LatchedPackets| force.frames().iter().map(|seen| seen.at_nanos).collect::<Vec<_>>();
         (0..).zip(&placed_packet).for_each(|(at, message)| drop(say(&mut force, at, Format::Fd, message)));
         assert_eq!(kept(&force), [0, 1, 3, 4, 5, 6, 7]);
         say(&mut force, 8, Format::Fd, &claims(0));

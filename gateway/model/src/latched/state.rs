@@ -11,13 +11,15 @@
 
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node};
-use protocol::message::{AppliesFrom, Joints, Message, NetworkPage, Readings, Request, SensorPage, SkinSensors};
+use protocol::message::{
+    AppliesFrom, Joints, Message, NetworkPage, Readings, Request, SensorPage, SkinSensors,
+};
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use super::touched::KnownContacts;
-use crate::tracker::{AddressClaim, Contact, PerCell, HeartbeatKind};
+use crate::tracker::{AddressClaim, Contact, HeartbeatKind, PerCell};
 
 /// Maximum number of messages since the last joints that are kept for a replay.
 const MAX_PENDING_MESSAGES: usize = 16_384;
@@ -277,8 +279,10 @@ mod tests {
     }
 
     fn mode(to: Node, words: i16) -> Message {
-        let request =
-            Request::Write { number: Parameter::Mode.number(), words: protocol::packet::padded_words([words]) };
+        let request = Request::Write {
+            number: Parameter::Mode.number(),
+            words: protocol::packet::padded_words([words]),
+        };
         Message::Configure { to, tag: 0, request }
     }
 
@@ -342,7 +346,14 @@ mod tests {
             assert_eq!(restored(&said), [Message::Resume, joints(3)]);
         }
         let measure = mode(Node::Everyone, 0);
-        let said = [to(1, AppliesFrom::Next, 1.0), joints(1), measure, to(1, AppliesFrom::Next, 1.0), joints(2), joints(3)];
+        let said = [
+            to(1, AppliesFrom::Next, 1.0),
+            joints(1),
+            measure,
+            to(1, AppliesFrom::Next, 1.0),
+            joints(2),
+            joints(3),
+        ];
         assert_eq!(restored(&said), [measure, Message::Resume, joints(3)]);
     }
 
@@ -429,7 +440,10 @@ mod tests {
         state.apply(&Message::Stimulus { to: Node::Everyone, from: AppliesFrom::Next, page: press(1.0) });
         state.apply(&joints(1));
         let messages = state.restoring(|it| it.get() == 7, None);
-        assert_eq!(messages, [Message::Resume, joints(255), joints(0), to(7, AppliesFrom::Next, 1.0), joints(1)]);
+        assert_eq!(
+            messages,
+            [Message::Resume, joints(255), joints(0), to(7, AppliesFrom::Next, 1.0), joints(1)]
+        );
     }
 
     #[test]
@@ -444,8 +458,15 @@ mod tests {
             tag: 0,
             request: Request::Write { number, words: [1; 6] },
         };
-        let said =
-            [owner, write(7), to(1, AppliesFrom::Next, 1.0), joints(1), joints(2), to(1, AppliesFrom::Next, 2.0), write(8)];
+        let said = [
+            owner,
+            write(7),
+            to(1, AppliesFrom::Next, 1.0),
+            joints(1),
+            joints(2),
+            to(1, AppliesFrom::Next, 2.0),
+            write(8),
+        ];
         let whole = restored(&said);
         for at in 1..=said.len() {
             let (before, after) = said.split_at(at);

@@ -163,7 +163,8 @@ impl Uplinks {
             let skipped = now.elapsed_since(self.next_hello).0 / HELLO_INTERVAL.0;
             self.next_hello = self.next_hello + Span((skipped + 1) * HELLO_INTERVAL.0);
             for wire in &mut self.wires {
-                wire.is_child &= wire.last_hello.is_some_and(|(_, at)| now.elapsed_since(at) <= HELLO_TIMEOUT);
+                wire.is_child &=
+                    wire.last_hello.is_some_and(|(_, at)| now.elapsed_since(at) <= HELLO_TIMEOUT);
             }
             self.hello_to_all(now);
         }
@@ -176,7 +177,8 @@ impl Uplinks {
 
     /// Returns the index of a root that has a cell without a node id below it.
     fn needs_node_ids(&self) -> Option<usize> {
-        let needs = |wire: &&Wire| wire.is_child && wire.last_hello.is_some_and(|(hello, _)| hello.unnumbered);
+        let needs =
+            |wire: &&Wire| wire.is_child && wire.last_hello.is_some_and(|(hello, _)| hello.unnumbered);
         self.wires.iter().find(needs).map(|wire| wire.root)
     }
 

@@ -22,7 +22,7 @@ use core::f64::consts::TAU;
 use std::path::Path;
 
 use protocol::document::{self, DocumentError};
-use protocol::skin::{SKIN_KEYS, MAX_ROBOT_JOINTS, Skin};
+use protocol::skin::{MAX_ROBOT_JOINTS, SKIN_KEYS, Skin};
 use protocol::time::{Micros, Span};
 use serde::{Deserialize, Serialize};
 

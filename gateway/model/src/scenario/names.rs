@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use protocol::document::{Checked, KeyPath};
 use protocol::port::PORTS;
-use protocol::skin::{CellName, SkinReply, Skin};
+use protocol::skin::{CellName, Skin, SkinReply};
 
 use super::raw;
 use crate::listing::ranges;

@@ -92,7 +92,9 @@ fn drawn(at: &KeyPath, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile
             path.fault(got, "a point [t_s, force_n] with t_s above 0 is needed: there the touch ends")
         );
     };
-    if let Some(for_s) = raw.for_s.filter(|seconds| !(*seconds >= 0.0 && span_from_seconds(*seconds) == length)) {
+    if let Some(for_s) =
+        raw.for_s.filter(|seconds| !(*seconds >= 0.0 && span_from_seconds(*seconds) == length))
+    {
         let why = format!("the points of the profile end at {} s: leave for_s out", length.seconds());
         return Err(at.key("for_s").fault(for_s, why));
     }

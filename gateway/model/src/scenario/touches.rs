@@ -193,7 +193,9 @@ impl Touches {
         for wrong in touched.faults.iter().filter(|wrong| wrong.holds_at(time)) {
             match wrong.fault {
                 SensorFault::Stuck => there.is_stuck = true,
-                SensorFault::Drift { n_per_s } => there.added_n += n_per_s * seconds(time.elapsed_since(wrong.at)),
+                SensorFault::Drift { n_per_s } => {
+                    there.added_n += n_per_s * seconds(time.elapsed_since(wrong.at))
+                }
             }
         }
         there
@@ -294,7 +296,9 @@ impl Touches {
         let stuck = faults().filter(|wrong| wrong.fault == SensorFault::Stuck).map(|wrong| wrong.at).min();
         let time = stuck.unwrap_or(time);
         let drift = touched.faults.iter().map(|wrong| match wrong.fault {
-            SensorFault::Drift { n_per_s } if wrong.holds_at(time) => n_per_s * seconds(time.elapsed_since(wrong.at)),
+            SensorFault::Drift { n_per_s } if wrong.holds_at(time) => {
+                n_per_s * seconds(time.elapsed_since(wrong.at))
+            }
             SensorFault::Drift { .. } | SensorFault::Stuck => 0.0,
         });
         let levels = touched

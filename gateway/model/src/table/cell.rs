@@ -1,7 +1,9 @@
 //! The gateway's state of one cell of a bus.
 
 use protocol::id::CellId;
-use protocol::message::{Answer, AppliesFrom, Heartbeat, NetworkPages, Readings, SensorPage, SkinSensors, State};
+use protocol::message::{
+    Answer, AppliesFrom, Heartbeat, NetworkPages, Readings, SensorPage, SkinSensors, State,
+};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::{Events, LinksDown, Parameter, Parameters};
@@ -16,7 +18,7 @@ use super::sensed::SensorFrames;
 use super::sent::SentJoints;
 use super::status::Status;
 use super::switched::{SWITCHES, Switch, SwitchStates};
-use crate::tracker::{Contact, CellTracker, Update, Uplink, HeartbeatKind};
+use crate::tracker::{CellTracker, Contact, HeartbeatKind, Update, Uplink};
 
 /// The packets that a cell has sent since they were requested.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -168,7 +170,8 @@ impl CellState {
     /// Applies a heartbeat of the cell. Returns the change of the running sum.
     pub(super) fn take_heartbeat(&mut self, update: &Update, heartbeat: &Heartbeat, epoch: Epoch) -> Change {
         // Ignores heartbeats of a cell that does not own the node id.
-        let of_owner = |word: &HeartbeatKind| !matches!(word, HeartbeatKind::Claimant | HeartbeatKind::Outsider);
+        let of_owner =
+            |word: &HeartbeatKind| !matches!(word, HeartbeatKind::Claimant | HeartbeatKind::Outsider);
         let Some(word) = update.word.filter(of_owner) else { return Change::default() };
         let started = matches!(word, HeartbeatKind::Started { .. } | HeartbeatKind::Shared);
         (self.said.heartbeat, self.last_joints) = (true, epoch);
@@ -216,7 +219,10 @@ impl CellState {
     #[must_use]
     pub fn is_ready(&self) -> bool {
         let claim = self.tracked.claim();
-        !self.tracked.is_dead() && !self.halt.halted && claim.is_settled() && claim.has_state(State::CONFIGURED)
+        !self.tracked.is_dead()
+            && !self.halt.halted
+            && claim.is_settled()
+            && claim.has_state(State::CONFIGURED)
     }
 
     /// Returns the newest sensor values by the stimuli and pages received; the default for unknown ones.

@@ -11,7 +11,7 @@ use super::held::Change;
 use super::replies::ReplyExpectation;
 use super::root_totals::{RootTotals, Sum, SumUse};
 use super::{Event, Notice, Positions, Table};
-use crate::tracker::{Update, HeartbeatKind};
+use crate::tracker::{HeartbeatKind, Update};
 
 /// Parameters whose write changes at once how a cell answers.
 const SWITCHED: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];
@@ -189,7 +189,8 @@ impl Table {
         if lag == 0 {
             broadcast.last_reply = Some(at);
             broadcast.in_time += u32::from(asked == ReplyExpectation::Due);
-            broadcast.is_whole &= asked == ReplyExpectation::Due || is_zero && asked == ReplyExpectation::NotDue;
+            broadcast.is_whole &=
+                asked == ReplyExpectation::Due || is_zero && asked == ReplyExpectation::NotDue;
         }
         if let (ReplyExpectation::Due, Some(expected)) = (asked, cell.outstanding.expected(number)) {
             let error =

@@ -34,7 +34,7 @@ use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Heartbeat, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::{Events, MAX_JOINTS, Sensing};
-use protocol::skin::{SkinReply, Safety, Skin};
+use protocol::skin::{Safety, Skin, SkinReply};
 use protocol::time::Micros;
 
 use crate::central::Central;
@@ -173,7 +173,8 @@ impl Table {
             let switched = SwitchStates::new(skin.events, sensing, described.baseline);
             cells.push(CellState::new(described, &part.parameters(described), summed, switched));
         }
-        let snapshot = Snapshot { sums: BusTotals::default(), sensors: vec![SkinSensors::default(); cells.len()] };
+        let snapshot =
+            Snapshot { sums: BusTotals::default(), sensors: vec![SkinSensors::default(); cells.len()] };
         Self {
             carried: BusFormat {
                 torque_format: skin.buses.get(bus).map(|bus| bus.torque_format).unwrap_or_default(),
@@ -322,7 +323,11 @@ impl Table {
         let (id, event) = match received.content {
             Content::Message(id, _, ref message) => {
                 self.counters.frame(id.kind, own);
-                return if own { self.receive_own(at, message, positions) } else { self.receive_foreign(at, id, message) };
+                return if own {
+                    self.receive_own(at, message, positions)
+                } else {
+                    self.receive_foreign(at, id, message)
+                };
             }
             Content::NotData => {
                 let is_error = received.frame.is_error();

@@ -48,7 +48,13 @@ impl SentJoints {
     /// Records a start of the cell; `sent` is its counter of sent packets, and `of` has the numbers of replies
     /// outstanding and in doubt. If `taken_back`, the apparent start was none: the earlier counts continue, and the
     /// returned number of replies is in doubt.
-    pub(super) fn restart(&mut self, word: HeartbeatKind, taken_back: bool, sent: u16, of: (u32, u64)) -> Option<u64> {
+    pub(super) fn restart(
+        &mut self,
+        word: HeartbeatKind,
+        taken_back: bool,
+        sent: u16,
+        of: (u32, u64),
+    ) -> Option<u64> {
         let (outstanding, in_doubt) = of;
         if let Some((before, _)) = &mut self.before {
             before.joints += self.since.joints;

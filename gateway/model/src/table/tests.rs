@@ -2,7 +2,7 @@
 
 use super::*;
 use protocol::can::Format;
-use protocol::message::{Answer, ReceivedCounts, Joints, Message, NetworkPage, Request, SensorPage, State};
+use protocol::message::{Answer, Joints, Message, NetworkPage, ReceivedCounts, Request, SensorPage, State};
 use protocol::packet::{self, Packet};
 use protocol::parameters::Parameter;
 
@@ -81,7 +81,8 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_clear_contact() {
     };
     let contact = [protocol::fixed::Q5_10::nearest(2.0); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    let press = (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::AppliesFrom::Next, page });
+    let press =
+        (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::AppliesFrom::Next, page });
     let hear = |table: &mut Table, heard: &[(bool, Message)]| {
         for (own, message) in heard {
             for frame in message.encode().frames(Format::Fd) {
@@ -133,11 +134,13 @@ fn a_start_that_was_none_takes_no_counters_that_explain_missing_replies() {
         let state = State::CONFIGURED.with(State::TEST_MODE, true);
         network(NetworkPage::Heartbeat(Heartbeat { sent, state, ..Heartbeat::default() }))
     };
-    let heard =
-        |joints, joints_late| network(NetworkPage::Received(ReceivedCounts { joints, joints_late, ..ReceivedCounts::default() }));
+    let heard = |joints, joints_late| {
+        network(NetworkPage::Received(ReceivedCounts { joints, joints_late, ..ReceivedCounts::default() }))
+    };
     let contact = [protocol::fixed::Q5_10::nearest(2.0); 3];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
-    let press = (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::AppliesFrom::Next, page });
+    let press =
+        (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::AppliesFrom::Next, page });
     let mut table = table(&[]);
     let mut ms = 0;
     let mut hear = |table: &mut Table, heard: &[(bool, Message)]| {
@@ -295,7 +298,11 @@ impl There {
         there.table.set_comparing(true);
         let state = State::CONFIGURED.with(State::TEST_MODE, true);
         there.says(NetworkPage::Heartbeat(Heartbeat { sent: 70, state, ..Heartbeat::default() }));
-        there.says(NetworkPage::Received(ReceivedCounts { stimuli, joints: 50, ..ReceivedCounts::default() }));
+        there.says(NetworkPage::Received(ReceivedCounts {
+            stimuli,
+            joints: 50,
+            ..ReceivedCounts::default()
+        }));
         there.hear(false, &Message::Sensors { from: Self::cell(), epoch: Epoch(10), page: Self::press(0.0) });
         there
     }

@@ -2,7 +2,7 @@
 
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q5_10};
-use protocol::message::{AppliesFrom, ReceivedCounts, Joints, Message, NetworkPage, SensorPage, State, Tree};
+use protocol::message::{AppliesFrom, Joints, Message, NetworkPage, ReceivedCounts, SensorPage, State, Tree};
 use protocol::packet::{self, Length, Words};
 use protocol::time::Span;
 
@@ -316,8 +316,9 @@ fn the_network_is_of_all_cells_that_are_described_or_heard() {
     bench.say(false, Message::Network { from: Node::Cell(cell(3)), epoch: Epoch(0), page });
     bench.heartbeat(9, 0, State::default());
     let seen = |bench: &Bench, at: Micros| {
-        let of =
-            |seen: ObservedCell| (seen.node, seen.serial.is_some(), seen.heartbeat.is_some(), seen.alive, seen.tree);
+        let of = |seen: ObservedCell| {
+            (seen.node, seen.serial.is_some(), seen.heartbeat.is_some(), seen.alive, seen.tree)
+        };
         bench.table.network(at).map(of).collect::<Vec<_>>()
     };
     let expected = |alive| {

@@ -95,7 +95,11 @@ impl CellTracker {
             HeartbeatKind::Claimant | HeartbeatKind::Outsider => self.account.count_outsider(),
         }
         self.account.heartbeat_at(joints);
-        let returned = away && matches!(word, HeartbeatKind::First | HeartbeatKind::Known | HeartbeatKind::Started { again: false });
+        let returned = away
+            && matches!(
+                word,
+                HeartbeatKind::First | HeartbeatKind::Known | HeartbeatKind::Started { again: false }
+            );
         Update { word: Some(word), revived, returned, taken_back }
     }
 

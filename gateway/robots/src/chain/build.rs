@@ -8,11 +8,11 @@ use protocol::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
 use protocol::skin::{REACH, reach};
 
 use super::path::{CarriedLink, behind, moves, path};
-use super::{NotCarried, UrdfChain, ChainJoint, LinkFrame};
-use crate::error::{RobotProblem, RobotError};
+use super::{ChainJoint, LinkFrame, NotCarried, UrdfChain};
+use crate::error::{RobotError, RobotProblem};
 use crate::residual::{self, Residual};
-use crate::rows::{self, Axis, MAX_LENGTH_M, MAX_RESIDUAL, DhRow, frames};
-use crate::urdf::{UrdfJointKind, Urdf, UrdfJoint};
+use crate::rows::{self, Axis, DhRow, MAX_LENGTH_M, MAX_RESIDUAL, frames};
+use crate::urdf::{Urdf, UrdfJoint, UrdfJointKind};
 
 /// Builds the chain from a root link (by default that of the robot) to a tip link. Returns the reason if it cannot be
 /// built.

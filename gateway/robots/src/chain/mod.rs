@@ -7,7 +7,7 @@ use nalgebra::Isometry3;
 use protocol::parameters::RowKind;
 use protocol::skin::{ChainRow, JointKind};
 
-use crate::error::{RobotProblem, RobotError};
+use crate::error::{RobotError, RobotProblem};
 use crate::nearest::nearest;
 use crate::rows::{DhRow, frames};
 use crate::urdf::Urdf;
@@ -97,7 +97,9 @@ impl UrdfChain {
                 let joint = self.joints.first().map_or_else(String::new, |joint| joint.name.clone());
                 RobotProblem::BeforeFirstJoint { link, joint }
             }
-            Some(NotCarried::MovedBy(joint)) => RobotProblem::OutsideChain { link, joint: joint.clone(), root, tip },
+            Some(NotCarried::MovedBy(joint)) => {
+                RobotProblem::OutsideChain { link, joint: joint.clone(), root, tip }
+            }
             Some(NotCarried::Elsewhere) => RobotProblem::AboveChain { link, root },
         };
         Err(RobotError::new(&self.file, None, problem))

@@ -3,8 +3,8 @@
 use nalgebra::Isometry3;
 use protocol::skin::JointKind;
 
-use crate::error::{RobotProblem, RobotError};
-use crate::urdf::{UrdfJointKind, Urdf, UrdfJoint};
+use crate::error::{RobotError, RobotProblem};
+use crate::urdf::{Urdf, UrdfJoint, UrdfJointKind};
 
 /// A link that moves with a chain.
 pub(crate) struct CarriedLink {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use crate::{UrdfChain, RowKind};
+use crate::{RowKind, UrdfChain};
 use nalgebra::{Isometry3, Point3, Vector3};
 
 /// Returns the folder of the package example-robot-data, from the environment variable `SKINBUS_ROBOTS`.

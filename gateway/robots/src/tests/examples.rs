@@ -2,7 +2,7 @@
 
 use std::fs;
 
-use crate::{UrdfChain, Geometry, JointKind, RowKind, Urdf};
+use crate::{Geometry, JointKind, RowKind, Urdf, UrdfChain};
 use nalgebra::Point3;
 use protocol::skin::reach;
 

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::{RobotProblem, RobotError, Urdf};
+use crate::{RobotError, RobotProblem, Urdf};
 use nalgebra::{Point3, Vector3};
 use protocol::skin::reach;
 

@@ -1,6 +1,6 @@
 //! Tests of files and chains that are rejected, and of their error messages.
 
-use crate::{CellOnLink, UrdfChain, SkinImport, Urdf};
+use crate::{CellOnLink, SkinImport, Urdf, UrdfChain};
 
 use super::written::{Written, robot, wrap};
 

@@ -2,7 +2,7 @@
 
 use core::f64::consts::{FRAC_PI_2, PI};
 
-use crate::{UrdfChain, JointKind, DhRow, RowKind, Urdf};
+use crate::{DhRow, JointKind, RowKind, Urdf, UrdfChain};
 use nalgebra::{Isometry3, Point3};
 use protocol::skin::reach;
 

@@ -1,6 +1,6 @@
 //! Tests that the URDF written for a skin has the same kinematics as the rows of the skin.
 
-use crate::{SkinImport, Isometry3, DhRow, Urdf, frames, pose_of, written};
+use crate::{DhRow, Isometry3, SkinImport, Urdf, frames, pose_of, written};
 use protocol::skin::Skin;
 
 const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples");

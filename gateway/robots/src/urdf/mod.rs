@@ -7,7 +7,7 @@ mod xml;
 
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
-use crate::error::{RobotProblem, RobotError};
+use crate::error::{RobotError, RobotProblem};
 use crate::nearest::nearest;
 
 pub use shape::{Geometry, Shape};
@@ -186,7 +186,10 @@ impl Urdf {
     fn link(&self, name: &str) -> Result<(usize, &UrdfLink), RobotError> {
         let found = self.links.iter().enumerate().find(|(_, link)| link.name == name);
         found.ok_or_else(|| {
-            self.error(RobotProblem::NoSuchLink { link: name.to_owned(), nearest: nearest(name, self.links()) })
+            self.error(RobotProblem::NoSuchLink {
+                link: name.to_owned(),
+                nearest: nearest(name, self.links()),
+            })
         })
     }
 

@@ -4,9 +4,9 @@ use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 use roxmltree::{Document, Node};
 
 use super::shape::{Geometry, Shape};
-use super::tree::{self, UnlinkedJoint, LinkWithLine};
-use super::{UrdfJointKind, UrdfLink, Mimic, Shapes, Urdf, UrdfJoint, xml};
-use crate::error::{RobotProblem, RobotError};
+use super::tree::{self, LinkWithLine, UnlinkedJoint};
+use super::{Mimic, Shapes, Urdf, UrdfJoint, UrdfJointKind, UrdfLink, xml};
+use crate::error::{RobotError, RobotProblem};
 
 /// Minimum length of an axis vector. A shorter one has no direction.
 const SHORTEST_AXIS: f64 = 1e-6;
@@ -171,11 +171,18 @@ impl<'a> UrdfParser<'a> {
         Ok(UnlinkedJoint { joint, parent, child })
     }
 
-    fn axis(&self, node: Node<'a, 'a>, thing: &str, kind: UrdfJointKind) -> Result<Unit<Vector3<f64>>, RobotError> {
+    fn axis(
+        &self,
+        node: Node<'a, 'a>,
+        thing: &str,
+        kind: UrdfJointKind,
+    ) -> Result<Unit<Vector3<f64>>, RobotError> {
         match kind {
             UrdfJointKind::Revolute | UrdfJointKind::Continuous | UrdfJointKind::Prismatic => {}
             // The axis of these joints is often 0 0 0, and is never used.
-            UrdfJointKind::Fixed | UrdfJointKind::Floating | UrdfJointKind::Planar => return Ok(Vector3::z_axis()),
+            UrdfJointKind::Fixed | UrdfJointKind::Floating | UrdfJointKind::Planar => {
+                return Ok(Vector3::z_axis());
+            }
         }
         let Some(node) = self.child(node, "axis") else { return Ok(Vector3::x_axis()) };
         let allowed = "three numbers, not all zero";

@@ -2,8 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{UrdfLink, Urdf, UrdfJoint};
-use crate::error::{RobotProblem, RobotError};
+use super::{Urdf, UrdfJoint, UrdfLink};
+use crate::error::{RobotError, RobotProblem};
 use crate::nearest::nearest;
 
 /// A joint that is not connected yet: its links are given by name.

@@ -3,10 +3,10 @@
 use std::borrow::Cow;
 
 use protocol::usage::printable;
-use protocol::xml::{XmlFault, ForeignFile, Prepared, detect_foreign, prepare, utf16_name};
+use protocol::xml::{ForeignFile, Prepared, XmlFault, detect_foreign, prepare, utf16_name};
 use roxmltree::{Document, Error};
 
-use crate::error::{RobotProblem, RobotError};
+use crate::error::{RobotError, RobotProblem};
 
 /// Decodes the bytes of a file: UTF-8, or Latin-1 or Windows-1252 if the file declares it. UTF-16 is rejected, because
 /// the parser of ROS (urdfdom) rejects it too: a robot that is imported here also loads there.

@@ -5,13 +5,13 @@ use std::io::{self, Write};
 use analysis::fit::traffic::BenchFrames;
 use analysis::fit::verdict::percent;
 use analysis::shadow::{
-    Answering, BusShadow, Delays, Identifier, Loads, Peak, Replies, Report, FrameTiming, Shadow, StartUp,
+    Answering, BusShadow, Delays, FrameTiming, Identifier, Loads, Peak, Replies, Report, Shadow, StartUp,
     Stretches,
 };
 
 use trace::capture::seconds_since;
 
-use crate::print::{KeyValueTable, count, harmless, comma_separated, or_else_text};
+use crate::print::{KeyValueTable, comma_separated, count, harmless, or_else_text};
 
 /// Writes the frames whose sending the model has computed, one object per line.
 pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {

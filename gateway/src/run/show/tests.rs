@@ -1,7 +1,8 @@
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use bench::summary::{
-    LoopSummary, PrivateMemory, OutagesSummary, RecordingAccount, RepliesSummary, UplinkSummary, Verdict, WrittenFile,
+    LoopSummary, OutagesSummary, PrivateMemory, RecordingAccount, RepliesSummary, UplinkSummary, Verdict,
+    WrittenFile,
 };
 use model::quantiles::Quantiles;
 

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use bench::bus::listen::{Listener, send};
 use model::decode::Decoded;
-use protocol::bus::{Bus, BusKind, KindChoice, Inbox, BusOptions};
+use protocol::bus::{Bus, BusKind, BusOptions, Inbox, KindChoice};
 use protocol::can::{Format, Frame};
 use protocol::candump;
 use protocol::candump::CandumpLine;

@@ -60,7 +60,8 @@ impl Seed {
         for (code, body) in records(&bytes[8..]) {
             let end = at + 9 + body.len();
             let within = if code == op::CHUNK { records(&unpacked(&body)) } else { vec![(code, body)] };
-            let mut part = FileRecord { bytes: at..end, code, messages: Vec::new(), described: BTreeSet::new() };
+            let mut part =
+                FileRecord { bytes: at..end, code, messages: Vec::new(), described: BTreeSet::new() };
             for (code, body) in within {
                 match code {
                     op::SCHEMA | op::CHANNEL => {
@@ -88,7 +89,8 @@ impl Seed {
 
     /// Records without a damaged byte.
     fn intact(&self, damaged: &Range<usize>) -> impl Iterator<Item = &FileRecord> {
-        let is_apart = |part: &&FileRecord| damaged.end <= part.bytes.start || part.bytes.end <= damaged.start;
+        let is_apart =
+            |part: &&FileRecord| damaged.end <= part.bytes.start || part.bytes.end <= damaged.start;
         self.parts.iter().filter(is_apart)
     }
 

@@ -2,10 +2,10 @@
 
 use std::io::{self, Write};
 
-use super::log::{OmittedProperties, LogWriter, Style, WriteOutcome};
+use super::log::{LogWriter, OmittedProperties, Style, WriteOutcome};
 use super::mcap::McapWriter;
 pub use super::mcap::Origin;
-use super::{CaptureError, Entry, CaptureFormat, Note, NoteKind, Reader};
+use super::{CaptureError, CaptureFormat, Entry, Note, NoteKind, Reader};
 use thiserror::Error;
 
 /// The file that [`convert`] writes: a candump log or an MCAP recording.

@@ -40,7 +40,10 @@ const MAGIC: &[(&[u8], InputFormat)] = &[
     (b"Timestamp;", CSV),
     (b"Time Stamp", CSV),
     (b"\xEF\xBB\xBFTime", CSV),
-    (b"version https://git-lfs", InputFormat::Other("a Git LFS pointer to a file", "fetch it with `git lfs pull`")),
+    (
+        b"version https://git-lfs",
+        InputFormat::Other("a Git LFS pointer to a file", "fetch it with `git lfs pull`"),
+    ),
     (
         b"#ROSBAG V",
         InputFormat::Other(
@@ -75,8 +78,10 @@ const PCAP: InputFormat = InputFormat::Other(
     "write lines like `(1700000000.123456) can0 123#00` from what `tshark -T fields -e frame.time_epoch -e can.id \
      -e data.data -r FILE` shows (identifiers are decimal there), or take the capture with `candump -l`",
 );
-const UTF_16: InputFormat =
-    InputFormat::Other("text in UTF-16", "save it as UTF-8, as with `iconv -f utf-16 -t utf-8 FILE > NEW.log`");
+const UTF_16: InputFormat = InputFormat::Other(
+    "text in UTF-16",
+    "save it as UTF-8, as with `iconv -f utf-16 -t utf-8 FILE > NEW.log`",
+);
 
 /// The format of an input, by its first bytes.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -135,7 +140,9 @@ pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
 
 /// Returns true if the bytes begin with a complete header record.
 fn is_header(bytes: &[u8]) -> bool {
-    let Some((&[code, ref length @ ..], body)) = bytes.split_first_chunk::<{ container::RECORD_HEADER_BYTES }>() else {
+    let Some((&[code, ref length @ ..], body)) =
+        bytes.split_first_chunk::<{ container::RECORD_HEADER_BYTES }>()
+    else {
         return false;
     };
     code == op::HEADER && container::own_length(code, body) == Some(u64::from_le_bytes(*length))
@@ -189,6 +196,9 @@ mod tests {
         }
         // The magic of skippable zstd frames begins with a parenthesis too.
         assert_eq!(detect_format(&mut Slow(b"(1")).unwrap(), (InputFormat::Text, b"(1".to_vec()));
-        assert_eq!(detect_format(&mut Slow(b"PK\x03\x04")).unwrap().0, InputFormat::Other("a zip archive", UNPACK));
+        assert_eq!(
+            detect_format(&mut Slow(b"PK\x03\x04")).unwrap().0,
+            InputFormat::Other("a zip archive", UNPACK)
+        );
     }
 }

@@ -24,11 +24,13 @@ mod text_kinds;
 mod times;
 
 pub use error::CaptureError;
-pub use extras::{RecordingExtras, LatchedFrame, RUN_METADATA, SKIN_ATTACHMENT, Topic, facts_of_run, seconds_since};
+pub use extras::{
+    LatchedFrame, RUN_METADATA, RecordingExtras, SKIN_ATTACHMENT, Topic, facts_of_run, seconds_since,
+};
 pub use mcap::ORIGIN_METADATA;
 pub(crate) use mcap::is_foreign_frame;
-pub use parts::{RecordingPart, PartsError};
-pub use place::{SeekPoint, SeekIndex};
+pub use parts::{PartsError, RecordingPart};
+pub use place::{SeekIndex, SeekPoint};
 pub use reader::Reader;
 pub use text_kinds::SKIN_OR_SCENARIO;
 

@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use super::{RecordingExtras, CaptureFormat};
+use super::{CaptureFormat, RecordingExtras};
 
 /// An error in a list of files that is to be read as one recording or capture.
 #[derive(Debug, Error)]
@@ -115,7 +115,13 @@ pub(super) struct CaptureFile {
 
 impl CaptureFile {
     /// Creates the entry for a file. `lines` is the number of lines up to the first frame; 0 for a recording.
-    pub(super) fn new(path: &Path, extras: &RecordingExtras, format: CaptureFormat, first: Option<u64>, lines: u64) -> Self {
+    pub(super) fn new(
+        path: &Path,
+        extras: &RecordingExtras,
+        format: CaptureFormat,
+        first: Option<u64>,
+        lines: u64,
+    ) -> Self {
         let (part, is_text) = (RecordingPart::of(path, extras), first.is_none() && lines > 0);
         Self { path: path.to_owned(), format, part, first, is_text }
     }
@@ -131,8 +137,9 @@ pub(super) fn together(mut files: Vec<CaptureFile>) -> Result<Vec<PathBuf>, Part
         return Err(PartsError::NoFrame(text.path.clone()));
     }
     let mut places = HashSet::new();
-    let mut is_again =
-        |file: &&CaptureFile| !places.insert(fs::canonicalize(&file.path).unwrap_or_else(|_| file.path.clone()));
+    let mut is_again = |file: &&CaptureFile| {
+        !places.insert(fs::canonicalize(&file.path).unwrap_or_else(|_| file.path.clone()))
+    };
     if let Some(again) = files.iter().find(|file| is_again(file)) {
         return Err(PartsError::Same(again.path.clone()));
     }

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::log::Clock;
-use super::mcap::{ReadFault, McapState};
+use super::mcap::{McapState, ReadFault};
 
 /// A position in a capture, directly before an entry.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]

@@ -13,11 +13,11 @@ use std::path::{Path, PathBuf};
 use ::mcap::records::op;
 use protocol::input;
 
-use super::log::{MAX_LINE_BYTES as LONGEST_LINE, LogReader, known_time};
+use super::log::{LogReader, MAX_LINE_BYTES as LONGEST_LINE, known_time};
 use super::magic::is_mcap;
-use super::place::{IndexedFile, SeekPoint, SeekIndex};
+use super::place::{IndexedFile, SeekIndex, SeekPoint};
 use super::{CaptureError, Entry, Reader};
-use crate::container::{MAX_DESCRIPTION_BYTES, MAGIC, find};
+use crate::container::{MAGIC, MAX_DESCRIPTION_BYTES, find};
 use crate::order::WINDOW_NS;
 
 /// The minimum distance between two indexed positions of a file, in bytes.

@@ -10,12 +10,12 @@ use protocol::input;
 
 use super::log::{Clock, LogReader, Remark};
 use super::magic::{self, InputFormat, is_mcap};
-use super::mcap::{ForeignBuses, ReadFault, McapReader, ORIGIN_METADATA, SOURCE, McapState, TopicSurvey};
+use super::mcap::{ForeignBuses, McapReader, McapState, ORIGIN_METADATA, ReadFault, SOURCE, TopicSurvey};
 use super::parts::{self, CaptureFile, PartsError};
-use super::place::{SeekPoint, SeekIndex};
+use super::place::{SeekIndex, SeekPoint};
 use super::text_kinds::kind_of;
 use super::times::TimeChecks;
-use super::{CaptureError, Entry, RecordingExtras, CaptureFormat, Item, FileWrapper};
+use super::{CaptureError, CaptureFormat, Entry, FileWrapper, Item, RecordingExtras};
 
 /// Reads a capture from its beginning to its end in bounded memory. The parts of a split recording are one capture.
 pub struct Reader {
@@ -50,7 +50,11 @@ enum Source {
 
 impl Source {
     /// Opens one file. The attachments and metadata of a recording are read at once if it is a regular file.
-    fn open(path: &Path, through: &FileWrapper, mut state: McapState) -> Result<(String, Self), CaptureError> {
+    fn open(
+        path: &Path,
+        through: &FileWrapper,
+        mut state: McapState,
+    ) -> Result<(String, Self), CaptureError> {
         let name = path.display().to_string();
         let failed = |source| CaptureError::Io { name: name.clone(), source };
         let mut file = input::open(path).map_err(failed)?;
@@ -318,10 +322,14 @@ impl Reader {
             let input = (self.through)(file);
             let empty = Source::Log(LogReader::new(&[], Box::new(io::empty())));
             self.source = match std::mem::replace(&mut self.source, empty) {
-                Source::Log(_) => Source::Log(LogReader::resume((place.offset, place.line, place.clock), input)),
+                Source::Log(_) => {
+                    Source::Log(LogReader::resume((place.offset, place.line, place.clock), input))
+                }
                 Source::Mcap(mcap) => {
                     let mut state = mcap.into_state();
-                    places.describe(place.part, &mut state).map_err(|fault| fault.into_capture_error(&name, self.entries))?;
+                    places
+                        .describe(place.part, &mut state)
+                        .map_err(|fault| fault.into_capture_error(&name, self.entries))?;
                     Source::Mcap(Box::new(McapReader::resume(place.offset, input, state, Some(regular))))
                 }
             };

@@ -55,7 +55,8 @@ impl TimeChecks {
     fn place(&mut self, bus: &str, nanos: u64) -> Option<usize> {
         let known = self.buses.iter().position(|it| it.name == bus);
         known.or_else(|| {
-            let new = BusTimes { name: bus.to_owned(), first: nanos, last: nanos, frames: 0, has_several: false };
+            let new =
+                BusTimes { name: bus.to_owned(), first: nanos, last: nanos, frames: 0, has_several: false };
             (self.buses.len() < BUSES).then(|| {
                 self.buses.push(new);
                 self.buses.len() - 1

@@ -99,7 +99,11 @@ impl Chunk {
         let packed = from.u64("compressed size")?;
         let packed = from.bytes(packed, "records")?;
         if claimed > MAX_RECORD_BYTES {
-            return Err(FormatError::Long { what: "chunk, unpacked,", bytes: claimed, limit: MAX_RECORD_BYTES });
+            return Err(FormatError::Long {
+                what: "chunk, unpacked,",
+                bytes: claimed,
+                limit: MAX_RECORD_BYTES,
+            });
         }
         let limit = FREE_BYTES.saturating_add(read.saturating_mul(BYTES_A_BYTE));
         self.total_bytes = self.total_bytes.saturating_add(claimed);
@@ -248,8 +252,14 @@ mod tests {
     fn what_a_chunk_claims_is_compared_with_what_is_there() {
         let one = record(3, b"abc");
         let long = record(u64::MAX, b"abc");
-        assert_eq!(unpacked(&chunk(12, 0, "", &long)), Err(FormatError::Overrun { bytes: u64::MAX, leftover: 3 }));
-        assert_eq!(unpacked(&chunk(5, 0, "", &one[..5])), Err(FormatError::Overrun { bytes: 9, leftover: 5 }));
+        assert_eq!(
+            unpacked(&chunk(12, 0, "", &long)),
+            Err(FormatError::Overrun { bytes: u64::MAX, leftover: 3 })
+        );
+        assert_eq!(
+            unpacked(&chunk(5, 0, "", &one[..5])),
+            Err(FormatError::Overrun { bytes: 9, leftover: 5 })
+        );
         assert_eq!(unpacked(&chunk(11, 0, "", &one)), Err(FormatError::Unpacked { claimed: 11, found: 12 }));
         let none = FormatError::Long { what: "chunk, unpacked,", bytes: u64::MAX, limit: MAX_RECORD_BYTES };
         assert_eq!(unpacked(&chunk(u64::MAX, 0, "zstd", &one)), Err(none));

@@ -130,7 +130,9 @@ pub enum FormatError {
     #[error("no record has the operation code {0:02x}")]
     Unknown(u8),
     /// The operation code does not fit the place of the record in the file, or its contents.
-    #[error("a record has the operation code {0:02x}, but its position or contents are those of another kind of record")]
+    #[error(
+        "a record has the operation code {0:02x}, but its position or contents are those of another kind of record"
+    )]
     Code(u8),
     /// The length field of a record contradicts the length of its contents.
     #[error(

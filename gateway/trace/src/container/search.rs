@@ -9,7 +9,7 @@ use std::io::{self, Read, Seek, SeekFrom};
 use mcap::records::op;
 
 use super::field::Fields;
-use super::{MAX_RECORD_BYTES, MAGIC, read_some};
+use super::{MAGIC, MAX_RECORD_BYTES, read_some};
 
 /// The length of a record's header in bytes: operation code and length.
 pub const RECORD_HEADER_BYTES: usize = 9;
@@ -95,8 +95,9 @@ pub fn first_record(
 fn head(bytes: &[u8], leftover: u64) -> Option<(u8, u64)> {
     let &[opcode, ref length @ ..] = bytes.first_chunk::<RECORD_HEADER_BYTES>()?;
     let length = u64::from_le_bytes(*length);
-    (min_length(opcode).is_some_and(|min| length >= min) && length <= leftover.checked_sub(RECORD_HEADER_BYTES as u64)?)
-        .then_some((opcode, length))
+    (min_length(opcode).is_some_and(|min| length >= min)
+        && length <= leftover.checked_sub(RECORD_HEADER_BYTES as u64)?)
+    .then_some((opcode, length))
 }
 
 /// Returns true if a chunk or an attachment begins with these bytes. Each of its lengths is stored twice.
@@ -185,8 +186,10 @@ pub(super) fn has_records(message: &[u8]) -> bool {
         let mut row = 0;
         while let Some((_, length)) = head(rest, rest.len() as u64) {
             row += 1;
-            rest =
-                usize::try_from(length).ok().and_then(|length| rest.get(RECORD_HEADER_BYTES + length..)).unwrap_or_default();
+            rest = usize::try_from(length)
+                .ok()
+                .and_then(|length| rest.get(RECORD_HEADER_BYTES + length..))
+                .unwrap_or_default();
         }
         row >= ROW || (row > 0 && rest.is_empty())
     })
@@ -217,5 +220,6 @@ fn next(input: &mut (impl Read + Seek), at: u64, size: u64) -> io::Result<Option
         read += came;
     }
     let there = bytes.get(..read).unwrap_or_default();
-    Ok(head(there, size.saturating_sub(at)).map(|(opcode, length)| (opcode, at + RECORD_HEADER_BYTES as u64 + length)))
+    Ok(head(there, size.saturating_sub(at))
+        .map(|(opcode, length)| (opcode, at + RECORD_HEADER_BYTES as u64 + length)))
 }

@@ -6,7 +6,7 @@ use mcap::records::op;
 
 use super::field::{Record, attachment_name, parse};
 use super::search::{RECORD_HEADER_BYTES, has_records, is_disguised, is_known, is_plain, own_length};
-use super::{FormatError, MAX_RECORD_BYTES, MAGIC, read_some};
+use super::{FormatError, MAGIC, MAX_RECORD_BYTES, read_some};
 
 /// The maximum number of bytes stored of a record that is too long for memory or that no reader needs.
 const BEGINNING: u64 = 64 << 10;

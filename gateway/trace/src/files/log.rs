@@ -42,7 +42,9 @@ impl LogFile {
     /// Returns an error, with advice to the user, if the file cannot be written.
     pub fn create(path: &Path, force: bool, stopped: &AtomicBool) -> io::Result<Self> {
         let state = match OutputTarget::inspect(path, force) {
-            Ok(OutputTarget::Stream) => LogTarget::Stream(InterruptibleWriter::new(open_stream(path, stopped)?)),
+            Ok(OutputTarget::Stream) => {
+                LogTarget::Stream(InterruptibleWriter::new(open_stream(path, stopped)?))
+            }
             Ok(OutputTarget::New) => LogTarget::Ours(begin(path)?),
             Ok(OutputTarget::Old) => {
                 // If the file was replaced by a symlink meanwhile, the link is not followed.

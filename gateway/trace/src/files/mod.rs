@@ -13,8 +13,8 @@ use std::sync::atomic::AtomicBool;
 
 pub use log::LogFile;
 pub use protocol::input::folder_of;
-pub use target::{STANDARD_OUTPUT, check, check_regular, rename, suffixed, sync_folder, with_hint};
 use target::{OutputTarget, open_stream, or_exists, part_of};
+pub use target::{STANDARD_OUTPUT, check, check_regular, rename, suffixed, sync_folder, with_hint};
 pub(crate) use target::{hold, identity, is_still, link, nameless, open_unfollowed, write_patiently};
 
 /// A file that gets its name only when it is complete. Until then it is unnamed, and so disappears if the program is

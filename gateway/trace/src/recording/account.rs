@@ -47,7 +47,13 @@ impl MessageCount {
     /// Returns the entry for a file of `bytes` bytes that holds these messages.
     pub(super) fn in_file(self, path: &Path, bytes: u64) -> WrittenFile {
         let Self { frames, others } = self;
-        WrittenFile { path: path.display().to_string(), format: "mcap", frames, messages: frames + others, bytes }
+        WrittenFile {
+            path: path.display().to_string(),
+            format: "mcap",
+            frames,
+            messages: frames + others,
+            bytes,
+        }
     }
 }
 

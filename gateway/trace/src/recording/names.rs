@@ -301,7 +301,11 @@ fn claim_orphan(path: &Path) -> Orphan {
     hold(&file).map_err(|error| {
         if error.kind() == io::ErrorKind::WouldBlock { PartFileError::Held } else { error.into() }
     })?;
-    if file::is_marked(&mut file).map_err(PartFileError::Unreadable)? { Ok(file) } else { Err(PartFileError::Unmarked) }
+    if file::is_marked(&mut file).map_err(PartFileError::Unreadable)? {
+        Ok(file)
+    } else {
+        Err(PartFileError::Unmarked)
+    }
 }
 
 /// Removes an orphaned file, if the name is still that of the file.

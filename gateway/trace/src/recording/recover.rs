@@ -19,7 +19,7 @@ use std::io::{self, Read, Seek, Write};
 use mcap::records::op;
 use thiserror::Error;
 
-use self::survey::{IntactRange, FileSurvey};
+use self::survey::{FileSurvey, IntactRange};
 use super::file::FileWriter;
 use crate::container::{Chunk, FormatError, Framed, Record, RecordReader, parse};
 
@@ -91,7 +91,11 @@ impl fmt::Display for RecoveryResult {
             (places, bytes) => write!(f, "; {bytes} damaged bytes in {places} places are lost")?,
         }
         if self.orphaned_messages > 0 {
-            write!(f, "; {} messages of topics that are described nowhere else are lost", self.orphaned_messages)?;
+            write!(
+                f,
+                "; {} messages of topics that are described nowhere else are lost",
+                self.orphaned_messages
+            )?;
         }
         if self.checksum && self.is_undamaged() {
             write!(f, "; a checksum of the whole was wrong, and none of a part")?;
@@ -178,7 +182,13 @@ struct Copy<W: Write> {
 
 impl<W: Write> Copy<W> {
     /// Copies a record that the survey found intact. `read` is the number of bytes of the input read so far.
-    fn copy_record(&mut self, chunk: &mut Chunk, code: u8, body: &[u8], read: u64) -> Result<(), RecoverError> {
+    fn copy_record(
+        &mut self,
+        chunk: &mut Chunk,
+        code: u8,
+        body: &[u8],
+        read: u64,
+    ) -> Result<(), RecoverError> {
         if code != op::CHUNK {
             return self.record(code, body).map_err(RecoverError::Write);
         }

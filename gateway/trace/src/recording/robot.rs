@@ -2,7 +2,7 @@
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use protocol::skin::{Cell, Chain, Skin};
-use robots::{LinkPose, RobotProblem, RobotError, DhRow, Urdf, frames, pose_of, written};
+use robots::{DhRow, LinkPose, RobotError, RobotProblem, Urdf, frames, pose_of, written};
 
 use crate::ros2::robot::Transform;
 

@@ -457,7 +457,8 @@ impl<T> SplitRecording<T> {
                     self.lost.frames = (self.lost.frames + kept.frames).saturating_sub(recovered.frames);
                     let others = recovered.messages - recovered.frames;
                     self.lost.others = (self.lost.others + kept.others).saturating_sub(others);
-                    self.written.push(MessageCount { frames: recovered.frames, others }.in_file(&goal, bytes));
+                    self.written
+                        .push(MessageCount { frames: recovered.frames, others }.in_file(&goal, bytes));
                 }
                 Ok(Repaired { new: None, .. }) => self.lost.add(kept),
                 Err(error) => {
@@ -488,5 +489,6 @@ impl<T> Drop for SplitRecording<T> {
 }
 
 fn has_room(path: &Path) -> bool {
-    statvfs(folder_of(path)).is_ok_and(|about| about.f_bavail.saturating_mul(about.f_frsize) >= MIN_FREE_BYTES)
+    statvfs(folder_of(path))
+        .is_ok_and(|about| about.f_bavail.saturating_mul(about.f_frsize) >= MIN_FREE_BYTES)
 }

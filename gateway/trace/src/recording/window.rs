@@ -64,7 +64,15 @@ impl Default for ReorderWindow {
             bytes.clear();
             bytes
         };
-        let none = WaitingMessage { log_nanos: 1, nanos: 1, begin: 0, end: 0, channel: 0, sequence: 0, is_frame: false };
+        let none = WaitingMessage {
+            log_nanos: 1,
+            nanos: 1,
+            begin: 0,
+            end: 0,
+            channel: 0,
+            sequence: 0,
+            is_frame: false,
+        };
         let mut waiting = vec![none; INITIAL_BYTES / size_of::<WaitingMessage>()];
         waiting.clear();
         Self {

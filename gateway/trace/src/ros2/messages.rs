@@ -6,7 +6,7 @@
 use protocol::can::{ERROR, EXTENDED, Format, Frame, REMOTE, check_identifier};
 use protocol::candump::{Direction, Record, Timestamp};
 
-use super::cdr::{CdrError, Encode, CdrReader, CdrWriter};
+use super::cdr::{CdrError, CdrReader, CdrWriter, Encode};
 use super::{Header, Message, definition};
 use crate::note::{Note, NoteKind};
 

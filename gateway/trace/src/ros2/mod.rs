@@ -10,7 +10,7 @@ pub mod robot;
 pub mod skin;
 pub mod standard;
 
-use cdr::{CdrError, Decode, Encode, CdrReader, CdrWriter};
+use cdr::{CdrError, CdrReader, CdrWriter, Decode, Encode};
 use thiserror::Error;
 
 /// A type that is recorded as a ROS 2 message.

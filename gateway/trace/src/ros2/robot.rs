@@ -1,6 +1,6 @@
 //! ROS 2 message types that show a robot: the poses of its links, and its description.
 
-use super::cdr::{Encode, CdrWriter};
+use super::cdr::{CdrWriter, Encode};
 use super::{Header, Message, definition};
 
 /// The pose of a coordinate frame relative to its parent frame.

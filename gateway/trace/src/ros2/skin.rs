@@ -1,6 +1,6 @@
 //! Message types of skinbus that record a run: the timing of the loop, torques, and the state of cells.
 
-use super::cdr::{CdrError, Decode, Encode, CdrReader, CdrWriter};
+use super::cdr::{CdrError, CdrReader, CdrWriter, Decode, Encode};
 use super::{Header, Message, definition};
 
 /// The timing and the state of a tick, as numbers that any viewer can plot.

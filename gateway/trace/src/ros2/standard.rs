@@ -1,6 +1,6 @@
 //! Standard ROS 2 message types, which every viewer supports.
 
-use super::cdr::{Encode, CdrWriter};
+use super::cdr::{CdrWriter, Encode};
 use super::{Header, Message, definition};
 
 /// `sensor_msgs/JointState`: the joints of a robot. An array of unknown values is empty.

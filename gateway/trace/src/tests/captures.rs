@@ -6,9 +6,9 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::Cursor;
 
-use crate::capture::convert::{ConversionCounts, CaptureWriter, convert};
+use crate::capture::convert::{CaptureWriter, ConversionCounts, convert};
 use crate::capture::log::{MAX_LINE_BYTES, Style};
-use crate::capture::{CaptureError, Entry, CaptureFormat, Note, NoteKind, Reader};
+use crate::capture::{CaptureError, CaptureFormat, Entry, Note, NoteKind, Reader};
 use crate::recording::file::FileWriter;
 use proptest::prelude::*;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, STANDARD_MASK};

@@ -12,7 +12,7 @@ use protocol::id::CellId;
 use protocol::message::{Message, SkinSensors};
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{SkinReply, Skin};
+use protocol::skin::{Skin, SkinReply};
 use protocol::time::Micros;
 use protocol::wire_time::{BitRates, Bits};
 
@@ -94,7 +94,8 @@ impl LiveBus {
         let is_wire = received.content == Content::NotData && wired(frame).is_some();
         if !is_wire && !matches!(message, Some(Message::Stimulus { .. })) {
             // On a bench, wire states and stimuli are frames of the same bus, but a real bus would not carry them.
-            let busy = self.rates.zip(Bits::from_frame(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
+            let busy =
+                self.rates.zip(Bits::from_frame(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
             self.load.busy_s += busy;
         }
         let mut joints = false;

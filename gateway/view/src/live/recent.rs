@@ -171,7 +171,12 @@ impl RecentFrames {
         let said = match watch.moments() {
             Ok(moments) => explain(skin, &moments),
             Err(error) => {
-                return Some(TorqueExplanation { number, epoch: epoch.0, cell: None, missing: vec![error.to_string()] });
+                return Some(TorqueExplanation {
+                    number,
+                    epoch: epoch.0,
+                    cell: None,
+                    missing: vec![error.to_string()],
+                });
             }
         };
         let bus = name(asked.bus);

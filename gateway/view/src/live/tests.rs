@@ -142,7 +142,11 @@ fn only_cells_of_the_skin_in_test_mode_may_be_pressed() {
     bench.heartbeat(12, 0);
     assert_eq!(bench.live.pressable_cell(0, 12), Some((0, CellId::new(12).unwrap())));
     assert_eq!(
-        (bench.live.pressable_cell(0, 0), bench.live.pressable_cell(0, 254), bench.live.pressable_cell(1, 12)),
+        (
+            bench.live.pressable_cell(0, 0),
+            bench.live.pressable_cell(0, 254),
+            bench.live.pressable_cell(1, 12)
+        ),
         (None, None, None)
     );
 }
@@ -193,7 +197,8 @@ fn a_bus_with_sums_says_where_cells_are_in_the_tree() {
     bench.joints(1, Q);
     for (node, parent) in [(1, Some(0)), (2, Some(1)), (3, None)] {
         bench.heartbeat(node, 0);
-        let page = NetworkPage::Tree(Tree { parent, parent_port: 0, working_ports: 0b0101, ..Tree::default() });
+        let page =
+            NetworkPage::Tree(Tree { parent, parent_port: 0, working_ports: 0b0101, ..Tree::default() });
         bench.say(&Message::Network {
             from: Node::Cell(CellId::new(node.into()).unwrap()),
             epoch: Epoch(1),
@@ -202,7 +207,12 @@ fn a_bus_with_sums_says_where_cells_are_in_the_tree() {
     }
     assert_eq!(
         places(&bench),
-        [Some(TreePlace(Some(0), 0b0101)), Some(TreePlace(Some(1), 0b0101)), Some(TreePlace(None, 0b0101)), None]
+        [
+            Some(TreePlace(Some(0), 0b0101)),
+            Some(TreePlace(Some(1), 0b0101)),
+            Some(TreePlace(None, 0b0101)),
+            None
+        ]
     );
     let json = serde_json::to_string(&bench.live.status_message(bench.now)).unwrap();
     assert!(json.contains(r#""tree":[[0,5],[1,5],[null,5],null]"#), "{json}");

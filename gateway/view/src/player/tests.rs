@@ -12,7 +12,9 @@ use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node};
-use protocol::message::{AppliesFrom, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::message::{
+    AppliesFrom, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State,
+};
 use protocol::packet::Epoch;
 
 /// The time of the first frame, in ns since 1970.
@@ -55,7 +57,11 @@ fn log(skin: &Skin) -> Vec<u8> {
         }
         let force = |n: f64| {
             let sensors = SkinSensors { contact: [Q5_10::nearest(n); 3], ..SkinSensors::default() };
-            Message::Stimulus { to: Node::Cell(cell(5)), from: AppliesFrom::Next, page: SensorPage::Skin(sensors) }
+            Message::Stimulus {
+                to: Node::Cell(cell(5)),
+                from: AppliesFrom::Next,
+                page: SensorPage::Skin(sensors),
+            }
         };
         match ms {
             6_000 | 30_000 => say(ms, 7, &force(1.0)),

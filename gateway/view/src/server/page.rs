@@ -87,7 +87,11 @@ fn live(begun: PrefixedStream, page: u64, shared: &Shared) -> io::Result<()> {
     Ok(())
 }
 
-fn exchange_messages(socket: &mut WebSocket<PrefixedStream>, page: u64, shared: &Shared) -> Result<(), Error> {
+fn exchange_messages(
+    socket: &mut WebSocket<PrefixedStream>,
+    page: u64,
+    shared: &Shared,
+) -> Result<(), Error> {
     socket.send(Message::text(shared.scene.as_str()))?;
     socket.get_ref().stream.set_read_timeout(Some(POLL_INTERVAL))?;
     let (mut sent, mut said_number, mut jumps) = (0, 0, 0);

@@ -10,11 +10,11 @@ use rustix::io::Errno;
 use rustix::net::{AddressFamily, RecvFlags, SendFlags, SocketFlags, SocketType, sockopt};
 use socketcan::{CanFdSocket, SocketOptions};
 
-use super::{HelloReply, FilterPart, ClientHello, OWN_BYTE, VERSION, decode_dropped};
-use super::{address, open_directory, default_directory};
+use super::{ClientHello, FilterPart, HelloReply, OWN_BYTE, VERSION, decode_dropped};
+use super::{address, default_directory, open_directory};
 use crate::bus::batch::{self, Datagram};
 use crate::bus::carrier::Carrier;
-use crate::bus::{Bus, BusError, Filter, BusOptions};
+use crate::bus::{Bus, BusError, BusOptions, Filter};
 
 /// Maximum time to wait for a server, which answers at once unless it is stopped.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
@@ -61,7 +61,9 @@ impl Carrier for Embedded {
             return Err(BusError::NoRoom(name.to_owned()));
         }
         match HelloReply::decode(bytes.get(..len).unwrap_or_default()) {
-            Some(HelloReply::Welcome { granted }) => Ok((socket, usize::try_from(granted).unwrap_or(usize::MAX))),
+            Some(HelloReply::Welcome { granted }) => {
+                Ok((socket, usize::try_from(granted).unwrap_or(usize::MAX)))
+            }
             Some(HelloReply::Refused { version }) => {
                 Err(BusError::Refused { name: name.to_owned(), ours: VERSION, theirs: version })
             }

@@ -89,9 +89,8 @@ fn find_in_table(table: &DeTable<'_>, at: usize) -> Option<FoundValue> {
 
 fn find_in_value(path: &str, value: &Spanned<DeValue<'_>>, at: usize) -> Option<FoundValue> {
     let inner = match value.get_ref() {
-        DeValue::Table(table) => {
-            find_in_table(table, at).map(|found| FoundValue { path: format!("{path}.{}", found.path), ..found })
-        }
+        DeValue::Table(table) => find_in_table(table, at)
+            .map(|found| FoundValue { path: format!("{path}.{}", found.path), ..found }),
         DeValue::Array(values) => values
             .iter()
             .enumerate()
@@ -102,5 +101,7 @@ fn find_in_value(path: &str, value: &Spanned<DeValue<'_>>, at: usize) -> Option<
         | DeValue::Boolean(_)
         | DeValue::Datetime(_) => None,
     };
-    inner.or_else(|| value.span().contains(&at).then(|| FoundValue { path: path.to_owned(), value: value.span() }))
+    inner.or_else(|| {
+        value.span().contains(&at).then(|| FoundValue { path: path.to_owned(), value: value.span() })
+    })
 }

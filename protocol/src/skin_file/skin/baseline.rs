@@ -43,7 +43,11 @@ pub(super) fn skin_baseline(raw: Option<raw::Baseline>) -> Result<Baseline, Docu
 }
 
 /// Returns the settings of a cell: `base`, with the keys that the cell overrides.
-pub(super) fn cell_baseline(at: &KeyPath, raw: &raw::RawCell, base: Baseline) -> Result<Baseline, DocumentFault> {
+pub(super) fn cell_baseline(
+    at: &KeyPath,
+    raw: &raw::RawCell,
+    base: Baseline,
+) -> Result<Baseline, DocumentFault> {
     let Baseline::On(mut to) = base else {
         let given = [("baseline_limit_n", raw.baseline_limit_n), ("baseline_n_per_c", raw.baseline_n_per_c)];
         let given = given.into_iter().find_map(|(key, value)| Some((key, value?)));

@@ -2,7 +2,7 @@
 
 use std::collections::HashSet;
 
-use super::{SkinBus, JointKind, SkinReply, Robot, raw, sensing};
+use super::{JointKind, Robot, SkinBus, SkinReply, raw, sensing};
 use crate::can::Format;
 use crate::document::{Checked, KeyPath};
 use crate::fixed::TorqueFormat;

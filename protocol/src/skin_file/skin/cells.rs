@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use super::chains::normalized;
 use super::reach::{REACH, reach};
-use super::{SkinBus, Cell, Robot, baseline, raw};
+use super::{Cell, Robot, SkinBus, baseline, raw};
 use crate::document::{Checked, KeyPath};
 use crate::fixed::Q;
 use crate::id::CellId;
@@ -17,7 +17,12 @@ pub(super) struct CellDefaults {
     pub(super) baseline: Baseline,
 }
 
-pub(super) fn cells(raw: &[raw::RawCell], robot: &Robot, buses: &[SkinBus], base: CellDefaults) -> Checked<Vec<Cell>> {
+pub(super) fn cells(
+    raw: &[raw::RawCell],
+    robot: &Robot,
+    buses: &[SkinBus],
+    base: CellDefaults,
+) -> Checked<Vec<Cell>> {
     let mut taken = HashMap::new();
     let mut serials = HashMap::new();
     let mut cells = Vec::with_capacity(raw.len());
@@ -38,7 +43,11 @@ pub(super) fn cells(raw: &[raw::RawCell], robot: &Robot, buses: &[SkinBus], base
     for (index, port, cell, neighbor) in neighbor_mentions(&cells) {
         if neighbor == cell.node || !taken.contains_key(&(cell.bus, neighbor)) {
             let why = "must be the node of another cell on the same bus, or 0";
-            return Err(KeyPath::top_level_key("cell").element(index).key("neighbors").element(port).fault(neighbor, why));
+            return Err(KeyPath::top_level_key("cell")
+                .element(index)
+                .key("neighbors")
+                .element(port)
+                .fault(neighbor, why));
         }
     }
     check_wire_ends(&cells)?;
@@ -70,13 +79,23 @@ fn check_wire_ends(cells: &[Cell]) -> Checked<()> {
                 "this wire has no other end: name node {node} in a further one of the neighbors of node {neighbor}, \
                  or put 0 here"
             );
-            return Err(KeyPath::top_level_key("cell").element(index).key("neighbors").element(port).fault(neighbor, why));
+            return Err(KeyPath::top_level_key("cell")
+                .element(index)
+                .key("neighbors")
+                .element(port)
+                .fault(neighbor, why));
         }
     }
     Ok(())
 }
 
-fn cell(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, buses: &[SkinBus], base: CellDefaults) -> Checked<Cell> {
+fn cell(
+    at: &KeyPath,
+    raw: &raw::RawCell,
+    robot: &Robot,
+    buses: &[SkinBus],
+    base: CellDefaults,
+) -> Checked<Cell> {
     let bus = bus(at, raw, buses)?;
     let node = CellId::new(raw.node);
     let why = "a cell's node is 1 to 254; further cells need another bus";
@@ -112,7 +131,10 @@ fn cell(at: &KeyPath, raw: &raw::RawCell, robot: &Robot, buses: &[SkinBus], base
         row,
         position: raw.position,
         normal: normal(at, raw)?,
-        orientation: raw.orientation.map(|it| normalized(&at.key("orientation"), "quaternion", it)).transpose()?,
+        orientation: raw
+            .orientation
+            .map(|it| normalized(&at.key("orientation"), "quaternion", it))
+            .transpose()?,
         neighbors,
         root: raw.root,
         contact: contact(at, raw.contact(), base.contact)?,
@@ -126,8 +148,16 @@ pub(super) fn contact(at: &KeyPath, raw: raw::Contact, base: Contact) -> Checked
     let mut to = base;
     at.key("alpha_c").set_word(alpha_c, &mut to.alpha_c, Q::try_nearest)?;
     at.key("alpha_p").set_word(alpha_p, &mut to.alpha_p, Q::try_nearest)?;
-    at.key("contact_threshold_n").set_word(contact_threshold_n, &mut to.contact_threshold, Q::try_at_least)?;
-    at.key("proximity_threshold").set_word(proximity_threshold, &mut to.proximity_threshold, Q::try_at_least)?;
+    at.key("contact_threshold_n").set_word(
+        contact_threshold_n,
+        &mut to.contact_threshold,
+        Q::try_at_least,
+    )?;
+    at.key("proximity_threshold").set_word(
+        proximity_threshold,
+        &mut to.proximity_threshold,
+        Q::try_at_least,
+    )?;
     at.key("force_threshold_n").set_word(force_threshold_n, &mut to.force_threshold, Q::try_at_least)?;
     Ok(to)
 }

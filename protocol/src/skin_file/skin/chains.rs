@@ -3,7 +3,9 @@
 use core::f64::consts::TAU;
 
 use super::raw;
-use super::robot::{ChainBase, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
+use super::robot::{
+    Chain, ChainBase, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot,
+};
 use crate::document::{Checked, KeyPath};
 use crate::fixed::Q1_14;
 use crate::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
@@ -22,7 +24,9 @@ pub(super) fn robot(raw: raw::Robot) -> Checked<Robot> {
         return Err(at.key("urdf").fault("\"\"", "the path of a file, from the skin's file"));
     }
     match (raw.joints, raw.joint.is_empty() && raw.chain.is_empty()) {
-        (Some(rows), true) => Ok(Robot { urdf: raw.urdf, ..serial_robot(&at, raw.name, &rows, raw.limits_rad)? }),
+        (Some(rows), true) => {
+            Ok(Robot { urdf: raw.urdf, ..serial_robot(&at, raw.name, &rows, raw.limits_rad)? })
+        }
         (None, false) => {
             if raw.limits_rad.is_some() {
                 return Err(at.key("limits_rad").fault("", "with [[robot.joint]] each joint has its limits"));
@@ -94,7 +98,10 @@ fn limits(at: &KeyPath, [min, max]: [f64; 2], kind: JointKind) -> Checked<[f64; 
         return Err(at.fault(got, "the smaller position comes first"));
     }
     if kind == JointKind::Prismatic && (min < -MAX_PRISMATIC_POSITION || max > MAX_PRISMATIC_POSITION) {
-        return Err(at.fault(got, format_args!("a joint slides within -{MAX_PRISMATIC_POSITION} to {MAX_PRISMATIC_POSITION} m")));
+        return Err(at.fault(
+            got,
+            format_args!("a joint slides within -{MAX_PRISMATIC_POSITION} to {MAX_PRISMATIC_POSITION} m"),
+        ));
     }
     Ok([min, max])
 }
@@ -152,10 +159,10 @@ fn base(at: &KeyPath, raw: &raw::Base) -> Checked<ChainBase> {
     if let Some((index, value)) =
         raw.position.iter().enumerate().find(|(_, it)| it.is_nan() || it.abs() > MAX_BASE_COORDINATE)
     {
-        return Err(at
-            .key("position")
-            .element(index)
-            .fault(value, format_args!("it must be within -{MAX_BASE_COORDINATE} to {MAX_BASE_COORDINATE} m")));
+        return Err(at.key("position").element(index).fault(
+            value,
+            format_args!("it must be within -{MAX_BASE_COORDINATE} to {MAX_BASE_COORDINATE} m"),
+        ));
     }
     let orientation = raw.orientation.map(|it| normalized(&at.key("orientation"), "quaternion", it));
     Ok(ChainBase {
@@ -194,8 +201,12 @@ fn chain(at: &KeyPath, raw: &raw::Chain, joints: &[Joint]) -> Checked<Chain> {
             return Err(at.fault(format_args!("{name:?}"), "this chain has the joint already"));
         }
         let [min, max] = joint.limits;
-        if joint.kind == JointKind::Prismatic && [min, max].iter().any(|q| (table.d + q).abs() > MAX_PRISMATIC_POSITION) {
-            let why = format!("d and its position together stay within -{MAX_PRISMATIC_POSITION} to {MAX_PRISMATIC_POSITION} m");
+        if joint.kind == JointKind::Prismatic
+            && [min, max].iter().any(|q| (table.d + q).abs() > MAX_PRISMATIC_POSITION)
+        {
+            let why = format!(
+                "d and its position together stay within -{MAX_PRISMATIC_POSITION} to {MAX_PRISMATIC_POSITION} m"
+            );
             return Err(at.fault(format_args!("{name:?} from {min} to {max} with d = {}", table.d), why));
         }
         chain.joints.push(number);

@@ -1,7 +1,7 @@
 //! Conversion of a skin file from raw values to checked types.
 
 use super::chains::{self, check_length};
-use super::{SkinBus, Cell, Controller, ControllerKind, LostBus, SkinReply, Safety, Skin, Timing};
+use super::{Cell, Controller, ControllerKind, LostBus, Safety, Skin, SkinBus, SkinReply, Timing};
 use super::{baseline, buses, cells, names, raw, sensing};
 use crate::document::{Checked, KeyPath, span_from_seconds};
 use crate::fixed::Q;
@@ -25,7 +25,9 @@ pub(super) fn skin_on(raw: raw::Skin, bus: &str) -> Checked<Skin> {
     let is_other = |cell: &Cell| skin.buses.get(cell.bus).is_some_and(|of| of.name != bus);
     match skin.cells.iter().position(is_other) {
         None => Ok(skin),
-        Some(index) => Err(KeyPath::top_level_key("cell").element(index).key("bus").fault("", "the cell of another bus")),
+        Some(index) => {
+            Err(KeyPath::top_level_key("cell").element(index).key("bus").fault("", "the cell of another bus"))
+        }
     }
 }
 

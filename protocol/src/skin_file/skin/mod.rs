@@ -30,7 +30,7 @@ use crate::time::Span;
 
 pub use cell_name::{CellName, split_bus};
 pub use reach::{REACH, reach};
-pub use robot::{ChainBase, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
+pub use robot::{Chain, ChainBase, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
 pub use wires::Wires;
 
 /// Keys at the top level that only skin files have. They distinguish a skin from a scenario.

@@ -89,7 +89,11 @@ mod tests {
             let text = two_buses(reply);
             let whole = Skin::parse("skin.toml", &text).unwrap();
             for (index, bus) in ["vcan0", "vcan1"].into_iter().enumerate() {
-                assert_eq!(Skin::parse_on("skin.toml", &text, bus).unwrap(), whole.with_cells_of_bus(index), "{bus}");
+                assert_eq!(
+                    Skin::parse_on("skin.toml", &text, bus).unwrap(),
+                    whole.with_cells_of_bus(index),
+                    "{bus}"
+                );
                 let part = without_other_cells(&text, bus).unwrap();
                 assert_eq!((part.matches("[[cell]]").count(), part.matches("[[bus]]").count()), (2, 2));
             }
@@ -113,7 +117,11 @@ mod tests {
         ] {
             let text = text.replace(from, to);
             for (index, bus) in ["vcan0", "vcan1"].into_iter().enumerate() {
-                assert_eq!(Skin::parse_on("skin.toml", &text, bus).unwrap(), whole.with_cells_of_bus(index), "{to}");
+                assert_eq!(
+                    Skin::parse_on("skin.toml", &text, bus).unwrap(),
+                    whole.with_cells_of_bus(index),
+                    "{to}"
+                );
             }
         }
     }

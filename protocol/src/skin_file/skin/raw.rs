@@ -222,7 +222,12 @@ impl Default for Safety {
     /// Returns limits with which the torque is held for two missing replies and decays over four more, and 25 bad
     /// cycles (1/20 s) halt the robot.
     fn default() -> Self {
-        Self { hold_epochs: 2, decay_epochs: 4, bad_cycles: 25, lost_bus: LostBus::Continue.name().to_owned() }
+        Self {
+            hold_epochs: 2,
+            decay_epochs: 4,
+            bad_cycles: 25,
+            lost_bus: LostBus::Continue.name().to_owned(),
+        }
     }
 }
 

@@ -37,7 +37,9 @@ pub(super) fn bus_sensing(at: &KeyPath, bus: &raw::RawBus) -> Result<Sensing, Do
     let words = [("off", Mode::Off), ("continuous", Mode::Continuous), ("event", Mode::Event)];
     let mode = at.key("sensing").choose(bus.sensing.as_deref().unwrap_or("off"), &words)?;
     match (mode, bus.sensing_hz) {
-        (Mode::Continuous, Some(hz)) => continuous_sensing(hz).map_err(|why| at.key("sensing_hz").fault(hz, why)),
+        (Mode::Continuous, Some(hz)) => {
+            continuous_sensing(hz).map_err(|why| at.key("sensing_hz").fault(hz, why))
+        }
         (Mode::Continuous, None) => {
             Err(at.key("sensing").fault("\"continuous\"", "sensing_hz is needed with it"))
         }

@@ -159,7 +159,10 @@ mod tests {
             wires.link_ids_of(id(1)),
             [link_id(0, false), link_id(1, false), none, none, link_id(3, false)]
         );
-        assert_eq!(wires.link_ids_of(id(2)), [link_id(2, false), link_id(0, true), link_id(1, true), none, none]);
+        assert_eq!(
+            wires.link_ids_of(id(2)),
+            [link_id(2, false), link_id(0, true), link_id(1, true), none, none]
+        );
         assert_eq!(wires.link_ids_of(id(3)), [none, none, none, link_id(2, true), link_id(4, false)]);
         let roots: Vec<_> = wires.roots().collect();
         assert_eq!(roots, [(id(1), LinkId { wire: 3, back: true }), (id(3), LinkId { wire: 4, back: true })]);

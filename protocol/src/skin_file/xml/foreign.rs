@@ -63,7 +63,8 @@ mod tests {
 
     #[test]
     fn files_that_stand_for_others_are_named() {
-        let what = |bytes: &[u8]| detect_foreign(bytes).map(|it| (it.line, it.what.split(' ').nth(1).unwrap()));
+        let what =
+            |bytes: &[u8]| detect_foreign(bytes).map(|it| (it.line, it.what.split(' ').nth(1).unwrap()));
         assert_eq!(what(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"), Some((None, "Git")));
         assert_eq!(what(b"\n<!DOCTYPE html>\n<html>"), Some((None, "web")));
         assert_eq!(what(b"<HTML lang='en'>"), Some((None, "web")));

@@ -18,7 +18,7 @@ use std::ops::Range;
 pub use encoding::{decode, utf16_name};
 pub use escape::escaped;
 pub use foreign::{ForeignFile, detect_foreign, kind_of_root};
-use tags::{XmlPart, Tag, parts};
+use tags::{Tag, XmlPart, parts};
 
 /// Maximum number of attributes of an element. The limit exists because a parser compares each attribute with all
 /// others.

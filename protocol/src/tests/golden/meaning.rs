@@ -6,13 +6,13 @@ use std::str::FromStr;
 use crate::fixed::{Q, TorqueFormat};
 use crate::id::{CellId, Kind, Node};
 use crate::message::{
-    Answer, BaselinePage, AppliesFrom, ReceivedCounts, Heartbeat, Joints, Message, MessageError, NetworkPage, PortState,
-    Ports, RejectedCounts, Request, SensorPage, SkinSensors, State, Tree,
+    Answer, AppliesFrom, BaselinePage, Heartbeat, Joints, Message, MessageError, NetworkPage, PortState,
+    Ports, ReceivedCounts, RejectedCounts, Request, SensorPage, SkinSensors, State, Tree,
 };
 use crate::packet::{Epoch, Length, MAX_WORDS, PacketError, WORDS, Words};
 use crate::parameters::{
-    Baseline, Contact, Events, LinksDown, Parameter, Parameters, Pose, Reply, Row, RowKind, Sensing, Slots,
-    BaselineSettings,
+    Baseline, BaselineSettings, Contact, Events, LinksDown, Parameter, Parameters, Pose, Reply, Row, RowKind,
+    Sensing, Slots,
 };
 use crate::port::{Hello, LinkId, PortMessage, Rank, Walk};
 

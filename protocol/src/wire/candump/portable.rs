@@ -7,7 +7,7 @@
 //!   0          11     18 20   3 or 8 digits, # or ## and flags, whole bytes, the end of the line
 //! ```
 
-use super::read::{eight_digits, four_bytes, is_blank, hex_value};
+use super::read::{eight_digits, four_bytes, hex_value, is_blank};
 use super::{Record, Timestamp};
 use crate::can::{EXTENDED, EXTENDED_MASK, Format, Frame, STANDARD_MASK};
 
@@ -129,7 +129,12 @@ mod tests {
 
     fn agrees(line: &[u8]) {
         if let Some(record) = parse_record(line) {
-            assert_eq!(parse_general(line), Ok(CandumpLine::Frame(record)), "{:?}", String::from_utf8_lossy(line));
+            assert_eq!(
+                parse_general(line),
+                Ok(CandumpLine::Frame(record)),
+                "{:?}",
+                String::from_utf8_lossy(line)
+            );
         }
     }
 

@@ -17,7 +17,9 @@ mod network;
 mod sensors;
 mod state;
 
-pub use network::{ReceivedCounts, Heartbeat, NetworkPage, NetworkPages, PortState, Ports, RejectedCounts, Tree};
+pub use network::{
+    Heartbeat, NetworkPage, NetworkPages, PortState, Ports, ReceivedCounts, RejectedCounts, Tree,
+};
 pub use sensors::{BaselinePage, Readings, SensorPage, SkinSensors};
 pub use state::State;
 
@@ -304,7 +306,8 @@ impl Message {
                 Self::Configured { from: sender()?, tag: epoch.0, answer }
             }
             Kind::Stimulus => {
-                let from = if count & FROM_NEXT_FLAG == 0 { AppliesFrom::Epoch(epoch) } else { AppliesFrom::Next };
+                let from =
+                    if count & FROM_NEXT_FLAG == 0 { AppliesFrom::Epoch(epoch) } else { AppliesFrom::Next };
                 let page = SensorPage::decode(kind, count & !FROM_NEXT_FLAG, words.six())?;
                 Self::Stimulus { to: addressee(kind, node)?, from, page }
             }

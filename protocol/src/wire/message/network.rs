@@ -241,9 +241,14 @@ impl NetworkPage {
                 let segments = [u16::from_le_bytes([a, b]), u16::from_le_bytes([c, d])];
                 (0, [segments[0], segments[1], configuration, sent, rejected, state.0])
             }
-            Self::Received(ReceivedCounts { joints, joints_late, joints_repeated, stimuli, stimuli_late, torques }) => {
-                (1, [joints, joints_late, joints_repeated, stimuli, stimuli_late, torques])
-            }
+            Self::Received(ReceivedCounts {
+                joints,
+                joints_late,
+                joints_repeated,
+                stimuli,
+                stimuli_late,
+                torques,
+            }) => (1, [joints, joints_late, joints_repeated, stimuli, stimuli_late, torques]),
             Self::Rejected(RejectedCounts { length, crc, foreign, meaning, incomplete, stimuli }) => {
                 (2, [length, crc, foreign, meaning, incomplete, stimuli])
             }

@@ -30,7 +30,7 @@ mod rows;
 mod switches;
 
 pub use abilities::{Abilities, MissingAbility};
-pub use baseline::{Baseline, Tare, BaselineSettings};
+pub use baseline::{Baseline, BaselineSettings, Tare};
 pub use error::ParameterError;
 pub use rows::{Row, RowKind};
 pub use switches::{Events, LinksDown, Reply, Sensing, Slots};

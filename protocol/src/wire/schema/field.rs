@@ -135,7 +135,9 @@ impl Field {
             | FieldFormat::Page(bits) => (bits, 0, false),
             FieldFormat::Flag(bits) => (bits, 0, bits == 16),
             FieldFormat::Port => (8, 0, false),
-            FieldFormat::Word | FieldFormat::Hex | FieldFormat::State | FieldFormat::Group(_) => (16, 0, false),
+            FieldFormat::Word | FieldFormat::Hex | FieldFormat::State | FieldFormat::Group(_) => {
+                (16, 0, false)
+            }
             FieldFormat::Signed | FieldFormat::Choice | FieldFormat::Reason => (16, 0, true),
             FieldFormat::Angle | FieldFormat::Position => (16, 14, true),
             FieldFormat::Torque => (16, TorqueFormat::default().fraction(), true),

@@ -2,7 +2,7 @@
 
 #[cfg(feature = "host")]
 use super::AdapterReport;
-use super::{BEL, CR, SlcanCommand, MAX_LINE, digit, dlc_len, number};
+use super::{BEL, CR, MAX_LINE, SlcanCommand, digit, dlc_len, number};
 use crate::can::{
     BIT_RATE_SWITCH, ERROR_STATE, EXTENDED, EXTENDED_MASK, FD_FORMAT, Format, Frame, STANDARD_MASK,
 };

@@ -301,11 +301,19 @@ fn bit_rates_have_these_commands() {
         (1_000_000, 8),
         (83_300, 9),
     ] {
-        assert_eq!(SlcanCommand::nominal_bit_rate(bit_rate), Some(SlcanCommand::BitRate(digit)), "{bit_rate}");
+        assert_eq!(
+            SlcanCommand::nominal_bit_rate(bit_rate),
+            Some(SlcanCommand::BitRate(digit)),
+            "{bit_rate}"
+        );
     }
     assert_eq!(SlcanCommand::nominal_bit_rate(300_000), None);
     for (bit_rate, digit) in [(500_000, 0), (1_000_000, 1), (2_000_000, 2), (5_000_000, 5), (8_000_000, 8)] {
-        assert_eq!(SlcanCommand::data_bit_rate(bit_rate), Some(SlcanCommand::DataBitRate(digit)), "{bit_rate}");
+        assert_eq!(
+            SlcanCommand::data_bit_rate(bit_rate),
+            Some(SlcanCommand::DataBitRate(digit)),
+            "{bit_rate}"
+        );
     }
     assert_eq!(SlcanCommand::data_bit_rate(9_000_000), None);
     assert_eq!(SlcanCommand::data_bit_rate(2_500_000), None);

@@ -23,7 +23,8 @@ fn of_many_that_start_at_once_over_a_stale_socket_one_wins() {
         let directory = parent.path().join("skinbus");
         leave_stale_socket(&directory);
         let won = std::thread::scope(|scope| {
-            let starts: Vec<_> = (0..8).map(|_| scope.spawn(|| ServerThread::start_in(&directory, BUS))).collect();
+            let starts: Vec<_> =
+                (0..8).map(|_| scope.spawn(|| ServerThread::start_in(&directory, BUS))).collect();
             let served: Vec<_> = starts.into_iter().filter_map(|start| start.join().unwrap().ok()).collect();
             served.len()
         });

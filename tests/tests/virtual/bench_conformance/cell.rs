@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use cell_node::flash::FlashState;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
-use conformance::bus::{TestBus, ObservedFrame, StopReason};
+use conformance::bus::{ObservedFrame, StopReason, TestBus};
 use protocol::can::{Format, Frame};
 use protocol::id::CellId;
 use protocol::packet::Packet;

@@ -8,7 +8,7 @@ use protocol::id::CellId;
 use protocol::message::{
     Answer, AppliesFrom, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
 };
-use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembly, Reassembler, WORDS, Words};
+use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembler, Reassembly, WORDS, Words};
 use protocol::parameters::{MAX_JOINTS, Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
@@ -97,7 +97,9 @@ impl Memory {
                 if to.addresses(cell) && self.test_mode && self.pending.len() < 8 =>
             {
                 let from = match (from, self.last) {
-                    (AppliesFrom::Epoch(first), Some((last, _))) if last.epochs_since(first) >= 0 => AppliesFrom::Next,
+                    (AppliesFrom::Epoch(first), Some((last, _))) if last.epochs_since(first) >= 0 => {
+                        AppliesFrom::Next
+                    }
                     (from, _) => from,
                 };
                 self.pending.push((from, page));

@@ -5,7 +5,7 @@ use std::os::fd::OwnedFd;
 use std::time::Duration;
 
 use protocol::bus::batch::{is_memory_shortage, send_one};
-use protocol::bus::embedded::{HelloReply, MAX_HELLO_BYTES, ClientHello, VERSION};
+use protocol::bus::embedded::{ClientHello, HelloReply, MAX_HELLO_BYTES, VERSION};
 use rustix::event::epoll::{self, EventData, EventFlags};
 use rustix::io::Errno;
 use rustix::net::{RecvFlags, Shutdown, SocketFlags, shutdown, sockopt};

@@ -1,7 +1,7 @@
 use std::collections::VecDeque;
 use std::os::unix::net::UnixStream;
 
-use protocol::bus::{Bus, KindChoice, Filter, Inbox, BusOptions};
+use protocol::bus::{Bus, BusOptions, Filter, Inbox, KindChoice};
 use protocol::can::{Frame, STANDARD_MASK};
 use tempfile::TempDir;
 

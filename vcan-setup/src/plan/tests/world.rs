@@ -68,7 +68,9 @@ impl World {
             StepAction::SetRates { index, rates, before, was_up } => {
                 let found = self.by_number(*index, name);
                 assert_eq!(found.up, *was_up);
-                let InterfaceKind::Hardware(hardware) = &mut found.kind else { panic!("no hardware: {found:?}") };
+                let InterfaceKind::Hardware(hardware) = &mut found.kind else {
+                    panic!("no hardware: {found:?}")
+                };
                 assert_eq!(hardware.rates(), *before);
                 (hardware.bitrate, hardware.data_bitrate) = (rates.bitrate, rates.data_bitrate);
                 hardware.fd = rates.data_bitrate.is_some();

@@ -1,7 +1,7 @@
 //! Rounding of sums with more than two products.
 
 use crate::kernel::Number;
-use crate::kernel::rounding::{Bounded, Saturating, Rounding};
+use crate::kernel::rounding::{Bounded, Rounding, Saturating};
 
 /// Roundings of sums that only the projection kernel needs, with saturation or without.
 pub(super) trait Sums: Rounding {

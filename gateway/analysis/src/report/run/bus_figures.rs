@@ -6,7 +6,7 @@ use protocol::id::{Command, Kind};
 use protocol::message::{Message, SensorPage};
 use protocol::packet::data_id;
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{SkinReply, Skin};
+use protocol::skin::{Skin, SkinReply};
 use protocol::time::Micros;
 use protocol::wire_time::Bits;
 
@@ -15,7 +15,7 @@ use super::touched::TouchHistory;
 use crate::fit::rates::ChosenRates;
 use crate::report::thin::{BinnedSums, ThinnedLine};
 use model::central::Central;
-use model::table::{Replies, BusTotals, Table};
+use model::table::{BusTotals, Replies, Table};
 use trace::capture::LatchedFrame;
 
 /// Interval in µs at which timeouts of cells are checked, as in the gateway's receiver.
@@ -257,7 +257,8 @@ impl BusFigures {
     /// Updates the force on each cell for the newest joints, from the cell's stimuli or its own measurement.
     fn forces(&mut self, at: f64) {
         let (table, central, measured) = (&self.table, &self.central, &self.measured);
-        let sensors = table.sensors(self.received.last_timeout_check).zip(table.cells()).zip(measured).enumerate();
+        let sensors =
+            table.sensors(self.received.last_timeout_check).zip(table.cells()).zip(measured).enumerate();
         let mut in_contact = Some(0);
         let forces = sensors.map(|(place, (((sensors, _), cell), measured))| {
             let stimulated = sensors.map(|sensors| central.force(place, &sensors));

@@ -3,7 +3,7 @@
 
 use protocol::skin::Skin;
 
-use super::bus_figures::{Effect, BusFigures};
+use super::bus_figures::{BusFigures, Effect};
 use super::motion::Motion;
 
 /// A capture with frames only, as far as it has been read.

@@ -20,7 +20,7 @@ mod touched;
 
 use std::path::PathBuf;
 
-use protocol::skin::{SkinBus, Skin};
+use protocol::skin::{Skin, SkinBus};
 use protocol::wire_time::BitRatesError;
 use thiserror::Error;
 
@@ -31,7 +31,8 @@ use bus_figures::BusFigures;
 use frames_only::FramesOnly;
 use motion::Motion;
 use trace::capture::{
-    CaptureError, Entry, RecordingExtras, CaptureFormat, Item, Note, NoteKind, OtherMessage, Reader, SKIN_ATTACHMENT, seconds_since,
+    CaptureError, CaptureFormat, Entry, Item, Note, NoteKind, OtherMessage, Reader, RecordingExtras,
+    SKIN_ATTACHMENT, seconds_since,
 };
 use trace::recording::layout::Layout;
 use trace::ros2::read;

@@ -125,7 +125,8 @@ impl Draft<'_> {
             .reduce(Accuracy::with);
         let accuracy = accuracy.unwrap_or_default();
         let farthest = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.farthest);
-        let farthest = farthest.max_by(|one, other| one.1.total_cmp(&other.1)).map(|(at, _)| self.view_command(at));
+        let farthest =
+            farthest.max_by(|one, other| one.1.total_cmp(&other.1)).map(|(at, _)| self.view_command(at));
         for (what, theirs, errors, is_whole) in [
             ("torques of single cells, loaded joints", paper::SINGLE_NM, accuracy.single, false),
             ("the whole skin's torque, all joints", paper::SUMMED_NM, accuracy.whole, true),

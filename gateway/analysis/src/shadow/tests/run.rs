@@ -8,7 +8,8 @@ use protocol::can::{BIT_RATE_SWITCH, FD_FORMAT, Format};
 use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Node};
 use protocol::message::{
-    AppliesFrom, ReceivedCounts, Heartbeat, Joints, Message, NetworkPage, RejectedCounts, Request, SensorPage, SkinSensors, State,
+    AppliesFrom, Heartbeat, Joints, Message, NetworkPage, ReceivedCounts, RejectedCounts, Request,
+    SensorPage, SkinSensors, State,
 };
 use protocol::packet::{Epoch, WORDS};
 

@@ -5,9 +5,9 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use model::tracker::{AddressClaim, PerCell, HeartbeatKind};
+use model::tracker::{AddressClaim, HeartbeatKind, PerCell};
 use protocol::id::CellId;
-use protocol::message::{Answer, ReceivedCounts, Joints, Message, NetworkPage};
+use protocol::message::{Answer, Joints, Message, NetworkPage, ReceivedCounts};
 use protocol::packet::{Epoch, Words};
 use protocol::schema::Units;
 use protocol::time::Micros;
@@ -23,8 +23,8 @@ use super::sums::{SumsByCell, Trees};
 use super::tally::Uncompared;
 use crate::replay::difference::ReplyKind;
 use crate::replay::survey::SurveyedCell as Surveyed;
-use model::latched::State;
 use model::latched::KnownContacts;
+use model::latched::State;
 
 /// Maximum number of remembered unanswered requests per cell.
 const ANNOUNCED: usize = 256;
@@ -396,7 +396,10 @@ impl BusComparator {
         let found = || PresentCell { progress: Progress::found(has_announced), ..PresentCell::default() };
         let present = self.present.entry(cell).or_insert_with(found);
         if let NetworkPage::Heartbeat(heartbeat) = page {
-            if matches!(present.claim.receive(Micros(0), heartbeat), HeartbeatKind::Claimant | HeartbeatKind::Outsider) {
+            if matches!(
+                present.claim.receive(Micros(0), heartbeat),
+                HeartbeatKind::Claimant | HeartbeatKind::Outsider
+            ) {
                 return;
             }
             present.progress = present.progress.next(if reported == Some(self.announcements) {

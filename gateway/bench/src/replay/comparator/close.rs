@@ -7,10 +7,10 @@ use protocol::packet::Words;
 
 use super::bus_comparator::{Both, BusComparator, KnownCell, Round};
 use super::states::contact::{self, End};
-use super::sums::{SumComparison, ROUNDING, EpochSums, OmitReason, compare};
+use super::sums::{EpochSums, OmitReason, ROUNDING, SumComparison, compare};
 use super::tally::Uncompared;
 use super::{Comparator, First, Tally};
-use crate::replay::difference::{DifferenceKind, SentValue, ReplyKind};
+use crate::replay::difference::{DifferenceKind, ReplyKind, SentValue};
 
 impl Comparator {
     pub(super) fn close_round(&mut self, index: usize) {
@@ -88,7 +88,9 @@ impl BusComparator {
                     let was_over = was_over && !known_cell.cell.is_counted_at(round.nanos);
                     is_end && (known_cell.end == End::Earlier || was_over)
                 };
-                let Some(known_cell) = known_cell.filter(is_later) else { return Some(DifferenceKind::Missing) };
+                let Some(known_cell) = known_cell.filter(is_later) else {
+                    return Some(DifferenceKind::Missing);
+                };
                 known_cell.end = known_cell.end.next(contact::Round::LateEnd);
                 tally.lacking.said_later += 1;
                 None
@@ -127,11 +129,15 @@ impl BusComparator {
                 then.is_doubtful(cell, is_touched, false)
                     || round.sending.is_repeated() && now.is_doubtful(cell, is_touched, true)
             };
-            if matches!(outcome, SumComparison::Different | SumComparison::Missing | SumComparison::Extra) && is_doubtful() {
+            if matches!(outcome, SumComparison::Different | SumComparison::Missing | SumComparison::Extra)
+                && is_doubtful()
+            {
                 outcome = SumComparison::Omitted(OmitReason::NotTaken);
             }
             let owns = [then.own_term(cell), now.own_term(cell)];
-            if let ([Some(then), Some(now)], SumComparison::Equal | SumComparison::Different) = (&owns, outcome) {
+            if let ([Some(then), Some(now)], SumComparison::Equal | SumComparison::Different) =
+                (&owns, outcome)
+            {
                 let max = tally.sum_words.count(then.differences(now));
                 tally.tolerated += u64::from(outcome == SumComparison::Equal && max > ROUNDING);
             }
@@ -202,7 +208,8 @@ impl BusComparator {
                     (None, Some(_)) => DifferenceKind::Extra,
                 };
                 tally.count(how, false);
-                let said = [recorded, now].map(|said| said.map(|(tag, answer)| SentValue::Answer(tag, answer)));
+                let said =
+                    [recorded, now].map(|said| said.map(|(tag, answer)| SentValue::Answer(tag, answer)));
                 first.note(how, self.called(), cell, None, said);
             }
         }

@@ -31,10 +31,10 @@ use states::first_joints::FirstJoints;
 use states::progress::Progress;
 use states::{line, sending};
 pub use sums::OwnTerm;
-use sums::{EpochSums, CellSum};
-pub use tally::{Uncompared, Steps, Tally};
+use sums::{CellSum, EpochSums};
+pub use tally::{Steps, Tally, Uncompared};
 
-use super::difference::{Difference, DifferenceKind, SentValue, ReplyKind, Position};
+use super::difference::{Difference, DifferenceKind, Position, ReplyKind, SentValue};
 use super::survey::SurveyedCell as Surveyed;
 
 /// Maximum number of joint broadcasts between the joints that a reply answers and the arrival of the reply. It is far
@@ -200,11 +200,7 @@ impl Comparator {
         let Some(number) = round else { return };
         it.sent = it.sent.max(number + 1);
         it.send(number, sending::Input::Sent { under: epoch });
-        while self
-            .buses
-            .get(bus_index)
-            .is_some_and(|bus_comparator| bus_comparator.base + WINDOW < number)
-        {
+        while self.buses.get(bus_index).is_some_and(|bus_comparator| bus_comparator.base + WINDOW < number) {
             self.close_round(bus_index);
         }
     }
@@ -336,10 +332,8 @@ impl Comparator {
     /// that are sent from then on.
     pub fn mute(&mut self, is_muted: bool) {
         self.is_muted = is_muted;
-        for announced in self
-            .buses
-            .iter_mut()
-            .flat_map(|bus_comparator| bus_comparator.announced.iter_mut().flatten())
+        for announced in
+            self.buses.iter_mut().flat_map(|bus_comparator| bus_comparator.announced.iter_mut().flatten())
         {
             announced.round = None;
         }

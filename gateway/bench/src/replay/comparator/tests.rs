@@ -1,10 +1,10 @@
 use super::bus_comparator::KnownCell;
 use super::*;
-use crate::replay::survey::{TimeRange, Survey};
+use crate::replay::survey::{Survey, TimeRange};
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
 use protocol::fixed::Q3_12;
-use protocol::message::{ReceivedCounts, Heartbeat, Joints, SensorPage, State as Flags, Tree};
+use protocol::message::{Heartbeat, Joints, ReceivedCounts, SensorPage, State as Flags, Tree};
 use protocol::packet;
 use protocol::parameters::Parameter as P;
 
@@ -61,8 +61,7 @@ fn rated_within(tolerance: u16, recording: &[Message], now: &[Message]) -> Compa
     }
     survey.finish();
     let cells = survey.buses[0].cells.clone();
-    comparator.buses[0].known =
-        cells.into_iter().map(|(node, cell)| (node, KnownCell::new(cell))).collect();
+    comparator.buses[0].known = cells.into_iter().map(|(node, cell)| (node, KnownCell::new(cell))).collect();
     comparator.mute(false);
     for (nanos, message) in times.zip(recording) {
         if let Message::Joints { epoch, .. } = *message {
@@ -123,7 +122,10 @@ fn one_step_is_a_difference() {
     let comparator = rated(&run(), &now);
     assert_eq!(counts(&comparator), [2, 1, 0, 0]);
     let first = comparator.first().unwrap();
-    assert_eq!((first.how, first.when.map(|when| (when.joints, when.epoch))), (DifferenceKind::Different, Some((2, 2))));
+    assert_eq!(
+        (first.how, first.when.map(|when| (when.joints, when.epoch))),
+        (DifferenceKind::Different, Some((2, 2)))
+    );
     assert!(first.text.ends_with("joint 1: 1 step more (0.0002 Nm)"), "{first:?}");
 }
 
@@ -132,7 +134,10 @@ fn missing_and_extra_replies_are_distinguished() {
     let mut now = run();
     now.remove(5);
     let comparator = rated(&run(), &now);
-    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([2, 0, 1, 0], DifferenceKind::Missing));
+    assert_eq!(
+        (counts(&comparator), comparator.first().unwrap().how),
+        ([2, 0, 1, 0], DifferenceKind::Missing)
+    );
     let mut now = run();
     now.insert(9, torque(1, 4, 9));
     let comparator = rated(&[&run()[..], &[joints(5)]].concat(), &now);
@@ -380,7 +385,10 @@ fn a_cell_that_adds_nothing_any_more_is_missing() {
     );
     let comparator = rated(&row(), &now);
     // It is unknown whether the parent received it then.
-    assert_eq!((counts(&comparator), comparator.first().unwrap().how), ([11, 0, 1, 0], DifferenceKind::Missing));
+    assert_eq!(
+        (counts(&comparator), comparator.first().unwrap().how),
+        ([11, 0, 1, 0], DifferenceKind::Missing)
+    );
 }
 
 #[test]

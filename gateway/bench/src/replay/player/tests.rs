@@ -73,12 +73,25 @@ fn frame(id: u32) -> Frame {
 }
 
 fn plain(at_us: u64, bus_link: usize, id: u32) -> PlayerStep {
-    PlayerStep::Frame(DueFrame { at: at_us * 1_000, bus_index: bus_link, frame: frame(id), role: FrameRole::Plain, is_late: false })
+    PlayerStep::Frame(DueFrame {
+        at: at_us * 1_000,
+        bus_index: bus_link,
+        frame: frame(id),
+        role: FrameRole::Plain,
+        is_late: false,
+    })
 }
 
 fn joints(at_us: u64, bus_link: usize, round: u64) -> PlayerStep {
-    let role = FrameRole::Joints(OpenJoints { epoch: Epoch(7), joints: Joints::default(), round: Some(round) });
-    PlayerStep::Frame(DueFrame { at: at_us * 1_000, bus_index: bus_link, frame: frame(1), role, is_late: false })
+    let role =
+        FrameRole::Joints(OpenJoints { epoch: Epoch(7), joints: Joints::default(), round: Some(round) });
+    PlayerStep::Frame(DueFrame {
+        at: at_us * 1_000,
+        bus_index: bus_link,
+        frame: frame(1),
+        role,
+        is_late: false,
+    })
 }
 
 fn play(player: Player, stage: &mut Fake, steps: impl IntoIterator<Item = PlayerStep>) -> PlayerResult {
@@ -147,8 +160,13 @@ fn in_lockstep_joints_wait_for_the_answers_to_those_before_on_their_bus() {
 
 #[test]
 fn the_first_segment_of_joints_waits_too() {
-    let segment =
-        PlayerStep::Frame(DueFrame { at: 0, bus_index: 0, frame: frame(1), role: FrameRole::SegmentOfJoints, is_late: false });
+    let segment = PlayerStep::Frame(DueFrame {
+        at: 0,
+        bus_index: 0,
+        frame: frame(1),
+        role: FrameRole::SegmentOfJoints,
+        is_late: false,
+    });
     let sync = vec![vec![frame(2), frame(2)]];
     let mut stage = Fake::default();
     play(
@@ -201,7 +219,8 @@ fn a_state_that_is_restored_takes_its_time_and_the_clock_begins_after_it() {
 
 #[test]
 fn frames_older_than_the_last_one_are_sent_at_once_and_are_not_late() {
-    let late = DueFrame { at: 9_000_000, bus_index: 0, frame: frame(9), role: FrameRole::Plain, is_late: true };
+    let late =
+        DueFrame { at: 9_000_000, bus_index: 0, frame: frame(9), role: FrameRole::Plain, is_late: true };
     let mut stage = Fake::default();
     let played =
         play(Player::new(1, Pace::Timed(1.0), None), &mut stage, [plain(0, 0, 1), PlayerStep::Frame(late)]);

@@ -50,7 +50,11 @@ fn decoded(frame: &Frame) -> Decoded {
 }
 
 /// All steps of `passes` passes.
-fn plan_summary(part: TimeRange, selection: impl FnOnce(&mut Selection), passes: u32) -> (Vec<DueFrame>, PlanSummary) {
+fn plan_summary(
+    part: TimeRange,
+    selection: impl FnOnce(&mut Selection),
+    passes: u32,
+) -> (Vec<DueFrame>, PlanSummary) {
     share_of(&capture(), part, selection, passes)
 }
 

@@ -5,7 +5,8 @@ use std::collections::BTreeSet;
 
 use super::*;
 use crate::summary::{
-    CellError, ErrorCells, HaltSummary, HostSummary, NetworkSummary, OutagesSummary, SumsSummary, UplinkSummary,
+    CellError, ErrorCells, HaltSummary, HostSummary, NetworkSummary, OutagesSummary, SumsSummary,
+    UplinkSummary,
 };
 use model::table::{Contributions, Errors};
 use trace::recording::account::{RecordingAccount, WrittenFile};
@@ -164,7 +165,8 @@ const CASES: &[Case] = &[
     }),
     ("the recording is incomplete, without 2 frames and 1 other message: ", |it| {
         let messages_lost = [("ticks", 1)].into();
-        it.recording = Some(RecordingAccount { lost: 2, lost_queue: 2, messages_lost, ..RecordingAccount::default() });
+        it.recording =
+            Some(RecordingAccount { lost: 2, lost_queue: 2, messages_lost, ..RecordingAccount::default() });
     }),
     ("replies missing on vcan0: 3 lost on the way to the gateway, 1 in doubt", |it| {
         it.buses[0].replies.in_time -= 4;
@@ -242,7 +244,8 @@ fn the_error_of_a_file_says_what_to_do_with_it_and_no_other_hint_does() {
         let path = "r.mcap.part".to_owned();
         let file = WrittenFile { path, format: "mcap", frames: 0, messages: 0, bytes: 0 };
         let errors = errors.iter().map(|&error| error.to_owned()).collect();
-        let recording = RecordingAccount { lost_write, errors, files: vec![file], ..RecordingAccount::default() };
+        let recording =
+            RecordingAccount { lost_write, errors, files: vec![file], ..RecordingAccount::default() };
         Summary { recording: Some(recording), ..well() }.lost_frames().unwrap()
     };
     let taken = "r.mcap: taken; r.mcap.part is the whole recording: rename it";

@@ -68,9 +68,15 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
         request(1, Request::Read { number: 0 }),
         request(2, write),
         request(3, Request::Read { number: 77 }),
-        request(4, Request::Write { number: Parameter::Mode.number(), words: padded_words([(!presses).into()]) }),
+        request(
+            4,
+            Request::Write { number: Parameter::Mode.number(), words: padded_words([(!presses).into()]) },
+        ),
         request(5, Request::Write { number: Parameter::Sensing.number(), words: padded_words([2]) }),
-        request(6, Request::Write { number: Parameter::Mode.number(), words: padded_words([(!presses).into()]) }),
+        request(
+            6,
+            Request::Write { number: Parameter::Mode.number(), words: padded_words([(!presses).into()]) },
+        ),
         session.joints(second, &[0; MAX_JOINTS]),
         Message::Halt,
     ];
@@ -89,8 +95,9 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
     session.idle(Span::from_millis(20))?;
     let came = session.answers().iter().filter(|it| it.at < end);
     let came: Vec<_> = came.map(|it| it.message.id().kind.name()).collect();
-    session
-        .check("CLAIM-2", came.is_empty(), || format!("a claiming cell must not answer requests, but sent {}", came.join(", ")));
+    session.check("CLAIM-2", came.is_empty(), || {
+        format!("a claiming cell must not answer requests, but sent {}", came.join(", "))
+    });
     let at = settled(session, claimed)?;
     if at.is_none() {
         return Ok(true);
@@ -99,10 +106,14 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
     session.known.halted = Some(true);
     session.known.hash = session.known.parameters.map(|it| it.hash());
     let is_on = session.exchange_all(&[])?.state().has(State::TEST_MODE);
-    session.check("CLAIM-2", is_on == presses, || "a claiming cell must ignore a write of parameter 5, but obeyed it".to_owned());
+    session.check("CLAIM-2", is_on == presses, || {
+        "a claiming cell must ignore a write of parameter 5, but obeyed it".to_owned()
+    });
     let counters = session.counters()?;
     let is_so = counters.heard.joints == 2 && counters.heard.torques == 0;
-    session.check("CLAIM-2", is_so, || format!("a claiming cell must count 2 joints and no torques, but the counters are {counters}"));
+    session.check("CLAIM-2", is_so, || {
+        format!("a claiming cell must count 2 joints and no torques, but the counters are {counters}")
+    });
     let refused = protocol::message::RejectedCounts { stimuli: u16::from(!presses), ..Default::default() };
     session.check("CLAIM-2", counters.refused == refused, || {
         format!("a claiming cell must not count packets that it ignores, but the counters are {counters}")
@@ -114,7 +125,7 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
             _ => None,
         });
         session.check("STIM-8", skin == Some(arm::press(4_096)), || {
-            format!("a claiming cell must latch a stimulus, but {} is latched", arm::format_skin(format_skin))
+            format!("a claiming cell must latch a stimulus, but {} is latched", arm::format_skin(skin))
         });
     }
     session.ready(&arm::example_parameters(2))?;
@@ -151,15 +162,20 @@ pub(super) fn stays(session: &mut Session<'_>) -> Result<(), StopReason> {
         if let Some((answered, state)) = answer {
             session.note_time("heartbeat to a claimant", at, answered);
             let is_so = state.has(State::CLAIMING) || answered >= end;
-            session.check("CLAIM-3", is_so, || "a claiming cell must set CLAIMING in its answer to a claim, but it is clear".to_owned());
-            session
-                .check("CLAIM-7", state.has(State::DUPLICATE), || "a claiming cell must set DUPLICATE in its answer to a claim, but it is clear".to_owned());
+            session.check("CLAIM-3", is_so, || {
+                "a claiming cell must set CLAIMING in its answer to a claim, but it is clear".to_owned()
+            });
+            session.check("CLAIM-7", state.has(State::DUPLICATE), || {
+                "a claiming cell must set DUPLICATE in its answer to a claim, but it is clear".to_owned()
+            });
         }
         session.idle(Span::from_millis(30))?;
     }
     session.begin_expected_exchange();
     let at = settled(session, claimed)?;
-    session.check("CLAIM-3", at.is_some(), || "the cell must not give way to a higher serial number, but did".to_owned());
+    session.check("CLAIM-3", at.is_some(), || {
+        "the cell must not give way to a higher serial number, but did".to_owned()
+    });
     session.known.hash = None;
     session.ready(&arm::example_parameters(2))?;
     Ok(())
@@ -191,7 +207,8 @@ fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Op
         let is_answered = new.count() > 1;
         if is_set && is_answered || !is_long || attempt == ATTEMPTS {
             session.check("CLAIM-7", is_set || !is_long, || {
-                "DUPLICATE must be set in the first heartbeat if claims came before it, but is clear".to_owned()
+                "DUPLICATE must be set in the first heartbeat if claims came before it, but is clear"
+                    .to_owned()
             });
             session.check("CLAIM-3", is_answered || !is_long, || {
                 "claims that came before the first heartbeat must be answered, but were not".to_owned()
@@ -215,12 +232,17 @@ pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), StopReason> {
     frames.extend(other.frames(session.format));
     session.send(&frames)?;
     let at = settled(session, claimed)?;
-    session
-        .check("CLAIM-3", at.is_some(), || "the cell must ignore a 4nn of a page that does not exist, but gave way to it".to_owned());
-    let is_set =
-        session.answers().iter().filter_map(CellPacket::beat).any(|(beat, _)| beat.state.has(State::DUPLICATE));
-    session
-        .check("COUNT-1", !is_set, || "DUPLICATE must not be set by a 4nn of a page that does not exist, but is set".to_owned());
+    session.check("CLAIM-3", at.is_some(), || {
+        "the cell must ignore a 4nn of a page that does not exist, but gave way to it".to_owned()
+    });
+    let is_set = session
+        .answers()
+        .iter()
+        .filter_map(CellPacket::beat)
+        .any(|(beat, _)| beat.state.has(State::DUPLICATE));
+    session.check("COUNT-1", !is_set, || {
+        "DUPLICATE must not be set by a 4nn of a page that does not exist, but is set".to_owned()
+    });
     session.known.hash = None;
     Ok(())
 }
@@ -257,7 +279,9 @@ fn is_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Result<(
     session.check("CLAIM-3", came == 0, || {
         format!("the cell (serial number {serial}) must give way to {what}, but sent {came} packets after it")
     });
-    session.check("CLAIM-4", came == 0, || format!("the cell must be silent after it gave way to {what}, but sent {came} packets"));
+    session.check("CLAIM-4", came == 0, || {
+        format!("the cell must be silent after it gave way to {what}, but sent {came} packets")
+    });
     Ok(())
 }
 

@@ -8,7 +8,7 @@ use protocol::message::{Answer, Heartbeat};
 use protocol::packet::Epoch;
 
 use super::*;
-use crate::bus::{TestBus, ObservedFrame};
+use crate::bus::{ObservedFrame, TestBus};
 
 const OLD: Span = Span(120);
 const NEW: Span = Span::from_millis(60);

@@ -3,7 +3,7 @@
 use nalgebra::Point3;
 use roxmltree::Node;
 
-use super::{Named as _, ElementIds, child, children, floats, numbers};
+use super::{ElementIds, Named as _, child, children, floats, numbers};
 use crate::mesh::polygon::{Triangulation, fan};
 use crate::mesh::{MAX_TRIANGLES, MeshError, Triangle, syntax, too_many};
 

@@ -208,7 +208,8 @@ impl Truth {
     /// Returns the tree that cells would build, breadth first.
     fn trees(&self) -> BTreeMap<CellId, Tree> {
         let mut trees = BTreeMap::new();
-        let mut next = VecDeque::from([(cell(1), Tree { parent: Some(0), parent_port: 4, ..Tree::default() })]);
+        let mut next =
+            VecDeque::from([(cell(1), Tree { parent: Some(0), parent_port: 4, ..Tree::default() })]);
         while let Some((node, tree)) = next.pop_front() {
             if trees.contains_key(&node) {
                 continue;
@@ -217,7 +218,10 @@ impl Truth {
             for other in (0..PORTS).filter_map(|port| self.works(WireEnd { cell: node, port })) {
                 let up = u8::try_from(other.port).unwrap();
                 let depth = tree.depth + 1;
-                next.push_back((other.cell, Tree { parent: Some(node.get()), parent_port: up, depth, ..Tree::default() }));
+                next.push_back((
+                    other.cell,
+                    Tree { parent: Some(node.get()), parent_port: up, depth, ..Tree::default() },
+                ));
             }
         }
         trees

@@ -32,7 +32,9 @@ pub(super) struct Candidate {
 impl Candidate {
     /// Returns the candidate after a heartbeat that is not the owner's; `before` is the candidate before it.
     pub(super) fn next(before: Option<Self>, new: Incarnation) -> Self {
-        let goes_on = |it: &Self| it.last.sent(&new).is_some() && new.at.elapsed_since(it.last.at) >= MIN_HEARTBEAT_INTERVAL;
+        let goes_on = |it: &Self| {
+            it.last.sent(&new).is_some() && new.at.elapsed_since(it.last.at) >= MIN_HEARTBEAT_INTERVAL
+        };
         let shown = before.filter(goes_on).map_or(1, |it| it.shown.saturating_add(1));
         Self { last: new, shown }
     }

@@ -81,7 +81,8 @@ impl Incarnation {
 
     /// Returns true if the cell can have sent this number of packets from its last heartbeat to the time `at`.
     pub(super) fn has_time_for(&self, at: Micros, sent: u16) -> bool {
-        u64::from(sent) <= u64::from(MAX_PACKETS_BEFORE_DEAD) * (1 + at.elapsed_since(self.at).0 / DEAD_AFTER.0)
+        u64::from(sent)
+            <= u64::from(MAX_PACKETS_BEFORE_DEAD) * (1 + at.elapsed_since(self.at).0 / DEAD_AFTER.0)
     }
 
     /// Returns true if a heartbeat is an old one of this life, or a copy of its last one.

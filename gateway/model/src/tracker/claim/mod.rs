@@ -79,7 +79,10 @@ impl AddressClaim {
         }
         match word {
             HeartbeatKind::Overtaken | HeartbeatKind::Outsider | HeartbeatKind::Claimant => {}
-            HeartbeatKind::First | HeartbeatKind::Known | HeartbeatKind::Started { .. } | HeartbeatKind::Shared => {
+            HeartbeatKind::First
+            | HeartbeatKind::Known
+            | HeartbeatKind::Started { .. }
+            | HeartbeatKind::Shared => {
                 self.candidate = None;
                 let before = self.serial().filter(|serial| *serial != heartbeat.serial);
                 self.previous = before.or(self.previous);

@@ -39,7 +39,7 @@
 //! whether it has settled; this needs no state.
 
 use super::HeartbeatKind;
-use super::life::{MAX_PACKETS_PER_HEARTBEAT, Incarnation};
+use super::life::{Incarnation, MAX_PACKETS_PER_HEARTBEAT};
 
 /// The owner of a node id, and how certain its ownership is.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -177,7 +177,8 @@ impl Ownership {
     pub(super) fn next(self, evidence: Evidence, new: Incarnation) -> (Self, HeartbeatKind) {
         use Evidence as E;
         const AGAIN: HeartbeatKind = HeartbeatKind::Started { again: true };
-        let left_of = |former: Incarnation, owner: Incarnation| if former.may_go_on(new.at) { former } else { owner };
+        let left_of =
+            |former: Incarnation, owner: Incarnation| if former.may_go_on(new.at) { former } else { owner };
         match (self, evidence) {
             // first_claim
             (Self::Free, E::Claims) => (Self::Sole { owner: new }, HeartbeatKind::Started { again: false }),
@@ -203,7 +204,9 @@ impl Ownership {
                 Self::Sole { .. } | Self::Doubted { .. } | Self::Shared { .. } | Self::Inherited { .. },
                 E::Continues,
             )
-            | (Self::Sole { .. } | Self::Doubted { .. }, E::Returns) => (self.with_last(new), HeartbeatKind::Known),
+            | (Self::Sole { .. } | Self::Doubted { .. }, E::Returns) => {
+                (self.with_last(new), HeartbeatKind::Known)
+            }
             // start
             (Self::Sole { owner }, E::Intrudes | E::Starts | E::Jumps | E::Succeeds) => {
                 (Self::Doubted { owner: new, former: owner }, AGAIN)
@@ -241,7 +244,9 @@ impl Ownership {
                 | E::Jumps
                 | E::Succeeds,
             )
-            | (Self::Sole { .. } | Self::Shared { .. }, E::FormerContinues) => (self, HeartbeatKind::Overtaken),
+            | (Self::Sole { .. } | Self::Shared { .. }, E::FormerContinues) => {
+                (self, HeartbeatKind::Overtaken)
+            }
         }
     }
 }

@@ -35,7 +35,10 @@ fn two_old_heartbeats_in_order_are_no_life() {
     };
     let known = HeartbeatKind::Known;
     let (old, outsider) = (HeartbeatKind::Overtaken, HeartbeatKind::Outsider);
-    assert_eq!(words(0), [HeartbeatKind::First, known, AGAIN, old, HeartbeatKind::Shared, old, known, outsider, known]);
+    assert_eq!(
+        words(0),
+        [HeartbeatKind::First, known, AGAIN, old, HeartbeatKind::Shared, old, known, outsider, known]
+    );
     // A cell that had started since could not have sent 2883 packets.
     assert_eq!(words(2000), [HeartbeatKind::First, known, outsider, old, known, old, known, outsider, known]);
 }
@@ -48,7 +51,11 @@ fn old_heartbeats_in_order_do_not_take_the_id_of_a_cell_that_hangs() {
     let heard = own.into_iter().chain(burst).chain([(1_718, 16_063), (1_975, 16_123)]);
     let words = words_at(heard.map(|(ms, sent)| (ms, 7, sent, State::default())));
     let count = |of: HeartbeatKind| words.iter().filter(|word| **word == of).count();
-    assert_eq!((count(HeartbeatKind::First), count(HeartbeatKind::Known), count(HeartbeatKind::Outsider)), (1, 6, 11), "{words:?}");
+    assert_eq!(
+        (count(HeartbeatKind::First), count(HeartbeatKind::Known), count(HeartbeatKind::Outsider)),
+        (1, 6, 11),
+        "{words:?}"
+    );
 }
 
 #[test]
@@ -58,9 +65,16 @@ fn a_restart_is_a_claim_or_a_counter_that_falls_back() {
     let started = HeartbeatKind::Started { again: false };
     assert_eq!(words(&life), [started, HeartbeatKind::Known, HeartbeatKind::Overtaken, HeartbeatKind::Known]);
     assert_eq!(words(&[(7, 900, settled), (7, 0, claims)]), [HeartbeatKind::First, AGAIN]);
-    assert_eq!(words(&[(7, 900, settled), (7, 1, settled)]), [HeartbeatKind::First, AGAIN], "its claim was lost");
+    assert_eq!(
+        words(&[(7, 900, settled), (7, 1, settled)]),
+        [HeartbeatKind::First, AGAIN],
+        "its claim was lost"
+    );
     assert_eq!(words(&[(7, 900, settled), (7, 771, settled)]), [HeartbeatKind::First, AGAIN]);
-    assert_eq!(words(&[(7, 900, settled), (7, 772, settled)]), [HeartbeatKind::First, HeartbeatKind::Overtaken]);
+    assert_eq!(
+        words(&[(7, 900, settled), (7, 772, settled)]),
+        [HeartbeatKind::First, HeartbeatKind::Overtaken]
+    );
     // A cell that wins against another claimant sends a heartbeat while still claiming.
     assert_eq!(words(&[(7, 0, claims), (7, 1, claims)]), [started, HeartbeatKind::Known]);
 }
@@ -69,7 +83,10 @@ fn a_restart_is_a_claim_or_a_counter_that_falls_back() {
 fn a_claimed_id_keeps_its_owner_until_the_claimant_settles() {
     let (claims, settled) = (State::CLAIMING, State::default());
     let said = [(7, 9, settled), (8, 0, claims), (7, 10, settled), (8, 1, settled), (8, 2, settled)];
-    assert_eq!(words(&said), [HeartbeatKind::First, HeartbeatKind::Claimant, HeartbeatKind::Known, AGAIN, HeartbeatKind::Known]);
+    assert_eq!(
+        words(&said),
+        [HeartbeatKind::First, HeartbeatKind::Claimant, HeartbeatKind::Known, AGAIN, HeartbeatKind::Known]
+    );
     let said = [(8, 0, claims), (7, 10, settled), (7, 11, settled)];
     assert_eq!(
         words(&said),
@@ -82,7 +99,16 @@ fn a_claimed_id_keeps_its_owner_until_the_claimant_settles() {
 fn two_cells_that_use_one_id_in_turn_do_not_restart_each_time() {
     let settled = State::default();
     let said = [(7, 90, settled), (9, 40, settled), (7, 91, settled), (9, 41, settled), (9, 42, settled)];
-    assert_eq!(words(&said), [HeartbeatKind::First, AGAIN, HeartbeatKind::Shared, HeartbeatKind::Outsider, HeartbeatKind::Outsider]);
+    assert_eq!(
+        words(&said),
+        [
+            HeartbeatKind::First,
+            AGAIN,
+            HeartbeatKind::Shared,
+            HeartbeatKind::Outsider,
+            HeartbeatKind::Outsider
+        ]
+    );
 }
 
 #[test]
@@ -142,10 +168,17 @@ fn a_quick_restart_is_not_taken_for_an_old_heartbeat() {
     for sent in [1, 2, 9, 300] {
         let said =
             [(0, 7, sent, settled), (100, 7, 0, claims), (360, 7, 1, settled), (610, 7, sent + 1, settled)];
-        assert_eq!(words_at(said), [HeartbeatKind::First, AGAIN, HeartbeatKind::Known, HeartbeatKind::Known], "{sent}");
+        assert_eq!(
+            words_at(said),
+            [HeartbeatKind::First, AGAIN, HeartbeatKind::Known, HeartbeatKind::Known],
+            "{sent}"
+        );
     }
     // A cell that has been away for a long time.
-    assert_eq!(words_at([(0, 7, 900, settled), (60_000, 7, 30_000, settled)]), [HeartbeatKind::First, HeartbeatKind::Known]);
+    assert_eq!(
+        words_at([(0, 7, 900, settled), (60_000, 7, 30_000, settled)]),
+        [HeartbeatKind::First, HeartbeatKind::Known]
+    );
 }
 
 #[test]

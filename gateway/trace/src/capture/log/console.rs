@@ -118,7 +118,8 @@ impl<'a> Cursor<'a> {
             // The line is from a log whose times are dates.
             let frame = id.contains(&b'#').then(|| core::str::from_utf8(id).ok()).flatten();
             if let Some(frame) = frame.and_then(|text| candump::parse_frame(text).ok()) {
-                let seen = ConsoleFrame { stamp, interface, frame, direction: self.direction(), has_flags: true };
+                let seen =
+                    ConsoleFrame { stamp, interface, frame, direction: self.direction(), has_flags: true };
                 return Some(Ok(ConsoleLine::Frame(seen)));
             }
         }
@@ -137,7 +138,11 @@ impl<'a> Cursor<'a> {
         if self.is_of_isotpsniffer(frame.is_ok()) {
             return None;
         }
-        Some(frame.map(|frame| ConsoleLine::Frame(ConsoleFrame { stamp, interface, frame, direction, has_flags })))
+        Some(
+            frame.map(|frame| {
+                ConsoleLine::Frame(ConsoleFrame { stamp, interface, frame, direction, has_flags })
+            }),
+        )
     }
 
     /// Parses the direction (`T` or `R`) after a frame in a log.

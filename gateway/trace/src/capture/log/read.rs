@@ -6,7 +6,7 @@ use std::ops::Range;
 use protocol::candump::{self, CandumpLine, Record};
 
 use super::clock::{Clock, Evidence, Remark};
-use super::console::{self, ConsoleLine, ConsoleFrame, Stamp};
+use super::console::{self, ConsoleFrame, ConsoleLine, Stamp};
 use crate::capture::{Entry, Note, NoteKind};
 use crate::container::read_some;
 
@@ -370,7 +370,8 @@ mod tests {
 
     #[test]
     fn of_a_line_without_end_the_beginning_is_kept_and_the_next_one_is_read() {
-        let long = || Err::<(), _>(format!("a line of more than {MAX_LINE_BYTES} bytes, whose rest is left out"));
+        let long =
+            || Err::<(), _>(format!("a line of more than {MAX_LINE_BYTES} bytes, whose rest is left out"));
         for piece in [4097, CHUNK] {
             let mut bytes = vec![b'('; 3 * CHUNK];
             bytes.extend_from_slice(b"\nnext\n");

@@ -161,7 +161,8 @@ impl<W: Write> LogWriter<W> {
             Digits::Six => false,
             Digits::Nine => true,
         };
-        let mut less = OmittedProperties { digits: !nine_digits && nanos % 1_000 != 0, ..OmittedProperties::default() };
+        let mut less =
+            OmittedProperties { digits: !nine_digits && nanos % 1_000 != 0, ..OmittedProperties::default() };
         let mut written = Record { time: Timestamp { nine_digits, ..time }, interface, frame, direction };
         let mut way = match direction {
             None => "",
@@ -278,7 +279,10 @@ mod tests {
         let as_is = |line: &str| (format!("{line}\n"), vec![WriteOutcome::All]);
         assert_eq!(written(style(Digits::Own, false), &[frame(line)]), as_is(line));
         let less = OmittedProperties::default();
-        let bare = (line.replace(" T", "\n"), vec![WriteOutcome::Less(OmittedProperties { direction: true, ..less })]);
+        let bare = (
+            line.replace(" T", "\n"),
+            vec![WriteOutcome::Less(OmittedProperties { direction: true, ..less })],
+        );
         assert_eq!(written(Style::default(), &[frame(line)]), bare);
         let six = (
             "(1.000000) can0 123#1122334455667788_A T\n".to_owned(),
@@ -359,8 +363,10 @@ mod tests {
         let lines = expected.map(|name| format!("(1.000000) {name} 123#"));
         assert_eq!(text.lines().collect::<Vec<_>>(), lines);
         let other = WriteOutcome::Less(OmittedProperties { name: true, ..OmittedProperties::default() });
-        let is_other =
-            names.iter().zip(expected).map(|(bus, name)| if *bus == name { WriteOutcome::All } else { other });
+        let is_other = names
+            .iter()
+            .zip(expected)
+            .map(|(bus, name)| if *bus == name { WriteOutcome::All } else { other });
         assert_eq!(wrote, is_other.collect::<Vec<_>>());
     }
 

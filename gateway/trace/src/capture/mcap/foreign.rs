@@ -102,7 +102,8 @@ mod tests {
         for byte in [0_u8, 1, 0, 2, 0xAA, 0xBB, 0, 0, 0, 0, 0, 0] {
             out.put(byte);
         }
-        let record = ForeignType::from_schema("cdr", "can_msgs/msg/Frame").unwrap().decode(&bytes, 9).unwrap();
+        let record =
+            ForeignType::from_schema("cdr", "can_msgs/msg/Frame").unwrap().decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#AABB");
         // The length field is changed, first into that of a remote frame and then into one that is too long.
         let at = bytes.len() - 12;

@@ -9,8 +9,10 @@ use ::mcap::records::op;
 use super::ReadFault;
 use super::buses::ForeignBuses;
 use super::state::{MAX_KEPT_BYTES, McapState, RequestedMessage};
-use crate::capture::{RecordingExtras, Item};
-use crate::container::{Chunk, FormatError, Framed, MAX_RECORD_BYTES, MAGIC, Record, RecordReader, first_record, parse};
+use crate::capture::{Item, RecordingExtras};
+use crate::container::{
+    Chunk, FormatError, Framed, MAGIC, MAX_RECORD_BYTES, Record, RecordReader, first_record, parse,
+};
 
 /// The number of bytes that are read at once.
 const READ_BYTES: usize = 1 << 18;
@@ -48,7 +50,12 @@ enum Phase {
 impl McapReader {
     /// Creates a reader for an input whose first bytes, `head`, have already been read. `file` is the input if it is a
     /// regular file.
-    pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>, state: McapState, file: Option<File>) -> Self {
+    pub(crate) fn new(
+        head: &[u8],
+        input: Box<dyn Read + Send>,
+        state: McapState,
+        file: Option<File>,
+    ) -> Self {
         let input = BufReader::with_capacity(READ_BYTES, Cursor::new(head.to_vec()).chain(input));
         let (source, chunk) = (RecordReader::new(input, MAX_KEPT_BYTES as u64), Chunk::default());
         let mut reader = Self {
@@ -70,7 +77,12 @@ impl McapReader {
 
     /// Creates a reader that continues at the record with the offset `bytes`. `state` holds the channels that are
     /// already known.
-    pub(crate) fn resume(bytes: u64, input: Box<dyn Read + Send>, state: McapState, file: Option<File>) -> Self {
+    pub(crate) fn resume(
+        bytes: u64,
+        input: Box<dyn Read + Send>,
+        state: McapState,
+        file: Option<File>,
+    ) -> Self {
         let input = BufReader::with_capacity(READ_BYTES, Cursor::new(Vec::new()).chain(input));
         let (source, chunk) = (RecordReader::at(bytes, input, MAX_KEPT_BYTES as u64), Chunk::default());
         Self {
@@ -204,7 +216,9 @@ impl McapReader {
                     Framed::Passed(..) | Framed::Unknown(..) => {}
                     Framed::Long(op::ATTACHMENT, _) => state.attachment(source.attachment_name(), &[]),
                     Framed::Long(_, bytes) => {
-                        return Err(FormatError::Long { what: "record", bytes, limit: MAX_RECORD_BYTES }.into());
+                        return Err(
+                            FormatError::Long { what: "record", bytes, limit: MAX_RECORD_BYTES }.into()
+                        );
                     }
                     Framed::Cut(_, bytes) => self.truncated(bytes)?,
                     Framed::End(bytes) => self.truncated(bytes)?,

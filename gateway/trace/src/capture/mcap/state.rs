@@ -12,8 +12,8 @@ use super::buses::{ForeignBuses, beginning};
 use super::foreign::ForeignType;
 use super::write::{SECONDS_DIGITS, TIME_DIGITS};
 use crate::capture::log::MAX_LINE_BYTES as LONGEST_LINE;
-use crate::capture::{Entry, RecordingExtras, Item, LatchedFrame, Note, NoteKind, OtherMessage, Topic};
-use crate::container::{FormatError, MetadataMap, MAGIC, NameBudget, Record as Raw, find, parse};
+use crate::capture::{Entry, Item, LatchedFrame, Note, NoteKind, OtherMessage, RecordingExtras, Topic};
+use crate::container::{FormatError, MAGIC, MetadataMap, NameBudget, Record as Raw, find, parse};
 use crate::recording::STATE_TOPIC_PREFIX;
 use crate::ros2::cdr::CdrError;
 use crate::ros2::{Message, MessageError, messages};
@@ -187,7 +187,12 @@ impl McapState {
     }
 
     /// Processes a record. Returns the message if it is requested.
-    pub(crate) fn process(&mut self, opcode: u8, body: &[u8], in_chunk: bool) -> Result<Option<RequestedMessage>, ReadFault> {
+    pub(crate) fn process(
+        &mut self,
+        opcode: u8,
+        body: &[u8],
+        in_chunk: bool,
+    ) -> Result<Option<RequestedMessage>, ReadFault> {
         match parse(opcode, body)? {
             Raw::Schema { id, name, .. } => {
                 if self.schemas.get(&id).is_none_or(|known| known != name) {

@@ -10,7 +10,7 @@ use super::buses::ForeignBuses;
 use super::foreign::ForeignType;
 use super::read::McapReader;
 use super::state::McapState;
-use crate::container::{MAX_DESCRIPTION_BYTES, MAGIC, Record, find, parse};
+use crate::container::{MAGIC, MAX_DESCRIPTION_BYTES, Record, find, parse};
 
 /// The maximum number of topics that are stored.
 const TOPICS: usize = 4_096;
@@ -47,8 +47,9 @@ impl TopicSurvey {
                 Ok(Record::Schema { id, name, .. }) => _ = schemas.insert((id, name.to_owned())),
                 Ok(Record::Channel { schema, topic, encoding, .. }) => {
                     says = true;
-                    let is_of =
-                        |name: &&(u16, String)| name.0 == schema && ForeignType::from_schema(encoding, &name.1).is_some();
+                    let is_of = |name: &&(u16, String)| {
+                        name.0 == schema && ForeignType::from_schema(encoding, &name.1).is_some()
+                    };
                     if self.topics.len() < TOPICS && schemas.iter().any(|name| is_of(&name)) {
                         self.topics.insert(topic.to_owned());
                     }

@@ -9,7 +9,7 @@ use robots::UniqueNames;
 
 use crate::capture::{Entry, Note, NoteKind};
 use crate::recording::file::{Channel, FileWriter};
-use crate::recording::{NOTES_TOPIC, BUS_TOPIC_PREFIX};
+use crate::recording::{BUS_TOPIC_PREFIX, NOTES_TOPIC};
 
 /// The maximum number of channels for frames. Each channel costs a reader memory, and a log may contain any number of
 /// buses.

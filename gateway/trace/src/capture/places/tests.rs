@@ -1,6 +1,6 @@
 use super::*;
 use crate::capture::log::{Digits, Style};
-use crate::capture::{Entry, CaptureFormat, convert::CaptureWriter};
+use crate::capture::{CaptureFormat, Entry, convert::CaptureWriter};
 use protocol::can::Frame;
 use protocol::candump::{Record, Timestamp};
 use std::os::fd::AsRawFd;

@@ -14,7 +14,8 @@ use mcap::records::op;
 use super::described::{Described, Trust};
 use super::{LONGEST_ATTACHMENT, RecoverError, RecoveryResult};
 use crate::container::{
-    Chunk, FormatError, Framed, RECORD_HEADER_BYTES, MAX_RECORD_BYTES, MAGIC, Record, RecordReader, first_record, is_record, parse,
+    Chunk, FormatError, Framed, MAGIC, MAX_RECORD_BYTES, RECORD_HEADER_BYTES, Record, RecordReader,
+    first_record, is_record, parse,
 };
 
 /// The number of records before a wrong one that are examined again, because their lengths may have been wrong.
@@ -265,7 +266,8 @@ impl<R: Read + Seek> Surveyor<R> {
         if !is_sure && !is_record(self.source.input(), end, self.limit)? {
             return Ok(None);
         }
-        let is_right = self.source.read_as(content - RECORD_HEADER_BYTES as u64, own)? && self.check_contents(code).is_ok();
+        let is_right = self.source.read_as(content - RECORD_HEADER_BYTES as u64, own)?
+            && self.check_contents(code).is_ok();
         let end = if is_shorter { by_length } else { end };
         Ok(is_right.then_some(Examined::As(code, own, end)))
     }

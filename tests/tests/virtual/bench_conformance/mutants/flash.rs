@@ -134,7 +134,9 @@ pub(crate) const LEAVES: &[Spoilt] = &[
             ) {
                 memory.count = memory.joints as u64;
             }
-            if let Message::Network { page: protocol::message::NetworkPage::Received(page), .. } = &mut message {
+            if let Message::Network { page: protocol::message::NetworkPage::Received(page), .. } =
+                &mut message
+            {
                 page.joints = page.joints.saturating_sub(u16::try_from(memory.count % 65_536).unwrap());
             }
             vec![(0, message)]

@@ -48,13 +48,17 @@ pub(crate) const JOINTS: &[Spoilt] = &[
     }),
     ("takes increasing epochs only", "JOINTS-1", |it| {
         it.hear = |memory, message, frame| match (message, memory.last) {
-            (Some(Message::Joints { epoch, .. }), Some((last, _))) if epoch.epochs_since(last) < 0 => Vec::new(),
+            (Some(Message::Joints { epoch, .. }), Some((last, _))) if epoch.epochs_since(last) < 0 => {
+                Vec::new()
+            }
             _ => vec![frame],
         };
     }),
     ("takes no epoch that is more than 16 ahead", "JOINTS-1", |it| {
         it.hear = |memory, message, frame| match (message, memory.last) {
-            (Some(Message::Joints { epoch, .. }), Some((last, _))) if epoch.epochs_since(last) > 16 => Vec::new(),
+            (Some(Message::Joints { epoch, .. }), Some((last, _))) if epoch.epochs_since(last) > 16 => {
+                Vec::new()
+            }
             _ => vec![frame],
         };
     }),

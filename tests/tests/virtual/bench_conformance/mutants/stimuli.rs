@@ -11,7 +11,11 @@ pub(crate) const STIMULI: &[Spoilt] = &[
     ("stimuli of later epochs are latched at once", "STIM-3", |it| {
         it.hear = |_, message, frame| match message {
             Some(Message::Stimulus { to, page, .. }) => {
-                vec![fd(&Message::Stimulus { to: *to, from: protocol::message::AppliesFrom::Next, page: *page })]
+                vec![fd(&Message::Stimulus {
+                    to: *to,
+                    from: protocol::message::AppliesFrom::Next,
+                    page: *page,
+                })]
             }
             _ => vec![frame],
         };
@@ -22,7 +26,11 @@ pub(crate) const STIMULI: &[Spoilt] = &[
                 Some(Message::Stimulus { to, from: protocol::message::AppliesFrom::Epoch(first), page }),
                 Some((last, _)),
             ) if first.0 < last.0 => {
-                vec![fd(&Message::Stimulus { to: *to, from: protocol::message::AppliesFrom::Next, page: *page })]
+                vec![fd(&Message::Stimulus {
+                    to: *to,
+                    from: protocol::message::AppliesFrom::Next,
+                    page: *page,
+                })]
             }
             _ => vec![frame],
         };
@@ -66,7 +74,10 @@ pub(crate) const STIMULI: &[Spoilt] = &[
             Some(Message::Joints { .. }) if memory.pending.is_empty() && memory.test_mode => {
                 let own = protocol::id::Node::Cell(protocol::id::CellId::new(NODE.into()).unwrap());
                 let page = SensorPage::Skin(protocol::message::SkinSensors::default());
-                vec![fd(&Message::Stimulus { to: own, from: protocol::message::AppliesFrom::Next, page }), frame]
+                vec![
+                    fd(&Message::Stimulus { to: own, from: protocol::message::AppliesFrom::Next, page }),
+                    frame,
+                ]
             }
             _ => vec![frame],
         };

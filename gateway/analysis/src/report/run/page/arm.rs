@@ -6,7 +6,7 @@ use super::super::bus_figures::BusFigures;
 use super::facts::micros;
 use super::{Draft, shown};
 use crate::paper;
-use crate::report::figure::{Axis, LowerDiagram, Figure, Mark, Section, Shape, Table, quantity};
+use crate::report::figure::{Axis, Figure, LowerDiagram, Mark, Section, Shape, Table, quantity};
 use crate::report::thin::ThinnedLine;
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Errors};
@@ -47,8 +47,9 @@ impl Draft<'_> {
              difference, once per epoch, of all cells' answers to the same joints and the central computation for them; an epoch without an \
              answer in time is a gap. Dotted: one step of the torque words."));
             let is_compared = self.run.bus_figures.iter().any(|it| it.lines.error.count() > 0);
-            let lacks = self
-                .missing_sentence("stimuli or sensors from which central torques, and the difference to them, follow");
+            let lacks = self.missing_sentence(
+                "stimuli or sensors from which central torques, and the difference to them, follow",
+            );
             section.text.extend(lacks.filter(|_| !is_compared));
         }
         if !free.is_empty() {
@@ -195,7 +196,8 @@ impl Draft<'_> {
                 figure("velocities", "Joint velocities", Axis::new("velocity", speed), &motion.velocity),
             ]
         });
-        let no_velocity = self.missing_sentence("joint velocities, because joints frames contain only positions");
+        let no_velocity =
+            self.missing_sentence("joint velocities, because joints frames contain only positions");
         let is_there = |figure: &Figure| no_velocity.is_none() || !figure.name.starts_with("velocities");
         let (still, figures): (Vec<_>, Vec<_>) = figures.filter(is_there).partition(is_zero);
         let mut section = Section::new("motion", "The arm").figures(figures.into_iter().filter_map(shown));
@@ -237,7 +239,8 @@ impl Draft<'_> {
             .marks(self.marks());
         let mut section = Section::new("cells", "Active cells");
         section.text.extend(
-            self.missing_sentence("stimuli or sensors of all cells, and so which are in contact").filter(|_| !is_known),
+            self.missing_sentence("stimuli or sensors of all cells, and so which are in contact")
+                .filter(|_| !is_known),
         );
         if is_zero(&figure) {
             let none =

@@ -1,6 +1,6 @@
 //! The sections on the buses: replies and packets of the cells, and the load of real buses.
 
-use super::super::bus_figures::{Latency, BusFigures};
+use super::super::bus_figures::{BusFigures, Latency};
 use super::{Draft, shown};
 use crate::fit::limits::MAX_NODES;
 use crate::fit::verdict::{Answer, percent};
@@ -151,8 +151,11 @@ impl Draft<'_> {
             "max",
         ];
         let of = self.run.skin.cells.len();
-        let title =
-            if rows.len() < of { format!("The {MAX_WORST_CELLS} worst of {of} cells") } else { "All cells".to_owned() };
+        let title = if rows.len() < of {
+            format!("The {MAX_WORST_CELLS} worst of {of} cells")
+        } else {
+            "All cells".to_owned()
+        };
         let title = format!("{title}: by replies late or missing, then losses, then the slowest reply");
         Some(Table::new(title, head, rows))
     }

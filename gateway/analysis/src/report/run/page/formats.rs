@@ -16,7 +16,10 @@ struct Choice<'a> {
 
 impl Choice<'_> {
     fn of(&self, format: TorqueFormat) -> RoundingErrors {
-        self.all.iter().find(|(it, _)| *it == format).map_or_else(RoundingErrors::default, |(_, rounded)| *rounded)
+        self.all
+            .iter()
+            .find(|(it, _)| *it == format)
+            .map_or_else(RoundingErrors::default, |(_, rounded)| *rounded)
     }
 
     /// Returns the finest format whose range contains every torque; the format with the widest range if there is none.

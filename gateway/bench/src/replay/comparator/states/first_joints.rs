@@ -13,7 +13,7 @@
 //! | `known` | `Taken` | `Sends` | unchanged | only its counters show a restart |
 
 use protocol::id::{CellId, Node};
-use protocol::message::{ReceivedCounts, Message, NetworkPage};
+use protocol::message::{Message, NetworkPage, ReceivedCounts};
 use protocol::packet::Epoch;
 
 /// State of a cell by the joints since its start.

@@ -48,7 +48,10 @@ fn the_same_contributions_are_equal_in_any_tree() {
     // Trees 1 - 2 - 3 and 1 - (2, 3); in the first, cell 2 only forwards.
     let contact = vec![words(10), None, words(30)];
     let both = (sums(&contact, &[0, 1, 2]), sums(&contact, &[0, 1, 1]));
-    assert_eq!(outcomes(&both.0, &both.1, 3), [SumComparison::Equal, SumComparison::Nothing, SumComparison::Equal]);
+    assert_eq!(
+        outcomes(&both.0, &both.1, 3),
+        [SumComparison::Equal, SumComparison::Nothing, SumComparison::Equal]
+    );
     let side = EpochSums::new(&both.0.0, &both.0.1, 5);
     let own = side.own_term(cell(1)).unwrap();
     assert_eq!((own.steps[0], own.cells, own.children), (Some(10), 1, vec![cell(2)]));
@@ -68,7 +71,10 @@ fn one_step_is_rounding_and_two_are_a_difference() {
 fn a_cell_without_contact_now_is_missing_and_one_without_contact_then_is_extra() {
     let then = sums(&vec![words(10), words(20), None], &[0, 0, 0]);
     let today = sums(&vec![words(10), None, words(1)], &[0, 0, 0]);
-    assert_eq!(outcomes(&then, &today, 3), [SumComparison::Equal, SumComparison::Missing, SumComparison::Extra]);
+    assert_eq!(
+        outcomes(&then, &today, 3),
+        [SumComparison::Equal, SumComparison::Missing, SumComparison::Extra]
+    );
     // A cell that only forwards still sends a sum; its own count shows it.
     let then = sums(&vec![words(10), words(20)], &[0, 1]);
     let today = sums(&vec![None, words(20)], &[0, 1]);
@@ -146,7 +152,10 @@ fn a_cell_between_two_parents_is_omitted_and_an_unreachable_one_is_not() {
     today.1.set_parent(cell(2), None, 2);
     assert_eq!(outcomes(&then, &today, 2), [SumComparison::Equal, SumComparison::Missing]);
     today.1.set_parent(cell(2), Some(0), 9);
-    assert_eq!(outcomes(&then, &today, 2), [SumComparison::Equal, SumComparison::Omitted(OmitReason::Changing)]);
+    assert_eq!(
+        outcomes(&then, &today, 2),
+        [SumComparison::Equal, SumComparison::Omitted(OmitReason::Changing)]
+    );
 }
 
 #[test]

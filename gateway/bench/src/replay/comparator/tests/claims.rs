@@ -23,7 +23,10 @@ fn a_claim_of_a_taken_node_id_explains_nothing_and_leaves_the_cell_there() {
         assert_eq!(extra(&with_claim(at)), extra(&run()), "recorded after {at}");
         let comparator = rated(&run(), &with_claim(at));
         assert_eq!(counts(&comparator), [3, 0, 0, 0], "heard after {at}");
-        assert!(comparator.present_cells(0).all(|(_, present)| present.claim.is_settled()), "heard after {at}");
+        assert!(
+            comparator.present_cells(0).all(|(_, present)| present.claim.is_settled()),
+            "heard after {at}"
+        );
     }
 }
 

@@ -3,7 +3,7 @@
 use protocol::message::{Heartbeat, State};
 use protocol::time::Micros;
 
-use super::{Evidence as E, Incarnation, Ownership, HeartbeatKind};
+use super::{Evidence as E, HeartbeatKind, Incarnation, Ownership};
 use Sample::{Doubted, DoubtedLong, Free, Inherited, InheritedLong, Shared, Sole};
 
 const AGAIN: HeartbeatKind = HeartbeatKind::Started { again: true };
