@@ -26,7 +26,6 @@ mod foreign;
 pub struct Stats {
     /// Times of the earliest and the latest frame, in ns.
     span: Option<(u64, u64)>,
-    /// The counts of the report that grow with each frame.
     counts: Report,
     bus_stats: Vec<BusStats>,
     is_untimed: bool,
@@ -44,7 +43,6 @@ struct BusStats {
     wires: Count,
     foreign: ForeignCounter,
     joints: Option<Joints>,
-    /// The cells of the bus, by node id.
     cells: Vec<Option<Box<CellStats>>>,
 }
 

@@ -66,13 +66,10 @@ impl Entry {
 #[derive(Debug, Default)]
 pub struct Outgoing {
     classic: bool,
-    /// True if frames must not switch to the data bit rate.
     one_rate: bool,
     pace: Pace,
-    /// The text of all entries that is not written yet.
     text: VecDeque<u8>,
     entries: VecDeque<Entry>,
-    /// The number of bytes of the first entry that are already written.
     written: usize,
     /// The number of entries that may be written by now, and the number of their bytes that are not written yet.
     released: usize,
@@ -80,7 +77,6 @@ pub struct Outgoing {
     busy_until: Duration,
     is_up: bool,
     stage: OpeningStage,
-    /// The number of frames sent since the adapter was opened. Frames that it refused are subtracted.
     since_open: u64,
     /// The counts of the frames.
     pub account: ToLineCounts,

@@ -32,24 +32,17 @@ pub enum Origin {
         at_ns: u64,
     },
     /// A write of the cell's mode, which ends its contact.
-    Mode {
-        /// Time of the write in ns since 1970.
-        at_ns: u64,
-    },
+    Mode { at_ns: u64 },
     /// A stimulus that set the cell's sensors.
     Stimulus {
         /// Time of the stimulus.
         at_ns: u64,
-        /// The epoch from which the stimulus applies; `None` for the next joints.
         from_epoch: Option<u8>,
         /// True if the stimulus came after the joints of that epoch.
         late: bool,
     },
     /// A sensors page that the cell sent.
-    Said {
-        /// Time of the page in ns since 1970.
-        at_ns: u64,
-    },
+    Said { at_ns: u64 },
 }
 
 /// A request for the joints of one epoch.
@@ -99,7 +92,6 @@ pub struct CellMoment {
 #[derive(Debug)]
 pub struct Watch<'a> {
     skin: &'a Skin,
-    /// The requested joints; `None` for all joints.
     requested: Option<RequestedJoints>,
     /// Time that counts as 0 s, in ns since 1970; `None` for the time of the first frame.
     zero: Option<u64>,
@@ -113,11 +105,9 @@ pub struct Watch<'a> {
 struct BusWatch {
     /// True if the capture has frames of the bus.
     is_in_capture: bool,
-    /// True if the skin has cells on the bus.
     cells_here: bool,
     last: Option<Epoch>,
     halted: bool,
-    /// Number of occurrences of the requested joints so far.
     occurrences: u32,
     /// Joints whose answers may still arrive, oldest first.
     open: VecDeque<OpenJoints>,
@@ -134,7 +124,6 @@ struct BusWatch {
 struct OpenJoints {
     epoch: Epoch,
     moment: Moment,
-    /// Number of joints packets since these joints.
     since: u32,
 }
 

@@ -5,8 +5,7 @@ use protocol::message::{
     Answer, AppliesFrom, Heartbeat, NetworkPages, Readings, SensorPage, SkinSensors, State,
 };
 use protocol::packet::{Epoch, WORDS};
-use protocol::parameters::MAX_JOINTS;
-use protocol::parameters::{Events, LinksDown, Parameter, Parameters};
+use protocol::parameters::{Events, LinksDown, MAX_JOINTS, Parameter, Parameters};
 use protocol::skin::{self, Safety};
 use protocol::time::Micros;
 
@@ -32,7 +31,6 @@ pub struct Responded {
 /// The halt state of a cell.
 #[derive(Clone, Copy, Debug, Default)]
 struct Halt {
-    /// True if the cell is halted, by its last heartbeat or a later command on the bus.
     halted: bool,
     /// True if the bus carried a halt or a resume since the cell's last heartbeat.
     commanded: bool,
@@ -47,7 +45,6 @@ pub struct CellState {
     pub serial: u32,
     /// True if the cell is wired to the gateway.
     pub root: bool,
-    /// The joint that moves the cell, from 1 in its chain.
     pub(super) joint: usize,
     /// Expected hash of the cell's configuration.
     pub configuration: u16,
@@ -62,19 +59,14 @@ pub struct CellState {
     /// Sensors frames of the cell.
     pub sensed: SensorFrames,
     pub(super) tracked: CellTracker,
-    /// The requested packets that the cell has sent.
     pub(super) said: Responded,
-    /// Contact state of the cell, as far as the bus shows it.
     contact: Contact<()>,
-    /// The switches that the cell should have, and those that it has confirmed.
     switched: SwitchStates,
     halt: Halt,
     sent: SentJoints,
     pub(super) outstanding: Outstanding,
-    /// The number of the last broadcast that the cell answered.
     pub(super) answered: Option<u64>,
     held: HeldTorque,
-    /// The sums that the cell sends if it is a root, on a bus with sums.
     pub(super) sums: Option<RootSums>,
 }
 

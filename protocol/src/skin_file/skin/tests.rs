@@ -66,7 +66,6 @@ fn wired_text(reply: &str, cells: &[([i64; 4], bool)]) -> String {
     text
 }
 
-/// Formats an error with its line but without its column.
 fn by_line(error: DocumentError) -> String {
     let DocumentError::InvalidValue { path, line, what, .. } = error else { return error.to_string() };
     format!("{path}:{line}: {what}")
@@ -464,7 +463,6 @@ normal = [0.0, 0.6, 0.8]
     let mut long = Skin::parse("skin.toml", &format!("{head}{long}")).unwrap();
     let (given, same) = (short.cells[0].normal, long.cells[0].normal);
     assert!(given.iter().zip(same).all(|(given, same)| (given - same).abs() < 1e-12), "{same:?}");
-    // An orientation contains more than the normal.
     assert!(long.cells[0].orientation.take().is_some() && short.cells[0].orientation.is_none());
     long.cells[0].normal = given;
     assert_eq!(short, long);
@@ -492,13 +490,10 @@ normal = [0.0, 0.6, 0.8]
 
 #[test]
 fn a_scenario_is_known_for_what_it_is() {
-    let said = Skin::parse("s.toml", "duration_s = 2.0\n[[touch]]\nall = true\nforce_n = 1.0\n")
-        .unwrap_err()
-        .to_string();
-    assert_eq!(
-        said,
-        "s.toml: this is a scenario, not a skin: `skinbus run SKIN --scenario SCENARIO` takes both"
-    );
+    let text = "duration_s = 2.0\n[[touch]]\nall = true\nforce_n = 1.0\n";
+    let said = Skin::parse("s.toml", text).unwrap_err().to_string();
+    let hint = "this is a scenario, not a skin: `skinbus run SKIN --scenario SCENARIO` takes both";
+    assert_eq!(said, format!("s.toml: {hint}"));
     let said = says("[controller]", "[motion]\n[controller]");
     assert!(said.contains("unknown field `motion`"), "a skin with a key too many: {said}");
 }
