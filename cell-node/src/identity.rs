@@ -15,7 +15,7 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// Returns the identifiers that this cell receives in every network state ([`Id::of_cell`]). A cell without a node
+    /// Returns the identifiers that this cell receives in every network state ([`Id::received_by_cell`]). A cell without a node
     /// id receives no identifiers, only messages at its ports.
     #[must_use]
     pub fn received_ids(&self) -> [Option<Id>; OWN_IDS] {

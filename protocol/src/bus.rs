@@ -72,7 +72,7 @@ pub struct BusOptions {
     pub receive_buffer: usize,
     /// Maximum time that [`Bus::send`] waits for room in the transmit queue.
     pub send_timeout: Duration,
-    /// The directory of embedded buses; `None` for [`embedded::usual_directory`].
+    /// The directory of embedded buses; `None` for [`embedded::default_directory`].
     pub directory: Option<PathBuf>,
 }
 
@@ -301,7 +301,7 @@ impl Bus {
         }
     }
 
-    /// Sends frames in order. If the transmit queue is full, waits for room, at most [`Options::send_timeout`] after
+    /// Sends frames in order. If the transmit queue is full, waits for room, at most [`BusOptions::send_timeout`] after
     /// the last accepted frame. Never allocates except on failure.
     ///
     /// # Errors

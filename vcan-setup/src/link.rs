@@ -20,7 +20,7 @@ pub struct Interface {
     pub name: String,
     /// The kind of the interface.
     pub kind: InterfaceKind,
-    /// True if this program made the interface, which then has the alias [`MARK`].
+    /// True if this program made the interface, which then has the alias [`ALIAS_MARK`].
     pub ours: bool,
     /// True if the interface is up.
     pub up: bool,

@@ -8,7 +8,7 @@
 //! ```
 //!
 //! A step makes an interface, or changes or removes one that this program has made. The only exception is
-//! [`Action::SetRates`], which changes CAN hardware and is planned only if the user requests it.
+//! [`StepAction::SetRates`], which changes CAN hardware and is planned only if the user requests it.
 
 use std::ffi::OsStr;
 

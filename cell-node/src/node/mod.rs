@@ -200,7 +200,7 @@ impl Node {
     }
 
     /// Returns the identifiers that this cell receives in its present state. The caller reads them again whenever
-    /// [`Node::poll_hears`] returns true.
+    /// [`Node::poll_received_ids`] returns true.
     pub fn received_ids(&self) -> impl Iterator<Item = Id> + use<'_> {
         self.slots().flatten()
     }

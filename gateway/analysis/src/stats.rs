@@ -4,7 +4,7 @@
 //!   frames, each decoded ──> Stats ──> Report: buses, kinds, epochs, refused frames, losses, cells
 //! ```
 //!
-//! The work per frame is bounded. Memory grows with the number of buses, up to [`BUSES`], not with the number of
+//! The work per frame is bounded. Memory grows with the number of buses, up to [`MAX_BUSES`], not with the number of
 //! frames.
 
 use model::decode::{Decoded, MAX_BUSES};

@@ -5,7 +5,7 @@
 //!   server of the page <── BenchState ──── main thread of the run
 //! ```
 //!
-//! Each [`State`] is complete: a state that did not fit into the pipe is superseded by the next one.
+//! Each [`BenchState`] is complete: a state that did not fit into the pipe is superseded by the next one.
 
 use std::io;
 use std::os::fd::OwnedFd;

@@ -17,7 +17,7 @@ pub struct SignalError {
     pub source: io::Error,
 }
 
-/// Catches signals and returns the flag that they set: [`stop::flag`].
+/// Catches signals and returns the flag that they set: [`stop::stop_flag`].
 ///
 /// # Errors
 /// Returns [`SignalError`] with the signal that cannot be caught.

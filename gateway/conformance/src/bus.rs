@@ -7,7 +7,7 @@ use thiserror::Error;
 /// A frame seen on the bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct ObservedFrame {
-    /// The time at which the frame was on the bus, on the clock of [`Bus::now`].
+    /// The time at which the frame was on the bus, on the clock of [`TestBus::now`].
     pub at: Micros,
     /// The frame.
     pub frame: Frame,
@@ -23,16 +23,16 @@ pub trait TestBus {
     /// Returns true if frames of this format can be sent, also if the cell uses the other format.
     fn carries(&self, format: Format) -> bool;
 
-    /// Sends frames, in order. [`Bus::receive`] returns each one, marked as own, once it was on the bus.
+    /// Sends frames, in order. [`TestBus::receive`] returns each one, marked as own, once it was on the bus.
     ///
     /// # Errors
-    /// Returns [`Stop`] if the bus does not accept the frames, or if the test is interrupted.
+    /// Returns [`StopReason`] if the bus does not accept the frames, or if the test is interrupted.
     fn send(&mut self, frames: &[Frame]) -> Result<(), StopReason>;
 
     /// Returns the next frame, or `None` if no frame arrives until then.
     ///
     /// # Errors
-    /// Returns [`Stop`] if the bus is gone, or if the test is interrupted.
+    /// Returns [`StopReason`] if the bus is gone, or if the test is interrupted.
     fn receive(&mut self, until: Micros) -> Result<Option<ObservedFrame>, StopReason>;
 
     /// Returns the maximum lateness of the bench itself since the last call, so that it does not count against the
@@ -48,13 +48,13 @@ pub trait TestBus {
     /// Begins to switch the cell off and on.
     ///
     /// # Errors
-    /// Returns [`Stop`] if the restart cannot begin.
+    /// Returns [`StopReason`] if the restart cannot begin.
     fn begin_restart(&mut self) -> Result<(), StopReason>;
 
     /// Returns true while the restart is in progress.
     ///
     /// # Errors
-    /// Returns [`Stop`] if the restart failed.
+    /// Returns [`StopReason`] if the restart failed.
     fn is_restarting(&mut self) -> Result<bool, StopReason>;
 }
 

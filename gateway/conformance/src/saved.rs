@@ -50,7 +50,7 @@ impl Session<'_> {
     /// answer.
     ///
     /// # Errors
-    /// Returns [`Stop`] if the bus fails, or if the test is interrupted.
+    /// Returns [`StopReason`] if the bus fails, or if the test is interrupted.
     pub fn save(&mut self) -> Result<Result<SavedCell, String>, StopReason> {
         let Reply::Value(identity) = self.read(Parameter::Identity.number())? else {
             return Ok(Err("it does not answer a read of parameter 0 (identity)".to_owned()));
@@ -81,7 +81,7 @@ impl Session<'_> {
     /// Restores the state of the cell, and returns descriptions of the parts that could not be restored.
     ///
     /// # Errors
-    /// Returns [`Stop`] if the bus fails.
+    /// Returns [`StopReason`] if the bus fails.
     pub fn restore(&mut self, saved: &SavedCell) -> Result<Vec<String>, StopReason> {
         let mut left = Vec::new();
         self.extend(RESTORE_TIMEOUT);

@@ -46,10 +46,10 @@ pub struct NodeSenders {
 }
 
 impl Survey {
-    /// Listens on the bus for [`LISTEN`], and returns the cells and gateways that send.
+    /// Listens on the bus for [`LISTEN_TIME`], and returns the cells and gateways that send.
     ///
     /// # Errors
-    /// Returns [`Stop`] if the bus fails, or if the test is interrupted.
+    /// Returns [`StopReason`] if the bus fails, or if the test is interrupted.
     pub fn listen(bus: &mut dyn TestBus, name: &str) -> Result<Self, StopReason> {
         let until = bus.now() + LISTEN_TIME;
         let mut decoder = Decoder::new(None);

@@ -69,7 +69,7 @@ pub struct ReferenceTorque {
 
 impl Central {
     /// Builds the reference from the quantised words that the cells compute with. All cells of the skin must sit on one
-    /// chain; for a skin with several buses, pass [`Skin::part_on`] of one bus.
+    /// chain; for a skin with several buses, pass [`Skin::with_cells_of_bus`] of one bus.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
         let mut links = Vec::new();

@@ -55,7 +55,7 @@ impl Attempt {
         self.due
     }
 
-    /// Handles the timeout and returns the next action; [`Turn::Again`] counts as a transmission. A call before the
+    /// Handles the timeout and returns the next action; [`RetryAction::Again`] counts as a transmission. A call before the
     /// timeout has no effect.
     pub fn turn(&mut self, now: Micros) -> RetryAction {
         if now < self.due {

@@ -2,7 +2,7 @@
 //! share of replies in time at the highest rate that the bench holds.
 //!
 //! A bench has the fewest buses that have enough node ids for its cells. The cells of each bus are one process. A bench
-//! holds a rate if the share [`HOLDS`] of the replies arrives in time while the share [`ACTIVE`] of the cells is
+//! holds a rate if the share [`MIN_IN_TIME_SHARE`] of the replies arrives in time while the share [`ACTIVE_SHARE`] of the cells is
 //! touched, and if the reason for every loss is known.
 
 mod section;
@@ -39,7 +39,7 @@ pub struct ScaleBench {
     pub buses: usize,
     /// The number of joint broadcasts per second.
     pub hz: f64,
-    /// True if the share [`ACTIVE`] of the cells is touched.
+    /// True if the share [`ACTIVE_SHARE`] of the cells is touched.
     pub active: bool,
     /// The duration of the run, in s.
     pub seconds: f64,
@@ -169,7 +169,7 @@ pub struct SizeFigures {
     pub holds: bool,
     /// The measurements while no cells are touched.
     pub quiet: BenchFigures,
-    /// The measurements while the share [`ACTIVE`] of the cells is touched.
+    /// The measurements while the share [`ACTIVE_SHARE`] of the cells is touched.
     pub active: BenchFigures,
 }
 

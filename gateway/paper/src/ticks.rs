@@ -20,7 +20,7 @@ use model::table::{Snapshot, Table};
 
 /// The maximum number of cells in Fig. 9 of the paper.
 pub const MAX_CELLS: usize = 3_000;
-/// The number of buses for [`MOST_CELLS`] cells.
+/// The number of buses for [`MAX_CELLS`] cells.
 pub const BUSES: usize = 12;
 /// The joint positions of the arm while times are measured, in rad.
 pub const POSE: [f64; WORDS] = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];

@@ -106,7 +106,7 @@ impl KindChoice {
         }
     }
 
-    /// Returns the kind of the bus of this name, which for [`Choice::Auto`] depends on the interfaces that
+    /// Returns the kind of the bus of this name, which for [`KindChoice::Auto`] depends on the interfaces that
     /// exist now.
     #[must_use]
     pub fn resolve(self, name: &str) -> BusKind {
@@ -205,7 +205,7 @@ impl KindChoices {
         Self { named: BTreeMap::new(), others: kind }
     }
 
-    /// Requests the given kind for each of these buses, and [`Choice::Auto`] for others.
+    /// Requests the given kind for each of these buses, and [`KindChoice::Auto`] for others.
     #[must_use]
     pub fn exactly<'a>(buses: impl IntoIterator<Item = (&'a str, BusKind)>) -> Self {
         let named = buses.into_iter().map(|(name, kind)| (name.to_owned(), KindChoice::Only(kind)));

@@ -68,20 +68,20 @@ pub fn exit_code(program: &str, done: Result<(), Failure>) -> ExitCode {
     ExitCode::from(code)
 }
 
-/// Writes a line to standard error in one write, made printable by [`shown`]. Errors are ignored.
+/// Writes a line to standard error in one write, made printable by [`printable`]. Errors are ignored.
 pub fn eprint_line(line: &str) {
     let _ = InterruptibleWriter::new(io::stderr()).write_all(format!("{}\n", printable(line)).as_bytes());
 }
 
-/// Writes text of several lines to standard error in one write, made printable by [`shown_lines`]. Errors are ignored.
+/// Writes text of several lines to standard error in one write, made printable by [`printable_lines`]. Errors are ignored.
 pub fn eprint_lines(text: &str) {
     let _ = InterruptibleWriter::new(io::stderr()).write_all(printable_lines(text).as_bytes());
 }
 
-/// Writes text to standard output. On a terminal, [`shown_lines`] makes the text printable first.
+/// Writes text to standard output. On a terminal, [`printable_lines`] makes the text printable first.
 ///
 /// # Errors
-/// Returns the errors of [`written`].
+/// Returns the errors of [`ignore_broken_pipe`].
 pub fn print_text(text: &str) -> Result<(), Failure> {
     if io::stdout().is_terminal() { print_raw(&printable_lines(text)) } else { print_raw(text) }
 }
@@ -89,7 +89,7 @@ pub fn print_text(text: &str) -> Result<(), Failure> {
 /// Writes text to standard output unchanged, including terminal control sequences.
 ///
 /// # Errors
-/// Returns the errors of [`written`].
+/// Returns the errors of [`ignore_broken_pipe`].
 pub fn print_raw(text: &str) -> Result<(), Failure> {
     ignore_broken_pipe(write_stdout(text))
 }
@@ -109,7 +109,7 @@ pub fn printable(text: &str) -> Cow<'_, str> {
     escape_chars(text, is_unprintable)
 }
 
-/// Makes a text of several lines printable, like [`shown`], but keeps line feeds and tabs.
+/// Makes a text of several lines printable, like [`printable`], but keeps line feeds and tabs.
 #[must_use]
 pub fn printable_lines(text: &str) -> Cow<'_, str> {
     escape_chars(text, |letter| is_unprintable(letter) && !matches!(letter, '\n' | '\t'))

@@ -2,7 +2,7 @@
 //! and allowed values.
 //!
 //! The file is deserialised into a plain struct with `serde`, which refuses unknown keys. A `check` function then
-//! converts the struct to checked types or returns a [`Fault`]. Deserialisation records no positions, which makes it
+//! converts the struct to checked types or returns a [`DocumentFault`]. Deserialisation records no positions, which makes it
 //! fast; after an error, the file is parsed again with positions.
 
 mod mistakes;
@@ -207,7 +207,7 @@ pub enum DocumentError {
 }
 
 impl DocumentError {
-    /// Returns [`DocumentError::Mistaken`] with `what` if the text is a file of another kind: it has one of the keys
+    /// Returns [`DocumentError::WrongKind`] with `what` if the text is a file of another kind: it has one of the keys
     /// `has` and none of the keys `lacks`. Otherwise returns the error unchanged.
     #[must_use]
     pub fn or_wrong_kind(self, text: &str, has: &[&str], lacks: &[&str], what: &'static str) -> Self {
@@ -233,7 +233,7 @@ pub fn span_from_seconds(seconds: f64) -> Span {
     Span((seconds * 1e6).round() as u64)
 }
 
-/// Reads a file of at most [`LONGEST`] bytes.
+/// Reads a file of at most [`MAX_FILE_BYTES`] bytes.
 ///
 /// # Errors
 /// Returns an error if the file is longer, or cannot be read as UTF-8.

@@ -118,9 +118,9 @@ pub enum SlcanCommand {
     Open,
     /// `L`: joins the bus in listen-only mode, in which the adapter does not acknowledge frames.
     Listen,
-    /// `S0` to `S9`: the nominal bit rate, see [`Command::nominal`].
+    /// `S0` to `S9`: the nominal bit rate, see [`SlcanCommand::nominal_bit_rate`].
     BitRate(u8),
-    /// `Y0` to `Y9`: the data bit rate, see [`Command::data`].
+    /// `Y0` to `Y9`: the data bit rate, see [`SlcanCommand::data_bit_rate`].
     DataBitRate(u8),
     /// `V` or `v`: requests the firmware version.
     Version,

@@ -56,7 +56,7 @@ impl FrameDatagram {
         self.format
     }
 
-    /// Returns the bytes of the larger struct, of which the datagram is the first [`Parcel::byte_len`].
+    /// Returns the bytes of the larger struct, of which the datagram is the first [`FrameDatagram::byte_len`].
     #[must_use]
     pub const fn bytes(&self) -> &[u8; FD_BYTES] {
         &self.bytes

@@ -220,7 +220,7 @@ impl Incoming {
         self.sources.iter().filter(|(_, source)| source.account.shared > 0).map(|(host, _)| host.as_str())
     }
 
-    /// Returns the number of messages from hosts beyond [`SOURCES`].
+    /// Returns the number of messages from hosts beyond [`MAX_SOURCES`].
     #[must_use]
     pub const fn unknown_hosts(&self) -> u64 {
         self.unknown_hosts

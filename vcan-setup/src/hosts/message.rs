@@ -80,7 +80,7 @@ pub enum MessageError {
     },
 }
 
-/// Encodes a message with at most [`FRAMES`] of the given frames.
+/// Encodes a message with at most [`MAX_FRAMES`] of the given frames.
 pub fn encode<'a>(head: &MessageHeader, frames: impl IntoIterator<Item = &'a Stamped>, bytes: &mut Vec<u8>) {
     bytes.clear();
     bytes.extend([VERSION, 0, 0, 0, 0, 0, 0, 0]);

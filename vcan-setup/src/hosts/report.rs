@@ -1,7 +1,7 @@
 //! Reports of a link to local programs, and the address of the link.
 //!
 //! A link listens at an abstract Unix address, which is unique to the bus and the network namespace. A program that
-//! connects receives a [`Report`] at once and after each change, as a line of JSON. It need not send anything.
+//! connects receives a [`LinkReport`] at once and after each change, as a line of JSON. It need not send anything.
 
 use std::collections::BTreeMap;
 use std::io::{self, ErrorKind, Read};
@@ -34,7 +34,7 @@ pub struct LinkReport {
     /// Frames received from the local bus that the link had put there, or that went around a circle. They are not sent
     /// to other hosts again.
     pub returned: u64,
-    /// The number of messages from hosts beyond the limit of [`SOURCES`](super::incoming::SOURCES).
+    /// The number of messages from hosts beyond the limit of [`SOURCES`](super::incoming::MAX_SOURCES).
     pub unknown_hosts: u64,
 }
 

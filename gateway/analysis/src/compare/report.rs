@@ -221,7 +221,7 @@ pub struct FirstDifference {
     pub time_s: Both<Option<f64>>,
     /// The differing words in each capture.
     pub words: Both<Option<i16>>,
-    /// The values of the differing words, in [`First::unit`].
+    /// The values of the differing words, in [`FirstDifference::unit`].
     pub values: Both<Option<f64>>,
     /// Unit of `values`: Nm, N, rad or m; absent without words.
     pub unit: Option<&'static str>,

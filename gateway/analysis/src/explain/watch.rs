@@ -32,17 +32,24 @@ pub enum Origin {
         at_ns: u64,
     },
     /// A write of the cell's mode, which ends its contact.
-    Mode { at_ns: u64 },
+    Mode {
+        /// Time of the write in ns since 1970.
+        at_ns: u64,
+    },
     /// A stimulus that set the cell's sensors.
     Stimulus {
         /// Time of the stimulus.
         at_ns: u64,
+        /// The epoch from which the stimulus applies; `None` for the next joints.
         from_epoch: Option<u8>,
         /// True if the stimulus came after the joints of that epoch.
         late: bool,
     },
     /// A sensors page that the cell sent.
-    Said { at_ns: u64 },
+    Said {
+        /// Time of the page in ns since 1970.
+        at_ns: u64,
+    },
 }
 
 /// A request for the joints of one epoch.
@@ -93,9 +100,7 @@ pub struct CellMoment {
 pub struct Watch<'a> {
     skin: &'a Skin,
     requested: Option<RequestedJoints>,
-    /// Time that counts as 0 s, in ns since 1970; `None` for the time of the first frame.
     zero: Option<u64>,
-    /// The buses of the skin, by their index in it.
     bus_watches: Vec<BusWatch>,
     /// Names of the buses in the capture that are not in the skin.
     others: Vec<String>,
@@ -220,7 +225,7 @@ impl<'a> Watch<'a> {
     }
 
     /// Returns the requested joints on each of the skin's buses; `None` for a bus that does not have them. Call it at
-    /// the end of the capture, or once [`Watch::take`] has returned true.
+    /// the end of the capture, or once [`Watch::receive`] has returned true.
     ///
     /// # Errors
     /// Returns [`NotFound`] if no bus has these joints.

@@ -62,7 +62,7 @@ impl ByLimit<bool> {
     }
 }
 
-/// The maximum number of cells on one bus by each limit; for nodes, [`NODES`] minus the gateway.
+/// The maximum number of cells on one bus by each limit; for nodes, [`MAX_NODES`] minus the gateway.
 pub type MaxCells = ByLimit<u32>;
 
 impl MaxCells {

@@ -174,7 +174,7 @@ impl Shadow {
         self.reported.as_mut()?.poll()
     }
 
-    /// Returns the name of a bus, given its number in [`Shaded::bus`].
+    /// Returns the name of a bus, given its number in [`FrameTiming::bus`].
     #[must_use]
     pub fn bus(&self, bus: usize) -> &str {
         self.bus_timings.get(bus).map_or("", |bus_timing| &bus_timing.name)

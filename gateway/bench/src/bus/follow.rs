@@ -3,16 +3,16 @@
 //!
 //! | state | event | next state | returned |
 //! |---|---|---|---|
-//! | `Working`, `Lost` | frames arrive | `Working` | [`Step::Frames`] |
-//! | `Working`, `Lost` | timeout | unchanged | [`Step::Nothing`] |
-//! | `Working` | the bus goes down | `Draining` | [`Step::Down`], once |
-//! | `Lost` | the bus is still down | unchanged, after a pause | [`Step::Nothing`] |
-//! | `Draining` | frames from before the loss | unchanged | [`Step::Leftover`] |
-//! | `Draining` | all leftover frames are read | `Lost` | [`Step::Drained`] |
-//! | any but `Gone` | the bus is removed | `Gone` | [`Step::Gone`], once |
-//! | `Gone` | the bus opens | `Working` | [`Step::Nothing`] |
-//! | `Gone` | the bus is still absent | unchanged | [`Step::Nothing`] |
-//! | `Gone` | the bus exists but does not open | unchanged | [`Step::Refused`], once per reason |
+//! | `Working`, `Lost` | frames arrive | `Working` | [`FollowStep::Frames`] |
+//! | `Working`, `Lost` | timeout | unchanged | [`FollowStep::Nothing`] |
+//! | `Working` | the bus goes down | `Draining` | [`FollowStep::Down`], once |
+//! | `Lost` | the bus is still down | unchanged, after a pause | [`FollowStep::Nothing`] |
+//! | `Draining` | frames from before the loss | unchanged | [`FollowStep::Leftover`] |
+//! | `Draining` | all leftover frames are read | `Lost` | [`FollowStep::Drained`] |
+//! | any but `Gone` | the bus is removed | `Gone` | [`FollowStep::Gone`], once |
+//! | `Gone` | the bus opens | `Working` | [`FollowStep::Nothing`] |
+//! | `Gone` | the bus is still absent | unchanged | [`FollowStep::Nothing`] |
+//! | `Gone` | the bus exists but does not open | unchanged | [`FollowStep::Refused`], once per reason |
 
 use std::thread;
 use std::time::{Duration, Instant};

@@ -1,7 +1,7 @@
 //! One bus, shared by the threads of a run: it may be lost and reopened, and senders never wait for that.
 //!
 //! The receiver reopens a bus that is gone. The control loop gets the new bus through a triple buffer, where it neither
-//! blocks nor frees memory. Threads that may block use [`Link::send`].
+//! blocks nor frees memory. Threads that may block use [`SharedBus::send`].
 
 use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -35,7 +35,7 @@ pub struct SharedBus {
 /// The control loop's end of the triple buffer that holds the open bus.
 pub type Slot = triple_buffer::Output<Arc<Bus>>;
 
-/// The end of a [`Link`] that the receiver's thread holds.
+/// The end of a [`SharedBus`] that the receiver's thread holds.
 #[derive(Debug)]
 pub struct ReceiveEnd {
     /// The link shared with the other threads.

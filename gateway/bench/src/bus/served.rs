@@ -88,7 +88,7 @@ pub enum ServeError {
 /// A bus to open: its name, its kind and its options.
 pub type BusTarget<'a> = (&'a str, KindChoice, BusOptions);
 
-/// Action for a bus that exists neither as an interface nor as an embedded bus, if its kind is [`Choice::Auto`].
+/// Action for a bus that exists neither as an interface nor as an embedded bus, if its kind is [`KindChoice::Auto`].
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum IfAbsent {
     /// Serve a new embedded bus, because this program starts all its cells.

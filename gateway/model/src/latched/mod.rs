@@ -8,7 +8,7 @@
 //! | [`touched`] | the cells in contact, as far as known | replays |
 //!
 //! Both follow each cell's contact by [`Contact`](crate::tracker::Contact) and the owner of each node id by
-//! [`Claim`](crate::tracker::Claim), under the same rules of `docs/reference/cell.md`:
+//! [`Claim`](crate::tracker::AddressClaim), under the same rules of `docs/reference/cell.md`:
 //!
 //! | message | effect |
 //! |---|---|

@@ -28,7 +28,7 @@ pub const RUN_METADATA: &str = "run";
 /// The key of the first tick's time in [`RUN`], in ns since 1970.
 const BEGAN: &str = "began_ns";
 
-/// Returns the contents of the metadata record [`RUN`] for a first tick at `nanos` ns since 1970.
+/// Returns the contents of the metadata record [`RUN_METADATA`] for a first tick at `nanos` ns since 1970.
 #[must_use]
 pub fn facts_of_run(nanos: u64) -> BTreeMap<String, String> {
     [(BEGAN.to_owned(), nanos.to_string())].into()

@@ -51,7 +51,7 @@ impl Chunk {
     /// decompressed size.
     ///
     /// # Errors
-    /// Returns [`Damage`] if the chunk is invalid. It then has no records.
+    /// Returns [`FormatError`] if the chunk is invalid. It then has no records.
     pub fn unpack(&mut self, record: &[u8], read: u64) -> Result<(), FormatError> {
         self.rewind();
         let unpacked = self.open(record, read);

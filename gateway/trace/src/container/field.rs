@@ -125,7 +125,7 @@ impl NameBudget {
     /// Counts a name of `bytes` bytes towards the limit.
     ///
     /// # Errors
-    /// Returns [`Damage::Names`] if the limit is exceeded.
+    /// Returns [`FormatError::Names`] if the limit is exceeded.
     pub fn add(&mut self, bytes: usize) -> Result<(), FormatError> {
         self.0 = self.0.saturating_add(bytes).saturating_add(Self::ENTRY_OVERHEAD);
         if self.0 > Self::LIMIT { Err(FormatError::Names { limit: Self::LIMIT }) } else { Ok(()) }
@@ -199,7 +199,7 @@ impl<'a> Fields<'a> {
 /// Decodes a record. Chunks, indexes and statistics are returned as [`Record::Other`].
 ///
 /// # Errors
-/// Returns [`Damage`] if the record is shorter than its fields, if a schema or another description is too long, if a
+/// Returns [`FormatError`] if the record is shorter than its fields, if a schema or another description is too long, if a
 /// name is not UTF-8,
 /// or if an attachment's checksum is wrong.
 pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, FormatError> {

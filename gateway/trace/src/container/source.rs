@@ -19,17 +19,17 @@ const FOOTER_CHECKED: usize = 16;
 /// A record of the file, or the reason why there is no further record.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Framed {
-    /// A record with this operation code, whose contents are in [`Source::body`].
+    /// A record with this operation code, whose contents are in [`RecordReader::body`].
     Record(u8),
     /// A skipped record with this operation code and length: an index, statistics, or a record of an application. Its
-    /// beginning is in [`Source::body`].
+    /// beginning is in [`RecordReader::body`].
     Passed(u8, u64),
-    /// A record with this operation code and length that is too long for memory. Its beginning is in [`Source::body`].
+    /// A record with this operation code and length that is too long for memory. Its beginning is in [`RecordReader::body`].
     Long(u8, u64),
     /// A record with an operation code that the format does not define, and its length.
     Unknown(u8, u64),
     /// A record with this operation code and length that the input does not hold completely. The available beginning,
-    /// up to a limit, is in [`Source::body`].
+    /// up to a limit, is in [`RecordReader::body`].
     Cut(u8, u64),
     /// The end of the input. The number counts the remaining bytes, which are too few for a record header; it is 0 if
     /// the file ends between two records.
@@ -87,7 +87,7 @@ impl<R: Read> RecordReader<R> {
         Self { read, checksum: None, ..Self::new(input, attachments) }
     }
 
-    /// Reads the magic bytes at the beginning or end of a file into [`Source::body`]. Returns true if they are correct.
+    /// Reads the magic bytes at the beginning or end of a file into [`RecordReader::body`]. Returns true if they are correct.
     ///
     /// # Errors
     /// Returns an error if the input fails.
@@ -139,7 +139,7 @@ impl<R: Read> RecordReader<R> {
     /// position in the file.
     ///
     /// # Errors
-    /// Returns [`Damage`] if the operation code or the length is wrong.
+    /// Returns [`FormatError`] if the operation code or the length is wrong.
     pub fn check(&self, framed: Framed) -> Result<(), FormatError> {
         let (code, bytes) = match framed {
             Framed::Unknown(code, _) => return Err(FormatError::Unknown(code)),
@@ -179,7 +179,7 @@ impl<R: Read> RecordReader<R> {
     /// those of the summary at the footer. Accepts a file without checksums, and one of which a part was skipped.
     ///
     /// # Errors
-    /// Returns [`Damage`] if the record or the checksum is wrong.
+    /// Returns [`FormatError`] if the record or the checksum is wrong.
     pub fn check_section(&mut self, code: u8) -> Result<(), FormatError> {
         let found = self.checksum.take().map(crc32fast::Hasher::finalize);
         let (Record::DataEnd { crc: saved } | Record::Footer { crc: saved }) = parse(code, &self.body)?
@@ -329,7 +329,7 @@ impl<R: Read + Seek> RecordReader<R> {
         Ok(())
     }
 
-    /// Reads the contents of the record at offset `began` into [`Source::body`]. Uses `length` instead of the record's
+    /// Reads the contents of the record at offset `began` into [`RecordReader::body`]. Uses `length` instead of the record's
     /// own length field, which is wrong. Returns true if the input has all these bytes.
     ///
     /// # Errors

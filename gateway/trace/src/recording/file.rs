@@ -3,7 +3,7 @@
 //! This is the only module that uses the writer of the crate `mcap`.
 //! The crate writes the schema and the channel of a message into the chunk of the first message, and again into the
 //! summary. This module repeats all schemas and channels outside of chunks, after that chunk and then every
-//! [`DESCRIBED_EVERY`] chunks. No single damaged place can therefore make all messages unreadable.
+//! [`CHUNKS_PER_DESCRIPTION`] chunks. No single damaged place can therefore make all messages unreadable.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File};

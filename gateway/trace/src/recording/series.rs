@@ -299,7 +299,7 @@ impl<T> SplitRecording<T> {
 
     /// Writes the messages that have waited long enough. Ends a file whose disk is full, or one that is large or old
     /// enough, the latter only if `holds` is false. Returns true if the caller should begin another file with
-    /// [`Series::next`].
+    /// [`SplitRecording::next`].
     pub fn flush(&mut self, holds: bool) -> bool {
         self.take_published();
         let Some(open) = &mut self.open else {

@@ -86,7 +86,7 @@ impl Timing {
 /// The message with which the cells of a bus reply to joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum SkinReply {
-    /// Each cell sends its own torque, in the format [`Bus::torque_format`].
+    /// Each cell sends its own torque, in the format [`SkinBus::torque_format`].
     Torque,
     /// Each cell sends the sum of its own torque and those of its children in the tree, in Q7.8.
     Sum {

@@ -1,8 +1,8 @@
 //! Reading of XML that a strict parser rejects, and detection of files that are not XML.
 //!
-//! [`text`] decodes a file by its byte order mark or its declaration. [`prepare`] repairs common errors without
+//! [`decode`] decodes a file by its byte order mark or its declaration. [`prepare`] repairs common errors without
 //! changing any value: it binds undeclared prefixes, blanks comments that contain `--` and document types without
-//! definitions, and strips trailing NUL bytes. Line numbers do not change. [`foreign`] detects files that are not XML
+//! definitions, and strips trailing NUL bytes. Line numbers do not change. [`detect_foreign`] detects files that are not XML
 //! or not of the expected kind. [`escaped`] escapes a text for XML or HTML.
 
 mod encoding;

@@ -22,7 +22,7 @@ pub enum Reassembly {
 
 /// The reassembly buffer for one identifier: the segments received so far of one packet.
 ///
-/// Segments arrive in order. The last segment of a packet arrives within [`Segment::within`] after the first. The
+/// Segments arrive in order. The last segment of a packet arrives within [`Reassembler::max_gap`] after the first. The
 /// length of a packet follows from its kind and the chain of its bus; if the chain is unknown, all lengths are tried.
 /// If the CRC is wrong, only the oldest segment is dropped, so that a lost frame costs one packet and not all later
 /// ones.
@@ -75,7 +75,7 @@ impl Reassembler {
     }
 
     /// Adds the next classic frame with this identifier. Its packets can have one of `lengths`, restricted to the
-    /// lengths that the identifier allows ([`Lengths::of`]).
+    /// lengths that the identifier allows ([`Lengths::for_id`]).
     ///
     /// # Errors
     /// Returns an error if no segment of packets with these lengths has the size of the frame. The buffer does not
