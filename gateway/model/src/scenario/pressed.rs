@@ -206,7 +206,7 @@ mod tests {
                 "4:25: touch[0].profile[1][0] = 1: the times of points must increase",
             ),
             ("profile = [[-1.0, 3.0]]", "4:13: touch[0].profile[0][0] = -1: must be 0 to 3.2e7 s after"),
-            ("profile = [[nan, 3.0]]", "4:13: touch[0].profile[0][0] = NaN: 0 to 3.2e7 s"),
+            ("profile = [[nan, 3.0]]", "4:13: touch[0].profile[0][0] = NaN: must be 0 to 3.2e7 s"),
             ("profile = [[1.0, 96.0]]", "4:18: touch[0].profile[0][1] = 96: 0 to 95.997 N are possible"),
             ("profile = [[1.0, -0.5]]", "4:18: touch[0].profile[0][1] = -0.5: 0 to 95.997 N are possible"),
             ("profile = [[1.0, nan]]", "4:18: touch[0].profile[0][1] = NaN: 0 to 95.997 N are possible"),
